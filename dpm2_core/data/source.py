@@ -1,0 +1,33 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What every loader offers: a drive as lazily read frames in time order."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Protocol
+
+from dpm2_core.frame import Array, Frame
+
+
+class Source(Protocol):
+    """A drive.
+
+    Attributes:
+        name: what reports call it, such as "04" or the bag's file name.
+        poses: (len, 4, 4) float64 T_world_lidar ground truth, one a frame, NaN where unknown; None without any.
+        T_cam_lidar: (4, 4) LiDAR to left camera 0 (KITTI's Tr), None when the calibration has none.
+        notes: what the user should be told once (a missing Tr, topics chosen), in words.
+    """
+
+    name: str
+    poses: Array | None
+    T_cam_lidar: Array | None
+    notes: list[str]
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        ...
+
+    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
+        """Frames start..stop-1 by position, read one at a time; an unreadable one comes with `problem` set."""
+        ...

@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The nouns of the project. A transform is `T_target_source`: p_target = T_target_source @ p_source."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Points = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A calibrated camera.
+
+    Attributes:
+        K: (3, 3) float64 intrinsics, pixels.
+        T_lidar_cam: (4, 4) float64, camera (x right, y down, z forward) to LiDAR frame, m.
+        size: (width, height) of the image, pixels.
+        distortion: plumb-bob coefficients k1, k2, p1, p2[, k3]; empty for a rectified image.
+        name: what messages call it.
+    """
+
+    K: Array
+    T_lidar_cam: Array
+    size: tuple[int, int]
+    distortion: tuple[float, ...] = ()
+    name: str = "camera"
+
+    def __post_init__(self) -> None:
+        if self.K.shape != (3, 3) or self.T_lidar_cam.shape != (4, 4):
+            raise ValueError(
+                f"{self.name}: K is {self.K.shape}, T_lidar_cam {self.T_lidar_cam.shape}; want (3, 3), (4, 4)"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Image:
+    """One picture: pixels (H, W, 3) uint8 RGB, and the camera that took it."""
+
+    pixels: NDArray[np.uint8]
+    camera: Camera
+
+    def __post_init__(self) -> None:
+        height, width = self.pixels.shape[:2]
+        if self.pixels.shape[2:] != (3,) or (width, height) != self.camera.size:
+            raise ValueError(
+                f"{self.camera.name}: image of {self.pixels.shape}, calibration for {self.camera.size[::-1]}"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """What the sensors saw at one time.
+
+    Attributes:
+        stamp: ns since the epoch of the source.
+        points: (N, 4) float32 [x, y, z in m, intensity 0..1] in the LiDAR frame; N may be 0, NaN is allowed.
+        time_offset: (N,) float32 s, capture time of each point relative to `stamp`; None where the source has none.
+        images: zero, one or several pictures.
+        index: position in its source (KITTI frame number, message count of a bag).
+        problem: why the scan could not be read; `points` is then empty and the frame counts as failed, not lost.
+    """
+
+    stamp: int
+    points: Points
+    time_offset: Points | None = None
+    images: tuple[Image, ...] = ()
+    index: int = 0
+    problem: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.points.ndim != 2 or self.points.shape[1] != 4:
+            raise ValueError(f"frame {self.index}: points are {self.points.shape}, want (N, 4)")
+        if self.time_offset is not None and self.time_offset.shape != self.points.shape[:1]:
+            raise ValueError(f"frame {self.index}: {len(self.time_offset)} time offsets for {len(self.points)} points")
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """The answer of every registration, geometric or neural.
+
+    Attributes:
+        T_target_source: (4, 4) float64.
+        covariance: (6, 6) [rotation rad, translation m] of xi in T = T_target_source @ Exp(xi).
+        confidence: 0..1, 0 for a guess.
+        rmse: root mean square residual of the inliers, m.
+        method: who answered.
+        ok: False: do not use it; `reason` says why in words.
+    """
+
+    T_target_source: Array
+    covariance: Array
+    confidence: float
+    rmse: float
+    method: str
+    ok: bool = True
+    reason: str = ""
+
+
+class State(StrEnum):
+    """Health of the odometry, as published in /diagnostics."""
+
+    INITIALISING = "initialising"
+    TRACKING = "tracking"
+    DEGRADED = "degraded"
+    LOST = "lost"
+    RELOCALISING = "relocalising"
+
+
+@dataclass(frozen=True, eq=False)
+class Keyframe:
+    """A place of the map.
+
+    Attributes:
+        id: count within its robot. robot: namespace, "" for the only one. stamp: ns. index: `Frame.index`.
+        T_odom_kf: (4, 4) pose when it was made, in the odometry frame; the pose graph holds the optimised one.
+        cloud: (M, 4) float32 sub-sampled points in its own LiDAR frame: the map and later refinement.
+        edge: registration of this keyframe to the one before, T_before_this; None for the first.
+    """
+
+    id: int
+    stamp: int
+    index: int
+    T_odom_kf: Array
+    cloud: Points
+    edge: Registration | None = None
+    robot: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class LoopClosure:
+    """A verified or refused loop: `registration.T_target_source` is T_from_to; `registration.ok` says accepted."""
+
+    from_id: int
+    to_id: int
+    registration: Registration
+
+
+@dataclass(frozen=True, eq=False)
+class Tracked:
+    """What the odometry knows after one frame.
+
+    Attributes:
+        stamp: ns, that of the cloud. index: `Frame.index`.
+        T_odom_lidar: (4, 4), always finite; the prediction where `registration.ok` is False.
+        covariance: (6, 6) as in `Registration`, of T_odom_lidar relative to the frame before.
+        twist: (6,) [rad/s, m/s] in the LiDAR frame.
+        registration: how it was found.
+        keyframe: set when this frame became one.
+        seconds: wall time of each stage.
+    """
+
+    stamp: int
+    index: int
+    T_odom_lidar: Array
+    covariance: Array
+    twist: Array
+    state: State
+    registration: Registration
+    keyframe: Keyframe | None = None
+    seconds: dict[str, float] = field(default_factory=dict)
