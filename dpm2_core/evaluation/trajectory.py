@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Trajectory files, KITTI and TUM, and which pose of one belongs to which of the other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from dpm2_core.errors import UsageError
+from dpm2_core.files import atomic_write
+from dpm2_core.frame import Array
+from dpm2_core.geometry import se3
+
+Keys = NDArray[np.int64]
+
+_TUM, _KITTI, _KITTI_INDEXED = 8, 12, 13  # numbers a line
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Poses and what tells them apart.
+
+    Attributes:
+        poses: (N, 4, 4) float64 T_world_sensor, m.
+        keys: (N,) int64: stamps in ns (TUM) or frame numbers (KITTI; the line number from 0 where no index is given).
+        kind: "tum", "kitti", or "kitti-indexed" where the first of 13 columns is the frame number.
+    """
+
+    poses: Array
+    keys: Keys
+    kind: str
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+
+def write_kitti(path: Path | str, poses: Array, index: Sequence[int] | Keys | None = None) -> None:
+    """(N, 4, 4) poses as 12 numbers a line, row-major; `index` puts the frame number in front, for missing frames."""
+    rows = np.asarray(poses, np.float64)[:, :3].reshape(-1, 12)
+    with atomic_write(path) as file:
+        if index is None:
+            np.savetxt(file, rows, "%.12e")
+        else:
+            np.savetxt(file, np.column_stack([index, rows]), ["%d"] + ["%.12e"] * 12)
+
+
+def write_tum(path: Path | str, stamps: Sequence[int] | Keys, poses: Array) -> None:
+    """`stamp x y z qx qy qz qw` a line; stamps in ns become seconds with nine decimals, which a float loses."""
+    poses = np.asarray(poses, np.float64).reshape(-1, 4, 4)
+    numbers = np.hstack([poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat()])
+    with atomic_write(path) as file:
+        file.write("# timestamp tx ty tz qx qy qz qw\n")
+        for stamp, row in zip(stamps, numbers, strict=True):
+            sign, ns = "-" if stamp < 0 else "", abs(int(stamp))
+            file.write(f"{sign}{ns // 10**9}.{ns % 10**9:09d} " + " ".join(f"{x:.12g}" for x in row) + "\n")
+
+
+def read_trajectory(path: Path | str) -> Trajectory:
+    """Read KITTI (12 numbers a line, or 13 with the frame number first) or TUM (8), told apart by their number.
+
+    Raises:
+        UsageError: no such file, or a line that is no pose; it names file and line.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not a text file"
+        raise UsageError(f"{path}: {reason}") from None
+    lines = [(number, line.split()) for number, line in enumerate(text.splitlines(), 1)]
+    lines = [(number, fields) for number, fields in lines if fields and not fields[0].startswith("#")]
+    if not lines:
+        raise UsageError(f"{path}: holds no pose")
+    columns = len(lines[0][1])
+    if columns not in (_TUM, _KITTI, _KITTI_INDEXED):
+        raise UsageError(f"{path}:{lines[0][0]}: {columns} numbers; want 8 (TUM), 12 or 13 (KITTI)")
+    keys: list[int] = []
+    rows: list[list[float]] = []
+    for number, fields in lines:
+        if len(fields) != columns:
+            raise UsageError(f"{path}:{number}: {len(fields)} numbers where the lines before have {columns}")
+        try:
+            rows.append([float(field) for field in fields])
+            keys.append(_key(fields[0], columns) if columns != _KITTI else len(keys))
+        except (ValueError, InvalidOperation) as error:
+            raise UsageError(f"{path}:{number}: {error if str(error)[0] != '[' else 'not a number'}") from None
+    poses, good = _poses(np.array(rows), columns)
+    if not good.all():
+        raise UsageError(f"{path}:{lines[int(np.argmin(good))][0]}: not a finite rigid transform")
+    if columns == _KITTI_INDEXED and len(set(keys)) < len(keys):
+        raise UsageError(f"{path}: the frame numbers of its first column repeat")
+    kind = {_TUM: "tum", _KITTI: "kitti", _KITTI_INDEXED: "kitti-indexed"}[columns]
+    return Trajectory(poses, np.array(keys, np.int64), kind)
+
+
+def _key(field: str, columns: int) -> int:
+    """A TUM stamp in ns, exact where a float would lose the last digits, or a frame number."""
+    value = Decimal(field) * (10**9 if columns == _TUM else 1)
+    if not value.is_finite() or abs(value) > 2**62 or (columns != _TUM and value != int(value)):
+        raise ValueError(f"{field} is not a {'time stamp' if columns == _TUM else 'frame number'}")
+    return round(value)
+
+
+def _poses(rows: Array, columns: int) -> tuple[Array, NDArray[np.bool_]]:
+    """(N, columns) numbers to (N, 4, 4) poses and which of them are finite rigid transforms."""
+    finite = np.isfinite(rows).all(1)
+    rows = np.where(finite[:, None], rows, 0.0)
+    if columns == _TUM:
+        quaternions = rows[:, 4:8]
+        good = finite & (np.abs(np.linalg.norm(quaternions, axis=1) - 1) < 0.01)
+        quaternions = np.where(good[:, None], quaternions, [0.0, 0.0, 0.0, 1.0])
+        return se3.make(Rotation.from_quat(quaternions).as_matrix(), rows[:, 1:4]), good
+    matrices = rows[:, -12:].reshape(-1, 3, 4)
+    R = matrices[:, :, :3]
+    # Published files hold 5 to 7 digits; 0.01 separates rounding from a matrix that is no rotation.
+    skew = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max((1, 2))
+    return se3.make(R, matrices[:, :, 3]), finite & (skew < 0.01) & (np.linalg.det(R) > 0)

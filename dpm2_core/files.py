@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Results reach the disk whole or not at all: a full disk or a kill leaves the file that was there before."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import IO, Any, Literal
+
+from dpm2_core.errors import Dpm2Error
+
+
+@contextmanager
+def atomic_write(path: Path | str, mode: Literal["w", "wb"] = "w") -> Iterator[IO[Any]]:
+    """A file that takes the name `path` when the block ends well, and vanishes when it does not.
+
+    Folders on the way are made. A pipe or device (`/dev/stdout`) is written to directly: it cannot be replaced.
+
+    Raises:
+        Dpm2Error: the file could not be written; it names `path`, and what was there is untouched.
+    """
+    path = Path(path)
+    target = path.resolve()  # a symbolic link stays one
+    part = target.with_name(f".{target.name}.{os.getpid()}.part")  # same folder: replacing is then atomic
+    encoding = None if "b" in mode else "utf-8"
+    try:
+        if path.exists() and not path.is_file() and not path.is_dir():
+            with path.open(mode, encoding=encoding) as file:
+                yield file
+            return
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with part.open(mode, encoding=encoding) as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(target)
+    except OSError as error:
+        raise Dpm2Error(f"{path}: not written: {error.strerror or error}") from error
+    finally:
+        with suppress(OSError):
+            part.unlink()
