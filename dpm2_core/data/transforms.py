@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A tree of static transforms from /tf_static messages or configuration, free of ROS. Never identity by default."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from dpm2_core.errors import UsageError
+from dpm2_core.frame import Array
+from dpm2_core.geometry import se3
+
+
+def transform_matrix(transform: Any) -> Array:
+    """geometry_msgs/Transform or Pose to (4, 4).
+
+    Raises:
+        UsageError: the quaternion is zero or anything is not finite.
+    """
+    t = transform.translation if hasattr(transform, "translation") else transform.position
+    q = transform.rotation if hasattr(transform, "rotation") else transform.orientation
+    quaternion, translation = np.array([q.x, q.y, q.z, q.w]), np.array([t.x, t.y, t.z])
+    if not (np.linalg.norm(quaternion) > 1e-6 and np.isfinite(quaternion).all() and np.isfinite(translation).all()):
+        raise UsageError(f"no rigid transform: rotation {quaternion.tolist()}, translation {translation.tolist()}")
+    return se3.make(Rotation.from_quat(quaternion).as_matrix(), translation)
+
+
+class TransformTree:
+    """Frames by name, each with its parent."""
+
+    def __init__(self) -> None:
+        self._parents: dict[str, tuple[str, Array]] = {}
+
+    def add(self, tf_message: Any) -> None:
+        """Take every transform of a tf2_msgs/TFMessage.
+
+        Raises:
+            UsageError: one of them is no rigid transform.
+        """
+        for stamped in tf_message.transforms:
+            try:
+                T = transform_matrix(stamped.transform)
+            except UsageError as error:
+                raise UsageError(f"tf {stamped.header.frame_id} -> {stamped.child_frame_id}: {error}") from None
+            self.set(stamped.header.frame_id, stamped.child_frame_id, T)
+
+    def set(self, parent: str, child: str, T_parent_child: Array) -> None:
+        """Place `child` in `parent`; a later call replaces an earlier one."""
+        self._parents[_name(child)] = (_name(parent), np.asarray(T_parent_child, np.float64))
+
+    def lookup(self, target_frame: str, source_frame: str) -> Array:
+        """T_target_source (4, 4).
+
+        Raises:
+            UsageError: the two are not connected; the message names both and every frame known.
+        """
+        target, source = _name(target_frame), _name(source_frame)
+        up_target, up_source = self._ancestors(target), self._ancestors(source)
+        common = next((frame for frame in up_source if frame in up_target), None)
+        if common is None or (target == source and target not in self.frames):
+            known = ", ".join(self.frames) or "none"
+            raise UsageError(f"no transform from {source_frame!r} to {target_frame!r}; frames known: {known}")
+        return se3.inverse(up_target[common]) @ up_source[common]
+
+    @property
+    def frames(self) -> list[str]:
+        """Names of every frame, sorted."""
+        return sorted({*self._parents, *(parent for parent, _ in self._parents.values())})
+
+    def _ancestors(self, frame: str) -> dict[str, Array]:
+        """The frame itself and everything above it, nearest first, each with T_ancestor_frame."""
+        out, T = {frame: np.eye(4)}, np.eye(4)
+        while frame in self._parents:
+            frame, T_parent_frame = self._parents[frame]
+            if frame in out:
+                break  # a cycle: broken input, but no reason to hang
+            T = T_parent_frame @ T
+            out[frame] = T
+        return out
+
+
+def _name(frame: str) -> str:
+    return frame.lstrip("/")  # tf1 names had a leading slash
