@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -87,8 +87,8 @@ def read_trajectory(path: Path | str) -> Trajectory:
         try:
             rows.append([float(field) for field in fields])
             keys.append(_key(fields[0], columns) if columns != _KITTI else len(keys))
-        except (ValueError, InvalidOperation) as error:
-            raise UsageError(f"{path}:{number}: {error if str(error)[0] != '[' else 'not a number'}") from None
+        except ValueError as error:
+            raise UsageError(f"{path}:{number}: {error}") from None
     poses, good = _poses(np.array(rows), columns)
     if not good.all():
         raise UsageError(f"{path}:{lines[int(np.argmin(good))][0]}: not a finite rigid transform")
@@ -108,7 +108,7 @@ def _key(field: str, columns: int) -> int:
 
 def _poses(rows: Array, columns: int) -> tuple[Array, NDArray[np.bool_]]:
     """(N, columns) numbers to (N, 4, 4) poses and which of them are finite rigid transforms."""
-    finite = np.isfinite(rows).all(1)
+    finite = np.logical_and.reduce(np.isfinite(rows), axis=1)
     rows = np.where(finite[:, None], rows, 0.0)
     if columns == _TUM:
         quaternions = rows[:, 4:8]
@@ -120,3 +120,48 @@ def _poses(rows: Array, columns: int) -> tuple[Array, NDArray[np.bool_]]:
     # Published files hold 5 to 7 digits; 0.01 separates rounding from a matrix that is no rotation.
     skew = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max((1, 2))
     return se3.make(R, matrices[:, :, 3]), finite & (skew < 0.01) & (np.linalg.det(R) > 0)
+
+
+def matched(gt: Trajectory, est: Trajectory, tolerance: float = 0.01) -> tuple[Array, Array]:
+    """Ground truth (N, 4, 4) and the estimate (N, 4, 4) of the same frames, NaN where it has none.
+
+    By stamp (nearest within `tolerance`, s) if both are TUM, by frame number if one carries it, else line by line.
+
+    Raises:
+        UsageError: nothing says which pose belongs to which, or none belong together.
+    """
+    stamped = gt.kind == est.kind == "tum"
+    numbered = "tum" not in (gt.kind, est.kind) and "kitti-indexed" in (gt.kind, est.kind)
+    if not stamped and not numbered:
+        if len(gt) == len(est):
+            return gt.poses, est.poses
+        raise UsageError(
+            f"ground truth has {len(gt)} poses ({gt.kind}), the estimate {len(est)} ({est.kind}), and neither frame"
+            " numbers (13 KITTI columns, the number first) nor stamps (both TUM) say which belong together"
+        )
+    gt_keys, order = np.unique(gt.keys, return_index=True)
+    gt_poses = gt.poses[order]
+    rows, near = _nearest(gt_keys, est.keys, round(tolerance * 1e9) if stamped else 0)
+    if not near.any():
+        unit = "time stamp" if stamped else "frame number"
+        raise UsageError(f"no {unit} of the estimate ({est.keys[0]}...) is one of the ground truth ({gt.keys[0]}...)")
+    rows, first = np.unique(rows[near], return_index=True)  # of several for one frame (a looped bag) the first
+    est_poses = np.full_like(gt_poses, np.nan)
+    est_poses[rows] = est.poses[near][first]
+    if stamped and _period(gt_keys) < 0.75 * _period(est.keys):
+        # Ground truth of a faster clock (GNSS, motion capture): the frames are those of the estimate.
+        return gt_poses[rows], est_poses[rows]
+    return gt_poses, est_poses
+
+
+def _period(keys: Keys) -> float:
+    """Median step between neighbours."""
+    return float(np.median(np.diff(keys))) if len(keys) > 1 else 0.0
+
+
+def _nearest(keys: Keys, wanted: Keys, tolerance: int) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """Row of the nearest of ascending `keys` for each wanted one, and whether it is within the tolerance."""
+    right = np.clip(np.searchsorted(keys, wanted), 0, len(keys) - 1)
+    left = np.maximum(right - 1, 0)
+    rows = np.where(np.abs(keys[left] - wanted) <= np.abs(keys[right] - wanted), left, right)
+    return rows, np.abs(keys[rows] - wanted) <= tolerance

@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The KITTI odometry metric: relative error over segments of given length along the ground truth.
+
+A. Geiger, P. Lenz, R. Urtasun, "Are we ready for autonomous driving?", CVPR 2012; agrees with the development kit's
+`evaluate_odometry.cpp` to every digit it prints (test_kitti_metric.py).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dpm2_core.frame import Array
+from dpm2_core.geometry import se3
+
+OFFICIAL_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
+"""Segment lengths of the benchmark, m."""
+
+
+@dataclass(frozen=True, eq=False)
+class SegmentErrors:
+    """One entry a segment.
+
+    Attributes:
+        length: (S,) m.
+        t_err: (S,) error of the relative translation over the length, a ratio.
+        r_err: (S,) error of the relative rotation over the length, rad/m.
+    """
+
+    length: Array
+    t_err: Array
+    r_err: Array
+
+    def __len__(self) -> int:
+        return len(self.length)
+
+    def of_length(self, length: float) -> SegmentErrors:
+        """Those of one length."""
+        chosen = self.length == length
+        return SegmentErrors(self.length[chosen], self.t_err[chosen], self.r_err[chosen])
+
+    def mean(self) -> tuple[float, float] | None:
+        """(t_err, r_err) as the benchmark ranks them; None where the drive is shorter than every length."""
+        return (float(self.t_err.mean()), float(self.r_err.mean())) if len(self) else None
+
+
+def segment_errors(
+    gt: Array, est: Array, lengths: Sequence[float] = OFFICIAL_LENGTHS, step: int | None = None
+) -> SegmentErrors:
+    """Compare (N, 4, 4) poses with (N, 4, 4) ground truth of the same frames and the same sensor frame.
+
+    Args:
+        est: rows of NaN where a frame has no estimate; segments that begin or end there are left out.
+        lengths: m.
+        step: a segment starts every `step` frames; as the benchmark does every 10, with other lengths every frame.
+    """
+    step = step or (10 if tuple(lengths) == OFFICIAL_LENGTHS else 1)
+    travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(gt[:, :3, 3], axis=0), axis=1))])
+    first, length = (grid.ravel() for grid in np.meshgrid(np.arange(0, len(gt), step), lengths, indexing="ij"))
+    last = np.searchsorted(travelled, travelled[first] + length, side="right")  # the first frame beyond the length
+    whole = last < len(gt)
+    first, last, length = first[whole], last[whole], length[whole]
+    both = known(est)[first] & known(est)[last]
+    first, last, length = first[both], last[both], length[both]
+    error = se3.inverse(relative(est, first, last)) @ relative(gt, first, last)
+    return SegmentErrors(length, np.linalg.norm(error[:, :3, 3], axis=1) / length, se3.angle(error) / length)
+
+
+def known(poses: Array) -> NDArray[np.bool_]:
+    """(N,) which of (N, 4, 4) poses are finite."""
+    return np.logical_and.reduce(np.isfinite(poses), axis=(1, 2))
+
+
+def relative(poses: Array, first: NDArray[np.intp], last: NDArray[np.intp]) -> Array:
+    """T_first_last of (N, 4, 4) poses for (S,) index pairs."""
+    return se3.inverse(poses[first]) @ poses[last]

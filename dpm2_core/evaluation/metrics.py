@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One set of error figures for every trajectory that this project judges, with one definition each.
+
+All compare the poses of the same sensor frame; the alignment of the two world frames is said with each figure.
+`evo` computes the same APE and RPE and is the oracle of the tests, but is under the GPL and so not a dependency.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict
+
+from dpm2_core.errors import UsageError
+from dpm2_core.evaluation.kitti_metric import OFFICIAL_LENGTHS, SegmentErrors, known, relative, segment_errors
+from dpm2_core.frame import Array
+from dpm2_core.geometry import se3
+
+
+class LengthErrors(BaseModel):
+    """The KITTI metric of one segment length."""
+
+    model_config = ConfigDict(frozen=True)
+
+    length_m: float
+    segments: int
+    t_err_percent: float | None
+    r_err_deg_per_100m: float | None
+
+
+class Metrics(BaseModel):
+    """The figures of one run; None where the drive or the ground truth does not allow them."""
+
+    model_config = ConfigDict(frozen=True, use_attribute_docstrings=True)
+
+    frames: int
+    """Frames of the drive."""
+    failed_frames: int
+    """Frames without an estimate of their own: missing, or only predicted."""
+    fps: float | None = None
+    """Frames a second of processing, reading excluded; None where it is not known."""
+    path_length_m: float | None = None
+    """Length of the ground truth, m."""
+    t_err_percent: float | None = None
+    """KITTI metric, translation: mean over all segments of `lengths_m`, percent. None: shorter than every length."""
+    r_err_deg_per_100m: float | None = None
+    """KITTI metric, rotation, degrees per 100 m."""
+    lengths_m: tuple[float, ...] = OFFICIAL_LENGTHS
+    """Segment lengths of the KITTI metric; the benchmark's are 100 to 800 m."""
+    segments: int = 0
+    """Segments that the KITTI metric averages over."""
+    per_length: tuple[LengthErrors, ...] = ()
+    """The KITTI metric by segment length."""
+    ape_rmse_m: float | None = None
+    """Root mean square position error after the best SE(3) alignment (Umeyama, without scale), m."""
+    rpe_trans_m: float | None = None
+    """Mean error of the translation from one frame to the next, m."""
+    rpe_rot_deg: float | None = None
+    """Mean error of the rotation from one frame to the next, degrees."""
+    final_drift_percent: float | None = None
+    """Position error at the last frame, aligned at the first pose alone, over the length of the path, percent."""
+
+
+def evaluate(
+    gt: Array,
+    est: Array,
+    lengths: Sequence[float] = OFFICIAL_LENGTHS,
+    *,
+    failed_frames: int | None = None,
+    fps: float | None = None,
+) -> Metrics:
+    """Judge (N, 4, 4) poses against (N, 4, 4) ground truth of the same frames.
+
+    Args:
+        gt: rows of NaN where the ground truth is unknown; these frames are not judged.
+        est: in the sensor frame of `gt` (the world frames may differ); rows of NaN where there is no estimate.
+        lengths: of the KITTI metric's segments, m.
+        failed_frames: as the SLAM system counted them; by default the frames without an estimate.
+        fps: frames a second, to be reported along.
+
+    Raises:
+        UsageError: the two differ in length, or fewer than two frames have both poses.
+    """
+    if len(gt) != len(est):
+        raise UsageError(f"ground truth has {len(gt)} poses, the estimate {len(est)}")
+    has_gt, has_est = known(gt), known(est)
+    both = has_gt & has_est
+    if both.sum() < 2:
+        raise UsageError(
+            f"only {both.sum()} of {len(gt)} frames have both an estimate and ground truth; want 2 or more"
+        )
+    segments = segment_errors(gt[has_gt], est[has_gt], lengths)
+    t_err, r_err = _percent(segments)
+    rpe_trans, rpe_rot = rpe(gt, est)
+    return Metrics(
+        frames=len(est),
+        failed_frames=int((~has_est).sum()) if failed_frames is None else failed_frames,
+        fps=fps,
+        path_length_m=path_length(gt[has_gt]),
+        t_err_percent=t_err,
+        r_err_deg_per_100m=r_err,
+        lengths_m=tuple(lengths),
+        segments=len(segments),
+        per_length=tuple(_of_length(segments, length) for length in lengths),
+        ape_rmse_m=ape_rmse(gt[both], est[both]),
+        rpe_trans_m=rpe_trans,
+        rpe_rot_deg=rpe_rot,
+        final_drift_percent=final_drift_percent(gt[both], est[both]),
+    )
+
+
+def align(source: Array, target: Array) -> Array:
+    """T_target_source (4, 4) that brings (N, 3) positions closest to (N, 3) others in the least squares sense.
+
+    S. Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI 1991.
+    """
+    source_mean, target_mean = source.mean(0), target.mean(0)
+    U, _, Vt = np.linalg.svd((target - target_mean).T @ (source - source_mean))
+    U[:, 2] *= np.sign(np.linalg.det(U @ Vt))
+    return se3.make(U @ Vt, target_mean - U @ Vt @ source_mean)
+
+
+def ape_rmse(gt: Array, est: Array) -> float:
+    """Root mean square position error, m, of (N, 4, 4) poses after alignment of all positions."""
+    T_gt_est = align(est[:, :3, 3], gt[:, :3, 3])
+    residual = (T_gt_est @ est)[:, :3, 3] - gt[:, :3, 3]
+    return float(np.sqrt((residual**2).sum(1).mean()))
+
+
+def rpe(gt: Array, est: Array) -> tuple[float | None, float | None]:
+    """Mean error from one frame to the next: translation m, rotation degrees; None without two known neighbours."""
+    both = known(gt) & known(est)
+    first = np.flatnonzero(both[:-1] & both[1:])
+    if not len(first):
+        return None, None
+    error = se3.inverse(relative(gt, first, first + 1)) @ relative(est, first, first + 1)
+    return float(np.linalg.norm(error[:, :3, 3], axis=1).mean()), float(np.degrees(se3.angle(error)).mean())
+
+
+def final_drift_percent(gt: Array, est: Array) -> float | None:
+    """Position error at the end of (N, 4, 4) poses aligned at the first, over the path; None for one that stands."""
+    length = path_length(gt)
+    end = (gt[0] @ se3.inverse(est[0]) @ est[-1])[:3, 3] - gt[-1, :3, 3]
+    return 100 * float(np.linalg.norm(end)) / length if length > 0 else None
+
+
+def path_length(poses: Array) -> float:
+    """Length of the way through (N, 4, 4) poses, m."""
+    return float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
+
+
+def _of_length(segments: SegmentErrors, length: float) -> LengthErrors:
+    chosen = segments.of_length(length)
+    t_err, r_err = _percent(chosen)
+    return LengthErrors(length_m=length, segments=len(chosen), t_err_percent=t_err, r_err_deg_per_100m=r_err)
+
+
+def _percent(segments: SegmentErrors) -> tuple[float | None, float | None]:
+    mean = segments.mean()
+    return (None, None) if mean is None else (100 * mean[0], 100 * float(np.degrees(mean[1])))
