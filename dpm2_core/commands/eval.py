@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`dpm2 eval`: judge a trajectory file against ground truth, and say how it was judged."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from dpm2_core.data.kitti import read_calib
+from dpm2_core.errors import UsageError
+from dpm2_core.evaluation.kitti_metric import OFFICIAL_LENGTHS
+from dpm2_core.evaluation.metrics import evaluate
+from dpm2_core.evaluation.report import metrics_table
+from dpm2_core.evaluation.trajectory import Trajectory, matched, read_trajectory
+from dpm2_core.files import atomic_write
+from dpm2_core.geometry import se3
+
+FRAME_AS_GIVEN = "as in the files; both must be poses of the same sensor"
+FRAME_CAMERA = "left camera; the estimate, poses of the LiDAR, was converted with Tr of the calibration"
+
+
+def eval_(
+    gt: Annotated[Path, typer.Option(help="Ground truth: KITTI (12 numbers a line, 13 with the frame number) or TUM.")],
+    est: Annotated[Path, typer.Option(help="The estimate, in either format.")],
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures to this file.")] = None,
+    lengths: Annotated[
+        str | None, typer.Option(help="Segment lengths of the KITTI metric, m, such as 10,20,30,40,50.")
+    ] = None,
+    calib: Annotated[
+        Path | None,
+        typer.Option(help="KITTI calib.txt: the estimate holds LiDAR poses, the ground truth camera poses."),
+    ] = None,
+) -> None:
+    """Judge a trajectory: KITTI metric, APE, RPE and final drift."""
+    chosen = parse_lengths(lengths) if lengths else OFFICIAL_LENGTHS
+    truth, estimate = read_trajectory(gt), read_trajectory(est)
+    if calib is not None:
+        estimate = in_camera_frame(estimate, calib)
+    metrics = evaluate(*matched(truth, estimate), chosen)
+    frame = FRAME_CAMERA if calib else FRAME_AS_GIVEN
+    Console().print(metrics_table(metrics, title=f"{est} against {gt}", frame=frame))
+    if json_file is not None:
+        result = {"gt": str(gt), "est": str(est), "frame": frame, **metrics.model_dump()}
+        with atomic_write(json_file) as file:
+            file.write(json.dumps(result, indent=2) + "\n")
+
+
+def parse_lengths(text: str) -> tuple[float, ...]:
+    """`10,20,30` to metres."""
+    try:
+        lengths = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        raise UsageError(f"--lengths {text}: want metres separated by commas, such as 10,20,30,40,50") from None
+    if not all(0 < length < float("inf") for length in lengths):
+        raise UsageError(f"--lengths {text}: every length must be above 0 m")
+    return lengths
+
+
+def in_camera_frame(trajectory: Trajectory, calib: Path) -> Trajectory:
+    """LiDAR poses to poses of the left camera; the world stays, which alignment makes up for."""
+    if not calib.is_file():
+        raise UsageError(f"{calib}: no such file")
+    T_cam_lidar = read_calib(calib).get("Tr")
+    if T_cam_lidar is None:
+        raise UsageError(f"{calib}: no Tr, the transform from the LiDAR to the left camera")
+    return Trajectory(trajectory.poses @ se3.inverse(T_cam_lidar), trajectory.keys, trajectory.kind)

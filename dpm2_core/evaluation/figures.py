@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The picture of a run: map, estimated and true trajectory from above."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dpm2_core.evaluation.kitti_metric import known
+from dpm2_core.evaluation.metrics import align
+from dpm2_core.files import atomic_write
+from dpm2_core.frame import Array, Points
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_BACKGROUND, _INK, _ESTIMATE, _TRUTH = "#0d1117", "#c9d1d9", "#ff9f1c", "#ffffff"
+_HEIGHTS = ("#3d4f8f", "#2f8f9d", "#7fd1ae", "#f6f3c0")  # ground to roofs
+_PIXELS = 1100  # of the map raster along its longer side: about 0.15 m on a street, where voxels are 0.2 m
+_MARGIN = 45.0  # m of map shown around the trajectory; beyond it a LiDAR map is mostly stray points
+
+
+def trajectory_png(
+    path: Path | str, est: Array, gt: Array | None = None, cloud: Points | None = None, title: str = ""
+) -> None:
+    """Draw a top view, x to the right and y up, to scale.
+
+    Args:
+        est: (N, 4, 4) poses in the map frame, z up.
+        gt: (N, 4, 4) of the same frames, NaN where unknown, in any world frame: aligned by its positions.
+        cloud: (M, 3+) map points in the map frame, m; coloured by height.
+
+    Raises:
+        Dpm2Error: the file could not be written.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # half a second to import: not for every command
+    from matplotlib.figure import Figure
+
+    est = est[known(est)]
+    truth = None if gt is None else _aligned(gt, est)
+    low, high = _bounds(est[:, :3, 3], cloud)
+    width, height = high - low
+    figure = Figure(figsize=(12, float(np.clip(12 * height / width, 3.5, 12)) + 0.8), dpi=150, facecolor=_BACKGROUND)
+    axes = figure.add_axes((0.01, 0.01, 0.98, 0.92), facecolor=_BACKGROUND, aspect="equal")
+    axes.set_axis_off()
+    if cloud is not None and len(cloud):
+        axes.imshow(_raster(cloud, low, high), extent=(low[0], high[0], low[1], high[1]), origin="lower")
+    if truth is not None:
+        axes.plot(truth[:, 0], truth[:, 1], "--", color=_TRUTH, lw=1.2, label="ground truth (aligned)", zorder=4)
+    axes.plot(est[:, 0, 3], est[:, 1, 3], color=_ESTIMATE, lw=3.0, label="estimate", zorder=3)
+    axes.plot(*est[0, :2, 3], "o", color=_ESTIMATE, ms=8, mec=_BACKGROUND, label="start", zorder=5)
+    axes.plot(*est[-1, :2, 3], "s", color=_ESTIMATE, ms=8, mec=_BACKGROUND, label="end", zorder=5)
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    axes.legend(loc="upper right", facecolor=_BACKGROUND, edgecolor="none", labelcolor=_INK, framealpha=0.7)
+    _scale_bar(axes, low, high)
+    figure.text(0.02, 0.955, title, color=_INK, fontsize=14)
+    with atomic_write(path, "wb") as file:
+        FigureCanvasAgg(figure).print_png(file)
+
+
+def _aligned(gt: Array, est: Array) -> Array | None:
+    """Known positions of the ground truth (K, 3) in the map frame; None with fewer than two."""
+    has_gt = known(gt)
+    if has_gt.sum() < 2:
+        return None
+    T_map_gt = align(gt[has_gt, :3, 3], est[has_gt, :3, 3])
+    return gt[has_gt, :3, 3] @ T_map_gt[:3, :3].T + T_map_gt[:3, 3]
+
+
+def _bounds(positions: Array, cloud: Points | None) -> tuple[Array, Array]:
+    """Corners (2,), (2,) of what is shown: the trajectory with a margin, which the map may cut to where points are."""
+    low, high = positions[:, :2].min(0) - _MARGIN, positions[:, :2].max(0) + _MARGIN
+    if cloud is not None and len(cloud):
+        reach = 3.0
+        low = np.maximum(low, np.minimum(np.percentile(cloud[:, :2], 0.5, axis=0), positions[:, :2].min(0)) - reach)
+        high = np.minimum(high, np.maximum(np.percentile(cloud[:, :2], 99.5, axis=0), positions[:, :2].max(0)) + reach)
+    return low, high
+
+
+def _raster(cloud: Points, low: Array, high: Array) -> NDArray[np.float64]:
+    """(H, W, 3) picture of the points: hue from the highest in each pixel, brightness from how many there are."""
+    from matplotlib.colors import LinearSegmentedColormap, to_rgb
+
+    pixel = (high - low).max() / _PIXELS
+    width, height = np.ceil((high - low) / pixel).astype(int)
+    inside = np.logical_and.reduce((cloud[:, :2] > low) & (cloud[:, :2] < high), axis=1)
+    x, y = ((cloud[inside, :2] - low) / pixel).astype(int).T
+    z = cloud[inside, 2]
+    cell = np.minimum(y, height - 1) * width + np.minimum(x, width - 1)
+    count = np.bincount(cell, minlength=width * height)
+    top = np.full(width * height, -np.inf)
+    np.maximum.at(top, cell, z)
+    bottom, ceiling = np.percentile(z, [3, 95]) if len(z) else (0.0, 1.0)
+    heights = LinearSegmentedColormap.from_list("heights", _HEIGHTS)
+    hue = heights(np.clip((top - bottom) / max(ceiling - bottom, 1e-3), 0, 1))[:, :3]
+    strength = np.where(count > 0, 0.3 + 0.7 * np.clip(np.log1p(count) / np.log(6), 0, 1), 0.0)[:, None]
+    return (np.array(to_rgb(_BACKGROUND)) * (1 - strength) + hue * strength).reshape(height, width, 3)
+
+
+def _scale_bar(axes: Axes, low: Array, high: Array) -> None:
+    """A bar of 1, 2 or 5 times a power of ten metres, about a sixth of the width."""
+    width = high[0] - low[0]
+    decade = 10.0 ** np.floor(np.log10(width / 6))
+    length = decade * max(step for step in (1, 2, 5) if step * decade <= width / 6)
+    x, y = low + 0.03 * width
+    axes.plot([x, x + length], [y, y], color=_INK, lw=3, solid_capstyle="butt", zorder=5)
+    axes.text(x + length / 2, y + 0.008 * width, f"{length:g} m", color=_INK, ha="center", va="bottom", zorder=5)

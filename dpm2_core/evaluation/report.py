@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Figures as tables for people, each row with its definition."""
+
+from __future__ import annotations
+
+import math
+
+from rich.table import Table
+
+from dpm2_core.evaluation.kitti_metric import OFFICIAL_LENGTHS
+from dpm2_core.evaluation.metrics import Metrics
+
+
+def metrics_table(metrics: Metrics, title: str, frame: str) -> Table:
+    """The figures, each row with its definition; `frame` says which sensor's poses were compared."""
+    table = Table(title=title, title_justify="left", caption=f"Sensor frame: {frame}.", caption_justify="left")
+    table.add_column("figure")
+    table.add_column("value", justify="right")
+    table.add_column("how it is measured")
+    t_err, r_err = metrics.t_err_percent, metrics.r_err_deg_per_100m
+    how = f"the path is shorter than {min(metrics.lengths_m):g} m; choose shorter --lengths"
+    if t_err is not None and r_err is not None:
+        lengths = ", ".join(f"{length:g}" for length in metrics.lengths_m)
+        start = "each 10th frame" if metrics.lengths_m == OFFICIAL_LENGTHS else "each frame"
+        devkit = f"the development kit prints {t_err / 100:.6f} {math.radians(r_err / 100):.6f}"
+        how = f"{metrics.segments} segments of {lengths} m from {start}, unaligned; {devkit}"
+    table.add_row(
+        "frames", str(metrics.frames), f"{metrics.failed_frames} failed; {_value(metrics.path_length_m, 'm')}"
+    )
+    table.add_row("KITTI t_err", _value(t_err, "%"), how)
+    table.add_row("KITTI r_err", _value(r_err, "deg/100 m"), "the same segments")
+    for part in metrics.per_length if metrics.segments else ():
+        values = f"{_value(part.r_err_deg_per_100m, 'deg/100 m')}, {part.segments} segments"
+        table.add_row(f"  {part.length_m:g} m", _value(part.t_err_percent, "%"), values)
+    table.add_row("APE rmse", _value(metrics.ape_rmse_m, "m"), "positions, SE(3) Umeyama alignment, no scale")
+    table.add_row("RPE translation", _value(metrics.rpe_trans_m, "m"), "mean of frame to frame, unaligned")
+    table.add_row("RPE rotation", _value(metrics.rpe_rot_deg, "deg"), "mean of frame to frame, unaligned")
+    table.add_row("final drift", _value(metrics.final_drift_percent, "%"), "last position, aligned at the first pose")
+    return table
+
+
+def _value(value: float | None, unit: str) -> str:
+    return "-" if value is None else f"{value:.4f} {unit}"
