@@ -25,7 +25,7 @@ def metrics_table(metrics: Metrics, title: str, frame: str) -> Table:
         devkit = f"the development kit prints {t_err / 100:.6f} {math.radians(r_err / 100):.6f}"
         how = f"{metrics.segments} segments of {lengths} m from {start}, unaligned; {devkit}"
     table.add_row(
-        "frames", str(metrics.frames), f"{metrics.failed_frames} failed; {_value(metrics.path_length_m, 'm')}"
+        "frames", str(metrics.frames), f"{metrics.failed_frames} failed; path {_value(metrics.path_length_m, 'm')}"
     )
     table.add_row("KITTI t_err", _value(t_err, "%"), how)
     table.add_row("KITTI r_err", _value(r_err, "deg/100 m"), "the same segments")

@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The PLY files, read back by the rules of the format alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dpm2_core.data.ply import write_ply
+
+
+def _read(path: Path) -> tuple[list[str], np.ndarray]:
+    head, _, body = path.read_bytes().partition(b"end_header\n")
+    return head.decode("ascii").splitlines(), np.frombuffer(body, "<f4").reshape(-1, 4)
+
+
+@pytest.mark.parametrize("count", [0, 1, 1000])
+def test_points_come_back_bit_for_bit(tmp_path: Path, count: int) -> None:
+    points = np.random.default_rng(0).normal(size=(count, 4)).astype(np.float32)
+    write_ply(tmp_path / "map.ply", points)
+    header, body = _read(tmp_path / "map.ply")
+    assert header[:2] == ["ply", "format binary_little_endian 1.0"]
+    assert f"element vertex {count}" in header
+    assert [line.split()[1:] for line in header if line.startswith("property")] == [
+        ["float", name] for name in ("x", "y", "z", "intensity")
+    ]
+    np.testing.assert_array_equal(body, points)
+
+
+def test_any_memory_layout_and_float_type_will_do(tmp_path: Path) -> None:
+    points = np.asfortranarray(np.arange(40, dtype=np.float64).reshape(10, 4))[::-2]
+    write_ply(tmp_path / "map.ply", points)
+    np.testing.assert_array_equal(_read(tmp_path / "map.ply")[1], points)
+
+
+def test_an_independent_reader_agrees(tmp_path: Path) -> None:
+    plyfile = pytest.importorskip("plyfile")
+    points = np.random.default_rng(0).normal(size=(10, 4)).astype(np.float32)
+    write_ply(tmp_path / "map.ply", points)
+    vertices = plyfile.PlyData.read(tmp_path / "map.ply")["vertex"]
+    np.testing.assert_array_equal(np.column_stack([vertices[n] for n in ("x", "y", "z", "intensity")]), points)
+
+
+def test_points_of_another_shape_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"want \(N, 4\)"):
+        write_ply(tmp_path / "map.ply", np.zeros((5, 3), np.float32))
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The figures against evo, against hand-made trajectories whose errors are known, and on incomplete input."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dpm2_core.errors import UsageError
+from dpm2_core.evaluation.metrics import align, ape_rmse, evaluate, final_drift_percent, path_length, rpe
+from dpm2_core.evaluation.trajectory import read_trajectory
+from dpm2_core.geometry import se3
+
+ELSEWHERE = se3.exp([0.3, -0.2, 2.0, 100, -50, 3])
+
+
+def _straight(count: int = 101) -> np.ndarray:
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, 0, 3] = np.arange(count)
+    return poses
+
+
+def test_evo_finds_the_same_ape_and_rpe_on_published_results(kitti_excerpt: Path) -> None:
+    pytest.importorskip("evo")
+    from evo.core.metrics import APE, RPE, PoseRelation, StatisticsType, Unit
+    from evo.core.trajectory import PosePath3D
+
+    gt = read_trajectory(kitti_excerpt / "gt_poses" / "00.txt").poses[:1000]
+    est = read_trajectory(kitti_excerpt / "results" / "KITTI_00_ORB.txt").poses[:1000]
+    paths = PosePath3D(poses_se3=list(gt)), PosePath3D(poses_se3=list(est))
+
+    def figure(metric: APE | RPE, statistic: StatisticsType) -> float:
+        metric.process_data(paths)
+        return metric.get_statistic(statistic)
+
+    trans, rot = rpe(gt, est)
+    # The files hold 7 to 10 digits: rotations are off by 1e-7, and two ways to take an angle differ by as much.
+    translation, degrees = PoseRelation.translation_part, PoseRelation.rotation_angle_deg
+    assert trans == pytest.approx(figure(RPE(translation, 1, Unit.frames), StatisticsType.mean), rel=1e-5)
+    assert rot == pytest.approx(figure(RPE(degrees, 1, Unit.frames), StatisticsType.mean), rel=1e-3)
+    paths[1].align(paths[0])
+    assert ape_rmse(gt, est) == pytest.approx(figure(APE(translation), StatisticsType.rmse), rel=1e-6)
+
+
+def test_align_recovers_the_transform_and_never_mirrors() -> None:
+    rng = np.random.default_rng(0)
+    for points in (
+        rng.normal(size=(50, 3)),
+        rng.normal(size=(50, 3)) * [1, 1, 0],
+        rng.normal(size=(50, 3)) * [1, 0, 0],
+    ):
+        T = align(points, points @ ELSEWHERE[:3, :3].T + ELSEWHERE[:3, 3])
+        np.testing.assert_allclose(points @ T[:3, :3].T + T[:3, 3], points @ ELSEWHERE[:3, :3].T + ELSEWHERE[:3, 3])
+        assert np.linalg.det(T[:3, :3]) == pytest.approx(1)
+    mirrored = points * [1, 1, -1]
+    assert np.linalg.det(align(points, mirrored)[:3, :3]) == pytest.approx(1)
+
+
+def test_a_perfect_estimate_in_another_world_frame_has_no_error() -> None:
+    metrics = evaluate(_straight(), ELSEWHERE @ _straight(), [10.0])
+    for error in (metrics.t_err_percent, metrics.r_err_deg_per_100m, metrics.ape_rmse_m, metrics.rpe_trans_m):
+        assert error == pytest.approx(0, abs=1e-9)
+    assert metrics.rpe_rot_deg == pytest.approx(0, abs=1e-6)
+    assert metrics.final_drift_percent == pytest.approx(0, abs=1e-9)
+    assert (metrics.frames, metrics.failed_frames, metrics.path_length_m) == (101, 0, 100.0)
+
+
+def test_known_errors_come_out_as_defined() -> None:
+    gt, est = _straight(), _straight()
+    est[:, 0, 3] *= 1.01  # 1 cm too far each metre
+    metrics = evaluate(gt, est, [10.0])
+    assert metrics.rpe_trans_m == pytest.approx(0.01)
+    assert metrics.final_drift_percent == pytest.approx(1.0)
+    assert metrics.t_err_percent == pytest.approx(1.1)  # 11 m segments over 10 m: see test_kitti_metric
+    # Residuals after alignment are 0.01 * (i - 50), i = 0..100.
+    assert metrics.ape_rmse_m == pytest.approx(0.01 * np.sqrt(np.mean((np.arange(101) - 50.0) ** 2)))
+    turned = gt @ se3.exp(np.outer(np.arange(101), np.radians([0, 0, 0.5, 0, 0, 0])))
+    assert rpe(gt, turned)[1] == pytest.approx(0.5)
+
+
+def test_rpe_is_the_mean_and_drift_is_aligned_at_the_first_pose() -> None:
+    gt, est = _straight(11), _straight(11)
+    est[5:, 0, 3] += 1  # one step of ten is a metre too long
+    assert rpe(gt, est)[0] == pytest.approx(0.1)
+    assert final_drift_percent(gt, est) == pytest.approx(10.0)
+    assert final_drift_percent(gt, ELSEWHERE @ est) == pytest.approx(10.0)
+
+
+def test_frames_that_are_missing_on_either_side_are_counted_and_do_not_spoil_the_rest() -> None:
+    gt, est = _straight(), _straight()
+    est[50] = np.nan
+    gt[20] = np.nan
+    metrics = evaluate(gt, est, [10.0])
+    assert (metrics.frames, metrics.failed_frames) == (101, 1)
+    assert metrics.rpe_trans_m == pytest.approx(0)
+    assert metrics.ape_rmse_m == pytest.approx(0)
+    assert metrics.final_drift_percent == pytest.approx(0)
+    assert metrics.path_length_m == 100
+
+
+def test_a_short_path_has_no_kitti_figure_but_the_others() -> None:
+    metrics = evaluate(_straight(51), _straight(51), fps=12.5, failed_frames=3)
+    assert metrics.t_err_percent is None
+    assert metrics.r_err_deg_per_100m is None
+    assert metrics.ape_rmse_m is not None
+    assert (metrics.fps, metrics.failed_frames) == (12.5, 3)
+    assert metrics.lengths_m == (100, 200, 300, 400, 500, 600, 700, 800)
+
+
+def test_standing_still_has_no_drift_per_length() -> None:
+    still = np.tile(np.eye(4), (10, 1, 1))
+    metrics = evaluate(still, still)
+    assert metrics.final_drift_percent is None
+    assert metrics.rpe_trans_m == 0
+    assert path_length(still) == 0
+
+
+def test_what_cannot_be_compared_is_refused() -> None:
+    with pytest.raises(UsageError, match="101 poses, the estimate 100"):
+        evaluate(_straight(), _straight(100))
+    nothing = np.full((10, 4, 4), np.nan)
+    with pytest.raises(UsageError, match="only 0 of 10 frames"):
+        evaluate(_straight(10), nothing)
+
+
+def test_the_fixed_keys_are_there() -> None:
+    """Scripts rely on these names in metrics.json."""
+    keys = set(evaluate(_straight(), _straight()).model_dump())
+    assert keys >= {"frames", "failed_frames", "fps", "t_err_percent", "r_err_deg_per_100m", "lengths_m"}
+    assert keys >= {"ape_rmse_m", "rpe_trans_m", "rpe_rot_deg", "final_drift_percent"}

@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Trajectory files keep what they were given, and what does not belong together is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from dpm2_core.errors import UsageError
+from dpm2_core.evaluation.trajectory import Trajectory, matched, read_trajectory, write_kitti, write_tum
+from dpm2_core.geometry import se3
+
+IDENTITY = "1 0 0 0 0 1 0 0 0 0 1 0"
+EPOCH = 1_317_617_735_123_456_789  # ns; as a float64 in seconds it would lose 100 ns
+
+
+def _poses(count: int, scale: float = 1000.0) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    return se3.make(Rotation.random(count, random_state=0).as_matrix(), rng.normal(scale=scale, size=(count, 3)))
+
+
+def test_kitti_keeps_poses_to_a_nanometre(tmp_path: Path) -> None:
+    poses = _poses(20)
+    write_kitti(tmp_path / "t.txt", poses)
+    read = read_trajectory(tmp_path / "t.txt")
+    np.testing.assert_allclose(read.poses, poses, atol=1e-9)  # 13 digits of some 1000 m
+    np.testing.assert_array_equal(read.keys, range(20))
+    assert read.kind == "kitti"
+
+
+def test_kitti_keeps_frame_numbers(tmp_path: Path) -> None:
+    numbers = [0, 3, 4, 999_999_999]
+    write_kitti(tmp_path / "t.txt", _poses(4), numbers)
+    read = read_trajectory(tmp_path / "t.txt")
+    assert (read.kind, read.keys.tolist()) == ("kitti-indexed", numbers)
+    np.testing.assert_allclose(read.poses, _poses(4), atol=1e-9)
+
+
+def test_tum_keeps_stamps_exactly_and_poses_to_a_micrometre(tmp_path: Path) -> None:
+    stamps = [-1, 0, 999_999_999, EPOCH, EPOCH + 1]
+    write_tum(tmp_path / "t.tum", stamps, _poses(5))
+    read = read_trajectory(tmp_path / "t.tum")
+    assert (read.kind, read.keys.tolist()) == ("tum", stamps)
+    np.testing.assert_allclose(read.poses, _poses(5), atol=1e-7)  # 12 digits of some 1000 m
+
+
+def test_exponents_comments_and_blank_lines_are_read(tmp_path: Path) -> None:
+    """numpy.savetxt, which many tools write with, uses exponents even for stamps and frame numbers."""
+    path = tmp_path / "t.txt"
+    path.write_text("# stamp ...\n\n1.5e+09 1e0 2 3 0 0 0 1\n  1500000000.25\t1 2 3 0 0 0 1  \n")
+    assert read_trajectory(path).keys.tolist() == [1_500_000_000 * 10**9, 1_500_000_000 * 10**9 + 250_000_000]
+    path.write_text(f"2.000e+01 {IDENTITY}\n2.1e+01 {IDENTITY}\n")
+    assert read_trajectory(path).keys.tolist() == [20, 21]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "holds no pose"),
+        ("# only a comment\n", "holds no pose"),
+        ("1 2 3\n", ":1: 3 numbers; want 8"),
+        (f"{IDENTITY}\n\n# gap\n{IDENTITY} 1\n", ":4: 13 numbers where the lines before have 12"),
+        (f"{IDENTITY}\n{IDENTITY[:-1]}x\n", ":2: .*'x'"),
+        (f"{IDENTITY}\n{IDENTITY[:-1]}nan\n", ":2: not a finite rigid transform"),
+        (f"{IDENTITY}\n{'0 ' * 12}\n", ":2: not a finite rigid transform"),
+        (f"{IDENTITY}\n-1 0 0 0 0 1 0 0 0 0 1 0\n", ":2: not a finite rigid transform"),
+        ("0 1 2 3 0 0 0 0\n", ":1: not a finite rigid transform"),
+        ("nan 1 2 3 0 0 0 1\n", ":1: nan is not a time stamp"),
+        ("1e300 1 2 3 0 0 0 1\n", ":1: 1e300 is not a time stamp"),
+        (f"0 {IDENTITY}\n1.5 {IDENTITY}\n", ":2: 1.5 is not a frame number"),
+        (f"7 {IDENTITY}\n7 {IDENTITY}\n", "frame numbers of its first column repeat"),
+    ],
+)
+def test_a_damaged_file_is_an_error_that_names_file_and_line(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "t.txt"
+    path.write_text(text)
+    with pytest.raises(UsageError, match=f"t.txt.*{message}"):
+        read_trajectory(path)
+
+
+def test_what_is_no_text_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "binary").write_bytes(bytes(range(256)))
+    for path, reason in ((tmp_path / "none", "No such file"), (tmp_path, "directory"), (tmp_path / "binary", "text")):
+        with pytest.raises(UsageError, match=f"{path}: .*{reason}"):
+            read_trajectory(path)
+
+
+def _trajectory(keys: list[int], kind: str) -> Trajectory:
+    """Poses whose x is their key, so that a match can be recognised."""
+    poses = np.tile(np.eye(4), (len(keys), 1, 1))
+    poses[:, 0, 3] = keys
+    return Trajectory(poses, np.array(keys, np.int64), kind)
+
+
+def _x(poses: np.ndarray) -> list[float | None]:
+    return [None if np.isnan(x) else x for x in poses[:, 0, 3]]
+
+
+def test_missing_frames_are_found_by_their_number() -> None:
+    gt, est = matched(_trajectory([0, 1, 2, 3, 4], "kitti"), _trajectory([3, 1], "kitti-indexed"))
+    assert (_x(gt), _x(est)) == ([0, 1, 2, 3, 4], [None, 1, None, 3, None])
+
+
+def test_stamps_match_within_the_tolerance_and_in_any_order() -> None:
+    s = 10**9
+    gt = _trajectory([2 * s, 1 * s, 3 * s], "tum")
+    _, est = matched(gt, _trajectory([3 * s - 9_999_999, s + 5_000_000, 2 * s + 11_000_000], "tum"))
+    assert _x(est) == [s + 5_000_000, None, 3 * s - 9_999_999]
+
+
+def test_of_two_estimates_for_one_frame_the_first_counts() -> None:
+    """A looped bag repeats its stamps."""
+    gt, est = _trajectory([0, 10**9], "tum"), _trajectory([0, 10**9, 0], "tum")
+    est.poses[2, 0, 3] = 77
+    assert _x(matched(gt, est)[1]) == [0, 10**9]
+
+
+def test_ground_truth_of_a_faster_clock_gives_one_frame_for_each_estimate() -> None:
+    fast = _trajectory([i * 10**7 for i in range(101)], "tum")
+    slow = _trajectory([i * 10**8 for i in range(11)], "tum")
+    gt, est = matched(fast, slow)
+    assert _x(gt) == _x(est) == [float(i * 10**8) for i in range(11)]
+
+
+def test_lines_match_lines_only_if_there_are_as_many() -> None:
+    kitti, tum = _trajectory([0, 1, 2], "kitti"), _trajectory([5, 6, 7], "tum")
+    assert _x(matched(kitti, tum)[1]) == [5, 6, 7]
+    for other in ("kitti", "tum"):
+        with pytest.raises(UsageError, match=r"3 poses .* 2 "):
+            matched(kitti, _trajectory([0, 1], other))
+
+
+@pytest.mark.parametrize("kind", ["tum", "kitti-indexed"])
+def test_nothing_in_common_is_an_error(kind: str) -> None:
+    with pytest.raises(UsageError, match="is one of the ground truth"):
+        matched(_trajectory([0, 10**9], kind), _trajectory([5 * 10**9], kind))

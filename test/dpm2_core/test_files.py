@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Results are whole or absent, and what was there before survives every failure."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from dpm2_core.errors import Dpm2Error
+from dpm2_core.files import atomic_write
+
+
+def test_the_file_appears_only_when_it_is_whole(tmp_path: Path) -> None:
+    path = tmp_path / "new folder" / "result.txt"
+    with atomic_write(path) as file:
+        file.write("µ")
+        assert not path.exists()
+    assert path.read_text(encoding="utf-8") == "µ"
+    assert [entry.name for entry in path.parent.iterdir()] == ["result.txt"]
+
+
+@pytest.mark.parametrize("failure", [RuntimeError, KeyboardInterrupt])
+def test_an_interrupted_writer_leaves_the_old_file_and_nothing_else(
+    tmp_path: Path, failure: type[BaseException]
+) -> None:
+    path = tmp_path / "result.txt"
+    path.write_text("old")
+
+    def write() -> None:
+        with atomic_write(path) as file:
+            file.write("half of the new")
+            raise failure
+
+    with pytest.raises(failure):
+        write()
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_full_disk_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
+    """A file size limit makes the kernel refuse the write half-way, as a full disk does, without root or a mount."""
+    path = tmp_path / "map.ply"
+    path.write_text("old")
+    program = f"""
+import resource, signal, numpy as np
+from dpm2_core.data.ply import write_ply
+from dpm2_core.errors import Dpm2Error
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
+try:
+    write_ply({str(path)!r}, np.ones((100_000, 4), np.float32))
+except Dpm2Error as error:
+    print(error)
+"""
+    answer = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert str(path) in answer.stdout
+    assert "File too large" in answer.stdout
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    for path in (tmp_path / "file" / "below.txt", tmp_path):
+        with pytest.raises(Dpm2Error, match=str(path)), atomic_write(path) as file:
+            file.write("x")
+    assert [entry.name for entry in tmp_path.iterdir()] == ["file"]
+    assert [entry.name for entry in tmp_path.parent.iterdir() if entry.name.endswith(".part")] == []
+
+
+def test_a_symbolic_link_stays_one(tmp_path: Path) -> None:
+    (tmp_path / "target").write_text("old")
+    (tmp_path / "link").symlink_to(tmp_path / "target")
+    with atomic_write(tmp_path / "link") as file:
+        file.write("new")
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "target").read_text() == "new"
+
+
+def test_a_pipe_is_written_to_and_not_replaced() -> None:
+    program = "from dpm2_core.files import atomic_write\nwith atomic_write('/dev/stdout') as f: f.write('through')"
+    answer = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert answer.stdout == "through"
+    assert Path("/dev/stdout").is_symlink()
