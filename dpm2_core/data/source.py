@@ -4,9 +4,61 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Protocol
+from pathlib import Path
+from typing import Annotated, Literal, Protocol
 
+from pydantic import Field
+
+from dpm2_core.config import Settings
+from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Frame
+
+# x, y, z in m, then a quaternion x, y, z, w: the order of tf2_ros' static_transform_publisher.
+Extrinsic = tuple[float, float, float, float, float, float, float]
+
+
+class InputSettings(Settings):
+    """How recordings and sensor messages are read."""
+
+    sequence: str = ""
+    """Sequence of a KITTI odometry root, such as 04; empty takes the only one."""
+
+    points_topic: str = ""
+    """PointCloud2 topic of a bag; empty takes /kitti/velo/pointcloud, else the only one."""
+
+    images: bool = True
+    """Use the camera where there is one."""
+
+    image_topic: str = ""
+    """Image or CompressedImage topic of a bag; empty takes /kitti/camera_color_left/image_raw, else the only one."""
+
+    camera_info_topic: str = ""
+    """CameraInfo topic of that image; empty takes the camera_info beside it."""
+
+    T_lidar_cam: Extrinsic | None = None
+    """Pose of the camera's optical frame in the LiDAR frame, [x, y, z (m), qx, qy, qz, qw]; null asks /tf_static."""
+
+    image_tolerance: Annotated[float, Field(gt=0, le=10)] = 0.05
+    """Largest difference of time between a cloud and its image, s."""
+
+    image_time_offset: Annotated[float, Field(ge=-10, le=10)] = 0.0
+    """Added to the stamps of images before they are compared with those of clouds, s."""
+
+    time_field: str | None = None
+    """PointCloud2 field with the time of each point; null looks for a usual name (t, time, stamp...), "" is none."""
+
+    time_unit: Literal["auto", "s", "ms", "us", "ns"] = "auto"
+    """Unit of that field; auto takes the one in which a scan lasts 2 ms to 2 s."""
+
+    intensity_max: Annotated[float, Field(gt=0)] | None = None
+    """Intensity that becomes 1; null takes 1, 255 or 65535 by the largest value of each cloud."""
+
+    vertical_angle_correction_deg: Annotated[float, Field(ge=-5, le=5)] | Literal["auto"] = "auto"
+    """Added to the elevation of each point, degrees. auto: what the recording says (dpm2_sim.json of a folder, topic
+    /kitti/vertical_angle_correction_deg of a bag), else KITTI's 0.205 for folders and topics under /kitti/, else 0."""
+
+    ground_truth_topic: str = ""
+    """Odometry or Path topic with true poses; empty takes /kitti/ground_truth/odom, else /kitti/ground_truth/path."""
 
 
 class Source(Protocol):
@@ -14,15 +66,21 @@ class Source(Protocol):
 
     Attributes:
         name: what reports call it, such as "04" or the bag's file name.
-        poses: (len, 4, 4) float64 T_world_lidar ground truth, one a frame, NaN where unknown; None without any.
-        T_cam_lidar: (4, 4) LiDAR to left camera 0 (KITTI's Tr), None when the calibration has none.
-        notes: what the user should be told once (a missing Tr, topics chosen), in words.
+        notes: what the user should be told once (a missing Tr, topics chosen), in words. Reading frames may add to it.
     """
 
     name: str
-    poses: Array | None
-    T_cam_lidar: Array | None
     notes: list[str]
+
+    @property
+    def poses(self) -> Array | None:
+        """(len, 4, 4) float64 T_world_lidar ground truth, one a frame, NaN where unknown; None without any."""
+        ...
+
+    @property
+    def T_cam_lidar(self) -> Array | None:
+        """(4, 4) LiDAR to left camera 0 (KITTI's Tr), None when the calibration has none."""
+        ...
 
     def __len__(self) -> int:
         """Number of frames."""
@@ -31,3 +89,26 @@ class Source(Protocol):
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
         """Frames start..stop-1 by position, read one at a time; an unreadable one comes with `problem` set."""
         ...
+
+
+def open_source(path: Path | str, settings: InputSettings | None = None) -> Source:
+    """Open whatever `path` is: a KITTI odometry sequence or root, a rosbag2 folder, or an .mcap or .db3 file.
+
+    Raises:
+        UsageError: there is nothing, or nothing that can be read; the message says what was found.
+    """
+    path, settings = Path(path), settings or InputSettings()
+    if not path.exists():
+        raise UsageError(f"{path}: no such file or folder")
+    if path.is_file() and path.suffix == ".bag":
+        raise UsageError(f"{path}: a ROS 1 bag; convert it first: rosbags-convert --src {path.name} --dst NEW_FOLDER")
+    # rosbags and its type store are slow to import, and of no use for a KITTI folder.
+    if path.is_file() or any(
+        file.suffix in (".mcap", ".db3") or file.name == "metadata.yaml" for file in path.iterdir()
+    ):
+        from dpm2_core.data.bags import BagSource
+
+        return BagSource(path, settings)
+    from dpm2_core.data.kitti import KittiSource
+
+    return KittiSource(path, settings)

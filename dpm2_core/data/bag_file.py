@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: Apache-2.0
+"""rosbag2 recordings without ROS: what is in them, their messages in order, and what is left of damaged ones."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import partial
+from io import BufferedReader, FileIO
+from pathlib import Path
+from typing import Any
+
+from mcap.records import Channel, Message, Schema
+from mcap.stream_reader import StreamReader
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.store import Typestore
+
+from dpm2_core.data.messages import MessageError
+from dpm2_core.errors import UsageError
+
+RawMessages = Iterator[tuple[str, int, bytes]]
+_MCAP_MAGIC = b"\x89MCAP0\r\n"
+
+
+@dataclass(eq=False)
+class Bag:
+    """An opened recording; it holds no file open between calls.
+
+    Attributes:
+        path: what was asked for.
+        types: topic to message type, such as sensor_msgs/msg/PointCloud2.
+        counts: topic to number of messages.
+        notes: what the user should be told (salvaged, damaged).
+    """
+
+    path: Path
+    types: dict[str, str]
+    counts: dict[str, int]
+    _read: Callable[[Collection[str]], RawMessages]
+    _typestore: Typestore
+    notes: list[str] = field(default_factory=list)
+
+    def messages(self, topics: Collection[str]) -> RawMessages:
+        """(topic, log time in ns, serialized message) of some topics, in order of log time.
+
+        Where the file turns out damaged the messages end, and `notes` says so.
+        """
+        wanted = [topic for topic in topics if topic in self.types]
+        if not wanted:
+            return
+        count = 0
+        try:
+            for message in self._read(wanted):
+                count += 1
+                yield message
+        except Exception as error:  # a damaged chunk raises anything from ReaderError to struct.error
+            self.notes.append(f"{self.path}: damaged after {count} messages of {', '.join(wanted)} ({_reason(error)})")
+
+    def decode(self, topic: str, data: bytes) -> Any:
+        """A message object of rosbags.
+
+        Raises:
+            MessageError: the bytes are no message of the topic's type.
+        """
+        try:
+            return self._typestore.deserialize_cdr(data, self.types[topic])
+        except Exception as error:  # overwritten bytes raise anything from SerdeError to UnicodeDecodeError
+            raise MessageError(f"{topic}: message of {len(data)} bytes is damaged ({_reason(error)})") from None
+
+    def first(self, topic: str) -> Any | None:
+        """The first message of a topic that can be decoded; None without."""
+        for _, _, data in self.messages([topic]):
+            with suppress(MessageError):
+                return self.decode(topic, data)
+        return None
+
+    def topics(self, *types: str) -> list[str]:
+        """Topics of these message types that have messages, sorted."""
+        return sorted(topic for topic, kind in self.types.items() if kind in types and self.counts[topic])
+
+
+def open_bag(path: Path) -> Bag:
+    """Open a rosbag2 folder, or a bare .mcap or .db3 file. A truncated MCAP file gives the messages that are whole.
+
+    Raises:
+        UsageError: there is nothing that can be read, and why.
+    """
+    attempts: list[list[Path]] = [[path]]
+    files = [path]
+    if path.is_dir():
+        files = sorted(file for file in path.iterdir() if file.suffix in (".mcap", ".db3"))
+        attempts = [[path], files] if (path / "metadata.yaml").is_file() else [files]
+    if not files:
+        raise UsageError(f"{path}: no .mcap or .db3 file in this folder")
+    reasons = []
+    for paths in attempts:
+        try:
+            bag = _open_indexed(path, paths)
+        except Exception as error:  # rosbags raises ReaderError, TypeError, apsw.Error... by the kind of damage
+            reasons.append(_reason(error))
+            continue
+        if path.is_dir() and paths is files:
+            missing = f"metadata.yaml is unusable ({reasons[0]})" if reasons else "no metadata.yaml"
+            bag.notes.append(f"{path}: {missing}; read {', '.join(file.name for file in files)}")
+        return bag
+    return _salvage(path, files, reasons[-1])
+
+
+def _reason(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def _open_indexed(path: Path, paths: list[Path]) -> Bag:
+    jazzy = get_typestore(Stores.ROS2_JAZZY)  # for recordings older than Iron, which carry no definitions
+    with AnyReader(paths, default_typestore=jazzy) as reader:
+        types = {connection.topic: connection.msgtype for connection in reader.connections}
+        counts = Counter(dict.fromkeys(types, 0))
+        for connection in reader.connections:
+            counts[connection.topic] += connection.msgcount
+        return Bag(path, types, dict(counts), partial(_read_indexed, paths, jazzy), reader.typestore)
+
+
+def _read_indexed(paths: list[Path], jazzy: Typestore, topics: Collection[str]) -> RawMessages:
+    with AnyReader(paths, default_typestore=jazzy) as reader:
+        wanted = [connection for connection in reader.connections if connection.topic in topics]
+        for connection, time, data in reader.messages(wanted):
+            yield connection.topic, time, data
+
+
+def _salvage(path: Path, files: list[Path], reason: str) -> Bag:
+    """What can be read of MCAP files from their start, without the index at their end."""
+    for file in files:
+        with file.open("rb") as stream:
+            head = stream.read(len(_MCAP_MAGIC))
+        if not head:
+            raise UsageError(f"{file}: the file is empty")
+        if head != _MCAP_MAGIC:
+            kind = "is no MCAP file (wrong magic bytes)" if file.suffix == ".mcap" else "cannot be read as a bag"
+            raise UsageError(f"{file}: {kind}: {reason}")
+    types: dict[str, str] = {}
+    counts: Counter[str] = Counter()
+    for topic, kind, _, _ in _whole_messages(files):
+        types[topic] = kind
+        counts[topic] += 1
+    if not types:
+        raise UsageError(f"{path}: truncated before its first message ({reason})")
+    bag = Bag(path, types, dict(counts), partial(_read_whole, files), get_typestore(Stores.ROS2_JAZZY))
+    bag.notes.append(f"{path}: truncated or never closed ({reason}); {counts.total()} messages of it could be saved")
+    return bag
+
+
+def _read_whole(files: list[Path], topics: Collection[str]) -> RawMessages:
+    return ((topic, time, data) for topic, _, time, data in _whole_messages(files) if topic in topics)
+
+
+def _whole_messages(files: list[Path]) -> Iterator[tuple[str, str, int, bytes]]:
+    """(topic, type, log time, data) in the order of the files, up to where each is cut."""
+    for file in files:
+        schemas: dict[int, str] = {}
+        channels: dict[int, tuple[str, str]] = {}
+        # The cut raises anything from EOFError to the decompressor's own errors.
+        with _WholeReads(FileIO(file)) as stream, suppress(Exception):
+            for record in StreamReader(stream, record_size_limit=file.stat().st_size).records:
+                if isinstance(record, Schema):
+                    schemas[record.id] = record.name
+                elif isinstance(record, Channel):
+                    channels[record.id] = (record.topic, schemas[record.schema_id])
+                elif isinstance(record, Message):
+                    yield (*channels[record.channel_id], record.log_time, record.data)
+
+
+class _WholeReads(BufferedReader):
+    """The mcap package takes a short read at the end of the file for the whole record."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        data = super().read(size)
+        if size is not None and len(data) < size:
+            raise EOFError
+        return data

@@ -1,0 +1,251 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A rosbag2 recording as a `Source`: clouds with the image nearest in time, calibration and ground truth."""
+
+from __future__ import annotations
+
+import struct
+from collections import deque
+from collections.abc import Iterator
+from functools import cached_property
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from dpm2_core.data import topics
+from dpm2_core.data.bag_file import open_bag
+from dpm2_core.data.kitti import HDL64_CORRECTION_DEG, correct_vertical_angle
+from dpm2_core.data.messages import MessageError, decode_camera, decode_image, decode_points, stamp_ns
+from dpm2_core.data.source import InputSettings
+from dpm2_core.data.transforms import TransformTree, transform_matrix
+from dpm2_core.errors import UsageError
+from dpm2_core.frame import Array, Camera, Frame, Image
+from dpm2_core.geometry import se3
+
+Stamps = NDArray[np.int64]
+
+_CLOUD = "sensor_msgs/msg/PointCloud2"
+_IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+_INFO = "sensor_msgs/msg/CameraInfo"
+_TRUTH = ("nav_msgs/msg/Odometry", "nav_msgs/msg/Path")
+_LATE = 500_000_000  # ns of log time that a cloud waits for its image
+_BUFFERED_IMAGES = 32  # bounds memory where their stamps are of no use
+_TRUTH_GAP = 1_000_000_000  # ns between two true poses beyond which nothing is known in between
+
+
+class BagSource:
+    """A rosbag2 folder, .mcap or .db3 file. See `Source` for what it offers; `Frame.index` is the message count.
+
+    Raises:
+        UsageError: it cannot be read, has no point clouds, leaves the choice of a topic open, or has a camera with
+            intrinsics but no known place.
+    """
+
+    def __init__(self, path: Path | str, settings: InputSettings | None = None) -> None:
+        self._settings = settings or InputSettings()
+        self.path = Path(path)
+        self.name = self.path.resolve().stem
+        self._bag = open_bag(self.path)
+        self.notes = self._bag.notes
+        self.points_topic = self._choose_points()
+        first = self._bag.first(self.points_topic)
+        self.lidar_frame: str = first.header.frame_id if first else ""
+        self.transforms = TransformTree()
+        for _, _, data in self._bag.messages([topics.TF_STATIC]):
+            self.transforms.add(self._bag.decode(topics.TF_STATIC, data))
+        self.T_cam_lidar: Array | None = None
+        if topics.GRAY_CAMERA in self.transforms.frames:
+            self.T_cam_lidar = self.transforms.lookup(topics.GRAY_CAMERA, self.lidar_frame)
+        self.vertical_angle_correction_deg = self._correction()
+        self.image_topic = self._choose_image()
+        self.camera = self._camera() if self.image_topic else None
+
+    def __len__(self) -> int:
+        return self._bag.counts[self.points_topic]
+
+    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
+        """Frames start..stop-1 as recorded, also where their stamps repeat or go back; `notes` says so."""
+        before, without, count = None, 0, 0
+        for index, (stamp, cloud, image) in enumerate(islice(self._pairs(), stop)):
+            if index < start:
+                continue
+            if before is not None and stamp <= before:
+                self._note_once("time stamps do not increase", f"at frame {index}: {(stamp - before) * 1e-9:+.3f} s")
+            frame = self._frame(index, stamp, cloud, image)
+            before, without, count = stamp, without + (not frame.images), count + 1
+            yield frame
+        if self.camera and without:
+            within = f"within {self._settings.image_tolerance} s"
+            self._note_once(f"{without} of {count} frames have no image of {self.image_topic}", within)
+
+    @cached_property
+    def stamps(self) -> Stamps:
+        """(len,) ns: the header's stamp, or the time of recording where it is 0. Reads the clouds through once."""
+        return np.array([_stamp(data, time) for _, time, data in self._bag.messages([self.points_topic])], np.int64)
+
+    @cached_property
+    def poses(self) -> Array | None:
+        """(len, 4, 4) T_world_lidar ground truth interpolated at the stamps, NaN where there is none; None without."""
+        asked = self._settings.ground_truth_topic
+        found = self._bag.topics(*_TRUTH)
+        if asked and asked not in found:
+            raise UsageError(f"{self.path}: no Odometry or Path messages on {asked}; {self._contents()}")
+        topic = next((topic for topic in (asked, topics.ODOMETRY, topics.PATH) if topic in found), None)
+        return None if topic is None else interpolate(*self._truth(topic), self.stamps)
+
+    def _choose_points(self) -> str:
+        asked, found = self._settings.points_topic, self._bag.topics(_CLOUD)
+        if asked or not found:
+            if asked in found:
+                return asked
+            raise UsageError(f"{self.path}: no PointCloud2 messages{f' on {asked}' * bool(asked)}; {self._contents()}")
+        if len(found) > 1:
+            if topics.POINTS not in found:
+                raise UsageError(f"{self.path}: several PointCloud2 topics, choose one with input.points_topic: "
+                                 + ", ".join(found))  # fmt: skip
+            self.notes.append(f"PointCloud2 topics {', '.join(found)}: {topics.POINTS} was chosen")
+            return topics.POINTS
+        return found[0]
+
+    def _choose_image(self) -> str:
+        """An image topic, empty for none."""
+        asked, found = self._settings.image_topic, self._bag.topics(*_IMAGES)
+        if not self._settings.images:
+            return ""
+        if asked:
+            if asked not in found:
+                raise UsageError(f"{self.path}: no images on {asked}; {self._contents()}")
+            return asked
+        silent = [topic for topic, kind in self._bag.types.items() if kind in _IMAGES and topic not in found]
+        if silent:
+            self.notes.append(f"no message on the image topic {', '.join(silent)}")
+        if len(found) > 1 and topics.IMAGE not in found:
+            self.notes.append(f"image topics {', '.join(found)}: none is used; choose one with input.image_topic")
+            return ""
+        return topics.IMAGE if topics.IMAGE in found else "".join(found)
+
+    def _camera(self) -> Camera | None:
+        namespace = self.image_topic.removesuffix("/compressed").rpartition("/")[0]
+        info_topic = self._settings.camera_info_topic or f"{namespace}/camera_info"
+        info = self._bag.first(info_topic) if self._bag.types.get(info_topic) == _INFO else None
+        if info is None:
+            if self._settings.image_topic or self._settings.camera_info_topic:
+                raise UsageError(
+                    f"{self.path}: no CameraInfo on {info_topic} for {self.image_topic}; {self._contents()}"
+                )
+            self.notes.append(f"images of {self.image_topic} are left out: no CameraInfo on {info_topic}")
+            return None
+        if self._settings.T_lidar_cam:
+            place = np.array(self._settings.T_lidar_cam)
+            T_lidar_cam = se3.make(Rotation.from_quat(place[3:]).as_matrix(), place[:3])
+        else:
+            try:
+                T_lidar_cam = self.transforms.lookup(self.lidar_frame, info.header.frame_id)
+            except UsageError as error:
+                raise UsageError(f"{self.path}: camera {self.image_topic}: {error}; "
+                                 "set input.T_lidar_cam, or input.images=false") from None  # fmt: skip
+        return decode_camera(info, T_lidar_cam, info.header.frame_id or self.image_topic)
+
+    def _correction(self) -> float:
+        wanted = self._settings.vertical_angle_correction_deg
+        if wanted != "auto":
+            return wanted
+        said = self._bag.first(topics.VERTICAL_ANGLE_CORRECTION)
+        if said is not None:
+            return float(said.data)
+        return HDL64_CORRECTION_DEG if self.points_topic.startswith("/kitti/") else 0.0
+
+    def _pairs(self) -> Iterator[tuple[int, bytes, bytes | None]]:
+        """(stamp, cloud, image or None), serialized. A cloud waits until no later image can be nearer, or too long."""
+        clouds: deque[tuple[int, int, bytes]] = deque()
+        images: deque[tuple[int, bytes]] = deque(maxlen=_BUFFERED_IMAGES)
+        shift = round(self._settings.image_time_offset * 1e9)
+        for topic, time, data in self._bag.messages([self.points_topic, self.image_topic][: 2 if self.camera else 1]):
+            if topic == self.points_topic:
+                clouds.append((_stamp(data, time), time, data))
+            else:
+                images.append((_stamp(data, time) + shift, data))
+            while clouds and (
+                not self.camera or (images and images[-1][0] >= clouds[0][0]) or time - clouds[0][1] > _LATE
+            ):
+                stamp, _, cloud = clouds.popleft()
+                yield stamp, cloud, self._nearest(stamp, images)
+        for stamp, _, cloud in clouds:
+            yield stamp, cloud, self._nearest(stamp, images)
+
+    def _nearest(self, stamp: int, images: deque[tuple[int, bytes]]) -> bytes | None:
+        tolerance = round(self._settings.image_tolerance * 1e9)
+        while images and images[0][0] < stamp - tolerance:
+            images.popleft()
+        taken, data = min(images, key=lambda image: abs(image[0] - stamp), default=(0, None))
+        return data if data is not None and abs(taken - stamp) <= tolerance else None
+
+    def _frame(self, index: int, stamp: int, cloud: bytes, image: bytes | None) -> Frame:
+        settings = self._settings
+        try:
+            msg = self._bag.decode(self.points_topic, cloud)
+            points, time = decode_points(msg, settings.time_field, settings.time_unit, settings.intensity_max)
+        except MessageError as error:
+            return Frame(stamp, np.empty((0, 4), np.float32), index=index, problem=str(error))
+        points = correct_vertical_angle(points, self.vertical_angle_correction_deg)
+        return Frame(stamp, points, time, self._images(image), index)
+
+    def _images(self, data: bytes | None) -> tuple[Image, ...]:
+        if data is None or self.camera is None:
+            return ()
+        try:
+            return (Image(decode_image(self._bag.decode(self.image_topic, data)), self.camera),)
+        except (MessageError, ValueError) as error:
+            self._note_once(f"images of {self.image_topic} that cannot be used are left out", f"the first: {error}")
+            return ()
+
+    def _truth(self, topic: str) -> tuple[Stamps, Array]:
+        """Stamps (M,) ns and T_world_lidar (M, 4, 4); of several Path messages the last, the most complete, counts."""
+        decoded = [self._bag.decode(topic, data) for _, _, data in self._bag.messages([topic])]
+        is_path = self._bag.types[topic] == _TRUTH[1]
+        stamped: list[Any] = decoded[-1].poses if is_path else decoded
+        stamps = np.array([stamp_ns(item.header) for item in stamped], np.int64)
+        T = np.array([transform_matrix(item.pose if is_path else item.pose.pose) for item in stamped]).reshape(-1, 4, 4)
+        child = "" if is_path or not decoded else decoded[0].child_frame_id
+        if child and child != self.lidar_frame:
+            T = T @ self.transforms.lookup(child, self.lidar_frame)
+        return stamps, T
+
+    def _contents(self) -> str:
+        listed = (f"{topic} ({kind}, {self._bag.counts[topic]})" for topic, kind in sorted(self._bag.types.items()))
+        return f"topics: {', '.join(listed) or 'none'}"
+
+    def _note_once(self, what: str, detail: str) -> None:
+        if not any(note.startswith(what) for note in self.notes):
+            self.notes.append(f"{what} ({detail})")
+
+
+def interpolate(stamps: Stamps, poses: Array, at: Stamps) -> Array:
+    """Poses (M, 4, 4) known at `stamps` (M,) ns to `at` (N,): exact where known, else along the screw between the
+    neighbours; NaN outside and in gaps beyond 1 s. Returns (N, 4, 4)."""
+    out = np.full((len(at), 4, 4), np.nan)
+    stamps, order = np.unique(stamps, return_index=True)
+    if not len(stamps):
+        return out
+    poses = poses[order]
+    left = np.clip(np.searchsorted(stamps, at, "right") - 1, 0, None)
+    right = np.minimum(left + 1, len(stamps) - 1)
+    gap = stamps[right] - stamps[left]
+    known = stamps[left] == at
+    out[known] = poses[left[known]]
+    between = ~known & (at > stamps[left]) & (at < stamps[right]) & (gap <= _TRUTH_GAP)
+    T0, T1 = poses[left[between]], poses[right[between]]
+    fraction = ((at - stamps[left])[between] / gap[between])[:, None]
+    out[between] = T0 @ se3.exp(fraction * se3.log(se3.inverse(T0) @ T1))
+    return out
+
+
+def _stamp(data: bytes, time: int) -> int:
+    """Stamp in ns of a serialized message that begins with a header, without decoding the rest; `time` if it is 0."""
+    if len(data) < 12:
+        return time
+    sec, nanosec = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)  # after the 4 bytes that name the order
+    return sec * 1_000_000_000 + nanosec or time

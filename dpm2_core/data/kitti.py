@@ -1,0 +1,267 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The KITTI odometry layout: sequences/NN/{velodyne,image_2,calib.txt,times.txt} and poses/NN.txt.
+
+A. Geiger, P. Lenz, R. Urtasun, "Are we ready for autonomous driving?", CVPR 2012.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dpm2_core.data.source import InputSettings
+from dpm2_core.errors import UsageError
+from dpm2_core.frame import Array, Camera, Frame, Image, Points
+from dpm2_core.geometry import se3
+
+HDL64_CORRECTION_DEG = 0.205
+"""What KITTI's scans lack in elevation: the intrinsic calibration of its HDL-64 (J.-E. Deschaud, "IMLS-SLAM", 2018)."""
+
+_PERIOD = 0.1  # s between scans, where times.txt does not say
+
+
+def correct_vertical_angle(points: Points, degrees: float) -> Points:
+    """Raise the elevation of each of (N, 4) points by `degrees`, keeping range and azimuth; invalid ones stay so."""
+    if not degrees:
+        return points
+    cos, sin = np.float32(np.cos(np.radians(degrees))), np.float32(np.sin(np.radians(degrees)))
+    x, y, z = points[:, 0], points[:, 1], points[:, 2]
+    rho = np.sqrt(x * x + y * y)
+    scale = cos - sin * z / np.maximum(rho, np.float32(1e-6))
+    out = np.empty_like(points)
+    np.multiply(x, scale, out=out[:, 0])
+    np.multiply(y, scale, out=out[:, 1])
+    np.add(z * cos, rho * sin, out=out[:, 2])
+    out[:, 3] = points[:, 3]
+    return out
+
+
+class KittiSource:
+    """A sequence folder, or the root above it with `sequences/NN`. See `Source` for what it offers.
+
+    Scans need not start at 0 nor follow each other. Images and poses are optional. A scan or image that cannot be read
+    costs its frame alone.
+
+    Raises:
+        UsageError: there are no scans, or a text file is damaged; the message names file and line.
+    """
+
+    def __init__(self, path: Path | str, settings: InputSettings | None = None) -> None:
+        self._settings = settings or InputSettings()
+        self.path = _sequence_folder(Path(path), self._settings.sequence)
+        self.name = self.path.resolve().name
+        self.notes: list[str] = []
+        scans = sorted((self.path / "velodyne").glob("*.bin"))
+        self._scans = [scan for scan in scans if scan.stem.isdecimal()]
+        if not self._scans:
+            raise UsageError(f"{self.path}: no scans (velodyne/NNNNNN.bin) in this folder")
+        self.numbers = np.array([int(scan.stem) for scan in self._scans])
+        self.vertical_angle_correction_deg = self._correction()
+        calib = read_calib(self.path / "calib.txt")
+        self.T_cam_lidar: Array | None = calib.get("Tr")
+        if self.T_cam_lidar is None:
+            self.notes.append(f"{self.path / 'calib.txt'} has no Tr: poses are of the LiDAR, not of the left camera")
+        self.stamps = self._stamps()
+        self.poses: Array | None = self._poses()
+        self.camera = self._camera(calib)
+
+    def __len__(self) -> int:
+        return len(self._scans)
+
+    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
+        """Frames start..stop-1 by position; `Frame.index` is the number in the file name."""
+        for scan, stamp in list(zip(self._scans, self.stamps, strict=True))[start:stop]:
+            points, problem = read_scan(scan)
+            yield Frame(
+                stamp=int(stamp),
+                points=correct_vertical_angle(points, self.vertical_angle_correction_deg),
+                images=self._images(scan.stem),
+                index=int(scan.stem),
+                problem=problem,
+            )
+
+    def _correction(self) -> float:
+        wanted = self._settings.vertical_angle_correction_deg
+        if wanted != "auto":
+            return wanted
+        note = self.path / "dpm2_sim.json"  # a simulated sensor has no such error, and says so
+        try:
+            return float(json.loads(note.read_text(encoding="utf-8"))["vertical_angle_correction_deg"])
+        except FileNotFoundError:
+            return HDL64_CORRECTION_DEG
+        except (OSError, ValueError, TypeError, KeyError) as error:
+            raise UsageError(f"{note}: no number vertical_angle_correction_deg ({error})") from None
+
+    def _stamps(self) -> NDArray[np.int64]:
+        """(len,) ns, continued at a steady pace where times.txt ends early."""
+        path, n = self.path / "times.txt", len(self)
+        times = read_numbers(path, 1)
+        seconds = self._of_each_scan(times)[:, 0]
+        known = np.isfinite(seconds)
+        if not known.any():
+            self.notes.append(f"{path}: missing or too short; frames are taken to be {_PERIOD} s apart")
+            seconds = (self.numbers - self.numbers[0]) * _PERIOD
+        elif not known.all():
+            last = int(np.flatnonzero(known)[-1])
+            step = float(np.median(np.diff(times[:, 0]))) if len(times) > 1 else _PERIOD
+            self.notes.append(f"{path}: {len(times)} times for {n} scans; the rest continue every {step:.3f} s")
+            seconds = np.where(known, seconds, seconds[last] + (self.numbers - self.numbers[last]) * step)
+        return np.round(seconds * 1e9).astype(np.int64)
+
+    def _poses(self) -> Array | None:
+        """(len, 4, 4) T_world_lidar from poses.txt here or poses/NN.txt of the root; None without."""
+        beside, above = self.path / "poses.txt", self.path.resolve().parents[1] / "poses" / f"{self.name}.txt"
+        path = next((file for file in (beside, above) if file.is_file()), None)
+        if path is None:
+            return None
+        if self.T_cam_lidar is None:
+            self.notes.append(f"{path} is of the camera: without Tr it is no ground truth for the LiDAR")
+            return None
+        rows = self._of_each_scan(read_numbers(path, 12)).reshape(-1, 3, 4)
+        known = np.isfinite(rows).all((1, 2))
+        if not known.all():
+            self.notes.append(f"{path}: {len(self) - known.sum()} of {len(self)} frames have no pose")
+        T_world_cam = np.full((len(self), 4, 4), np.nan)
+        # Rounded to 7 digits in the files, which a quaternion on the way through a bag would not keep.
+        T_world_cam[known] = se3.orthonormalised(se3.make(rows[known, :, :3], rows[known, :, 3]))
+        return se3.inverse(self.T_cam_lidar) @ T_world_cam @ self.T_cam_lidar
+
+    def _of_each_scan(self, rows: Array) -> Array:
+        """The row of each scan: by frame number if there are enough, else counted from the first scan; NaN beyond."""
+        if len(rows) > self.numbers[-1]:
+            at = self.numbers
+        else:
+            at = np.arange(len(self)) if len(rows) == len(self) else self.numbers - self.numbers[0]
+        out = np.full((len(self), rows.shape[1]), np.nan)
+        out[at < len(rows)] = rows[at[at < len(rows)]]
+        return out
+
+    def _camera(self, calib: dict[str, Array]) -> Camera | None:
+        """The left colour camera, its size that of the first image that can be read; None without images."""
+        if not self._settings.images:
+            return None
+        paths = [path for path in map(self._image_path, self._scans) if path]
+        if not paths:
+            return None
+        size = next((pixels.shape[1::-1] for pixels in map(read_image, paths) if pixels is not None), None)
+        if size is None:
+            self.notes.append(f"{paths[0].parent}: none of its images can be read")
+            return None
+        if self.T_cam_lidar is None:
+            self.notes.append("images are left out: without Tr the camera's place is not known")
+            return None
+        if "P2" not in calib:
+            raise UsageError(f"{self.path / 'calib.txt'}: no P2, which image_2 needs; without images it is not needed")
+        K, offset = calib["P2"][:, :3], calib["P2"][:, 3]
+        # P2 = K [I | t] with t from the left grey camera 0, which the poses and Tr refer to.
+        T_cam2_cam0 = se3.make(np.eye(3), np.linalg.solve(K, offset))
+        return Camera(K, se3.inverse(T_cam2_cam0 @ self.T_cam_lidar), size, name="camera_color_left")
+
+    def _image_path(self, scan: Path) -> Path | None:
+        paths = (self.path / "image_2" / f"{scan.stem}{suffix}" for suffix in (".png", ".jpg"))
+        return next((path for path in paths if path.is_file()), None)
+
+    def _images(self, stem: str) -> tuple[Image, ...]:
+        path = self._image_path(Path(stem)) if self.camera else None
+        if path is None or self.camera is None:
+            return ()
+        pixels = read_image(path)
+        if pixels is not None and pixels.shape[1::-1] == self.camera.size:
+            return (Image(pixels, self.camera),)
+        found = "cannot be read" if pixels is None else f"is {pixels.shape[1]}x{pixels.shape[0]}"
+        self.notes.append(f"{path} {found} (others are {'x'.join(map(str, self.camera.size))}): frame used without it")
+        return ()
+
+
+def read_scan(path: Path) -> tuple[Points, str | None]:
+    """A velodyne file to (N, 4) float32 [x, y, z in m, intensity 0..1], or an empty array and what is wrong."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        return np.empty((0, 4), np.float32), f"{path}: {error.strerror}"
+    if len(data) % 16:
+        return np.empty((0, 4), np.float32), f"{path}: {len(data)} bytes are no whole number of points (16 bytes each)"
+    return np.frombuffer(data, "<f4").reshape(-1, 4), None
+
+
+def read_image(path: Path) -> NDArray[np.uint8] | None:
+    """An image file to (H, W, 3) uint8 RGB; None if it cannot be decoded."""
+    try:
+        pixels = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error:
+        return None
+    return None if pixels is None else cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB, dst=pixels)
+
+
+def read_calib(path: Path) -> dict[str, Array]:
+    """P0..P3 (3, 4) and Tr (4, 4, LiDAR to left grey camera), those that a calib.txt has; nothing if there is none.
+
+    Raises:
+        UsageError: a line is damaged; the message names it.
+    """
+    calib: dict[str, Array] = {}
+    for number, line in enumerate(_lines(path), 1):
+        key, colon, text = line.partition(":")
+        if not colon or key.strip() not in ("P0", "P1", "P2", "P3", "Tr"):
+            continue  # raw and object calibrations have many more
+        matrix = _row(text, 12, f"{path}:{number}: {key}").reshape(3, 4)
+        name = key.strip()
+        if name == "Tr":
+            R = matrix[:, :3]
+            if np.abs(R @ R.T - np.eye(3)).max() > 0.01 or np.linalg.det(R) < 0:
+                raise UsageError(f"{path}:{number}: Tr is no rigid transform")
+            calib[name] = se3.orthonormalised(se3.make(R, matrix[:, 3]))
+        elif matrix[0, 0] <= 0 or matrix[1, 1] <= 0 or not np.allclose(matrix[2, :3], [0, 0, 1]):
+            raise UsageError(f"{path}:{number}: {name} is no projection matrix of a rectified camera")
+        else:
+            calib[name] = matrix
+    return calib
+
+
+def read_numbers(path: Path, columns: int) -> Array:
+    """(lines, columns) float64 of a text file without header; no rows if there is no such file.
+
+    Raises:
+        UsageError: a line has another number of numbers, or something else; the message names it.
+    """
+    rows = [_row(line, columns, f"{path}:{i}") for i, line in enumerate(_lines(path), 1) if line.strip()]
+    return np.array(rows).reshape(-1, columns)
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        return path.read_text(encoding="utf-8").splitlines()
+    except FileNotFoundError:
+        return []
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(f"{path}: {getattr(error, 'strerror', None) or 'not a text file'}") from None
+
+
+def _row(text: str, count: int, where: str) -> Array:
+    try:
+        row = np.array([float(word) for word in text.split()])
+    except ValueError as error:
+        raise UsageError(f"{where}: {error}") from None
+    if len(row) != count or not np.isfinite(row).all():
+        raise UsageError(f"{where}: {len(row)} numbers, want {count} finite ones")
+    return row
+
+
+def _sequence_folder(path: Path, sequence: str) -> Path:
+    if (path / "velodyne").is_dir():
+        return path
+    if not path.is_dir():
+        raise UsageError(f"{path}: no such folder")
+    root = path / "sequences" if (path / "sequences").is_dir() else path
+    found = sorted(folder.name for folder in root.iterdir() if (folder / "velodyne").is_dir())
+    if sequence in found or (not sequence and len(found) == 1):
+        return root / (sequence or found[0])
+    if found:
+        asked = f"no sequence {sequence}" if sequence else "several sequences"
+        raise UsageError(f"{path}: {asked}; choose one with input.sequence: {', '.join(found)}")
+    raise UsageError(f"{path}: no KITTI sequence (no velodyne folder in it or below sequences/) and no bag")

@@ -1,0 +1,16 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Topics and frames of a KITTI bag, named as the kitti2bag tool made them usual."""
+
+POINTS = "/kitti/velo/pointcloud"
+IMAGE = "/kitti/camera_color_left/image_raw"
+CAMERA_INFO = "/kitti/camera_color_left/camera_info"
+TF_STATIC = "/tf_static"
+ODOMETRY = "/kitti/ground_truth/odom"
+PATH = "/kitti/ground_truth/path"
+VERTICAL_ANGLE_CORRECTION = "/kitti/vertical_angle_correction_deg"
+"""std_msgs/Float64, latched: degrees to add to the elevation of each point, which the recording itself lacks."""
+
+MAP, BASE, LIDAR = "map", "base_link", "velo_link"
+GRAY_CAMERA = "camera_gray_left"
+"""KITTI's camera 0, which poses and Tr refer to."""
+COLOR_CAMERA = "camera_color_left"
