@@ -6,9 +6,10 @@ Each part of the package keeps its own `Settings` type beside the code it config
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar, get_args
 
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -17,6 +18,9 @@ from pydantic.fields import FieldInfo
 from dpm2_core.errors import UsageError
 
 T = TypeVar("T", bound="Settings")
+
+# PyYAML lets the errors of int() and datetime() through, and recurses.
+_NOT_YAML = (yaml.YAMLError, ValueError, RecursionError)
 
 
 class Settings(BaseModel):
@@ -37,19 +41,20 @@ def load_settings(kind: type[T], path: Path | None = None, overrides: Sequence[s
     origin: dict[str, str] = {}
     if path is not None:
         _merge(tree, _read(path))
-        origin = {key: str(path) for key in _leaves(tree)}
     for setting in overrides:
         key, equals, text = setting.partition("=")
-        if not equals or not key.strip():
+        key = key.strip()
+        if not equals or not key:
             raise UsageError(f"--set {setting}: want KEY=VALUE, such as slam.registration=geometric")
         try:
             value = yaml.safe_load(text)
-        except yaml.YAMLError:
+        except _NOT_YAML:
             value = text
-        for part in reversed(key.strip().split(".")):
+        for part in reversed(key.split(".")):
             value = {part: value}
         _merge(tree, value)
-        origin[key.strip()] = f"--set {setting}"
+        origin.pop(key, None)  # the last one is to blame
+        origin[key] = f"--set {setting}"
     return settings_from(kind, tree, origin, str(path) if path else "configuration")
 
 
@@ -58,7 +63,7 @@ def settings_from(kind: type[T], tree: dict[str, Any], origin: dict[str, str] | 
     try:
         return kind.model_validate(tree)
     except ValidationError as error:
-        raise UsageError("; ".join(_explain(kind, e, origin or {}, default) for e in error.errors())) from None
+        raise UsageError("; ".join(_explain(kind, error, origin or {}, default))) from None
 
 
 def dump_settings(settings: Settings) -> str:
@@ -78,9 +83,10 @@ def flat_fields(kind: type[Settings], prefix: str = "") -> Iterator[tuple[str, F
 def _read(path: Path) -> dict[str, Any]:
     try:
         tree = yaml.safe_load(path.read_text(encoding="utf-8"))
+        json.dumps(tree, default=str, skipkeys=True)  # refuses a mapping that holds itself through an alias
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror}") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except _NOT_YAML as error:
         raise UsageError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
     if tree is None:
         return {}
@@ -91,30 +97,53 @@ def _read(path: Path) -> dict[str, Any]:
 
 def _merge(tree: dict[str, Any], more: dict[str, Any]) -> None:
     for key, value in more.items():
-        if isinstance(value, dict) and isinstance(tree.get(key), dict):
+        if isinstance(value, dict):
+            # A copy: two keys may share one mapping through a YAML anchor, and each is its own.
+            tree[key] = dict(tree[key]) if isinstance(tree.get(key), dict) else {}
             _merge(tree[key], value)
         else:
             tree[key] = value
 
 
-def _leaves(tree: dict[str, Any], prefix: str = "") -> Iterator[str]:
-    for key, value in tree.items():
-        yield f"{prefix}{key}"
-        if isinstance(value, dict):
-            yield from _leaves(value, f"{prefix}{key}.")
+def _explain(kind: type[Settings], error: ValidationError, origin: dict[str, str], default: str) -> Iterator[str]:
+    """One message a key, saying where it was set; the branches of a union become `this or that`."""
+    messages: dict[str, list[str]] = {}
+    for e in error.errors():
+        unknown = e["type"] == "extra_forbidden"
+        parts, allowed = _field(kind, e["loc"][:-1] if unknown else e["loc"])
+        key = ".".join([*parts, str(e["loc"][-1])] if unknown else parts)
+        where = next((origin[name] for name in reversed(origin) if _related(name, key)), default)
+        if unknown:
+            yield f"{where}: unknown key {key}; allowed here: {', '.join(allowed.model_fields)}"
+        else:
+            message = f"{e['msg'][0].lower()}{e['msg'][1:]}, got {e['input']!r}"
+            messages.setdefault(f"{where}: {key}" if key else where, []).append(message)
+    yield from (f"{key}: {' or '.join(branches)}" for key, branches in messages.items())
 
 
-def _explain(kind: type[Settings], error: Any, origin: dict[str, str], default: str) -> str:
-    parts = [str(part) for part in error["loc"]]
-    key = ".".join(parts)
-    prefixes = (".".join(parts[:n]) for n in range(len(parts), 0, -1))
-    where = next((origin[prefix] for prefix in prefixes if prefix in origin), default)
-    if error["type"] == "extra_forbidden":
-        for part in parts[:-1]:
-            annotation = kind.model_fields[part].annotation
-            kind = cast("type[Settings]", annotation)
-        return f"{where}: unknown key {key}; allowed here: {', '.join(kind.model_fields)}"
-    return f"{where}: {key}: {error['msg'][0].lower()}{error['msg'][1:]}, got {error['input']!r}"
+def _field(kind: type[Settings], location: tuple[str | int, ...]) -> tuple[list[str], type[Settings]]:
+    """Names and indices of a pydantic error location without its union branches, and the type they lead to."""
+    parts = []
+    for part in location:
+        if isinstance(part, int):
+            parts.append(str(part))
+        elif part in kind.model_fields:
+            parts.append(part)
+            kind = next(_settings_in(kind.model_fields[part].annotation), kind)
+    return parts, kind
+
+
+def _settings_in(annotation: Any) -> Iterator[type[Settings]]:
+    """The configuration types in an annotation such as `tuple[Inner, ...]` or `Inner | None`."""
+    if isinstance(annotation, type) and issubclass(annotation, Settings):
+        yield annotation
+    for argument in get_args(annotation):
+        yield from _settings_in(argument)
+
+
+def _related(a: str, b: str) -> bool:
+    """Whether one dotted key is the other, above or below it."""
+    return f"{a}.".startswith(f"{b}.") or f"{b}.".startswith(f"{a}.")
 
 
 def _dump(settings: Settings, depth: int) -> Iterator[str]:

@@ -8,9 +8,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import hypothesis
 import pytest
 
 KITTI = Path(os.environ.get("DPM2_KITTI", Path(__file__).resolve().parents[2] / "shared" / "kitti"))
+
+# The same examples in every run, however slow the machine is.
+hypothesis.settings.register_profile("dpm2", deadline=None, derandomize=True)
+hypothesis.settings.load_profile("dpm2")
 
 
 @pytest.fixture(scope="session")

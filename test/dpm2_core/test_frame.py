@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A noun with fields that do not fit together cannot be made, and the message says what does not fit."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dpm2_core.frame import Camera, Frame, Image
+
+CAMERA = Camera(K=np.eye(3), T_lidar_cam=np.eye(4), size=(40, 30), name="left")
+
+
+def _pixels(height: int, width: int, channels: int = 3) -> np.ndarray:
+    return np.zeros((height, width, channels), np.uint8)
+
+
+def test_an_image_fits_its_camera() -> None:
+    assert Image(_pixels(30, 40), CAMERA).camera is CAMERA
+
+
+@pytest.mark.parametrize("pixels", [_pixels(40, 30), _pixels(30, 40, 1), _pixels(30, 40)[..., 0]])
+def test_an_image_of_another_shape_is_refused(pixels: np.ndarray) -> None:
+    with pytest.raises(ValueError, match=r"left: image of .* calibration for \(30, 40\)"):
+        Image(pixels, CAMERA)
+
+
+def test_a_camera_wants_matrices_of_the_right_shape() -> None:
+    with pytest.raises(ValueError, match=r"camera: K is \(3, 4\)"):
+        Camera(K=np.zeros((3, 4)), T_lidar_cam=np.eye(4), size=(40, 30))
+    with pytest.raises(ValueError, match=r"T_lidar_cam \(3, 4\)"):
+        Camera(K=np.eye(3), T_lidar_cam=np.zeros((3, 4)), size=(40, 30))
+
+
+def test_a_frame_may_be_empty_and_may_hold_nan() -> None:
+    for points in (np.zeros((0, 4), np.float32), np.full((3, 4), np.nan, np.float32)):
+        assert Frame(stamp=0, points=points).problem is None
+
+
+@pytest.mark.parametrize("shape", [(5,), (5, 3), (1, 5, 4)])
+def test_points_without_intensity_or_of_another_rank_are_refused(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=r"frame 7: points are .* want \(N, 4\)"):
+        Frame(stamp=0, points=np.zeros(shape, np.float32), index=7)
+
+
+def test_every_point_wants_its_time_offset() -> None:
+    points = np.zeros((5, 4), np.float32)
+    assert Frame(stamp=0, points=points, time_offset=np.zeros(5, np.float32)).time_offset is not None
+    with pytest.raises(ValueError, match="4 time offsets for 5 points"):
+        Frame(stamp=0, points=points, time_offset=np.zeros(4, np.float32))
+
+
+def test_nouns_cannot_be_changed() -> None:
+    frame = Frame(stamp=0, points=np.zeros((1, 4), np.float32))
+    with pytest.raises(AttributeError):
+        frame.stamp = 1  # type: ignore[misc]
