@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A spinning multi-beam LiDAR by ray casting: points, labels, and the twin of each scan without what moves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from dpm2_core.geometry import se3
+from dpm2_core.sim.config import LidarConfig
+from dpm2_core.sim.materials import MISS, MOVING_LABEL, REFLECTANCE, RETRO, ROUGHNESS, Label, Material
+from dpm2_core.sim.mesh import Hits, Mesh, Scene
+from dpm2_core.sim.world import World
+
+Array = NDArray[np.float64]
+Float = NDArray[np.float32]
+
+_CAR_BODY = (1.5, 1.67, 0.85, 0.56)
+"""Edges of the roof ahead, behind and aside, and the sensor's height over it, m: hides what it hides on KITTI's car."""
+
+
+def elevations(beams: int) -> Array:
+    """(beams,) rad above the horizon, top beam first."""
+    degrees = {
+        16: np.linspace(15, -15, 16),
+        32: np.linspace(10.67, -30.67, 32),
+        64: np.concatenate([np.linspace(2, -8.33, 32), np.linspace(-8.83, -24.8, 32)]),
+        128: np.linspace(15, -25, 128),
+    }[beams]
+    return np.radians(degrees)
+
+
+@dataclass(eq=False)
+class Scan:
+    """One turn, by beam from the top, within a beam by azimuth from straight ahead to the left.
+
+    Attributes:
+        points: (N, 4) float32 [x, y, z in m, intensity 0..1] in the LiDAR frame.
+        label: (N,) uint32 SemanticKITTI: class in the low 16 bits (252 and more where moving), instance of a mover in the high ones.
+        moving: (N,) bool. ring: (N,) uint8, 0 is the top beam. time_offset: (N,) float32 s, relative to the middle of the turn.
+        static: (M, 4) float32, what the same pulses return without anything that moves.
+    """
+
+    points: Float
+    label: NDArray[np.uint32]
+    moving: NDArray[np.bool_]
+    ring: NDArray[np.uint8]
+    time_offset: Float
+    static: Float
+
+
+class Lidar:
+    """Scans worlds. Holds no state between scans: one may serve many threads."""
+
+    def __init__(self, config: LidarConfig | None = None) -> None:
+        self.config = config = config or LidarConfig()
+        elevation = elevations(config.beams)[:, None]
+        azimuth = np.arange(config.columns)[None] * (2 * np.pi / config.columns)
+        directions = np.stack(
+            [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation) + 0 * azimuth],
+            -1,
+        ).reshape(-1, 3)
+        ring, column = np.divmod(np.arange(len(directions)), config.columns)
+        if config.car_body:
+            keep = ~_hidden_by_car(directions)
+            directions, ring, column = directions[keep], ring[keep], column[keep]
+        self.directions = np.ascontiguousarray(directions, np.float32)
+        self.ring, self.column = ring.astype(np.uint8), column
+        # It turns clockwise and looks straight ahead at the stamp.
+        turn = -np.remainder(azimuth[0] + np.pi, 2 * np.pi) + np.pi
+        self.column_time = (turn / (2 * np.pi) * config.period).astype(np.float32)
+
+    def scan(
+        self, world: World, T_world_lidar: Array, time: float, rng: np.random.Generator, twist: Array | None = None
+    ) -> Scan:
+        """One turn at a pose (4, 4).
+
+        Args:
+            time: s, where the movers are. They stand still during the turn.
+            twist: (6,) [rad/s, m/s] of the sensor in its own frame during the turn: each point is then given in the frame of its
+                own moment, as a driver delivers it. None: a scan already corrected for motion, as KITTI's odometry set has.
+        """
+        origins, directions = self._rays(T_world_lidar, twist)
+        config = self.config
+        n = len(directions)
+        chance = rng.random(n, np.float32)
+        jitter = rng.standard_normal((2, n), np.float32)
+        still = world.scene.cast(origins, directions, config.range)
+        still_points, still_back = self._returns(world, world.static, still, origins, directions, chance, jitter)
+        label = _labels(world.static, still.face, still_back)
+        moving = np.zeros(n, bool)
+        points, back = still_points, still_back
+        movers = world.traffic.mesh(time, T_world_lidar[:2, 3])
+        if movers is not None:
+            mesh, instance = movers
+            hits, toward = _cast_movers(mesh, origins, directions, config.range)
+            moving[toward] = hits.distance < still.distance[toward]
+            near = moving[toward]
+            chosen = toward[near]
+            hits = Hits(hits.distance[near], hits.face[near], hits.normal[near], hits.weights[near])
+            seen, came = self._returns(
+                world, mesh, hits, origins[chosen], directions[chosen], chance[chosen], jitter[:, chosen], chosen
+            )
+            points, back, label = points.copy(), back.copy(), label.copy()
+            points[chosen], back[chosen] = seen, came
+            label[chosen] = MOVING_LABEL[mesh.label[hits.face]] | (instance[hits.face].astype(np.uint32) << 16)
+        return Scan(
+            points[back],
+            label[back],
+            moving[back],
+            self.ring[back],
+            self.column_time[self.column[back]],
+            still_points[still_back],
+        )
+
+    def _rays(self, T_world_lidar: Array, twist: Array | None) -> tuple[Float, Float]:
+        if twist is None:
+            directions = self.directions @ T_world_lidar[:3, :3].T.astype(np.float32)
+            return np.broadcast_to(T_world_lidar[:3, 3].astype(np.float32), directions.shape).copy(), directions
+        T = T_world_lidar @ se3.exp(np.asarray(twist) * self.column_time[:, None].astype(float))
+        R = T[:, :3, :3].astype(np.float32)[self.column]
+        directions = np.einsum("nij,nj->ni", R, self.directions)
+        return T[:, :3, 3].astype(np.float32)[self.column], directions
+
+    def _returns(
+        self, world: World, mesh: Mesh, hits: Hits, origins: Float, directions: Float, chance: Float, jitter: Float,
+        which: NDArray[np.intp] | slice = slice(None),
+    ) -> tuple[Float, NDArray[np.bool_]]:  # fmt: skip
+        """Points (R, 4) in the LiDAR frame and whether each pulse came back (R,)."""
+        config = self.config
+        face = np.maximum(hits.face, 0)
+        material = mesh.material[face]
+        normal = hits.normal
+        cosine = np.abs(np.einsum("ij,ij->i", normal, directions))
+        cosine /= np.sqrt(np.einsum("ij,ij->i", normal, normal)) + np.float32(1e-12)
+        paint = mesh.colour[face].sum(1, dtype=np.float32) / np.float32(3 * 150)
+        reflectance = REFLECTANCE[material] * (np.float32(0.55) + np.float32(0.45) * np.minimum(paint, np.float32(1.6)))
+        facing = np.where(RETRO[material], 1, 0.55 + 0.45 * np.sqrt(cosine)).astype(np.float32)
+        distance = np.where(hits.face >= 0, hits.distance, 0).astype(np.float32)
+        # What is left of the pulse, against what the receiver needs; the exponent is far below 2: gain control.
+        strength = reflectance * (cosine + np.float32(0.02)) * (np.float32(30) / np.maximum(distance, 5)) ** 2
+        lost = config.dropout + MISS[material] + (1 - config.dropout) * np.exp(-strength / np.float32(0.012))
+        back = (hits.face >= 0) & (chance > lost)
+        sigma = np.hypot(np.float32(config.noise), ROUGHNESS[material])
+        measured = distance + sigma * jitter[0]
+        back &= (measured >= config.min_range) & (measured <= config.range)
+        points = np.empty((len(distance), 4), np.float32)
+        points[:, :3] = self.directions[which] * measured[:, None]
+        intensity = reflectance * facing * np.exp(-distance / 160) + np.float32(0.03) * jitter[1]
+        points[:, 3] = np.rint(intensity.clip(0, 1) * 100) / 100
+        return points, back
+
+
+def _hidden_by_car(directions: Array) -> NDArray[np.bool_]:
+    ahead, behind, aside, clearance = _CAR_BODY
+    flat = np.hypot(directions[:, 0], directions[:, 1]) + 1e-9
+    along, across = directions[:, 0] / flat, np.abs(directions[:, 1]) / flat
+    reach = np.minimum(
+        np.where(along > 0, ahead, behind) / np.maximum(np.abs(along), 1e-9), aside / np.maximum(across, 1e-9)
+    )
+    return -directions[:, 2] / flat * reach > clearance
+
+
+def _labels(mesh: Mesh, face: NDArray[np.int32], back: NDArray[np.bool_]) -> NDArray[np.uint32]:
+    out = np.zeros(len(face), np.uint32)
+    out[back] = mesh.label[face[back]]
+    return out
+
+
+def _cast_movers(mesh: Mesh, origins: Float, directions: Float, reach: float) -> tuple[Hits, NDArray[np.intp]]:
+    """Hits of those rays alone that can meet a mover: within the elevations and azimuths that the movers span."""
+    away = mesh.vertices - origins[:1]
+    bins = 720
+    flat = np.hypot(away[:, 0], away[:, 1])
+    covered = np.zeros(bins, bool)
+    triangles = np.arctan2(away[:, 1], away[:, 0])[mesh.faces]
+    span = np.abs(np.angle(np.exp(1j * (triangles - triangles[:, :1])))).max(1)
+    steps = np.linspace(-1, 1, 9)[None] * (span[:, None] + 0.03)
+    covered[(((triangles[:, :1] + steps) / (2 * np.pi)) * bins).astype(int) % bins] = True
+    low, high = (away[:, 2] / flat).min() - 0.02, (away[:, 2] / flat).max() + 0.02
+    slope = directions[:, 2] / np.hypot(directions[:, 0], directions[:, 1])
+    azimuth = (np.arctan2(directions[:, 1], directions[:, 0]) / (2 * np.pi) * bins).astype(int) % bins
+    toward = np.flatnonzero(covered[azimuth] & (slope > low) & (slope < high))
+    scene = Scene(mesh)
+    return scene.cast(np.ascontiguousarray(origins[toward]), np.ascontiguousarray(directions[toward]), reach), toward
+
+
+__all__ = ["Label", "Lidar", "Material", "Rotation", "Scan", "elevations"]

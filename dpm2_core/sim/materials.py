@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What things are (SemanticKITTI classes) and what they are made of (optical properties)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+
+
+class Label(IntEnum):
+    """SemanticKITTI class ids, those that the worlds contain."""
+
+    CAR = 10
+    BICYCLE = 11
+    TRUCK = 18
+    PERSON = 30
+    BICYCLIST = 31
+    ROAD = 40
+    PARKING = 44
+    SIDEWALK = 48
+    OTHER_GROUND = 49
+    BUILDING = 50
+    FENCE = 51
+    STRUCTURE = 52
+    MARKING = 60
+    VEGETATION = 70
+    TRUNK = 71
+    TERRAIN = 72
+    POLE = 80
+    SIGN = 81
+    OBJECT = 99
+
+
+MOVING_LABEL = np.arange(100, dtype=np.uint32)
+"""(100,) the SemanticKITTI id of a class when it moves: 10 becomes 252."""
+for _still, _moving in {10: 252, 18: 258, 30: 254, 31: 253}.items():
+    MOVING_LABEL[_still] = _moving
+
+
+class Material(IntEnum):
+    """Index into the property arrays of this module."""
+
+    ASPHALT = 0
+    PAVING = 1
+    GRASS = 2
+    SOIL = 3
+    PLASTER = 4
+    BRICK = 5
+    GLASS = 6
+    ROOF = 7
+    BARK = 8
+    LEAF = 9
+    METAL = 10
+    SIGN = 11
+    PAINT = 12
+    RUBBER = 13
+    CONCRETE = 14
+    WOOD = 15
+    CLOTH = 16
+    TILE = 17
+    LAMP = 18
+
+
+@dataclass(frozen=True)
+class _Optics:
+    """reflectance: LiDAR intensity at normal incidence; miss: share of pulses that vanish (glass, dark paint);
+    roughness: extra range noise, m; retro: little dependence on incidence."""
+
+    reflectance: float
+    miss: float = 0.0
+    roughness: float = 0.0
+    retro: bool = False
+
+
+_TABLE = {
+    Material.ASPHALT: _Optics(0.33),
+    Material.PAVING: _Optics(0.38),
+    Material.GRASS: _Optics(0.42, 0.01, 0.03),
+    Material.SOIL: _Optics(0.35, 0.0, 0.015),
+    Material.PLASTER: _Optics(0.42),
+    Material.BRICK: _Optics(0.34),
+    Material.GLASS: _Optics(0.10, 0.55),
+    Material.ROOF: _Optics(0.3, 0.02),
+    Material.BARK: _Optics(0.3, 0.03, 0.01),
+    Material.LEAF: _Optics(0.4, 0.12, 0.04),
+    Material.METAL: _Optics(0.3, 0.06),
+    Material.SIGN: _Optics(0.95, 0.0, 0.0, True),
+    Material.PAINT: _Optics(0.3, 0.12),
+    Material.RUBBER: _Optics(0.08, 0.2),
+    Material.CONCRETE: _Optics(0.4),
+    Material.WOOD: _Optics(0.38, 0.01),
+    Material.CLOTH: _Optics(0.35, 0.02, 0.01),
+    Material.TILE: _Optics(0.4, 0.01),
+    Material.LAMP: _Optics(0.3, 0.3),
+}
+
+REFLECTANCE = np.array([_TABLE[m].reflectance for m in Material], np.float32)
+MISS = np.array([_TABLE[m].miss for m in Material], np.float32)
+ROUGHNESS = np.array([_TABLE[m].roughness for m in Material], np.float32)
+RETRO = np.array([_TABLE[m].retro for m in Material])

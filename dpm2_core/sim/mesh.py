@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Triangle meshes with a class, a material, a colour and surface coordinates on every triangle, and their ray casting."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+from numpy.typing import ArrayLike, NDArray
+
+from dpm2_core.sim.materials import Label, Material
+
+Float = NDArray[np.float32]
+Int = NDArray[np.int32]
+
+
+@dataclass(eq=False)
+class Mesh:
+    """A triangle soup.
+
+    Attributes:
+        vertices: (V, 3) float32 m. faces: (F, 3) int32.
+        label: (F,) uint8 `Label`. material: (F,) uint8 `Material`. colour: (F, 3) uint8 RGB.
+        uv: (F, 3, 2) float32, surface coordinates of the corners, m. texture: (F,) uint16, what sets patterns apart.
+    """
+
+    vertices: Float
+    faces: Int
+    label: NDArray[np.uint8]
+    material: NDArray[np.uint8]
+    colour: NDArray[np.uint8]
+    uv: Float
+    texture: NDArray[np.uint16]
+
+    def __len__(self) -> int:
+        return len(self.faces)
+
+
+def make(
+    vertices: ArrayLike,
+    faces: ArrayLike,
+    label: Label | NDArray[np.integer],
+    material: Material | NDArray[np.integer],
+    colour: ArrayLike = (128, 128, 128),
+    uv: Float | None = None,
+) -> Mesh:
+    """A mesh from (V, 3) vertices and (F, 3) faces; the other values are for all triangles or one each.
+
+    Without `uv` each triangle is projected along the axis that its normal is nearest to.
+    """
+    vertices, faces = np.asarray(vertices, np.float32), np.asarray(faces, np.int32)
+    n = len(faces)
+    return Mesh(
+        vertices,
+        faces,
+        np.broadcast_to(np.asarray(label, np.uint8), n).copy(),
+        np.broadcast_to(np.asarray(material, np.uint8), n).copy(),
+        np.broadcast_to(np.asarray(colour, np.uint8), (n, 3)).copy(),
+        _box_uv(vertices[faces]) if uv is None else np.asarray(uv, np.float32),
+        np.zeros(n, np.uint16),
+    )
+
+
+def _box_uv(corners: Float) -> Float:
+    normal = np.abs(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    axes = np.array([[1, 2], [0, 2], [0, 1]])[normal.argmax(-1)]
+    return np.take_along_axis(corners, axes[:, None, :], axis=-1)
+
+
+def merge(meshes: Sequence[Mesh]) -> Mesh:
+    """One mesh of all triangles, in order."""
+    offsets = np.cumsum([0] + [len(m.vertices) for m in meshes[:-1]])
+    columns = {f.name: np.concatenate([getattr(m, f.name) for m in meshes]) for f in fields(Mesh) if f.name != "faces"}
+    faces = np.concatenate([m.faces + np.int32(k) for m, k in zip(meshes, offsets, strict=True)])
+    return Mesh(faces=faces, **columns)
+
+
+def placed(template: Mesh, poses: ArrayLike, texture: ArrayLike = 0, tint: ArrayLike | None = None) -> Mesh:
+    """Copies of a template.
+
+    Args:
+        poses: (N, 3, 4) or (N, 4, 4) affine maps template to world (scales and mirrors allowed).
+        texture: (N,) pattern numbers.
+        tint: (N, 3) colour factors, 1 leaves the colour; None for all 1.
+    """
+    poses = np.asarray(poses, np.float32)
+    n, v = len(poses), len(template.vertices)
+    points = np.einsum("nij,vj->nvi", poses[:, :3, :3], template.vertices) + poses[:, None, :3, 3]
+    faces = template.faces[None] + (np.arange(n, dtype=np.int32) * v)[:, None, None]
+    colour = np.repeat(template.colour[None], n, 0)
+    if tint is not None:
+        colour = (colour * np.asarray(tint, np.float32)[:, None]).clip(0, 255).astype(np.uint8)
+    f = len(template)
+    return Mesh(
+        points.reshape(-1, 3),
+        faces.reshape(-1, 3),
+        np.tile(template.label, n),
+        np.tile(template.material, n),
+        colour.reshape(-1, 3),
+        np.tile(template.uv, (n, 1, 1)),
+        np.repeat(np.broadcast_to(np.asarray(texture, np.uint16), n), f),
+    )
+
+
+def pose(xy: ArrayLike, z: ArrayLike, yaw: ArrayLike, scale: ArrayLike = 1.0) -> NDArray[np.float64]:
+    """(N, 3, 4) maps that scale by `scale` (N,) or (N, 3), turn about z by `yaw` (N,) rad and move to xy (N, 2), z (N,)."""
+    xy, yaw = np.atleast_2d(np.asarray(xy, float)), np.atleast_1d(np.asarray(yaw, float))
+    n = len(xy)
+    out = np.zeros((n, 3, 4))
+    out[:, 0, 0] = out[:, 1, 1] = np.cos(yaw)
+    out[:, 1, 0] = np.sin(yaw)
+    out[:, 0, 1] = -out[:, 1, 0]
+    out[:, 2, 2] = 1.0
+    scale = np.asarray(scale, float)
+    out[:, :, :3] *= scale[:, None, :] if scale.ndim == 2 else np.broadcast_to(scale, n)[:, None, None]
+    out[:, :2, 3], out[:, 2, 3] = xy, z
+    return out
+
+
+@dataclass(eq=False)
+class Hits:
+    """Nearest hits of R rays.
+
+    Attributes:
+        distance: (R,) float32 m, inf where nothing was hit. face: (R,) int32 triangle, -1 where nothing was hit.
+        normal: (R, 3) float32, not normalised, either side. weights: (R, 2) float32 barycentric, of corners 1 and 2.
+    """
+
+    distance: Float
+    face: Int
+    normal: Float
+    weights: Float
+
+
+class Scene:
+    """A mesh ready for ray casting. Casting is thread-safe and runs without the interpreter lock."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        self.mesh = mesh
+        self._scene = EmbreeScene()
+        TriangleMesh(self._scene, np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(mesh.faces))
+        self.cast(np.zeros((1, 3), np.float32), np.array([[0, 0, 1]], np.float32))  # builds the tree: not thread-safe
+
+    def cast(self, origins: Float, directions: Float, reach: float = 1e4) -> Hits:
+        """Rays from (R, 3) origins along (R, 3) directions (unit length), up to `reach` m; both float32."""
+        out = self._scene.run(origins, directions, query="INTERSECT", output=True)
+        face = out["primID"].copy()
+        distance = out["tfar"].copy()
+        lost = (face < 0) | (distance > reach)
+        face[lost], distance[lost] = -1, np.inf
+        return Hits(distance, face, out["Ng"], np.stack([out["u"], out["v"]], -1))

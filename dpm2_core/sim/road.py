@@ -1,0 +1,265 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the streets run and how the car drives on them. Plane coordinates in m; arc length `s` in m."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path as FilePath
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial import cKDTree
+
+from dpm2_core.errors import UsageError
+from dpm2_core.sim.config import Preset
+
+Array = NDArray[np.float64]
+ROAD_KINDS = ("straight", "loop", "figure8", "random")
+STEP = 0.5
+"""Distance of the samples of a path, m."""
+FRAME_PERIOD = 0.1
+"""Time between two poses of a file, s."""
+
+
+class Path:
+    """A smooth plane curve, sampled every `STEP` m.
+
+    Attributes:
+        xy: (M, 2) m. closed: the end joins the start. length: m. yaw: (M,) unwrapped heading, rad.
+    """
+
+    def __init__(self, xy: ArrayLike, closed: bool = False) -> None:
+        line = np.asarray(xy, float)
+        xy = np.concatenate([line, line[:1]]) if closed else line
+        chord = np.linalg.norm(np.diff(xy, axis=0), axis=1)
+        xy = xy[np.concatenate([[True], chord > 1e-6])]
+        s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))])
+        self.closed, self.length = closed, float(s[-1])
+        self.s = np.linspace(0, self.length, max(int(round(self.length / STEP)), 2) + 1)
+        self.xy = np.stack([np.interp(self.s, s, xy[:, k]) for k in (0, 1)], -1)
+        ahead = np.gradient(self.xy, axis=0)
+        if closed:
+            ahead[0] = ahead[-1] = self.xy[1] - self.xy[-2]
+        self.yaw = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
+
+    def at(self, s: ArrayLike, lateral: ArrayLike = 0.0) -> tuple[Array, Array]:
+        """Points (N, 2) and headings (N,) at arc lengths (N,), `lateral` m to the left; wraps round a closed path."""
+        at = np.atleast_1d(np.asarray(s, float))
+        at = np.mod(at, self.length) if self.closed else np.clip(at, 0, self.length)
+        yaw = np.interp(at, self.s, self.yaw)
+        xy = np.stack([np.interp(at, self.s, self.xy[:, k]) for k in (0, 1)], -1)
+        left = np.stack([-np.sin(yaw), np.cos(yaw)], -1)
+        return xy + left * np.broadcast_to(np.asarray(lateral, float), at.shape)[:, None], yaw
+
+    def shifted(self, lateral: float) -> Path:
+        """The parallel curve `lateral` m to the left, smoothed where it would fold."""
+        xy = self.at(self.s, lateral)[0]
+        return Path(_smooth(xy[:-1] if self.closed else xy, 2.0, self.closed), self.closed)
+
+
+@dataclass(eq=False)
+class Road:
+    """Streets and a drive.
+
+    Attributes:
+        streets: centre lines; the drive follows the first `main` of them, the others branch off.
+        drive: the path of the car. times: (K,) s and travelled: (K,) m, the drive's progress; a closed one goes on.
+        height: (M,) m of the samples of the first streets, None where the terrain is free.
+    """
+
+    streets: list[Path]
+    main: int
+    drive: Path
+    times: Array
+    travelled: Array
+    heights: list[Array] | None = None
+
+    def distance(self, time: ArrayLike) -> Array:
+        """Arc length on the drive, m, at times (N,) s."""
+        time = np.asarray(time, float)
+        if not self.drive.closed:
+            return np.interp(time, self.times, self.travelled)
+        laps = np.floor(time / self.times[-1])
+        return laps * self.drive.length + np.interp(time - laps * self.times[-1], self.times, self.travelled)
+
+
+def make_road(kind: str, preset: Preset, rng: np.random.Generator, length: float = 400.0) -> Road:
+    """A road of about `length` m (a lap, where it is closed) to drive on.
+
+    Args:
+        kind: straight, loop, figure8, random, or a file of KITTI poses (camera frame, 12 numbers a line).
+
+    Raises:
+        UsageError: no such kind or file, or the file holds no drive.
+    """
+    if kind not in ROAD_KINDS:
+        return _road_of_poses(kind, preset, rng)
+    centre = _centre(kind, preset, rng, length)
+    drive = centre.shifted(-preset.lane)
+    start = 0.0 if centre.closed else min(MARGIN, drive.length / 4)
+    times, travelled = _progress(drive, preset.speed, start)
+    return Road([centre, *_side_streets([centre], preset, rng)], 1, drive, times, travelled)
+
+
+MARGIN = 110.0
+"""Road behind the start and beyond the end of an open drive, m: farther than the LiDAR sees."""
+
+
+def _centre(kind: str, preset: Preset, rng: np.random.Generator, length: float) -> Path:
+    if kind == "random":
+        if preset.degenerate:
+            kind = "arc"
+        else:
+            kind = str(rng.choice(["loop", "blob", "wave", "figure8"], p=[0.35, 0.25, 0.3, 0.1]))
+    turn = rng.uniform(0, 2 * np.pi)
+    t = np.linspace(0, 1, 1024, endpoint=False)
+    if kind == "straight":
+        xy = np.stack([np.linspace(-MARGIN, length + MARGIN, 1024), np.zeros(1024)], -1)
+    elif kind == "arc":  # constant curvature: as degenerate as a straight
+        radius = rng.choice([-1, 1]) * rng.uniform(400, 3000)
+        a = np.linspace(-MARGIN, length + MARGIN, 4096) / radius
+        xy = np.stack([np.sin(a), 1 - np.cos(a)], -1) * radius
+    elif kind == "wave":
+        x = np.linspace(-MARGIN, length + MARGIN, 2048)
+        wave = sum(a * np.sin(2 * np.pi * x / w + p) for a, w, p in zip(
+            rng.uniform(2, 14, 3), rng.uniform(90, 300, 3), rng.uniform(0, 6.3, 3), strict=True))  # fmt: skip
+        xy = np.stack([x, wave], -1)
+    elif kind == "figure8":
+        xy = np.stack([np.sin(2 * np.pi * t), 0.8 * np.sin(4 * np.pi * t)], -1)
+    elif kind == "blob":
+        radius = 1 + sum(a * np.cos(2 * np.pi * k * t + p) for k, a, p in zip(
+            (2, 3, 4, 5), rng.uniform(0.02, 0.13, 4), rng.uniform(0, 6.3, 4), strict=True))  # fmt: skip
+        xy = radius[:, None] * np.stack([np.cos(2 * np.pi * t), np.sin(2 * np.pi * t)], -1)
+    else:
+        a = rng.uniform(1.2, 2.0)
+        xy = np.array([[0, 0], [a, 0], [a, 1], [0, 1]])
+        xy = np.concatenate(
+            [np.linspace(p, q, 256, endpoint=False) for p, q in zip(xy, np.roll(xy, -1, 0), strict=True)]
+        )
+    closed = kind in ("loop", "blob", "figure8")
+    if closed:
+        shape = Path(xy, True)
+        # Gaussian smoothing rounds the corners with gradually changing curvature, as real streets do.
+        shape = Path(shape.xy[:-1] * length / shape.length, True)
+        path = Path(_smooth(shape.xy[:-1], min(7.0, length / 25), True), True)
+        xy = path.xy[:-1] * length / path.length
+    R = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    return Path(xy @ R.T, closed)
+
+
+def _smooth(xy: Array, sigma: float, closed: bool) -> Array:
+    """Gaussian smoothing by `sigma` m of samples about `STEP` m apart; the ends of an open line stay."""
+    if closed:
+        return gaussian_filter1d(xy, sigma / STEP, axis=0, mode="wrap")
+    # reflection through the end point keeps both the end and its direction
+    n = min(len(xy) - 1, int(4 * sigma / STEP) + 1)
+    padded = np.concatenate([2 * xy[0] - xy[n:0:-1], xy, 2 * xy[-1] - xy[-2 : -n - 2 : -1]])
+    return gaussian_filter1d(padded, sigma / STEP, axis=0)[n:-n]
+
+
+def _progress(path: Path, speed: float, start: float) -> tuple[Array, Array]:
+    """Times and arc lengths of a comfortable drive from `start`: 2.2 m/s^2 sideways, 1.5 m/s^2 along."""
+    laps = 3 if path.closed else 1  # the middle lap of three is periodic
+    curvature = np.abs(np.gradient(path.yaw, path.s))
+    curvature = np.maximum(gaussian_filter1d(curvature, 4, mode="wrap" if path.closed else "nearest"), 1e-4)
+    pace = speed * (1 + 0.08 * np.sin(2 * np.pi * path.s / path.length * max(1, round(path.length / 90))))
+    square = np.tile(np.minimum(pace**2, 2.2 / curvature)[: -1 if path.closed else None], laps)
+    s = np.arange(len(square)) * (path.s[1] - path.s[0])
+    slope = 2 * 1.5 * s
+    square = np.minimum(np.minimum.accumulate(square - slope) + slope, square)
+    square = np.minimum((np.minimum.accumulate((square + slope)[::-1])[::-1]) - slope, square)
+    if path.closed:
+        n = len(square) // 3
+        square = np.concatenate([square[n : 2 * n], square[n : n + 1]])
+    pace = np.sqrt(square)
+    first = int(np.searchsorted(path.s, start))
+    times = np.concatenate([[0.0], np.cumsum(np.diff(path.s[first:]) * 2 / (pace[first:-1] + pace[first + 1 :]))])
+    return times, path.s[first:]
+
+
+def _side_streets(streets: list[Path], preset: Preset, rng: np.random.Generator) -> list[Path]:
+    """Branches to one side or both; one that meets the main road again ends there."""
+    tree = cKDTree(np.concatenate([p.xy for p in streets]))
+    found: list[Path] = []
+    for street in streets:
+        s = rng.uniform(20, 60)
+        while preset.side_streets > 0 and s < street.length - 20:
+            (foot,), (yaw,) = street.at(s)
+            for side in rng.choice([-1, 1], rng.integers(1, 3), replace=False):
+                heading = yaw + side * np.pi / 2 + rng.normal(0, 0.12)
+                reach = np.arange(0, rng.uniform(45, 110), STEP)
+                xy = foot + reach[:, None] * np.array([np.cos(heading), np.sin(heading)])
+                met = np.flatnonzero((reach > 25) & (tree.query(xy)[0] < STEP))
+                xy = xy[: met[0] + 1] if len(met) else xy
+                clear = tree.query(xy[reach[: len(xy)] > 18])[0] > 14
+                if clear.all() or len(met):
+                    found.append(Path(xy))
+            s += rng.exponential(100 / preset.side_streets) + 22
+    return found
+
+
+def read_kitti_poses(path: FilePath) -> Array:
+    """(N, 3, 4) poses of a KITTI file.
+
+    Raises:
+        UsageError: not readable, or not 12 finite numbers on each line.
+    """
+    try:
+        rows = np.loadtxt(path, ndmin=2)
+    except OSError as error:
+        raise UsageError(f"--road {path}: {error.strerror or error}") from None
+    except (ValueError, UnicodeDecodeError):
+        raise UsageError(f"--road {path}: not a file of KITTI poses (12 numbers a line)") from None
+    if rows.ndim != 2 or rows.shape[1:] != (12,) or not np.isfinite(rows).all():
+        raise UsageError(f"--road {path}: not a file of KITTI poses (12 finite numbers a line)")
+    return rows.reshape(-1, 3, 4)
+
+
+def _road_of_poses(kind: str, preset: Preset, rng: np.random.Generator) -> Road:
+    file = FilePath(kind)
+    if not file.is_file():
+        raise UsageError(f"--road {kind}: want one of {', '.join(ROAD_KINDS)}, or a file of KITTI poses")
+    position = read_kitti_poses(file)[:, :, 3][:, [2, 0, 1]] * (1, -1, -1)  # camera to x ahead, y left, z up
+    moved = np.linalg.norm(np.diff(position[:, :2], axis=0), axis=1)
+    if len(position) < 2 or moved.sum() < 20:
+        raise UsageError(f"--road {file}: a drive of {moved.sum():.0f} m; want at least 20 m")
+    # Standing frames are noise in heading: the path leaves them out, the progress keeps them.
+    keep = np.concatenate([[True], np.diff(np.floor(np.cumsum(moved) / STEP)) > 0, [True]])
+    raw = Path(position[keep, :2])
+    drive = Path(_smooth(raw.xy, 2.0, False))
+    at = np.concatenate([[0.0], np.cumsum(moved)])
+    travelled: Array = np.interp(at, at[keep], _arc_lengths(position[keep, :2])) * (drive.length / raw.length)
+    centre = drive.shifted(preset.lane)
+    z = gaussian_filter1d(np.interp(drive.s, travelled, position[:, 2]), 4)
+    z = np.interp(np.linspace(0, 1, len(centre.xy)), np.linspace(0, 1, len(z)), z)
+    n = int(MARGIN / STEP)
+    beyond = np.arange(1, n + 1)[:, None] * STEP
+    heading = np.stack([np.cos(centre.yaw[[0, -1]]), np.sin(centre.yaw[[0, -1]])], -1)
+    xy = np.concatenate([centre.xy[0] - beyond[::-1] * heading[0], centre.xy, centre.xy[-1] + beyond * heading[1]])
+    z = np.pad(z, n, mode="edge")
+    pieces = list(_first_visits(xy))
+    streets = [Path(xy[a:b]) for a, b in pieces]
+    heights = [
+        np.interp(p.s, np.linspace(0, p.length, b - a), z[a:b]) for p, (a, b) in zip(streets, pieces, strict=True)
+    ]
+    sides = _side_streets(streets, preset, rng)
+    times = np.arange(len(position)) * FRAME_PERIOD
+    return Road([*streets, *sides], len(streets), drive, times, travelled, heights)
+
+
+def _arc_lengths(xy: Array) -> Array:
+    steps = np.linalg.norm(np.diff(xy, axis=0), axis=1)
+    return np.concatenate([np.zeros(1), np.cumsum(steps, dtype=float)])
+
+
+def _first_visits(xy: Array, radius: float = 5.0, lag: float = 30.0) -> Iterator[tuple[int, int]]:
+    """Runs [a, b) of samples that are no return to within `radius` m of a place left more than `lag` m of driving ago."""
+    pairs = cKDTree(xy).query_pairs(radius, output_type="ndarray")
+    pairs = pairs[np.abs(pairs[:, 0] - pairs[:, 1]) > lag / STEP]
+    new = np.ones(len(xy), bool)
+    new[pairs.max(1)] = False
+    # a stub shorter than 10 m between two returns would be a second road on top of the first
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], new.astype(np.int8), [0]])))
+    return ((int(a), int(b)) for a, b in edges.reshape(-1, 2) if (b - a) * STEP > 10)

@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The solids that props are made of, in m, z up."""
+
+from __future__ import annotations
+
+import numpy as np
+import trimesh
+from numpy.typing import ArrayLike
+
+from dpm2_core.sim.materials import Label, Material
+from dpm2_core.sim.mesh import Mesh, make, merge
+
+BOX_FACES = np.array([
+    [0, 2, 1], [0, 3, 2], [4, 5, 6], [4, 6, 7], [0, 1, 5], [0, 5, 4], [1, 2, 6], [1, 6, 5], [2, 3, 7], [2, 7, 6], [3, 0, 4], [3, 4, 7]
+])  # fmt: skip
+
+
+def box(low: ArrayLike, high: ArrayLike, label: Label, material: Material, colour: ArrayLike) -> Mesh:
+    """An upright box between two corners (3,)."""
+    (x, y, z), (X, Y, Z) = np.asarray(low, float), np.asarray(high, float)
+    corners = [(x, y, z), (X, y, z), (X, Y, z), (x, Y, z), (x, y, Z), (X, y, Z), (X, Y, Z), (x, Y, Z)]
+    return make(corners, BOX_FACES, label, material, colour)
+
+
+def rod(
+    start: ArrayLike, end: ArrayLike, radii: tuple[float, float], sides: int, label: Label, material: Material, colour: ArrayLike
+) -> Mesh:  # fmt: skip
+    """A tapered tube from `start` to `end`, capped at the end."""
+    start, end = np.asarray(start, float), np.asarray(end, float)
+    axis = (end - start) / np.linalg.norm(end - start)
+    u = np.cross(axis, (1.0, 0, 0) if abs(axis[0]) < 0.9 else (0, 1.0, 0))
+    u /= np.linalg.norm(u)
+    a = np.arange(sides) * 2 * np.pi / sides
+    ring = np.cos(a)[:, None] * u + np.sin(a)[:, None] * np.cross(axis, u)
+    points = np.concatenate([start + radii[0] * ring, end + radii[1] * ring, end[None]])
+    i, j = np.arange(sides), (np.arange(sides) + 1) % sides
+    faces = np.concatenate([
+        np.stack([i, j, j + sides], -1), np.stack([i, j + sides, i + sides], -1),
+        np.stack([i + sides, j + sides, np.full(sides, 2 * sides)], -1),
+    ])  # fmt: skip
+    return make(points, faces, label, material, colour)
+
+
+def blob(
+    centre: ArrayLike, radii: ArrayLike, rough: float, rng: np.random.Generator, label: Label, material: Material, colour: ArrayLike, detail: int = 1
+) -> Mesh:  # fmt: skip
+    """An ellipsoid of 20 * 4**detail triangles with its vertices moved in and out by the share `rough`."""
+    sphere = trimesh.creation.icosphere(subdivisions=detail)
+    points = sphere.vertices * (1 + rng.normal(0, rough, (len(sphere.vertices), 1))) * np.asarray(radii) + np.asarray(
+        centre
+    )
+    return make(points, sphere.faces, label, material, colour)
+
+
+def leaves(
+    centres: ArrayLike, size: float, rng: np.random.Generator, colour: ArrayLike, label: Label = Label.VEGETATION
+) -> Mesh:
+    """One randomly turned triangle of about `size` m at each of the centres (N, 3), its brightness random."""
+    centres = np.asarray(centres, float)
+    n = len(centres)
+    corners = centres[:, None] + rng.normal(0, 0.6 * size, (n, 3, 3))
+    shade = rng.uniform(0.65, 1.3, (n, 1)) * np.asarray(colour)
+    faces = np.arange(3 * n).reshape(n, 3)
+    return make(corners.reshape(-1, 3), faces, label, Material.LEAF, shade.clip(0, 255))
+
+
+def extrusion(profile: ArrayLike, y: ArrayLike, label: Label, material: Material, colour: ArrayLike) -> Mesh:
+    """A closed convex-ish side profile (N, 2) of x, z, stretched across: half widths `y` (N,) at its corners."""
+    profile = np.asarray(profile, float)
+    n = len(profile)
+    y = np.broadcast_to(np.asarray(y, float), n)
+    left = np.stack([profile[:, 0], y, profile[:, 1]], -1)
+    right = left * (1, -1, 1)
+    centre = np.stack([left.mean(0), right.mean(0)])
+    points = np.concatenate([left, right, centre])
+    i, j = np.arange(n), (np.arange(n) + 1) % n
+    faces = np.concatenate([
+        np.stack([i, j, j + n], -1), np.stack([i, j + n, i + n], -1),
+        np.stack([i, j, np.full(n, 2 * n)], -1), np.stack([i + n, j + n, np.full(n, 2 * n + 1)], -1),
+    ])  # fmt: skip
+    return make(points, faces, label, material, colour)
+
+
+def relief(
+    x: ArrayLike, z: ArrayLike, depth: ArrayLike, material: ArrayLike, colour: ArrayLike, label: Label = Label.BUILDING
+) -> Mesh:
+    """A wall in the xz plane with recesses and bays: what a facade is.
+
+    Args:
+        x: (N+1,) and z: (M+1,) borders of its cells, m.
+        depth: (N, M) m, towards +y. material: (N, M). colour: (N, M, 3).
+
+    The steps between cells of different depth are walls of the shallower cell's neighbour's colour.
+    """
+    x, z, depth = np.asarray(x, float), np.asarray(z, float), np.asarray(depth, float)
+    material, colour = np.asarray(material), np.asarray(colour)
+    i, j = np.indices(depth.shape).reshape(2, -1)
+    d = depth.ravel()
+    front = _quads(x[i], d, z[j], x[i + 1], d, z[j], x[i + 1], d, z[j + 1], x[i], d, z[j + 1])
+    quads, materials, colours = [front], [material.reshape(-1)], [colour.reshape(-1, 3)]
+    ring = np.pad(depth, ((1, 1), (0, 0)))  # jambs; at the ends down to the plane
+    i, j = np.nonzero(np.diff(ring, axis=0))
+    quads.append(
+        _quads(
+            x[i],
+            ring[i, j],
+            z[j],
+            x[i],
+            ring[i + 1, j],
+            z[j],
+            x[i],
+            ring[i + 1, j],
+            z[j + 1],
+            x[i],
+            ring[i, j],
+            z[j + 1],
+        )
+    )
+    shallow = np.where(ring[i, j] < ring[i + 1, j], np.clip(i - 1, 0, None), np.clip(i, None, len(depth) - 1))
+    materials.append(np.full(len(i), Material.PLASTER))
+    colours.append(colour[shallow, j])
+    ring = np.pad(depth, ((0, 0), (1, 1)))  # sills and lintels
+    i, j = np.nonzero(np.diff(ring, axis=1))
+    quads.append(
+        _quads(
+            x[i],
+            ring[i, j],
+            z[j],
+            x[i + 1],
+            ring[i, j],
+            z[j],
+            x[i + 1],
+            ring[i, j + 1],
+            z[j],
+            x[i],
+            ring[i, j + 1],
+            z[j],
+        )
+    )
+    shallow = np.where(ring[i, j] < ring[i, j + 1], np.clip(j - 1, 0, None), np.clip(j, None, depth.shape[1] - 1))
+    materials.append(np.full(len(i), Material.CONCRETE))
+    colours.append(colour[i, shallow])
+    points = np.concatenate(quads).reshape(-1, 3)
+    corner = np.arange(len(points)).reshape(-1, 4)
+    faces = corner[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
+    return make(points, faces, label, np.repeat(np.concatenate(materials), 2), np.repeat(np.concatenate(colours), 2, 0))
+
+
+def _quads(*columns: np.ndarray) -> np.ndarray:
+    return np.stack(columns, -1).reshape(-1, 4, 3)
+
+
+def turned(mesh: Mesh, yaw: float, to: ArrayLike = (0.0, 0.0, 0.0)) -> Mesh:
+    """The mesh turned about z by `yaw` rad and moved; its surface coordinates stay."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]], np.float32)
+    return Mesh(
+        mesh.vertices @ R.T + np.asarray(to, np.float32),
+        mesh.faces,
+        mesh.label,
+        mesh.material,
+        mesh.colour,
+        mesh.uv,
+        mesh.texture,
+    )
+
+
+__all__ = ["blob", "box", "extrusion", "leaves", "merge", "relief", "rod", "turned"]

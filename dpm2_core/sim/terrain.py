@@ -1,0 +1,246 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The ground: how far each place is from the streets, how high it lies, and its mesh.
+
+Everything that stands in a world is placed by one raster, the distance to the kerb of the nearest street. It treats crossings,
+loops and streets that are driven twice alike: nothing can stand on a road, whichever pass made it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import cast
+
+import contourpy
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import distance_transform_edt, gaussian_filter
+from scipy.spatial import cKDTree
+
+from dpm2_core.sim.config import Preset
+from dpm2_core.sim.materials import Label, Material
+from dpm2_core.sim.mesh import Mesh, make, merge
+from dpm2_core.sim.road import STEP, Road
+
+Array = NDArray[np.float64]
+RESOLUTION = 0.5
+"""Of the rasters, m."""
+MARGIN = 100.0
+"""Ground beyond the streets, m."""
+FINE = 14.0
+"""The ground mesh has triangles of 1 m up to this distance from a kerb, of 4 m beyond, m."""
+KERB = 0.12
+"""Height of a sidewalk above the road, m."""
+
+
+@dataclass(eq=False)
+class Kerbline:
+    """A line at a constant distance from the kerb: xy (N, 2) and outward (N, 2) unit vectors, 1 m apart; `junction` (N,) near a crossing."""
+
+    xy: Array
+    outward: Array
+    junction: NDArray[np.bool_]
+
+
+class Terrain:
+    """Rasters over the streets' bounding box.
+
+    Attributes:
+        origin: (2,) m, centre of cell [0, 0]; cells are `RESOLUTION` apart, rows along y.
+        edge: (H, W) float32 m, distance to the nearest kerb, negative on a road.
+        height: (H, W) float32 m, without kerbs. nearest: (H, W) int32, sample of the nearest street.
+        centre: (S, 2) m and yaw, along: (S,) of all street samples; junction: (S,) near another street.
+    """
+
+    def __init__(self, road: Road, preset: Preset, rng: np.random.Generator) -> None:
+        self.preset = preset
+        self.centre = np.concatenate([p.xy for p in road.streets])
+        self.yaw = np.concatenate([p.yaw for p in road.streets])
+        offsets = np.cumsum([0.0] + [p.length + 1e3 for p in road.streets])
+        self.along = np.concatenate([p.s + o for p, o in zip(road.streets, offsets[:-1], strict=True)])
+        self.half_width = np.concatenate(
+            [np.full(len(p.xy), preset.half_width * (1 if k < road.main else 0.8)) for k, p in enumerate(road.streets)]
+        )
+        self.junction = self._junctions(road)
+        low, high = self.centre.min(0) - MARGIN, self.centre.max(0) + MARGIN
+        # whole 4 m cells
+        self.origin = np.floor(low / 4) * 4
+        shape = (np.ceil((high - self.origin) / 4) * 4 / RESOLUTION).astype(int) + 1
+        self.nearest = self._nearest(shape)
+        distance = self._distance()
+        self.edge = (distance - self.half_width[self.nearest]).astype(np.float32)
+        self.height = self._heights(road, rng)
+
+    def _junctions(self, road: Road) -> NDArray[np.bool_]:
+        reach = 2 * self.preset.half_width + 1
+        pairs = cKDTree(self.centre).query_pairs(reach, output_type="ndarray")
+        apart = np.abs(self.along[pairs[:, 0]] - self.along[pairs[:, 1]])
+        laps = road.streets[0].length if road.drive.closed else np.inf
+        pairs = pairs[(apart > 3 * reach) & (np.abs(apart - laps) > 3 * reach)]
+        out = np.zeros(len(self.centre), bool)
+        out[pairs.ravel()] = True
+        return out
+
+    def _nearest(self, shape: NDArray[np.int_]) -> NDArray[np.int32]:
+        mark = np.full((shape[1], shape[0]), -1, np.int32)
+        column, row = np.rint((self.centre - self.origin) / RESOLUTION).astype(int).T
+        mark[row, column] = np.arange(len(self.centre), dtype=np.int32)
+        at = distance_transform_edt(mark < 0, return_distances=False, return_indices=True)
+        return mark[at[0], at[1]]
+
+    def _distance(self) -> Array:
+        y = self.origin[1] + np.arange(self.nearest.shape[0])[:, None] * RESOLUTION - self.centre[self.nearest, 1]
+        x = self.origin[0] + np.arange(self.nearest.shape[1])[None] * RESOLUTION - self.centre[self.nearest, 0]
+        return np.hypot(x, y)
+
+    def _heights(self, road: Road, rng: np.random.Generator) -> NDArray[np.float32]:
+        preset, shape = self.preset, self.edge.shape
+        waves = zip(rng.normal(0, 0.5, 6), rng.uniform(60, 300, 6), rng.uniform(0, 6.3, (6, 2)), strict=True)
+        z = sum(
+            a * np.sin(2 * np.pi / w * (self.centre @ (np.cos(p[0]), np.sin(p[0]))) + p[1]) for a, w, p in waves
+        ) * preset.hills  # fmt: skip
+        if road.heights is not None:
+            known = np.concatenate(road.heights)
+            beside = cKDTree(self.centre[: len(known)]).query(self.centre[len(known) :])[1]
+            z = np.concatenate([known, known[beside]])
+        height = gaussian_filter(np.asarray(z, np.float32)[self.nearest], 5 / RESOLUTION)
+        if preset.roughness > 0:
+            beside = np.clip(self.edge - max(preset.sidewalk, 0.3), 0, None)
+            rough = sum(a * _value_noise(shape, w, rng) for a, w in ((1.0, 2.5), (1.6, 8.0), (4.0, 30.0)))
+            height += preset.roughness * np.minimum(beside / 3, 1) * rough
+            # slopes, banks and ditches that come and go along the road
+            bank = _value_noise(shape, 45.0, rng) * preset.hills * 0.09
+            height += bank * np.clip(self.edge - 3, 0, 40)
+            if not preset.sidewalk:
+                ditch = np.clip(_value_noise(shape, 60.0, rng), 0, None)
+                height -= 0.6 * ditch * np.exp(-(((self.edge - 2.2) / 0.8) ** 2))
+        return height.astype(np.float32)
+
+    def _cell(self, xy: ArrayLike) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
+        at = np.rint((np.asarray(xy) - self.origin.astype(np.asarray(xy).dtype)) / RESOLUTION).astype(np.int32)
+        return at[..., 1].clip(0, self.edge.shape[0] - 1), at[..., 0].clip(0, self.edge.shape[1] - 1)
+
+    def edge_at(self, xy: ArrayLike) -> NDArray[np.float32]:
+        """Distance to the kerb, m, at points (N, 2)."""
+        return self.edge[self._cell(xy)]
+
+    def height_at(self, xy: ArrayLike) -> Array:
+        """Ground height, m, at points (N, 2), bilinear between the 1 m nodes of the mesh, without kerbs."""
+        at = (np.asarray(xy, float) - self.origin) / (2 * RESOLUTION)
+        grid = self.height[::2, ::2]
+        cell = np.floor(at).astype(int)
+        i, j = cell[..., 1].clip(0, grid.shape[0] - 2), cell[..., 0].clip(0, grid.shape[1] - 2)
+        v, u = (at[..., 1] - i).clip(0, 1), (at[..., 0] - j).clip(0, 1)
+        low = grid[i, j] * (1 - u) + grid[i, j + 1] * u
+        return low * (1 - v) + (grid[i + 1, j] * (1 - u) + grid[i + 1, j + 1] * u) * v
+
+    def surface_at(self, xy: ArrayLike) -> Array:
+        """Height of what one stands on, kerbs included, m, at points (N, 2)."""
+        edge = self.edge_at(xy)
+        return self.height_at(xy) + KERB * ((edge > 0) & (edge < self.preset.sidewalk))
+
+    def lane_coordinates(self, xy: NDArray[np.floating]) -> tuple[NDArray, NDArray, NDArray[np.bool_]]:
+        """Of points (N, 2): metres to the left of the nearest street's centre, metres along it, and whether at a crossing."""
+        sample = self.nearest[self._cell(xy)]
+        yaw = self.yaw[sample].astype(xy.dtype)
+        away = xy - self.centre[sample].astype(xy.dtype)
+        c, s = np.cos(yaw), np.sin(yaw)
+        along = self.along[sample].astype(xy.dtype) + c * away[:, 0] + s * away[:, 1]
+        return c * away[:, 1] - s * away[:, 0], along, self.junction[sample]
+
+    def contour(self, level: float) -> Iterator[Kerbline]:
+        """The lines `level` m outside the kerb (negative: on the road), streets' ends included."""
+        x = self.origin[0] + np.arange(self.edge.shape[1]) * RESOLUTION
+        y = self.origin[1] + np.arange(self.edge.shape[0]) * RESOLUTION
+        for line in cast("list[Array]", contourpy.contour_generator(x, y, self.edge).lines(level)):
+            length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+            if length[-1] < 6:
+                continue
+            s = np.linspace(0, length[-1], int(length[-1]) + 1)
+            xy = np.stack([np.interp(s, length, line[:, k]) for k in (0, 1)], -1)
+            xy[1:-1] = (xy[:-2] + 2 * xy[1:-1] + xy[2:]) / 4
+            sample = self.nearest[self._cell(xy)]
+            away = xy - self.centre[sample]
+            away /= np.linalg.norm(away, axis=1, keepdims=True) + 1e-9
+            yield Kerbline(xy, away, self.junction[sample])
+
+    def ground(self) -> Mesh:
+        """The mesh of the ground, roads and sidewalks included."""
+        return merge([*self._grid(), *self._sidewalks()])
+
+    def _grid(self) -> Iterator[Mesh]:
+        fine_nodes = self.height[::2, ::2], self.edge[::2, ::2]
+        near = fine_nodes[1] < FINE
+        corners = near[:-1, :-1] | near[1:, :-1] | near[:-1, 1:] | near[1:, 1:]
+        yield _grid_mesh(self.origin, 2 * RESOLUTION, *fine_nodes, corners, self.preset)
+        blocks = corners.reshape(corners.shape[0] // 4, 4, corners.shape[1] // 4, 4).all((1, 3))
+        height, edge = self.height[::8, ::8], self.edge[::8, ::8]
+        seen = ~blocks & (edge[:-1, :-1] < MARGIN - 10)
+        yield _grid_mesh(self.origin, 8 * RESOLUTION, height, edge, seen, self.preset)
+
+    def _sidewalks(self) -> Iterator[Mesh]:
+        if not self.preset.sidewalk:
+            return
+        for line in self.contour(0.0):
+            yield kerbside_ribbon(
+                self, line, ((-0.02, -0.02), (0.0, KERB), (0.12, KERB), (self.preset.sidewalk, KERB), (self.preset.sidewalk + 0.05, -0.1)),
+                Label.SIDEWALK, Material.PAVING, (165, 160, 152),
+            )  # fmt: skip
+
+
+def kerbside_ribbon(
+    terrain: Terrain, line: Kerbline, profile: tuple[tuple[float, float], ...], label: Label, material: Material, colour: ArrayLike
+) -> Mesh:  # fmt: skip
+    """A section of (offset outward, height over the ground) points, m, drawn along a line on the terrain."""
+    section = np.asarray(profile, float)
+    xy = line.xy[:, None] + line.outward[:, None] * section[:, :1]
+    z = terrain.height_at(xy.reshape(-1, 2)).reshape(xy.shape[:2]) + section[:, 1]
+    return sheet(np.concatenate([xy, z[..., None]], -1), label, material, colour)
+
+
+def sheet(points: ArrayLike, label: Label, material: Material, colour: ArrayLike) -> Mesh:
+    """A surface through a grid (N, M, 3) of points; surface coordinates are metres along its columns and rows."""
+    points = np.asarray(points, float)
+    n, m = points.shape[:2]
+    node = np.arange(n * m).reshape(n, m)
+    a, b, c, d = node[:-1, :-1], node[1:, :-1], node[1:, 1:], node[:-1, 1:]
+    faces = np.stack([a, b, c, a, c, d], -1).reshape(-1, 3)
+    middle = points[:, m // 2]
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(middle, axis=0), axis=1))])
+    across = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points[n // 2], axis=0), axis=1))])
+    uv = np.stack(np.broadcast_arrays(along[:, None], across[None]), -1).reshape(-1, 2)
+    return make(points.reshape(-1, 3), faces, label, material, colour, uv[faces])
+
+
+def _grid_mesh(
+    origin: Array, cell: float, height: NDArray, edge: NDArray, keep: NDArray[np.bool_], preset: Preset
+) -> Mesh:
+    """Two triangles for each kept cell of a height grid, classified by the distance of its centre to the kerb."""
+    i, j = np.nonzero(keep)
+    used = np.zeros(height.shape, bool)
+    for di, dj in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        used[i + di, j + dj] = True
+    number = np.cumsum(used.ravel(), dtype=np.int32).reshape(used.shape) - 1
+    rows, columns = np.nonzero(used)
+    xyz = np.stack([origin[0] + columns * cell, origin[1] + rows * cell, height[used]], -1)
+    a, b, c, d = number[i, j], number[i, j + 1], number[i + 1, j + 1], number[i + 1, j]
+    faces = np.stack([a, b, c, a, c, d], -1).reshape(-1, 3)
+    middle = np.repeat((edge[i, j] + edge[i, j + 1] + edge[i + 1, j + 1] + edge[i + 1, j]) / 4, 2)
+    road = middle < 0.1
+    paved = preset.degenerate | (middle < preset.sidewalk)
+    label = np.where(road, Label.ROAD, np.where(paved, Label.SIDEWALK, Label.TERRAIN))
+    material = np.where(road, Material.ASPHALT, np.where(paved, Material.PAVING, Material.GRASS))
+    colour = np.where(road[:, None], (112, 110, 110), np.where(paved[:, None], (150, 146, 138), (98, 118, 60)))
+    return make(xyz, faces, label, material, colour, xyz[:, :2].astype(np.float32)[faces])
+
+
+def _value_noise(shape: tuple[int, ...], wavelength: float, rng: np.random.Generator) -> NDArray[np.float32]:
+    """(H, W) smooth noise of standard deviation about 0.5 with features of `wavelength` m."""
+    nodes = [int(n * RESOLUTION / wavelength) + 4 for n in shape]
+    coarse = rng.normal(0, 0.6, nodes).astype(np.float32)
+    scale = wavelength / RESOLUTION
+    to_node = np.array([[1 / scale, 0, 1], [0, 1 / scale, 1]])
+    return cv2.warpAffine(
+        coarse, to_node, (shape[1], shape[0]), flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE
+    )  # fmt: skip

@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A world: streets, ground, what stands beside them, and what moves.
+
+world = build_world("random", "suburb", seed=7)
+T_world_lidar, time = world.sample_pose(np.random.default_rng(0))
+scan = Lidar(LidarConfig()).scan(world, T_world_lidar, time, np.random.default_rng(1))
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from dpm2_core.errors import UsageError
+from dpm2_core.geometry import se3
+from dpm2_core.sim import sections
+from dpm2_core.sim.config import PRESET_NAMES, PRESETS, PresetName
+from dpm2_core.sim.layout import Layout
+from dpm2_core.sim.mesh import Mesh, Scene, merge
+from dpm2_core.sim.road import Road, make_road
+from dpm2_core.sim.terrain import Terrain
+from dpm2_core.sim.traffic import Traffic, make_traffic
+
+Array = NDArray[np.float64]
+
+
+@dataclass(eq=False)
+class World:
+    """Everything a sensor can see. x and y are level, z up, m.
+
+    Attributes:
+        preset: its name. seed: with road and preset it determines the world. road, terrain, traffic: its parts.
+        scene: what does not move, ready for ray casting.
+    """
+
+    preset: PresetName
+    seed: int
+    road: Road
+    terrain: Terrain
+    traffic: Traffic
+    scene: Scene
+
+    @property
+    def static(self) -> Mesh:
+        """The mesh of what does not move."""
+        return self.scene.mesh
+
+    def pose_at(self, s: float, lateral: float = 0.0, heading: float = 0.0, height: float = 1.73) -> Array:
+        """T_world_lidar (4, 4) of a car at arc length `s` m of the drive, `lateral` m to the left of it and turned by `heading` rad.
+
+        The car stands on the ground under its wheels; the sensor is `height` m above it, x ahead, y left, z up.
+        """
+        (xy,), (yaw,) = self.road.drive.at(s, lateral)
+        yaw = yaw + heading
+        ahead, left = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
+        feet = xy + np.array([1.4 * ahead, -1.4 * ahead, 0.8 * left, -0.8 * left])
+        z = self.terrain.height_at(feet)
+        x_axis = np.array([*(2.8 * ahead), z[0] - z[1]])
+        y_axis = np.array([*(1.6 * left), z[2] - z[3]])
+        z_axis = np.cross(x_axis, y_axis)
+        R = np.stack([x_axis / np.linalg.norm(x_axis), np.zeros(3), z_axis / np.linalg.norm(z_axis)], -1)
+        R[:, 1] = np.cross(R[:, 2], R[:, 0])
+        return se3.make(R, np.array([*xy, z.mean()]) + height * R[:, 2])
+
+    def drive_pose(self, time: float, height: float = 1.73) -> Array:
+        """T_world_lidar (4, 4) of the drive at a time, s, with the small motions of its suspension."""
+        t = time * 2 * np.pi
+        sway = np.array([np.sin(0.9 * t) + 0.6 * np.sin(1.7 * t + 1), np.sin(1.1 * t + 2) + 0.5 * np.sin(2.3 * t), 0])
+        bounce = 0.006 * np.sin(1.3 * t) + 0.004 * np.sin(2.1 * t + 1)
+        T_body_lidar = se3.make(Rotation.from_rotvec(sway * (0.003, 0.004, 0)).as_matrix(), (0, 0, bounce))
+        return self.pose_at(float(self.road.distance(time)), height=height) @ T_body_lidar
+
+    def sample_pose(
+        self, rng: np.random.Generator, lateral: float = 1.0, heading: float = 0.1, height: float = 1.73
+    ) -> tuple[Array, float]:
+        """T_world_lidar (4, 4) at a random place of the drive, up to `lateral` m beside and `heading` rad off it, and its time, s."""
+        time = float(rng.uniform(0, self.road.times[-1]))
+        tilt = Rotation.from_rotvec([*rng.normal(0, 0.006, 2), 0]).as_matrix()
+        T = self.pose_at(
+            float(self.road.distance(time)),
+            rng.uniform(-lateral, lateral),
+            rng.uniform(-heading, heading),
+            height + rng.normal(0, 0.01),
+        )
+        return T @ se3.make(tilt, np.zeros(3)), time
+
+
+def build_world(road: str = "random", preset: str = "city", seed: int = 0, length: float = 400.0) -> World:
+    """A world, the same for the same arguments.
+
+    Args:
+        road: straight, loop, figure8, random, or a file of KITTI poses.
+        preset: city, suburb, rural, highway or tunnel.
+        length: of the road (a lap, where it is closed), m; a file has its own.
+
+    Raises:
+        UsageError: no such road or preset, or a length or seed that cannot be.
+    """
+    if preset not in PRESETS:
+        raise UsageError(f"--preset {preset}: want one of {', '.join(PRESET_NAMES)}")
+    if not 60 <= length <= 20000:
+        raise UsageError(f"length {length:g} m of road: want 60 to 20000")
+    if seed < 0:
+        raise UsageError(f"--seed {seed}: want 0 or more")
+    kind = PRESETS[preset]
+    rngs = [np.random.default_rng([seed, PRESET_NAMES.index(preset), k]) for k in range(4)]
+    streets = make_road(road, kind, rngs[0], length)
+    terrain = Terrain(streets, kind, rngs[1])
+    meshes = [terrain.ground()]
+    if preset == "highway":
+        meshes += sections.highway(streets, terrain, rngs[2])
+    elif preset == "tunnel":
+        meshes += sections.tunnel(streets, terrain, rngs[2])
+    else:
+        meshes += Layout(streets, terrain, kind, rngs[2]).meshes()
+    traffic = make_traffic(streets, terrain, kind, rngs[3])
+    return World(preset, seed, streets, terrain, traffic, Scene(merge(meshes)))
