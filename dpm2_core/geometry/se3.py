@@ -85,3 +85,9 @@ def orthonormalised(T: Array) -> Array:
     U, _, Vt = np.linalg.svd(T[..., :3, :3])
     U[..., -1] *= np.sign(np.linalg.det(U @ Vt))[..., None]
     return make(U @ Vt, T[..., :3, 3])
+
+
+def quaternion(T: Array) -> Array:
+    """Rotation of (4, 4) as the unit quaternion x, y, z, w with w >= 0."""
+    q = Rotation.from_matrix(T[:3, :3]).as_quat()
+    return q if q[3] >= 0 else -q

@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The `dpm2` command. Errors of use exit with 2 and one line on stderr, failures of the work with 1."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+import typer
+
+from dpm2_core import __version__
+from dpm2_core.commands import config, run
+from dpm2_core.errors import Dpm2Error, UsageError
+
+app = typer.Typer(help="LiDAR-visual SLAM.", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+app.command()(run.run)
+app.add_typer(config.app, name="config")
+
+
+@app.command()
+def version() -> None:
+    """Print the version."""
+    typer.echo(__version__)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point of the console script."""
+    sys.exit(_status(arguments))
+
+
+def _status(arguments: Sequence[str] | None) -> int:
+    try:
+        return app(args=list(arguments) if arguments is not None else None, standalone_mode=False) or 0
+    except UsageError as error:
+        print(f"dpm2: {error}", file=sys.stderr)
+        return 2
+    except Dpm2Error as error:
+        print(f"dpm2: {error}", file=sys.stderr)
+        return 1
+    except Exception as error:
+        # click's own errors of use (an unknown option, a missing argument) know their exit code and their message.
+        message, code = getattr(error, "format_message", None), getattr(error, "exit_code", None)
+        if message is None or code is None:
+            raise
+        print(f"dpm2: {' '.join(message().split()) or 'see dpm2 --help'}", file=sys.stderr)
+        return int(code)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,23 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`dpm2 config`: what can be set, and what is."""
+
+from __future__ import annotations
+
+import typer
+
+from dpm2_core.commands.run import ConfigFile, Overrides
+from dpm2_core.config import dump_settings, load_settings
+from dpm2_core.slam.system import Config
+
+app = typer.Typer(help="Look at the configuration.")
+
+
+@app.callback()
+def group() -> None:
+    """Look at the configuration."""
+
+
+@app.command()
+def dump(config: ConfigFile = None, settings: Overrides = None) -> None:
+    """Print every key with its description and value, as YAML that --config takes."""
+    typer.echo(dump_settings(load_settings(Config, config, settings or [])), nl=False)

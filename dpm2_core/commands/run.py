@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`dpm2 run`: a recording through the SLAM at full speed, without ROS."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from time import perf_counter
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from dpm2_core.config import dump_settings, load_settings
+from dpm2_core.data.ply import write_ply
+from dpm2_core.data.prefetch import prefetch
+from dpm2_core.data.source import Source, open_source
+from dpm2_core.errors import UsageError
+from dpm2_core.evaluation.metrics import Metrics, evaluate
+from dpm2_core.evaluation.report import metrics_table
+from dpm2_core.evaluation.trajectory import Trajectory, matched, read_trajectory, write_kitti, write_tum
+from dpm2_core.files import atomic_write
+from dpm2_core.frame import Array
+from dpm2_core.geometry import se3
+from dpm2_core.slam.output import TrajectoryRecorder
+from dpm2_core.slam.system import Config, SlamSystem
+
+ConfigFile = Annotated[Path | None, typer.Option("--config", help="YAML file; `dpm2 config dump` shows every key.")]
+Overrides = Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, such as slam.map.voxel=0.3.")]
+
+
+def run(
+    src: Annotated[Path, typer.Argument(help="KITTI odometry sequence or root, rosbag2 folder, .mcap or .db3 file.")],
+    out: Annotated[Path, typer.Option(help="Folder for the results.")],
+    gt: Annotated[Path | None, typer.Option(help="Ground truth (KITTI: left camera; TUM: LiDAR).")] = None,
+    frames: Annotated[str, typer.Option(help="Which frames, a:b by position from 0.")] = ":",
+    no_image: Annotated[bool, typer.Option("--no-image", help="Leave the camera out.")] = False,
+    config: ConfigFile = None,
+    settings: Overrides = None,
+) -> None:
+    """Run the SLAM on a recording and write trajectory, map, picture, timing and metrics."""
+    overrides = [*(settings or []), *(["input.images=false"] if no_image else [])]
+    chosen = load_settings(Config, config, overrides)
+    start, stop = parse_range(frames)
+    console = Console(stderr=True)
+    # The geometric registration does not look at images: decoding them would only cost time.
+    source = open_source(src, chosen.input.model_copy(update={"images": False}))
+    stop = len(source) if stop is None else min(stop, len(source))
+    if start >= stop:
+        raise UsageError(f"--frames {frames}: {src} has {len(source)} frames")
+    truth = _ground_truth(source, gt, start, stop)
+    out.mkdir(parents=True, exist_ok=True)
+    with atomic_write(out / "config.yaml") as file:
+        file.write(dump_settings(chosen))
+    system, recorder = SlamSystem(chosen.slam), TrajectoryRecorder()
+    seconds, failed, wall = _drive(source, start, stop, system, recorder, console)
+    for note in source.notes:
+        console.print(note, style="yellow")
+    metrics = _write(out, source, system, recorder, truth, failed, seconds, wall)
+    if metrics is not None:
+        sensor = "LiDAR" if source.T_cam_lidar is None else "left camera"
+        Console().print(metrics_table(metrics, title=f"{source.name}, {len(recorder)} frames", frame=sensor))
+    console.print(f"Results in {out}")
+
+
+def parse_range(text: str) -> tuple[int, int | None]:
+    """`a:b`, `a:`, `:b` or `:` to (a, b or None)."""
+    first, colon, last = text.partition(":")
+    if not colon or not all(part.isdecimal() or not part for part in (first, last)):
+        raise UsageError(f"--frames {text}: want a:b, such as 0:100")
+    return int(first or 0), int(last) if last else None
+
+
+def _drive(
+    source: Source, start: int, stop: int, system: SlamSystem, recorder: TrajectoryRecorder, console: Console
+) -> tuple[dict[str, list[float]], int, float]:
+    """All frames through the system: seconds a stage and frame, failed frames, wall time in s. Ctrl-C ends it early."""
+    seconds: dict[str, list[float]] = {}
+    failed = 0
+    began = perf_counter()
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console) as progress:
+        task = progress.add_task(source.name, total=stop - start)
+        try:
+            for frame in prefetch(source.frames(start, stop)):
+                tracked = system.process(frame)
+                recorder.add(tracked)
+                for stage, time in tracked.seconds.items():
+                    seconds.setdefault(stage, []).append(time)
+                if not tracked.registration.ok:
+                    failed += 1
+                    progress.console.print(f"frame {frame.index}: {tracked.registration.reason}", style="yellow")
+                progress.update(task, advance=1, description=f"{source.name} {tracked.state}")
+        except KeyboardInterrupt:
+            console.print(f"interrupted after {len(recorder)} frames; writing what there is", style="yellow")
+    return seconds, failed, perf_counter() - began
+
+
+def _ground_truth(source: Source, gt: Path | None, start: int, stop: int) -> Array | Trajectory | None:
+    """Poses of the processed frames (LiDAR frame), or a trajectory to be matched by stamp; None without any."""
+    if gt is None:
+        return None if source.poses is None else source.poses[start:stop]
+    truth = read_trajectory(gt)
+    if truth.kind == "tum" or truth.kind == "kitti-indexed":
+        return truth
+    wanted = range(start, stop)
+    if len(truth) < len(source):
+        raise UsageError(f"{gt}: {len(truth)} poses for {len(source)} frames of {source.name}")
+    if len(truth) > len(source):  # a file of the whole sequence beside an excerpt: KITTI's frame numbers tell
+        wanted_numbers = [frame.index for frame in source.frames(start, stop)]
+        if max(wanted_numbers) >= len(truth):
+            raise UsageError(f"{gt}: {len(truth)} poses, but {source.name} has frame {max(wanted_numbers)}")
+        poses = truth.poses[wanted_numbers]
+    else:
+        poses = truth.poses[list(wanted)]
+    return poses if source.T_cam_lidar is None else _in_other_frame(poses, se3.inverse(source.T_cam_lidar))
+
+
+def _in_other_frame(poses: Array, T_other_sensor: Array) -> Array:
+    """Poses of one sensor as those of another that is rigidly mounted to it."""
+    return T_other_sensor @ poses @ se3.inverse(T_other_sensor)
+
+
+def _write(
+    out: Path,
+    source: Source,
+    system: SlamSystem,
+    recorder: TrajectoryRecorder,
+    truth: Array | Trajectory | None,
+    failed: int,
+    seconds: dict[str, list[float]],
+    wall: float,
+) -> Metrics | None:
+    """All result files; the metrics when there is ground truth."""
+    from dpm2_core.evaluation.figures import trajectory_png
+
+    poses = recorder.poses(system.mapper.poses)
+    sensor = poses if source.T_cam_lidar is None else _in_other_frame(poses, source.T_cam_lidar)
+    write_kitti(out / "trajectory_kitti.txt", sensor)
+    write_tum(out / "trajectory.tum", recorder.stamps, poses)
+    cloud = system.mapper.cloud()
+    write_ply(out / "map.ply", cloud)
+    system.mapper.write_g2o(out / "pose_graph.g2o")
+    total = np.sum(list(seconds.values()), axis=0)
+    fps = len(total) / float(total.sum()) if len(total) else 0.0
+    stages = {stage: _summary(times) for stage, times in [*seconds.items(), ("total", total.tolist())]}
+    timing = {"frames": len(recorder), "fps": fps, "wall_s": wall, "stages_ms": stages}
+    _write_json(out / "timing.json", timing)
+    metrics = None
+    if isinstance(truth, Trajectory):
+        own = Trajectory(poses, np.array(recorder.stamps), "tum")
+        if truth.kind == "kitti-indexed":
+            own = Trajectory(sensor, np.array(recorder.index), "kitti-indexed")
+        truth, poses = matched(truth, own)
+        metrics = evaluate(truth, poses, failed_frames=failed, fps=fps)
+    elif truth is not None and np.isfinite(truth[: len(poses), 0, 0]).sum() >= 2:
+        truth = truth[: len(poses)]
+        T = source.T_cam_lidar
+        judged = truth if T is None else _in_other_frame(truth, T)
+        metrics = evaluate(judged, sensor, failed_frames=failed, fps=fps)
+    trajectory_png(out / "trajectory.png", poses, truth, cloud, title=f"{source.name}: {len(recorder)} frames")
+    if metrics is not None:
+        _write_json(out / "metrics.json", metrics.model_dump())
+    return metrics
+
+
+def _summary(times: list[float]) -> dict[str, float]:
+    median, p95 = np.percentile(np.array(times) * 1e3, [50, 95]) if times else (0.0, 0.0)
+    return {"median": round(float(median), 3), "p95": round(float(p95), 3)}
+
+
+def _write_json(path: Path, content: object) -> None:
+    with atomic_write(path) as file:
+        file.write(json.dumps(content, indent=2) + "\n")

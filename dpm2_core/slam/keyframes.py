@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which scans become places of the map, and how well each is tied to the one before."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from dpm2_core.config import Settings
+from dpm2_core.frame import Array, Frame, Keyframe, Registration
+from dpm2_core.geometry import se3
+from dpm2_core.slam.preprocess import Scan
+
+
+class KeyframeSettings(Settings):
+    """Spacing of keyframes and the drift that is assumed between them."""
+
+    distance: float = 5.0
+    """Motion after which a scan becomes a keyframe, m."""
+    angle: float = 25.0
+    """Turn after which a scan becomes a keyframe, degrees."""
+    range: float = 60.0
+    """Points farther than this do not enter the map, m."""
+    drift_translation: float = 0.01
+    """Standard deviation of the odometry a metre of motion, m: the stiffness of odometry edges in the pose graph."""
+    drift_rotation: float = 0.03
+    """The same for rotation, degrees a metre."""
+
+
+class KeyframeSelector:
+    """Makes a keyframe of the first registered scan and then by motion."""
+
+    def __init__(self, settings: KeyframeSettings, robot: str = "") -> None:
+        self._settings = settings
+        self._robot = robot
+        self.reset()
+
+    def reset(self) -> None:
+        self._last: Keyframe | None = None
+        self._doubt = np.zeros((6, 6))
+
+    def doubt(self, covariance: Array) -> None:
+        """The odometry was broken by that much (6, 6): the next edge is to be no firmer."""
+        self._doubt = self._doubt + covariance
+
+    def select(self, frame: Frame, scan: Scan, T_odom_lidar: Array, registration: Registration) -> Keyframe | None:
+        """The keyframe that this scan makes, or None. A scan that was not registered never makes one."""
+        if not registration.ok:
+            return None
+        s, last, edge = self._settings, self._last, None
+        if last is not None:
+            T_last_this = se3.inverse(last.T_odom_kf) @ T_odom_lidar
+            metres, radians = np.linalg.norm(T_last_this[:3, 3]), se3.angle(T_last_this)
+            if metres < s.distance and radians < np.radians(s.angle):
+                return None
+            sigma = np.repeat([np.radians(s.drift_rotation), s.drift_translation], 3) * max(metres, 1.0)
+            covariance = registration.covariance + np.diag(sigma**2) + self._doubt
+            edge = replace(registration, T_target_source=T_last_this, covariance=covariance)
+        near = np.einsum("ij,ij->i", scan.cloud[:, :3], scan.cloud[:, :3]) < s.range**2
+        keyframe_id = 0 if last is None else last.id + 1
+        keyframe = Keyframe(keyframe_id, frame.stamp, frame.index, T_odom_lidar, scan.cloud[near], edge, self._robot)
+        self._last, self._doubt = keyframe, np.zeros((6, 6))
+        return keyframe

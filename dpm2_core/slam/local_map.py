@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The surroundings that a scan is registered to: recent points, a k-d tree, planes fitted where they are asked for."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from small_gicp import KdTree
+
+from dpm2_core.config import Settings
+from dpm2_core.frame import Array
+from dpm2_core.geometry import se3
+from dpm2_core.geometry.planes import fit_planes
+from dpm2_core.geometry.voxel import voxel_first
+
+
+class LocalMapSettings(Settings):
+    """The local map of the odometry."""
+
+    voxel: float = 0.5
+    """Edge of the cells that hold one point each, m."""
+    spacing: float = 2.0
+    """A scan enters the map after this much motion, m (or a turn of 10 degrees)."""
+    radius: float = 100.0
+    """Points farther than this from the sensor are forgotten, m."""
+    scans: int = 25
+    """Points that entered this many scans ago are forgotten: bounds memory, and traces of moving things."""
+    plane_neighbours: int = 15
+    """Points that a local plane is fitted to."""
+
+
+class LocalMap:
+    """Points (M, 3) float64 in the odometry frame, the oldest first; empty until the first `insert`."""
+
+    def __init__(self, settings: LocalMapSettings, threads: int = 2) -> None:
+        self._settings = settings
+        self._threads = threads
+        self.clear()
+
+    def clear(self) -> None:
+        self.points: Array = np.zeros((0, 3))
+        self._entered: NDArray[np.int32] = np.zeros(0, np.int32)
+        self._inserted = 0
+        self._T_last: Array | None = None
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def wants(self, T_odom_lidar: Array) -> bool:
+        """Whether a scan taken at that pose would show enough that is new."""
+        if self._T_last is None:
+            return True
+        moved = se3.inverse(self._T_last) @ T_odom_lidar
+        return bool(np.linalg.norm(moved[:3, 3]) > self._settings.spacing or se3.angle(moved) > np.radians(10))
+
+    def insert(self, points: NDArray[np.floating], T_odom_lidar: Array) -> None:
+        """Add the (N, 3+) points of a scan where the map has none yet; drop what is far or old."""
+        new = points[:, :3].astype(np.float64) @ T_odom_lidar[:3, :3].T + T_odom_lidar[:3, 3]
+        joined = np.concatenate([self.points, new])
+        entered = np.concatenate([self._entered, np.full(len(new), self._inserted, np.int32)])
+        away = joined - T_odom_lidar[:3, 3]
+        kept = np.einsum("ij,ij->i", away, away) < self._settings.radius**2
+        kept &= entered > self._inserted - self._settings.scans
+        joined, entered = joined[kept], entered[kept]
+        first = voxel_first(joined, self._settings.voxel)
+        self.points, self._entered = joined[first], entered[first]
+        self._inserted += 1
+        self._T_last = T_odom_lidar
+        self._tree = KdTree(self.points, num_threads=self._threads)
+        self._normals = np.empty((len(self.points), 3))
+        self._variances = np.full(len(self.points), np.nan)
+
+    def nearest(self, queries: Array) -> tuple[NDArray[np.int64], Array]:
+        """Index of and squared distance (m2) to the nearest map point of each of the (Q, 3) queries."""
+        index, squared = self._tree.batch_nearest_neighbor_search(queries, num_threads=self._threads)
+        return np.asarray(index).view(np.int64), np.asarray(squared)
+
+    def planes(self, index: NDArray[np.int64]) -> tuple[Array, Array]:
+        """Unit normal (Q, 3) and variance along it (Q,), m2, of the surface around each of those map points."""
+        wanted = index[np.isnan(self._variances[index])]
+        if len(wanted):
+            wanted = np.unique(wanted)
+            k = min(self._settings.plane_neighbours, len(self.points))
+            around, _ = self._tree.batch_knn_search(self.points[wanted], k, num_threads=self._threads)
+            self._normals[wanted], self._variances[wanted] = fit_planes(self.points[np.asarray(around).view(np.int64)])
+        return self._normals[index], self._variances[index]

@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scan by scan: predict, register to the local map, gate, update. The state says how far the answer can be trusted."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from time import perf_counter
+
+import numpy as np
+
+from dpm2_core.config import Settings
+from dpm2_core.frame import Array, Frame, Registration, State, Tracked
+from dpm2_core.geometry import se3
+from dpm2_core.slam.keyframes import KeyframeSelector
+from dpm2_core.slam.local_map import LocalMap
+from dpm2_core.slam.preprocess import Preprocessor, Scan
+from dpm2_core.slam.registration import GeometricRegistration
+
+
+class OdometrySettings(Settings):
+    """When to believe a registration, and what to do when there is none."""
+
+    max_acceleration: float = 40.0
+    """A registration that differs from the prediction by more than this allows is refused, m/s2 (0.5 m are free)."""
+    max_turn: float = 200.0
+    """The same for rotation, deg/s of difference from the predicted rate (3 deg are free)."""
+    degraded_sigma: float = 0.15
+    """Standard deviation of the position in its worst direction above which the state is `degraded`, m."""
+    lost_after: int = 5
+    """Frames without a registration until the state is `lost`; `degraded` before."""
+    restart_after: int = 20
+    """Frames without a registration until a new local map is begun at the predicted pose."""
+
+
+_PERIOD = 0.1  # s, assumed between two stamps that do not advance
+_STARTS = (0.0, 1.0, 2.0, 3.0, -1.0)  # m along x, tried while the velocity is unknown: up to 110 km/h at 10 Hz
+_UNKNOWN = np.diag([0.05, 0.05, 0.05, 0.5, 0.5, 0.5]) ** 2  # variance that a second without registration adds
+
+
+class Odometry:
+    """The pose of the LiDAR in the odometry frame, which is that of the first usable scan."""
+
+    def __init__(
+        self,
+        settings: OdometrySettings,
+        preprocessor: Preprocessor,
+        registration: GeometricRegistration,
+        local_map: LocalMap,
+        keyframes: KeyframeSelector,
+    ) -> None:
+        self._settings = settings
+        self._preprocessor = preprocessor
+        self._registration = registration
+        self._local_map = local_map
+        self._keyframes = keyframes
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything; the next scan is the first."""
+        self._T = np.eye(4)
+        self._twist: Array | None = None  # unknown until two scans are registered
+        self._covariance = np.zeros((6, 6))
+        self._stamp: int | None = None
+        self._failures = 0
+        self._local_map.clear()
+        self._keyframes.reset()
+
+    def process(self, frame: Frame) -> Tracked:
+        """Pose of one frame; never raises for what a sensor may deliver, and always gives a finite pose."""
+        clock = [perf_counter()]
+        dt = self._elapsed(frame.stamp)
+        twist = np.zeros(6) if self._twist is None else self._twist
+        scan = self._preprocessor.prepare(frame, twist)
+        clock.append(perf_counter())
+        T_predicted = self._T @ se3.exp(twist * dt)
+        registration = self._register(scan, T_predicted, dt, frame.problem)
+        clock.append(perf_counter())
+        self._update(scan, registration, dt)
+        keyframe = self._keyframes.select(frame, scan, self._T, registration)
+        clock.append(perf_counter())
+        return Tracked(
+            stamp=frame.stamp,
+            index=frame.index,
+            T_odom_lidar=self._T,
+            covariance=self._covariance,
+            twist=np.zeros(6) if self._twist is None else self._twist,
+            state=self._state(registration),
+            registration=registration,
+            keyframe=keyframe,
+            seconds=dict(zip(("preprocess", "register", "update"), np.diff(clock).tolist(), strict=True)),
+        )
+
+    def _elapsed(self, stamp: int) -> float:
+        """Seconds since the frame before; stamps that repeat, jump back or pause count as one nominal period."""
+        dt = _PERIOD if self._stamp is None else (stamp - self._stamp) * 1e-9
+        self._stamp = stamp
+        return dt if 0 < dt < 2 else _PERIOD
+
+    def _register(self, scan: Scan, T_predicted: Array, dt: float, problem: str | None) -> Registration:
+        if problem is not None:
+            return Registration(T_predicted, _UNKNOWN, 0.0, np.inf, "none", False, problem)
+        if not len(self._local_map):
+            ok = len(scan.source) >= self._registration.min_points
+            reason = "" if ok else f"{len(scan.source)} points; a map needs {self._registration.min_points}"
+            return Registration(T_predicted, np.zeros((6, 6)), float(ok), 0.0, "first", ok, reason)
+        if self._twist is None:
+            starts = [T_predicted @ se3.exp([0, 0, 0, x, 0, 0]) for x in _STARTS]
+            found = [self._registration.register(scan.source, self._local_map, T, 2.0) for T in starts]
+            return max(found, key=lambda r: (r.ok, round(r.confidence, 2), -r.rmse))
+        widen = 1.0 + min(self._failures, 4)
+        answer = self._registration.register(scan.source, self._local_map, T_predicted, widen)
+        return self._gated(answer, T_predicted, dt)
+
+    def _gated(self, answer: Registration, T_predicted: Array, dt: float) -> Registration:
+        """Refuse what no vehicle can do; the allowance grows while nothing has been registered."""
+        time = dt * (1 + self._failures)
+        off = se3.inverse(T_predicted) @ answer.T_target_source
+        metres, degrees = float(np.linalg.norm(off[:3, 3])), float(np.degrees(se3.angle(off)))
+        if answer.ok and metres > 0.5 + self._settings.max_acceleration * time * time:
+            return replace(answer, ok=False, reason=f"{metres:.1f} m from the prediction")
+        if answer.ok and degrees > 3 + self._settings.max_turn * time:
+            return replace(answer, ok=False, reason=f"{degrees:.0f} deg from the prediction")
+        return answer
+
+    def _update(self, scan: Scan, registration: Registration, dt: float) -> None:
+        """Move on: to the registered pose, or to the predicted one with the doubt that it deserves."""
+        if not registration.ok:
+            self._coast(scan, dt)
+            return
+        if registration.method != "first":
+            moved = se3.inverse(self._T) @ registration.T_target_source
+            self._twist = se3.log(moved) / dt
+        self._T = registration.T_target_source
+        self._covariance = registration.covariance
+        self._failures = 0
+        if self._local_map.wants(self._T):
+            self._local_map.insert(scan.cloud, self._T)
+
+    def _coast(self, scan: Scan, dt: float) -> None:
+        """Nothing registered: follow the prediction with growing doubt; after long enough, begin a new local map."""
+        if not len(self._local_map):
+            return
+        self._failures += 1
+        self._covariance = self._covariance + _UNKNOWN * dt * self._failures
+        if self._failures <= self._settings.restart_after and self._twist is not None:
+            self._T = self._T @ se3.exp(self._twist * dt)
+        if self._failures >= self._settings.restart_after and len(scan.source) >= self._registration.min_points:
+            self._keyframes.doubt(self._covariance)
+            self._local_map.clear()
+            self._local_map.insert(scan.cloud, self._T)
+            self._twist, self._failures = None, 0
+
+    def _state(self, registration: Registration) -> State:
+        if self._failures >= self._settings.lost_after:
+            return State.LOST
+        if self._twist is None:
+            return State.INITIALISING
+        sigma = np.sqrt(np.linalg.eigvalsh(registration.covariance[3:, 3:])[-1])
+        if not registration.ok or sigma > self._settings.degraded_sigma:
+            return State.DEGRADED
+        return State.TRACKING

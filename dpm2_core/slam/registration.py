@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scan to local map by point-to-plane least squares, each residual weighed by how well the plane is known."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dpm2_core.config import Settings
+from dpm2_core.frame import Array, Registration
+from dpm2_core.geometry import se3
+from dpm2_core.slam.local_map import LocalMap
+
+
+class GeometricSettings(Settings):
+    """The geometric registration."""
+
+    gate: float = 2.0
+    """Correspondences farther apart than this are ignored in the first iteration, m; it shrinks to `final_gate`."""
+    final_gate: float = 0.5
+    """The same in the last iterations, m."""
+    noise: float = 0.06
+    """Standard deviation of a point on a perfect plane, m: range noise and calibration."""
+    iterations: int = 15
+    """At most so many Gauss-Newton steps."""
+    min_points: int = 80
+    """Fewer inliers than this are no answer."""
+    min_inliers: float = 0.35
+    """A smaller share of inliers among the points is no answer."""
+
+
+class GeometricRegistration:
+    """Iteratively reweighted Gauss-Newton; a coarse pass over every fourth point brings the full one close."""
+
+    def __init__(self, settings: GeometricSettings) -> None:
+        self._settings = settings
+        self.min_points = settings.min_points
+
+    def register(self, source: Array, target: LocalMap, T_guess: Array, widen: float = 1.0) -> Registration:
+        """Pose of a scan in the map.
+
+        Args:
+            source: (N, 3) float64 points in the sensor frame.
+            target: the local map; T_target_source is then T_odom_lidar.
+            T_guess: (4, 4) prediction.
+            widen: factor on the first gate, for a prediction that is known to be poor.
+        """
+        s = self._settings
+        if len(source) < s.min_points or len(target) < s.min_points:
+            reason = f"{len(source)} points against a map of {len(target)}; {s.min_points} needed"
+            return _failed(T_guess, reason)
+        T, gate = T_guess, s.gate * widen
+        H = np.zeros((6, 6))
+        inliers, rmse, coarse = 0, np.inf, len(source) > 4 * s.min_points
+        for _ in range(s.iterations):
+            points = source[::4] if coarse else source
+            step, H, inliers, rmse = self._step(points, target, T, gate)
+            if inliers < s.min_points / 4:
+                return _failed(T_guess, f"{inliers} of {len(points)} points near the map")
+            T = T @ se3.exp(step)
+            gate = max(0.7 * gate, s.final_gate)
+            small = np.linalg.norm(step[3:]) < (0.02 if coarse else 5e-4) and np.linalg.norm(step[:3]) < (
+                1e-3 if coarse else 5e-5
+            )
+            if small and coarse:
+                coarse = False
+            elif small and gate == s.final_gate:
+                break
+        share = inliers / len(points)
+        # Neighbouring points share their plane, so they are not independent: count one in ten.
+        covariance: Array = np.linalg.inv(H / 10 + 1e-9 * np.eye(6))
+        ok = inliers >= s.min_points and share >= s.min_inliers
+        reason = "" if ok else f"{inliers} of {len(points)} points fit the map"
+        return Registration(se3.orthonormalised(T), covariance, share, rmse, "geometric", ok, reason)
+
+    def _step(self, source: Array, target: LocalMap, T: Array, gate: float) -> tuple[Array, Array, int, float]:
+        """One Gauss-Newton step: xi (6,) on the right of T, information (6, 6), inliers, their rmse in m."""
+        moved = source @ T[:3, :3].T + T[:3, 3]
+        index, squared = target.nearest(moved)
+        near = squared < gate * gate
+        index, moved, source = index[near], moved[near], source[near]
+        normals, spread = target.planes(index)
+        residual = np.einsum("ij,ij->i", moved - target.points[index], normals)
+        variance = self._settings.noise**2 + spread
+        normalised = residual * residual / variance
+        weight = 1 / (variance * (1 + normalised))  # Cauchy kernel
+        normals_body = normals @ T[:3, :3]
+        J = np.concatenate([np.cross(source, normals_body), normals_body], 1)
+        H = J.T @ (J * weight[:, None])
+        step = np.linalg.solve(H + 1e-6 * np.eye(6), -J.T @ (weight * residual))
+        fits = normalised < 9
+        rmse = float(np.sqrt(np.mean(residual[fits] ** 2))) if fits.any() else np.inf
+        return step, H, int(fits.sum()), rmse
+
+
+def _failed(T_guess: Array, reason: str) -> Registration:
+    return Registration(T_guess, np.diag([0.1, 0.1, 0.1, 1.0, 1.0, 1.0]), 0.0, np.inf, "geometric", False, reason)

@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The whole SLAM: odometry makes keyframes, the mapper makes them consistent. Synchronous and deterministic."""
+
+from __future__ import annotations
+
+from time import perf_counter
+from typing import Literal
+
+from dpm2_core.config import Settings
+from dpm2_core.data.source import InputSettings
+from dpm2_core.frame import Frame, Tracked
+from dpm2_core.slam.keyframes import KeyframeSelector, KeyframeSettings
+from dpm2_core.slam.local_map import LocalMap, LocalMapSettings
+from dpm2_core.slam.loop_closure import LoopCloser, LoopSettings
+from dpm2_core.slam.mapper import Mapper, MapSettings
+from dpm2_core.slam.odometry import Odometry, OdometrySettings
+from dpm2_core.slam.pose_graph import PoseGraph, PoseGraphSettings
+from dpm2_core.slam.preprocess import Preprocessor, PreprocessSettings
+from dpm2_core.slam.registration import GeometricRegistration, GeometricSettings
+
+
+class SlamSettings(Settings):
+    """The SLAM, stage by stage."""
+
+    registration: Literal["geometric"] = "geometric"
+    """How a scan finds its pose."""
+    threads: int = 2
+    """Threads of the neighbour search."""
+    preprocess: PreprocessSettings = PreprocessSettings()
+    geometric: GeometricSettings = GeometricSettings()
+    local_map: LocalMapSettings = LocalMapSettings()
+    odometry: OdometrySettings = OdometrySettings()
+    keyframes: KeyframeSettings = KeyframeSettings()
+    loops: LoopSettings = LoopSettings()
+    pose_graph: PoseGraphSettings = PoseGraphSettings()
+    map: MapSettings = MapSettings()
+
+
+class Config(Settings):
+    """Everything that `dpm2 run` can be told."""
+
+    input: InputSettings = InputSettings()
+    slam: SlamSettings = SlamSettings()
+
+
+class SlamSystem:
+    """One robot: `odometry` runs on every frame, `mapper` on every keyframe; the ROS node runs them in two threads."""
+
+    def __init__(self, settings: SlamSettings | None = None, robot: str = "") -> None:
+        self._settings = settings or SlamSettings()
+        self.odometry = make_odometry(self._settings, robot)
+        self.mapper = make_mapper(self._settings)
+
+    def process(self, frame: Frame) -> Tracked:
+        """Take one frame in: its pose in the odometry frame, and the map one keyframe richer when it shows enough."""
+        tracked = self.odometry.process(frame)
+        started = perf_counter()
+        if tracked.keyframe is not None:
+            self.mapper.add(tracked.keyframe)
+        tracked.seconds["map"] = perf_counter() - started
+        return tracked
+
+    def reset(self) -> None:
+        """Begin anew, with an empty map."""
+        self.odometry.reset()
+        self.mapper = make_mapper(self._settings)
+
+
+def make_odometry(s: SlamSettings, robot: str = "") -> Odometry:
+    """The odometry with its collaborators."""
+    return Odometry(
+        s.odometry,
+        Preprocessor(s.preprocess),
+        GeometricRegistration(s.geometric),
+        LocalMap(s.local_map, s.threads),
+        KeyframeSelector(s.keyframes, robot),
+    )
+
+
+def make_mapper(s: SlamSettings) -> Mapper:
+    """The mapper with its collaborators."""
+    return Mapper(s.map, PoseGraph(s.pose_graph), LoopCloser(s.loops, s.geometric, s.threads))
