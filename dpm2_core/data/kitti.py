@@ -180,13 +180,14 @@ class KittiSource:
 
 def read_scan(path: Path) -> tuple[Points, str | None]:
     """A velodyne file to (N, 4) float32 [x, y, z in m, intensity 0..1], or an empty array and what is wrong."""
+    nothing = np.empty((0, 4), np.float32)
     try:
-        data = path.read_bytes()
+        values, size = np.fromfile(path, "<f4"), path.stat().st_size
     except OSError as error:
-        return np.empty((0, 4), np.float32), f"{path}: {error.strerror}"
-    if len(data) % 16:
-        return np.empty((0, 4), np.float32), f"{path}: {len(data)} bytes are no whole number of points (16 bytes each)"
-    return np.frombuffer(data, "<f4").reshape(-1, 4), None
+        return nothing, f"{path}: {error.strerror}"
+    if size % 16:
+        return nothing, f"{path}: {size} bytes are no whole number of points (16 bytes each)"
+    return values.reshape(-1, 4), None
 
 
 def read_image(path: Path) -> NDArray[np.uint8] | None:

@@ -121,8 +121,9 @@ def decode_points(
     Intensity is scaled to 0..1 by `intensity_max`; without it, by the first of 1 (floating point only), 255 and 65535
     that is not below the largest value of this cloud. It is 0 where the cloud has none.
 
-    Time is looked for under its usual names. The unit is the one in which the points span 2 ms to 2 s. Values beyond
-    2 s are absolute and become relative to `msg.header.stamp`, or to the earliest point if that is another clock's.
+    Time is looked for under its usual names. The unit is the one in which the points span 2 ms to 2 s (integers: us
+    or ns). Values beyond 2 s are absolute and become relative to `msg.header.stamp`, or to the earliest point if that
+    is another clock's.
 
     Args:
         msg: the message.
@@ -131,7 +132,7 @@ def decode_points(
         intensity_max: intensity that becomes 1.
 
     Returns:
-        points: (N, 4) float32 [x, y, z in m, intensity 0..1]; a read-only view where the layout allows.
+        points: (N, 4) float32 [x, y, z in m, intensity 0..1]; a view of the message where its layout allows.
         time_offset: (N,) float32 s relative to the header's stamp; None without the field or where it is constant.
 
     Raises:
@@ -209,7 +210,7 @@ def _time_offset(time: NDArray[Any], points: Points, stamp: int, unit: TimeUnit)
 
 def _time_scale(first: float, last: float, floating: bool) -> float:
     """Seconds per unit: by the span, else (a few points only) by size as an epoch, else by type."""
-    for scale in _SECONDS.values():
+    for scale in [_SECONDS[unit] for unit in (("s", "ms") if floating else ()) + ("us", "ns")]:
         if _LONGEST_SCAN / 1000 < (last - first) * scale <= _LONGEST_SCAN:
             return scale
     for scale in _SECONDS.values():

@@ -81,3 +81,269 @@ def test_any_layout_decodes_as_struct_does(case: tuple[SimpleNamespace, np.ndarr
     assert time is None
     np.testing.assert_array_equal(points[:, :3], want.astype(np.float32))
     np.testing.assert_array_equal(points[:, 3], 0)
+
+
+def test_the_packed_layout_is_not_copied() -> None:
+    msg = cloud(xyz(intensity=np.linspace(0, 1, 5, dtype=np.float32)))
+    points, _ = messages.decode_points(msg)
+    assert np.shares_memory(points, msg.data)
+    np.testing.assert_array_equal(points[:, 3], np.linspace(0, 1, 5, dtype=np.float32))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "want"),
+    [
+        ("intensity", np.float32([0, 0.25, 1]), [0, 0.25, 1]),
+        ("i", np.float32([0, 51, 255]), [0, 0.2, 1]),
+        ("reflectivity", np.float32([0, 13107, 60000]), [0, 0.2, 60000 / 65535]),
+        ("intensity", np.uint8([0, 1, 51]), [0, 1 / 255, 0.2]),  # an integer 1 is dark, not full
+        ("intensity", np.uint16([0, 1, 255]), [0, 1 / 255, 1]),
+        ("Intensity", np.uint16([0, 13107, 65535]), [0, 0.2, 1]),
+        ("intensity", np.float64([0, np.nan, 255]), [0, 0, 1]),  # an unknown intensity does not make the point unknown
+        ("intensity", np.float32([-1, np.inf, 1]), [0, 0, 1]),
+        ("ring", np.uint8([1, 2, 3]), [0, 0, 0]),
+    ],
+)
+def test_intensity_is_scaled_to_one(name: str, value: np.ndarray, want: list[float]) -> None:
+    msg = cloud(xyz(3, **{name: value}))
+    before = bytes(msg.data)
+    points, _ = messages.decode_points(msg)
+    np.testing.assert_allclose(points[:, 3], want, rtol=1e-6)
+    assert bytes(msg.data) == before  # the message itself is left alone
+
+
+def test_intensity_max_is_obeyed() -> None:
+    points, _ = messages.decode_points(cloud(xyz(2, intensity=np.float32([0.5, 4]))), intensity_max=2.0)
+    np.testing.assert_allclose(points[:, 3], [0.25, 1])
+
+
+RAMP = np.linspace(0, 0.1, 5)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "want", "tolerance"),
+    [
+        ("t", (RAMP * 1e9).astype(np.uint32), RAMP, 1e-8),  # Ouster
+        ("offset_time", (RAMP * 1e9).astype(np.uint32), RAMP, 1e-8),  # Livox CustomMsg
+        ("time", RAMP.astype(np.float32), RAMP, 1e-8),  # Velodyne
+        ("time", (RAMP - 0.1).astype(np.float32), RAMP - 0.1, 1e-8),  # stamped at the end of the sweep
+        ("t", (RAMP * 1e6).astype(np.uint32), RAMP, 1e-6),
+        ("time_stamp", (RAMP * 1e3).astype(np.float32), RAMP, 1e-6),
+        ("timestamp", STAMP * 1e-9 + RAMP, RAMP, 1e-6),  # Hesai: epoch in s; a double resolves 0.24 us there
+        ("timestamp", STAMP + RAMP * 1e9, RAMP, 1e-6),  # Livox PointCloud2: epoch in ns
+        ("timestamp", STAMP * 1e-3 + RAMP * 1e6, RAMP, 1e-6),
+        ("timestamp", 7200.0 + RAMP, RAMP, 1e-6),  # clock of the sensor since it was switched on
+        ("t", np.uint32([1_800_000_000, 1_800_050_000, 1_800_100_000]), [0, 0.05, 0.1], 1e-6),  # us of the hour
+    ],
+)
+def test_time_units_and_origins(name: str, value: np.ndarray, want: np.ndarray, tolerance: float) -> None:
+    _, time = messages.decode_points(cloud(xyz(len(value), **{name: value})))
+    assert time is not None
+    assert time.dtype == np.float32
+    np.testing.assert_allclose(time, want, atol=tolerance)
+
+
+def test_times_that_tell_nothing() -> None:
+    constant = cloud(xyz(3, t=np.uint32([7, 7, 7])))
+    assert messages.decode_points(constant)[1] is None
+    named = cloud(xyz(3, sweep=np.float32([0, 0.5, 1])))
+    assert messages.decode_points(named)[1] is None
+    assert messages.decode_points(cloud(xyz(3, t=np.float32([0, 0.5, 1]))), time_field="")[1] is None
+    _, time = messages.decode_points(named, time_field="sweep", time_unit="ms")
+    np.testing.assert_allclose(time, [0, 5e-4, 1e-3], rtol=1e-6)
+    with pytest.raises(MessageError, match="no time field t; fields: x, y, z, sweep"):
+        messages.decode_points(named, time_field="t")
+
+
+def test_few_points_take_the_unit_of_their_type() -> None:
+    """Two points 1 us apart: the span says nothing, an integer is then ns and a float s."""
+    np.testing.assert_allclose(messages.decode_points(cloud(xyz(2, t=np.uint32([0, 1000]))))[1], [0, 1e-6])
+    np.testing.assert_allclose(messages.decode_points(cloud(xyz(2, t=np.float32([0, 1e-6]))))[1], [0, 1e-6])
+    stamps = STAMP * 1e-9 + np.array([0, 1e-6])
+    np.testing.assert_allclose(messages.decode_points(cloud(xyz(2, t=stamps)))[1], [0, 1e-6], atol=3e-7)
+
+
+def test_missing_returns_do_not_spoil_the_times() -> None:
+    columns = xyz(4, timestamp=STAMP * 1e-9 + np.array([0, 0.05, 0, 0.1]))
+    columns["timestamp"][2] = 0.0  # as drivers leave it
+    for name in "xyz":
+        columns[name][2] = np.nan
+    points, time = messages.decode_points(cloud(columns))
+    assert np.isnan(points[2, :3]).all()
+    np.testing.assert_allclose(time, [0, 0.05, 0, 0.1], atol=1e-6)
+
+
+def test_odd_points_keep_their_place() -> None:
+    columns = xyz(5)
+    columns["x"][:] = [np.nan, np.inf, 0, -np.inf, 1]
+    points, _ = messages.decode_points(cloud(columns))
+    np.testing.assert_array_equal(points[:, 0], columns["x"])
+    huge = cloud({k: np.array([1e300, 1.0]) for k in "xyz"})
+    assert np.isinf(messages.decode_points(huge)[0][0, 0])
+
+
+def test_empty_cloud() -> None:
+    points, time = messages.decode_points(cloud(xyz(0, intensity=np.empty(0, np.float32), t=np.empty(0, np.uint32))))
+    assert points.shape == (0, 4)
+    assert time is None
+
+
+def broken(**changes: Any) -> SimpleNamespace:
+    msg = cloud(xyz(6, intensity=np.zeros(6, np.float32)))
+    return SimpleNamespace(**(vars(msg) | changes))
+
+
+@pytest.mark.parametrize(
+    ("msg", "message"),
+    [
+        (broken(fields=[field("x", 0, 7), field("range", 4, 7)]), "no field y, z; fields: x, range"),
+        (broken(fields=[]), "no field x, y, z; fields: none"),
+        (broken(data=np.zeros(80, np.uint8)), "80 bytes of data, 96 declared"),
+        (broken(data=b""), "0 bytes of data, 96 declared"),
+        (broken(height=2, width=3, row_step=40), "row_step 40 is less than"),
+        (broken(fields=[field("x", 0, 7), field("y", 4, 7), field("z", 14, 7)]), "field z ends beyond point_step 16"),
+        (broken(fields=[field("x", 0, 7), field("y", 4, 7), field("z", 8, 9)]), "field z: unknown datatype 9"),
+    ],
+)
+def test_contradictory_clouds_are_refused(msg: SimpleNamespace, message: str) -> None:
+    with pytest.raises(MessageError, match=message):
+        messages.decode_points(msg)
+
+
+def test_row_step_of_a_single_row_is_not_needed() -> None:
+    assert messages.decode_points(broken(row_step=0))[0].shape == (6, 4)
+
+
+@pytest.mark.parametrize("kind", ["i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"])
+def test_written_columns_come_back(kind: str) -> None:
+    """What `cloud_fields` writes, `cloud_view` reads: any type, and features of many values a point."""
+    rng = np.random.default_rng(1)
+    columns = {"x": rng.normal(size=7).astype("f4"), "feature": rng.integers(0, 100, (7, 16)).astype(kind)}
+    view = messages.cloud_view(SimpleNamespace(**messages.cloud_fields(columns, SimpleNamespace)))
+    for name, column in columns.items():
+        np.testing.assert_array_equal(view[name], column)
+
+
+def picture(height: int = 6, width: int = 8) -> np.ndarray:
+    return np.random.default_rng(2).integers(0, 256, (height, width, 3), dtype=np.uint8)
+
+
+def image(pixels: np.ndarray, encoding: str, padding: int = 0, big: bool = False) -> SimpleNamespace:
+    rows = pixels.astype(pixels.dtype.newbyteorder(">" if big else "<")).reshape(len(pixels), -1).view(np.uint8)
+    data = np.pad(rows, ((0, 0), (0, padding)), constant_values=99)
+    return SimpleNamespace(
+        header=header(), height=pixels.shape[0], width=pixels.shape[1], encoding=encoding, is_bigendian=big,
+        step=data.shape[1], data=array.array("B", data.tobytes()),
+    )  # fmt: skip
+
+
+RGB = picture()
+GRAY = RGB[..., 0].copy()
+
+
+@pytest.mark.parametrize("padding", [0, 5])
+@pytest.mark.parametrize(
+    ("encoding", "pixels", "want"),
+    [
+        ("rgb8", RGB, RGB),
+        ("bgr8", RGB[..., ::-1], RGB),
+        ("8UC3", RGB[..., ::-1], RGB),
+        ("rgba8", np.dstack([RGB, GRAY]), RGB),
+        ("bgra8", np.dstack([RGB[..., ::-1], GRAY]), RGB),
+        ("mono8", GRAY, np.dstack([GRAY] * 3)),
+        ("mono16", GRAY.astype(np.uint16) * 256 + 17, np.dstack([GRAY] * 3)),
+        ("16UC1", GRAY.astype(np.uint16) * 256 + 17, np.dstack([GRAY] * 3)),
+    ],
+)
+def test_image_encodings(encoding: str, pixels: np.ndarray, want: np.ndarray, padding: int) -> None:
+    for big in (False, True):
+        decoded = messages.decode_image(image(pixels, encoding, padding, big))
+        assert decoded.dtype == np.uint8
+        np.testing.assert_array_equal(decoded, want)
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+@pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
+def test_bayer_patterns_give_the_colour_they_were_made_from(pattern: str, bits: int) -> None:
+    """A uniformly coloured scene survives the mosaic exactly, and only with the right pattern."""
+    colour = np.array([200, 120, 40], np.uint8)
+    mosaic = np.empty((8, 8), np.uint8)
+    for i, letter in enumerate(pattern):
+        mosaic[i // 2 :: 2, i % 2 :: 2] = colour["rgb".index(letter)]
+    pixels = mosaic if bits == 8 else mosaic.astype(np.uint16) << 8
+    decoded = messages.decode_image(image(pixels, f"bayer_{pattern}{bits}"))
+    np.testing.assert_array_equal(decoded[2:-2, 2:-2], np.broadcast_to(colour, (4, 4, 3)))
+
+
+def test_compressed_images() -> None:
+    smooth = cv2.resize(picture(4, 4), (64, 48), interpolation=cv2.INTER_CUBIC)
+    for form, tolerance in (("png", 0), ("jpeg", 30)):  # JPEG of a smooth picture, quality 95
+        data = cv2.imencode(f".{form}", cv2.cvtColor(smooth, cv2.COLOR_RGB2BGR))[1].reshape(-1)
+        decoded = messages.decode_image(SimpleNamespace(header=header(), format=form, data=data))
+        assert np.abs(decoded.astype(int) - smooth).max() <= tolerance
+
+
+@pytest.mark.parametrize(
+    ("msg", "message"),
+    [
+        (image(RGB, "yuv411"), "encoding 'yuv411' is not supported; supported: rgb8, bgr8"),
+        (SimpleNamespace(**(vars(image(RGB, "rgb8")) | {"height": 7})), "144 bytes of data, 168 needed"),
+        (SimpleNamespace(**(vars(image(RGB, "rgb8")) | {"step": 5})), "step 5"),
+        (SimpleNamespace(**(vars(image(RGB, "rgb8")) | {"width": 0})), "0 x 6"),
+        (SimpleNamespace(format="jpeg", data=b"\xff\xd8garbage"), "'jpeg' and 9 bytes cannot be decoded"),
+        (SimpleNamespace(format="png", data=b""), "0 bytes cannot be decoded"),
+        (SimpleNamespace(format="16UC1; compressedDepth png", data=b"12345"), "compressedDepth"),
+    ],
+)
+def test_images_that_cannot_be_used_are_named(msg: SimpleNamespace, message: str) -> None:
+    with pytest.raises(MessageError, match=message):
+        messages.decode_image(msg)
+
+
+def info(**changes: Any) -> SimpleNamespace:
+    K, P = np.array([500, 0, 320, 0, 510, 240, 0, 0, 1.0]), np.array([480, 0, 310, 0, 0, 490, 230, 0, 0, 0, 1, 0.0])
+    base = {"k": K, "p": P, "d": [0.0] * 5, "distortion_model": "plumb_bob", "width": 640, "height": 480}
+    return SimpleNamespace(**(base | changes))
+
+
+def test_camera_of_a_rectified_image_has_the_rectified_intrinsics() -> None:
+    camera = messages.decode_camera(info(), np.eye(4), "left")
+    np.testing.assert_array_equal(camera.K, [[480, 0, 310], [0, 490, 230], [0, 0, 1]])
+    assert (camera.size, camera.distortion, camera.name) == ((640, 480), (), "left")
+    unrectified = messages.decode_camera(info(p=np.zeros(12), d=[]), np.eye(4), "left")
+    assert unrectified.K[0, 0] == 500
+
+
+@pytest.mark.parametrize(("model", "count"), [("plumb_bob", 5), ("rational_polynomial", 8)])
+def test_camera_with_distortion_keeps_it(model: str, count: int) -> None:
+    D = [-0.3, 0.1, 0.001, -0.002, 0.01, 0.02, 0.03, 0.04][:count]
+    camera = messages.decode_camera(info(d=D, distortion_model=model), np.eye(4), "left")
+    assert camera.distortion == tuple(D)
+    assert camera.K[0, 0] == 500
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"d": [0.1] * 4, "distortion_model": "equidistant"}, "left: distortion model 'equidistant' is not supported"),
+        ({"k": np.zeros(9), "p": np.zeros(12)}, "left: CameraInfo has no focal length"),
+        ({"width": 0}, "left: CameraInfo has no image size"),
+    ],
+)
+def test_camera_that_cannot_be_used(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(MessageError, match=message):
+        messages.decode_camera(info(**changes), np.eye(4), "left")
+
+
+def test_real_rclpy_messages_decode_alike() -> None:
+    """The duck typing holds for the classes that the node gets, with array.array data."""
+    sensor_msgs = pytest.importorskip("sensor_msgs.msg")
+    columns = xyz(50, intensity=np.linspace(0, 1, 50, dtype=np.float32), t=np.arange(50, dtype=np.uint32) * 2_000_000)
+    fields = messages.cloud_fields(columns, sensor_msgs.PointField)
+    data = array.array("B", fields.pop("data").tobytes())
+    msg = sensor_msgs.PointCloud2(data=data, **fields)
+    points, time = messages.decode_points(msg)
+    np.testing.assert_array_equal(points, np.stack([columns[k] for k in ("x", "y", "z", "intensity")], 1))
+    np.testing.assert_allclose(time, np.arange(50) * 2e-3, atol=1e-8)
+    camera = messages.decode_camera(sensor_msgs.CameraInfo(k=info().k, p=info().p, width=64, height=48), np.eye(4), "c")
+    assert camera.K[0, 0] == 480
