@@ -64,6 +64,10 @@ class TransformTree:
             raise UsageError(f"no transform from {source_frame!r} to {target_frame!r}; frames known: {known}")
         return se3.inverse(up_target[common]) @ up_source[common]
 
+    def root(self, frame: str) -> str:
+        """The topmost frame above `frame`; itself where nothing is."""
+        return list(self._ancestors(_name(frame)))[-1]
+
     @property
     def frames(self) -> list[str]:
         """Names of every frame, sorted."""

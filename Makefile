@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+# Every target sets up what it needs; all a machine must have is Python 3.11 or 3.12 and a C++ compiler (for /tf).
+# On a machine with ROS 2 Jazzy use colcon instead: docs/ros2.md.
+
+SHELL := /bin/bash
+PYTHON ?= $(firstword $(shell for p in python3.11 python3.12 python3; do \
+	$$p -c 'import sys; sys.exit(sys.version_info[:2] not in ((3, 11), (3, 12)))' 2>/dev/null && echo $$p; done))
+BIN := .venv/bin
+READY := .venv/.ready
+EXTRAS ?= test
+
+# The environment is self-contained: a sourced ROS 2, another environment's bootstrap or its libraries must not leak in.
+unexport PYTHONPATH PYTHONHOME VIRTUAL_ENV AMENT_PREFIX_PATH ROS_DISTRO LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
+
+.PHONY: help setup demo test lint bench sim parameters clean
+help:  ## this list
+	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:[^#]*##/\t/' | expand -t 12
+
+setup: $(READY)  ## create .venv with everything in it
+$(READY): setup.py pyproject.toml
+	@test -n "$(PYTHON)" || { echo "no Python 3.11 or 3.12 on PATH; set PYTHON=/path/to/python3.11" >&2; exit 2; }
+	@test -x $(BIN)/python || $(PYTHON) -m venv .venv || { rm -rf .venv; echo "the venv module is missing (Debian, Ubuntu: apt install python3-venv)" >&2; exit 1; }
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[$(EXTRAS)]'
+	@$(BIN)/python -m dpm2_ros.build_tf2_msgs || echo "continuing without /tf" >&2
+	@touch $@
+
+demo: setup  ## simulate a drive, replay it into slam_node, check and show what comes out; SRC=<KITTI sequence or bag> for your own
+	$(BIN)/python -m dpm2_ros.demo $(if $(SRC),"$(SRC)") --out out/demo
+
+test: setup  ## all tests
+	$(BIN)/python -m pytest $(ARGS)
+
+lint:  ## style and types
+	@$(MAKE) --no-print-directory setup
+	@$(BIN)/python -c 'import ruff, mypy' 2>/dev/null || $(BIN)/python -m pip install --quiet '.[dev]' --no-build-isolation 2>/dev/null || $(BIN)/python -m pip install --quiet 'ruff>=0.9' 'mypy>=1.13' types-PyYAML
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+bench: setup  ## the figures of benchmarks/, beside KISS-ICP
+	@$(BIN)/python -c 'import kiss_icp' 2>/dev/null || $(BIN)/python -m pip install --quiet -e '.[bench]'
+	$(BIN)/python -m benchmarks $(ARGS)
+
+sim: setup  ## a synthetic drive in KITTI layout in out/sim
+	$(BIN)/dpm2 sim out/sim --frames $(or $(FRAMES),300) --seed $(or $(SEED),1) $(ARGS)
+
+parameters: setup  ## regenerate docs/parameters.md
+	$(BIN)/python -m dpm2_ros.parameters > docs/parameters.md
+
+clean:  ## remove what was built and measured, keep the environment
+	rm -rf build dist install log out *.egg-info

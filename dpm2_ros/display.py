@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What RViz and Foxglove show of the map: the optimised path, and the pose graph with its loops."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from geometry_msgs.msg import Point, PoseStamped, Vector3
+from nav_msgs.msg import Path
+from std_msgs.msg import ColorRGBA
+from visualization_msgs.msg import Marker, MarkerArray
+
+from dpm2_core.frame import Array
+from dpm2_core.slam.mapper import Mapper
+from dpm2_ros.conversions import header, pose_to_msg
+
+GRAY, GREEN, BLUE, RED = (0.7, 0.7, 0.7), (0.1, 0.8, 0.2), (0.2, 0.5, 1.0), (1.0, 0.2, 0.2)
+
+
+def path_to_msg(poses: Array, stamps: Sequence[int], frame_id: str) -> Path:
+    """(N, 4, 4) optimised poses to nav_msgs/Path; stamps in ns."""
+    pairs = zip(stamps, poses, strict=True)
+    stamped = [PoseStamped(header=header(stamp, frame_id), pose=pose_to_msg(T)) for stamp, T in pairs]
+    return Path(header=header(stamps[-1] if stamps else 0, frame_id), poses=stamped)
+
+
+def pose_graph_to_msg(mapper: Mapper, stamp: int, frame_id: str) -> MarkerArray:
+    """Nodes gray, odometry edges green, accepted loops blue, refused ones red."""
+    positions = mapper.poses[:, :3, 3]
+    node = {keyframe.id: n for n, keyframe in enumerate(mapper.keyframes)}
+    loops = [(node[c.from_id], node[c.to_id], c.registration.ok) for c in mapper.closures]
+    steps = [(a, b) for a, b, _, _ in mapper.edges if b == a + 1]
+    parts = (
+        (Marker.SPHERE_LIST, GRAY, 0.6, positions),
+        (Marker.LINE_LIST, GREEN, 0.15, _ends(positions, steps)),
+        (Marker.LINE_LIST, BLUE, 0.3, _ends(positions, [(a, b) for a, b, ok in loops if ok])),
+        (Marker.LINE_LIST, RED, 0.1, _ends(positions, [(a, b) for a, b, ok in loops if not ok])),
+    )
+    markers = []
+    for id, (kind, colour, size, points) in enumerate(parts):
+        marker = Marker(header=header(stamp, frame_id), ns="pose_graph", id=id, type=kind)
+        marker.action = Marker.ADD if len(points) else Marker.DELETE
+        marker.pose = pose_to_msg(np.eye(4))
+        marker.scale = Vector3(x=size, y=size, z=size)
+        marker.color = ColorRGBA(r=colour[0], g=colour[1], b=colour[2], a=1.0)
+        marker.points = [Point(x=x, y=y, z=z) for x, y, z in points.tolist()]
+        markers.append(marker)
+    return MarkerArray(markers=markers)
+
+
+def _ends(positions: Array, pairs: Iterable[tuple[int, int]]) -> Array:
+    """(2 E, 3) end points of E edges between nodes."""
+    return positions[np.array(list(pairs), np.intp).reshape(-1)]

@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How the node is doing, counted as it works and reported on /diagnostics once a second."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Mapping
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.node import Node
+
+from dpm2_core.frame import State, Tracked
+from dpm2_ros.frames import FrameBuilder
+from dpm2_ros.mapping import MapperThread
+from dpm2_ros.subscriptions import STEADY, Inputs
+from dpm2_ros.synchronizer import CameraState, Verdict
+
+OK, WARN, ERROR, STALE = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR, DiagnosticStatus.STALE
+SILENT = 2.0
+"""Seconds without a message after which a sensor counts as silent."""
+
+_LEVEL = {State.TRACKING: OK, State.INITIALISING: OK, State.DEGRADED: WARN, State.RELOCALISING: WARN, State.LOST: ERROR}
+
+
+class Health:
+    """Figures of the odometry: of the whole run, and of the last 200 frames where they are rates or times."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._latency: deque[float] = deque(maxlen=200)
+        self._done: deque[float] = deque(maxlen=50)
+        self._seconds: dict[str, deque[float]] = {}
+        self.processed = self.failed = self.errors = 0
+        self.last: Tracked | None = None
+        self._last_good: float | None = None
+
+    def add(self, tracked: Tracked, latency: float) -> None:
+        """One frame is out, `latency` s after its cloud came in."""
+        now = time.monotonic()
+        with self._lock:
+            self.processed += 1
+            self.failed += not tracked.registration.ok
+            self.last = tracked
+            self._latency.append(latency)
+            self._done.append(now)
+            for stage, seconds in tracked.seconds.items():
+                self._seconds.setdefault(stage, deque(maxlen=200)).append(seconds)
+            if tracked.registration.ok:
+                self._last_good = now
+
+    def figures(self) -> dict[str, str]:
+        """Name to value, as text with its unit in the name."""
+        now = time.monotonic()
+        with self._lock:
+            out = {
+                "state": str(self.last.state) if self.last else "waiting",
+                "processed": str(self.processed),
+                "failed registrations": str(self.failed),
+                "internal errors": str(self.errors),
+                "rate (Hz)": f"{self._rate(now):.1f}",
+            }
+            if self.last is not None:
+                out["confidence"] = f"{self.last.registration.confidence:.2f}"
+            if self._last_good is not None:
+                out["last good registration (s ago)"] = f"{now - self._last_good:.1f}"
+            if self._latency:
+                p50, p95 = np.percentile(list(self._latency), [50, 95]) * 1000
+                out |= {"latency p50 (ms)": f"{p50:.1f}", "latency p95 (ms)": f"{p95:.1f}"}
+            out |= {f"{stage} p50 (ms)": f"{1000 * np.median(list(s)):.1f}" for stage, s in self._seconds.items()}
+        return out
+
+    def _rate(self, now: float) -> float:
+        recent = [done for done in self._done if done > now - 5]
+        return (len(recent) - 1) / (recent[-1] - recent[0]) if len(recent) > 1 else 0.0
+
+
+class Diagnostics:
+    """Publishes the state of odometry, camera and mapper."""
+
+    def __init__(
+        self, node: Node, inputs: Inputs, frames: FrameBuilder, health: Health, mapper: MapperThread | None
+    ) -> None:
+        self._node, self._inputs, self._frames, self._health, self._mapper = node, inputs, frames, health, mapper
+        self.frame_problem = ""
+        """Set while the pose is not that of the frame that was asked for."""
+        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        node.create_timer(1.0, self.publish, clock=STEADY)
+
+    def publish(self) -> None:
+        """Send it now."""
+        status = [self._odometry()]
+        status += [self._camera(camera) for camera in self._inputs.synchronizer.cameras]
+        if self._mapper is not None:
+            accepted, tried = self._mapper.loops
+            figures = {"keyframes": self._mapper.keyframes, "loops accepted": accepted, "loops tried": tried}
+            status.append(self._status("mapper", OK, f"{self._mapper.keyframes} keyframes, {accepted} loops", figures))
+        message = DiagnosticArray(status=status)
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        self._publisher.publish(message)
+
+    def _odometry(self) -> DiagnosticStatus:
+        synchronizer, health = self._inputs.synchronizer, self._health
+        counts = synchronizer.counts
+        figures = health.figures() | {
+            "received": str(sum(counts.values())),
+            "dropped (queue full)": str(synchronizer.dropped),
+            "refused (stamp repeated)": str(counts[Verdict.REPEATED]),
+            "refused (stamp out of order)": str(counts[Verdict.OUT_OF_ORDER]),
+            "restarts": str(counts[Verdict.RESTARTED]),
+            "waiting": str(len(synchronizer)),
+        }
+        silence = _silence(synchronizer.last_arrival)
+        last = health.last
+        if silence is None:
+            found = self._inputs.candidates()
+            hint = f"; point clouds are published on {', '.join(found)}" if found else ""
+            return self._status("odometry", STALE, f"no cloud on {self._inputs.points_topic} yet{hint}", figures)
+        if silence > SILENT:
+            return self._status(
+                "odometry", STALE, f"no cloud on {self._inputs.points_topic} for {silence:.0f} s", figures
+            )
+        if last is None:
+            return self._status("odometry", OK, "the first cloud is being processed", figures)
+        level, text = _LEVEL[last.state], str(last.state)
+        if last.registration.reason:
+            text += f": {last.registration.reason}"
+        if self.frame_problem:
+            level, text = max(level, WARN), f"{text}; {self.frame_problem}"
+        if synchronizer.dropped and len(synchronizer):
+            level, text = max(level, WARN), f"{text}; cannot keep up, {synchronizer.dropped} clouds dropped"
+        return self._status("odometry", level, text, figures)
+
+    def _camera(self, camera: CameraState) -> DiagnosticStatus:
+        figures = {"received": camera.received, "used": camera.matched, "late": camera.late}
+        silence = _silence(camera.last_arrival)
+        if silence is None:
+            level, text = WARN, f"no image on {self._inputs.image_topic} yet; LiDAR only"
+        elif silence > SILENT:
+            level, text = WARN, f"no image on {self._inputs.image_topic} for {silence:.0f} s; LiDAR only"
+        elif self._frames.image_problem:
+            level, text = ERROR, f"{self._frames.image_problem}; LiDAR only"
+        elif not camera.awaited:
+            level, text = WARN, "images come too late or have stamps of another clock; LiDAR only"
+        else:
+            level, text = OK, "in use"
+        return self._status("camera", level, text, figures)
+
+    def _status(self, part: str, level: bytes, text: str, figures: Mapping[str, object]) -> DiagnosticStatus:
+        values = [KeyValue(key=key, value=str(value)) for key, value in figures.items()]
+        name = f"{self._node.get_fully_qualified_name().lstrip('/')}: {part}"
+        return DiagnosticStatus(level=level, name=name, message=text, hardware_id="", values=values)
+
+
+def _silence(last_arrival: float | None) -> float | None:
+    return None if last_arrival is None else time.monotonic() - last_arrival

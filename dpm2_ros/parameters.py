@@ -1,0 +1,183 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every configuration value as a ROS parameter of the same name; `python -m dpm2_ros.parameters` writes their page.
+
+Order of precedence: defaults, the YAML file named by `config_file`, parameters. All are read once, at the start.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import types
+import typing
+from collections.abc import Iterator
+from enum import Enum
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import annotated_types
+from pydantic.fields import FieldInfo
+
+from dpm2_core.config import Settings, flat_fields, load_settings, settings_from
+from dpm2_core.errors import UsageError
+
+if TYPE_CHECKING:
+    from rcl_interfaces.msg import ParameterDescriptor
+    from rclpy.node import Node
+
+T = TypeVar("T", bound=Settings)
+CONFIG_FILE = "config_file"
+_OF_RCLPY = ("use_sim_time", "start_type_description_service", "qos_overrides.")
+
+
+def load_parameters(node: Node, kind: type[T]) -> T:
+    """The node's configuration; afterwards every value is declared, described and read-only.
+
+    Args:
+        node: made with automatically_declare_parameters_from_overrides=True, so that what was given can be seen,
+            misspelt names included.
+
+    Raises:
+        UsageError: an unknown parameter or a value that is not allowed.
+    """
+    fields = dict(flat_fields(kind))
+    given = {
+        name: parameter.value
+        for name, parameter in node.get_parameters_by_prefix("").items()
+        if not name.startswith(_OF_RCLPY) and parameter.value is not None
+    }
+    file = given.pop(CONFIG_FILE, "")
+    if unknown := sorted(set(given) - set(fields)):
+        raise UsageError(f"unknown parameter {', '.join(unknown)}; docs/parameters.md lists them")
+    tree = load_settings(kind, Path(file) if file else None).model_dump()
+    for name, value in given.items():
+        branch = tree
+        *path, leaf = name.split(".")
+        for part in path:
+            branch = branch[part]
+        branch[leaf] = value.tolist() if hasattr(value, "tolist") else value
+    config = settings_from(kind, tree, dict.fromkeys(given, "ROS parameter"))
+    for name in (*given, *([CONFIG_FILE] if file else [])):
+        node.undeclare_parameter(name)
+    _declare(node, CONFIG_FILE, str(file), "YAML file with settings, as for `dpm2 run --config`.", None)
+    for name, info in fields.items():
+        _declare(node, name, _plain(functools.reduce(getattr, name.split("."), config)), _text(info), info)
+    return config
+
+
+def _declare(node: Node, name: str, value: Any, description: str, info: FieldInfo | None) -> None:
+    node.declare_parameter(name, value, _descriptor(description, value, info), ignore_override=True)
+
+
+def _descriptor(description: str, value: Any, info: FieldInfo | None) -> ParameterDescriptor:
+    from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+
+    descriptor = ParameterDescriptor(description=description, read_only=True, dynamic_typing=value is None)
+    if info is None:
+        return descriptor
+    descriptor.additional_constraints = f"{_kind(info)} {_allowed(info)}".strip()
+    limits = {type(limit): limit for limit in _limits(info)}
+    if annotated_types.Ge in limits and annotated_types.Le in limits:  # ROS ranges have two closed ends
+        low, high = limits[annotated_types.Ge].ge, limits[annotated_types.Le].le
+        if isinstance(value, float):
+            descriptor.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high))]
+        elif isinstance(value, int) and not isinstance(value, bool):
+            descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
+    return descriptor
+
+
+def _plain(value: Any) -> Any:
+    """As ROS has it: no tuples, enumerations or paths."""
+    if isinstance(value, Enum):
+        return value.value
+    if isinstance(value, (tuple, list)):
+        return [_plain(item) for item in value]
+    return str(value) if isinstance(value, Path) else value
+
+
+def _text(info: FieldInfo) -> str:
+    return " ".join((info.description or "").split())
+
+
+def _limits(info: FieldInfo) -> list[Any]:
+    """annotated_types of the field, also where they sit inside `X | None` or an alias."""
+    found = list(info.metadata)
+    for part in typing.get_args(info.annotation):
+        found += getattr(part, "__metadata__", ())
+    flat: list[Any] = []
+    for item in found:
+        flat += item.metadata if isinstance(item, FieldInfo) else [item]
+    return flat
+
+
+def _allowed(info: FieldInfo) -> str:
+    signs = (("ge", "at least"), ("gt", "above"), ("le", "at most"), ("lt", "below"))
+    pairs = ((word, getattr(limit, sign, None)) for limit in _limits(info) for sign, word in signs)
+    return ", ".join(f"{word} {value:g}" for word, value in pairs if value is not None)
+
+
+def _kind(info: FieldInfo) -> str:
+    return _type_name(info.annotation)
+
+
+def _type_name(annotation: Any) -> str:
+    if annotation is type(None):
+        return "unset"
+    origin, args = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin is typing.Annotated:
+        return _type_name(args[0])
+    if origin is typing.Literal:
+        return " or ".join(str(arg) for arg in args)
+    if origin in (typing.Union, types.UnionType):
+        return " or ".join(_type_name(arg) for arg in args)
+    if origin in (tuple, list):
+        kinds = [arg for arg in args if arg is not Ellipsis]
+        count = f"{len(kinds)} " if origin is tuple and Ellipsis not in args else ""
+        return f"list of {count}{_type_name(kinds[0])}"
+    if isinstance(annotation, type) and issubclass(annotation, Enum):
+        return " or ".join(str(member.value) for member in annotation)
+    return {str: "text", Path: "path"}.get(annotation, getattr(annotation, "__name__", str(annotation)))
+
+
+def page(kind: type[Settings]) -> str:
+    """The Markdown page of all parameters."""
+    return "\n".join([*_head(), *_sections(kind)]) + "\n"
+
+
+def _head() -> list[str]:
+    return [
+        "# Parameters",
+        "",
+        "<!-- Written by `make parameters` from the settings themselves; a test keeps it up to date. -->",
+        "",
+        "One list for everything: `slam_node` and `mapper_node` take each value as a ROS parameter of this name",
+        "(`--ros-args -p slam.registration:=geometric`), `dpm2 run` as `--set slam.registration=geometric` (all but",
+        "`ros.*`), and both from a YAML file (`-p config_file:=FILE`, `--config FILE`; `dpm2 config dump` writes one).",
+        "Defaults are overridden by the file, the file by single values. An unknown name or a value that is not",
+        "allowed ends the program with exit code 2 and one line that says what is. All are read once, at the start.",
+    ]
+
+
+def _sections(kind: type[Settings]) -> Iterator[str]:
+    section = None
+    for name, info in flat_fields(kind):
+        prefix = name.rpartition(".")[0]
+        if prefix != section:
+            section = prefix
+            yield from (
+                "",
+                f"## {section or 'General'}",
+                "",
+                "| parameter | type | default | meaning |",
+                "|---|---|---|---|",
+            )
+        allowed = _allowed(info)
+        kind_text = f"{_kind(info)}, {allowed}" if allowed else _kind(info)
+        default = json.dumps(_plain(info.get_default(call_default_factory=True)), default=str)
+        yield f"| `{name}` | {kind_text} | `{default}` | {_text(info)} |"
+
+
+if __name__ == "__main__":
+    from dpm2_ros.settings import NodeConfig
+
+    print(page(NodeConfig), end="")

@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The life of a process: signals, spinning, exit codes. One or several SIGINT or SIGTERM end it cleanly.
+
+rclpy's own handlers give up at the second SIGINT, which `ros2 launch` sends, and with them a map that is being saved.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from dpm2_core.errors import Dpm2Error, UsageError
+
+STOP = threading.Event()
+"""Set by the first signal."""
+
+
+def catch_signals() -> None:
+    """From here on SIGINT and SIGTERM set `STOP` and nothing else."""
+    for name in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(name, lambda *_: STOP.set())
+
+
+def exit_code(work: Callable[[], int | None]) -> int:
+    """Run `work`; an error of use or a failed work ends in one line on stderr and the code that the CLI uses too."""
+    try:
+        return work() or 0
+    except UsageError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except Dpm2Error as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+
+
+def ros_context(arguments: Sequence[str]) -> None:
+    """rclpy.init without its signal handlers.
+
+    Raises:
+        UsageError: `--ros-args` that ROS does not understand.
+    """
+    import rclpy
+    from rclpy.signals import SignalHandlerOptions
+
+    try:
+        rclpy.init(args=list(arguments), signal_handler_options=SignalHandlerOptions.NO)
+    except Exception as error:  # rclpy raises RCLError, UnknownROSArgsError and RuntimeError by the kind of mistake
+        raise UsageError(f"ROS arguments: {str(error).splitlines()[0]}") from None
+
+
+def spin_node(make: Callable[[], Any], arguments: Sequence[str]) -> int:
+    """Make a node, spin it until a signal comes, close it.
+
+    Args:
+        make: returns a node with `close()`, which saves what must be saved and may raise Dpm2Error.
+        arguments: those of the process, without its name.
+    """
+    import rclpy
+    from rclpy.executors import SingleThreadedExecutor
+
+    ros_context(arguments)
+    try:
+        node = make()
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        try:
+            while not STOP.is_set():
+                executor.spin_once(timeout_sec=0.1)
+        finally:
+            try:
+                node.close()
+            finally:
+                executor.shutdown()
+                node.destroy_node()
+    finally:
+        rclpy.try_shutdown()
+    return 0

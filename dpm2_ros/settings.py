@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Settings of the nodes: frames, queues, what is published. `NodeConfig` adds them to those of the core."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from dpm2_core.config import Settings
+from dpm2_core.slam.system import Config
+
+FrameName = Annotated[str, Field(pattern=r"^[^/\s]\S*$")]
+Period = Annotated[float, Field(ge=0.1, le=3600)]
+
+
+class RosSettings(Settings):
+    """What only the nodes need; topics are in `input`, shared with `dpm2 run`."""
+
+    reliability: Literal["auto", "reliable", "best_effort"] = "auto"
+    """Of the subscriptions. auto follows the publishers: best effort as soon as one of them offers no more."""
+
+    queue_depth: int = Field(default=10, ge=1, le=1000)
+    """Clouds that may wait for the worker; when full, the oldest is dropped, and counted in /diagnostics."""
+
+    sync_timeout: float = Field(default=0.03, ge=0, le=5)
+    """How long a cloud waits for its image before it goes on without, s."""
+
+    map_frame: FrameName = "map"
+    """Frame of the optimised map."""
+
+    odom_frame: FrameName = "odom"
+    """Frame of the continuous odometry."""
+
+    base_frame: str = ""
+    """Frame whose pose is published; empty takes the root above the LiDAR in /tf_static, else the LiDAR's own frame."""
+
+    tf_timeout: float = Field(default=2.0, ge=0, le=60)
+    """How long the first cloud waits for /tf_static, if anybody publishes it, s."""
+
+    publish_tf_odom: bool = True
+    """slam_node publishes odom -> base on /tf."""
+
+    publish_tf_map: bool = True
+    """The mapper publishes map -> odom on /tf."""
+
+    embed_mapper: bool = True
+    """slam_node hosts the mapper; false where a mapper_node runs apart."""
+
+    map_period: Period = 5.0
+    """Least time between two /dpm2/map, s; it is built only when somebody listens and it has changed."""
+
+    map_max_points: int = Field(default=200_000, ge=1000, le=10_000_000)
+    """Largest /dpm2/map; a larger one is thinned evenly for publishing, not in memory and not on disk."""
+
+    path_period: Period = 1.0
+    """Least time between two /dpm2/path and two /dpm2/pose_graph, s."""
+
+    map_directory: str = "dpm2_map"
+    """Folder that ~/save_map and the end of the node save into; relative to the working directory, and within it one
+    named after the namespace, if any. Empty: nothing is saved at the end, and ~/save_map refuses."""
+
+
+class NodeConfig(Config):
+    """The core's configuration and that of the nodes."""
+
+    ros: RosSettings = RosSettings()

@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Clouds and images in, odometry, keyframes and (with the mapper embedded) the map out."""
+
+from __future__ import annotations
+
+import threading
+import time
+import traceback
+
+import numpy as np
+from nav_msgs.msg import Odometry
+from rclpy.node import Node
+from sensor_msgs.msg import PointCloud2
+from std_srvs.srv import Trigger
+
+from dpm2_core.errors import UsageError
+from dpm2_core.frame import Array, Keyframe, Tracked
+from dpm2_core.geometry import se3
+from dpm2_core.slam.system import make_odometry
+from dpm2_ros.conversions import cloud_to_msg, edge_to_msg, keyframe_name, odometry_to_msg, to_base
+from dpm2_ros.frames import FrameBuilder
+from dpm2_ros.health import Diagnostics, Health
+from dpm2_ros.mapping import KEEP_ALL, MapperThread, robot_name
+from dpm2_ros.parameters import load_parameters
+from dpm2_ros.settings import NodeConfig
+from dpm2_ros.subscriptions import Inputs
+from dpm2_ros.synchronizer import Bundle
+from dpm2_ros.tf import TransformBroadcaster
+
+
+class SlamNode(Node):
+    """The executor's thread only fills a queue; a worker empties it; the mapper has a thread of its own.
+
+    Raises:
+        UsageError: a parameter that is not allowed.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("slam_node", automatically_declare_parameters_from_overrides=True)
+        self._config = load_parameters(self, NodeConfig)
+        ros, self._robot = self._config.ros, robot_name(self)
+        self._odometry = make_odometry(self._config.slam, self._robot)
+        self._inputs = Inputs(self, self._config.input, ros)
+        self._frames = FrameBuilder(self._config.input, self._inputs, self.get_logger().error)
+        self._mapper = MapperThread(self, self._config, self._robot) if ros.embed_mapper else None
+        self._health = Health()
+        self._diagnostics = Diagnostics(self, self._inputs, self._frames, self._health, self._mapper)
+        self._odom = self.create_publisher(Odometry, "dpm2/odom", 10)
+        self._keyframe = self.create_publisher(PointCloud2, "dpm2/keyframe", KEEP_ALL)
+        self._keyframe_odom = self.create_publisher(Odometry, "dpm2/keyframe_odom", KEEP_ALL)
+        self._tf = TransformBroadcaster(self, ros.odom_frame, ros.publish_tf_odom)
+        self.create_service(Trigger, "~/reset", self._on_reset)
+        self._reset_wanted = threading.Event()
+        self._stopping = threading.Event()
+        self._begin()
+        self._index = 0
+        self._worker = threading.Thread(target=self._work, name="worker")
+        self._worker.start()
+        self.get_logger().info(f"waiting for clouds on {self._inputs.subscriptions[0].topic}")
+
+    def close(self) -> None:
+        """End the worker after the frame it is at, then the mapper, which saves the map.
+
+        Raises:
+            Dpm2Error: the map could not be written.
+        """
+        self._stopping.set()
+        self._worker.join()
+        self.get_logger().info(
+            f"{self._health.processed} clouds processed, {self._inputs.synchronizer.dropped} dropped"
+        )
+        if self._mapper is not None:
+            self._mapper.close()
+
+    def _begin(self) -> None:
+        """The state of a drive at its start."""
+        self._odometry.reset()
+        self._base_frame = ""  # decided with the first cloud
+        self._T_base_lidar = np.eye(4)
+        self._covariance = np.zeros((6, 6))
+        self._before: Tracked | None = None
+
+    def _work(self) -> None:
+        while not self._stopping.is_set():
+            bundle = self._inputs.take(timeout=0.1)
+            if self._reset_wanted.is_set():
+                self._reset_wanted.clear()
+                self._restart(save=False)
+            if bundle is None:
+                continue
+            try:
+                self._process(bundle)
+            except Exception:  # a bug; but the drive goes on, and /diagnostics counts it
+                self._health.errors += 1
+                self.get_logger().error(f"cloud at {bundle.stamp} ns: {traceback.format_exc()}")
+
+    def _restart(self, save: bool) -> None:
+        self._begin()
+        if self._mapper is not None:
+            self._mapper.reset(save)
+
+    def _process(self, bundle: Bundle) -> None:
+        """One frame, from messages to messages."""
+        if bundle.restarted and self._before is not None:
+            self.get_logger().warning("time went back by more than a second (a looped bag?): starting again")
+            self._restart(save=True)
+        if not self._base_frame:
+            self._choose_base(bundle.cloud.header.frame_id or "lidar")
+        tracked = self._odometry.process(self._frames.frame(bundle, self._index))
+        self._index += 1
+        if not np.array_equal(self._T_base_lidar, np.eye(4)):
+            tracked = to_base(tracked, self._T_base_lidar)
+        self._publish(tracked)
+        self._health.add(tracked, time.monotonic() - bundle.arrival)
+
+    def _choose_base(self, lidar_frame: str) -> None:
+        """Which frame's pose is published, and where the LiDAR is in it: known, or the LiDAR's own; never assumed."""
+        end = time.monotonic() + self._config.ros.tf_timeout
+        while not (self._inputs.calibrated(lidar_frame) or self._stopping.is_set() or time.monotonic() > end):
+            time.sleep(0.01)
+        tree, wanted = self._inputs.static.tree, self._config.ros.base_frame
+        problem = ""
+        base = wanted or tree.root(lidar_frame)
+        try:
+            T_base_lidar: Array = np.eye(4) if base == lidar_frame else tree.lookup(base, lidar_frame)
+        except UsageError as error:
+            problem = f"{error}; the pose is that of {lidar_frame}"
+            self.get_logger().error(f"ros.base_frame: {problem}")
+            base, T_base_lidar = lidar_frame, np.eye(4)
+        self._diagnostics.frame_problem = problem
+        self._base_frame, self._T_base_lidar = base, T_base_lidar
+
+    def _publish(self, tracked: Tracked) -> None:
+        before, seconds = self._before, 0.1
+        if before is not None:
+            A = se3.adjoint(se3.inverse(tracked.T_odom_lidar) @ before.T_odom_lidar)
+            self._covariance = A @ self._covariance @ A.T + tracked.covariance
+            seconds = max((tracked.stamp - before.stamp) * 1e-9, 1e-3)
+        self._before = tracked
+        ros = self._config.ros
+        self._odom.publish(odometry_to_msg(tracked, self._covariance, seconds, ros.odom_frame, self._base_frame))
+        self._tf.send(tracked.T_odom_lidar, tracked.stamp, self._base_frame)
+        if tracked.keyframe is not None:
+            self._publish_keyframe(tracked.keyframe)
+        if self._mapper is not None:
+            self._mapper.broadcast(tracked.stamp)
+
+    def _publish_keyframe(self, keyframe: Keyframe) -> None:
+        name = keyframe_name(self._robot, keyframe.id)
+        covariance = np.zeros((6, 6)) if keyframe.edge is None else keyframe.edge.covariance
+        odom_frame = self._config.ros.odom_frame
+        self._keyframe_odom.publish(edge_to_msg(keyframe.T_odom_kf, covariance, keyframe.stamp, odom_frame, name))
+        self._keyframe.publish(cloud_to_msg(keyframe.cloud, keyframe.stamp, name))
+        if self._mapper is not None:
+            self._mapper.add(keyframe)
+
+    def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._reset_wanted.set()
+        response.success = True
+        response.message = "odometry and map start again with the next cloud"
+        if self._mapper is None:
+            response.message = "odometry starts again with the next cloud; so does the map of the mapper that listens"
+        return response

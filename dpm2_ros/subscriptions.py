@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Subscriptions that suit their publishers, and what comes in through them."""
+
+from __future__ import annotations
+
+import copy
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
+from std_msgs.msg import Float64
+
+from dpm2_core.data import topics
+from dpm2_core.data.messages import stamp_ns
+from dpm2_core.data.source import InputSettings
+from dpm2_core.data.transforms import TransformTree
+from dpm2_core.errors import UsageError
+from dpm2_ros.settings import RosSettings
+from dpm2_ros.synchronizer import Bundle, Synchronizer, Verdict
+from dpm2_ros.tf import TFMessage
+
+STEADY = Clock(clock_type=ClockType.STEADY_TIME)
+"""For timers that must go on when /clock stops at the end of a bag."""
+
+LATCHED = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+class MatchedSubscription:
+    """A subscription with the reliability that the publishers offer.
+
+    A reliable subscriber never connects to a best-effort publisher, and a best-effort one loses data that a reliable
+    publisher would have sent again. So it starts reliable, and `refresh`, called often, follows the publishers.
+    """
+
+    def __init__(self, node: Node, kind: type, topic: str, callback: Callable[[Any], None], ros: RosSettings) -> None:
+        self._node, self._kind, self._callback = node, kind, callback
+        self._setting, self._depth = ros.reliability, ros.queue_depth
+        self.topic: str = node.resolve_topic_name(topic)
+        self.reliability = ReliabilityPolicy.RELIABLE
+        self._subscription: Any = None
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Follow the publishers of this moment."""
+        wanted = self.reliability
+        if self._setting != "auto":
+            wanted = ReliabilityPolicy[self._setting.upper()]
+        elif offered := self._node.get_publishers_info_by_topic(self.topic):
+            reliable = all(info.qos_profile.reliability != ReliabilityPolicy.BEST_EFFORT for info in offered)
+            wanted = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+        if self._subscription is not None and wanted == self.reliability:
+            return
+        before, self.reliability = self._subscription, wanted
+        qos = QoSProfile(depth=self._depth, history=HistoryPolicy.KEEP_LAST, reliability=wanted)
+        self._subscription = self._node.create_subscription(self._kind, self.topic, self._callback, qos)
+        if before is not None:
+            self._node.destroy_subscription(before)
+            self._node.get_logger().info(f"{self.topic}: {wanted.name.lower()}, as its publisher")
+
+
+class StaticTransforms:
+    """What /tf_static says. Without tf2_msgs there is none, and extrinsics come from parameters alone."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self.tree = TransformTree()
+        if TFMessage is not None:
+            node.create_subscription(TFMessage, topics.TF_STATIC, self._on_message, LATCHED)
+
+    def knows(self, frame: str) -> bool:
+        """Whether the frame is in the tree, or nobody is there who could put it in."""
+        return frame.lstrip("/") in self.tree.frames or not self._node.count_publishers(topics.TF_STATIC)
+
+    def _on_message(self, message: Any) -> None:
+        tree = copy.deepcopy(self.tree)  # the worker may be reading the present one
+        try:
+            tree.add(message)
+        except UsageError as error:
+            self._node.get_logger().error(str(error))
+        self.tree = tree
+
+
+class Inputs:
+    """Clouds, images and calibration as they come in. The callbacks only put them into the synchroniser's queue."""
+
+    def __init__(self, node: Node, settings: InputSettings, ros: RosSettings) -> None:
+        self._node = node
+        self.points_topic = settings.points_topic or topics.POINTS
+        self.image_topic = (settings.image_topic or topics.IMAGE) if settings.images else ""
+        self._image_shift = round(settings.image_time_offset * 1e9)
+        self._arrived = threading.Condition()
+        self.synchronizer = Synchronizer(
+            cameras=1 if self.image_topic else 0,
+            depth=ros.queue_depth,
+            timeout=ros.sync_timeout,
+            tolerance=settings.image_tolerance,
+        )
+        self.camera_info: CameraInfo | None = None
+        self.angle_correction_deg: float | None = None
+        self.static = StaticTransforms(node)
+        self.subscriptions = [MatchedSubscription(node, PointCloud2, self.points_topic, self._on_cloud, ros)]
+        if self.image_topic:
+            image_type = CompressedImage if self.image_topic.endswith("/compressed") else Image
+            beside = self.image_topic.removesuffix("/compressed").rpartition("/")[0]
+            info_topic = settings.camera_info_topic or f"{beside}/camera_info".removeprefix("" if beside else "/")
+            self.subscriptions += [
+                MatchedSubscription(node, image_type, self.image_topic, self._on_image, ros),
+                MatchedSubscription(node, CameraInfo, info_topic, self._on_camera_info, ros),
+            ]
+        node.create_subscription(Float64, topics.VERTICAL_ANGLE_CORRECTION, self._on_correction, LATCHED)
+        node.create_timer(0.1, self._refresh, clock=STEADY)
+
+    def take(self, timeout: float) -> Bundle | None:
+        """The next cloud that is ready, with its images; None after `timeout` s without one."""
+        end = time.monotonic() + timeout
+        with self._arrived:
+            while True:
+                now = time.monotonic()
+                bundle = self.synchronizer.pop(now)
+                if bundle is not None or now >= end:
+                    return bundle
+                self._arrived.wait(min(end, self.synchronizer.deadline() or end) - now)
+
+    def calibrated(self, lidar_frame: str) -> bool:
+        """Whether everything latched that somebody publishes about the LiDAR has arrived."""
+        correction = self.angle_correction_deg is not None
+        return self.static.knows(lidar_frame) and (
+            correction or not self._node.count_publishers(topics.VERTICAL_ANGLE_CORRECTION)
+        )
+
+    def candidates(self) -> list[str]:
+        """Topics on which somebody else publishes point clouds."""
+        own = {topic for topic, _ in self._node.get_publisher_names_and_types_by_node(
+            self._node.get_name(), self._node.get_namespace())}  # fmt: skip
+        kind = "sensor_msgs/msg/PointCloud2"
+        return sorted(
+            topic
+            for topic, kinds in self._node.get_topic_names_and_types()
+            if kind in kinds and topic not in own and self._node.count_publishers(topic)
+        )
+
+    def _on_cloud(self, message: PointCloud2) -> None:
+        with self._arrived:
+            verdict = self.synchronizer.add_cloud(self._stamp(message), message, time.monotonic())
+            self._arrived.notify()
+        if verdict is not Verdict.ACCEPTED:
+            self._node.get_logger().warning(
+                f"cloud at {stamp_ns(message.header) / 1e9:.3f} s: {verdict}", throttle_duration_sec=5
+            )
+
+    def _on_image(self, message: Any) -> None:
+        with self._arrived:
+            stamp = self._stamp(message) + self._image_shift
+            self.synchronizer.add_image(0, stamp, message, time.monotonic())
+            self._arrived.notify()
+
+    def _stamp(self, message: Any) -> int:
+        """ns; drivers that leave the stamp at 0 get the time of arrival."""
+        return stamp_ns(message.header) or self._node.get_clock().now().nanoseconds
+
+    def _on_camera_info(self, message: CameraInfo) -> None:
+        self.camera_info = message
+
+    def _on_correction(self, message: Float64) -> None:
+        self.angle_correction_deg = message.data
+
+    def _refresh(self) -> None:
+        for subscription in self.subscriptions:
+            subscription.refresh()

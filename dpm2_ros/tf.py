@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""/tf, where tf2_msgs is there: part of every ROS installation, built by `dpm2_ros.build_tf2_msgs` for ROS from pip."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from typing import Any
+
+from rclpy.node import Node
+
+from dpm2_core.frame import Array
+from dpm2_ros.conversions import transform_to_msg
+
+TFMessage: Any = None
+with suppress(ImportError):
+    from tf2_msgs.msg import TFMessage  # type: ignore[no-redef]
+
+
+class TransformBroadcaster:
+    """Publishes one transform of /tf.
+
+    Args:
+        enabled: False publishes nothing.
+    """
+
+    def __init__(self, node: Node, parent: str, enabled: bool) -> None:
+        self._parent = parent
+        self._publisher = None
+        if not enabled:
+            return
+        if TFMessage is None:
+            node.get_logger().error("no /tf: tf2_msgs is missing; `python -m dpm2_ros.build_tf2_msgs` builds it")
+            return
+        self._publisher = node.create_publisher(TFMessage, "/tf", 100)
+
+    def send(self, T_parent_child: Array, stamp: int, child: str) -> None:
+        """(4, 4) at a stamp in ns."""
+        if self._publisher is not None:
+            self._publisher.publish(
+                TFMessage(transforms=[transform_to_msg(T_parent_child, stamp, self._parent, child)])
+            )

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One description for `pip install .` and `colcon build`."""
+
+import os
+import sys
+from glob import glob
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+EXECUTABLES = ("slam_node", "mapper_node", "bag_player")
+
+REQUIREMENTS = [
+    "numpy>=1.26,<3",  # every array
+    "scipy>=1.11,<2",  # rotations, nearest neighbours
+    "torch>=2.6,<2.14",  # the network; CPU wheels serve
+    "small_gicp>=1.0,<2",  # scan registration, multi-threaded, without the GIL
+    "gtsam>=4.3,<4.4",  # pose graph; the first with wheels for numpy 2
+    "pydantic>=2.7,<3",  # typed configuration
+    "PyYAML>=6,<7",  # configuration files
+    "typer>=0.12,<1",  # command line
+    "rich>=13,<16",  # progress bars and tables
+    "rosbags>=0.11,<0.12",  # bags without ROS; 0.x releases change the interface
+    "mcap>=1.2,<2",  # salvages bags whose recording was cut off
+    "opencv-python-headless>=4.9,<6",  # image decoding; headless: no Qt beside RViz
+    "matplotlib>=3.8,<4",  # trajectory pictures
+    "trimesh>=4,<6",  # meshes of the synthetic city
+    "embreex>=2.17.7,<5",  # ray casting in the synthetic city
+    "fpsample>=1.0,<2",  # farthest point sampling at native speed
+]
+ROS = [
+    "ros-jazzy-rclpy>=7.1,<8",  # ROS 2 Jazzy itself
+    "ros-rclpy[fastrtps]>=7.1.6,<8",  # its DDS
+    "ros-jazzy-common-interfaces>=5.3,<6",  # sensor_msgs, nav_msgs, ...
+]
+EXTRAS = {
+    "test": ["pytest>=8,<10", "pytest-timeout>=2.3,<3", "hypothesis>=6.100,<7"],
+    "bench": ["kiss-icp>=1.2,<2"],  # the baseline of the benchmarks
+}
+EXTRAS["dev"] = [*EXTRAS["test"], *EXTRAS["bench"], "ruff>=0.9", "mypy>=1.13", "types-PyYAML"]
+
+
+def ros2_run_stubs() -> list[str]:
+    """What `ros2 run` finds in lib/dpm2_ros after pip: each starts the console script of the same environment."""
+    folder = Path("build/ros2_run")
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in EXECUTABLES:
+        stub = folder / name
+        stub.write_text(f'#!/bin/sh\nexec "${{0%/*}}/../../bin/{name}" "$@"\n')
+        stub.chmod(0o755)
+    return [str(folder / name) for name in EXECUTABLES]
+
+
+data_files = [
+    ("share/ament_index/resource_index/packages", ["resource/dpm2_ros"]),
+    ("share/dpm2_ros", ["package.xml"]),
+    ("share/dpm2_ros/config", sorted(glob("config/*"))),
+    ("share/dpm2_ros/launch", sorted(glob("launch/*.launch.py"))),
+]
+if "bdist_wheel" in sys.argv:  # pip; under colcon the options below put the console scripts themselves there
+    data_files.append(("lib/dpm2_ros", ros2_run_stubs()))
+
+setup(
+    name="dpm2_ros",
+    version="0.1.0",
+    description="LiDAR-visual SLAM with neural descriptors for ROS 2",
+    long_description=Path("README.md").read_text(encoding="utf-8") if Path("README.md").is_file() else "",
+    long_description_content_type="text/markdown",
+    license="Apache-2.0",
+    maintainer="The dpm2 developers",
+    maintainer_email="dpm2@example.org",
+    packages=find_packages(include=["dpm2_core", "dpm2_core.*", "dpm2_ros", "dpm2_ros.*"]),
+    package_data={"dpm2_core": ["weights/*"]},
+    data_files=data_files,
+    python_requires=">=3.11,<3.13",
+    # On a machine with ROS 2 sourced, its own packages serve, and the wheels would shadow them.
+    install_requires=REQUIREMENTS + ([] if os.environ.get("ROS_DISTRO") else ROS),
+    extras_require=EXTRAS,
+    zip_safe=False,
+    entry_points={
+        "console_scripts": [
+            *(f"{name} = dpm2_ros.executables:{name}" for name in EXECUTABLES),
+            "dpm2 = dpm2_core.cli:main",
+        ]
+    },
+    options={
+        "install": {"install_scripts": "$base/lib/dpm2_ros"},
+        "develop": {"script_dir": "$base/lib/dpm2_ros"},
+    },
+)
