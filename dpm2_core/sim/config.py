@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from typing import Literal
 
+import numpy as np
 from pydantic import Field
 
 from dpm2_core.config import Settings
@@ -52,11 +53,11 @@ class CameraConfig(Settings):
 
 
 class Preset(Settings):
-    """A kind of place. Densities are means: each world varies them by its seed."""
+    """A kind of place. Densities are means: `varied` draws each world's own."""
 
     half_width: float
     """Centre line to kerb, m."""
-    lane: float
+    lane: float = 1.8
     """Centre line to the middle of the driven lane, m."""
     sidewalk: float = 0.0
     """Width, m; 0 for a grass verge."""
@@ -80,6 +81,8 @@ class Preset(Settings):
     """Share of the kerb with parked cars."""
     poles: float = 0.0
     """Lamps, signs, bollards and boxes per 100 m and side."""
+    clutter: float = 0.0
+    """Sheds, boxes, benches and cars in yards, per 100 m and side."""
     tufts: float = 0.0
     """Of grass, per m and side."""
     people: float = 0.0
@@ -98,17 +101,37 @@ class Preset(Settings):
 
 PRESETS: dict[PresetName, Preset] = {
     "city": Preset(
-        half_width=5.4, lane=1.75, sidewalk=2.4, setback=4.0, buildings=0.8, floors=(2, 6), side_streets=1.2, trees=4.0,
-        bushes=3.0, boundaries=0.3, parked=0.45, poles=6.0, tufts=0.1, people=2.5, traffic=1.5, speed=11.0, hills=0.6,
+        half_width=5.0, sidewalk=2.2, setback=3.6, buildings=0.8, floors=(2, 6), side_streets=1.2, trees=4.0, bushes=6.0,
+        boundaries=0.45, parked=0.7, poles=7.0, clutter=5.0, tufts=0.15, people=2.5, traffic=1.5, speed=11.0, hills=0.8,
     ),
     "suburb": Preset(
-        half_width=4.8, lane=1.6, sidewalk=1.8, setback=8.0, buildings=0.55, floors=(1, 3), side_streets=1.0, trees=5.0,
-        bushes=9.0, boundaries=0.65, parked=0.3, poles=4.0, tufts=0.4, people=1.0, traffic=0.8, speed=10.0, hills=1.5,
+        half_width=4.4, sidewalk=1.7, setback=7.0, buildings=0.6, floors=(1, 3), side_streets=1.0, trees=6.0, bushes=16.0,
+        boundaries=0.8, parked=0.45, poles=5.0, clutter=7.0, tufts=0.5, people=1.0, traffic=0.8, speed=10.0, hills=1.5,
+        roughness=0.07,
     ),
     "rural": Preset(
-        half_width=3.6, lane=1.7, setback=16.0, buildings=0.08, floors=(1, 2), side_streets=0.3, trees=3.5, forest=1.5,
-        bushes=8.0, boundaries=0.15, poles=2.5, tufts=1.2, people=0.1, traffic=0.8, speed=16.0, hills=4.0, roughness=0.18,
+        half_width=3.8, setback=16.0, buildings=0.1, floors=(1, 2), side_streets=0.3, trees=4.0, forest=1.5, bushes=12.0,
+        boundaries=0.2, poles=3.0, clutter=1.0, tufts=1.2, people=0.1, traffic=0.8, speed=16.0, hills=4.0, roughness=0.15,
     ),
     "highway": Preset(half_width=11.0, lane=6.5, speed=25.0, hills=0.0, roughness=0.0, traffic=1.5, degenerate=True),
-    "tunnel": Preset(half_width=4.2, lane=1.8, speed=14.0, hills=0.0, roughness=0.0, traffic=0.3, degenerate=True),
+    "tunnel": Preset(half_width=4.2, speed=14.0, hills=0.0, roughness=0.0, traffic=0.3, degenerate=True),
 }  # fmt: skip
+_DENSITIES = (
+    "buildings", "side_streets", "trees", "forest", "bushes", "boundaries", "parked", "poles", "clutter", "tufts", "people",
+    "traffic", "hills", "roughness",
+)  # fmt: skip
+
+
+def varied(preset: Preset, rng: np.random.Generator) -> Preset:
+    """One world's own values: variety of worlds is what makes a network trained on them work elsewhere."""
+    if preset.degenerate:
+        return preset.model_copy(update={"traffic": preset.traffic * rng.uniform(0.3, 1.7)})
+    own = {name: getattr(preset, name) * rng.uniform(0.3, 1.6) for name in _DENSITIES}
+    own |= {name: min(own[name], 0.95) for name in ("buildings", "boundaries", "parked")}
+    half_width = preset.half_width * rng.uniform(0.65, 1.25)
+    sidewalk = preset.sidewalk * rng.uniform(0.6, 1.5)
+    own |= {"half_width": half_width, "sidewalk": sidewalk}
+    # past the parked cars, in a narrow street in its middle
+    own["lane"] = float(np.clip(half_width - (3.0 if preset.parked else 1.7), 0.3, 1.8))
+    own["setback"] = max(preset.setback * rng.uniform(0.5, 1.5), sidewalk + 0.5)
+    return preset.model_copy(update=own)

@@ -13,17 +13,17 @@ from scipy.spatial import cKDTree
 from dpm2_core.sim import plants
 from dpm2_core.sim.buildings import building
 from dpm2_core.sim.config import Preset
-from dpm2_core.sim.furniture import FURNITURE
+from dpm2_core.sim.furniture import FURNITURE, street_box
 from dpm2_core.sim.materials import Label, Material
-from dpm2_core.sim.mesh import Mesh, placed, pose
+from dpm2_core.sim.mesh import Mesh, merge, placed, pose
 from dpm2_core.sim.road import Road
 from dpm2_core.sim.shapes import box, leaves
 from dpm2_core.sim.terrain import RESOLUTION, Kerbline, Terrain, kerbside_ribbon
 from dpm2_core.sim.vehicles import car, truck
 
 Array = NDArray[np.float64]
-CLEAR_OF_DRIVE = 2.7
-"""Nothing stands nearer to the path of the car's middle than this, m."""
+CLEAR_OF_DRIVE = 2.15
+"""Nothing below the height of a car reaches nearer to the path of the car's middle than this, m (parked cars: their middle)."""
 
 
 class Layout:
@@ -36,29 +36,29 @@ class Layout:
 
     def meshes(self) -> Iterator[Mesh]:
         """All static props. The order decides who gets a place: cars first, then buildings, then green."""
-        preset, vary = self.preset, self.rng.uniform(0.4, 1.6, 8)
+        preset = self.preset
         if preset.parked:
-            yield from self._parked(min(preset.parked * vary[0], 0.85))
+            yield from self._parked(preset.parked)
         if preset.buildings:
-            share = min(preset.buildings * vary[1], 0.97)
-            setback = preset.setback * self.rng.uniform(0.75, 1.3)
+            share, setback = preset.buildings, preset.setback
             for level, chance in ((setback, share), (setback + 24, 0.5 * share), (setback + 50, 0.4 * share)):
                 yield from self._buildings(level, chance)
         if preset.boundaries:
-            yield from self._boundaries(preset.boundaries * vary[2])
+            yield from self._boundaries(preset.boundaries)
         kerb = preset.sidewalk or 1.2
-        yield from self._scattered(self._furniture(), preset.poles * vary[3], (0.45, 0.9), 0.3, aligned=True)
+        furniture = self._furniture()
+        yield from self._scattered(furniture, preset.poles, (0.45, 0.9), 0.3, aligned=True)
         trees = [plants.tree(self.rng) for _ in range(10)]
         bushes = [plants.bush(self.rng) for _ in range(8)]
-        yield from self._scattered(trees, preset.trees * vary[4], (0.7, kerb + 3), 0.7, scale=(0.7, 1.15))
-        yield from self._scattered(trees, preset.trees * vary[5], (kerb + 4, kerb + 40), 0.7)
-        yield from self._scattered(trees, 12 * preset.forest * vary[6], (5, 30), 0.7, patchy=True)
-        yield from self._scattered(bushes, 12 * preset.forest * vary[6], (4, 16), 0.3, patchy=True)
-        yield from self._scattered(bushes, preset.bushes * vary[7], (kerb + 0.8, kerb + 14), 0.5)
+        yield from self._scattered(trees, preset.trees, (0.7, kerb + 3), 0.7, scale=(0.7, 1.15))
+        yield from self._scattered(trees, preset.trees, (kerb + 4, kerb + 40), 0.7)
+        yield from self._scattered(trees, 12 * preset.forest, (5, 30), 0.7, patchy=True)
+        yield from self._scattered(bushes, 12 * preset.forest, (4, 16), 0.3, patchy=True)
+        yield from self._scattered(bushes, preset.bushes, (kerb + 0.8, kerb + 14), 0.5)
+        clutter = [*furniture, *(street_box(self.rng) for _ in range(6)), *(car(self.rng) for _ in range(6))]
+        yield from self._scattered(clutter, preset.clutter, (kerb + 2.5, kerb + 22), 1.2)
         tufts = [plants.tuft(self.rng) for _ in range(8)]
-        yield from self._scattered(
-            tufts, 100 * preset.tufts * vary[0], (preset.sidewalk + 0.6, preset.sidewalk + 7), 0.0
-        )
+        yield from self._scattered(tufts, 100 * preset.tufts, (preset.sidewalk + 0.6, preset.sidewalk + 7), 0.0)
 
     def _furniture(self) -> list[Mesh]:
         kinds = self.rng.choice(len(FURNITURE), 14, p=[p for _, p in FURNITURE])
@@ -80,35 +80,31 @@ class Layout:
         if per_100m <= 0:
             return
         terrain, rng = self.terrain, self.rng
+        reach = np.array([_reach(template) for template in templates])
         for line in terrain.contour(0.5 * (band[0] + band[1])):
             n = rng.poisson(per_100m * len(line.xy) / 100)
             at = rng.integers(0, len(line.xy), n)
             if patchy:  # belts of about 40 m: half of the line, by a random wave
                 at = at[np.sin(at * rng.uniform(0.05, 0.12) + rng.uniform(0, 6.3)) > 0.2]
-                n = len(at)
+            n = len(at)
+            if not n:
+                continue
             xy = line.xy[at] + line.outward[at] * rng.uniform(-0.5, 0.5, (n, 1)) * (band[1] - band[0])
-            edge = terrain.edge_at(xy)
-            keep = (edge > band[0] - 0.25) & (self.drive.query(xy)[0] > CLEAR_OF_DRIVE)
+            which = rng.integers(0, len(templates), n)
+            size = np.ones(n) if aligned else rng.uniform(*scale, n)
+            keep = terrain.edge_at(xy) > band[0] - 0.25
+            keep &= self.drive.query(xy)[0] > CLEAR_OF_DRIVE + reach[which] * size
             row, column = terrain._cell(xy)
             keep &= self.taken[row, column] == 0
-            xy, at = xy[keep], at[keep]
-            if radius and len(xy):
+            if radius:
                 close = cKDTree(xy).query_pairs(2 * radius, output_type="ndarray")
-                lone = np.ones(len(xy), bool)
-                lone[close[:, 1]] = False
-                xy, at = xy[lone], at[lone]
-                row, column = terrain._cell(xy)
-                self.taken[row, column] = 1
+                keep[close[keep[close].all(1), 1]] = False
+                self.taken[row[keep], column[keep]] = 1
+            xy, at, which, size = xy[keep], at[keep], which[keep], size[keep]
             yaw = rng.uniform(0, 2 * np.pi, len(xy))
             if aligned:
                 yaw = np.arctan2(line.outward[at, 1], line.outward[at, 0]) - np.pi / 2 + rng.normal(0, 0.05, len(xy))
-            which = rng.integers(0, len(templates), len(xy))
-            size = np.ones(len(xy)) if aligned else rng.uniform(*scale, len(xy))
-            tint = (
-                np.ones((len(xy), 3))
-                if aligned
-                else rng.uniform(0.8, 1.2, (len(xy), 1)) * rng.uniform(0.93, 1.07, (len(xy), 3))
-            )
+            tint = rng.uniform(0.8, 1.2, (len(xy), 1)) * rng.uniform(0.93, 1.07, (len(xy), 3))
             z = terrain.surface_at(xy)
             texture = rng.integers(0, 65536, len(xy))
             for k, template in enumerate(templates):
@@ -126,7 +122,7 @@ class Layout:
                 bend = np.abs(np.diff(line.outward[i - 2 : i + 4], axis=0)).sum()
                 if rng.random() > share or line.junction[max(i - 4, 0) : i + 8].any() or bend > 0.25:
                     continue
-                if self.drive.query(line.xy[i])[0] < CLEAR_OF_DRIVE + 0.2:
+                if self.drive.query(line.xy[i])[0] < CLEAR_OF_DRIVE:
                     continue
                 ahead = line.xy[j] - line.xy[i]
                 yaw = np.arctan2(ahead[1], ahead[0]) + rng.normal(0, 0.03) + np.pi * (rng.random() < 0.15)
@@ -230,11 +226,15 @@ class Layout:
         width = gap * rng.uniform(0.3, 0.75)
         pickets = [box((x, 0, -0.1), (x + width, 0.02, h), *kind) for x in np.arange(0, 1, gap)]
         rails = [box((0, 0.02, z), (1.02, 0.06, z + 0.08), *kind) for z in (0.25 * h, 0.8 * h)]
-        from dpm2_core.sim.mesh import merge
-
         ahead = np.diff(line.xy, axis=0)
         yaw = np.arctan2(ahead[:, 1], ahead[:, 0])
         stretch = np.stack([np.linalg.norm(ahead, axis=1), np.ones(len(yaw)), np.ones(len(yaw))], -1)
         poses = pose(line.xy[:-1], self.terrain.height_at(line.xy[:-1]), yaw)
         poses[:, :, :3] *= stretch[:, None]
         yield placed(merge([*pickets, *rails]), poses, rng.integers(65536, size=len(poses)))
+
+
+def _reach(mesh: Mesh) -> float:
+    """Of what would touch a passing car or its sensor: the horizontal extent of its lower 3 m, m."""
+    low = mesh.vertices[mesh.vertices[:, 2] < 3.0]
+    return float(np.hypot(low[:, 0], low[:, 1]).max())

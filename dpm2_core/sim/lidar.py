@@ -7,11 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from dpm2_core.geometry import se3
 from dpm2_core.sim.config import LidarConfig
-from dpm2_core.sim.materials import MISS, MOVING_LABEL, REFLECTANCE, RETRO, ROUGHNESS, Label, Material
+from dpm2_core.sim.materials import DARK, MISS, MOVING_LABEL, REFLECTANCE, RETRO, ROUGHNESS
 from dpm2_core.sim.mesh import Hits, Mesh, Scene
 from dpm2_core.sim.world import World
 
@@ -69,6 +68,8 @@ class Lidar:
             directions, ring, column = directions[keep], ring[keep], column[keep]
         self.directions = np.ascontiguousarray(directions, np.float32)
         self.ring, self.column = ring.astype(np.uint8), column
+        # No two laser-receiver pairs are equally sensitive.
+        self.gain = np.random.default_rng(config.beams).normal(1, 0.12, config.beams).astype(np.float32)[ring]
         # It turns clockwise and looks straight ahead at the stamp.
         turn = -np.remainder(azimuth[0] + np.pi, 2 * np.pi) + np.pi
         self.column_time = (turn / (2 * np.pi) * config.period).astype(np.float32)
@@ -86,23 +87,22 @@ class Lidar:
         origins, directions = self._rays(T_world_lidar, twist)
         config = self.config
         n = len(directions)
-        chance = rng.random(n, np.float32)
+        chance = rng.random((2, n), np.float32)
         jitter = rng.standard_normal((2, n), np.float32)
         still = world.scene.cast(origins, directions, config.range)
         still_points, still_back = self._returns(world, world.static, still, origins, directions, chance, jitter)
         label = _labels(world.static, still.face, still_back)
         moving = np.zeros(n, bool)
         points, back = still_points, still_back
-        movers = world.traffic.mesh(time, T_world_lidar[:2, 3])
+        movers = world.cast_movers(time, origins, directions, config.range)
         if movers is not None:
-            mesh, instance = movers
-            hits, toward = _cast_movers(mesh, origins, directions, config.range)
+            mesh, instance, hits, toward = movers
             moving[toward] = hits.distance < still.distance[toward]
             near = moving[toward]
             chosen = toward[near]
             hits = Hits(hits.distance[near], hits.face[near], hits.normal[near], hits.weights[near])
             seen, came = self._returns(
-                world, mesh, hits, origins[chosen], directions[chosen], chance[chosen], jitter[:, chosen], chosen
+                world, mesh, hits, origins[chosen], directions[chosen], chance[:, chosen], jitter[:, chosen], chosen
             )
             points, back, label = points.copy(), back.copy(), label.copy()
             points[chosen], back[chosen] = seen, came
@@ -133,24 +133,26 @@ class Lidar:
         config = self.config
         face = np.maximum(hits.face, 0)
         material = mesh.material[face]
-        normal = hits.normal
-        cosine = np.abs(np.einsum("ij,ij->i", normal, directions))
-        cosine /= np.sqrt(np.einsum("ij,ij->i", normal, normal)) + np.float32(1e-12)
+        cosine = np.abs(np.einsum("ij,ij->i", hits.normal, directions))
+        cosine /= np.sqrt(np.einsum("ij,ij->i", hits.normal, hits.normal)) + np.float32(1e-12)
         paint = mesh.colour[face].sum(1, dtype=np.float32) / np.float32(3 * 150)
         reflectance = REFLECTANCE[material] * (np.float32(0.55) + np.float32(0.45) * np.minimum(paint, np.float32(1.6)))
-        facing = np.where(RETRO[material], 1, 0.55 + 0.45 * np.sqrt(cosine)).astype(np.float32)
         distance = np.where(hits.face >= 0, hits.distance, 0).astype(np.float32)
-        # What is left of the pulse, against what the receiver needs; the exponent is far below 2: gain control.
+        # What is left of the pulse against what the receiver needs.
         strength = reflectance * (cosine + np.float32(0.02)) * (np.float32(30) / np.maximum(distance, 5)) ** 2
-        lost = config.dropout + MISS[material] + (1 - config.dropout) * np.exp(-strength / np.float32(0.012))
-        back = (hits.face >= 0) & (chance > lost)
+        # Whole panes and panels vanish rather than single pulses: half of the share is drawn once a quad.
+        panel = ((face >> 1) * 40503 & 0xFFFF).astype(np.float32) / np.float32(0xFFFF)
+        lost = config.dropout + MISS[material] * 2 * panel + np.exp(-strength / np.float32(0.012))
+        back = (hits.face >= 0) & (chance[0] > lost)
         sigma = np.hypot(np.float32(config.noise), ROUGHNESS[material])
         measured = distance + sigma * jitter[0]
         back &= (measured >= config.min_range) & (measured <= config.range)
         points = np.empty((len(distance), 4), np.float32)
         points[:, :3] = self.directions[which] * measured[:, None]
-        intensity = reflectance * facing * np.exp(-distance / 160) + np.float32(0.03) * jitter[1]
-        points[:, 3] = np.rint(intensity.clip(0, 1) * 100) / 100
+        facing = np.where(RETRO[material], 1, 0.55 + 0.45 * np.sqrt(cosine)).astype(np.float32)
+        intensity = reflectance * facing * np.exp(-distance / 160) * self.gain[which] + np.float32(0.03) * jitter[1]
+        faint = DARK[material] + np.float32(0.6) / (1 + np.exp((np.float32(38) - distance) / 7))
+        points[:, 3] = np.where(chance[1] < faint, 0, np.rint(intensity.clip(0, 1) * 100) / 100)
         return points, back
 
 
@@ -168,24 +170,3 @@ def _labels(mesh: Mesh, face: NDArray[np.int32], back: NDArray[np.bool_]) -> NDA
     out = np.zeros(len(face), np.uint32)
     out[back] = mesh.label[face[back]]
     return out
-
-
-def _cast_movers(mesh: Mesh, origins: Float, directions: Float, reach: float) -> tuple[Hits, NDArray[np.intp]]:
-    """Hits of those rays alone that can meet a mover: within the elevations and azimuths that the movers span."""
-    away = mesh.vertices - origins[:1]
-    bins = 720
-    flat = np.hypot(away[:, 0], away[:, 1])
-    covered = np.zeros(bins, bool)
-    triangles = np.arctan2(away[:, 1], away[:, 0])[mesh.faces]
-    span = np.abs(np.angle(np.exp(1j * (triangles - triangles[:, :1])))).max(1)
-    steps = np.linspace(-1, 1, 9)[None] * (span[:, None] + 0.03)
-    covered[(((triangles[:, :1] + steps) / (2 * np.pi)) * bins).astype(int) % bins] = True
-    low, high = (away[:, 2] / flat).min() - 0.02, (away[:, 2] / flat).max() + 0.02
-    slope = directions[:, 2] / np.hypot(directions[:, 0], directions[:, 1])
-    azimuth = (np.arctan2(directions[:, 1], directions[:, 0]) / (2 * np.pi) * bins).astype(int) % bins
-    toward = np.flatnonzero(covered[azimuth] & (slope > low) & (slope < high))
-    scene = Scene(mesh)
-    return scene.cast(np.ascontiguousarray(origins[toward]), np.ascontiguousarray(directions[toward]), reach), toward
-
-
-__all__ = ["Label", "Lidar", "Material", "Rotation", "Scan", "elevations"]

@@ -65,38 +65,44 @@ class Material(IntEnum):
 
 @dataclass(frozen=True)
 class _Optics:
-    """reflectance: LiDAR intensity at normal incidence; miss: share of pulses that vanish (glass, dark paint);
-    roughness: extra range noise, m; retro: little dependence on incidence."""
+    """Of one material.
+
+    Attributes:
+        reflectance: LiDAR intensity at normal incidence. miss: share of pulses that vanish. dark: share of returns too weak
+            to measure their intensity (0 then). roughness: extra range noise, m. retro: little dependence on incidence.
+    """
 
     reflectance: float
     miss: float = 0.0
+    dark: float = 0.01
     roughness: float = 0.0
     retro: bool = False
 
 
 _TABLE = {
-    Material.ASPHALT: _Optics(0.33),
+    Material.ASPHALT: _Optics(0.33, dark=0.04),
     Material.PAVING: _Optics(0.38),
-    Material.GRASS: _Optics(0.42, 0.01, 0.03),
-    Material.SOIL: _Optics(0.35, 0.0, 0.015),
-    Material.PLASTER: _Optics(0.42),
-    Material.BRICK: _Optics(0.34),
-    Material.GLASS: _Optics(0.10, 0.55),
-    Material.ROOF: _Optics(0.3, 0.02),
-    Material.BARK: _Optics(0.3, 0.03, 0.01),
-    Material.LEAF: _Optics(0.4, 0.12, 0.04),
-    Material.METAL: _Optics(0.3, 0.06),
-    Material.SIGN: _Optics(0.95, 0.0, 0.0, True),
-    Material.PAINT: _Optics(0.3, 0.12),
-    Material.RUBBER: _Optics(0.08, 0.2),
-    Material.CONCRETE: _Optics(0.4),
-    Material.WOOD: _Optics(0.38, 0.01),
-    Material.CLOTH: _Optics(0.35, 0.02, 0.01),
-    Material.TILE: _Optics(0.4, 0.01),
-    Material.LAMP: _Optics(0.3, 0.3),
+    Material.GRASS: _Optics(0.44, 0.01, 0.03, 0.03),
+    Material.SOIL: _Optics(0.38, 0.0, 0.02, 0.015),
+    Material.PLASTER: _Optics(0.52),
+    Material.BRICK: _Optics(0.46),
+    Material.GLASS: _Optics(0.15, 0.8, 0.7),
+    Material.ROOF: _Optics(0.35, 0.02),
+    Material.BARK: _Optics(0.38, 0.03, 0.05, 0.01),
+    Material.LEAF: _Optics(0.46, 0.12, 0.03, 0.04),
+    Material.METAL: _Optics(0.36, 0.08, 0.2),
+    Material.SIGN: _Optics(0.95, retro=True),
+    Material.PAINT: _Optics(0.3, 0.3, 0.35),
+    Material.RUBBER: _Optics(0.1, 0.3, 0.5),
+    Material.CONCRETE: _Optics(0.44),
+    Material.WOOD: _Optics(0.42, 0.01, 0.05),
+    Material.CLOTH: _Optics(0.38, 0.03, 0.1, 0.01),
+    Material.TILE: _Optics(0.46, 0.01),
+    Material.LAMP: _Optics(0.3, 0.3, 0.3),
 }
 
 REFLECTANCE = np.array([_TABLE[m].reflectance for m in Material], np.float32)
 MISS = np.array([_TABLE[m].miss for m in Material], np.float32)
+DARK = np.array([_TABLE[m].dark for m in Material], np.float32)
 ROUGHNESS = np.array([_TABLE[m].roughness for m in Material], np.float32)
 RETRO = np.array([_TABLE[m].retro for m in Material])

@@ -48,9 +48,9 @@ def _broadleaf(rng: np.random.Generator) -> Mesh:
             )
         )
         size = np.array([1, 1, rng.uniform(0.6, 1.0)]) * spread * rng.uniform(0.4, 0.7)
-        parts.append(blob(tip, size * 0.75, 0.14, rng, Label.VEGETATION, Material.LEAF, green * 0.75))
-        shell = rng.normal(size=(int(28 * spread), 3))
-        shell *= rng.uniform(0.75, 1.15, (len(shell), 1)) / np.linalg.norm(shell, axis=1, keepdims=True)
+        parts.append(blob(tip, size * 0.6, 0.22, rng, Label.VEGETATION, Material.LEAF, green * 0.75))
+        shell = rng.normal(size=(int(55 * spread), 3))
+        shell *= rng.uniform(0.5, 1.2, (len(shell), 1)) / np.linalg.norm(shell, axis=1, keepdims=True)
         parts.append(leaves(tip + shell * size, 0.45, rng, green))
     return merge(parts)
 
@@ -77,8 +77,8 @@ def bush(rng: np.random.Generator) -> Mesh:
     for _ in range(rng.integers(1, 4)):
         at = np.array([*rng.normal(0, 0.45 * size, 2), size * rng.uniform(0.4, 0.8)])
         radii = size * rng.uniform(0.5, 0.9, 3)
-        parts.append(blob(at, radii * 0.8, 0.18, rng, Label.VEGETATION, Material.LEAF, green * 0.8))
-        shell = rng.normal(size=(int(50 * size), 3))
+        parts.append(blob(at, radii * 0.65, 0.25, rng, Label.VEGETATION, Material.LEAF, green * 0.8))
+        shell = rng.normal(size=(int(90 * size), 3))
         parts.append(leaves(at + shell / np.linalg.norm(shell, axis=1, keepdims=True) * radii, 0.28, rng, green))
     return merge(parts)
 

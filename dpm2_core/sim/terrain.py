@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 from dpm2_core.sim.config import Preset
 from dpm2_core.sim.materials import Label, Material
 from dpm2_core.sim.mesh import Mesh, make, merge
-from dpm2_core.sim.road import STEP, Road
+from dpm2_core.sim.road import Road
 
 Array = NDArray[np.float64]
 RESOLUTION = 0.5
@@ -106,11 +106,14 @@ class Terrain:
             z = np.concatenate([known, known[beside]])
         height = gaussian_filter(np.asarray(z, np.float32)[self.nearest], 5 / RESOLUTION)
         if preset.roughness > 0:
+            # a crowned carriageway that is not quite even
+            height -= 0.02 * np.clip(self.edge + preset.half_width, 0, preset.half_width)
+            height += 0.012 * (_value_noise(shape, 5.0, rng) + _value_noise(shape, 14.0, rng))
             beside = np.clip(self.edge - max(preset.sidewalk, 0.3), 0, None)
             rough = sum(a * _value_noise(shape, w, rng) for a, w in ((1.0, 2.5), (1.6, 8.0), (4.0, 30.0)))
             height += preset.roughness * np.minimum(beside / 3, 1) * rough
             # slopes, banks and ditches that come and go along the road
-            bank = _value_noise(shape, 45.0, rng) * preset.hills * 0.09
+            bank = _value_noise(shape, 45.0, rng) * preset.hills * 0.05
             height += bank * np.clip(self.edge - 3, 0, 40)
             if not preset.sidewalk:
                 ditch = np.clip(_value_noise(shape, 60.0, rng), 0, None)
@@ -161,9 +164,11 @@ class Terrain:
             xy = np.stack([np.interp(s, length, line[:, k]) for k in (0, 1)], -1)
             xy[1:-1] = (xy[:-2] + 2 * xy[1:-1] + xy[2:]) / 4
             sample = self.nearest[self._cell(xy)]
-            away = xy - self.centre[sample]
-            away /= np.linalg.norm(away, axis=1, keepdims=True) + 1e-9
-            yield Kerbline(xy, away, self.junction[sample])
+            ahead = np.gradient(xy, axis=0)
+            outward = np.stack([-ahead[:, 1], ahead[:, 0]], -1) / np.linalg.norm(ahead, axis=1, keepdims=True)
+            away = np.einsum("ij,ij->i", outward, xy - self.centre[sample])
+            outward *= np.sign(away + 1e-9)[:, None]
+            yield Kerbline(xy, outward, self.junction[sample])
 
     def ground(self) -> Mesh:
         """The mesh of the ground, roads and sidewalks included."""

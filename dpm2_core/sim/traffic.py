@@ -79,7 +79,7 @@ def make_traffic(road: Road, terrain: Terrain, preset: Preset, rng: np.random.Ge
         lateral = np.where(oncoming, 2 * preset.lane - 3.6 * rng.integers(0, 2, n_cars), 3.6)
     else:
         follows |= ~oncoming
-        lateral = np.full(n_cars, 2 * preset.lane)
+        lateral = np.full(n_cars, max(2 * preset.lane, 2.4))
     lateral = np.where(follows, 0.0, lateral)
     start = np.where(follows, rng.uniform(14, 90, n_cars), rng.uniform(0, length, n_cars))
     walk = rng.uniform(0.6, 1.4) + preset.half_width

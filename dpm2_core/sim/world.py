@@ -17,14 +17,15 @@ from scipy.spatial.transform import Rotation
 from dpm2_core.errors import UsageError
 from dpm2_core.geometry import se3
 from dpm2_core.sim import sections
-from dpm2_core.sim.config import PRESET_NAMES, PRESETS, PresetName
+from dpm2_core.sim.config import PRESET_NAMES, PRESETS, PresetName, varied
 from dpm2_core.sim.layout import Layout
-from dpm2_core.sim.mesh import Mesh, Scene, merge
+from dpm2_core.sim.mesh import Hits, Mesh, Scene, merge
 from dpm2_core.sim.road import Road, make_road
 from dpm2_core.sim.terrain import Terrain
 from dpm2_core.sim.traffic import Traffic, make_traffic
 
 Array = NDArray[np.float64]
+Float = NDArray[np.float32]
 
 
 @dataclass(eq=False)
@@ -87,6 +88,23 @@ class World:
         )
         return T @ se3.make(tilt, np.zeros(3)), time
 
+    def cast_movers(
+        self, time: float, origins: Float, directions: Float, reach: float
+    ) -> tuple[Mesh, NDArray[np.uint16], Hits, NDArray[np.intp]] | None:
+        """What rays (R, 3) meet of the movers at a time, s.
+
+        Returns:
+            The movers' mesh and the number (F,) of the mover that each triangle belongs to; the hits of the K rays that point
+            towards movers at all, and which (K,) rays these are. None if no mover is in sight.
+        """
+        movers = self.traffic.mesh(time, origins[0])
+        if movers is None:
+            return None
+        mesh, instance = movers
+        toward = _towards(mesh, origins[0], directions)
+        hits = Scene(mesh).cast(origins[toward], directions[toward], reach)
+        return mesh, instance, hits, toward
+
 
 def build_world(road: str = "random", preset: str = "city", seed: int = 0, length: float = 400.0) -> World:
     """A world, the same for the same arguments.
@@ -105,8 +123,8 @@ def build_world(road: str = "random", preset: str = "city", seed: int = 0, lengt
         raise UsageError(f"length {length:g} m of road: want 60 to 20000")
     if seed < 0:
         raise UsageError(f"--seed {seed}: want 0 or more")
-    kind = PRESETS[preset]
-    rngs = [np.random.default_rng([seed, PRESET_NAMES.index(preset), k]) for k in range(4)]
+    rngs = [np.random.default_rng([seed, PRESET_NAMES.index(preset), k]) for k in range(5)]
+    kind = varied(PRESETS[preset], rngs[4])
     streets = make_road(road, kind, rngs[0], length)
     terrain = Terrain(streets, kind, rngs[1])
     meshes = [terrain.ground()]
@@ -118,3 +136,19 @@ def build_world(road: str = "random", preset: str = "city", seed: int = 0, lengt
         meshes += Layout(streets, terrain, kind, rngs[2]).meshes()
     traffic = make_traffic(streets, terrain, kind, rngs[3])
     return World(preset, seed, streets, terrain, traffic, Scene(merge(meshes)))
+
+
+def _towards(mesh: Mesh, origin: Float, directions: Float) -> NDArray[np.intp]:
+    """Those rays (of R, 3) that lie within the azimuths and elevations which a mesh covers as seen from a point (3,)."""
+    bins = 720
+    away = mesh.vertices - origin
+    flat = np.hypot(away[:, 0], away[:, 1]) + np.float32(1e-3)
+    corners = np.arctan2(away[:, 1], away[:, 0])[mesh.faces]
+    width = np.abs(np.remainder(corners - corners[:, :1] + np.pi, 2 * np.pi) - np.pi).max(1, keepdims=True) + 0.03
+    covered = np.zeros(bins, bool)
+    azimuths = corners[:, :1] + width * np.linspace(-1, 1, 9)
+    covered[np.floor(azimuths / (2 * np.pi) * bins).astype(int) % bins] = True
+    slope = directions[:, 2] / (np.hypot(directions[:, 0], directions[:, 1]) + np.float32(1e-6))
+    low, high = (away[:, 2] / flat).min() - 0.02, (away[:, 2] / flat).max() + 0.02
+    azimuth = np.floor(np.arctan2(directions[:, 1], directions[:, 0]) / (2 * np.pi) * bins).astype(int) % bins
+    return np.flatnonzero(covered[azimuth] & (slope > low) & (slope < high))
