@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`dpm2 bench`: run the benchmarks and write down how they were run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from dpm2_core.errors import UsageError
+
+
+def bench(
+    names: Annotated[list[str] | None, typer.Argument(help="geometric, memory; geometric by default.")] = None,
+    source: Annotated[
+        list[Path] | None, typer.Option(help="A KITTI sequence or bag with ground truth, instead of the excerpt.")
+    ] = None,
+    kitti: Annotated[
+        Path | None, typer.Option(help="KITTI excerpt, packed or in KITTI layout; else $DPM2_KITTI, ../shared/kitti.")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder for NAME.json.")] = Path("benchmarks"),
+    repetitions: Annotated[int, typer.Option(min=1, help="Runs of every method on every drive.")] = 3,
+    threads: Annotated[int, typer.Option(min=1, help="Processors that every method may use.")] = 2,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", help="KEY=VALUE of the configuration; repeat for more.")
+    ] = None,
+) -> None:
+    """Measure accuracy and speed beside KISS-ICP on the same scans, or memory over a long drive."""
+    from dpm2_core.evaluation.bench import BENCHES  # imports the whole SLAM
+    from dpm2_core.evaluation.bench.harness import Options, write_report
+
+    names = names or ["geometric"]
+    if unknown := [name for name in names if name not in BENCHES]:
+        raise UsageError(f"{unknown[0]}: no such benchmark; choose from {', '.join(BENCHES)}")
+    options = Options(source or (), kitti, repetitions, threads, settings or ())
+    for name in names:
+        report = BENCHES[name](options)
+        path = out / f"{name}.json"
+        write_report(path, name, report, options)
+        Console().print(report.view, f"written to {path}")

@@ -1,0 +1,13 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Benchmarks that can be repeated: each is a function from `Options` to a `Report`, found by its name in `BENCHES`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from dpm2_core.evaluation.bench.geometric import bench_geometric
+from dpm2_core.evaluation.bench.harness import Options, Report
+from dpm2_core.evaluation.bench.memory import bench_memory
+
+BENCHES: dict[str, Callable[[Options], Report]] = {"geometric": bench_geometric, "memory": bench_memory}
+"""By the name that `dpm2 bench NAME` and `benchmarks/NAME.json` share."""

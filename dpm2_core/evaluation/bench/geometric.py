@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The geometric SLAM beside KISS-ICP: the same scans, processors and process, in turns."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from time import perf_counter, process_time
+from typing import Any
+
+import numpy as np
+from rich.console import Group
+from rich.progress import Progress
+from rich.table import Table
+
+from dpm2_core.config import load_settings
+from dpm2_core.data.source import Source
+from dpm2_core.errors import UsageError
+from dpm2_core.evaluation.bench.harness import Options, Report, drives, processors, unique_name
+from dpm2_core.evaluation.metrics import Metrics, evaluate
+from dpm2_core.frame import Array, Frame
+from dpm2_core.slam.system import Config, SlamSystem
+
+LENGTHS = (10.0, 20.0, 30.0, 40.0, 50.0)
+"""Segments of the KITTI metric, m: the excerpts are too short for those of the benchmark."""
+
+OURS, BASELINE = "dpm2", "kiss-icp"
+
+_ERRORS = ("rpe_trans_m", "rpe_rot_deg", "ape_rmse_m", "final_drift_percent", "t_err_percent", "r_err_deg_per_100m")
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """One method on one drive, once.
+
+    Attributes:
+        poses: (N, 4, 4) T_odom_lidar, before any loop closure.
+        seconds: (N,) wall time of each frame. cpu_seconds: of all frames and threads, which other programs disturb less.
+        stages: (N,) wall time of each stage, s.
+        failed: frames without a registration.
+    """
+
+    poses: Array
+    seconds: Array
+    cpu_seconds: float
+    stages: dict[str, Array] = field(default_factory=dict)
+    failed: int = 0
+
+
+Method = Callable[[Sequence[Frame]], Outcome]
+
+
+def dpm2(options: Options) -> Method:
+    """This project's SLAM, its mapper included."""
+    overrides = [f"slam.threads={options.threads}", *options.overrides]
+    settings = load_settings(Config, None, overrides).slam
+
+    def run(frames: Sequence[Frame]) -> Outcome:
+        system = SlamSystem(settings)
+        tracked, seconds = [], np.zeros(len(frames))
+        cpu = process_time()
+        for i, frame in enumerate(frames):
+            started = perf_counter()
+            tracked.append(system.process(frame))
+            seconds[i] = perf_counter() - started
+        cpu = process_time() - cpu
+        stages = {stage: np.array([t.seconds[stage] for t in tracked]) for stage in tracked[0].seconds}
+        failed = sum(not t.registration.ok for t in tracked)
+        return Outcome(np.array([t.T_odom_lidar for t in tracked]), seconds, cpu, stages, failed)
+
+    return run
+
+
+def kiss_icp(options: Options) -> Method | None:
+    """I. Vizzo et al., "KISS-ICP", RA-L 2023, as its pipeline runs and times it; None where it is not installed."""
+    try:
+        from kiss_icp.config import load_config
+        from kiss_icp.kiss_icp import KissICP
+    except ImportError:
+        return None
+    config = load_config(None)
+    config.data.deskew = False  # KITTI's scans are compensated already
+    config.data.max_range = 100.0
+    config.mapping.voxel_size = 1.0  # its default: a hundredth of the range
+    config.registration.max_num_threads = options.threads
+
+    def run(frames: Sequence[Frame]) -> Outcome:
+        clouds = [frame.points[np.isfinite(frame.points[:, :3]).all(1), :3].astype(np.float64) for frame in frames]
+        odometry = KissICP(config)
+        poses, seconds = np.zeros((len(frames), 4, 4)), np.zeros(len(frames))
+        cpu = process_time()
+        for i, cloud in enumerate(clouds):
+            started = perf_counter()
+            odometry.register_frame(cloud, np.array([]))
+            seconds[i] = perf_counter() - started
+            poses[i] = odometry.last_pose
+        return Outcome(poses, seconds, process_time() - cpu)
+
+    return run
+
+
+def bench_geometric(options: Options) -> Report:
+    """Every method on every drive, `repetitions` times in turns; only processing is timed, the scans are in memory.
+
+    Raises:
+        UsageError: there is no drive, or one has no ground truth.
+    """
+    methods = {name: run for name, run in ((OURS, dpm2(options)), (BASELINE, kiss_icp(options))) if run is not None}
+    results: dict[str, Any] = {}
+    with drives(options) as sources, processors(options.threads), Progress(transient=True) as progress:
+        task = progress.add_task("benchmark", total=len(sources) * options.repetitions * len(methods))
+        for source in sources:
+            if source.poses is None:
+                raise UsageError(f"{source.name}: the drive has no ground truth to compare with")
+            frames = list(source.frames())
+            outcomes: dict[str, list[Outcome]] = {name: [] for name in methods}
+            for _ in range(options.repetitions):
+                for name, run in methods.items():
+                    progress.update(task, description=f"{source.name}: {name}")
+                    outcomes[name].append(run(frames))
+                    progress.advance(task)
+            results[unique_name(source, results)] = {name: summary(source, outcomes[name]) for name in methods}
+            del frames
+    notes = [] if BASELINE in methods else ["kiss-icp is not installed (pip install kiss-icp): no comparison."]
+    for methods_of_drive in results.values():
+        _compare(methods_of_drive)
+    view = Group(_table(results), *(_stages(name, result) for name, result in results.items()), *notes)
+    return Report({"segment_lengths_m": LENGTHS, "drives": results}, view)
+
+
+def summary(source: Source, outcomes: Sequence[Outcome]) -> dict[str, Any]:
+    """Medians over the repetitions of errors and speed, and the spread of the latter."""
+    assert source.poses is not None
+    judged = [evaluate(source.poses, o.poses, LENGTHS, failed_frames=o.failed) for o in outcomes]
+    fps = np.array([len(o.seconds) / o.seconds.sum() for o in outcomes])
+    seconds = np.concatenate([o.seconds for o in outcomes])
+    stages = {stage: np.concatenate([o.stages[stage] for o in outcomes]) for stage in outcomes[0].stages}
+    return {
+        **_median(judged),
+        "fps": float(np.median(fps)),
+        "fps_of_repetitions": fps.round(2).tolist(),
+        "cpu_ms": 1e3 * float(np.median([o.cpu_seconds / len(o.seconds) for o in outcomes])),
+        "frame_ms": _quantiles_ms(seconds),
+        "stages_ms": {stage: _quantiles_ms(values) for stage, values in stages.items()},
+    }
+
+
+def _median(judged: Sequence[Metrics]) -> dict[str, Any]:
+    """Each figure's median; multi-threaded sums may differ in the last digits from run to run."""
+    medians: dict[str, Any] = {name: getattr(judged[0], name) for name in ("frames", "path_length_m", "segments")}
+    for name in ("failed_frames", *_ERRORS):
+        values = [getattr(metrics, name) for metrics in judged]
+        medians[name] = None if None in values else float(np.median(values))
+    return medians
+
+
+def _quantiles_ms(seconds: Array) -> dict[str, float]:
+    median, p95 = np.percentile(1e3 * seconds, [50, 95])
+    return {"median": round(float(median), 2), "p95": round(float(p95), 2)}
+
+
+def _compare(methods: dict[str, Any]) -> None:
+    """Add our figures over the baseline's; frames a second pairwise, because neighbours in time share the machine."""
+    if BASELINE not in methods:
+        return
+    ours, baseline = methods[OURS], methods[BASELINE]
+    pairs = np.array(ours["fps_of_repetitions"]) / np.array(baseline["fps_of_repetitions"])
+    ratios = {name: ours[name] / baseline[name] if ours[name] and baseline[name] else None for name in _ERRORS}
+    ratios["cpu_ms"] = ours["cpu_ms"] / baseline["cpu_ms"]
+    methods["ratio"] = {**ratios, "fps": float(np.median(pairs))}
+
+
+def _table(results: dict[str, Any]) -> Table:
+    table = Table(title="RPE: mean. APE: after SE(3) alignment. Drift: aligned at the start.", title_justify="left")
+    for column in ("drive", "method"):
+        table.add_column(column, no_wrap=True)
+    for column in ("RPE m", "RPE deg", "APE m", "drift %", "Hz", "p95 ms", "CPU ms"):
+        table.add_column(column, justify="right", no_wrap=True)
+    for drive, methods in results.items():
+        for method, row in methods.items():
+            errors = ["-" if row[name] is None else f"{row[name]:.3f}" for name in _ERRORS[:4]]
+            if method == "ratio":
+                speed = [f"{row['fps']:.2f}", "", f"{row['cpu_ms']:.2f}"]
+            else:
+                speed = [f"{row['fps']:.1f}", f"{row['frame_ms']['p95']:.0f}", f"{row['cpu_ms']:.0f}"]
+            table.add_row(drive, method, *errors, *speed)
+        table.add_section()
+    return table
+
+
+def _stages(drive: str, methods: dict[str, Any]) -> Table:
+    table = Table(title=f"Stages of {OURS} on {drive}, ms", title_justify="left")
+    for column in ("stage", "median", "p95"):
+        table.add_column(column, justify="left" if column == "stage" else "right")
+    for stage, quantiles in methods[OURS]["stages_ms"].items():
+        table.add_row(stage, f"{quantiles['median']:.1f}", f"{quantiles['p95']:.1f}")
+    return table

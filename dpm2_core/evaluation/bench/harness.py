@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What every benchmark needs: drives to run on, the same processors for all, and a record of how it was made."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import shlex
+import subprocess
+import sys
+import tempfile
+from collections.abc import Container, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+from rich.console import Group
+
+from dpm2_core.data.source import Source, open_source
+from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.files import atomic_write
+
+_REPOSITORY = Path(__file__).resolve().parents[3]
+_PACKAGES = ("numpy", "scipy", "small_gicp", "gtsam", "torch", "kiss-icp")
+
+
+@dataclass(frozen=True)
+class Options:
+    """What `dpm2 bench` was asked for.
+
+    Attributes:
+        sources: KITTI sequences or bags; by default the KITTI excerpt.
+        kitti: folder of the excerpt, packed (it holds unpack.py) or in KITTI layout; None looks for it.
+        repetitions: of every method on every drive.
+        threads: processors that every method may use.
+        overrides: `key=value` settings of the SLAM.
+    """
+
+    sources: Sequence[Path] = ()
+    kitti: Path | None = None
+    repetitions: int = 3
+    threads: int = 2
+    overrides: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
+class Report:
+    """A benchmark's outcome: `results` for JSON, `view` for the terminal."""
+
+    results: dict[str, Any]
+    view: Group
+
+
+@contextmanager
+def drives(options: Options) -> Iterator[list[Source]]:
+    """The drives to run on; an excerpt that is packed is unpacked for as long as the block lasts.
+
+    Raises:
+        UsageError: there is none.
+    """
+    if options.sources:
+        yield [open_source(path) for path in options.sources]
+        return
+    kitti = options.kitti or Path(os.environ.get("DPM2_KITTI", _REPOSITORY.parent / "shared" / "kitti"))
+    if not kitti.is_dir():
+        raise UsageError(f"{kitti}: no KITTI excerpt; give --kitti, or --source with a drive such as `dpm2 sim` makes")
+    with tempfile.TemporaryDirectory(prefix="dpm2_bench_") as folder:
+        root = kitti
+        if (kitti / "unpack.py").is_file():
+            root = Path(folder)
+            done = subprocess.run([sys.executable, str(kitti / "unpack.py"), folder], capture_output=True, text=True)
+            if done.returncode:
+                raise Dpm2Error(f"{kitti / 'unpack.py'}: {done.stderr.strip().splitlines()[-1:]}")
+        sequences = sorted(path for path in (root / "sequences").glob("*") if (path / "velodyne").is_dir())
+        if not sequences:
+            raise UsageError(f"{kitti}: neither unpack.py nor sequences/NN/velodyne in it")
+        yield [open_source(path) for path in sequences]
+
+
+def unique_name(source: Source, taken: Container[str]) -> str:
+    """The drive's name, counted up where another one, such as a second folder `00`, already has it."""
+    names = (source.name if n == 1 else f"{source.name} ({n})" for n in count(1))
+    return next(name for name in names if name not in taken)
+
+
+@contextmanager
+def processors(number: int) -> Iterator[None]:
+    """Bind this process to `number` processors, so that no library can take more than another."""
+    if not hasattr(os, "sched_setaffinity"):  # not Linux: each method's own thread setting has to do
+        yield
+        return
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, sorted(before)[:number])
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, before)
+
+
+def write_report(path: Path, name: str, report: Report, options: Options) -> None:
+    """The results with everything that is needed to judge and repeat them, as JSON.
+
+    Raises:
+        Dpm2Error: the file could not be written.
+    """
+    record = {
+        "benchmark": name,
+        "command": shlex.join(["dpm2", *sys.argv[1:]]),
+        "commit": git_commit(),
+        "machine": {"processor": _processor(), "cpus": os.cpu_count(), "threads": options.threads},
+        "versions": {"python": platform.python_version(), **{p: _version(p) for p in _PACKAGES}},
+        "overrides": list(options.overrides),
+        **report.results,
+    }
+    with atomic_write(path) as file:
+        file.write(json.dumps(record, indent=1) + "\n")
+
+
+def git_commit() -> str | None:
+    """The commit that was measured, with "+" where files differ from it; None outside a repository."""
+    try:
+        commit = _git("rev-parse", "--short=12", "HEAD")
+        return commit + ("+" if _git("status", "--porcelain", "--untracked-files=no", "--", "dpm2_core") else "")
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+def _git(*arguments: str) -> str:
+    done = subprocess.run(["git", *arguments], cwd=_REPOSITORY, capture_output=True, text=True, check=True)
+    return done.stdout.strip()
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def _processor() -> str:
+    """Model of the processor, as Linux names it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.machine())

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Resident memory of the SLAM over a long drive: whether it levels off."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Group
+from rich.progress import track
+from rich.table import Table
+
+from dpm2_core.config import load_settings
+from dpm2_core.errors import Dpm2Error
+from dpm2_core.evaluation.bench.harness import Options, Report, drives, unique_name
+from dpm2_core.slam.system import Config, SlamSystem
+
+_EVERY = 50  # frames between two samples
+
+
+def bench_memory(options: Options) -> Report:
+    """Run the SLAM over each drive, read frame by frame, and sample the resident set every 50 frames."""
+    settings = load_settings(Config, None, [f"slam.threads={options.threads}", *options.overrides]).slam
+    results: dict[str, Any] = {}
+    with drives(options) as sources:
+        for source in sources:
+            system = SlamSystem(settings)
+            samples = [(0, resident_mb())]
+            frames = track(source.frames(), description=f"{source.name}: memory", total=len(source), transient=True)
+            for count, frame in enumerate(frames, 1):
+                system.process(frame)
+                if count % _EVERY == 0:
+                    samples.append((count, resident_mb()))
+            results[unique_name(source, results)] = levelling(samples) | {"keyframes": len(system.mapper.keyframes)}
+    return Report({"drives": results}, Group(_table(results)))
+
+
+def levelling(samples: list[tuple[int, float]]) -> dict[str, Any]:
+    """Growth of (frame, MB) samples over the second half, by a straight line, and over the whole."""
+    frames, megabytes = np.array(samples, np.float64).T
+    late = frames >= frames[-1] / 2
+    slope = float(np.polyfit(frames[late], megabytes[late], 1)[0]) if late.sum() > 1 else None
+    return {
+        "frames": int(frames[-1]),
+        "rss_mb": {"start": megabytes[0], "half": float(megabytes[late][0]), "end": megabytes[-1]},
+        "growth_mb_per_1000_frames_second_half": None if slope is None else 1000 * slope,
+        "samples": samples,
+    }
+
+
+def resident_mb() -> float:
+    """Resident set of this process, MB.
+
+    Raises:
+        Dpm2Error: the system is not Linux.
+    """
+    try:
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    except OSError:
+        raise Dpm2Error("the memory benchmark reads /proc/self/statm, which only Linux has") from None
+    return round(pages * os.sysconf("SC_PAGE_SIZE") / 2**20, 1)
+
+
+def _table(results: dict[str, Any]) -> Table:
+    table = Table(title="Resident memory, MB", title_justify="left")
+    for column in ("drive", "frames", "keyframes", "start", "half way", "end", "growth a 1000 frames, second half"):
+        table.add_column(column, justify="left" if column == "drive" else "right")
+    for drive, row in results.items():
+        rss, slope = row["rss_mb"], row["growth_mb_per_1000_frames_second_half"]
+        figures = [f"{rss[when]:.0f}" for when in ("start", "half", "end")] + ["-" if slope is None else f"{slope:.1f}"]
+        table.add_row(drive, str(row["frames"]), str(row["keyframes"]), *figures)
+    return table
