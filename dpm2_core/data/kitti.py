@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from dpm2_core.data.messages import scale_intensity
 from dpm2_core.data.source import InputSettings
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Camera, Frame, Image, Points
@@ -32,11 +33,12 @@ def correct_vertical_angle(points: Points, degrees: float) -> Points:
     cos, sin = np.float32(np.cos(np.radians(degrees))), np.float32(np.sin(np.radians(degrees)))
     x, y, z = points[:, 0], points[:, 1], points[:, 2]
     rho = np.sqrt(x * x + y * y)
-    scale = cos - sin * z / np.maximum(rho, np.float32(1e-6))
     out = np.empty_like(points)
-    np.multiply(x, scale, out=out[:, 0])
-    np.multiply(y, scale, out=out[:, 1])
-    np.add(z * cos, rho * sin, out=out[:, 2])
+    with np.errstate(invalid="ignore"):  # infinite points become NaN, no less invalid
+        scale = cos - sin * z / np.maximum(rho, np.float32(1e-6))
+        np.multiply(x, scale, out=out[:, 0])
+        np.multiply(y, scale, out=out[:, 1])
+        np.add(z * cos, rho * sin, out=out[:, 2])
     out[:, 3] = points[:, 3]
     return out
 
@@ -77,6 +79,7 @@ class KittiSource:
         """Frames start..stop-1 by position; `Frame.index` is the number in the file name."""
         for scan, stamp in list(zip(self._scans, self.stamps, strict=True))[start:stop]:
             points, problem = read_scan(scan)
+            points = scale_intensity(points, self._settings.intensity_max)  # KITTI's are in 0..1, not everyone's are
             yield Frame(
                 stamp=int(stamp),
                 points=correct_vertical_angle(points, self.vertical_angle_correction_deg),

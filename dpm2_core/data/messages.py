@@ -118,8 +118,7 @@ def decode_points(
 ) -> tuple[Points, Points | None]:
     """sensor_msgs/PointCloud2 to points and their capture times. Invalid points stay where they are, as NaN or zeros.
 
-    Intensity is scaled to 0..1 by `intensity_max`; without it, by the first of 1 (floating point only), 255 and 65535
-    that is not below the largest value of this cloud. It is 0 where the cloud has none.
+    Intensity becomes 0..1 as `scale_intensity` says, and is 0 where the cloud has none.
 
     Time is looked for under its usual names. The unit is the one in which the points span 2 ms to 2 s (integers: us
     or ns). Values beyond 2 s are absolute and become relative to `msg.header.stamp`, or to the earliest point if that
@@ -129,7 +128,7 @@ def decode_points(
         msg: the message.
         time_field: field with the time of each point; None looks for a usual name, "" takes none.
         time_unit: unit of that field.
-        intensity_max: intensity that becomes 1.
+        intensity_max: intensity that becomes 1, as in `scale_intensity`.
 
     Returns:
         points: (N, 4) float32 [x, y, z in m, intensity 0..1]; a view of the message where its layout allows.
@@ -172,22 +171,28 @@ def _points(view: NDArray[np.void], intensity: str | None, intensity_max: float 
         with np.errstate(over="ignore"):  # a double beyond float32 becomes inf, and an invalid point
             for i, name in enumerate(wanted):
                 points[:, i] = _first(view[name])
-    if not intensity or not len(points):
+    if not intensity:
         return points
+    return scale_intensity(points, intensity_max, integer=view.dtype[intensity].base.kind != "f")
+
+
+def scale_intensity(points: Points, intensity_max: float | None = None, integer: bool = False) -> Points:
+    """(N, 4) points with intensity in 0..1: the same array if it is already, else a copy. Unknown (NaN) becomes 0.
+
+    Args:
+        intensity_max: value that becomes 1; None takes the first of 1 (unless `integer`), 255 and 65535 that is not
+            below the largest value here.
+        integer: whether 1 is the least value above 0.
+    """
     value = points[:, 3]
-    low, high = value.min(), value.max()
-    if intensity_max is None and view.dtype[intensity].base.kind == "f" and low >= 0 and high <= 1:
+    if not len(points) or (intensity_max is None and not integer and value.min() >= 0 and value.max() <= 1):
         return points  # as NaN compares false, these are clean
     value = np.nan_to_num(value, nan=0.0, posinf=0.0, neginf=0.0)
-    scale = intensity_max or _intensity_range(value.max(), view.dtype[intensity].base.kind == "f")
-    if not points.flags.writeable or np.shares_memory(points, view):
-        points = points.copy()
+    limits = (255.0,) if integer else (1.0, 255.0)
+    scale = intensity_max or next((limit for limit in limits if value.max() <= limit), 65535.0)
+    points = points.copy()
     points[:, 3] = np.clip(value / np.float32(scale), 0, 1)
     return points
-
-
-def _intensity_range(high: float, floating: bool) -> float:
-    return next((limit for limit in ((1.0, 255.0) if floating else (255.0,)) if high <= limit), 65535.0)
 
 
 def _time_offset(time: NDArray[Any], points: Points, stamp: int, unit: TimeUnit) -> Points | None:

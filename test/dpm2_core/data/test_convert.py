@@ -1,0 +1,256 @@
+# SPDX-License-Identifier: Apache-2.0
+"""KITTI to bag: nothing changes on the way, and what fails or is killed leaves nothing that looks whole."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import dpm2_core
+from dpm2_core.commands.convert import app
+from dpm2_core.data import topics
+from dpm2_core.data.bag_file import open_bag
+from dpm2_core.data.bags import BagSource
+from dpm2_core.data.convert import EPOCH_NS, convert_kitti
+from dpm2_core.data.kitti import KittiSource
+from dpm2_core.data.source import InputSettings
+from dpm2_core.errors import UsageError
+from dpm2_core.geometry import se3
+
+MakeFolder = Callable[..., Path]
+ROOT = Path(dpm2_core.__file__).resolve().parents[1]
+
+
+def assert_same_drive(bag: BagSource, folder: KittiSource) -> None:
+    assert len(bag) == len(folder)
+    assert bag.vertical_angle_correction_deg == folder.vertical_angle_correction_deg
+    for ours, theirs in zip(bag.frames(), folder.frames(), strict=True):
+        assert ours.stamp == EPOCH_NS + theirs.stamp
+        np.testing.assert_array_equal(ours.points, theirs.points)
+        assert len(ours.images) == len(theirs.images)
+        for a, b in zip(ours.images, theirs.images, strict=True):
+            np.testing.assert_array_equal(a.pixels, b.pixels)
+    for ours_T, theirs_T in ((bag.poses, folder.poses), (bag.T_cam_lidar, folder.T_cam_lidar)):
+        assert ours_T is not None
+        np.testing.assert_allclose(ours_T, theirs_T, rtol=0, atol=1e-9)
+    if folder.camera:
+        assert bag.camera is not None
+        np.testing.assert_array_equal(bag.camera.K, folder.camera.K)
+        np.testing.assert_allclose(bag.camera.T_lidar_cam, folder.camera.T_lidar_cam, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("zstd", [False, True])
+def test_round_trip(kitti_folder: MakeFolder, tmp_path: Path, zstd: bool) -> None:
+    folder = kitti_folder(numbers=[3, 4, 6])
+    steps: list[tuple[int, int]] = []
+    notes = convert_kitti(folder, tmp_path / "bag", zstd=zstd, progress=lambda *step: steps.append(step))
+    assert notes == []
+    assert steps == [(1, 3), (2, 3), (3, 3)]
+    assert_same_drive(BagSource(tmp_path / "bag"), KittiSource(folder))
+    assert sorted(os.listdir(tmp_path)) == ["bag", "kitti"]
+
+
+def test_round_trip_of_the_real_excerpt(kitti_root: Path, tmp_path: Path) -> None:
+    convert_kitti(kitti_root, tmp_path / "bag", "04", end=6)
+    bag, folder = BagSource(tmp_path / "bag"), KittiSource(kitti_root, InputSettings(sequence="04"))
+    folder._scans, folder.stamps, folder.poses = folder._scans[:6], folder.stamps[:6], folder.poses[:6]  # type: ignore[index]
+    assert_same_drive(bag, folder)
+
+
+def test_a_simulated_drive_stays_without_correction(kitti_folder: MakeFolder, tmp_path: Path) -> None:
+    folder = kitti_folder()
+    (folder / "dpm2_sim.json").write_text('{"vertical_angle_correction_deg": 0}')
+    convert_kitti(folder, tmp_path / "bag")
+    assert BagSource(tmp_path / "bag").vertical_angle_correction_deg == 0
+    assert_same_drive(BagSource(tmp_path / "bag"), KittiSource(folder))
+
+
+def test_topics_frames_and_qos_are_those_of_kitti2bag(kitti_folder: MakeFolder, tmp_path: Path) -> None:
+    folder = kitti_folder()
+    convert_kitti(folder, tmp_path / "bag")
+    bag = open_bag(tmp_path / "bag")
+    assert bag.types == {
+        "/kitti/velo/pointcloud": "sensor_msgs/msg/PointCloud2",
+        "/kitti/camera_color_left/image_raw": "sensor_msgs/msg/Image",
+        "/kitti/camera_color_left/camera_info": "sensor_msgs/msg/CameraInfo",
+        "/tf_static": "tf2_msgs/msg/TFMessage",
+        "/kitti/ground_truth/odom": "nav_msgs/msg/Odometry",
+        "/kitti/ground_truth/path": "nav_msgs/msg/Path",
+        "/kitti/vertical_angle_correction_deg": "std_msgs/msg/Float64",
+    }
+    latched = {topics.TF_STATIC, topics.PATH, topics.VERTICAL_ANGLE_CORRECTION}
+    assert bag.counts == {t: 1 if t in latched else 5 for t in bag.types}
+    cloud = bag.first("/kitti/velo/pointcloud")
+    assert [field.name for field in cloud.fields] == ["x", "y", "z", "intensity"]
+    assert (cloud.header.frame_id, cloud.point_step, cloud.width) == ("velo_link", 16, 60)
+    image = bag.first(topics.IMAGE)
+    assert (image.encoding, image.header.frame_id, image.width) == ("rgb8", "camera_color_left", 40)
+    links = {(t.header.frame_id, t.child_frame_id) for t in bag.first("/tf_static").transforms}
+    assert links == {("base_link", "velo_link"), ("velo_link", "camera_gray_left"), ("velo_link", "camera_color_left")}
+    path = bag.first("/kitti/ground_truth/path")
+    assert len(path.poses) == 5
+    assert bag.first("/kitti/ground_truth/odom").child_frame_id == "velo_link"
+
+    from rosbags.highlevel import AnyReader
+
+    with AnyReader([tmp_path / "bag"]) as reader:
+        durability = {c.topic: c.ext.offered_qos_profiles[0].durability.name for c in reader.connections}
+    assert {topic for topic, name in durability.items() if name == "TRANSIENT_LOCAL"} == latched
+    order = [topic for topic, _, _ in bag.messages(list(bag.types))][3:7]
+    assert order == [topics.CAMERA_INFO, topics.IMAGE, topics.ODOMETRY, topics.POINTS]  # the image is there before
+
+
+def test_part_of_a_drive_without_images(kitti_folder: MakeFolder, tmp_path: Path) -> None:
+    folder = kitti_folder()
+    convert_kitti(folder.parents[1], tmp_path / "bag", "07", start=1, end=3, images=False)
+    source = BagSource(tmp_path / "bag")
+    assert [frame.stamp - EPOCH_NS for frame in source.frames()] == [100_000_000, 200_000_000]
+    assert topics.IMAGE not in open_bag(tmp_path / "bag").types
+    assert source.poses is not None
+    np.testing.assert_allclose(source.poses[:, 0, 3], [1, 2], atol=1e-12)
+
+
+def test_a_bare_sequence_becomes_a_lidar_bag(kitti_folder: MakeFolder, tmp_path: Path) -> None:
+    """No calibration, no poses: points alone, and nothing made up for the rest."""
+    folder = kitti_folder(images=False)
+    for path in (folder / "calib.txt", folder / "times.txt", folder.parents[1] / "poses" / "07.txt"):
+        path.unlink()
+    notes = convert_kitti(folder, tmp_path / "bag")
+    assert len(notes) == 2
+    source = BagSource(tmp_path / "bag")
+    assert len(list(source.frames())) == 5
+    assert source.poses is None
+    assert source.T_cam_lidar is None
+    np.testing.assert_allclose(source.transforms.lookup("base_link", "velo_link")[2, 3], 1.73)
+
+
+def test_a_scan_that_cannot_be_read_stays_a_frame(kitti_folder: MakeFolder, tmp_path: Path) -> None:
+    folder = kitti_folder()
+    (folder / "velodyne" / "000002.bin").write_bytes(b"123")
+    notes = convert_kitti(folder, tmp_path / "bag")
+    assert "000002.bin: 3 bytes are no whole number of points (16 bytes each): written as an empty cloud" in notes[0]
+    assert [len(frame.points) for frame in BagSource(tmp_path / "bag").frames()] == [60, 60, 0, 60, 60]
+
+
+def test_what_is_there_is_refused_or_replaced(kitti_folder: MakeFolder, tmp_path: Path) -> None:
+    folder, out = kitti_folder(), tmp_path / "bag"
+    convert_kitti(folder, out, end=2)
+    with pytest.raises(UsageError, match="exists already; use --overwrite"):
+        convert_kitti(folder, out)
+    assert len(BagSource(out)) == 2
+    convert_kitti(folder, out, overwrite=True)
+    assert len(BagSource(out)) == 5
+    other = tmp_path / "photos"
+    other.mkdir()
+    (other / "holiday.jpg").touch()
+    with pytest.raises(UsageError, match="not a rosbag2 folder, so it is not overwritten"):
+        convert_kitti(folder, other, overwrite=True)
+    assert (other / "holiday.jpg").exists()
+
+
+@pytest.mark.parametrize(
+    ("out", "arguments", "message"),
+    [
+        ("bag", {"start": 5}, "no frames 5:; it has 5"),
+        ("bag", {"start": 3, "end": 3}, "no frames 3:3; it has 5"),
+        ("bag", {"sequence": "99"}, None),
+        ("bag.mcap", {}, "a rosbag2 recording is a folder; leave out the .mcap"),
+    ],
+)
+def test_requests_that_cannot_be_met(
+    kitti_folder: MakeFolder, tmp_path: Path, out: str, arguments: dict[str, object], message: str | None
+) -> None:
+    root = kitti_folder().parents[1]
+    with pytest.raises(UsageError, match=message or "no sequence 99; choose one"):
+        convert_kitti(root, tmp_path / out, **arguments)  # type: ignore[arg-type]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["kitti"]
+
+
+def run(code: str, *arguments: object) -> subprocess.Popen[str]:
+    command = [sys.executable, "-c", code, *map(str, arguments)]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
+
+
+def test_a_killed_conversion_leaves_nothing_that_looks_whole(kitti_folder: MakeFolder, tmp_path: Path) -> None:
+    folder, out = kitti_folder(), tmp_path / "bag"
+    code = """
+import sys, time
+from pathlib import Path
+from dpm2_core.data.convert import convert_kitti
+def progress(done, total):
+    print(done, flush=True)
+    time.sleep(60 if done == 3 else 0)
+convert_kitti(Path(sys.argv[1]), Path(sys.argv[2]), progress=progress)
+"""
+    process = run(code, folder, out)
+    assert process.stdout is not None
+    while process.stdout.readline() != "3\n":
+        assert process.poll() is None, process.communicate()
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    assert not out.exists()
+    convert_kitti(folder, out)  # and the next try clears up
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["bag", "kitti"]
+    assert len(BagSource(out)) == 5
+
+
+def test_a_full_disk_is_an_error_without_leftovers(kitti_folder: MakeFolder, tmp_path: Path) -> None:
+    """A limit on the size of files raises the OSError that a full disk does; the bag that was there survives."""
+    folder, out = kitti_folder(), tmp_path / "bag"
+    convert_kitti(folder, out, end=1)
+    np.zeros((200_000, 4), "<f4").tofile(folder / "velodyne" / "000004.bin")
+    code = """
+import resource, sys
+from pathlib import Path
+from dpm2_core.data.convert import convert_kitti
+from dpm2_core.errors import Dpm2Error, UsageError
+resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, 1_000_000))
+try:
+    convert_kitti(Path(sys.argv[1]), Path(sys.argv[2]), overwrite=True)
+except Dpm2Error as error:
+    print(type(error).__name__, error)
+"""
+    output, errors = run(code, folder, out).communicate(timeout=60)
+    assert output == f"Dpm2Error {out}: not written: File too large\n", errors
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["bag", "kitti"]
+    assert len(BagSource(out)) == 1
+
+
+def test_a_place_that_cannot_be_written_is_named(kitti_folder: MakeFolder, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    from dpm2_core.errors import Dpm2Error
+
+    with pytest.raises(Dpm2Error, match=r"file/bag: not written: Not a directory"):
+        convert_kitti(kitti_folder(), tmp_path / "file" / "bag")
+
+
+def test_command_line(kitti_folder: MakeFolder, tmp_path: Path) -> None:
+    folder, out = kitti_folder(), tmp_path / "bag"
+    arguments = ["kitti", str(folder), str(out), "--start", "1", "--end", "4", "--no-images", "--zstd"]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, result.output
+    assert len(BagSource(out)) == 3
+    result = CliRunner().invoke(app, ["kitti", str(folder), str(out)])
+    assert isinstance(result.exception, UsageError)
+    assert CliRunner().invoke(app, ["kitti", str(folder), str(out), "--overwrite"]).exit_code == 0
+    assert len(BagSource(out)) == 5
+
+
+def test_ground_truth_starts_where_the_drive_does(kitti_folder: MakeFolder, tmp_path: Path) -> None:
+    """Frames without a pose have none in the bag either: no zero pose, no repeated one."""
+    folder = kitti_folder()
+    (folder / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3)
+    convert_kitti(folder, tmp_path / "bag")
+    poses = BagSource(tmp_path / "bag").poses
+    assert poses is not None
+    np.testing.assert_allclose(poses[:3], se3.exp(np.zeros((3, 6))), atol=1e-12)
+    assert np.isnan(poses[3:]).all()
