@@ -26,7 +26,7 @@ def kitti(
     start: Annotated[int, typer.Option(min=0, help="First scan, counted from 0.")] = 0,
     end: Annotated[int | None, typer.Option(min=0, help="Scan to stop before.")] = None,
     images: Annotated[bool, typer.Option("--images/--no-images", help="With image_2.")] = True,
-    zstd: Annotated[bool, typer.Option("--zstd", help="Compress: about half the size, half the speed.")] = False,
+    zstd: Annotated[bool, typer.Option("--zstd", help="Compress: about a third smaller, and slower.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a bag that is there.")] = False,
 ) -> None:
     """KITTI odometry to a bag with the topic names of kitti2bag, ground truth included where there is some."""

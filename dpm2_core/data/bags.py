@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from dpm2_core.data import topics
 from dpm2_core.data.bag_file import open_bag
@@ -138,10 +137,8 @@ class BagSource:
                 )
             self.notes.append(f"images of {self.image_topic} are left out: no CameraInfo on {info_topic}")
             return None
-        if self._settings.T_lidar_cam:
-            place = np.array(self._settings.T_lidar_cam)
-            T_lidar_cam = se3.make(Rotation.from_quat(place[3:]).as_matrix(), place[:3])
-        else:
+        T_lidar_cam = self._settings.extrinsic()
+        if T_lidar_cam is None:
             try:
                 T_lidar_cam = self.transforms.lookup(self.lidar_frame, info.header.frame_id)
             except UsageError as error:

@@ -118,7 +118,7 @@ class KittiSource:
 
     def _poses(self) -> Array | None:
         """(len, 4, 4) T_world_lidar from poses.txt here or poses/NN.txt of the root; None without."""
-        beside, above = self.path / "poses.txt", self.path.resolve().parents[1] / "poses" / f"{self.name}.txt"
+        beside, above = self.path / "poses.txt", self.path.resolve().parent.parent / "poses" / f"{self.name}.txt"
         path = next((file for file in (beside, above) if file.is_file()), None)
         if path is None:
             return None

@@ -7,14 +7,22 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Literal, Protocol
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
+from scipy.spatial.transform import Rotation
 
 from dpm2_core.config import Settings
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Frame
+from dpm2_core.geometry import se3
 
 # x, y, z in m, then a quaternion x, y, z, w: the order of tf2_ros' static_transform_publisher.
-Extrinsic = tuple[float, float, float, float, float, float, float]
+Place = tuple[float, float, float, float, float, float, float]
+
+
+def _unit(place: Place) -> Place:
+    if abs(sum(q * q for q in place[3:]) - 1) > 0.01:
+        raise ValueError("qx, qy, qz, qw are no unit quaternion")
+    return place
 
 
 class InputSettings(Settings):
@@ -35,7 +43,7 @@ class InputSettings(Settings):
     camera_info_topic: str = ""
     """CameraInfo topic of that image; empty takes the camera_info beside it."""
 
-    T_lidar_cam: Extrinsic | None = None
+    T_lidar_cam: Annotated[Place, AfterValidator(_unit)] | None = None
     """Pose of the camera's optical frame in the LiDAR frame, [x, y, z (m), qx, qy, qz, qw]; null asks /tf_static."""
 
     image_tolerance: Annotated[float, Field(gt=0, le=10)] = 0.05
@@ -59,6 +67,11 @@ class InputSettings(Settings):
 
     ground_truth_topic: str = ""
     """Odometry or Path topic with true poses; empty takes /kitti/ground_truth/odom, else /kitti/ground_truth/path."""
+
+    def extrinsic(self) -> Array | None:
+        """T_lidar_cam as (4, 4); None if it is not set here."""
+        place = self.T_lidar_cam
+        return None if place is None else se3.make(Rotation.from_quat(place[3:]).as_matrix(), place[:3])
 
 
 class Source(Protocol):

@@ -106,7 +106,7 @@ def test_a_missing_extrinsic_is_an_error_never_identity(bags: Any, tmp_path: Pat
         UsageError, match=r"'cam' to 'velo_link'; frames known: base_link, velo_link; set .*T_lidar_cam"
     ):
         BagSource(bag)
-    camera = BagSource(bag, InputSettings(T_lidar_cam=(0.1, 0.2, 0.3, 0, 0, 0, 2))).camera
+    camera = BagSource(bag, InputSettings(T_lidar_cam=(0.1, 0.2, 0.3, 0, 0, 0, 1))).camera
     assert camera is not None
     np.testing.assert_allclose(camera.T_lidar_cam[:3, 3], [0.1, 0.2, 0.3])
     np.testing.assert_allclose(camera.T_lidar_cam[:3, :3], np.eye(3))

@@ -47,6 +47,7 @@ def test_what_is_no_recording_is_named(tmp_path: Path) -> None:
         ({"time_unit": "min"}, "time_unit"),
         ({"image_tolerance": 0}, "image_tolerance"),
         ({"T_lidar_cam": [1, 2, 3]}, "T_lidar_cam"),
+        ({"T_lidar_cam": [1, 2, 3, 0, 0, 0, 0]}, "T_lidar_cam: .*no unit quaternion"),
         ({"vertical_angle_correction_deg": "off"}, "vertical_angle_correction_deg"),
     ],
 )
