@@ -39,7 +39,7 @@ lint:  ## style and types
 
 bench: setup  ## the figures of benchmarks/, beside KISS-ICP
 	@$(BIN)/python -c 'import kiss_icp' 2>/dev/null || $(BIN)/python -m pip install --quiet -e '.[bench]'
-	$(BIN)/python -m benchmarks $(ARGS)
+	$(BIN)/python -m dpm2_core.cli bench $(ARGS)
 
 sim: setup  ## a synthetic drive in KITTI layout in out/sim
 	$(BIN)/dpm2 sim out/sim --frames $(or $(FRAMES),300) --seed $(or $(SEED),1) $(ARGS)

@@ -1,44 +1,57 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Entry points. Signals are caught before the slow imports, so that a process stopped while starting ends cleanly."""
+"""Entry points: console scripts, `ros2 run dpm2_ros NAME`, and `python -m dpm2_ros.executables NAME`.
+
+Signals are caught before the slow imports, so that a process that is stopped while it starts ends cleanly as well.
+"""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Sequence
 
 from dpm2_ros.runtime import catch_signals, exit_code, spin_node
 
 
-def slam_node() -> int:
-    """`ros2 run dpm2_ros slam_node`."""
-    catch_signals()
+def slam_node(arguments: Sequence[str] | None = None) -> int:
+    """Odometry and, by default, the map."""
 
-    def work() -> int:
+    def work(arguments: Sequence[str]) -> int:
         from dpm2_ros.slam_node import SlamNode
 
-        return spin_node(SlamNode, sys.argv[1:])
+        return spin_node(SlamNode, arguments)
 
-    return exit_code(work)
+    return _run(work, arguments)
 
 
-def mapper_node() -> int:
-    """`ros2 run dpm2_ros mapper_node`."""
-    catch_signals()
+def mapper_node(arguments: Sequence[str] | None = None) -> int:
+    """The map apart."""
 
-    def work() -> int:
+    def work(arguments: Sequence[str]) -> int:
         from dpm2_ros.mapper_node import MapperNode
 
-        return spin_node(MapperNode, sys.argv[1:])
+        return spin_node(MapperNode, arguments)
 
-    return exit_code(work)
+    return _run(work, arguments)
 
 
-def bag_player() -> int:
-    """`ros2 run dpm2_ros bag_player`."""
-    catch_signals()
+def bag_player(arguments: Sequence[str] | None = None) -> int:
+    """Plays a recording."""
 
-    def work() -> int:
+    def work(arguments: Sequence[str]) -> int:
         from dpm2_ros.bag_player import main
 
-        return main(sys.argv[1:])
+        return main(arguments)
 
-    return exit_code(work)
+    return _run(work, arguments)
+
+
+def _run(work: Callable[[Sequence[str]], int], arguments: Sequence[str] | None) -> int:
+    catch_signals()
+    return exit_code(lambda: work(sys.argv[1:] if arguments is None else arguments))
+
+
+if __name__ == "__main__":
+    executables = {"slam_node": slam_node, "mapper_node": mapper_node, "bag_player": bag_player}
+    if len(sys.argv) < 2 or sys.argv[1] not in executables:
+        sys.exit(f"usage: python -m dpm2_ros.executables {{{','.join(executables)}}} ...")
+    sys.exit(executables[sys.argv[1]](sys.argv[2:]))

@@ -6,6 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dpm2_core.data.ply import write_ply
 from dpm2_core.evaluation.trajectory import write_tum
@@ -35,23 +36,34 @@ class TrajectoryRecorder:
         self._T_odom_lidar.append(tracked.T_odom_lidar)
 
     def poses(self, T_map_kf: Array) -> Array:
-        """(N, 4, 4) T_map_lidar of all frames, given the (K, 4, 4) optimised poses of the keyframes.
+        """(N, 4, 4) T_map_lidar of all frames, given the (K, 4, 4) optimised poses of the keyframes."""
+        return corrected(np.array(self._T_odom_lidar).reshape(-1, 4, 4), np.array(self._keyframe, np.intp), T_map_kf)
 
-        The correction of a frame is interpolated between the keyframes before and after it: rigidly following one
-        keyframe would put steps into the trajectory where a loop was closed.
-        """
-        T_odom = np.array(self._T_odom_lidar).reshape(-1, 4, 4)
-        if not self._keyframe:
-            return T_odom
-        at = np.array(self._keyframe)
-        corrections = T_map_kf @ se3.inverse(T_odom[at])
-        position = np.arange(len(T_odom))
-        before = np.clip(np.searchsorted(at, position, side="right") - 1, 0, len(at) - 1)
-        after = np.minimum(before + 1, len(at) - 1)
-        span = np.maximum(at[after] - at[before], 1)
-        share = np.clip((position - at[before]) / span, 0, 1)[:, None]
-        between = se3.log(se3.inverse(corrections[before]) @ corrections[after])
-        return corrections[before] @ se3.exp(share * between) @ T_odom
+
+def corrected(T_odom_lidar: Array, keyframes: NDArray[np.intp], T_map_kf: Array) -> Array:
+    """Odometry poses in the map frame, corrected as the keyframes around them were.
+
+    The correction of a frame is interpolated between the keyframes before and after it: rigidly following one
+    keyframe would put steps into the trajectory where a loop was closed.
+
+    Args:
+        T_odom_lidar: (N, 4, 4).
+        keyframes: (K,) ascending positions of the keyframes among them.
+        T_map_kf: (K, 4, 4) optimised poses of the keyframes.
+
+    Returns:
+        (N, 4, 4) T_map_lidar; the odometry itself without any keyframe.
+    """
+    if not len(keyframes):
+        return T_odom_lidar
+    corrections = T_map_kf @ se3.inverse(T_odom_lidar[keyframes])
+    position = np.arange(len(T_odom_lidar))
+    before = np.clip(np.searchsorted(keyframes, position, side="right") - 1, 0, len(keyframes) - 1)
+    after = np.minimum(before + 1, len(keyframes) - 1)
+    span = np.maximum(keyframes[after] - keyframes[before], 1)
+    share = np.clip((position - keyframes[before]) / span, 0, 1)[:, None]
+    between = se3.log(se3.inverse(corrections[before]) @ corrections[after])
+    return corrections[before] @ se3.exp(share * between) @ T_odom_lidar
 
 
 def save_map(mapper: Mapper, directory: Path) -> None:

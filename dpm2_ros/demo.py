@@ -1,0 +1,225 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`make demo`: a drive through bag, player and slam_node, checked and shown. Without a drive, one is simulated."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from dpm2_core.data.bags import BagSource
+from dpm2_core.data.convert import convert_kitti
+from dpm2_core.data.source import InputSettings
+from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.evaluation.figures import trajectory_png
+from dpm2_core.evaluation.metrics import evaluate
+from dpm2_core.evaluation.trajectory import read_trajectory
+from dpm2_core.files import atomic_write
+from dpm2_core.frame import Array
+from dpm2_core.geometry import se3
+from dpm2_core.slam.output import corrected
+from dpm2_ros.replay import Replay, replay
+from dpm2_ros.runtime import exit_code
+from dpm2_ros.tf import TFMessage
+
+QUEUE = 50
+"""Clouds that slam_node may hold here: a machine that stalls for a moment shows latency, and loses nothing."""
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """Figures (the content of summary.json), and what was checked: text to whether it holds."""
+
+    summary: dict[str, float | int | None]
+    checks: dict[str, bool]
+
+
+def demo(
+    src: Annotated[Path | None, typer.Argument(help="KITTI sequence, rosbag2 folder or .mcap; none: simulate")] = None,
+    out: Annotated[Path, typer.Option(help="folder for everything that is made")] = Path("out/demo"),
+    frames: Annotated[int, typer.Option(help="length of the simulated drive", min=20)] = 150,
+    seed: Annotated[int, typer.Option(help="of the simulated drive")] = 7,
+    rate: Annotated[float, typer.Option(help="speed of playing; 1: that of the recording", min=0.05)] = 1.0,
+) -> int:
+    """Replay a drive into slam_node and check what comes out. Exit code 1 if a check fails."""
+    console = Console()
+    out.mkdir(parents=True, exist_ok=True)
+    bag = prepare(src, out, frames, seed, console)
+    source = BagSource(bag, InputSettings(images=False))
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console) as progress:
+        task = progress.add_task("bag_player -> slam_node -> /dpm2/odom", total=len(source))
+        parameters = {"ros.queue_depth": QUEUE, "ros.map_period": 2.0}
+        result = replay(
+            bag, source.points_topic, out, rate, parameters, lambda done: progress.update(task, completed=done)
+        )
+    outcome = judge(source, result, out)
+    with atomic_write(out / "summary.json") as file:
+        file.write(json.dumps(outcome.summary, indent=2) + "\n")
+    console.print(_table(source, result, outcome, out))
+    failed = [check for check, holds in outcome.checks.items() if not holds]
+    for check in failed:
+        console.print(f"[red]failed:[/red] {check}")
+    if failed:
+        console.print(f"logs: {out / 'slam_node.log'}, {out / 'bag_player.log'}")
+    return 1 if failed else 0
+
+
+def prepare(src: Path | None, out: Path, frames: int, seed: int, console: Console) -> Path:
+    """The bag to play: `src` itself, a KITTI sequence converted, or a simulated one; what was made before is reused.
+
+    Raises:
+        UsageError: `src` is nothing that can be read.
+    """
+    if src is not None and not src.exists():
+        raise UsageError(f"{src}: no such file or folder")
+    if src is not None and (src.is_file() or any(src.glob("*.mcap")) or any(src.glob("*.db3"))):
+        return src
+    if src is None:
+        src = out / f"city_{frames}_{seed}"
+        if not (src / "poses.txt").is_file():
+            shutil.rmtree(src, ignore_errors=True)
+            part = src.with_name(src.name + ".part")
+            shutil.rmtree(part, ignore_errors=True)
+            _simulate(part, frames, seed)
+            part.rename(src)
+    bag = out / f"bag_{src.resolve().name}"
+    made_from = bag.with_suffix(".source")  # the same name elsewhere is another drive
+    if not (bag / "metadata.yaml").is_file() or made_from.read_text() != str(src.resolve()):
+        with console.status(f"converting {src} to {bag}"):
+            for note in convert_kitti(src, bag, overwrite=True):
+                console.print(note, style="yellow")
+        made_from.write_text(str(src.resolve()))
+    return bag
+
+
+def _simulate(out: Path, frames: int, seed: int) -> None:
+    command = ["sim", str(out), "--frames", str(frames), "--seed", str(seed), "--road", "loop"]
+    if subprocess.run([sys.executable, "-m", "dpm2_core.cli", *command], check=False).returncode:
+        raise Dpm2Error(f"dpm2 {' '.join(command)} failed")
+
+
+def judge(source: BagSource, result: Replay, out: Path) -> Outcome:
+    """Compare what came out with what went in, and with the ground truth where there is some; draws the picture."""
+    stamps = source.stamps
+    found = [stamp for stamp in dict.fromkeys(stamps.tolist()) if stamp in result.poses]
+    summary: dict[str, float | int | None] = {
+        "frames_in": len(result.published),
+        "frames_out": len(result.poses),
+        "dropped": len(result.published) - len(found),
+        "latency_p50_ms": None,
+        "latency_p95_ms": None,
+        "ape_rmse_m": None,
+        "rpe_trans_m": None,
+        "rpe_rot_deg": None,
+        "loops": result.loops,
+    }
+    published = dict(zip(stamps.tolist(), result.published.tolist(), strict=False))
+    latency = [(result.received[stamp] - published[stamp]) * 1e-6 for stamp in found if stamp in published]
+    if latency:
+        summary["latency_p50_ms"], summary["latency_p95_ms"] = np.percentile(latency, [50, 95]).round(2).tolist()
+    checks = {
+        "every cloud has its odometry, with the same stamp": len(found) == len(result.published) > 0,
+        "no odometry without its cloud": len(found) == len(result.poses),
+        "the map arrived, with points in it": result.map is not None and len(result.map) > 0,
+        "the map was saved": (out / "map" / "map.ply").is_file(),
+        "/diagnostics arrived": bool(result.diagnostics),
+        "slam_node and bag_player ended cleanly": set(result.exit_codes.values()) == {0},
+    }
+    if TFMessage is not None:
+        wanted = {f"odom -> {result.base_frame}", "map -> odom"}
+        checks["/tf has odom -> base and map -> odom"] = wanted <= result.tf
+    if len(found) > 1:
+        _judge_poses(source, result, out, found, summary, checks)
+    return Outcome(summary, checks)
+
+
+def _judge_poses(
+    source: BagSource,
+    result: Replay,
+    out: Path,
+    found: list[int],
+    summary: dict[str, float | int | None],
+    checks: dict[str, bool],
+) -> None:
+    stamps = source.stamps
+    poses = map_poses(source, result, out, found)
+    est = np.full((len(stamps), 4, 4), np.nan)
+    position = {stamp: n for n, stamp in reversed(list(enumerate(stamps.tolist())))}
+    est[[position[stamp] for stamp in found]] = poses
+    truth = source.poses
+    if truth is not None and np.isfinite(truth[:, 0, 0]).sum() > 1:
+        metrics = evaluate(truth, est)
+        summary["ape_rmse_m"] = metrics.ape_rmse_m
+        summary["rpe_trans_m"], summary["rpe_rot_deg"] = metrics.rpe_trans_m, metrics.rpe_rot_deg
+        if metrics.ape_rmse_m is not None and metrics.path_length_m is not None:
+            checks["the trajectory is right to 1 % of its length"] = metrics.ape_rmse_m < 0.01 * metrics.path_length_m
+    trajectory_png(out / "trajectory.png", est, truth, result.map, title=f"{source.name}: {len(found)} frames")
+
+
+def map_poses(source: BagSource, result: Replay, out: Path, found: list[int]) -> Array:
+    """(N, 4, 4) poses of the LiDAR for the stamps `found`, corrected as the saved map's keyframes were."""
+    T_odom_base = np.array([result.poses[stamp] for stamp in found])
+    saved = out / "map" / "trajectory.tum"
+    if saved.is_file():
+        keyframes = read_trajectory(saved)
+        position = {stamp: n for n, stamp in enumerate(found)}
+        known = [n for n, stamp in enumerate(keyframes.keys.tolist()) if stamp in position]
+        at = np.array([position[keyframes.keys[n]] for n in known], np.intp)
+        T_odom_base = corrected(T_odom_base, at, keyframes.poses[known])
+    if result.base_frame == source.lidar_frame:
+        return T_odom_base
+    T_base_lidar = source.transforms.lookup(result.base_frame, source.lidar_frame)
+    return se3.inverse(T_base_lidar) @ T_odom_base @ T_base_lidar
+
+
+def _table(source: BagSource, result: Replay, outcome: Outcome, out: Path) -> Table:
+    s = outcome.summary
+    table = Table(title=f"{source.name} through ROS 2", title_justify="left", show_header=False)
+    table.add_column()
+    table.add_column(justify="right")
+    table.add_column()
+    table.add_row("clouds in", str(s["frames_in"]), f"{source.points_topic}")
+    table.add_row("poses out", str(s["frames_out"]), "/dpm2/odom, of the same stamp")
+    table.add_row("dropped", str(s["dropped"]), f"queue of {QUEUE}; the node counts {_said(result, 'dropped')}")
+    table.add_row("latency p50", _value(s["latency_p50_ms"], "ms", 1), "cloud published to odometry received")
+    table.add_row("latency p95", _value(s["latency_p95_ms"], "ms", 1), "")
+    table.add_row("APE rmse", _value(s["ape_rmse_m"], "m", 3), "positions after SE(3) alignment, LiDAR frame")
+    table.add_row("RPE translation", _value(s["rpe_trans_m"], "m", 4), "mean of frame to frame")
+    table.add_row("RPE rotation", _value(s["rpe_rot_deg"], "deg", 4), "")
+    table.add_row("keyframes, loops", f"{len(result.keyframes)}, {s['loops']}", "/dpm2/keyframe, /dpm2/loop_closure")
+    table.add_row(
+        "map", f"{0 if result.map is None else len(result.map)}", f"points in the last of {result.maps} /dpm2/map"
+    )
+    table.add_row("checks", f"{sum(outcome.checks.values())} of {len(outcome.checks)}", "hold")
+    table.add_row("files", "", f"{out / 'map' / 'map.ply'}\n{out / 'summary.json'}\n{out / 'trajectory.png'}")
+    return table
+
+
+def _said(result: Replay, key: str) -> str:
+    return next((value for name, value in result.diagnostics.items() if name.startswith(key)), "-")
+
+
+def _value(value: float | int | None, unit: str, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f} {unit}"
+
+
+def main() -> int:
+    """Entry point of `python -m dpm2_ros.demo`."""
+    app = typer.Typer(add_completion=False)
+    app.command()(demo)
+    return exit_code(lambda: app(standalone_mode=False))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,238 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A bag through bag_player and slam_node, two processes over real DDS, and a subscriber that notes what arrives."""
+
+from __future__ import annotations
+
+import csv
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dpm2_core.data.messages import decode_points, stamp_ns
+from dpm2_core.data.transforms import transform_matrix
+from dpm2_core.errors import Dpm2Error
+from dpm2_core.frame import Array, Points
+from dpm2_ros.share import share_directory
+
+Nanoseconds = NDArray[np.int64]
+
+
+@dataclass(eq=False)
+class Replay:
+    """What went in and what came out.
+
+    Attributes:
+        published: time at which each cloud was published, ns of the monotonic clock, in the order of the bag.
+        poses: stamp (ns) to T_odom_base (4, 4), and `received`: stamp to the time at which it arrived, ns likewise.
+        keyframes: stamps of the keyframes.
+        map: the last /dpm2/map; None if none came.
+        maps, loops: messages on /dpm2/map and /dpm2/loop_closure.
+        tf: "parent -> child" seen on /tf.
+        diagnostics: the last values of the odometry's status.
+        base_frame: child_frame_id of the odometry.
+        exit_codes: of the processes, by name.
+    """
+
+    published: Nanoseconds = field(default_factory=lambda: np.zeros(0, np.int64))
+    poses: dict[int, Array] = field(default_factory=dict)
+    received: dict[int, int] = field(default_factory=dict)
+    keyframes: list[int] = field(default_factory=list)
+    map: Points | None = None
+    maps: int = 0
+    loops: int = 0
+    tf: set[str] = field(default_factory=set)
+    diagnostics: dict[str, str] = field(default_factory=dict)
+    base_frame: str = ""
+    exit_codes: dict[str, int] = field(default_factory=dict)
+
+
+def ros_environment(domain: int | None = None) -> dict[str, str]:
+    """This process' environment with the DDS profile, on this machine only, in a domain that others hardly use."""
+    return os.environ | {
+        "FASTRTPS_DEFAULT_PROFILES_FILE": str(share_directory() / "config" / "fastdds.xml"),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "ROS_DOMAIN_ID": str(random.randint(1, 100) if domain is None else domain),
+        "PYTHONUNBUFFERED": "1",
+    }
+
+
+def start(name: str, arguments: Sequence[str], environment: Mapping[str, str], log: Path) -> subprocess.Popen[bytes]:
+    """One of the executables as a process; its output goes to `log`."""
+    with log.open("wb") as file:
+        command = [sys.executable, "-m", "dpm2_ros.executables", name, *arguments]
+        return subprocess.Popen(command, env=environment, stdout=file, stderr=subprocess.STDOUT)
+
+
+def stop(process: subprocess.Popen[bytes], timeout: float = 60.0) -> int:
+    """SIGINT, and the exit code; killed if it does not end."""
+    with suppress(ProcessLookupError):
+        process.send_signal(signal.SIGINT)
+    try:
+        return process.wait(timeout)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        return process.wait()
+
+
+def replay(
+    bag: Path,
+    points_topic: str,
+    out: Path,
+    rate: float = 1.0,
+    parameters: Mapping[str, object] | None = None,
+    progress: Callable[[int], None] = lambda frames: None,
+) -> Replay:
+    """Play the bag into slam_node; returns when both processes have ended. Logs and the map go to `out`.
+
+    Args:
+        points_topic: of the clouds in the bag.
+        rate: speed of playing.
+        parameters: of slam_node.
+        progress: told the number of frames that have come out, now and then.
+
+    Raises:
+        Dpm2Error: a process ended before its time; the message gives the end of its log.
+    """
+    environment = ros_environment()
+    os.environ.update(environment)  # the subscriber in this process reads it when rclpy starts
+    given = {"use_sim_time": True, "input.points_topic": points_topic, "ros.map_directory": str(out / "map")}
+    pairs = [f"{name}:={_yaml(value)}" for name, value in (given | dict(parameters or {})).items()]
+    arguments = ["--ros-args", *(part for pair in pairs for part in ("-p", pair))]
+    times = out / "published.csv"
+    slam = start("slam_node", arguments, environment, out / "slam_node.log")
+    player: subprocess.Popen[bytes] | None = None
+    result = Replay()
+    try:
+        with _Listener(result) as listener:
+            playing = [str(bag), "--rate", str(rate), "--wait", "60", "--log", str(times)]
+            player = start("bag_player", playing, environment, out / "bag_player.log")
+            while player.poll() is None:
+                if slam.poll() is not None:
+                    raise Dpm2Error(f"slam_node ended with {slam.returncode}: {_tail(out / 'slam_node.log')}")
+                listener.spin(0.2)
+                progress(len(result.poses))
+            if player.returncode:
+                raise Dpm2Error(f"bag_player ended with {player.returncode}: {_tail(out / 'bag_player.log')}")
+            result.published = _published(times, points_topic)
+            _drain(listener, result)
+            progress(len(result.poses))
+    finally:
+        if player is not None:
+            result.exit_codes["bag_player"] = stop(player) if player.poll() is None else player.returncode
+        result.exit_codes["slam_node"] = stop(slam)
+    return result
+
+
+def _drain(listener: _Listener, result: Replay) -> None:
+    """Until everything that was published has come out, or nothing more does; then for the map with the last of it."""
+    before, quiet = -1, 0.0
+    while len(result.poses) < len(result.published) and quiet < 3.0:
+        quiet = 0.0 if len(result.poses) > before else quiet + 0.2
+        before = len(result.poses)
+        listener.spin(0.2)
+    end = time.monotonic() + 15.0
+    while not (listener.map_is_complete() and result.diagnostics) and time.monotonic() < end:
+        listener.spin(0.2)
+
+
+class _Listener:
+    """Subscribes to what slam_node publishes."""
+
+    def __init__(self, result: Replay) -> None:
+        self._result = result
+        self._map_stamp = -1
+
+    def __enter__(self) -> _Listener:
+        import rclpy
+        from diagnostic_msgs.msg import DiagnosticArray
+        from nav_msgs.msg import Odometry
+        from rclpy.executors import SingleThreadedExecutor
+        from rclpy.signals import SignalHandlerOptions
+        from sensor_msgs.msg import PointCloud2
+
+        from dpm2_ros.mapping import KEEP_ALL, LAST_ONE
+        from dpm2_ros.tf import TFMessage
+
+        rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+        self._node = rclpy.create_node("replay_listener")
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self._node)
+        subscribe = self._node.create_subscription
+        subscribe(Odometry, "/dpm2/odom", self._on_odom, 1000)
+        subscribe(Odometry, "/dpm2/keyframe_odom", self._on_keyframe, KEEP_ALL)
+        subscribe(Odometry, "/dpm2/loop_closure", self._on_loop, KEEP_ALL)
+        subscribe(PointCloud2, "/dpm2/map", self._on_map, LAST_ONE)
+        subscribe(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
+        if TFMessage is not None:
+            subscribe(TFMessage, "/tf", self._on_tf, 1000)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        import rclpy
+
+        self._executor.shutdown()
+        self._node.destroy_node()
+        rclpy.try_shutdown()
+
+    def map_is_complete(self) -> bool:
+        """Whether the last map holds the last keyframe."""
+        return bool(self._result.keyframes) and self._map_stamp == self._result.keyframes[-1]
+
+    def spin(self, seconds: float) -> None:
+        """Take what arrives during that time."""
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0:
+            self._executor.spin_once(timeout_sec=left)
+
+    def _on_odom(self, message: Any) -> None:
+        stamp = stamp_ns(message.header)
+        self._result.received[stamp] = time.monotonic_ns()
+        self._result.poses[stamp] = transform_matrix(message.pose.pose)
+        self._result.base_frame = message.child_frame_id
+
+    def _on_keyframe(self, message: Any) -> None:
+        self._result.keyframes.append(stamp_ns(message.header))
+
+    def _on_loop(self, _message: Any) -> None:
+        self._result.loops += 1
+
+    def _on_map(self, message: Any) -> None:
+        self._result.map, _ = decode_points(message, time_field="", intensity_max=1.0)
+        self._result.maps += 1
+        self._map_stamp = stamp_ns(message.header)
+
+    def _on_tf(self, message: Any) -> None:
+        self._result.tf.update(f"{one.header.frame_id} -> {one.child_frame_id}" for one in message.transforms)
+
+    def _on_diagnostics(self, message: Any) -> None:
+        for status in message.status:
+            if status.name.endswith("slam_node: odometry"):
+                self._result.diagnostics = {"message": status.message} | {v.key: v.value for v in status.values}
+
+
+def _published(times: Path, points_topic: str) -> Nanoseconds:
+    with times.open() as file:
+        rows = [int(row["published_ns"]) for row in csv.DictReader(file) if row["topic"] == points_topic]
+    return np.array(rows, np.int64)
+
+
+def _tail(log: Path) -> str:
+    lines = [line for line in log.read_text(errors="replace").splitlines() if line.strip()]
+    return lines[-1] if lines else "it said nothing"
+
+
+def _yaml(value: object) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f'"{value}"' if isinstance(value, str) else str(value)
