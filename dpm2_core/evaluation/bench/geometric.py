@@ -35,7 +35,8 @@ class Outcome:
 
     Attributes:
         poses: (N, 4, 4) T_odom_lidar, before any loop closure.
-        seconds: (N,) wall time of each frame. cpu_seconds: of all frames and threads, which other programs disturb less.
+        seconds: (N,) wall time of each frame.
+        cpu_seconds: of all frames and threads; other programs disturb it less.
         stages: (N,) wall time of each stage, s.
         failed: frames without a registration.
     """
