@@ -6,14 +6,12 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from dpm2_core.data.kitti import HDL64_CORRECTION_DEG, correct_vertical_angle
 from dpm2_core.data.messages import MessageError, decode_camera, decode_image, decode_points
 from dpm2_core.data.source import InputSettings
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Frame, Image
-from dpm2_core.geometry import se3
 from dpm2_ros.subscriptions import Inputs
 from dpm2_ros.synchronizer import Bundle
 
@@ -67,9 +65,9 @@ class FrameBuilder:
         return images
 
     def _extrinsic(self, lidar_frame: str, camera_frame: str) -> Array:
-        if self._settings.T_lidar_cam is not None:
-            place = np.array(self._settings.T_lidar_cam)
-            return se3.make(Rotation.from_quat(place[3:]).as_matrix(), place[:3])
+        T_lidar_cam = self._settings.extrinsic()
+        if T_lidar_cam is not None:
+            return T_lidar_cam
         try:
             return self._inputs.static.tree.lookup(lidar_frame, camera_frame)
         except UsageError as error:

@@ -174,7 +174,7 @@ def _sections(kind: type[Settings]) -> Iterator[str]:
         allowed = _allowed(info)
         kind_text = f"{_kind(info)}, {allowed}" if allowed else _kind(info)
         default = json.dumps(_plain(info.get_default(call_default_factory=True)), default=str)
-        yield f"| `{name}` | {kind_text} | `{default}` | {_text(info)} |"
+        yield f"| `{name}` | {kind_text} | `{default}` | {_text(info).replace('|', '&#124;')} |"
 
 
 if __name__ == "__main__":

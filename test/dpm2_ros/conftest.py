@@ -1,0 +1,223 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A small drive, and real nodes over real DDS: in this process for their logic, as processes for their lives."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from sensor_msgs.msg import PointCloud2
+
+from dpm2_core.data.convert import convert_kitti
+from dpm2_core.frame import Array, Points
+from dpm2_core.geometry import se3
+from dpm2_ros.conversions import cloud_to_msg
+from dpm2_ros.replay import ros_environment
+
+ENVIRONMENT = ros_environment(domain=1)
+os.environ.update(
+    {name: ENVIRONMENT[name] for name in ("FASTRTPS_DEFAULT_PROFILES_FILE", "ROS_AUTOMATIC_DISCOVERY_RANGE")}
+)
+_domains = iter(range(1, 10**6))
+
+FRAMES, PERIOD, STEP = 16, 100_000_000, 0.8  # scans, ns and m between them
+START = 1_700_000_000_000_000_000
+LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE)
+
+
+def new_domain() -> int:
+    """One that no other test of this run, and hardly one beside it, uses."""
+    return 1 + (os.getpid() * 7 + next(_domains)) % 100
+
+
+def scan(T_world_lidar: Array) -> Points:
+    """(N, 4) points of a street within 40 m: ground, house fronts, side walls. The same points from everywhere."""
+    world = _street()
+    local = se3.transform(se3.inverse(T_world_lidar), world)
+    return local[np.einsum("ij,ij->i", local[:, :3], local[:, :3]) < 40.0**2]
+
+
+def _street() -> Points:
+    rng = np.random.default_rng(0)
+    x = np.arange(-60, 120, 0.35, dtype=np.float32)
+    ground = np.stack(np.meshgrid(x, np.arange(-12, 12.1, 0.7)), -1).reshape(-1, 2)
+    parts = [np.column_stack([ground, np.full(len(ground), -1.7)])]
+    for side in (-1, 1):
+        for house in range(-6, 12):
+            front = 8 + rng.uniform(0, 4)
+            along, up = np.meshgrid(10 * house + np.arange(0, 9, 0.35), np.arange(-1.7, 5, 0.5))
+            parts.append(np.column_stack([along.ravel(), np.full(along.size, side * front), up.ravel()]))
+            depth, up = np.meshgrid(np.arange(front, front + 4, 0.35), np.arange(-1.7, 5, 0.5))
+            parts.append(np.column_stack([np.full(depth.size, 10.0 * house), side * depth.ravel(), up.ravel()]))
+    points = np.concatenate(parts)
+    return np.column_stack([points, rng.uniform(0, 1, len(points))]).astype(np.float32)
+
+
+def pose(n: int) -> Array:
+    """T_world_lidar of the n-th scan: straight on with a slight turn."""
+    return se3.exp([0, 0, 0.004 * n, STEP * n, 0, 0])
+
+
+class Drive:
+    """The drive, scan by scan."""
+
+    frames, period, start = FRAMES, PERIOD, START
+
+    def stamp(self, n: int) -> int:
+        """ns."""
+        return START + n * PERIOD
+
+    def pose(self, n: int) -> Array:
+        """T_start_lidar (4, 4)."""
+        return se3.inverse(pose(0)) @ pose(n)
+
+    def cloud(self, n: int, frame_id: str = "lidar") -> PointCloud2:
+        """The n-th scan as a message."""
+        return cloud_to_msg(scan(pose(n)), self.stamp(n), frame_id)
+
+
+@pytest.fixture(scope="session")
+def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The drive as a KITTI sequence, with images of noise."""
+    import cv2
+
+    root = tmp_path_factory.mktemp("drive")
+    (root / "velodyne").mkdir()
+    (root / "image_2").mkdir()
+    rng = np.random.default_rng(1)
+    for n in range(FRAMES):
+        scan(pose(n)).tofile(root / "velodyne" / f"{n:06d}.bin")
+        cv2.imwrite(str(root / "image_2" / f"{n:06d}.png"), rng.integers(0, 255, (40, 120, 3), np.uint8))
+    Tr = np.array([[0, -1, 0, 0.0], [0, 0, -1, -0.08], [1, 0, 0, -0.27], [0, 0, 0, 1]])
+    P = "70 0 60 0 0 70 20 0 0 0 1 0"
+    lines = [*(f"P{i}: {P}" for i in range(4)), "Tr: " + " ".join(map(str, Tr[:3].ravel()))]
+    (root / "calib.txt").write_text("\n".join(lines) + "\n")
+    (root / "times.txt").write_text("".join(f"{n * PERIOD * 1e-9:.6e}\n" for n in range(FRAMES)))
+    poses = [Tr @ se3.inverse(pose(0)) @ pose(n) @ se3.inverse(Tr) for n in range(FRAMES)]
+    np.savetxt(root / "poses.txt", np.array(poses)[:, :3].reshape(-1, 12))
+    return root
+
+
+@pytest.fixture(scope="session")
+def bag(sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The drive as a bag."""
+    out = tmp_path_factory.mktemp("bags") / "drive"
+    convert_kitti(sequence, out)
+    return out
+
+
+class Harness:
+    """Nodes under test and a tester's node, spun by one thread."""
+
+    def __init__(self, parameters: Sequence[str], domain: int, namespace: str) -> None:
+        pairs = [part for pair in ("ros.map_directory:=''", *parameters) for part in ("-p", pair)]
+        remap = ["-r", f"__ns:={namespace}"] if namespace else []
+        rclpy.init(
+            args=["--ros-args", *pairs, *remap], domain_id=domain, signal_handler_options=SignalHandlerOptions.NO
+        )
+        self.node = rclpy.create_node("tester", use_global_arguments=False)
+        self.received: dict[str, list[Any]] = {}
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self.node)
+        self._closing: list[Any] = []
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._spin)
+        self._thread.start()
+
+    def _spin(self) -> None:
+        while not self._ended.is_set():
+            self._executor.spin_once(timeout_sec=0.05)
+
+    def add(self, node: Node) -> Any:
+        """Spin and in the end close a node."""
+        self._executor.add_node(node)
+        self._executor.wake()
+        self._closing.append(node)
+        return node
+
+    def hear(self, kind: type, topic: str, qos: Any = 100) -> list[Any]:
+        """The messages of a topic, as they come."""
+        messages = self.received.setdefault(topic, [])
+        self.node.create_subscription(kind, topic, messages.append, qos)
+        self._executor.wake()
+        return messages
+
+    def publisher(self, kind: type, topic: str, reliable: bool = True, latched: bool = False) -> Any:
+        """A publisher."""
+        reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+        durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
+        return self.node.create_publisher(
+            kind, topic, QoSProfile(depth=50, reliability=reliability, durability=durability)
+        )
+
+    @staticmethod
+    def wait(condition: Callable[[], Any], what: str, timeout: float = 15.0) -> None:
+        """Until it holds; fails saying what was waited for."""
+        end = time.monotonic() + timeout
+        while not condition():
+            assert time.monotonic() < end, f"waited {timeout} s for {what}"
+            time.sleep(0.01)
+
+    def close(self) -> None:
+        """Close the nodes under test, then everything else."""
+        try:
+            for node in self._closing:
+                node.close()
+        finally:
+            self._ended.set()
+            self._thread.join()
+            self._executor.shutdown()
+            for node in (*self._closing, self.node):
+                node.destroy_node()
+            rclpy.try_shutdown()
+
+
+@pytest.fixture
+def ros() -> Iterator[Callable[..., Harness]]:
+    """Makes a `Harness`: ros(*"name:=value" parameters, namespace="")."""
+    made: list[Harness] = []
+
+    def make(*parameters: str, namespace: str = "") -> Harness:
+        made.append(Harness(parameters, new_domain(), namespace))
+        return made[-1]
+
+    yield make
+    for harness in made:
+        harness.close()
+
+
+@pytest.fixture
+def run() -> Callable[..., subprocess.CompletedProcess[str]]:
+    """Runs one of the executables to its end: run("slam_node", *arguments)."""
+
+    def finish(name: str, *arguments: str, timeout: float = 60.0) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "dpm2_ros.executables", name, *arguments]
+        environment = ros_environment(new_domain())
+        return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=timeout, check=False)
+
+    return finish
+
+
+@pytest.fixture
+def domain() -> int:
+    """A ROS domain of this test's own."""
+    return new_domain()
+
+
+@pytest.fixture
+def drive() -> Drive:
+    """The drive, scan by scan."""
+    return Drive()

@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every setting is a declared, described, read-only parameter; a mistake is one line and exit code 2."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import rclpy
+from rcl_interfaces.msg import ParameterType
+from rclpy.parameter import Parameter
+
+from dpm2_core.config import flat_fields
+from dpm2_core.errors import UsageError
+from dpm2_ros.parameters import load_parameters, page
+from dpm2_ros.settings import NodeConfig
+
+DOCS = Path(__file__).resolve().parents[2] / "docs" / "parameters.md"
+
+
+def load(*parameters: str) -> tuple[NodeConfig, object]:
+    """Configuration and node, with parameters as on the command line."""
+    arguments = ["--ros-args", *(part for pair in parameters for part in ("-p", pair))] if parameters else []
+    rclpy.init(args=arguments)
+    node = rclpy.create_node("parameters", automatically_declare_parameters_from_overrides=True)
+    return load_parameters(node, NodeConfig), node
+
+
+@pytest.fixture(autouse=True)
+def _shut_down():
+    yield
+    rclpy.try_shutdown()
+
+
+def test_defaults_are_those_of_the_settings() -> None:
+    assert load()[0] == NodeConfig()
+
+
+def test_every_setting_is_declared_described_and_read_only() -> None:
+    _, node = load()
+    for name, info in flat_fields(NodeConfig):
+        descriptor = node.describe_parameter(name)
+        assert descriptor.description == " ".join(info.description.split()), name
+        assert descriptor.read_only, name
+        (result,) = node.set_parameters([Parameter(name, value=node.get_parameter(name).value)])
+        assert not result.successful, name
+
+
+def test_types_and_ranges() -> None:
+    _, node = load()
+    queue = node.describe_parameter("ros.queue_depth")
+    assert queue.type == ParameterType.PARAMETER_INTEGER
+    assert (queue.integer_range[0].from_value, queue.integer_range[0].to_value) == (1, 1000)
+    timeout = node.describe_parameter("ros.sync_timeout")
+    assert timeout.type == ParameterType.PARAMETER_DOUBLE
+    assert (timeout.floating_point_range[0].from_value, timeout.floating_point_range[0].to_value) == (0, 5)
+    assert "auto or reliable or best_effort" in node.describe_parameter("ros.reliability").additional_constraints
+
+
+def test_values_of_every_kind() -> None:
+    config, node = load(
+        "ros.queue_depth:=3",
+        "ros.sync_timeout:=1",  # ROS takes it for an integer
+        "slam.map.voxel:=0.3",
+        "ros.reliability:=best_effort",
+        "ros.publish_tf_odom:=false",
+        "input.T_lidar_cam:=[0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]",
+        "input.time_field:=''",
+    )
+    assert (config.ros.queue_depth, config.ros.sync_timeout, config.slam.map.voxel) == (3, 1.0, 0.3)
+    assert (config.ros.reliability, config.ros.publish_tf_odom) == ("best_effort", False)
+    assert config.input.T_lidar_cam == (0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+    assert config.input.time_field == ""
+    assert node.get_parameter("ros.sync_timeout").value == 1.0
+    assert list(node.get_parameter("input.T_lidar_cam").value) == [0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+
+
+def test_parameters_override_the_file(tmp_path: Path) -> None:
+    file = tmp_path / "settings.yaml"
+    file.write_text("ros: {queue_depth: 5, odom_frame: drift}\nslam: {map: {voxel: 0.25}}\n")
+    config, node = load(f"config_file:={file}", "ros.queue_depth:=7")
+    assert (config.ros.queue_depth, config.ros.odom_frame, config.slam.map.voxel) == (7, "drift", 0.25)
+    assert node.get_parameter("config_file").value == str(file)
+
+
+@pytest.mark.parametrize(
+    ("parameter", "message"),
+    [
+        ("ros.queue_depht:=3", "unknown parameter ros.queue_depht; docs/parameters.md"),
+        ("queue_depth:=3", "unknown parameter queue_depth"),
+        ("ros.queue_depth:=0", "ROS parameter: ros.queue_depth: .*greater than or equal to 1, got 0"),
+        ("ros.queue_depth:=many", "ros.queue_depth: .*valid integer.*got 'many'"),
+        ("ros.reliability:=maybe", "'auto', 'reliable' or 'best_effort', got 'maybe'"),
+        ("ros.sync_timeout:=.nan", "ros.sync_timeout"),
+        ("ros.map_frame:=''", "ros.map_frame"),
+        ("input.T_lidar_cam:=[1.0, 2.0]", "input.T_lidar_cam"),
+        ("config_file:=/no/such.yaml", "/no/such.yaml: No such file"),
+    ],
+)
+def test_mistakes_are_named(parameter: str, message: str) -> None:
+    with pytest.raises(UsageError, match=message) as error:
+        load(parameter)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("-p", "ros.queue_depth:=0"), "ros.queue_depth"),
+        (("-p", "nonsense"), "nonsense"),
+        (("--unknown-flag",), "unknown-flag"),
+    ],
+)
+def test_a_process_ends_with_2_and_one_line(
+    run: Callable[..., subprocess.CompletedProcess[str]], arguments: tuple[str, ...], says: str
+) -> None:
+    done = run("slam_node", "--ros-args", *arguments)
+    errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
+    assert done.returncode == 2
+    assert len(errors) == 1
+    assert says in errors[0]
+    assert "Traceback" not in done.stderr
+
+
+def test_the_page_of_parameters_is_up_to_date() -> None:
+    assert DOCS.read_text() == page(NodeConfig), "run `make parameters`"

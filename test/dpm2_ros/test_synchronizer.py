@@ -1,0 +1,200 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The cloud leads; an image joins in time or not at all; nothing is lost uncounted."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dpm2_ros.synchronizer import PATIENCE, Bundle, Synchronizer, Verdict
+
+MS = 1_000_000
+
+
+def make(cameras: int = 1, depth: int = 10, timeout: float = 0.03, tolerance: float = 0.05) -> Synchronizer:
+    return Synchronizer(cameras, depth, timeout, tolerance)
+
+
+def drain(synchronizer: Synchronizer, now: float) -> list[Bundle]:
+    return list(iter(lambda: synchronizer.pop(now), None))
+
+
+def test_without_a_camera_nothing_waits() -> None:
+    synchronizer = make(cameras=0)
+    synchronizer.add_cloud(100 * MS, "a", now=0.0)
+    assert [bundle.cloud for bundle in drain(synchronizer, 0.0)] == ["a"]
+
+
+@pytest.mark.parametrize(
+    ("image_stamp_ms", "arrives_s", "joins"),
+    [
+        (100, 0.00, True),  # together with the cloud
+        (149, 0.02, True),  # at the edge of the tolerance, within the timeout
+        (51, 0.029, True),  # earlier by the tolerance
+        (151, 0.00, False),  # beyond the tolerance
+        (100, 0.04, False),  # too late
+    ],
+)
+def test_an_image_joins_within_timeout_and_tolerance(image_stamp_ms: int, arrives_s: float, joins: bool) -> None:
+    synchronizer = make()
+    synchronizer.add_cloud(100 * MS, "cloud", now=0.0)
+    if arrives_s < 0.03:
+        synchronizer.add_image(0, image_stamp_ms * MS, "image", now=arrives_s)
+    (bundle,) = drain(synchronizer, now=0.03)
+    assert bundle.images == ({0: "image"} if joins else {})
+
+
+def test_a_cloud_waits_for_its_image_and_no_longer() -> None:
+    synchronizer = make()
+    synchronizer.add_cloud(100 * MS, "cloud", now=1.0)
+    assert synchronizer.pop(1.029) is None
+    assert synchronizer.deadline() == pytest.approx(1.03)
+    assert synchronizer.pop(1.03) is not None
+
+
+def test_a_later_image_ends_the_wait() -> None:
+    """Once the camera is beyond the cloud, its image will not come any more."""
+    synchronizer = make()
+    synchronizer.add_cloud(100 * MS, "cloud", now=0.0)
+    synchronizer.add_image(0, 200 * MS, "next", now=0.0)
+    assert synchronizer.pop(0.0) is not None
+
+
+def test_the_nearest_of_several_images_is_taken() -> None:
+    synchronizer = make()
+    for stamp in (60, 97, 140):
+        synchronizer.add_image(0, stamp * MS, stamp, now=0.0)
+    synchronizer.add_cloud(100 * MS, "cloud", now=0.0)
+    assert drain(synchronizer, 0.0)[0].images == {0: 97}
+
+
+def test_with_two_cameras_each_is_waited_for() -> None:
+    synchronizer = make(cameras=2)
+    synchronizer.add_cloud(100 * MS, "cloud", now=0.0)
+    synchronizer.add_image(0, 100 * MS, "left", now=0.0)
+    assert synchronizer.pop(0.01) is None
+    synchronizer.add_image(1, 100 * MS, "right", now=0.01)
+    assert drain(synchronizer, 0.01)[0].images == {0: "left", 1: "right"}
+
+
+def test_a_camera_that_never_comes_is_not_waited_for_forever() -> None:
+    synchronizer = make()
+    for n in range(PATIENCE):
+        synchronizer.add_cloud((100 + n) * 100 * MS, n, now=float(n))
+        assert synchronizer.pop(n + 0.01) is None
+        assert synchronizer.pop(n + 0.03) is not None
+    synchronizer.add_cloud(1000 * 100 * MS, "last", now=100.0)
+    assert synchronizer.pop(100.0) is not None
+    assert not synchronizer.cameras[0].awaited
+
+
+def test_a_camera_that_comes_late_in_the_drive_is_used_from_then_on() -> None:
+    """Its images arrive a little after the clouds: too late for one that does not wait, in time for one that does."""
+    synchronizer = make()
+    joined = []
+    for n in range(3 * PATIENCE):
+        arrival = 0.1 * n
+        synchronizer.add_cloud((100 + 100 * n) * MS, n, arrival)
+        taken = drain(synchronizer, arrival)
+        if n >= 2 * PATIENCE:
+            synchronizer.add_image(0, (100 + 100 * n) * MS, n, arrival + 0.01)
+        taken += drain(synchronizer, arrival + 0.05)
+        joined += [bool(bundle.images) for bundle in taken]
+    assert joined == [False] * (2 * PATIENCE + 1) + [True] * (PATIENCE - 1)
+
+
+def test_a_camera_that_is_always_too_late_costs_no_latency() -> None:
+    synchronizer = make()
+    for n in range(20):
+        synchronizer.add_cloud((100 + 100 * n) * MS, n, 0.1 * n)
+        waits = synchronizer.pop(0.1 * n) is None
+        assert waits == (n < PATIENCE)
+        drain(synchronizer, 0.1 * n + 0.03)
+        synchronizer.add_image(0, (100 + 100 * n) * MS, n, 0.1 * n + 0.07)
+    assert synchronizer.cameras[0].late == 20
+
+
+def test_a_camera_that_stops_is_given_up_after_some_frames() -> None:
+    synchronizer = make()
+    for n in range(20):
+        if n < 5:
+            synchronizer.add_image(0, (100 + 100 * n) * MS, n, 0.1 * n)
+        synchronizer.add_cloud((100 + 100 * n) * MS, n, 0.1 * n)
+        waits = synchronizer.pop(0.1 * n) is None
+        assert waits == (5 <= n < 5 + PATIENCE)
+        drain(synchronizer, 0.1 * n + 0.03)
+    assert synchronizer.cameras[0].matched == 5
+
+
+def test_a_full_queue_drops_the_oldest_and_counts() -> None:
+    synchronizer = make(depth=3)
+    for n in range(5):
+        synchronizer.add_cloud((100 + n) * MS, n, now=0.0)
+    assert [bundle.cloud for bundle in drain(synchronizer, 1.0)] == [2, 3, 4]
+    assert synchronizer.dropped == 2
+
+
+@pytest.mark.parametrize(
+    ("stamp_ms", "verdict"),
+    [
+        (10_000, Verdict.REPEATED),
+        (9_900, Verdict.OUT_OF_ORDER),
+        (9_000, Verdict.OUT_OF_ORDER),
+        (8_999, Verdict.RESTARTED),
+        (10_001, Verdict.ACCEPTED),
+        (99_000, Verdict.ACCEPTED),
+    ],
+)
+def test_stamps_that_repeat_jump_back_or_forward(stamp_ms: int, verdict: Verdict) -> None:
+    synchronizer = make(cameras=0)
+    synchronizer.add_cloud(10_000 * MS, "before", now=0.0)
+    assert synchronizer.add_cloud(stamp_ms * MS, "after", now=0.1) is verdict
+    left = drain(synchronizer, 0.1)
+    accepted = verdict in (Verdict.ACCEPTED, Verdict.RESTARTED)
+    assert [bundle.cloud for bundle in left] == ["before"] + ["after"] * accepted
+    assert [bundle.restarted for bundle in left] == [False] + [verdict is Verdict.RESTARTED] * accepted
+    assert synchronizer.counts[verdict] == 1 + (verdict is Verdict.ACCEPTED)
+
+
+def test_a_restart_survives_the_drop_of_its_cloud() -> None:
+    synchronizer = make(cameras=0, depth=2)
+    for stamp in (10_000, 1_000, 1_100, 1_200):
+        synchronizer.add_cloud(stamp * MS, stamp, now=0.0)
+    assert [(b.cloud, b.restarted) for b in drain(synchronizer, 0.0)] == [(1_100, True), (1_200, False)]
+
+
+def test_images_join_again_after_a_restart() -> None:
+    synchronizer = make()
+    joined = []
+    for stamp in (10_000, 10_100, 1_000, 1_100):
+        synchronizer.add_image(0, stamp * MS, stamp, now=0.0)
+        synchronizer.add_cloud(stamp * MS, stamp, now=0.0)
+        joined += [bundle.images for bundle in drain(synchronizer, 0.0)]
+    assert joined == [{0: stamp} for stamp in (10_000, 10_100, 1_000, 1_100)]
+
+
+@given(
+    events=st.lists(
+        st.tuples(st.sampled_from(["cloud", "left", "right"]), st.integers(0, 60), st.floats(0, 0.05)), max_size=60
+    ),
+    depth=st.integers(1, 5),
+)
+def test_every_cloud_leaves_once_or_is_counted(events: list[tuple[str, int, float]], depth: int) -> None:
+    """Whatever comes in, in whatever order: accepted clouds leave in order, each once; images stay within tolerance."""
+    synchronizer, now, given_in, out = make(cameras=2, depth=depth), 0.0, [], []
+    for what, stamp, pause in events:
+        now += pause
+        if what == "cloud":
+            verdict = synchronizer.add_cloud(stamp * 50 * MS, stamp * 50 * MS, now)
+            if verdict in (Verdict.ACCEPTED, Verdict.RESTARTED):
+                given_in.append(stamp * 50 * MS)
+        else:
+            synchronizer.add_image(what == "right", stamp * 50 * MS, stamp * 50 * MS, now)
+        out += drain(synchronizer, now)
+    out += drain(synchronizer, now + 1)
+    assert len(synchronizer) == 0
+    assert len(out) + synchronizer.dropped == len(given_in)
+    remaining = iter(given_in)
+    assert all(bundle.cloud in remaining for bundle in out)  # a subsequence: same order, none twice
+    assert all(abs(image - bundle.stamp) <= 50 * MS for bundle in out for image in bundle.images.values())
