@@ -9,6 +9,7 @@ from time import perf_counter, process_time
 from typing import Any
 
 import numpy as np
+from rich.box import SIMPLE
 from rich.console import Group
 from rich.progress import Progress
 from rich.table import Table
@@ -19,6 +20,7 @@ from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.bench.harness import Options, Report, drives, processors, unique_name
 from dpm2_core.evaluation.metrics import Metrics, evaluate
 from dpm2_core.frame import Array, Frame
+from dpm2_core.slam.output import TrajectoryRecorder
 from dpm2_core.slam.system import Config, SlamSystem
 
 LENGTHS = (10.0, 20.0, 30.0, 40.0, 50.0)
@@ -34,7 +36,7 @@ class Outcome:
     """One method on one drive, once.
 
     Attributes:
-        poses: (N, 4, 4) T_odom_lidar, before any loop closure.
+        poses: (N, 4, 4) of the LiDAR; ours as `dpm2 run` writes them, after optimisation of the pose graph.
         seconds: (N,) wall time of each frame.
         cpu_seconds: of all frames and threads; other programs disturb it less.
         stages: (N,) wall time of each stage, s.
@@ -58,7 +60,7 @@ def dpm2(options: Options) -> Method:
 
     def run(frames: Sequence[Frame]) -> Outcome:
         system = SlamSystem(settings)
-        tracked, seconds = [], np.zeros(len(frames))
+        tracked, recorder, seconds = [], TrajectoryRecorder(), np.zeros(len(frames))
         cpu = process_time()
         for i, frame in enumerate(frames):
             started = perf_counter()
@@ -67,7 +69,9 @@ def dpm2(options: Options) -> Method:
         cpu = process_time() - cpu
         stages = {stage: np.array([t.seconds[stage] for t in tracked]) for stage in tracked[0].seconds}
         failed = sum(not t.registration.ok for t in tracked)
-        return Outcome(np.array([t.T_odom_lidar for t in tracked]), seconds, cpu, stages, failed)
+        for t in tracked:
+            recorder.add(t)
+        return Outcome(recorder.poses(system.mapper.poses), seconds, cpu, stages, failed)
 
     return run
 
@@ -172,7 +176,9 @@ def _compare(methods: dict[str, Any]) -> None:
 
 
 def _table(results: dict[str, Any]) -> Table:
-    table = Table(title="RPE: mean. APE: after SE(3) alignment. Drift: aligned at the start.", title_justify="left")
+    table = Table(
+        title="RPE: mean. APE: after SE(3) alignment. Drift: aligned at the start.", title_justify="left", box=SIMPLE
+    )
     for column in ("drive", "method"):
         table.add_column(column, no_wrap=True)
     for column in ("RPE m", "RPE deg", "APE m", "drift %", "Hz", "p95 ms", "CPU ms"):
@@ -190,7 +196,7 @@ def _table(results: dict[str, Any]) -> Table:
 
 
 def _stages(drive: str, methods: dict[str, Any]) -> Table:
-    table = Table(title=f"Stages of {OURS} on {drive}, ms", title_justify="left")
+    table = Table(title=f"Stages of {OURS} on {drive}, ms", title_justify="left", box=SIMPLE)
     for column in ("stage", "median", "p95"):
         table.add_column(column, justify="left" if column == "stage" else "right")
     for stage, quantiles in methods[OURS]["stages_ms"].items():

@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.box import SIMPLE
 from rich.console import Group
 from rich.progress import track
 from rich.table import Table
 
 from dpm2_core.config import load_settings
-from dpm2_core.errors import Dpm2Error
+from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.evaluation.bench.harness import Options, Report, drives, unique_name
 from dpm2_core.slam.system import Config, SlamSystem
 
@@ -21,7 +22,13 @@ _EVERY = 50  # frames between two samples
 
 
 def bench_memory(options: Options) -> Report:
-    """Run the SLAM over each drive, read frame by frame, and sample the resident set every 50 frames."""
+    """Run the SLAM over each drive, read frame by frame, and sample the resident set every 50 frames.
+
+    Raises:
+        UsageError: no drive was given; the KITTI excerpt is too short to say anything.
+    """
+    if not options.sources:
+        raise UsageError("memory: give --source with a long drive; `dpm2 sim DIR --frames 2000 --no-images` makes one")
     settings = load_settings(Config, None, [f"slam.threads={options.threads}", *options.overrides]).slam
     results: dict[str, Any] = {}
     with drives(options) as sources:
@@ -64,7 +71,7 @@ def resident_mb() -> float:
 
 
 def _table(results: dict[str, Any]) -> Table:
-    table = Table(title="Resident memory, MB", title_justify="left")
+    table = Table(title="Resident memory, MB", title_justify="left", box=SIMPLE)
     for column in ("drive", "frames", "keyframes", "start", "half way", "end", "growth a 1000 frames, second half"):
         table.add_column(column, justify="left" if column == "drive" else "right")
     for drive, row in results.items():

@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`dpm2 eval` prints the reference figures, says how it judged, and refuses what it cannot judge."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dpm2_core.commands.eval import eval_, parse_lengths
+from dpm2_core.data.kitti import read_calib
+from dpm2_core.errors import UsageError
+from dpm2_core.evaluation.trajectory import read_trajectory, write_kitti, write_tum
+from dpm2_core.geometry import se3
+
+
+@pytest.mark.parametrize(("name", "printed"), [("ORB", "0.006997 0.000044"), ("SPTAM", "0.014870 0.000097")])
+def test_it_prints_what_the_development_kit_prints(
+    kitti_excerpt: Path, capsys: pytest.CaptureFixture[str], name: str, printed: str
+) -> None:
+    eval_(kitti_excerpt / "gt_poses" / "00.txt", kitti_excerpt / "results" / f"KITTI_00_{name}.txt")
+    shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "3283 segments" in shown
+    for figure in printed.split():
+        assert figure in shown
+    assert "Umeyama" in shown
+    assert "Sensor frame" in shown
+
+
+def _drive(count: int = 60) -> np.ndarray:
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, 2, 3] = np.arange(count)  # the camera looks along z
+    return poses
+
+
+def test_the_json_holds_the_fixed_keys_and_how_they_were_measured(tmp_path: Path) -> None:
+    est = _drive()
+    est[:, 2, 3] *= 1.01
+    write_kitti(tmp_path / "gt.txt", _drive())
+    write_kitti(tmp_path / "est.txt", est[:-10], range(50))
+    eval_(tmp_path / "gt.txt", tmp_path / "est.txt", tmp_path / "new" / "m.json", "10,20")
+    result = json.loads((tmp_path / "new" / "m.json").read_text())
+    assert (result["frames"], result["failed_frames"], result["fps"]) == (60, 10, None)
+    assert (result["lengths_m"], result["segments"]) == ([10, 20], 39 + 29)
+    assert result["rpe_trans_m"] == pytest.approx(0.01)
+    assert result["final_drift_percent"] == pytest.approx(1.0)
+    assert result["t_err_percent"] == pytest.approx((39 * 1.1 + 29 * 1.05) / 68)
+    assert "same sensor" in result["frame"]
+    eval_(tmp_path / "gt.txt", tmp_path / "est.txt", tmp_path / "m.json")
+    assert json.loads((tmp_path / "m.json").read_text())["t_err_percent"] is None
+
+
+def test_lidar_poses_meet_camera_ground_truth_through_the_calibration(tmp_path: Path, kitti_excerpt: Path) -> None:
+    """Compared without it, a drive that turns by 90 degrees seems decimetres off."""
+    folder = kitti_excerpt / "00"
+    T_cam_lidar = read_calib(folder / "calib.txt")["Tr"]
+    T_lidar = se3.inverse(T_cam_lidar) @ read_trajectory(folder / "poses.txt").poses @ T_cam_lidar
+    write_tum(tmp_path / "est.tum", np.arange(len(T_lidar)) * 10**8, T_lidar)
+    for calib, least, most in ((folder / "calib.txt", 0, 1e-5), (None, 0.1, 10)):
+        eval_(folder / "poses.txt", tmp_path / "est.tum", tmp_path / "m.json", calib=calib)
+        ape = json.loads((tmp_path / "m.json").read_text())["ape_rmse_m"]
+        assert least <= ape <= most
+
+
+def test_different_lengths_are_refused_naming_both(tmp_path: Path) -> None:
+    write_kitti(tmp_path / "gt.txt", _drive(60))
+    write_kitti(tmp_path / "est.txt", _drive(50))
+    with pytest.raises(UsageError, match=r"60 poses .* 50 "):
+        eval_(tmp_path / "gt.txt", tmp_path / "est.txt")
+
+
+@pytest.mark.parametrize("text", ["", "ten", "10,,20", "0", "-5", "inf", "nan"])
+def test_lengths_that_are_none_are_refused(text: str) -> None:
+    with pytest.raises(UsageError, match=f"--lengths {text}"):
+        parse_lengths(text)
+
+
+def test_a_calibration_without_tr_or_that_is_not_there_is_refused(tmp_path: Path) -> None:
+    write_kitti(tmp_path / "gt.txt", _drive())
+    (tmp_path / "calib.txt").write_text("P0: 1 0 0 0 0 1 0 0 0 0 1 0\n")
+    for name, reason in (("calib.txt", "no Tr"), ("none.txt", "no such file")):
+        with pytest.raises(UsageError, match=f"{name}: {reason}"):
+            eval_(tmp_path / "gt.txt", tmp_path / "gt.txt", calib=tmp_path / name)

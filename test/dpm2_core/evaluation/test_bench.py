@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The benchmark harness runs each method on the same drive, and its record says how it was made."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dpm2_core.commands.bench import bench
+from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.evaluation.bench.harness import Options, drives, processors
+from dpm2_core.evaluation.bench.memory import levelling, resident_mb
+from dpm2_core.evaluation.trajectory import write_kitti
+from dpm2_core.geometry import se3
+
+FRAMES = 6
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A KITTI sequence of a street with houses, 1 m a frame, as points with 1 cm of noise."""
+    folder = tmp_path_factory.mktemp("street")
+    (folder / "velodyne").mkdir()
+    (folder / "calib.txt").write_text("Tr: 0 -1 0 0 0 0 -1 0 1 0 0 0\n")
+    (folder / "dpm2_sim.json").write_text('{"vertical_angle_correction_deg": 0}')
+    rng = np.random.default_rng(0)
+    ground = rng.uniform([-40, -8, -1.7], [50, 8, -1.7], (12_000, 3))
+    walls = rng.uniform([-40, -1, -1.7], [50, 1, 5], (24_000, 3))
+    walls[:, 1] = np.where(walls[:, 1] < 0, -8, 8) + 2 * (np.floor(walls[:, 0] / 7) % 2)  # set back every other house
+    world = np.vstack([ground, walls])
+    T_world_lidar = se3.exp(np.outer(np.arange(FRAMES), [0, 0, 0.01, 1, 0, 0]))
+    for i, T in enumerate(T_world_lidar):
+        points = se3.transform(se3.inverse(T), world + rng.normal(scale=0.01, size=world.shape))
+        scan = np.column_stack([points, np.full(len(points), 0.5)]).astype("<f4")
+        scan.tofile(folder / "velodyne" / f"{i:06d}.bin")
+    T_cam_lidar = se3.make([[0, -1, 0], [0, 0, -1], [1, 0, 0]], [0, 0, 0])
+    write_kitti(folder / "poses.txt", T_cam_lidar @ T_world_lidar @ se3.inverse(T_cam_lidar))
+    return folder
+
+
+def test_the_geometric_benchmark_records_errors_speed_and_origin(drive: Path, tmp_path: Path) -> None:
+    bench(["geometric"], source=[drive, drive], out=tmp_path, repetitions=2, threads=1, settings=["slam.map.voxel=1"])
+    record = json.loads((tmp_path / "geometric.json").read_text())
+    assert (record["benchmark"], record["overrides"]) == ("geometric", ["slam.map.voxel=1"])
+    assert record["machine"]["threads"] == 1
+    assert record["versions"]["numpy"] == np.__version__
+    assert set(record["drives"]) == {drive.name, f"{drive.name} (2)"}
+    ours = record["drives"][drive.name]["dpm2"]
+    assert (ours["frames"], ours["failed_frames"]) == (FRAMES, 0)
+    assert ours["rpe_trans_m"] < 0.02  # noise of 1 cm a point, thousands of points
+    assert len(ours["fps_of_repetitions"]) == 2
+    assert ours["frame_ms"]["p95"] >= ours["frame_ms"]["median"] > 0
+    assert set(ours["stages_ms"]) == {"preprocess", "register", "update", "map"}
+
+
+def test_kiss_icp_runs_beside_it_on_the_same_scans(drive: Path, tmp_path: Path) -> None:
+    pytest.importorskip("kiss_icp")
+    bench(None, source=[drive], out=tmp_path, repetitions=1, threads=2)
+    methods = json.loads((tmp_path / "geometric.json").read_text())["drives"][drive.name]
+    assert methods["kiss-icp"]["rpe_trans_m"] < 0.02
+    ratio = methods["ratio"]
+    assert ratio["fps"] == pytest.approx(methods["dpm2"]["fps"] / methods["kiss-icp"]["fps"], rel=0.01)
+    assert ratio["ape_rmse_m"] == pytest.approx(methods["dpm2"]["ape_rmse_m"] / methods["kiss-icp"]["ape_rmse_m"])
+
+
+def test_the_memory_benchmark_samples_the_resident_set(drive: Path, tmp_path: Path) -> None:
+    bench(["memory"], source=[drive], out=tmp_path)
+    result = json.loads((tmp_path / "memory.json").read_text())["drives"][drive.name]
+    assert result["samples"][0][0] == 0
+    assert result["rss_mb"]["start"] > 20, "an interpreter with numpy alone takes more"
+    assert result["keyframes"] >= 1
+
+
+def test_memory_that_grows_and_memory_that_levels_off_are_told_apart() -> None:
+    frames = range(0, 2001, 50)
+    grows = levelling([(n, 100 + 0.1 * n) for n in frames])
+    level = levelling([(n, 100 + min(0.1 * n, 80)) for n in frames])
+    assert grows["growth_mb_per_1000_frames_second_half"] == pytest.approx(100)
+    assert level["growth_mb_per_1000_frames_second_half"] == pytest.approx(0, abs=1e-9)
+    assert level["rss_mb"] == {"start": 100, "half": 180, "end": 180}
+    assert levelling([(0, 100.0)])["growth_mb_per_1000_frames_second_half"] is None
+
+
+def test_the_resident_set_follows_what_is_allocated() -> None:
+    before = resident_mb()
+    block = np.ones(2**23)  # 64 MB
+    assert resident_mb() - before == pytest.approx(64, abs=8)
+    del block
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="only Linux binds a process to processors")
+def test_processors_are_limited_inside_the_block_alone() -> None:
+    before = os.sched_getaffinity(0)
+    with processors(1):
+        assert len(os.sched_getaffinity(0)) == 1
+    assert os.sched_getaffinity(0) == before
+
+
+def test_a_packed_excerpt_is_unpacked_for_as_long_as_the_run_lasts(drive: Path, tmp_path: Path) -> None:
+    unpack = tmp_path / "unpack.py"
+    unpack.write_text(f"import shutil, sys\nshutil.copytree({str(drive)!r}, sys.argv[1] + '/sequences/07')")
+    with drives(Options(kitti=tmp_path)) as sources:
+        assert [(source.name, len(source)) for source in sources] == [("07", FRAMES)]
+        frame = next(iter(sources[0].frames(0, 1)))
+    assert len(frame.points) == 36_000
+    unpack.write_text("raise SystemExit('scan 3 is damaged')")
+    with pytest.raises(Dpm2Error, match=r"unpack\.py: .*scan 3 is damaged"), drives(Options(kitti=tmp_path)):
+        pass
+
+
+def test_what_cannot_be_measured_is_refused(drive: Path, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="speed: no such benchmark; choose from geometric, memory"):
+        bench(["geometric", "speed"])
+    with pytest.raises(UsageError, match="none: no KITTI excerpt"):
+        bench(kitti=tmp_path / "none")
+    with pytest.raises(UsageError, match=r"neither unpack\.py nor sequences"):
+        bench(kitti=tmp_path)
+    with pytest.raises(UsageError, match="memory: give --source"):
+        bench(["memory"])
+    with pytest.raises(UsageError, match="nonsense"):
+        bench(source=[drive], settings=["slam.nonsense=1"], out=tmp_path)
+    blind = tmp_path / "blind"
+    (blind / "velodyne").mkdir(parents=True)
+    (blind / "velodyne" / "000000.bin").write_bytes(b"\0" * 16)
+    with pytest.raises(UsageError, match="blind: the drive has no ground truth"):
+        bench(source=[blind], out=tmp_path)
+    assert not list(tmp_path.glob("*.json"))
