@@ -101,6 +101,11 @@ class Registration:
     ok: bool = True
     reason: str = ""
 
+    @property
+    def worst_sigma(self) -> float:
+        """Standard deviation of the position in its least certain direction, m."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.covariance[3:, 3:])[-1]))
+
 
 class State(StrEnum):
     """Health of the odometry, as published in /diagnostics."""

@@ -30,6 +30,8 @@ class LoopSettings(Settings):
     """Share of the points that must fit the map around the candidate."""
     max_rmse: float = 0.2
     """Largest residual of those that fit, m."""
+    max_sigma: float = 0.1
+    """Largest standard deviation of the position in its worst direction, m: refuses loops along a tunnel."""
     neighbours: int = 5
     """Keyframes on either side of the candidate that make up the map to register to."""
 
@@ -64,6 +66,8 @@ class LoopCloser:
             found = replace(found, ok=False, reason=f"only {found.confidence:.0%} of the points fit")
         elif found.ok and found.rmse > s.max_rmse:
             found = replace(found, ok=False, reason=f"residual {found.rmse:.2f} m")
+        elif found.ok and (sigma := found.worst_sigma) > s.max_sigma:
+            found = replace(found, ok=False, reason=f"position uncertain by {sigma:.2f} m")
         elif found.ok and (metres > 1.0 + s.drift * since[candidate] or degrees > 3.0 + 0.02 * since[candidate]):
             found = replace(found, ok=False, reason=f"{metres:.1f} m, {degrees:.1f} deg from the odometry")
         return LoopClosure(keyframes[candidate].id, keyframes[to].id, found)

@@ -24,7 +24,10 @@ class OdometrySettings(Settings):
     """A registration that differs from the prediction by more than this allows is refused, m/s2 (0.5 m are free)."""
     max_turn: float = 200.0
     """The same for rotation, deg/s of difference from the predicted rate (3 deg are free)."""
-    degraded_sigma: float = 0.15
+    steadiness: float = 10.0
+    """Standard deviation of the acceleration, m/s2 (and, in rad/s2, of the angular one): how far the prediction is
+    trusted where the points do not tell, as along a tunnel. Elsewhere they outweigh it."""
+    degraded_sigma: float = 0.08
     """Standard deviation of the position in its worst direction above which the state is `degraded`, m."""
     lost_after: int = 5
     """Frames without a registration until the state is `lost`; `degraded` before."""
@@ -62,6 +65,7 @@ class Odometry:
         self._covariance = np.zeros((6, 6))
         self._stamp: int | None = None
         self._failures = 0
+        self._first: Frame | None = None
         self._local_map.clear()
         self._keyframes.reset()
 
@@ -74,8 +78,12 @@ class Odometry:
         clock.append(perf_counter())
         T_predicted = self._T @ se3.exp(twist * dt)
         registration = self._register(scan, T_predicted, dt, frame.problem)
+        if self._first is not None and registration.ok:
+            scan, registration = self._begin_again(self._first, frame, registration, dt)
         clock.append(perf_counter())
         self._update(scan, registration, dt)
+        if registration.method == "first" and frame.time_offset is not None:
+            self._first = frame
         keyframe = self._keyframes.select(frame, scan, self._T, registration)
         clock.append(perf_counter())
         return Tracked(
@@ -106,9 +114,10 @@ class Odometry:
         if self._twist is None:
             starts = [T_predicted @ se3.exp([0, 0, 0, x, 0, 0]) for x in _STARTS]
             found = [self._registration.register(scan.source, self._local_map, T, 2.0) for T in starts]
-            return max(found, key=lambda r: (r.ok, round(r.confidence, 2), -r.rmse))
+            return max(found, key=lambda r: (r.ok, round(20 * r.confidence)))  # the first of equals: least motion
         widen = 1.0 + min(self._failures, 4)
-        answer = self._registration.register(scan.source, self._local_map, T_predicted, widen)
+        prior = np.eye(6) / (self._settings.steadiness * dt * dt * (1 + self._failures) ** 2) ** 2
+        answer = self._registration.register(scan.source, self._local_map, T_predicted, widen, prior)
         return self._gated(answer, T_predicted, dt)
 
     def _gated(self, answer: Registration, T_predicted: Array, dt: float) -> Registration:
@@ -121,6 +130,17 @@ class Odometry:
         if answer.ok and degrees > 3 + self._settings.max_turn * time:
             return replace(answer, ok=False, reason=f"{degrees:.0f} deg from the prediction")
         return answer
+
+    def _begin_again(
+        self, first: Frame, frame: Frame, registration: Registration, dt: float
+    ) -> tuple[Scan, Registration]:
+        """The second scan has shown the velocity: undo the motion in the first one too, and register anew."""
+        self._first = None
+        twist = se3.log(se3.inverse(self._T) @ registration.T_target_source) / dt
+        self._local_map.clear()
+        self._local_map.insert(self._preprocessor.prepare(first, twist).cloud, self._T)
+        scan = self._preprocessor.prepare(frame, twist)
+        return scan, self._registration.register(scan.source, self._local_map, registration.T_target_source)
 
     def _update(self, scan: Scan, registration: Registration, dt: float) -> None:
         """Move on: to the registered pose, or to the predicted one with the doubt that it deserves."""
@@ -155,7 +175,6 @@ class Odometry:
             return State.LOST
         if self._twist is None:
             return State.INITIALISING
-        sigma = np.sqrt(np.linalg.eigvalsh(registration.covariance[3:, 3:])[-1])
-        if not registration.ok or sigma > self._settings.degraded_sigma:
+        if not registration.ok or registration.worst_sigma > self._settings.degraded_sigma:
             return State.DEGRADED
         return State.TRACKING

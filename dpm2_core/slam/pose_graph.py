@@ -17,8 +17,8 @@ from dpm2_core.geometry import se3
 class PoseGraphSettings(Settings):
     """Optimisation of the keyframe poses."""
 
-    loop_kernel: float = 1.0
-    """Width of the Cauchy kernel on loop edges, in standard deviations."""
+    loop_kernel: float = 5.0
+    """Width of the Cauchy kernel on loop edges, in standard deviations: what is many times farther off hardly pulls."""
     iterations: int = 50
     """At most so many Levenberg-Marquardt steps a solve."""
 
@@ -70,10 +70,9 @@ class PoseGraph:
             for node, pose in enumerate(self._poses):
                 file.write(f"VERTEX_SE3:QUAT {node} {_pose_text(pose)}\n")
             for a, b, T, covariance in self.edges:
-                # g2o: translation first, and rotation as the vector part of the quaternion, half the angle
+                # Translation first; rotation in rad, as gtsam, Ceres and SE-Sync read it.
                 order = [3, 4, 5, 0, 1, 2]
-                scale = np.repeat([1.0, 2.0], 3)
-                information = np.linalg.inv(covariance)[np.ix_(order, order)] * np.outer(scale, scale)
+                information = np.linalg.inv(covariance)[np.ix_(order, order)]
                 upper = " ".join(f"{x:.17g}" for x in information[np.triu_indices(6)])
                 file.write(f"EDGE_SE3:QUAT {a} {b} {_pose_text(T)} {upper}\n")
 

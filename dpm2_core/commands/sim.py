@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`dpm2 sim`: a drive through the synthetic city."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from dpm2_core.config import settings_from
+from dpm2_core.sim.config import LidarConfig, PresetName
+
+
+def sim(
+    out: Annotated[Path, typer.Argument(help="Folder to make, in KITTI odometry layout; a complete one is reused.")],
+    frames: Annotated[int | None, typer.Option(help="At 10 Hz; 150, or all of a file.", show_default=False)] = None,
+    seed: Annotated[int, typer.Option(help="Of the world and the noise.")] = 0,
+    road: Annotated[
+        str, typer.Option(help="straight, loop, figure8, random, or a file of KITTI poses to drive along.")
+    ] = "loop",
+    preset: Annotated[PresetName, typer.Option(help="city, suburb, rural, highway or tunnel.")] = "city",
+    images: Annotated[bool, typer.Option("--images/--no-images", help="With image_2.")] = True,
+    beams: Annotated[int, typer.Option(help="Of the LiDAR: 16, 32, 64 or 128.")] = 64,
+    height: Annotated[float, typer.Option(help="Of the LiDAR above the ground, m.")] = 1.73,
+    reach: Annotated[float, typer.Option("--range", help="Of the LiDAR, m.")] = 80.0,
+    workers: Annotated[int, typer.Option(min=1, help="Threads; they do not change the result.")] = 2,
+) -> None:
+    """Simulate a drive: scans, images, poses, point labels, scans without moving objects, and a map of the ground."""
+    from dpm2_core.sim.drive import simulate  # embree and the rest are slow to import for the other commands
+
+    lidar = settings_from(LidarConfig, {"beams": beams, "height": height, "range": reach}, default="dpm2 sim")
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console) as bar:
+        task = bar.add_task(f"{preset} -> {out}", total=None)
+        made = simulate(
+            out, frames, seed, road, preset, images, lidar, workers=workers,
+            progress=lambda done, total: bar.update(task, completed=done, total=total),
+        )  # fmt: skip
+    console.print(f"{out}: {'written' if made else 'is there already'}", highlight=False, markup=False)

@@ -1,0 +1,31 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The fast voxel grid is exactly the first point of every cell."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dpm2_core.geometry.voxel import voxel_first
+
+
+@given(st.integers(0, 10_000), st.integers(0, 3000), st.floats(0.05, 5), st.sampled_from([np.float32, np.float64]))
+def test_first_of_every_cell(seed: int, count: int, size: float, dtype: type) -> None:
+    points = (np.random.default_rng(seed).normal(size=(count, 4)) * 40).astype(dtype)
+    cells = np.floor(points[:, :3] * points.dtype.type(1 / size)).astype(int)
+    seen: dict[tuple[int, ...], int] = {}
+    for i, cell in enumerate(map(tuple, cells)):
+        seen.setdefault(cell, i)
+    assert voxel_first(points, size).tolist() == sorted(seen.values())
+
+
+def test_many_cells_that_share_slots() -> None:
+    """More cells than the hash table has room for without collisions: still exact."""
+    points = np.random.default_rng(0).uniform(-500, 500, (400_000, 3))
+    cells = np.floor(points).astype(int)
+    assert len(voxel_first(points, 1.0)) == len(np.unique(cells, axis=0))
+
+
+def test_nothing_in_nothing_out() -> None:
+    assert len(voxel_first(np.zeros((0, 4), np.float32), 0.5)) == 0
