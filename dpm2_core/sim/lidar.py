@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dpm2_core.geometry import se3
 from dpm2_core.sim.config import LidarConfig
 from dpm2_core.sim.materials import DARK, MISS, MOVING_LABEL, REFLECTANCE, RETRO, ROUGHNESS
-from dpm2_core.sim.mesh import Hits, Mesh, Scene
+from dpm2_core.sim.mesh import Hits, Mesh, rotated
 from dpm2_core.sim.world import World
 
 Array = NDArray[np.float64]
@@ -100,7 +100,7 @@ class Lidar:
             moving[toward] = hits.distance < still.distance[toward]
             near = moving[toward]
             chosen = toward[near]
-            hits = Hits(hits.distance[near], hits.face[near], hits.normal[near], hits.weights[near])
+            hits = hits.part(near)
             seen, came = self._returns(
                 world, mesh, hits, origins[chosen], directions[chosen], chance[:, chosen], jitter[:, chosen], chosen
             )
@@ -118,7 +118,7 @@ class Lidar:
 
     def _rays(self, T_world_lidar: Array, twist: Array | None) -> tuple[Float, Float]:
         if twist is None:
-            directions = self.directions @ T_world_lidar[:3, :3].T.astype(np.float32)
+            directions = rotated(self.directions, T_world_lidar[:3, :3])
             return np.broadcast_to(T_world_lidar[:3, 3].astype(np.float32), directions.shape).copy(), directions
         T = T_world_lidar @ se3.exp(np.asarray(twist) * self.column_time[:, None].astype(float))
         R = T[:, :3, :3].astype(np.float32)[self.column]

@@ -32,13 +32,13 @@ class Path:
 
     def __init__(self, xy: ArrayLike, closed: bool = False) -> None:
         line = np.asarray(xy, float)
-        xy = np.concatenate([line, line[:1]]) if closed else line
-        chord = np.linalg.norm(np.diff(xy, axis=0), axis=1)
-        xy = xy[np.concatenate([[True], chord > 1e-6])]
-        s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))])
+        if closed:
+            line = np.concatenate([line, line[:1]])
+        line = line[np.concatenate([[True], np.linalg.norm(np.diff(line, axis=0), axis=1) > 1e-6])]
+        s = _arc_lengths(line)
         self.closed, self.length = closed, float(s[-1])
-        self.s = np.linspace(0, self.length, max(int(round(self.length / STEP)), 2) + 1)
-        self.xy = np.stack([np.interp(self.s, s, xy[:, k]) for k in (0, 1)], -1)
+        self.s = np.linspace(0, self.length, max(round(self.length / STEP), 2) + 1)
+        self.xy = np.stack([np.interp(self.s, s, line[:, k]) for k in (0, 1)], -1)
         ahead = np.gradient(self.xy, axis=0)
         if closed:
             ahead[0] = ahead[-1] = self.xy[1] - self.xy[-2]
@@ -143,7 +143,7 @@ def _centre(kind: str, preset: Preset, rng: np.random.Generator, length: float) 
         shape = Path(xy, True)
         # Gaussian smoothing rounds the corners with gradually changing curvature, as real streets do.
         shape = Path(shape.xy[:-1] * length / shape.length, True)
-        path = Path(_smooth(shape.xy[:-1], min(7.0, length / 25), True), True)
+        path = Path(_smooth(shape.xy[:-1], float(np.clip(length / 11, 4.0, 12.0)), True), True)
         xy = path.xy[:-1] * length / path.length
     R = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     return Path(xy @ R.T, closed)
@@ -160,12 +160,12 @@ def _smooth(xy: Array, sigma: float, closed: bool) -> Array:
 
 
 def _progress(path: Path, speed: float, start: float) -> tuple[Array, Array]:
-    """Times and arc lengths of a comfortable drive from `start`: 2.2 m/s^2 sideways, 1.5 m/s^2 along."""
+    """Times and arc lengths of a comfortable drive from `start`: 4 m/s^2 sideways, 1.5 m/s^2 along."""
     laps = 3 if path.closed else 1  # the middle lap of three is periodic
     curvature = np.abs(np.gradient(path.yaw, path.s))
     curvature = np.maximum(gaussian_filter1d(curvature, 4, mode="wrap" if path.closed else "nearest"), 1e-4)
     pace = speed * (1 + 0.08 * np.sin(2 * np.pi * path.s / path.length * max(1, round(path.length / 90))))
-    square = np.tile(np.minimum(pace**2, 2.2 / curvature)[: -1 if path.closed else None], laps)
+    square = np.tile(np.minimum(pace**2, 4.0 / curvature)[: -1 if path.closed else None], laps)
     s = np.arange(len(square)) * (path.s[1] - path.s[0])
     slope = 2 * 1.5 * s
     square = np.minimum(np.minimum.accumulate(square - slope) + slope, square)
@@ -250,8 +250,7 @@ def _road_of_poses(kind: str, preset: Preset, rng: np.random.Generator) -> Road:
 
 
 def _arc_lengths(xy: Array) -> Array:
-    steps = np.linalg.norm(np.diff(xy, axis=0), axis=1)
-    return np.concatenate([np.zeros(1), np.cumsum(steps, dtype=float)])
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))])
 
 
 def _first_visits(xy: Array, radius: float = 5.0, lag: float = 30.0) -> Iterator[tuple[int, int]]:

@@ -54,7 +54,7 @@ class Terrain:
     """
 
     def __init__(self, road: Road, preset: Preset, rng: np.random.Generator) -> None:
-        self.preset = preset
+        self.preset, self.resolution = preset, RESOLUTION
         self.centre = np.concatenate([p.xy for p in road.streets])
         self.yaw = np.concatenate([p.yaw for p in road.streets])
         offsets = np.cumsum([0.0] + [p.length + 1e3 for p in road.streets])
@@ -143,6 +143,17 @@ class Terrain:
         edge = self.edge_at(xy)
         return self.height_at(xy) + KERB * ((edge > 0) & (edge < self.preset.sidewalk))
 
+    def elevation(self) -> NDArray[np.float32]:
+        """(H, W) m, what one stands on at the cells, kerbs included; NaN beyond the mesh."""
+        y, x = (
+            self.origin[k] + np.arange(n) * RESOLUTION for k, n in ((1, self.edge.shape[0]), (0, self.edge.shape[1]))
+        )
+        out = np.full(self.edge.shape, np.nan, np.float32)
+        inside = self.edge < MARGIN - 15
+        xy = np.stack(np.broadcast_arrays(x[None], y[:, None]), -1)[inside]
+        out[inside] = self.surface_at(xy)
+        return out
+
     def lane_coordinates(self, xy: NDArray[np.floating]) -> tuple[NDArray, NDArray, NDArray[np.bool_]]:
         """Of points (N, 2): metres to the left of the nearest street's centre, metres along it, and whether at a crossing."""
         sample = self.nearest[self._cell(xy)]
@@ -175,14 +186,33 @@ class Terrain:
         return merge([*self._grid(), *self._sidewalks()])
 
     def _grid(self) -> Iterator[Mesh]:
-        fine_nodes = self.height[::2, ::2], self.edge[::2, ::2]
-        near = fine_nodes[1] < FINE
+        edge = self.edge[::2, ::2]
+        near = edge < FINE
         corners = near[:-1, :-1] | near[1:, :-1] | near[:-1, 1:] | near[1:, 1:]
-        yield _grid_mesh(self.origin, 2 * RESOLUTION, *fine_nodes, corners, self.preset)
+        x, y = (self.origin[k] + np.arange(n) * 2 * RESOLUTION for k, n in ((0, edge.shape[1]), (1, edge.shape[0])))
+        xy = np.stack(np.broadcast_arrays(x[None], y[:, None]), -1)
+        yield self._cells(*_snapped(xy, edge), corners)
         blocks = corners.reshape(corners.shape[0] // 4, 4, corners.shape[1] // 4, 4).all((1, 3))
-        height, edge = self.height[::8, ::8], self.edge[::8, ::8]
-        seen = ~blocks & (edge[:-1, :-1] < MARGIN - 10)
-        yield _grid_mesh(self.origin, 8 * RESOLUTION, height, edge, seen, self.preset)
+        coarse = edge[::4, ::4]
+        yield self._cells(xy[::4, ::4], coarse, ~blocks & (coarse[:-1, :-1] < MARGIN - 10))
+
+    def _cells(self, xy: Array, edge: NDArray, keep: NDArray[np.bool_]) -> Mesh:
+        """Two triangles for each kept cell between nodes (H, W, 2), classified by the mean distance to the kerb."""
+        i, j = np.nonzero(keep)
+        used = np.zeros(edge.shape, bool)
+        for di, dj in ((0, 0), (0, 1), (1, 0), (1, 1)):
+            used[i + di, j + dj] = True
+        number = np.cumsum(used.ravel(), dtype=np.int32).reshape(used.shape) - 1
+        a, b, c, d = number[i, j], number[i, j + 1], number[i + 1, j + 1], number[i + 1, j]
+        faces = np.stack([a, b, c, a, c, d], -1).reshape(-1, 3)
+        xyz = np.concatenate([xy[used], self.height_at(xy[used])[:, None]], -1)
+        middle = edge[used][faces].mean(1)
+        road = middle < 0
+        paved = self.preset.degenerate | (middle < self.preset.sidewalk)
+        label = np.where(road, Label.ROAD, np.where(paved, Label.SIDEWALK, Label.TERRAIN))
+        material = np.where(road, Material.ASPHALT, np.where(paved, Material.PAVING, Material.GRASS))
+        colour = np.where(road[:, None], (112, 110, 110), np.where(paved[:, None], (150, 146, 138), (98, 118, 60)))
+        return make(xyz, faces, label, material, colour, xyz[:, :2].astype(np.float32)[faces])
 
     def _sidewalks(self) -> Iterator[Mesh]:
         if not self.preset.sidewalk:
@@ -218,26 +248,14 @@ def sheet(points: ArrayLike, label: Label, material: Material, colour: ArrayLike
     return make(points.reshape(-1, 3), faces, label, material, colour, uv[faces])
 
 
-def _grid_mesh(
-    origin: Array, cell: float, height: NDArray, edge: NDArray, keep: NDArray[np.bool_], preset: Preset
-) -> Mesh:
-    """Two triangles for each kept cell of a height grid, classified by the distance of its centre to the kerb."""
-    i, j = np.nonzero(keep)
-    used = np.zeros(height.shape, bool)
-    for di, dj in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        used[i + di, j + dj] = True
-    number = np.cumsum(used.ravel(), dtype=np.int32).reshape(used.shape) - 1
-    rows, columns = np.nonzero(used)
-    xyz = np.stack([origin[0] + columns * cell, origin[1] + rows * cell, height[used]], -1)
-    a, b, c, d = number[i, j], number[i, j + 1], number[i + 1, j + 1], number[i + 1, j]
-    faces = np.stack([a, b, c, a, c, d], -1).reshape(-1, 3)
-    middle = np.repeat((edge[i, j] + edge[i, j + 1] + edge[i + 1, j + 1] + edge[i + 1, j]) / 4, 2)
-    road = middle < 0.1
-    paved = preset.degenerate | (middle < preset.sidewalk)
-    label = np.where(road, Label.ROAD, np.where(paved, Label.SIDEWALK, Label.TERRAIN))
-    material = np.where(road, Material.ASPHALT, np.where(paved, Material.PAVING, Material.GRASS))
-    colour = np.where(road[:, None], (112, 110, 110), np.where(paved[:, None], (150, 146, 138), (98, 118, 60)))
-    return make(xyz, faces, label, material, colour, xyz[:, :2].astype(np.float32)[faces])
+def _snapped(xy: Array, edge: NDArray[np.float32]) -> tuple[Array, NDArray[np.float32]]:
+    """Nodes (H, W, 2) of a grid of 1 m, those next to a kerb moved onto it, and their distances to it: a road then has a
+    straight rim instead of a staircase."""
+    down, across = np.gradient(edge)
+    slope = np.hypot(down, across) + 1e-6
+    shift = np.where((np.abs(edge) < 0.71) & (slope > 0.5), edge, 0)  # 0.71: half of a cell's diagonal
+    step = -(shift / slope)[..., None] * np.stack([across, down], -1) / slope[..., None]
+    return xy + step, edge - shift
 
 
 def _value_noise(shape: tuple[int, ...], wavelength: float, rng: np.random.Generator) -> NDArray[np.float32]:

@@ -106,7 +106,7 @@ class World:
         return mesh, instance, hits, toward
 
 
-def build_world(road: str = "random", preset: str = "city", seed: int = 0, length: float = 400.0) -> World:
+def build_world(road: str = "random", preset: PresetName = "city", seed: int = 0, length: float = 400.0) -> World:
     """A world, the same for the same arguments.
 
     Args:
@@ -123,8 +123,8 @@ def build_world(road: str = "random", preset: str = "city", seed: int = 0, lengt
         raise UsageError(f"length {length:g} m of road: want 60 to 20000")
     if seed < 0:
         raise UsageError(f"--seed {seed}: want 0 or more")
-    rngs = [np.random.default_rng([seed, PRESET_NAMES.index(preset), k]) for k in range(5)]
-    kind = varied(PRESETS[preset], rngs[4])
+    rngs = [random_stream(seed, preset, k) for k in range(4)]
+    kind = varied(PRESETS[preset], random_stream(seed, preset, 4))
     streets = make_road(road, kind, rngs[0], length)
     terrain = Terrain(streets, kind, rngs[1])
     meshes = [terrain.ground()]
@@ -138,16 +138,23 @@ def build_world(road: str = "random", preset: str = "city", seed: int = 0, lengt
     return World(preset, seed, streets, terrain, traffic, Scene(merge(meshes)))
 
 
+def random_stream(seed: int, preset: PresetName, part: int) -> np.random.Generator:
+    """The random numbers of one part of a world: 0 roads, 1 terrain, 2 props, 3 traffic, 4 the preset's own values."""
+    return np.random.default_rng([seed, PRESET_NAMES.index(preset), part])
+
+
 def _towards(mesh: Mesh, origin: Float, directions: Float) -> NDArray[np.intp]:
     """Those rays (of R, 3) that lie within the azimuths and elevations which a mesh covers as seen from a point (3,)."""
     bins = 720
     away = mesh.vertices - origin
     flat = np.hypot(away[:, 0], away[:, 1]) + np.float32(1e-3)
     corners = np.arctan2(away[:, 1], away[:, 0])[mesh.faces]
-    width = np.abs(np.remainder(corners - corners[:, :1] + np.pi, 2 * np.pi) - np.pi).max(1, keepdims=True) + 0.03
-    covered = np.zeros(bins, bool)
-    azimuths = corners[:, :1] + width * np.linspace(-1, 1, 9)
-    covered[np.floor(azimuths / (2 * np.pi) * bins).astype(int) % bins] = True
+    spread = np.remainder(corners - corners[:, :1] + np.pi, 2 * np.pi) - np.pi
+    first = np.floor((corners[:, 0] + spread.min(1) - 0.01) / (2 * np.pi) * bins).astype(int)
+    last = np.floor((corners[:, 0] + spread.max(1) + 0.01) / (2 * np.pi) * bins).astype(int)
+    # +1 where a triangle begins, -1 after its end, over three turns folded into one
+    steps = np.bincount(first + bins, minlength=3 * bins + 1) - np.bincount(last + bins + 1, minlength=3 * bins + 1)
+    covered = np.cumsum(steps)[: 3 * bins].reshape(3, bins).any(0)
     slope = directions[:, 2] / (np.hypot(directions[:, 0], directions[:, 1]) + np.float32(1e-6))
     low, high = (away[:, 2] / flat).min() - 0.02, (away[:, 2] / flat).max() + 0.02
     azimuth = np.floor(np.arctan2(directions[:, 1], directions[:, 0]) / (2 * np.pi) * bins).astype(int) % bins

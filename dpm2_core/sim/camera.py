@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A rectified colour camera by ray casting: sun, sky, shadows, exposure, vignetting, noise."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dpm2_core.frame import Camera
+from dpm2_core.geometry import se3
+from dpm2_core.sim.config import CameraConfig
+from dpm2_core.sim.materials import Material
+from dpm2_core.sim.mesh import Hits, Mesh, Scene, rotated
+from dpm2_core.sim.shading import Surface, Textures
+from dpm2_core.sim.world import World
+
+Array = NDArray[np.float64]
+Float = NDArray[np.float32]
+_LINEAR = (np.arange(256, dtype=np.float32) / 255) ** np.float32(2.2)
+_RESPONSE = 255 * np.minimum(np.arange(4096, dtype=np.float32) / 4096 * 3 * 1.25, 1) ** np.float32(1 / 2.2)
+REACH = 600.0
+"""How far one sees, m."""
+
+
+def calibration(config: CameraConfig, name: str = "image_2") -> Camera:
+    """The camera on the car: looking ahead, 0.27 m ahead of and 0.08 m below the LiDAR, 0.06 m left of its middle."""
+    K = np.array([[config.focal, 0, config.width / 2 - 0.5], [0, config.focal, config.height / 2 - 0.5], [0, 0, 1]])
+    axes = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # x right, y down, z ahead
+    return Camera(K, se3.make(axes, (0.27, 0.06, -0.08)), (config.width, config.height), name=name)
+
+
+class Light:
+    """Sun and sky of a world, by its seed; in a tunnel only the lamps."""
+
+    def __init__(self, world: World) -> None:
+        rng = np.random.default_rng([world.seed, 78])
+        elevation, azimuth = np.radians(rng.uniform(22, 60)), rng.uniform(0, 2 * np.pi)
+        level = np.cos(elevation)
+        self.sun = np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], np.float32)
+        self.overcast = float(rng.beta(0.6, 1.4))
+        warm = np.array([1.0, 0.95, 0.86], np.float32)
+        self.direct = warm * np.float32(1.5 * (1 - 0.85 * self.overcast))
+        self.ambient = np.array([0.36, 0.41, 0.48], np.float32) * np.float32(1 + 0.8 * self.overcast)
+        self.tunnel = world.preset == "tunnel"
+        self.exposure = float(rng.uniform(0.85, 1.2))
+        self.textures = Textures(world.seed)
+
+    def sky(self, view: Float) -> Float:
+        """(P, 3) colour of the sky along directions (P, 3): a gradient, clouds, the glow round the sun."""
+        if self.tunnel:
+            return np.full((len(view), 3), 1.4, np.float32)
+        up = np.clip(view[:, 2], 0.0, 1)[:, None]
+        blue = np.array([0.62, 0.76, 0.95], np.float32) * (1 - up) + np.array([0.22, 0.42, 0.85], np.float32) * up
+        plane = view[:, :2] / (view[:, 2:] + np.float32(0.12))
+        cloud = sum(
+            a * self.textures.noise(plane + k, w) for k, (a, w) in enumerate(((1, 1.9), (0.5, 0.8), (0.25, 0.3)))
+        )
+        cover = np.clip(0.5 * cloud - 0.5 + 1.6 * self.overcast, 0, 1)[:, None]
+        grey = np.array([0.86, 0.87, 0.9], np.float32) * np.clip(0.9 + 0.1 * cloud[:, None], 0.6, 1.2)
+        glow = np.exp((view @ self.sun - 1) * 12)[:, None] * (1 - 0.7 * self.overcast)
+        return 1.15 * (blue * (1 - cover) + grey * cover) + glow
+
+    def shine(self, surface: Surface, lit: Float) -> Float:
+        """(P, 3) light on each point, of which the sun's share reaches `lit` (P,)."""
+        if self.tunnel:
+            falloff = 0.35 + 0.5 * np.clip(-surface.normal[:, 2] * 0.3 + np.abs(surface.normal[:, 2]), 0, 1)
+            return falloff[:, None] * np.array([1.15, 1.0, 0.78], np.float32)
+        facing = np.clip(surface.normal @ self.sun, 0, 1) * lit
+        leaf = surface.material == Material.LEAF  # lit from both sides
+        facing = np.where(leaf, 0.35 * lit + 0.5 * facing, facing)
+        open_sky = 0.6 + 0.4 * surface.normal[:, 2]
+        return facing[:, None] * self.direct + open_sky[:, None] * self.ambient
+
+
+@lru_cache(maxsize=64)
+def _light(world: World) -> Light:
+    return Light(world)
+
+
+@lru_cache(maxsize=8)
+def _rays(config: CameraConfig) -> Float:
+    """(H*W, 3) unit directions of the pixels in the camera frame."""
+    K = calibration(config).K
+    v, u = np.indices((config.height, config.width)).astype(float).reshape(2, -1)
+    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], -1)
+    return (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(np.float32)
+
+
+def render(
+    world: World, config: CameraConfig, T_world_cam: Array, time: float, rng: np.random.Generator
+) -> NDArray[np.uint8]:  # fmt: skip
+    """(H, W, 3) uint8 RGB of a world from a pose (4, 4) at a time, s; `rng` makes the pixel noise."""
+    light = _light(world)
+    view = rotated(_rays(config), T_world_cam[:3, :3])
+    eye = T_world_cam[:3, 3].astype(np.float32)
+    origins = np.broadcast_to(eye, view.shape).copy()
+    hits = world.scene.cast(origins, view, REACH)
+    surface, seen, distance = _visible(world, hits, origins, view, time, config)
+    radiance = np.empty((len(view), 3), np.float32)
+    sky = np.flatnonzero(~seen)
+    radiance[sky] = light.sky(view[sky])
+    albedo = light.textures.albedo(surface, world.terrain)
+    shape = (config.height, config.width)
+    lit = np.ones(len(albedo), np.float32)
+    if config.shadows and not light.tunnel and light.overcast < 0.85:
+        lit = _sunlit(world, surface, seen, light, time, eye, shape)
+    colour = albedo * light.shine(surface, lit)
+    lamp = surface.material == Material.LAMP
+    colour[lamp] = 1.3
+    haze = (1 - np.exp(-distance / np.float32(900 if not light.tunnel else 300)))[:, None]
+    radiance[seen] = colour * (1 - haze) + haze * np.array([0.72, 0.78, 0.86], np.float32)
+    return _develop(radiance.reshape(*shape, 3), light.exposure, config.noise, rng)
+
+
+def _visible(
+    world: World, hits: Hits, origins: Float, view: Float, time: float, config: CameraConfig
+) -> tuple[Surface, NDArray[np.bool_], Float]:
+    """The nearest surface points of the rays that meet one, static or moving; which rays these are; their distances."""
+    columns = _attributes(world.static, hits)
+    distance = hits.distance
+    movers = world.cast_movers(time, origins, view, REACH)
+    if movers is not None:
+        mesh, _, moving, toward = movers
+        near = moving.distance < distance[toward]
+        chosen = toward[near]
+        distance[chosen] = moving.distance[near]
+        for column, own in zip(columns, _attributes(mesh, moving), strict=True):
+            column[chosen] = own[near]
+    seen = np.isfinite(distance)
+    normal, uv, texture, material, colour = (column[seen] for column in columns)
+    direction, distance = view[seen], distance[seen]
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True) + np.float32(1e-12)
+    slope = np.einsum("ij,ij->i", normal, direction)
+    normal *= -np.sign(slope)[:, None]
+    footprint = distance / np.float32(config.focal) / np.sqrt(np.maximum(np.abs(slope), np.float32(0.02)))
+    position = origins[seen] + direction * distance[:, None]
+    surface = Surface(position, normal, direction, uv, texture, material, _LINEAR[colour], footprint)
+    return surface, seen, distance
+
+
+def _attributes(mesh: Mesh, hits: Hits) -> tuple[NDArray, ...]:
+    face = np.maximum(hits.face, 0)
+    corners = mesh.uv[face]
+    uv = (1 - hits.u - hits.v)[:, None] * corners[:, 0]
+    uv += hits.u[:, None] * corners[:, 1]
+    uv += hits.v[:, None] * corners[:, 2]
+    return hits.normal, uv, mesh.texture[face], mesh.material[face], mesh.colour[face]
+
+
+def _sunlit(
+    world: World,
+    surface: Surface,
+    seen: NDArray[np.bool_],
+    light: Light,
+    time: float,
+    eye: Float,
+    shape: tuple[int, int],
+) -> Float:
+    """(P,) 0..1, from rays to the sun through every other pixel of every other row."""
+    grid = np.full(seen.shape, -1, np.int32)
+    grid[seen] = np.arange(len(surface.material), dtype=np.int32)
+    sparse = grid.reshape(shape)[::2, ::2]
+    point = sparse[sparse >= 0]
+    origins = surface.position[point] + surface.normal[point] * np.float32(0.03)
+    towards = np.broadcast_to(light.sun, origins.shape).copy()
+    free = world.scene.cast(origins, towards, 150.0).face < 0
+    movers = world.traffic.mesh(time, eye)
+    if movers is not None:
+        free &= Scene(movers[0]).cast(origins, towards, 150.0).face < 0
+    half = np.ones(sparse.shape, np.float32)
+    half[sparse >= 0] = free
+    full = cv2.resize(half, (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR)
+    return full.reshape(-1)[seen]
+
+
+def _develop(radiance: Float, exposure: float, noise: float, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Automatic exposure, the lens's fall-off, the sensor's response and noise."""
+    height, width = radiance.shape[:2]
+    v, u = (np.linspace(-1, 1, n, dtype=np.float32) for n in (height, width))
+    vignette = 1 - 0.22 * (u[None] ** 2 * 0.8 + v[:, None] ** 2 * 0.2)
+    level = np.float32(exposure * 0.24 / (radiance[::4, ::4].mean() + 0.02))
+    x = radiance * (vignette * level)[..., None]
+    x *= np.float32(4096 / 3) / (1 + x)  # rolls off towards white
+    image = _RESPONSE[x.astype(np.uint16).clip(0, 4095)]
+    image += rng.standard_normal(image.shape, np.float32) * np.float32(noise)
+    return image.clip(0, 255).astype(np.uint8)

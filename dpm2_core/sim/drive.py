@@ -1,0 +1,231 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A drive through a world, written as a KITTI odometry data set with labels, static twins and a ground elevation map."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.geometry import se3
+from dpm2_core.sim.camera import calibration, render
+from dpm2_core.sim.config import PRESETS, CameraConfig, LidarConfig, PresetName, varied
+from dpm2_core.sim.lidar import Lidar
+from dpm2_core.sim.road import FRAME_PERIOD, ROAD_KINDS, make_road
+from dpm2_core.sim.world import World, build_world, random_stream
+
+Array = NDArray[np.float64]
+NOTE = "dpm2_sim.json"
+OVERLAP = 16.0
+"""How far a closed drive goes on beyond its start, m."""
+LONGEST_LAP = 800.0
+"""A longer drive goes round again, m."""
+_LIDAR_STREAM, _CAMERA_STREAM = 10, 11
+
+
+def simulate(
+    out: Path,
+    frames: int | None = None,
+    seed: int = 0,
+    road: str = "loop",
+    preset: PresetName = "city",
+    images: bool = True,
+    lidar: LidarConfig | None = None,
+    camera: CameraConfig | None = None,
+    workers: int = 2,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> bool:
+    """Write a drive to `out`, which appears when it is complete and not before.
+
+    Args:
+        out: root of the KITTI layout: sequences/00/{velodyne,image_2,labels,static,...}, poses/00.txt.
+        frames: at 10 Hz; None for 150, or all of a file of poses. The result does not depend on `workers`.
+        road, preset, seed: see `build_world`. The lap of a closed road is chosen so that the drive ends where it began.
+        progress: called with frames done and frames in all.
+
+    Returns:
+        False if the same drive was there already, and is left as it is.
+
+    Raises:
+        UsageError: an argument cannot be, or `out` holds something else. Dpm2Error: it could not be written.
+    """
+    lidar, camera = lidar or LidarConfig(), camera or CameraConfig()
+    frames = _frames(road, frames)
+    recipe = _recipe(frames, seed, road, preset, images, lidar, camera)
+    if _is_there(out, recipe):
+        return False
+    world = build_world(road, preset, seed, _length(road, preset, seed, frames) if road in ROAD_KINDS else 400.0)
+    drive = _Drive(world, Lidar(lidar), camera if images else None, frames)
+    with _whole(out) as part:
+        drive.write(part, recipe, workers, progress)
+    return True
+
+
+def _frames(road: str, frames: int | None) -> int:
+    if frames is not None and frames < 1:
+        raise UsageError(f"--frames {frames}: want at least 1")
+    if road in ROAD_KINDS:
+        return 150 if frames is None else frames
+    known = len(make_road(road, PRESETS["city"], np.random.default_rng(0)).times)
+    if frames is not None and frames > known:
+        raise UsageError(f"--frames {frames}: {road} has {known}")
+    return known if frames is None else frames
+
+
+def _length(road: str, preset: PresetName, seed: int, frames: int) -> float:
+    """Of the road, m, that a drive of so many frames just fills."""
+    if preset not in PRESETS:
+        return 400.0  # build_world refuses it with the proper words
+    kind = varied(PRESETS[preset], random_stream(seed, preset, 4))
+    end = (frames - 1) * FRAME_PERIOD
+    length = float(np.clip(end * kind.speed, 60, 20000))
+    for _ in range(12):  # how far it goes depends on the curves, and these on the length
+        streets = make_road(road, kind, random_stream(seed, preset, 0), length)
+        driven = float(streets.distance(end) - streets.distance(0.0))
+        if streets.drive.closed:
+            length = min(length + 0.8 * (driven - OVERLAP - streets.drive.length), LONGEST_LAP)
+        else:
+            length = driven
+        length = float(np.clip(length, 60, 20000))
+    return length
+
+
+def _recipe(frames: int, seed: int, road: str, preset: PresetName, images: bool, lidar: LidarConfig, camera: CameraConfig) -> dict[str, Any]:  # fmt: skip
+    if road not in ROAD_KINDS:
+        road = f"{Path(road).name} sha256:{hashlib.sha256(Path(road).read_bytes()).hexdigest()}"
+    return {
+        "generator": "dpm2 sim 1",
+        "frames": frames,
+        "seed": seed,
+        "road": road,
+        "preset": preset,
+        "images": images,
+        "vertical_angle_correction_deg": 0,
+        "lidar": lidar.model_dump(),
+        "camera": camera.model_dump(),
+    }
+
+
+def _is_there(out: Path, recipe: dict[str, Any]) -> bool:
+    """Whether `out` holds this very drive; UsageError if it holds anything else."""
+    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
+        return False
+    try:
+        found = json.loads((out / "sequences" / "00" / NOTE).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        raise UsageError(f"{out}: is there already and is no simulated drive; choose another folder") from None
+    if found != recipe:
+        differ = [key for key in recipe if not isinstance(found, dict) or found.get(key) != recipe[key]]
+        raise UsageError(
+            f"{out}: holds a drive with other {', '.join(differ) or 'settings'}; remove it or choose another"
+        )
+    return True
+
+
+@contextmanager
+def _whole(out: Path) -> Iterator[Path]:
+    """A folder that is named `out` when the block ends well, and is gone when it does not."""
+    part = out.with_name(f".{out.name}.{os.getpid()}.part")
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        for left in out.parent.glob(f".{out.name}.*.part"):  # of runs that were killed
+            if not _alive(left.name.split(".")[-2]):
+                shutil.rmtree(left, ignore_errors=True)
+        part.mkdir()
+        yield part
+        with suppress(OSError):
+            out.rmdir()  # an empty folder may be there
+        part.rename(out)
+    except OSError as error:
+        raise Dpm2Error(f"{out}: not written: {error.strerror or error}") from error
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+
+
+def _alive(pid: str) -> bool:
+    try:
+        os.kill(int(pid), 0)
+    except PermissionError:
+        return True
+    except (OSError, ValueError, OverflowError):
+        return False
+    return True
+
+
+class _Drive:
+    """One world, sensors and the poses of the drive; writes frames in any order."""
+
+    def __init__(self, world: World, lidar: Lidar, camera: CameraConfig | None, frames: int) -> None:
+        self.world, self.lidar, self.camera = world, lidar, camera
+        self.times = np.arange(frames) * FRAME_PERIOD
+        height = lidar.config.height
+        self.T_world_lidar = np.stack([world.drive_pose(t, height) for t in self.times])
+        self.view = camera or CameraConfig()
+        colour = calibration(self.view)
+        # The poses and Tr of the layout are of the left grey camera 0; the colour camera 2 sits beside it.
+        self.T_lidar_cam0 = colour.T_lidar_cam.copy()
+        self.T_lidar_cam0[1, 3] = 0.0
+        self.T_lidar_cam2, self.K = colour.T_lidar_cam, colour.K
+
+    def write(self, root: Path, recipe: dict[str, Any], workers: int, progress: Callable[[int, int], None]) -> None:
+        sequence = root / "sequences" / "00"
+        for name in ("velodyne", "labels", "static", *(["image_2"] if self.camera else [])):
+            (sequence / name).mkdir(parents=True)
+        self._write_texts(root, sequence)
+        self._write_ground(sequence / "ground.npz")
+        pool = ThreadPoolExecutor(max(1, workers))
+        try:
+            for done, _ in enumerate(pool.map(lambda i: self._write_frame(sequence, i), range(len(self.times))), 1):
+                progress(done, len(self.times))
+        finally:
+            pool.shutdown(cancel_futures=True)
+        (sequence / NOTE).write_text(json.dumps(recipe, indent=1) + "\n", encoding="utf-8")
+
+    def _write_frame(self, sequence: Path, i: int) -> None:
+        world, time, T = self.world, float(self.times[i]), self.T_world_lidar[i]
+        scan = self.lidar.scan(world, T, time, np.random.default_rng([world.seed, _LIDAR_STREAM, i]))
+        scan.points.tofile(sequence / "velodyne" / f"{i:06d}.bin")
+        scan.label.tofile(sequence / "labels" / f"{i:06d}.label")
+        scan.static.tofile(sequence / "static" / f"{i:06d}.bin")
+        if self.camera:
+            rng = np.random.default_rng([world.seed, _CAMERA_STREAM, i])
+            pixels = render(world, self.camera, T @ self.T_lidar_cam2, time, rng)
+            png = cv2.imencode(".png", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
+            (sequence / "image_2" / f"{i:06d}.png").write_bytes(png.tobytes())
+
+    def _write_texts(self, root: Path, sequence: Path) -> None:
+        T_world_cam = self.T_world_lidar @ self.T_lidar_cam0
+        rows = (se3.inverse(T_world_cam[0]) @ T_world_cam)[:, :3].reshape(-1, 12)
+        (root / "poses").mkdir()
+        for path in (root / "poses" / "00.txt", sequence / "poses.txt"):
+            np.savetxt(path, rows, "%.9e")
+        np.savetxt(sequence / "times.txt", self.times, "%.6e")
+        calib = io.StringIO()
+        for k, left in enumerate((0.0, -0.54, self.T_lidar_cam2[1, 3], -0.48)):
+            P = np.concatenate([self.K, self.K @ [[left], [0], [0]]], 1)
+            calib.write(f"P{k}: " + " ".join(f"{v:.12e}" for v in P.ravel()) + "\n")
+        calib.write("Tr: " + " ".join(f"{v:.12e}" for v in se3.inverse(self.T_lidar_cam0)[:3].ravel()) + "\n")
+        (sequence / "calib.txt").write_text(calib.getvalue(), encoding="utf-8")
+
+    def _write_ground(self, path: Path) -> None:
+        """Height of the ground, kerbs included, NaN where there is none, in the grid's frame; T_grid_cam0 leads there."""
+        terrain = self.world.terrain
+        np.savez_compressed(
+            path,
+            elevation=terrain.elevation(),
+            origin=terrain.origin,
+            resolution=terrain.resolution,
+            T_grid_cam0=self.T_world_lidar[0] @ self.T_lidar_cam0,
+        )
