@@ -57,12 +57,12 @@ def run(
     system, recorder = SlamSystem(chosen.slam), TrajectoryRecorder()
     seconds, failed, wall = _drive(source, start, stop, system, recorder, console)
     for note in source.notes:
-        console.print(note, style="yellow")
+        console.print(note, style="yellow", soft_wrap=True)
     metrics = _write(out, source, system, recorder, truth, failed, seconds, wall)
     if metrics is not None:
         sensor = "LiDAR" if source.T_cam_lidar is None else "left camera"
         Console().print(metrics_table(metrics, title=f"{source.name}, {len(recorder)} frames", frame=sensor))
-    console.print(f"Results in {out}")
+    console.print(f"Results in {out}", soft_wrap=True)
 
 
 def parse_range(text: str) -> tuple[int, int | None]:
@@ -91,7 +91,9 @@ def _drive(
                     seconds.setdefault(stage, []).append(time)
                 if not tracked.registration.ok:
                     failed += 1
-                    progress.console.print(f"frame {frame.index}: {tracked.registration.reason}", style="yellow")
+                    progress.console.print(
+                        f"frame {frame.index}: {tracked.registration.reason}", style="yellow", soft_wrap=True
+                    )
                 progress.update(task, advance=1, description=f"{source.name} {tracked.state}")
         except KeyboardInterrupt:
             console.print(f"interrupted after {len(recorder)} frames; writing what there is", style="yellow")

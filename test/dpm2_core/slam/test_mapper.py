@@ -124,7 +124,7 @@ def test_a_lap_is_closed(lap: tuple[list[Keyframe], Array]) -> None:
         assert np.linalg.norm((se3.inverse(true) @ closure.registration.T_target_source)[:3, 3]) < 0.1
     end, open_end = (np.linalg.norm((m.poses[-1] - truth[-1])[:3, 3]) for m in (mapper, open_ended))
     assert end < 0.1 * open_end
-    assert ape_rmse(truth, mapper.poses) < 0.5 * ape_rmse(truth, open_ended.poses)  # the drift bends each step alike
+    assert ape_rmse(truth, mapper.poses) < 0.8 * ape_rmse(truth, open_ended.poses)  # the drift bends each step alike
     # the odometry was not touched: T_map_odom carries the correction
     last = mapper.T_map_odom @ keyframes[-1].T_odom_kf
     np.testing.assert_allclose(last, mapper.poses[-1], atol=1e-6)

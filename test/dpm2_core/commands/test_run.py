@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`dpm2 run` as a user calls it: every file is there, every error is one line and an exit code, nothing is lost."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dpm2_core.data.convert import convert_kitti
+from dpm2_core.evaluation.trajectory import read_trajectory
+from dpm2_core.sim.config import LidarConfig
+from dpm2_core.sim.drive import simulate
+
+FRAMES = 12
+RESULTS = {
+    "trajectory_kitti.txt", "trajectory.tum", "map.ply", "trajectory.png", "timing.json", "config.yaml",
+    "metrics.json", "pose_graph.g2o",
+}  # fmt: skip
+
+
+def dpm2(*arguments: object, **options: object) -> subprocess.CompletedProcess[str]:
+    """The command in a process of its own."""
+    command = [sys.executable, "-m", "dpm2_core.cli", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, **options)  # type: ignore[call-overload]
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A short simulated drive without images."""
+    root = tmp_path_factory.mktemp("drive") / "sim"
+    simulate(root, FRAMES, seed=2, road="straight", preset="suburb", images=False, lidar=LidarConfig(columns=900))
+    return root
+
+
+@pytest.fixture
+def sequence(drive: Path, tmp_path: Path) -> Path:
+    """A copy of its sequence folder, to be damaged."""
+    copy = tmp_path / "sequence"
+    shutil.copytree(drive / "sequences" / "00", copy)
+    return copy
+
+
+def test_writes_everything_and_is_right(drive: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    done = dpm2("run", drive, "--out", out)
+    assert done.returncode == 0, done.stderr
+    assert {path.name for path in out.iterdir()} == RESULTS
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["frames"] == FRAMES
+    assert metrics["failed_frames"] == 0
+    assert metrics["t_err_percent"] is None  # 12 m are too short for 100 m segments
+    assert metrics["ape_rmse_m"] < 0.03
+    assert metrics["rpe_trans_m"] < 0.02
+    assert metrics["fps"] > 0
+    estimate = read_trajectory(out / "trajectory_kitti.txt")
+    truth = read_trajectory(drive / "poses" / "00.txt")
+    assert len(estimate) == FRAMES
+    np.testing.assert_allclose(estimate.poses[:, :3, 3], truth.poses[:, :3, 3], atol=0.05)  # camera frame, as KITTI's
+    assert (out / "trajectory.png").read_bytes()[1:4] == b"PNG"
+    again = dpm2("eval", "--gt", drive / "poses" / "00.txt", "--est", out / "trajectory_kitti.txt", "--json", out / "e")
+    assert again.returncode == 0, again.stderr
+    assert json.loads((out / "e").read_text())["ape_rmse_m"] == pytest.approx(metrics["ape_rmse_m"], rel=1e-6)
+
+
+def test_a_bag_gives_the_same(drive: Path, tmp_path: Path) -> None:
+    convert_kitti(drive, tmp_path / "bag")
+    for source, out in ((drive, "folder"), (tmp_path / "bag", "bag_out")):
+        done = dpm2("run", source, "--out", tmp_path / out, "--frames", "2:9")
+        assert done.returncode == 0, done.stderr
+    # The bag's stamps are absolute, so intervals differ in the last digits of a float: not one answer to the bit.
+    folder, bag = (read_trajectory(tmp_path / out / "trajectory_kitti.txt").poses for out in ("folder", "bag_out"))
+    assert len(folder) == 7
+    np.testing.assert_allclose(folder, bag, atol=1e-6)
+    assert json.loads((tmp_path / "bag_out" / "metrics.json").read_text())["ape_rmse_m"] < 0.03
+
+
+def test_resolved_configuration_is_written_and_reads_back(drive: Path, tmp_path: Path) -> None:
+    first = tmp_path / "first"
+    assert dpm2("run", drive, "--out", first, "--frames", ":3", "--set", "slam.map.voxel=0.7").returncode == 0
+    assert "voxel: 0.7" in (first / "config.yaml").read_text()
+    second = tmp_path / "second"
+    done = dpm2("run", drive, "--out", second, "--frames", ":3", "--config", first / "config.yaml")
+    assert done.returncode == 0, done.stderr
+    assert (second / "config.yaml").read_text() == (first / "config.yaml").read_text()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["/nowhere"], "/nowhere: no such file"),
+        (["SRC", "--frames", "5"], "--frames 5: want a:b"),
+        (["SRC", "--frames", "50:60"], "12 frames"),
+        (["SRC", "--set", "slam.registraton=neural"], "unknown key slam.registraton; allowed here: registration"),
+        (["SRC", "--set", "slam.registration=magic"], "slam.registration"),
+        (["SRC", "--set", "slam.map.voxel=coarse"], "slam.map.voxel"),
+        (["SRC", "--config", "/nowhere.yaml"], "/nowhere.yaml"),
+        (["SRC", "--gt", "/nowhere.txt"], "/nowhere.txt"),
+        (["SRC", "--colour", "red"], "--colour"),
+    ],
+)
+def test_errors_of_use(drive: Path, tmp_path: Path, arguments: list[str], words: str) -> None:
+    done = dpm2("run", *[drive if a == "SRC" else a for a in arguments], "--out", tmp_path / "out")
+    assert done.returncode == 2
+    assert words in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_damaged_scans_fail_alone(sequence: Path, tmp_path: Path) -> None:
+    """A scan cut short, one of NaN and an empty one: each costs its own frame, and is named."""
+    (sequence / "velodyne" / "000004.bin").write_bytes(b"\0" * 1003)
+    np.full((500, 4), np.nan, np.float32).tofile(sequence / "velodyne" / "000006.bin")
+    (sequence / "velodyne" / "000008.bin").write_bytes(b"")
+    done = dpm2("run", sequence, "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert (metrics["frames"], metrics["failed_frames"]) == (FRAMES, 3)
+    assert metrics["ape_rmse_m"] < 0.1
+    assert len(read_trajectory(tmp_path / "out" / "trajectory_kitti.txt")) == FRAMES
+    for number in (4, 6, 8):
+        assert f"frame {number}:" in done.stderr
+    assert "1003" in done.stderr
+
+
+def test_without_calibration_poses_stay_in_the_lidar_frame(sequence: Path, tmp_path: Path) -> None:
+    (sequence / "calib.txt").unlink()
+    (sequence / "poses.txt").unlink(missing_ok=True)
+    done = dpm2("run", sequence, "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    assert "not of the left camera" in done.stderr
+    assert not (tmp_path / "out" / "metrics.json").exists()
+    poses = read_trajectory(tmp_path / "out" / "trajectory_kitti.txt").poses
+    assert poses[-1, 0, 3] > 5  # x is ahead: the LiDAR's axes, not the camera's
+
+
+def test_given_ground_truth(drive: Path, sequence: Path, tmp_path: Path) -> None:
+    (sequence / "poses.txt").unlink(missing_ok=True)
+    done = dpm2("run", sequence, "--out", tmp_path / "out", "--gt", drive / "poses" / "00.txt", "--frames", "1:10")
+    assert done.returncode == 0, done.stderr
+    assert json.loads((tmp_path / "out" / "metrics.json").read_text())["ape_rmse_m"] < 0.03
+    short = tmp_path / "short.txt"
+    short.write_text("\n".join((drive / "poses" / "00.txt").read_text().splitlines()[:5]) + "\n")
+    refused = dpm2("run", sequence, "--out", tmp_path / "out2", "--gt", short)
+    assert refused.returncode == 2
+    assert "5 poses" in refused.stderr
+
+
+def test_full_disk_keeps_the_old_map(drive: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert dpm2("run", drive, "--out", out, "--frames", ":4").returncode == 0
+    before = (out / "map.ply").read_bytes()
+
+    def limit() -> None:  # no file may grow beyond 50 kB: writing the map fails as on a full disk
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000))
+
+    done = dpm2("run", drive, "--out", out, preexec_fn=limit)
+    assert done.returncode == 1
+    assert "map.ply" in done.stderr
+    assert (out / "map.ply").read_bytes() == before
+    assert not [path for path in out.iterdir() if path.suffix == ".part"]
+
+
+def test_interrupted_run_writes_what_there_is(drive: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "dpm2_core.cli", "run", str(drive), "--out", str(out)]
+    process = subprocess.Popen([*command], stderr=subprocess.PIPE, text=True, env={**os.environ, "COLUMNS": "100"})
+    while not (out / "config.yaml").exists():
+        time.sleep(0.01)
+    time.sleep(0.25)
+    process.send_signal(signal.SIGINT)
+    _, stderr = process.communicate(timeout=60)
+    assert process.returncode == 0, stderr
+    assert "trajectory_kitti.txt" in {path.name for path in out.iterdir()}
+
+
+def test_config_dump_shows_every_key() -> None:
+    done = dpm2("config", "dump", "--set", "slam.threads=1")
+    assert done.returncode == 0
+    assert "threads: 1" in done.stdout
+    assert "# Spacing of the points that enter maps, m." in done.stdout
+    assert dpm2("config", "dump", "--set", "nonsense=1").returncode == 2
