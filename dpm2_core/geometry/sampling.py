@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Point sampling in numpy: range crop, voxel grid, farthest points, hybrid neighbour query."""
+
+from __future__ import annotations
+
+import fpsample
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+Points = NDArray[np.float32]
+Index = NDArray[np.int64]
+
+
+def in_range(points: Points, near: float, far: float) -> NDArray[np.bool_]:
+    """Mask of the (N, 3) points whose distance from the origin is near..far m; NaN and inf are outside."""
+    squared = np.einsum("ij,ij->i", points, points)
+    return (squared >= near * near) & (squared <= far * far)
+
+
+def voxel_first(points: Points, size: float) -> Index:
+    """Indices of the first of the (N, 3) finite points in each cubic cell of `size` m, in the order of the cells.
+
+    The grid starts at the minimum of the cloud.
+    """
+    if len(points) == 0:
+        return np.zeros(0, np.int64)
+    cell = ((points - points.min(0)) * np.float32(1 / size)).astype(np.int64)
+    extent = cell.max(0) + 1
+    key = (cell[:, 0] * extent[1] + cell[:, 1]) * extent[2] + cell[:, 2]
+    return np.unique(key, return_index=True)[1]
+
+
+def farthest_points(points: Points, count: int) -> Index:
+    """Farthest point sampling of (N, 3) points from the first one on: min(N, count) indices, in sampling order.
+
+    A prefix of the result is the farthest point sampling of that length: one call serves all levels of a pyramid.
+    """
+    if len(points) <= count:
+        # all of them, still in farthest-first order, so that prefixes stay well spread
+        count = len(points)
+    if count <= 1:
+        return np.arange(count)
+    height = 3 if len(points) < 1000 else 5  # of the bucket tree; 5 is fastest around 15,000 points
+    return fpsample.bucket_fps_kdline_sampling(points, count, h=height, start_idx=0).astype(np.int64)
+
+
+def neighbours(tree: cKDTree, queries: Points, k: int, radius: float) -> Index:
+    """(M, k) indices of the neighbours of each query, nearest first; those beyond `radius` m repeat the nearest.
+
+    The hybrid of a ball query and k nearest neighbours. The tree holds at least one point.
+    """
+    distance, index = tree.query(queries, [*range(1, k + 1)])
+    return np.where(distance <= radius, index, index[:, :1])  # a missing neighbour has distance inf

@@ -1,0 +1,245 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Shape of the network: typed, with the presets `paper`, `base` and `small` and the DeepPointMap v1 mode."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import Field
+
+from dpm2_core.config import Settings, settings_from
+from dpm2_core.errors import UsageError
+
+FusionKind = Literal[
+    "none", "biased", "point_painting", "roi_pooling", "scale_dot", "without_learnable", "without_spatial"
+]
+
+
+class StageSettings(Settings):
+    """One resolution of the point backbone."""
+
+    points: int = Field(gt=0)
+    """Points kept by farthest point sampling."""
+    radius: float = Field(gt=0)
+    """Radius of the set abstraction, m."""
+    neighbours: int = Field(gt=0)
+    """Neighbours in the set abstraction."""
+    channels: int = Field(gt=0)
+    """Channels out."""
+    residual_radii: tuple[float, ...] = ()
+    """Radius of each inverted residual block, m."""
+    residual_neighbours: int = Field(16, gt=0)
+    """Neighbours in the inverted residual blocks."""
+
+
+class PointsSettings(Settings):
+    """The LiDAR side: preprocessing and point backbone."""
+
+    backbone: str = "pointnext"
+    """Name in the registry of point backbones."""
+    voxel: float = Field(0.3, gt=0)
+    """Edge of the input voxel grid, m."""
+    near: float = Field(1.0, ge=0)
+    """Points nearer than this are dropped, m."""
+    far: float = Field(60.0, gt=0)
+    """Points farther than this are dropped, and the unit of the network's coordinates, m."""
+    view_aligned: bool = True
+    """Express every neighbourhood in the frame whose x axis points horizontally away from the sensor. Features and
+    offsets then do not change with the heading of the vehicle. False: the sensor's axes, as in the paper."""
+    moments: bool = True
+    """Add mean and scatter matrix of each first-stage neighbourhood to its features: the local surface, explicitly."""
+    pool_first: bool = True
+    """Take the maximum over neighbours before normalising: several times faster. False: after, as PointNeXt does."""
+    stem: int = Field(16, gt=0)
+    """Channels of the point-wise stem."""
+    stages: tuple[StageSettings, ...] = (
+        StageSettings(points=2048, radius=1.5, neighbours=16, channels=32),
+        StageSettings(points=512, radius=4, neighbours=24, channels=96, residual_radii=(8,), residual_neighbours=16),
+        StageSettings(points=256, radius=8, neighbours=24, channels=128, residual_radii=(12,), residual_neighbours=16),
+        StageSettings(points=64, radius=24, neighbours=24, channels=192),
+    )
+    """From fine to coarse; the points of each are the first ones of the stage before."""
+    upsample: int = Field(0, ge=0)
+    """Feature propagation steps from the coarsest stage back up."""
+
+
+class ImageSettings(Settings):
+    """The camera side."""
+
+    backbone: str = "convnext"
+    """Name in the registry of image backbones, `timm:NAME` with the optional extra, or `none`: LiDAR only."""
+    size: tuple[int, int] = (128, 416)
+    """Height and width that pictures are resized to, pixels."""
+    depths: tuple[int, ...] = (1, 1, 2, 1)
+    """ConvNeXt blocks of each stage."""
+    channels: tuple[int, ...] = (24, 48, 96, 128)
+    """ConvNeXt channels of each stage."""
+    pyramid: int = Field(64, gt=0)
+    """Channels of the feature pyramid."""
+    strides: tuple[int, ...] = (8, 16)
+    """Levels of the pyramid whose pixels become tokens."""
+
+
+class FusionSettings(Settings):
+    """Reference points and multi-modal transformer."""
+
+    kind: FusionKind = "biased"
+    """How LiDAR and image features reach the reference points; none is DeepPointMap v1, the backbone's own points.
+    The others than biased are the alternatives of the paper's Table 4."""
+    reference: Literal["fps", "uniform", "normal"] = "fps"
+    """How reference points are chosen: farthest point sampling of the cloud, or random positions (Table 3)."""
+    points: int = Field(256, gt=0)
+    """Number of reference points."""
+    reference_features: bool = True
+    """Start a reference point from the backbone's features where it is one of its points; False: from xyz alone."""
+    layers: int = Field(3, gt=0)
+    """Multi-modal transformer layers."""
+    heads: int = Field(4, gt=0)
+    """Attention heads."""
+    alpha_lidar: float = Field(0.1, gt=0)
+    """Decay of the point-to-point bias, 1/m."""
+    alpha_image: tuple[float, ...] = (0.3, 1.0, 2.5, 6.0)
+    """Decay of the point-to-ray bias, 1/m: one for all heads, or one a head."""
+    learned_gain: bool = True
+    """A learned factor per head and branch on the z-scored spatial bias; False: 1, as in the paper."""
+    levels: tuple[int, ...] = (1, 3)
+    """Backbone levels, 0 the finest, whose key-points the LiDAR branch reads."""
+    relative: bool = True
+    """Among reference points, add to the attention a learned bias from where one lies as seen from the other."""
+    image_mask: Literal["view", "front"] = "view"
+    """Which reference points read an image: those that project into it, or, as in the paper, all, with the pixels
+    whose rays point away counted as far."""
+
+
+class DecoderSettings(Settings):
+    """Correlation of two descriptor sets, and the heads."""
+
+    width: int = Field(128, gt=0)
+    """Channels."""
+    layers: int = Field(3, gt=0)
+    """Self and cross attention layers."""
+    heads: int = Field(4, gt=0)
+    """Attention heads."""
+    position: Literal["sine", "relative"] = "relative"
+    """`sine`: code of absolute coordinates added before each attention, as in DeepPointMap. `relative`: a learned bias
+    from where one descriptor lies as seen from the other; it does not depend on origin or heading."""
+    precision: bool = True
+    """Predict with each offset its 3x3 precision (inverse covariance), and weigh the pose with it."""
+    temperature: float = Field(0.1, gt=0)
+    """Of the dual softmax over similarities."""
+    pair_ratio: float = Field(0.5, gt=0, le=1)
+    """Pairs used for the pose: floor(ratio * (M + N)) // 2 of the most similar."""
+    offset_limit: float = Field(2.0, gt=0)
+    """Pairs with a longer predicted offset are dropped, m."""
+    covariance_scale: float = Field(4.0, gt=0)
+    """Factor on the covariance of the pose: both directions of a pair and neighbouring pairs err alike."""
+
+
+class NetworkSettings(Settings):
+    """The whole network."""
+
+    preset: str = "small"
+    """Name that weights are stored under and checked against."""
+    channels: int = Field(128, gt=0)
+    """Channels of a descriptor."""
+    points: PointsSettings = PointsSettings()
+    image: ImageSettings = ImageSettings()
+    fusion: FusionSettings = FusionSettings()
+    decoder: DecoderSettings = DecoderSettings()
+
+
+_V1_STAGES = [
+    {"points": 4096, "radius": 3, "neighbours": 32, "channels": 32, "residual_radii": [6], "residual_neighbours": 32},
+    {"points": 1024, "radius": 6, "neighbours": 32, "channels": 64, "residual_radii": [12], "residual_neighbours": 32},
+    {
+        "points": 256,
+        "radius": 12,
+        "neighbours": 32,
+        "channels": 128,
+        "residual_radii": [24, 24],
+        "residual_neighbours": 32,
+    },
+    {"points": 64, "radius": 24, "neighbours": 32, "channels": 256, "residual_radii": [48], "residual_neighbours": 32},
+    {"points": 16, "radius": 48, "neighbours": 16, "channels": 512, "residual_radii": [96], "residual_neighbours": 16},
+]
+_V1: dict[str, Any] = {
+    "preset": "v1",
+    "points": {"view_aligned": False, "moments": False, "pool_first": False, "stages": _V1_STAGES, "upsample": 2},
+    "image": {"backbone": "none"},
+    "fusion": {"kind": "none"},
+    "decoder": {"width": 256, "heads": 8, "position": "sine", "precision": False},
+}
+_PAPER: dict[str, Any] = {
+    **_V1,
+    "preset": "paper",
+    "image": {
+        "backbone": "convnext",
+        "size": [192, 624],
+        "depths": [3, 3, 9, 3],
+        "channels": [96, 192, 384, 768],
+        "pyramid": 128,
+        "strides": [16, 32],
+    },
+    "fusion": {
+        "reference_features": False,
+        "heads": 8,
+        "alpha_lidar": 0.07,
+        "alpha_image": [0.5],
+        "learned_gain": False,
+        "levels": [2, 3, 4],
+        "relative": False,
+        "image_mask": "front",
+    },
+}
+_BASE: dict[str, Any] = {
+    "preset": "base",
+    "points": {
+        "stages": [
+            {
+                "points": 4096,
+                "radius": 1.5,
+                "neighbours": 24,
+                "channels": 48,
+                "residual_radii": [3],
+                "residual_neighbours": 16,
+            },
+            {
+                "points": 1024,
+                "radius": 3,
+                "neighbours": 32,
+                "channels": 96,
+                "residual_radii": [6],
+                "residual_neighbours": 24,
+            },
+            {
+                "points": 256,
+                "radius": 8,
+                "neighbours": 32,
+                "channels": 192,
+                "residual_radii": [12, 12],
+                "residual_neighbours": 24,
+            },
+            {"points": 64, "radius": 24, "neighbours": 32, "channels": 256, "residual_radii": [36]},
+        ]
+    },
+    "image": {
+        "size": [192, 624],
+        "depths": [2, 2, 4, 2],
+        "channels": [48, 96, 192, 256],
+        "pyramid": 96,
+    },
+    "fusion": {"layers": 4, "heads": 8, "alpha_image": [0.3, 0.3, 1.0, 1.0, 2.5, 2.5, 6.0, 6.0]},
+    "decoder": {"width": 256, "layers": 4, "heads": 8},
+}
+PRESETS: dict[str, dict[str, Any]] = {"small": {}, "base": _BASE, "paper": _PAPER, "v1": _V1}
+
+
+def preset(name: str) -> NetworkSettings:
+    """Settings by name.
+
+    Raises:
+        UsageError: no such preset.
+    """
+    if name not in PRESETS:
+        raise UsageError(f"network preset {name}: want one of {', '.join(PRESETS)}")
+    return settings_from(NetworkSettings, PRESETS[name], default=f"preset {name}")

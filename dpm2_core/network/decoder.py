@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Two descriptor sets become correlated descriptors, and those a pose or an overlap probability."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from dpm2_core.frame import Registration
+from dpm2_core.network.attention import Attention, RelativeBias, sine_code
+from dpm2_core.network.config import NetworkSettings
+from dpm2_core.network.descriptors import Descriptors, Tokens, to_tokens
+from dpm2_core.network.heads import OffsetHead, OverlapHead, PointMLP
+from dpm2_core.network.registration import register_batch
+
+
+class Correlated(NamedTuple):
+    """Features (B, N, C) and (B, M, C) after each set has seen the other."""
+
+    source: Tensor
+    target: Tensor
+
+
+class DecoderLayer(nn.Module):
+    """Self-attention, cross-attention, MLP, each with a residual and LayerNorm; weights shared by both sets."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.self_attention = Attention(width, heads)
+        self.cross_attention = Attention(width, heads)
+        self.mlp = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, width))
+        self.norms = nn.ModuleList(nn.LayerNorm(width) for _ in range(3))
+
+    def alone(self, x: Tensor, code: Tensor | None, bias: Tensor | None, mask: Tensor) -> Tensor:
+        """Self-attention of a set x (B, N, C)."""
+        x = x if code is None else x + code
+        x = self.norms[0](x + self.self_attention(x, x, bias, mask))
+        return x if code is None else x + code
+
+    def across(self, x: Tensor, other: Tensor, other_mask: Tensor) -> Tensor:
+        """Cross-attention of x (B, N, C) to other (B, M, C), then the MLP."""
+        x = self.norms[1](x + self.cross_attention(x, other, None, other_mask))
+        return self.norms[2](x + self.mlp(x))
+
+
+class Decoder(nn.Module):
+    """Transformer over two sets with its heads."""
+
+    def __init__(self, settings: NetworkSettings) -> None:
+        super().__init__()
+        decoder = settings.decoder
+        width = decoder.width
+        self.settings = decoder
+        self.view_aligned = settings.points.view_aligned
+        self.project = nn.Linear(settings.channels, width)
+        self.layers = nn.ModuleList(DecoderLayer(width, decoder.heads) for _ in range(decoder.layers))
+        self.relative = RelativeBias(decoder.layers, decoder.heads) if decoder.position == "relative" else None
+        self.similarity = PointMLP(width)
+        self.offset = OffsetHead(width, decoder.precision)
+        self.overlap = OverlapHead(width)
+        self.coarse = PointMLP(settings.channels)
+
+    def forward(self, source: Tokens, target: Tokens) -> Correlated:
+        """Correlate two batches of sets."""
+        x, y = self.project(source.features), self.project(target.features)
+        x_code, x_bias = self._position(source)
+        y_code, y_bias = self._position(target)
+        x_mask, y_mask = source.mask[:, None, None], target.mask[:, None, None]
+        for i, layer in enumerate(self.layers):
+            assert isinstance(layer, DecoderLayer)
+            x = layer.alone(x, x_code, x_bias[i], x_mask)
+            y = layer.alone(y, y_code, y_bias[i], y_mask)
+            x, y = layer.across(x, y, y_mask), layer.across(y, x, x_mask)
+        return Correlated(x, y)
+
+    def _position(self, tokens: Tokens) -> tuple[Tensor | None, Sequence[Tensor | None]]:
+        """Position code (B, N, C), and the attention bias of each layer."""
+        if self.relative is None:
+            return sine_code(tokens.xyz, self.settings.width), [None] * len(self.layers)
+        return None, self.relative(tokens.xyz, tokens.axis)
+
+    @torch.inference_mode()
+    def register(self, source: Descriptors, target: Descriptors) -> Registration:
+        """Pose of the source in the frame of the target; either may be merged from several frames."""
+        return self.register_many([source], [target])[0]
+
+    @torch.inference_mode()
+    def register_many(self, sources: list[Descriptors], targets: list[Descriptors]) -> list[Registration]:
+        """`register` for a batch of pairs."""
+        device = next(self.parameters()).device
+        source = to_tokens(sources, self.view_aligned, device)
+        target = to_tokens(targets, self.view_aligned, device)
+        with torch.autocast(device.type, torch.bfloat16):
+            return register_batch(self, source, target, self(source, target))
+
+    @torch.inference_mode()
+    def overlap_probability(self, sources: list[Descriptors], targets: list[Descriptors]) -> list[float]:
+        """Probability that each pair was seen from within 20 m."""
+        device = next(self.parameters()).device
+        source = to_tokens(sources, self.view_aligned, device)
+        target = to_tokens(targets, self.view_aligned, device)
+        with torch.autocast(device.type, torch.bfloat16):
+            logits = self.overlap(*self(source, target), source.mask, target.mask)
+        return logits.sigmoid().tolist()

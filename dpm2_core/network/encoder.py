@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a frame to its descriptors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from dpm2_core.frame import Frame, Image
+from dpm2_core.network.config import ImageSettings, NetworkSettings
+from dpm2_core.network.descriptors import Descriptors, Tokens
+from dpm2_core.network.fusion import Fusion
+from dpm2_core.network.pointnext import Scale, view_axes
+from dpm2_core.network.pyramid import PointBatch, build_pyramid, collate, crop
+from dpm2_core.network.registry import image_backbone, point_backbone
+from dpm2_core.network.spatial import Views
+
+
+class Encoded(NamedTuple):
+    """Descriptors of a batch, and the key-points of the point backbone that the auxiliary loss reads."""
+
+    tokens: Tokens
+    scales: list[Scale]
+
+
+class Encoder(nn.Module):
+    """Point backbone, image backbone and visual-point fusion."""
+
+    def __init__(self, settings: NetworkSettings) -> None:
+        super().__init__()
+        self.settings = settings
+        self.points = point_backbone(settings.points)
+        self.image = image_backbone(settings.image)
+        channels: list[int] = self.points.channels  # type: ignore[assignment]
+        self.fusion = Fusion(settings, channels) if settings.fusion.kind != "none" else None
+        self.level = len(channels) - 1 - settings.points.upsample  # descriptors of the version without fusion
+        if self.fusion is None and channels[self.level] != settings.channels:
+            raise ValueError(f"level {self.level} has {channels[self.level]} channels, descriptors {settings.channels}")
+
+    def forward(self, points: PointBatch, views: Views | None = None) -> Encoded:
+        """Encode a batch; `views` None where no frame of it has a picture."""
+        scales = self.points(points)
+        if self.fusion is None:
+            scale = scales[self.level]
+            axis = view_axes(scale.xyz)
+            if not self.settings.points.view_aligned:
+                axis = torch.zeros_like(axis) + torch.tensor([1.0, 0.0], device=axis.device)
+            return Encoded(Tokens(scale.xyz, scale.features, axis, scale.mask), scales)
+        maps = []
+        if self.image is None:
+            views = None
+        if views is not None and self.image is not None:
+            maps = self.image(views.pixels.flatten(0, 1))
+        return Encoded(self.fusion(scales, views, maps), scales)
+
+    @torch.inference_mode()
+    def encode(self, frame: Frame) -> Descriptors:
+        """Descriptors of one frame, from its raw points and its pictures, if any.
+
+        Raises:
+            Dpm2Error: too few points in range.
+        """
+        device = next(self.parameters()).device
+        points = collate([build_pyramid(crop(frame.points, self.settings.points), self.settings.points)])
+        views = collate_views([frame.images], self.settings.image) if self.image is not None else None
+        return self.encode_batch(points, views, device)[0]
+
+    @torch.inference_mode()
+    def encode_batch(self, points: PointBatch, views: Views | None, device: torch.device) -> list[Descriptors]:
+        """Descriptors of a batch of prepared frames."""
+        with torch.autocast(device.type, torch.bfloat16):
+            tokens = self(*to_device((points, views), device)).tokens
+        xyz, features, mask = (field.cpu() for field in (tokens.xyz, tokens.features.half(), tokens.mask))
+        return [Descriptors(x[m].numpy(), f[m].numpy()) for x, f, m in zip(xyz, features, mask, strict=True)]
+
+
+def collate_views(images: Sequence[Sequence[Image]], settings: ImageSettings) -> Views | None:
+    """Resize and stack the pictures of each frame; absent ones are masked, None if no frame has any."""
+    most = max((len(frame) for frame in images), default=0)
+    if most == 0:
+        return None
+    height, width = settings.size
+    pixels = np.zeros((len(images), most, 3, height, width), np.uint8)
+    K = np.tile(np.eye(3, dtype=np.float32), (len(images), most, 1, 1))
+    T = np.tile(np.eye(4, dtype=np.float32), (len(images), most, 1, 1))
+    present = np.zeros((len(images), most), bool)
+    for b, frame in enumerate(images):
+        for v, image in enumerate(frame):
+            pixels[b, v], K[b, v] = resize(image.pixels, image.camera.K, settings.size)
+            T[b, v] = image.camera.T_lidar_cam
+            present[b, v] = True
+    return Views(*(torch.from_numpy(array) for array in (pixels, K, T, present)))
+
+
+def resize(pixels: np.ndarray, K: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Resize (H, W, 3) to (3, *size) and scale the intrinsics, pixel centres being at integers."""
+    height, width = pixels.shape[:2]
+    out = cv2.resize(pixels, size[::-1], interpolation=cv2.INTER_AREA)
+    scale = np.diag([size[1] / width, size[0] / height, 1.0])
+    shift = np.eye(3)
+    shift[:2, 2] = 0.5
+    return out.transpose(2, 0, 1), np.linalg.inv(shift) @ scale @ shift @ K
+
+
+def to_device(batch: Any, device: torch.device | str) -> Any:
+    """Move a NamedTuple or tuple of tensors, nested at will."""
+    if batch is None or isinstance(batch, Tensor):
+        return batch if batch is None else batch.to(device, non_blocking=True)
+    moved = [to_device(item, device) for item in batch]
+    return type(batch)(*moved) if hasattr(batch, "_fields") else tuple(moved)

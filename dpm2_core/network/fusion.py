@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Visual-point fusion: reference points and the multi-modal transformer (MMT) with the alternatives of Table 4."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from dpm2_core.network.attention import Attention, RelativeBias, sine_code
+from dpm2_core.network.config import NetworkSettings
+from dpm2_core.network.convnext import FeatureMap
+from dpm2_core.network.descriptors import Tokens
+from dpm2_core.network.pointnext import Scale, to_view, view_axes
+from dpm2_core.network.spatial import Views, point_bias, ray_bias, sample_at_points, token_pixels
+
+SAMPLED = {"point_painting": 1, "roi_pooling": 3}  # side of the window that replaces the image attention
+
+
+class ReferencePoints(nn.Module):
+    """The reference points generator (RPG): where descriptors sit, and their first features."""
+
+    def __init__(self, settings: NetworkSettings, scale_channels: list[int]) -> None:
+        super().__init__()
+        fusion, points = settings.fusion, settings.points
+        self.n, self.far, self.kind = fusion.points, points.far, fusion.reference
+        self.levels = [
+            i
+            for i, stage in enumerate(points.stages)
+            if fusion.reference_features and fusion.reference == "fps" and stage.points >= fusion.points
+        ]
+        if fusion.reference != "fps":
+            noise = torch.Generator().manual_seed(0)  # the same places in every frame, as descriptors must recur
+            if fusion.reference == "uniform":
+                xyz = torch.rand(self.n, 3, generator=noise) * 2 - 1
+            else:
+                xyz = torch.randn(self.n, 3, generator=noise) / 3
+            self.register_buffer("fixed", xyz * torch.tensor([points.far, points.far, 3.0]))
+        channels = 3 + sum(scale_channels[i] for i in self.levels)
+        width = settings.channels
+        self.embed = nn.Sequential(nn.Linear(channels, width), nn.ReLU(), nn.Linear(width, width))
+        self.view_aligned = points.view_aligned
+
+    def forward(self, scales: list[Scale]) -> Tokens:
+        """The finest scale's points are the farthest point sampling of the cloud, so a prefix of them is one, too."""
+        finest = scales[0]
+        if self.kind == "fps":
+            xyz, mask = finest.xyz[:, : self.n], finest.mask[:, : self.n]
+        else:
+            xyz = self.fixed.expand(len(finest.xyz), -1, -1)  # type: ignore[operator]
+            mask = torch.ones_like(xyz[..., 0], dtype=torch.bool)
+        axis = view_axes(xyz)
+        if not self.view_aligned:
+            axis = torch.zeros_like(axis) + torch.tensor([1.0, 0.0], device=axis.device)
+        parts = [to_view(xyz, axis) / self.far] + [scales[i].features[:, : self.n] for i in self.levels]
+        dtype = parts[-1].dtype
+        return Tokens(xyz, self.embed(torch.cat([part.to(dtype) for part in parts], -1)), axis, mask)
+
+
+class FusionLayer(nn.Module):
+    """Self-attention of reference points, one attention a modality, and an MLP over the three."""
+
+    def __init__(self, settings: NetworkSettings) -> None:
+        super().__init__()
+        width, fusion = settings.channels, settings.fusion
+        learnable = fusion.kind != "without_learnable"
+        camera = settings.image.backbone != "none"
+        sampled = fusion.kind in SAMPLED
+        self.self_attention = Attention(width, fusion.heads)
+        self.lidar = Attention(width, fusion.heads, learnable)
+        self.image = Attention(width, fusion.heads, learnable) if camera and not sampled else None
+        self.sampled = nn.Linear(width, width) if camera and sampled else None
+        self.norms = nn.ModuleList(nn.LayerNorm(width) for _ in range(2))
+        self.fuse = nn.Sequential(
+            nn.Linear((3 if camera else 2) * width, 2 * width), nn.ReLU(), nn.Linear(2 * width, width)
+        )
+        spatial = fusion.kind not in ("without_spatial", "scale_dot")
+        self.gains = nn.ParameterList()
+        if spatial and fusion.learned_gain:
+            self.gains.extend(nn.Parameter(torch.ones(fusion.heads, 1, 1)) for _ in range(2))
+        self.camera = camera
+
+    def _bias(self, branch: int, bias: Tensor | None) -> Tensor | None:
+        return bias * self.gains[branch].to(bias.dtype) if bias is not None and len(self.gains) else bias
+
+    def forward(
+        self, references: Tensor, among: tuple[Tensor | None, Tensor], lidar: Branch, image: Branch | None
+    ) -> Tensor:
+        """references (B, N, C); `among` is bias and mask of the self-attention."""
+        x = self.norms[0](references + self.self_attention(references, references, *among))
+        parts = [x, self.lidar(x, lidar.tokens, self._bias(0, lidar.bias), lidar.mask)]
+        if self.camera:
+            if image is None:
+                parts.append(torch.zeros_like(x))
+            elif self.sampled is not None:
+                parts.append(self.sampled(image.tokens) * image.mask[:, 0, :, :1])
+            else:
+                assert self.image is not None
+                parts.append(self.image(x, image.tokens, self._bias(1, image.bias), image.mask))
+        return self.norms[1](x + self.fuse(torch.cat(parts, -1)))
+
+
+class Branch:
+    """Tokens (B, T, C) of one modality, their spatial bias (B, h, N, T) or None, and mask (B, 1, N or 1, T)."""
+
+    def __init__(self, tokens: Tensor, bias: Tensor | None, mask: Tensor) -> None:
+        self.tokens, self.bias, self.mask = tokens, bias, mask
+
+
+class Fusion(nn.Module):
+    """Reference points gather from LiDAR key-points and feature pixels: the descriptors of a frame."""
+
+    def __init__(self, settings: NetworkSettings, scale_channels: list[int]) -> None:
+        super().__init__()
+        fusion, width = settings.fusion, settings.channels
+        self.settings = fusion
+        self.references = ReferencePoints(settings, scale_channels)
+        self.lidar_in = nn.ModuleList(nn.Linear(scale_channels[i], width) for i in fusion.levels)
+        if settings.image.backbone != "none":
+            self.image_in = nn.Linear(settings.image.pyramid, width)
+            self.image_norm = nn.LayerNorm(width)
+        self.lidar_norm = nn.LayerNorm(width)
+        self.layers = nn.ModuleList(FusionLayer(settings) for _ in range(fusion.layers))
+        self.relative = RelativeBias(fusion.layers, fusion.heads) if fusion.relative else None
+        self.out = nn.Linear(width, settings.channels)
+
+    def forward(self, scales: list[Scale], views: Views | None, maps: list[FeatureMap]) -> Tokens:
+        """scales of the point backbone; views with the feature maps (B * V, C, h, w) of their pictures, or None."""
+        refs = self.references(scales)
+        chosen = [scales[i] for i in self.settings.levels]
+        lidar = self._lidar(refs, chosen)
+        image = self._image(refs, views, maps) if views is not None else None
+        self_mask = refs.mask[:, None, None]
+        biases = [None] * len(self.layers) if self.relative is None else self.relative(refs.xyz, refs.axis)
+        x = refs.features
+        if self.settings.kind == "scale_dot":
+            x = x + sine_code(refs.xyz, x.shape[-1])
+        for layer, bias in zip(self.layers, biases, strict=True):
+            x = layer(x, (bias, self_mask), lidar, image)
+        return refs._replace(features=self.out(x))
+
+    def _lidar(self, refs: Tokens, scales: list[Scale]) -> Branch:
+        features = torch.cat([project(s.features) for project, s in zip(self.lidar_in, scales, strict=True)], 1)
+        xyz, mask = torch.cat([s.xyz for s in scales], 1), torch.cat([s.mask for s in scales], 1)
+        features = self.lidar_norm(features)
+        bias = None
+        if self.settings.kind == "scale_dot":
+            features = features + sine_code(xyz, features.shape[-1])
+        elif self.settings.kind != "without_spatial":
+            bias = point_bias(refs.xyz, xyz, mask, self.settings.alpha_lidar)
+        return Branch(features, bias, mask[:, None, None])
+
+    def _image(self, refs: Tokens, views: Views, maps: list[FeatureMap]) -> Branch:
+        batch, count = views.present.shape
+        kind = self.settings.kind
+        uv = token_pixels(maps)
+        bias, seen = ray_bias(refs.xyz, views, uv, self.settings.alpha_image)
+        if kind in SAMPLED:
+            finest = maps[0].features.unflatten(0, (batch, count))[:, 0]
+            sampled = sample_at_points(refs.xyz, views, finest, SAMPLED[kind])
+            return Branch(self.image_norm(self.image_in(sampled)), None, seen[:, None, :, :1])
+        flat = torch.cat([m.features.flatten(2).transpose(1, 2) for m in maps], 1)
+        tokens = self.image_norm(self.image_in(flat)).unflatten(0, (batch, count)).flatten(1, 2)
+        present = views.present.repeat_interleave(len(uv), 1)[:, None, None]
+        if self.settings.image_mask == "view":
+            present = seen.repeat_interleave(len(uv), 2)[:, None]
+        if kind == "scale_dot":
+            tokens = tokens + sine_code(torch.nn.functional.pad(uv / 8, (0, 1)), tokens.shape[-1]).repeat(count, 1)
+        spatial = None if kind in ("scale_dot", "without_spatial") else bias
+        return Branch(tokens, spatial, present)

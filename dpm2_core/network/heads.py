@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Heads on (correlated) descriptors: similarity, offset with precision, overlap, and the coarse pairing of training."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from dpm2_core.network.pointnext import from_view, to_view
+
+
+class PointMLP(nn.Sequential):
+    """Two point-wise layers: similarity head (width, width) and coarse pairing head (channels, channels)."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, width))
+
+
+class OffsetHead(nn.Module):
+    """Where the point that corresponds to descriptor b lies as seen from descriptor a, and how sure that is.
+
+    The answer is given in a's view frame: its covariance then turns with the sensor, as the surfaces do.
+    """
+
+    def __init__(self, width: int, precision: bool) -> None:
+        super().__init__()
+        self.precision = precision
+        self.deep = nn.Sequential(
+            nn.Linear(2 * width, width), nn.ReLU(), nn.Linear(width, width // 2), nn.ReLU(),
+            nn.Linear(width // 2, width // 4),
+        )  # fmt: skip
+        self.skip = nn.Linear(2 * width, width // 4)
+        self.out = nn.Linear(width // 4, 9 if precision else 3)
+
+    def forward(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+        """a, b (..., C): offset (..., 3), m, and lower-triangular L (..., 3, 3), 1/m, of the precision L L^T.
+
+        Without predicted precision L is the identity.
+        """
+        both = torch.cat([a, b], -1)
+        out = self.out(torch.relu(self.deep(both) + self.skip(both))).float()
+        offset = out[..., :3]
+        if not self.precision:
+            return offset, torch.eye(3, device=out.device).expand(*out.shape[:-1], 3, 3)
+        diagonal = torch.exp(out[..., 3:6].clamp(-5, 5) + 0.7)  # starts at a deviation of 0.5 m
+        zero = torch.zeros_like(offset[..., 0])
+        lower = out[..., 6:] * diagonal  # relative to its row's scale
+        L = torch.stack(
+            [
+                diagonal[..., 0], zero, zero,
+                lower[..., 0], diagonal[..., 1], zero,
+                lower[..., 1], lower[..., 2], diagonal[..., 2],
+            ],
+            -1,
+        )  # fmt: skip
+        return offset, L.unflatten(-1, (3, 3))
+
+
+class OverlapHead(nn.Module):
+    """Probability that two frames are within 20 m: point-wise layers, mean over the valid points, classifier."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.points = PointMLP(width)
+        self.classify = nn.Sequential(nn.Linear(2 * width, 2 * width), nn.ReLU(), nn.Linear(2 * width, 1))
+
+    def forward(self, source: Tensor, target: Tensor, source_mask: Tensor, target_mask: Tensor) -> Tensor:
+        """source (B, N, C), target (B, M, C) with masks (B, N), (B, M): logits (B,)."""
+        pooled = []
+        for features, mask in ((source, source_mask), (target, target_mask)):
+            weight = mask[..., None].to(features.dtype)
+            pooled.append((self.points(features) * weight).sum(1) / weight.sum(1).clamp(min=1))
+        return self.classify(torch.cat(pooled, -1))[..., 0].float()
+
+
+def residuals_in_view(offset: Tensor, true: Tensor, axis: Tensor) -> Tensor:
+    """Predicted offset (..., 3) in the view frame minus the true one (..., 3), given in the set's frame."""
+    return offset - to_view(true, axis)
+
+
+def into_set_frame(offset: Tensor, L: Tensor, axis: Tensor) -> tuple[Tensor, Tensor]:
+    """Turn offset (..., 3) and L (..., 3, 3) from the view frame into the set's frame: R o and R L."""
+    columns = from_view(L.transpose(-1, -2), axis[..., None, :])
+    return from_view(offset, axis), columns.transpose(-1, -2)

@@ -1,0 +1,20 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Encoder and decoder as one model."""
+
+from __future__ import annotations
+
+from torch import nn
+
+from dpm2_core.network.config import NetworkSettings
+from dpm2_core.network.decoder import Decoder
+from dpm2_core.network.encoder import Encoder
+
+
+class DeepPointMap2(nn.Module):
+    """The whole network."""
+
+    def __init__(self, settings: NetworkSettings) -> None:
+        super().__init__()
+        self.settings = settings
+        self.encoder = Encoder(settings)
+        self.decoder = Decoder(settings)

@@ -1,0 +1,252 @@
+# SPDX-License-Identifier: Apache-2.0
+"""PointNeXt-like point backbone: set abstraction, inverted residual blocks, feature propagation; LayerNorm, ReLU."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from dpm2_core.network.config import PointsSettings, StageSettings
+from dpm2_core.network.pyramid import PointBatch
+
+MOMENTS = 9  # mean (3) and scatter matrix (6) of a neighbourhood
+
+
+class Scale(NamedTuple):
+    """Key-points of one resolution: xyz (B, n, 3) m, features (B, n, C), mask (B, n) True where valid."""
+
+    xyz: Tensor
+    features: Tensor
+    mask: Tensor
+
+
+def gather(values: Tensor, index: Tensor) -> Tensor:
+    """values (B, n, C) at index (B, ...): (B, ..., C)."""
+    batch, n, channels = values.shape
+    offset = torch.arange(batch, device=index.device).view(-1, *[1] * (index.ndim - 1)) * n
+    flat = (index + offset).reshape(-1)
+    return nn.functional.embedding(flat, values.reshape(-1, channels)).view(*index.shape, channels)
+
+
+def view_axes(xyz: Tensor) -> Tensor:
+    """Horizontal unit vectors (..., 2) from the sensor at the origin to points (..., 3); (1, 0) straight above it."""
+    xy = xyz[..., :2]
+    length = xy.norm(dim=-1, keepdim=True)
+    forward = torch.zeros_like(xy)
+    forward[..., 0] = 1
+    return torch.where(length > 1e-3, xy / length.clamp(min=1e-3), forward)
+
+
+def to_view(vectors: Tensor, axis: Tensor) -> Tensor:
+    """Turn vectors (..., 3) into the frames whose x axes are `axis` (..., 2); broadcasts."""
+    c, s = axis[..., 0], axis[..., 1]
+    x, y, z = vectors.unbind(-1)
+    return torch.stack([c * x + s * y, c * y - s * x, z], -1)
+
+
+def from_view(vectors: Tensor, axis: Tensor) -> Tensor:
+    """Inverse of `to_view`."""
+    return to_view(vectors, torch.stack([axis[..., 0], -axis[..., 1]], -1))
+
+
+class ConvNormAct(nn.Sequential):
+    """Point-wise linear layer, LayerNorm, ReLU unless `act` is False."""
+
+    def __init__(self, channels_in: int, channels_out: int, act: bool = True) -> None:
+        super().__init__(nn.Linear(channels_in, channels_out), nn.LayerNorm(channels_out))
+        if act:
+            self.append(nn.ReLU())
+
+
+class Pooled(nn.Module):
+    """Linear layer, LayerNorm, ReLU and maximum over neighbours.
+
+    `pool_first` takes the maximum right after the linear layer: k times less to normalise, and the part of the layer
+    that reads the neighbour's own features is computed once a point before it is gathered.
+    """
+
+    def __init__(self, channels_in: int, places: int, channels_out: int, pool_first: bool) -> None:
+        super().__init__()
+        self.split = (channels_in, places)
+        self.pool_first = pool_first
+        self.linear = nn.Linear(channels_in + places, channels_out)
+        self.norm = nn.LayerNorm(channels_out)
+
+    def forward(self, features: Tensor, index: Tensor, places: Tensor) -> Tensor:
+        """features (B, m, C), index (B, n, k) into m, places (B, n, k, P): (B, n, channels_out)."""
+        if not self.pool_first:
+            joined = torch.cat([gather(features, index), places.to(features.dtype)], -1)
+            return torch.relu(self.norm(self.linear(joined))).amax(2)
+        of_features, of_places = self.linear.weight.split(self.split, 1)
+        own = nn.functional.linear(features, of_features, self.linear.bias)
+        return torch.relu(self.norm(pool_neighbours(own, index, places, of_places)))
+
+
+def pool_neighbours(own: Tensor | None, index: Tensor | None, places: Tensor, weight: Tensor) -> Tensor:
+    """Maximum over k of own[index] + weight @ places, without keeping the (n, k, C) sums for the gradient.
+
+    own (B, m, C) and index (B, n, k), or None for places alone; places (B, n, k, P), weight (C, P): (B, n, C).
+    """
+    with torch.no_grad():
+        sums = nn.functional.linear(places, weight)
+        if own is not None and index is not None:
+            sums = gather(own, index).add_(sums)
+        if torch.is_inference_mode_enabled():
+            return sums.amax(2)
+        best = argmax_neighbour(sums)
+    n_places = places.shape[-1]
+    chosen = places.gather(2, best[..., None].expand(*best.shape, n_places))
+    out = (chosen * weight).sum(-1)
+    if own is not None and index is not None:
+        out = out + own.gather(1, index.gather(2, best))
+    return out
+
+
+def argmax_neighbour(sums: Tensor) -> Tensor:
+    """Index (B, n, C) of the largest of (B, n, k, C) over k < 256.
+
+    `argmax` over an inner dimension is many times slower than `amax` on the CPU, so the index rides in the lowest bits.
+    """
+    k = torch.arange(sums.shape[2], dtype=torch.int32, device=sums.device)[:, None]
+    tagged = sums.float().view(torch.int32).bitwise_and(~255).bitwise_or(k)
+    return tagged.view(torch.float32).amax(2).view(torch.int32).bitwise_and(255).long()
+
+
+class Aggregation(nn.Module):
+    """Neighbour features with their relative places through one layer, then the maximum."""
+
+    def __init__(self, channels_in: int, channels_out: int, radius: float, settings: PointsSettings) -> None:
+        super().__init__()
+        self.radius = radius
+        self.view_aligned = settings.view_aligned
+        self.pooled = Pooled(channels_in, 5 if settings.view_aligned else 3, channels_out, settings.pool_first)
+
+    def forward(self, xyz: Tensor, centres: Tensor, features: Tensor, index: Tensor) -> Tensor:
+        """xyz (B, m, 3), centres (B, n, 3), features (B, m, C), index (B, n, k) into m: (B, n, channels_out)."""
+        delta = (gather(xyz, index) - centres[:, :, None]) / self.radius
+        if not self.view_aligned:
+            return self.pooled(features, index, delta)
+        axis = view_axes(centres)[:, :, None]
+        turn = gather(view_axes(xyz), index)  # the neighbour's own axis, seen in the centre's
+        turned = to_view(torch.cat([turn, turn[..., :1]], -1), axis)[..., :2]
+        return self.pooled(features, index, torch.cat([to_view(delta, axis), turned], -1))
+
+
+class PatchAbstraction(nn.Module):
+    """Stem and first set abstraction, on the neighbourhoods of raw points.
+
+    The stem is linear, so it is applied to centre and offset apart: the same result without a stem per neighbour.
+    """
+
+    def __init__(self, settings: PointsSettings) -> None:
+        super().__init__()
+        stage = settings.stages[0]
+        self.radius, self.far = stage.radius, settings.far
+        self.view_aligned, self.pool_first = settings.view_aligned, settings.pool_first
+        self.stem = nn.Linear(3, settings.stem)
+        self.linear = nn.Linear(settings.stem + 3, stage.channels)
+        self.norm = nn.LayerNorm(stage.channels)
+        self.moments = ConvNormAct(stage.channels + MOMENTS, stage.channels) if settings.moments else None
+
+    def forward(self, centres: Tensor, patches: Tensor) -> Tensor:
+        """centres (B, n, 3), patches (B, n, k, 3), both m: (B, n, channels)."""
+        if self.view_aligned:
+            axis = view_axes(centres)
+            centres, patches = to_view(centres, axis), to_view(patches, axis[:, :, None])
+        local = patches / self.radius
+        of_stem, of_place = self.linear.weight.split((self.stem.out_features, 3), 1)
+        of_delta = of_place + of_stem @ self.stem.weight * (self.radius / self.far)
+        at_centre = self.linear(nn.functional.pad(self.stem(centres / self.far), (0, 3)))
+        if self.pool_first:
+            out = torch.relu(self.norm(pool_neighbours(None, None, local, of_delta) + at_centre))
+        else:
+            out = nn.functional.linear(local, of_delta) + at_centre[:, :, None]
+            out = torch.relu(self.norm(out)).amax(2)
+        if self.moments is None:
+            return out
+        return self.moments(torch.cat([out, neighbourhood_moments(local).to(out.dtype)], -1))
+
+
+def neighbourhood_moments(local: Tensor) -> Tensor:
+    """Mean and scatter of neighbourhoods (..., k, 3), the scatter divided by its trace: (..., 9)."""
+    mean = local.mean(-2)
+    centred = local - mean[..., None, :]
+    x, y, z = centred.unbind(-1)
+    scatter = torch.stack([(a * b).mean(-1) for a, b in ((x, x), (y, y), (z, z), (x, y), (x, z), (y, z))], -1)
+    trace = scatter[..., :3].sum(-1, keepdim=True)
+    return torch.cat([mean, scatter / (trace + 1e-4)], -1)
+
+
+class InvertedResidual(nn.Module):
+    """Aggregation among the points of a level, then a point-wise inverted bottleneck, added to the input."""
+
+    def __init__(self, channels: int, radius: float, settings: PointsSettings) -> None:
+        super().__init__()
+        self.aggregation = Aggregation(channels, channels, radius, settings)
+        self.expand = ConvNormAct(channels, 4 * channels)
+        self.project = ConvNormAct(4 * channels, channels, act=False)
+
+    def forward(self, xyz: Tensor, features: Tensor, index: Tensor) -> Tensor:
+        """xyz (B, n, 3), features (B, n, C), index (B, n, k): (B, n, C)."""
+        out = self.project(self.expand(self.aggregation(xyz, xyz, features, index)))
+        return torch.relu(out + features)
+
+
+class FeaturePropagation(nn.Module):
+    """Features of a coarse level brought to a fine one by inverse-distance weights, joined with its own."""
+
+    def __init__(self, coarse: int, fine: int, channels: int) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(ConvNormAct(coarse + fine, channels), ConvNormAct(channels, channels))
+
+    def forward(self, coarse: Scale, fine: Scale, index: Tensor) -> Scale:
+        """index (B, n_fine, 3) into the coarse points."""
+        delta = gather(coarse.xyz, index) - fine.xyz[:, :, None]
+        weight = 1 / ((delta * delta).sum(-1) + 1e-6)
+        weight = (weight / weight.sum(-1, keepdim=True)).to(coarse.features.dtype)
+        carried = (gather(coarse.features, index) * weight[..., None]).sum(2)
+        return Scale(fine.xyz, self.layers(torch.cat([carried, fine.features], -1)), fine.mask)
+
+
+class PointNeXt(nn.Module):
+    """The backbone; `channels` lists those of the scales it returns, fine to coarse."""
+
+    def __init__(self, settings: PointsSettings) -> None:
+        super().__init__()
+        stages = settings.stages
+        self.sizes = [stage.points for stage in stages]
+        self.patch = PatchAbstraction(settings)
+        self.abstractions = nn.ModuleList(
+            Aggregation(before.channels, stage.channels, stage.radius, settings) for before, stage in pairwise(stages)
+        )
+        self.residuals = nn.ModuleList(nn.ModuleList(self._residuals(stage, settings)) for stage in stages)
+        self.channels = [stage.channels for stage in stages]
+        self.ups = nn.ModuleList()
+        for level in range(len(stages) - 2, len(stages) - 2 - settings.upsample, -1):
+            self.ups.append(FeaturePropagation(self.channels[level + 1], self.channels[level], self.channels[level]))
+
+    @staticmethod
+    def _residuals(stage: StageSettings, settings: PointsSettings) -> list[InvertedResidual]:
+        return [InvertedResidual(stage.channels, radius, settings) for radius in stage.residual_radii]
+
+    def forward(self, batch: PointBatch) -> list[Scale]:
+        """All levels, fine to coarse."""
+        scales: list[Scale] = []
+        for level, size in enumerate(self.sizes):
+            xyz = batch.xyz[:, :size]
+            if level == 0:
+                features = self.patch(xyz, batch.patches)
+            else:
+                before = scales[-1]
+                features = self.abstractions[level - 1](before.xyz, xyz, before.features, batch.groups[level - 1])
+            for block, index in zip(self.residuals[level], batch.locals[level], strict=True):  # type: ignore[call-overload]
+                features = block(xyz, features, index)
+            mask = torch.arange(size, device=xyz.device) < batch.valid[:, None]
+            scales.append(Scale(xyz, features, mask))
+        for step, up in enumerate(self.ups):
+            level = len(scales) - 2 - step
+            scales[level] = up(scales[level + 1], scales[level], batch.ups[step])
+        return scales

@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A raw scan becomes the point pyramid that the backbone reads: sampling and neighbour search, once, in numpy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from dpm2_core.errors import Dpm2Error
+from dpm2_core.geometry.sampling import farthest_points, in_range, neighbours, voxel_first
+from dpm2_core.network.config import PointsSettings
+
+MIN_POINTS = 32  # below this a scan says nothing about the pose
+
+
+@dataclass(frozen=True, eq=False)
+class Pyramid:
+    """Levels of one scan; the points of a level are a prefix of those of the level before.
+
+    Attributes:
+        xyz: (n_0, 3) float32 m, farthest-first; zeros after `count`.
+        count: valid points of the first level; that of level i is min(count, n_i).
+        patches: (n_0, k_0, 3) float16 m, input points around each first-level point, relative to it.
+        groups: per further level (n_i, k_i) int16, neighbours in the level before.
+        locals: per level, per residual block (n_i, k) int16, neighbours in the level itself.
+        ups: per feature propagation, coarse to fine, (n_fine, 3) int16, the nearest points of the coarser level.
+    """
+
+    xyz: NDArray[np.float32]
+    count: int
+    patches: NDArray[np.float16]
+    groups: tuple[NDArray[np.int16], ...]
+    locals: tuple[tuple[NDArray[np.int16], ...], ...]
+    ups: tuple[NDArray[np.int16], ...]
+
+
+class PointBatch(NamedTuple):
+    """A batch of pyramids as tensors, fields as in `Pyramid` with a leading dimension B; `valid` (B,) is its count."""
+
+    xyz: Tensor
+    valid: Tensor
+    patches: Tensor
+    groups: tuple[Tensor, ...]
+    locals: tuple[tuple[Tensor, ...], ...]
+    ups: tuple[Tensor, ...]
+
+
+def crop(points: NDArray[np.float32], settings: PointsSettings) -> NDArray[np.float32]:
+    """Range crop and voxel grid of (N, 3+) points: (M, 3)."""
+    xyz = np.ascontiguousarray(points[:, :3])
+    xyz = xyz[in_range(xyz, settings.near, settings.far)]
+    return xyz[voxel_first(xyz, settings.voxel)]
+
+
+def build_pyramid(cloud: NDArray[np.float32], settings: PointsSettings) -> Pyramid:
+    """The pyramid of a cropped (M, 3) cloud.
+
+    Raises:
+        Dpm2Error: fewer than `MIN_POINTS` points.
+    """
+    if len(cloud) < MIN_POINTS:
+        raise Dpm2Error(f"scan has {len(cloud)} points within {settings.near}-{settings.far} m, want {MIN_POINTS}")
+    stages = settings.stages
+    first = stages[0]
+    xyz = cloud[farthest_points(cloud, first.points)]
+    count = len(xyz)
+    index = neighbours(_tree(cloud), xyz, first.neighbours, first.radius)
+    patches = np.zeros((first.points, first.neighbours, 3), np.float16)
+    patches[:count] = cloud[index] - xyz[:, None]
+
+    trees = [_tree(xyz[: stage.points]) for stage in stages]
+    groups = tuple(
+        _padded(neighbours(trees[i], xyz[: stage.points], stage.neighbours, stage.radius), stage.points)
+        for i, stage in enumerate(stages[1:])
+    )
+    locals_ = tuple(
+        tuple(
+            _padded(neighbours(tree, xyz[: stage.points], stage.residual_neighbours, radius), stage.points)
+            for radius in stage.residual_radii
+        )
+        for tree, stage in zip(trees, stages, strict=True)
+    )
+    ups = tuple(
+        _padded(neighbours(trees[i + 1], xyz[: stages[i].points], 3, np.inf), stages[i].points)
+        for i in range(len(stages) - 2, len(stages) - 2 - settings.upsample, -1)
+    )
+    full = np.zeros((first.points, 3), np.float32)
+    full[:count] = xyz
+    return Pyramid(full, count, patches, groups, locals_, ups)
+
+
+def _tree(points: NDArray[np.float32]) -> cKDTree:
+    return cKDTree(points, leafsize=16, balanced_tree=False, compact_nodes=False)  # builds 3 times faster
+
+
+def _padded(index: NDArray[np.int64], rows: int) -> NDArray[np.int16]:
+    out = np.zeros((rows, index.shape[1]), np.int16)
+    out[: len(index)] = index
+    return out
+
+
+def collate(pyramids: list[Pyramid]) -> PointBatch:
+    """Stack pyramids of one configuration."""
+
+    def index(arrays: list[NDArray[np.int16]]) -> Tensor:
+        return torch.from_numpy(np.stack(arrays)).long()
+
+    return PointBatch(
+        torch.from_numpy(np.stack([p.xyz for p in pyramids])),
+        torch.tensor([p.count for p in pyramids]),
+        torch.from_numpy(np.stack([p.patches for p in pyramids])).float(),
+        tuple(index(list(level)) for level in zip(*(p.groups for p in pyramids), strict=True)),
+        tuple(
+            tuple(index(list(block)) for block in zip(*levels, strict=True))
+            for levels in zip(*(p.locals for p in pyramids), strict=True)
+        ),
+        tuple(index(list(level)) for level in zip(*(p.ups for p in pyramids), strict=True)),
+    )

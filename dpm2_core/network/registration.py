@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Correlated descriptors to a pose: dual softmax, offsets, robust weighted SVD, precision-weighted solve."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from dpm2_core.frame import Registration
+from dpm2_core.geometry.kabsch import transform, weighted_kabsch
+from dpm2_core.network.descriptors import Tokens
+from dpm2_core.network.heads import into_set_frame
+from dpm2_core.network.losses import cosine
+
+if TYPE_CHECKING:
+    from dpm2_core.network.decoder import Correlated, Decoder
+
+CERTAIN = 0.5  # pairs above this start as inliers, beside the SURE most confident
+SURE = 64
+MIN_INLIERS = 30
+CONFIDENT = 30  # pairs whose mean confidence is that of the registration
+SOFT = 3.0  # degrees of freedom of the Student weights in the precision-weighted solve
+
+
+class Correspondences(NamedTuple):
+    """Points that should coincide, both directions of each pair, most confident first.
+
+    Attributes:
+        source, target: (B, 2K, 3) m, in the source and in the target frame.
+        weight: (B, 2K) confidence 0..1, 0 where dropped.
+        L: (B, 2K, 3, 3), precision L L^T, the first K in the source frame, the others in the target frame.
+    """
+
+    source: Tensor
+    target: Tensor
+    weight: Tensor
+    L: Tensor
+
+
+def softmax_both(scores: Tensor, source_mask: Tensor, target_mask: Tensor) -> Tensor:
+    """Dual softmax of scores (B, N, M), over rows times over columns: probability of each match; 0 at padding."""
+    valid = source_mask[:, :, None] & target_mask[:, None]
+    scores = scores.masked_fill(~valid, -1e4)
+    return scores.softmax(2) * scores.softmax(1) * valid
+
+
+def best_pairs(probability: Tensor, ratio: float) -> tuple[Tensor, Tensor, Tensor]:
+    """The floor(ratio (N + M)) // 2 most probable pairs of (B, N, M): probability, row and column (B, K)."""
+    _, n, m = probability.shape
+    k = min(int(ratio * (n + m)) // 2, n * m)
+    value, flat = probability.flatten(1).topk(k)
+    return value, flat // m, flat % m
+
+
+def take(values: Tensor, index: Tensor) -> Tensor:
+    """values (B, N, C) at index (B, K): (B, K, C)."""
+    return values.gather(1, index[..., None].expand(-1, -1, values.shape[-1]))
+
+
+def correspond(decoder: Decoder, source: Tokens, target: Tokens, correlated: Correlated) -> Correspondences:
+    """Choose pairs and predict, for each, the offsets in both directions."""
+    settings = decoder.settings
+    similarity = cosine(decoder.similarity(correlated.source), decoder.similarity(correlated.target))
+    probability = softmax_both(similarity / settings.temperature, source.mask, target.mask)
+    weight, i, j = best_pairs(probability, settings.pair_ratio)
+    x, y = take(source.xyz, i), take(target.xyz, j)
+    a, b = take(correlated.source, i), take(correlated.target, j)
+    there, L_there = decoder.offset(a, b)
+    back, L_back = decoder.offset(b, a)
+    there, L_there = into_set_frame(there, L_there, take(source.axis, i))
+    back, L_back = into_set_frame(back, L_back, take(target.axis, j))
+    short = [offset.norm(dim=-1) <= settings.offset_limit for offset in (there, back)]
+    return Correspondences(
+        torch.cat([x + there, x], 1),
+        torch.cat([y, y + back], 1),
+        torch.cat([weight * short[0], weight * short[1]], 1),
+        torch.cat([L_there, L_back], 1),
+    )
+
+
+def robust_kabsch(pairs: Correspondences, rounds: int = 3) -> tuple[Tensor, Tensor]:
+    """Weighted SVD on inliers that are chosen anew each round: those within mean + 3 deviations of the inliers.
+
+    Returns:
+        T (B, 4, 4) float64 and inliers (B, 2K).
+    """
+    weight = pairs.weight
+    inliers = weight > CERTAIN
+    inliers.scatter_(1, weight.topk(min(SURE, weight.shape[1]))[1], True)
+    inliers &= weight > 0
+    T = weighted_kabsch(pairs.source, pairs.target, weight * inliers)
+    for _ in range(rounds):
+        error = (transform(T, pairs.source) - pairs.target).norm(dim=-1)
+        count = inliers.sum(1, keepdim=True).clamp(min=1)
+        mean = (error * inliers).sum(1, keepdim=True) / count
+        spread = (((error - mean) ** 2 * inliers).sum(1, keepdim=True) / count).sqrt()
+        chosen = (error <= mean + 3 * spread) & (weight > 0)
+        enough = chosen.sum(1, keepdim=True) >= MIN_INLIERS
+        inliers = torch.where(enough, chosen, inliers)
+        T = weighted_kabsch(pairs.source, pairs.target, weight * inliers)
+    return T, inliers
+
+
+def whitened(T: Tensor, pairs: Correspondences) -> tuple[Tensor, Tensor]:
+    """Residuals in units of their deviation (B, 2K, 3) and their Jacobian (B, 2K, 3, 6) for T exp(xi)."""
+    half = pairs.source.shape[1] // 2
+    R, t = T[:, None, :3, :3], T[:, None, :3, 3]
+    source, target, L = pairs.source.double(), pairs.target.double(), pairs.L.double()
+    moved_back = ((target - t)[..., None, :] @ R)[..., 0, :]  # R^T (y - t)
+    L = torch.cat([L[:, :half], R.transpose(-1, -2) @ L[:, half:]], 1)  # all in the source frame
+    zero = torch.zeros_like(source[..., 0])
+    x, y, z = source.unbind(-1)
+    minus_hat = torch.stack([zero, z, -y, -z, zero, x, y, -x, zero], -1).unflatten(-1, (3, 3))
+    eye = torch.eye(3, dtype=source.dtype, device=source.device).expand_as(minus_hat)
+    jacobian = L.transpose(-1, -2) @ torch.cat([minus_hat, eye], -1)
+    residual = (L.transpose(-1, -2) @ (source - moved_back)[..., None])[..., 0]
+    return residual, jacobian
+
+
+def precision_solve(T: Tensor, pairs: Correspondences, rounds: int = 8) -> tuple[Tensor, Tensor]:
+    """Iteratively reweighted Gauss-Newton on the residuals weighed with their predicted precision.
+
+    Args:
+        T: (B, 4, 4) start. pairs: the correspondences.
+
+    Returns:
+        T (B, 4, 4) and the information matrix (B, 6, 6) of xi in T exp(xi), rotation first.
+    """
+    information = T.new_zeros(len(T), 6, 6)
+    damping = torch.eye(6, dtype=T.dtype, device=T.device) * 1e-6
+    for _ in range(rounds):
+        residual, jacobian = whitened(T, pairs)
+        squared = (residual * residual).sum(-1)
+        weight = pairs.weight * (SOFT + 3) / (SOFT + squared)
+        weighted = jacobian * weight[..., None, None]
+        information = (weighted.flatten(1, 2).transpose(1, 2) @ jacobian.flatten(1, 2)) + damping
+        gradient = weighted.flatten(1, 2).transpose(1, 2) @ residual.flatten(1, 2)[..., None]
+        T = T @ exp(-torch.linalg.solve(information, gradient)[..., 0])
+    return T, information
+
+
+def exp(xi: Tensor) -> Tensor:
+    """SE(3) exponential of (B, 6) [rotation, translation]."""
+    w, v = xi[:, :3], xi[:, 3:]
+    zero = torch.zeros_like(w[:, 0])
+    x, y, z = w.unbind(-1)
+    generator = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
+    out = xi.new_zeros(len(xi), 4, 4)
+    out[:, :3, :3], out[:, :3, 3] = generator, v
+    return torch.linalg.matrix_exp(out)
+
+
+def register_batch(decoder: Decoder, source: Tokens, target: Tokens, correlated: Correlated) -> list[Registration]:
+    """The registrations of a batch, T_target_source each."""
+    pairs = correspond(decoder, source, target, correlated)
+    T, inliers = robust_kabsch(pairs)
+    if decoder.settings.precision:
+        T, information = precision_solve(T, pairs)
+    error = (transform(T, pairs.source.double()) - pairs.target).norm(dim=-1)
+    count = inliers.sum(1)
+    rmse = ((error**2 * inliers).sum(1) / count.clamp(min=1)).sqrt()
+    if not decoder.settings.precision:
+        sigma = rmse.clamp(min=0.02)[:, None, None, None] / 3**0.5
+        _, jacobian = whitened(T, pairs._replace(L=torch.eye(3, device=T.device).expand_as(pairs.L)))
+        jacobian = (jacobian * inliers[..., None, None] / sigma).flatten(1, 2)
+        information = jacobian.transpose(1, 2) @ jacobian + 1e-6 * torch.eye(6, device=T.device)
+    covariance = decoder.settings.covariance_scale * torch.linalg.inv(information)
+    confidence = _confidence(pairs.weight, inliers)
+    return [
+        _answer(*row)
+        for row in zip(T.cpu(), covariance.cpu(), confidence.tolist(), rmse.tolist(), count.tolist(), strict=True)
+    ]
+
+
+def _confidence(weight: Tensor, inliers: Tensor) -> Tensor:
+    best = (weight * inliers).topk(min(CONFIDENT, weight.shape[1]))[0]
+    return best.mean(1)
+
+
+def _answer(T: Tensor, covariance: Tensor, confidence: float, rmse: float, count: int) -> Registration:
+    finite = bool(T.isfinite().all() and covariance.isfinite().all())
+    if count < 3 or not finite:
+        reason = f"{count} matching descriptors, want 3" if finite else "no finite pose"
+        nothing = torch.eye(4, dtype=torch.float64).numpy()
+        return Registration(nothing, torch.eye(6).double().numpy() * 1e6, 0.0, float("inf"), "neural", False, reason)
+    return Registration(T.numpy(), covariance.numpy(), confidence, rmse, "neural")

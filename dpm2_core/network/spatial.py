@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where tokens are: spatial biases of LiDAR key-points and feature pixels, and image features at projected points."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from dpm2_core.geometry.rays import pixel_rays, point_ray_distance, project
+from dpm2_core.network.attention import zscore
+from dpm2_core.network.convnext import FeatureMap
+
+
+class Views(NamedTuple):
+    """The pictures of a batch, resized.
+
+    Attributes:
+        pixels: (B, V, 3, H, W) uint8.
+        K: (B, V, 3, 3) intrinsics of the resized picture, pixels.
+        T_lidar_cam: (B, V, 4, 4).
+        present: (B, V) False where a picture is missing.
+    """
+
+    pixels: Tensor
+    K: Tensor
+    T_lidar_cam: Tensor
+    present: Tensor
+
+
+def point_bias(points: Tensor, tokens: Tensor, token_mask: Tensor, alpha: float) -> Tensor:
+    """z-score over the tokens of exp(-alpha |p - r|): points (B, N, 3), tokens (B, T, 3): (B, 1, N, T)."""
+    squared = (
+        (points * points).sum(-1)[..., None]
+        + (tokens * tokens).sum(-1)[:, None]
+        - 2 * points @ tokens.transpose(-1, -2)
+    )
+    distance = squared.clamp(min=1e-6).sqrt()
+    return _compact(zscore(torch.exp(-alpha * distance), token_mask[:, None])[:, None])
+
+
+def _compact(bias: Tensor) -> Tensor:
+    """bf16 under autocast: the largest tensors of the network, read by every layer."""
+    return bias.bfloat16() if torch.is_autocast_enabled(bias.device.type) else bias
+
+
+def token_pixels(maps: list[FeatureMap]) -> Tensor:
+    """Centres (T, 2) in the resized picture of the pixels of all maps, u then v."""
+    parts = []
+    for features, stride in maps:
+        h, w = features.shape[-2:]
+        v, u = torch.meshgrid(torch.arange(h), torch.arange(w), indexing="ij")
+        parts.append((torch.stack([u, v], -1).reshape(-1, 2) + 0.5) * stride - 0.5)
+    return torch.cat(parts).to(maps[0].features.device)
+
+
+def ray_bias(points: Tensor, views: Views, uv: Tensor, alphas: tuple[float, ...]) -> tuple[Tensor, Tensor]:
+    """Bias of feature pixels by the distance of points from their rays.
+
+    Args:
+        points: (B, N, 3), m. uv: (T, 2), pixels, the same in every view. alphas: 1/m, one or one a head.
+
+    Returns:
+        The z-score over the V * T tokens of M exp(-alpha distance), (B, len(alphas), N, V * T), M being 0 for points
+        behind the camera; and `seen` (B, N, V), True where the point projects into a picture that is present.
+    """
+    distances, fronts, seen = [], [], []
+    height, width = views.pixels.shape[-2:]
+    for view in range(views.pixels.shape[1]):
+        K, T_lidar_cam = views.K[:, view].float(), views.T_lidar_cam[:, view].float()
+        distance, front = point_ray_distance(points, *pixel_rays(uv, K, T_lidar_cam))
+        distances.append(distance)
+        fronts.append(front)
+        at, depth = project(points, K, T_lidar_cam)
+        inside = (depth > 0.1) & (at[..., 0] >= 0) & (at[..., 0] < width) & (at[..., 1] >= 0) & (at[..., 1] < height)
+        seen.append(inside & views.present[:, view, None])
+    distance, front = torch.cat(distances, -1)[:, None], torch.cat(fronts, -1)[:, None]
+    alpha = torch.tensor(alphas, device=points.device).view(1, -1, 1, 1)
+    readable = views.present.repeat_interleave(len(uv), 1)[:, None, None]
+    return _compact(zscore(torch.exp(-alpha * distance) * front, readable)), torch.stack(seen, -1)
+
+
+def sample_at_points(points: Tensor, views: Views, features: Tensor, window: int) -> Tensor:
+    """Features of the first view's finest map around projected points.
+
+    Args:
+        points: (B, N, 3), m. features: (B, C, h, w). window: 1 or 3, side of the square of samples, a map pixel apart.
+
+    Returns:
+        (B, N, C), the mean of the window; zero outside the picture.
+    """
+    height, width = views.pixels.shape[-2:]
+    uv, depth = project(points, views.K[:, 0].float(), views.T_lidar_cam[:, 0].float())
+    size = torch.tensor([width, height], device=uv.device)
+    grid = (uv + 0.5) / size * 2 - 1
+    grid = torch.where(depth[..., None] > 0.1, grid, torch.full_like(grid, -9))  # behind: outside
+    steps = torch.arange(window, device=uv.device) - window // 2
+    shift = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), -1).reshape(-1, 2)
+    shift = shift * 2 / torch.tensor(features.shape[:1:-1], device=uv.device)
+    samples = torch.nn.functional.grid_sample(
+        features.float(), grid[:, :, None] + shift, mode="bilinear", padding_mode="zeros", align_corners=False
+    )
+    return samples.mean(-1).transpose(1, 2)

@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Weights as safetensors: nothing that is loaded can execute code, and nothing is loaded into the wrong network."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+
+from dpm2_core.errors import UsageError
+from dpm2_core.network.config import NetworkSettings, settings_from
+from dpm2_core.network.model import DeepPointMap2
+
+
+def fingerprint(settings: NetworkSettings) -> str:
+    """Short hash of everything that gives the network its shape and meaning."""
+    text = json.dumps(settings.model_dump(mode="json", exclude={"preset"}), sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def save_weights(model: DeepPointMap2, path: Path, about: dict[str, str], half: bool = True) -> None:
+    """Write all parameters with the network's settings; `half` stores fp16, half the size."""
+    state = {
+        name: (value.half() if half and value.is_floating_point() else value).contiguous().cpu()
+        for name, value in model.state_dict().items()
+    }
+    metadata = {**about, "preset": model.settings.preset, "network": model.settings.model_dump_json()}
+    part = path.with_suffix(".part")
+    save_file(state, part, metadata)
+    part.replace(path)
+
+
+def _read(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
+    try:
+        with safe_open(path, "pt") as file:
+            return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
+    except FileNotFoundError:
+        raise UsageError(f"{path}: no such weights") from None
+    except (SafetensorError, OSError) as error:
+        raise UsageError(f"{path}: not a safetensors file ({error}); pickled weights are never loaded") from None
+
+
+def load_weights(model: DeepPointMap2, path: Path) -> dict[str, str]:
+    """Load strictly; returns the metadata.
+
+    Raises:
+        UsageError: missing file, another format, weights of another preset or shape.
+    """
+    state, metadata = _read(path)
+    stored = metadata.get("preset", "unknown")
+    if stored != model.settings.preset:
+        raise UsageError(f"{path}: weights of preset {stored}, the network is preset {model.settings.preset}")
+    own = model.state_dict()
+    wrong = list(own.keys() ^ state.keys()) + [
+        name for name in own.keys() & state.keys() if own[name].shape != state[name].shape
+    ]
+    if wrong:
+        raise UsageError(f"{path}: does not fit preset {stored}: {len(wrong)} tensors differ, such as {min(wrong)}")
+    model.load_state_dict(state)
+    return metadata
+
+
+def load_model(path: Path) -> DeepPointMap2:
+    """The network that a weights file describes, with its weights, ready for inference.
+
+    Raises:
+        UsageError: as `load_weights`.
+    """
+    _, metadata = _read(path)
+    if "network" not in metadata:
+        raise UsageError(f"{path}: safetensors without a network description")
+    model = DeepPointMap2(settings_from(NetworkSettings, json.loads(metadata["network"]), default=str(path)))
+    load_weights(model, path)
+    return model.eval().requires_grad_(False)

@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Augmentation of one sample: occlusion, drops, rigid motion with its pose and extrinsics, and the pictures."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from dpm2_core.config import Settings
+from dpm2_core.frame import Array, Image
+from dpm2_core.geometry import se3
+from dpm2_core.network.pyramid import MIN_POINTS
+from dpm2_core.training.packed import Sample
+
+Cloud = NDArray[np.float32]
+
+
+class AugmentSettings(Settings):
+    """Strength of each augmentation; probabilities are per frame."""
+
+    drop: float = Field(0.5, ge=0, lt=1)
+    """Points are dropped at a ratio drawn from 0 to this."""
+    occlusion: float = Field(0.1, ge=0, le=1)
+    """Probability of RandomOcclusion: sectors behind near shields are lost."""
+    beams: float = Field(0.1, ge=0, le=1)
+    """Probability that only every second or fourth elevation survives."""
+    jitter: float = Field(0.005, ge=0)
+    """Deviation of point noise, m, cut at 3 deviations."""
+    yaw: float = Field(3.1416, ge=0)
+    """Turn of the sensor about its own axis, rad, up to either side."""
+    tilt: float = Field(0.03, ge=0)
+    """Deviation of roll and pitch, rad."""
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.2)
+    """Deviation of the origin's translation, m. Sideways shifts take the origin away from the sensor: they suit the
+    networks that work in the sensor's axes only (3, 3, 1.5 there)."""
+    image_drop: float = Field(0.15, ge=0, le=1)
+    """Probability that all pictures of a frame are missing."""
+    image_black: float = Field(0.05, ge=0, le=1)
+    """Probability that a picture is black."""
+    exposure: float = Field(0.3, ge=0)
+    """Deviation of the logarithm of exposure."""
+    colour: float = Field(0.08, ge=0)
+    """Deviation of the logarithm of each colour's gain."""
+    extrinsic_rotation: float = Field(0.002, ge=0)
+    """Deviation of the error of the extrinsics, rad."""
+    extrinsic_translation: float = Field(0.01, ge=0)
+    """The same, m."""
+
+
+def augment(sample: Sample, settings: AugmentSettings, noise: np.random.Generator) -> Sample:
+    """A changed copy; its pose and extrinsics fit the changed cloud."""
+    cloud = sample.cloud
+    for change in (_beams, _occlude, _drop):
+        changed = change(cloud, settings, noise)
+        if len(changed) >= 4 * MIN_POINTS:  # never lose the scan altogether
+            cloud = changed
+    cloud = noise.permutation(cloud)  # farthest point sampling starts elsewhere
+    moved = random_motion(settings, noise)
+    jitter = np.clip(noise.standard_normal(cloud.shape, np.float32), -3, 3) * np.float32(settings.jitter)
+    cloud = se3.transform(moved, cloud) + jitter
+    images = () if noise.random() < settings.image_drop else sample.images
+    return Sample(
+        cloud.astype(np.float32),
+        sample.pose @ se3.inverse(moved),
+        tuple(augment_image(image, moved, settings, noise) for image in images),
+    )
+
+
+def random_motion(settings: AugmentSettings, noise: np.random.Generator) -> Array:
+    """T_new_old of the sensor frame."""
+    yaw = noise.uniform(-settings.yaw, settings.yaw)
+    tilt = noise.normal(0, 1, 2) * settings.tilt
+    turned = se3.exp([0, 0, yaw, 0, 0, 0]) @ se3.exp([*tilt, 0, 0, 0, 0])
+    turned[:3, 3] = noise.normal(0, 1, 3) * settings.shift
+    return turned
+
+
+def _drop(cloud: Cloud, settings: AugmentSettings, noise: np.random.Generator) -> Cloud:
+    return cloud[noise.random(len(cloud)) >= noise.uniform(0, settings.drop)]
+
+
+def _beams(cloud: Cloud, settings: AugmentSettings, noise: np.random.Generator) -> Cloud:
+    if noise.random() >= settings.beams:
+        return cloud
+    elevation = np.arctan2(cloud[:, 2], np.hypot(cloud[:, 0], cloud[:, 1]))
+    beam = np.round(elevation / np.radians(0.42)).astype(int)  # spacing of a 64-beam sensor
+    return cloud[beam % noise.choice([2, 4]) == 0]
+
+
+def _occlude(cloud: Cloud, settings: AugmentSettings, noise: np.random.Generator) -> Cloud:
+    if noise.random() >= settings.occlusion:
+        return cloud
+    azimuth = np.arctan2(cloud[:, 1], cloud[:, 0])
+    distance = np.linalg.norm(cloud, axis=1)
+    lost = np.zeros(len(cloud), bool)
+    for shield in range(noise.integers(1, 4)):
+        width = np.radians(noise.uniform(10, 150)) / (shield + 1)
+        start = noise.uniform(-np.pi, np.pi)
+        lost |= ((azimuth - start) % (2 * np.pi) < width) & (distance >= noise.uniform(2, 10))
+    return cloud[~lost]
+
+
+def augment_image(image: Image, T_new_old: Array, settings: AugmentSettings, noise: np.random.Generator) -> Image:
+    """Exposure, colour and black-out of the pixels; extrinsics moved with the LiDAR frame and slightly wrong."""
+    gain = np.exp(noise.normal(0, settings.exposure) + noise.normal(0, settings.colour, 3))
+    if noise.random() < settings.image_black:
+        gain = np.zeros(3)
+    pixels = np.clip(image.pixels * gain.astype(np.float32), 0, 255).astype(np.uint8)
+    error = se3.exp(
+        np.concatenate([
+            noise.normal(0, settings.extrinsic_rotation, 3), noise.normal(0, settings.extrinsic_translation, 3)
+        ])
+    )  # fmt: skip
+    camera = replace(image.camera, T_lidar_cam=T_new_old @ image.camera.T_lidar_cam @ error)
+    return Image(pixels, camera)

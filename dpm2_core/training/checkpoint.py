@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Checkpoints of a training: everything a resumed run needs to continue the same curve, written atomically."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+from dpm2_core.errors import UsageError
+
+FORMAT = 1
+
+
+def save_checkpoint(path: Path, module: nn.Module, ema: nn.Module, optimiser: torch.optim.Optimizer, step: int) -> None:
+    """Weights, averaged weights, optimiser and step. Everything random follows from seed and step."""
+    state = {
+        "format": FORMAT,
+        "module": module.state_dict(),
+        "ema": ema.state_dict(),
+        "optimiser": optimiser.state_dict(),
+        "step": step,
+    }
+    part = path.with_suffix(".part")
+    torch.save(state, part)
+    os.replace(part, path)
+
+
+def load_checkpoint(path: Path, module: nn.Module, ema: nn.Module, optimiser: torch.optim.Optimizer | None) -> int:
+    """Restore a run; returns the step it had finished.
+
+    Raises:
+        UsageError: no checkpoint, or one of another network.
+    """
+    try:
+        state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)  # executes nothing
+    except (OSError, RuntimeError, ValueError, EOFError) as error:
+        raise UsageError(f"{path}: no checkpoint: {error}") from None
+    except Exception as error:  # weights_only refuses pickled code with pickle.UnpicklingError
+        raise UsageError(f"{path}: not a checkpoint of this program: {str(error).splitlines()[0]}") from None
+    try:
+        module.load_state_dict(state["module"])
+        ema.load_state_dict(state["ema"])
+    except (KeyError, RuntimeError) as error:
+        first = str(error).splitlines()[-1].strip()
+        raise UsageError(f"{path}: checkpoint of another network: {first}") from None
+    if optimiser is not None:
+        optimiser.load_state_dict(state["optimiser"])
+    return int(state["step"])
+
+
+class Log:
+    """One JSON object a line, and TensorBoard where its package is installed."""
+
+    def __init__(self, folder: Path, append: bool) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self.file = (folder / "log.jsonl").open("a" if append else "w", buffering=1)
+        try:
+            from torch.utils.tensorboard import SummaryWriter
+
+            self.board: SummaryWriter | None = SummaryWriter(str(folder / "tensorboard"))
+        except ImportError:
+            self.board = None
+
+    def write(self, step: int, figures: dict[str, float]) -> None:
+        """Log figures of a step."""
+        self.file.write(json.dumps({"step": step, **{k: round(v, 6) for k, v in figures.items()}}) + "\n")
+        if self.board is not None:
+            for name, value in figures.items():
+                self.board.add_scalar(name, value, step)
+
+    def close(self) -> None:
+        """Flush and close."""
+        self.file.close()
+        if self.board is not None:
+            self.board.close()

@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Groups of near-by frames as batches: drawn by weight, augmented, sampled into pyramids."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from pydantic import Field
+from torch import Tensor
+from torch.utils.data import DataLoader, IterableDataset, get_worker_info
+
+from dpm2_core.config import Settings
+from dpm2_core.frame import Array
+from dpm2_core.network.config import NetworkSettings
+from dpm2_core.network.encoder import collate_views
+from dpm2_core.network.pyramid import PointBatch, Pyramid, build_pyramid, collate
+from dpm2_core.network.spatial import Views
+from dpm2_core.training.augment import AugmentSettings, augment
+from dpm2_core.training.packed import PackedDrive, Sample, open_packed
+
+
+class DataSettings(Settings):
+    """What to train on."""
+
+    packed: dict[str, float] = Field({})
+    """Folders of packed drives (`dpm2 train pack`) and the weight of each in the mixture."""
+    groups: int = Field(4, gt=0)
+    """Places in a batch, per process."""
+    frames: int = Field(4, ge=2)
+    """Frames of each place: one, and others within `radius` of it."""
+    radius: float = Field(20.0, gt=0)
+    """m."""
+    images: bool = False
+    """Read the pictures."""
+    workers: int = Field(1, ge=0)
+    """Processes that load and sample; 0 loads in the training process."""
+    augment: AugmentSettings = AugmentSettings()
+
+
+class Batch(NamedTuple):
+    """Frames of G places, F each, in the order place by place.
+
+    Attributes:
+        points: G * F pyramids. views: their pictures, or None.
+        poses: (G, F, 4, 4) float64 T_world_lidar; worlds of different places are unrelated.
+    """
+
+    points: PointBatch
+    views: Views | None
+    poses: Tensor
+
+
+def draw_group(poses: Array, frames: int, radius: float, noise: np.random.Generator) -> np.ndarray:
+    """Indices (frames,) of one frame and others whose distance from it is about uniform in 0..radius m.
+
+    poses (n, 4, 4), NaN where unknown; frames repeat where the neighbourhood holds too few.
+    """
+    known = np.flatnonzero(np.isfinite(poses[:, :3, 3]).all(1))
+    first = noise.choice(known)
+    distance = np.linalg.norm(poses[known, :3, 3] - poses[first, :3, 3], axis=1)
+    others = known[(distance <= radius) & (known != first)]
+    if len(others) == 0:
+        return np.full(frames, first)
+    distance = np.linalg.norm(poses[others, :3, 3] - poses[first, :3, 3], axis=1)
+    chosen = [first]
+    for wanted in noise.uniform(0, radius, frames - 1):
+        gap = np.abs(distance - wanted)
+        if len(others) >= frames - 1:
+            gap[np.isin(others, chosen)] = np.inf
+        chosen.append(others[gap.argmin()])
+    return np.array(chosen)
+
+
+class GroupDataset(IterableDataset):
+    """An endless stream of batches; batch `n` depends on seed and `n` alone, so a resumed run sees the same."""
+
+    def __init__(
+        self,
+        settings: DataSettings,
+        network: NetworkSettings,
+        seed: int,
+        start: int = 0,
+        shard: tuple[int, int] = (0, 1),
+    ) -> None:
+        self.settings, self.network, self.seed, self.start, self.shard = settings, network, seed, start, shard
+        drives: list[PackedDrive] = []
+        chances: list[float] = []
+        for folder, weight in settings.packed.items():
+            found = open_packed(Path(folder))
+            frames = sum(len(drive) for drive in found)
+            drives += found
+            chances += [weight * len(drive) / frames for drive in found]
+        self.drives: Sequence[PackedDrive] = drives
+        self.chances = np.array(chances) / sum(chances)
+
+    def __iter__(self) -> Iterator[Batch]:
+        info = get_worker_info()
+        step, stride = self.start, 1
+        if info is not None:
+            step, stride = self.start + info.id, info.num_workers
+        while True:
+            yield self.batch(step)
+            step += stride
+
+    def batch(self, step: int) -> Batch:
+        """Batch number `step` of this process."""
+        noise = np.random.default_rng([self.seed, step, self.shard[0]])
+        settings = self.settings
+        pyramids: list[Pyramid] = []
+        images = []
+        poses = []
+        for _ in range(settings.groups):
+            drive = self.drives[noise.choice(len(self.drives), p=self.chances)]
+            for index in draw_group(drive.poses, settings.frames, settings.radius, noise):
+                sample: Sample = augment(drive[index], settings.augment, noise)
+                pyramids.append(build_pyramid(sample.cloud, self.network.points))
+                images.append(sample.images if settings.images else ())
+                poses.append(sample.pose)
+        views = collate_views(images, self.network.image) if settings.images else None
+        shaped = torch.from_numpy(np.stack(poses)).view(settings.groups, settings.frames, 4, 4)
+        return Batch(collate(pyramids), views, shaped)
+
+    def loader(self) -> DataLoader:
+        """Batches in order, prepared ahead by worker processes."""
+        workers = self.settings.workers
+        return DataLoader(
+            self,
+            batch_size=None,
+            num_workers=workers,
+            prefetch_factor=4 if workers else None,
+            persistent_workers=False,
+            worker_init_fn=_one_thread,
+        )
+
+
+def _one_thread(worker: int) -> None:
+    torch.set_num_threads(1)

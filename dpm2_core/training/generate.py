@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Packed training drives: from the synthetic city, one a world, and from any source with poses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+
+import numpy as np
+from pydantic import Field
+
+from dpm2_core.config import Settings
+from dpm2_core.data.source import Source
+from dpm2_core.errors import UsageError
+from dpm2_core.frame import Camera, Image
+from dpm2_core.network.config import NetworkSettings, PointsSettings, preset
+from dpm2_core.network.encoder import resize
+from dpm2_core.network.pyramid import crop
+from dpm2_core.sim.camera import calibration, render
+from dpm2_core.sim.config import CameraConfig, LidarConfig, PresetName
+from dpm2_core.sim.lidar import Lidar
+from dpm2_core.sim.world import build_world
+from dpm2_core.training.packed import Sample, write_packed
+
+
+class GenerateSettings(Settings):
+    """Synthetic training drives."""
+
+    worlds: int = Field(100, gt=0)
+    """Worlds, each a folder."""
+    first_seed: int = Field(1000, ge=0)
+    """Seed of the first world; the others follow. Validation takes seeds from 900000 on."""
+    frames: int = Field(70, gt=1)
+    """Scans of each world, at random places of its road."""
+    length: float = Field(180.0, ge=60)
+    """Road of a world, m."""
+    mixture: dict[PresetName, float] = Field(
+        {"city": 0.3, "suburb": 0.3, "rural": 0.28, "highway": 0.06, "tunnel": 0.06}
+    )
+    """Share of each kind of place."""
+    images: bool = False
+    """Render a picture with each scan."""
+    preset: str = "small"
+    """Network preset: its crop and picture size are stored."""
+
+
+def generate_world(folder: Path, seed: int, settings: GenerateSettings) -> None:
+    """One world's drive; the same for the same seed and settings."""
+    noise = np.random.default_rng([seed, 77])
+    kinds = sorted(settings.mixture)
+    weights = np.array([settings.mixture[kind] for kind in kinds])
+    kind = kinds[noise.choice(len(kinds), p=weights / weights.sum())]
+    network = preset(settings.preset)
+    world = build_world("random", kind, seed, settings.length)
+    lidar = Lidar(LidarConfig(columns=int(noise.choice([1448, 1810, 2170])), height=1.73 + noise.uniform(-0.2, 0.3)))
+    camera = _camera(network)
+    samples = []
+    for _ in range(settings.frames):
+        T, time = world.sample_pose(noise, height=lidar.config.height)
+        scan = lidar.scan(world, T, time, noise)
+        images: tuple[Image, ...] = ()
+        if settings.images:
+            view = calibration(camera)
+            pixels = render(world, camera, T @ view.T_lidar_cam, time, noise)
+            images = (small_image(Image(pixels, view), network),)
+        samples.append(Sample(crop(scan.points, network.points), T, images))
+    write_packed(folder, samples, {"source": "synthetic city", "preset": kind, "seed": seed})
+
+
+def _camera(network: NetworkSettings) -> CameraConfig:
+    """KITTI's field of view at twice the network's picture size: averaged down, it is free of aliasing."""
+    height, width = network.image.size
+    return CameraConfig(width=2 * width, height=2 * height, focal=720.0 * 2 * width / 1241)
+
+
+def small_image(image: Image, network: NetworkSettings) -> Image:
+    """The picture at the network's size."""
+    pixels, K = resize(image.pixels, image.camera.K, network.image.size)
+    height, width = network.image.size
+    camera = Camera(K, image.camera.T_lidar_cam, (width, height), image.camera.distortion, image.camera.name)
+    return Image(np.ascontiguousarray(pixels.transpose(1, 2, 0)), camera)
+
+
+def generate(
+    out: Path, settings: GenerateSettings, workers: int, progress: Callable[[int, int], None] = lambda done, total: None
+) -> None:
+    """All worlds, several at a time; those that are there already stay, so a killed run continues."""
+    seeds = range(settings.first_seed, settings.first_seed + settings.worlds)
+    folders = {seed: out / f"world_{seed:06d}" for seed in seeds}
+    missing = [seed for seed in seeds if not folders[seed].exists()]
+    done = settings.worlds - len(missing)
+    progress(done, settings.worlds)
+    with ProcessPoolExecutor(workers) as pool:
+        running = [pool.submit(generate_world, folders[seed], seed, settings) for seed in missing]
+        for future in as_completed(running):
+            future.result()
+            done += 1
+            progress(done, settings.worlds)
+
+
+def pack(source: Source, folder: Path, network: NetworkSettings, frames: Sequence[int] | None = None) -> int:
+    """Pack the frames of a source that have a pose; returns how many.
+
+    Raises:
+        UsageError: the source has no poses.
+    """
+    if source.poses is None:
+        raise UsageError(f"{source.name}: no ground truth poses, training needs them")
+    settings: PointsSettings = network.points
+    samples = []
+    wanted = set(range(len(source)) if frames is None else frames)
+    for position, frame in enumerate(source.frames()):
+        pose = source.poses[position]
+        if position not in wanted or frame.problem is not None or not np.isfinite(pose).all():
+            continue
+        images = tuple(small_image(image, network) for image in frame.images)
+        samples.append(Sample(crop(frame.points, settings), pose, images))
+    if not samples:
+        raise UsageError(f"{source.name}: no readable frame with a pose")
+    write_packed(folder, samples, {"source": source.name})
+    return len(samples)

@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Phase-one objective: pairing, coarse, backbone and offset losses of one batch of encoded frames."""
+
+from __future__ import annotations
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from dpm2_core.config import Settings
+from dpm2_core.geometry.kabsch import transform
+from dpm2_core.network.decoder import Correlated, Decoder
+from dpm2_core.network.descriptors import Tokens
+from dpm2_core.network.heads import residuals_in_view
+from dpm2_core.network.losses import Labels, cosine, info_nce, label_pairs, mahalanobis_offset, student_offset
+from dpm2_core.network.registration import softmax_both, take
+
+
+class LossSettings(Settings):
+    """Weights of the losses, and how pairs are drawn for the offsets."""
+
+    pairing: float = 1.0
+    """On correlated descriptors."""
+    coarse: float = 0.1
+    """On the encoder's descriptors, through the coarse head."""
+    backbone: float = 0.1
+    """On the point backbone's key-points, through a head of its own."""
+    offset: float = 1.0
+    """On predicted offsets."""
+    near: int = Field(128, gt=0)
+    """Pairs drawn per set pair among those within `offset_limit` of each other."""
+    own: int = Field(128, ge=0)
+    """Pairs per set pair that are the network's own best matches: what it will be asked at inference."""
+    own_limit: float = Field(6.0, gt=0)
+    """Own matches wrong by more are left out, m."""
+    neutral_is_negative: bool = True
+    """Near-by points other than the nearest count as negatives in the pairing loss."""
+
+
+def phase_one_loss(
+    decoder: Decoder, source: Tokens, target: Tokens, T_target_source: Tensor, settings: LossSettings
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Loss of a batch of set pairs, and figures for the log.
+
+    Args:
+        T_target_source: (B, 4, 4) truth.
+    """
+    temperature = decoder.settings.temperature
+    labels = label_pairs(source.xyz, target.xyz, T_target_source, (source.mask, target.mask))
+    correlated = decoder(source, target)
+    scores = cosine(decoder.similarity(correlated.source), decoder.similarity(correlated.target)) / temperature
+    pairing = info_nce(scores, labels, settings.neutral_is_negative)
+    coarse_scores = cosine(decoder.coarse(source.features), decoder.coarse(target.features)) / temperature
+    coarse = info_nce(coarse_scores, labels, False)
+    offset, error = offset_loss(decoder, source, target, T_target_source, correlated, scores.detach(), labels, settings)
+    total = settings.pairing * pairing + settings.coarse * coarse + settings.offset * offset
+    figures = {"pairing": pairing, "coarse": coarse, "offset": offset, "offset_m": error}
+    return total, {**figures, "right": matches_right(scores.detach(), labels, decoder.settings.offset_limit)}
+
+
+def matches_right(scores: Tensor, labels: Labels, limit: float) -> Tensor:
+    """Share of the sources with a positive whose best match lies within `limit` m."""
+    used = labels.forward >= 0
+    best = scores.masked_fill(labels.distance.isinf(), -1e4).argmax(2, keepdim=True)
+    right = (labels.distance.gather(2, best)[..., 0] <= limit) & used
+    return right.sum() / used.sum().clamp(min=1)
+
+
+def offset_loss(
+    decoder: Decoder,
+    source: Tokens,
+    target: Tokens,
+    T_target_source: Tensor,
+    correlated: Correlated,
+    scores: Tensor,
+    labels: Labels,
+    settings: LossSettings,
+) -> tuple[Tensor, Tensor]:
+    """Loss of the offsets of near pairs and of the network's own best matches; mean error of the near ones, m."""
+    m = labels.distance.shape[2]
+    limit = decoder.settings.offset_limit
+    chance = torch.rand_like(labels.distance).masked_fill(labels.distance > limit, -1).flatten(1)
+    drawn, flat = chance.topk(settings.near)
+    near_weight = (drawn >= 0).float()
+    weight = near_weight
+    if settings.own:
+        probability = softmax_both(scores, source.mask, target.mask)
+        own = probability.flatten(1).topk(settings.own)[1]
+        good = (labels.distance.flatten(1).gather(1, own) <= settings.own_limit).float()
+        flat, weight = torch.cat([flat, own], 1), torch.cat([near_weight, good], 1)
+    i, j = flat // m, flat % m
+    x, y = take(source.xyz, i), take(target.xyz, j)
+    a, b = take(correlated.source, i), take(correlated.target, j)
+    there, L_there = decoder.offset(a, b)
+    back, L_back = decoder.offset(b, a)
+    T = T_target_source
+    inverse = torch.linalg.inv(T.double()).to(T.dtype)
+    residual = torch.cat(
+        [
+            residuals_in_view(there, transform(inverse, y) - x, take(source.axis, i)),
+            residuals_in_view(back, transform(T, x) - y, take(target.axis, j)),
+        ]
+    )
+    weights = weight.repeat(2, 1)
+    if decoder.settings.precision:
+        loss = student_offset(residual, torch.cat([L_there, L_back]), weights)
+    else:
+        loss = mahalanobis_offset(residual.flatten(0, 1), weights.flatten())
+    n = settings.near
+    error = (residual.detach()[:, :n].norm(dim=-1) * weights[:, :n]).sum() / weights[:, :n].sum().clamp(min=1)
+    return loss, error

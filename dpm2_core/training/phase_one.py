@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Phase one: registration, of pairs of frames and of merged sets."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+
+from dpm2_core.config import Settings
+from dpm2_core.network.config import NetworkSettings, preset
+from dpm2_core.network.encoder import to_device
+from dpm2_core.network.losses import cosine, info_nce, label_pairs
+from dpm2_core.network.model import DeepPointMap2
+from dpm2_core.network.pointnext import Scale
+from dpm2_core.network.pyramid import PointBatch
+from dpm2_core.network.spatial import Views
+from dpm2_core.network.weights import load_weights, save_weights
+from dpm2_core.training.checkpoint import load_checkpoint
+from dpm2_core.training.dataset import Batch, DataSettings, GroupDataset
+from dpm2_core.training.objective import LossSettings, phase_one_loss
+from dpm2_core.training.sets import Plan, merge_tokens, plan_sets
+from dpm2_core.training.trainer import OptimiserSettings, process_group, train
+from dpm2_core.training.validation import PairSet
+
+
+class PhaseOne(nn.Module):
+    """The network with its loss, as one module, so that it compiles and distributes whole."""
+
+    def __init__(self, network: NetworkSettings, loss: LossSettings) -> None:
+        super().__init__()
+        self.loss = loss
+        self.model = DeepPointMap2(network)
+        channels: list[int] = self.model.encoder.points.channels  # type: ignore[assignment]
+        sizes = [stage.points for stage in network.points.stages]
+        self.level = min(range(len(sizes)), key=lambda i: abs(sizes[i] - 256))  # key-points as dense as descriptors
+        self.backbone_head = nn.Linear(channels[self.level], network.channels)
+
+    def forward(
+        self, points: PointBatch, views: Views | None, plans: tuple[Plan, ...]
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Mean loss over the plans, and figures of the first."""
+        encoded = self.model.encoder(points, views)
+        total = encoded.tokens.features.new_zeros((), dtype=torch.float32)
+        figures: dict[str, Tensor] = {}
+        for plan in plans:
+            source = merge_tokens(encoded.tokens, plan.source, plan.T_source)
+            target = merge_tokens(encoded.tokens, plan.target, plan.T_target)
+            loss, found = phase_one_loss(self.model.decoder, source, target, plan.T_target_source, self.loss)
+            total = total + loss / len(plans)
+            figures = figures or found
+        if self.loss.backbone:
+            auxiliary = self._backbone_loss(encoded.scales[self.level], plans[0])
+            total = total + self.loss.backbone * auxiliary
+            figures["backbone"] = auxiliary
+        figures["loss"] = total
+        return total, {name: value.detach().float() for name, value in figures.items()}
+
+    def _backbone_loss(self, scale: Scale, plan: Plan) -> Tensor:
+        """InfoNCE of the backbone's key-points of single frames."""
+        i, j = plan.source[:, 0], plan.target[:, 0]
+        features = self.backbone_head(scale.features)
+        labels = label_pairs(scale.xyz[i], scale.xyz[j], plan.T_target_source, (scale.mask[i], scale.mask[j]))
+        return info_nce(cosine(features[i], features[j]) / self.model.decoder.settings.temperature, labels, False)
+
+
+class PhaseOneSettings(Settings):
+    """A training of phase one."""
+
+    preset: str = "small"
+    """Network preset."""
+    data: DataSettings = DataSettings()
+    validation: str = ""
+    """Folder of packed drives of other worlds, for validation; empty: none."""
+    validation_pairs: int = Field(200, gt=0)
+    """Frame pairs of a validation."""
+    loss: LossSettings = LossSettings()
+    optimiser: OptimiserSettings = OptimiserSettings()
+    pairs: int = Field(4, gt=0)
+    """Frame pairs drawn from each place."""
+    sets: float = Field(0.25, ge=0, le=1)
+    """Share of steps that also register merged sets: one frame to the others, or half to half."""
+    start: str = ""
+    """Weights (safetensors) to start from; empty: random."""
+
+
+def plans_of(poses: Tensor, settings: PhaseOneSettings, step: int) -> tuple[Plan, ...]:
+    """What a step registers: frame pairs, and at times one set pair a place."""
+    noise = torch.Generator().manual_seed(settings.optimiser.seed * 1_000_003 + step)
+    radius, frames = settings.data.radius, poses.shape[1]
+    plans = [plan_sets(poses, settings.pairs, (1, 1), radius, noise)]
+    if frames > 2 and torch.rand((), generator=noise) < settings.sets:
+        sides = (1, frames - 1) if torch.rand((), generator=noise) < 0.5 else (frames // 2, frames - frames // 2)
+        plans.append(plan_sets(poses, 1, sides, radius, noise))
+    return tuple(plans)
+
+
+def phase_one(settings: PhaseOneSettings, out: Path, resume: bool = False) -> Path:
+    """Train; checkpoints, log and at the end the averaged weights, `weights.safetensors`, go to `out`."""
+    with process_group() as (rank, world, device):
+        torch.manual_seed(settings.optimiser.seed)
+        network = preset(settings.preset)
+        module = PhaseOne(network, settings.loss).to(device)
+        if settings.start:
+            load_weights(module.model, Path(settings.start))
+        ema = copy.deepcopy(module).requires_grad_(False)
+        start = load_checkpoint(out / "checkpoint.pt", module, ema, None) if resume else 0
+        data = GroupDataset(settings.data, network, settings.optimiser.seed, start, (rank, world))
+
+        def loss(run: nn.Module, batch: Batch, step: int) -> tuple[Tensor, dict[str, Tensor]]:
+            return run(*to_device((batch.points, batch.views, plans_of(batch.poses, settings, step)), device))
+
+        validate = validator(settings, network) if settings.validation and rank == 0 else None
+        train(
+            module, ema, iter(data.loader()), loss, settings.optimiser, out, resume, validate, start, rank, device
+        )  # fmt: skip
+        if rank == 0:
+            save_weights(ema.model, out / "weights.safetensors", {"phase": "1", "steps": str(settings.optimiser.steps)})
+    return out / "weights.safetensors"
+
+
+def validator(settings: PhaseOneSettings, network: NetworkSettings) -> Callable[[nn.Module], dict[str, float]]:
+    """A function that measures a module on frame pairs of unseen worlds."""
+    pairs = PairSet(Path(settings.validation), settings.validation_pairs, network, settings.data.images)
+
+    def validate(module: nn.Module) -> dict[str, float]:
+        assert isinstance(module, PhaseOne)
+        return pairs.measure(module.model)
+
+    return validate

@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which descriptor sets of a batch are registered to which: pairs of frames, and merged sets as maps are."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from dpm2_core.geometry.kabsch import transform
+from dpm2_core.network.descriptors import Tokens
+
+
+class Plan(NamedTuple):
+    """Set pairs of a batch of encoded frames.
+
+    Attributes:
+        source, target: (B, S) and (B, R) indices of the frames that each side merges, in the frame of its first.
+        T_source, T_target: (B, S, 4, 4) and (B, R, 4, 4), of each member to the first of its side.
+        T_target_source: (B, 4, 4) truth between the first ones.
+    """
+
+    source: Tensor
+    target: Tensor
+    T_source: Tensor
+    T_target: Tensor
+    T_target_source: Tensor
+
+
+def plan_sets(poses: Tensor, per_group: int, sides: tuple[int, int], radius: float, noise: torch.Generator) -> Plan:
+    """Draw `per_group` set pairs from every group.
+
+    Args:
+        poses: (G, F, 4, 4) float64. sides: frames of source and target. radius: m, between the first ones of the sides.
+    """
+    groups, frames = poses.shape[:2]
+    count = sum(sides)
+    rows, truth = [], []
+    for group in range(groups):
+        t = poses[group, :, :3, 3]
+        close = torch.cdist(t, t) <= radius
+        for _ in range(per_group):
+            order = torch.randperm(frames, generator=noise)[:count]
+            for _ in range(20):
+                if close[order[0], order[sides[0]]]:
+                    break
+                order = torch.randperm(frames, generator=noise)[:count]
+            else:
+                order = torch.tensor([0, *range(1, count)])
+            rows.append(order + group * frames)
+            truth.append(poses[group, order])
+    index, T = torch.stack(rows), torch.stack(truth)
+    inverse = torch.linalg.inv(T)
+    first, second = 0, sides[0]
+    return Plan(
+        index[:, :second],
+        index[:, second:],
+        (inverse[:, None, first] @ T[:, :second]).float(),
+        (inverse[:, None, second] @ T[:, second:]).float(),
+        (inverse[:, second] @ T[:, first]).float(),
+    )
+
+
+def merge_tokens(tokens: Tokens, index: Tensor, T: Tensor) -> Tokens:
+    """Sets (B, S * N) of frames index (B, S) of a batch of tokens, moved by T (B, S, 4, 4)."""
+    batch, size = index.shape
+    flat = index.flatten()
+    if size == 1:  # its own frame
+        return Tokens(*(field[flat] for field in tokens))
+    T = T.flatten(0, 1)
+    xyz = transform(T, tokens.xyz[flat])
+    axis = tokens.axis[flat] @ T[:, :2, :2].transpose(1, 2)
+    axis = axis / axis.norm(dim=-1, keepdim=True).clamp(min=1e-6)
+
+    def joined(x: Tensor) -> Tensor:
+        return x.reshape(batch, -1, *x.shape[2:])
+
+    return Tokens(joined(xyz), joined(tokens.features[flat]), joined(axis), joined(tokens.mask[flat]))

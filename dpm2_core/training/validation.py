@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Registration of fixed frame pairs of unseen worlds: what limits a network, and which checkpoint is best."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from dpm2_core.geometry import se3
+from dpm2_core.network.config import NetworkSettings
+from dpm2_core.network.descriptors import Descriptors
+from dpm2_core.network.encoder import collate_views
+from dpm2_core.network.model import DeepPointMap2
+from dpm2_core.network.pyramid import build_pyramid, collate
+from dpm2_core.training.packed import open_packed
+
+NEAR, FAR = 5.0, 20.0  # m, between the frames of a pair
+SUCCESS = (0.6, 1.5)  # m, deg
+
+
+class PairSet:
+    """Pairs drawn once: half up to 5 m apart, half 5 to 20 m; every second one with the source turned at random."""
+
+    def __init__(self, root: Path, pairs: int, network: NetworkSettings, images: bool, seed: int = 0) -> None:
+        noise = np.random.default_rng(seed)
+        self.drives = open_packed(root)
+        self.network, self.images = network, images
+        self.frames: dict[tuple[int, int, float], int] = {}
+        self.pairs: list[tuple[int, int, np.ndarray, float]] = []
+        while len(self.pairs) < pairs:
+            d = int(noise.integers(len(self.drives)))
+            poses = self.drives[d].poses
+            a = int(noise.integers(len(poses)))
+            distance = np.linalg.norm(poses[:, :3, 3] - poses[a, :3, 3], axis=1)
+            low, high = (0.0, NEAR) if len(self.pairs) % 2 == 0 else (NEAR, FAR)
+            others = np.flatnonzero((distance > low) & (distance <= high))
+            if len(others) == 0:
+                continue
+            b = int(noise.choice(others))
+            yaw = float(noise.uniform(-np.pi, np.pi)) if len(self.pairs) % 4 >= 2 else 0.0
+            turn = se3.exp([0, 0, yaw, 0, 0, 0])
+            T = se3.inverse(poses[b]) @ poses[a] @ se3.inverse(turn)
+            self.pairs.append((self._frame(d, a, yaw), self._frame(d, b, 0.0), T, float(distance[b])))
+
+    def _frame(self, drive: int, index: int, yaw: float) -> int:
+        return self.frames.setdefault((drive, index, yaw), len(self.frames))
+
+    @torch.inference_mode()
+    def encode(self, model: DeepPointMap2, batch: int = 8) -> list[Descriptors]:
+        """Descriptors of every frame of the set."""
+        keys = list(self.frames)
+        out: list[Descriptors] = []
+        device = next(model.parameters()).device
+        for begin in range(0, len(keys), batch):
+            pyramids, images = [], []
+            for drive, index, yaw in keys[begin : begin + batch]:
+                sample = self.drives[drive][index]
+                turn = se3.exp([0, 0, yaw, 0, 0, 0])
+                pyramids.append(build_pyramid(se3.transform(turn, sample.cloud), self.network.points))
+                turned = [
+                    type(i)(i.pixels, type(i.camera)(i.camera.K, turn @ i.camera.T_lidar_cam, i.camera.size))
+                    for i in sample.images
+                ]
+                images.append(turned if self.images else [])
+            out += model.encoder.encode_batch(collate(pyramids), collate_views(images, self.network.image), device)
+        return out
+
+    def errors(self, model: DeepPointMap2, batch: int = 16) -> np.ndarray:
+        """Per pair: distance m, turned (0 or 1), translation error m, rotation error deg, squared Mahalanobis error."""
+        descriptors = self.encode(model)
+        rows = []
+        for begin in range(0, len(self.pairs), batch):
+            chunk = self.pairs[begin : begin + batch]
+            answers = model.decoder.register_many(
+                [descriptors[p[0]] for p in chunk], [descriptors[p[1]] for p in chunk]
+            )
+            for i, ((_, _, T, distance), answer) in enumerate(zip(chunk, answers, strict=True), begin):
+                xi = se3.log(se3.inverse(answer.T_target_source) @ T)
+                error = np.linalg.norm(answer.T_target_source[:3, 3] - T[:3, 3])
+                squared = xi @ np.linalg.solve(answer.covariance, xi)
+                rows.append((distance, i % 4 >= 2, error, np.degrees(np.linalg.norm(xi[:3])), squared))
+        return np.array(rows)
+
+    def measure(self, model: DeepPointMap2) -> dict[str, float]:
+        """Medians and success rates of near and far pairs, straight and turned."""
+        rows = self.errors(model)
+        near = rows[:, 0] <= NEAR
+        good = (rows[:, 2] < SUCCESS[0]) & (rows[:, 3] < SUCCESS[1])
+        out = {}
+        for name, chosen in (("near", near), ("far", ~near), ("turned", rows[:, 1] > 0)):
+            out[f"{name}_m"] = float(np.median(rows[chosen, 2]))
+            out[f"{name}_deg"] = float(np.median(rows[chosen, 3]))
+            out[f"{name}_success"] = float(good[chosen].mean())
+        out["chi2"] = float(np.median(rows[good, 4])) if good.any() else float("nan")
+        return out
