@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The synthetic city: ray-cast LiDAR scans and camera images of random worlds, with exact poses, labels and static twins."""
+"""The synthetic city: ray-cast scans and images of random worlds, with exact poses, labels and static twins."""

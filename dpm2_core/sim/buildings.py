@@ -36,8 +36,14 @@ def building(width: float, depth: float, floors: int, rng: np.random.Generator) 
 
 
 def _facade(
-    width: float, floors: int, wall: NDArray, material: Material, style: dict[str, float], rng: np.random.Generator, front: bool
-) -> Mesh:  # fmt: skip
+    width: float,
+    floors: int,
+    wall: NDArray,
+    material: Material,
+    style: dict[str, float],
+    rng: np.random.Generator,
+    front: bool,
+) -> Mesh:
     """One wall from -width/2 to width/2 along x, facing -y, with a grid of windows."""
     bays = max(1, round(width / style["bay"])) if front else max(1, round(width / 4.5))
     pitch = width / bays
@@ -64,8 +70,15 @@ def _facade(
 
 
 def _features(
-    bays: int, floors: int, pitch: float, style: dict[str, float], depth: NDArray, window: NDArray[np.bool_], colour: NDArray, rng: np.random.Generator
-) -> None:  # fmt: skip
+    bays: int,
+    floors: int,
+    pitch: float,
+    style: dict[str, float],
+    depth: NDArray,
+    window: NDArray[np.bool_],
+    colour: NDArray,
+    rng: np.random.Generator,
+) -> None:
     """Doors, shops, bays, recesses and balconies, written into the cells of a front."""
     door = 1 + 2 * int(rng.integers(bays))
     depth[door, :2] += rng.uniform(0.3, 0.8)

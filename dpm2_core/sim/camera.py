@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A rectified colour camera by ray casting: sun, sky, shadows, exposure, vignetting, noise."""
+"""A rectified colour camera by ray casting: shadows, exposure, vignetting, noise."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from dpm2_core.frame import Camera
 from dpm2_core.geometry import se3
 from dpm2_core.sim.config import CameraConfig
+from dpm2_core.sim.light import Light
 from dpm2_core.sim.materials import Material
 from dpm2_core.sim.mesh import Hits, Mesh, Scene, rotated
-from dpm2_core.sim.shading import Surface, Textures
+from dpm2_core.sim.shading import Surface
 from dpm2_core.sim.world import World
 
 Array = NDArray[np.float64]
@@ -32,54 +33,6 @@ def calibration(config: CameraConfig, name: str = "image_2") -> Camera:
     return Camera(K, se3.make(axes, (0.27, 0.06, -0.08)), (config.width, config.height), name=name)
 
 
-class Light:
-    """Sun and sky of a world, by its seed; in a tunnel only the lamps."""
-
-    def __init__(self, world: World) -> None:
-        rng = np.random.default_rng([world.seed, 78])
-        elevation, azimuth = np.radians(rng.uniform(22, 60)), rng.uniform(0, 2 * np.pi)
-        level = np.cos(elevation)
-        self.sun = np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], np.float32)
-        self.overcast = float(rng.beta(0.6, 1.4))
-        warm = np.array([1.0, 0.95, 0.86], np.float32)
-        self.direct = warm * np.float32(1.5 * (1 - 0.85 * self.overcast))
-        self.ambient = np.array([0.36, 0.41, 0.48], np.float32) * np.float32(1 + 0.8 * self.overcast)
-        self.tunnel = world.preset == "tunnel"
-        self.exposure = float(rng.uniform(0.85, 1.2))
-        self.textures = Textures(world.seed)
-
-    def sky(self, view: Float) -> Float:
-        """(P, 3) colour of the sky along directions (P, 3): a gradient, clouds, the glow round the sun."""
-        if self.tunnel:
-            return np.full((len(view), 3), 1.4, np.float32)
-        up = np.clip(view[:, 2], 0.0, 1)[:, None]
-        blue = np.array([0.62, 0.76, 0.95], np.float32) * (1 - up) + np.array([0.22, 0.42, 0.85], np.float32) * up
-        plane = view[:, :2] / (view[:, 2:] + np.float32(0.12))
-        cloud = sum(
-            a * self.textures.noise(plane + k, w) for k, (a, w) in enumerate(((1, 1.9), (0.5, 0.8), (0.25, 0.3)))
-        )
-        cover = np.clip(0.5 * cloud - 0.5 + 1.6 * self.overcast, 0, 1)[:, None]
-        grey = np.array([0.86, 0.87, 0.9], np.float32) * np.clip(0.9 + 0.1 * cloud[:, None], 0.6, 1.2)
-        glow = np.exp((view @ self.sun - 1) * 12)[:, None] * (1 - 0.7 * self.overcast)
-        return 1.15 * (blue * (1 - cover) + grey * cover) + glow
-
-    def shine(self, surface: Surface, lit: Float) -> Float:
-        """(P, 3) light on each point, of which the sun's share reaches `lit` (P,)."""
-        if self.tunnel:
-            falloff = 0.35 + 0.5 * np.clip(-surface.normal[:, 2] * 0.3 + np.abs(surface.normal[:, 2]), 0, 1)
-            return falloff[:, None] * np.array([1.15, 1.0, 0.78], np.float32)
-        facing = np.clip(surface.normal @ self.sun, 0, 1) * lit
-        leaf = surface.material == Material.LEAF  # lit from both sides
-        facing = np.where(leaf, 0.35 * lit + 0.5 * facing, facing)
-        open_sky = 0.6 + 0.4 * surface.normal[:, 2]
-        return facing[:, None] * self.direct + open_sky[:, None] * self.ambient
-
-
-@lru_cache(maxsize=64)
-def _light(world: World) -> Light:
-    return Light(world)
-
-
 @lru_cache(maxsize=8)
 def _rays(config: CameraConfig) -> Float:
     """(H*W, 3) unit directions of the pixels in the camera frame."""
@@ -91,9 +44,9 @@ def _rays(config: CameraConfig) -> Float:
 
 def render(
     world: World, config: CameraConfig, T_world_cam: Array, time: float, rng: np.random.Generator
-) -> NDArray[np.uint8]:  # fmt: skip
+) -> NDArray[np.uint8]:
     """(H, W, 3) uint8 RGB of a world from a pose (4, 4) at a time, s; `rng` makes the pixel noise."""
-    light = _light(world)
+    light = world.light
     view = rotated(_rays(config), T_world_cam[:3, :3])
     eye = T_world_cam[:3, 3].astype(np.float32)
     origins = np.broadcast_to(eye, view.shape).copy()

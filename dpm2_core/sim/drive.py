@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A drive through a world, written as a KITTI odometry data set with labels, static twins and a ground elevation map."""
+"""A drive through a world, written as a KITTI odometry data set with labels, static twins and a map of the ground."""
 
 from __future__ import annotations
 
@@ -102,7 +102,9 @@ def _length(road: str, preset: PresetName, seed: int, frames: int) -> float:
     return length
 
 
-def _recipe(frames: int, seed: int, road: str, preset: PresetName, images: bool, lidar: LidarConfig, camera: CameraConfig) -> dict[str, Any]:  # fmt: skip
+def _recipe(
+    frames: int, seed: int, road: str, preset: PresetName, images: bool, lidar: LidarConfig, camera: CameraConfig
+) -> dict[str, Any]:
     if road not in ROAD_KINDS:
         road = f"{Path(road).name} sha256:{hashlib.sha256(Path(road).read_bytes()).hexdigest()}"
     return {
@@ -220,7 +222,7 @@ class _Drive:
         (sequence / "calib.txt").write_text(calib.getvalue(), encoding="utf-8")
 
     def _write_ground(self, path: Path) -> None:
-        """Height of the ground, kerbs included, NaN where there is none, in the grid's frame; T_grid_cam0 leads there."""
+        """Height of the ground, kerbs included, NaN where unknown; T_grid_cam0 is the first pose in its frame."""
         terrain = self.world.terrain
         np.savez_compressed(
             path,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What stands along a kerb: lamps, signs, bollards, boxes, benches; x along the street, -y towards the road, z up from the ground."""
+"""What stands along a kerb: x along the street, -y towards the road, z up from the ground."""
 
 from __future__ import annotations
 
@@ -72,10 +72,13 @@ def shelter(rng: np.random.Generator) -> Mesh:
     """A bus stop: a roof on four posts with a glass back."""
     length = rng.uniform(2.5, 4.5)
     posts = [
-        rod((x, y, -0.2), (x, y, 2.3), (0.05, 0.05), 6, Label.POLE, Material.METAL, GREY) for x in (-length / 2, length / 2) for y in (-0.6, 0.7)
+        rod((x, y, -0.2), (x, y, 2.3), (0.05, 0.05), 6, Label.POLE, Material.METAL, GREY)
+        for x in (-length / 2, length / 2)
+        for y in (-0.6, 0.7)
     ]  # fmt: skip
     return merge([
-        *posts, box((-length / 2 - 0.1, -0.8, 2.3), (length / 2 + 0.1, 0.9, 2.42), Label.STRUCTURE, Material.METAL, (90, 94, 98)),
+        *posts,
+        box((-length / 2 - 0.1, -0.8, 2.3), (length / 2 + 0.1, 0.9, 2.42), Label.STRUCTURE, Material.METAL, (90,) * 3),
         box((-length / 2, 0.7, 0.3), (length / 2, 0.73, 2.1), Label.STRUCTURE, Material.GLASS, (90, 110, 120)),
         box((-length / 2, 0.25, 0.45), (length / 2, 0.6, 0.52), Label.OBJECT, Material.WOOD, (120, 100, 80)),
     ])  # fmt: skip

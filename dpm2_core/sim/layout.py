@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Puts the props beside the streets of a terrain. Every placement asks the same two rasters: distance to the kerb, and taken."""
+"""Puts the props beside the streets. Every placement asks the same two rasters: distance to the kerb, and taken."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from dpm2_core.sim.vehicles import car, truck
 
 Array = NDArray[np.float64]
 CLEAR_OF_DRIVE = 2.15
-"""Nothing below the height of a car reaches nearer to the path of the car's middle than this, m (parked cars: their middle)."""
+"""Nothing as low as a car reaches nearer to the path of the car's middle than this (parked cars: their middle), m."""
 
 
 class Layout:
@@ -73,9 +73,15 @@ class Layout:
         cv2.fillConvexPoly(self.taken, corners, 1)
 
     def _scattered(
-        self, templates: list[Mesh], per_100m: float, band: tuple[float, float], radius: float, aligned: bool = False,
-        patchy: bool = False, scale: tuple[float, float] = (0.8, 1.25),
-    ) -> Iterator[Mesh]:  # fmt: skip
+        self,
+        templates: list[Mesh],
+        per_100m: float,
+        band: tuple[float, float],
+        radius: float,
+        aligned: bool = False,
+        patchy: bool = False,
+        scale: tuple[float, float] = (0.8, 1.25),
+    ) -> Iterator[Mesh]:
         """Copies at random places of a band beside the kerb, that keep `radius` m from what is there already."""
         if per_100m <= 0:
             return

@@ -38,8 +38,10 @@ class Scan:
 
     Attributes:
         points: (N, 4) float32 [x, y, z in m, intensity 0..1] in the LiDAR frame.
-        label: (N,) uint32 SemanticKITTI: class in the low 16 bits (252 and more where moving), instance of a mover in the high ones.
-        moving: (N,) bool. ring: (N,) uint8, 0 is the top beam. time_offset: (N,) float32 s, relative to the middle of the turn.
+        label: (N,) uint32 as in SemanticKITTI: class in the low 16 bits (252 and more where moving), number of the
+            mover in the high ones.
+        moving: (N,) bool. ring: (N,) uint8, 0 is the top beam.
+        time_offset: (N,) float32 s, from the middle of the turn.
         static: (M, 4) float32, what the same pulses return without anything that moves.
     """
 
@@ -81,8 +83,8 @@ class Lidar:
 
         Args:
             time: s, where the movers are. They stand still during the turn.
-            twist: (6,) [rad/s, m/s] of the sensor in its own frame during the turn: each point is then given in the frame of its
-                own moment, as a driver delivers it. None: a scan already corrected for motion, as KITTI's odometry set has.
+            twist: (6,) [rad/s, m/s] of the sensor in its own frame during the turn: each point is then given in the
+                frame of its own moment, as a driver delivers it. None: already corrected for motion, as KITTI's are.
         """
         origins, directions = self._rays(T_world_lidar, twist)
         config = self.config
@@ -126,9 +128,16 @@ class Lidar:
         return T[:, :3, 3].astype(np.float32)[self.column], directions
 
     def _returns(
-        self, world: World, mesh: Mesh, hits: Hits, origins: Float, directions: Float, chance: Float, jitter: Float,
+        self,
+        world: World,
+        mesh: Mesh,
+        hits: Hits,
+        origins: Float,
+        directions: Float,
+        chance: Float,
+        jitter: Float,
         which: NDArray[np.intp] | slice = slice(None),
-    ) -> tuple[Float, NDArray[np.bool_]]:  # fmt: skip
+    ) -> tuple[Float, NDArray[np.bool_]]:
         """Points (R, 4) in the LiDAR frame and whether each pulse came back (R,)."""
         config = self.config
         face = np.maximum(hits.face, 0)

@@ -68,8 +68,8 @@ class _Optics:
     """Of one material.
 
     Attributes:
-        reflectance: LiDAR intensity at normal incidence. miss: share of pulses that vanish. dark: share of returns too weak
-            to measure their intensity (0 then). roughness: extra range noise, m. retro: little dependence on incidence.
+        reflectance: LiDAR intensity at normal incidence. miss: share of pulses that vanish. dark: share of returns too
+            weak to measure their intensity (0 then). roughness: extra range noise, m. retro: bright at any incidence.
     """
 
     reflectance: float

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Triangle meshes with a class, a material, a colour and surface coordinates on every triangle, and their ray casting."""
+"""Triangle meshes with class, material, colour and surface coordinates on every triangle, and ray casting."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def placed(template: Mesh, poses: ArrayLike, texture: ArrayLike = 0, tint: Array
 
 
 def pose(xy: ArrayLike, z: ArrayLike, yaw: ArrayLike, scale: ArrayLike = 1.0) -> NDArray[np.float64]:
-    """(N, 3, 4) maps that scale by `scale` (N,) or (N, 3), turn about z by `yaw` (N,) rad and move to xy (N, 2), z (N,)."""
+    """(N, 3, 4) maps: scale by `scale` (N,) or (N, 3), turn about z by `yaw` (N,) rad, move to xy (N, 2) and z (N,)."""
     xy, yaw = np.atleast_2d(np.asarray(xy, float)), np.atleast_1d(np.asarray(yaw, float))
     n = len(xy)
     out = np.zeros((n, 3, 4))
@@ -121,7 +121,7 @@ def pose(xy: ArrayLike, z: ArrayLike, yaw: ArrayLike, scale: ArrayLike = 1.0) ->
 
 
 def rotated(directions: Float, R: ArrayLike) -> Float:
-    """Directions (N, 3) float32 turned by a rotation (3, 3); three times faster than a product with so narrow a matrix."""
+    """Directions (N, 3) float32 turned by a rotation (3, 3); faster than the product with so narrow a matrix."""
     R = np.asarray(R, np.float32)
     out = directions[:, :1] * R[:, 0]
     out += directions[:, 1:2] * R[:, 1]
@@ -143,7 +143,6 @@ class Hits:
     normal: Float
     u: Float
     v: Float
-
 
     def part(self, which: NDArray[np.bool_]) -> Hits:
         """Some of the rays."""

@@ -66,7 +66,7 @@ class Road:
     Attributes:
         streets: centre lines; the drive follows the first `main` of them, the others branch off.
         drive: the path of the car. times: (K,) s and travelled: (K,) m, the drive's progress; a closed one goes on.
-        height: (M,) m of the samples of the first streets, None where the terrain is free.
+        heights: (M,) m of the samples of each main street, None where the terrain is free.
     """
 
     streets: list[Path]
@@ -245,7 +245,7 @@ def _road_of_poses(kind: str, preset: Preset, rng: np.random.Generator) -> Road:
         np.interp(p.s, np.linspace(0, p.length, b - a), z[a:b]) for p, (a, b) in zip(streets, pieces, strict=True)
     ]
     sides = _side_streets(streets, preset, rng)
-    times = np.arange(len(position)) * FRAME_PERIOD
+    times = np.arange(len(position), dtype=float) * FRAME_PERIOD
     return Road([*streets, *sides], len(streets), drive, times, travelled, heights)
 
 
@@ -254,7 +254,7 @@ def _arc_lengths(xy: Array) -> Array:
 
 
 def _first_visits(xy: Array, radius: float = 5.0, lag: float = 30.0) -> Iterator[tuple[int, int]]:
-    """Runs [a, b) of samples that are no return to within `radius` m of a place left more than `lag` m of driving ago."""
+    """Runs [a, b) of samples that are no return to within `radius` m of a place left more than `lag` m ago."""
     pairs = cKDTree(xy).query_pairs(radius, output_type="ndarray")
     pairs = pairs[np.abs(pairs[:, 0] - pairs[:, 1]) > lag / STEP]
     new = np.ones(len(xy), bool)

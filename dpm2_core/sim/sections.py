@@ -15,7 +15,7 @@ from dpm2_core.sim.road import Path, Road
 from dpm2_core.sim.terrain import Terrain, sheet
 
 WALL = 5.5
-"""Height of the noise barriers, m: above what a beam at +2 deg sees within 80 m, so that trees behind them show in images alone."""
+"""Height of the noise barriers, m: a beam at +2 deg cannot see over them within 80 m, a camera can: trees."""
 
 
 def swept(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What surfaces look like: procedural textures in surface coordinates, nowhere periodic, and fading out as a pixel outgrows them.
+"""What surfaces look like: procedural textures, nowhere periodic, that fade out as a pixel outgrows them.
 
 All functions work on P visible points at once. Noise comes from one tile of random numbers, sampled at wavelengths that
 do not divide one another and with an own offset for each object.
@@ -27,8 +27,8 @@ class Surface:
 
     Attributes:
         position: (P, 3) m in the world. normal: (P, 3) unit, towards the eye. view: (P, 3) unit, from the eye.
-        uv: (P, 2) m on the surface. texture: (P,) number of the object's pattern. material: (P,). colour: (P, 3) 0..1, its paint.
-        footprint: (P,) m, what a pixel covers on the surface.
+        uv: (P, 2) m on the surface. texture: (P,) number of the object's pattern. material: (P,).
+        colour: (P, 3) 0..1, its paint. footprint: (P,) m, what a pixel covers on the surface.
     """
 
     position: Float
@@ -60,6 +60,7 @@ class Textures:
     def noise(self, at: Float, wavelength: float, channels: int = 1) -> Float:
         """(P,) or (P, 3) smooth noise of unit variance at (P, 2) m."""
         n = len(at)
+        # as an image of 1024 columns, which is what remap takes
         xy = np.zeros((max(-(-n // 1024), 1) * 1024, 2), np.float32)
         scaled = at * np.float32(3.0 / wavelength / _TILE)
         xy[:n] = (scaled - np.floor(scaled)) * np.float32(_TILE)
@@ -202,35 +203,26 @@ def _brick(t: Textures, s: Surface, out: Float, uv: Float, terrain: Terrain) -> 
 
 
 def _roof(t: Textures, s: Surface, out: Float, uv: Float, _: Terrain) -> Float:
-    rows = np.maximum(_lines(uv[:, 1], 0.34, 0.08, s.footprint), _lines(uv[:, 0], 0.25, 0.04, s.footprint))
+    rows: Float = np.maximum(_lines(uv[:, 1], 0.34, 0.08, s.footprint), _lines(uv[:, 0], 0.25, 0.04, s.footprint))
     return out * (1 - 0.35 * rows)[:, None]
 
 
 def _wood(t: Textures, s: Surface, out: Float, uv: Float, _: Terrain) -> Float:
-    return (
-        out
-        * (
-            1
-            - 0.45 * _lines(uv[:, 0], 0.15, 0.015, s.footprint)
-            + 0.1 * t.noise(uv * np.array([8, 0.5], np.float32), 0.6)
-        )[:, None]
-    )
+    grain = 0.1 * t.noise(uv * np.array([8, 0.5], np.float32), 0.6)
+    return out * (1 + grain - 0.45 * _lines(uv[:, 0], 0.15, 0.015, s.footprint))[:, None]
 
 
 def _panels(t: Textures, s: Surface, out: Float, uv: Float, _: Terrain) -> Float:
-    """Barriers and tunnel walls: panels of many tints, dirt, graffiti, painted bands; the image's only hold in these places."""
+    """Barriers and tunnel walls: panels of many tints, dirt, graffiti: the image's only hold in these places."""
+    # panels of unequal width: a slowly varying stretch keeps the seams from repeating
     along, up = s.uv[:, 0], s.uv[:, 1]
-    width = 2.5 + 0.6 * np.sin(np.floor(along / 97.0) * 1.7)
-    panel = np.floor(along / width)
-    h = _hash(panel, np.floor(up / 1.35))
-    out = (
-        out
-        * (0.6 + 0.65 * _unit(h))[:, None]
-        * (1 + 0.22 * (_unit(h, 1) - 0.5)[:, None] * np.array([1, 0, -1], np.float32))
-    )
-    seam = np.maximum(_lines(along, 2.5, 0.03, s.footprint), _lines(up, 1.35, 0.03, s.footprint))
+    along = along + 0.9 * np.sin(along / 3.7) + 1.3 * np.sin(along / 6.1 + 1) + 2.1 * np.sin(along / 17.3 + 2)
+    h = _hash(np.floor(along / 2.5), np.floor(up / 1.35), s.texture)
+    hue = (_unit(h, 1) - 0.5)[:, None] * np.array([0.22, 0, -0.22], np.float32)
+    out = out * (0.6 + 0.65 * _unit(h))[:, None] * (1 + hue)
+    seam: Float = np.maximum(_lines(along, 2.5, 0.03, s.footprint), _lines(up, 1.35, 0.03, s.footprint))
     out = out * (1 - 0.5 * seam)[:, None]
-    dirt = np.clip(t.noise(uv * np.array([1, 0.2], np.float32) + 43, 0.9) + 0.8 * t.noise(uv + 47, 5.3), 0, 2.5)
+    dirt: Float = np.clip(t.noise(uv * np.array([1, 0.2], np.float32) + 43, 0.9) + 0.8 * t.noise(uv + 47, 5.3), 0, 2.5)
     out = out * (1 - 0.22 * dirt)[:, None]
     patch = _hash(np.floor((along + 0.9 * t.noise(uv, 3.7)) / 3.3), np.floor(up / 1.1))
     letters = np.abs(t.noise(uv + 83, 1.1)) + 0.35 * t.noise(uv + 89, 0.35) < 0.55

@@ -8,10 +8,11 @@ import trimesh
 from numpy.typing import ArrayLike
 
 from dpm2_core.sim.materials import Label, Material
-from dpm2_core.sim.mesh import Mesh, make, merge
+from dpm2_core.sim.mesh import Mesh, make
 
 BOX_FACES = np.array([
-    [0, 2, 1], [0, 3, 2], [4, 5, 6], [4, 6, 7], [0, 1, 5], [0, 5, 4], [1, 2, 6], [1, 6, 5], [2, 3, 7], [2, 7, 6], [3, 0, 4], [3, 4, 7]
+    [0, 2, 1], [0, 3, 2], [4, 5, 6], [4, 6, 7], [0, 1, 5], [0, 5, 4],
+    [1, 2, 6], [1, 6, 5], [2, 3, 7], [2, 7, 6], [3, 0, 4], [3, 4, 7],
 ])  # fmt: skip
 
 
@@ -23,8 +24,14 @@ def box(low: ArrayLike, high: ArrayLike, label: Label, material: Material, colou
 
 
 def rod(
-    start: ArrayLike, end: ArrayLike, radii: tuple[float, float], sides: int, label: Label, material: Material, colour: ArrayLike
-) -> Mesh:  # fmt: skip
+    start: ArrayLike,
+    end: ArrayLike,
+    radii: tuple[float, float],
+    sides: int,
+    label: Label,
+    material: Material,
+    colour: ArrayLike,
+) -> Mesh:
     """A tapered tube from `start` to `end`, capped at the end."""
     start, end = np.asarray(start, float), np.asarray(end, float)
     axis = (end - start) / np.linalg.norm(end - start)
@@ -42,8 +49,15 @@ def rod(
 
 
 def blob(
-    centre: ArrayLike, radii: ArrayLike, rough: float, rng: np.random.Generator, label: Label, material: Material, colour: ArrayLike, detail: int = 1
-) -> Mesh:  # fmt: skip
+    centre: ArrayLike,
+    radii: ArrayLike,
+    rough: float,
+    rng: np.random.Generator,
+    label: Label,
+    material: Material,
+    colour: ArrayLike,
+    detail: int = 1,
+) -> Mesh:
     """An ellipsoid of 20 * 4**detail triangles with its vertices moved in and out by the share `rough`."""
     sphere = trimesh.creation.icosphere(subdivisions=detail)
     points = sphere.vertices * (1 + rng.normal(0, rough, (len(sphere.vertices), 1))) * np.asarray(radii) + np.asarray(
@@ -163,6 +177,3 @@ def turned(mesh: Mesh, yaw: float, to: ArrayLike = (0.0, 0.0, 0.0)) -> Mesh:
         mesh.uv,
         mesh.texture,
     )
-
-
-__all__ = ["blob", "box", "extrusion", "leaves", "merge", "relief", "rod", "turned"]

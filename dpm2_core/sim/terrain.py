@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The ground: how far each place is from the streets, how high it lies, and its mesh.
 
-Everything that stands in a world is placed by one raster, the distance to the kerb of the nearest street. It treats crossings,
-loops and streets that are driven twice alike: nothing can stand on a road, whichever pass made it.
+Everything that stands in a world is placed by one raster, the distance to the kerb of the nearest street. It treats
+crossings, loops and streets that are driven twice alike: nothing can stand on a road, whichever pass made it.
 """
 
 from __future__ import annotations
@@ -36,7 +36,11 @@ KERB = 0.12
 
 @dataclass(eq=False)
 class Kerbline:
-    """A line at a constant distance from the kerb: xy (N, 2) and outward (N, 2) unit vectors, 1 m apart; `junction` (N,) near a crossing."""
+    """A line at a constant distance from the kerb.
+
+    Attributes:
+        xy: (N, 2) m, points 1 m apart. outward: (N, 2) unit vectors away from the road. junction: (N,) near a crossing.
+    """
 
     xy: Array
     outward: Array
@@ -155,7 +159,7 @@ class Terrain:
         return out
 
     def lane_coordinates(self, xy: NDArray[np.floating]) -> tuple[NDArray, NDArray, NDArray[np.bool_]]:
-        """Of points (N, 2): metres to the left of the nearest street's centre, metres along it, and whether at a crossing."""
+        """Of points (N, 2): m to the left of the nearest street's centre, m along it, and whether at a crossing."""
         sample = self.nearest[self._cell(xy)]
         yaw = self.yaw[sample].astype(xy.dtype)
         away = xy - self.centre[sample].astype(xy.dtype)
@@ -215,18 +219,27 @@ class Terrain:
         return make(xyz, faces, label, material, colour, xyz[:, :2].astype(np.float32)[faces])
 
     def _sidewalks(self) -> Iterator[Mesh]:
-        if not self.preset.sidewalk:
+        if not (width := self.preset.sidewalk):
             return
         for line in self.contour(0.0):
             yield kerbside_ribbon(
-                self, line, ((-0.02, -0.02), (0.0, KERB), (0.12, KERB), (self.preset.sidewalk, KERB), (self.preset.sidewalk + 0.05, -0.1)),
-                Label.SIDEWALK, Material.PAVING, (165, 160, 152),
-            )  # fmt: skip
+                self,
+                line,
+                ((-0.02, -0.02), (0.0, KERB), (0.12, KERB), (width, KERB), (width + 0.05, -0.1)),
+                Label.SIDEWALK,
+                Material.PAVING,
+                (165, 160, 152),
+            )
 
 
 def kerbside_ribbon(
-    terrain: Terrain, line: Kerbline, profile: tuple[tuple[float, float], ...], label: Label, material: Material, colour: ArrayLike
-) -> Mesh:  # fmt: skip
+    terrain: Terrain,
+    line: Kerbline,
+    profile: tuple[tuple[float, float], ...],
+    label: Label,
+    material: Material,
+    colour: ArrayLike,
+) -> Mesh:
     """A section of (offset outward, height over the ground) points, m, drawn along a line on the terrain."""
     section = np.asarray(profile, float)
     xy = line.xy[:, None] + line.outward[:, None] * section[:, :1]
@@ -249,8 +262,10 @@ def sheet(points: ArrayLike, label: Label, material: Material, colour: ArrayLike
 
 
 def _snapped(xy: Array, edge: NDArray[np.float32]) -> tuple[Array, NDArray[np.float32]]:
-    """Nodes (H, W, 2) of a grid of 1 m, those next to a kerb moved onto it, and their distances to it: a road then has a
-    straight rim instead of a staircase."""
+    """Nodes (H, W, 2) of a grid of 1 m, those next to a kerb moved onto it, and their distances (H, W) to it, m.
+
+    A road then has a straight rim instead of a staircase.
+    """
     down, across = np.gradient(edge)
     slope = np.hypot(down, across) + 1e-6
     shift = np.where((np.abs(edge) < 0.71) & (slope > 0.5), edge, 0)  # 0.71: half of a cell's diagonal
@@ -264,6 +279,5 @@ def _value_noise(shape: tuple[int, ...], wavelength: float, rng: np.random.Gener
     coarse = rng.normal(0, 0.6, nodes).astype(np.float32)
     scale = wavelength / RESOLUTION
     to_node = np.array([[1 / scale, 0, 1], [0, 1 / scale, 1]])
-    return cv2.warpAffine(
-        coarse, to_node, (shape[1], shape[0]), flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE
-    )  # fmt: skip
+    flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+    return cv2.warpAffine(coarse, to_node, (shape[1], shape[0]), flags=flags, borderMode=cv2.BORDER_REPLICATE)

@@ -26,8 +26,8 @@ class Traffic:
     """M movers along the drive.
 
     Attributes:
-        models: one mesh each. start, speed, lateral: (M,) m, m/s and m to the left of the drive; speed is against the drive
-            where negative. follows: (M,) keeps its distance ahead of the car instead. phase: (M,) of its small variations.
+        models: one mesh each. start, speed, lateral: (M,) m, m/s and m to the left of the drive; a negative speed is
+            against it. follows: (M,) keeps its distance ahead of the car instead. phase: (M,) of its small variations.
     """
 
     road: Road
@@ -49,7 +49,7 @@ class Traffic:
         return xy, yaw + np.where(self.speed < 0, np.pi, 0.0)
 
     def mesh(self, time: float, around: ArrayLike) -> tuple[Mesh, NDArray[np.uint16]] | None:
-        """Everything in sight of a place (2,) at a time, and the instance number (F,) of each triangle; None if nothing is."""
+        """All in sight of a place (2,) at a time, and the number (F,) of each triangle's mover; None without any."""
         if not self.models:
             return None
         xy, yaw = self.poses(time)

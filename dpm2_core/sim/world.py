@@ -19,6 +19,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.sim import sections
 from dpm2_core.sim.config import PRESET_NAMES, PRESETS, PresetName, varied
 from dpm2_core.sim.layout import Layout
+from dpm2_core.sim.light import Light
 from dpm2_core.sim.mesh import Hits, Mesh, Scene, merge
 from dpm2_core.sim.road import Road, make_road
 from dpm2_core.sim.terrain import Terrain
@@ -34,7 +35,7 @@ class World:
 
     Attributes:
         preset: its name. seed: with road and preset it determines the world. road, terrain, traffic: its parts.
-        scene: what does not move, ready for ray casting.
+        scene: what does not move, ready for ray casting. light: sun and sky.
     """
 
     preset: PresetName
@@ -43,6 +44,7 @@ class World:
     terrain: Terrain
     traffic: Traffic
     scene: Scene
+    light: Light
 
     @property
     def static(self) -> Mesh:
@@ -50,7 +52,7 @@ class World:
         return self.scene.mesh
 
     def pose_at(self, s: float, lateral: float = 0.0, heading: float = 0.0, height: float = 1.73) -> Array:
-        """T_world_lidar (4, 4) of a car at arc length `s` m of the drive, `lateral` m to the left of it and turned by `heading` rad.
+        """T_world_lidar (4, 4) at arc length `s` m of the drive, `lateral` m to the left, turned by `heading` rad.
 
         The car stands on the ground under its wheels; the sensor is `height` m above it, x ahead, y left, z up.
         """
@@ -77,7 +79,7 @@ class World:
     def sample_pose(
         self, rng: np.random.Generator, lateral: float = 1.0, heading: float = 0.1, height: float = 1.73
     ) -> tuple[Array, float]:
-        """T_world_lidar (4, 4) at a random place of the drive, up to `lateral` m beside and `heading` rad off it, and its time, s."""
+        """T_world_lidar (4, 4) at a random place, up to `lateral` m and `heading` rad off the drive; its time, s."""
         time = float(rng.uniform(0, self.road.times[-1]))
         tilt = Rotation.from_rotvec([*rng.normal(0, 0.006, 2), 0]).as_matrix()
         T = self.pose_at(
@@ -94,8 +96,8 @@ class World:
         """What rays (R, 3) meet of the movers at a time, s.
 
         Returns:
-            The movers' mesh and the number (F,) of the mover that each triangle belongs to; the hits of the K rays that point
-            towards movers at all, and which (K,) rays these are. None if no mover is in sight.
+            The movers' mesh and the number (F,) of the mover that each triangle belongs to; the hits of the K rays that
+            point towards movers at all, and which (K,) rays these are. None if no mover is in sight.
         """
         movers = self.traffic.mesh(time, origins[0])
         if movers is None:
@@ -135,7 +137,7 @@ def build_world(road: str = "random", preset: PresetName = "city", seed: int = 0
     else:
         meshes += Layout(streets, terrain, kind, rngs[2]).meshes()
     traffic = make_traffic(streets, terrain, kind, rngs[3])
-    return World(preset, seed, streets, terrain, traffic, Scene(merge(meshes)))
+    return World(preset, seed, streets, terrain, traffic, Scene(merge(meshes)), Light(seed, preset == "tunnel"))
 
 
 def random_stream(seed: int, preset: PresetName, part: int) -> np.random.Generator:
@@ -144,7 +146,7 @@ def random_stream(seed: int, preset: PresetName, part: int) -> np.random.Generat
 
 
 def _towards(mesh: Mesh, origin: Float, directions: Float) -> NDArray[np.intp]:
-    """Those rays (of R, 3) that lie within the azimuths and elevations which a mesh covers as seen from a point (3,)."""
+    """Which rays (R, 3) lie within the azimuths and elevations that a mesh covers as seen from a point (3,)."""
     bins = 720
     away = mesh.vertices - origin
     flat = np.hypot(away[:, 0], away[:, 1]) + np.float32(1e-3)
@@ -154,7 +156,7 @@ def _towards(mesh: Mesh, origin: Float, directions: Float) -> NDArray[np.intp]:
     last = np.floor((corners[:, 0] + spread.max(1) + 0.01) / (2 * np.pi) * bins).astype(int)
     # +1 where a triangle begins, -1 after its end, over three turns folded into one
     steps = np.bincount(first + bins, minlength=3 * bins + 1) - np.bincount(last + bins + 1, minlength=3 * bins + 1)
-    covered = np.cumsum(steps)[: 3 * bins].reshape(3, bins).any(0)
+    covered = np.cumsum(steps)[: 3 * bins].reshape(3, bins).max(0) > 0
     slope = directions[:, 2] / (np.hypot(directions[:, 0], directions[:, 1]) + np.float32(1e-6))
     low, high = (away[:, 2] / flat).min() - 0.02, (away[:, 2] / flat).max() + 0.02
     azimuth = np.floor(np.arctan2(directions[:, 1], directions[:, 0]) / (2 * np.pi) * bins).astype(int) % bins
