@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from dpm2_core.config import Settings
-from dpm2_core.frame import Array, Keyframe, LoopClosure, Registration
+from dpm2_core.frame import Array, Points, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.slam.local_map import LocalMap, LocalMapSettings
 from dpm2_core.slam.registration import GeometricRegistration, GeometricSettings
@@ -44,8 +44,16 @@ class LoopCloser:
         self._registration = GeometricRegistration(registration)
         self._threads = threads
 
-    def close(self, keyframes: Sequence[Keyframe], poses: Array) -> LoopClosure | None:
-        """Try to close a loop with the last keyframe; `poses` (N, 4, 4) are all T_map_kf. None: nobody is near."""
+    def close(self, clouds: Sequence[Points], poses: Array) -> tuple[int, Registration] | None:
+        """Try to close a loop with the last keyframe.
+
+        Args:
+            clouds: those of all keyframes, each (M, 4) in its own frame.
+            poses: (N, 4, 4) T_map_kf of all keyframes.
+
+        Returns:
+            The candidate and T_candidate_last, accepted or refused with its reason; None: nobody is near.
+        """
         s = self._settings
         positions = poses[:, :3, 3]
         steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
@@ -59,7 +67,7 @@ class LoopCloser:
         to = len(poses) - 1
         candidate = int(near[np.argmin(distance[near])])
         T_guess = se3.inverse(poses[candidate]) @ poses[to]
-        found = self._verify(keyframes, poses, candidate, T_guess)
+        found = self._verify(clouds, poses, candidate, T_guess)
         moved = se3.inverse(T_guess) @ found.T_target_source
         metres, degrees = float(np.linalg.norm(moved[:3, 3])), float(np.degrees(se3.angle(moved)))
         if found.ok and found.confidence < s.min_inliers:
@@ -70,14 +78,14 @@ class LoopCloser:
             found = replace(found, ok=False, reason=f"position uncertain by {sigma:.2f} m")
         elif found.ok and (metres > 1.0 + s.drift * since[candidate] or degrees > 3.0 + 0.02 * since[candidate]):
             found = replace(found, ok=False, reason=f"{metres:.1f} m, {degrees:.1f} deg from the odometry")
-        return LoopClosure(keyframes[candidate].id, keyframes[to].id, found)
+        return candidate, found
 
-    def _verify(self, keyframes: Sequence[Keyframe], poses: Array, candidate: int, T_guess: Array) -> Registration:
+    def _verify(self, clouds: Sequence[Points], poses: Array, candidate: int, T_guess: Array) -> Registration:
         """T_candidate_new by points against the keyframes around the candidate, in its frame."""
         around = range(max(0, candidate - self._settings.neighbours), candidate + self._settings.neighbours + 1)
         local_map = LocalMap(LocalMapSettings(), self._threads)
         to_candidate = se3.inverse(poses[candidate])
-        clouds = [se3.transform(to_candidate @ poses[i], keyframes[i].cloud) for i in around if i < len(keyframes) - 1]
-        local_map.insert(np.concatenate(clouds), np.eye(4))
-        source = keyframes[-1].cloud[::2, :3].astype(np.float64)
+        near = [se3.transform(to_candidate @ poses[i], clouds[i]) for i in around if i < len(clouds) - 1]
+        local_map.insert(np.concatenate(near), np.eye(4))
+        source = clouds[-1][::2, :3].astype(np.float64)
         return self._registration.register(source, local_map, T_guess, widen=2.0)
