@@ -56,6 +56,8 @@ class BagPlayer:
 
     def __init__(self, node: Any, options: Options) -> None:
         self._node, self._options = node, options
+        if not options.bag.exists():
+            raise UsageError(f"{options.bag}: no such file or folder")
         self._bag: Bag = open_bag(options.bag)
         if missing := [topic for topic in options.topics if topic not in self._bag.types]:
             raise UsageError(f"{options.bag}: no topic {', '.join(missing)}; topics: {', '.join(self._bag.types)}")
@@ -77,8 +79,7 @@ class BagPlayer:
             if STOP.is_set() or not self._options.loop:
                 break
             self._node.get_logger().info(f"{self._options.bag}: again from the start")
-        for publisher in self._publishers.values():  # what is on its way must not end with the process
-            publisher.wait_for_all_acked(Duration(seconds=0 if STOP.is_set() else 2))
+        self._await_delivery(seconds=0.0 if STOP.is_set() else 1.0)
         for note in self._bag.notes:
             self._node.get_logger().warning(note)
         if self._options.log is not None:
@@ -125,6 +126,12 @@ class BagPlayer:
                 raise Dpm2Error(f"nobody listens to {', '.join(waiting)} after {options.wait:g} s")
         STOP.wait(0.2)  # other topics of the same subscriber are matched within moments of each other
 
+    def _await_delivery(self, seconds: float) -> None:
+        """What is on its way must not end with the process. (A last receipt may come only seconds later: never mind.)"""
+        end = time.monotonic() + seconds
+        for publisher in self._publishers.values():
+            publisher.wait_for_all_acked(Duration(seconds=max(0.0, end - time.monotonic())))
+
     def _play_once(self) -> int:
         count, origin, began, ticked = 0, None, 0.0, 0.0
         for topic, log_time, data in prefetch(self._selected()):
@@ -167,7 +174,7 @@ class BagPlayer:
 
 def main(arguments: Sequence[str]) -> int:
     """`bag_player BAG [options] [--ros-args ...]`."""
-    app = typer.Typer(add_completion=False)
+    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
     app.command()(_play)
     ros_context(arguments)
     try:

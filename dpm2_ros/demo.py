@@ -152,11 +152,11 @@ def _judge_poses(
     summary: dict[str, float | int | None],
     checks: dict[str, bool],
 ) -> None:
-    stamps = source.stamps
-    poses = map_poses(source, result, out, found)
+    stamps = source.stamps.tolist()
+    position = {stamp: n for n, stamp in reversed(list(enumerate(stamps)))}
+    rows = [position[stamp] for stamp in found]
     est = np.full((len(stamps), 4, 4), np.nan)
-    position = {stamp: n for n, stamp in reversed(list(enumerate(stamps.tolist())))}
-    est[[position[stamp] for stamp in found]] = poses
+    est[rows] = map_poses(source, result, out, found)
     truth = source.poses
     if truth is not None and np.isfinite(truth[:, 0, 0]).sum() > 1:
         metrics = evaluate(truth, est)
@@ -164,7 +164,8 @@ def _judge_poses(
         summary["rpe_trans_m"], summary["rpe_rot_deg"] = metrics.rpe_trans_m, metrics.rpe_rot_deg
         if metrics.ape_rmse_m is not None and metrics.path_length_m is not None:
             checks["the trajectory is right to 1 % of its length"] = metrics.ape_rmse_m < 0.01 * metrics.path_length_m
-    trajectory_png(out / "trajectory.png", est, truth, result.map, title=f"{source.name}: {len(found)} frames")
+    seen = None if truth is None else truth[rows]
+    trajectory_png(out / "trajectory.png", est[rows], seen, result.map, title=f"{source.name}: {len(found)} frames")
 
 
 def map_poses(source: BagSource, result: Replay, out: Path, found: list[int]) -> Array:
@@ -216,7 +217,7 @@ def _value(value: float | int | None, unit: str, digits: int) -> str:
 
 def main() -> int:
     """Entry point of `python -m dpm2_ros.demo`."""
-    app = typer.Typer(add_completion=False)
+    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
     app.command()(demo)
     return exit_code(lambda: app(standalone_mode=False))
 

@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is in the bag arrives, unchanged, in order and in time."""
+
+from __future__ import annotations
+
+import csv
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+
+from dpm2_core.data import topics
+from dpm2_core.data.bags import BagSource
+from dpm2_core.data.messages import decode_image, decode_points, stamp_ns
+from dpm2_core.data.source import InputSettings
+from dpm2_ros.bag_player import main
+from dpm2_ros.replay import ros_environment, start
+from dpm2_ros.runtime import exit_code
+from dpm2_ros.tf import TFMessage
+
+LATCHED_DEPTH = 10
+
+
+class Ears:
+    """Subscribers to the KITTI topics, and the player as a process."""
+
+    def __init__(self, harness: Any, domain: int, log: Path) -> None:
+        from rclpy.qos import DurabilityPolicy, QoSProfile
+
+        self.harness, self._domain, self._log = harness, domain, log
+        self.clouds = harness.hear(PointCloud2, topics.POINTS)
+        self.images = harness.hear(Image, topics.IMAGE)
+        self.infos = harness.hear(CameraInfo, topics.CAMERA_INFO)
+        self.clock = harness.hear(Clock, "/clock", 1000)
+        latched = QoSProfile(depth=LATCHED_DEPTH, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.static = harness.hear(TFMessage, topics.TF_STATIC, latched)
+        self.process: subprocess.Popen[bytes] | None = None
+
+    def play(self, *arguments: str) -> subprocess.Popen[bytes]:
+        environment = ros_environment(self._domain)
+        self.process = start("bag_player", arguments, environment, self._log)
+        return self.process
+
+    def output(self) -> str:
+        return self._log.read_text()
+
+
+@pytest.fixture
+def ears(ros: Callable[..., Any], tmp_path: Path) -> Iterator[Ears]:
+    harness = ros()
+    domain = harness.node.context.get_domain_id()
+    heard = Ears(harness, domain, tmp_path / "player.log")
+    yield heard
+    if heard.process is not None and heard.process.poll() is None:
+        heard.process.kill()
+        heard.process.wait()
+
+
+def test_everything_arrives_as_recorded_and_in_time(ears: Ears, bag: Path, drive: Any, tmp_path: Path) -> None:
+    player = ears.play(str(bag), "--wait", "20", "--rate", "2", "--log", str(tmp_path / "times.csv"))
+    assert player.wait(30) == 0, ears.output()
+    ears.harness.wait(lambda: len(ears.clouds) == len(ears.images) == drive.frames, "every cloud and image")
+    source = BagSource(bag, InputSettings(vertical_angle_correction_deg=0.0))
+    for message, image, frame in zip(ears.clouds, ears.images, source.frames(), strict=True):
+        assert stamp_ns(message.header) == frame.stamp
+        np.testing.assert_array_equal(decode_points(message)[0], frame.points)
+        np.testing.assert_array_equal(decode_image(image), frame.images[0].pixels)
+    assert len(ears.infos) == drive.frames
+    assert {t.child_frame_id for t in ears.static[0].transforms} >= {"velo_link", "camera_color_left"}
+    with (tmp_path / "times.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["topic"] == topics.POINTS]
+    published = np.array([int(row["published_ns"]) for row in rows])
+    assert len(published) == drive.frames
+    # 0.1 s at twice the speed; on a busy machine single ones may be late, but none early
+    seconds = (published - published[0]) * 1e-9
+    assert (seconds > 0.05 * np.arange(drive.frames) - 0.02).all()
+    assert np.median(seconds - 0.05 * np.arange(drive.frames)) < 0.3
+    now = np.array([message.clock.sec * 10**9 + message.clock.nanosec for message in ears.clock])
+    assert len(now) > 50
+    assert (np.diff(now) >= -20_000_000).all()  # while it waits the clock is measured, and may be ahead by a moment
+    assert now[0] >= source.stamps[0] - 20_000_000
+    assert now[-1] == source.stamps[-1]
+
+
+def test_start_duration_and_topics(ears: Ears, bag: Path, drive: Any) -> None:
+    arguments = ["--start", "0.45", "--duration", "0.4", "--topics", topics.POINTS, "--topics", topics.TF_STATIC]
+    assert ears.play(str(bag), "--wait", "20", *arguments).wait(30) == 0, ears.output()
+    ears.harness.wait(lambda: len(ears.clouds) >= 4, "four clouds")
+    stamps = BagSource(bag, InputSettings(images=False)).stamps.tolist()
+    assert [stamp_ns(message.header) for message in ears.clouds] == stamps[5:9]
+    assert ears.images == []
+    assert ears.static  # calibration comes from wherever one starts
+
+
+def test_it_loops_until_it_is_stopped(ears: Ears, bag: Path, drive: Any) -> None:
+    player = ears.play(str(bag), "--wait", "20", "--loop", "--rate", "8")
+    ears.harness.wait(lambda: len(ears.clouds) > 2 * drive.frames, "a third round")
+    player.send_signal(signal.SIGINT)
+    player.send_signal(signal.SIGINT)
+    assert player.wait(10) == 0
+    assert "Traceback" not in ears.output()
+    stamps = [stamp_ns(message.header) for message in ears.clouds]
+    assert stamps[drive.frames : 2 * drive.frames] == stamps[: drive.frames]
+
+
+def test_it_waits_for_subscribers(ros: Callable[..., Any], bag: Path, tmp_path: Path, drive: Any) -> None:
+    """Nothing is lost to a subscriber that comes later than the player."""
+    harness = ros()
+    environment = ros_environment(harness.node.context.get_domain_id())
+    player = start("bag_player", [str(bag), "--wait", "30", "--rate", "4"], environment, tmp_path / "log")
+    try:
+        harness.wait(lambda: harness.node.count_publishers(topics.POINTS), "the player")
+        time.sleep(0.3)
+        clouds = harness.hear(PointCloud2, topics.POINTS)
+        assert player.wait(30) == 0
+        harness.wait(lambda: len(clouds) == drive.frames, "every cloud")
+    finally:
+        player.kill()
+
+
+def play_here(*arguments: str) -> int:
+    """In this process: quicker, where nothing is to be heard."""
+    return exit_code(lambda: main(arguments))
+
+
+def test_nobody_listening_is_an_error(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert play_here(str(bag), "--wait", "0.3") == 1
+    assert f"nobody listens to {topics.POINTS} after 0.3 s" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["/no/such/bag"], "/no/such/bag: no such file or folder"),
+        ([], "Missing argument"),
+        (["BAG", "--rate", "0"], "--rate"),
+        (["BAG", "--no-such-option"], "--no-such-option"),
+        (["BAG", "--topics", "/nothing"], "no topic /nothing; topics: "),
+        (["BAG", "--ros-args", "--nonsense"], "nonsense"),
+    ],
+)
+def test_mistakes_end_with_2_and_one_line(
+    bag: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], says: str
+) -> None:
+    assert play_here(*(str(bag) if argument == "BAG" else argument for argument in arguments)) == 2
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
+    assert says in line.replace("'", "")
+
+
+def test_a_truncated_bag_plays_what_is_left(ears: Ears, bag: Path, tmp_path: Path, drive: Any) -> None:
+    (whole,) = bag.glob("*.mcap")
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(whole.read_bytes()[: whole.stat().st_size * 6 // 10])
+    assert ears.play(str(cut), "--wait", "20", "--rate", "4").wait(30) == 0, ears.output()
+    time.sleep(0.5)
+    assert 0 < len(ears.clouds) < drive.frames
+    assert "truncated" in ears.output()

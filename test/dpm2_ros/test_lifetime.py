@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Processes end cleanly, with the map saved, however impatient whoever stops them is."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import PointCloud2
+
+from dpm2_core.data import topics
+from dpm2_core.data.bags import BagSource
+from dpm2_core.data.messages import stamp_ns
+from dpm2_core.data.source import InputSettings
+from dpm2_core.evaluation.metrics import ape_rmse
+from dpm2_ros.demo import judge, map_poses
+from dpm2_ros.mapping import KEEP_ALL
+from dpm2_ros.replay import replay, ros_environment, start
+
+SAVED = ["map.ply", "pose_graph.g2o", "trajectory.tum"]
+
+
+@pytest.mark.parametrize(("name", "times"), [("SIGINT", 2), ("SIGTERM", 1), ("SIGTERM", 2)])
+def test_slam_node_saves_its_map_when_stopped(
+    ros: Callable[..., Any], drive: Any, tmp_path: Path, name: str, times: int
+) -> None:
+    harness = ros()
+    odometry = harness.hear(Odometry, "/dpm2/odom")
+    lidar = harness.publisher(PointCloud2, topics.POINTS)
+    parameters = ["-p", f"ros.map_directory:={tmp_path / 'map'}", "-p", "input.images:=false"]
+    environment = ros_environment(harness.node.context.get_domain_id())
+    process = start("slam_node", ["--ros-args", *parameters], environment, tmp_path / "log")
+    try:
+        harness.wait(
+            lambda: lidar.get_subscription_count() and harness.node.count_publishers("/dpm2/odom"), "slam_node"
+        )
+        time.sleep(0.2)
+        for n in range(8):
+            lidar.publish(drive.cloud(n))
+        harness.wait(lambda: odometry, "odometry")
+        for _ in range(times):
+            process.send_signal(getattr(signal, name))
+            time.sleep(0.02)
+        assert process.wait(30) == 0
+    finally:
+        process.kill()
+    output = (tmp_path / "log").read_text()
+    assert "Traceback" not in output
+    assert f"saved in {tmp_path / 'map'}" in output
+    assert sorted(path.name for path in (tmp_path / "map").iterdir()) == SAVED
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.6])
+def test_stopped_while_it_starts(tmp_path: Path, domain: int, delay: float) -> None:
+    """From the moment Python runs the entry point, also during imports."""
+    process = start("slam_node", [], ros_environment(domain), tmp_path / "log")
+    while not _handles_sigint(process) and process.poll() is None:
+        time.sleep(0.01)
+    time.sleep(delay)
+    process.send_signal(signal.SIGINT)
+    assert process.wait(30) == 0
+    assert "Traceback" not in (tmp_path / "log").read_text()
+
+
+def _handles_sigint(process: subprocess.Popen[bytes]) -> bool:
+    """Whether SIGTERM is caught: Python itself catches SIGINT only."""
+    status = Path(f"/proc/{process.pid}/status").read_text()
+    caught = next(line.split()[1] for line in status.splitlines() if line.startswith("SigCgt"))
+    return bool(int(caught, 16) >> (signal.SIGTERM - 1) & 1)
+
+
+def test_a_map_that_cannot_be_saved_at_the_end_is_exit_code_1(
+    ros: Callable[..., Any], drive: Any, tmp_path: Path
+) -> None:
+    harness = ros()
+    odometry = harness.hear(Odometry, "/dpm2/odom")
+    lidar = harness.publisher(PointCloud2, topics.POINTS)
+    (tmp_path / "map").write_text("in the way")
+    parameters = ["-p", f"ros.map_directory:={tmp_path / 'map'}", "-p", "input.images:=false"]
+    environment = ros_environment(harness.node.context.get_domain_id())
+    process = start("slam_node", ["--ros-args", *parameters], environment, tmp_path / "log")
+    try:
+        harness.wait(
+            lambda: lidar.get_subscription_count() and harness.node.count_publishers("/dpm2/odom"), "slam_node"
+        )
+        time.sleep(0.2)
+        lidar.publish(drive.cloud(0))
+        harness.wait(lambda: odometry, "odometry")
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 1
+    finally:
+        process.kill()
+    output = (tmp_path / "log").read_text()
+    assert "Traceback" not in output
+    assert f"error: {tmp_path / 'map'}" in output
+    assert (tmp_path / "map").read_text() == "in the way"
+
+
+def test_a_drive_through_player_slam_node_and_mapper_node(
+    ros: Callable[..., Any], bag: Path, drive: Any, tmp_path: Path
+) -> None:
+    """Three processes, the mapper apart: every cloud comes out, and the mapper saves the map of all keyframes."""
+    harness = ros()
+    odometry, keyframes = harness.hear(Odometry, "/dpm2/odom"), harness.hear(Odometry, "/dpm2/keyframe_odom", KEEP_ALL)
+    environment = ros_environment(harness.node.context.get_domain_id())
+    apart = ["--ros-args", "-p", "ros.embed_mapper:=false", "-p", "ros.map_directory:=''", "-p", "use_sim_time:=true"]
+    saving = ["--ros-args", "-p", f"ros.map_directory:={tmp_path / 'map'}"]
+    processes = {
+        "slam_node": start("slam_node", apart, environment, tmp_path / "slam.log"),
+        "mapper_node": start("mapper_node", saving, environment, tmp_path / "mapper.log"),
+    }
+    try:
+        harness.wait(lambda: harness.node.count_subscribers("/dpm2/keyframe") == 1, "the mapper", timeout=30)
+        player = start("bag_player", [str(bag), "--wait", "20"], environment, tmp_path / "player.log")
+        processes["player"] = player
+        assert player.wait(60) == 0
+        harness.wait(lambda: len(odometry) == drive.frames, "every pose")
+        for process in (processes["slam_node"], processes["mapper_node"]):
+            process.send_signal(signal.SIGINT)
+            assert process.wait(30) == 0
+    finally:
+        for process in processes.values():
+            process.kill()
+    stamps = BagSource(bag, InputSettings(images=False)).stamps.tolist()
+    assert [stamp_ns(message.header) for message in odometry] == stamps
+    assert f"map of {len(keyframes)} keyframes saved" in (tmp_path / "mapper.log").read_text()
+    assert len(keyframes) >= 3
+
+
+def test_replay_is_judged_by_what_arrived(bag: Path, drive: Any, tmp_path: Path) -> None:
+    """What `make demo` does: all checks hold; and without one pose, or in a wrong order of events, they do not."""
+    result = replay(bag, topics.POINTS, tmp_path, parameters={"ros.map_period": 0.5, "slam.keyframes.distance": 2.0})
+    source = BagSource(bag, InputSettings(images=False))
+    outcome = judge(source, result, tmp_path)
+    assert all(outcome.checks.values()), outcome.checks
+    summary = outcome.summary
+    assert list(summary) == [
+        "frames_in", "frames_out", "dropped", "latency_p50_ms", "latency_p95_ms",
+        "ape_rmse_m", "rpe_trans_m", "rpe_rot_deg", "loops",
+    ]  # fmt: skip
+    assert (summary["frames_in"], summary["frames_out"], summary["dropped"]) == (drive.frames, drive.frames, 0)
+    assert 0 < summary["latency_p50_ms"] <= summary["latency_p95_ms"]
+    assert summary["ape_rmse_m"] < 0.05
+    assert (tmp_path / "trajectory.png").is_file()
+    poses = map_poses(source, result, tmp_path, source.stamps.tolist())
+    assert ape_rmse(source.poses, poses) == pytest.approx(summary["ape_rmse_m"])
+    lost = result.poses.pop(source.stamps.tolist()[3])
+    outcome = judge(source, result, tmp_path)
+    assert not outcome.checks["every cloud has its odometry, with the same stamp"]
+    assert (outcome.summary["frames_out"], outcome.summary["dropped"]) == (drive.frames - 1, 1)
+    result.poses[12345] = lost
+    assert not judge(source, result, tmp_path).checks["no odometry without its cloud"]

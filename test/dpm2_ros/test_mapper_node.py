@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The mapper apart builds the same map as the embedded one, from messages alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import PointCloud2
+
+from dpm2_core.data.transforms import transform_matrix
+from dpm2_core.evaluation.trajectory import read_trajectory
+from dpm2_core.frame import Keyframe
+from dpm2_core.geometry import se3
+from dpm2_ros.conversions import cloud_to_msg, edge_to_msg, keyframe_name
+from dpm2_ros.mapper_node import MapperNode, keyframe_from
+from dpm2_ros.mapping import KEEP_ALL
+from dpm2_ros.tf import TFMessage
+
+
+@pytest.fixture
+def mapper(ros: Callable[..., Any], tmp_path: Path) -> Any:
+    """Harness with a mapper_node that saves to tmp_path/map, and `send(name, T, cloud)` for keyframes."""
+    harness = ros(f"ros.map_directory:={tmp_path / 'map'}")
+    harness.mapper = harness.add(MapperNode())
+    clouds = harness.node.create_publisher(PointCloud2, "/dpm2/keyframe", KEEP_ALL)
+    poses = harness.node.create_publisher(Odometry, "/dpm2/keyframe_odom", KEEP_ALL)
+    harness.wait(lambda: clouds.get_subscription_count() and poses.get_subscription_count(), "the mapper's ears")
+
+    def send(id: int, T: np.ndarray, points: np.ndarray, cloud_first: bool = False, name: str = "") -> None:
+        name = name or keyframe_name("", id)
+        pose = edge_to_msg(T, np.eye(6) * 1e-4, 1000 + id, "odom", name)
+        messages = [(poses, pose), (clouds, cloud_to_msg(points, 1000 + id, name))]
+        for publisher, message in reversed(messages) if cloud_first else messages:
+            publisher.publish(message)
+
+    harness.send = send
+    return harness
+
+
+def points(seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(0, 1, (500, 4)).astype(np.float32) * [20, 20, 5, 1]
+
+
+@pytest.mark.parametrize("cloud_first", [False, True])
+def test_keyframes_become_a_map_in_either_order_of_messages(mapper: Any, tmp_path: Path, cloud_first: bool) -> None:
+    T = [se3.exp([0, 0, 0.1 * n, 5.0 * n, 0, 0]) for n in range(4)]
+    for n in range(4):
+        mapper.send(n, T[n], points(n).astype(np.float32), cloud_first)
+    mapper.wait(lambda: mapper.mapper._mapper.keyframes == 4, "four keyframes")
+    mapper.mapper.close()
+    mapper._closing.remove(mapper.mapper)
+    saved = read_trajectory(tmp_path / "map" / "trajectory.tum")
+    assert saved.keys.tolist() == [1000, 1001, 1002, 1003]
+    np.testing.assert_allclose(saved.poses, T, atol=1e-6)
+    header = (tmp_path / "map" / "map.ply").read_bytes()[:300].decode("ascii", "replace")
+    assert int(header.split("element vertex ")[1].split()[0]) > 1000
+
+
+def test_a_keyframe_of_another_name_is_refused_and_the_rest_goes_on(mapper: Any) -> None:
+    mapper.send(0, np.eye(4), points(0).astype(np.float32))
+    mapper.send(1, np.eye(4), points(0).astype(np.float32), name="not a keyframe")
+    mapper.send(1, se3.exp([0, 0, 0, 5, 0, 0]), points(1).astype(np.float32))
+    mapper.wait(lambda: mapper.mapper._mapper.keyframes == 2, "two keyframes")
+
+
+def test_a_restarted_odometry_starts_a_new_map(mapper: Any, tmp_path: Path) -> None:
+    for id in (0, 1, 2, 0):
+        mapper.send(id, se3.exp([0, 0, 0, 5.0 * id, 0, 0]), points(id).astype(np.float32))
+    mapper.wait(lambda: mapper.mapper._mapper.keyframes == 1, "the new map")
+    assert len(read_trajectory(tmp_path / "map" / "trajectory.tum")) == 3  # the old one was saved
+
+
+def test_map_to_odom_goes_out_with_every_odometry(mapper: Any) -> None:
+    odometry = mapper.publisher(Odometry, "/dpm2/odom")
+    heard = mapper.hear(TFMessage, "/tf")
+    mapper.wait(lambda: odometry.get_subscription_count() and mapper.mapper.count_subscribers("/tf"), "connections")
+    odometry.publish(edge_to_msg(np.eye(4), np.eye(6), 77, "odom", "base"))
+    mapper.wait(lambda: heard, "/tf")
+    transform = heard[0].transforms[0]
+    assert (transform.header.frame_id, transform.child_frame_id, transform.header.stamp.nanosec) == ("map", "odom", 77)
+    np.testing.assert_array_equal(transform_matrix(transform.transform), np.eye(4))
+
+
+def test_a_missed_keyframe_makes_a_softer_edge() -> None:
+    """The edge leads to the last that arrived, with the covariance of all the steps between."""
+    before = Keyframe(3, 0, 0, se3.exp([0, 0, 0, 5, 0, 0]), np.zeros((0, 4), np.float32))
+    T, covariance = se3.exp([0, 0, 0.5, 12, 1, 0]), np.diag([1.0, 2, 3, 4, 5, 6])
+    pose = edge_to_msg(T, covariance, 9, "odom", "kf_5")
+    keyframe = keyframe_from(pose, np.zeros((0, 4), np.float32), "", 5, before)
+    assert keyframe.edge is not None
+    np.testing.assert_allclose(before.T_odom_kf @ keyframe.edge.T_target_source, T, atol=1e-9)
+    np.testing.assert_allclose(keyframe.edge.covariance, 2 * covariance, atol=1e-9)
+
+
+@pytest.mark.parametrize("before", [None, 5, 7])
+def test_the_first_keyframe_and_one_that_goes_back_have_no_edge(before: int | None) -> None:
+    last = None if before is None else Keyframe(before, 0, 0, np.eye(4), np.zeros((0, 4), np.float32))
+    pose = edge_to_msg(np.eye(4), np.eye(6), 9, "odom", "kf_5")
+    assert keyframe_from(pose, np.zeros((0, 4), np.float32), "", 5, last).edge is None

@@ -1,0 +1,391 @@
+# SPDX-License-Identifier: Apache-2.0
+"""slam_node over real DDS: a test publishes clouds and images and subscribes to what comes out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import TransformStamped
+from nav_msgs.msg import Odometry
+from nav_msgs.msg import Path as PathMsg
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from std_srvs.srv import Trigger
+from visualization_msgs.msg import MarkerArray
+
+from dpm2_core.data.messages import decode_points, stamp_ns
+from dpm2_core.data.topics import CAMERA_INFO, IMAGE, POINTS
+from dpm2_core.data.transforms import transform_matrix
+from dpm2_core.geometry import se3
+from dpm2_ros.conversions import cloud_to_msg, stamp_to_msg, transform_to_msg
+from dpm2_ros.slam_node import SlamNode
+from dpm2_ros.tf import TFMessage
+
+LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE)
+ACCURATE = 0.05  # m: the scans are exact, sampled at 0.35 m, and averaged into voxels of 0.5 m
+
+
+class Rig:
+    """A slam_node, a LiDAR, and ears."""
+
+    def __init__(self, ros: Callable[..., Any], drive: Any, *parameters: str, reliable: bool = True, **options: Any):
+        quiet = () if any(p.startswith("input.images") for p in parameters) else ("input.images:=false",)
+        self.harness = ros(*quiet, *parameters, **options)
+        self.drive = drive
+        self.lidar = self.harness.publisher(PointCloud2, POINTS, reliable)
+        self.odom = self.harness.hear(Odometry, f"{options.get('namespace', '')}/dpm2/odom")
+        self.diagnostics = self.harness.hear(DiagnosticArray, "/diagnostics")
+        self.node: SlamNode = self.harness.add(SlamNode())
+        self.wait = self.harness.wait
+        self.wait(lambda: self.lidar.get_subscription_count(), "the subscription to the clouds")
+        self.wait(lambda: self.node.count_subscribers(self.odom_topic), "the test's subscription")
+
+    @property
+    def odom_topic(self) -> str:
+        return self.node.resolve_topic_name("dpm2/odom")
+
+    def send(self, n: int, stamp: int | None = None, **changes: Any) -> None:
+        message = self.drive.cloud(n, **changes)
+        if stamp is not None:
+            message.header.stamp = stamp_to_msg(stamp)
+        self.lidar.publish(message)
+
+    def send_and_wait(self, *numbers: int, **changes: Any) -> None:
+        """One after the other, each when the one before has come out."""
+        for n in numbers:
+            before = len(self.odom)
+            self.send(n, **changes)
+            self.wait(lambda before=before: len(self.odom) > before, f"the odometry of cloud {n}")
+
+    def status(self, part: str = "odometry") -> DiagnosticStatus:
+        """The next one."""
+        seen = len(self.diagnostics)
+        self.wait(lambda: len(self.diagnostics) > seen, "diagnostics")
+        return next(s for s in self.diagnostics[-1].status if s.name.endswith(f"slam_node: {part}"))
+
+    def values(self, part: str = "odometry") -> dict[str, str]:
+        return {value.key: value.value for value in self.status(part).values}
+
+    def stamps(self) -> list[int]:
+        return [stamp_ns(message.header) for message in self.odom]
+
+
+@pytest.fixture
+def rig(ros: Callable[..., Any], drive: Any) -> Callable[..., Rig]:
+    return lambda *parameters, **options: Rig(ros, drive, *parameters, **options)
+
+
+@pytest.mark.parametrize("reliable", [True, False], ids=["reliable", "best effort"])
+def test_every_cloud_gives_its_pose(rig: Callable[..., Rig], drive: Any, reliable: bool) -> None:
+    """Also from a best-effort publisher, which a reliable subscription would never hear."""
+    r = rig(reliable=reliable)
+    r.send_and_wait(*range(drive.frames))
+    assert r.stamps() == [drive.stamp(n) for n in range(drive.frames)]
+    for n, message in enumerate(r.odom):
+        T = transform_matrix(message.pose.pose)
+        assert np.linalg.norm(T[:3, 3] - drive.pose(n)[:3, 3]) < ACCURATE
+        assert (message.header.frame_id, message.child_frame_id) == ("odom", "lidar")
+    covariance = np.array(r.odom[-1].pose.covariance).reshape(6, 6)
+    assert (np.linalg.eigvalsh(covariance) > 0).all()
+    assert np.trace(covariance) > np.trace(np.array(r.odom[5].pose.covariance).reshape(6, 6))  # doubt accumulates
+    assert r.odom[-1].twist.twist.linear.x == pytest.approx(8.0, abs=0.6)  # 0.8 m in 0.1 s
+    values = r.values()
+    assert (values["received"], values["processed"], values["dropped (queue full)"]) == ("16", "16", "0")
+    assert float(values["latency p95 (ms)"]) > 0
+    assert r.status().level == DiagnosticStatus.OK
+
+
+def test_keyframes_map_path_and_tf(rig: Callable[..., Rig], drive: Any) -> None:
+    r = rig("ros.map_period:=0.1", "ros.path_period:=0.1")
+    hear = r.harness.hear
+    keyframes, poses = hear(PointCloud2, "/dpm2/keyframe"), hear(Odometry, "/dpm2/keyframe_odom")
+    maps, paths = hear(PointCloud2, "/dpm2/map", LATCHED), hear(PathMsg, "/dpm2/path", LATCHED)
+    graphs, tf = hear(MarkerArray, "/dpm2/pose_graph", LATCHED), hear(TFMessage, "/tf")
+    r.wait(lambda: r.node.count_subscribers("/tf") and r.node.count_subscribers("/dpm2/keyframe"), "subscriptions")
+    r.send_and_wait(*range(drive.frames))
+    r.wait(lambda: len(keyframes) == len(poses) >= 3, "three keyframes in 12 m")
+    assert [k.header.frame_id for k in keyframes] == [f"kf_{n}" for n in range(len(keyframes))]
+    assert [stamp_ns(k.header) for k in keyframes] == [stamp_ns(p.header) for p in poses]
+    assert poses[1].child_frame_id == "kf_1"
+    points, _ = decode_points(keyframes[1], intensity_max=1.0)
+    assert points.shape[0] > 1000
+    r.wait(lambda: maps and stamp_ns(maps[-1].header) == stamp_ns(poses[-1].header), "the map of the last keyframe")
+    assert maps[-1].header.frame_id == "map"
+    assert maps[-1].width > points.shape[0]
+    r.wait(lambda: paths and len(paths[-1].poses) == len(poses), "the path")
+    r.wait(lambda: graphs and len(graphs[-1].markers[0].points) == len(poses), "the pose graph")
+    pairs = {(t.header.frame_id, t.child_frame_id): t for message in tf for t in message.transforms}
+    assert set(pairs) == {("map", "odom"), ("odom", "lidar")}
+    moved = transform_matrix(pairs["odom", "lidar"].transform)
+    np.testing.assert_allclose(moved, transform_matrix(r.odom[-1].pose.pose), atol=1e-9)
+    assert stamp_ns(pairs["map", "odom"].header) == drive.stamp(drive.frames - 1)
+
+
+def test_the_map_is_bounded_and_built_only_for_listeners(rig: Callable[..., Rig], drive: Any) -> None:
+    r = rig("ros.map_max_points:=1000", "ros.map_period:=0.1")
+    r.send_and_wait(0, 1, 2)
+    display = r.node._mapper._displays[2]
+    time.sleep(0.5)
+    assert display._shown == 0  # nobody listens: nothing was built
+    maps = r.harness.hear(PointCloud2, "/dpm2/map", LATCHED)
+    r.wait(lambda: maps, "the map, once somebody listens")
+    time.sleep(0.5)
+    assert [m.width for m in maps] == [1000]  # and not again while nothing changes
+
+
+def test_tf_can_be_switched_off(rig: Callable[..., Rig]) -> None:
+    r = rig("ros.publish_tf_odom:=false", "ros.publish_tf_map:=false")
+    assert r.node.count_publishers("/tf") == 0
+
+
+def test_a_namespace_holds_a_robot(rig: Callable[..., Rig]) -> None:
+    r = rig("input.points_topic:=/kitti/velo/pointcloud", namespace="/robot_1")
+    keyframes = r.harness.hear(PointCloud2, "/robot_1/dpm2/keyframe")
+    r.wait(lambda: r.node.count_subscribers("/robot_1/dpm2/keyframe"), "the subscription")
+    r.send_and_wait(0, 1)
+    r.wait(lambda: keyframes, "a keyframe")
+    assert keyframes[0].header.frame_id == "robot_1/kf_0"
+    assert r.status().name == "robot_1/slam_node: odometry"
+
+
+def test_the_base_is_the_root_of_tf_static(rig: Callable[..., Rig], drive: Any) -> None:
+    """The pose of base_link, which starts at the origin, although the LiDAR is mounted ahead, above and turned."""
+    T_base_lidar = se3.exp([0.0, 0.05, 0.4, 1.0, 0.2, 1.5])
+    r = rig()
+    static = r.harness.publisher(TFMessage, "/tf_static", latched=True)
+    static.publish(TFMessage(transforms=[transform_to_msg(T_base_lidar, 0, "base_link", "lidar")]))
+    r.wait(lambda: "lidar" in r.node._inputs.static.tree.frames, "/tf_static")
+    r.send_and_wait(*range(8))
+    for n, message in enumerate(r.odom):
+        assert message.child_frame_id == "base_link"
+        expected = T_base_lidar @ drive.pose(n) @ se3.inverse(T_base_lidar)
+        assert np.linalg.norm(transform_matrix(message.pose.pose)[:3, 3] - expected[:3, 3]) < ACCURATE
+
+
+def test_a_base_frame_that_nobody_knows_is_said_and_never_assumed(rig: Callable[..., Rig]) -> None:
+    r = rig("ros.base_frame:=base_link", "ros.tf_timeout:=0.1")
+    r.send_and_wait(0, 1)
+    assert r.odom[-1].child_frame_id == "lidar"
+    status = r.status()
+    assert status.level == DiagnosticStatus.WARN
+    assert "no transform from 'lidar' to 'base_link'" in status.message
+
+
+class Camera:
+    """A camera of noise, 8 by 6 pixels."""
+
+    def __init__(self, r: Rig) -> None:
+        self._rig = r
+        self._image, self._info = r.harness.publisher(Image, IMAGE), r.harness.publisher(CameraInfo, CAMERA_INFO)
+        r.wait(
+            lambda: self._image.get_subscription_count() and self._info.get_subscription_count(), "the camera's ears"
+        )
+
+    def send(self, n: int, offset: float = 0.0) -> None:
+        stamp = self._rig.drive.stamp(n) + round(offset * 1e9)
+        info = CameraInfo(height=6, width=8, distortion_model="plumb_bob", k=[5.0, 0, 4, 0, 5, 3, 0, 0, 1])
+        info.p = [5.0, 0, 4, 0, 0, 5, 3, 0, 0, 0, 1, 0]
+        image = Image(height=6, width=8, encoding="rgb8", step=24, data=bytes(144))
+        for message in (info, image):
+            message.header.stamp, message.header.frame_id = stamp_to_msg(stamp), "camera"
+        self._info.publish(info)
+        self._image.publish(image)
+
+
+def with_camera(rig: Callable[..., Rig], *parameters: str) -> tuple[Rig, Camera]:
+    r = rig("input.images:=true", *parameters)
+    return r, Camera(r)
+
+
+PLACE = "input.T_lidar_cam:=[0.0, 0.0, 0.0, 0.5, -0.5, 0.5, -0.5]"
+
+
+def test_an_image_joins_its_cloud(rig: Callable[..., Rig]) -> None:
+    r, camera = with_camera(rig, PLACE, "ros.sync_timeout:=2.0")
+    frames = record_frames(r)
+    for n in range(4):
+        camera.send(n, offset=0.01)
+        r.send_and_wait(n)
+    assert [len(frame.images) for frame in frames] == [1] * 4
+    assert frames[0].images[0].pixels.shape == (6, 8, 3)
+    np.testing.assert_allclose(frames[0].images[0].camera.T_lidar_cam[:3, 2], [1, 0, 0], atol=1e-9)  # looks ahead
+    assert r.status("camera").level == DiagnosticStatus.OK
+
+
+def test_extrinsics_come_from_tf_static(rig: Callable[..., Rig]) -> None:
+    r, camera = with_camera(rig, "ros.sync_timeout:=2.0")
+    T = se3.exp([0.1, -1.2, 1.2, 0.3, 0.0, -0.1])
+    static = r.harness.publisher(TFMessage, "/tf_static", latched=True)
+    transforms: list[TransformStamped] = [transform_to_msg(T, 0, "lidar", "camera")]
+    static.publish(TFMessage(transforms=transforms))
+    frames = record_frames(r)
+    for n in range(3):
+        camera.send(n)
+        r.send_and_wait(n)
+    np.testing.assert_allclose(frames[-1].images[0].camera.T_lidar_cam, T, atol=1e-9)
+
+
+def test_a_missing_extrinsic_refuses_the_images_and_says_so(rig: Callable[..., Rig]) -> None:
+    r, camera = with_camera(rig, "ros.sync_timeout:=2.0")
+    frames = record_frames(r)
+    for n in range(3):
+        camera.send(n)
+        r.send_and_wait(n)
+    assert [len(frame.images) for frame in frames] == [0] * 3
+    status = r.status("camera")
+    assert status.level == DiagnosticStatus.ERROR
+    assert "no transform from 'camera' to 'lidar'" in status.message
+    assert "input.T_lidar_cam" in status.message
+
+
+def test_a_camera_that_never_comes_comes_late_and_stops(rig: Callable[..., Rig], drive: Any) -> None:
+    """Every cloud gets its pose all the while, and /diagnostics tells."""
+    r, camera = with_camera(rig, PLACE, "ros.sync_timeout:=0.05")
+    frames = record_frames(r)
+    r.send_and_wait(0, 1, 2)
+    assert "no image on /kitti/camera_color_left/image_raw yet" in r.status("camera").message
+    for n in range(3, 10):
+        camera.send(n)
+        time.sleep(0.02)
+        r.send_and_wait(n)
+    assert r.status("camera").level == DiagnosticStatus.OK
+    r.send_and_wait(*range(10, drive.frames))
+    assert [bool(frame.images) for frame in frames] == [3 <= n < 10 for n in range(drive.frames)]
+    r.wait(lambda: r.status("camera").level == DiagnosticStatus.WARN, "the silence of the camera to be noticed")
+    assert "no image" in r.status("camera").message
+
+
+def record_frames(r: Rig) -> list[Any]:
+    """What the odometry is given."""
+    frames: list[Any] = []
+    process = r.node._odometry.process
+
+    def recording(frame: Any) -> Any:
+        frames.append(frame)
+        return process(frame)
+
+    r.node._odometry.process = recording  # type: ignore[method-assign]
+    return frames
+
+
+def test_bad_clouds_among_good_ones(rig: Callable[..., Rig], drive: Any) -> None:
+    """Empty, of 50 points, all NaN, all zero, without x, cut short: each gets a pose, and the drive goes on."""
+    r = rig()
+    r.send_and_wait(*range(5))
+    good = decode_points(drive.cloud(5))[0]
+    bad = [good[:0], good[:50], np.full_like(good, np.nan), np.zeros_like(good), np.full_like(good, np.inf)]
+    messages = [cloud_to_msg(points, drive.stamp(5 + n), "lidar") for n, points in enumerate(bad)]
+    without_x = drive.cloud(10)
+    without_x.fields = without_x.fields[1:]
+    cut = drive.cloud(11)
+    cut.data = cut.data[:1000]
+    for message in (*messages, without_x, cut):
+        before = len(r.odom)
+        r.lidar.publish(message)
+        r.wait(lambda before=before: len(r.odom) > before, "the pose of a bad cloud")
+    assert np.isfinite(transform_matrix(r.odom[-1].pose.pose)).all()
+    assert r.status().level in (DiagnosticStatus.WARN, DiagnosticStatus.ERROR)
+    r.send_and_wait(*range(12, drive.frames))
+    assert len(r.odom) == drive.frames
+    end = transform_matrix(r.odom[-1].pose.pose)[:3, 3]
+    assert np.linalg.norm(end - drive.pose(drive.frames - 1)[:3, 3]) < 0.3
+    assert r.values()["internal errors"] == "0"
+
+
+def test_stamps_that_repeat_or_go_back(rig: Callable[..., Rig], drive: Any) -> None:
+    r = rig()
+    r.send_and_wait(0, 1, 2)
+    r.send(2)
+    r.send(1)
+    r.send_and_wait(3)
+    assert r.stamps() == [drive.stamp(n) for n in range(4)]
+    values = r.values()
+    assert (values["refused (stamp repeated)"], values["refused (stamp out of order)"]) == ("1", "1")
+
+
+def test_a_looped_bag_starts_again(rig: Callable[..., Rig], drive: Any, tmp_path: Path) -> None:
+    """Odometry and map begin anew, and the map of the first round is on disk."""
+    r = rig(f"ros.map_directory:={tmp_path / 'map'}")
+    r.send_and_wait(*range(drive.frames))
+    r.send_and_wait(0, 1)
+    assert transform_matrix(r.odom[-2].pose.pose)[:3, 3] == pytest.approx([0, 0, 0], abs=1e-9)
+    r.wait(lambda: r.node._mapper.keyframes == 1, "the new map")
+    assert (tmp_path / "map" / "map.ply").is_file()
+    assert r.values()["restarts"] == "1"
+
+
+def test_clouds_that_stop_are_noticed(rig: Callable[..., Rig]) -> None:
+    r = rig()
+    status = r.status()
+    assert status.level == DiagnosticStatus.STALE
+    assert "no cloud on /kitti/velo/pointcloud yet" in status.message
+    r.send_and_wait(0)
+    r.wait(lambda: "no cloud on /kitti/velo/pointcloud for" in r.status().message, "the silence to be noticed")
+    assert r.status().level == DiagnosticStatus.STALE
+
+
+def test_a_wrong_topic_is_told_with_the_right_one(ros: Callable[..., Any], drive: Any) -> None:
+    r = Rig.__new__(Rig)
+    r.harness = ros("input.points_topic:=/points", "input.images:=false")
+    r.wait, r.diagnostics = r.harness.wait, r.harness.hear(DiagnosticArray, "/diagnostics")
+    r.harness.publisher(PointCloud2, "/os_cloud/points")
+    r.harness.add(SlamNode())
+    r.wait(lambda: "are published on /os_cloud/points" in r.status().message, "the hint")
+
+
+def test_an_overloaded_node_drops_the_oldest_and_counts(rig: Callable[..., Rig], drive: Any) -> None:
+    r = rig("ros.queue_depth:=2")
+    process = r.node._odometry.process
+    r.node._odometry.process = lambda frame: (time.sleep(0.4), process(frame))[1]  # type: ignore[method-assign]
+    for n in range(8):
+        r.send(n)
+        time.sleep(0.05)
+    r.wait(lambda: r.stamps() and r.stamps()[-1] == drive.stamp(7), "the last cloud")
+    values = r.values()
+    assert int(values["dropped (queue full)"]) == 8 - len(r.odom) > 0
+    assert values["received"] == "8"
+
+
+def call(r: Rig, service: str) -> Trigger.Response:
+    client = r.harness.node.create_client(Trigger, service)
+    assert client.wait_for_service(10)
+    future = client.call_async(Trigger.Request())
+    r.wait(future.done, service)
+    return future.result()
+
+
+def test_save_map_answers_in_words(rig: Callable[..., Rig], drive: Any, tmp_path: Path) -> None:
+    r = rig(f"ros.map_directory:={tmp_path / 'map'}")
+    answer = call(r, "/slam_node/save_map")
+    assert (answer.success, answer.message) == (False, "no map is saved: there is no keyframe yet")
+    r.send_and_wait(0, 1)
+    answer = call(r, "/slam_node/save_map")
+    assert answer.success
+    assert answer.message == f"map of 1 keyframes saved in {tmp_path / 'map'}"
+    assert sorted(path.name for path in (tmp_path / "map").iterdir()) == ["map.ply", "pose_graph.g2o", "trajectory.tum"]
+
+
+def test_a_map_that_cannot_be_saved_is_an_answer(rig: Callable[..., Rig], drive: Any, tmp_path: Path) -> None:
+    """The disk is full as far as the file system goes: the map's folder is a file."""
+    r = rig(f"ros.map_directory:={tmp_path / 'map'}")
+    r.send_and_wait(0)
+    (tmp_path / "map").write_text("in the way")
+    answer = call(r, "/slam_node/save_map")
+    assert not answer.success
+    assert str(tmp_path / "map") in answer.message
+    (tmp_path / "map").unlink()  # so that the end of the node can save
+
+
+def test_reset_starts_again(rig: Callable[..., Rig], drive: Any) -> None:
+    r = rig()
+    r.send_and_wait(*range(6))
+    assert call(r, "/slam_node/reset").success
+    r.wait(lambda: r.node._mapper.keyframes == 0, "the empty map")
+    r.send_and_wait(6)
+    assert transform_matrix(r.odom[-1].pose.pose)[:3, 3] == pytest.approx([0, 0, 0], abs=1e-9)
