@@ -127,7 +127,7 @@ class BagPlayer:
         STOP.wait(0.2)  # other topics of the same subscriber are matched within moments of each other
 
     def _await_delivery(self, seconds: float) -> None:
-        """What is on its way must not end with the process. (A last receipt may come only seconds later: never mind.)"""
+        """What is on its way must not end with the process. A last receipt may come only seconds later."""
         end = time.monotonic() + seconds
         for publisher in self._publishers.values():
             publisher.wait_for_all_acked(Duration(seconds=max(0.0, end - time.monotonic())))

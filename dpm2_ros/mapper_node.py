@@ -82,7 +82,7 @@ class MapperNode(Node):
 
 
 def keyframe_from(pose: Odometry, points: Points, robot: str, id: int, before: Keyframe | None) -> Keyframe:
-    """A keyframe from its messages; its edge leads to the last one that arrived, and gets softer with those missed.
+    """A keyframe from its messages; its edge leads to the last one that arrived (the mapper reckons with those missed).
 
     Raises:
         UsageError: the pose is no rigid transform.
@@ -90,7 +90,7 @@ def keyframe_from(pose: Odometry, points: Points, robot: str, id: int, before: K
     T_odom_kf = transform_matrix(pose.pose.pose)
     edge = None
     if before is not None and id > before.id:
-        covariance = covariance_from_ros(pose.pose.covariance, T_odom_kf[:3, :3]) * (id - before.id)
+        covariance = covariance_from_ros(pose.pose.covariance, T_odom_kf[:3, :3])
         T_before_this = se3.inverse(before.T_odom_kf) @ T_odom_kf
         edge = Registration(T_before_this, covariance, confidence=1.0, rmse=0.0, method="odometry")
     return Keyframe(id, stamp_ns(pose.header), id, T_odom_kf, points, edge, robot)
