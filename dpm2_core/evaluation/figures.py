@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from dpm2_core.evaluation.kitti_metric import known
 from dpm2_core.evaluation.metrics import align
@@ -47,7 +48,7 @@ def trajectory_png(
     axes = figure.add_axes((0.01, 0.01, 0.98, 0.92), facecolor=_BACKGROUND, aspect="equal")
     axes.set_axis_off()
     if cloud is not None and len(cloud):
-        axes.imshow(_raster(cloud, low, high), extent=(low[0], high[0], low[1], high[1]), origin="lower")
+        axes.imshow(_raster(cloud, est[:, :3, 3], low, high), extent=(low[0], high[0], low[1], high[1]), origin="lower")
     if truth is not None:
         axes.plot(truth[:, 0], truth[:, 1], "--", color=_TRUTH, lw=1.2, label="ground truth (aligned)", zorder=4)
     axes.plot(est[:, 0, 3], est[:, 1, 3], color=_ESTIMATE, lw=3.0, label="estimate", zorder=3)
@@ -80,23 +81,30 @@ def _bounds(positions: Array, cloud: Points | None) -> tuple[Array, Array]:
     return low, high
 
 
-def _raster(cloud: Points, low: Array, high: Array) -> NDArray[np.float64]:
-    """(H, W, 3) picture of the points: hue from the highest in each pixel, brightness from how many there are."""
+def _raster(cloud: Points, positions: Array, low: Array, high: Array) -> NDArray[np.float64]:
+    """(H, W, 3) picture of the points: hue from the highest in each pixel, brightness from how many there are.
+
+    Heights count from the nearest of the (N, 3) positions of the LiDAR: a street on a hill must not outshine houses
+    in the valley. Pixels are no finer than the spacing of the points, so that surfaces look like surfaces.
+    """
     from matplotlib.colors import LinearSegmentedColormap, to_rgb
 
-    pixel = (high - low).max() / _PIXELS
+    cloud = cloud[np.logical_and.reduce((cloud[:, :2] > low) & (cloud[:, :2] < high), axis=1), :3]
+    if not len(cloud):
+        return np.full((1, 1, 3), to_rgb(_BACKGROUND))
+    nearest = KDTree(cloud).query(cloud[:: len(cloud) // 2000 + 1], k=[2])[0]
+    pixel = max((high - low).max() / _PIXELS, np.median(np.minimum(nearest, 1.0)))  # inf for a single point
     width, height = np.ceil((high - low) / pixel).astype(int)
-    inside = np.logical_and.reduce((cloud[:, :2] > low) & (cloud[:, :2] < high), axis=1)
-    x, y = ((cloud[inside, :2] - low) / pixel).astype(int).T
-    z = cloud[inside, 2]
+    x, y = ((cloud[:, :2] - low) / pixel).astype(int).T
+    z = cloud[:, 2] - positions[KDTree(positions[:, :2]).query(cloud[:, :2])[1], 2]
     cell = np.minimum(y, height - 1) * width + np.minimum(x, width - 1)
     count = np.bincount(cell, minlength=width * height)
     top = np.full(width * height, -np.inf)
     np.maximum.at(top, cell, z)
-    bottom, ceiling = np.percentile(z, [3, 95]) if len(z) else (0.0, 1.0)
+    bottom, ceiling = np.percentile(z, [3, 95])
     heights = LinearSegmentedColormap.from_list("heights", _HEIGHTS)
     hue = heights(np.clip((top - bottom) / max(ceiling - bottom, 1e-3), 0, 1))[:, :3]
-    strength = np.where(count > 0, 0.3 + 0.7 * np.clip(np.log1p(count) / np.log(6), 0, 1), 0.0)[:, None]
+    strength = np.where(count > 0, 0.4 + 0.6 * np.clip(np.log1p(count) / np.log(6), 0, 1), 0.0)[:, None]
     return (np.array(to_rgb(_BACKGROUND)) * (1 - strength) + hue * strength).reshape(height, width, 3)
 
 
