@@ -20,10 +20,10 @@ from rich.table import Table
 from dpm2_core.data.bags import BagSource
 from dpm2_core.data.convert import convert_kitti
 from dpm2_core.data.source import InputSettings
+from dpm2_core.data.trajectory import read_trajectory
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.evaluation.figures import trajectory_png
 from dpm2_core.evaluation.metrics import evaluate
-from dpm2_core.evaluation.trajectory import read_trajectory
 from dpm2_core.files import atomic_write
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3

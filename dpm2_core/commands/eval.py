@@ -11,11 +11,11 @@ import typer
 from rich.console import Console
 
 from dpm2_core.data.kitti import read_calib
+from dpm2_core.data.trajectory import Trajectory, matched, read_trajectory
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.kitti_metric import OFFICIAL_LENGTHS
 from dpm2_core.evaluation.metrics import evaluate
 from dpm2_core.evaluation.report import metrics_table
-from dpm2_core.evaluation.trajectory import Trajectory, matched, read_trajectory
 from dpm2_core.files import atomic_write
 from dpm2_core.geometry import se3
 

@@ -17,10 +17,10 @@ from dpm2_core.config import dump_settings, load_settings
 from dpm2_core.data.ply import write_ply
 from dpm2_core.data.prefetch import prefetch
 from dpm2_core.data.source import Source, open_source
+from dpm2_core.data.trajectory import Trajectory, matched, read_trajectory, write_kitti, write_tum
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.metrics import Metrics, evaluate
 from dpm2_core.evaluation.report import metrics_table
-from dpm2_core.evaluation.trajectory import Trajectory, matched, read_trajectory, write_kitti, write_tum
 from dpm2_core.files import atomic_write
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3

@@ -12,8 +12,8 @@ import pytest
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import PointCloud2
 
+from dpm2_core.data.trajectory import read_trajectory
 from dpm2_core.data.transforms import transform_matrix
-from dpm2_core.evaluation.trajectory import read_trajectory
 from dpm2_core.frame import Keyframe
 from dpm2_core.geometry import se3
 from dpm2_ros.conversions import cloud_to_msg, edge_to_msg, keyframe_name

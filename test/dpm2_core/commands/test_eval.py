@@ -11,8 +11,8 @@ import pytest
 
 from dpm2_core.commands.eval import eval_, parse_lengths
 from dpm2_core.data.kitti import read_calib
+from dpm2_core.data.trajectory import read_trajectory, write_kitti, write_tum
 from dpm2_core.errors import UsageError
-from dpm2_core.evaluation.trajectory import read_trajectory, write_kitti, write_tum
 from dpm2_core.geometry import se3
 
 

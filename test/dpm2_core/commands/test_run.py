@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from dpm2_core.data.convert import convert_kitti
-from dpm2_core.evaluation.trajectory import read_trajectory
+from dpm2_core.data.trajectory import read_trajectory
 from dpm2_core.sim.config import LidarConfig
 from dpm2_core.sim.drive import simulate
 

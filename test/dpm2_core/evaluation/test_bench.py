@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from dpm2_core.commands.bench import bench
+from dpm2_core.data.trajectory import write_kitti
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.evaluation.bench.harness import Options, drives, processors
 from dpm2_core.evaluation.bench.memory import levelling, resident_mb
-from dpm2_core.evaluation.trajectory import write_kitti
 from dpm2_core.geometry import se3
 
 FRAMES = 6

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dpm2_core.data.trajectory import read_trajectory
 from dpm2_core.evaluation.kitti_metric import OFFICIAL_LENGTHS, segment_errors
-from dpm2_core.evaluation.trajectory import read_trajectory
 from dpm2_core.geometry import se3
 
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dpm2_core.data.trajectory import read_trajectory
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.metrics import align, ape_rmse, evaluate, final_drift_percent, path_length, rpe
-from dpm2_core.evaluation.trajectory import read_trajectory
 from dpm2_core.geometry import se3
 
 ELSEWHERE = se3.exp([0.3, -0.2, 2.0, 100, -50, 3])

@@ -179,7 +179,7 @@ def test_no_keyframe_no_correction() -> None:
 
 
 def test_saved_map_holds_all_of_it(tmp_path: Path, lap: tuple[list[Keyframe], Array]) -> None:
-    from dpm2_core.evaluation.trajectory import read_trajectory
+    from dpm2_core.data.trajectory import read_trajectory
 
     mapper = make_mapper(SlamSettings())
     for keyframe in lap[0][:4]:

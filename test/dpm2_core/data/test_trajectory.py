@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from dpm2_core.data.trajectory import Trajectory, matched, read_trajectory, write_kitti, write_tum
 from dpm2_core.errors import UsageError
-from dpm2_core.evaluation.trajectory import Trajectory, matched, read_trajectory, write_kitti, write_tum
 from dpm2_core.geometry import se3
 
 IDENTITY = "1 0 0 0 0 1 0 0 0 0 1 0"
