@@ -49,10 +49,11 @@ class Layout:
         furniture = self._furniture()
         yield from self._scattered(furniture, preset.poles, (0.45, 0.9), 0.3, aligned=True)
         trees = [plants.tree(self.rng) for _ in range(10)]
+        distant = [plants.tree(self.rng, 0.4) for _ in range(10)]
         bushes = [plants.bush(self.rng) for _ in range(8)]
         yield from self._scattered(trees, preset.trees, (0.7, kerb + 3), 0.7, scale=(0.7, 1.15))
-        yield from self._scattered(trees, preset.trees, (kerb + 4, kerb + 40), 0.7)
-        yield from self._scattered(trees, 12 * preset.forest, (5, 30), 0.7, patchy=True)
+        yield from self._scattered(distant, preset.trees, (kerb + 4, kerb + 40), 0.7)
+        yield from self._scattered(distant, 12 * preset.forest, (5, 30), 0.7, patchy=True)
         yield from self._scattered(bushes, 12 * preset.forest, (4, 16), 0.3, patchy=True)
         yield from self._scattered(bushes, preset.bushes, (kerb + 0.8, kerb + 14), 0.5)
         clutter = [*furniture, *(street_box(self.rng) for _ in range(6)), *(car(self.rng) for _ in range(6))]
@@ -166,7 +167,8 @@ class Layout:
         front = (line.xy[start] + line.xy[end]) / 2 + inward * self.rng.uniform(0, 2.0) * (level > 6)
         u, v = np.meshgrid(np.linspace(-0.5, 0.5, 9) * (width - 0.5), np.linspace(0.2, depth, 9))
         spots = front + u.reshape(-1, 1) * along + v.reshape(-1, 1) * inward
-        if self.terrain.edge_at(spots).min() < min(level, self.preset.setback) * 0.7 or not self._free(spots):
+        near = self.terrain.edge_at(spots).min() < min(level, self.preset.setback) * 0.7
+        if near or self.drive.query(spots)[0].min() < CLEAR_OF_DRIVE + 1 or not self._free(spots):
             return None
         outline = [front + a * width / 2 * along + b * inward for a, b in ((-1, 0), (1, 0), (1, depth), (-1, depth))]
         self._take(outline)

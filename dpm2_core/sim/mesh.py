@@ -38,6 +38,11 @@ class Mesh:
     def __len__(self) -> int:
         return len(self.faces)
 
+    def part(self, keep: NDArray[np.bool_]) -> Mesh:
+        """Some of the triangles; the vertices stay."""
+        columns = {f.name: getattr(self, f.name)[keep] for f in fields(self) if f.name != "vertices"}
+        return Mesh(self.vertices, **columns)
+
 
 def make(
     vertices: ArrayLike,

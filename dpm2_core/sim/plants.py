@@ -18,12 +18,15 @@ def _green(rng: np.random.Generator) -> np.ndarray:
     return GREENS[rng.integers(len(GREENS))] * rng.uniform(0.8, 1.15)
 
 
-def tree(rng: np.random.Generator) -> Mesh:
-    """A broad-leaved or a coniferous tree of 5 to 16 m, its foot at the origin."""
-    return _conifer(rng) if rng.random() < 0.2 else _broadleaf(rng)
+def tree(rng: np.random.Generator, leafage: float = 1.0) -> Mesh:
+    """A broad-leaved or a coniferous tree of 5 to 16 m, its foot at the origin.
+
+    `leafage` scales the number of leaf clusters, against their area: less of it will do farther away.
+    """
+    return _conifer(rng, leafage) if rng.random() < 0.2 else _broadleaf(rng, leafage)
 
 
-def _broadleaf(rng: np.random.Generator) -> Mesh:
+def _broadleaf(rng: np.random.Generator, leafage: float) -> Mesh:
     height, clear = rng.uniform(5, 15), rng.uniform(1.6, 3.4)
     girth, green = 0.012 * height + rng.uniform(0.05, 0.14), _green(rng)
     bark = np.array((96, 84, 70)) * rng.uniform(0.7, 1.2)
@@ -49,22 +52,22 @@ def _broadleaf(rng: np.random.Generator) -> Mesh:
         )
         size = np.array([1, 1, rng.uniform(0.6, 1.0)]) * spread * rng.uniform(0.4, 0.7)
         parts.append(blob(tip, size * 0.6, 0.22, rng, Label.VEGETATION, Material.LEAF, green * 0.75))
-        shell = rng.normal(size=(int(55 * spread), 3))
+        shell = rng.normal(size=(int(45 * leafage * spread), 3))
         shell *= rng.uniform(0.5, 1.2, (len(shell), 1)) / np.linalg.norm(shell, axis=1, keepdims=True)
-        parts.append(leaves(tip + shell * size, 0.45, rng, green))
+        parts.append(leaves(tip + shell * size, 0.45 / leafage**0.5, rng, green))
     return merge(parts)
 
 
-def _conifer(rng: np.random.Generator) -> Mesh:
+def _conifer(rng: np.random.Generator, leafage: float) -> Mesh:
     height, foot, green = rng.uniform(5, 14), rng.uniform(0.3, 1.5), _green(rng) * (0.7, 0.8, 0.8)
     radius = height * rng.uniform(0.14, 0.25)
     parts = [rod((0, 0, -0.5), (0, 0, height * 0.9), (0.18, 0.04), 6, Label.TRUNK, Material.BARK, (84, 70, 58))]
-    share = rng.beta(1, 1.6, int(34 * height))
+    share = rng.beta(1, 1.6, int(34 * leafage * height))
     angle = rng.uniform(0, 6.3, len(share))
     out = radius * (1 - share) * rng.uniform(0.5, 1.1, len(share))
     centres = np.stack([out * np.cos(angle), out * np.sin(angle), foot + share * (height - foot)], -1)
     parts += [
-        leaves(centres, 0.5, rng, green),
+        leaves(centres, 0.5 / leafage**0.5, rng, green),
         rod((0, 0, foot), (0, 0, height), (radius * 0.75, 0.02), 9, Label.VEGETATION, Material.LEAF, green * 0.7),
     ]
     return merge(parts)
@@ -78,7 +81,7 @@ def bush(rng: np.random.Generator) -> Mesh:
         at = np.array([*rng.normal(0, 0.45 * size, 2), size * rng.uniform(0.4, 0.8)])
         radii = size * rng.uniform(0.5, 0.9, 3)
         parts.append(blob(at, radii * 0.65, 0.25, rng, Label.VEGETATION, Material.LEAF, green * 0.8))
-        shell = rng.normal(size=(int(90 * size), 3))
+        shell = rng.normal(size=(int(70 * size), 3))
         parts.append(leaves(at + shell / np.linalg.norm(shell, axis=1, keepdims=True) * radii, 0.28, rng, green))
     return merge(parts)
 

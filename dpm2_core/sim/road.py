@@ -228,9 +228,11 @@ def _road_of_poses(kind: str, preset: Preset, rng: np.random.Generator) -> Road:
     # Standing frames are noise in heading: the path leaves them out, the progress keeps them.
     keep = np.concatenate([[True], np.diff(np.floor(np.cumsum(moved) / STEP)) > 0, [True]])
     raw = Path(position[keep, :2])
-    drive = Path(_smooth(raw.xy, 2.0, False))
-    at = np.concatenate([[0.0], np.cumsum(moved)])
-    travelled: Array = np.interp(at, at[keep], _arc_lengths(position[keep, :2])) * (drive.length / raw.length)
+    smooth = _smooth(raw.xy, 2.0, False)
+    drive = Path(smooth)
+    at = _arc_lengths(position[:, :2])
+    on_raw = np.interp(at, at[keep], _arc_lengths(position[keep, :2]))
+    travelled: Array = np.interp(on_raw, raw.s, _arc_lengths(smooth))
     centre = drive.shifted(preset.lane)
     z = gaussian_filter1d(np.interp(drive.s, travelled, position[:, 2]), 4)
     z = np.interp(np.linspace(0, 1, len(centre.xy)), np.linspace(0, 1, len(z)), z)
@@ -259,6 +261,5 @@ def _first_visits(xy: Array, radius: float = 5.0, lag: float = 30.0) -> Iterator
     pairs = pairs[np.abs(pairs[:, 0] - pairs[:, 1]) > lag / STEP]
     new = np.ones(len(xy), bool)
     new[pairs.max(1)] = False
-    # a stub shorter than 10 m between two returns would be a second road on top of the first
     edges = np.flatnonzero(np.diff(np.concatenate([[0], new.astype(np.int8), [0]])))
-    return ((int(a), int(b)) for a, b in edges.reshape(-1, 2) if (b - a) * STEP > 10)
+    return ((int(a), int(b)) for a, b in edges.reshape(-1, 2) if b - a > 3)

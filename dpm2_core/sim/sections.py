@@ -3,10 +3,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial import cKDTree
 
 from dpm2_core.sim import plants
 from dpm2_core.sim.materials import Label, Material
@@ -29,20 +30,22 @@ def swept(
     return sheet(np.concatenate([xy, z[..., None]], -1), label, material, colour)
 
 
+def clear(meshes: Iterable[Mesh], road: Road, terrain: Terrain) -> Iterator[Mesh]:
+    """The meshes without what would bar the drive, where a road from a file meets or crosses itself."""
+    drive = cKDTree(road.drive.xy)
+    for mesh in meshes:
+        xy = mesh.vertices[:, :2]
+        low = mesh.vertices[:, 2] < terrain.height_at(xy) + 3
+        barring = low & (drive.query(xy, distance_upper_bound=1.5)[0] < 1.5)
+        yield mesh.part(~barring[mesh.faces].any(1))
+
+
 def highway(road: Road, terrain: Terrain, rng: np.random.Generator) -> Iterator[Mesh]:
     """A concrete median, guard rails and noise barriers; trees behind the barriers."""
     half = terrain.preset.half_width
     grey = (172, 170, 164)
-    median = [
-        (-0.32, 0),
-        (-0.32, 0.08),
-        (-0.15, 0.33),
-        (-0.1, 0.85),
-        (0.1, 0.85),
-        (0.15, 0.33),
-        (0.32, 0.08),
-        (0.32, 0),
-    ]
+    flank = [(0.1, 0.85), (0.15, 0.33), (0.32, 0.08), (0.32, 0)]
+    median = [*((-y, z) for y, z in reversed(flank)), *flank]
     for street in road.streets[: road.main]:
         yield swept(street, terrain, median, Label.FENCE, Material.CONCRETE, grey)
         for side in (-1, 1):
@@ -52,10 +55,11 @@ def highway(road: Road, terrain: Terrain, rng: np.random.Generator) -> Iterator[
             y = side * (half + rng.uniform(3, 5))
             wall = [(y, -0.3), (y, WALL), (y + side * 0.25, WALL), (y + side * 0.25, -0.3)]
             yield swept(street, terrain, wall, Label.STRUCTURE, Material.TILE, rng.uniform(110, 190, 3))
-    trees = [plants.tree(rng) for _ in range(8)]
+    trees = [plants.tree(rng, 0.4) for _ in range(8)]
     for line in terrain.contour(half + 12):
         at = rng.integers(0, len(line.xy), len(line.xy) // 7)
         xy = line.xy[at] + line.outward[at] * rng.uniform(0, 25, (len(at), 1))
+        xy = xy[terrain.edge_at(xy) > 10]  # not between two arms of a road
         for k, tree in enumerate(trees):
             mine = xy[k :: len(trees)]
             if len(mine):

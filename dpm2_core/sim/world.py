@@ -131,9 +131,9 @@ def build_world(road: str = "random", preset: PresetName = "city", seed: int = 0
     terrain = Terrain(streets, kind, rngs[1])
     meshes = [terrain.ground()]
     if preset == "highway":
-        meshes += sections.highway(streets, terrain, rngs[2])
+        meshes += sections.clear(sections.highway(streets, terrain, rngs[2]), streets, terrain)
     elif preset == "tunnel":
-        meshes += sections.tunnel(streets, terrain, rngs[2])
+        meshes += sections.clear(sections.tunnel(streets, terrain, rngs[2]), streets, terrain)
     else:
         meshes += Layout(streets, terrain, kind, rngs[2]).meshes()
     traffic = make_traffic(streets, terrain, kind, rngs[3])
