@@ -20,7 +20,7 @@ setup: $(READY)  ## create .venv with everything in it
 $(READY): setup.py pyproject.toml
 	@test -n "$(PYTHON)" || { echo "no Python 3.11 or 3.12 on PATH; set PYTHON=/path/to/python3.11" >&2; exit 2; }
 	@test -x $(BIN)/python || $(PYTHON) -m venv .venv || { rm -rf .venv; echo "the venv module is missing (Debian, Ubuntu: apt install python3-venv)" >&2; exit 1; }
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[$(EXTRAS)]'
+	$(BIN)/python -m pip install -qq --disable-pip-version-check -e '.[$(EXTRAS)]'
 	@$(BIN)/python -m dpm2_ros.build_tf2_msgs || echo "continuing without /tf" >&2
 	@touch $@
 
@@ -32,13 +32,13 @@ test: setup  ## all tests
 
 lint:  ## style and types
 	@$(MAKE) --no-print-directory setup
-	@$(BIN)/python -c 'import ruff, mypy' 2>/dev/null || $(BIN)/python -m pip install --quiet '.[dev]' --no-build-isolation 2>/dev/null || $(BIN)/python -m pip install --quiet 'ruff>=0.9' 'mypy>=1.13' types-PyYAML
+	@$(BIN)/python -c 'import ruff, mypy' 2>/dev/null || $(BIN)/python -m pip install -qq '.[dev]' --no-build-isolation 2>/dev/null || $(BIN)/python -m pip install -qq 'ruff>=0.9' 'mypy>=1.13' types-PyYAML
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
 bench: setup  ## the figures of benchmarks/, beside KISS-ICP
-	@$(BIN)/python -c 'import kiss_icp' 2>/dev/null || $(BIN)/python -m pip install --quiet -e '.[bench]'
+	@$(BIN)/python -c 'import kiss_icp' 2>/dev/null || $(BIN)/python -m pip install -qq -e '.[bench]'
 	$(BIN)/python -m dpm2_core.cli bench $(ARGS)
 
 sim: setup  ## a synthetic drive in KITTI layout in out/sim

@@ -87,8 +87,7 @@ def prepare(src: Path | None, out: Path, frames: int, seed: int, console: Consol
         return src
     if src is None:
         src = out / f"city_{frames}_{seed}"
-        if not (src / "poses.txt").is_file():
-            shutil.rmtree(src, ignore_errors=True)
+        if not src.is_dir():
             part = src.with_name(src.name + ".part")
             shutil.rmtree(part, ignore_errors=True)
             _simulate(part, frames, seed)

@@ -115,11 +115,14 @@ def replay(
     result = Replay()
     try:
         with _Listener(result) as listener:
+            alive = _watch(slam, "slam_node", out)
+            while not listener.connected():  # or the first poses would go out before anybody hears them
+                alive()
+                listener.spin(0.1)
             playing = [str(bag), "--rate", str(rate), "--wait", "60", "--log", str(times)]
             player = start("bag_player", playing, environment, out / "bag_player.log")
             while player.poll() is None:
-                if slam.poll() is not None:
-                    raise Dpm2Error(f"slam_node ended with {slam.returncode}: {_tail(out / 'slam_node.log')}")
+                alive()
                 listener.spin(0.2)
                 progress(len(result.poses))
             if player.returncode:
@@ -132,6 +135,16 @@ def replay(
             result.exit_codes["bag_player"] = stop(player) if player.poll() is None else player.returncode
         result.exit_codes["slam_node"] = stop(slam)
     return result
+
+
+def _watch(process: subprocess.Popen[bytes], name: str, out: Path) -> Callable[[], None]:
+    """A function that raises when the process has ended."""
+
+    def alive() -> None:
+        if process.poll() is not None:
+            raise Dpm2Error(f"{name} ended with {process.returncode}: {_tail(out / f'{name}.log')}")
+
+    return alive
 
 
 def _drain(listener: _Listener, result: Replay) -> None:
@@ -184,6 +197,11 @@ class _Listener:
         self._executor.shutdown()
         self._node.destroy_node()
         rclpy.try_shutdown()
+
+    def connected(self) -> bool:
+        """Whether slam_node is heard, and its other topics have been found too."""
+        topics = ("/dpm2/odom", "/dpm2/keyframe_odom", "/dpm2/loop_closure", "/dpm2/map")
+        return bool(self._result.diagnostics) and all(self._node.count_publishers(topic) for topic in topics)
 
     def map_is_complete(self) -> bool:
         """Whether the last map holds the last keyframe."""
