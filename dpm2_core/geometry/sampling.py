@@ -32,16 +32,15 @@ def voxel_first(points: Points, size: float) -> Index:
 
 
 def farthest_points(points: Points, count: int) -> Index:
-    """Farthest point sampling of (N, 3) points from the first one on: min(N, count) indices, in sampling order.
+    """Farthest point sampling of (N, 3) points: min(N, count) indices, in sampling order.
 
+    The start is the same for the same cloud; which point it is follows from fpsample's tree, not from `start_idx` alone.
     A prefix of the result is the farthest point sampling of that length: one call serves all levels of a pyramid.
     """
-    if len(points) <= count:
-        # all of them, still in farthest-first order, so that prefixes stay well spread
-        count = len(points)
+    count = min(count, len(points))
     if count <= 1:
         return np.arange(count)
-    height = 3 if len(points) < 1000 else 5  # of the bucket tree; 5 is fastest around 15,000 points
+    height = min(5, len(points).bit_length() - 1)  # of the bucket tree; 5 is fastest around 15,000 points
     return fpsample.bucket_fps_kdline_sampling(points, count, h=height, start_idx=0).astype(np.int64)
 
 

@@ -19,7 +19,7 @@ def zscore(values: Tensor, mask: Tensor | None = None) -> Tensor:
     mean = (values * weight).sum(-1, keepdim=True) / count
     centred = (values - mean) * weight
     deviation = ((centred * centred).sum(-1, keepdim=True) / count).sqrt()
-    return centred / deviation.clamp(min=1e-6)
+    return centred / deviation.clamp(min=1e-4)
 
 
 def sine_code(xyz: Tensor, width: int) -> Tensor:

@@ -76,7 +76,8 @@ class FusionLayer(nn.Module):
         spatial = fusion.kind not in ("without_spatial", "scale_dot")
         self.gains = nn.ParameterList()
         if spatial and fusion.learned_gain:
-            self.gains.extend(nn.Parameter(torch.ones(fusion.heads, 1, 1)) for _ in range(2))
+            branches = 1 if self.image is None else 2
+            self.gains.extend(nn.Parameter(torch.ones(fusion.heads, 1, 1)) for _ in range(branches))
         self.camera = camera
 
     def _bias(self, branch: int, bias: Tensor | None) -> Tensor | None:

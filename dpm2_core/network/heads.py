@@ -31,6 +31,10 @@ class OffsetHead(nn.Module):
         )  # fmt: skip
         self.skip = nn.Linear(2 * width, width // 4)
         self.out = nn.Linear(width // 4, 9 if precision else 3)
+        nn.init.zeros_(
+            self.out.weight
+        )  # no offset, 0.5 m: the likelihood's steep gradients wait until features mean something
+        nn.init.zeros_(self.out.bias)
 
     def forward(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
         """a, b (..., C): offset (..., 3), m, and lower-triangular L (..., 3, 3), 1/m, of the precision L L^T.

@@ -110,8 +110,10 @@ def whitened(T: Tensor, pairs: Correspondences) -> tuple[Tensor, Tensor]:
     source, target, L = pairs.source.double(), pairs.target.double(), pairs.L.double()
     moved_back = ((target - t)[..., None, :] @ R)[..., 0, :]  # R^T (y - t)
     L = torch.cat([L[:, :half], R.transpose(-1, -2) @ L[:, half:]], 1)  # all in the source frame
-    zero = torch.zeros_like(source[..., 0])
-    x, y, z = source.unbind(-1)
+    # A step turns the point that its own frame does not hold fixed: the target's, seen from the source, or the source's.
+    arm = torch.cat([moved_back[:, :half], source[:, half:]], 1)
+    zero = torch.zeros_like(arm[..., 0])
+    x, y, z = arm.unbind(-1)
     minus_hat = torch.stack([zero, z, -y, -z, zero, x, y, -x, zero], -1).unflatten(-1, (3, 3))
     eye = torch.eye(3, dtype=source.dtype, device=source.device).expand_as(minus_hat)
     jacobian = L.transpose(-1, -2) @ torch.cat([minus_hat, eye], -1)

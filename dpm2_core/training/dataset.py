@@ -87,6 +87,7 @@ class GroupDataset(IterableDataset):
         shard: tuple[int, int] = (0, 1),
     ) -> None:
         self.settings, self.network, self.seed, self.start, self.shard = settings, network, seed, start, shard
+        self.draw = draw_group
         drives: list[PackedDrive] = []
         chances: list[float] = []
         for folder, weight in settings.packed.items():
@@ -115,7 +116,7 @@ class GroupDataset(IterableDataset):
         poses = []
         for _ in range(settings.groups):
             drive = self.drives[noise.choice(len(self.drives), p=self.chances)]
-            for index in draw_group(drive.poses, settings.frames, settings.radius, noise):
+            for index in self.draw(drive.poses, settings.frames, settings.radius, noise):
                 sample: Sample = augment(drive[index], settings.augment, noise)
                 pyramids.append(build_pyramid(sample.cloud, self.network.points))
                 images.append(sample.images if settings.images else ())

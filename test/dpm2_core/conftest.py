@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""For the tests of network and training: a street of boxes, a camera, and networks small enough."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+
+from dpm2_core.config import settings_from
+from dpm2_core.frame import Camera, Image
+from dpm2_core.geometry import se3
+from dpm2_core.network.config import NetworkSettings
+from dpm2_core.network.model import DeepPointMap2
+
+TINY = {
+    "preset": "tiny",
+    "channels": 32,
+    "points": {
+        "stages": [
+            {"points": 256, "radius": 2, "neighbours": 8, "channels": 16},
+            {"points": 64, "radius": 6, "neighbours": 8, "channels": 32, "residual_radii": [12.0]},
+        ]
+    },
+    "image": {"size": [32, 64], "depths": [1, 1, 1], "channels": [8, 16, 16], "pyramid": 16, "strides": [8, 16]},
+    "fusion": {"points": 48, "layers": 1, "levels": [1], "alpha_image": [0.3, 1.0, 2.5, 6.0]},
+    "decoder": {"width": 32, "layers": 1},
+}
+
+
+def tiny(**changes: dict[str, object]) -> NetworkSettings:
+    """The tiny network with sections changed."""
+    tree = {key: {**value, **changes.get(key, {})} if isinstance(value, dict) else value for key, value in TINY.items()}
+    return settings_from(NetworkSettings, tree)
+
+
+def street(noise: np.random.Generator, points: int = 4000) -> np.ndarray:
+    """(points, 3) float32 on the ground and on the faces of boxes, 1.7 m below to 8 m above the sensor."""
+    ground = np.column_stack([noise.uniform(-40, 40, (points // 2, 2)), np.full(points // 2, -1.7)])
+    parts = [ground]
+    boxes = 25
+    for _ in range(boxes):
+        centre = np.append(noise.uniform(-35, 35, 2), -1.7)
+        half = noise.uniform([1, 1, 1], [5, 5, 8])
+        side = noise.uniform(-1, 1, (points // 2 // boxes, 3))
+        axis = noise.integers(0, 2, len(side))
+        side[np.arange(len(side)), axis] = np.sign(side[np.arange(len(side)), axis])
+        parts.append(centre + side * half)
+    return np.concatenate(parts).astype(np.float32)
+
+
+def picture(noise: np.random.Generator, size: tuple[int, int] = (128, 64)) -> Image:
+    """A forward-looking camera with a random picture, (width, height)."""
+    K = np.array([[60.0, 0, size[0] / 2 - 0.5], [0, 60.0, size[1] / 2 - 0.5], [0, 0, 1]])
+    T_lidar_cam = se3.make([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0.3, 0.05, -0.1])
+    pixels = noise.integers(0, 255, (size[1], size[0], 3), dtype=np.uint8)
+    return Image(pixels, Camera(K, T_lidar_cam, size))
+
+
+@pytest.fixture(name="tiny")
+def _tiny() -> Callable[..., NetworkSettings]:
+    """Settings of the tiny network, with sections changed."""
+    return tiny
+
+
+@pytest.fixture(name="street")
+def _street() -> Callable[..., np.ndarray]:
+    """street(noise, points=4000): a cloud."""
+    return street
+
+
+@pytest.fixture(name="picture")
+def _picture() -> Callable[..., Image]:
+    """picture(noise, size=(128, 64)): a picture with its camera."""
+    return picture
+
+
+@pytest.fixture
+def noise() -> np.random.Generator:
+    """Seeded."""
+    return np.random.default_rng(7)
+
+
+@pytest.fixture
+def model() -> DeepPointMap2:
+    """A tiny network with seeded random weights."""
+    torch.manual_seed(0)
+    return DeepPointMap2(tiny()).eval()

@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Encoder: sizes, masks, invariances, and pictures that are missing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.frame import Frame, Image
+from dpm2_core.geometry import se3
+from dpm2_core.network.config import PRESETS, preset
+from dpm2_core.network.encoder import Encoder, collate_views, resize
+from dpm2_core.network.model import DeepPointMap2
+from dpm2_core.network.pointnext import argmax_neighbour
+from dpm2_core.network.pyramid import build_pyramid, collate, crop
+from dpm2_core.network.spatial import Views
+
+
+def frame(cloud: np.ndarray, *images: Image) -> Frame:
+    """A frame of (N, 3) points."""
+    return Frame(0, np.column_stack([cloud, np.zeros(len(cloud))]).astype(np.float32), images=images)
+
+
+def parameters(module: torch.nn.Module) -> int:
+    """Number of them."""
+    return sum(p.numel() for p in module.parameters())
+
+
+def test_parameters_are_those_of_deep_point_map() -> None:
+    """Version 1, LiDAR only: 3.824 M in the encoder, 2.776 M in the decoder, as counted from the published shapes."""
+    model = DeepPointMap2(preset("v1"))
+    assert round(parameters(model.encoder) / 1e6, 3) == 3.824
+    assert round(parameters(model.decoder) / 1e6, 3) == 2.776
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_give_256_descriptors_of_128_channels(name: str, noise: np.random.Generator, street: Callable) -> None:
+    """The contract of every preset, and 70 kB a frame."""
+    torch.manual_seed(0)
+    out = Encoder(preset(name)).eval().encode(frame(street(noise, 6000)))
+    assert out.xyz.shape == (256, 3)
+    assert out.features.shape == (256, 128)
+    assert out.xyz.nbytes + out.features.nbytes <= 70_000
+    assert np.isfinite(out.features).all()
+
+
+def test_unknown_preset_and_backbone_are_refused(tiny: Callable) -> None:
+    """In one line that names the choices."""
+    with pytest.raises(UsageError, match=r"network preset big: want one of small, base, paper, v1"):
+        preset("big")
+    with pytest.raises(UsageError, match=r"points.backbone kpconv: want one of pointnext"):
+        Encoder(tiny(points={"backbone": "kpconv"}))
+    with pytest.raises(UsageError, match=r"image.backbone vgg: want one of none, convnext, timm:NAME"):
+        Encoder(tiny(image={"backbone": "vgg"}))
+
+
+def test_order_of_points_changes_nothing(model: DeepPointMap2, noise: np.random.Generator, street: Callable) -> None:
+    """A scan of one point a voxel gives the same descriptors in any order of its points."""
+    cloud = street(noise, 1500)
+    settings = model.settings.points
+    while len(thinned := crop(cloud, settings)) < len(cloud):  # a lost outermost point moves the grid: until it rests
+        cloud = thinned
+    one, other = (model.encoder.encode(frame(c)) for c in (cloud, noise.permutation(cloud)))
+    assert np.array_equal(one.xyz, other.xyz)
+    assert np.array_equal(one.features, other.features)
+
+
+def test_heading_changes_nothing(model: DeepPointMap2, noise: np.random.Generator, street: Callable) -> None:
+    """Turned about the vertical, the same samples get the same features: what `view_aligned` promises."""
+    pyramid = build_pyramid(street(noise, 1500), model.settings.points)
+    R = se3.exp([0, 0, 2.1, 0, 0, 0])[:3, :3].astype(np.float32)
+    turned = replace(pyramid, xyz=pyramid.xyz @ R.T, patches=(pyramid.patches @ R.T).astype(np.float16))
+    one, other = (model.encoder(collate([p])).tokens for p in (pyramid, turned))
+    torch.testing.assert_close(one.features, other.features, atol=2e-3, rtol=0)  # patches are float16
+
+
+def test_padding_changes_nothing(model: DeepPointMap2, noise: np.random.Generator, street: Callable) -> None:
+    """A sparse scan encodes alike alone and in a batch with a full one; its padding is masked."""
+    settings = model.settings.points
+    sparse, full = build_pyramid(street(noise, 100)[:40], settings), build_pyramid(street(noise), settings)
+    alone = model.encoder(collate([sparse])).tokens
+    together = model.encoder(collate([full, sparse])).tokens
+    assert together.mask.sum(1).tolist() == [48, 40]
+    torch.testing.assert_close(together.features[1], alone.features[0], atol=1e-5, rtol=0)
+    poisoned = sparse.xyz.copy()
+    poisoned[sparse.count :] = 1e3  # the values of padding are not read either
+    changed = type(sparse)(poisoned, sparse.count, sparse.patches, sparse.groups, sparse.locals, sparse.ups)
+    torch.testing.assert_close(
+        model.encoder(collate([changed])).tokens.features[0, :40], alone.features[0, :40], atol=1e-5, rtol=0
+    )
+
+
+@pytest.mark.parametrize("beams", [16, 32])
+def test_sparse_sensors(model: DeepPointMap2, noise: np.random.Generator, beams: int) -> None:
+    """Few beams give finite descriptors."""
+    azimuth = np.linspace(-np.pi, np.pi, 100)
+    elevation = np.radians(np.linspace(-15, -3, beams))[:, None]
+    reach = 1.7 / np.tan(-elevation)
+    cloud = np.stack([reach * np.cos(azimuth), reach * np.sin(azimuth), -1.7 + 0 * reach * azimuth], -1).reshape(-1, 3)
+    assert np.isfinite(model.encoder.encode(frame(cloud)).features).all()
+
+
+@pytest.mark.parametrize("cloud", [np.zeros((0, 3)), np.full((50, 3), np.nan), np.zeros((500, 3)), np.ones((5, 3)) * 9])
+def test_empty_scans_are_refused(model: DeepPointMap2, cloud: np.ndarray) -> None:
+    """Nothing in range: an error that says how much there was."""
+    with pytest.raises(Dpm2Error, match=r"scan has \d+ points within"):
+        model.encoder.encode(frame(cloud))
+
+
+def views_of(model: DeepPointMap2, *frames: list[Image]) -> Views:
+    """Batch of pictures."""
+    views = collate_views(frames, model.settings.image)
+    assert views is not None
+    return views
+
+
+def test_missing_picture_equals_no_camera(
+    model: DeepPointMap2, noise: np.random.Generator, street: Callable, picture: Callable
+) -> None:
+    """Exactly: in a batch whose other frame has a picture, the one without gives what the LiDAR alone gives."""
+    pyramid = build_pyramid(street(noise), model.settings.points)
+    alone = model.encoder(collate([pyramid])).tokens.features
+    both = model.encoder(collate([pyramid, pyramid]), views_of(model, [], [picture(noise)])).tokens.features
+    assert torch.equal(both[0], alone[0])
+    assert (both[1] - alone[0]).abs().max() > 1e-3  # the picture is used
+
+
+def test_only_reference_points_in_view_read_the_picture(
+    model: DeepPointMap2, noise: np.random.Generator, street: Callable, picture: Callable
+) -> None:
+    """With one fusion layer, what lies behind the camera does not depend on the pixels."""
+    pyramid = build_pyramid(street(noise), model.settings.points)
+    points = collate([pyramid])
+    one, other = (model.encoder(points, views_of(model, [picture(noise)])).tokens for _ in range(2))
+    behind = one.xyz[0, :, 0] < 0
+    assert torch.equal(one.features[0][behind], other.features[0][behind])
+    assert not torch.equal(one.features[0][~behind], other.features[0][~behind])
+
+
+def test_several_cameras(model: DeepPointMap2, noise: np.random.Generator, street: Callable, picture: Callable) -> None:
+    """Their order does not matter."""
+    pyramid = build_pyramid(street(noise), model.settings.points)
+    a, b = picture(noise), picture(noise)
+    one = model.encoder(collate([pyramid]), views_of(model, [a, b])).tokens.features
+    other = model.encoder(collate([pyramid]), views_of(model, [b, a])).tokens.features
+    torch.testing.assert_close(one, other, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize(
+    "kind", ["biased", "point_painting", "roi_pooling", "scale_dot", "without_learnable", "without_spatial"]
+)
+@pytest.mark.parametrize("reference", ["fps", "uniform", "normal"])
+def test_alternatives_of_the_ablations(
+    noise: np.random.Generator, kind: str, reference: str, tiny: Callable, street: Callable, picture: Callable
+) -> None:
+    """Every choice of Tables 3 and 4 runs, uses the picture, and gives each parameter of its own a gradient."""
+    torch.manual_seed(0)
+    model = DeepPointMap2(tiny(fusion={"kind": kind, "reference": reference}))
+    points = collate([build_pyramid(street(noise), model.settings.points)])
+    features = model.encoder(points, views_of(model, [picture(noise)])).tokens.features
+    features.square().sum().backward()
+    fusion = model.encoder.fusion
+    assert fusion is not None
+    without = {name for name, p in fusion.named_parameters() if p.grad is None}
+    assert not without
+    assert features.isfinite().all()
+
+
+def test_resize_moves_the_intrinsics_with_the_pixels() -> None:
+    """A bright pixel's ray is the same before and after halving: centres of pixels are at integers."""
+    pixels = np.zeros((64, 128, 3), np.uint8)
+    pixels[20:22, 40:42] = 255  # centre (40.5, 20.5)
+    K = np.array([[60.0, 0, 63.5], [0, 60.0, 31.5], [0, 0, 1]])
+    small, K_small = resize(pixels, K, (32, 64))
+    v, u = np.unravel_index(small[0].argmax(), small[0].shape)
+    before = np.linalg.solve(K, [40.5, 20.5, 1])
+    np.testing.assert_allclose(np.linalg.solve(K_small, [u, v, 1]), before, atol=1e-9)
+
+
+def test_argmax_neighbour() -> None:
+    """The index that `amax` would choose, in bf16 and float32, negative values included."""
+    torch.manual_seed(0)
+    for dtype in (torch.bfloat16, torch.float32):
+        sums = (torch.randn(2, 9, 24, 8) - 1).to(dtype)
+        best = argmax_neighbour(sums)
+        found = sums.gather(2, best[:, :, None])[:, :, 0]
+        torch.testing.assert_close(found, sums.amax(2), atol=1e-4, rtol=1e-4)  # float32 loses 8 bits to the index

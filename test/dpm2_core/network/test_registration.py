@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From correspondences to a pose, and the decoder around it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from dpm2_core.geometry import se3
+from dpm2_core.geometry.kabsch import transform
+from dpm2_core.network.descriptors import Descriptors, merge, to_tokens
+from dpm2_core.network.heads import OffsetHead, into_set_frame
+from dpm2_core.network.model import DeepPointMap2
+from dpm2_core.network.pointnext import from_view, to_view
+from dpm2_core.network.registration import (
+    Correspondences,
+    best_pairs,
+    precision_solve,
+    robust_kabsch,
+    softmax_both,
+    whitened,
+)
+
+
+def perfect(noise: np.random.Generator, batch: int = 2, pairs: int = 60) -> tuple[Correspondences, torch.Tensor]:
+    """Matches without error, and the pose."""
+    T = torch.from_numpy(se3.exp(noise.normal(0, 1, (batch, 6)) * [0.3, 0.3, 2, 5, 5, 1]))
+    source = torch.from_numpy(noise.normal(0, 15, (batch, 2 * pairs, 3)))
+    root = torch.from_numpy(noise.normal(0, 1, (batch, 2 * pairs, 3, 3))).tril()
+    root.diagonal(dim1=-2, dim2=-1).abs_().add_(0.5)
+    weight = torch.from_numpy(noise.uniform(0.2, 1, (batch, 2 * pairs)))
+    return Correspondences(source, transform(T, source), weight, root), T
+
+
+def test_perfect_matches_give_the_exact_pose(noise: np.random.Generator) -> None:
+    """Weighted SVD to rounding; the precision-weighted solve stays there and gets there from 0.3 rad and 2 m off."""
+    pairs, T = perfect(noise)
+    found, _ = robust_kabsch(pairs)
+    torch.testing.assert_close(found, T, atol=1e-6, rtol=0)
+    off = T @ torch.from_numpy(se3.exp([0.1, -0.1, 0.3, 1, -2, 0.5]))
+    torch.testing.assert_close(precision_solve(off, pairs, rounds=30)[0], T, atol=1e-6, rtol=0)
+
+
+def test_outliers_are_left_out(noise: np.random.Generator) -> None:
+    """A fifth of the matches off by tens of metres, with low confidence, moves neither solution by a millimetre."""
+    pairs, T = perfect(noise)
+    wrong = torch.arange(pairs.source.shape[1]) % 5 == 0
+    target = torch.where(wrong[:, None], pairs.target + 30 * torch.randn(pairs.target.shape), pairs.target)
+    pairs = pairs._replace(target=target, weight=torch.where(wrong, 0.05, pairs.weight))
+    found, inliers = robust_kabsch(pairs, rounds=10)
+    assert not inliers[:, wrong].any()
+    torch.testing.assert_close(precision_solve(found, pairs)[0], T, atol=1e-3, rtol=0)
+
+
+def test_precision_tells_which_direction_to_trust(noise: np.random.Generator) -> None:
+    """Points on planes, matched anywhere along them: useless to the SVD, exact with precision across the planes."""
+    pairs, T = perfect(noise, batch=1, pairs=150)
+    n = pairs.source.shape[1]
+    normal = torch.nn.functional.normalize(torch.from_numpy(noise.normal(0, 1, (n, 3))), dim=-1)
+    slide = torch.from_numpy(noise.normal(0, 0.7, (n, 3)))
+    slide = slide - (slide * normal).sum(-1, keepdim=True) * normal
+    # In the first half the precision is given in the source frame, in the second in the target frame.
+    half = n // 2
+    R = T[0, :3, :3]
+    source = pairs.source.clone()
+    source[0, :half] += slide[:half]
+    target = pairs.target.clone()
+    target[0, half:] += slide[half:]
+    across = torch.linalg.cholesky(1e4 * normal[:, :, None] * normal[:, None] + 1e-2 * torch.eye(3).double())
+    pairs = Correspondences(source, target, torch.ones(1, n).double(), across[None])
+    svd, _ = robust_kabsch(pairs)
+    solved, information = precision_solve(svd, pairs)
+    error = se3.log(se3.inverse(T[0].numpy()) @ solved[0].numpy())
+    assert np.linalg.norm(error[3:]) < 0.01
+    assert np.linalg.norm(svd[0, :3, 3] - T[0, :3, 3]) > 3 * np.linalg.norm(error[3:])
+    assert np.linalg.eigvalsh(information[0].numpy()).min() > 0
+    assert torch.linalg.det(R).item() == pytest.approx(1)
+
+
+def test_jacobian_of_the_residuals(noise: np.random.Generator) -> None:
+    """Against central differences of T exp(xi)."""
+    pairs, T = perfect(noise, pairs=5)
+    pairs = pairs._replace(target=pairs.target + 0.3)
+    _, jacobian = whitened(T, pairs)
+    for k in range(6):
+        step = torch.from_numpy(se3.exp(np.eye(6)[k] * 1e-6))
+        back = torch.from_numpy(se3.exp(-np.eye(6)[k] * 1e-6))
+        numeric = (whitened(T @ step, pairs)[0] - whitened(T @ back, pairs)[0]) / 2e-6
+        torch.testing.assert_close(jacobian[..., k], numeric, atol=1e-4, rtol=1e-4)
+
+
+def test_moving_both_clouds_moves_the_answer(noise: np.random.Generator) -> None:
+    """T' = A T B^-1 when the target moves by A and the source by B, to 1e-4."""
+    pairs, _ = perfect(noise)
+    pairs = pairs._replace(
+        target=pairs.target + 0.2 * torch.randn(pairs.target.shape), L=torch.eye(3).expand_as(pairs.L)
+    )
+    A, B = (torch.from_numpy(se3.exp(noise.normal(0, 1, (2, 6)) * [1, 1, 1, 9, 9, 9])) for _ in range(2))
+    moved = pairs._replace(source=transform(B, pairs.source), target=transform(A, pairs.target))
+    for solve in (lambda p: robust_kabsch(p)[0], lambda p: precision_solve(robust_kabsch(p)[0], p, rounds=30)[0]):
+        expected = A @ solve(pairs) @ torch.linalg.inv(B)
+        torch.testing.assert_close(solve(moved), expected, atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize(("n", "m", "k"), [(256, 256, 128), (256, 512, 192), (3, 2, 1), (1, 1, 0)])
+def test_number_of_pairs(n: int, m: int, k: int) -> None:
+    """floor(0.5 (M + N)) // 2 of the most probable, in descending order."""
+    probability = torch.rand(2, n, m)
+    value, row, column = best_pairs(probability, 0.5)
+    assert value.shape == (2, k)
+    assert torch.equal(value, probability[torch.arange(2)[:, None], row, column])
+    assert (value.diff() <= 0).all()
+
+
+def test_dual_softmax_at_padding_is_zero() -> None:
+    """Probabilities of valid pairs do not depend on what is padded."""
+    scores = torch.randn(1, 4, 5)
+    masks = torch.tensor([[True, True, True, False]]), torch.tensor([[True, True, True, True, False]])
+    probability = softmax_both(scores, *masks)
+    assert (probability[0, 3] == 0).all()
+    assert (probability[0, :, 4] == 0).all()
+    torch.testing.assert_close(probability[:, :3, :4], scores[:, :3, :4].softmax(2) * scores[:, :3, :4].softmax(1))
+
+
+def test_view_frames_are_inverse() -> None:
+    """Offsets and precisions go into the set's frame and back; R L has the covariance R C R^T."""
+    axis = torch.nn.functional.normalize(torch.randn(7, 2), dim=-1)
+    vectors = torch.randn(7, 3)
+    torch.testing.assert_close(to_view(from_view(vectors, axis), axis), vectors)
+    L = torch.randn(7, 3, 3).tril()
+    offset, turned = into_set_frame(vectors, L, axis)
+    precision = L @ L.mT
+    torch.testing.assert_close(
+        (offset[:, None] @ (turned @ turned.mT) @ offset[..., None]).squeeze(),
+        (vectors[:, None] @ precision @ vectors[..., None]).squeeze(),
+        atol=1e-4,
+        rtol=1e-4,
+    )
+
+
+def test_offset_head_starts_without_offset() -> None:
+    """Zero offset and a deviation of half a metre, whatever the features; a valid triangle always."""
+    head = OffsetHead(32, precision=True)
+    offset, L = head(torch.randn(5, 32), torch.randn(5, 32))
+    assert (offset == 0).all()
+    torch.testing.assert_close(L, torch.eye(3).expand(5, 3, 3) * 2.0, atol=0.03, rtol=0)
+    torch.nn.init.normal_(head.out.weight)
+    assert (head(torch.randn(5, 32), torch.randn(5, 32))[1].diagonal(dim1=-2, dim2=-1) > 0).all()
+
+
+def described(model: DeepPointMap2, noise: np.random.Generator, n: int) -> Descriptors:
+    """Random descriptors."""
+    features = noise.normal(0, 1, (n, model.settings.channels)).astype(np.float16)
+    return Descriptors(noise.normal(0, 15, (n, 3)).astype(np.float32), features)
+
+
+def test_registration_of_sets_of_different_sizes(model: DeepPointMap2, noise: np.random.Generator) -> None:
+    """A batch answers as its members alone do: frames, merged maps and sparse scans together."""
+    sizes = [(48, 48), (48, 144), (30, 48)]
+    sources = [described(model, noise, n) for n, _ in sizes]
+    targets = [merge([described(model, noise, 48).moved(se3.exp(noise.normal(0, 1, 6)))] * (m // 48)) for _, m in sizes]
+    together = model.decoder.register_many(sources, targets)
+    for source, target, answer in zip(sources, targets, together, strict=True):
+        assert answer.T_target_source.shape == (4, 4)
+        assert np.linalg.eigvalsh(answer.covariance).min() > 0
+        assert 0 <= answer.confidence <= 1
+        assert answer.method == "neural"
+        alone = model.decoder.register(source, target)
+        # padding adds columns to bf16 products, and more pairs are kept in the larger batch
+        assert alone.confidence == pytest.approx(answer.confidence, abs=0.05)
+
+
+def test_too_few_descriptors_are_no_registration(model: DeepPointMap2, noise: np.random.Generator) -> None:
+    """Not ok, with a reason, and no exception."""
+    answer = model.decoder.register(described(model, noise, 1), described(model, noise, 1))
+    assert not answer.ok
+    assert answer.confidence == 0
+    assert "matching descriptors" in answer.reason
+
+
+def test_swapping_the_heading_frame_of_a_set_changes_nothing(model: DeepPointMap2, noise: np.random.Generator) -> None:
+    """Correlated descriptors do not depend on the frame that a set is given in: no prior pose is needed."""
+    a, b = described(model, noise, 48), described(model, noise, 48)
+    moved = b.moved(se3.exp([0, 0, 2.5, 12, -7, 0.4]))
+    tokens = to_tokens([a], True)
+    one = model.decoder(tokens, to_tokens([Descriptors(b.xyz, b.features, b.axes)], True))
+    other = model.decoder(tokens, to_tokens([moved], True))
+    torch.testing.assert_close(one.source, other.source, atol=1e-4, rtol=0)
+    torch.testing.assert_close(one.target, other.target, atol=1e-4, rtol=0)
