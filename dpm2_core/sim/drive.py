@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.geometry import se3
 from dpm2_core.sim.camera import calibration, render
-from dpm2_core.sim.config import PRESETS, CameraConfig, LidarConfig, PresetName, varied
+from dpm2_core.sim.config import CameraConfig, LidarConfig, PresetName
 from dpm2_core.sim.lidar import Lidar
-from dpm2_core.sim.road import FRAME_PERIOD, ROAD_KINDS, make_road
-from dpm2_core.sim.world import World, build_world, random_stream
+from dpm2_core.sim.road import FRAME_PERIOD, ROAD_KINDS, make_road, read_drive
+from dpm2_core.sim.world import World, build_world, own_preset, random_stream
 
 Array = NDArray[np.float64]
 NOTE = "dpm2_sim.json"
@@ -66,7 +66,7 @@ def simulate(
     recipe = _recipe(frames, seed, road, preset, images, lidar, camera)
     if _is_there(out, recipe):
         return False
-    world = build_world(road, preset, seed, _length(road, preset, seed, frames) if road in ROAD_KINDS else 400.0)
+    world = build_world(road, preset, seed, fitting_length(road, preset, seed, frames) if road in ROAD_KINDS else 400.0)
     drive = _Drive(world, Lidar(lidar), camera if images else None, frames)
     with _whole(out) as part:
         drive.write(part, recipe, workers, progress)
@@ -78,17 +78,15 @@ def _frames(road: str, frames: int | None) -> int:
         raise UsageError(f"--frames {frames}: want at least 1")
     if road in ROAD_KINDS:
         return 150 if frames is None else frames
-    known = len(make_road(road, PRESETS["city"], np.random.default_rng(0)).times)
+    known = len(read_drive(Path(road)))
     if frames is not None and frames > known:
         raise UsageError(f"--frames {frames}: {road} has {known}")
     return known if frames is None else frames
 
 
-def _length(road: str, preset: PresetName, seed: int, frames: int) -> float:
+def fitting_length(road: str, preset: PresetName, seed: int, frames: int) -> float:
     """Of the road, m, that a drive of so many frames just fills."""
-    if preset not in PRESETS:
-        return 400.0  # build_world refuses it with the proper words
-    kind = varied(PRESETS[preset], random_stream(seed, preset, 4))
+    kind = own_preset(preset, seed)
     end = (frames - 1) * FRAME_PERIOD
     length = float(np.clip(end * kind.speed, 60, 20000))
     for _ in range(12):  # how far it goes depends on the curves, and these on the length

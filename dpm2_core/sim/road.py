@@ -95,7 +95,7 @@ def make_road(kind: str, preset: Preset, rng: np.random.Generator, length: float
         UsageError: no such kind or file, or the file holds no drive.
     """
     if kind not in ROAD_KINDS:
-        return _road_of_poses(kind, preset, rng)
+        return _road_of_poses(FilePath(kind), preset, rng)
     centre = _centre(kind, preset, rng, length)
     drive = centre.shifted(-preset.lane)
     start = 0.0 if centre.closed else min(MARGIN, drive.length / 4)
@@ -200,30 +200,31 @@ def _side_streets(streets: list[Path], preset: Preset, rng: np.random.Generator)
     return found
 
 
-def read_kitti_poses(path: FilePath) -> Array:
-    """(N, 3, 4) poses of a KITTI file.
+def read_drive(path: FilePath) -> Array:
+    """(N, 3) positions of a file of KITTI poses, x ahead at the start, y left, z up, m.
 
     Raises:
-        UsageError: not readable, or not 12 finite numbers on each line.
+        UsageError: no such file, or not 12 finite numbers on each line.
     """
+    if not path.is_file():
+        raise UsageError(f"--road {path}: want one of {', '.join(ROAD_KINDS)}, or a file of KITTI poses")
     try:
-        rows = np.loadtxt(path, ndmin=2)
+        rows = np.array(
+            [[float(word) for word in line.split()] for line in path.read_text().splitlines() if line.strip()]
+        )
     except OSError as error:
         raise UsageError(f"--road {path}: {error.strerror or error}") from None
-    except (ValueError, UnicodeDecodeError):
+    except ValueError:  # words, lines of different lengths, or no text at all
         raise UsageError(f"--road {path}: not a file of KITTI poses (12 numbers a line)") from None
-    if rows.ndim != 2 or rows.shape[1:] != (12,) or not np.isfinite(rows).all():
+    if rows.ndim != 2 or rows.shape[1] != 12 or not np.isfinite(rows).all():
         raise UsageError(f"--road {path}: not a file of KITTI poses (12 finite numbers a line)")
-    return rows.reshape(-1, 3, 4)
+    return rows[:, [11, 3, 7]] * (1, -1, -1)
 
 
-def _road_of_poses(kind: str, preset: Preset, rng: np.random.Generator) -> Road:
-    file = FilePath(kind)
-    if not file.is_file():
-        raise UsageError(f"--road {kind}: want one of {', '.join(ROAD_KINDS)}, or a file of KITTI poses")
-    position = read_kitti_poses(file)[:, :, 3][:, [2, 0, 1]] * (1, -1, -1)  # camera to x ahead, y left, z up
+def _road_of_poses(file: FilePath, preset: Preset, rng: np.random.Generator) -> Road:
+    position = read_drive(file)
     moved = np.linalg.norm(np.diff(position[:, :2], axis=0), axis=1)
-    if len(position) < 2 or moved.sum() < 20:
+    if moved.sum() < 20:
         raise UsageError(f"--road {file}: a drive of {moved.sum():.0f} m; want at least 20 m")
     # Standing frames are noise in heading: the path leaves them out, the progress keeps them.
     keep = np.concatenate([[True], np.diff(np.floor(np.cumsum(moved) / STEP)) > 0, [True]])

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from dpm2_core.errors import UsageError
 from dpm2_core.geometry import se3
 from dpm2_core.sim import sections
-from dpm2_core.sim.config import PRESET_NAMES, PRESETS, PresetName, varied
+from dpm2_core.sim.config import PRESET_NAMES, PRESETS, Preset, PresetName, varied
 from dpm2_core.sim.layout import Layout
 from dpm2_core.sim.light import Light
 from dpm2_core.sim.mesh import Hits, Mesh, Scene, merge
@@ -119,14 +119,10 @@ def build_world(road: str = "random", preset: PresetName = "city", seed: int = 0
     Raises:
         UsageError: no such road or preset, or a length or seed that cannot be.
     """
-    if preset not in PRESETS:
-        raise UsageError(f"--preset {preset}: want one of {', '.join(PRESET_NAMES)}")
     if not 60 <= length <= 20000:
         raise UsageError(f"length {length:g} m of road: want 60 to 20000")
-    if seed < 0:
-        raise UsageError(f"--seed {seed}: want 0 or more")
+    kind = own_preset(preset, seed)
     rngs = [random_stream(seed, preset, k) for k in range(4)]
-    kind = varied(PRESETS[preset], random_stream(seed, preset, 4))
     streets = make_road(road, kind, rngs[0], length)
     terrain = Terrain(streets, kind, rngs[1])
     meshes = [terrain.ground()]
@@ -138,6 +134,19 @@ def build_world(road: str = "random", preset: PresetName = "city", seed: int = 0
         meshes += Layout(streets, terrain, kind, rngs[2]).meshes()
     traffic = make_traffic(streets, terrain, kind, rngs[3])
     return World(preset, seed, streets, terrain, traffic, Scene(merge(meshes)), Light(seed, preset == "tunnel"))
+
+
+def own_preset(preset: PresetName, seed: int) -> Preset:
+    """The preset as the world of a seed has it.
+
+    Raises:
+        UsageError: no such preset, or a negative seed.
+    """
+    if preset not in PRESETS:
+        raise UsageError(f"--preset {preset}: want one of {', '.join(PRESET_NAMES)}")
+    if seed < 0:
+        raise UsageError(f"--seed {seed}: want 0 or more")
+    return varied(PRESETS[preset], random_stream(seed, preset, 4))
 
 
 def random_stream(seed: int, preset: PresetName, part: int) -> np.random.Generator:

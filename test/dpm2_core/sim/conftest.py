@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Worlds and files that several tests of the synthetic city share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dpm2_core.sim.world import World, build_world
+
+
+@pytest.fixture(scope="session")
+def city() -> World:
+    return build_world("loop", "city", seed=3, length=110)
+
+
+@pytest.fixture(scope="session")
+def tunnel() -> World:
+    return build_world("straight", "tunnel", seed=1, length=60)
+
+
+@pytest.fixture(scope="session")
+def highway() -> World:
+    return build_world("straight", "highway", seed=1, length=60)
+
+
+@pytest.fixture(scope="session")
+def poses_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """KITTI poses (camera frame) of 1.4 laps round a block, the second 0.8 m beside the first, with a stop."""
+    s = np.concatenate([np.arange(0, 100, 1.0), np.full(15, 100.0), np.arange(100, 220, 1.0)])
+    angle = s / 25.0
+    radius = 25 + 0.8 * (angle > 2 * np.pi) + 4 * np.cos(2 * angle)
+    x, y, z = radius * np.cos(angle), radius * np.sin(angle), 1.5 * np.sin(angle)
+    poses = np.zeros((len(s), 3, 4))
+    poses[:, :, :3] = np.eye(3)
+    poses[:, :, 3] = np.stack([-y, -z, x], -1)  # right, down, ahead
+    poses[:, :, 3] += np.random.default_rng(0).normal(0, 0.003, (len(s), 3))
+    path = tmp_path_factory.mktemp("road") / "poses.txt"
+    np.savetxt(path, poses.reshape(-1, 12))
+    return path
