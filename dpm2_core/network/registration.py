@@ -110,7 +110,7 @@ def whitened(T: Tensor, pairs: Correspondences) -> tuple[Tensor, Tensor]:
     source, target, L = pairs.source.double(), pairs.target.double(), pairs.L.double()
     moved_back = ((target - t)[..., None, :] @ R)[..., 0, :]  # R^T (y - t)
     L = torch.cat([L[:, :half], R.transpose(-1, -2) @ L[:, half:]], 1)  # all in the source frame
-    # A step turns the point that its own frame does not hold fixed: the target's, seen from the source, or the source's.
+    # In the source frame the step turns the target's point, in the target frame the source's.
     arm = torch.cat([moved_back[:, :half], source[:, half:]], 1)
     zero = torch.zeros_like(arm[..., 0])
     x, y, z = arm.unbind(-1)

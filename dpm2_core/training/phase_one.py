@@ -99,8 +99,11 @@ def plans_of(poses: Tensor, settings: PhaseOneSettings, step: int) -> tuple[Plan
     return tuple(plans)
 
 
-def phase_one(settings: PhaseOneSettings, out: Path, resume: bool = False) -> Path:
-    """Train; checkpoints, log and at the end the averaged weights, `weights.safetensors`, go to `out`."""
+def phase_one(settings: PhaseOneSettings, out: Path, resume: bool = False, until: int | None = None) -> Path:
+    """Train; checkpoints, log and at the end the averaged weights, `weights.safetensors`, go to `out`.
+
+    until: stop after this step; `resume` continues from there.
+    """
     with process_group() as (rank, world, device):
         torch.manual_seed(settings.optimiser.seed)
         network = preset(settings.preset)
@@ -116,8 +119,19 @@ def phase_one(settings: PhaseOneSettings, out: Path, resume: bool = False) -> Pa
 
         validate = validator(settings, network) if settings.validation and rank == 0 else None
         train(
-            module, ema, iter(data.loader()), loss, settings.optimiser, out, resume, validate, start, rank, device
-        )  # fmt: skip
+            module,
+            ema,
+            iter(data.loader()),
+            loss,
+            settings.optimiser,
+            out,
+            resume,
+            validate,
+            start,
+            rank,
+            device,
+            until,
+        )
         if rank == 0:
             save_weights(ema.model, out / "weights.safetensors", {"phase": "1", "steps": str(settings.optimiser.steps)})
     return out / "weights.safetensors"

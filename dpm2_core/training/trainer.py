@@ -119,6 +119,7 @@ def train(
     start: int,
     rank: int,
     device: torch.device,
+    until: int | None = None,
 ) -> None:
     """Run steps `start`.. of a training.
 
@@ -126,6 +127,7 @@ def train(
         module: what is trained, on its device; `ema` its averaged twin.
         loss: of (module, batch, step), the mean over this process's share.
         validate: figures of a module for the log, called on the averaged weights.
+        until: stop after this step, with a checkpoint; None for all of them.
     """
     keep_memory()
     optimiser = torch.optim.AdamW(parameter_groups(module, settings.decay), settings.rate)
@@ -141,7 +143,8 @@ def train(
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, disable=rank != 0) as progress:
         task = progress.add_task("training", total=settings.steps, completed=start)
-        for step in range(start, settings.steps):
+        end = settings.steps if until is None else min(until, settings.steps)
+        for step in range(start, end):
             begin = time.perf_counter()
             batch = next(batches)
             waited = time.perf_counter() - begin
@@ -163,7 +166,7 @@ def train(
             if log is None:
                 continue
             log.write(step, {**described, "norm": float(norm), "rate": rate, "seconds": seconds, "waited": waited})
-            last = step + 1 == settings.steps
+            last = step + 1 == end
             if last or (step + 1) % settings.save_every == 0:
                 save_checkpoint(checkpoint, module, ema, optimiser, step + 1)
             if validate is not None and (last or (step + 1) % settings.validate_every == 0):

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Weights: round trip, and everything that must not be loaded."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from dpm2_core.errors import UsageError
+from dpm2_core.network.model import DeepPointMap2
+from dpm2_core.network.weights import load_model, load_weights, save_weights
+
+
+@pytest.fixture
+def saved(model: DeepPointMap2, tmp_path: Path) -> Path:
+    """Weights of the tiny network."""
+    save_weights(model, tmp_path / "tiny.safetensors", {"steps": "3"})
+    return tmp_path / "tiny.safetensors"
+
+
+def test_round_trip(model: DeepPointMap2, saved: Path) -> None:
+    """A file describes its network and holds every tensor, to fp16."""
+    loaded = load_model(saved)
+    assert loaded.settings == model.settings
+    for name, value in model.state_dict().items():
+        torch.testing.assert_close(loaded.state_dict()[name], value, atol=1e-3, rtol=1e-3)
+    assert load_weights(model, saved)["steps"] == "3"
+
+
+def test_wrong_preset_is_refused(saved: Path, tiny: Callable) -> None:
+    """With both names."""
+    other = DeepPointMap2(tiny().model_copy(update={"preset": "huge"}))
+    with pytest.raises(UsageError, match="weights of preset tiny, the network is preset huge"):
+        load_weights(other, saved)
+
+
+def test_wrong_shape_under_the_right_name_is_refused(saved: Path, tiny: Callable) -> None:
+    """Also when a whole layer is missing; nothing is loaded then."""
+    other = DeepPointMap2(tiny(decoder={"layers": 2}))
+    before = {name: value.clone() for name, value in other.state_dict().items()}
+    with pytest.raises(UsageError, match=r"does not fit preset tiny: \d+ tensors differ, such as decoder"):
+        load_weights(other, saved)
+    assert all(torch.equal(before[name], value) for name, value in other.state_dict().items())
+
+
+class _Bomb:
+    def __reduce__(self) -> tuple[Callable, tuple[str]]:
+        return (Path.touch, (Path("exploded"),))  # type: ignore[return-value]
+
+
+def test_a_pickle_is_refused_and_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither a bare pickle nor one in torch's format."""
+    monkeypatch.chdir(tmp_path)
+    Path("bare.safetensors").write_bytes(pickle.dumps(_Bomb()))
+    torch.save({"x": _Bomb()}, "torch.safetensors")
+    for name in ("bare.safetensors", "torch.safetensors"):
+        with pytest.raises(UsageError, match="not a safetensors file"):
+            load_model(Path(name))
+    assert not Path("exploded").exists()
+
+
+def test_missing_truncated_and_foreign_files(saved: Path, tmp_path: Path) -> None:
+    """Each in one line with the path."""
+    with pytest.raises(UsageError, match="no such weights"):
+        load_model(tmp_path / "none.safetensors")
+    saved.write_bytes(saved.read_bytes()[:1000])
+    with pytest.raises(UsageError, match="not a safetensors file"):
+        load_model(saved)
+    save_file({"x": torch.zeros(1)}, tmp_path / "foreign.safetensors")
+    with pytest.raises(UsageError, match="without a network description"):
+        load_model(tmp_path / "foreign.safetensors")

@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Training data: packing, augmentation that keeps the truth, and groups."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial import cKDTree
+
+from dpm2_core.errors import UsageError
+from dpm2_core.geometry import se3
+from dpm2_core.network.model import DeepPointMap2
+from dpm2_core.training.augment import AugmentSettings, augment
+from dpm2_core.training.dataset import DataSettings, GroupDataset, draw_group
+from dpm2_core.training.packed import QUANTUM, PackedDrive, Sample, open_packed, write_packed
+from dpm2_core.training.phase_two import average_precision, draw_overlap
+from dpm2_core.training.sets import merge_tokens, plan_sets
+
+NOTHING = {"drop": 0, "occlusion": 0, "beams": 0, "jitter": 0, "yaw": 0, "tilt": 0, "shift": (0, 0, 0), "image_drop": 0}
+
+
+def test_packing_keeps_clouds_to_a_millimetre(packed: Path, samples: list[Sample]) -> None:
+    """Points to half a quantum, poses and pictures exactly."""
+    drive = PackedDrive(packed / "world")
+    assert len(drive) == len(samples)
+    for found, true in zip((drive[i] for i in range(len(drive))), samples, strict=True):
+        assert np.abs(found.cloud - true.cloud).max() <= QUANTUM / 2 + 1e-5
+        assert np.array_equal(found.pose, true.pose)
+        assert np.array_equal(found.images[0].pixels, true.images[0].pixels)
+        assert np.array_equal(found.images[0].camera.T_lidar_cam, true.images[0].camera.T_lidar_cam)
+
+
+def test_an_unfinished_drive_is_not_opened(packed: Path, samples: list[Sample], tmp_path: Path) -> None:
+    """What a killed run leaves has another name, and is replaced by the next."""
+    root = tmp_path / "root"
+    shutil.copytree(packed / "world", root / "new.part")
+    with pytest.raises(UsageError, match="no packed drive"):
+        open_packed(root)
+    write_packed(root / "new", samples, {})
+    assert [drive.name for drive in open_packed(root)] == ["new"]
+    assert not (root / "new.part").exists()
+
+
+def test_foreign_folders_are_refused(tmp_path: Path) -> None:
+    """No poses, or another format."""
+    (tmp_path / "about.json").write_text("{}")
+    with pytest.raises(UsageError, match="no packed drive"):
+        open_packed(tmp_path)
+
+
+def test_augmentation_keeps_points_where_they_are_in_the_world(samples: list[Sample]) -> None:
+    """After a rigid motion of the sensor frame, pose times cloud is the same set of points, and so is the camera."""
+    sample = samples[0]
+    motion = {"yaw": 3, "tilt": 0.1, "shift": (2, 2, 1), "extrinsic_rotation": 0, "extrinsic_translation": 0}
+    changed = augment(sample, AugmentSettings(**{**NOTHING, **motion}), np.random.default_rng(0))
+    assert not np.allclose(changed.pose, sample.pose)
+    assert len(changed.cloud) == len(sample.cloud)
+    tree = cKDTree(se3.transform(sample.pose, sample.cloud.astype(np.float64)))
+    distance, index = tree.query(se3.transform(changed.pose, changed.cloud.astype(np.float64)))
+    assert distance.max() < 1e-4
+    assert len(set(index)) == len(index)
+    before, after = (s.pose @ s.images[0].camera.T_lidar_cam for s in (sample, changed))
+    np.testing.assert_allclose(after, before, atol=1e-9)
+
+
+def test_occlusion_removes_what_lies_behind(samples: list[Sample]) -> None:
+    """Sectors lose their far points only, nothing nearer than 2 m, and never the whole scan."""
+    settings = AugmentSettings(**{**NOTHING, "occlusion": 1})
+    cloud = samples[0].cloud
+    sizes = set()
+    for seed in range(10):
+        kept = augment(samples[0], settings, np.random.default_rng(seed)).cloud
+        sizes.add(len(kept))
+        near = np.linalg.norm(cloud, axis=1) < 2
+        assert (np.linalg.norm(kept, axis=1) < 2).sum() == near.sum()
+        assert len(kept) >= 128
+    assert len(sizes) > 5
+
+
+def test_pictures_are_dropped_blacked_and_exposed(samples: list[Sample]) -> None:
+    """With certainty where the probability is 1; pixels stay bytes."""
+    noise = np.random.default_rng(0)
+    assert augment(samples[0], AugmentSettings(**{**NOTHING, "image_drop": 1}), noise).images == ()
+    (black,) = augment(samples[0], AugmentSettings(**NOTHING, image_black=1), noise).images
+    assert not black.pixels.any()
+    (exposed,) = augment(samples[0], AugmentSettings(**NOTHING, image_black=0, exposure=1), noise).images
+    assert exposed.pixels.dtype == np.uint8
+    assert exposed.pixels.mean() != samples[0].images[0].pixels.mean()
+
+
+def test_groups_are_near_and_spread() -> None:
+    """All within the radius of the first; distances about uniform; unknown poses are never drawn."""
+    poses = np.tile(np.eye(4), (400, 1, 1))
+    poses[:, 0, 3] = np.arange(400) * 0.5
+    poses[::7] = np.nan
+    noise = np.random.default_rng(0)
+    distances = []
+    for _ in range(200):
+        chosen = draw_group(poses, 4, 20, noise)
+        assert len(set(chosen)) == 4
+        assert np.isfinite(poses[chosen]).all()
+        distances += list(np.abs(poses[chosen[1:], 0, 3] - poses[chosen[0], 0, 3]))
+    assert max(distances) <= 20
+    assert np.histogram(distances, 4, (0, 20))[0].min() > 0.2 * len(distances)  # 0.25 each
+
+
+def test_a_lonely_frame_is_its_own_group() -> None:
+    """No neighbour within the radius: it repeats."""
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[1, 0, 3] = 100
+    assert len(set(draw_group(poses, 3, 20, np.random.default_rng(0)))) == 1
+
+
+def test_overlap_groups_have_half_positives_and_hard_negatives() -> None:
+    """Two of four within 20 m, one within 20 to 40 m, one beyond."""
+    poses = np.tile(np.eye(4), (200, 1, 1))
+    poses[:, 0, 3] = np.arange(200)
+    noise = np.random.default_rng(0)
+    for _ in range(50):
+        chosen = draw_overlap(poses, 5, 20, noise)
+        distance = np.abs(poses[chosen[1:], 0, 3] - poses[chosen[0], 0, 3])
+        assert (distance[:2] <= 20).all()
+        assert 20 < distance[2] <= 40 < distance[3]
+
+
+def test_average_precision_of_known_rankings() -> None:
+    """All right is 1; one positive ranked second is a half."""
+    assert average_precision(np.array([0.9, 0.8, 0.1]), np.array([True, True, False])) == 1
+    assert average_precision(np.array([0.9, 0.8, 0.1]), np.array([False, True, False])) == 0.5
+
+
+def test_batches_depend_on_their_number_alone(packed: Path, tiny: Callable) -> None:
+    """So that a resumed run, with any number of workers, sees the same."""
+    settings = DataSettings(packed={str(packed): 1.0}, groups=1, frames=2, images=True, workers=0)
+    data = GroupDataset(settings, tiny(), seed=3)
+    later = GroupDataset(settings.model_copy(update={"workers": 2}), tiny(), seed=3, start=2)
+    for step, batch in zip(range(2, 5), later.loader(), strict=False):
+        again = data.batch(step)
+        assert torch.equal(again.points.xyz, batch.points.xyz)
+        assert torch.equal(again.poses, batch.poses)
+    assert not torch.equal(data.batch(0).points.xyz, data.batch(1).points.xyz)
+
+
+@pytest.mark.parametrize("sides", [(1, 1), (1, 3), (2, 2)])
+def test_plans_hold_the_truth(model: DeepPointMap2, packed: Path, sides: tuple[int, int]) -> None:
+    """Members moved to the first of their side, and one side to the other, meet in the world."""
+    data = GroupDataset(DataSettings(packed={str(packed): 1.0}, groups=2, frames=4, workers=0), model.settings, 0)
+    batch = data.batch(0)
+    plan = plan_sets(batch.poses, 2, sides, 20.0, torch.Generator().manual_seed(0))
+    flat = batch.poses.flatten(0, 1).float()
+    for row in range(4):
+        members = torch.cat([plan.source[row], plan.target[row]])
+        assert len(set((members // 4).tolist())) == 1  # one place
+        assert len(set(members.tolist())) == sum(sides)
+        first_source, first_target = flat[plan.source[row, 0]], flat[plan.target[row, 0]]
+        torch.testing.assert_close(first_target @ plan.T_target_source[row], first_source, atol=1e-3, rtol=0)
+        for k in range(sides[1]):
+            torch.testing.assert_close(
+                first_target @ plan.T_target[row, k], flat[plan.target[row, k]], atol=1e-3, rtol=0
+            )
+    tokens = model.encoder(batch.points).tokens
+    merged = merge_tokens(tokens, plan.target, plan.T_target)
+    assert merged.xyz.shape == (4, 48 * sides[1], 3)
+    torch.testing.assert_close(merged.axis.norm(dim=-1), torch.ones(4, 48 * sides[1]))

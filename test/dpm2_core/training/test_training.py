@@ -1,0 +1,183 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Training: it learns, resumes to the same weights, and several processes give the gradients of one."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from dpm2_core.errors import UsageError
+from dpm2_core.network.config import PRESETS
+from dpm2_core.training.augment import AugmentSettings
+from dpm2_core.training.dataset import DataSettings, GroupDataset
+from dpm2_core.training.objective import LossSettings
+from dpm2_core.training.phase_one import PhaseOne, PhaseOneSettings, phase_one, plans_of
+from dpm2_core.training.phase_two import PhaseTwoSettings, phase_two
+from dpm2_core.training.trainer import OptimiserSettings, learning_rate
+
+STILL = AugmentSettings(drop=0, occlusion=0, beams=0, jitter=0, tilt=0, shift=(0, 0, 0), image_drop=0)
+
+
+@pytest.fixture
+def settings(packed: Path, tiny: Callable, monkeypatch: pytest.MonkeyPatch) -> PhaseOneSettings:
+    """Phase one of the tiny network on the packed drive, in float32, without compiling."""
+    monkeypatch.setitem(PRESETS, "tiny", tiny().model_dump())
+    return PhaseOneSettings(
+        preset="tiny",
+        data=DataSettings(packed={str(packed): 1.0}, groups=1, frames=3, workers=0, images=True),
+        validation=str(packed),
+        validation_pairs=4,
+        loss=LossSettings(near=32, own=16),
+        pairs=2,
+        sets=0.5,
+        optimiser=OptimiserSettings(steps=4, compile=False, bf16=False, save_every=2, validate_every=2, warmup=1),
+    )
+
+
+def losses(out: Path) -> dict[int, float]:
+    """Logged loss of each step, the last entry of a step counting."""
+    rows = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
+    return {row["step"]: row["loss"] for row in rows if "loss" in row}
+
+
+def test_resumed_equals_uninterrupted(settings: PhaseOneSettings, tmp_path: Path) -> None:
+    """A run stopped after 2 of 4 steps and resumed logs the same losses and ends with the same weights, bit for bit."""
+    whole, halves = tmp_path / "whole", tmp_path / "halves"
+    phase_one(settings, whole)
+    phase_one(settings, halves, until=2)
+    phase_one(settings, halves, resume=True)
+    assert losses(halves) == losses(whole)
+    assert len(losses(whole)) == 4
+    one, other = (load_file(out / "weights.safetensors") for out in (whole, halves))
+    assert all(torch.equal(one[name], other[name]) for name in one)
+
+
+def test_log_has_figures_and_validation(settings: PhaseOneSettings, tmp_path: Path) -> None:
+    """One JSON object a line; validation gives medians and success of near, far and turned pairs."""
+    phase_one(settings, tmp_path / "out")
+    rows = [json.loads(line) for line in (tmp_path / "out" / "log.jsonl").read_text().splitlines()]
+    assert {"pairing", "coarse", "backbone", "offset", "offset_m", "right", "norm", "rate"} <= rows[0].keys()
+    validations = [row for row in rows if "near_m" in row]
+    assert [row["step"] for row in validations] == [1, 3]
+    assert {"near_deg", "near_success", "turned_m", "chi2"} <= validations[0].keys()
+
+
+def test_a_checkpoint_of_another_network_is_refused(settings: PhaseOneSettings, tmp_path: Path) -> None:
+    """And so is a file that is none."""
+    phase_one(settings, tmp_path / "out")
+    with pytest.raises(UsageError, match="checkpoint of another network"):
+        phase_one(settings.model_copy(update={"preset": "small"}), tmp_path / "out", resume=True)
+    (tmp_path / "out" / "checkpoint.pt").write_bytes(b"garbage")
+    with pytest.raises(UsageError, match="not a checkpoint"):
+        phase_one(settings, tmp_path / "out", resume=True)
+
+
+def test_phase_two_changes_the_overlap_head_alone(settings: PhaseOneSettings, tmp_path: Path) -> None:
+    """Every other tensor of the weights stays as phase one left it."""
+    start = phase_one(settings, tmp_path / "one")
+    second = PhaseTwoSettings(
+        preset="tiny", start=str(start), data=settings.data, validation=settings.validation, validation_batches=1,
+        optimiser=settings.optimiser.model_copy(update={"rate": 1e-2}),
+    )  # fmt: skip
+    before, after = load_file(start), load_file(phase_two(second, tmp_path / "two"))
+    changed = {name for name in before if not torch.equal(before[name], after[name])}
+    assert changed
+    assert all(name.startswith("decoder.overlap.") for name in changed)
+
+
+def test_it_overfits_four_pairs_to_two_centimetres(packed: Path, tiny: Callable) -> None:
+    """The same 4 pairs over and over are registered to 2 cm: nothing in the chain blocks the signal."""
+    torch.manual_seed(0)
+    network = tiny(fusion={"points": 128}, points={})
+    module = PhaseOne(network, LossSettings())
+    data = GroupDataset(
+        DataSettings(packed={str(packed): 1.0}, groups=1, frames=4, workers=0, augment=STILL), network, seed=0
+    )
+    batch = data.batch(0)
+    settings = PhaseOneSettings(pairs=4, sets=0.0)
+    plans = plans_of(batch.poses, settings, 0)
+    optimiser = torch.optim.AdamW(module.parameters(), 3e-3)
+    for step in range(300):
+        for group in optimiser.param_groups:
+            group["lr"] = 3e-3 * min(1, (step + 1) / 20) * (1 - step / 300)
+        loss, _ = module(batch.points, None, plans)
+        optimiser.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(module.parameters(), 1.0)
+        optimiser.step()
+    assert max(_errors(module, batch, plans)) < 0.02
+
+
+def _errors(module: PhaseOne, batch: object, plans: tuple) -> list[float]:
+    """Translation error of each pair, m."""
+    from dpm2_core.network.registration import register_batch
+    from dpm2_core.training.sets import merge_tokens
+
+    with torch.inference_mode():
+        tokens = module.model.encoder(batch.points).tokens  # type: ignore[attr-defined]
+        (plan,) = plans
+        source = merge_tokens(tokens, plan.source, plan.T_source)
+        target = merge_tokens(tokens, plan.target, plan.T_target)
+        answers = register_batch(module.model.decoder, source, target, module.model.decoder(source, target))
+    return [
+        float((torch.from_numpy(answer.T_target_source[:3, 3]) - T[:3, 3]).norm())
+        for answer, T in zip(answers, plan.T_target_source, strict=True)
+    ]
+
+
+def test_learning_rate() -> None:
+    """Warm-up to the peak, cosine through the half, to the floor."""
+    settings = OptimiserSettings(steps=110, warmup=10, rate=1.0, final_rate=0.2)
+    assert [round(learning_rate(settings, s), 6) for s in (0, 9, 10, 60, 110)] == [0.1, 1.0, 1.0, 0.6, 0.2]
+
+
+RANKS = """
+import sys, torch
+from dpm2_core.config import settings_from
+from dpm2_core.network.config import NetworkSettings
+from dpm2_core.training.dataset import DataSettings, GroupDataset
+from dpm2_core.training.objective import LossSettings
+from dpm2_core.training.phase_one import PhaseOne, PhaseOneSettings, plans_of
+from dpm2_core.training.trainer import process_group
+from torch.nn.parallel import DistributedDataParallel
+
+out, packed, network = sys.argv[1:]
+network = NetworkSettings.model_validate_json(network)
+settings = PhaseOneSettings(pairs=2, sets=0)
+with process_group() as (rank, world, device):
+    torch.manual_seed(0)
+    module = PhaseOne(network, LossSettings(near=16, own=8))
+    run = DistributedDataParallel(module, find_unused_parameters=True) if world > 1 else module
+    shares = [rank] if world > 1 else [0, 1]
+    for share in shares:
+        options = DataSettings(packed={packed: 1.0}, groups=1, frames=2, workers=0)
+        batch = GroupDataset(options, network, 0, 0, (share, 2)).batch(0)
+        torch.manual_seed(1)
+        loss, _ = run(batch.points, None, plans_of(batch.poses, settings, 0))
+        (loss / len(shares)).backward()
+    if rank == 0:
+        torch.save({name: p.grad for name, p in module.named_parameters() if p.grad is not None}, out)
+"""
+
+
+def test_two_processes_give_the_gradients_of_one(tmp_path: Path, packed: Path, tiny: Callable) -> None:
+    """gloo on the CPU, started by torchrun: each rank its share of the places, the mean of the losses."""
+    script = tmp_path / "ranks.py"
+    script.write_text(RANKS)
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[3]), "OMP_NUM_THREADS": "1"}
+    arguments = [str(packed), tiny().model_dump_json()]
+    subprocess.run([sys.executable, script, tmp_path / "one", *arguments], check=True, env=environment)
+    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
+    subprocess.run([*torchrun, script, tmp_path / "two", *arguments], check=True, env=environment, capture_output=True)
+    one, two = (torch.load(tmp_path / name, weights_only=True) for name in ("one", "two"))
+    assert len(one) > 50
+    for name, gradient in one.items():
+        torch.testing.assert_close(two[name], gradient, atol=1e-6, rtol=1e-4, msg=name)
