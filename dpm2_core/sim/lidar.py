@@ -87,36 +87,25 @@ class Lidar:
                 frame of its own moment, as a driver delivers it. None: already corrected for motion, as KITTI's are.
         """
         origins, directions = self._rays(T_world_lidar, twist)
-        config = self.config
-        n = len(directions)
-        chance = rng.random((2, n), np.float32)
-        jitter = rng.standard_normal((2, n), np.float32)
-        still = world.scene.cast(origins, directions, config.range)
-        still_points, still_back = self._returns(world, world.static, still, origins, directions, chance, jitter)
-        label = _labels(world.static, still.face, still_back)
-        moving = np.zeros(n, bool)
-        points, back = still_points, still_back
-        movers = world.cast_movers(time, origins, directions, config.range)
-        if movers is not None:
-            mesh, instance, hits, toward = movers
-            moving[toward] = hits.distance < still.distance[toward]
-            near = moving[toward]
-            chosen = toward[near]
-            hits = hits.part(near)
-            seen, came = self._returns(
-                world, mesh, hits, origins[chosen], directions[chosen], chance[:, chosen], jitter[:, chosen], chosen
+        chance = rng.random((2, len(directions)), np.float32)
+        jitter = rng.standard_normal((2, len(directions)), np.float32)
+        still = world.scene.cast(origins, directions, self.config.range)
+        points, back = self._returns(world.static, still, directions, chance, jitter)
+        label = world.static.label[np.maximum(still.face, 0)].astype(np.uint32)
+        static = points[back]
+        moving = np.zeros(len(directions), bool)
+        if movers := world.movers(time, T_world_lidar[:3, 3]):
+            hits, toward = movers.cast(origins if twist is not None else origins[0], directions, self.config.range)
+            near = hits.distance < still.distance[toward]
+            hits, which = hits.part(near), toward[near]
+            moving[which] = True
+            points[which], back[which] = self._returns(
+                movers.scene.mesh, hits, directions[which], chance[:, which], jitter[:, which], which
             )
-            points, back, label = points.copy(), back.copy(), label.copy()
-            points[chosen], back[chosen] = seen, came
-            label[chosen] = MOVING_LABEL[mesh.label[hits.face]] | (instance[hits.face].astype(np.uint32) << 16)
-        return Scan(
-            points[back],
-            label[back],
-            moving[back],
-            self.ring[back],
-            self.column_time[self.column[back]],
-            still_points[still_back],
-        )
+            kind = MOVING_LABEL[movers.scene.mesh.label[hits.face]]
+            label[which] = kind | movers.number[hits.face].astype(np.uint32) << 16
+        time_offset = self.column_time[self.column[back]]
+        return Scan(points[back], label[back], moving[back], self.ring[back], time_offset, static)
 
     def _rays(self, T_world_lidar: Array, twist: Array | None) -> tuple[Float, Float]:
         if twist is None:
@@ -129,10 +118,8 @@ class Lidar:
 
     def _returns(
         self,
-        world: World,
         mesh: Mesh,
         hits: Hits,
-        origins: Float,
         directions: Float,
         chance: Float,
         jitter: Float,
@@ -173,9 +160,3 @@ def _hidden_by_car(directions: Array) -> NDArray[np.bool_]:
         np.where(along > 0, ahead, behind) / np.maximum(np.abs(along), 1e-9), aside / np.maximum(across, 1e-9)
     )
     return -directions[:, 2] / flat * reach > clearance
-
-
-def _labels(mesh: Mesh, face: NDArray[np.int32], back: NDArray[np.bool_]) -> NDArray[np.uint32]:
-    out = np.zeros(len(face), np.uint32)
-    out[back] = mesh.label[face[back]]
-    return out

@@ -88,7 +88,7 @@ class Textures:
             if len(which):
                 part = surface.part(which)
                 out[which] = paint(self, part, out[which], uv[which], terrain)
-        return out.clip(0.01, 1)
+        return out.clip(0.01, 1, out=out)
 
 
 _CONTRAST = np.ones(len(Material), np.float32)

@@ -9,12 +9,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dpm2_core.sim.config import Preset
-from dpm2_core.sim.mesh import Mesh, merge, placed, pose
+from dpm2_core.sim.mesh import Hits, Mesh, Scene, merge, placed, pose
 from dpm2_core.sim.road import Road
 from dpm2_core.sim.terrain import Terrain
 from dpm2_core.sim.vehicles import car, cyclist, person, truck
 
 Array = NDArray[np.float64]
+Float = NDArray[np.float32]
 SIGHT = 110.0
 """Movers farther from the sensor are left out, m."""
 GAP = 6.5
@@ -48,8 +49,8 @@ class Traffic:
         xy, yaw = drive.at(s, self.lateral)
         return xy, yaw + np.where(self.speed < 0, np.pi, 0.0)
 
-    def mesh(self, time: float, around: ArrayLike) -> tuple[Mesh, NDArray[np.uint16]] | None:
-        """All in sight of a place (2,) at a time, and the number (F,) of each triangle's mover; None without any."""
+    def movers(self, time: float, around: ArrayLike) -> Movers | None:
+        """What is in sight of a place (2 or 3,) at a time, s; None if nothing is."""
         if not self.models:
             return None
         xy, yaw = self.poses(time)
@@ -57,10 +58,42 @@ class Traffic:
         seen = np.flatnonzero((away < SIGHT) & (away > GAP))
         if not len(seen):
             return None
-        z = self.terrain.surface_at(xy[seen])
-        poses = pose(xy[seen], z, yaw[seen])
+        poses = pose(xy[seen], self.terrain.surface_at(xy[seen]), yaw[seen])
         meshes = [placed(self.models[k], poses[i : i + 1], k * 101 % 65536) for i, k in enumerate(seen)]
-        return merge(meshes), np.repeat((seen + 1).astype(np.uint16), [len(m) for m in meshes])
+        return Movers(Scene(merge(meshes)), np.repeat((seen + 1).astype(np.uint16), [len(m) for m in meshes]))
+
+
+@dataclass(eq=False)
+class Movers:
+    """What moves, at one time: a scene, and the number (F,) of the mover that each of its triangles belongs to."""
+
+    scene: Scene
+    number: NDArray[np.uint16]
+
+    def cast(self, origin: Float, directions: Float, reach: float) -> tuple[Hits, NDArray[np.intp]]:
+        """Hits of those K rays that can meet a mover, and which (K,) they are, of R along (R, 3) from (3,) or (R, 3)."""
+        all_rays = origin.ndim == 2
+        toward = np.arange(len(directions)) if all_rays else _towards(self.scene.mesh, origin, directions)
+        origins = np.ascontiguousarray(np.broadcast_to(origin, directions.shape)[toward])
+        return self.scene.cast(origins, directions[toward], reach), toward
+
+
+def _towards(mesh: Mesh, origin: Float, directions: Float) -> NDArray[np.intp]:
+    """Which rays (R, 3) lie within the azimuths and elevations that a mesh covers as seen from a point (3,)."""
+    bins = 720
+    away = mesh.vertices - origin
+    flat = np.hypot(away[:, 0], away[:, 1]) + np.float32(1e-3)
+    corners = np.arctan2(away[:, 1], away[:, 0])[mesh.faces]
+    spread = np.remainder(corners - corners[:, :1] + np.pi, 2 * np.pi) - np.pi
+    first = np.floor((corners[:, 0] + spread.min(1) - 0.01) / (2 * np.pi) * bins).astype(int)
+    last = np.floor((corners[:, 0] + spread.max(1) + 0.01) / (2 * np.pi) * bins).astype(int)
+    # +1 where a triangle begins, -1 after its end, over three turns folded into one
+    steps = np.bincount(first + bins, minlength=3 * bins + 1) - np.bincount(last + bins + 1, minlength=3 * bins + 1)
+    covered = np.cumsum(steps)[: 3 * bins].reshape(3, bins).max(0) > 0
+    slope = directions[:, 2] / (np.hypot(directions[:, 0], directions[:, 1]) + np.float32(1e-6))
+    low, high = (away[:, 2] / flat).min() - 0.02, (away[:, 2] / flat).max() + 0.02
+    azimuth = np.floor(np.arctan2(directions[:, 1], directions[:, 0]) / (2 * np.pi) * bins).astype(int) % bins
+    return np.flatnonzero(covered[azimuth] & (slope > low) & (slope < high))
 
 
 def make_traffic(road: Road, terrain: Terrain, preset: Preset, rng: np.random.Generator) -> Traffic:

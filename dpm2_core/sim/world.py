@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from dpm2_core.errors import UsageError
@@ -20,13 +20,12 @@ from dpm2_core.sim import sections
 from dpm2_core.sim.config import PRESET_NAMES, PRESETS, Preset, PresetName, varied
 from dpm2_core.sim.layout import Layout
 from dpm2_core.sim.light import Light
-from dpm2_core.sim.mesh import Hits, Mesh, Scene, merge
+from dpm2_core.sim.mesh import Mesh, Scene, merge
 from dpm2_core.sim.road import Road, make_road
 from dpm2_core.sim.terrain import Terrain
-from dpm2_core.sim.traffic import Traffic, make_traffic
+from dpm2_core.sim.traffic import Movers, Traffic, make_traffic
 
 Array = NDArray[np.float64]
-Float = NDArray[np.float32]
 
 
 @dataclass(eq=False)
@@ -90,22 +89,9 @@ class World:
         )
         return T @ se3.make(tilt, np.zeros(3)), time
 
-    def cast_movers(
-        self, time: float, origins: Float, directions: Float, reach: float
-    ) -> tuple[Mesh, NDArray[np.uint16], Hits, NDArray[np.intp]] | None:
-        """What rays (R, 3) meet of the movers at a time, s.
-
-        Returns:
-            The movers' mesh and the number (F,) of the mover that each triangle belongs to; the hits of the K rays that
-            point towards movers at all, and which (K,) rays these are. None if no mover is in sight.
-        """
-        movers = self.traffic.mesh(time, origins[0])
-        if movers is None:
-            return None
-        mesh, instance = movers
-        toward = _towards(mesh, origins[0], directions)
-        hits = Scene(mesh).cast(origins[toward], directions[toward], reach)
-        return mesh, instance, hits, toward
+    def movers(self, time: float, around: ArrayLike) -> Movers | None:
+        """What moves in sight of a place (2 or 3,) at a time, s; None if nothing does."""
+        return self.traffic.movers(time, around)
 
 
 def build_world(road: str = "random", preset: PresetName = "city", seed: int = 0, length: float = 400.0) -> World:
@@ -152,21 +138,3 @@ def own_preset(preset: PresetName, seed: int) -> Preset:
 def random_stream(seed: int, preset: PresetName, part: int) -> np.random.Generator:
     """The random numbers of one part of a world: 0 roads, 1 terrain, 2 props, 3 traffic, 4 the preset's own values."""
     return np.random.default_rng([seed, PRESET_NAMES.index(preset), part])
-
-
-def _towards(mesh: Mesh, origin: Float, directions: Float) -> NDArray[np.intp]:
-    """Which rays (R, 3) lie within the azimuths and elevations that a mesh covers as seen from a point (3,)."""
-    bins = 720
-    away = mesh.vertices - origin
-    flat = np.hypot(away[:, 0], away[:, 1]) + np.float32(1e-3)
-    corners = np.arctan2(away[:, 1], away[:, 0])[mesh.faces]
-    spread = np.remainder(corners - corners[:, :1] + np.pi, 2 * np.pi) - np.pi
-    first = np.floor((corners[:, 0] + spread.min(1) - 0.01) / (2 * np.pi) * bins).astype(int)
-    last = np.floor((corners[:, 0] + spread.max(1) + 0.01) / (2 * np.pi) * bins).astype(int)
-    # +1 where a triangle begins, -1 after its end, over three turns folded into one
-    steps = np.bincount(first + bins, minlength=3 * bins + 1) - np.bincount(last + bins + 1, minlength=3 * bins + 1)
-    covered = np.cumsum(steps)[: 3 * bins].reshape(3, bins).max(0) > 0
-    slope = directions[:, 2] / (np.hypot(directions[:, 0], directions[:, 1]) + np.float32(1e-6))
-    low, high = (away[:, 2] / flat).min() - 0.02, (away[:, 2] / flat).max() + 0.02
-    azimuth = np.floor(np.arctan2(directions[:, 1], directions[:, 0]) / (2 * np.pi) * bins).astype(int) % bins
-    return np.flatnonzero(covered[azimuth] & (slope > low) & (slope < high))
