@@ -30,9 +30,8 @@ demo: setup  ## simulate a drive, replay it into slam_node, check and show what 
 test: setup  ## all tests
 	$(BIN)/python -m pytest $(ARGS)
 
-lint:  ## style and types
-	@$(MAKE) --no-print-directory setup
-	@$(BIN)/python -c 'import ruff, mypy' 2>/dev/null || $(BIN)/python -m pip install -qq '.[dev]' --no-build-isolation 2>/dev/null || $(BIN)/python -m pip install -qq 'ruff>=0.9' 'mypy>=1.13' types-PyYAML
+lint: setup  ## style and types
+	@$(BIN)/python -c 'import ruff, mypy' 2>/dev/null || $(BIN)/python -m pip install -qq -e '.[dev]'
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy

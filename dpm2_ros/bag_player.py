@@ -20,7 +20,7 @@ from rosgraph_msgs.msg import Clock
 from dpm2_core.data import topics
 from dpm2_core.data.bag_file import Bag, open_bag
 from dpm2_core.data.prefetch import prefetch
-from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.errors import UsageError
 from dpm2_core.files import atomic_write
 from dpm2_ros.conversions import stamp_to_msg
 from dpm2_ros.runtime import STOP, ros_context
@@ -69,7 +69,7 @@ class BagPlayer:
         """Play to the end, or until a signal; returns the number of messages.
 
         Raises:
-            Dpm2Error: nobody listens, or the log cannot be written.
+            Dpm2Error: the log cannot be written.
         """
         self._publish_latched()
         self._await_subscribers()
@@ -112,18 +112,16 @@ class BagPlayer:
             self._publishers[topic].publish(bytes(data))
 
     def _await_subscribers(self) -> None:
-        """Until the clouds (or, without any, everything) have their subscribers."""
+        """Until the clouds (or, without any, everything) have their subscribers; not for ever."""
         options = self._options
-        if options.wait <= 0:
-            return
         clouds = [topic for topic in self._publishers if self._bag.types[topic] == _CLOUD] or list(self._publishers)
-        waiting, end = list(clouds), time.monotonic() + options.wait
-        while waiting and not STOP.wait(0.02):
-            waiting = [
-                topic for topic in waiting if self._publishers[topic].get_subscription_count() < options.subscribers
-            ]
-            if waiting and time.monotonic() > end:
-                raise Dpm2Error(f"nobody listens to {', '.join(waiting)} after {options.wait:g} s")
+        end = time.monotonic() + options.wait
+        while waiting := [t for t in clouds if self._publishers[t].get_subscription_count() < options.subscribers]:
+            if time.monotonic() >= end:
+                self._node.get_logger().warning(f"playing, though nobody listens to {', '.join(waiting)} yet")
+                return
+            if STOP.wait(0.02):
+                return
         STOP.wait(0.2)  # other topics of the same subscriber are matched within moments of each other
 
     def _await_delivery(self, seconds: float) -> None:
@@ -197,12 +195,12 @@ def _play(
     duration: Annotated[float | None, typer.Option(help="seconds to play, of the recording's time", min=0)] = None,
     loop: Annotated[bool, typer.Option("--loop", help="start again at the end, until stopped")] = False,
     topics: Annotated[list[str] | None, typer.Option(help="only these topics; may be repeated")] = None,
-    wait: Annotated[float, typer.Option(help="seconds to wait for subscribers of the clouds; 0: none", min=0)] = 0.0,
-    subscribers: Annotated[int, typer.Option(help="how many of them to wait for", min=1)] = 1,
+    wait: Annotated[float, typer.Option(help="longest wait for somebody to listen to the clouds, s", min=0)] = 2.0,
+    subscribers: Annotated[int, typer.Option(help="how many listeners to wait for", min=1)] = 1,
     clock: Annotated[bool, typer.Option(help="publish /clock, for nodes with use_sim_time")] = True,
     log: Annotated[Path | None, typer.Option(help="CSV file for the moment at which each message went out")] = None,
 ) -> int:
-    """Publish a recording. Exit code 1 if nobody listens, 2 for a bag that cannot be read."""
+    """Publish a recording. Exit code 2 for one that cannot be read."""
     node = rclpy.create_node("bag_player")
     try:
         options = Options(bag, rate, start, duration, loop, tuple(topics or ()), wait, subscribers, clock, log)

@@ -35,7 +35,7 @@ class RosSettings(Settings):
     base_frame: str = ""
     """Frame whose pose is published; empty takes the root above the LiDAR in /tf_static, else the LiDAR's own frame."""
 
-    tf_timeout: float = Field(default=2.0, ge=0, le=60)
+    tf_timeout: float = Field(default=0.5, ge=0, le=60)
     """How long the first cloud waits for /tf_static, if anybody publishes it, s."""
 
     publish_tf_odom: bool = True
