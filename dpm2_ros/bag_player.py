@@ -178,12 +178,6 @@ def main(arguments: Sequence[str]) -> int:
     try:
         own = remove_ros_args(["bag_player", *arguments])[1:]
         return int(app(args=own, standalone_mode=False, prog_name="bag_player") or 0)
-    except Exception as error:
-        # click's own errors of use (an unknown option, a missing argument) know their message, in whichever package.
-        message = getattr(error, "format_message", None)
-        if message is None:
-            raise
-        raise UsageError(" ".join(message().split()) or "see bag_player --help") from None
     finally:
         rclpy.try_shutdown()
 

@@ -218,7 +218,10 @@ def main() -> int:
     """Entry point of `python -m dpm2_ros.demo`."""
     app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
     app.command()(demo)
-    return exit_code(lambda: app(standalone_mode=False))
+    try:
+        return exit_code(lambda: app(standalone_mode=False))
+    except KeyboardInterrupt:
+        return 130
 
 
 if __name__ == "__main__":

@@ -34,6 +34,13 @@ def exit_code(work: Callable[[], int | None]) -> int:
     except Dpm2Error as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
+    except Exception as error:
+        # click's own errors of use (an unknown option, a missing argument); typer may carry a click of its own
+        message = getattr(error, "format_message", None)
+        if message is None:
+            raise
+        print(f"error: {' '.join(message().split()) or 'see --help'}", file=sys.stderr)
+        return 2
 
 
 def ros_context(arguments: Sequence[str]) -> None:
