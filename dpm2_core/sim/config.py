@@ -101,18 +101,18 @@ class Preset(Settings):
 
 PRESETS: dict[PresetName, Preset] = {
     "city": Preset(
-        half_width=5.0, sidewalk=2.2, setback=3.6, buildings=0.8, floors=(2, 6), side_streets=1.2, trees=4.0,
-        bushes=6.0, boundaries=0.45, parked=0.7, poles=7.0, clutter=5.0, tufts=0.15, people=2.5, traffic=1.5,
-        speed=11.0, hills=0.8,
+        half_width=5.0, sidewalk=2.2, setback=3.6, buildings=0.8, floors=(2, 6), side_streets=1.1, trees=6.0,
+        forest=0.15, bushes=12.0, boundaries=0.5, parked=0.7, poles=7.0, clutter=5.0, tufts=0.15, people=2.5,
+        traffic=1.5, speed=11.0, hills=0.8,
     ),
     "suburb": Preset(
-        half_width=4.4, sidewalk=1.7, setback=7.0, buildings=0.6, floors=(1, 3), side_streets=1.0, trees=6.0,
-        bushes=16.0, boundaries=0.8, parked=0.45, poles=5.0, clutter=7.0, tufts=0.5, people=1.0, traffic=0.8,
-        speed=10.0, hills=1.5,        roughness=0.07,
+        half_width=4.4, sidewalk=1.7, setback=7.0, buildings=0.6, floors=(1, 3), side_streets=0.9, trees=7.0,
+        forest=0.4, bushes=18.0, boundaries=0.8, parked=0.45, poles=5.0, clutter=7.0, tufts=0.5, people=1.0,
+        traffic=0.8, speed=10.0, hills=1.5, roughness=0.07,
     ),
     "rural": Preset(
-        half_width=3.8, setback=16.0, buildings=0.1, floors=(1, 2), side_streets=0.3, trees=4.0, forest=1.5,
-        bushes=12.0, boundaries=0.2, poles=3.0, clutter=1.0, tufts=1.2, people=0.1, traffic=0.8, speed=16.0,
+        half_width=3.8, setback=16.0, buildings=0.1, floors=(1, 2), side_streets=0.3, trees=4.0, forest=2.4,
+        bushes=14.0, boundaries=0.25, poles=3.0, clutter=1.0, tufts=1.2, people=0.1, traffic=0.8, speed=16.0,
         hills=4.0, roughness=0.15,
     ),
     "highway": Preset(half_width=11.0, lane=6.5, speed=25.0, hills=0.0, roughness=0.0, traffic=1.5, degenerate=True),

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from dpm2_core.geometry import se3
 from dpm2_core.sim.config import LidarConfig
-from dpm2_core.sim.materials import DARK, MISS, MOVING_LABEL, REFLECTANCE, RETRO, ROUGHNESS
+from dpm2_core.sim.materials import DARK, MISS, MOVING_LABEL, REFLECTANCE, RETRO, ROUGHNESS, Label
 from dpm2_core.sim.mesh import Hits, Mesh, rotated
+from dpm2_core.sim.shading import road_marking
 from dpm2_core.sim.world import World
 
 Array = NDArray[np.float64]
@@ -92,6 +93,8 @@ class Lidar:
         still = world.scene.cast(origins, directions, self.config.range)
         points, back = self._returns(world.static, still, directions, chance, jitter)
         label = world.static.label[np.maximum(still.face, 0)].astype(np.uint32)
+        if not world.terrain.preset.degenerate:  # there, intensity would tell the motion
+            self._paint(world, T_world_lidar, points, label, back)
         static = points[back]
         moving = np.zeros(len(directions), bool)
         if movers := world.movers(time, T_world_lidar[:3, 3]):
@@ -106,6 +109,17 @@ class Lidar:
             label[which] = kind | movers.number[hits.face].astype(np.uint32) << 16
         time_offset = self.column_time[self.column[back]]
         return Scan(points[back], label[back], moving[back], self.ring[back], time_offset, static)
+
+    def _paint(
+        self, world: World, T_world_lidar: Array, points: Float, label: NDArray[np.uint32], back: NDArray[np.bool_]
+    ) -> None:
+        """Brightens and labels the returns from lane markings, in place."""
+        road = np.flatnonzero(back & (label == Label.ROAD))
+        xy = points[road, :3] @ T_world_lidar[:2, :3].T.astype(np.float32) + T_world_lidar[:2, 3].astype(np.float32)
+        footprint = np.full(len(xy), 0.03, np.float32)
+        painted = road[road_marking(*world.terrain.lane_coordinates(xy), footprint, world.terrain) > 0.5]
+        label[painted] = Label.MARKING
+        points[painted, 3] = np.minimum(points[painted, 3] * np.float32(1.7), 1)
 
     def _rays(self, T_world_lidar: Array, twist: Array | None) -> tuple[Float, Float]:
         if twist is None:
@@ -138,7 +152,7 @@ class Lidar:
         strength = reflectance * (cosine + np.float32(0.02)) * (np.float32(30) / np.maximum(distance, 5)) ** 2
         # Whole panes and panels vanish rather than single pulses: half of the share is drawn once a quad.
         panel = ((face >> 1) * 40503 & 0xFFFF).astype(np.float32) / np.float32(0xFFFF)
-        lost = config.dropout + MISS[material] * 2 * panel + np.exp(-strength / np.float32(0.012))
+        lost = config.dropout + MISS[material] * 2 * panel + np.exp(-strength / np.float32(0.006))
         back = (hits.face >= 0) & (chance[0] > lost)
         sigma = np.hypot(np.float32(config.noise), ROUGHNESS[material])
         measured = distance + sigma * jitter[0]

@@ -71,7 +71,7 @@ class Movers:
     number: NDArray[np.uint16]
 
     def cast(self, origin: Float, directions: Float, reach: float) -> tuple[Hits, NDArray[np.intp]]:
-        """Hits of those K rays that can meet a mover, and which (K,) they are, of R along (R, 3) from (3,) or (R, 3)."""
+        """Hits of those K rays that can meet a mover, and which (K,) they are, of R from (3,) or (R, 3)."""
         all_rays = origin.ndim == 2
         toward = np.arange(len(directions)) if all_rays else _towards(self.scene.mesh, origin, directions)
         origins = np.ascontiguousarray(np.broadcast_to(origin, directions.shape)[toward])
