@@ -14,6 +14,7 @@ REQUIREMENTS = [
     "numpy>=1.26,<3",  # every array
     "scipy>=1.11,<2",  # rotations, nearest neighbours
     "torch>=2.6,<2.14",  # the network; CPU wheels serve
+    "safetensors>=0.4,<1",  # weights: data that cannot execute code
     "small_gicp>=1.0,<2",  # scan registration, multi-threaded, without the GIL
     "gtsam>=4.3,<4.4",  # pose graph; the first with wheels for numpy 2
     "pydantic>=2.7,<3",  # typed configuration
