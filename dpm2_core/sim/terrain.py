@@ -100,10 +100,12 @@ class Terrain:
 
     def _heights(self, road: Road, rng: np.random.Generator) -> NDArray[np.float32]:
         preset, shape = self.preset, self.edge.shape
-        waves = zip(rng.normal(0, 0.5, 6), rng.uniform(60, 300, 6), rng.uniform(0, 6.3, (6, 2)), strict=True)
-        z = sum(
-            a * np.sin(2 * np.pi / w * (self.centre @ (np.cos(p[0]), np.sin(p[0]))) + p[1]) for a, w, p in waves
-        ) * preset.hills  # fmt: skip
+        # long waves are high, short ones low: grades stay such as streets have
+        waves = zip(rng.normal(0, 0.001, 6), rng.uniform(60, 300, 6), rng.uniform(0, 6.3, (6, 2)), strict=True)
+        z = preset.hills * sum(
+            steep * w * np.sin(2 * np.pi / w * (self.centre @ (np.cos(turn), np.sin(turn))) + phase)
+            for steep, w, (turn, phase) in waves
+        )
         if road.heights is not None:
             known = np.concatenate(road.heights)
             beside = cKDTree(self.centre[: len(known)]).query(self.centre[len(known) :])[1]
