@@ -10,6 +10,7 @@ import numpy as np
 from dpm2_core.config import Settings
 from dpm2_core.frame import Array, Frame, Keyframe, Registration
 from dpm2_core.geometry import se3
+from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.slam.preprocess import Scan
 
 
@@ -20,6 +21,8 @@ class KeyframeSettings(Settings):
     """Motion after which a scan becomes a keyframe, m."""
     angle: float = 25.0
     """Turn after which a scan becomes a keyframe, degrees."""
+    voxel: float = 0.3
+    """Spacing of the points of a keyframe, m."""
     range: float = 60.0
     """Points farther than this do not enter the map, m."""
     drift_translation: float = 0.01
@@ -57,8 +60,9 @@ class KeyframeSelector:
             sigma = np.repeat([np.radians(s.drift_rotation), s.drift_translation], 3) * max(metres, 1.0)
             covariance = registration.covariance + np.diag(sigma**2) + self._doubt
             edge = replace(registration, T_target_source=T_last_this, covariance=covariance)
-        near = np.einsum("ij,ij->i", scan.cloud[:, :3], scan.cloud[:, :3]) < s.range**2
+        near = scan.points[np.einsum("ij,ij->i", scan.points[:, :3], scan.points[:, :3]) < s.range**2]
+        cloud = near[voxel_first(near, s.voxel)]
         keyframe_id = 0 if last is None else last.id + 1
-        keyframe = Keyframe(keyframe_id, frame.stamp, frame.index, T_odom_lidar, scan.cloud[near], edge, self._robot)
+        keyframe = Keyframe(keyframe_id, frame.stamp, frame.index, T_odom_lidar, cloud, edge, self._robot)
         self._last, self._doubt = keyframe, np.zeros((6, 6))
         return keyframe

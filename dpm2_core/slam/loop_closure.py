@@ -11,8 +11,11 @@ import numpy as np
 from dpm2_core.config import Settings
 from dpm2_core.frame import Array, Points, Registration
 from dpm2_core.geometry import se3
+from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.slam.local_map import LocalMap, LocalMapSettings
 from dpm2_core.slam.registration import GeometricRegistration, GeometricSettings
+
+_SOURCE_VOXEL = 0.8  # m, spacing of the points that are registered, as in the odometry
 
 
 class LoopSettings(Settings):
@@ -87,5 +90,6 @@ class LoopCloser:
         to_candidate = se3.inverse(poses[candidate])
         near = [se3.transform(to_candidate @ poses[i], clouds[i]) for i in around if i < len(clouds) - 1]
         local_map.insert(np.concatenate(near), np.eye(4))
-        source = clouds[-1][::2, :3].astype(np.float64)
+        last = clouds[-1]
+        source = last[voxel_first(last, _SOURCE_VOXEL), :3].astype(np.float64)
         return self._registration.register(source, local_map, T_guess, widen=2.0)

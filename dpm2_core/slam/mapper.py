@@ -22,7 +22,7 @@ _NO_POINTS: Points = np.zeros((0, 4), np.float32)
 class MapSettings(Settings):
     """The map that is shown and saved."""
 
-    voxel: float = 0.5
+    voxel: float = 0.3
     """Spacing of its points, m."""
 
 

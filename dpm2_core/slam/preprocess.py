@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A raw scan into the two clouds that the odometry works with: one for the map, a sparser one to register."""
+"""A raw scan into what the odometry works with: its valid points, some of them for the map, fewer to register."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class PreprocessSettings(Settings):
     max_range: float = 90.0
     """Farther returns are dropped, m."""
     map_voxel: float = 0.5
-    """Spacing of the points that enter maps, m."""
+    """Spacing of the points that enter the local map, m."""
     source_voxel: float = 0.8
     """Spacing of the points that are registered, m; at least `map_voxel`."""
     deskew: bool = True
@@ -41,8 +41,14 @@ class PreprocessSettings(Settings):
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """A prepared scan in the LiDAR frame at its stamp: `cloud` (M, 4) float32 for maps, `source` (N, 3) float64."""
+    """A prepared scan in the LiDAR frame at its stamp.
 
+    Attributes:
+        points: (P, 4) float32, all that were measured within range.
+        cloud: (M, 4) float32, those for the local map. source: (N, 3) float64, those to register.
+    """
+
+    points: Points
     cloud: Points
     source: Array
 
@@ -63,7 +69,7 @@ class Preprocessor:
             points = deskew(points, frame.time_offset[used], twist)
         cloud = points[voxel_first(points, s.map_voxel)]
         source = cloud[voxel_first(cloud, s.source_voxel), :3].astype(np.float64)
-        return Scan(cloud, source)
+        return Scan(points, cloud, source)
 
 
 def deskew(points: Points, time_offset: Points, twist: Array) -> Points:

@@ -188,5 +188,5 @@ def test_config_dump_shows_every_key() -> None:
     done = dpm2("config", "dump", "--set", "slam.threads=1")
     assert done.returncode == 0
     assert "threads: 1" in done.stdout
-    assert "# Spacing of the points that enter maps, m." in done.stdout
+    assert "# Spacing of the points that enter the local map, m." in done.stdout
     assert dpm2("config", "dump", "--set", "nonsense=1").returncode == 2
