@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from time import perf_counter, process_time
 from typing import Any
 
@@ -142,12 +143,19 @@ def summary(source: Source, outcomes: Sequence[Outcome]) -> dict[str, Any]:
     stages = {stage: np.concatenate([o.stages[stage] for o in outcomes]) for stage in outcomes[0].stages}
     return {
         **_median(judged),
+        "ape_rmse_m_of_thirds": _thirds(source.poses, outcomes[0].poses),
         "fps": float(np.median(fps)),
         "fps_of_repetitions": fps.round(2).tolist(),
         "cpu_ms": 1e3 * float(np.median([o.cpu_seconds / len(o.seconds) for o in outcomes])),
         "frame_ms": _quantiles_ms(seconds),
         "stages_ms": {stage: _quantiles_ms(values) for stage, values in stages.items()},
     }
+
+
+def _thirds(truth: Array, poses: Array) -> list[float | None]:
+    """APE of each third of the drive alone: tells an error all along from a jump, of the estimate or of the truth."""
+    edges = np.linspace(0, len(truth), 4).astype(int)
+    return [evaluate(truth[a:b], poses[a:b]).ape_rmse_m if b - a > 1 else None for a, b in pairwise(edges.tolist())]
 
 
 def _median(judged: Sequence[Metrics]) -> dict[str, Any]:
