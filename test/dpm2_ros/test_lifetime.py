@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import PointCloud2
 
@@ -108,6 +109,7 @@ def test_a_drive_through_player_slam_node_and_mapper_node(
     """Three processes, the mapper apart: every cloud comes out, and the mapper saves the map of all keyframes."""
     harness = ros()
     odometry, keyframes = harness.hear(Odometry, "/dpm2/odom"), harness.hear(Odometry, "/dpm2/keyframe_odom", KEEP_ALL)
+    diagnostics = harness.hear(DiagnosticArray, "/diagnostics")
     environment = ros_environment(harness.node.context.get_domain_id())
     apart = ["--ros-args", "-p", "ros.embed_mapper:=false", "-p", "ros.map_directory:=''", "-p", "use_sim_time:=true"]
     saving = ["--ros-args", "-p", f"ros.map_directory:={tmp_path / 'map'}"]
@@ -117,6 +119,15 @@ def test_a_drive_through_player_slam_node_and_mapper_node(
     }
     try:
         harness.wait(lambda: harness.node.count_subscribers("/dpm2/keyframe") == 1, "the mapper", timeout=30)
+        # What is published before the two have found each other is lost, as always in DDS: wait until one is heard.
+        harness.wait(
+            lambda: (
+                any("slam_node" in status.name for message in diagnostics for status in message.status)
+                and harness.node.count_publishers("/dpm2/odom") == 1
+            ),
+            "slam_node",
+            timeout=30,
+        )
         player = start("bag_player", [str(bag), "--wait", "20"], environment, tmp_path / "player.log")
         processes["player"] = player
         assert player.wait(60) == 0
