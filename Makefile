@@ -12,9 +12,9 @@ EXTRAS ?= test
 # The environment is self-contained: a sourced ROS 2, another environment's bootstrap or its libraries must not leak in.
 unexport PYTHONPATH PYTHONHOME VIRTUAL_ENV AMENT_PREFIX_PATH ROS_DISTRO LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: help setup demo test lint bench sim parameters clean
+.PHONY: help setup demo test lint bench bench-ros bench-memory sim parameters clean
 help:  ## this list
-	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:[^#]*##/\t/' | expand -t 12
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:[^#]*##/\t/' | expand -t 16
 
 setup: $(READY)  ## create .venv with everything in it
 $(READY): setup.py pyproject.toml
@@ -39,6 +39,13 @@ lint: setup  ## style and types
 bench: setup  ## the figures of benchmarks/, beside KISS-ICP
 	@$(BIN)/python -c 'import kiss_icp' 2>/dev/null || $(BIN)/python -m pip install -qq -e '.[bench]'
 	$(BIN)/python -m dpm2_core.cli bench $(ARGS)
+
+bench-ros: setup  ## the KITTI excerpt through bag, player and slam_node at 10 Hz
+	$(BIN)/python -m dpm2_ros.bench $(ARGS)
+
+bench-memory: setup  ## resident memory over a synthetic drive of 2,000 frames (8 GB on disk)
+	$(BIN)/python -m dpm2_core.cli sim out/memory --frames 2000 --seed 3 --no-images
+	$(BIN)/python -m dpm2_core.cli bench memory --source out/memory $(ARGS)
 
 sim: setup  ## a synthetic drive in KITTI layout in out/sim
 	$(BIN)/dpm2 sim out/sim --frames $(or $(FRAMES),300) --seed $(or $(SEED),1) $(ARGS)

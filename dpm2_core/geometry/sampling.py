@@ -34,7 +34,7 @@ def voxel_first(points: Points, size: float) -> Index:
 def farthest_points(points: Points, count: int) -> Index:
     """Farthest point sampling of (N, 3) points: min(N, count) indices, in sampling order.
 
-    The start is the same for the same cloud; which point it is follows from fpsample's tree, not from `start_idx` alone.
+    The start is the same for the same cloud; which point it is follows from the tree, not from `start_idx` alone.
     A prefix of the result is the farthest point sampling of that length: one call serves all levels of a pyramid.
     """
     count = min(count, len(points))

@@ -101,7 +101,7 @@ def processors(number: int) -> Iterator[None]:
         os.sched_setaffinity(0, before)
 
 
-def write_report(path: Path, name: str, report: Report, options: Options) -> None:
+def write_report(path: Path, name: str, report: Report, options: Options, program: str = "dpm2") -> None:
     """The results with everything that is needed to judge and repeat them, as JSON.
 
     Raises:
@@ -109,7 +109,7 @@ def write_report(path: Path, name: str, report: Report, options: Options) -> Non
     """
     record = {
         "benchmark": name,
-        "command": shlex.join(["dpm2", *sys.argv[1:]]),
+        "command": shlex.join([*program.split(), *sys.argv[1:]]),
         "commit": git_commit(),
         "machine": {"processor": _processor(), "cpus": os.cpu_count(), "threads": options.threads},
         "versions": {"python": platform.python_version(), **{p: _version(p) for p in _PACKAGES}},

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`make bench-ros`: the KITTI excerpt through bag, bag_player and slam_node at 10 Hz, with the node's own defaults."""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.box import SIMPLE
+from rich.console import Console, Group
+from rich.table import Table
+
+from dpm2_core.data import topics
+from dpm2_core.data.bags import BagSource
+from dpm2_core.data.convert import convert_kitti
+from dpm2_core.data.kitti import KittiSource
+from dpm2_core.data.source import InputSettings
+from dpm2_core.evaluation.bench.harness import Options, Report, drives, write_report
+from dpm2_ros.demo import judge
+from dpm2_ros.replay import replay
+from dpm2_ros.runtime import exit_code
+
+FIGURES = ("frames_in", "frames_out", "dropped", "latency_p50_ms", "latency_p95_ms", "ape_rmse_m", "rpe_trans_m")
+
+
+def bench(
+    source: Annotated[list[Path] | None, typer.Option(help="KITTI sequences instead of the excerpt.")] = None,
+    out: Annotated[Path, typer.Option(help="Folder for ros.json.")] = Path("benchmarks"),
+    repetitions: Annotated[int, typer.Option(min=1, help="Replays of every drive.")] = 3,
+) -> int:
+    """Replay every drive at its own speed and judge what comes out; medians, and the worst of what must not happen."""
+    options = Options(sources=source or (), repetitions=repetitions)
+    results: dict[str, dict[str, float | int | None]] = {}
+    with drives(options) as sources, tempfile.TemporaryDirectory(prefix="dpm2_bench_ros_") as folder:
+        for drive in sources:
+            assert isinstance(drive, KittiSource)
+            bag, work = Path(folder) / f"bag_{drive.name}", Path(folder) / drive.name
+            work.mkdir()
+            convert_kitti(drive.path, bag)
+            played = BagSource(bag, InputSettings(images=False))
+            runs = [judge(played, replay(bag, topics.POINTS, work), work) for _ in range(repetitions)]
+            results[drive.name] = {
+                name: _median([run.summary[name] for run in runs], worst=name == "dropped") for name in FIGURES
+            } | {"failed_checks": sum(not holds for run in runs for holds in run.checks.values())}
+    table = Table(title="Bag -> bag_player -> slam_node -> /dpm2/odom", title_justify="left", box=SIMPLE)
+    for column in ("drive", *FIGURES, "failed checks"):
+        table.add_column(column, justify="right")
+    for name, row in results.items():
+        table.add_row(name, *("-" if value is None else f"{value:.4g}" for value in row.values()))
+    write_report(
+        out / "ros.json", "ros", Report({"drives": results}, Group(table)), options, "python -m dpm2_ros.bench"
+    )
+    Console().print(table)
+    return 1 if any(row["failed_checks"] for row in results.values()) else 0
+
+
+def _median(values: list[float | int | None], worst: bool) -> float | None:
+    known = [value for value in values if value is not None]
+    if len(known) < len(values):
+        return None
+    return float(max(known) if worst else np.median(known))
+
+
+def main() -> int:
+    """Entry point of `python -m dpm2_ros.bench`."""
+    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+    app.command()(bench)
+    return exit_code(lambda: app(standalone_mode=False))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
