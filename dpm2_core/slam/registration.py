@@ -28,6 +28,7 @@ class GeometricSettings(Settings):
     """A smaller share of inliers among the points is no answer."""
 
 
+_COARSE, _FINE = (1e-3, 0.02), (1e-4, 1e-3)  # rad and m: a smaller step ends the pass
 _CORRELATED = 10
 _NORMAL_NOISE = 0.09  # rad, of fitted normals; measured rms along smooth tunnels: 0.02 to 0.12, in towns over 0.25
 
@@ -70,13 +71,11 @@ class GeometricRegistration:
             step = np.linalg.solve(H + prior, -gradient - pull)
             T = se3.orthonormalised(T @ se3.exp(step))
             gate = max(0.7 * gate, s.final_gate)
-            small = np.linalg.norm(step[3:]) < (0.02 if coarse else 5e-4) and np.linalg.norm(step[:3]) < (
-                1e-3 if coarse else 5e-5
-            )
-            if small and coarse:
-                coarse = False
-            elif small and gate == s.final_gate:
-                break
+            radians, metres = _COARSE if coarse else _FINE
+            if np.linalg.norm(step[:3]) < radians and np.linalg.norm(step[3:]) < metres:
+                if not coarse:
+                    break
+                coarse, gate = False, s.final_gate
         share = inliers / len(points)
         ok = inliers >= s.min_points and share >= s.min_inliers
         reason = "" if ok else f"{inliers} of {len(points)} points fit the map"
