@@ -9,6 +9,8 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from dpm2_core.descriptors import Descriptors
+
 Array = NDArray[np.float64]
 Points = NDArray[np.float32]
 
@@ -126,6 +128,7 @@ class Keyframe:
         T_odom_kf: (4, 4) pose when it was made, in the odometry frame; the pose graph holds the optimised one.
         cloud: (M, 4) float32 sub-sampled points in its own LiDAR frame: the map and later refinement.
         edge: registration of this keyframe to the one before, T_before_this; None for the first.
+        descriptors: neural ones, in its own LiDAR frame; None where the registration makes none.
     """
 
     id: int
@@ -135,6 +138,7 @@ class Keyframe:
     cloud: Points
     edge: Registration | None = None
     robot: str = ""
+    descriptors: Descriptors | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,10 +9,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from dpm2_core.descriptors import Descriptors
 from dpm2_core.frame import Registration
 from dpm2_core.network.attention import Attention, RelativeBias, sine_code
 from dpm2_core.network.config import NetworkSettings
-from dpm2_core.network.descriptors import Descriptors, Tokens, to_tokens
+from dpm2_core.network.descriptors import Tokens, to_tokens
 from dpm2_core.network.heads import OffsetHead, OverlapHead, PointMLP
 from dpm2_core.network.registration import register_batch
 

@@ -11,9 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from dpm2_core.descriptors import Descriptors
 from dpm2_core.frame import Frame, Image
 from dpm2_core.network.config import ImageSettings, NetworkSettings
-from dpm2_core.network.descriptors import Descriptors, Tokens
+from dpm2_core.network.descriptors import Tokens
 from dpm2_core.network.fusion import Fusion
 from dpm2_core.network.pointnext import Scale, view_axes
 from dpm2_core.network.pyramid import PointBatch, build_pyramid, collate, crop

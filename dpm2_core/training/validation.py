@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from dpm2_core.descriptors import Descriptors
 from dpm2_core.geometry import se3
 from dpm2_core.network.config import NetworkSettings
-from dpm2_core.network.descriptors import Descriptors
 from dpm2_core.network.encoder import collate_views
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pyramid import build_pyramid, collate

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 import torch
 
+from dpm2_core.descriptors import Descriptors, merge
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.kabsch import transform
-from dpm2_core.network.descriptors import Descriptors, merge, to_tokens
+from dpm2_core.network.descriptors import to_tokens
 from dpm2_core.network.heads import OffsetHead, into_set_frame
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pointnext import from_view, to_view
