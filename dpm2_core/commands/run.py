@@ -45,8 +45,10 @@ def run(
     chosen = load_settings(Config, config, overrides)
     start, stop = parse_range(frames)
     console = Console(stderr=True)
-    # The geometric registration does not look at images: decoding them would only cost time.
-    source = open_source(src, chosen.input.model_copy(update={"images": False}))
+    system, recorder = SlamSystem(chosen.slam), TrajectoryRecorder()
+    # Decoding images that nobody looks at would only cost time.
+    images = chosen.input.images and system.odometry.uses_images
+    source = open_source(src, chosen.input.model_copy(update={"images": images}))
     stop = len(source) if stop is None else min(stop, len(source))
     if start >= stop:
         raise UsageError(f"--frames {frames}: {src} has {len(source)} frames")
@@ -54,7 +56,6 @@ def run(
     out.mkdir(parents=True, exist_ok=True)
     with atomic_write(out / "config.yaml") as file:
         file.write(dump_settings(chosen))
-    system, recorder = SlamSystem(chosen.slam), TrajectoryRecorder()
     seconds, failed, wall = _drive(source, start, stop, system, recorder, console)
     for note in source.notes:
         console.print(note, style="yellow", soft_wrap=True)

@@ -63,6 +63,8 @@ class KeyframeSelector:
         near = scan.points[np.einsum("ij,ij->i", scan.points[:, :3], scan.points[:, :3]) < s.range**2]
         cloud = near[voxel_first(near, s.voxel)]
         keyframe_id = 0 if last is None else last.id + 1
-        keyframe = Keyframe(keyframe_id, frame.stamp, frame.index, T_odom_lidar, cloud, edge, self._robot)
+        keyframe = Keyframe(
+            keyframe_id, frame.stamp, frame.index, T_odom_lidar, cloud, edge, self._robot, scan.descriptors
+        )
         self._last, self._doubt = keyframe, np.zeros((6, 6))
         return keyframe

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scan by scan: predict, register to the local map, gate, update. The state says how far the answer can be trusted."""
+"""Scan by scan: predict, register, gate, update. The state says how far the answer can be trusted."""
 
 from __future__ import annotations
 
@@ -12,9 +12,8 @@ from dpm2_core.config import Settings
 from dpm2_core.frame import Array, Frame, Registration, State, Tracked
 from dpm2_core.geometry import se3
 from dpm2_core.slam.keyframes import KeyframeSelector
-from dpm2_core.slam.local_map import LocalMap
-from dpm2_core.slam.preprocess import Preprocessor, Scan
-from dpm2_core.slam.registration import GeometricRegistration
+from dpm2_core.slam.preprocess import Scan
+from dpm2_core.slam.scan_registration import Prediction, ScanRegistration
 
 
 class OdometrySettings(Settings):
@@ -32,7 +31,7 @@ class OdometrySettings(Settings):
     lost_after: int = 5
     """Frames without a registration until the state is `lost`; `degraded` before."""
     restart_after: int = 20
-    """Frames without a registration until a new local map is begun at the predicted pose."""
+    """Frames without a registration until a new map is begun at the predicted pose."""
 
 
 _PERIOD = 0.1  # s, assumed between two stamps that do not advance
@@ -43,20 +42,16 @@ _UNKNOWN = np.diag([0.05, 0.05, 0.05, 0.5, 0.5, 0.5]) ** 2  # variance that a se
 class Odometry:
     """The pose of the LiDAR in the odometry frame, which is that of the first usable scan."""
 
-    def __init__(
-        self,
-        settings: OdometrySettings,
-        preprocessor: Preprocessor,
-        registration: GeometricRegistration,
-        local_map: LocalMap,
-        keyframes: KeyframeSelector,
-    ) -> None:
+    def __init__(self, settings: OdometrySettings, registration: ScanRegistration, keyframes: KeyframeSelector) -> None:
         self._settings = settings
-        self._preprocessor = preprocessor
         self._registration = registration
-        self._local_map = local_map
         self._keyframes = keyframes
         self.reset()
+
+    @property
+    def uses_images(self) -> bool:
+        """Whether frames should come with their pictures."""
+        return self._registration.uses_images
 
     def reset(self) -> None:
         """Forget everything; the next scan is the first."""
@@ -66,7 +61,7 @@ class Odometry:
         self._stamp: int | None = None
         self._failures = 0
         self._first: Frame | None = None
-        self._local_map.clear()
+        self._registration.clear()
         self._keyframes.reset()
 
     def process(self, frame: Frame) -> Tracked:
@@ -74,7 +69,7 @@ class Odometry:
         clock = [perf_counter()]
         dt = self._elapsed(frame.stamp)
         twist = np.zeros(6) if self._twist is None else self._twist
-        scan = self._preprocessor.prepare(frame, twist)
+        scan = self._registration.prepare(frame, twist)
         clock.append(perf_counter())
         T_predicted = self._T @ se3.exp(twist * dt)
         registration = self._register(scan, T_predicted, dt, frame.problem)
@@ -107,17 +102,15 @@ class Odometry:
     def _register(self, scan: Scan, T_predicted: Array, dt: float, problem: str | None) -> Registration:
         if problem is not None:
             return Registration(T_predicted, _UNKNOWN, 0.0, np.inf, "none", False, problem)
-        if not len(self._local_map):
-            ok = len(scan.source) >= self._registration.min_points
-            reason = "" if ok else f"{len(scan.source)} points; a map needs {self._registration.min_points}"
-            return Registration(T_predicted, np.zeros((6, 6)), float(ok), 0.0, "first", ok, reason)
+        if not len(self._registration):
+            refusal = self._registration.refusal(scan)
+            return Registration(T_predicted, np.zeros((6, 6)), float(not refusal), 0.0, "first", not refusal, refusal)
         if self._twist is None:
             starts = [T_predicted @ se3.exp([0, 0, 0, x, 0, 0]) for x in _STARTS]
-            found = [self._registration.register(scan.source, self._local_map, T, 2.0) for T in starts]
-            return max(found, key=lambda r: (r.ok, round(20 * r.confidence)))  # the first of equals: least motion
+            return self._registration.register(scan, Prediction(starts, widen=2.0))
         widen = 1.0 + min(self._failures, 4)
-        prior = np.eye(6) / (self._settings.steadiness * dt * dt * (1 + self._failures) ** 2) ** 2
-        answer = self._registration.register(scan.source, self._local_map, T_predicted, widen, prior)
+        information = np.eye(6) / (self._settings.steadiness * dt * dt * (1 + self._failures) ** 2) ** 2
+        answer = self._registration.register(scan, Prediction([T_predicted], widen, information))
         return self._gated(answer, T_predicted, dt)
 
     def _gated(self, answer: Registration, T_predicted: Array, dt: float) -> Registration:
@@ -137,10 +130,10 @@ class Odometry:
         """The second scan has shown the velocity: undo the motion in the first one too, and register anew."""
         self._first = None
         twist = se3.log(se3.inverse(self._T) @ registration.T_target_source) / dt
-        self._local_map.clear()
-        self._local_map.insert(self._preprocessor.prepare(first, twist).cloud, self._T)
-        scan = self._preprocessor.prepare(frame, twist)
-        return scan, self._registration.register(scan.source, self._local_map, registration.T_target_source)
+        self._registration.clear()
+        self._registration.update(self._registration.prepare(first, twist), self._T)
+        scan = self._registration.prepare(frame, twist)
+        return scan, self._registration.register(scan, Prediction([registration.T_target_source]))
 
     def _update(self, scan: Scan, registration: Registration, dt: float) -> None:
         """Move on: to the registered pose, or to the predicted one with the doubt that it deserves."""
@@ -153,21 +146,20 @@ class Odometry:
         self._T = registration.T_target_source
         self._covariance = registration.covariance
         self._failures = 0
-        if self._local_map.wants(self._T):
-            self._local_map.insert(scan.cloud, self._T)
+        self._registration.update(scan, self._T)
 
     def _coast(self, scan: Scan, dt: float) -> None:
-        """Nothing registered: follow the prediction with growing doubt; after long enough, begin a new local map."""
-        if not len(self._local_map):
+        """Nothing registered: follow the prediction with growing doubt; after long enough, begin a new map."""
+        if not len(self._registration):
             return
         self._failures += 1
         self._covariance = self._covariance + _UNKNOWN * dt * self._failures
         if self._failures <= self._settings.restart_after and self._twist is not None:
             self._T = self._T @ se3.exp(self._twist * dt)
-        if self._failures >= self._settings.restart_after and len(scan.source) >= self._registration.min_points:
+        if self._failures >= self._settings.restart_after and not self._registration.refusal(scan):
             self._keyframes.doubt(self._covariance)
-            self._local_map.clear()
-            self._local_map.insert(scan.cloud, self._T)
+            self._registration.clear()
+            self._registration.update(scan, self._T)
             self._twist, self._failures = None, 0
 
     def _state(self, registration: Registration) -> State:

@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from pydantic import model_validator
 
 from dpm2_core.config import Settings
+from dpm2_core.descriptors import Descriptors
 from dpm2_core.frame import Array, Frame, Points
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.voxel import voxel_first
@@ -45,12 +46,15 @@ class Scan:
 
     Attributes:
         points: (P, 4) float32, all that were measured within range.
-        cloud: (M, 4) float32, those for the local map. source: (N, 3) float64, those to register.
+        cloud: (M, 4) float32, those for the local map. source: (N, 3) float64, those to register. Both are empty where
+            the registration works on descriptors alone.
+        descriptors: neural ones; None where there are none.
     """
 
     points: Points
-    cloud: Points
-    source: Array
+    cloud: Points = field(default_factory=lambda: np.zeros((0, 4), np.float32))
+    source: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    descriptors: Descriptors | None = None
 
 
 class Preprocessor:
@@ -59,16 +63,24 @@ class Preprocessor:
     def __init__(self, settings: PreprocessSettings) -> None:
         self._settings = settings
 
-    def prepare(self, frame: Frame, twist: Array) -> Scan:
-        """NaN, inf and zero points are dropped; `twist` (6,) [rad/s, m/s] is the motion that deskewing undoes."""
+    def measured(self, frame: Frame, twist: Array) -> Points:
+        """The valid points (P, 4); `twist` (6,) [rad/s, m/s] is the motion that deskewing undoes.
+
+        NaN, inf and zero points are dropped, and those out of range.
+        """
         s = self._settings
         squared = np.einsum("ij,ij->i", frame.points[:, :3], frame.points[:, :3])
         used = (squared >= s.min_range**2) & (squared <= s.max_range**2) & (squared > 0)  # False for NaN
         points = frame.points[used]
         if s.deskew and frame.time_offset is not None:
             points = deskew(points, frame.time_offset[used], twist)
-        cloud = points[voxel_first(points, s.map_voxel)]
-        source = cloud[voxel_first(cloud, s.source_voxel), :3].astype(np.float64)
+        return points
+
+    def prepare(self, frame: Frame, twist: Array) -> Scan:
+        """`measured`, thinned out for local map and registration."""
+        points = self.measured(frame, twist)
+        cloud = points[voxel_first(points, self._settings.map_voxel)]
+        source = cloud[voxel_first(cloud, self._settings.source_voxel), :3].astype(np.float64)
         return Scan(points, cloud, source)
 
 

@@ -6,6 +6,8 @@ from __future__ import annotations
 from time import perf_counter
 from typing import Literal
 
+from pydantic import Field
+
 from dpm2_core.config import Settings
 from dpm2_core.data.source import InputSettings
 from dpm2_core.frame import Frame, Tracked
@@ -13,21 +15,25 @@ from dpm2_core.slam.keyframes import KeyframeSelector, KeyframeSettings
 from dpm2_core.slam.local_map import LocalMap, LocalMapSettings
 from dpm2_core.slam.loop_closure import LoopCloser, LoopSettings
 from dpm2_core.slam.mapper import Mapper, MapSettings
+from dpm2_core.slam.neural import NeuralScanRegistration, NeuralSettings, load_network
 from dpm2_core.slam.odometry import Odometry, OdometrySettings
 from dpm2_core.slam.pose_graph import PoseGraph, PoseGraphSettings
 from dpm2_core.slam.preprocess import Preprocessor, PreprocessSettings
+from dpm2_core.slam.refined import RefinedScanRegistration
 from dpm2_core.slam.registration import GeometricRegistration, GeometricSettings
+from dpm2_core.slam.scan_registration import GeometricScanRegistration, ScanRegistration
 
 
 class SlamSettings(Settings):
     """The SLAM, stage by stage."""
 
-    registration: Literal["geometric"] = "geometric"
-    """How a scan finds its pose."""
-    threads: int = 2
-    """Threads of the neighbour search."""
+    registration: Literal["geometric", "neural", "refined"] = "geometric"
+    """How a scan finds its pose: by points, by neural descriptors, or by descriptors and then points."""
+    threads: int = Field(2, ge=1)
+    """Threads of the neighbour search and of the network."""
     preprocess: PreprocessSettings = PreprocessSettings()
     geometric: GeometricSettings = GeometricSettings()
+    neural: NeuralSettings = NeuralSettings()
     local_map: LocalMapSettings = LocalMapSettings()
     odometry: OdometrySettings = OdometrySettings()
     keyframes: KeyframeSettings = KeyframeSettings()
@@ -68,13 +74,24 @@ class SlamSystem:
 
 def make_odometry(s: SlamSettings, robot: str = "") -> Odometry:
     """The odometry with its collaborators."""
-    return Odometry(
-        s.odometry,
-        Preprocessor(s.preprocess),
-        GeometricRegistration(s.geometric),
-        LocalMap(s.local_map, s.threads),
-        KeyframeSelector(s.keyframes, robot),
+    return Odometry(s.odometry, make_registration(s), KeyframeSelector(s.keyframes, robot))
+
+
+def make_registration(s: SlamSettings) -> ScanRegistration:
+    """What `registration` names.
+
+    Raises:
+        UsageError: the network has no weights to run with.
+    """
+    preprocessor = Preprocessor(s.preprocess)
+    geometric = GeometricScanRegistration(
+        preprocessor, GeometricRegistration(s.geometric), LocalMap(s.local_map, s.threads)
     )
+    if s.registration == "geometric":
+        return geometric
+    network = load_network(s.neural.weights, s.threads, s.neural.preset)
+    neural = NeuralScanRegistration(s.neural, preprocessor, network)
+    return neural if s.registration == "neural" else RefinedScanRegistration(neural, geometric)
 
 
 def make_mapper(s: SlamSettings) -> Mapper:

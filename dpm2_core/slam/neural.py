@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scan to map by neural descriptors: those of a frame to the merged ones of keyframes around it; no start needed."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from pydantic import Field
+
+from dpm2_core.config import Settings
+from dpm2_core.descriptors import Descriptors, merge
+from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.frame import Array, Frame, Registration
+from dpm2_core.geometry import se3
+from dpm2_core.slam.preprocess import Preprocessor, Scan
+from dpm2_core.slam.scan_registration import Prediction
+
+if TYPE_CHECKING:  # torch takes seconds to import, and the geometric SLAM does without
+    from dpm2_core.network.model import DeepPointMap2
+
+SHIPPED = Path(__file__).resolve().parents[1] / "weights"
+
+
+class NeuralSettings(Settings):
+    """Registration by the network; `registration` must be `neural` or `refined`."""
+
+    weights: str = "small"
+    """Name of weights that come with dpm2, or path of a .safetensors file."""
+    preset: str = ""
+    """Preset that the weights must have been trained for; empty takes any."""
+    spacing: float = Field(3.0, gt=0)
+    """A frame's descriptors enter the map after this much motion, m (or a turn of 15 degrees)."""
+    frames: int = Field(2, ge=1, le=16)
+    """So many of the map's frames, the nearest to the predicted pose, are merged and registered to."""
+    radius: float = Field(20.0, gt=0)
+    """Frames farther than this from the predicted pose are not registered to, unless all are, m."""
+    min_confidence: float = Field(0.1, ge=0, le=1)
+    """Mean probability of the best matches below which there is no answer."""
+    max_rmse: float = Field(0.5, gt=0)
+    """Largest residual of the matches, m."""
+
+
+_KEPT = 20  # frames: at least as many as can lie around the next one
+
+
+@dataclass(frozen=True, eq=False)
+class _Place:
+    """Where a frame was taken, T_odom_kf (4, 4), and what the network made of it."""
+
+    T_odom_kf: Array
+    descriptors: Descriptors
+
+
+class DescriptorMap:
+    """The descriptors of the last keyframes of the odometry."""
+
+    def __init__(self, spacing: float, frames: int, radius: float) -> None:
+        self._spacing, self._frames, self._radius = spacing, frames, radius
+        self._places: deque[_Place] = deque(maxlen=_KEPT)
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def clear(self) -> None:
+        self._places.clear()
+
+    def wants(self, T_odom_lidar: Array) -> bool:
+        """Whether a frame taken at that pose would show enough that is new."""
+        if not self._places:
+            return True
+        moved = se3.inverse(self._places[-1].T_odom_kf) @ T_odom_lidar
+        return bool(np.linalg.norm(moved[:3, 3]) >= self._spacing or se3.angle(moved) >= np.radians(15))
+
+    def insert(self, descriptors: Descriptors, T_odom_lidar: Array) -> None:
+        """Add those of a frame taken there."""
+        self._places.append(_Place(T_odom_lidar, descriptors))
+
+    def around(self, T_odom_lidar: Array) -> tuple[Array, Descriptors]:
+        """Pose T_odom_kf of the nearest frame, and the merged descriptors of it and its neighbours in its frame."""
+        distance = [float(np.linalg.norm(p.T_odom_kf[:3, 3] - T_odom_lidar[:3, 3])) for p in self._places]
+        order = np.argsort(distance, kind="stable")[: self._frames]
+        near = [self._places[i] for i in order if distance[i] <= self._radius or i == order[0]]
+        T_kf_odom = se3.inverse(near[0].T_odom_kf)
+        others = [place.descriptors.moved(T_kf_odom @ place.T_odom_kf) for place in near[1:]]
+        return near[0].T_odom_kf, merge([near[0].descriptors, *others])
+
+
+class NeuralScanRegistration:
+    """Descriptors to the descriptors of earlier frames. The prediction only chooses which those are."""
+
+    def __init__(self, settings: NeuralSettings, preprocessor: Preprocessor, model: DeepPointMap2) -> None:
+        self._settings = settings
+        self._preprocessor = preprocessor
+        self._model = model
+        self._map = DescriptorMap(settings.spacing, settings.frames, settings.radius)
+
+    @property
+    def uses_images(self) -> bool:
+        return self._model.encoder.image is not None
+
+    def __len__(self) -> int:
+        return len(self._map)
+
+    def clear(self) -> None:
+        self._map.clear()
+
+    def prepare(self, frame: Frame, twist: Array) -> Scan:
+        return self.described(frame, Scan(self._preprocessor.measured(frame, twist)))
+
+    def described(self, frame: Frame, scan: Scan) -> Scan:
+        """The scan with its descriptors; without, if it has too few points."""
+        deskewed = replace(frame, points=scan.points, time_offset=None)
+        try:
+            return replace(scan, descriptors=self._model.encoder.encode(deskewed))
+        except Dpm2Error:
+            return scan
+
+    def refusal(self, scan: Scan) -> str:
+        return "" if scan.descriptors is not None else f"{len(scan.points)} points: too few for descriptors"
+
+    def register(self, scan: Scan, prediction: Prediction) -> Registration:
+        T_predicted = prediction.starts[0]
+        if scan.descriptors is None:
+            return _failed(T_predicted, self.refusal(scan))
+        T_odom_kf, target = self._map.around(T_predicted)
+        found = self._model.decoder.register(scan.descriptors, target)
+        if not found.ok:
+            return _failed(T_predicted, found.reason)
+        found = replace(found, T_target_source=se3.orthonormalised(T_odom_kf @ found.T_target_source))
+        if found.confidence < self._settings.min_confidence:
+            return replace(found, ok=False, reason=f"matches with a confidence of only {found.confidence:.2f}")
+        if found.rmse > self._settings.max_rmse:
+            return replace(found, ok=False, reason=f"matches fit to {found.rmse:.2f} m only")
+        return found
+
+    def update(self, scan: Scan, T_odom_lidar: Array) -> None:
+        if scan.descriptors is not None and self._map.wants(T_odom_lidar):
+            self._map.insert(scan.descriptors, T_odom_lidar)
+
+
+def shipped() -> Sequence[str]:
+    """Names of the weights that come with dpm2."""
+    return sorted(path.stem for path in SHIPPED.glob("*.safetensors"))
+
+
+def load_network(weights: str, threads: int, preset: str = "") -> DeepPointMap2:
+    """The network with weights, ready to run on the CPU.
+
+    Args:
+        weights: name of shipped weights, or path of a .safetensors file.
+        threads: of torch, which has one number for the whole process.
+        preset: that the weights must be of; empty: any.
+
+    Raises:
+        UsageError: no such weights, or of another preset.
+    """
+    path = SHIPPED / f"{weights}.safetensors"
+    if weights not in shipped():
+        path = Path(weights)
+        if not path.is_file():
+            names = ", ".join(shipped()) or "none"
+            raise UsageError(f"slam.neural.weights {weights}: no such file; weights that come with dpm2: {names}")
+    import torch
+
+    from dpm2_core.network.weights import load_model
+
+    torch.set_num_threads(threads)
+    model = load_model(path)
+    if preset and model.settings.preset != preset:
+        raise UsageError(f"{path}: weights of preset {model.settings.preset}, slam.neural.preset is {preset}")
+    return model
+
+
+def _failed(T_predicted: Array, reason: str) -> Registration:
+    covariance = np.diag([0.1, 0.1, 0.1, 1.0, 1.0, 1.0])
+    return Registration(T_predicted, covariance, 0.0, np.inf, "neural", False, reason)
