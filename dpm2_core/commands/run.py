@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from pathlib import Path
 from time import perf_counter
 from typing import Annotated
@@ -14,6 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from dpm2_core.config import dump_settings, load_settings
+from dpm2_core.data.corrupt import CorruptedSource, parse_corruption
 from dpm2_core.data.ply import write_ply
 from dpm2_core.data.prefetch import prefetch
 from dpm2_core.data.source import Source, open_source
@@ -37,18 +39,28 @@ def run(
     gt: Annotated[Path | None, typer.Option(help="Ground truth (KITTI: left camera; TUM: LiDAR).")] = None,
     frames: Annotated[str, typer.Option(help="Which frames, a:b by position from 0.")] = ":",
     no_image: Annotated[bool, typer.Option("--no-image", help="Leave the camera out.")] = False,
+    corrupt: Annotated[
+        str | None,
+        typer.Option(
+            help="Let sensors fail, NAME=VALUE,...: shares of frames camera (black), no_image, overexposed, "
+            "underexposed (by stops), obstruction; share of beams; extrinsic_deg, extrinsic_m, time_offset (s); seed."
+        ),
+    ] = None,
     config: ConfigFile = None,
     settings: Overrides = None,
 ) -> None:
     """Run the SLAM on a recording and write trajectory, map, picture, timing and metrics."""
     overrides = [*(settings or []), *(["input.images=false"] if no_image else [])]
     chosen = load_settings(Config, config, overrides)
+    corruption = None if corrupt is None else parse_corruption(corrupt)
     start, stop = parse_range(frames)
     console = Console(stderr=True)
     system, recorder = SlamSystem(chosen.slam), TrajectoryRecorder()
     # Decoding images that nobody looks at would only cost time.
     images = chosen.input.images and system.odometry.uses_images
     source = open_source(src, chosen.input.model_copy(update={"images": images}))
+    if corruption is not None:
+        source = CorruptedSource(source, corruption)
     stop = len(source) if stop is None else min(stop, len(source))
     if start >= stop:
         raise UsageError(f"--frames {frames}: {src} has {len(source)} frames")
@@ -56,10 +68,10 @@ def run(
     out.mkdir(parents=True, exist_ok=True)
     with atomic_write(out / "config.yaml") as file:
         file.write(dump_settings(chosen))
-    seconds, failed, wall = _drive(source, start, stop, system, recorder, console)
+    seconds, answers, wall = _drive(source, start, stop, system, recorder, console)
     for note in source.notes:
         console.print(note, style="yellow", soft_wrap=True)
-    metrics = _write(out, source, system, recorder, truth, failed, seconds, wall)
+    metrics = _write(out, source, system, recorder, truth, answers, seconds, wall)
     if metrics is not None:
         sensor = "LiDAR" if source.T_cam_lidar is None else "left camera"
         Console().print(metrics_table(metrics, title=f"{source.name}, {len(recorder)} frames", frame=sensor))
@@ -76,10 +88,13 @@ def parse_range(text: str) -> tuple[int, int | None]:
 
 def _drive(
     source: Source, start: int, stop: int, system: SlamSystem, recorder: TrajectoryRecorder, console: Console
-) -> tuple[dict[str, list[float]], int, float]:
-    """All frames through the system: seconds a stage and frame, failed frames, wall time in s. Ctrl-C ends it early."""
+) -> tuple[dict[str, list[float]], Counter[str], float]:
+    """All frames through the system: seconds a stage and frame, who answered how often, wall time in s.
+
+    Ctrl-C ends it early.
+    """
     seconds: dict[str, list[float]] = {}
-    failed = 0
+    answers: Counter[str] = Counter()
     began = perf_counter()
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console) as progress:
@@ -90,15 +105,15 @@ def _drive(
                 recorder.add(tracked)
                 for stage, time in tracked.seconds.items():
                     seconds.setdefault(stage, []).append(time)
+                answers[tracked.registration.method if tracked.registration.ok else "failed"] += 1
                 if not tracked.registration.ok:
-                    failed += 1
                     progress.console.print(
                         f"frame {frame.index}: {tracked.registration.reason}", style="yellow", soft_wrap=True
                     )
                 progress.update(task, advance=1, description=f"{source.name} {tracked.state}")
         except KeyboardInterrupt:
             console.print(f"interrupted after {len(recorder)} frames; writing what there is", style="yellow")
-    return seconds, failed, perf_counter() - began
+    return seconds, answers, perf_counter() - began
 
 
 def _ground_truth(source: Source, gt: Path | None, start: int, stop: int) -> Array | Trajectory | None:
@@ -132,7 +147,7 @@ def _write(
     system: SlamSystem,
     recorder: TrajectoryRecorder,
     truth: Array | Trajectory | None,
-    failed: int,
+    answers: Counter[str],
     seconds: dict[str, list[float]],
     wall: float,
 ) -> Metrics | None:
@@ -149,9 +164,9 @@ def _write(
     total = np.sum(list(seconds.values()), axis=0)
     fps = len(total) / float(total.sum()) if len(total) else 0.0
     stages = {stage: _summary(times) for stage, times in [*seconds.items(), ("total", total.tolist())]}
-    timing = {"frames": len(recorder), "fps": fps, "wall_s": wall, "stages_ms": stages}
+    timing = {"frames": len(recorder), "fps": fps, "wall_s": wall, "answers": dict(answers), "stages_ms": stages}
     _write_json(out / "timing.json", timing)
-    metrics = None
+    metrics, failed = None, answers["failed"]
     if isinstance(truth, Trajectory):
         own = Trajectory(poses, np.array(recorder.stamps), "tum")
         if truth.kind == "kitti-indexed":

@@ -195,3 +195,24 @@ def test_config_dump_shows_every_key() -> None:
     assert "threads: 1" in done.stdout
     assert "# Spacing of the points that enter the local map, m." in done.stdout
     assert dpm2("config", "dump", "--set", "nonsense=1").returncode == 2
+
+
+def test_corrupted_sensors_on_request(drive: Path, tmp_path: Path) -> None:
+    for share in (0.0, 1.0):
+        out = tmp_path / str(share)
+        done = dpm2("run", drive, "--out", out, "--frames", "0:4", "--corrupt", f"beams={share},seed=1")
+        assert done.returncode == 0, done.stderr
+        answers = json.loads((out / "timing.json").read_text())["answers"]
+        assert answers == ({"first": 1, "geometric": 3} if share == 0 else {"failed": 4})
+    done = dpm2("run", drive, "--out", tmp_path / "no", "--corrupt", "camera=2")
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "--corrupt camera=2: camera" in done.stderr
+    assert not (tmp_path / "no").exists()
+
+
+def test_a_network_without_weights_is_an_error_of_use(drive: Path, tmp_path: Path) -> None:
+    settings = ("--set", "slam.registration=neural", "--set", f"slam.neural.weights={tmp_path}/none.safetensors")
+    done = dpm2("run", drive, "--out", tmp_path / "no", *settings)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "none.safetensors: no such file; weights that come with dpm2:" in done.stderr
+    assert not (tmp_path / "no").exists()

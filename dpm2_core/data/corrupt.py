@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A drive with failing sensors, for experiments: the same failures for the same seed, whatever else is corrupted."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Annotated, NamedTuple
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from pydantic import Field
+from scipy.spatial.transform import Rotation
+
+from dpm2_core.config import Settings, settings_from
+from dpm2_core.data.source import Source
+from dpm2_core.errors import UsageError
+from dpm2_core.frame import Array, Frame, Image, Points
+from dpm2_core.geometry import se3
+
+Share = Annotated[float, Field(ge=0, le=1)]
+
+
+class CorruptionSettings(Settings):
+    """What fails, and how often. The frames hit at a share of 0.3 are among those hit at 0.5 with the same seed."""
+
+    seed: int = Field(0, ge=0)
+    """Of everything random."""
+    camera: Share = 0.0
+    """Share of frames with black pictures."""
+    no_image: Share = 0.0
+    """Share of frames without pictures."""
+    overexposed: Share = 0.0
+    """Share of frames whose pictures are too bright."""
+    underexposed: Share = 0.0
+    """Share of frames whose pictures are too dark."""
+    stops: float = Field(3.0, ge=0, le=16)
+    """By how much: each stop doubles or halves the light."""
+    obstruction: Share = 0.0
+    """Share of frames in which a random box near the LiDAR hides all that is behind it."""
+    beams: Share = 0.0
+    """Share of the LiDAR's beams that are dead all the time; a beam is a band of 0.4 deg of elevation."""
+    extrinsic_deg: float = Field(0.0, ge=0, le=180)
+    """The calibration of every camera is turned by that much about a random axis, degrees."""
+    extrinsic_m: float = Field(0.0, ge=0)
+    """And shifted by that much in a random direction, m."""
+    time_offset: float = Field(0.0, ge=0)
+    """Pictures come late: a frame has those of the last frame at least that old, s; none while there is none."""
+
+
+_BAND = np.radians(0.4)  # the spacing of an HDL-64
+# Streams of random numbers, so that no corruption changes another.
+_CAMERA, _NO_IMAGE, _OVER, _UNDER, _OBSTRUCTION, _BEAMS, _EXTRINSIC, _BOX = range(8)
+
+
+class Box(NamedTuple):
+    """A box: T_lidar_box (4, 4) of its centre, and half its edges (3,), m."""
+
+    T_lidar_box: Array
+    half: Array
+
+
+def random_box(rng: np.random.Generator) -> Box:
+    """A box of 0.5 to 3 m an edge at any angle, its surface at least 0.5 m and its centre at most 8.1 m away."""
+    half = rng.uniform(0.25, 1.5, 3)
+    distance = np.linalg.norm(half) + rng.uniform(0.5, 5.5)
+    azimuth, elevation = rng.uniform(-np.pi, np.pi), rng.uniform(-0.3, 0.1)
+    direction = [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
+    return Box(se3.make(Rotation.random(random_state=rng).as_matrix(), distance * np.array(direction)), half)
+
+
+def hidden_by(box: Box, points: Points) -> NDArray[np.bool_]:
+    """Which of (N, 3+) points in the LiDAR frame cannot be seen from the origin because the box is in the way.
+
+    That is, the segment from the origin to the point meets the box (A. Kay, J. Kajiya, "Ray tracing complex scenes",
+    SIGGRAPH 1986: slabs). False for NaN.
+    """
+    T_box_lidar = se3.inverse(box.T_lidar_box)
+    origin = T_box_lidar[:3, 3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        direction = points[:, :3].astype(np.float64) @ T_box_lidar[:3, :3].T
+        first, second = (-box.half - origin) / direction, (box.half - origin) / direction
+        enter = np.minimum(first, second).max(1, initial=0)
+        leave = np.maximum(first, second).min(1, initial=1)
+        return enter <= leave
+
+
+class CorruptedSource:
+    """A `Source` whose frames are corrupted as they are read; poses and calibration in files stay true."""
+
+    def __init__(self, source: Source, settings: CorruptionSettings) -> None:
+        self._source = source
+        self._settings = settings
+        self.name, self.notes = source.name, source.notes
+        turn, shift = self._rng(_EXTRINSIC).normal(size=(2, 3))
+        turn *= np.radians(settings.extrinsic_deg) / np.linalg.norm(turn)
+        shift *= settings.extrinsic_m / np.linalg.norm(shift)
+        self._T_true_wrong = se3.make(Rotation.from_rotvec(turn).as_matrix(), shift)
+        bands = int(np.pi / _BAND) + 1
+        self._dead = self._rng(_BEAMS).permutation(bands) < round(settings.beams * bands)
+        self._hit = {kind: self._chosen(kind, share) for kind, share in self._shares().items()}
+
+    @property
+    def poses(self) -> Array | None:
+        return self._source.poses
+
+    @property
+    def T_cam_lidar(self) -> Array | None:
+        return self._source.T_cam_lidar
+
+    def __len__(self) -> int:
+        return len(self._source)
+
+    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
+        """The frames start..stop-1, the same ones whether or not those before are read."""
+        late = self._settings.time_offset
+        before: deque[Frame] = deque()
+        first = self._first_needed(start)
+        for position, frame in enumerate(self._source.frames(first, stop), first):
+            images = frame.images
+            if late:
+                before.append(frame)
+                while len(before) > 1 and frame.stamp - before[1].stamp >= round(late * 1e9):
+                    before.popleft()
+                images = before[0].images if frame.stamp - before[0].stamp >= round(late * 1e9) else ()
+            if position >= start:
+                yield self._corrupted(replace(frame, images=images), position)
+
+    def _first_needed(self, start: int) -> int:
+        """With late pictures the frames before are read too, at 5 Hz or more as many as the delay is long."""
+        return max(0, start - int(np.ceil(self._settings.time_offset * 20))) if self._settings.time_offset else start
+
+    def _shares(self) -> dict[int, float]:
+        s = self._settings
+        kinds = (_CAMERA, _NO_IMAGE, _OVER, _UNDER, _OBSTRUCTION)
+        return dict(zip(kinds, (s.camera, s.no_image, s.overexposed, s.underexposed, s.obstruction), strict=True))
+
+    def _chosen(self, kind: int, share: float) -> NDArray[np.bool_]:
+        """(len,) True for exactly that share of the frames."""
+        rank = self._rng(kind).permutation(len(self._source))
+        return rank < round(share * len(rank))
+
+    def _rng(self, kind: int, position: int = 0) -> np.random.Generator:
+        return np.random.default_rng([self._settings.seed, kind, position])
+
+    def _corrupted(self, frame: Frame, position: int) -> Frame:
+        kept = ~self._dead[self._bands(frame.points)]
+        if self._hit[_OBSTRUCTION][position]:
+            kept &= ~hidden_by(random_box(self._rng(_BOX, position)), frame.points)
+        offset = None if frame.time_offset is None else frame.time_offset[kept]
+        images = () if self._hit[_NO_IMAGE][position] else tuple(self._image(i, position) for i in frame.images)
+        return replace(frame, points=frame.points[kept], time_offset=offset, images=images)
+
+    @staticmethod
+    def _bands(points: Points) -> NDArray[np.intp]:
+        """(N,) number of the beam, by elevation; points that are no measurement count as level."""
+        x, y, z = points[:, :3].T
+        with np.errstate(invalid="ignore", over="ignore"):
+            elevation = np.arctan2(z, np.hypot(x, y))
+        return ((np.nan_to_num(elevation) + np.pi / 2) / _BAND).astype(np.intp)
+
+    def _image(self, image: Image, position: int) -> Image:
+        pixels, stops = image.pixels, self._settings.stops
+        if self._hit[_OVER][position]:
+            pixels = exposed(pixels, stops)
+        if self._hit[_UNDER][position]:
+            pixels = exposed(pixels, -stops)
+        if self._hit[_CAMERA][position]:
+            pixels = np.zeros_like(pixels)
+        return Image(pixels, replace(image.camera, T_lidar_cam=image.camera.T_lidar_cam @ self._T_true_wrong))
+
+
+def exposed(pixels: NDArray[np.uint8], stops: float) -> NDArray[np.uint8]:
+    """Pixels under 2**stops times the light, at a gamma of 2.2, clipped."""
+    table = np.arange(256) * 2 ** (stops / 2.2)
+    return np.clip(np.rint(table), 0, 255).astype(np.uint8)[pixels]
+
+
+def parse_corruption(text: str) -> CorruptionSettings:
+    """`camera=0.3,obstruction=0.5,seed=1` as settings.
+
+    Raises:
+        UsageError: not of that form, an unknown name, or a value out of range.
+    """
+    tree, origin = {}, {}
+    for part in text.split(","):
+        key, equals, value = (piece.strip() for piece in part.partition("="))
+        if not (key and equals and value):
+            raise UsageError(f"--corrupt {text}: want NAME=VALUE,..., such as camera=0.3,seed=1")
+        try:
+            tree[key] = yaml.safe_load(value)
+        except (yaml.YAMLError, ValueError):
+            tree[key] = value
+        origin[key] = f"--corrupt {part.strip()}"
+    return settings_from(CorruptionSettings, tree, origin, "--corrupt")
