@@ -21,6 +21,7 @@ CERTAIN = 0.5  # pairs above this start as inliers, beside the SURE most confide
 SURE = 64
 MIN_INLIERS = 30
 CONFIDENT = 30  # pairs whose mean confidence is that of the registration
+CHI2 = 11.3  # 99 % quantile with 3 degrees of freedom: inliers of the precision-weighted solve
 SOFT = 3.0  # degrees of freedom of the Student weights in the precision-weighted solve
 
 
@@ -160,6 +161,8 @@ def register_batch(decoder: Decoder, source: Tokens, target: Tokens, correlated:
     T, inliers = robust_kabsch(pairs)
     if decoder.settings.precision:
         T, information = precision_solve(T, pairs)
+        residual, _ = whitened(T, pairs)  # the SVD's inliers were inliers of another pose
+        inliers = ((residual * residual).sum(-1) <= CHI2) & (pairs.weight > 0)
     error = (transform(T, pairs.source.double()) - pairs.target).norm(dim=-1)
     count = inliers.sum(1)
     rmse = ((error**2 * inliers).sum(1) / count.clamp(min=1)).sqrt()

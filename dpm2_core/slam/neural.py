@@ -33,7 +33,7 @@ class NeuralSettings(Settings):
     """Name of weights that come with dpm2, or path of a .safetensors file."""
     preset: str = ""
     """Preset that the weights must have been trained for; empty takes any."""
-    spacing: float = Field(3.0, gt=0)
+    spacing: float = Field(2.0, gt=0)
     """A frame's descriptors enter the map after this much motion, m (or a turn of 15 degrees)."""
     frames: int = Field(2, ge=1, le=16)
     """So many of the map's frames, the nearest to the predicted pose, are merged and registered to."""
@@ -41,8 +41,8 @@ class NeuralSettings(Settings):
     """Frames farther than this from the predicted pose are not registered to, unless all are, m."""
     min_confidence: float = Field(0.1, ge=0, le=1)
     """Mean probability of the best matches below which there is no answer."""
-    max_rmse: float = Field(0.5, gt=0)
-    """Largest residual of the matches, m."""
+    max_sigma: float = Field(0.6, gt=0)
+    """Largest standard deviation of the position in its worst direction, m."""
 
 
 _KEPT = 20  # frames: at least as many as can lie around the next one
@@ -134,8 +134,8 @@ class NeuralScanRegistration:
         found = replace(found, T_target_source=se3.orthonormalised(T_odom_kf @ found.T_target_source))
         if found.confidence < self._settings.min_confidence:
             return replace(found, ok=False, reason=f"matches with a confidence of only {found.confidence:.2f}")
-        if found.rmse > self._settings.max_rmse:
-            return replace(found, ok=False, reason=f"matches fit to {found.rmse:.2f} m only")
+        if (sigma := found.worst_sigma) > self._settings.max_sigma:
+            return replace(found, ok=False, reason=f"position uncertain by {sigma:.2f} m")
         return found
 
     def update(self, scan: Scan, T_odom_lidar: Array) -> None:
