@@ -13,7 +13,7 @@ from dpm2_core.errors import UsageError
 
 
 def bench(
-    names: Annotated[list[str] | None, typer.Argument(help="geometric, memory; geometric by default.")] = None,
+    names: Annotated[list[str] | None, typer.Argument(help="geometric, memory, neural; geometric by default.")] = None,
     source: Annotated[
         list[Path] | None, typer.Option(help="A KITTI sequence or bag with ground truth, instead of the excerpt.")
     ] = None,
@@ -26,15 +26,20 @@ def bench(
     settings: Annotated[
         list[str] | None, typer.Option("--set", help="KEY=VALUE of the configuration; repeat for more.")
     ] = None,
+    weights: Annotated[str | None, typer.Option(help="neural: shipped weights, or a .safetensors file.")] = None,
+    unseen: Annotated[
+        Path | None, typer.Option(help="neural: packed drives (`dpm2 train data`) instead of new unseen worlds.")
+    ] = None,
+    pairs: Annotated[int, typer.Option(min=1, help="neural: pairs of frames of each kind.")] = 150,
 ) -> None:
-    """Measure accuracy and speed beside KISS-ICP on the same scans, or memory over a long drive."""
+    """Measure accuracy and speed beside KISS-ICP on the same scans, memory over a long drive, or the network."""
     from dpm2_core.evaluation.bench import BENCHES  # imports the whole SLAM
     from dpm2_core.evaluation.bench.harness import Options, write_report
 
     names = names or ["geometric"]
     if unknown := [name for name in names if name not in BENCHES]:
         raise UsageError(f"{unknown[0]}: no such benchmark; choose from {', '.join(BENCHES)}")
-    options = Options(source or (), kitti, repetitions, threads, settings or ())
+    options = Options(source or (), kitti, repetitions, threads, settings or (), weights, unseen, pairs)
     for name in names:
         report = BENCHES[name](options)
         path = out / f"{name}.json"

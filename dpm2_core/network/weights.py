@@ -44,6 +44,15 @@ def _read(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
         raise UsageError(f"{path}: not a safetensors file ({error}); pickled weights are never loaded") from None
 
 
+def read_metadata(path: Path) -> dict[str, str]:
+    """What was written about the weights beside them.
+
+    Raises:
+        UsageError: missing file, or another format.
+    """
+    return _read(path)[1]
+
+
 def load_weights(model: DeepPointMap2, path: Path) -> dict[str, str]:
     """Load strictly; returns the metadata.
 

@@ -148,8 +148,22 @@ def shipped() -> Sequence[str]:
     return sorted(path.stem for path in SHIPPED.glob("*.safetensors"))
 
 
+def weights_path(weights: str) -> Path:
+    """The file of shipped weights by their name, or the file of that path.
+
+    Raises:
+        UsageError: there is neither.
+    """
+    if weights in shipped():
+        return SHIPPED / f"{weights}.safetensors"
+    if not Path(weights).is_file():
+        names = ", ".join(shipped()) or "none"
+        raise UsageError(f"slam.neural.weights {weights}: no such file; weights that come with dpm2: {names}")
+    return Path(weights)
+
+
 def load_network(weights: str, threads: int, preset: str = "") -> DeepPointMap2:
-    """The network with weights, ready to run on the CPU.
+    """The network with weights, ready to run on the CPU; without its camera if it was trained without pictures.
 
     Args:
         weights: name of shipped weights, or path of a .safetensors file.
@@ -159,18 +173,15 @@ def load_network(weights: str, threads: int, preset: str = "") -> DeepPointMap2:
     Raises:
         UsageError: no such weights, or of another preset.
     """
-    path = SHIPPED / f"{weights}.safetensors"
-    if weights not in shipped():
-        path = Path(weights)
-        if not path.is_file():
-            names = ", ".join(shipped()) or "none"
-            raise UsageError(f"slam.neural.weights {weights}: no such file; weights that come with dpm2: {names}")
+    path = weights_path(weights)
     import torch
 
-    from dpm2_core.network.weights import load_model
+    from dpm2_core.network.weights import load_model, read_metadata
 
     torch.set_num_threads(threads)
     model = load_model(path)
+    if read_metadata(path).get("images") != "true":
+        model.encoder.image = None  # a branch that has never seen a picture would only disturb
     if preset and model.settings.preset != preset:
         raise UsageError(f"{path}: weights of preset {model.settings.preset}, slam.neural.preset is {preset}")
     return model

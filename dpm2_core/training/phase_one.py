@@ -133,7 +133,8 @@ def phase_one(settings: PhaseOneSettings, out: Path, resume: bool = False, until
             until,
         )
         if rank == 0:
-            save_weights(ema.model, out / "weights.safetensors", {"phase": "1", "steps": str(settings.optimiser.steps)})
+            about = {"phase": "1", "steps": str(settings.optimiser.steps), "images": str(settings.data.images).lower()}
+            save_weights(ema.model, out / "weights.safetensors", about)
     return out / "weights.safetensors"
 
 

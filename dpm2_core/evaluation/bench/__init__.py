@@ -9,5 +9,17 @@ from dpm2_core.evaluation.bench.geometric import bench_geometric
 from dpm2_core.evaluation.bench.harness import Options, Report
 from dpm2_core.evaluation.bench.memory import bench_memory
 
-BENCHES: dict[str, Callable[[Options], Report]] = {"geometric": bench_geometric, "memory": bench_memory}
+
+def bench_neural(options: Options) -> Report:
+    """See `neural.bench_neural`; torch is imported only for it."""
+    from dpm2_core.evaluation.bench import neural
+
+    return neural.bench_neural(options)
+
+
+BENCHES: dict[str, Callable[[Options], Report]] = {
+    "geometric": bench_geometric,
+    "memory": bench_memory,
+    "neural": bench_neural,
+}
 """By the name that `dpm2 bench NAME` and `benchmarks/NAME.json` share."""

@@ -77,11 +77,10 @@ def dpm2(options: Options) -> Method:
     return run
 
 
-def kiss_icp(options: Options) -> Method | None:
-    """I. Vizzo et al., "KISS-ICP", RA-L 2023, as its pipeline runs and times it; None where it is not installed."""
+def kiss_config(options: Options) -> Any | None:
+    """KISS-ICP's configuration for KITTI; None where it is not installed."""
     try:
         from kiss_icp.config import load_config
-        from kiss_icp.kiss_icp import KissICP
     except ImportError:
         return None
     config = load_config(None)
@@ -89,6 +88,15 @@ def kiss_icp(options: Options) -> Method | None:
     config.data.max_range = 100.0
     config.mapping.voxel_size = 1.0  # its default: a hundredth of the range
     config.registration.max_num_threads = options.threads
+    return config
+
+
+def kiss_icp(options: Options) -> Method | None:
+    """I. Vizzo et al., "KISS-ICP", RA-L 2023, as its pipeline runs and times it; None where it is not installed."""
+    config = kiss_config(options)
+    if config is None:
+        return None
+    from kiss_icp.kiss_icp import KissICP
 
     def run(frames: Sequence[Frame]) -> Outcome:
         clouds = [frame.points[np.isfinite(frame.points[:, :3]).all(1), :3].astype(np.float64) for frame in frames]
@@ -147,8 +155,8 @@ def summary(source: Source, outcomes: Sequence[Outcome]) -> dict[str, Any]:
         "fps": float(np.median(fps)),
         "fps_of_repetitions": fps.round(2).tolist(),
         "cpu_ms": 1e3 * float(np.median([o.cpu_seconds / len(o.seconds) for o in outcomes])),
-        "frame_ms": _quantiles_ms(seconds),
-        "stages_ms": {stage: _quantiles_ms(values) for stage, values in stages.items()},
+        "frame_ms": quantiles_ms(seconds),
+        "stages_ms": {stage: quantiles_ms(values) for stage, values in stages.items()},
     }
 
 
@@ -167,7 +175,8 @@ def _median(judged: Sequence[Metrics]) -> dict[str, Any]:
     return medians
 
 
-def _quantiles_ms(seconds: Array) -> dict[str, float]:
+def quantiles_ms(seconds: Array) -> dict[str, float]:
+    """Median and 95th percentile of (N,) seconds, ms."""
     median, p95 = np.percentile(1e3 * seconds, [50, 95])
     return {"median": round(float(median), 2), "p95": round(float(p95), 2)}
 

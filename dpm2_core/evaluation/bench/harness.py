@@ -38,6 +38,9 @@ class Options:
         repetitions: of every method on every drive.
         threads: processors that every method may use.
         overrides: `key=value` settings of the SLAM.
+        weights: of the network, a name or a path; None: those of the settings.
+        unseen: packed drives of worlds that the network has not seen; None makes some.
+        pairs: of frames of each kind.
     """
 
     sources: Sequence[Path] = ()
@@ -45,6 +48,9 @@ class Options:
     repetitions: int = 3
     threads: int = 2
     overrides: Sequence[str] = ()
+    weights: str | None = None
+    unseen: Path | None = None
+    pairs: int = 150
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,11 @@ from dpm2_core.data.trajectory import write_kitti
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.evaluation.bench.harness import Options, drives, processors
 from dpm2_core.evaluation.bench.memory import levelling, resident_mb
+from dpm2_core.evaluation.bench.pairs import pairs_of, summarised
 from dpm2_core.geometry import se3
+from dpm2_core.network.model import DeepPointMap2
+from dpm2_core.network.weights import save_weights
+from dpm2_core.training.packed import Sample, write_packed
 
 FRAMES = 6
 
@@ -129,3 +134,51 @@ def test_what_cannot_be_measured_is_refused(drive: Path, tmp_path: Path) -> None
     with pytest.raises(UsageError, match="blind: the drive has no ground truth"):
         bench(source=[blind], out=tmp_path)
     assert not list(tmp_path.glob("*.json"))
+
+
+def test_the_neural_benchmark_measures_pairs_odometry_and_stages(
+    drive: Path, tmp_path: Path, model: DeepPointMap2, street: Callable[..., np.ndarray], noise: np.random.Generator
+) -> None:
+    """With random weights: the classical methods beside it are right, and refined falls back on points."""
+    save_weights(model, tmp_path / "tiny.safetensors", {"steps": "0", "images": "true"})
+    poses = se3.exp(np.outer(np.arange(4.0), [0, 0, 0.1, 3, 0, 0]))
+    samples = [Sample(street(noise), T) for T in poses]
+    write_packed(tmp_path / "unseen" / "world", samples, {})
+    bench(
+        ["neural"], source=[drive], out=tmp_path, repetitions=1, threads=1, pairs=3,
+        weights=str(tmp_path / "tiny.safetensors"), unseen=tmp_path / "unseen",
+    )  # fmt: skip
+    record = json.loads((tmp_path / "neural.json").read_text())
+    assert (record["weights"]["preset"], record["weights"]["steps"]) == ("tiny", "0")
+    assert record["synthetic"]["up to 20 m"]["neural"]["pairs"] > 0
+    ours = record["drives"][drive.name]
+    consecutive = ours["pairs"]["consecutive"]
+    assert set(consecutive) >= {"neural", "refined", "geometric", "small_gicp"}
+    assert consecutive["small_gicp"]["median_m"] < 0.1  # 1 m of motion, walls on both sides
+    assert consecutive["small_gicp"]["success"] == 1
+    assert ours["pairs"]["8 apart"]["neural"]["pairs"] == 0  # six frames
+    assert ours["odometry"]["geometric"]["ape_rmse_m"] < 0.02
+    assert ours["network_stages_ms"]["total"]["median"] > 0
+    assert 0 < ours["descriptor_bytes"] < 70_000
+
+
+def test_pairs_are_of_their_kind_and_have_a_true_pose() -> None:
+    poses = se3.exp(np.outer(np.arange(40.0), [0, 0, 0, 1.5, 0, 0]))
+    poses[7] = np.nan
+    kinds = pairs_of(poses, most=10)
+    assert all(0 < len(pairs) <= 10 for pairs in kinds.values())
+    assert all(7 not in pair for pairs in kinds.values() for pair in pairs)
+    assert all(b - a == 1 for a, b in kinds["consecutive"])
+    assert all(b - a == 8 for a, b in kinds["8 apart"])
+    assert all(10 <= 1.5 * (b - a) <= 20 for a, b in kinds["10-20 m"])
+
+
+def test_a_pair_without_an_answer_is_a_failure() -> None:
+    rows = np.array([[0.1, 0.2], [0.1, 2.0], [np.inf, np.inf], [0.3, 0.4]])
+    assert summarised(rows) == {
+        "pairs": 4,
+        "median_m": pytest.approx(0.2),
+        "median_deg": pytest.approx(1.2),
+        "success": 0.5,
+    }
+    assert summarised(rows[2:3])["median_m"] is None

@@ -185,6 +185,14 @@ def test_missing_weights_and_a_wrong_preset_are_errors_of_use(weights: Path) -> 
         load_network(__file__, 1)
 
 
+@pytest.mark.parametrize(("about", "camera"), [({"images": "true"}, True), ({"images": "false"}, False), ({}, False)])
+def test_a_camera_branch_that_was_never_trained_is_left_out(
+    model: DeepPointMap2, tmp_path: Path, about: dict[str, str], camera: bool
+) -> None:
+    save_weights(model, tmp_path / "w.safetensors", about)
+    assert (load_network(str(tmp_path / "w.safetensors"), 1).encoder.image is not None) is camera
+
+
 def test_threads_are_those_of_the_settings(weights: Path) -> None:
     before = torch.get_num_threads()
     try:

@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pairs of frames registered without any prior: errors of each method against the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import small_gicp
+from numpy.typing import NDArray
+
+from dpm2_core.frame import Array, Frame
+from dpm2_core.geometry import se3
+from dpm2_core.slam.scan_registration import Prediction, ScanRegistration
+
+SUCCESS_M, SUCCESS_DEG = 0.6, 1.5
+"""Errors below which a registration counts as a success."""
+
+PairMethod = Callable[[Frame, Frame], Array | None]
+"""T_first_second (4, 4) of two frames; None: no answer."""
+
+Pairs = Sequence[tuple[int, int]]
+
+
+def pairs_of(poses: Array, most: int) -> dict[str, list[tuple[int, int]]]:
+    """Positions of pairs in a drive, at most so many of each kind, evenly spread.
+
+    Args:
+        poses: (N, 4, 4) truth; pairs with an unknown pose are left out.
+    """
+    n, at = len(poses), poses[:, :3, 3]
+    kinds: dict[str, list[tuple[int, int]]] = {
+        "consecutive": [(i, i + 1) for i in range(n - 1)],
+        "8 apart": [(i, i + 8) for i in range(n - 8)],
+        "10-20 m": [],
+    }
+    rng = np.random.default_rng(0)
+    for i in range(n):
+        distance = np.linalg.norm(at[i + 1 :] - at[i], axis=1)
+        reach = np.flatnonzero((distance >= 10) & (distance <= 20))
+        if len(reach):
+            kinds["10-20 m"].append((i, i + 1 + int(rng.choice(reach))))
+    known: NDArray[np.bool_] = np.isfinite(poses.sum((1, 2)))
+    out = {}
+    for kind, pairs in kinds.items():
+        usable = [(a, b) for a, b in pairs if known[a] and known[b]]
+        out[kind] = [usable[k] for k in np.unique(np.linspace(0, len(usable) - 1, min(most, len(usable))).astype(int))]
+    return out
+
+
+def by_registration(registration: ScanRegistration) -> PairMethod:
+    """What the odometry uses, with a map of one frame and the identity as prediction."""
+
+    def register(first: Frame, second: Frame) -> Array | None:
+        registration.clear()
+        registration.update(registration.prepare(first, np.zeros(6)), np.eye(4))
+        answer = registration.register(registration.prepare(second, np.zeros(6)), Prediction([np.eye(4)], widen=2.0))
+        return answer.T_target_source if answer.ok else None
+
+    return register
+
+
+def gicp_from_identity(threads: int) -> PairMethod:
+    """small_gicp's GICP of the two scans at 0.25 m, started at the identity with correspondences up to 2 m."""
+
+    def register(first: Frame, second: Frame) -> Array:
+        target, source = (f.points[np.isfinite(f.points[:, :3]).all(1), :3].astype(np.float64) for f in (first, second))
+        options = {"max_correspondence_distance": 2.0, "max_iterations": 50, "num_threads": threads}
+        return np.asarray(small_gicp.align(target, source, **options).T_target_source)
+
+    return register
+
+
+def kiss_from_identity(config: Any) -> PairMethod:
+    """KISS-ICP on a drive of two frames: with no motion known, it starts at the identity."""
+
+    def register(first: Frame, second: Frame) -> Array:
+        from kiss_icp.kiss_icp import KissICP
+
+        odometry = KissICP(config)
+        for frame in (first, second):
+            points = frame.points[np.isfinite(frame.points[:, :3]).all(1), :3].astype(np.float64)
+            odometry.register_frame(points, np.array([]))
+        return np.asarray(odometry.last_pose)
+
+    return register
+
+
+def pair_errors(method: PairMethod, frames: Sequence[Frame], poses: Array, pairs: Pairs) -> Array:
+    """(len(pairs), 2) translation error, m, and rotation error, deg; inf where there was no answer."""
+    errors = np.full((len(pairs), 2), np.inf)
+    for row, (a, b) in zip(errors, pairs, strict=True):
+        T = method(frames[a], frames[b])
+        if T is not None:
+            off = se3.inverse(se3.inverse(poses[a]) @ poses[b]) @ T
+            row[:] = np.linalg.norm(off[:3, 3]), np.degrees(se3.angle(off))
+    return errors
+
+
+def summarised(errors: Array) -> dict[str, float | int | None]:
+    """Median errors and success rate of (N, 2) errors, m and deg; None where there is nothing to say."""
+    if not len(errors):
+        return {"pairs": 0, "median_m": None, "median_deg": None, "success": None}
+    median = np.median(errors, axis=0)
+    good = (errors[:, 0] < SUCCESS_M) & (errors[:, 1] < SUCCESS_DEG)
+    m, deg = (float(value) if np.isfinite(value) else None for value in median)
+    return {"pairs": len(errors), "median_m": m, "median_deg": deg, "success": float(good.mean())}
+
+
+def all_pairs(
+    methods: Mapping[str, PairMethod], frames: Sequence[Frame], poses: Array, most: int, advance: Callable[[], None]
+) -> dict[str, dict[str, Any]]:
+    """Every kind of pair by every method; `advance` is called after each of them."""
+    out: dict[str, dict[str, Any]] = {}
+    for kind, pairs in pairs_of(poses, most).items():
+        out[kind] = {}
+        for name, method in methods.items():
+            out[kind][name] = summarised(pair_errors(method, frames, poses, pairs))
+            advance()
+    return out
