@@ -9,12 +9,13 @@ from collections.abc import Sequence
 import typer
 
 from dpm2_core import __version__
-from dpm2_core.commands import bench, config, convert, eval, run, sim, train
+from dpm2_core.commands import bench, config, convert, eval, run, show, sim, train
 from dpm2_core.errors import Dpm2Error, UsageError
 
 app = typer.Typer(help="LiDAR-visual SLAM.", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 app.command()(run.run)
 app.command("eval")(eval.eval_)
+app.command()(show.show)
 app.command()(sim.sim)
 app.command()(bench.bench)
 app.add_typer(convert.app, name="convert")

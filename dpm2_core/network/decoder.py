@@ -10,12 +10,12 @@ import torch
 from torch import Tensor, nn
 
 from dpm2_core.descriptors import Descriptors
-from dpm2_core.frame import Registration
+from dpm2_core.frame import Array, Registration
 from dpm2_core.network.attention import Attention, RelativeBias, sine_code
 from dpm2_core.network.config import NetworkSettings
 from dpm2_core.network.descriptors import Tokens, to_tokens
 from dpm2_core.network.heads import OffsetHead, OverlapHead, PointMLP
-from dpm2_core.network.registration import register_batch
+from dpm2_core.network.registration import correspond, register_batch
 
 
 class Correlated(NamedTuple):
@@ -96,6 +96,17 @@ class Decoder(nn.Module):
         target = to_tokens(targets, self.view_aligned, device)
         with torch.autocast(device.type, torch.bfloat16):
             return register_batch(self, source, target, self(source, target))
+
+    @torch.inference_mode()
+    def matches(self, source: Descriptors, target: Descriptors) -> tuple[Array, Array, Array]:
+        """The descriptors that `register` pairs: positions (K, 3) in each frame, m, and confidence (K,) 0..1."""
+        device = next(self.parameters()).device
+        x, y = (to_tokens([descriptors], self.view_aligned, device) for descriptors in (source, target))
+        with torch.autocast(device.type, torch.bfloat16):
+            pairs = correspond(self, x, y, self(x, y))
+        half = pairs.weight.shape[1] // 2  # then the same pairs again, in the other direction
+        at_source, at_target = pairs.source[0, half:].double().cpu(), pairs.target[0, :half].double().cpu()
+        return at_source.numpy(), at_target.numpy(), pairs.weight[0, :half].double().cpu().numpy()
 
     @torch.inference_mode()
     def overlap_probability(self, sources: list[Descriptors], targets: list[Descriptors]) -> list[float]:

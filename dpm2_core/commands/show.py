@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`dpm2 show`: two scans with their matched descriptors, as the network sees them."""
+
+from __future__ import annotations
+
+from itertools import islice
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from dpm2_core.data.source import InputSettings, Source, open_source
+from dpm2_core.errors import UsageError
+from dpm2_core.frame import Frame
+
+
+def show(
+    src: Annotated[Path, typer.Argument(help="KITTI sequence or root, rosbag2 folder, .mcap or .db3 file.")],
+    frames: Annotated[str, typer.Option(help="Two frames a,b by position from 0; b is registered to a.")],
+    out: Annotated[Path, typer.Option(help="PNG to write.")] = Path("matches.png"),
+    weights: Annotated[str, typer.Option(help="Name of shipped weights, or a .safetensors file.")] = "small",
+) -> None:
+    """Draw two scans from above with their matched descriptors, coloured by confidence, and how they fit."""
+    from dpm2_core.evaluation.matches import matches_png
+    from dpm2_core.slam.neural import load_network
+
+    first, second = _two(frames)
+    source = open_source(src, InputSettings(images=False))
+    target, moving = _frame(source, src, first), _frame(source, src, second)
+    model = load_network(weights, threads=2)
+    of_target, of_source = model.encoder.encode(target), model.encoder.encode(moving)
+    found = model.decoder.register(of_source, of_target)
+    matched = model.decoder.matches(of_source, of_target)
+    title = f"{source.name}, frame {moving.index} to frame {target.index}"
+    matches_png(out, moving.points, target.points, matched, found, title)
+    Console(stderr=True).print(f"{out}: {title}", soft_wrap=True)
+
+
+def _two(text: str) -> tuple[int, int]:
+    parts = text.split(",")
+    if len(parts) != 2 or not all(part.strip().isdecimal() for part in parts):
+        raise UsageError(f"--frames {text}: want two positions a,b, such as 0,8")
+    return int(parts[0]), int(parts[1])
+
+
+def _frame(source: Source, src: Path, position: int) -> Frame:
+    if position >= len(source):
+        raise UsageError(f"--frames {position}: {src} has {len(source)} frames")
+    frame = next(islice(source.frames(position, position + 1), 1))
+    if frame.problem:
+        raise UsageError(f"frame {position} of {src}: {frame.problem}")
+    return frame

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A look inside a registration: which descriptors of two scans were matched, how surely, and what came of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from dpm2_core.files import atomic_write
+from dpm2_core.frame import Array, Points, Registration
+from dpm2_core.geometry import se3
+
+_BACKGROUND, _INK, _TARGET, _SOURCE = "#0d1117", "#c9d1d9", "#3f7fbf", "#ff9f1c"
+_REACH = 50.0  # m of each scan that is drawn around its sensor
+
+
+def matches_png(
+    path: Path | str,
+    source: Points,
+    target: Points,
+    matched: tuple[Array, Array, Array],
+    found: Registration,
+    title: str = "",
+) -> None:
+    """Two views from above: the scans beside each other with their matches, and one on top of the other as registered.
+
+    Args:
+        source, target: (N, 3+) points of the two scans, each in its own frame, m.
+        matched: positions (K, 3) in the source, (K, 3) in the target, and confidence (K,) 0..1 of each match.
+        found: T_target_source.
+
+    Raises:
+        Dpm2Error: the file could not be written.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # half a second to import: not for every command
+    from matplotlib.collections import LineCollection
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(18, 7.2), dpi=110, facecolor=_BACKGROUND)
+    beside = figure.add_axes((0.01, 0.02, 0.63, 0.88), facecolor=_BACKGROUND, aspect="equal")
+    above = figure.add_axes((0.66, 0.02, 0.33, 0.88), facecolor=_BACKGROUND, aspect="equal")
+    at_source, at_target, confidence = matched
+    right = np.array([2.1 * _REACH, 0.0])
+    for axes, points, shift, colour in (
+        (beside, target, np.zeros(2), _TARGET),
+        (beside, source, right, _SOURCE),
+        (above, target, np.zeros(2), _TARGET),
+        (above, se3.transform(found.T_target_source, source), np.zeros(2), _SOURCE),
+    ):
+        near = points[np.abs(points[:, :2]).max(1) < _REACH]
+        axes.plot(*(near[:, :2] + shift).T, ",", color=colour, alpha=0.6)
+        axes.set_axis_off()
+    order = np.argsort(confidence)  # the surest on top
+    ends = np.stack([at_target[order, :2], at_source[order, :2] + right], 1)
+    lines = LineCollection(list(ends), array=confidence[order], cmap="viridis", linewidths=0.8, clim=(0, 1))
+    beside.add_collection(lines)
+    for column in (0, 1):
+        beside.scatter(
+            ends[:, column, 0], ends[:, column, 1], c=confidence[order], cmap="viridis", vmin=0, vmax=1, s=9, zorder=3
+        )
+    beside.set(xlim=(-_REACH, right[0] + _REACH), ylim=(-_REACH, _REACH))
+    above.set(xlim=(-_REACH, _REACH), ylim=(-_REACH, _REACH))
+    bar = figure.colorbar(lines, ax=beside, fraction=0.02, pad=0.01)
+    bar.set_label("confidence of a match", color=_INK)
+    bar.ax.tick_params(colors=_INK)
+    moved = found.T_target_source
+    outcome = (
+        f"{np.linalg.norm(moved[:3, 3]):.2f} m, {np.degrees(se3.angle(moved)):.2f} deg apart; "
+        f"confidence {found.confidence:.2f}, rmse {found.rmse:.2f} m"
+        if found.ok
+        else f"not registered: {found.reason}"
+    )
+    figure.text(0.02, 0.945, f"{title}: {outcome}", color=_INK, fontsize=13)
+    with atomic_write(path, "wb") as file:
+        FigureCanvasAgg(figure).print_png(file)

@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`dpm2 show` draws what the network matched, and refuses what it cannot draw in one line."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from dpm2_core.network.model import DeepPointMap2
+from dpm2_core.network.weights import save_weights
+
+from ..conftest import street, tiny
+
+
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two scans of a street, 1 m apart, and weights of a tiny untrained network beside them."""
+    folder = tmp_path_factory.mktemp("show")
+    (folder / "velodyne").mkdir()
+    points = np.c_[street(np.random.default_rng(0)), np.full(4000, 0.5)].astype(np.float32)
+    for number in (0, 1):
+        (points - np.array([number, 0, 0, 0], np.float32)).tofile(folder / "velodyne" / f"{number:06d}.bin")
+    torch.manual_seed(0)
+    save_weights(DeepPointMap2(tiny()), folder / "tiny.safetensors", {})
+    return folder
+
+
+def show(sequence: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "dpm2_core.cli", "show", str(sequence), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120)
+
+
+def test_draws_a_picture(sequence: Path, tmp_path: Path) -> None:
+    weights = str(sequence / "tiny.safetensors")
+    done = show(sequence, "--frames", "0,1", "--out", str(tmp_path / "m.png"), "--weights", weights)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "m.png").read_bytes()[1:4] == b"PNG"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--frames", "0"], "want two positions"),
+        (["--frames", "0,7"], "2 frames"),
+        (["--frames", "0,1", "--weights", "/nowhere"], "/nowhere"),
+    ],
+)
+def test_errors_of_use(sequence: Path, arguments: list[str], words: str) -> None:
+    done = show(sequence, *arguments)
+    assert done.returncode == 2
+    assert words in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
