@@ -67,6 +67,7 @@ class Road:
         streets: centre lines; the drive follows the first `main` of them, the others branch off.
         drive: the path of the car. times: (K,) s and travelled: (K,) m, the drive's progress; a closed one goes on.
         heights: (M,) m of the samples of each main street, None where the terrain is free.
+        slip: (K,) rad, heading of the car relative to the direction of the drive; None: it heads where it goes.
     """
 
     streets: list[Path]
@@ -75,6 +76,11 @@ class Road:
     times: Array
     travelled: Array
     heights: list[Array] | None = None
+    slip: Array | None = None
+
+    def slip_at(self, time: float) -> float:
+        """How far the car is turned to the left of where it goes, rad, at a time, s."""
+        return 0.0 if self.slip is None else float(np.interp(time, self.times, self.slip))
 
     def distance(self, time: ArrayLike) -> Array:
         """Arc length on the drive, m, at times (N,) s."""
@@ -201,7 +207,7 @@ def _side_streets(streets: list[Path], preset: Preset, rng: np.random.Generator)
 
 
 def read_drive(path: FilePath) -> Array:
-    """(N, 3) positions of a file of KITTI poses, x ahead at the start, y left, z up, m.
+    """(N, 4) positions of a file of KITTI poses, x ahead at the start, y left, z up, m, and headings, rad.
 
     Raises:
         UsageError: no such file, or not 12 finite numbers on each line.
@@ -218,7 +224,8 @@ def read_drive(path: FilePath) -> Array:
         raise UsageError(f"--road {path}: not a file of KITTI poses (12 numbers a line)") from None
     if rows.ndim != 2 or rows.shape[1] != 12 or not np.isfinite(rows).all():
         raise UsageError(f"--road {path}: not a file of KITTI poses (12 finite numbers a line)")
-    return rows[:, [11, 3, 7]] * (1, -1, -1)
+    heading = np.arctan2(-rows[:, 2], rows[:, 10])  # of the camera's z axis, which looks ahead
+    return np.concatenate([rows[:, [11, 3, 7]] * (1, -1, -1), np.unwrap(heading)[:, None]], 1)
 
 
 def _road_of_poses(file: FilePath, preset: Preset, rng: np.random.Generator) -> Road:
@@ -249,7 +256,9 @@ def _road_of_poses(file: FilePath, preset: Preset, rng: np.random.Generator) -> 
     ]
     sides = _side_streets(streets, preset, rng)
     times = np.arange(len(position), dtype=float) * FRAME_PERIOD
-    return Road([*streets, *sides], len(streets), drive, times, travelled, heights)
+    slip = position[:, 3] - np.interp(travelled, drive.s, drive.yaw)
+    slip = np.remainder(slip + np.pi, 2 * np.pi) - np.pi
+    return Road([*streets, *sides], len(streets), drive, times, travelled, heights, slip)
 
 
 def _arc_lengths(xy: Array) -> Array:

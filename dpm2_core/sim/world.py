@@ -73,7 +73,7 @@ class World:
         sway = np.array([np.sin(0.9 * t) + 0.6 * np.sin(1.7 * t + 1), np.sin(1.1 * t + 2) + 0.5 * np.sin(2.3 * t), 0])
         bounce = 0.006 * np.sin(1.3 * t) + 0.004 * np.sin(2.1 * t + 1)
         T_body_lidar = se3.make(Rotation.from_rotvec(sway * (0.003, 0.004, 0)).as_matrix(), (0, 0, bounce))
-        return self.pose_at(float(self.road.distance(time)), height=height) @ T_body_lidar
+        return self.pose_at(float(self.road.distance(time)), 0.0, self.road.slip_at(time), height) @ T_body_lidar
 
     def sample_pose(
         self, rng: np.random.Generator, lateral: float = 1.0, heading: float = 0.1, height: float = 1.73

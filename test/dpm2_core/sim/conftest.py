@@ -33,8 +33,12 @@ def poses_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     angle = s / 25.0
     radius = 25 + 0.8 * (angle > 2 * np.pi) + 4 * np.cos(2 * angle)
     x, y, z = radius * np.cos(angle), radius * np.sin(angle), 1.5 * np.sin(angle)
+    steeper = -8 * np.sin(2 * angle)  # d radius / d angle
+    heading = np.arctan2(steeper * np.sin(angle) + x, steeper * np.cos(angle) - y)
     poses = np.zeros((len(s), 3, 4))
-    poses[:, :, :3] = np.eye(3)
+    poses[:, 0, 0] = poses[:, 2, 2] = np.cos(heading)
+    poses[:, 2, 0], poses[:, 0, 2] = np.sin(heading), -np.sin(heading)
+    poses[:, 1, 1] = 1.0
     poses[:, :, 3] = np.stack([-y, -z, x], -1)  # right, down, ahead
     poses[:, :, 3] += np.random.default_rng(0).normal(0, 0.003, (len(s), 3))
     path = tmp_path_factory.mktemp("road") / "poses.txt"

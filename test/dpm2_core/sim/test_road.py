@@ -71,6 +71,21 @@ def test_a_file_is_followed_and_its_second_lap_uses_the_first_one_s_street(poses
     assert main < lap * 1.15 + 2 * 110  # the straight approach and exit; two laps would be 60 m more
 
 
+def test_the_car_heads_where_the_file_says(poses_file: Path, tmp_path: Path) -> None:
+    """In bends a camera ahead of the rear axle does not look where it goes; the file knows."""
+    road = make_road(str(poses_file), PRESETS["city"], np.random.default_rng(0))
+    assert np.degrees(np.median(np.abs(road.slip))) < 1  # this file's car heads along its path
+    rows = np.loadtxt(poses_file).reshape(-1, 3, 4)
+    turned = np.radians(20.0)  # to the left: about the camera's y axis, which looks down, by the negative angle
+    R = np.array([[np.cos(turned), 0, -np.sin(turned)], [0, 1, 0], [np.sin(turned), 0, np.cos(turned)]])
+    rows[:, :, :3] = rows[:, :, :3] @ R
+    np.savetxt(tmp_path / "turned.txt", rows.reshape(-1, 12))
+    other = make_road(str(tmp_path / "turned.txt"), PRESETS["city"], np.random.default_rng(0))
+    np.testing.assert_allclose(other.slip - road.slip, turned, atol=1e-9)
+    time = float(road.times[40])
+    assert other.slip_at(time) == other.slip[40]
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
