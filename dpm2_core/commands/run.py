@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from contextlib import nullcontext
 from pathlib import Path
 from time import perf_counter
 from typing import Annotated
@@ -15,7 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from dpm2_core.config import dump_settings, load_settings
-from dpm2_core.data.corrupt import CorruptedSource, parse_corruption
+from dpm2_core.data.corrupt import CorruptedSource, CorruptionSettings, parse_corruption
 from dpm2_core.data.ply import write_ply
 from dpm2_core.data.prefetch import prefetch
 from dpm2_core.data.source import Source, open_source
@@ -26,7 +27,9 @@ from dpm2_core.evaluation.report import metrics_table
 from dpm2_core.files import atomic_write
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
+from dpm2_core.slam.map_store import MapStore
 from dpm2_core.slam.output import TrajectoryRecorder
+from dpm2_core.slam.session import open_session, resume_at
 from dpm2_core.slam.system import Config, SlamSystem
 
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="YAML file; `dpm2 config dump` shows every key.")]
@@ -46,6 +49,10 @@ def run(
             "underexposed (by stops), obstruction; share of beams; extrinsic_deg, extrinsic_m, time_offset (s); seed."
         ),
     ] = None,
+    map_file: Annotated[
+        Path | None, typer.Option("--map", help="Map file, such as drive.dpm2map, written as the drive goes on.")
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on where --map ends: a run was cut off.")] = False,
     config: ConfigFile = None,
     settings: Overrides = None,
 ) -> None:
@@ -55,15 +62,35 @@ def run(
     corruption = None if corrupt is None else parse_corruption(corrupt)
     start, stop = parse_range(frames)
     console = Console(stderr=True)
-    system, recorder = SlamSystem(chosen.slam), TrajectoryRecorder()
+    store = None if map_file is None else open_session(map_file, chosen.slam, dump_settings(chosen), resume)
+    with nullcontext() if store is None else store:
+        _run(src, out, gt, (start, stop), corruption, chosen, store, resume, console)
+
+
+def _run(
+    src: Path,
+    out: Path,
+    gt: Path | None,
+    span: tuple[int, int | None],
+    corruption: CorruptionSettings | None,
+    chosen: Config,
+    store: MapStore | None,
+    resume: bool,
+    console: Console,
+) -> None:
+    """The drive, when it is clear what is wanted."""
+    start, stop = span
+    system, recorder = SlamSystem(chosen.slam, store=store), TrajectoryRecorder()
     # Decoding images that nobody looks at would only cost time.
-    images = chosen.input.images and system.odometry.uses_images
+    images = chosen.input.images and (system.odometry.uses_images or chosen.slam.map.thumbnail > 0)
     source = open_source(src, chosen.input.model_copy(update={"images": images}))
     if corruption is not None:
         source = CorruptedSource(source, corruption)
     stop = len(source) if stop is None else min(stop, len(source))
+    if resume:
+        start = resume_at(system.mapper, source, start)
     if start >= stop:
-        raise UsageError(f"--frames {frames}: {src} has {len(source)} frames")
+        raise UsageError(f"--frames {span[0]}:{'' if span[1] is None else span[1]}: {src} has {len(source)} frames")
     truth = _ground_truth(source, gt, start, stop)
     out.mkdir(parents=True, exist_ok=True)
     with atomic_write(out / "config.yaml") as file:
@@ -71,6 +98,9 @@ def run(
     seconds, answers, wall = _drive(source, start, stop, system, recorder, console)
     for note in source.notes:
         console.print(note, style="yellow", soft_wrap=True)
+    system.mapper.finish()
+    if problem := system.mapper.store_problem:
+        console.print(f"map file incomplete: {problem}", style="red", soft_wrap=True)
     metrics = _write(out, source, system, recorder, truth, answers, seconds, wall)
     if metrics is not None:
         sensor = "LiDAR" if source.T_cam_lidar is None else "left camera"
@@ -95,6 +125,7 @@ def _drive(
     """
     seconds: dict[str, list[float]] = {}
     answers: Counter[str] = Counter()
+    problem = ""  # of the map file
     began = perf_counter()
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console) as progress:
@@ -103,6 +134,9 @@ def _drive(
             for frame in prefetch(source.frames(start, stop)):
                 tracked = system.process(frame)
                 recorder.add(tracked)
+                if (now := system.mapper.store_problem) and not problem:
+                    progress.console.print(f"map file: {now}", style="red", soft_wrap=True)
+                problem = now
                 for stage, time in tracked.seconds.items():
                     seconds.setdefault(stage, []).append(time)
                 answers[tracked.registration.method if tracked.registration.ok else "failed"] += 1
@@ -154,7 +188,7 @@ def _write(
     """All result files; the metrics when there is ground truth."""
     from dpm2_core.evaluation.figures import trajectory_png
 
-    poses = recorder.poses(system.mapper.poses)
+    poses = recorder.poses(system.mapper.poses[system.mapper.session_start :])
     sensor = poses if source.T_cam_lidar is None else _in_other_frame(poses, source.T_cam_lidar)
     write_kitti(out / "trajectory_kitti.txt", sensor)
     write_tum(out / "trajectory.tum", recorder.stamps, poses)

@@ -1,22 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Keyframes in, a globally consistent map out."""
+"""Keyframes in, a globally consistent map out; with a store, a map file that is never more than a keyframe behind."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
 
 from dpm2_core.config import Settings
-from dpm2_core.frame import Array, Keyframe, LoopClosure, Points
+from dpm2_core.frame import Array, Frame, Keyframe, LoopClosure, Points
 from dpm2_core.geometry import se3
-from dpm2_core.geometry.voxel import voxel_first
+from dpm2_core.slam.cloud_codec import pack_cloud
 from dpm2_core.slam.cloud_store import CloudStore
 from dpm2_core.slam.loop_closure import LoopCloser
+from dpm2_core.slam.loop_consistency import Loop
+from dpm2_core.slam.map_data import NO_POINTS, borrowing, load_map, map_cloud, restore
+from dpm2_core.slam.map_rows import Edge
+from dpm2_core.slam.map_store import MapStore
+from dpm2_core.slam.map_writer import MapWriter
+from dpm2_core.slam.moving import MovingSettings, MovingWindow
 from dpm2_core.slam.pose_graph import PoseGraph
-
-_NO_POINTS: Points = np.zeros((0, 4), np.float32)
+from dpm2_core.slam.redundancy import RedundancySettings, lender
 
 
 class MapSettings(Settings):
@@ -24,19 +32,40 @@ class MapSettings(Settings):
 
     voxel: float = 0.3
     """Spacing of its points, m."""
+    thumbnail: int = Field(0, ge=0, le=1024)
+    """Width of the picture that a map file keeps of each keyframe, pixels; 0: none."""
+    moving: MovingSettings = MovingSettings()
+    redundancy: RedundancySettings = RedundancySettings()
 
 
 class Mapper:
-    """Holds keyframes and pose graph; the odometry runs on untouched, `T_map_odom` carries every correction."""
+    """Holds keyframes and pose graph; the odometry runs on untouched, `T_map_odom` carries every correction.
 
-    def __init__(self, settings: MapSettings, graph: PoseGraph, loops: LoopCloser) -> None:
+    Attributes:
+        keyframes: all, without their clouds; a node is a position among them. ids count on over the sessions.
+        session_start: node of the first keyframe of this session: those before are of a map that was loaded.
+        closures: loops tried in this session.
+        T_map_odom: (4, 4).
+    """
+
+    def __init__(
+        self, settings: MapSettings, graph: PoseGraph, loops: LoopCloser, store: MapStore | None = None
+    ) -> None:
+        """`store`: the map file to go on with, its session begun; None keeps the map in memory, clouds on disk."""
         self._settings = settings
         self._graph = graph
         self._loops = loops
-        self.keyframes: list[Keyframe] = []  # without their clouds, which are on disk
-        self._clouds = CloudStore()
+        self.keyframes: list[Keyframe] = []
         self.closures: list[LoopClosure] = []
         self.T_map_odom: Array = np.eye(4)
+        self._clouds = CloudStore()
+        self._writer: MapWriter | None = None
+        self._first_id: dict[str, int] = {}  # of a robot's first keyframe in this session, where it was here before
+        self._tie: Array | None = None  # covariance of the session's first keyframe relative to the last of the map
+        if store is not None:
+            self._load(store)
+        self.session_start = len(self.keyframes)
+        self._moving = MovingWindow(settings.moving)
 
     @property
     def poses(self) -> Array:
@@ -48,44 +77,128 @@ class Mapper:
         """Odometry edges and accepted loops: from, to, T_from_to, covariance."""
         return self._graph.edges
 
-    def add(self, keyframe: Keyframe) -> list[LoopClosure]:
-        """Take a keyframe in; returns the loops that were tried, accepted or not."""
-        self._add_node(keyframe)
-        self._clouds.append(keyframe.cloud)
-        self.keyframes.append(replace(keyframe, cloud=_NO_POINTS))
-        tried = self._loops.close(self._clouds, self.poses)
-        if tried is None:
-            return []
-        node, found = tried
-        closure = LoopClosure(self.keyframes[node].id, keyframe.id, found)
-        self.closures.append(closure)
-        if found.ok:
-            self._graph.add_loop(node, len(self.keyframes) - 1, found.T_target_source, found.covariance)
-            self._graph.optimise()
-            self.T_map_odom = se3.orthonormalised(self.poses[-1] @ se3.inverse(keyframe.T_odom_kf))
-        return [closure]
+    @property
+    def clouds(self) -> Sequence[Points]:
+        """(M, 4) of each keyframe in its own frame, read from disk; without what moves."""
+        return self._clouds
+
+    @property
+    def store_problem(self) -> str:
+        """Why the map file is behind, in words; empty when it is not, or when there is none."""
+        return "" if self._writer is None else self._writer.problem
+
+    def start_session(self, T_map_odom: Array, covariance: Array | None = None) -> None:
+        """Before the first keyframe of a session in a loaded map: where its odometry begins.
+
+        Args:
+            T_map_odom: (4, 4).
+            covariance: (6, 6) of the first keyframe's pose relative to the last one of the map, which are then joined
+                by an edge; None: the new session is not tied to the map before a loop is found.
+        """
+        self.T_map_odom, self._tie = T_map_odom, covariance
+
+    def add(self, keyframe: Keyframe, thumbnail: bytes | None = None) -> list[LoopClosure]:
+        """Take a keyframe in, with a JPEG if wanted; returns the loops that were tried, accepted or not."""
+        node, cloud = len(self.keyframes), keyframe.cloud
+        keyframe = self._loops.described(keyframe)
+        keyframe = replace(keyframe, id=keyframe.id + self._first_id.get(keyframe.robot, 0), cloud=NO_POINTS)
+        edges = self._add_node(keyframe)
+        self._clouds.append(pack_cloud(cloud))
+        self.keyframes.append(keyframe)
+        closures, loops = self._close_loops(node)
+        again = edges if node == self.session_start else []  # the frame with which the session before ended
+        loan = lender(node, [*again, *loops], self._clouds.loan, self._settings.redundancy)
+        if loan is not None:
+            self._clouds.borrow(node, loan)
+            self.keyframes[node] = borrowing(keyframe, self.keyframes, loan)
+        self._mark_moving(self._moving.add(node, cloud, self.poses))
+        if self._writer is not None:
+            self._writer.add(node, self.keyframes[node], thumbnail)
+            for edge in (*edges, *loops):
+                self._writer.add_edge(edge)
+            self._writer.sync(self.poses)
+        return closures
+
+    def finish(self) -> None:
+        """At the end of a drive: judge the last clouds, bring the map file up to date."""
+        self._mark_moving(self._moving.finish(self.poses))
+        if self._writer is not None:
+            self._writer.sync(self.poses)
 
     def cloud(self, voxel_size: float | None = None) -> Points:
         """The map (M, 4) float32 in the map frame, one point in each voxel of that size (default: settings)."""
-        voxel = voxel_size or self._settings.voxel
-        cloud, poses = _NO_POINTS, self.poses
-        for start in range(0, len(poses), 50):  # in parts: memory is that of the map, not of all the clouds
-            part = range(start, min(start + 50, len(poses)))
-            cloud = np.concatenate([cloud, *(se3.transform(poses[i], self._clouds[i]) for i in part)])
-            cloud = cloud[voxel_first(cloud, voxel)]
-        return cloud
-
-    def _add_node(self, keyframe: Keyframe) -> None:
-        """A node with an edge to the keyframe before, also when some between them never arrived."""
-        T_map_kf = self.T_map_odom @ keyframe.T_odom_kf
-        if keyframe.edge is None or not self.keyframes:
-            self._graph.add_node(T_map_kf, None, None)
-            return
-        before = self.keyframes[-1]
-        missed = max(keyframe.id - before.id, 1)
-        T_before_this = se3.inverse(before.T_odom_kf) @ keyframe.T_odom_kf
-        self._graph.add_node(T_map_kf, T_before_this, keyframe.edge.covariance * missed)
+        return map_cloud(self._clouds, self.poses, voxel_size or self._settings.voxel)
 
     def write_g2o(self, path: Path) -> None:
         """The pose graph as a g2o file."""
         self._graph.write_g2o(path)
+
+    def _load(self, store: MapStore) -> None:
+        data = load_map(store)
+        self.keyframes, self._clouds = data.keyframes, data.clouds
+        restore(self._graph, data)
+        for keyframe in data.keyframes:
+            self._first_id[keyframe.robot] = max(self._first_id.get(keyframe.robot, 0), keyframe.id + 1)
+        if not store.read_only:
+            self._writer = MapWriter(store, self._clouds, data.poses)
+
+    def _add_node(self, keyframe: Keyframe) -> list[Edge]:
+        """A node with an edge to the keyframe before, also when some between them never arrived."""
+        T_map_kf, node = self.T_map_odom @ keyframe.T_odom_kf, len(self.keyframes)
+        if node == self.session_start and self._tie is not None:
+            T_before_this, covariance = se3.inverse(self.poses[-1]) @ T_map_kf, self._tie
+        elif keyframe.edge is None or node == self.session_start:
+            self._graph.add_node(T_map_kf, None, None)
+            return []
+        else:
+            before = self.keyframes[-1]
+            T_before_this = se3.inverse(before.T_odom_kf) @ keyframe.T_odom_kf
+            covariance = keyframe.edge.covariance * max(keyframe.id - before.id, 1)
+        self._graph.add_node(T_map_kf, T_before_this, covariance)
+        edge = Edge("odometry", node - 1, node, T_before_this, covariance)
+        found = keyframe.edge
+        if found is not None:
+            edge = replace(edge, confidence=found.confidence, rmse=found.rmse, method=found.method)
+        return [edge]
+
+    def _close_loops(self, node: int) -> tuple[list[LoopClosure], list[Edge]]:
+        """Loops of the last keyframe, as they are published and as they are stored."""
+        tried = self._loops.close(self.keyframes, self._clouds, self.poses)
+        closures = [
+            LoopClosure(self.keyframes[loop.from_node].id, self.keyframes[loop.to_node].id, loop.registration)
+            for loop in tried
+        ]
+        self.closures += closures
+        accepted = [loop for loop in tried if loop.registration.ok]
+        for loop in accepted:
+            found = loop.registration
+            self._graph.add_loop(loop.from_node, loop.to_node, found.T_target_source, found.covariance)
+        if accepted:
+            self._graph.optimise()
+            self.T_map_odom = se3.orthonormalised(self.poses[-1] @ se3.inverse(self.keyframes[node].T_odom_kf))
+        return closures, [_loop_edge(loop) for loop in tried]
+
+    def _mark_moving(self, judged: Iterable[tuple[int, NDArray[np.bool_]]]) -> None:
+        for node, moving in judged:
+            if self._clouds.loan(node) is None and moving.any():
+                self._clouds.set_moving(node, moving)
+                if self._writer is not None:
+                    self._writer.set_moving(node)
+
+
+def _loop_edge(loop: Loop) -> Edge:
+    r = loop.registration
+    told = (r.ok, r.confidence, r.rmse, r.method, r.reason)
+    return Edge("loop", loop.from_node, loop.to_node, r.T_target_source, r.covariance, *told)
+
+
+def thumbnail(frame: Frame, width: int) -> bytes | None:
+    """JPEG of the frame's first picture, `width` pixels wide; None without a picture, or for a width of 0."""
+    if not frame.images or not width:
+        return None
+    import cv2
+
+    pixels = frame.images[0].pixels
+    height = max(1, round(width * pixels.shape[0] / pixels.shape[1]))
+    small = cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA)
+    return bytes(cv2.imencode(".jpg", cv2.cvtColor(small, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 80])[1])

@@ -14,7 +14,8 @@ from dpm2_core.frame import Frame, Tracked
 from dpm2_core.slam.keyframes import KeyframeSelector, KeyframeSettings
 from dpm2_core.slam.local_map import LocalMap, LocalMapSettings
 from dpm2_core.slam.loop_closure import LoopCloser, LoopSettings
-from dpm2_core.slam.mapper import Mapper, MapSettings
+from dpm2_core.slam.map_store import MapStore
+from dpm2_core.slam.mapper import Mapper, MapSettings, thumbnail
 from dpm2_core.slam.neural import NeuralScanRegistration, NeuralSettings, load_network
 from dpm2_core.slam.odometry import Odometry, OdometrySettings
 from dpm2_core.slam.pose_graph import PoseGraph, PoseGraphSettings
@@ -52,22 +53,23 @@ class Config(Settings):
 class SlamSystem:
     """One robot: `odometry` runs on every frame, `mapper` on every keyframe; the ROS node runs them in two threads."""
 
-    def __init__(self, settings: SlamSettings | None = None, robot: str = "") -> None:
+    def __init__(self, settings: SlamSettings | None = None, robot: str = "", store: MapStore | None = None) -> None:
+        """`store`: the map file to write, or to go on with; its session has begun."""
         self._settings = settings or SlamSettings()
         self.odometry = make_odometry(self._settings, robot)
-        self.mapper = make_mapper(self._settings)
+        self.mapper = make_mapper(self._settings, store)
 
     def process(self, frame: Frame) -> Tracked:
         """Take one frame in: its pose in the odometry frame, and the map one keyframe richer when it shows enough."""
         tracked = self.odometry.process(frame)
         started = perf_counter()
         if tracked.keyframe is not None:
-            self.mapper.add(tracked.keyframe)
+            self.mapper.add(tracked.keyframe, thumbnail(frame, self._settings.map.thumbnail))
         tracked.seconds["map"] = perf_counter() - started
         return tracked
 
     def reset(self) -> None:
-        """Begin anew, with an empty map."""
+        """Begin anew, with an empty map; one in a file stays as it is."""
         self.odometry.reset()
         self.mapper = make_mapper(self._settings)
 
@@ -94,6 +96,18 @@ def make_registration(s: SlamSettings) -> ScanRegistration:
     return neural if s.registration == "neural" else RefinedScanRegistration(neural, geometric)
 
 
-def make_mapper(s: SlamSettings) -> Mapper:
-    """The mapper with its collaborators."""
-    return Mapper(s.map, PoseGraph(s.pose_graph), LoopCloser(s.loops, s.geometric, s.threads))
+def make_mapper(s: SlamSettings, store: MapStore | None = None) -> Mapper:
+    """The mapper with its collaborators; with a map file, if there is one."""
+    return Mapper(s.map, PoseGraph(s.pose_graph), make_loops(s), store)
+
+
+def make_loops(s: SlamSettings) -> LoopCloser:
+    """The loop closer, with a network if it is to use descriptors.
+
+    Raises:
+        UsageError: the network has no weights to run with.
+    """
+    network = None
+    if s.loops.enabled and s.loops.descriptors:
+        network = load_network(s.neural.weights, s.threads, s.neural.preset)
+    return LoopCloser(s.loops, s.geometric, s.threads, network)

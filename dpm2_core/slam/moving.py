@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which points of a cloud belong to things that moved away: other keyframes look through the place where they were.
+
+A cloud is compared with range images of its neighbours. Where a neighbour sees nothing at or before a point but
+something well behind it, the point was not there then. One such witness may be chance (leaves, glass, the rim of a
+pole), so two are wanted, and more than there are neighbours that saw something at the point.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from scipy.ndimage import minimum_filter
+
+from dpm2_core.config import Settings
+from dpm2_core.frame import Array, Points
+from dpm2_core.geometry import se3
+
+_PIXEL = np.radians(1.0)
+_COLUMNS = 360
+_LOWEST, _ROWS = np.radians(-45.0), 90
+_HALVES = (1, 2, 4)  # half sizes, pixels, of the windows in which a near return counts
+_CLEARANCE = 0.25  # m above the local ground: lower points stay, for the ground is seen at grazing angles
+
+
+class MovingSettings(Settings):
+    """Keeping points of moving things out of the map."""
+
+    window: int = Field(5, ge=0)
+    """So many keyframes before and after one are its witnesses; 0 keeps all points."""
+    witnesses: int = Field(2, ge=1)
+    """So many must look through the place of a point."""
+    margin: float = Field(0.5, gt=0)
+    """What they see must lie so far behind it, m; 3 % of the range are added."""
+    footprint: float = Field(0.3, gt=0)
+    """A return within this of the line of sight counts as seeing the point, m."""
+
+
+class RangeImage:
+    """The nearest return in each direction from a sensor, one degree a pixel; inf where there is none."""
+
+    def __init__(self, points: Points) -> None:
+        """(M, 4) in the sensor's frame."""
+        r, row, column = _spherical(points[:, :3])
+        self._own = _nearest(r, row, column)
+        # The ground before a thing is within any window around it, and hides nothing.
+        above = height_above_ground(points) > _CLEARANCE
+        standing = _nearest(r[above], row[above], column[above])
+        self._near = [minimum_filter(standing, 2 * half + 1, mode=("nearest", "wrap")) for half in _HALVES]
+
+    def judge(self, points: Points, settings: MovingSettings) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """For (M, 3+) points in the sensor's frame: whether they are looked through, and whether they are seen."""
+        r, row, column = _spherical(points[:, :3])
+        margin = settings.margin + 0.03 * r
+        window = np.searchsorted(_HALVES[:-1], settings.footprint / np.maximum(r, 0.1) / _PIXEL)
+        near = np.choose(window, [image[row, column] for image in self._near])
+        own = self._own[row, column]
+        through = np.isfinite(own) & (np.minimum(own, near) > r + margin) & (r > 2.0)
+        return through, np.abs(near - r) <= margin
+
+
+def _nearest(r: Points, row: NDArray[np.intp], column: NDArray[np.intp]) -> Points:
+    image = np.full((_ROWS, _COLUMNS), np.inf, np.float32)
+    np.minimum.at(image, (row, column), r)
+    return image
+
+
+def find_moving(
+    cloud: Points, T_map_kf: Array, others: Sequence[tuple[RangeImage, Array]], settings: MovingSettings
+) -> NDArray[np.bool_]:
+    """Which of the (M, 4) points of a keyframe belong to moving things.
+
+    Args:
+        cloud: in the keyframe's frame. T_map_kf: (4, 4).
+        others: range image and T_map_kf of its witnesses.
+
+    Returns:
+        (M,) bool.
+    """
+    through, seen = np.zeros(len(cloud), np.int16), np.zeros(len(cloud), np.int16)
+    candidates = np.flatnonzero(height_above_ground(cloud) > _CLEARANCE)
+    part = cloud[candidates]
+    for image, T_map_other in others:
+        looked, present = image.judge(se3.transform(se3.inverse(T_map_other) @ T_map_kf, part), settings)
+        through[candidates] += looked
+        seen[candidates] += present
+    return (through >= settings.witnesses) & (through > seen)
+
+
+class MovingWindow:
+    """The last keyframes of a drive: each is judged once there are as many after it as before it."""
+
+    def __init__(self, settings: MovingSettings) -> None:
+        self._settings = settings
+        self._seen: deque[tuple[int, Points, RangeImage]] = deque(maxlen=2 * settings.window + 1)
+        self._next = 0  # the first node that has not been judged
+
+    def add(self, node: int, cloud: Points, poses: Array) -> Iterator[tuple[int, NDArray[np.bool_]]]:
+        """Take in the whole cloud (M, 4) of the next node; yields the node that can be judged now, and its mask.
+
+        `poses` (N, 4, 4) are T_map_kf of all nodes so far.
+        """
+        if self._settings.window:
+            self._seen.append((node, cloud, RangeImage(cloud)))
+            yield from self._judge(node - self._settings.window, poses)
+
+    def finish(self, poses: Array) -> Iterator[tuple[int, NDArray[np.bool_]]]:
+        """Judge those at the end of the drive by what there is."""
+        if self._seen:
+            yield from self._judge(self._seen[-1][0], poses)
+
+    def _judge(self, last: int, poses: Array) -> Iterator[tuple[int, NDArray[np.bool_]]]:
+        for node, cloud, _ in self._seen:
+            if self._next <= node <= last:
+                others = [(image, poses[n]) for n, _, image in self._seen if n != node]
+                yield node, find_moving(cloud, poses[node], others, self._settings)
+                self._next = node + 1
+
+
+def height_above_ground(points: Points, cell: float = 1.0, reach: int = 2) -> NDArray[np.float32]:
+    """(M,) m of (M, 3+) points above the lowest one within `reach` cells of `cell` m around them."""
+    if not len(points):
+        return np.zeros(0, np.float32)
+    at = np.floor(points[:, :2] / cell).astype(np.int64)
+    at -= at.min(0)
+    lowest = np.full(at.max(0) + 1, np.inf, np.float32)
+    np.minimum.at(lowest, (at[:, 0], at[:, 1]), points[:, 2])
+    around = minimum_filter(lowest, 2 * reach + 1, mode="constant", cval=np.inf)
+    return points[:, 2] - around[at[:, 0], at[:, 1]]
+
+
+def _spherical(xyz: Points) -> tuple[Points, NDArray[np.intp], NDArray[np.intp]]:
+    """Range (M,) m, row and column (M,) of the range image for (M, 3) points."""
+    r = np.sqrt(np.einsum("ij,ij->i", xyz, xyz))
+    elevation = np.arcsin(np.clip(xyz[:, 2] / np.maximum(r, 1e-6), -1, 1))
+    row = np.clip((elevation - _LOWEST) / _PIXEL, 0, _ROWS - 1).astype(np.intp)
+    column = (np.arctan2(xyz[:, 1], xyz[:, 0]) / _PIXEL).astype(np.float64) % _COLUMNS
+    return r, row, np.minimum(column.astype(np.intp), _COLUMNS - 1)
