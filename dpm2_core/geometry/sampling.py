@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Point sampling in numpy: range crop, voxel grid, farthest points, hybrid neighbour query."""
+"""Point sampling in numpy: range crop, farthest points, hybrid neighbour query."""
 
 from __future__ import annotations
 
@@ -16,19 +16,6 @@ def in_range(points: Points, near: float, far: float) -> NDArray[np.bool_]:
     """Mask of the (N, 3) points whose distance from the origin is near..far m; NaN and inf are outside."""
     squared = np.einsum("ij,ij->i", points, points)
     return (squared >= near * near) & (squared <= far * far)
-
-
-def voxel_first(points: Points, size: float) -> Index:
-    """Indices of the first of the (N, 3) finite points in each cubic cell of `size` m, in the order of the cells.
-
-    The grid starts at the minimum of the cloud.
-    """
-    if len(points) == 0:
-        return np.zeros(0, np.int64)
-    cell = ((points - points.min(0)) * np.float32(1 / size)).astype(np.int64)
-    extent = cell.max(0) + 1
-    key = (cell[:, 0] * extent[1] + cell[:, 1]) * extent[2] + cell[:, 2]
-    return np.unique(key, return_index=True)[1]
 
 
 def farthest_points(points: Points, count: int) -> Index:

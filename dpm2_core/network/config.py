@@ -131,6 +131,8 @@ class DecoderSettings(Settings):
     """Pairs used for the pose: floor(ratio * (M + N)) // 2 of the most similar."""
     offset_limit: float = Field(2.0, gt=0)
     """Pairs with a longer predicted offset are dropped, m."""
+    guided: int = Field(2, ge=0)
+    """Times that descriptors are matched anew with the pose at hand. 0: the paper's single matching."""
     covariance_scale: float = Field(4.0, gt=0)
     """Factor on the covariance of the pose: both directions of a pair and neighbouring pairs err alike."""
 
@@ -167,7 +169,7 @@ _V1: dict[str, Any] = {
     "points": {"view_aligned": False, "moments": False, "pool_first": False, "stages": _V1_STAGES, "upsample": 2},
     "image": {"backbone": "none"},
     "fusion": {"kind": "none"},
-    "decoder": {"width": 256, "heads": 8, "position": "sine", "precision": False},
+    "decoder": {"width": 256, "heads": 8, "position": "sine", "precision": False, "guided": 0},
 }
 _PAPER: dict[str, Any] = {
     **_V1,

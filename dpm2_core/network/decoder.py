@@ -15,7 +15,7 @@ from dpm2_core.network.attention import Attention, RelativeBias, sine_code
 from dpm2_core.network.config import NetworkSettings
 from dpm2_core.network.descriptors import Tokens, to_tokens
 from dpm2_core.network.heads import OffsetHead, OverlapHead, PointMLP
-from dpm2_core.network.registration import correspond, register_batch
+from dpm2_core.network.registration import correspond, match_scores, register_batch
 
 
 class Correlated(NamedTuple):
@@ -103,7 +103,8 @@ class Decoder(nn.Module):
         device = next(self.parameters()).device
         x, y = (to_tokens([descriptors], self.view_aligned, device) for descriptors in (source, target))
         with torch.autocast(device.type, torch.bfloat16):
-            pairs = correspond(self, x, y, self(x, y))
+            correlated = self(x, y)
+            pairs = correspond(self, x, y, correlated, match_scores(self, correlated))
         half = pairs.weight.shape[1] // 2  # then the same pairs again, in the other direction
         at_source, at_target = pairs.source[0, half:].double().cpu(), pairs.target[0, :half].double().cpu()
         return at_source.numpy(), at_target.numpy(), pairs.weight[0, :half].double().cpu().numpy()

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.frame import Frame, Image
 from dpm2_core.network.config import ImageSettings, NetworkSettings
+from dpm2_core.network.convnext import FeatureMap
 from dpm2_core.network.descriptors import Tokens
 from dpm2_core.network.fusion import Fusion
 from dpm2_core.network.pointnext import Scale, view_axes
@@ -23,10 +24,11 @@ from dpm2_core.network.spatial import Views
 
 
 class Encoded(NamedTuple):
-    """Descriptors of a batch, and the key-points of the point backbone that the auxiliary loss reads."""
+    """Descriptors of a batch, and what the auxiliary losses read: key-points, and feature maps of the pictures."""
 
     tokens: Tokens
     scales: list[Scale]
+    maps: list[FeatureMap]
 
 
 class Encoder(nn.Module):
@@ -51,13 +53,13 @@ class Encoder(nn.Module):
             axis = view_axes(scale.xyz)
             if not self.settings.points.view_aligned:
                 axis = torch.zeros_like(axis) + torch.tensor([1.0, 0.0], device=axis.device)
-            return Encoded(Tokens(scale.xyz, scale.features, axis, scale.mask), scales)
+            return Encoded(Tokens(scale.xyz, scale.features, axis, scale.mask), scales, [])
         maps = []
         if self.image is None:
             views = None
         if views is not None and self.image is not None:
             maps = self.image(views.pixels.flatten(0, 1))
-        return Encoded(self.fusion(scales, views, maps), scales)
+        return Encoded(self.fusion(scales, views, maps), scales, maps)
 
     @torch.inference_mode()
     def encode(self, frame: Frame) -> Descriptors:

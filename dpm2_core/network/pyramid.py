@@ -13,7 +13,8 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.geometry.sampling import farthest_points, in_range, neighbours, voxel_first
+from dpm2_core.geometry.sampling import farthest_points, in_range, neighbours
+from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.network.config import PointsSettings
 
 MIN_POINTS = 32  # below this a scan says nothing about the pose
@@ -52,10 +53,11 @@ class PointBatch(NamedTuple):
 
 
 def crop(points: NDArray[np.float32], settings: PointsSettings) -> NDArray[np.float32]:
-    """Range crop and voxel grid of (N, 3+) points: (M, 3)."""
+    """Range crop and voxel grid of (N, 3+) points: (M, 3), ordered so that the order of the input does not matter."""
     xyz = np.ascontiguousarray(points[:, :3])
     xyz = xyz[in_range(xyz, settings.near, settings.far)]
-    return xyz[voxel_first(xyz, settings.voxel)]
+    xyz = xyz[voxel_first(xyz, settings.voxel)]
+    return xyz[np.argsort(xyz[:, 0])]
 
 
 def build_pyramid(cloud: NDArray[np.float32], settings: PointsSettings) -> Pyramid:

@@ -1,15 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Correlated descriptors to a pose: dual softmax, offsets, robust weighted SVD, precision-weighted solve."""
+"""Correlated descriptors to a pose: dual softmax, offsets, consensus, precision-weighted solve or robust SVD.
+
+Beyond the paper: the first pose is a consensus of pairs that keep each other's distances, and with it the descriptors
+are matched again, each to what lies near it.
+"""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from dpm2_core.frame import Registration
 from dpm2_core.geometry.kabsch import transform, weighted_kabsch
+from dpm2_core.network.consensus import TOLERANCE, consensus
 from dpm2_core.network.descriptors import Tokens
 from dpm2_core.network.heads import into_set_frame
 from dpm2_core.network.losses import cosine
@@ -17,10 +23,9 @@ from dpm2_core.network.losses import cosine
 if TYPE_CHECKING:
     from dpm2_core.network.decoder import Correlated, Decoder
 
-CERTAIN = 0.5  # pairs above this start as inliers, beside the SURE most confident
-SURE = 64
 MIN_INLIERS = 30
 CONFIDENT = 30  # pairs whose mean confidence is that of the registration
+NEAR = 4.0  # m, what comes farther apart under a rough pose is no match
 CHI2 = 11.3  # 99 % quantile with 3 degrees of freedom: inliers of the precision-weighted solve
 SOFT = 3.0  # degrees of freedom of the Student weights in the precision-weighted solve
 
@@ -60,11 +65,18 @@ def take(values: Tensor, index: Tensor) -> Tensor:
     return values.gather(1, index[..., None].expand(-1, -1, values.shape[-1]))
 
 
-def correspond(decoder: Decoder, source: Tokens, target: Tokens, correlated: Correlated) -> Correspondences:
-    """Choose pairs and predict, for each, the offsets in both directions."""
-    settings = decoder.settings
+def match_scores(decoder: Decoder, correlated: Correlated) -> Tensor:
+    """Similarities (B, N, M) in units of the temperature."""
     similarity = cosine(decoder.similarity(correlated.source), decoder.similarity(correlated.target))
-    probability = softmax_both(similarity / settings.temperature, source.mask, target.mask)
+    return similarity / decoder.settings.temperature
+
+
+def correspond(
+    decoder: Decoder, source: Tokens, target: Tokens, correlated: Correlated, scores: Tensor
+) -> Correspondences:
+    """Choose pairs by their scores (B, N, M) and predict, for each, the offsets in both directions."""
+    settings = decoder.settings
+    probability = softmax_both(scores, source.mask, target.mask)
     weight, i, j = best_pairs(probability, settings.pair_ratio)
     x, y = take(source.xyz, i), take(target.xyz, j)
     a, b = take(correlated.source, i), take(correlated.target, j)
@@ -81,26 +93,45 @@ def correspond(decoder: Decoder, source: Tokens, target: Tokens, correlated: Cor
     )
 
 
-def robust_kabsch(pairs: Correspondences, rounds: int = 3) -> tuple[Tensor, Tensor]:
+def first_pose(pairs: Correspondences) -> Tensor:
+    """The pose (B, 4, 4) that most pairs support, however many are wrong."""
+    half = pairs.source.shape[1] // 2  # the other half are the same pairs, seen from the target
+    return consensus(pairs.source[:, :half], pairs.target[:, :half], pairs.weight[:, :half])
+
+
+def guided_scores(scores: Tensor, T: Tensor, source: Tokens, target: Tokens) -> Tensor:
+    """Scores given a rough pose: only descriptors that it brings near each other can match.
+
+    The nearer ones are not preferred: that would confirm the rough pose, and made it worse where it was good.
+    """
+    distance = torch.cdist(transform(T, source.xyz), target.xyz)
+    return scores.masked_fill(distance > NEAR, -1e4)
+
+
+def robust_kabsch(pairs: Correspondences, T: Tensor, rounds: int = 3) -> tuple[Tensor, Tensor]:
     """Weighted SVD on inliers that are chosen anew each round: those within mean + 3 deviations of the inliers.
+
+    Args:
+        T: (B, 4, 4), rough pose; the first inliers are the pairs within `TOLERANCE` of it.
 
     Returns:
         T (B, 4, 4) float64 and inliers (B, 2K).
     """
-    weight = pairs.weight
-    inliers = weight > CERTAIN
-    inliers.scatter_(1, weight.topk(min(SURE, weight.shape[1]))[1], True)
-    inliers &= weight > 0
-    T = weighted_kabsch(pairs.source, pairs.target, weight * inliers)
+    usable = pairs.weight > 0
+    error = (transform(T, pairs.source) - pairs.target).norm(dim=-1)
+    inliers = (error <= TOLERANCE) & usable
+    few = inliers.sum(1, keepdim=True) < MIN_INLIERS
+    inliers = torch.where(few, usable, inliers)
+    T = weighted_kabsch(pairs.source, pairs.target, pairs.weight * inliers)
     for _ in range(rounds):
         error = (transform(T, pairs.source) - pairs.target).norm(dim=-1)
         count = inliers.sum(1, keepdim=True).clamp(min=1)
         mean = (error * inliers).sum(1, keepdim=True) / count
         spread = (((error - mean) ** 2 * inliers).sum(1, keepdim=True) / count).sqrt()
-        chosen = (error <= mean + 3 * spread) & (weight > 0)
+        chosen = (error <= mean + 3 * spread) & usable
         enough = chosen.sum(1, keepdim=True) >= MIN_INLIERS
         inliers = torch.where(enough, chosen, inliers)
-        T = weighted_kabsch(pairs.source, pairs.target, weight * inliers)
+        T = weighted_kabsch(pairs.source, pairs.target, pairs.weight * inliers)
     return T, inliers
 
 
@@ -157,37 +188,59 @@ def exp(xi: Tensor) -> Tensor:
 
 def register_batch(decoder: Decoder, source: Tokens, target: Tokens, correlated: Correlated) -> list[Registration]:
     """The registrations of a batch, T_target_source each."""
-    pairs = correspond(decoder, source, target, correlated)
-    T, inliers = robust_kabsch(pairs)
-    if decoder.settings.precision:
-        T, information = precision_solve(T, pairs)
-        residual, _ = whitened(T, pairs)  # the SVD's inliers were inliers of another pose
-        inliers = ((residual * residual).sum(-1) <= CHI2) & (pairs.weight > 0)
+    scores = match_scores(decoder, correlated)
+    unguided = pairs = correspond(decoder, source, target, correlated, scores)
+    if pairs.weight.shape[1] == 0:
+        return [_nothing("0 matching descriptors, want 3")] * len(scores)
+    T = first_pose(pairs)
+    solve = _solve_precise if decoder.settings.precision else _solve_svd
+    T, information, inliers = solve(pairs, T)
+    for _ in range(decoder.settings.guided):
+        pairs = correspond(decoder, source, target, correlated, guided_scores(scores, T, source, target))
+        T, information, inliers = solve(pairs, T)
     error = (transform(T, pairs.source.double()) - pairs.target).norm(dim=-1)
     count = inliers.sum(1)
     rmse = ((error**2 * inliers).sum(1) / count.clamp(min=1)).sqrt()
-    if not decoder.settings.precision:
-        sigma = rmse.clamp(min=0.02)[:, None, None, None] / 3**0.5
-        _, jacobian = whitened(T, pairs._replace(L=torch.eye(3, device=T.device).expand_as(pairs.L)))
-        jacobian = (jacobian * inliers[..., None, None] / sigma).flatten(1, 2)
-        information = jacobian.transpose(1, 2) @ jacobian + 1e-6 * torch.eye(6, device=T.device)
     covariance = decoder.settings.covariance_scale * torch.linalg.inv(information)
-    confidence = _confidence(pairs.weight, inliers)
+    confidence = _confidence(unguided, T)
     return [
         _answer(*row)
         for row in zip(T.cpu(), covariance.cpu(), confidence.tolist(), rmse.tolist(), count.tolist(), strict=True)
     ]
 
 
-def _confidence(weight: Tensor, inliers: Tensor) -> Tensor:
-    best = (weight * inliers).topk(min(CONFIDENT, weight.shape[1]))[0]
-    return best.mean(1)
+def _solve_precise(pairs: Correspondences, T: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Pose, information and inliers by the predicted precisions."""
+    T, information = precision_solve(T, pairs)
+    residual, _ = whitened(T, pairs)
+    return T, information, ((residual * residual).sum(-1) <= CHI2) & (pairs.weight > 0)
+
+
+def _solve_svd(pairs: Correspondences, T: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Pose, information and inliers by the robust SVD: every offset counts as known like the others."""
+    T, inliers = robust_kabsch(pairs, T)
+    error = (transform(T, pairs.source.double()) - pairs.target).norm(dim=-1)
+    rmse = ((error**2 * inliers).sum(1) / inliers.sum(1).clamp(min=1)).sqrt()
+    sigma = rmse.clamp(min=0.02)[:, None, None, None] / 3**0.5
+    _, jacobian = whitened(T, pairs._replace(L=torch.eye(3, device=T.device).expand_as(pairs.L)))
+    jacobian = (jacobian * inliers[..., None, None] / sigma).flatten(1, 2)
+    return T, jacobian.transpose(1, 2) @ jacobian + 1e-6 * torch.eye(6, device=T.device), inliers
+
+
+def _confidence(unguided: Correspondences, T: Tensor) -> Tensor:
+    """Mean probability of the best pairs that the pose bears out, as matched without knowing it."""
+    error = (transform(T, unguided.source.double()) - unguided.target).norm(dim=-1)
+    weight = unguided.weight * (error <= TOLERANCE)
+    return weight.topk(min(CONFIDENT, weight.shape[1]))[0].mean(1)
 
 
 def _answer(T: Tensor, covariance: Tensor, confidence: float, rmse: float, count: int) -> Registration:
-    finite = bool(T.isfinite().all() and covariance.isfinite().all())
-    if count < 3 or not finite:
-        reason = f"{count} matching descriptors, want 3" if finite else "no finite pose"
-        nothing = torch.eye(4, dtype=torch.float64).numpy()
-        return Registration(nothing, torch.eye(6).double().numpy() * 1e6, 0.0, float("inf"), "neural", False, reason)
+    if not bool(T.isfinite().all() and covariance.isfinite().all()):
+        return _nothing("no finite pose")
+    if count < 3:
+        return _nothing(f"{count} matching descriptors, want 3")
     return Registration(T.numpy(), covariance.numpy(), confidence, rmse, "neural")
+
+
+def _nothing(reason: str) -> Registration:
+    return Registration(np.eye(4), np.eye(6) * 1e6, 0.0, np.inf, "neural", False, reason)

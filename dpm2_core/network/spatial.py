@@ -66,19 +66,24 @@ def ray_bias(points: Tensor, views: Views, uv: Tensor, alphas: tuple[float, ...]
         behind the camera; and `seen` (B, N, V), True where the point projects into a picture that is present.
     """
     distances, fronts, seen = [], [], []
-    height, width = views.pixels.shape[-2:]
     for view in range(views.pixels.shape[1]):
         K, T_lidar_cam = views.K[:, view].float(), views.T_lidar_cam[:, view].float()
         distance, front = point_ray_distance(points, *pixel_rays(uv, K, T_lidar_cam))
         distances.append(distance)
         fronts.append(front)
-        at, depth = project(points, K, T_lidar_cam)
-        inside = (depth > 0.1) & (at[..., 0] >= 0) & (at[..., 0] < width) & (at[..., 1] >= 0) & (at[..., 1] < height)
-        seen.append(inside & views.present[:, view, None])
+        seen.append(seen_from(points, views, view))
     distance, front = torch.cat(distances, -1)[:, None], torch.cat(fronts, -1)[:, None]
     alpha = torch.tensor(alphas, device=points.device).view(1, -1, 1, 1)
     readable = views.present.repeat_interleave(len(uv), 1)[:, None, None]
     return _compact(zscore(torch.exp(-alpha * distance) * front, readable)), torch.stack(seen, -1)
+
+
+def seen_from(points: Tensor, views: Views, view: int) -> Tensor:
+    """Which points (B, N, 3) project into a view's picture, where there is one: (B, N)."""
+    height, width = views.pixels.shape[-2:]
+    at, depth = project(points, views.K[:, view].float(), views.T_lidar_cam[:, view].float())
+    inside = (depth > 0.1) & (at[..., 0] >= 0) & (at[..., 0] < width) & (at[..., 1] >= 0) & (at[..., 1] < height)
+    return inside & views.present[:, view, None]
 
 
 def sample_at_points(points: Tensor, views: Views, features: Tensor, window: int) -> Tensor:

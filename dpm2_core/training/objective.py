@@ -25,6 +25,8 @@ class LossSettings(Settings):
     """On the encoder's descriptors, through the coarse head."""
     backbone: float = 0.1
     """On the point backbone's key-points, through a head of its own."""
+    image: float = 0.1
+    """On the features of the first picture where descriptors project into it, through a head of its own."""
     offset: float = 0.2
     """On predicted offsets. The likelihood's gradient is that of a distance divided by its deviation, some 0.1 m: with
     weight 1 it drowns the pairing."""

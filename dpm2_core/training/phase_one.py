@@ -13,12 +13,12 @@ from torch import Tensor, nn
 
 from dpm2_core.config import Settings
 from dpm2_core.network.config import NetworkSettings, preset
-from dpm2_core.network.encoder import to_device
+from dpm2_core.network.encoder import Encoded, to_device
 from dpm2_core.network.losses import cosine, info_nce, label_pairs
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pointnext import Scale
 from dpm2_core.network.pyramid import PointBatch
-from dpm2_core.network.spatial import Views
+from dpm2_core.network.spatial import Views, sample_at_points, seen_from
 from dpm2_core.network.weights import load_weights, save_weights
 from dpm2_core.training.checkpoint import load_checkpoint
 from dpm2_core.training.dataset import Batch, DataSettings, GroupDataset
@@ -39,6 +39,8 @@ class PhaseOne(nn.Module):
         sizes = [stage.points for stage in network.points.stages]
         self.level = min(range(len(sizes)), key=lambda i: abs(sizes[i] - 256))  # key-points as dense as descriptors
         self.backbone_head = nn.Linear(channels[self.level], network.channels)
+        camera = network.image.backbone != "none" and loss.image > 0
+        self.image_head = nn.Linear(network.image.pyramid, network.channels) if camera else None
 
     def forward(
         self, points: PointBatch, views: Views | None, plans: tuple[Plan, ...]
@@ -57,6 +59,10 @@ class PhaseOne(nn.Module):
             auxiliary = self._backbone_loss(encoded.scales[self.level], plans[0])
             total = total + self.loss.backbone * auxiliary
             figures["backbone"] = auxiliary
+        if self.image_head is not None and views is not None:
+            auxiliary = self._image_loss(self.image_head, encoded, views, plans[0])
+            total = total + self.loss.image * auxiliary
+            figures["image"] = auxiliary
         figures["loss"] = total
         return total, {name: value.detach().float() for name, value in figures.items()}
 
@@ -65,6 +71,18 @@ class PhaseOne(nn.Module):
         i, j = plan.source[:, 0], plan.target[:, 0]
         features = self.backbone_head(scale.features)
         labels = label_pairs(scale.xyz[i], scale.xyz[j], plan.T_target_source, (scale.mask[i], scale.mask[j]))
+        return info_nce(cosine(features[i], features[j]) / self.model.decoder.settings.temperature, labels, False)
+
+    def _image_loss(self, head: nn.Module, encoded: Encoded, views: Views, plan: Plan) -> Tensor:
+        """InfoNCE of the pictures' features where the descriptors project: the image branch learns long before the
+        fusion makes use of it."""
+        frames, count = views.present.shape
+        finest = encoded.maps[0].features.unflatten(0, (frames, count))[:, 0]
+        xyz = encoded.tokens.xyz
+        features = head(sample_at_points(xyz, views, finest, 1).to(finest.dtype))
+        mask = encoded.tokens.mask & seen_from(xyz, views, 0)
+        i, j = plan.source[:, 0], plan.target[:, 0]
+        labels = label_pairs(xyz[i], xyz[j], plan.T_target_source, (mask[i], mask[j]))
         return info_nce(cosine(features[i], features[j]) / self.model.decoder.settings.temperature, labels, False)
 
 

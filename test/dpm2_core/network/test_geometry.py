@@ -14,23 +14,13 @@ from scipy.spatial.transform import Rotation
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.kabsch import transform, weighted_kabsch
 from dpm2_core.geometry.rays import pixel_rays, point_ray_distance, project
-from dpm2_core.geometry.sampling import farthest_points, in_range, neighbours, voxel_first
+from dpm2_core.geometry.sampling import farthest_points, in_range, neighbours
 
 
 def test_range_refuses_what_is_not_finite() -> None:
     """NaN, inf and the origin of a lost return are outside."""
     points = np.array([[np.nan, 0, 0], [np.inf, 0, 0], [0, 0, 0], [3, 4, 0], [61, 0, 0]], np.float32)
     assert in_range(points, 1, 60).tolist() == [False, False, False, True, False]
-
-
-def test_voxel_keeps_the_first_point_of_each_cell(noise: np.random.Generator) -> None:
-    """Every cell is represented once, by its first point, as a dictionary over cells says."""
-    points = noise.uniform(-3, 3, (500, 3)).astype(np.float32)
-    cells: dict[tuple[int, ...], int] = {}
-    for i, cell in enumerate(((points - points.min(0)) / np.float32(0.5)).astype(int)):
-        cells.setdefault(tuple(cell), i)
-    assert sorted(voxel_first(points, 0.5)) == sorted(cells.values())
-    assert len(voxel_first(points[:0], 0.5)) == 0
 
 
 @pytest.mark.parametrize("n", [5, 200, 3000])

@@ -10,13 +10,15 @@ import torch
 from dpm2_core.descriptors import Descriptors, merge
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.kabsch import transform
-from dpm2_core.network.descriptors import to_tokens
+from dpm2_core.network.descriptors import Tokens, to_tokens
 from dpm2_core.network.heads import OffsetHead, into_set_frame
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pointnext import from_view, to_view
 from dpm2_core.network.registration import (
     Correspondences,
     best_pairs,
+    first_pose,
+    guided_scores,
     precision_solve,
     robust_kabsch,
     softmax_both,
@@ -37,7 +39,7 @@ def perfect(noise: np.random.Generator, batch: int = 2, pairs: int = 60) -> tupl
 def test_perfect_matches_give_the_exact_pose(noise: np.random.Generator) -> None:
     """Weighted SVD to rounding; the precision-weighted solve stays there and gets there from 0.3 rad and 2 m off."""
     pairs, T = perfect(noise)
-    found, _ = robust_kabsch(pairs)
+    found, _ = robust_kabsch(pairs, first_pose(pairs))
     torch.testing.assert_close(found, T, atol=1e-6, rtol=0)
     off = T @ torch.from_numpy(se3.exp([0.1, -0.1, 0.3, 1, -2, 0.5]))
     torch.testing.assert_close(precision_solve(off, pairs, rounds=30)[0], T, atol=1e-6, rtol=0)
@@ -49,9 +51,36 @@ def test_outliers_are_left_out(noise: np.random.Generator) -> None:
     wrong = torch.arange(pairs.source.shape[1]) % 5 == 0
     target = torch.where(wrong[:, None], pairs.target + 30 * torch.randn(pairs.target.shape), pairs.target)
     pairs = pairs._replace(target=target, weight=torch.where(wrong, 0.05, pairs.weight))
-    found, inliers = robust_kabsch(pairs, rounds=10)
+    found, inliers = robust_kabsch(pairs, first_pose(pairs), rounds=10)
     assert not inliers[:, wrong].any()
     torch.testing.assert_close(precision_solve(found, pairs)[0], T, atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize("wrong", [0.5, 0.7])
+def test_consensus_survives_a_majority_of_wrong_matches(noise: np.random.Generator, wrong: float) -> None:
+    """Wrong matches as confident as the right ones, to anywhere in the scene: right ones within 0.2 m decide."""
+    pairs, T = perfect(noise, batch=4, pairs=100)
+    bad = torch.from_numpy(noise.random(pairs.weight.shape) < wrong)
+    anywhere = transform(T, torch.from_numpy(noise.normal(0, 15, pairs.target.shape)))
+    target = torch.where(
+        bad[..., None], anywhere, pairs.target + torch.from_numpy(noise.normal(0, 0.1, (*bad.shape, 3)))
+    )
+    found = first_pose(pairs._replace(target=target))
+    for estimate, truth in zip(found.numpy(), T.numpy(), strict=True):
+        error = se3.log(se3.inverse(truth) @ estimate)
+        assert np.linalg.norm(error[3:]) < 0.3  # 0.1 m of noise a point, some thirty right matches
+        assert np.linalg.norm(error[:3]) < 0.03
+
+
+def test_guidance_leaves_what_the_pose_brings_together() -> None:
+    """Descriptors that come to lie far apart cannot match; among the near ones the scores decide, as before."""
+    xyz = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [9, 0, 0]]])
+    tokens = Tokens(xyz, torch.zeros(1, 3, 4), torch.zeros(1, 3, 2), torch.ones(1, 3, dtype=torch.bool))
+    scores = torch.rand(1, 3, 3)
+    guided = guided_scores(scores, torch.eye(4)[None], tokens, tokens)
+    assert (guided[0, 2, :2] == -1e4).all()
+    assert (guided[0, :2, 2] == -1e4).all()
+    assert torch.equal(guided[0, :2, :2], scores[0, :2, :2])
 
 
 def test_precision_tells_which_direction_to_trust(noise: np.random.Generator) -> None:
@@ -70,7 +99,7 @@ def test_precision_tells_which_direction_to_trust(noise: np.random.Generator) ->
     target[0, half:] += slide[half:]
     across = torch.linalg.cholesky(1e4 * normal[:, :, None] * normal[:, None] + 1e-2 * torch.eye(3).double())
     pairs = Correspondences(source, target, torch.ones(1, n).double(), across[None])
-    svd, _ = robust_kabsch(pairs)
+    svd, _ = robust_kabsch(pairs, first_pose(pairs))
     solved, information = precision_solve(svd, pairs)
     error = se3.log(se3.inverse(T[0].numpy()) @ solved[0].numpy())
     assert np.linalg.norm(error[3:]) < 0.01
@@ -99,7 +128,11 @@ def test_moving_both_clouds_moves_the_answer(noise: np.random.Generator) -> None
     )
     A, B = (torch.from_numpy(se3.exp(noise.normal(0, 1, (2, 6)) * [1, 1, 1, 9, 9, 9])) for _ in range(2))
     moved = pairs._replace(source=transform(B, pairs.source), target=transform(A, pairs.target))
-    for solve in (lambda p: robust_kabsch(p)[0], lambda p: precision_solve(robust_kabsch(p)[0], p, rounds=30)[0]):
+    for solve in (
+        first_pose,
+        lambda p: robust_kabsch(p, first_pose(p))[0],
+        lambda p: precision_solve(first_pose(p), p, rounds=30)[0],
+    ):
         expected = A @ solve(pairs) @ torch.linalg.inv(B)
         torch.testing.assert_close(solve(moved), expected, atol=1e-4, rtol=0)
 

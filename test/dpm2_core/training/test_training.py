@@ -64,10 +64,23 @@ def test_log_has_figures_and_validation(settings: PhaseOneSettings, tmp_path: Pa
     """One JSON object a line; validation gives medians and success of near, far and turned pairs."""
     phase_one(settings, tmp_path / "out")
     rows = [json.loads(line) for line in (tmp_path / "out" / "log.jsonl").read_text().splitlines()]
-    assert {"pairing", "coarse", "backbone", "offset", "offset_m", "right", "norm", "rate"} <= rows[0].keys()
+    assert {"pairing", "coarse", "backbone", "image", "offset", "offset_m", "right", "norm", "rate"} <= rows[0].keys()
     validations = [row for row in rows if "near_m" in row]
     assert [row["step"] for row in validations] == [1, 3]
     assert {"near_deg", "near_success", "turned_m", "chi2"} <= validations[0].keys()
+
+
+def test_pictures_have_a_loss_of_their_own(settings: PhaseOneSettings, tiny: Callable) -> None:
+    """It is a finite figure that trains the image branch; without pictures it is absent, not zero."""
+    module = PhaseOne(tiny(), settings.loss)
+    batch = GroupDataset(settings.data, tiny(), seed=0).batch(0)
+    plans = plans_of(batch.poses, settings, 0)
+    total, figures = module(batch.points, batch.views, plans)
+    assert figures["image"] > 0
+    total.backward()
+    assert module.image_head is not None
+    assert module.image_head.weight.grad.abs().sum() > 0
+    assert "image" not in module(batch.points, None, plans)[1]
 
 
 def test_a_checkpoint_of_another_network_is_refused(settings: PhaseOneSettings, tmp_path: Path) -> None:
