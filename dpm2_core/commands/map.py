@@ -1,0 +1,220 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`dpm2 map`: look into map files, write them in other formats, join, thin out and mend them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.box import SIMPLE
+from rich.console import Console
+from rich.table import Table
+from scipy.spatial.transform import Rotation
+
+from dpm2_core.config import load_settings
+from dpm2_core.data.pcd import write_las, write_pcd
+from dpm2_core.data.ply import write_ply
+from dpm2_core.data.trajectory import write_kitti, write_tum
+from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.frame import Array
+from dpm2_core.geometry import se3
+from dpm2_core.slam.map_data import MapData, load_map, map_cloud, restore, save_as, trajectory
+from dpm2_core.slam.map_store import MapStore
+
+app = typer.Typer(help="Map files: info, export, merge, prune, check.", no_args_is_help=True)
+
+MapFile = Annotated[Path, typer.Argument(metavar="MAP", help="Map file, as `dpm2 run --map` writes it.")]
+ConfigFile = Annotated[Path | None, typer.Option("--config", help="YAML file; `dpm2 config dump` shows every key.")]
+Overrides = Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, such as slam.map.voxel=0.3.")]
+
+
+@app.command()
+def info(path: MapFile) -> None:
+    """What is in a map."""
+    with MapStore.open(path) as store:
+        data = load_map(store, descriptors=False)
+        with_descriptors = sum(row[0] or 0 for row in store.rows("payloads", "descriptors IS NOT NULL"))
+        extent = _extent(data)
+    size = sum(file.stat().st_size for suffix in ("", "-wal") if (file := Path(f"{path}{suffix}")).exists())
+    loops = [edge for edge in data.edges if edge.kind == "loop"]
+    own = sum(data.clouds.loan(node) is None for node in range(len(data)))
+    table = Table(title=str(path), title_justify="left", box=SIMPLE, show_header=False)
+    robots = ", ".join(sorted({keyframe.robot or "(one)" for keyframe in data.keyframes})) or "-"
+    rows = (
+        ("keyframes", f"{len(data)}, {own} of them with their own cloud, {with_descriptors} with descriptors"),
+        ("pruned", str(len(data.trail))),
+        ("robots", robots),
+        ("length", f"{_length(data):.1f} m"),
+        ("extent", extent),
+        ("loops", f"{sum(edge.ok for edge in loops)} accepted of {len(loops)} tried"),
+        ("size", f"{size / 1e6:.2f} MB, {size / max(len(data), 1) / 1e3:.1f} kB a keyframe"),
+    )
+    for row in rows:
+        table.add_row(*row)
+    for s in data.sessions:
+        count = data.session.count(s.number)
+        told = f"{count} keyframes, {s.started}, dpm2 {s.program}, weights {s.weights or 'none'}"
+        table.add_row(f"session {s.number}", told)
+    Console().print(table)
+
+
+@app.command()
+def export(
+    path: MapFile,
+    out: Annotated[Path, typer.Argument(help="File to write; its ending says what, unless --format does.")],
+    format: Annotated[
+        str, typer.Option(help="ply, pcd, las, occupancy (YAML and PGM for Nav2), tum, kitti or g2o.")
+    ] = "",
+    voxel: Annotated[float, typer.Option(min=0.01, help="Spacing of the points of a cloud, m.")] = 0.3,
+    resolution: Annotated[float, typer.Option(min=0.01, help="Cell of the occupancy grid, m.")] = 0.1,
+) -> None:
+    """Write a map as a point cloud, an occupancy grid, a trajectory of its keyframes, or a pose graph."""
+    kind = format or _ENDINGS.get(out.suffix.lower(), "")
+    if kind not in _EXPORTS:
+        raise UsageError(f"{out}: choose --format from {', '.join(_EXPORTS)}")
+    with MapStore.open(path) as store:
+        data = load_map(store, descriptors=False)
+        if not len(data):
+            raise UsageError(f"{path}: no keyframe in it yet")
+        _EXPORTS[kind](data, out, voxel, resolution)
+    Console(stderr=True).print(f"{out} written", highlight=False, soft_wrap=True)
+
+
+@app.command()
+def merge(
+    paths: Annotated[list[Path], typer.Argument(metavar="MAP MAP...", help="Map files; the first one's frame stays.")],
+    out: Annotated[Path, typer.Option(help="New map file.")],
+    transform: Annotated[
+        list[str] | None,
+        typer.Option(help='Pose of a further map in the first: "x y z yaw" (m, deg) or "x y z qx qy qz qw"; one each.'),
+    ] = None,
+    align: Annotated[bool, typer.Option("--align", help="Find the maps in each other by their descriptors.")] = False,
+    config: ConfigFile = None,
+    settings: Overrides = None,
+) -> None:
+    """Join maps, by known transforms or by the places that they share."""
+    from dpm2_core.slam.map_merge import align as aligned
+    from dpm2_core.slam.map_merge import loops_by, merge_maps, optimised
+    from dpm2_core.slam.pose_graph import PoseGraph
+    from dpm2_core.slam.system import Config, make_loops
+
+    given = [parse_transform(text) for text in transform or ()]
+    if len(paths) < 2 or align == bool(given) or (given and len(given) != len(paths) - 1):
+        raise UsageError("merge: want two or more maps, and either --align or a --transform for each but the first")
+    chosen = load_settings(Config, config, settings or ()).slam
+    with ExitStack() as stack:
+        first, *others = (load_map(stack.enter_context(MapStore.open(path)), descriptors=True) for path in paths)
+        for number, other in enumerate(others):
+            if align:
+                T, loops = aligned(first, other, loops_by(make_loops(chosen)))
+                first = optimised(merge_maps(first, other, T, loops), PoseGraph(chosen.pose_graph))
+                Console(stderr=True).print(f"{paths[number + 1]}: {len(loops)} loops to what came before")
+            else:
+                first = merge_maps(first, other, given[number])
+        save_as(first, out)
+    Console(stderr=True).print(f"{out}: {len(first)} keyframes", highlight=False, soft_wrap=True)
+
+
+@app.command()
+def prune(
+    path: MapFile,
+    out: Annotated[Path, typer.Option(help="New map file.")],
+    distance: Annotated[float, typer.Option(min=0, help="From an older keyframe, m; 0: only what borrows.")] = 3.0,
+    angle: Annotated[float, typer.Option(min=0, max=180, help="Between their headings, degrees.")] = 30.0,
+) -> None:
+    """Take out the keyframes that revisits made redundant; what they constrain and where they were stays."""
+    from dpm2_core.slam.map_prune import prune as pruned
+    from dpm2_core.slam.map_prune import redundant_nodes
+
+    with MapStore.open(path) as store:
+        data = load_map(store)
+        less = pruned(data, redundant_nodes(data, distance, angle))
+        save_as(less, out)
+    Console(stderr=True).print(f"{out}: {len(less)} keyframes of {len(data)}", highlight=False, soft_wrap=True)
+
+
+@app.command()
+def check(
+    path: MapFile,
+    recover: Annotated[Path | None, typer.Option(help="Write what is good to this new map file.")] = None,
+) -> None:
+    """Look for damage: database, checksum of every row, edges that lead nowhere, poses that are none."""
+    from dpm2_core.slam.map_check import check_map
+
+    found = check_map(path, recover)
+    console = Console(soft_wrap=True, highlight=False, markup=False)
+    for problem in found.problems:
+        console.print(problem)
+    if recover is not None:
+        console.print(f"{recover}: {found.keyframes} keyframes, {found.lost} lost, {found.lost_clouds} without cloud")
+    elif found.problems:
+        raise Dpm2Error(
+            f"{path}: {len(found.problems)} problems, {found.keyframes} keyframes can be recovered with --recover OUT"
+        )
+    else:
+        console.print(f"{path}: {found.keyframes} keyframes, sound")
+
+
+def parse_transform(text: str) -> Array:
+    """`x y z yaw` (m, degrees) or `x y z qx qy qz qw` to (4, 4).
+
+    Raises:
+        UsageError: it is neither.
+    """
+    try:
+        numbers = [float(word) for word in text.replace(",", " ").split()]
+        if len(numbers) not in (4, 7) or not np.isfinite(numbers).all():
+            raise ValueError
+        angles = numbers[3:]
+        R = Rotation.from_euler("z", angles[0], degrees=True) if len(angles) == 1 else Rotation.from_quat(angles)
+    except ValueError:
+        raise UsageError(f'--transform "{text}": want "x y z yaw" or "x y z qx qy qz qw"') from None
+    return se3.make(R.as_matrix(), numbers[:3])
+
+
+def _length(data: MapData) -> float:
+    """Of the way through all keyframes, session by session, m."""
+    steps = np.linalg.norm(np.diff(data.poses[:, :3, 3], axis=0), axis=1)
+    same = np.diff(data.session) == 0
+    return float(steps[same].sum()) if len(data) > 1 else 0.0
+
+
+def _extent(data: MapData) -> str:
+    if not len(data):
+        return "-"
+    size = np.ptp(data.poses[:, :3, 3], axis=0)
+    return f"{size[0]:.1f} x {size[1]:.1f} x {size[2]:.1f} m, of the keyframes"
+
+
+def _export_g2o(data: MapData, out: Path, voxel: float, resolution: float) -> None:
+    from dpm2_core.slam.pose_graph import PoseGraph, PoseGraphSettings
+
+    graph = PoseGraph(PoseGraphSettings())
+    restore(graph, data)
+    graph.write_g2o(out)
+
+
+def _export_occupancy(data: MapData, out: Path, voxel: float, resolution: float) -> None:
+    from dpm2_core.slam.occupancy import OccupancySettings, occupancy_grid, write_grid
+
+    write_grid(out, occupancy_grid(data.clouds, data.poses, OccupancySettings(resolution=resolution)))
+
+
+_Export = Callable[[MapData, Path, float, float], None]
+_EXPORTS: dict[str, _Export] = {
+    "ply": lambda data, out, voxel, _: write_ply(out, map_cloud(data.clouds, data.poses, voxel)),
+    "pcd": lambda data, out, voxel, _: write_pcd(out, map_cloud(data.clouds, data.poses, voxel)),
+    "las": lambda data, out, voxel, _: write_las(out, map_cloud(data.clouds, data.poses, voxel)),
+    "occupancy": _export_occupancy,
+    "tum": lambda data, out, *_: write_tum(out, *trajectory(data)),
+    "kitti": lambda data, out, *_: write_kitti(out, trajectory(data)[1]),
+    "g2o": _export_g2o,
+}
+_ENDINGS = {
+    ".ply": "ply", ".pcd": "pcd", ".las": "las", ".yaml": "occupancy", ".pgm": "occupancy", ".tum": "tum",
+    ".g2o": "g2o",
+}  # fmt: skip
