@@ -6,8 +6,9 @@ Each part of the package keeps its own `Settings` type beside the code it config
 
 from __future__ import annotations
 
+import copy
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
@@ -69,6 +70,13 @@ def settings_from(kind: type[T], tree: dict[str, Any], origin: dict[str, str] | 
 def dump_settings(settings: Settings) -> str:
     """YAML of every value, each key preceded by its description."""
     return "\n".join(_dump(settings, 0)) + "\n"
+
+
+def merged(tree: Mapping[str, Any], more: Mapping[str, Any]) -> dict[str, Any]:
+    """A nested dictionary with the keys of another one put in."""
+    out = copy.deepcopy(dict(tree))
+    _merge(out, dict(more))
+    return out
 
 
 def flat_fields(kind: type[Settings], prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:

@@ -65,6 +65,35 @@ def phase2(
     phase_two(load_settings(PhaseTwoSettings, config, settings or []), out, resume)
 
 
+@train.command()
+def ablation(
+    config: ConfigOption = None,
+    settings: SetOption = None,
+    out: OutOption = Path("out/ablation"),
+    report: Annotated[Path, typer.Option("--json", help="Table to write.")] = Path("benchmarks/ablation.json"),
+) -> None:
+    """The paper's Table 4: alternatives of the fusion, trained alike; continues where it was stopped."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from dpm2_core.evaluation.bench.harness import write_record
+    from dpm2_core.training.ablation import AblationSettings
+    from dpm2_core.training.ablation import ablation as compare
+
+    chosen = load_settings(AblationSettings, config, settings or [])
+    if not chosen.measure:
+        raise UsageError("measure: want the folders of packed drives to measure on, such as {unseen: out/train/val}")
+    found = compare(chosen, out)
+    table = Table(
+        "fusion", *(f"{drives}: {what}" for drives in chosen.measure for what in ("near m", "success", "far"))
+    )
+    for name, rows in found.items():
+        cells = [f"{r['near_m']:.3f} {r['near_success']:.0%} {r['far_success']:.0%}".split() for r in rows.values()]
+        table.add_row(name, *(cell for row in cells for cell in row))
+    write_record(report, "ablation", {"settings": chosen.model_dump(mode="json"), "variants": found})
+    Console().print(table, f"written to {report}")
+
+
 def _refuse_overwriting(out: Path, resume: bool) -> None:
     if (out / "checkpoint.pt").exists() and not resume:
         raise UsageError(f"{out}: holds a training; --resume continues it, another --out keeps it")

@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, Literal
 
 from pydantic import Field
 
-from dpm2_core.config import Settings, settings_from
+from dpm2_core.config import Settings, merged, settings_from
 from dpm2_core.errors import UsageError
 
 FusionKind = Literal[
@@ -236,12 +237,12 @@ _BASE: dict[str, Any] = {
 PRESETS: dict[str, dict[str, Any]] = {"small": {}, "base": _BASE, "paper": _PAPER, "v1": _V1}
 
 
-def preset(name: str) -> NetworkSettings:
-    """Settings by name.
+def preset(name: str, changes: Mapping[str, Any] | None = None) -> NetworkSettings:
+    """Settings by name, with changes such as {"fusion": {"layers": 2}}.
 
     Raises:
-        UsageError: no such preset.
+        UsageError: no such preset, or a change that its settings do not allow.
     """
     if name not in PRESETS:
         raise UsageError(f"network preset {name}: want one of {', '.join(PRESETS)}")
-    return settings_from(NetworkSettings, PRESETS[name], default=f"preset {name}")
+    return settings_from(NetworkSettings, merged(PRESETS[name], changes or {}), default=f"preset {name}")

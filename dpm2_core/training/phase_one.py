@@ -6,6 +6,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch
 from pydantic import Field
@@ -91,6 +92,8 @@ class PhaseOneSettings(Settings):
 
     preset: str = "small"
     """Network preset."""
+    network: dict[str, Any] = Field({})
+    """Changes to the preset, such as {fusion: {kind: scale_dot}}."""
     data: DataSettings = DataSettings()
     validation: str = ""
     """Folder of packed drives of other worlds, for validation; empty: none."""
@@ -124,7 +127,7 @@ def phase_one(settings: PhaseOneSettings, out: Path, resume: bool = False, until
     """
     with process_group() as (rank, world, device):
         torch.manual_seed(settings.optimiser.seed)
-        network = preset(settings.preset)
+        network = preset(settings.preset, settings.network)
         module = PhaseOne(network, settings.loss).to(device)
         if settings.start:
             load_weights(module.model, Path(settings.start))

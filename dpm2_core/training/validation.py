@@ -84,12 +84,14 @@ class PairSet:
         return np.array(rows)
 
     def measure(self, model: DeepPointMap2) -> dict[str, float]:
-        """Medians and success rates of near and far pairs, straight and turned."""
+        """Medians and success rates of near and far pairs, and of turned ones; kinds without a pair are left out."""
         rows = self.errors(model)
         near = rows[:, 0] <= NEAR
         good = (rows[:, 2] < SUCCESS[0]) & (rows[:, 3] < SUCCESS[1])
         out = {}
         for name, chosen in (("near", near), ("far", ~near), ("turned", rows[:, 1] > 0)):
+            if not chosen.any():
+                continue
             out[f"{name}_m"] = float(np.median(rows[chosen, 2]))
             out[f"{name}_deg"] = float(np.median(rows[chosen, 3]))
             out[f"{name}_success"] = float(good[chosen].mean())

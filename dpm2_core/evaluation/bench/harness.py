@@ -108,7 +108,13 @@ def processors(number: int) -> Iterator[None]:
 
 
 def write_report(path: Path, name: str, report: Report, options: Options, program: str = "dpm2") -> None:
-    """The results with everything that is needed to judge and repeat them, as JSON.
+    """The results of a benchmark; see `write_record`."""
+    results = {"overrides": list(options.overrides), **report.results}
+    write_record(path, name, results, program, options.threads)
+
+
+def write_record(path: Path, name: str, results: dict[str, Any], program: str = "dpm2", threads: int = 2) -> None:
+    """Results with everything that is needed to judge and repeat them, as JSON.
 
     Raises:
         Dpm2Error: the file could not be written.
@@ -117,10 +123,9 @@ def write_report(path: Path, name: str, report: Report, options: Options, progra
         "benchmark": name,
         "command": shlex.join([*program.split(), *sys.argv[1:]]),
         "commit": git_commit(),
-        "machine": {"processor": _processor(), "cpus": os.cpu_count(), "threads": options.threads},
+        "machine": {"processor": _processor(), "cpus": os.cpu_count(), "threads": threads},
         "versions": {"python": platform.python_version(), **{p: _version(p) for p in _PACKAGES}},
-        "overrides": list(options.overrides),
-        **report.results,
+        **results,
     }
     with atomic_write(path) as file:
         file.write(json.dumps(record, indent=1) + "\n")
