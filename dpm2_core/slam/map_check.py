@@ -18,7 +18,7 @@ from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Array, Keyframe
 from dpm2_core.geometry import se3
 from dpm2_core.slam import map_schema
-from dpm2_core.slam.cloud_codec import unpack_cloud
+from dpm2_core.slam.cloud_codec import pack_cloud, unpack_cloud
 from dpm2_core.slam.cloud_store import CloudStore, Loan
 from dpm2_core.slam.map_data import NO_POINTS, MapData, save_as, subset
 from dpm2_core.slam.map_rows import Edge, Session, bytes_array, edge_of, pruned_of, unpack_descriptors
@@ -122,6 +122,7 @@ class _Salvage:
         edges = self._bridged(edges, [keyframes[node] for node in good], [session[node] for node in good])
         trail = [pruned_of((*row[:4], new[row[4]], row[5])) for row in self._rows("trail", "rowid") if row[4] in new]
         # A map in the old numbers with holes, of which the good nodes are then taken.
+        nothing = pack_cloud(NO_POINTS)
         filler = Keyframe(0, 0, 0, np.eye(4), NO_POINTS)
         whole = MapData(
             [keyframes.get(node, filler) for node in range(last)],
@@ -130,7 +131,7 @@ class _Salvage:
             [],
             [],
             self._sessions(session),
-            CloudStore(lambda node: self._payload(node)[0], moving, loans),
+            CloudStore(lambda node: self._payload(node)[0] or nothing, moving, loans),
             lambda node: self._payload(node)[2],
         )
         return subset(whole, good, edges, trail)

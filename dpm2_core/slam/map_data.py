@@ -59,7 +59,8 @@ def load_map(store: MapStore, descriptors: bool = True) -> MapData:
         Dpm2Error: it is damaged; the message says where.
     """
     try:
-        return _load(store, descriptors)
+        with store.snapshot():
+            return _load(store, descriptors)
     except ValueError as error:
         raise Dpm2Error(f"{store.path}: {error}; see dpm2 map check") from None
 

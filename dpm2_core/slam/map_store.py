@@ -197,6 +197,20 @@ class MapStore:
         self.close()
 
     @contextmanager
+    def snapshot(self) -> Iterator[None]:
+        """All that is read in this block is of one instant, whatever another process writes meanwhile.
+
+        Raises:
+            Dpm2Error: it cannot be read.
+        """
+        with _explained(self.path):
+            self._connection.execute("BEGIN")
+            try:
+                yield
+            finally:
+                self._connection.execute("ROLLBACK")
+
+    @contextmanager
     def _transaction(self) -> Iterator[sqlite3.Connection]:
         with _explained(self.path):
             self._connection.execute("BEGIN IMMEDIATE")

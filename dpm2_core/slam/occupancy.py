@@ -83,7 +83,7 @@ def occupancy_grid(clouds: Sequence[Points], poses: Array, settings: OccupancySe
     used = np.argwhere(grid != _UNKNOWN)
     first, last = (used.min(0), used.max(0) + 1) if len(used) else (np.zeros(2, int), np.ones(2, int))
     grid = grid[first[0] : last[0], first[1] : last[1]]
-    x, y = (low + first) * size
+    x, y = np.round((low + first) * size, 6)
     return Grid(np.ascontiguousarray(grid.T[::-1]), (float(x), float(y)), size)
 
 

@@ -28,7 +28,8 @@ def open_session(path: Path, settings: SlamSettings, config: str, resume: bool) 
     Raises:
         UsageError: the file is there, or holds descriptors of other weights. Dpm2Error: it cannot be written.
     """
-    weights = "" if settings.registration == "geometric" else weights_id(weights_path(settings.neural.weights))
+    described = settings.registration != "geometric" or (settings.loops.enabled and settings.loops.descriptors)
+    weights = weights_id(weights_path(settings.neural.weights)) if described else ""
     if path.exists() and not resume:
         raise UsageError(f"--map {path}: there is a file already; --resume goes on with it")
     store = MapStore.open(path, read_only=False) if path.exists() else MapStore.create(path)

@@ -1,19 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""For the tests of network and training: a street of boxes, a camera, and networks small enough."""
+"""A street of boxes, a camera, networks small enough; a small map."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from dpm2_core.config import settings_from
-from dpm2_core.frame import Camera, Image
+from dpm2_core.descriptors import Descriptors
+from dpm2_core.frame import Camera, Image, Keyframe, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.network.config import NetworkSettings
 from dpm2_core.network.model import DeepPointMap2
+from dpm2_core.slam.cloud_codec import pack_cloud
+from dpm2_core.slam.map_rows import Edge
+from dpm2_core.slam.map_store import Change, MapStore
 
 TINY = {
     "preset": "tiny",
@@ -88,3 +93,35 @@ def model() -> DeepPointMap2:
     """A tiny network with seeded random weights."""
     torch.manual_seed(0)
     return DeepPointMap2(tiny()).eval()
+
+
+@pytest.fixture
+def drive(noise: np.random.Generator) -> list[Keyframe]:
+    """Twelve keyframes along a bend, with clouds, descriptors and odometry edges."""
+    poses = se3.exp(np.arange(12)[:, None] * np.array([0, 0, 0.05, 5.0, 0.1, 0.0]))
+    out = []
+    for i, T in enumerate(poses):
+        cloud = np.column_stack([noise.uniform(-40, 40, (300, 2)), noise.uniform(-2, 6, 300), noise.random(300)])
+        d = Descriptors(noise.normal(size=(8, 3)).astype(np.float32), noise.normal(size=(8, 16)).astype(np.float16))
+        covariance = np.diag(np.arange(1.0, 7.0)) * 1e-4
+        edge = Registration(se3.inverse(poses[i - 1]) @ T, covariance, 0.9, 0.05, "test") if i else None
+        out.append(Keyframe(i, 10**15 + i * 10**8 + 7, 3 * i, T, cloud.astype(np.float32), edge, "", d))
+    return out
+
+
+@pytest.fixture
+def map_file(tmp_path: Path, drive: list[Keyframe]) -> Path:
+    """A closed map file of that drive, with a loop that was accepted and one that was refused."""
+    path = tmp_path / "drive.dpm2map"
+    with MapStore.create(path) as store:
+        store.begin_session("slam: {}", "small 0123456789abcdef")
+        for node, keyframe in enumerate(drive):
+            change = Change([(node, keyframe, pack_cloud(keyframe.cloud), None)], poses={node: keyframe.T_odom_kf})
+            if (found := keyframe.edge) is not None:
+                told = (found.T_target_source, found.covariance)
+                change.edges.append(Edge("odometry", node - 1, node, *told, True, 0.9, 0.05, "test"))
+            store.write(change)
+        T = se3.inverse(drive[2].T_odom_kf) @ drive[11].T_odom_kf
+        refused = Edge("loop", 0, 11, np.eye(4), np.eye(6), False, 0.1, np.inf, "test", "too far")
+        store.write(Change(edges=[Edge("loop", 2, 11, T, np.eye(6) * 1e-4, method="test"), refused]))
+    return path
