@@ -1,21 +1,31 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Loops by geometry: near keyframes of long ago, verified by registering the points; each refusal has its reason."""
+"""Loops: places that look alike, and places near by the pose; each is registered and verified before it counts.
+
+A candidate must convince four times: the network, which finds it and registers it without any start; the points of the
+new keyframe, which must fit the map around it; the odometry, whose drift has limits; and, where the correction is
+large, a second loop that says the same. Whatever fails is kept with the reason.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dpm2_core.config import Settings
-from dpm2_core.frame import Array, Points, Registration
+from dpm2_core.frame import Array, Keyframe, Points, Registration
 from dpm2_core.geometry import se3
-from dpm2_core.geometry.voxel import voxel_first
-from dpm2_core.slam.local_map import LocalMap, LocalMapSettings
-from dpm2_core.slam.registration import GeometricRegistration, GeometricSettings
+from dpm2_core.slam.loop_consistency import Consistency, ConsistencySettings, Loop, Path, refused
+from dpm2_core.slam.place_recognition import PlaceRecognition, merged
+from dpm2_core.slam.registration import GeometricSettings
+from dpm2_core.slam.verification import VerificationSettings, Verifier
 
-_SOURCE_VOXEL = 0.8  # m, spacing of the points that are registered, as in the odometry
+if TYPE_CHECKING:  # torch takes seconds to import
+    from dpm2_core.network.model import DeepPointMap2
+
+_MERGED = 6.0  # m, path around a keyframe whose descriptors are merged with its own
 
 
 class LoopSettings(Settings):
@@ -23,73 +33,147 @@ class LoopSettings(Settings):
 
     enabled: bool = True
     """Close loops at all."""
+    descriptors: bool = True
+    """Find places again by neural descriptors (`neural.weights`), which then every keyframe gets, whatever registers
+    the scans; without, only keyframes near by the pose are candidates."""
     gap: float = 50.0
     """Path that must lie between two keyframes of a loop, m."""
+    candidates: int = 4
+    """So many keyframes that look like the new one are registered by the network..."""
+    verified: int = 2
+    """...and so many of them, the most confident first, by their points."""
+    min_confidence: float = 0.15
+    """Of the network's registration, below which the points are not asked."""
     radius: float = 8.0
-    """Keyframes nearer than this are candidates, m; `drift` widens it."""
+    """The keyframe nearest by the pose is a candidate, too, if nearer than this, m; `drift` widens it."""
     drift: float = 0.01
-    """Odometry error to reckon with a metre of path since the candidate: widens the search and bounds a correction."""
-    min_inliers: float = 0.6
-    """Share of the points that must fit the map around the candidate."""
-    max_rmse: float = 0.2
-    """Largest residual of those that fit, m."""
-    max_sigma: float = 0.1
-    """Largest standard deviation of the position in its worst direction, m: refuses loops along a tunnel."""
-    neighbours: int = 5
-    """Keyframes on either side of the candidate that make up the map to register to."""
+    """Widens the radius by so many metres a metre of path since that keyframe."""
+    surroundings: float = 22.0
+    """Keyframes so near to a candidate along the path make up the map to register to, m."""
+    verification: VerificationSettings = VerificationSettings()
+    consistency: ConsistencySettings = ConsistencySettings()
 
 
 class LoopCloser:
-    """Proposes the nearest old keyframe and registers the new one to the map around it."""
+    """Finds and judges the loops of each new keyframe. A node is a keyframe's position in the map."""
 
-    def __init__(self, settings: LoopSettings, registration: GeometricSettings, threads: int = 2) -> None:
+    def __init__(
+        self,
+        settings: LoopSettings,
+        registration: GeometricSettings,
+        threads: int = 2,
+        network: DeepPointMap2 | None = None,
+    ) -> None:
         self._settings = settings
-        self._registration = GeometricRegistration(registration)
-        self._threads = threads
+        self._verifier = Verifier(settings.verification, registration, threads)
+        self._places = PlaceRecognition(network) if network is not None else None
+        self._path = Path()
+        self._consistency = Consistency(settings.consistency, self._path)
 
-    def close(self, clouds: Sequence[Points], poses: Array) -> tuple[int, Registration] | None:
-        """Try to close a loop with the last keyframe.
+    def described(self, keyframe: Keyframe) -> Keyframe:
+        """The keyframe with descriptors, of its cloud where its registration made none."""
+        if keyframe.descriptors is not None or self._places is None:
+            return keyframe
+        return replace(keyframe, descriptors=self._places.describe(keyframe.cloud))
+
+    def close(self, keyframes: Sequence[Keyframe], clouds: Sequence[Points], poses: Array) -> list[Loop]:
+        """Try to close loops with the last keyframe.
 
         Args:
-            clouds: those of all keyframes, each (M, 4) in its own frame.
-            poses: (N, 4, 4) T_map_kf of all keyframes.
+            keyframes: all of them. clouds: theirs, each (M, 4) in its own frame. poses: (N, 4, 4) T_map_kf.
 
         Returns:
-            The candidate and T_candidate_last, accepted or refused with its reason; None: nobody is near.
+            Every candidate, accepted or refused with its reason; and earlier ones of which it took a second to be sure.
         """
-        s = self._settings
-        positions = poses[:, :3, 3]
-        steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
-        path = np.concatenate([[0.0], np.cumsum(steps)])
-        since = path[-1] - path
-        distance = np.linalg.norm(positions - positions[-1], axis=1)
-        reach = s.radius + s.drift * since
-        near = np.flatnonzero((since > s.gap) & (distance < reach))
-        if not s.enabled or len(near) == 0:
-            return None
-        to = len(poses) - 1
-        candidate = int(near[np.argmin(distance[near])])
-        T_guess = se3.inverse(poses[candidate]) @ poses[to]
-        found = self._verify(clouds, poses, candidate, T_guess)
-        moved = se3.inverse(T_guess) @ found.T_target_source
-        metres, degrees = float(np.linalg.norm(moved[:3, 3])), float(np.degrees(se3.angle(moved)))
-        if found.ok and found.confidence < s.min_inliers:
-            found = replace(found, ok=False, reason=f"only {found.confidence:.0%} of the points fit")
-        elif found.ok and found.rmse > s.max_rmse:
-            found = replace(found, ok=False, reason=f"residual {found.rmse:.2f} m")
-        elif found.ok and (sigma := found.worst_sigma) > s.max_sigma:
-            found = replace(found, ok=False, reason=f"position uncertain by {sigma:.2f} m")
-        elif found.ok and (metres > 1.0 + s.drift * since[candidate] or degrees > 3.0 + 0.02 * since[candidate]):
-            found = replace(found, ok=False, reason=f"{metres:.1f} m, {degrees:.1f} deg from the odometry")
-        return candidate, found
+        for node in range(len(self._path), len(keyframes)):
+            self._path.append(keyframes[node])
+        if self._places is not None:
+            self._places.update(keyframes)
+        if not self._settings.enabled or len(keyframes) < 2:
+            return []
+        node = len(keyframes) - 1
+        since = self._path.since(node)
+        tried, proposals = self._proposals(node, since, keyframes, poses)
+        for number, proposal in enumerate(proposals):
+            if number >= self._settings.verified:
+                tried.append(refused(proposal, "others are more likely"))
+                continue
+            loop = self._verified(proposal, keyframes, clouds, poses)
+            if not loop.registration.ok:
+                tried.append(loop)
+                continue
+            T_expected = se3.inverse(poses[loop.from_node]) @ poses[node]
+            tried += self._consistency.judge(loop, T_expected)
+            break
+        return tried
 
-    def _verify(self, clouds: Sequence[Points], poses: Array, candidate: int, T_guess: Array) -> Registration:
-        """T_candidate_new by points against the keyframes around the candidate, in its frame."""
-        around = range(max(0, candidate - self._settings.neighbours), candidate + self._settings.neighbours + 1)
-        local_map = LocalMap(LocalMapSettings(), self._threads)
-        to_candidate = se3.inverse(poses[candidate])
-        near = [se3.transform(to_candidate @ poses[i], clouds[i]) for i in around if i < len(clouds) - 1]
-        local_map.insert(np.concatenate(near), np.eye(4))
-        last = clouds[-1]
-        source = last[voxel_first(last, _SOURCE_VOXEL), :3].astype(np.float64)
-        return self._registration.register(source, local_map, T_guess, widen=2.0)
+    def _proposals(
+        self, node: int, since: Array, keyframes: Sequence[Keyframe], poses: Array
+    ) -> tuple[list[Loop], list[Loop]]:
+        """Candidates that the network refused, and those for the points to judge, the most likely first."""
+        s, descriptors = self._settings, keyframes[node].descriptors
+        nearest = self._nearest(since, poses)
+        refusals: list[Loop] = []
+        proposals: list[Loop] = []
+        if self._places is not None and descriptors is not None:
+            similar = self._places.similar(descriptors, since > s.gap, s.candidates)
+            found = self._registered(node, similar, keyframes)
+            for loop in sorted(found, key=lambda loop: -loop.registration.confidence):
+                r = loop.registration
+                if not r.ok:
+                    refusals.append(loop)
+                elif r.confidence < s.min_confidence:
+                    refusals.append(refused(loop, f"descriptors match with a confidence of only {r.confidence:.2f}"))
+                else:
+                    proposals.append(loop)
+        if nearest is not None and all(abs(loop.from_node - nearest) > 1 for loop in proposals):
+            T_guess = se3.inverse(poses[nearest]) @ poses[node]
+            by_pose = Registration(T_guess, np.eye(6), 0.0, 0.0, "pose")
+            proposals.insert(min(len(proposals), 1), Loop(nearest, node, by_pose))
+        return refusals, proposals
+
+    def _registered(self, node: int, candidates: Sequence[int], keyframes: Sequence[Keyframe]) -> list[Loop]:
+        """The network's answer to each candidate."""
+        assert self._places is not None
+        source = keyframes[node].descriptors
+        targets = [keyframes[c].descriptors for c in candidates]
+        assert source is not None
+        answers = self._places.register(source, [t for t in targets if t is not None])
+        return [Loop(c, node, answer) for c, answer in zip(candidates, answers, strict=True)]
+
+    def _nearest(self, since: Array, poses: Array) -> int | None:
+        """The keyframe nearest by the pose, if it is near enough for the drift since then."""
+        s, positions = self._settings, poses[:, :3, 3]
+        distance = np.linalg.norm(positions - positions[-1], axis=1)
+        near = np.flatnonzero((since > s.gap) & np.isfinite(since) & (distance < s.radius + s.drift * since))
+        return int(near[np.argmin(distance[near])]) if len(near) else None
+
+    def _verified(self, proposal: Loop, keyframes: Sequence[Keyframe], clouds: Sequence[Points], poses: Array) -> Loop:
+        """The points' answer; if they disagree, once more from the pose that the descriptors around both suggest."""
+        nodes = self._around(proposal.from_node, proposal.to_node, self._settings.surroundings)
+        T_candidate_kf = se3.inverse(poses[proposal.from_node]) @ poses[nodes]
+        around = self._verifier.surroundings([clouds[n] for n in nodes], T_candidate_kf)
+        proposed = proposal.registration
+        by_pose = proposed.method == "pose"
+        cloud = clouds[proposal.to_node]
+        found = self._verifier.verify(cloud, around, proposed.T_target_source, 2.0 if by_pose else 1.0).registration
+        if not found.ok and not by_pose:
+            again = self._map_to_map(proposal, keyframes, poses)
+            if again.ok:
+                second = self._verifier.verify(cloud, around, again.T_target_source).registration
+                found = second if second.ok else found
+        return replace(proposal, registration=found)
+
+    def _map_to_map(self, proposal: Loop, keyframes: Sequence[Keyframe], poses: Array) -> Registration:
+        """T_from_to by the descriptors of the keyframes around both."""
+        assert self._places is not None
+        a, b = proposal.from_node, proposal.to_node
+        before = np.flatnonzero(self._path.since(b) <= _MERGED)
+        source = merged(keyframes, poses, before.tolist(), b)
+        target = merged(keyframes, poses, self._around(a, b, _MERGED), a)
+        return self._places.register(source, [target])[0]
+
+    def _around(self, candidate: int, node: int, reach: float) -> list[int]:
+        """The candidate and those nearer to it than `reach` m along the path, without what the new one just passed."""
+        near = (self._path.since(candidate) <= reach) & (self._path.since(node) > self._settings.gap / 2)
+        return np.flatnonzero(near).tolist()

@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Does a loop agree with what is known already? With the odometry between its ends, or with another loop nearby.
+
+Two loops and the odometry between their ends make a circle, after which one must be where one was: J. Mangelson et al.,
+"Pairwise Consistent Measurement Set Maximization for Robust Multi-robot Map Merging", ICRA 2018.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dpm2_core.config import Settings
+from dpm2_core.frame import Array, Keyframe, Registration
+from dpm2_core.geometry import se3
+
+_BROKEN = 0.5  # m, standard deviation of an odometry edge that says that the odometry was lost
+
+
+class ConsistencySettings(Settings):
+    """How far loops may differ from the odometry and from each other."""
+
+    drift: float = 0.02
+    """Odometry error to reckon with a metre of path: a loop that corrects more (and 1 m) is refused."""
+    drift_turn: float = 0.02
+    """The same for rotation, degrees a metre (and 3 degrees)."""
+    certain: float = 2.0
+    """A loop that corrects the odometry by no more than this, m (and degrees), needs no other loop to confirm it."""
+    reach: float = 100.0
+    """Another loop confirms it if both its ends are nearer than this along the path, m..."""
+    circle: float = 0.4
+    """...and the circle of the two misses its start by no more than this, m (and three times that, degrees)..."""
+    circle_drift: float = 0.01
+    """...and this, a metre of the path in the circle (and three times that, degrees)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """A loop between two nodes: `registration.T_target_source` is T_from_to; `registration.ok` says accepted."""
+
+    from_node: int
+    to_node: int
+    registration: Registration
+
+
+class Path:
+    """The odometry of all keyframes, in segments: one robot, one session, until the odometry was lost."""
+
+    def __init__(self) -> None:
+        self._segment = np.zeros(256, np.int64)
+        self._metres = np.zeros(256)  # since the segment began
+        self._T_odom_kf: list[Array] = []
+        self._last: dict[str, int] = {}  # by robot
+
+    def __len__(self) -> int:
+        return len(self._T_odom_kf)
+
+    def append(self, keyframe: Keyframe) -> None:
+        """Add the next node."""
+        node, before = len(self), self._last.get(keyframe.robot)
+        if node == len(self._segment):
+            self._segment = np.concatenate([self._segment, np.zeros_like(self._segment)])
+            self._metres = np.concatenate([self._metres, np.zeros_like(self._metres)])
+        self._last[keyframe.robot] = node
+        self._T_odom_kf.append(keyframe.T_odom_kf)
+        if before is None or keyframe.edge is None or keyframe.edge.worst_sigma > _BROKEN:
+            self._segment[node], self._metres[node] = node, 0.0
+            return
+        step = np.linalg.norm(keyframe.T_odom_kf[:3, 3] - self._T_odom_kf[before][:3, 3])
+        self._segment[node], self._metres[node] = self._segment[before], self._metres[before] + step
+
+    def since(self, node: int) -> Array:
+        """(N,) metres of path between each node and this one; inf where there is no odometry between them."""
+        metres, same = self._metres[: len(self)], self._segment[: len(self)] == self._segment[node]
+        return np.where(same, np.abs(metres - metres[node]), np.inf)
+
+    def between(self, a: int, b: int) -> float:
+        """The same for two nodes."""
+        return float(abs(self._metres[a] - self._metres[b])) if self._segment[a] == self._segment[b] else np.inf
+
+    def T(self, a: int, b: int) -> Array:
+        """T_a_b (4, 4) by odometry, of two nodes of one segment."""
+        return se3.inverse(self._T_odom_kf[a]) @ self._T_odom_kf[b]
+
+
+class Consistency:
+    """Lets a verified loop pass when the odometry or another loop agrees; until then it waits."""
+
+    def __init__(self, settings: ConsistencySettings, path: Path) -> None:
+        self._settings = settings
+        self._path = path
+        self._accepted: list[Loop] = []
+        self._waiting: list[Loop] = []
+
+    def judge(self, loop: Loop, T_expected: Array) -> list[Loop]:
+        """Judge a loop that the points have verified.
+
+        Args:
+            T_expected: (4, 4) T_from_to as the map has it.
+
+        Returns:
+            The loop, accepted or refused with the reason; if accepted, with those that waited for one like it.
+        """
+        s, found = self._settings, loop.registration
+        since = self._path.between(loop.from_node, loop.to_node)
+        metres, degrees = _apart(T_expected, found.T_target_source)
+        if np.isfinite(since):
+            if metres > 1 + s.drift * since or degrees > 3 + s.drift_turn * since:
+                return [refused(loop, f"{metres:.1f} m, {degrees:.1f} deg from the odometry")]
+            if metres <= s.certain and degrees <= s.certain:
+                return self._accept([loop, *(w for w in self._waiting if self._agree(loop, w))])
+        confirmed = [w for w in self._waiting if self._agree(loop, w)]
+        if confirmed or any(self._agree(loop, a) for a in self._accepted[-200:]):
+            return self._accept([loop, *confirmed])
+        self._waiting.append(loop)
+        return [refused(loop, f"{metres:.1f} m from the odometry: waits for a second loop that agrees")]
+
+    def _accept(self, loops: Sequence[Loop]) -> list[Loop]:
+        self._accepted += loops
+        self._waiting = [w for w in self._waiting if all(w is not loop for loop in loops)]
+        return list(loops)
+
+    def _agree(self, one: Loop, other: Loop) -> bool:
+        """Whether the circle through both closes."""
+        s, path = self._settings, self._path
+        there = path.between(one.from_node, other.from_node)
+        back = path.between(one.to_node, other.to_node)
+        if one.to_node == other.to_node or max(there, back) > s.reach:
+            return False
+        around = path.T(one.from_node, other.from_node) @ other.registration.T_target_source
+        metres, degrees = _apart(one.registration.T_target_source, around @ path.T(other.to_node, one.to_node))
+        allowed = s.circle + s.circle_drift * (there + back)
+        return metres <= allowed and degrees <= 3 * allowed
+
+
+def refused(loop: Loop, reason: str) -> Loop:
+    """The loop with the reason why it is not accepted."""
+    return replace(loop, registration=replace(loop.registration, ok=False, reason=reason))
+
+
+def _apart(a: Array, b: Array) -> tuple[float, float]:
+    """Distance of two transforms, m and degrees."""
+    difference = se3.inverse(a) @ b
+    return float(np.linalg.norm(difference[:3, 3])), float(np.degrees(se3.angle(difference)))

@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The points' word on a pose that somebody else proposed: does what stands there fit, and how well is it known?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dpm2_core.config import Settings
+from dpm2_core.frame import Array, Points, Registration
+from dpm2_core.geometry import se3
+from dpm2_core.geometry.voxel import voxel_first
+from dpm2_core.slam.local_map import LocalMap, LocalMapSettings
+from dpm2_core.slam.registration import GeometricRegistration, GeometricSettings
+
+_SOURCE_VOXEL = 0.8  # m, spacing of the points that are registered, as in the odometry
+_CELL = 2.0  # m, of the grid whose lowest points are the ground
+_ABOVE = 0.5  # m over it: what stands there
+
+
+class VerificationSettings(Settings):
+    """What a pose must show to be believed."""
+
+    min_inliers: float = 0.6
+    """Share of the points that must fit the map."""
+    min_structure: float = 0.6
+    """The same for what stands above the ground: the road fits anywhere."""
+    min_points: int = 150
+    """So many points above the ground at least; where nothing stands, nothing can be told apart."""
+    max_rmse: float = 0.2
+    """Largest residual of the points that fit, m."""
+    max_sigma: float = 0.1
+    """Largest standard deviation of the position in its worst direction, m: refuses loops along a tunnel."""
+    max_moved: float = 2.0
+    """The points may not move the proposed pose farther than this, m..."""
+    max_turned: float = 5.0
+    """...or turn it by more than this, degrees."""
+    range: float = 40.0
+    """Points farther than this from the sensor have no say, m: another lane sees other things behind them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What the points say.
+
+    Attributes:
+        registration: the pose that they prefer; `ok` says whether it is believed, `reason` why not.
+        structure: share of the points above the ground that fit. points: number of those.
+        moved: from the proposed pose, m. turned: the same, degrees.
+    """
+
+    registration: Registration
+    structure: float = 0.0
+    points: int = 0
+    moved: float = 0.0
+    turned: float = 0.0
+
+
+class Verifier:
+    """Registers a cloud to the keyframes around a place, from a proposed pose, and judges the result."""
+
+    def __init__(self, settings: VerificationSettings, registration: GeometricSettings, threads: int) -> None:
+        self._settings = settings
+        self._noise = registration.noise
+        self._gate = registration.final_gate
+        self._registration = GeometricRegistration(registration)
+        self._threads = threads
+
+    def surroundings(self, clouds: Sequence[Points], poses: Array) -> LocalMap:
+        """The map of (M, 4) clouds taken at (N, 4, 4) poses, in the frame of those poses, to be verified against."""
+        local_map = LocalMap(LocalMapSettings(), self._threads)
+        parts = [se3.transform(T, cloud) for T, cloud in zip(poses, clouds, strict=True)]
+        local_map.insert(np.concatenate(parts), np.eye(4))
+        return local_map
+
+    def verify(self, cloud: Points, around: LocalMap, T_proposed: Array, widen: float = 1.0) -> Evidence:
+        """Judge a pose of a cloud (M, 4) in a map.
+
+        Args:
+            widen: factor on how far from the proposed pose the points may look for theirs.
+        """
+        near = cloud[np.einsum("ij,ij->i", cloud[:, :3], cloud[:, :3]) < self._settings.range**2]
+        source = near[voxel_first(near, _SOURCE_VOXEL), :3].astype(np.float64)
+        found = self._registration.register(source, around, T_proposed, widen)
+        if not found.ok:
+            return Evidence(found)
+        fits = self._fits(source, around, found.T_target_source)
+        standing = above_ground(source)
+        points = int(standing.sum())
+        structure = float(fits[standing].mean()) if points else 0.0
+        moved = se3.inverse(T_proposed) @ found.T_target_source
+        metres, degrees = float(np.linalg.norm(moved[:3, 3])), float(np.degrees(se3.angle(moved)))
+        evidence = Evidence(
+            replace(found, confidence=min(found.confidence, structure)), structure, points, metres, degrees
+        )
+        reason = self._objection(evidence, float(fits.mean()), widen)
+        return replace(evidence, registration=replace(evidence.registration, ok=not reason, reason=reason))
+
+    def _fits(self, source: Array, around: LocalMap, T: Array) -> NDArray[np.bool_]:
+        """Which points (N,) lie on a surface of the map."""
+        moved = source @ T[:3, :3].T + T[:3, 3]
+        index, squared = around.nearest(moved)
+        normals, spread = around.planes(index)
+        residual = np.einsum("ij,ij->i", moved - around.points[index], normals)
+        return (squared < self._gate**2) & (residual**2 < 9 * (self._noise**2 + spread))
+
+    def _objection(self, e: Evidence, share: float, widen: float) -> str:
+        """Why it is not believed; empty if it is."""
+        s, found = self._settings, e.registration
+        if share < s.min_inliers:
+            return f"only {share:.0%} of the points fit"
+        if e.points < s.min_points:
+            return f"only {e.points} points above the ground"
+        if e.structure < s.min_structure:
+            return f"only {e.structure:.0%} of what stands there fits"
+        if found.rmse > s.max_rmse:
+            return f"residual {found.rmse:.2f} m"
+        if (sigma := found.worst_sigma) > s.max_sigma:
+            return f"position uncertain by {sigma:.2f} m"
+        if e.moved > widen * s.max_moved or e.turned > widen * s.max_turned:
+            return f"points and proposal {e.moved:.1f} m, {e.turned:.1f} deg apart"
+        return ""
+
+
+def above_ground(points: Array) -> NDArray[np.bool_]:
+    """Which points (N, 3) of a level scan stand above the lowest around them."""
+    cells, cell = np.unique(np.floor(points[:, :2] / _CELL).astype(np.int64), axis=0, return_inverse=True)
+    lowest = np.full(len(cells), np.inf)
+    np.minimum.at(lowest, cell.ravel(), points[:, 2])
+    return points[:, 2] > lowest[cell.ravel()] + _ABOVE
