@@ -25,6 +25,15 @@ class Correlated(NamedTuple):
     target: Tensor
 
 
+class _Alone(NamedTuple):
+    """A set after its first self-attention (B, N, C), its position code or attention bias per layer, and its mask."""
+
+    features: Tensor
+    code: Tensor | None
+    biases: Sequence[Tensor | None]
+    mask: Tensor
+
+
 class DecoderLayer(nn.Module):
     """Self-attention, cross-attention, MLP, each with a residual and LayerNorm; weights shared by both sets."""
 
@@ -63,34 +72,53 @@ class Decoder(nn.Module):
         self.offset = OffsetHead(width, decoder.precision)
         self.overlap = OverlapHead(width)
         self.coarse = PointMLP(settings.channels)
+        self._kept: tuple[Descriptors, Tokens, _Alone] | None = None
 
     def forward(self, source: Tokens, target: Tokens) -> Correlated:
         """Correlate two batches of sets."""
-        x, y = self.project(source.features), self.project(target.features)
-        x_code, x_bias = self._position(source)
-        y_code, y_bias = self._position(target)
-        x_mask, y_mask = source.mask[:, None, None], target.mask[:, None, None]
+        return self._correlate(self._alone(source), self._alone(target))
+
+    def _alone(self, tokens: Tokens) -> _Alone:
+        """What a set's part in the correlation is before it has seen another one."""
+        code: Tensor | None = None
+        biases: Sequence[Tensor | None] = [None] * len(self.layers)
+        if self.relative is None:
+            code = sine_code(tokens.xyz, self.settings.width)
+        else:
+            biases = self.relative(tokens.xyz, tokens.axis)
+        mask = tokens.mask[:, None, None]
+        first = self.layers[0]
+        assert isinstance(first, DecoderLayer)
+        return _Alone(first.alone(self.project(tokens.features), code, biases[0], mask), code, biases, mask)
+
+    def _correlate(self, source: _Alone, target: _Alone) -> Correlated:
+        x, y = source.features, target.features
         for i, layer in enumerate(self.layers):
             assert isinstance(layer, DecoderLayer)
-            x = layer.alone(x, x_code, x_bias[i], x_mask)
-            y = layer.alone(y, y_code, y_bias[i], y_mask)
-            x, y = layer.across(x, y, y_mask), layer.across(y, x, x_mask)
+            if i > 0:
+                x = layer.alone(x, source.code, source.biases[i], source.mask)
+                y = layer.alone(y, target.code, target.biases[i], target.mask)
+            x, y = layer.across(x, y, target.mask), layer.across(y, x, source.mask)
         return Correlated(x, y)
-
-    def _position(self, tokens: Tokens) -> tuple[Tensor | None, Sequence[Tensor | None]]:
-        """Position code (B, N, C), and the attention bias of each layer."""
-        if self.relative is None:
-            return sine_code(tokens.xyz, self.settings.width), [None] * len(self.layers)
-        return None, self.relative(tokens.xyz, tokens.axis)
 
     @torch.inference_mode()
     def register(self, source: Descriptors, target: Descriptors) -> Registration:
-        """Pose of the source in the frame of the target; either may be merged from several frames."""
-        return self.register_many([source], [target])[0]
+        """Pose of the source in the frame of the target; either may be merged from several frames.
+
+        The target's part of the work is kept for the next call with the same object, such as the map of an odometry.
+        """
+        device = next(self.parameters()).device
+        x = to_tokens([source], self.view_aligned, device)
+        with torch.autocast(device.type, torch.bfloat16):
+            if self._kept is None or self._kept[0] is not target:
+                y = to_tokens([target], self.view_aligned, device)
+                self._kept = (target, y, self._alone(y))
+            _, y, alone = self._kept
+            return register_batch(self, x, y, self._correlate(self._alone(x), alone))[0]
 
     @torch.inference_mode()
     def register_many(self, sources: list[Descriptors], targets: list[Descriptors]) -> list[Registration]:
-        """`register` for a batch of pairs."""
+        """`register` for a batch of pairs; nothing is kept."""
         device = next(self.parameters()).device
         source = to_tokens(sources, self.view_aligned, device)
         target = to_tokens(targets, self.view_aligned, device)

@@ -62,6 +62,7 @@ class DescriptorMap:
     def __init__(self, spacing: float, frames: int, radius: float) -> None:
         self._spacing, self._frames, self._radius = spacing, frames, radius
         self._places: deque[_Place] = deque(maxlen=_KEPT)
+        self._merged: tuple[list[_Place], Descriptors] | None = None
 
     def __len__(self) -> int:
         return len(self._places)
@@ -85,9 +86,11 @@ class DescriptorMap:
         distance = [float(np.linalg.norm(p.T_odom_kf[:3, 3] - T_odom_lidar[:3, 3])) for p in self._places]
         order = np.argsort(distance, kind="stable")[: self._frames]
         near = [self._places[i] for i in order if distance[i] <= self._radius or i == order[0]]
-        T_kf_odom = se3.inverse(near[0].T_odom_kf)
-        others = [place.descriptors.moved(T_kf_odom @ place.T_odom_kf) for place in near[1:]]
-        return near[0].T_odom_kf, merge([near[0].descriptors, *others])
+        if self._merged is None or self._merged[0] != near:  # else the same object: the decoder keeps its part of it
+            T_kf_odom = se3.inverse(near[0].T_odom_kf)
+            others = [place.descriptors.moved(T_kf_odom @ place.T_odom_kf) for place in near[1:]]
+            self._merged = near, merge([near[0].descriptors, *others])
+        return near[0].T_odom_kf, self._merged[1]
 
 
 class NeuralScanRegistration:

@@ -222,3 +222,20 @@ def test_swapping_the_heading_frame_of_a_set_changes_nothing(model: DeepPointMap
     other = model.decoder(tokens, to_tokens([moved], True))
     torch.testing.assert_close(one.source, other.source, atol=1e-4, rtol=0)
     torch.testing.assert_close(one.target, other.target, atol=1e-4, rtol=0)
+
+
+def test_a_target_that_stays_gives_the_same_answer_again(model: DeepPointMap2, noise: np.random.Generator) -> None:
+    """What is kept of a target between calls changes nothing, and another target is not mistaken for it."""
+
+    def some(n: int) -> Descriptors:
+        features = noise.standard_normal((n, model.settings.channels))
+        return Descriptors(noise.uniform(-20, 20, (n, 3)).astype(np.float32), features.astype(np.float16))
+
+    target, other, sources = some(40), some(40), [some(30), some(30)]
+    together = model.decoder.register_many([sources[0], sources[1], sources[0]], [target, target, other])
+    one_by_one = [
+        model.decoder.register(s, t) for s, t in zip([*sources, sources[0]], [target, target, other], strict=True)
+    ]
+    for a, b in zip(together, one_by_one, strict=True):
+        np.testing.assert_allclose(a.confidence, b.confidence, rtol=0.05)  # bf16: batches round differently
+    assert model.decoder.register(sources[0], target).confidence == one_by_one[0].confidence
