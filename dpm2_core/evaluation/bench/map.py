@@ -1,0 +1,263 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The map file: kills at random instants of a real `dpm2 run`, laps of one block, what moving things leave behind."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.box import SIMPLE
+from rich.console import Console, Group
+from rich.progress import track
+from rich.table import Table
+
+from dpm2_core.config import load_settings
+from dpm2_core.data.source import open_source
+from dpm2_core.errors import Dpm2Error
+from dpm2_core.evaluation.bench.harness import Options, Report
+from dpm2_core.evaluation.metrics import ape_rmse
+from dpm2_core.frame import Array, Keyframe, Registration
+from dpm2_core.geometry import se3
+from dpm2_core.geometry.voxel import voxel_first
+from dpm2_core.sim.config import LidarConfig
+from dpm2_core.sim.drive import simulate
+from dpm2_core.sim.lidar import Lidar
+from dpm2_core.sim.world import World, build_world
+from dpm2_core.slam.cloud_codec import unpack_mask
+from dpm2_core.slam.map_check import check_map
+from dpm2_core.slam.map_data import MapData, load_map, map_cloud, save_as
+from dpm2_core.slam.map_prune import prune, redundant_nodes
+from dpm2_core.slam.map_store import MapStore
+from dpm2_core.slam.mapper import Mapper
+from dpm2_core.slam.system import Config, SlamSettings, make_mapper
+
+Mask = NDArray[np.bool_]
+
+KILLS = 50
+LAPS = 5
+_FRAMES = 200
+_DRIFT = np.array([0, 0, 2e-4, 0.01, 0.005, 0.0])  # of the odometry, a keyframe, rad and m
+
+# `dpm2 run`, which says on a pipe when the mapper has taken a keyframe in: what must then be in the file.
+_CHILD = """
+import os, sys
+from dpm2_core.cli import main
+from dpm2_core.slam.mapper import Mapper
+add = Mapper.add
+def told(self, *arguments):
+    out = add(self, *arguments)
+    os.write(int(sys.argv[1]), b"k")
+    return out
+Mapper.add = told
+main(sys.argv[2:])
+"""
+
+
+def bench_map(options: Options) -> Report:
+    """50 kills of a drive, and five laps of a block with traffic."""
+    with tempfile.TemporaryDirectory(prefix="dpm2_bench_map_") as folder:
+        crash = crashes(Path(folder), options)
+        laps = bench_laps(Path(folder), options)
+    return Report({"crash": crash, "laps": laps}, Group(_crash_table(crash), _laps_table(laps)))
+
+
+def crashes(folder: Path, options: Options) -> dict[str, Any]:
+    """Drives that are killed at random instants and resumed until they end, beside one that is left alone."""
+    drive = folder / "drive"
+    simulate(drive, _FRAMES, seed=5, road="loop", preset="suburb", images=False, lidar=LidarConfig(beams=16))
+    truth = open_source(drive).poses
+    assert truth is not None
+    command = ["run", str(drive), "--out", str(folder / "out"), "--set", "slam.loops.descriptors=false"]
+    command += [word for setting in options.overrides for word in ("--set", setting)]
+    alone = folder / "alone.dpm2map"
+    started = time.perf_counter()
+    _run([*command, "--map", str(alone)], None)
+    duration = time.perf_counter() - started
+    rng, kills, finals = np.random.default_rng(0), [], []
+    path = folder / "killed0.dpm2map"
+    with_bar = track(range(KILLS), description="kills", transient=True, console=Console(stderr=True))
+    for _ in with_bar:
+        before = _keyframes(path)
+        while True:
+            added = _run([*command, "--map", str(path), "--resume"], float(rng.uniform(0.3, 0.7 * duration)))
+            if added is not None:
+                break
+            finals.append(path)  # it came to its end before the kill: the next drive begins
+            path = folder / f"killed{len(finals)}.dpm2map"
+            before = 0
+        found = check_map(path) if path.exists() else None
+        after = _keyframes(path)
+        kills.append({"opens": found is None or not found.problems, "lost": before + added - after})
+    _run([*command, "--map", str(path), "--resume"], None)
+    finals.append(path)
+    ape = [_ape(final, truth) for final in (alone, *finals)]
+    return {
+        "frames": _FRAMES,
+        "keyframes": _keyframes(alone),
+        "kills": len(kills),
+        "maps_that_open": sum(kill["opens"] for kill in kills),
+        # Of the keyframes that the mapper had taken in; the one in flight is not among them, and may be there.
+        "most_keyframes_lost": max(max(kill["lost"], 0) for kill in kills),
+        "keyframes_in_flight_saved": sum(kill["lost"] < 0 for kill in kills),
+        "drives": len(finals),
+        "ape_m": {"uninterrupted": ape[0], "killed": ape[1:]},
+        "seconds_uninterrupted": duration,
+    }
+
+
+def _run(arguments: list[str], kill_after: float | None) -> int | None:
+    """Run `dpm2`; keyframes taken in before it was killed, None if it ended by itself.
+
+    Raises:
+        Dpm2Error: it failed.
+    """
+    read, write = os.pipe()
+    environment = os.environ | {"MPLBACKEND": "Agg"}
+    child = subprocess.Popen(
+        [sys.executable, "-c", _CHILD, str(write), *arguments],
+        pass_fds=[write], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env=environment,
+    )  # fmt: skip
+    os.close(write)
+    try:
+        _, errors = child.communicate(timeout=kill_after)
+    except subprocess.TimeoutExpired:
+        child.send_signal(signal.SIGKILL)
+        child.communicate()
+    with os.fdopen(read, "rb") as pipe:
+        added = len(pipe.read())
+    if child.returncode > 0:
+        raise Dpm2Error(f"dpm2 {' '.join(arguments)}: {errors.strip().splitlines()[-1:]}")
+    return added if child.returncode < 0 else None
+
+
+def _keyframes(path: Path) -> int:
+    if not path.exists():
+        return 0
+    with MapStore.open(path) as store:
+        return sum(1 for _ in store.rows("keyframes"))
+
+
+def _ape(path: Path, truth: Array) -> float:
+    """Of the keyframes of a map, m, those that a resumed run made twice counted once."""
+    with MapStore.open(path) as store:
+        data = load_map(store, descriptors=False)
+    rows = {keyframe.index: node for node, keyframe in enumerate(data.keyframes)}
+    return float(ape_rmse(truth[list(rows)], data.poses[list(rows.values())]))
+
+
+def bench_laps(folder: Path, options: Options) -> dict[str, Any]:
+    """Laps of one block, other traffic each time: growth of the map, and what the traffic leaves in it."""
+    settings = load_settings(Config, None, ["slam.loops.descriptors=false", *options.overrides]).slam
+    world = build_world("loop", "city", seed=3, length=250.0)
+    path, growth = folder / "laps.dpm2map", []
+    labels: list[Mask] = []
+    with MapStore.create(path) as store:
+        store.begin_session()
+        mapper, previous = make_mapper(settings, store), None
+        for lap in range(LAPS):
+            for keyframe, moving in _lap(world, lap, previous):
+                mapper.add(keyframe)
+                labels.append(moving)
+                previous = keyframe
+            growth.append(_lap_row(mapper, path, lap))
+        mapper.finish()
+        data = load_map(store, descriptors=False)
+        dynamics = _moving(data, labels, settings)
+        pruned = prune(data, redundant_nodes(data, 0, 0))
+        save_as(pruned, folder / "pruned.dpm2map")
+    sizes = [file.stat().st_size for file in (path, folder / "pruned.dpm2map")]
+    return {
+        "lap_m": float(world.road.drive.length),
+        "laps": growth,
+        "bytes_after_closing": sizes[0],
+        "bytes_pruned": sizes[1],
+        "keyframes_pruned": len(pruned),
+        "kB_a_keyframe_without_descriptors": growth[0]["bytes"] / growth[0]["keyframes"] / 1e3,
+        "moving": dynamics,
+    }
+
+
+def _lap(world: World, lap: int, previous: Keyframe | None) -> Iterator[tuple[Keyframe, Mask]]:
+    """Keyframes every 5 m with drifting odometry, and which of their points move (M,)."""
+    lidar, rng = Lidar(LidarConfig(columns=1024)), np.random.default_rng(lap)
+    at = np.arange(0.0, world.road.drive.length, 5.0)
+    for number, s in enumerate(track(at, description=f"lap {lap + 1}", transient=True, console=Console(stderr=True))):
+        T_world_kf = world.pose_at(float(s))
+        scan = lidar.scan(world, T_world_kf, 100.0 * lap + s / 8, rng)
+        near = np.flatnonzero(np.einsum("ij,ij->i", scan.points[:, :3], scan.points[:, :3]) < 60.0**2)
+        near = near[voxel_first(scan.points[near], 0.3)]
+        node = lap * len(at) + number
+        edge, T_odom_kf = None, T_world_kf
+        if previous is not None:
+            T = se3.inverse(world.pose_at(float(at[number - 1]))) @ T_world_kf @ se3.exp(_DRIFT)
+            edge = Registration(T, np.diag([1e-3] * 3 + [0.03] * 3) ** 2, 0.9, 0.05, "simulated")
+            T_odom_kf = previous.T_odom_kf @ T
+        previous = Keyframe(node, node * 10**8, node, T_odom_kf, scan.points[near], edge)
+        yield previous, scan.moving[near]
+
+
+def _lap_row(mapper: Mapper, path: Path, lap: int) -> dict[str, Any]:
+    own = sum(not mapper.borrows(node) for node in range(len(mapper.keyframes)))
+    size = sum(file.stat().st_size for suffix in ("", "-wal") if (file := Path(f"{path}{suffix}")).exists())
+    accepted = sum(closure.registration.ok for closure in mapper.closures)
+    return {"lap": lap + 1, "keyframes": len(mapper.keyframes), "with_own_cloud": own, "bytes": size, "loops": accepted}
+
+
+def _moving(data: MapData, labels: list[Mask], settings: SlamSettings) -> dict[str, float]:
+    """Share of the points of moving things in the map before and after, of them removed, of static ones removed."""
+    own = [node for node in range(len(data)) if data.clouds.loan(node) is None]
+    masks = {}
+    for node in own:
+        packed = data.clouds.moving(node)
+        masks[node] = np.zeros(len(labels[node]), bool) if packed is None else unpack_mask(packed, len(labels[node]))
+    moving = np.concatenate([labels[node] for node in own])
+    removed = np.concatenate([masks[node] for node in own])
+    points = np.concatenate([se3.transform(data.poses[node], data.clouds.whole(node)) for node in own])
+    before = voxel_first(points, settings.map.voxel)
+    left = np.flatnonzero(~removed)
+    after = left[voxel_first(points[left], settings.map.voxel)]
+    return {
+        "share_before": float(moving[before].mean()),
+        "share_after": float(moving[after].mean()),
+        "removed": float(removed[moving].mean()),
+        "static_removed": float(removed[~moving].mean()),
+        "points_of_map": len(map_cloud(data.clouds, data.poses, settings.map.voxel)),
+    }
+
+
+def _crash_table(crash: dict[str, Any]) -> Table:
+    table = Table(title="Kills of a running drive", title_justify="left", box=SIMPLE, show_header=False)
+    ape = crash["ape_m"]
+    for row in (
+        ("kills, maps that open", f"{crash['kills']}, {crash['maps_that_open']}"),
+        ("most keyframes lost at a kill, besides the one in flight", str(crash["most_keyframes_lost"])),
+        ("APE uninterrupted, m", f"{ape['uninterrupted']:.4f}"),
+        ("APE of killed and resumed drives, m", ", ".join(f"{value:.4f}" for value in ape["killed"])),
+    ):
+        table.add_row(*row)
+    return table
+
+
+def _laps_table(laps: dict[str, Any]) -> Table:
+    table = Table(title=f"Laps of {laps['lap_m']:.0f} m", title_justify="left", box=SIMPLE)
+    for column in ("lap", "keyframes", "with own cloud", "MB", "loops"):
+        table.add_column(column, justify="right")
+    for row in laps["laps"]:
+        figures = (row["lap"], row["keyframes"], row["with_own_cloud"], f"{row['bytes'] / 1e6:.2f}", row["loops"])
+        table.add_row(*map(str, figures))
+    table.add_row("pruned", str(laps["keyframes_pruned"]), "", f"{laps['bytes_pruned'] / 1e6:.2f}", "")
+    m = laps["moving"]
+    table.caption = (
+        f"points of moving things: {m['share_before']:.2%} of the map before, {m['share_after']:.2%} after; "
+        f"{m['removed']:.0%} of them removed, and {m['static_removed']:.3%} of the static ones"
+    )
+    return table
