@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 import json
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, get_args
@@ -48,7 +49,8 @@ def load_settings(kind: type[T], path: Path | None = None, overrides: Sequence[s
         if not equals or not key:
             raise UsageError(f"--set {setting}: want KEY=VALUE, such as slam.registration=geometric")
         try:
-            value = yaml.safe_load(text)
+            # YAML 1.1 would take 04 for an octal number; here it is the name of a sequence.
+            value = text.strip() if re.fullmatch(r"\s*0\d+\s*", text) else yaml.safe_load(text)
         except _NOT_YAML:
             value = text
         for part in reversed(key.split(".")):

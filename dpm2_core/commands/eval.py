@@ -7,10 +7,13 @@ import json
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 from rich.console import Console
 
+from dpm2_core.config import load_settings
 from dpm2_core.data.kitti import read_calib
+from dpm2_core.data.source import InputSettings, open_source
 from dpm2_core.data.trajectory import Trajectory, matched, read_trajectory
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.kitti_metric import OFFICIAL_LENGTHS
@@ -24,7 +27,10 @@ FRAME_CAMERA = "left camera; the estimate, poses of the LiDAR, was converted wit
 
 
 def eval_(
-    gt: Annotated[Path, typer.Option(help="Ground truth: KITTI (12 numbers a line, 13 with the frame number) or TUM.")],
+    gt: Annotated[
+        Path,
+        typer.Option(help="Ground truth: a KITTI, KITTI-360 or TUM file, or a drive whose poses are known."),
+    ],
     est: Annotated[Path, typer.Option(help="The estimate, in either format.")],
     json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures to this file.")] = None,
     lengths: Annotated[
@@ -34,10 +40,16 @@ def eval_(
         Path | None,
         typer.Option(help="KITTI calib.txt: the estimate holds LiDAR poses, the ground truth camera poses."),
     ] = None,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", help="KEY=VALUE of input where --gt is a drive, such as sequence=04.")
+    ] = None,
 ) -> None:
     """Judge a trajectory: KITTI metric, APE, RPE and final drift."""
+    if settings and not gt.is_dir():
+        raise UsageError(f"--set {settings[0]}: says how a drive is read, and {gt} is a file")
     chosen = parse_lengths(lengths) if lengths else OFFICIAL_LENGTHS
-    truth, estimate = read_trajectory(gt), read_trajectory(est)
+    truth = _of_drive(gt, settings or []) if gt.is_dir() else read_trajectory(gt)
+    estimate = read_trajectory(est)
     if calib is not None:
         estimate = in_camera_frame(estimate, calib)
     metrics = evaluate(*matched(truth, estimate), chosen)
@@ -47,6 +59,17 @@ def eval_(
         result = {"gt": str(gt), "est": str(est), "frame": frame, **metrics.model_dump()}
         with atomic_write(json_file) as file:
             file.write(json.dumps(result, indent=2) + "\n")
+
+
+def _of_drive(path: Path, settings: list[str]) -> Trajectory:
+    """True poses of a drive by frame number, of the left camera where its place is known, as `dpm2 run` writes them."""
+    source = open_source(path, load_settings(InputSettings, None, [*settings, "images=false"]))
+    if source.poses is None:
+        raise UsageError(f"{path}: the drive has no ground truth")
+    T = np.eye(4) if source.T_cam_lidar is None else source.T_cam_lidar
+    numbers = getattr(source, "numbers", np.arange(len(source)))  # those in the file names
+    known = np.isfinite(source.poses).all((1, 2))
+    return Trajectory(T @ source.poses[known] @ se3.inverse(T), numbers[known], "kitti-indexed")
 
 
 def parse_lengths(text: str) -> tuple[float, ...]:

@@ -38,6 +38,41 @@ def data(
 
 
 @train.command()
+def pack(
+    src: Annotated[Path, typer.Argument(help="KITTI, KITTI-360 or KITTI-CARLA folder, or a bag; with ground truth.")],
+    out: Annotated[Path, typer.Argument(help="Folder of the packed drive; name it under data.packed to train on it.")],
+    frames: Annotated[str, typer.Option(help="Positions a:b to pack, from 0.")] = ":",
+    preset: Annotated[str, typer.Option(help="Network preset: its crop and picture size are stored.")] = "small",
+    no_image: Annotated[bool, typer.Option("--no-image", help="Leave the pictures out.")] = False,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", help="KEY=VALUE of input, such as sequence=04.")
+    ] = None,
+) -> None:
+    """A recorded drive with ground truth, packed for training."""
+    from dpm2_core.commands.run import parse_range
+    from dpm2_core.data.source import InputSettings, open_source
+    from dpm2_core.network.config import preset as network_preset
+    from dpm2_core.training.generate import pack as write  # torch and embree are slow to import
+
+    if out.exists():
+        raise UsageError(f"{out}: is there already; remove it, or choose another folder")
+    overrides = [*(settings or []), *(["images=false"] if no_image else [])]
+    source = open_source(src, load_settings(InputSettings, None, overrides))
+    network = network_preset(preset)
+    start, stop = parse_range(frames)
+    chosen = range(len(source))[start:stop]
+    if not chosen:
+        raise UsageError(f"--frames {frames}: {src} has {len(source)} frames")
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns) as bar:
+        task = bar.add_task(f"{source.name} -> {out}", total=len(chosen))
+        packed = write(source, out, network, chosen, lambda: bar.advance(task))
+    for note in source.notes:
+        typer.echo(note, err=True)
+    typer.echo(f"{out}: {packed} frames", err=True)
+
+
+@train.command()
 def phase1(
     config: ConfigOption = None,
     settings: SetOption = None,

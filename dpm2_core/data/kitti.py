@@ -119,8 +119,11 @@ class KittiSource:
     def _poses(self) -> Array | None:
         """(len, 4, 4) T_world_lidar from poses.txt here or poses/NN.txt of the root; None without."""
         beside, above = self.path / "poses.txt", self.path.resolve().parent.parent / "poses" / f"{self.name}.txt"
-        path = next((file for file in (beside, above) if file.is_file()), None)
+        wanted = {"auto": (beside, above), "kitti": (above,), "semantic_kitti": (beside,)}[self._settings.kitti_poses]
+        path = next((file for file in wanted if file.is_file()), None)
         if path is None:
+            if self._settings.kitti_poses != "auto":
+                raise UsageError(f"{wanted[0]}: no such file (input.kitti_poses is {self._settings.kitti_poses})")
             return None
         if self.T_cam_lidar is None:
             self.notes.append(f"{path} is of the camera: without Tr it is no ground truth for the LiDAR")
@@ -209,11 +212,11 @@ def read_calib(path: Path) -> dict[str, Array]:
         UsageError: a line is damaged; the message names it.
     """
     calib: dict[str, Array] = {}
-    for number, line in enumerate(_lines(path), 1):
+    for number, line in enumerate(read_lines(path), 1):
         key, colon, text = line.partition(":")
         if not colon or key.strip() not in ("P0", "P1", "P2", "P3", "Tr"):
             continue  # raw and object calibrations have many more
-        matrix = _row(text, 12, f"{path}:{number}: {key}").reshape(3, 4)
+        matrix = parse_row(text, 12, f"{path}:{number}: {key}").reshape(3, 4)
         name = key.strip()
         if name == "Tr":
             R = matrix[:, :3]
@@ -227,17 +230,22 @@ def read_calib(path: Path) -> dict[str, Array]:
     return calib
 
 
-def read_numbers(path: Path, columns: int) -> Array:
-    """(lines, columns) float64 of a text file without header; no rows if there is no such file.
+def read_numbers(path: Path, columns: int, skip: int = 0) -> Array:
+    """(lines, columns) float64 of a text file below a header of `skip` lines; no rows if there is no such file.
 
     Raises:
         UsageError: a line has another number of numbers, or something else; the message names it.
     """
-    rows = [_row(line, columns, f"{path}:{i}") for i, line in enumerate(_lines(path), 1) if line.strip()]
+    rows = [
+        parse_row(line, columns, f"{path}:{i}")
+        for i, line in enumerate(read_lines(path)[skip:], 1 + skip)
+        if line.strip()
+    ]
     return np.array(rows).reshape(-1, columns)
 
 
-def _lines(path: Path) -> list[str]:
+def read_lines(path: Path) -> list[str]:
+    """Lines of a text file; none if there is no such file."""
     try:
         return path.read_text(encoding="utf-8").splitlines()
     except FileNotFoundError:
@@ -246,7 +254,8 @@ def _lines(path: Path) -> list[str]:
         raise UsageError(f"{path}: {getattr(error, 'strerror', None) or 'not a text file'}") from None
 
 
-def _row(text: str, count: int, where: str) -> Array:
+def parse_row(text: str, count: int, where: str) -> Array:
+    """(count,) finite numbers of a line; the UsageError of any other line begins with `where`."""
     try:
         row = np.array([float(word) for word in text.split()])
     except ValueError as error:

@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from dpm2_core.errors import UsageError
 from dpm2_core.files import atomic_write
-from dpm2_core.frame import Points
+from dpm2_core.frame import Array, Points
 
 _HEADER = """ply
 format binary_little_endian 1.0
@@ -33,3 +35,40 @@ def write_ply(path: Path | str, points: Points) -> None:
     with atomic_write(path, "wb") as file:
         file.write(_HEADER.format(count=len(points)).encode("ascii"))
         file.write(np.ascontiguousarray(points, "<f4").data)
+
+
+_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2",
+    "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4",
+    "double": "<f8", "float64": "<f8",
+}  # fmt: skip
+
+
+def read_ply(path: Path | str, names: Sequence[str]) -> Array:
+    """(N, len(names)) float64 of these properties of the vertices, the first element of a little-endian binary PLY.
+
+    Raises:
+        UsageError: not such a file, cut short, or without one of the properties.
+    """
+    try:
+        data = Path(path).read_bytes()
+    except OSError as error:
+        raise UsageError(f"{path}: {error.strerror}") from None
+    end = data.find(b"end_header")
+    start = data.find(b"\n", end) + 1
+    header = [line.split() for line in data[: max(end, 0)].decode("ascii", "replace").splitlines()]
+    if ["ply"] not in header[:1] or ["format", "binary_little_endian", "1.0"] not in header or not start:
+        raise UsageError(f"{path}: no little-endian binary PLY")
+    elements = [i for i, line in enumerate(header) if line[:1] == ["element"]]
+    try:
+        first, last = elements[0], [*elements, len(header)][1]
+        count = int(header[first][2])
+        layout = np.dtype([(line[2], _TYPES[line[1]]) for line in header[first + 1 : last] if line[0] == "property"])
+    except (IndexError, ValueError, KeyError) as error:
+        raise UsageError(f"{path}: header of the PLY is damaged ({error})") from None
+    if missing := [name for name in names if name not in (layout.names or ())]:
+        raise UsageError(f"{path}: no property {missing[0]}; it has {', '.join(layout.names or ())}")
+    if count < 0 or len(data) - start < count * layout.itemsize:
+        raise UsageError(f"{path}: ends before its {count} points do")
+    vertices = np.frombuffer(data, layout, count, start)
+    return np.stack([vertices[name].astype(np.float64) for name in names], 1)

@@ -29,7 +29,12 @@ class InputSettings(Settings):
     """How recordings and sensor messages are read."""
 
     sequence: str = ""
-    """Sequence of a KITTI odometry root, such as 04; empty takes the only one."""
+    """Sequence of a root folder: 04 of KITTI odometry, 0009 of KITTI-360, Town01 of KITTI-CARLA; empty takes the only
+    one."""
+
+    kitti_poses: Literal["auto", "kitti", "semantic_kitti"] = "auto"
+    """Ground truth of KITTI odometry: poses/NN.txt (kitti), poses.txt in the sequence's folder, which SemanticKITTI
+    publishes (semantic_kitti), or the latter where it is there, else the former (auto)."""
 
     points_topic: str = ""
     """PointCloud2 topic of a bag; empty takes /kitti/velo/pointcloud, else the only one."""
@@ -105,7 +110,7 @@ class Source(Protocol):
 
 
 def open_source(path: Path | str, settings: InputSettings | None = None) -> Source:
-    """Open whatever `path` is: a KITTI odometry sequence or root, a rosbag2 folder, or an .mcap or .db3 file.
+    """Open whatever `path` is: a folder of KITTI odometry, KITTI-360 or KITTI-CARLA, or a rosbag2 recording.
 
     Raises:
         UsageError: there is nothing, or nothing that can be read; the message says what was found.
@@ -122,6 +127,14 @@ def open_source(path: Path | str, settings: InputSettings | None = None) -> Sour
         from dpm2_core.data.bags import BagSource
 
         return BagSource(path, settings)
+    if (path / "data_3d_raw").is_dir() or (path / "velodyne_points").is_dir():
+        from dpm2_core.data.kitti360 import Kitti360Source
+
+        return Kitti360Source(path, settings)
+    if (path / "frames").is_dir() or (path / "generated").is_dir() or any(path.glob("*/generated/frames")):
+        from dpm2_core.data.kitti_carla import KittiCarlaSource
+
+        return KittiCarlaSource(path, settings)
     from dpm2_core.data.kitti import KittiSource
 
     return KittiSource(path, settings)

@@ -19,7 +19,7 @@ from dpm2_core.geometry import se3
 
 Keys = NDArray[np.int64]
 
-_TUM, _KITTI, _KITTI_INDEXED = 8, 12, 13  # numbers a line
+_TUM, _KITTI, _KITTI_INDEXED, _KITTI_360 = 8, 12, 13, 17  # numbers a line
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +62,7 @@ def write_tum(path: Path | str, stamps: Sequence[int] | Keys, poses: Array) -> N
 
 
 def read_trajectory(path: Path | str) -> Trajectory:
-    """Read KITTI (12 numbers a line, or 13 with the frame number first) or TUM (8), told apart by their number.
+    """Read KITTI (12 numbers a line, or 13 with the frame number first), KITTI-360 (also 17) or TUM (8).
 
     Raises:
         UsageError: no such file, or a line that is no pose; it names file and line.
@@ -77,8 +77,8 @@ def read_trajectory(path: Path | str) -> Trajectory:
     if not lines:
         raise UsageError(f"{path}: holds no pose")
     columns = len(lines[0][1])
-    if columns not in (_TUM, _KITTI, _KITTI_INDEXED):
-        raise UsageError(f"{path}:{lines[0][0]}: {columns} numbers; want 8 (TUM), 12 or 13 (KITTI)")
+    if columns not in (_TUM, _KITTI, _KITTI_INDEXED, _KITTI_360):
+        raise UsageError(f"{path}:{lines[0][0]}: {columns} numbers; want 8 (TUM), 12 or 13 (KITTI) or 17 (KITTI-360)")
     keys: list[int] = []
     rows: list[list[float]] = []
     for number, fields in lines:
@@ -89,7 +89,10 @@ def read_trajectory(path: Path | str) -> Trajectory:
             keys.append(_key(fields[0], columns) if columns != _KITTI else len(keys))
         except ValueError as error:
             raise UsageError(f"{path}:{number}: {error}") from None
-    poses, good = _poses(np.array(rows), columns)
+    numbers = np.array(rows)
+    if columns == _KITTI_360:  # the frame number and all 16 of a 4 x 4 matrix
+        numbers, columns = numbers[:, :_KITTI_INDEXED], _KITTI_INDEXED
+    poses, good = _poses(numbers, columns)
     if not good.all():
         raise UsageError(f"{path}:{lines[int(np.argmin(good))][0]}: not a finite rigid transform")
     if columns == _KITTI_INDEXED and len(set(keys)) < len(keys):

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 
@@ -13,14 +13,16 @@ from pydantic import Field
 from dpm2_core.config import Settings
 from dpm2_core.data.source import Source
 from dpm2_core.errors import UsageError
-from dpm2_core.frame import Camera, Image
-from dpm2_core.network.config import NetworkSettings, PointsSettings, preset
+from dpm2_core.frame import Array, Camera, Frame, Image
+from dpm2_core.geometry import se3
+from dpm2_core.network.config import NetworkSettings, preset
 from dpm2_core.network.encoder import resize
 from dpm2_core.network.pyramid import crop
 from dpm2_core.sim.camera import calibration, render
 from dpm2_core.sim.config import CameraConfig, LidarConfig, PresetName
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.world import build_world
+from dpm2_core.slam.preprocess import deskew
 from dpm2_core.training.packed import Sample, write_packed
 
 
@@ -99,24 +101,54 @@ def generate(
             progress(done, settings.worlds)
 
 
-def pack(source: Source, folder: Path, network: NetworkSettings, frames: Sequence[int] | None = None) -> int:
+def pack(
+    source: Source,
+    folder: Path,
+    network: NetworkSettings,
+    frames: range | None = None,
+    advance: Callable[[], None] = lambda: None,
+) -> int:
     """Pack the frames of a source that have a pose; returns how many.
 
+    Points with time offsets are moved to where they are seen from at the stamp, by the true motion. `frames`: positions
+    to look at; `advance` is called after each.
+
     Raises:
-        UsageError: the source has no poses.
+        UsageError: the source has no poses, or its frames do not all have as many pictures.
     """
     if source.poses is None:
         raise UsageError(f"{source.name}: no ground truth poses, training needs them")
-    settings: PointsSettings = network.points
-    samples = []
-    wanted = set(range(len(source)) if frames is None else frames)
-    for position, frame in enumerate(source.frames()):
-        pose = source.poses[position]
-        if position not in wanted or frame.problem is not None or not np.isfinite(pose).all():
-            continue
+    chosen = frames or range(len(source))
+    samples: list[Sample] = []
+    before: tuple[Frame, Array] | None = None  # a motion needs the next pose, so each frame waits for it
+
+    def add(frame: Frame, pose: Array, twist: Array) -> None:
+        points = frame.points
+        if frame.time_offset is not None:
+            points = deskew(points, frame.time_offset, twist)
         images = tuple(small_image(image, network) for image in frame.images)
-        samples.append(Sample(crop(frame.points, settings), pose, images))
-    if not samples:
+        samples.append(Sample(crop(points, network.points), pose, images))
+
+    twist = np.zeros(6)
+    for position, frame in enumerate(source.frames(chosen.start, chosen.stop), chosen.start):
+        advance()
+        pose = source.poses[position]
+        if position not in chosen or frame.problem is not None or not np.isfinite(pose).all():
+            continue
+        if before is not None:
+            twist = _twist(before, (frame, pose))
+            add(*before, twist)
+        before = frame, pose
+    if before is None:
         raise UsageError(f"{source.name}: no readable frame with a pose")
+    add(*before, twist)
+    if len({len(sample.images) for sample in samples}) > 1:
+        raise UsageError(f"{source.name}: some frames have a picture and some have none; --no-image packs them without")
     write_packed(folder, samples, {"source": source.name})
     return len(samples)
+
+
+def _twist(before: tuple[Frame, Array], after: tuple[Frame, Array]) -> Array:
+    """(6,) [rad/s, m/s] from one stamped pose to the next."""
+    seconds = max(1e-3, (after[0].stamp - before[0].stamp) * 1e-9)
+    return se3.log(se3.inverse(before[1]) @ after[1]) / seconds

@@ -8,7 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from dpm2_core.cli import app
 from dpm2_core.commands.eval import eval_, parse_lengths
 from dpm2_core.data.kitti import read_calib
 from dpm2_core.data.trajectory import read_trajectory, write_kitti, write_tum
@@ -83,3 +85,23 @@ def test_a_calibration_without_tr_or_that_is_not_there_is_refused(tmp_path: Path
     for name, reason in (("calib.txt", "no Tr"), ("none.txt", "no such file")):
         with pytest.raises(UsageError, match=f"{name}: {reason}"):
             eval_(tmp_path / "gt.txt", tmp_path / "gt.txt", calib=tmp_path / name)
+
+
+def test_a_drive_is_its_own_ground_truth(tmp_path: Path) -> None:
+    """--gt may be a drive of any layout: it judges an estimate of the left camera that has frame numbers."""
+    folder = tmp_path / "sequences" / "07"
+    (folder / "velodyne").mkdir(parents=True)
+    poses = np.stack([se3.exp([0, 0.02 * n, 0, 0, 0, n]) for n in range(6)])
+    for n in range(6):
+        np.zeros(4, "<f4").tofile(folder / "velodyne" / f"{n:06d}.bin")
+    (folder / "calib.txt").write_text("Tr: 0 -1 0 0.1 0 0 -1 -0.2 1 0 0 -0.3\n")
+    write_kitti(folder / "poses.txt", poses)
+    write_kitti(tmp_path / "est.txt", poses[1:], range(1, 6))
+    run = CliRunner().invoke(
+        app, ["eval", "--gt", str(folder), "--est", str(tmp_path / "est.txt"), "--json", str(tmp_path / "m.json")]
+    )
+    assert run.exit_code == 0, run.output
+    assert json.loads((tmp_path / "m.json").read_text())["ape_rmse_m"] < 1e-6
+    (folder / "poses.txt").unlink()
+    run = CliRunner().invoke(app, ["eval", "--gt", str(folder), "--est", str(tmp_path / "est.txt")])
+    assert "no ground truth" in str(run.exception)

@@ -304,3 +304,19 @@ def test_real_excerpts(kitti_root: Path) -> None:
     assert len(frame.points) > 100_000
     assert frame.images[0].pixels.shape == (370, 1226, 3)
     assert 0 <= frame.points[:, 3].min() <= frame.points[:, 3].max() <= 1
+
+
+def test_semantic_kitti_poses_are_a_choice(kitti_folder: Callable[..., Path]) -> None:
+    """poses.txt of the sequence's folder, or poses/NN.txt; one that was asked for and is missing is named."""
+    folder = kitti_folder(images=False)
+    kitti = KittiSource(folder, InputSettings(kitti_poses="kitti")).poses
+    with pytest.raises(UsageError, match=r"poses.txt: no such file .*semantic_kitti"):
+        KittiSource(folder, InputSettings(kitti_poses="semantic_kitti"))
+    (folder / "poses.txt").write_text("".join(f"1 0 0 0 0 1 0 0 0 0 1 {2 * n}\n" for n in range(5)))
+    suma = KittiSource(folder, InputSettings(kitti_poses="semantic_kitti")).poses
+    assert kitti is not None
+    assert suma is not None
+    np.testing.assert_allclose(suma[4, :3, 3] - suma[0, :3, 3], 2 * (kitti[4, :3, 3] - kitti[0, :3, 3]), atol=1e-12)
+    np.testing.assert_array_equal(KittiSource(folder).poses, suma)
+    again = KittiSource(folder, InputSettings(kitti_poses="kitti")).poses
+    np.testing.assert_array_equal(again, kitti)

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dpm2_core.data.ply import write_ply
+from dpm2_core.data.ply import read_ply, write_ply
+from dpm2_core.errors import UsageError
 
 
 def _read(path: Path) -> tuple[list[str], np.ndarray]:
@@ -47,3 +48,19 @@ def test_points_of_another_shape_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"want \(N, 4\)"):
         write_ply(tmp_path / "map.ply", np.zeros((5, 3), np.float32))
     assert not list(tmp_path.iterdir())
+
+
+def test_what_is_written_is_read(tmp_path: Path) -> None:
+    """Properties by name, in the order asked for; a missing one, a text file and a short one are refused by name."""
+    points = np.random.default_rng(0).normal(size=(10, 4)).astype(np.float32)
+    path = tmp_path / "map.ply"
+    write_ply(path, points)
+    np.testing.assert_array_equal(read_ply(path, ("intensity", "x")), points[:, [3, 0]])
+    with pytest.raises(UsageError, match="no property time; it has x, y, z, intensity"):
+        read_ply(path, ("time",))
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(UsageError, match="ends before its 10 points do"):
+        read_ply(path, ("x",))
+    path.write_text("hello")
+    with pytest.raises(UsageError, match="no little-endian binary PLY"):
+        read_ply(path, ("x",))
