@@ -16,7 +16,9 @@ from safetensors.torch import load_file
 
 from dpm2_core.errors import UsageError
 from dpm2_core.network.config import PRESETS
+from dpm2_core.network.weights import read_metadata
 from dpm2_core.training.augment import AugmentSettings
+from dpm2_core.training.checkpoint import Log
 from dpm2_core.training.dataset import DataSettings, GroupDataset
 from dpm2_core.training.objective import LossSettings
 from dpm2_core.training.phase_one import PhaseOne, PhaseOneSettings, phase_one, plans_of
@@ -203,3 +205,69 @@ def test_two_processes_give_the_gradients_of_one(tmp_path: Path, packed: Path, t
     assert len(one) > 50
     for name, gradient in one.items():
         torch.testing.assert_close(two[name], gradient, atol=1e-6, rtol=1e-4, msg=name)
+
+
+def test_tensorboard_has_the_figures_of_the_log(settings: PhaseOneSettings, tmp_path: Path) -> None:
+    """Where its package is installed: the same losses at the same steps as log.jsonl, to float32."""
+    accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    phase_one(settings, tmp_path / "out")
+    events = accumulator.EventAccumulator(str(tmp_path / "out" / "tensorboard")).Reload()
+    written = {event.step: event.value for event in events.Scalars("loss")}
+    assert written == pytest.approx(losses(tmp_path / "out"), rel=1e-5)
+    assert [event.step for event in events.Scalars("near_m")] == [1, 3]
+
+
+def test_without_tensorboard_the_log_alone_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its package is an optional one."""
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)  # what a missing package looks like to import
+    log = Log(tmp_path, append=False)
+    log.write(7, {"loss": 0.5})
+    log.close()
+    assert json.loads((tmp_path / "log.jsonl").read_text()) == {"step": 7, "loss": 0.5}
+    assert not (tmp_path / "tensorboard").exists()
+
+
+def test_phase_two_keeps_what_the_weights_say_of_phase_one(settings: PhaseOneSettings, tmp_path: Path) -> None:
+    """Steps and pictures of phase one, by which the SLAM knows whether to use the camera, stay; the phase is two."""
+    start = phase_one(settings, tmp_path / "one")
+    second = PhaseTwoSettings(
+        preset="tiny", start=str(start), data=settings.data,
+        optimiser=settings.optimiser.model_copy(update={"steps": 1}),
+    )  # fmt: skip
+    before, after = read_metadata(start), read_metadata(phase_two(second, tmp_path / "two"))
+    assert before["images"] == "true"
+    assert before["phase"] == "1"
+    assert {**before, "phase": "2"} == after
+
+
+LOOP = """
+import sys
+from pathlib import Path
+from dpm2_core.network.config import PRESETS
+from dpm2_core.training.phase_one import PhaseOneSettings, phase_one
+import json
+out, settings, network = sys.argv[1:]
+PRESETS["tiny"] = json.loads(network)
+phase_one(PhaseOneSettings.model_validate_json(settings), Path(out))
+"""
+
+
+def test_the_whole_loop_runs_under_torchrun(settings: PhaseOneSettings, tiny: Callable, tmp_path: Path) -> None:
+    """Two gloo ranks train, log, validate and save once; their losses are not those of one process' smaller batch."""
+    script = tmp_path / "loop.py"
+    script.write_text(LOOP)
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[3]), "OMP_NUM_THREADS": "1"}
+    arguments = [settings.model_dump_json(), tiny().model_dump_json()]
+    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
+    done = subprocess.run(
+        [*torchrun, script, tmp_path / "two", *arguments], env=environment, capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert sorted(losses(tmp_path / "two")) == [0, 1, 2, 3]
+    rows = (tmp_path / "two" / "log.jsonl").read_text().splitlines()
+    assert len([row for row in rows if '"loss"' in row]) == 4  # of one rank
+    phase_one(settings, tmp_path / "one")
+    one, two = (load_file(tmp_path / name / "weights.safetensors") for name in ("one", "two"))
+    assert one.keys() == two.keys()
+    assert any(not torch.equal(one[name], two[name]) for name in one)  # the second rank's share counts
+    assert all(torch.isfinite(tensor).all() for tensor in two.values())
