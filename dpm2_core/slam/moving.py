@@ -15,10 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 from scipy.ndimage import minimum_filter
+from scipy.spatial import cKDTree
 
 from dpm2_core.config import Settings
 from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
+
+Mask = NDArray[np.bool_]
 
 _PIXEL = np.radians(1.0)
 _COLUMNS = 360
@@ -36,6 +39,8 @@ class MovingSettings(Settings):
     """So many must look through the place of a point."""
     margin: float = Field(0.5, gt=0)
     """What they see must lie so far behind it, m; 3 % of the range are added."""
+    growth: float = Field(0.7, gt=0)
+    """Points this near to a moving one move with it, unless neighbours saw them, m."""
     footprint: float = Field(0.3, gt=0)
     """A return within this of the line of sight counts as seeing the point, m."""
 
@@ -88,7 +93,20 @@ def find_moving(
         looked, present = image.judge(se3.transform(se3.inverse(T_map_other) @ T_map_kf, part), settings)
         through[candidates] += looked
         seen[candidates] += present
-    return (through >= settings.witnesses) & (through > seen)
+    moving = (through >= settings.witnesses) & (through > seen)
+    return _grown(moving, cloud, candidates[through[candidates] >= seen[candidates]], settings.growth)
+
+
+def _grown(moving: Mask, cloud: Points, candidates: NDArray[np.intp], reach: float) -> Mask:
+    """With those candidates that touch a moving point: the rest of a car, against the sky or out of their sight."""
+    grown = moving.copy()
+    edge = np.flatnonzero(moving)
+    while len(edge) and len(candidates):
+        near, _ = cKDTree(cloud[edge, :3]).query(cloud[candidates, :3], distance_upper_bound=reach)
+        edge = candidates[np.isfinite(near)]
+        edge = edge[~grown[edge]]
+        grown[edge] = True
+    return grown
 
 
 class MovingWindow:

@@ -44,7 +44,7 @@ Mask = NDArray[np.bool_]
 
 KILLS = 50
 LAPS = 5
-_FRAMES = 200
+_FRAMES = 120
 _DRIFT = np.array([0, 0, 2e-4, 0.01, 0.005, 0.0])  # of the odometry, a keyframe, rad and m
 
 # `dpm2 run`, which says on a pipe when the mapper has taken a keyframe in: what must then be in the file.
@@ -52,6 +52,7 @@ _CHILD = """
 import os, sys
 from dpm2_core.cli import main
 from dpm2_core.slam.mapper import Mapper
+os.write(int(sys.argv[1]), b"s")
 add = Mapper.add
 def told(self, *arguments):
     out = add(self, *arguments)
@@ -81,14 +82,14 @@ def crashes(folder: Path, options: Options) -> dict[str, Any]:
     alone = folder / "alone.dpm2map"
     started = time.perf_counter()
     _run([*command, "--map", str(alone)], None)
-    duration = time.perf_counter() - started
+    duration = time.perf_counter() - started  # from the imports to the last picture
     rng, kills, finals = np.random.default_rng(0), [], []
     path = folder / "killed0.dpm2map"
     with_bar = track(range(KILLS), description="kills", transient=True, console=Console(stderr=True))
     for _ in with_bar:
         before = _keyframes(path)
         while True:
-            added = _run([*command, "--map", str(path), "--resume"], float(rng.uniform(0.3, 0.7 * duration)))
+            added = _run([*command, "--map", str(path), "--resume"], float(rng.uniform(0, 0.4 * duration)))
             if added is not None:
                 break
             finals.append(path)  # it came to its end before the kill: the next drive begins
@@ -115,7 +116,7 @@ def crashes(folder: Path, options: Options) -> dict[str, Any]:
 
 
 def _run(arguments: list[str], kill_after: float | None) -> int | None:
-    """Run `dpm2`; keyframes taken in before it was killed, None if it ended by itself.
+    """Run `dpm2`; keyframes taken in before it was killed, so many s after its imports; None if it ended by itself.
 
     Raises:
         Dpm2Error: it failed.
@@ -127,6 +128,7 @@ def _run(arguments: list[str], kill_after: float | None) -> int | None:
         pass_fds=[write], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env=environment,
     )  # fmt: skip
     os.close(write)
+    os.read(read, 1)
     try:
         _, errors = child.communicate(timeout=kill_after)
     except subprocess.TimeoutExpired:

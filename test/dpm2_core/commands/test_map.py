@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`dpm2 map` and `dpm2 run --map` on real files; what they write is read back by other means."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dpm2_core.cli import main
+from dpm2_core.data.trajectory import read_trajectory
+from dpm2_core.frame import Array, Keyframe
+from dpm2_core.geometry import se3
+from dpm2_core.sim.config import LidarConfig
+from dpm2_core.sim.drive import simulate
+from dpm2_core.slam.map_data import MapData, load_map
+from dpm2_core.slam.map_store import MapStore
+
+
+def dpm2(*words: object) -> int:
+    with pytest.raises(SystemExit) as end:
+        main([str(word) for word in words])
+    return int(end.value.code or 0)
+
+
+def loaded(path: Path) -> MapData:
+    with MapStore.open(path) as store:
+        return load_map(store)
+
+
+def test_info(map_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert dpm2("map", "info", map_file) == 0
+    told = " ".join(capsys.readouterr().out.split())
+    for words in (
+        "12, 12 of them",
+        "12 with descriptors",
+        "1 accepted of 2 tried",
+        "kB a keyframe",
+        "small 0123456789",
+    ):
+        assert words in told, told
+
+
+def test_trajectories_and_graph(tmp_path: Path, map_file: Path, drive: list[Keyframe]) -> None:
+    import gtsam
+
+    poses = np.array([k.T_odom_kf for k in drive])
+    for name in ("a.tum", "a.g2o"):
+        assert dpm2("map", "export", map_file, tmp_path / name) == 0
+    assert dpm2("map", "export", map_file, tmp_path / "kitti.txt", "--format", "kitti") == 0
+    tum, kitti = read_trajectory(tmp_path / "a.tum"), read_trajectory(tmp_path / "kitti.txt")
+    assert list(tum.keys) == [k.stamp for k in drive]
+    np.testing.assert_allclose(tum.poses, poses, atol=1e-9)
+    np.testing.assert_allclose(kitti.poses, poses, atol=1e-9)
+    factors, values = gtsam.readG2o(str(tmp_path / "a.g2o"), True)
+    assert factors.size() == 12  # 11 of odometry and the accepted loop
+    np.testing.assert_allclose(values.atPose3(11).matrix(), poses[11], atol=1e-9)
+
+
+def test_clouds_agree_in_every_format(tmp_path: Path, map_file: Path) -> None:
+    for ending in ("ply", "pcd"):
+        assert dpm2("map", "export", map_file, tmp_path / f"a.{ending}", "--voxel", 1.0) == 0
+    ply = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")[2]
+    pcd = (tmp_path / "a.pcd").read_bytes().partition(b"DATA binary\n")[2]
+    assert ply == pcd
+    points = np.frombuffer(ply, "<f4").reshape(-1, 4)
+    assert len(points) > 3000
+    assert len(np.unique(np.floor(points[:, :3]).astype(int), axis=0)) == len(points)
+
+
+def test_occupancy(tmp_path: Path, map_file: Path) -> None:
+    assert dpm2("map", "export", map_file, tmp_path / "grid.yaml", "--resolution", 0.5) == 0
+    assert {p.name for p in tmp_path.glob("grid.*")} == {"grid.yaml", "grid.pgm"}
+
+
+def test_what_cannot_be_exported(tmp_path: Path, map_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert dpm2("map", "export", map_file, tmp_path / "a.jpg") == 2
+    assert "choose --format from ply, pcd" in capsys.readouterr().err
+    with MapStore.create(tmp_path / "empty.dpm2map") as store:
+        store.begin_session()
+    assert dpm2("map", "export", tmp_path / "empty.dpm2map", tmp_path / "a.ply") == 2
+    assert "no keyframe" in capsys.readouterr().err
+    assert dpm2("map", "info", tmp_path / "empty.dpm2map") == 0
+
+
+def test_merge_by_transform(tmp_path: Path, map_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "both.dpm2map"
+    assert dpm2("map", "merge", map_file, map_file, "--out", out, "--transform", "10 0 0 90") == 0
+    both = loaded(out)
+    T = se3.make([[0, -1, 0], [1, 0, 0], [0, 0, 1]], [10, 0, 0])
+    np.testing.assert_allclose(both.poses[12:], T @ both.poses[:12], atol=1e-9)
+    capsys.readouterr()
+    for words in (["--transform", "1 2 3"], [], ["--align", "--transform", "0 0 0 0"], ["--transform", "a b c d"]):
+        assert dpm2("map", "merge", map_file, map_file, "--out", tmp_path / "no", *words) == 2
+        assert len(capsys.readouterr().err.splitlines()) == 1
+    assert dpm2("map", "merge", map_file, map_file, "--out", out, "--transform", "0 0 0 0") == 2
+    assert "a file already" in capsys.readouterr().err
+
+
+def test_check_and_recover(tmp_path: Path, map_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert dpm2("map", "check", map_file) == 0
+    assert "sound" in capsys.readouterr().out
+    content = bytearray(map_file.read_bytes())
+    content[-3000:-100] = bytes(2900)
+    map_file.write_bytes(content)
+    assert dpm2("map", "check", map_file) == 1
+    assert "--recover" in capsys.readouterr().err
+    assert dpm2("map", "check", map_file, "--recover", tmp_path / "good.dpm2map") == 0
+    assert dpm2("map", "check", tmp_path / "good.dpm2map") == 0
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A lap of 60 frames."""
+    folder = tmp_path_factory.mktemp("drive") / "drive"
+    simulate(folder, 60, 3, "loop", "suburb", False, LidarConfig(beams=32, columns=512))
+    return folder
+
+
+def aligned(data: MapData) -> dict[int, Array]:
+    return {k.index: T for k, T in zip(data.keyframes, data.poses, strict=True)}
+
+
+RUN = ("--set", "slam.loops.descriptors=false")
+
+
+def test_run_writes_a_map_and_goes_on_with_it(
+    tmp_path: Path, recording: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole, parts = tmp_path / "whole.dpm2map", tmp_path / "parts.dpm2map"
+    assert dpm2("run", recording, "--out", tmp_path / "a", "--map", whole, *RUN) == 0
+    assert dpm2("run", recording, "--out", tmp_path / "b", "--map", parts, "--frames", "0:35", *RUN) == 0
+    before = len(loaded(parts))
+    assert dpm2("run", recording, "--out", tmp_path / "b", "--map", parts, *RUN) == 2
+    assert "--resume goes on with it" in capsys.readouterr().err
+    assert dpm2("run", recording, "--out", tmp_path / "b", "--map", parts, "--resume", *RUN) == 0
+    one, two = loaded(whole), loaded(parts)
+    assert set(two.session) == {1, 2}
+    assert two.keyframes[before].index == two.keyframes[before - 1].index  # it begins where the first part ended
+    assert two.clouds.loan(before) is not None  # and borrows that one's cloud
+    assert "registration: geometric" in one.sessions[0].config
+    assert two.keyframes[-1].index >= 50
+    # As good as in one go: the ends of both lie within 5 cm, and so does each keyframe that both have.
+    a, b = aligned(one), aligned(two)
+    common = sorted(a.keys() & b.keys())
+    assert len(common) > before - 1
+    assert max(np.linalg.norm(a[i][:3, 3] - b[i][:3, 3]) for i in common) < 0.05
+    # Only the new frames are in the trajectory of the second run, the map has all.
+    assert len(read_trajectory(tmp_path / "b" / "trajectory.tum")) == 60 - two.keyframes[before].index
+
+
+def test_a_map_of_another_drive_is_not_gone_on_with(
+    tmp_path: Path, recording: Path, map_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert dpm2("run", recording, "--out", tmp_path / "a", "--map", map_file, "--resume", *RUN) == 2
+    assert "is not in" in capsys.readouterr().err
+
+
+def test_reading_commands_leave_the_file_as_it_is(tmp_path: Path, map_file: Path) -> None:
+    before = hashlib.sha256(map_file.read_bytes()).digest()
+    dpm2("map", "info", map_file)
+    dpm2("map", "check", map_file)
+    dpm2("map", "prune", map_file, "--out", tmp_path / "less.dpm2map")
+    dpm2("map", "export", map_file, tmp_path / "a.ply")
+    assert hashlib.sha256(map_file.read_bytes()).digest() == before
