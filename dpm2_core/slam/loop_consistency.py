@@ -16,7 +16,7 @@ from dpm2_core.config import Settings
 from dpm2_core.frame import Array, Keyframe, Registration
 from dpm2_core.geometry import se3
 
-_BROKEN = 0.5  # m, standard deviation of an odometry edge that says that the odometry was lost
+BROKEN = 0.5  # m, standard deviation of an odometry edge that says that the odometry was lost
 
 
 class ConsistencySettings(Settings):
@@ -65,7 +65,7 @@ class Path:
             self._metres = np.concatenate([self._metres, np.zeros_like(self._metres)])
         self._last[keyframe.robot] = node
         self._T_odom_kf.append(keyframe.T_odom_kf)
-        if before is None or keyframe.edge is None or keyframe.edge.worst_sigma > _BROKEN:
+        if before is None or keyframe.edge is None or keyframe.edge.worst_sigma > BROKEN:
             self._segment[node], self._metres[node] = node, 0.0
             return
         step = np.linalg.norm(keyframe.T_odom_kf[:3, 3] - self._T_odom_kf[before][:3, 3])
