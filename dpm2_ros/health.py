@@ -96,7 +96,10 @@ class Diagnostics:
         if self._mapper is not None:
             accepted, tried = self._mapper.loops
             figures = {"keyframes": self._mapper.keyframes, "loops accepted": accepted, "loops tried": tried}
-            status.append(self._status("mapper", OK, f"{self._mapper.keyframes} keyframes, {accepted} loops", figures))
+            level, text = OK, f"{self._mapper.keyframes} keyframes, {accepted} loops"
+            if problem := self._mapper.store_problem:
+                level, text = WARN, f"{text}; map file incomplete: {problem}"
+            status.append(self._status("mapper", level, text, figures))
         message = DiagnosticArray(status=status)
         message.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(message)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +19,13 @@ from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
+from dpm2_core.config import dump_settings
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Keyframe
+from dpm2_core.slam.map_store import MapStore
+from dpm2_core.slam.mapper import Mapper
 from dpm2_core.slam.output import save_map
+from dpm2_core.slam.session import open_session
 from dpm2_core.slam.system import make_mapper
 from dpm2_ros.conversions import cloud_to_msg, edge_to_msg, keyframe_name
 from dpm2_ros.display import path_to_msg, pose_graph_to_msg
@@ -40,7 +45,8 @@ class MapperThread:
 
     def __init__(self, node: Node, config: NodeConfig, robot: str) -> None:
         self._node, self._config, self._robot = node, config, robot
-        self._mapper = make_mapper(config.slam)
+        self._store: MapStore | None = None
+        self._mapper = self._new_mapper()
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="mapper")
         self._stamp = 0  # of the last keyframe, ns
         self._changes = 0
@@ -67,6 +73,11 @@ class MapperThread:
         """Loops accepted, and loops tried."""
         closures = list(self._mapper.closures)
         return sum(closure.registration.ok for closure in closures), len(closures)
+
+    @property
+    def store_problem(self) -> str:
+        """Why the map file is behind, in words; empty when it is not, or when there is none."""
+        return self._mapper.store_problem
 
     @property
     def directory(self) -> Path | None:
@@ -97,6 +108,7 @@ class MapperThread:
         last: Future[str] | None = None
         if self.directory is not None:
             last = self._thread.submit(self._save)
+        self._submit(self._finish_file)
         self._thread.shutdown(wait=True)
         if last is not None:
             try:
@@ -128,8 +140,26 @@ class MapperThread:
         self._changes += 1
 
     def _reset(self) -> None:
-        self._mapper = make_mapper(self._config.slam)
+        self._finish_file()
+        self._mapper = self._new_mapper()
         self._changes += 1
+
+    def _new_mapper(self) -> Mapper:
+        """An empty one, with a map file if there is to be one. A file that cannot be made is no reason not to map."""
+        ros = self._config.ros
+        if ros.map_file:
+            path = free_path(Path(ros.map_file), self._robot)
+            try:
+                self._store = open_session(path, self._config.slam, dump_settings(self._config), resume=False)
+            except Dpm2Error as error:
+                self._node.get_logger().error(f"no map file: {error}")
+        return make_mapper(self._config.slam, self._store)
+
+    def _finish_file(self) -> None:
+        if self._store is not None:
+            self._mapper.finish()
+            self._store.close()
+            self._store = None
 
     def _save(self) -> str:
         if self.directory is None:
@@ -202,6 +232,13 @@ class _OtherCallbacks:
 
     def __await__(self) -> Any:
         yield
+
+
+def free_path(path: Path, robot: str) -> Path:
+    """The path with the robot's name, and with -2, -3, ... while there is a file of that name."""
+    stem = f"{path.stem}_{robot.replace('/', '_')}" if robot else path.stem
+    names = (stem if n == 1 else f"{stem}-{n}" for n in count(1))
+    return next(p for name in names if not (p := path.with_name(name + path.suffix)).exists())
 
 
 def robot_name(node: Node) -> str:

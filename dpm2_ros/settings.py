@@ -60,6 +60,11 @@ class RosSettings(Settings):
     """Folder that ~/save_map and the end of the node save into; relative to the working directory, and within it one
     named after the namespace, if any. Empty: nothing is saved at the end, and ~/save_map refuses."""
 
+    map_file: str = ""
+    """Map file, such as drive.dpm2map, that is written as the drive goes on, so that a crash costs no more than a
+    keyframe; `dpm2 map` reads it. The namespace, if any, and a number, if it is there already, are added to its name.
+    Empty: none."""
+
 
 class NodeConfig(Config):
     """The core's configuration and that of the nodes."""

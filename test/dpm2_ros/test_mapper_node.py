@@ -16,6 +16,8 @@ from dpm2_core.data.trajectory import read_trajectory
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.frame import Keyframe
 from dpm2_core.geometry import se3
+from dpm2_core.slam.map_data import load_map
+from dpm2_core.slam.map_store import MapStore
 from dpm2_ros.conversions import cloud_to_msg, edge_to_msg, keyframe_name
 from dpm2_ros.mapper_node import MapperNode, keyframe_from
 from dpm2_ros.mapping import KEEP_ALL
@@ -59,6 +61,25 @@ def test_keyframes_become_a_map_in_either_order_of_messages(mapper: Any, tmp_pat
     np.testing.assert_allclose(saved.poses, T, atol=1e-6)
     header = (tmp_path / "map" / "map.ply").read_bytes()[:300].decode("ascii", "replace")
     assert int(header.split("element vertex ")[1].split()[0]) > 1000
+
+
+def test_a_map_file_is_written_as_the_drive_goes_on(mapper: Any, tmp_path: Path) -> None:
+    """All keyframes are in it before the node ends; a new map gets a file of its own."""
+    thread = mapper.mapper._mapper
+    ros = thread._config.ros.model_copy(update={"map_file": str(tmp_path / "drive.dpm2map")})
+    thread._config = thread._config.model_copy(update={"ros": ros})
+    thread.reset(save=False)
+    for id in (0, 1, 2, 0):
+        mapper.send(id, se3.exp([0, 0, 0, 5.0 * id, 0, 0]), points(id).astype(np.float32))
+        mapper.wait(lambda expected=id + 1: thread.keyframes == expected, "the keyframe")
+    assert thread.store_problem == ""
+
+    def stored(name: str) -> int:
+        with MapStore.open(tmp_path / name) as store:
+            return len(load_map(store))
+
+    assert stored("drive.dpm2map") == 3
+    mapper.wait(lambda: stored("drive-2.dpm2map") == 1, "the keyframe in the new file")
 
 
 def test_a_keyframe_of_another_name_is_refused_and_the_rest_goes_on(mapper: Any) -> None:
