@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
+from dpm2_core.commands.map_graph import optimize
 from dpm2_core.config import load_settings
 from dpm2_core.data.pcd import write_las, write_pcd
 from dpm2_core.data.ply import write_ply
@@ -25,7 +26,8 @@ from dpm2_core.geometry import se3
 from dpm2_core.slam.map_data import MapData, load_map, map_cloud, restore, save_as, trajectory
 from dpm2_core.slam.map_store import MapStore
 
-app = typer.Typer(help="Map files: info, export, merge, prune, check.", no_args_is_help=True)
+app = typer.Typer(help="Map files: info, export, merge, prune, check; pose graphs: optimize.", no_args_is_help=True)
+app.command()(optimize)
 
 MapFile = Annotated[Path, typer.Argument(metavar="MAP", help="Map file, as `dpm2 run --map` writes it.")]
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="YAML file; `dpm2 config dump` shows every key.")]

@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`dpm2 map optimize`: anybody's pose graph, robustly."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.box import SIMPLE
+from rich.console import Console
+from rich.table import Table
+
+from dpm2_core.errors import Dpm2Error
+from dpm2_core.files import atomic_write
+
+
+def optimize(
+    graph: Annotated[Path, typer.Argument(metavar="GRAPH.g2o", help="SE2 or SE3:QUAT; VERTEX lines may be absent.")],
+    out: Annotated[Path, typer.Option(help="New g2o file: optimised vertices, odometry, the loops that were kept.")],
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="The figures, and for each loop the verdict and why.")
+    ] = None,
+) -> None:
+    """Optimise a pose graph and reject the loops that cannot be true."""
+    from dpm2_core.slam.g2o import read_g2o, require_connected, write_g2o
+    from dpm2_core.slam.graph_data import total_chi2
+    from dpm2_core.slam.robust_graph import RobustSettings, least_squares, optimise
+
+    file = read_g2o(graph)
+    require_connected(graph, file)
+    data = file.graph
+    began = time.perf_counter()
+    try:
+        solution = optimise(data, RobustSettings())
+        poses = least_squares(replace(data, poses=solution.poses), solution.kept)
+    except RuntimeError as error:  # gtsam's: the system is singular
+        raise Dpm2Error(f"{graph}: {' '.join(str(error).split())}") from None
+    seconds = time.perf_counter() - began
+    optimised = replace(file, graph=replace(data, poses=poses))
+    figures: dict[str, Any] = {
+        "vertices": len(data),
+        "edges": int(data.chained.sum()) + len(data.ends),
+        "loops": len(data.ends),
+        "kept": int(solution.kept.sum()),
+        "rejected": int((~solution.kept).sum()),
+        "chi2_before": total_chi2(data, data.poses),
+        "chi2_after": total_chi2(data, poses, solution.kept),
+        "seconds": seconds,
+    }
+    write_g2o(out, optimised, solution.kept)
+    if json_file is not None:
+        verdicts = [
+            {"from": int(a), "to": int(b), "kept": bool(kept), "reason": solution.reason(loop)}
+            for loop, ((a, b), kept) in enumerate(zip(file.ids[data.ends], solution.kept, strict=True))
+        ]
+        record = {**figures, "settled": solution.settled, "ignored": file.ignored, "verdicts": verdicts}
+        with atomic_write(json_file) as text:
+            text.write(json.dumps(record, indent=1) + "\n")
+    _show(graph, figures, file.ignored, solution.settled)
+
+
+def _show(graph: Path, figures: dict[str, Any], ignored: dict[str, int], settled: bool) -> None:
+    table = Table(title=str(graph), title_justify="left", box=SIMPLE, show_header=False)
+    for name, value in figures.items():
+        note = {"chi2_before": ", with every loop", "chi2_after": ", with the loops kept"}.get(name, "")
+        text = f"{value:.4g}" if isinstance(value, float) and np.isfinite(value) else str(value)
+        table.add_row(name.replace("_", " "), text + note)
+    for tag, count in ignored.items():
+        table.add_row("ignored", f"{count} lines {tag}")
+    if not settled:
+        table.add_row("note", "the verdicts had not come to rest; these are the last ones")
+    Console().print(table)

@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A pose graph as arrays, and its odometry chain in closed form: what lies between two nodes, with what covariance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dpm2_core.frame import Array
+from dpm2_core.geometry import se3
+
+Index = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class GraphData:
+    """Nodes are 0..N-1; the odometry is a chain of edges n-1 -> n, which may be broken; all other edges are loops.
+
+    Attributes:
+        poses: (N, 4, 4) T_map_node, the start of an optimisation.
+        chained: (N,) whether node n is tied to n-1 by odometry. Where it is not, a trajectory begins.
+        steps: (N, 4, 4) T_before_this of the odometry; identity where there is none.
+        step_covariances: (N, 6, 6) [rotation rad, translation m] of `steps`; zero where there is none.
+        ends: (E, 2) from and to of each loop.
+        T_from_to: (E, 4, 4) of each loop.
+        covariances: (E, 6, 6) of each loop.
+        fixed: nodes that keep their pose; the first of each trajectory that nothing ties to another does anyway.
+    """
+
+    poses: Array
+    chained: NDArray[np.bool_]
+    steps: Array
+    step_covariances: Array
+    ends: Index = field(default_factory=lambda: np.zeros((0, 2), np.intp))
+    T_from_to: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    covariances: Array = field(default_factory=lambda: np.zeros((0, 6, 6)))
+    fixed: Index = field(default_factory=lambda: np.zeros(0, np.intp))
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+
+def loop_errors(poses: Array, ends: Index, T_from_to: Array) -> Array:
+    """(E, 6) tangent from what each edge measured to what the poses say."""
+    return se3.log(se3.inverse(T_from_to) @ se3.inverse(poses[ends[:, 0]]) @ poses[ends[:, 1]])
+
+
+def mahalanobis(errors: Array, covariances: Array) -> Array:
+    """(E,) squared lengths of (E, 6) errors, in standard deviations."""
+    return np.einsum("ni,ni->n", errors, np.linalg.solve(covariances, errors[..., None])[..., 0])
+
+
+def total_chi2(graph: GraphData, poses: Array, loops: NDArray[np.bool_] | slice = slice(None)) -> float:
+    """Sum over the odometry and the chosen loops."""
+    nodes = np.flatnonzero(graph.chained)
+    ends = np.stack([nodes - 1, nodes], -1)
+    odometry = mahalanobis(loop_errors(poses, ends, graph.steps[nodes]), graph.step_covariances[nodes])
+    errors = loop_errors(poses, graph.ends[loops], graph.T_from_to[loops])
+    return float(odometry.sum() + mahalanobis(errors, graph.covariances[loops]).sum())
+
+
+def trajectories(graph: GraphData) -> Index:
+    """(N,) number of the trajectory that each node belongs to, from 0."""
+    return np.cumsum(~graph.chained) - 1
+
+
+def integrate(graph: GraphData) -> Array:
+    """(N, 4, 4): each trajectory laid out by its odometry from the pose of its first node."""
+    out = graph.poses.copy()
+    for node in np.flatnonzero(graph.chained):  # each needs the one before: a recursion, 3 us a node
+        out[node] = out[node - 1] @ graph.steps[node]
+    return out
+
+
+class Stretches:
+    """The odometry between chosen nodes, compounded: a graph that is small where loops are few, with the same optimum.
+
+    Attributes:
+        nodes: (K,) chosen nodes, ascending, with the first and the last of each trajectory.
+        T: (K, 4, 4) T_before_this between each and the one chosen before; identity where `tied` is False.
+        covariances: (K, 6, 6) of `T`; identity where `tied` is False.
+        tied: (K,) whether odometry ties it to the one chosen before.
+    """
+
+    def __init__(self, graph: GraphData, odometry: Array, chosen: Index) -> None:
+        """`odometry`: (N, 4, 4) of `integrate`; `chosen`: any nodes, in any order."""
+        starts = np.flatnonzero(~graph.chained)
+        lasts = np.append(starts[1:], len(graph)) - 1
+        self.nodes: Index = np.unique(np.concatenate([chosen, starts, lasts]))
+        self.tied = graph.chained[self.nodes]
+        before = np.where(self.tied, np.arange(len(self.nodes)) - 1, np.arange(len(self.nodes)))
+        ends = odometry[self.nodes]
+        self.T = se3.inverse(ends[before]) @ ends
+        self._owner = np.searchsorted(self.nodes, np.arange(len(graph)))  # the chosen node at or after each node
+        self._T_owner_node = se3.inverse(ends[self._owner]) @ odometry
+        A = se3.adjoint(self._T_owner_node)
+        self._parts = A @ graph.step_covariances @ np.swapaxes(A, -1, -2)  # of each step, at the end of its stretch
+        first = np.concatenate([[0], self.nodes[:-1] + 1])
+        self.covariances = np.add.reduceat(self._parts, first, axis=0)
+        self.covariances[~self.tied] = np.eye(6)
+        self._first = first
+
+    def spread(self, poses: Array) -> Array:
+        """(N, 4, 4) poses of all nodes from those of the chosen ones, (K, 4, 4).
+
+        What a stretch is off between two chosen nodes is shared out among its steps by their covariances, which is
+        where least squares puts it, to first order.
+        """
+        k = np.flatnonzero(self.tied)
+        errors = np.zeros((len(self.nodes), 6))
+        errors[k] = se3.log(se3.inverse(self.T[k]) @ se3.inverse(poses[k - 1]) @ poses[k])
+        pull = np.linalg.solve(self.covariances, errors[..., None])
+        share = (self._parts @ pull[self._owner])[..., 0]
+        moved = np.cumsum(share, axis=0)
+        moved -= (moved - share)[self._first][self._owner]
+        ends = poses.copy()
+        ends[k] = poses[k - 1] @ self.T[k]  # where the odometry alone would put it
+        out = ends[self._owner] @ se3.exp(moved) @ self._T_owner_node
+        out[self.nodes] = poses
+        return out
+
+
+def chain_chi2(graph: GraphData, odometry: Array) -> Array:
+    """(E,) squared distance of each loop from the odometry between its ends, in standard deviations of both together.
+
+    nan where the ends are of two trajectories. `odometry`: (N, 4, 4) of `integrate`.
+    """
+    number = trajectories(graph)[graph.ends]
+    out = np.full(len(graph.ends), np.nan)
+    same = np.flatnonzero(number[:, 0] == number[:, 1])
+    A = se3.adjoint(odometry)
+    summed = np.cumsum(A @ graph.step_covariances @ np.swapaxes(A, -1, -2), axis=0)  # in the map frame: steps add up
+    ends = graph.ends[same]
+    back = se3.adjoint(se3.inverse(odometry[ends[:, 1]]))
+    between = back @ (summed[ends.max(1)] - summed[ends.min(1)]) @ np.swapaxes(back, -1, -2)
+    errors = loop_errors(odometry, ends, graph.T_from_to[same])
+    out[same] = mahalanobis(errors, between + graph.covariances[same])
+    return out
