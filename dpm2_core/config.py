@@ -48,11 +48,7 @@ def load_settings(kind: type[T], path: Path | None = None, overrides: Sequence[s
         key = key.strip()
         if not equals or not key:
             raise UsageError(f"--set {setting}: want KEY=VALUE, such as slam.registration=geometric")
-        try:
-            # YAML 1.1 would take 04 for an octal number; here it is the name of a sequence.
-            value = text.strip() if re.fullmatch(r"\s*0\d+\s*", text) else yaml.safe_load(text)
-        except _NOT_YAML:
-            value = text
+        value = _value(text)
         for part in reversed(key.split(".")):
             value = {part: value}
         _merge(tree, value)
@@ -103,6 +99,14 @@ def _read(path: Path) -> dict[str, Any]:
     if not isinstance(tree, dict):
         raise UsageError(f"{path}: want a mapping of keys, found {type(tree).__name__}")
     return tree
+
+
+def _value(text: str) -> Any:
+    """The value of a setting, YAML; text that is none is a string, and so is 04: no octal number, but a sequence."""
+    try:
+        return text.strip() if re.fullmatch(r"\s*0\d+\s*", text) else yaml.safe_load(text)
+    except _NOT_YAML:
+        return text
 
 
 def _merge(tree: dict[str, Any], more: dict[str, Any]) -> None:

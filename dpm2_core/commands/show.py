@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`dpm2 show`: two scans with their matched descriptors, as the network sees them."""
+"""`dpm2 show`: two scans with their matched descriptors and a picture with attention, as the network sees them."""
 
 from __future__ import annotations
 
@@ -20,20 +20,29 @@ def show(
     frames: Annotated[str, typer.Option(help="Two frames a,b by position from 0; b is registered to a.")],
     out: Annotated[Path, typer.Option(help="PNG to write.")] = Path("matches.png"),
     weights: Annotated[str, typer.Option(help="Name of shipped weights, or a .safetensors file.")] = "small",
+    point: Annotated[
+        int | None, typer.Option(help="Reference point whose attention to the picture of b is shown.")
+    ] = None,
 ) -> None:
-    """Draw two scans from above with their matched descriptors, coloured by confidence, and how they fit."""
+    """Draw two scans from above with their matched descriptors, coloured by confidence, and how they fit.
+
+    With weights that have a camera, also what a reference point reads from the picture.
+    """
+    from dpm2_core.evaluation.attention import image_attention
     from dpm2_core.evaluation.matches import matches_png
     from dpm2_core.slam.neural import load_network
 
     first, second = _two(frames)
-    source = open_source(src, InputSettings(images=False))
-    target, moving = _frame(source, src, first), _frame(source, src, second)
     model = load_network(weights, threads=2)
+    source = open_source(src, InputSettings(images=model.encoder.image is not None))
+    target, moving = _frame(source, src, first), _frame(source, src, second)
+    wanted = point is not None or (model.encoder.image is not None and moving.images)
+    looked = image_attention(model, moving, point) if wanted else None
     of_target, of_source = model.encoder.encode(target), model.encoder.encode(moving)
     found = model.decoder.register(of_source, of_target)
     matched = model.decoder.matches(of_source, of_target)
     title = f"{source.name}, frame {moving.index} to frame {target.index}"
-    matches_png(out, moving.points, target.points, matched, found, title)
+    matches_png(out, moving.points, target.points, matched, found, title, looked)
     Console(stderr=True).print(f"{out}: {title}", soft_wrap=True)
 
 

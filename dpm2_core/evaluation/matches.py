@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dpm2_core.evaluation.attention import ImageAttention, draw_attention
 from dpm2_core.files import atomic_write
 from dpm2_core.frame import Array, Points, Registration
 from dpm2_core.geometry import se3
@@ -22,6 +23,7 @@ def matches_png(
     matched: tuple[Array, Array, Array],
     found: Registration,
     title: str = "",
+    looked: ImageAttention | None = None,
 ) -> None:
     """Two views from above: the scans beside each other with their matches, and one on top of the other as registered.
 
@@ -29,6 +31,7 @@ def matches_png(
         source, target: (N, 3+) points of the two scans, each in its own frame, m.
         matched: positions (K, 3) in the source, (K, 3) in the target, and confidence (K,) 0..1 of each match.
         found: T_target_source.
+        looked: what to draw of the source's picture; None: nothing.
 
     Raises:
         Dpm2Error: the file could not be written.
@@ -37,9 +40,16 @@ def matches_png(
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(18, 7.2), dpi=110, facecolor=_BACKGROUND)
-    beside = figure.add_axes((0.01, 0.02, 0.63, 0.88), facecolor=_BACKGROUND, aspect="equal")
-    above = figure.add_axes((0.66, 0.02, 0.33, 0.88), facecolor=_BACKGROUND, aspect="equal")
+    low = 0.0 if looked is None else 0.43  # the picture's share of the height, below the scans
+    figure = Figure(figsize=(18, 7.2 / (1 - low)), dpi=110, facecolor=_BACKGROUND)
+
+    def place(left: float, width: float) -> tuple[float, float, float, float]:
+        return left, low + 0.02 * (1 - low), width, 0.88 * (1 - low)
+
+    beside = figure.add_axes(place(0.01, 0.63), facecolor=_BACKGROUND, aspect="equal")
+    above = figure.add_axes(place(0.66, 0.33), facecolor=_BACKGROUND, aspect="equal")
+    if looked is not None:
+        draw_attention(figure.add_axes((0.02, 0.01, 0.96, low - 0.04), facecolor=_BACKGROUND), looked)
     at_source, at_target, confidence = matched
     right = np.array([2.1 * _REACH, 0.0])
     for axes, points, shift, colour in (
@@ -71,6 +81,6 @@ def matches_png(
         if found.ok
         else f"not registered: {found.reason}"
     )
-    figure.text(0.02, 0.945, f"{title}: {outcome}", color=_INK, fontsize=13)
+    figure.text(0.02, low + 0.945 * (1 - low), f"{title}: {outcome}", color=_INK, fontsize=13)
     with atomic_write(path, "wb") as file:
         FigureCanvasAgg(figure).print_png(file)

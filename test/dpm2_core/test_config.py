@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from pydantic import Field
 
 from dpm2_core.config import Settings, dump_settings, flat_fields, load_settings
+from dpm2_core.data.source import InputSettings
 from dpm2_core.errors import UsageError
 
 
@@ -185,3 +186,9 @@ def test_flat_fields_name_every_leaf_that_can_be_set() -> None:
 def test_settings_cannot_be_changed() -> None:
     with pytest.raises(ValueError, match="frozen"):
         Outer().count = 4  # type: ignore[misc]
+
+
+def test_a_number_with_leading_zeros_stays_what_was_typed() -> None:
+    """04 is a sequence, which YAML 1.1 would read as an octal number."""
+    assert load_settings(InputSettings, None, ["sequence=04"]).sequence == "04"
+    assert load_settings(InputSettings, None, ["image_time_offset=0.5"]).image_time_offset == 0.5

@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -40,6 +42,26 @@ def test_draws_a_picture(sequence: Path, tmp_path: Path) -> None:
     done = show(sequence, "--frames", "0,1", "--out", str(tmp_path / "m.png"), "--weights", weights)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "m.png").read_bytes()[1:4] == b"PNG"
+
+
+def test_draws_the_picture_with_attention(sequence: Path, tmp_path: Path) -> None:
+    """With weights that have a camera and a drive with pictures, the drawing has a third part below."""
+    folder = tmp_path / "drive"
+    shutil.copytree(sequence, folder)
+    (folder / "calib.txt").write_text("P2: 60 0 63.5 0 0 60 31.5 0 0 0 1 0\nTr: 0 -1 0 0 0 0 -1 -0.1 1 0 0 -0.3\n")
+    (folder / "image_2").mkdir()
+    for number in (0, 1):
+        cv2.imwrite(str(folder / "image_2" / f"{number:06d}.png"), np.full((64, 128, 3), 90, np.uint8))
+    torch.manual_seed(0)
+    save_weights(DeepPointMap2(tiny()), folder / "camera.safetensors", {"images": "true"})
+    sizes = []
+    for name in ("tiny", "camera"):
+        out, weights = tmp_path / f"{name}.png", str(folder / f"{name}.safetensors")
+        done = show(folder, "--frames", "0,1", "--out", str(out), "--weights", weights)
+        assert done.returncode == 0, done.stderr
+        sizes.append(cv2.imread(str(out)).shape)
+    assert sizes[1][0] > 1.5 * sizes[0][0]
+    assert sizes[1][1] == sizes[0][1]
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the network looks: the attention of a reference point to the picture (the paper's Figure 7).
+
+The network keeps no attention weights, since that would cost time and memory in every frame. They are computed again
+here from what the last fusion layer's image attention was given and its own projections.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from dpm2_core.errors import UsageError
+from dpm2_core.frame import Array, Frame
+from dpm2_core.geometry.rays import project
+from dpm2_core.network.attention import Attention
+from dpm2_core.network.encoder import collate_views, to_device
+from dpm2_core.network.model import DeepPointMap2
+from dpm2_core.network.pyramid import build_pyramid, collate, crop
+from dpm2_core.network.spatial import seen_from
+
+_INK, _CHOSEN = "#c9d1d9", "#ff9f1c"
+
+
+@dataclass(frozen=True, eq=False)
+class ImageAttention:
+    """What a frame's descriptors read from its first picture.
+
+    Attributes:
+        pixels: (H, W, 3) uint8, as the network sees it.
+        points: (N, 3) reference points, m. uv: (N, 2) where they are in the picture, pixels. seen: (N,) whether in it.
+        chosen: one of them. heat: (H, W) 0..1, its attention, the mean of all heads, per pixel; 1 is the most.
+    """
+
+    pixels: NDArray[np.uint8]
+    points: Array
+    uv: Array
+    seen: NDArray[np.bool_]
+    chosen: int
+    heat: NDArray[np.float32]
+
+
+@torch.inference_mode()
+def image_attention(model: DeepPointMap2, frame: Frame, point: int | None = None) -> ImageAttention:
+    """Attention of one reference point in the last layer; by default of the one nearest to the middle of the picture.
+
+    Raises:
+        UsageError: weights without a camera or without attention to it, a frame without a picture, no such point, or
+            none in the picture.
+    """
+    encoder = model.encoder
+    attention = None if encoder.fusion is None else encoder.fusion.layers[-1].image
+    if encoder.image is None or not isinstance(attention, Attention):
+        raise UsageError("these weights have no camera branch with attention, so there is none to show")
+    views = collate_views([frame.images[:1]], encoder.settings.image)
+    if views is None:
+        raise UsageError(f"frame {frame.index} has no picture")
+    points = collate([build_pyramid(crop(frame.points, encoder.settings.points), encoder.settings.points)])
+    given: list[Any] = []
+    hook = attention.register_forward_pre_hook(lambda module, arguments: given.append(arguments))
+    device = next(model.parameters()).device
+    try:
+        encoded = encoder(*to_device((points, views), device))
+    finally:
+        hook.remove()
+    views = to_device(views, device)
+    xyz = encoded.tokens.xyz
+    seen = (seen_from(xyz, views, 0) & encoded.tokens.mask)[0].cpu().numpy()
+    uv = _projected(xyz, views)
+    height, width = encoder.settings.image.size
+    if point is None:
+        if not seen.any():
+            raise UsageError(f"no reference point of frame {frame.index} is in its picture")
+        off = np.linalg.norm(uv - [width / 2, height / 2], axis=1)
+        point = int(np.where(seen, off, np.inf).argmin())
+    elif not 0 <= point < len(seen) or not seen[point]:
+        raise UsageError(f"point {point}: want one in the picture: {', '.join(map(str, np.flatnonzero(seen)))}")
+    weights = attention_weights(attention, *given[-1])[0, :, point].mean(0)
+    sizes = [m.features.shape[-2:] for m in encoded.maps]
+    heat = np.zeros((height, width), np.float32)
+    for (h, w), part in zip(sizes, weights.float().cpu().split([h * w for h, w in sizes]), strict=True):
+        # Attention per pixel: that of a coarse map is spread over more of them.
+        grid = part.view(h, w).numpy() * (h * w)
+        heat += cv2.resize(grid, (width, height), interpolation=cv2.INTER_LINEAR)
+    heat /= max(float(heat.max()), 1e-9)
+    pixels = views.pixels[0, 0].permute(1, 2, 0).cpu().numpy()
+    return ImageAttention(pixels, xyz[0].cpu().numpy().astype(np.float64), uv, seen, point, heat)
+
+
+def attention_weights(
+    attention: Attention, x: Tensor, tokens: Tensor, bias: Tensor | None, mask: Tensor | None
+) -> Tensor:
+    """(B, heads, N, T), rows adding up to 1; the arguments are those of `Attention.forward`."""
+
+    def split(values: Tensor) -> Tensor:
+        return values.view(*values.shape[:2], attention.heads, -1).transpose(1, 2)
+
+    scores = torch.zeros((), device=x.device)
+    if attention.query is not None and attention.key is not None:
+        scores = split(attention.query(x)) @ split(attention.key(tokens)).transpose(-1, -2)
+        scores = scores / math.sqrt(x.shape[-1] // attention.heads)
+    if bias is not None:
+        scores = scores + bias
+    if mask is not None:
+        scores = scores.masked_fill(~mask, -1e4)
+    return scores.expand(-1, attention.heads, -1, -1).softmax(-1)
+
+
+def _projected(xyz: Tensor, views: Any) -> Array:
+    """(N, 2) pixels of reference points (1, N, 3) in the first picture."""
+    uv, _ = project(xyz, views.K[:, 0].float(), views.T_lidar_cam[:, 0].float())
+    return uv[0].cpu().numpy().astype(np.float64)
+
+
+def draw_attention(axes: Any, looked: ImageAttention) -> None:
+    """The picture with its reference points, and over it the attention of the chosen one."""
+    grey = looked.pixels.mean(2, keepdims=True) / 255 * 0.7
+    colour = cv2.cvtColor(
+        cv2.applyColorMap((255 * looked.heat).astype(np.uint8), cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB
+    )
+    axes.imshow(grey + (colour / 255 - grey) * (0.75 * looked.heat[..., None]))
+    near = np.linalg.norm(looked.points, axis=1)
+    axes.scatter(*looked.uv[looked.seen].T, c=near[looked.seen], cmap="viridis_r", s=14, linewidths=0)
+    x, y = looked.uv[looked.chosen]
+    axes.plot(x, y, "o", markersize=16, markerfacecolor="none", markeredgecolor=_CHOSEN, markeredgewidth=2)
+    axes.set_title(
+        f"reference points, near ones dark; attention of point {looked.chosen}, {near[looked.chosen]:.1f} m away",
+        color=_INK,
+    )
+    axes.set_axis_off()

@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The attention that is shown is the one that the network used."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+
+from dpm2_core.errors import UsageError
+from dpm2_core.evaluation.attention import attention_weights, image_attention
+from dpm2_core.frame import Frame, Image
+from dpm2_core.network.attention import Attention
+from dpm2_core.network.config import NetworkSettings
+from dpm2_core.network.model import DeepPointMap2
+
+
+@pytest.mark.parametrize("learnable", [True, False])
+def test_weights_give_what_the_module_gives(learnable: bool) -> None:
+    """Recomputed weights times the values, through the output projection, are the output of the module."""
+    torch.manual_seed(0)
+    attention = Attention(16, 4, learnable)
+    x, tokens, bias = torch.randn(2, 5, 16), torch.randn(2, 7, 16), torch.randn(2, 1, 5, 7)
+    mask = torch.ones(2, 1, 1, 7, dtype=torch.bool)
+    mask[..., 3:5] = False
+    weights = attention_weights(attention, x, tokens, bias, mask)
+    assert weights.shape == (2, 4, 5, 7)
+    assert weights[..., 3:5].max() < 1e-6
+    torch.testing.assert_close(weights.sum(-1), torch.ones(2, 4, 5))
+    value = attention.value(tokens).view(2, 7, 4, 4).transpose(1, 2)
+    out = attention.out((weights @ value).transpose(1, 2).reshape(2, 5, 16))
+    torch.testing.assert_close(out, attention(x, tokens, bias, mask))
+
+
+@pytest.fixture
+def frame(street: Callable, picture: Callable) -> Frame:
+    noise = np.random.default_rng(0)
+    points = np.c_[street(noise), np.full(4000, 0.5)].astype(np.float32)
+    return Frame(0, points, images=(picture(noise),))
+
+
+def test_a_point_attends_around_where_it_is_seen(model: DeepPointMap2, frame: Frame) -> None:
+    """Even untrained, by the distance from rays: the picture's brightest place is near the point's projection."""
+    looked = image_attention(model, frame)
+    height, width = model.settings.image.size
+    assert looked.heat.shape == looked.pixels.shape[:2] == (height, width)
+    assert looked.heat.max() == pytest.approx(1)
+    assert looked.heat.min() >= 0
+    distances = []
+    for point in np.flatnonzero(looked.seen):
+        other = image_attention(model, frame, int(point))
+        v, u = np.unravel_index(other.heat.argmax(), other.heat.shape)
+        distances.append(np.hypot(u - other.uv[point, 0], v - other.uv[point, 1]))
+    assert np.median(distances) < 12  # pixels; the maps have strides of 8 and 16, chance would give about 25
+
+
+def test_it_leaves_the_network_as_it_was(model: DeepPointMap2, frame: Frame) -> None:
+    """No hook stays behind, and descriptors are the same as before."""
+    before = model.encoder.encode(frame).features
+    image_attention(model, frame)
+    assert model.encoder.fusion is not None
+    assert not model.encoder.fusion.layers[-1].image._forward_pre_hooks
+    assert np.array_equal(model.encoder.encode(frame).features, before)
+
+
+def test_what_cannot_be_shown_is_said(
+    model: DeepPointMap2, tiny: Callable[..., NetworkSettings], frame: Frame, picture: Callable[..., Image]
+) -> None:
+    """No picture, no such point, no camera."""
+    with pytest.raises(UsageError, match="has no picture"):
+        image_attention(model, Frame(0, frame.points))
+    behind = int(np.flatnonzero(~image_attention(model, frame).seen)[0])
+    with pytest.raises(UsageError, match=f"point {behind}: want one in the picture"):
+        image_attention(model, frame, behind)
+    with pytest.raises(UsageError, match="no camera"):
+        image_attention(DeepPointMap2(tiny(image={"backbone": "none"})), frame)
