@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`dpm2 map optimize` from file to file, and its errors in one line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dpm2_core.cli import main
+from dpm2_core.evaluation.bench.pose_graph import are_right, made_drive
+from dpm2_core.slam.g2o import G2o, read_g2o, write_g2o
+
+
+def status(*arguments: str) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main(["map", "optimize", *arguments])
+    return int(ended.value.code or 0)
+
+
+def test_wrong_loops_are_named_and_left_out(tmp_path: Path) -> None:
+    truth, graph = made_drive(10, count=1500, right=20)
+    right = are_right(truth, graph)
+    assert right.sum() == 20  # the wrong ones are really wrong
+    path, out, told = tmp_path / "in.g2o", tmp_path / "out.g2o", tmp_path / "out.json"
+    write_g2o(path, G2o(graph, np.arange(1500), planar=False))
+    assert status(str(path), "--out", str(out), "--json", str(told)) == 0
+    found = read_g2o(out)
+    assert found.has_poses
+    assert {tuple(e) for e in found.graph.ends.tolist()} == {tuple(e) for e in graph.ends[right].tolist()}
+    record = json.loads(told.read_text())
+    assert (record["kept"], record["rejected"]) == (20, 10)
+    assert [verdict["kept"] for verdict in record["verdicts"]] == right.tolist()
+    assert record["chi2_after"] < 1e-2 * record["chi2_before"]
+
+
+def test_bad_input_is_one_line_and_leaves_no_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out.g2o"
+    (tmp_path / "two.g2o").write_text("EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\nEDGE_SE2 7 8 1 0 0 1 0 0 1 0 1\n")
+    for path, message in ((tmp_path / "none.g2o", "No such file"), (tmp_path / "two.g2o", "no edge connects")):
+        assert status(str(path), "--out", str(out)) == 2
+        error = capsys.readouterr().err
+        assert message in error
+        assert error.count("\n") == 1
+        assert str(path) in error
+    assert not out.exists()
