@@ -13,7 +13,9 @@ from dpm2_core.errors import UsageError
 
 
 def bench(
-    names: Annotated[list[str] | None, typer.Argument(help="geometric, memory, neural; geometric by default.")] = None,
+    names: Annotated[
+        list[str] | None, typer.Argument(help="geometric (default), map, memory, neural, pose-graph, roads.")
+    ] = None,
     source: Annotated[
         list[Path] | None, typer.Option(help="A KITTI sequence or bag with ground truth, instead of the excerpt.")
     ] = None,
@@ -30,7 +32,10 @@ def bench(
     unseen: Annotated[
         Path | None, typer.Option(help="neural: packed drives (`dpm2 train data`) instead of new unseen worlds.")
     ] = None,
-    pairs: Annotated[int, typer.Option(min=1, help="neural: pairs of frames of each kind.")] = 150,
+    pairs: Annotated[int, typer.Option(min=1, help="neural: pairs of frames of each kind.")] = 60,
+    only: Annotated[
+        str | None, typer.Option(help="neural: this part alone, again; else those that neural.json lacks.")
+    ] = None,
 ) -> None:
     """Measure accuracy and speed beside KISS-ICP on the same scans, memory over a long drive, or the network."""
     from dpm2_core.evaluation.bench import BENCHES  # imports the whole SLAM
@@ -39,7 +44,7 @@ def bench(
     names = names or ["geometric"]
     if unknown := [name for name in names if name not in BENCHES]:
         raise UsageError(f"{unknown[0]}: no such benchmark; choose from {', '.join(BENCHES)}")
-    options = Options(source or (), kitti, repetitions, threads, settings or (), weights, unseen, pairs)
+    options = Options(source or (), kitti, repetitions, threads, settings or (), weights, unseen, pairs, only, out)
     for name in names:
         report = BENCHES[name](options)
         path = out / f"{name}.json"

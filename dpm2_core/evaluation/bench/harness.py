@@ -24,7 +24,7 @@ from dpm2_core.data.source import Source, open_source
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.files import atomic_write
 
-_REPOSITORY = Path(__file__).resolve().parents[3]
+REPOSITORY = Path(__file__).resolve().parents[3]
 _PACKAGES = ("numpy", "scipy", "small_gicp", "gtsam", "torch", "kiss-icp")
 
 
@@ -41,6 +41,8 @@ class Options:
         weights: of the network, a name or a path; None: those of the settings.
         unseen: packed drives of worlds that the network has not seen; None makes some.
         pairs: of frames of each kind.
+        only: part of a benchmark that has several; None: all that are not in its file yet.
+        out: folder of NAME.json. cache: folder where simulated drives stay for a later run.
     """
 
     sources: Sequence[Path] = ()
@@ -50,7 +52,10 @@ class Options:
     overrides: Sequence[str] = ()
     weights: str | None = None
     unseen: Path | None = None
-    pairs: int = 150
+    pairs: int = 60
+    only: str | None = None
+    out: Path = Path("benchmarks")
+    cache: Path = Path("out/bench")
 
 
 @dataclass(frozen=True)
@@ -71,7 +76,7 @@ def drives(options: Options) -> Iterator[list[Source]]:
     if options.sources:
         yield [open_source(path) for path in options.sources]
         return
-    kitti = options.kitti or Path(os.environ.get("DPM2_KITTI", _REPOSITORY.parent / "shared" / "kitti"))
+    kitti = options.kitti or Path(os.environ.get("DPM2_KITTI", REPOSITORY.parent / "shared" / "kitti"))
     if not kitti.is_dir():
         raise UsageError(f"{kitti}: no KITTI excerpt; give --kitti, or --source with a drive such as `dpm2 sim` makes")
     with tempfile.TemporaryDirectory(prefix="dpm2_bench_") as folder:
@@ -131,6 +136,15 @@ def write_record(path: Path, name: str, results: dict[str, Any], program: str = 
         file.write(json.dumps(record, indent=1) + "\n")
 
 
+def read_parts(path: Path, weights: dict[str, Any]) -> dict[str, Any]:
+    """Parts of an earlier, unfinished run with the same weights; none if it is of others, damaged or not there."""
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+        return dict(record["parts"]) if record["weights"] == weights else {}
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
+
+
 def git_commit() -> str | None:
     """The commit that was measured, with "+" where files differ from it; None outside a repository."""
     try:
@@ -141,7 +155,7 @@ def git_commit() -> str | None:
 
 
 def _git(*arguments: str) -> str:
-    done = subprocess.run(["git", *arguments], cwd=_REPOSITORY, capture_output=True, text=True, check=True)
+    done = subprocess.run(["git", *arguments], cwd=REPOSITORY, capture_output=True, text=True, check=True)
     return done.stdout.strip()
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
+from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.scan_registration import Prediction, ScanRegistration
 
 SUCCESS_M, SUCCESS_DEG = 0.6, 1.5
@@ -50,12 +51,18 @@ def pairs_of(poses: Array, most: int) -> dict[str, list[tuple[int, int]]]:
 
 
 def by_registration(registration: ScanRegistration) -> PairMethod:
-    """What the odometry uses, with a map of one frame and the identity as prediction."""
+    """What the odometry uses, with a map of one frame and the identity as prediction; a frame is prepared once."""
+    prepared: dict[int, Scan] = {}
+
+    def scan_of(frame: Frame) -> Scan:
+        if frame.index not in prepared:
+            prepared[frame.index] = registration.prepare(frame, np.zeros(6))
+        return prepared[frame.index]
 
     def register(first: Frame, second: Frame) -> Array | None:
         registration.clear()
-        registration.update(registration.prepare(first, np.zeros(6)), np.eye(4))
-        answer = registration.register(registration.prepare(second, np.zeros(6)), Prediction([np.eye(4)], widen=2.0))
+        registration.update(scan_of(first), np.eye(4))
+        answer = registration.register(scan_of(second), Prediction([np.eye(4)], widen=2.0))
         return answer.T_target_source if answer.ok else None
 
     return register
@@ -109,13 +116,11 @@ def summarised(errors: Array) -> dict[str, float | int | None]:
 
 
 def all_pairs(
-    methods: Mapping[str, PairMethod], frames: Sequence[Frame], poses: Array, most: int, advance: Callable[[], None]
+    kinds: Mapping[str, Mapping[str, PairMethod]], frames: Sequence[Frame], poses: Array, most: int
 ) -> dict[str, dict[str, Any]]:
-    """Every kind of pair by every method; `advance` is called after each of them."""
-    out: dict[str, dict[str, Any]] = {}
-    for kind, pairs in pairs_of(poses, most).items():
-        out[kind] = {}
-        for name, method in methods.items():
-            out[kind][name] = summarised(pair_errors(method, frames, poses, pairs))
-            advance()
-    return out
+    """Each kind of pair, at most so many of it, by its methods."""
+    pairs = pairs_of(poses, most)
+    return {
+        kind: {name: summarised(pair_errors(method, frames, poses, pairs[kind])) for name, method in methods.items()}
+        for kind, methods in kinds.items()
+    }

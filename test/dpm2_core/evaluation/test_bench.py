@@ -17,6 +17,7 @@ from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.evaluation.bench.harness import Options, drives, processors
 from dpm2_core.evaluation.bench.memory import levelling, resident_mb
 from dpm2_core.evaluation.bench.pairs import pairs_of, summarised
+from dpm2_core.frame import Image
 from dpm2_core.geometry import se3
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.weights import save_weights
@@ -137,29 +138,54 @@ def test_what_cannot_be_measured_is_refused(drive: Path, tmp_path: Path) -> None
 
 
 def test_the_neural_benchmark_measures_pairs_odometry_and_stages(
-    drive: Path, tmp_path: Path, model: DeepPointMap2, street: Callable[..., np.ndarray], noise: np.random.Generator
+    drive: Path,
+    tmp_path: Path,
+    model: DeepPointMap2,
+    street: Callable[..., np.ndarray],
+    noise: np.random.Generator,
+    picture: Callable[..., Image],
 ) -> None:
     """With random weights: the classical methods beside it are right, and refined falls back on points."""
     save_weights(model, tmp_path / "tiny.safetensors", {"steps": "0", "images": "true"})
     poses = se3.exp(np.outer(np.arange(4.0), [0, 0, 0.1, 3, 0, 0]))
-    samples = [Sample(street(noise), T) for T in poses]
+    samples = [Sample(street(noise), T, (picture(noise),)) for T in poses]
     write_packed(tmp_path / "unseen" / "world", samples, {})
     bench(
         ["neural"], source=[drive], out=tmp_path, repetitions=1, threads=1, pairs=3,
         weights=str(tmp_path / "tiny.safetensors"), unseen=tmp_path / "unseen",
     )  # fmt: skip
-    record = json.loads((tmp_path / "neural.json").read_text())
+    path = tmp_path / "neural.json"
+    record = json.loads(path.read_text())
     assert (record["weights"]["preset"], record["weights"]["steps"]) == ("tiny", "0")
-    assert record["synthetic"]["up to 20 m"]["neural"]["pairs"] > 0
-    ours = record["drives"][drive.name]
-    consecutive = ours["pairs"]["consecutive"]
-    assert set(consecutive) >= {"neural", "refined", "geometric", "small_gicp"}
-    assert consecutive["small_gicp"]["median_m"] < 0.1  # 1 m of motion, walls on both sides
-    assert consecutive["small_gicp"]["success"] == 1
-    assert ours["pairs"]["8 apart"]["neural"]["pairs"] == 0  # six frames
-    assert ours["odometry"]["geometric"]["ape_rmse_m"] < 0.02
-    assert ours["network_stages_ms"]["total"]["median"] > 0
-    assert 0 < ours["descriptor_bytes"] < 70_000
+    parts = record["parts"]
+    assert list(parts) == ["synthetic", "real", "odometry", "corruption", "image", "overlap", "speed"]
+    assert parts["synthetic"]["pairs"]["up to 20 m, any yaw"]["neural"]["pairs"] > 0
+    ours = parts["real"]["drives"][drive.name]
+    assert list(ours["consecutive"]) == ["neural"]
+    assert set(ours["10-20 m"]) >= {"neural", "refined", "geometric", "small_gicp"}
+    assert ours["8 apart"]["neural"]["pairs"] == 0  # six frames
+    assert parts["odometry"]["drives"][drive.name]["geometric"]["ape_rmse_m"] < 0.02
+    assert set(parts["corruption"]["error_ratio"]) == {"LiDAR obstruction 100 %", "camera failure 100 %"}
+    assert {"neural with camera", "neural without camera"} <= set(parts["image"]["pairs"]["tunnel, up to 5 m"])
+    assert 0 <= parts["overlap"]["average_precision"] <= 1
+    speed = parts["speed"]["drives"][drive.name]
+    assert speed["stages_ms"]["total"]["median"] > 0
+    assert 0 < speed["descriptor_bytes"] < 70_000
+    # What is there stays, what is missing is measured, and a part that is asked for is measured again.
+    del record["parts"]["overlap"]
+    record["parts"]["real"]["seconds"] = record["parts"]["speed"]["seconds"] = -1
+    path.write_text(json.dumps(record))
+    again = {"source": [drive], "out": tmp_path, "repetitions": 1, "threads": 1, "pairs": 3,
+             "weights": str(tmp_path / "tiny.safetensors"), "unseen": tmp_path / "unseen"}  # fmt: skip
+    bench(["neural"], **again)
+    parts = json.loads(path.read_text())["parts"]
+    assert "average_precision" in parts["overlap"]
+    assert parts["real"]["seconds"] == -1
+    bench(["neural"], only="speed", **again)
+    parts = json.loads(path.read_text())["parts"]
+    assert parts["speed"]["seconds"] >= 0 > parts["real"]["seconds"]
+    with pytest.raises(UsageError, match="--only taste: no such part; choose from synthetic"):
+        bench(["neural"], only="taste", **again)
 
 
 def test_pairs_are_of_their_kind_and_have_a_true_pose() -> None:

@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tables of `dpm2 bench neural`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rich.box import SIMPLE
+from rich.console import Group, RenderableType
+from rich.table import Table
+
+
+def view(parts: Mapping[str, Any]) -> Group:
+    """Every part that was measured; what could not be is said below its table."""
+    shown: list[RenderableType] = []
+    for name, title in (
+        ("synthetic", "Unseen synthetic worlds"),
+        ("corruption", "Failing sensors"),
+        ("image", "Where the image must matter"),
+    ):
+        if name in parts:
+            shown.append(_pair_table(title, parts[name]["pairs"]))
+            shown += [
+                f"{key}: {text}" for key, text in parts[name].items() if isinstance(text, str) and key != "commit"
+            ]
+            if "error_ratio" in parts[name]:
+                ratios = (f"{key} {ratio:.2f}" for key, ratio in parts[name]["error_ratio"].items())
+                shown.append(f"median error over the clean one: {', '.join(ratios)}")
+    for drive, kinds in parts.get("real", {}).get("drives", {}).items():
+        shown.append(_pair_table(f"{drive}: pairs without a prior", kinds))
+    for drive, methods in parts.get("odometry", {}).get("drives", {}).items():
+        shown.append(_odometry_table(drive, methods))
+    if "overlap" in parts:
+        row = parts["overlap"]
+        shown.append(
+            f"Overlap head: average precision {row['average_precision']:.3f} on {row['pairs']} pairs, "
+            f"{row['positive']} within 20 m, {row['negative_20_40_m']} at 20-40 m."
+        )
+    for drive, row in parts.get("speed", {}).get("drives", {}).items():
+        shown.append(_stage_table(drive, row))
+        shown.append(f"Descriptors of a frame: {row['descriptor_bytes']} bytes.")
+        if "with the camera" in row:
+            shown.append(f"with the camera: {row['with the camera']}")
+    return Group(*shown)
+
+
+def _new_table(title: str, words: Sequence[str], figures: Sequence[str]) -> Table:
+    table = Table(title=title, title_justify="left", box=SIMPLE)
+    for column in words:
+        table.add_column(column, no_wrap=True)
+    for column in figures:
+        table.add_column(column, justify="right", no_wrap=True)
+    return table
+
+
+def _pair_table(title: str, kinds: Mapping[str, Any]) -> Table:
+    figures = ("pairs", "median m", "deg", "success %")
+    table = _new_table(f"{title}. Success: 0.6 m, 1.5 deg.", ("kind", "method"), figures)
+    for kind, methods in kinds.items():
+        for method, row in methods.items():
+            values = (("median_m", 1, 3), ("median_deg", 1, 3), ("success", 100, 1))
+            shown = ["-" if row[key] is None else f"{scale * row[key]:.{digits}f}" for key, scale, digits in values]
+            table.add_row(kind, method, str(row["pairs"]), *shown)
+        table.add_section()
+    return table
+
+
+def _odometry_table(drive: str, methods: Mapping[str, Any]) -> Table:
+    figures = ("RPE m", "deg", "APE m", "drift %", "failed", "ms", "p95", "ratio")
+    table = _new_table(f"{drive}: odometry. Ratio: of median times to KISS-ICP's.", ("method",), figures)
+    for method, row in methods.items():
+        keys = ("rpe_trans_m", "rpe_rot_deg", "ape_rmse_m", "final_drift_percent")
+        errors = ["-" if row[key] is None else f"{row[key]:.3f}" for key in keys]
+        ms = row["frame_ms"]
+        times = [f"{ms['median']:.0f}", f"{ms['p95']:.0f}", f"{ms.get('ratio', float('nan')):.2f}"]
+        table.add_row(method, *errors, f"{row['failed_frames']:.0f}", *times)
+    return table
+
+
+def _stage_table(drive: str, row: Mapping[str, Any]) -> Table:
+    ratio = f" Ratio of medians to KISS-ICP's: {row['ratio']:.2f}." if "ratio" in row else ""
+    table = _new_table(f"{drive}: encode and register, ms a frame.{ratio}", ("stage",), ("median", "p95"))
+    extra = {name: row[name] for name in ("without_camera_ms", "kiss-icp") if name in row}
+    for stage, ms in {**row["stages_ms"], **extra}.items():
+        table.add_row(stage, f"{ms['median']:.1f}", f"{ms['p95']:.1f}")
+    return table
