@@ -17,9 +17,17 @@ def bench_neural(options: Options) -> Report:
     return neural.bench_neural(options)
 
 
+def bench_pose_graph(options: Options) -> Report:
+    """See `pose_graph.bench_pose_graph`; gtsam is imported only for it."""
+    from dpm2_core.evaluation.bench import pose_graph
+
+    return pose_graph.bench_pose_graph(options)
+
+
 BENCHES: dict[str, Callable[[Options], Report]] = {
     "geometric": bench_geometric,
     "memory": bench_memory,
     "neural": bench_neural,
+    "pose-graph": bench_pose_graph,
 }
 """By the name that `dpm2 bench NAME` and `benchmarks/NAME.json` share."""
