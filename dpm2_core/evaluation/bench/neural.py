@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from hashlib import sha256
 from itertools import pairwise
 from time import perf_counter
 from typing import Any
@@ -89,7 +90,7 @@ def _weights(name: str) -> dict[str, Any]:
     path = weights_path(name)
     about = read_metadata(path)
     about.pop("network", None)
-    return {"name": name, "bytes": path.stat().st_size, **about}
+    return {"name": name, "bytes": path.stat().st_size, "sha256": sha256(path.read_bytes()).hexdigest(), **about}
 
 
 def _of_drives(one: Callable[[Source, list[Frame], DeepPointMap2, Options], Any]) -> Part:
