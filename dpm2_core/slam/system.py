@@ -22,6 +22,7 @@ from dpm2_core.slam.pose_graph import PoseGraph, PoseGraphSettings
 from dpm2_core.slam.preprocess import Preprocessor, PreprocessSettings
 from dpm2_core.slam.refined import RefinedScanRegistration
 from dpm2_core.slam.registration import GeometricRegistration, GeometricSettings
+from dpm2_core.slam.relocalise import RelocaliseSettings
 from dpm2_core.slam.scan_registration import GeometricScanRegistration, ScanRegistration
 
 
@@ -39,6 +40,7 @@ class SlamSettings(Settings):
     odometry: OdometrySettings = OdometrySettings()
     keyframes: KeyframeSettings = KeyframeSettings()
     loops: LoopSettings = LoopSettings()
+    relocalise: RelocaliseSettings = RelocaliseSettings()
     pose_graph: PoseGraphSettings = PoseGraphSettings()
     map: MapSettings = MapSettings()
 

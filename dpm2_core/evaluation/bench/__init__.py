@@ -10,11 +10,32 @@ from dpm2_core.evaluation.bench.harness import Options, Report
 from dpm2_core.evaluation.bench.memory import bench_memory
 
 
+def bench_map(options: Options) -> Report:
+    """See `map.bench_map`; the simulator is imported only for it."""
+    from dpm2_core.evaluation.bench import map
+
+    return map.bench_map(options)
+
+
 def bench_neural(options: Options) -> Report:
     """See `neural.bench_neural`; torch is imported only for it."""
     from dpm2_core.evaluation.bench import neural
 
     return neural.bench_neural(options)
+
+
+def bench_relocalise(options: Options) -> Report:
+    """See `relocalise.bench_relocalise`."""
+    from dpm2_core.evaluation.bench import relocalise
+
+    return relocalise.bench_relocalise(options)
+
+
+def bench_roads(options: Options) -> Report:
+    """See `roads.bench_roads`; the simulator and torch are imported only for it."""
+    from dpm2_core.evaluation.bench import roads
+
+    return roads.bench_roads(options)
 
 
 def bench_pose_graph(options: Options) -> Report:
@@ -26,8 +47,11 @@ def bench_pose_graph(options: Options) -> Report:
 
 BENCHES: dict[str, Callable[[Options], Report]] = {
     "geometric": bench_geometric,
+    "map": bench_map,
     "memory": bench_memory,
     "neural": bench_neural,
     "pose-graph": bench_pose_graph,
+    "relocalise": bench_relocalise,
+    "roads": bench_roads,
 }
 """By the name that `dpm2 bench NAME` and `benchmarks/NAME.json` share."""

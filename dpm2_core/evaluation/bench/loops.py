@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Loops against the truth: how many were wrong, and which revisits were found."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from dpm2_core.frame import Array, LoopClosure
+from dpm2_core.geometry import se3
+
+WRONG_M, WRONG_DEG = 5.0, 5.0
+"""A loop that is off by more than either is wrong."""
+NEAR, GAP = 10.0, 50.0
+"""A revisit: a keyframe so near to an earlier one, m, with at least so much path between them, m."""
+
+
+def judge_loops(closures: Sequence[LoopClosure], truth: Array) -> dict[str, Any]:
+    """Counts of loops and revisits.
+
+    Args:
+        closures: all that were tried; ids are positions in `truth`.
+        truth: (N, 4, 4) true poses of the keyframes.
+
+    Returns:
+        accepted and wrong loops, the median error of the right ones, and for revisits in the same direction (within
+        45 deg), in reverse (beyond 135 deg) and across how many there were and for how many a right loop was accepted.
+        A keyframe counts as a revisit in the same direction if any earlier one near it looks there, and so on.
+    """
+    found: set[int] = set()
+    errors, wrong, refusals = [], 0, Counter[str]()
+    for closure in closures:
+        r = closure.registration
+        true = se3.inverse(truth[closure.from_id]) @ truth[closure.to_id]
+        off = se3.inverse(true) @ r.T_target_source
+        metres, degrees = float(np.linalg.norm(off[:3, 3])), float(np.degrees(se3.angle(off)))
+        if not r.ok:
+            refusals[" ".join(word for word in r.reason.split() if not any(c.isdigit() for c in word))] += 1
+        elif metres > WRONG_M or degrees > WRONG_DEG:
+            wrong += 1
+        else:
+            errors.append((metres, degrees))
+            found.add(closure.to_id)
+    result: dict[str, Any] = {
+        "tried": len(closures),
+        "accepted": len(errors) + wrong,
+        "wrong": wrong,
+        "error_m": _quantiles([e[0] for e in errors]),
+        "error_deg": _quantiles([e[1] for e in errors]),
+        "refusals": dict(refusals.most_common()),
+    }
+    for kind, nodes in revisits(truth).items():
+        result[kind] = {"revisits": len(nodes), "found": len(nodes & found)}
+    return result
+
+
+def revisits(truth: Array) -> dict[str, set[int]]:
+    """The keyframes that come back to an earlier place, by their heading there; (N, 4, 4) true poses."""
+    positions = truth[:, :3, 3]
+    path = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))])
+    heading = np.arctan2(truth[:, 1, 0], truth[:, 0, 0])
+    kinds: dict[str, set[int]] = {"same": set(), "reverse": set(), "cross": set()}
+    for node in range(len(truth)):
+        near = np.linalg.norm(positions[:node] - positions[node], axis=1) < NEAR
+        earlier = np.flatnonzero(near & (path[node] - path[:node] > GAP))
+        turned = np.degrees(np.abs(np.angle(np.exp(1j * (heading[earlier] - heading[node])))))
+        if (turned < 45).any():
+            kinds["same"].add(node)
+        elif (turned > 135).any():
+            kinds["reverse"].add(node)
+        elif len(earlier):
+            kinds["cross"].add(node)
+    return kinds
+
+
+def _quantiles(values: Sequence[float]) -> dict[str, float] | None:
+    if not values:
+        return None
+    return {"median": round(float(np.median(values)), 4), "max": round(float(np.max(values)), 4)}

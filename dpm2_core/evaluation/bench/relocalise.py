@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Relocalisation in a saved map: random places, headings and offsets, other traffic than when the map was made."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from rich.console import Group
+from rich.progress import Progress
+
+from dpm2_core.config import load_settings
+from dpm2_core.evaluation.bench.harness import Options, Report, processors
+from dpm2_core.evaluation.bench.roads import open_road, road_files
+from dpm2_core.frame import Array, Frame, Keyframe, Points, Registration
+from dpm2_core.geometry import se3
+from dpm2_core.sim.lidar import Lidar
+from dpm2_core.sim.source import SimulatedDrive
+from dpm2_core.slam.map_data import load_map
+from dpm2_core.slam.map_store import MapStore
+from dpm2_core.slam.neural import load_network
+from dpm2_core.slam.preprocess import Preprocessor
+from dpm2_core.slam.relocalise import Relocaliser, thinned
+from dpm2_core.slam.system import Config, SlamSettings, make_mapper
+
+RIGHT_M, RIGHT_DEG = 0.3, 1.0
+"""An answer no farther off is right."""
+LATERAL = (-1.2, 3.0)
+"""m to the left of the drive: as far as cars at the kerb leave room, and into the other lane."""
+APART = 5000.0
+"""Between the roads in the map, m: the one map of all of them."""
+_EDGE = np.diag(np.repeat([np.radians(0.15), 0.05], 3) ** 2)
+
+
+@dataclass(frozen=True)
+class Road:
+    """A road in the map: its drive, and T_map_world (4, 4)."""
+
+    drive: SimulatedDrive
+    T_map_world: Array
+
+
+def bench_relocalise(options: Options) -> Report:
+    """Survey the roads at a keyframe each 5 m, save the map, load it, and look for `pairs` random scans in it.
+
+    Raises:
+        UsageError: there are no pose files.
+    """
+    settings = load_settings(Config, None, [f"slam.threads={options.threads}", *options.overrides]).slam
+    with Progress(transient=True) as progress, tempfile.TemporaryDirectory() as folder, processors(options.threads):
+        file = Path(folder) / "map.dpm2"
+        roads = survey(options, settings, file, progress)
+        with MapStore.open(file) as store:
+            data = load_map(store)
+            network = load_network(settings.neural.weights, settings.threads, settings.neural.preset)
+            relocaliser = Relocaliser(
+                settings.relocalise, settings.geometric, network, data.keyframes, data.clouds, data.poses,
+                settings.threads,
+            )  # fmt: skip
+            task = progress.add_task("relocalise", total=options.pairs)
+            rows = []
+            for cloud, truth in visits(roads, settings, options.pairs):
+                started = perf_counter()
+                found = relocaliser.find(cloud)
+                rows.append(_row(found, truth, perf_counter() - started))
+                progress.advance(task)
+            results = {"keyframes": len(data), "lateral_m": LATERAL, **judged(rows)}
+    return Report(results, Group(*(f"{name}: {value}" for name, value in results.items())))
+
+
+def survey(options: Options, settings: SlamSettings, file: Path, progress: Progress) -> list[Road]:
+    """Write the map of all roads, poses as they truly are: relocalisation alone is judged."""
+    settings = settings.model_copy(update={"loops": settings.loops.model_copy(update={"gap": np.inf})})
+    roads: list[Road] = []
+    with MapStore.create(file) as store:
+        store.begin_session()
+        mapper = make_mapper(settings, store)
+        for path in road_files(options):
+            drive = open_road(path)
+            road = Road(drive, se3.make(np.eye(3), np.array([0, APART * len(roads), 0])))
+            roads.append(road)
+            frames = spaced(drive, 5.0)
+            task = progress.add_task(f"map of {drive.name}", total=len(frames))
+            for i in frames:
+                cloud = thinned(_measured(drive.frame(i), settings), settings.keyframes.voxel, settings.keyframes.range)
+                edge = Registration(np.eye(4), _EDGE, 1.0, 0.1, "survey") if mapper.keyframes else None
+                T = road.T_map_world @ drive.poses[i]
+                mapper.add(Keyframe(len(mapper.keyframes), i, i, T, cloud, edge))
+                progress.advance(task)
+        mapper.finish()
+    return roads
+
+
+def visits(roads: list[Road], settings: SlamSettings, count: int) -> Iterator[tuple[Points, Array]]:
+    """Clouds of random visits, and T_map_lidar (4, 4) where they truly were taken."""
+    rng, lidar = np.random.default_rng(0), Lidar()
+    lengths = np.array([road.drive.world.road.drive.length for road in roads])
+    for _ in range(count):
+        road = roads[int(rng.choice(len(roads), p=lengths / lengths.sum()))]
+        world = road.drive.world
+        s = rng.uniform(5, world.road.drive.length - 5)
+        T = world.pose_at(s, rng.uniform(*LATERAL), rng.uniform(-np.pi, np.pi))
+        scan = lidar.scan(world, T, rng.uniform(0, world.road.times[-1]), rng)
+        points = _measured(Frame(0, scan.points), settings)
+        yield thinned(points, settings.keyframes.voxel, settings.keyframes.range), road.T_map_world @ T
+
+
+def spaced(drive: SimulatedDrive, metres: float) -> list[int]:
+    """Frames of a drive that are so far apart along it."""
+    driven = drive.world.road.distance(drive.times)
+    return sorted({int(np.searchsorted(driven, s)) for s in np.arange(0, driven[-1], metres)})
+
+
+def judged(rows: list[tuple[bool, float, float, float]]) -> dict[str, Any]:
+    """Figures of answers: given or not, m and degrees off, seconds."""
+    ok, metres, degrees, seconds = (np.array(column) for column in zip(*rows, strict=True))
+    right = ok & (metres <= RIGHT_M) & (degrees <= RIGHT_DEG)
+    given = metres[ok.astype(bool)]
+    return {
+        "visits": len(rows),
+        "right": round(float(right.mean()), 4),
+        "no_answer": int((~ok.astype(bool)).sum()),
+        "wrong": int((ok & ~right).sum()),
+        "median_error_m": round(float(np.median(given)), 4) if len(given) else None,
+        "seconds": {f"p{q}": round(float(np.percentile(seconds, q)), 3) for q in (50, 95)},
+    }
+
+
+def _row(found: Registration, truth: Array, seconds: float) -> tuple[bool, float, float, float]:
+    off = se3.inverse(found.T_target_source) @ truth
+    return found.ok, float(np.linalg.norm(off[:3, 3])), float(np.degrees(se3.angle(off))), seconds
+
+
+def _measured(frame: Frame, settings: SlamSettings) -> Points:
+    return Preprocessor(settings.preprocess).measured(frame, np.zeros(6))

@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""SLAM on real roads: the synthetic city laid along trajectories of KITTI, with traffic, at full length."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from rich.box import SIMPLE
+from rich.console import Group
+from rich.progress import Progress
+from rich.table import Table
+
+from dpm2_core.config import load_settings
+from dpm2_core.errors import UsageError
+from dpm2_core.evaluation.bench.harness import REPOSITORY, Options, Report
+from dpm2_core.evaluation.bench.loops import judge_loops
+from dpm2_core.evaluation.metrics import evaluate
+from dpm2_core.sim.config import PresetName
+from dpm2_core.sim.source import SimulatedDrive
+from dpm2_core.slam.output import TrajectoryRecorder
+from dpm2_core.slam.system import Config, SlamSettings, SlamSystem
+
+ROADS: dict[str, PresetName] = {"00": "suburb", "05": "suburb", "06": "city", "07": "city", "09": "rural"}
+"""Sequences, and what kind of place stands along them."""
+FIRST_SEED = 800_000
+"""Worlds that no training has seen: the number of the sequence is added."""
+_ERRORS = ("t_err_percent", "r_err_deg_per_100m", "ape_rmse_m", "final_drift_percent")
+
+
+def bench_roads(options: Options) -> Report:
+    """Odometry alone and SLAM on each road, and all loops that were tried.
+
+    Raises:
+        UsageError: there are no pose files.
+    """
+    settings = load_settings(Config, None, [f"slam.threads={options.threads}", *options.overrides]).slam
+    roads: dict[str, Any] = {}
+    with Progress(transient=True) as progress:
+        for path in road_files(options):
+            roads[path.stem] = drive(path, settings, progress)
+            progress.console.print(f"{path.stem}: {roads[path.stem]}", soft_wrap=True)
+    results = {"worlds": {"presets": ROADS, "first_seed": FIRST_SEED}, "roads": roads, "summary": _summary(roads)}
+    return Report(results, Group(_table(roads), str(results["summary"])))
+
+
+def open_road(path: Path) -> SimulatedDrive:
+    """The drive along a file of poses, in the world that belongs to it."""
+    number = int(path.stem) if path.stem.isdigit() else 99
+    return SimulatedDrive(str(path), ROADS.get(path.stem, "suburb"), FIRST_SEED + number, name=path.stem)
+
+
+def drive(path: Path, settings: SlamSettings, progress: Progress) -> dict[str, Any]:
+    """One road: metrics of odometry alone and of the SLAM, and its loops."""
+    source = open_road(path)
+    system, recorder = SlamSystem(settings), TrajectoryRecorder()
+    task = progress.add_task(path.stem, total=len(source))
+    failed, odometry_s, map_s = 0, [], []
+    started = perf_counter()
+    for frame in source.frames():
+        tracked = system.process(frame)
+        recorder.add(tracked)
+        failed += not tracked.registration.ok
+        odometry_s.append(sum(tracked.seconds.values()) - tracked.seconds["map"])
+        if tracked.keyframe is not None:
+            map_s.append(tracked.seconds["map"])
+        progress.advance(task)
+    mapper = system.mapper
+    keyframes = np.array([k.index for k in mapper.keyframes])
+    alone = evaluate(source.poses, recorder.poses(np.array([k.T_odom_kf for k in mapper.keyframes])))
+    slam = evaluate(source.poses, recorder.poses(mapper.poses), failed_frames=failed)
+    return {
+        "frames": len(source),
+        "path_length_m": slam.path_length_m,
+        "failed_frames": failed,
+        "keyframes": len(keyframes),
+        "odometry": {name: getattr(alone, name) for name in _ERRORS},
+        "slam": {name: getattr(slam, name) for name in _ERRORS},
+        "loops": judge_loops(mapper.closures, source.poses[keyframes]),
+        "odometry_ms": _quantiles(odometry_s),
+        "keyframe_ms": _quantiles(map_s),
+        "wall_s": round(perf_counter() - started, 1),
+    }
+
+
+def road_files(options: Options) -> Sequence[Path]:
+    """The pose files to drive along: those given, or `ROADS` of the KITTI excerpt.
+
+    Raises:
+        UsageError: one is missing.
+    """
+    if options.sources:
+        return options.sources
+    kitti = options.kitti or Path(os.environ.get("DPM2_KITTI", REPOSITORY.parent / "shared" / "kitti"))
+    found = [kitti / "gt_poses" / f"{name}.txt" for name in ROADS]
+    if missing := [path for path in found if not path.is_file()]:
+        raise UsageError(f"{missing[0]}: no such pose file; give --kitti, or --source with files of KITTI poses")
+    return found
+
+
+def _summary(roads: dict[str, Any]) -> dict[str, Any]:
+    """Loops of all roads together."""
+    total: dict[str, Any] = {"accepted": 0, "wrong": 0}
+    for name in ("accepted", "wrong"):
+        total[name] = sum(road["loops"][name] for road in roads.values())
+    for kind in ("same", "reverse", "cross"):
+        there = sum(road["loops"][kind]["revisits"] for road in roads.values())
+        found = sum(road["loops"][kind]["found"] for road in roads.values())
+        total[kind] = {"revisits": there, "found": found, "recall": round(found / there, 3) if there else None}
+    return total
+
+
+def _quantiles(seconds: Sequence[float]) -> dict[str, float]:
+    median, p95 = np.percentile(1e3 * np.array(seconds), [50, 95])
+    return {"median": round(float(median), 1), "p95": round(float(p95), 1)}
+
+
+def _table(roads: dict[str, Any]) -> Table:
+    table = Table(title="Odometry alone -> SLAM; KITTI metric, APE after alignment", title_justify="left", box=SIMPLE)
+    for column in ("road", "t_err %", "r_err deg/100 m", "APE m", "loops", "wrong", "same", "reverse", "cross"):
+        table.add_column(column, justify="right", no_wrap=True)
+    for name, road in roads.items():
+        errors = [f"{road['odometry'][e]:.3f} -> {road['slam'][e]:.3f}" for e in _ERRORS[:3]]
+        loops = road["loops"]
+        recalls = [f"{loops[kind]['found']}/{loops[kind]['revisits']}" for kind in ("same", "reverse", "cross")]
+        table.add_row(name, *errors, str(loops["accepted"]), str(loops["wrong"]), *recalls)
+    return table
