@@ -19,7 +19,6 @@ from dpm2_core.slam.map_store import Change, MapStore
 from dpm2_core.slam.pose_graph import PoseGraph
 
 NO_POINTS: Points = np.zeros((0, 4), np.float32)
-_ANYWHERE = np.diag([1e2] * 3 + [1e4] * 3) ** 2  # rad, m: an edge that says nothing
 Thumbnail = Callable[[int], bytes | None]
 
 
@@ -188,12 +187,9 @@ def trajectory(data: MapData) -> tuple[list[int], Array]:
 def restore(graph: PoseGraph, data: MapData) -> None:
     """Fill an empty pose graph with the nodes and constraints of a map."""
     chain = {edge.to_node: edge for edge in data.constraints if edge.kind == "odometry" and _follows(edge)}
-    tied = {end for edge in data.constraints for end in (edge.from_node, edge.to_node)}
     for node, T_map_kf in enumerate(data.poses):
         if (edge := chain.get(node)) is not None:
             graph.add_node(T_map_kf, edge.T_from_to, edge.covariance)
-        elif node and node in tied:  # where a session begins that only loops tie to the others
-            graph.add_node(T_map_kf, se3.inverse(data.poses[node - 1]) @ T_map_kf, _ANYWHERE)
         else:
             graph.add_node(T_map_kf, None, None)
     for edge in data.constraints:

@@ -68,7 +68,10 @@ class MapWriter:
         self._keyframes = self._keyframes[len(keyframes) :]
         self._edges = [edge for edge in self._edges if max(edge.from_node, edge.to_node) >= ends]
         self._moving -= masks.keys()
-        self._written = np.array(poses[:ends] if not last else poses)
+        written = np.array(poses[:ends] if not last else poses)
+        still = [node for node in range(min(len(self._written), len(written))) if node not in change.poses]
+        written[still] = self._written[still]  # small moves add up until they are worth writing
+        self._written = written
 
     def _moved(self, poses: Array) -> dict[int, Array]:
         """Poses that the file does not have, by node."""

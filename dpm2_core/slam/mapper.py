@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from dpm2_core.config import Settings
+from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Array, Frame, Keyframe, LoopClosure, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.cloud_codec import pack_cloud
@@ -111,20 +112,23 @@ class Mapper:
         self.keyframes.append(keyframe)
         closures, loops = self._close_loops(node)
         again = edges if node == self.session_start else []  # the frame with which the session before ended
-        loan = lender(node, [*again, *loops], self._clouds.loan, self._settings.redundancy)
+        loan = lender(node, [*again, *self._kept(loops)], self._clouds.loan, self._settings.redundancy)
         if loan is not None:
             self._clouds.borrow(node, loan)
             self.keyframes[node] = borrowing(keyframe, self.keyframes, loan)
-        self._mark_moving(self._moving.add(node, cloud, self.poses))
+        poses = self.poses
+        self._mark_moving(self._moving.add(node, cloud, poses))
         if self._writer is not None:
             self._writer.add(node, self.keyframes[node], thumbnail)
             for edge in (*edges, *loops):
                 self._writer.add_edge(edge)
-            self._writer.sync(self.poses)
+            self._writer.sync(poses)
         return closures
 
     def finish(self) -> None:
-        """At the end of a drive: judge the last clouds, bring the map file up to date."""
+        """At the end of a drive: wait for the solver, judge the last clouds, bring the map file up to date."""
+        self._optimise(changed=False, wait=True)
+        self._graph.close()
         self._mark_moving(self._moving.finish(self.poses))
         if self._writer is not None:
             self._writer.sync(self.poses)
@@ -177,10 +181,25 @@ class Mapper:
         for loop in accepted:
             found = loop.registration
             self._graph.add_loop(loop.from_node, loop.to_node, found.T_target_source, found.covariance)
-        if accepted:
-            self._graph.optimise()
-            self.T_map_odom = se3.orthonormalised(self.poses[-1] @ se3.inverse(self.keyframes[node].T_odom_kf))
+        self._optimise(bool(accepted))
         return closures, [_loop_edge(loop) for loop in tried]
+
+    def _optimise(self, changed: bool, wait: bool = False) -> None:
+        """Solve the graph if it has `changed`, take in what another process has solved; `wait` for that."""
+        moved = self._graph.collect(wait)
+        if changed:
+            try:
+                self._graph.optimise()
+                moved = True
+            except Dpm2Error as error:  # the drive goes on, with the poses as they were
+                self._graph.problem = str(error)
+        if moved:
+            self.T_map_odom = se3.orthonormalised(self.poses[-1] @ se3.inverse(self.keyframes[-1].T_odom_kf))
+
+    def _kept(self, loops: Sequence[Edge]) -> list[Edge]:
+        """Those that the graph believes, too: on another's word no cloud is given up."""
+        doubted = {(told.from_node, told.to_node) for told in self._graph.verdicts if not told.kept}
+        return [edge for edge in loops if (edge.from_node, edge.to_node) not in doubted]
 
     def _mark_moving(self, judged: Iterable[tuple[int, NDArray[np.bool_]]]) -> None:
         for node, moving in judged:
