@@ -34,8 +34,7 @@ def recovered(path: Path) -> MapData:
     assert path.read_bytes() == before
     assert check_map(out).problems == []
     with MapStore.open(out) as store:
-        data = load_map(store)
-        return data
+        return load_map(store)
 
 
 def test_a_sound_map_has_no_problems(map_file: Path, drive: list[Keyframe]) -> None:
