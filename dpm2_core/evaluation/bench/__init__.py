@@ -10,6 +10,13 @@ from dpm2_core.evaluation.bench.harness import Options, Report
 from dpm2_core.evaluation.bench.memory import bench_memory
 
 
+def bench_loop_cost(options: Options) -> Report:
+    """See `loop_cost.bench_loop_cost`."""
+    from dpm2_core.evaluation.bench import loop_cost
+
+    return loop_cost.bench_loop_cost(options)
+
+
 def bench_map(options: Options) -> Report:
     """See `map.bench_map`; the simulator is imported only for it."""
     from dpm2_core.evaluation.bench import map
@@ -47,6 +54,7 @@ def bench_pose_graph(options: Options) -> Report:
 
 BENCHES: dict[str, Callable[[Options], Report]] = {
     "geometric": bench_geometric,
+    "loop-cost": bench_loop_cost,
     "map": bench_map,
     "memory": bench_memory,
     "neural": bench_neural,
