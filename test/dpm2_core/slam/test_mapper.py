@@ -20,6 +20,8 @@ from dpm2_core.slam.output import TrajectoryRecorder, save_map
 from dpm2_core.slam.pose_graph import PoseGraph, PoseGraphSettings
 from dpm2_core.slam.system import SlamSettings, make_mapper
 
+# Loops by descriptors have tests of their own; here the pose leads to the candidates, which is faster.
+BY_POSE = SlamSettings.model_validate({"loops": {"descriptors": False}})
 SIGMA = np.diag([1e-3, 1e-3, 1e-3, 0.02, 0.02, 0.02]) ** 2
 
 
@@ -110,7 +112,7 @@ def lap() -> tuple[list[Keyframe], Array]:
 
 def test_a_lap_is_closed(lap: tuple[list[Keyframe], Array]) -> None:
     keyframes, truth = lap
-    mapper = make_mapper(SlamSettings())
+    mapper = make_mapper(BY_POSE)
     for keyframe in keyframes:
         mapper.add(keyframe)
     open_ended = make_mapper(SlamSettings.model_validate({"loops": {"enabled": False}}))
@@ -133,7 +135,7 @@ def test_a_lap_is_closed(lap: tuple[list[Keyframe], Array]) -> None:
 def test_look_alikes_are_refused_with_a_reason(lap: tuple[list[Keyframe], Array]) -> None:
     """The odometry claims to be back at the start, but the points come from elsewhere."""
     keyframes, _ = lap
-    mapper = make_mapper(SlamSettings())
+    mapper = make_mapper(BY_POSE)
     for keyframe in keyframes[:-4]:
         mapper.add(keyframe)
     elsewhere = keyframes[len(keyframes) // 2].cloud
@@ -144,7 +146,7 @@ def test_look_alikes_are_refused_with_a_reason(lap: tuple[list[Keyframe], Array]
 
 
 def test_map_is_one_point_a_voxel_in_the_map_frame(lap: tuple[list[Keyframe], Array]) -> None:
-    mapper = make_mapper(SlamSettings())
+    mapper = make_mapper(BY_POSE)
     assert mapper.cloud().shape == (0, 4)
     for keyframe in lap[0][:3]:
         mapper.add(keyframe)
@@ -181,7 +183,7 @@ def test_no_keyframe_no_correction() -> None:
 def test_saved_map_holds_all_of_it(tmp_path: Path, lap: tuple[list[Keyframe], Array]) -> None:
     from dpm2_core.data.trajectory import read_trajectory
 
-    mapper = make_mapper(SlamSettings())
+    mapper = make_mapper(BY_POSE)
     for keyframe in lap[0][:4]:
         mapper.add(keyframe)
     save_map(mapper, tmp_path / "map")
