@@ -23,8 +23,8 @@ from dpm2_core.data.trajectory import write_kitti, write_tum
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
-from dpm2_core.slam.map_data import MapData, load_map, map_cloud, restore, save_as, trajectory
-from dpm2_core.slam.map_store import MapStore
+from dpm2_core.slam.map.data import MapData, load_map, map_cloud, restore, save_as, trajectory
+from dpm2_core.slam.map.store import MapStore
 
 app = typer.Typer(help="Map files: info, export, merge, prune, check; pose graphs: optimize.", no_args_is_help=True)
 app.command()(optimize)
@@ -99,9 +99,9 @@ def merge(
     settings: Overrides = None,
 ) -> None:
     """Join maps, by known transforms or by the places that they share."""
-    from dpm2_core.slam.map_merge import align as aligned
-    from dpm2_core.slam.map_merge import loops_by, merge_maps, optimised
-    from dpm2_core.slam.pose_graph import PoseGraph
+    from dpm2_core.slam.graph.pose_graph import PoseGraph
+    from dpm2_core.slam.map.merge import align as aligned
+    from dpm2_core.slam.map.merge import loops_by, merge_maps, optimised
     from dpm2_core.slam.system import Config, make_loops
 
     given = [parse_transform(text) for text in transform or ()]
@@ -129,8 +129,8 @@ def prune(
     angle: Annotated[float, typer.Option(min=0, max=180, help="Between their headings, degrees.")] = 30.0,
 ) -> None:
     """Take out the keyframes that revisits made redundant; what they constrain and where they were stays."""
-    from dpm2_core.slam.map_prune import prune as pruned
-    from dpm2_core.slam.map_prune import redundant_nodes
+    from dpm2_core.slam.map.prune import prune as pruned
+    from dpm2_core.slam.map.prune import redundant_nodes
 
     with MapStore.open(path) as store:
         data = load_map(store)
@@ -145,7 +145,7 @@ def check(
     recover: Annotated[Path | None, typer.Option(help="Write what is good to this new map file.")] = None,
 ) -> None:
     """Look for damage: database, checksum of every row, edges that lead nowhere, poses that are none."""
-    from dpm2_core.slam.map_check import check_map
+    from dpm2_core.slam.map.check import check_map
 
     found = check_map(path, recover)
     console = Console(soft_wrap=True, highlight=False, markup=False)
@@ -193,7 +193,7 @@ def _extent(data: MapData) -> str:
 
 
 def _export_g2o(data: MapData, out: Path, voxel: float, resolution: float) -> None:
-    from dpm2_core.slam.pose_graph import PoseGraph, PoseGraphSettings
+    from dpm2_core.slam.graph.pose_graph import PoseGraph, PoseGraphSettings
 
     graph = PoseGraph(PoseGraphSettings())
     restore(graph, data)
@@ -201,7 +201,7 @@ def _export_g2o(data: MapData, out: Path, voxel: float, resolution: float) -> No
 
 
 def _export_occupancy(data: MapData, out: Path, voxel: float, resolution: float) -> None:
-    from dpm2_core.slam.occupancy import OccupancySettings, occupancy_grid, write_grid
+    from dpm2_core.slam.map.occupancy import OccupancySettings, occupancy_grid, write_grid
 
     write_grid(out, occupancy_grid(data.clouds, data.poses, OccupancySettings(resolution=resolution)))
 

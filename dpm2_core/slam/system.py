@@ -11,18 +11,18 @@ from pydantic import Field
 from dpm2_core.config import Settings
 from dpm2_core.data.source import InputSettings
 from dpm2_core.frame import Frame, Tracked
+from dpm2_core.slam.graph.pose_graph import PoseGraph, PoseGraphSettings
 from dpm2_core.slam.keyframes import KeyframeSelector, KeyframeSettings
 from dpm2_core.slam.local_map import LocalMap, LocalMapSettings
-from dpm2_core.slam.loop_closure import LoopCloser, LoopSettings
-from dpm2_core.slam.map_store import MapStore
-from dpm2_core.slam.mapper import Mapper, MapSettings, thumbnail
+from dpm2_core.slam.loops.closure import LoopCloser, LoopSettings
+from dpm2_core.slam.loops.relocalise import RelocaliseSettings
+from dpm2_core.slam.map.mapper import Mapper, MapSettings, thumbnail
+from dpm2_core.slam.map.store import MapStore
 from dpm2_core.slam.neural import NeuralScanRegistration, NeuralSettings, load_network
 from dpm2_core.slam.odometry import Odometry, OdometrySettings
-from dpm2_core.slam.pose_graph import PoseGraph, PoseGraphSettings
 from dpm2_core.slam.preprocess import Preprocessor, PreprocessSettings
 from dpm2_core.slam.refined import RefinedScanRegistration
 from dpm2_core.slam.registration import GeometricRegistration, GeometricSettings
-from dpm2_core.slam.relocalise import RelocaliseSettings
 from dpm2_core.slam.scan_registration import GeometricScanRegistration, ScanRegistration
 
 

@@ -16,9 +16,9 @@ from dpm2_core.frame import Camera, Image, Keyframe, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.network.config import NetworkSettings
 from dpm2_core.network.model import DeepPointMap2
-from dpm2_core.slam.cloud_codec import pack_cloud
-from dpm2_core.slam.map_rows import Edge
-from dpm2_core.slam.map_store import Change, MapStore
+from dpm2_core.slam.map.cloud_codec import pack_cloud
+from dpm2_core.slam.map.rows import Edge
+from dpm2_core.slam.map.store import Change, MapStore
 
 TINY = {
     "preset": "tiny",

@@ -16,8 +16,8 @@ from dpm2_core.data.trajectory import read_trajectory
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.frame import Keyframe
 from dpm2_core.geometry import se3
-from dpm2_core.slam.map_data import load_map
-from dpm2_core.slam.map_store import MapStore
+from dpm2_core.slam.map.data import load_map
+from dpm2_core.slam.map.store import MapStore
 from dpm2_ros.conversions import cloud_to_msg, edge_to_msg, keyframe_name
 from dpm2_ros.mapper_node import MapperNode, keyframe_from
 from dpm2_ros.mapping import KEEP_ALL

@@ -23,10 +23,10 @@ from dpm2_core.evaluation.bench.harness import REPOSITORY, Options, Report
 from dpm2_core.evaluation.metrics import ape_rmse
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
-from dpm2_core.slam.g2o import read_g2o
-from dpm2_core.slam.graph_data import GraphData, integrate
-from dpm2_core.slam.graph_worker import GraphWorker
-from dpm2_core.slam.robust_graph import RobustSettings, least_squares, optimise
+from dpm2_core.slam.graph.data import GraphData, integrate
+from dpm2_core.slam.graph.g2o import read_g2o
+from dpm2_core.slam.graph.robust import RobustSettings, least_squares, optimise
+from dpm2_core.slam.graph.worker import GraphWorker
 
 _STEP = np.array([4e-4, 4e-4, 2e-3, 0.02, 0.02, 0.02])  # rad, m: noise of the made drive's odometry
 _LOOP = np.array([5e-3, 5e-3, 5e-3, 0.05, 0.05, 0.05])

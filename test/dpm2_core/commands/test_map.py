@@ -15,8 +15,8 @@ from dpm2_core.frame import Array, Keyframe
 from dpm2_core.geometry import se3
 from dpm2_core.sim.config import LidarConfig
 from dpm2_core.sim.drive import simulate
-from dpm2_core.slam.map_data import MapData, load_map
-from dpm2_core.slam.map_store import MapStore
+from dpm2_core.slam.map.data import MapData, load_map
+from dpm2_core.slam.map.store import MapStore
 
 
 def dpm2(*words: object) -> int:

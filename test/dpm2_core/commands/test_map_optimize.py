@@ -11,7 +11,7 @@ import pytest
 
 from dpm2_core.cli import main
 from dpm2_core.evaluation.bench.pose_graph import are_right, made_drive
-from dpm2_core.slam.g2o import G2o, read_g2o, write_g2o
+from dpm2_core.slam.graph.g2o import G2o, read_g2o, write_g2o
 
 
 def status(*arguments: str) -> int:

@@ -1,0 +1,211 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The pose graph of the running system: it grows by keyframes and loops, and no wrong loop bends it."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from dpm2_core.errors import Dpm2Error
+from dpm2_core.frame import Array
+from dpm2_core.geometry import se3
+from dpm2_core.slam.graph import robust
+from dpm2_core.slam.graph.data import GraphData
+from dpm2_core.slam.graph.g2o import G2o, write_g2o
+from dpm2_core.slam.graph.robust import RobustSettings, Solution
+from dpm2_core.slam.graph.worker import GraphWorker
+
+_log = logging.getLogger(__name__)
+_SHORT = 50  # loops: fewer are solved in about 20 ms, sooner than they are sent anywhere
+_ATTEMPTS = 2  # processes that may die over one graph
+
+
+class PoseGraphSettings(RobustSettings):
+    """Optimisation of the keyframe poses."""
+
+    background: bool = False
+    """Optimise in another process while the drive goes on, for a live system; the result then depends on its timing."""
+
+
+@dataclass(frozen=True)
+class LoopVerdict:
+    """What the graph thinks of a loop; a later one may differ.
+
+    Attributes:
+        kept: False: the poses do without it. reason: in words, empty until it has been judged.
+    """
+
+    from_node: int
+    to_node: int
+    kept: bool
+    reason: str
+
+
+class PoseGraph:
+    """Keyframe poses T_map_kf, odometry edges and loop edges; node n is the n-th one added.
+
+    Attributes:
+        problem: what last went wrong in the background, in words; empty since it went well.
+    """
+
+    def __init__(self, settings: PoseGraphSettings) -> None:
+        self._settings = settings
+        self._poses: list[Array] = []
+        self._chained: list[bool] = []
+        self._steps: list[Array] = []
+        self._step_covariances: list[Array] = []
+        self._loops: list[tuple[int, int, Array, Array]] = []
+        self._verdicts: list[LoopVerdict] = []
+        self._worker = GraphWorker()
+        self._sent = 0  # loops in the graph that is being solved
+        self._failures = 0
+        self.problem = ""
+
+    def __len__(self) -> int:
+        return len(self._poses)
+
+    @property
+    def poses(self) -> Array:
+        """(N, 4, 4) T_map_kf."""
+        return np.array(self._poses).reshape(-1, 4, 4)
+
+    @property
+    def edges(self) -> list[tuple[int, int, Array, Array]]:
+        """Odometry edges, then the loops that are kept or not judged yet: from, to, T_from_to, covariance."""
+        chain = [
+            (node - 1, node, self._steps[node], self._step_covariances[node])
+            for node, chained in enumerate(self._chained)
+            if chained
+        ]
+        return chain + [loop for loop, told in zip(self._loops, self._verdicts, strict=True) if told.kept]
+
+    @property
+    def verdicts(self) -> list[LoopVerdict]:
+        """One for each loop, in the order in which they were added."""
+        return list(self._verdicts)
+
+    @property
+    def busy(self) -> bool:
+        """Whether another process is optimising."""
+        return self._worker.busy
+
+    def add_node(self, T_map_kf: Array, T_before_this: Array | None, covariance: Array | None) -> None:
+        """Append a keyframe: with an edge to the one before, or as the start of a trajectory of its own.
+
+        A part of the graph that nothing ties to another keeps the pose of its first node.
+        """
+        chained = T_before_this is not None and covariance is not None
+        self._poses.append(T_map_kf)
+        self._chained.append(chained)
+        self._steps.append(T_before_this if T_before_this is not None and chained else np.eye(4))
+        self._step_covariances.append(covariance if covariance is not None and chained else np.zeros((6, 6)))
+
+    def add_loop(self, from_node: int, to_node: int, T_from_to: Array, covariance: Array) -> None:
+        """Tie two keyframes that saw the same place."""
+        self._loops.append((from_node, to_node, T_from_to, covariance))
+        self._verdicts.append(LoopVerdict(from_node, to_node, True, ""))
+
+    def optimise(self) -> None:
+        """Move the poses to the optimum and judge the loops: here and now, or (`background`) in another process.
+
+        Raises:
+            Dpm2Error: the graph cannot be solved.
+        """
+        if self._settings.background and len(self._loops) >= _SHORT:
+            self.collect()
+            if not self.busy:
+                self._submit()
+            return
+        try:
+            self._apply(robust.optimise(self._data(), self._settings), len(self._loops))
+        except RuntimeError as error:  # gtsam's: the system is singular
+            raise Dpm2Error(f"pose graph: {' '.join(str(error).split())}") from None
+
+    def collect(self, wait: bool = False) -> bool:
+        """Take in what the other process found, if it has; call it with every keyframe.
+
+        The nodes added meanwhile follow the ones before them by their odometry. Loops added meanwhile are sent off.
+
+        Args:
+            wait: until there is nothing more to wait for, as at the end of a drive.
+
+        Returns:
+            Whether poses or verdicts changed.
+        """
+        changed = False
+        while self.busy:
+            try:
+                solution = self._worker.take(wait)
+            except Dpm2Error as error:
+                self.problem = str(error)
+                self._failures += 1
+                _log.warning("%s%s", error, ": started again" if self._failures < _ATTEMPTS else "")
+                if self._failures < _ATTEMPTS:
+                    self._submit()
+                continue
+            if solution is None:
+                break
+            self._apply(solution, self._sent)
+            self.problem, self._failures, changed = "", 0, True
+            if len(self._loops) > self._sent:
+                self._submit()
+        return changed
+
+    def close(self) -> None:
+        """End the other process, if there is one."""
+        self._worker.close()
+
+    def covariance(self, node: int) -> Array:
+        """(6, 6) [rotation rad, translation m] of xi in T_map_kf @ Exp(xi), relative to the node that is held fixed."""
+        return self._joint([node])
+
+    def relative_covariance(self, a: int, b: int) -> Array:
+        """(6, 6) of xi in T_a_b @ Exp(xi) of two different nodes; small between neighbours, however far from the start.
+
+        Raises:
+            ValueError: it is one node.
+        """
+        if a == b:
+            raise ValueError(f"covariance of node {a} relative to itself")
+        joint = self._joint([a, b])
+        J = np.hstack([-se3.adjoint(se3.inverse(self._poses[b]) @ self._poses[a]), np.eye(6)])
+        return np.asarray(J @ joint @ J.T)
+
+    def write_g2o(self, path: Path) -> None:
+        """All vertices, the odometry and the loops that are kept, in g2o's SE3:QUAT format at full precision."""
+        kept = np.array([told.kept for told in self._verdicts], np.bool_)
+        write_g2o(path, G2o(self._data(), np.arange(len(self)), planar=False), kept)
+
+    def _joint(self, nodes: list[int]) -> Array:
+        kept = np.array([told.kept for told in self._verdicts], np.bool_)
+        return robust.joint_covariance(self._data(), self.poses, kept, np.array(nodes, np.intp))
+
+    def _data(self) -> GraphData:
+        return GraphData(
+            self.poses,
+            np.array(self._chained, np.bool_),
+            np.array(self._steps).reshape(-1, 4, 4),
+            np.array(self._step_covariances).reshape(-1, 6, 6),
+            np.array([loop[:2] for loop in self._loops], np.intp).reshape(-1, 2),
+            np.array([loop[2] for loop in self._loops]).reshape(-1, 4, 4),
+            np.array([loop[3] for loop in self._loops]).reshape(-1, 6, 6),
+        )
+
+    def _submit(self) -> None:
+        self._sent = len(self._loops)
+        self._worker.submit(self._data(), self._settings)
+
+    def _apply(self, solution: Solution, loops: int) -> None:
+        count = len(solution.poses)
+        follow = solution.poses[-1] @ se3.inverse(self._poses[count - 1])
+        self._poses[:count] = list(solution.poses)
+        for node in range(count, len(self._poses)):
+            if not self._chained[node]:
+                break  # another trajectory: nothing ties it to what moved
+            self._poses[node] = follow @ self._poses[node]
+        for loop in range(loops):
+            a, b = self._loops[loop][:2]
+            self._verdicts[loop] = LoopVerdict(a, b, bool(solution.kept[loop]), solution.reason(loop))

@@ -1,0 +1,208 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Robust least squares on a pose graph: the poses, and for each loop whether it can be true.
+
+The odometry is trusted within its covariances, loops are not. A loop that the odometry between its ends flatly
+contradicts is set aside, the others are solved for under a Cauchy kernel (which hardly listens to what is far off), and
+every loop, also those set aside, is then judged by how far the optimised poses are from it; so on until the verdicts
+stay. Only the nodes at the ends of loops are unknowns: the odometry between them is compounded, its inner nodes follow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from dpm2_core.config import Settings
+from dpm2_core.frame import Array
+from dpm2_core.geometry import se3
+from dpm2_core.slam.graph.data import (
+    GraphData,
+    Index,
+    Stretches,
+    chain_chi2,
+    integrate,
+    loop_errors,
+    mahalanobis,
+    trajectories,
+)
+
+_FIXED = 1e-6  # rad and m, standard deviation of a pose that stays
+
+
+class RobustSettings(Settings):
+    """How loops are weighed and judged."""
+
+    loop_kernel: float = Field(5.0, gt=0)
+    """Width of the Cauchy kernel on loop edges, in standard deviations: what is many times farther off hardly pulls."""
+    loop_sigmas: float = Field(10.0, gt=0)
+    """A loop is kept if the optimised poses are within so many standard deviations of it. Right ones are within 5,
+    wrong ones hundreds off: the room between is for covariances that promise too much."""
+    odometry_sigmas: float = Field(20.0, gt=0)
+    """A loop starts out set aside if the odometry between its ends is more than so many standard deviations off."""
+    rounds: int = Field(8, ge=1)
+    """At most so many times of solving and judging."""
+    iterations: int = Field(50, ge=1)
+    """At most so many Levenberg-Marquardt steps in each."""
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """The outcome.
+
+    Attributes:
+        poses: (N, 4, 4) optimised.
+        kept: (E,) whether each loop was used.
+        sigmas: (E,) how far the optimised poses are from each loop, in standard deviations.
+        odometry_sigmas: (E,) how far the odometry alone is; nan for loops between two trajectories.
+        rounds: of solving and judging.
+        settled: whether the verdicts stayed; after `rounds` of the settings the last ones stand.
+    """
+
+    poses: Array
+    kept: NDArray[np.bool_]
+    sigmas: Array
+    odometry_sigmas: Array
+    rounds: int = 0
+    settled: bool = True
+
+    def reason(self, loop: int) -> str:
+        """Why a loop was kept or rejected, in words."""
+        told = f"{self.sigmas[loop]:.1f} sigma from the optimised poses"
+        if np.isfinite(self.odometry_sigmas[loop]):
+            told += f", {self.odometry_sigmas[loop]:.1f} from the odometry"
+        return told
+
+
+def optimise(graph: GraphData, settings: RobustSettings) -> Solution:
+    """Optimise and judge; deterministic.
+
+    Raises:
+        RuntimeError: gtsam found the system to be singular, as with a covariance that is none.
+    """
+    odometry = integrate(graph)
+    apart = np.sqrt(chain_chi2(graph, odometry))
+    believed = ~(apart > settings.odometry_sigmas)
+    start = _aligned(graph, graph.poses, believed, settings.loop_kernel)
+    stretches = Stretches(graph, odometry, np.concatenate([graph.ends.ravel(), graph.fixed]))
+    ends = np.searchsorted(stretches.nodes, graph.ends)
+    poses = start[stretches.nodes]
+    settled, count = False, 0
+    while not settled and count < settings.rounds:
+        count += 1
+        factors = _factors(graph, stretches, ends, poses, believed, settings.loop_kernel)
+        poses = _solved(factors, poses, settings.iterations)
+        sigmas = np.sqrt(mahalanobis(loop_errors(poses, ends, graph.T_from_to), graph.covariances))
+        kept = sigmas <= settings.loop_sigmas
+        settled = bool((kept == believed).all())
+        if not settled and count < settings.rounds:
+            believed = kept
+    return Solution(stretches.spread(poses), believed, sigmas, apart, count, settled)
+
+
+def least_squares(graph: GraphData, kept: NDArray[np.bool_], iterations: int = 50) -> Array:
+    """(N, 4, 4) the plain least-squares optimum over the odometry and the loops kept, every node an unknown."""
+    stretches = Stretches(graph, integrate(graph), np.arange(len(graph)))
+    return _solved(_factors(graph, stretches, graph.ends, graph.poses, kept, None), graph.poses, iterations)
+
+
+def joint_covariance(graph: GraphData, poses: Array, kept: NDArray[np.bool_], nodes: Index) -> Array:
+    """(6 n, 6 n) covariance of distinct nodes' poses, [rotation, translation] of T_map_node @ Exp(xi) each in turn.
+
+    Args:
+        poses: (N, 4, 4) optimised. kept: (E,) loops to count.
+    """
+    ends = graph.ends[kept].ravel()
+    stretches = Stretches(graph, integrate(graph), np.concatenate([ends, graph.fixed, nodes]))
+    ends = np.searchsorted(stretches.nodes, graph.ends)  # of loops not kept too, which are then not read
+    at = poses[stretches.nodes]
+    marginals = gtsam.Marginals(_factors(graph, stretches, ends, at, kept, None), _values(at))
+    keys = np.searchsorted(stretches.nodes, nodes)
+    if len(keys) == 1:
+        return np.asarray(marginals.marginalCovariance(int(keys[0])))
+    joint = marginals.jointMarginalCovariance([int(key) for key in keys])
+    return np.block([[joint.at(int(a), int(b)) for b in keys] for a in keys])
+
+
+def _factors(
+    graph: GraphData, stretches: Stretches, ends: Index, poses: Array, believed: NDArray[np.bool_], kernel: float | None
+) -> Any:
+    """The gtsam graph of the chosen nodes; `ends` count among them, no kernel: plain least squares."""
+    factors, gaussian = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.Gaussian.Covariance
+    noise: gtsam.noiseModel.Base
+    for k in np.flatnonzero(stretches.tied):
+        noise = gaussian(stretches.covariances[k])
+        factors.add(gtsam.BetweenFactorPose3(int(k) - 1, int(k), gtsam.Pose3(stretches.T[k]), noise))
+    for loop in np.flatnonzero(believed):
+        noise = gaussian(graph.covariances[loop])
+        if kernel is not None:
+            noise = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(kernel), noise)
+        a, b = ends[loop].tolist()
+        factors.add(gtsam.BetweenFactorPose3(a, b, gtsam.Pose3(graph.T_from_to[loop]), noise))
+    still = gtsam.noiseModel.Isotropic.Sigma(6, _FIXED)
+    for anchor in _anchors(graph, stretches, ends[believed]):
+        factors.add(gtsam.PriorFactorPose3(anchor, gtsam.Pose3(poses[anchor]), still))
+    return factors
+
+
+def _anchors(graph: GraphData, stretches: Stretches, ends: Index) -> Iterator[int]:
+    """The fixed nodes, and one in each part of the graph that has none."""
+    count = len(stretches.nodes)
+    tied = np.flatnonzero(stretches.tied)
+    rows, columns = np.concatenate([tied, ends[:, 0]]), np.concatenate([tied - 1, ends[:, 1]])
+    part = connected_components(coo_array((np.ones(len(rows)), (rows, columns)), (count, count)), directed=False)[1]
+    fixed = np.searchsorted(stretches.nodes, graph.fixed)
+    yield from np.unique(fixed).tolist()
+    first = np.unique(part, return_index=True)[1]
+    yield from first[~np.isin(part[first], part[fixed])].tolist()
+
+
+def _values(poses: Array) -> Any:
+    values = gtsam.Values()
+    for node, pose in enumerate(poses):
+        values.insert(node, gtsam.Pose3(pose))
+    return values
+
+
+def _solved(factors: Any, poses: Array, iterations: int) -> Array:
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setMaxIterations(iterations)
+    solved = gtsam.LevenbergMarquardtOptimizer(factors, _values(poses), parameters).optimize()
+    return np.array([solved.atPose3(node).matrix() for node in range(len(poses))])
+
+
+def _aligned(graph: GraphData, poses: Array, believed: NDArray[np.bool_], kernel: float) -> Array:
+    """Poses with each trajectory placed rigidly where most of its loops to those before agree that it is.
+
+    Without it a trajectory whose own frame is far away or turned would have to find its place by many small steps.
+    """
+    number = trajectories(graph)
+    if number[-1] == 0:
+        return poses
+    poses = poses.copy()
+    ends_number = number[graph.ends]
+    for this in range(1, number[-1] + 1):
+        own = number == this
+        ties = np.flatnonzero(believed & (ends_number.max(1) == this) & (ends_number.min(1) < this))
+        if not len(ties) or own[graph.fixed].any():
+            continue
+        ends, T = graph.ends[ties], graph.T_from_to[ties]
+        swap = ends_number[ties, 0] == this
+        before, after = np.where(swap, ends[:, 1], ends[:, 0]), np.where(swap, ends[:, 0], ends[:, 1])
+        T_before_after = np.where(swap[:, None, None], se3.inverse(T), T)
+        moves = poses[before] @ T_before_after @ se3.inverse(poses[after])
+        trials = np.concatenate([np.eye(4)[None], moves])
+        costs = []
+        for move in trials:
+            moved = se3.inverse(T_before_after) @ se3.inverse(poses[before]) @ move @ poses[after]
+            chi2 = mahalanobis(se3.log(moved), graph.covariances[ties])
+            costs.append(np.log1p(chi2 / kernel**2).sum())
+        poses[own] = trials[int(np.argmin(costs))] @ poses[own]
+    return poses

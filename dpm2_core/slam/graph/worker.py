@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Optimises a pose graph in a process of its own: gtsam holds Python's lock while it works, and odometry must not wait.
+
+The process is a fresh interpreter, never a fork (safe beside rclpy's threads and locks), in a session of its own (an
+interrupt from the terminal is for the program, not for it) and lives as long as its standard input: when the program
+ends, however it ends, it reads end of file and goes.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import subprocess
+import sys
+import threading
+from contextlib import suppress
+from pathlib import Path
+from typing import IO, Any
+
+from dpm2_core.errors import Dpm2Error
+from dpm2_core.slam.graph.data import GraphData
+from dpm2_core.slam.graph.robust import RobustSettings, Solution, optimise
+
+_NICE = 10  # it yields to the odometry where processors are few
+
+
+class GraphWorker:
+    """One process that solves one graph at a time; started with the first, again after it died."""
+
+    def __init__(self) -> None:
+        self._process: subprocess.Popen[bytes] | None = None
+        self._waiter: threading.Thread | None = None
+        self._answer: Solution | Dpm2Error | None = None
+
+    @property
+    def busy(self) -> bool:
+        """Whether a graph was submitted whose answer has not been taken."""
+        return self._waiter is not None
+
+    @property
+    def pid(self) -> int | None:
+        """Of the process, None while there is none."""
+        return None if self._process is None else self._process.pid
+
+    def submit(self, graph: GraphData, settings: RobustSettings) -> None:
+        """Begin; returns at once. `busy` must be False."""
+        assert self._waiter is None, "a graph is being solved"
+        # The thread does nothing but wait for the pipes: the first write lasts until the process has imported gtsam.
+        self._waiter = threading.Thread(target=self._exchange, args=(graph, settings), daemon=True)
+        self._waiter.start()
+
+    def take(self, wait: bool = False) -> Solution | None:
+        """The answer, once; None while there is none.
+
+        Raises:
+            Dpm2Error: the process died, or the graph cannot be solved. The worker can be used again.
+        """
+        if self._waiter is None or (self._waiter.is_alive() and not wait):
+            return None
+        self._waiter.join()
+        self._waiter, answer, self._answer = None, self._answer, None
+        if isinstance(answer, Dpm2Error):
+            raise answer
+        return answer
+
+    def close(self) -> None:
+        """End the process."""
+        process, self._process = self._process, None
+        if process is not None:
+            process.kill()
+            process.wait()
+        if self._waiter is not None:
+            self._waiter.join()
+            self._waiter, self._answer = None, None
+        if process is not None:
+            _shut(process)
+
+    def _exchange(self, graph: GraphData, settings: RobustSettings) -> None:
+        process = self._process
+        if process is None or process.poll() is not None:
+            process = self._process = _start()
+        try:
+            assert process.stdin is not None
+            assert process.stdout is not None
+            pickle.dump(
+                (graph, settings.model_dump(include=set(RobustSettings.model_fields))), process.stdin, protocol=5
+            )
+            process.stdin.flush()
+            self._answer = pickle.load(process.stdout)
+        except (OSError, ValueError, EOFError, pickle.UnpicklingError):
+            process.kill()
+            status = process.wait()
+            self._process = None
+            self._answer = Dpm2Error(f"the pose graph optimiser's process ended by itself (status {status})")
+
+
+def _start() -> subprocess.Popen[bytes]:
+    root = str(Path(__file__).resolve().parents[3])
+    path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
+    return subprocess.Popen(
+        [sys.executable, "-m", __name__],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        start_new_session=True,
+        env={**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
+    )
+
+
+def _shut(process: subprocess.Popen[bytes]) -> None:
+    for pipe in (process.stdin, process.stdout):
+        if pipe is not None:
+            with suppress(OSError):  # what it had not read yet
+                pipe.close()
+
+
+def _serve(requests: IO[bytes], answers: IO[bytes]) -> None:
+    """Answer until end of file."""
+    while True:
+        try:
+            graph, settings = pickle.load(requests)
+        except EOFError:
+            return
+        answer: Any
+        try:
+            answer = optimise(graph, RobustSettings(**settings))
+        except RuntimeError as error:  # gtsam's: the system is singular
+            answer = Dpm2Error(f"pose graph: {' '.join(str(error).split())}")
+        pickle.dump(answer, answers, protocol=5)
+        answers.flush()
+
+
+if __name__ == "__main__":
+    os.nice(_NICE)
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # whatever a library prints must not get between the answers
+    try:
+        _serve(sys.stdin.buffer, answers)
+    except BrokenPipeError:  # the program has gone
+        os._exit(0)

@@ -1,0 +1,179 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Loops: places that look alike, and places near by the pose; each is registered and verified before it counts.
+
+A candidate must convince four times: the network, which finds it and registers it without any start; the points of the
+new keyframe, which must fit the map around it; the odometry, whose drift has limits; and, where the correction is
+large, a second loop that says the same. Whatever fails is kept with the reason.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dpm2_core.config import Settings
+from dpm2_core.frame import Array, Keyframe, Points, Registration
+from dpm2_core.geometry import se3
+from dpm2_core.slam.loops.consistency import Consistency, ConsistencySettings, Loop, Path, refused
+from dpm2_core.slam.loops.place_recognition import PlaceRecognition, merged
+from dpm2_core.slam.loops.verification import VerificationSettings, Verifier
+from dpm2_core.slam.registration import GeometricSettings
+
+if TYPE_CHECKING:  # torch takes seconds to import
+    from dpm2_core.network.model import DeepPointMap2
+
+_MERGED = 6.0  # m, path around a keyframe whose descriptors are merged with its own
+
+
+class LoopSettings(Settings):
+    """Search for and verification of loops."""
+
+    enabled: bool = True
+    """Close loops at all."""
+    descriptors: bool = True
+    """Find places again by neural descriptors (`neural.weights`), which then every keyframe gets, whatever registers
+    the scans; without, only keyframes near by the pose are candidates."""
+    gap: float = 50.0
+    """Path that must lie between two keyframes of a loop, m."""
+    candidates: int = 4
+    """So many keyframes that look like the new one are registered by the network..."""
+    verified: int = 2
+    """...and so many of them, the most confident first, by their points."""
+    min_confidence: float = 0.15
+    """Of the network's registration, below which the points are not asked."""
+    radius: float = 8.0
+    """The keyframe nearest by the pose is a candidate, too, if nearer than this, m; `drift` widens it."""
+    drift: float = 0.01
+    """Widens the radius by so many metres a metre of path since that keyframe."""
+    surroundings: float = 22.0
+    """Keyframes so near to a candidate along the path make up the map to register to, m."""
+    verification: VerificationSettings = VerificationSettings()
+    consistency: ConsistencySettings = ConsistencySettings()
+
+
+class LoopCloser:
+    """Finds and judges the loops of each new keyframe. A node is a keyframe's position in the map."""
+
+    def __init__(
+        self,
+        settings: LoopSettings,
+        registration: GeometricSettings,
+        threads: int = 2,
+        network: DeepPointMap2 | None = None,
+    ) -> None:
+        self._settings = settings
+        self._verifier = Verifier(settings.verification, registration, threads)
+        self._places = PlaceRecognition(network) if network is not None else None
+        self._path = Path()
+        self._consistency = Consistency(settings.consistency, self._path)
+
+    def described(self, keyframe: Keyframe) -> Keyframe:
+        """The keyframe with descriptors, of its cloud where its registration made none."""
+        if keyframe.descriptors is not None or self._places is None:
+            return keyframe
+        return replace(keyframe, descriptors=self._places.describe(keyframe.cloud))
+
+    def close(self, keyframes: Sequence[Keyframe], clouds: Sequence[Points], poses: Array) -> list[Loop]:
+        """Try to close loops with the last keyframe.
+
+        Args:
+            keyframes: all of them. clouds: theirs, each (M, 4) in its own frame. poses: (N, 4, 4) T_map_kf.
+
+        Returns:
+            Every candidate, accepted or refused with its reason; and earlier ones of which it took a second to be sure.
+        """
+        for node in range(len(self._path), len(keyframes)):
+            self._path.append(keyframes[node])
+        if self._places is not None:
+            self._places.update(keyframes)
+        if not self._settings.enabled or len(keyframes) < 2:
+            return []
+        node = len(keyframes) - 1
+        since = self._path.since(node)
+        tried, proposals = self._proposals(node, since, keyframes, poses)
+        for number, proposal in enumerate(proposals):
+            if number >= self._settings.verified:
+                tried.append(refused(proposal, "others are more likely"))
+                continue
+            loop = self._verified(proposal, keyframes, clouds, poses)
+            if not loop.registration.ok:
+                tried.append(loop)
+                continue
+            T_expected = se3.inverse(poses[loop.from_node]) @ poses[node]
+            tried += self._consistency.judge(loop, T_expected)
+            break
+        return tried
+
+    def _proposals(
+        self, node: int, since: Array, keyframes: Sequence[Keyframe], poses: Array
+    ) -> tuple[list[Loop], list[Loop]]:
+        """Candidates that the network refused, and those for the points to judge, the most likely first."""
+        s, descriptors = self._settings, keyframes[node].descriptors
+        nearest = self._nearest(since, poses)
+        refusals: list[Loop] = []
+        proposals: list[Loop] = []
+        if self._places is not None and descriptors is not None:
+            similar = self._places.similar(descriptors, since > s.gap, s.candidates)
+            found = self._registered(node, similar, keyframes)
+            for loop in sorted(found, key=lambda loop: -loop.registration.confidence):
+                r = loop.registration
+                if not r.ok:
+                    refusals.append(loop)
+                elif r.confidence < s.min_confidence:
+                    refusals.append(refused(loop, f"descriptors match with a confidence of only {r.confidence:.2f}"))
+                else:
+                    proposals.append(loop)
+        if nearest is not None and all(abs(loop.from_node - nearest) > 1 for loop in proposals):
+            T_guess = se3.inverse(poses[nearest]) @ poses[node]
+            by_pose = Registration(T_guess, np.eye(6), 0.0, 0.0, "pose")
+            proposals.insert(min(len(proposals), 1), Loop(nearest, node, by_pose))
+        return refusals, proposals
+
+    def _registered(self, node: int, candidates: Sequence[int], keyframes: Sequence[Keyframe]) -> list[Loop]:
+        """The network's answer to each candidate."""
+        assert self._places is not None
+        source = keyframes[node].descriptors
+        targets = [keyframes[c].descriptors for c in candidates]
+        assert source is not None
+        answers = self._places.register(source, [t for t in targets if t is not None])
+        return [Loop(c, node, answer) for c, answer in zip(candidates, answers, strict=True)]
+
+    def _nearest(self, since: Array, poses: Array) -> int | None:
+        """The keyframe nearest by the pose, if it is near enough for the drift since then."""
+        s, positions = self._settings, poses[:, :3, 3]
+        distance = np.linalg.norm(positions - positions[-1], axis=1)
+        near = np.flatnonzero((since > s.gap) & np.isfinite(since) & (distance < s.radius + s.drift * since))
+        return int(near[np.argmin(distance[near])]) if len(near) else None
+
+    def _verified(self, proposal: Loop, keyframes: Sequence[Keyframe], clouds: Sequence[Points], poses: Array) -> Loop:
+        """The points' answer; if they disagree, once more from the pose that the descriptors around both suggest."""
+        nodes = self._around(proposal.from_node, proposal.to_node, self._settings.surroundings)
+        T_candidate_kf = se3.inverse(poses[proposal.from_node]) @ poses[nodes]
+        around = self._verifier.surroundings([clouds[n] for n in nodes], T_candidate_kf)
+        proposed = proposal.registration
+        by_pose = proposed.method == "pose"
+        cloud = clouds[proposal.to_node]
+        found = self._verifier.verify(cloud, around, proposed.T_target_source, 2.0 if by_pose else 1.0).registration
+        if not found.ok and not by_pose:
+            again = self._map_to_map(proposal, keyframes, poses)
+            if again.ok:
+                second = self._verifier.verify(cloud, around, again.T_target_source).registration
+                found = second if second.ok else found
+        return replace(proposal, registration=found)
+
+    def _map_to_map(self, proposal: Loop, keyframes: Sequence[Keyframe], poses: Array) -> Registration:
+        """T_from_to by the descriptors of the keyframes around both."""
+        assert self._places is not None
+        a, b = proposal.from_node, proposal.to_node
+        before = np.flatnonzero(self._path.since(b) <= _MERGED)
+        source = merged(keyframes, poses, before.tolist(), b)
+        target = merged(keyframes, poses, self._around(a, b, _MERGED), a)
+        return self._places.register(source, [target])[0]
+
+    def _around(self, candidate: int, node: int, reach: float) -> list[int]:
+        """The candidate and those nearer to it than `reach` m along the path, without what the new one just passed."""
+        near = (self._path.since(candidate) <= reach) & (self._path.since(node) > self._settings.gap / 2)
+        return np.flatnonzero(near).tolist()

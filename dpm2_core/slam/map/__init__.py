@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The map: keyframes, their store on disk, maintenance and exports."""

@@ -1,0 +1,282 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is wrong with a map file, and what of it is good: row by row, each judged for itself."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+import tempfile
+from collections.abc import Iterator
+from contextlib import closing, suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.frame import Array, Keyframe
+from dpm2_core.geometry import se3
+from dpm2_core.slam.map import schema
+from dpm2_core.slam.map.cloud_codec import pack_cloud, unpack_cloud
+from dpm2_core.slam.map.cloud_store import CloudStore, Loan
+from dpm2_core.slam.map.data import NO_POINTS, MapData, save_as, subset
+from dpm2_core.slam.map.rows import Edge, Session, bytes_array, edge_of, pruned_of, unpack_descriptors
+
+_RIGID = 1e-3  # a rotation matrix that is off by more is damage, not rounding
+_DOUBT = np.diag([0.05] * 3 + [0.5] * 3) ** 2  # of an edge that bridges a lost keyframe, rad and m
+
+
+@dataclass
+class Findings:
+    """What a check found.
+
+    Attributes:
+        problems: one line each; empty: the map is sound.
+        keyframes: that can be used. lost: keyframes that cannot. lost_clouds: usable, but without their payload.
+    """
+
+    problems: list[str] = field(default_factory=list)
+    keyframes: int = 0
+    lost: int = 0
+    lost_clouds: int = 0
+
+
+def check_map(path: Path, recover: Path | None = None) -> Findings:
+    """Judge a map file without changing it; write the good part of it to a new file if wanted.
+
+    Raises:
+        UsageError: no map at all, or a later dpm2's. Dpm2Error: nothing can be read, or `recover` cannot be written.
+    """
+    if not path.is_file():
+        raise UsageError(f"{path}: no such map file")
+    findings = Findings()
+    with tempfile.TemporaryDirectory(prefix="dpm2_check_") as folder:
+        copy = Path(folder) / "map"  # SQLite replays FILE-wal when it opens a map: not on the patient
+        for suffix in ("", "-wal"):
+            with suppress(FileNotFoundError):
+                shutil.copyfile(f"{path}{suffix}", f"{copy}{suffix}")
+        with closing(_opened(copy, path, findings)) as sql:
+            data = _Salvage(sql, findings).run()
+            findings.keyframes = len(data)
+            if recover is not None:
+                if not len(data):
+                    raise Dpm2Error(f"{path}: nothing in it can be recovered")
+                save_as(data, recover)
+    return findings
+
+
+def _opened(copy: Path, path: Path, findings: Findings) -> sqlite3.Connection:
+    """The copy of the map as a database; with a new first page where the old one makes no sense."""
+    try:
+        sql = sqlite3.connect(copy, isolation_level=None)
+        version = schema.version_of(sql, path)
+        sql.execute("SELECT count(*) FROM sqlite_master").fetchone()
+    except sqlite3.DatabaseError as error:
+        findings.problems.append(f"header: {error}")
+        sql = _with_new_header(copy)
+        version = schema.VERSION
+    with suppress(sqlite3.DatabaseError):
+        rows = [row[0] for row in sql.execute("PRAGMA integrity_check(20)")]
+        findings.problems += [f"database: {' '.join(line.split())}" for line in rows if line != "ok"]
+    try:
+        schema.migrate(sql, version)
+    except sqlite3.DatabaseError as error:
+        raise Dpm2Error(f"{path}: a damaged map of version {version}, which cannot be read: {error}") from None
+    return sql
+
+
+def _with_new_header(copy: Path) -> sqlite3.Connection:
+    """The first page holds the schema, which is the same in all maps: that of an empty one serves."""
+    empty = copy.with_name("empty")
+    with closing(sqlite3.connect(empty, isolation_level=None)) as sql:
+        schema.create(sql)
+        size = sql.execute("PRAGMA page_size").fetchone()[0]
+    Path(f"{copy}-wal").unlink(missing_ok=True)
+    page = bytearray(empty.read_bytes()[:size])
+    page[28:32] = (copy.stat().st_size // size).to_bytes(4, "big")  # pages in the file
+    page[32:40] = bytes(8)  # no free pages
+    with copy.open("r+b") as file:
+        file.write(page)
+    return sqlite3.connect(copy, isolation_level=None)
+
+
+class _Salvage:
+    """Reads what can be read of a map."""
+
+    def __init__(self, sql: sqlite3.Connection, findings: Findings) -> None:
+        self._sql, self._findings = sql, findings
+
+    def run(self) -> MapData:
+        """All that is good, without gaps."""
+        keyframes, session, loans = self._keyframes()
+        poses = self._poses(keyframes)
+        good = sorted(keyframes)
+        new = {node: position for position, node in enumerate(good)}
+        last = max(good, default=-1) + 1
+        moving: list[bytes | None] = [None] * last
+        for node, mask in self._rows("moving"):
+            if node in keyframes:
+                moving[node] = mask
+        edges = self._edges(new)
+        edges = self._bridged(edges, [keyframes[node] for node in good], [session[node] for node in good])
+        trail = [pruned_of((*row[:4], new[row[4]], row[5])) for row in self._rows("trail", "rowid") if row[4] in new]
+        # A map in the old numbers with holes, of which the good nodes are then taken.
+        nothing = pack_cloud(NO_POINTS)
+        filler = Keyframe(0, 0, 0, np.eye(4), NO_POINTS)
+        whole = MapData(
+            [keyframes.get(node, filler) for node in range(last)],
+            [session.get(node, 1) for node in range(last)],
+            np.array([poses.get(node, np.eye(4)) for node in range(last)]).reshape(-1, 4, 4),
+            [],
+            [],
+            self._sessions(session),
+            CloudStore(lambda node: self._payload(node)[0] or nothing, moving, loans),
+            lambda node: self._payload(node)[2],
+        )
+        return subset(whole, good, edges, trail)
+
+    def _keyframes(self) -> tuple[dict[int, Keyframe], dict[int, int], dict[int, Loan]]:
+        keyframes: dict[int, Keyframe] = {}
+        session: dict[int, int] = {}
+        loans: dict[int, Loan] = {}
+        for node, id, robot, number, stamp, frame, T, lender, T_lent in self._rows("keyframes"):
+            if not _rigid(T_odom_kf := bytes_array(T, 4)):
+                self._problem(f"keyframe {node}: its odometry pose is no finite rigid transform")
+                continue
+            keyframes[node] = Keyframe(id, stamp, frame, T_odom_kf, NO_POINTS, None, robot)
+            session[node] = number
+            if lender is not None:
+                loans[node] = Loan(lender, bytes_array(T_lent, 4))
+        end = self._end()
+        if missing := sorted(set(range(end)) - keyframes.keys()):
+            self._problem(f"keyframes lost: {_listed(missing)}")
+            self._findings.lost = len(missing)
+        for node, loan in list(loans.items()):
+            if loan.lender not in keyframes:
+                self._problem(f"keyframe {node}: borrows the cloud of {loan.lender}, which is lost")
+                del loans[node]
+        without = [node for node in keyframes if node not in loans and self._payload(node, complain=True)[0] is None]
+        self._findings.lost_clouds = len(without)
+        for node in keyframes.keys() - set(without) - loans.keys():
+            packed = self._payload(node)[1]
+            descriptors = None if packed is None else unpack_descriptors(packed)
+            keyframes[node] = replace(keyframes[node], descriptors=descriptors)
+        return keyframes, session, loans
+
+    def _payload(self, node: int, complain: bool = False) -> tuple[bytes | None, bytes | None, bytes | None]:
+        """Packed cloud, descriptors and thumbnail of a node, if they are good."""
+        try:
+            row = self._row("payloads", node)
+            if row is None:
+                raise ValueError("none there")
+            unpack_cloud(row[1])
+            return row[1], row[2], row[3]
+        except ValueError as error:
+            if complain:
+                self._problem(f"keyframe {node}: its payload is lost: {error}")
+            return None, None, None
+
+    def _poses(self, keyframes: dict[int, Keyframe]) -> dict[int, Array]:
+        """T_map_kf by node; one that is lost follows from the keyframe before, by odometry."""
+        stored = {node: bytes_array(T, 4) for node, T in self._rows("poses")}
+        poses: dict[int, Array] = {}
+        T_map_odom = np.eye(4)
+        for node in sorted(keyframes):
+            T = stored.get(node)
+            if T is None or not _rigid(T):
+                what = "lost" if T is None else "no finite rigid transform"
+                self._problem(f"keyframe {node}: its optimised pose is {what}")
+                T = T_map_odom @ keyframes[node].T_odom_kf
+            poses[node] = T
+            T_map_odom = T @ se3.inverse(keyframes[node].T_odom_kf)
+        return poses
+
+    def _edges(self, new: dict[int, int]) -> list[Edge]:
+        edges = []
+        for row in self._rows("edges"):
+            edge = edge_of(row)
+            if edge.from_node not in new or edge.to_node not in new:
+                self._problem(f"edge {row[0]}: leads from {edge.from_node} to {edge.to_node}, which are not both there")
+            elif not _rigid(edge.T_from_to) or (edge.ok and not _positive(edge.covariance)):
+                self._problem(f"edge {row[0]}: not a finite rigid transform with a positive covariance")
+            else:
+                edges.append(replace(edge, from_node=new[edge.from_node], to_node=new[edge.to_node]))
+        return edges
+
+    def _bridged(self, edges: list[Edge], keyframes: list[Keyframe], session: list[int]) -> list[Edge]:
+        """With odometry edges over the holes that lost keyframes and edges have left."""
+        tied = {edge.to_node for edge in edges if edge.kind == "odometry"}
+        out = list(edges)
+        for node in range(1, len(keyframes)):
+            a, b = keyframes[node - 1], keyframes[node]
+            if node not in tied and (session[node], b.robot) == (session[node - 1], a.robot) and b.id > 0:
+                T_a_b = se3.inverse(a.T_odom_kf) @ b.T_odom_kf
+                out.append(Edge("odometry", node - 1, node, T_a_b, _DOUBT, method="bridge"))
+        return out
+
+    def _sessions(self, session: dict[int, int]) -> list[Session]:
+        try:
+            return [Session(*row) for row in self._sql.execute("SELECT * FROM sessions ORDER BY session")]
+        except sqlite3.DatabaseError as error:
+            self._problem(f"sessions: {error}")
+            return [Session(number, "", "", "", "") for number in sorted(set(session.values()))]
+
+    def _rows(self, table: str, key: str = "") -> Iterator[tuple[Any, ...]]:
+        """The good rows of a table, each fetched by its key so that a damaged page costs only what is on it."""
+        key = key or schema.CONTENT[table][0]
+        for number in range(self._last(table, key) + 1):
+            try:
+                row = self._row(table, number, key)
+            except ValueError as error:
+                self._problem(f"{table} {number}: {error}")
+                continue
+            if row is not None:
+                yield row
+
+    def _row(self, table: str, number: int, key: str = "") -> tuple[Any, ...] | None:
+        names = schema.CONTENT[table]
+        query = f"SELECT {', '.join(names)}, crc FROM {table} WHERE {key or names[0]} = ?"
+        try:
+            row = self._sql.execute(query, (number,)).fetchone()
+        except (sqlite3.DatabaseError, OverflowError, UnicodeDecodeError) as error:
+            raise ValueError(str(error)) from None
+        if row is None:
+            return None
+        try:
+            intact = schema.row_crc(*row[:-1]) == row[-1]
+        except Exception:  # values of types that no row has
+            intact = False
+        if not intact:
+            raise ValueError("its checksum is wrong")
+        return tuple(row[:-1])
+
+    def _last(self, table: str, key: str) -> int:
+        try:
+            return int(self._sql.execute(f"SELECT coalesce(max({key}), -1) FROM {table}").fetchone()[0])
+        except (sqlite3.DatabaseError, TypeError, ValueError):
+            return self._end() * 10  # of edges there are several a keyframe
+
+    def _end(self) -> int:
+        """One more than the last node that any table knows."""
+        last = -1
+        for table in ("keyframes", "payloads", "poses"):
+            with suppress(sqlite3.DatabaseError, TypeError, ValueError):
+                last = max(last, int(self._sql.execute(f"SELECT coalesce(max(node), -1) FROM {table}").fetchone()[0]))
+        return min(last, 10_000_000) + 1
+
+    def _problem(self, text: str) -> None:
+        self._findings.problems.append(text)
+
+
+def _rigid(T: Array) -> bool:
+    R = T[:3, :3]
+    return bool(np.isfinite(T).all() and np.abs(R @ R.T - np.eye(3)).max() < _RIGID and (T[3] == [0, 0, 0, 1]).all())
+
+
+def _positive(covariance: Array) -> bool:
+    return bool(np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance)[0] > 0)
+
+
+def _listed(numbers: list[int]) -> str:
+    return ", ".join(map(str, numbers[:10])) + (f" and {len(numbers) - 10} more" if len(numbers) > 10 else "")

@@ -1,0 +1,227 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Keyframes in, a globally consistent map out; with a store, a map file that is never more than a keyframe behind."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from dpm2_core.config import Settings
+from dpm2_core.errors import Dpm2Error
+from dpm2_core.frame import Array, Frame, Keyframe, LoopClosure, Points
+from dpm2_core.geometry import se3
+from dpm2_core.slam.graph.pose_graph import PoseGraph
+from dpm2_core.slam.loops.closure import LoopCloser
+from dpm2_core.slam.loops.consistency import Loop
+from dpm2_core.slam.map.cloud_codec import pack_cloud
+from dpm2_core.slam.map.cloud_store import CloudStore
+from dpm2_core.slam.map.data import NO_POINTS, borrowing, load_map, map_cloud, restore
+from dpm2_core.slam.map.moving import MovingSettings, MovingWindow
+from dpm2_core.slam.map.redundancy import RedundancySettings, lender
+from dpm2_core.slam.map.rows import Edge
+from dpm2_core.slam.map.store import MapStore
+from dpm2_core.slam.map.writer import MapWriter
+
+
+class MapSettings(Settings):
+    """The map that is shown and saved."""
+
+    voxel: float = 0.3
+    """Spacing of its points, m."""
+    thumbnail: int = Field(0, ge=0, le=1024)
+    """Width of the picture that a map file keeps of each keyframe, pixels; 0: none."""
+    moving: MovingSettings = MovingSettings()
+    redundancy: RedundancySettings = RedundancySettings()
+
+
+class Mapper:
+    """Holds keyframes and pose graph; the odometry runs on untouched, `T_map_odom` carries every correction.
+
+    Attributes:
+        keyframes: all, without their clouds; a node is a position among them. ids count on over the sessions.
+        session_start: node of the first keyframe of this session: those before are of a map that was loaded.
+        closures: loops tried in this session.
+        T_map_odom: (4, 4).
+    """
+
+    def __init__(
+        self, settings: MapSettings, graph: PoseGraph, loops: LoopCloser, store: MapStore | None = None
+    ) -> None:
+        """`store`: the map file to go on with, its session begun; None keeps the map in memory, clouds on disk."""
+        self._settings = settings
+        self._graph = graph
+        self._loops = loops
+        self.keyframes: list[Keyframe] = []
+        self.closures: list[LoopClosure] = []
+        self.T_map_odom: Array = np.eye(4)
+        self._clouds = CloudStore()
+        self._writer: MapWriter | None = None
+        self._first_id: dict[str, int] = {}  # of a robot's first keyframe in this session, where it was here before
+        self._tie: Array | None = None  # covariance of the session's first keyframe relative to the last of the map
+        if store is not None:
+            self._load(store)
+        self.session_start = len(self.keyframes)
+        self._moving = MovingWindow(settings.moving)
+
+    @property
+    def poses(self) -> Array:
+        """(N, 4, 4) optimised T_map_kf of all keyframes."""
+        return self._graph.poses
+
+    @property
+    def edges(self) -> list[tuple[int, int, Array, Array]]:
+        """Odometry edges and accepted loops: from, to, T_from_to, covariance."""
+        return self._graph.edges
+
+    @property
+    def clouds(self) -> Sequence[Points]:
+        """(M, 4) of each keyframe in its own frame, read from disk; without what moves."""
+        return self._clouds
+
+    def borrows(self, node: int) -> bool:
+        """Whether a keyframe came back to an older one, and shows that one's cloud and descriptors as its own."""
+        return self._clouds.loan(node) is not None
+
+    @property
+    def store_problem(self) -> str:
+        """Why the map file is behind, in words; empty when it is not, or when there is none."""
+        return "" if self._writer is None else self._writer.problem
+
+    def start_session(self, T_map_odom: Array, covariance: Array | None = None) -> None:
+        """Before the first keyframe of a session in a loaded map: where its odometry begins.
+
+        Args:
+            T_map_odom: (4, 4).
+            covariance: (6, 6) of the first keyframe's pose relative to the last one of the map, which are then joined
+                by an edge; None: the new session is not tied to the map before a loop is found.
+        """
+        self.T_map_odom, self._tie = T_map_odom, covariance
+
+    def add(self, keyframe: Keyframe, thumbnail: bytes | None = None) -> list[LoopClosure]:
+        """Take a keyframe in, with a JPEG if wanted; returns the loops that were tried, accepted or not."""
+        node, cloud = len(self.keyframes), keyframe.cloud
+        keyframe = self._loops.described(keyframe)
+        keyframe = replace(keyframe, id=keyframe.id + self._first_id.get(keyframe.robot, 0), cloud=NO_POINTS)
+        edges = self._add_node(keyframe)
+        self._clouds.append(pack_cloud(cloud))
+        self.keyframes.append(keyframe)
+        closures, loops = self._close_loops(node)
+        again = edges if node == self.session_start else []  # the frame with which the session before ended
+        loan = lender(node, [*again, *self._kept(loops)], self._clouds.loan, self._settings.redundancy)
+        if loan is not None:
+            self._clouds.borrow(node, loan)
+            self.keyframes[node] = borrowing(keyframe, self.keyframes, loan)
+        poses = self.poses
+        self._mark_moving(self._moving.add(node, cloud, poses))
+        if self._writer is not None:
+            self._writer.add(node, self.keyframes[node], thumbnail)
+            for edge in (*edges, *loops):
+                self._writer.add_edge(edge)
+            self._writer.sync(poses)
+        return closures
+
+    def finish(self) -> None:
+        """At the end of a drive: wait for the solver, judge the last clouds, bring the map file up to date."""
+        self._optimise(changed=False, wait=True)
+        self._graph.close()
+        self._mark_moving(self._moving.finish(self.poses))
+        if self._writer is not None:
+            self._writer.sync(self.poses)
+
+    def cloud(self, voxel_size: float | None = None) -> Points:
+        """The map (M, 4) float32 in the map frame, one point in each voxel of that size (default: settings)."""
+        return map_cloud(self._clouds, self.poses, voxel_size or self._settings.voxel)
+
+    def write_g2o(self, path: Path) -> None:
+        """The pose graph as a g2o file."""
+        self._graph.write_g2o(path)
+
+    def _load(self, store: MapStore) -> None:
+        data = load_map(store)
+        self.keyframes, self._clouds = data.keyframes, data.clouds
+        restore(self._graph, data)
+        for keyframe in data.keyframes:
+            self._first_id[keyframe.robot] = max(self._first_id.get(keyframe.robot, 0), keyframe.id + 1)
+        if not store.read_only:
+            self._writer = MapWriter(store, self._clouds, data.poses)
+
+    def _add_node(self, keyframe: Keyframe) -> list[Edge]:
+        """A node with an edge to the keyframe before, also when some between them never arrived."""
+        T_map_kf, node = self.T_map_odom @ keyframe.T_odom_kf, len(self.keyframes)
+        if node == self.session_start and self._tie is not None:
+            T_before_this, covariance = se3.inverse(self.poses[-1]) @ T_map_kf, self._tie
+        elif keyframe.edge is None or node == self.session_start:
+            self._graph.add_node(T_map_kf, None, None)
+            return []
+        else:
+            before = self.keyframes[-1]
+            T_before_this = se3.inverse(before.T_odom_kf) @ keyframe.T_odom_kf
+            covariance = keyframe.edge.covariance * max(keyframe.id - before.id, 1)
+        self._graph.add_node(T_map_kf, T_before_this, covariance)
+        edge = Edge("odometry", node - 1, node, T_before_this, covariance)
+        found = keyframe.edge
+        if found is not None:
+            edge = replace(edge, confidence=found.confidence, rmse=found.rmse, method=found.method)
+        return [edge]
+
+    def _close_loops(self, node: int) -> tuple[list[LoopClosure], list[Edge]]:
+        """Loops of the last keyframe, as they are published and as they are stored."""
+        tried = self._loops.close(self.keyframes, self._clouds, self.poses)
+        closures = [
+            LoopClosure(self.keyframes[loop.from_node].id, self.keyframes[loop.to_node].id, loop.registration)
+            for loop in tried
+        ]
+        self.closures += closures
+        accepted = [loop for loop in tried if loop.registration.ok]
+        for loop in accepted:
+            found = loop.registration
+            self._graph.add_loop(loop.from_node, loop.to_node, found.T_target_source, found.covariance)
+        self._optimise(bool(accepted))
+        return closures, [_loop_edge(loop) for loop in tried]
+
+    def _optimise(self, changed: bool, wait: bool = False) -> None:
+        """Solve the graph if it has `changed`, take in what another process has solved; `wait` for that."""
+        moved = self._graph.collect(wait)
+        if changed:
+            try:
+                self._graph.optimise()
+                moved = True
+            except Dpm2Error as error:  # the drive goes on, with the poses as they were
+                self._graph.problem = str(error)
+        if moved:
+            self.T_map_odom = se3.orthonormalised(self.poses[-1] @ se3.inverse(self.keyframes[-1].T_odom_kf))
+
+    def _kept(self, loops: Sequence[Edge]) -> list[Edge]:
+        """Those that the graph believes, too: on another's word no cloud is given up."""
+        doubted = {(told.from_node, told.to_node) for told in self._graph.verdicts if not told.kept}
+        return [edge for edge in loops if (edge.from_node, edge.to_node) not in doubted]
+
+    def _mark_moving(self, judged: Iterable[tuple[int, NDArray[np.bool_]]]) -> None:
+        for node, moving in judged:
+            if self._clouds.loan(node) is None and moving.any():
+                self._clouds.set_moving(node, moving)
+                if self._writer is not None:
+                    self._writer.set_moving(node)
+
+
+def _loop_edge(loop: Loop) -> Edge:
+    r = loop.registration
+    told = (r.ok, r.confidence, r.rmse, r.method, r.reason)
+    return Edge("loop", loop.from_node, loop.to_node, r.T_target_source, r.covariance, *told)
+
+
+def thumbnail(frame: Frame, width: int) -> bytes | None:
+    """JPEG of the frame's first picture, `width` pixels wide; None without a picture, or for a width of 0."""
+    if not frame.images or not width:
+        return None
+    import cv2
+
+    pixels = frame.images[0].pixels
+    height = max(1, round(width * pixels.shape[0] / pixels.shape[1]))
+    small = cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA)
+    return bytes(cv2.imencode(".jpg", cv2.cvtColor(small, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 80])[1])

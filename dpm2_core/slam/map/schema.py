@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Layout of a map file: an SQLite database, so that any program can read one, and a kill at any instant is no matter.
+
+Rows carry a CRC-32 of their content, since SQLite finds damaged pages of its trees, but not damage within a value.
+Numbers in blobs are little-endian: poses 16, covariances 36 float64, row by row.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+import struct
+import zlib
+from pathlib import Path
+
+from dpm2_core.errors import UsageError
+
+APPLICATION_ID = 0x64706D32
+"""The bytes `dpm2` at offset 68 of the file."""
+VERSION = 2
+"""Of the schema, in SQLite's user_version."""
+
+SCHEMA = """
+CREATE TABLE sessions (          -- every time that a program wrote to the map
+  session  INTEGER PRIMARY KEY,  -- from 1
+  program  TEXT NOT NULL,        -- version of dpm2
+  started  TEXT NOT NULL,        -- ISO 8601, UTC
+  config   TEXT NOT NULL,        -- YAML, or empty
+  weights  TEXT NOT NULL         -- name and hash of the network's weights, or empty
+);
+CREATE TABLE keyframes (
+  node     INTEGER PRIMARY KEY,  -- from 0, without gaps
+  id       INTEGER NOT NULL,     -- count within its robot
+  robot    TEXT NOT NULL,
+  session  INTEGER NOT NULL,
+  stamp    INTEGER NOT NULL,     -- ns
+  frame    INTEGER NOT NULL,     -- number in the recording
+  T_odom_kf BLOB NOT NULL,
+  lender   INTEGER,              -- a revisit: the keyframe with whose payload it makes do
+  T_kf_lender BLOB,
+  crc      INTEGER NOT NULL
+);
+CREATE TABLE payloads (
+  node     INTEGER PRIMARY KEY,
+  cloud    BLOB NOT NULL,        -- see slam/cloud_codec.py
+  descriptors BLOB,              -- see slam/map/rows.py
+  thumbnail BLOB,                -- JPEG
+  crc      INTEGER NOT NULL
+);
+CREATE TABLE moving (            -- points of a cloud that belong to moving things: one bit each, deflated
+  node     INTEGER PRIMARY KEY,
+  mask     BLOB NOT NULL,
+  crc      INTEGER NOT NULL
+);
+CREATE TABLE poses (             -- optimised
+  node     INTEGER PRIMARY KEY,
+  T_map_kf BLOB NOT NULL,
+  crc      INTEGER NOT NULL
+);
+CREATE TABLE edges (
+  id       INTEGER PRIMARY KEY,
+  kind     TEXT NOT NULL,        -- odometry or loop
+  from_node INTEGER NOT NULL,
+  to_node  INTEGER NOT NULL,
+  T_from_to BLOB NOT NULL,
+  covariance BLOB NOT NULL,      -- rotation (rad) first, then translation (m), in the frame of to_node
+  ok       INTEGER NOT NULL,     -- 0: a loop that was refused
+  confidence REAL NOT NULL,
+  rmse     REAL NOT NULL,        -- m
+  method   TEXT NOT NULL,
+  reason   TEXT NOT NULL,        -- of a refusal
+  crc      INTEGER NOT NULL
+);
+CREATE TABLE trail (             -- keyframes that were pruned: where they were, relative to one that is still there
+  id       INTEGER NOT NULL,
+  robot    TEXT NOT NULL,
+  session  INTEGER NOT NULL,
+  stamp    INTEGER NOT NULL,
+  node     INTEGER NOT NULL,
+  T_node_kf BLOB NOT NULL,
+  crc      INTEGER NOT NULL
+);
+"""
+
+CONTENT = {
+    "keyframes": ("node", "id", "robot", "session", "stamp", "frame", "T_odom_kf", "lender", "T_kf_lender"),
+    "payloads": ("node", "cloud", "descriptors", "thumbnail"),
+    "moving": ("node", "mask"),
+    "poses": ("node", "T_map_kf"),
+    "edges": (
+        "id", "kind", "from_node", "to_node", "T_from_to", "covariance", "ok", "confidence", "rmse", "method", "reason",
+    ),
+    "trail": ("id", "robot", "session", "stamp", "node", "T_node_kf"),
+}  # fmt: skip
+"""Columns of the tables with checksums, in the order in which the checksum takes them."""
+
+# Version 1 kept payloads beside the keyframes, without checksums, masks or refused loops.
+_TO_2 = """
+ALTER TABLE keyframes RENAME TO keyframes_1;
+ALTER TABLE edges RENAME TO edges_1;
+{schema}
+INSERT INTO sessions SELECT 1, program, created, config, weights FROM about;
+INSERT INTO keyframes SELECT node, node, robot, 1, stamp, frame, T_odom_kf, NULL, NULL,
+  row_crc(node, node, robot, 1, stamp, frame, T_odom_kf, NULL, NULL) FROM keyframes_1;
+INSERT INTO payloads SELECT node, cloud, descriptors, NULL, row_crc(node, cloud, descriptors, NULL) FROM keyframes_1;
+INSERT INTO poses SELECT node, T_map_kf, row_crc(node, T_map_kf) FROM keyframes_1;
+INSERT INTO edges SELECT rowid, kind, from_node, to_node, T_from_to, covariance, 1, 1.0, 0.0, '', '',
+  row_crc(rowid, kind, from_node, to_node, T_from_to, covariance, 1, 1.0, 0.0, '', '') FROM edges_1;
+DROP TABLE keyframes_1;
+DROP TABLE edges_1;
+DROP TABLE about;
+"""
+
+
+def row_crc(*values: bytes | str | int | float | None) -> int:
+    """CRC-32 of a row: type and length go in too, so that nothing moves from one column to the next unseen."""
+    crc = 0
+    for value in values:
+        if isinstance(value, str):
+            value = value.encode()
+        if value is None:
+            data = b"n"
+        elif isinstance(value, bytes):
+            data = b"b" + struct.pack("<q", len(value)) + value
+        elif isinstance(value, float):
+            data = b"f" + struct.pack("<d", value)
+        else:
+            data = b"i" + struct.pack("<q", value)
+        crc = zlib.crc32(data, crc)
+    return crc
+
+
+def create(connection: sqlite3.Connection) -> None:
+    """An empty map in an empty database."""
+    connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+    connection.executescript(f"BEGIN; {SCHEMA} PRAGMA user_version = {VERSION}; COMMIT;")
+
+
+def version_of(connection: sqlite3.Connection, path: Path) -> int:
+    """Version of the schema.
+
+    Raises:
+        UsageError: the file is no map, or one of a later dpm2.
+    """
+    if connection.execute("PRAGMA application_id").fetchone()[0] != APPLICATION_ID:
+        raise UsageError(f"{path}: an SQLite database, but no dpm2 map")
+    version = int(connection.execute("PRAGMA user_version").fetchone()[0])
+    if version > VERSION:
+        raise UsageError(f"{path}: written by a later dpm2 (map version {version}, this one reads up to {VERSION})")
+    return version
+
+
+def migrate(connection: sqlite3.Connection, version: int) -> None:
+    """Bring an older map to `VERSION`, whole or not at all."""
+    if version < 2:
+        connection.create_function("row_crc", -1, row_crc, deterministic=True)
+        connection.executescript(f"BEGIN IMMEDIATE; {_TO_2.format(schema=SCHEMA)} PRAGMA user_version = 2; COMMIT;")

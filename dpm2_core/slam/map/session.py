@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A drive into a map file: a new one, or on from where an earlier run was cut off."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from dpm2_core.data.source import Source
+from dpm2_core.errors import UsageError
+from dpm2_core.slam.map.mapper import Mapper
+from dpm2_core.slam.map.rows import Session, weights_id
+from dpm2_core.slam.map.store import MapStore
+from dpm2_core.slam.neural import weights_path
+from dpm2_core.slam.system import SlamSettings
+
+_SAME_FRAME = np.diag([1e-4] * 3 + [1e-3] * 3) ** 2  # rad, m: the rounding of what is the same frame
+
+
+def open_session(path: Path, settings: SlamSettings, config: str, resume: bool) -> MapStore:
+    """The map file to write to, with a new session begun.
+
+    Args:
+        config: YAML, kept with the session.
+        resume: go on with the file, if there is one; else it must not exist.
+
+    Raises:
+        UsageError: the file is there, or holds descriptors of other weights. Dpm2Error: it cannot be written.
+    """
+    described = settings.registration != "geometric" or (settings.loops.enabled and settings.loops.descriptors)
+    weights = weights_id(weights_path(settings.neural.weights)) if described else ""
+    if path.exists() and not resume:
+        raise UsageError(f"--map {path}: there is a file already; --resume goes on with it")
+    store = MapStore.open(path, read_only=False) if path.exists() else MapStore.create(path)
+    try:
+        for row in store.rows("sessions"):
+            if (before := Session(*row).weights) and weights and before != weights:
+                raise UsageError(f"--map {path}: made with weights {before}, not with {weights}")
+        store.begin_session(config, weights)
+    except BaseException:
+        store.close()
+        raise
+    return store
+
+
+def resume_at(mapper: Mapper, source: Source, start: int) -> int:
+    """Position in the source of the map's last keyframe, from where the mapper goes on; `start` for an empty map.
+
+    Raises:
+        UsageError: the frame of that keyframe is not in the source.
+    """
+    if not mapper.keyframes:
+        return start
+    last = mapper.keyframes[-1]
+    first = next(iter(source.frames(0, 1)), None)
+    position = -1 if first is None else last.index - first.index
+    found = next(iter(source.frames(position, position + 1)), None) if 0 <= position < len(source) else None
+    if found is None or found.stamp != last.stamp:
+        raise UsageError(f"--resume: frame {last.index}, where the map ends, is not in {source.name}")
+    mapper.start_session(mapper.poses[-1], _SAME_FRAME)
+    return position

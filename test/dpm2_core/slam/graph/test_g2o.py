@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""g2o files: what is written is read back to the last digit, what is wrong is named with its line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from dpm2_core.errors import UsageError
+from dpm2_core.geometry import se3
+from dpm2_core.slam.graph.g2o import read_g2o, require_connected, write_g2o
+
+I3 = "1 0 0 1 0 1"
+I6 = "1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1"
+
+
+def file(tmp_path: Path, *lines: str) -> Path:
+    path = tmp_path / "graph.g2o"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.mark.parametrize("planar", [True, False])
+def test_round_trip_at_full_precision(tmp_path: Path, planar: bool) -> None:
+    rng = np.random.default_rng(0)
+    size, tag = (3, "SE2") if planar else (6, "SE3:QUAT")
+    T = se3.exp(rng.normal(size=(4, 6)) * ([0, 0, 1, 9, 9, 0] if planar else [1, 1, 1, 9, 9, 9]))
+    lines = ["# a comment", "FIX 7"]
+    for n, (a, b) in enumerate([(5, 7), (7, 8), (8, 2**60 + 1), (5, 8)]):
+        A = rng.normal(size=(size, size))
+        upper = (A @ A.T + np.eye(size))[np.triu_indices(size)]
+        yaw = np.arctan2(T[n, 1, 0], T[n, 0, 0])
+        pose = (*T[n, :2, 3], yaw) if planar else (*T[n, :3, 3], *Rotation.from_matrix(T[n, :3, :3]).as_quat())
+        lines.append(f"EDGE_{tag} {a} {b} " + " ".join(f"{x:.17g}" for x in (*pose, *upper)))
+    first = read_g2o(file(tmp_path, *lines))
+    assert not first.has_poses
+    assert first.planar is planar
+    np.testing.assert_array_equal(first.ids, [5, 7, 8, 2**60 + 1])  # more than a float64 holds
+    np.testing.assert_allclose(first.graph.steps[1:], T[:3], atol=1e-14)
+    np.testing.assert_allclose(first.graph.poses[3], T[0] @ T[1] @ T[2], atol=1e-13)  # laid out by the odometry
+    write_g2o(tmp_path / "out.g2o", first)
+    second = read_g2o(tmp_path / "out.g2o")
+    assert second.has_poses
+    for name in ("poses", "steps", "T_from_to", "step_covariances", "covariances", "ends", "fixed"):
+        # A pose passes through a quaternion or an angle, a covariance through an inverse: rounding in the last digits.
+        np.testing.assert_allclose(getattr(second.graph, name), getattr(first.graph, name), rtol=1e-12, atol=1e-13)
+
+
+def test_an_edge_backwards_along_the_chain_is_odometry(tmp_path: Path) -> None:
+    found = read_g2o(file(tmp_path, f"EDGE_SE2 1 0 -2 0 0 {I3}", f"EDGE_SE2 1 2 2 0 0 {I3}")).graph
+    assert len(found.ends) == 0
+    np.testing.assert_allclose(found.poses[:, 0, 3], [0, 2, 4])
+    # 1 rad of error at the far end of 2 m shows as 2 m sideways, seen from this one.
+    np.testing.assert_allclose(found.step_covariances[1][4, 4], 1 + 2**2)
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        (["EDGE_SE2 0 1 1 0 0 1 0 0 1 0"], r"graph.g2o:1: EDGE_SE2 with 10 numbers, want 11"),
+        ([f"EDGE_SE2 0 1 1 nan 0 {I3}"], r"graph.g2o:1: a number that is not finite"),
+        ([f"EDGE_SE2 0 1 1 x 0 {I3}"], r"graph.g2o:1: not a number"),
+        (["", "EDGE_SE2 0 1 1 0 0 1 0 0 0 0 1"], r"graph.g2o:2: information matrix not positive definite"),
+        ([f"EDGE_SE2 0 0 1 0 0 {I3}"], r"graph.g2o:1: edge from vertex 0 to itself"),
+        ([f"EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 2 {I6}"], r"graph.g2o:1: the quaternion is not of unit length"),
+        (["VERTEX_SE2 0 0 0 0", f"EDGE_SE2 0 1 1 0 0 {I3}"], r"graph.g2o:2: edge of vertex 1, which has no VERTEX"),
+        (["VERTEX_SE2 0 0 0 0"] * 2 + [f"EDGE_SE2 0 1 1 0 0 {I3}"], r"graph.g2o:2: vertex 0 again"),
+        ([f"EDGE_SE2 0 1 1 0 0 {I3}", f"EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1 {I6}"], "SE2 and SE3 lines in one graph"),
+        ([f"EDGE_SE2 0 1 1 0 0 {I3}", "FIX 9"], "FIX 9: no such vertex"),
+        (["EDGE_XY 0 1 2 3"], "no EDGE_SE2 or EDGE_SE3:QUAT line"),
+        ([f"EDGE_SE2 0 {2**70} 1 0 0 {I3}"], r"graph.g2o:1: not a number"),
+    ],
+)
+def test_what_is_wrong_is_named(tmp_path: Path, lines: list[str], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        read_g2o(file(tmp_path, *lines))
+
+
+def test_a_missing_and_a_binary_file(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="No such file"):
+        read_g2o(tmp_path / "none.g2o")
+    (tmp_path / "b.g2o").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(UsageError, match="no text file"):
+        read_g2o(tmp_path / "b.g2o")
+
+
+def test_a_part_that_no_edge_reaches_is_named(tmp_path: Path) -> None:
+    path = file(tmp_path, *(f"EDGE_SE2 {a} {a + 1} 1 0 0 {I3}" for a in (0, 1, 2, 10)))
+    with pytest.raises(UsageError, match="2 parts that no edge connects; one has 2 vertices: 10, 11"):
+        require_connected(path, read_g2o(path))
+
+
+def test_unknown_tags_are_counted(tmp_path: Path) -> None:
+    assert read_g2o(file(tmp_path, "PARAMS_X 1", f"EDGE_SE2 0 1 1 0 0 {I3}", "PARAMS_X 2")).ignored == {"PARAMS_X": 2}

@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The growing pose graph: verdicts, covariances, and the process that optimises it in the background."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from dpm2_core.frame import Array
+from dpm2_core.geometry import se3
+from dpm2_core.slam.graph import pose_graph
+from dpm2_core.slam.graph.pose_graph import PoseGraph, PoseGraphSettings
+
+STEP = np.diag([2e-3, 2e-3, 2e-3, 0.02, 0.02, 0.02]) ** 2
+LOOP = np.diag([5e-3, 5e-3, 5e-3, 0.05, 0.05, 0.05]) ** 2
+T_STEP = se3.exp([0, 0, 2 * np.pi / 50, 20 * 2 * np.pi / 50, 0, 0])  # 50 to a lap of 20 m radius
+DRIFT = se3.exp([0, 0, 5e-4, 0.01, 0, 0])
+
+
+def drive(graph: PoseGraph, count: int) -> None:
+    for _ in range(count):
+        if not len(graph):
+            graph.add_node(np.eye(4), None, None)
+        else:
+            graph.add_node(graph.poses[-1] @ T_STEP @ DRIFT, T_STEP @ DRIFT, STEP)
+
+
+def truth(count: int) -> Array:
+    return np.array([np.linalg.matrix_power(T_STEP, n) for n in range(count)])
+
+
+@pytest.fixture
+def background(monkeypatch: pytest.MonkeyPatch) -> Iterator[PoseGraph]:
+    """A graph of a lap with a loop that goes to the other process however small it is."""
+    monkeypatch.setattr(pose_graph, "_SHORT", 0)
+    graph = PoseGraph(PoseGraphSettings(background=True))
+    drive(graph, 55)
+    graph.add_loop(0, 50, np.eye(4), LOOP)
+    yield graph
+    graph.close()
+
+
+def test_a_wrong_loop_is_rejected_with_a_reason_and_is_no_edge() -> None:
+    graph = PoseGraph(PoseGraphSettings())
+    drive(graph, 55)
+    graph.add_loop(0, 50, np.eye(4), LOOP)
+    graph.add_loop(5, 30, np.eye(4), LOOP)  # 40 m wrong
+    graph.optimise()
+    right, wrong = graph.verdicts
+    assert right.kept
+    assert not wrong.kept
+    assert "sigma from the optimised poses" in wrong.reason
+    assert "from the odometry" in wrong.reason
+    assert [edge[:2] for edge in graph.edges if edge[1] != edge[0] + 1] == [(0, 50)]
+
+
+def test_background_gives_what_inline_gives(background: PoseGraph) -> None:
+    inline = PoseGraph(PoseGraphSettings())
+    drive(inline, 55)
+    inline.add_loop(0, 50, np.eye(4), LOOP)
+    inline.optimise()
+    background.optimise()
+    assert background.busy
+    assert background.collect(wait=True)
+    np.testing.assert_allclose(background.poses, inline.poses, atol=1e-9)
+    assert background.verdicts == inline.verdicts
+    assert not background.collect()
+
+
+def test_nodes_and_loops_added_meanwhile_are_not_lost(background: PoseGraph) -> None:
+    background.optimise()
+    drive(background, 10)
+    before = background.poses
+    background.add_loop(10, 60, np.eye(4), LOOP)
+    background.optimise()  # busy: it waits for its turn
+    while not background.collect():
+        time.sleep(0.02)
+    after = background.poses
+    relative = [se3.inverse(p[54]) @ p[64] for p in (before, after)]
+    np.testing.assert_allclose(relative[0], relative[1], atol=1e-9)  # the new nodes followed the old ones
+    assert background.collect(wait=True)  # the second loop was sent off by itself
+    assert all(told.kept and told.reason for told in background.verdicts)
+    assert np.linalg.norm(background.poses[60, :3, 3] - background.poses[10, :3, 3]) < 0.1
+
+
+def test_a_killed_process_is_replaced(background: PoseGraph) -> None:
+    background.optimise()
+    background.collect(wait=True)
+    pid = background._worker.pid
+    assert pid is not None
+    os.kill(pid, signal.SIGSTOP)  # so that it dies with the graph in hand
+    background.add_loop(2, 52, np.eye(4), LOOP)
+    background.optimise()
+    os.kill(pid, signal.SIGKILL)
+    assert background.collect(wait=True)
+    assert background.problem == ""
+    assert background._worker.pid != pid
+    assert background.verdicts[1].kept
+    assert background.verdicts[1].reason
+
+
+def test_no_process_outlives_a_killed_program() -> None:
+    program = (
+        "import time, numpy as np\n"
+        "from dpm2_core.slam.graph import pose_graph as p\n"
+        "p._SHORT = 0\n"
+        "g = p.PoseGraph(p.PoseGraphSettings(background=True))\n"
+        "C = np.eye(6) * 1e-2\n"
+        "g.add_node(np.eye(4), None, None)\n"
+        "for _ in range(9): g.add_node(np.eye(4), np.eye(4), C)\n"
+        "g.add_loop(0, 9, np.eye(4), C); g.optimise(); g.collect(wait=True)\n"
+        "print(g._worker.pid, flush=True); time.sleep(60)\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        pid = int(parent.stdout.readline())
+        os.kill(pid, 0)  # it lives
+        parent.kill()
+    for _ in range(100):
+        try:
+            with open(f"/proc/{pid}/stat") as file:
+                if file.read().rpartition(")")[2].split()[0] == "Z":  # ended, nobody has asked for its status
+                    return
+        except FileNotFoundError:
+            return
+        time.sleep(0.1)
+    os.kill(pid, signal.SIGKILL)
+    pytest.fail("the optimiser's process lives on")
+
+
+def test_the_relative_covariance_of_neighbours_is_that_of_their_edge() -> None:
+    graph = PoseGraph(PoseGraphSettings())
+    drive(graph, 30)
+    np.testing.assert_allclose(graph.relative_covariance(20, 21), STEP, rtol=1e-3, atol=1e-9)
+    assert np.trace(graph.covariance(29)) > 20 * np.trace(STEP)
+    with pytest.raises(ValueError, match="relative to itself"):
+        graph.relative_covariance(3, 3)
+
+
+def test_a_loop_makes_the_far_end_certain() -> None:
+    graph = PoseGraph(PoseGraphSettings())
+    drive(graph, 55)
+    before = np.trace(graph.covariance(50))
+    graph.add_loop(0, 50, np.eye(4), LOOP)
+    graph.optimise()
+    after = graph.covariance(50)
+    assert np.trace(after) < before
+    assert np.trace(after) < np.trace(LOOP)

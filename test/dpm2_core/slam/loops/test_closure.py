@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Loops in a street that is driven again: the same way, in reverse, and across; the drift may be as it likes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+
+import numpy as np
+import pytest
+
+from dpm2_core.descriptors import Descriptors
+from dpm2_core.frame import Array, Keyframe, Points, Registration
+from dpm2_core.geometry import se3
+from dpm2_core.network.model import DeepPointMap2
+from dpm2_core.sim.config import LidarConfig
+from dpm2_core.sim.lidar import Lidar
+from dpm2_core.sim.world import World, build_world
+from dpm2_core.slam.loops.closure import LoopCloser, LoopSettings
+from dpm2_core.slam.loops.consistency import Loop
+from dpm2_core.slam.neural import load_network
+from dpm2_core.slam.registration import GeometricSettings
+
+FIRM = np.diag([1e-3] * 3 + [0.02] * 3) ** 2
+STREET = np.arange(40.0, 105.0, 5.0)
+
+
+@cache
+def suburb() -> World:
+    return build_world("straight", "suburb", seed=8, length=160.0)
+
+
+@cache
+def network() -> DeepPointMap2:
+    return load_network("small", 2)
+
+
+@cache
+def described(s: float, lateral: float, heading: float) -> Descriptors | None:
+    return closer().described(Keyframe(0, 0, 0, np.eye(4), scan(s, lateral, heading))).descriptors
+
+
+@cache
+def scan(s: float, lateral: float, heading: float) -> Points:
+    """What is seen there, the same each time."""
+    rng = np.random.default_rng([int(10 * s), int(100 + lateral), int(10 * heading)])
+    return Lidar(LidarConfig()).scan(suburb(), where(s, lateral, heading), 0.1 * s, rng).points
+
+
+def where(s: float, lateral: float = 0.0, heading: float = 0.0) -> Array:
+    return suburb().pose_at(s, lateral, heading)
+
+
+def closer(**settings: object) -> LoopCloser:
+    return LoopCloser(LoopSettings.model_validate(settings), GeometricSettings(), 2, network())
+
+
+def drive(places: Sequence[tuple[float, float, float]], jump: Array, **settings: object) -> tuple[list[Loop], Array]:
+    """The loops that are tried along the street and then at `places`, before which the odometry errs by `jump`."""
+    at = [(s, 0.0, 0.0) for s in STREET] + list(places)
+    truth = np.array([where(*place) for place in at])
+    odometry = truth.copy()
+    odometry[len(STREET) :] = jump @ odometry[len(STREET) :]
+    loops, keyframes, clouds = [], [], []
+    search = closer(**settings)
+    for i, place in enumerate(at):
+        edge = Registration(np.eye(4), FIRM, 1.0, 0.1, "test") if i else None
+        clouds.append(scan(*place))
+        keyframes.append(Keyframe(i, i, i, odometry[i], clouds[-1], edge, "", described(*place)))
+        loops += search.close(keyframes, clouds, odometry[: i + 1])
+    return loops, truth
+
+
+def errors(loops: Sequence[Loop], truth: Array) -> list[float]:
+    """Distances of the accepted ones from the truth, m."""
+    true = [se3.inverse(truth[loop.from_node]) @ truth[loop.to_node] for loop in loops]
+    off = [se3.inverse(T) @ loop.registration.T_target_source for T, loop in zip(true, loops, strict=True)]
+    return [float(np.linalg.norm(T[:3, 3])) for T in off]
+
+
+@pytest.mark.parametrize("heading", [0.0, np.pi, np.pi / 2], ids=["same", "reverse", "across"])
+def test_a_revisit_is_found_whatever_the_drift_and_heading(heading: float) -> None:
+    """The odometry is 3 m and 3 degrees off, and says nothing of where to look: the nearest by pose is off the mark."""
+    places = [(s, 2.5, heading) for s in (62.0, 67.0, 72.0)]
+    jump = se3.exp(np.array([0, 0, np.radians(1.5), 2.5, 1.0, 0]))
+    loops, truth = drive(places, jump, gap=30.0, consistency={"drift": 0.05})
+    accepted = [loop for loop in loops if loop.registration.ok]
+    assert {loop.to_node for loop in accepted} == {len(STREET), len(STREET) + 1, len(STREET) + 2}
+    assert max(errors(accepted, truth)) < 0.1
+    waited = [loop for loop in loops if "waits" in loop.registration.reason]
+    assert len(waited) <= 1  # the first, for the second
+
+
+def test_a_place_never_seen_closes_no_loop_and_each_candidate_has_its_reason() -> None:
+    world = build_world("straight", "city", seed=5, length=160.0)
+    lidar, rng, search = Lidar(LidarConfig()), np.random.default_rng(0), closer(gap=30.0)
+    keyframes, clouds, loops = [], [], []
+    poses = np.array([where(s) for s in STREET] + [where(s) for s in (60.0, 65.0)])
+    for i, T in enumerate(poses):
+        elsewhere = i >= len(STREET)
+        cloud = lidar.scan(world, world.pose_at(60.0 + i), 0.0, rng).points if elsewhere else scan(STREET[i], 0.0, 0.0)
+        edge = Registration(np.eye(4), FIRM, 1.0, 0.1, "test") if i else None
+        clouds.append(cloud)
+        known = None if elsewhere else described(STREET[i], 0.0, 0.0)
+        keyframes.append(search.described(Keyframe(i, i, i, T, cloud, edge, "", known)))
+        loops = search.close(keyframes, clouds, poses[: i + 1]) if elsewhere else loops
+    assert loops
+    assert all(not loop.registration.ok and loop.registration.reason for loop in loops)
+
+
+def test_without_descriptors_the_pose_alone_leads_to_loops() -> None:
+    jump = se3.exp(np.array([0, 0, 0, 0.5, 0.5, 0]))
+    at = [(s, 0.0, 0.0) for s in STREET] + [(62.0, 1.0, 0.0)]
+    truth = np.array([where(*place) for place in at])
+    poses = truth.copy()
+    poses[-1] = jump @ poses[-1]
+    search = LoopCloser(LoopSettings(gap=30.0), GeometricSettings(), 2)
+    clouds = [scan(*place) for place in at]
+    keyframes = [
+        Keyframe(i, i, i, poses[i], clouds[i], Registration(np.eye(4), FIRM, 1.0, 0.1, "test") if i else None)
+        for i in range(len(at))
+    ]
+    assert search.described(keyframes[0]).descriptors is None
+    (loop,) = search.close(keyframes, clouds, poses)
+    assert loop.registration.ok, loop.registration.reason
+    assert errors([loop], truth)[0] < 0.1
+
+
+def test_disabled_it_closes_nothing_and_a_cloud_too_small_for_descriptors_is_no_failure() -> None:
+    search = closer(enabled=False)
+    tiny = Keyframe(0, 0, 0, np.eye(4), np.zeros((3, 4), np.float32), None)
+    assert search.described(tiny).descriptors is None
+    assert search.close([tiny, tiny], [tiny.cloud] * 2, np.array([np.eye(4)] * 2)) == []
