@@ -22,10 +22,10 @@ from visualization_msgs.msg import MarkerArray
 from dpm2_core.config import dump_settings
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Keyframe
-from dpm2_core.slam.map_store import MapStore
-from dpm2_core.slam.mapper import Mapper
+from dpm2_core.slam.map.mapper import Mapper
+from dpm2_core.slam.map.session import open_session
+from dpm2_core.slam.map.store import MapStore
 from dpm2_core.slam.output import save_map
-from dpm2_core.slam.session import open_session
 from dpm2_core.slam.system import make_mapper
 from dpm2_ros.conversions import cloud_to_msg, edge_to_msg, keyframe_name
 from dpm2_ros.display import path_to_msg, pose_graph_to_msg
