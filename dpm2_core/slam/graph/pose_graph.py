@@ -121,7 +121,7 @@ class PoseGraph:
             return
         try:
             self._apply(robust.optimise(self._data(), self._settings), len(self._loops))
-        except RuntimeError as error:  # gtsam's: the system is singular
+        except (RuntimeError, np.linalg.LinAlgError) as error:  # gtsam's or numpy's: the system is singular
             raise Dpm2Error(f"pose graph: {' '.join(str(error).split())}") from None
 
     def collect(self, wait: bool = False) -> bool:

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
+from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph import pose_graph
@@ -153,3 +154,14 @@ def test_a_loop_makes_the_far_end_certain() -> None:
     after = graph.covariance(50)
     assert np.trace(after) < before
     assert np.trace(after) < np.trace(LOOP)
+
+
+def test_a_covariance_that_is_none_is_an_error_of_the_work() -> None:
+    """A singular covariance says so in one line; the poses stay."""
+    graph = PoseGraph(PoseGraphSettings())
+    graph.add_node(np.eye(4), None, None)
+    graph.add_node(np.eye(4), np.eye(4), np.eye(6))
+    graph.add_loop(0, 1, np.eye(4), np.zeros((6, 6)))
+    with pytest.raises(Dpm2Error, match="pose graph"):
+        graph.optimise()
+    assert np.array_equal(graph.poses, np.tile(np.eye(4), (2, 1, 1)))
