@@ -73,6 +73,20 @@ def pack(
 
 
 @train.command()
+def image(
+    config: ConfigOption = None,
+    settings: SetOption = None,
+    out: OutOption = Path("out/image"),
+    resume: ResumeOption = False,
+) -> None:
+    """The image branch alone, before phase one with pictures."""
+    from dpm2_core.training.phase_image import PhaseImageSettings, phase_image
+
+    _refuse_overwriting(out, resume)
+    phase_image(load_settings(PhaseImageSettings, config, settings or []), out, resume)
+
+
+@train.command()
 def phase1(
     config: ConfigOption = None,
     settings: SetOption = None,

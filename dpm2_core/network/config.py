@@ -107,6 +107,9 @@ class FusionSettings(Settings):
     """Backbone levels, 0 the finest, whose key-points the LiDAR branch reads."""
     relative: bool = True
     """Among reference points, add to the attention a learned bias from where one lies as seen from the other."""
+    pixel: bool = True
+    """Add the picture's feature where a reference point projects to its descriptor: along a tunnel the texture right
+    there tells places apart, and the way through the attention is long to learn. False: the paper's."""
     image_mask: Literal["view", "front"] = "view"
     """Which reference points read an image: those that project into it, or, as in the paper, all, with the pixels
     whose rays point away counted as far."""
@@ -191,6 +194,7 @@ _PAPER: dict[str, Any] = {
         "learned_gain": False,
         "levels": [2, 3, 4],
         "relative": False,
+        "pixel": False,
         "image_mask": "front",
     },
 }

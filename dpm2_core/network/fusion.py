@@ -11,7 +11,7 @@ from dpm2_core.network.config import NetworkSettings
 from dpm2_core.network.convnext import FeatureMap
 from dpm2_core.network.descriptors import Tokens
 from dpm2_core.network.pointnext import Scale, to_view, view_axes
-from dpm2_core.network.spatial import Views, point_bias, ray_bias, sample_at_points, token_pixels
+from dpm2_core.network.spatial import Views, picture_features, point_bias, ray_bias, sample_at_points, token_pixels
 
 SAMPLED = {"point_painting": 1, "roi_pooling": 3}  # side of the window that replaces the image attention
 
@@ -119,6 +119,11 @@ class Fusion(nn.Module):
         if settings.image.backbone != "none":
             self.image_in = nn.Linear(settings.image.pyramid, width)
             self.image_norm = nn.LayerNorm(width)
+        self.pixel = None
+        if settings.image.backbone != "none" and fusion.pixel:
+            self.pixel = nn.Linear(settings.image.pyramid, settings.channels)
+            self.pixel_in = nn.Linear(settings.channels, settings.channels, bias=False)
+            nn.init.zeros_(self.pixel_in.weight)  # begins as the network without
         self.lidar_norm = nn.LayerNorm(width)
         self.layers = nn.ModuleList(FusionLayer(settings) for _ in range(fusion.layers))
         self.relative = RelativeBias(fusion.layers, fusion.heads) if fusion.relative else None
@@ -137,7 +142,12 @@ class Fusion(nn.Module):
             x = x + sine_code(refs.xyz, x.shape[-1])
         for layer, bias in zip(self.layers, biases, strict=True):
             x = layer(x, (bias, self_mask), lidar, image)
-        return refs._replace(features=self.out(x))
+        x = self.out(x)
+        if self.pixel is not None and views is not None:
+            features, seen = picture_features(refs.xyz, views, maps)
+            texture = nn.functional.normalize(self.pixel(features).float(), dim=-1).to(x.dtype)
+            x = x + self.pixel_in(texture) * seen[..., None]
+        return refs._replace(features=x)
 
     def _lidar(self, refs: Tokens, scales: list[Scale]) -> Branch:
         features = torch.cat([project(s.features) for project, s in zip(self.lidar_in, scales, strict=True)], 1)

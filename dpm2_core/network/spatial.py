@@ -86,8 +86,8 @@ def seen_from(points: Tensor, views: Views, view: int) -> Tensor:
     return inside & views.present[:, view, None]
 
 
-def sample_at_points(points: Tensor, views: Views, features: Tensor, window: int) -> Tensor:
-    """Features of the first view's finest map around projected points.
+def sample_at_points(points: Tensor, views: Views, features: Tensor, window: int, view: int = 0) -> Tensor:
+    """Features of a view's finest map around projected points.
 
     Args:
         points: (B, N, 3), m. features: (B, C, h, w). window: 1 or 3, side of the square of samples, a map pixel apart.
@@ -96,7 +96,7 @@ def sample_at_points(points: Tensor, views: Views, features: Tensor, window: int
         (B, N, C), the mean of the window; zero outside the picture.
     """
     height, width = views.pixels.shape[-2:]
-    uv, depth = project(points, views.K[:, 0].float(), views.T_lidar_cam[:, 0].float())
+    uv, depth = project(points, views.K[:, view].float(), views.T_lidar_cam[:, view].float())
     size = torch.tensor([width, height], device=uv.device)
     grid = (uv + 0.5) / size * 2 - 1
     grid = torch.where(depth[..., None] > 0.1, grid, torch.full_like(grid, -9))  # behind: outside
@@ -107,3 +107,19 @@ def sample_at_points(points: Tensor, views: Views, features: Tensor, window: int
         features.float(), grid[:, :, None] + shift, mode="bilinear", padding_mode="zeros", align_corners=False
     )
     return samples.mean(-1).transpose(1, 2)
+
+
+def picture_features(points: Tensor, views: Views, maps: list[FeatureMap]) -> tuple[Tensor, Tensor]:
+    """Features of the finest maps where points project.
+
+    Args:
+        points: (B, N, 3), m.
+
+    Returns:
+        (B, N, C), the mean of the views that see the point, zero where none does; and (B, N), whether any does.
+    """
+    finest = maps[0].features.unflatten(0, tuple(views.present.shape))
+    seen = torch.stack([seen_from(points, views, view) for view in range(finest.shape[1])], -1)
+    sampled = [sample_at_points(points, views, finest[:, view], 1, view) for view in range(finest.shape[1])]
+    total = (torch.stack(sampled, -1) * seen[:, :, None]).sum(-1)
+    return (total / seen.sum(-1, keepdim=True).clamp(min=1)).to(finest.dtype), seen.any(-1)

@@ -28,6 +28,8 @@ class DataSettings(Settings):
 
     packed: dict[str, float] = Field({})
     """Folders of packed drives (`dpm2 train pack`) and the weight of each in the mixture."""
+    emphasis: dict[str, float] = Field({})
+    """Factor on the weight of drives of a preset of the synthetic city, such as {tunnel: 3}."""
     groups: int = Field(4, gt=0)
     """Places in a batch, per process."""
     frames: int = Field(4, ge=2)
@@ -94,7 +96,8 @@ class GroupDataset(IterableDataset):
             found = open_packed(Path(folder))
             frames = sum(len(drive) for drive in found)
             drives += found
-            chances += [weight * len(drive) / frames for drive in found]
+            factors = [settings.emphasis.get(str(drive.about.get("preset")), 1.0) for drive in found]
+            chances += [weight * factor * len(drive) / frames for drive, factor in zip(found, factors, strict=True)]
         self.drives: Sequence[PackedDrive] = drives
         self.chances = np.array(chances) / sum(chances)
 

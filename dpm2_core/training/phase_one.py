@@ -19,7 +19,7 @@ from dpm2_core.network.losses import cosine, info_nce, label_pairs
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pointnext import Scale
 from dpm2_core.network.pyramid import PointBatch
-from dpm2_core.network.spatial import Views, sample_at_points, seen_from
+from dpm2_core.network.spatial import Views, picture_features
 from dpm2_core.network.weights import load_weights, save_weights
 from dpm2_core.training.checkpoint import load_checkpoint
 from dpm2_core.training.dataset import Batch, DataSettings, GroupDataset
@@ -40,8 +40,11 @@ class PhaseOne(nn.Module):
         sizes = [stage.points for stage in network.points.stages]
         self.level = min(range(len(sizes)), key=lambda i: abs(sizes[i] - 256))  # key-points as dense as descriptors
         self.backbone_head = nn.Linear(channels[self.level], network.channels)
-        camera = network.image.backbone != "none" and loss.image > 0
-        self.image_head = nn.Linear(network.image.pyramid, network.channels) if camera else None
+        fusion = self.model.encoder.fusion
+        self.image_head: nn.Module | None = None
+        if network.image.backbone != "none" and loss.image > 0:
+            own = None if fusion is None else fusion.pixel
+            self.image_head = nn.Linear(network.image.pyramid, network.channels) if own is None else own
 
     def forward(
         self, points: PointBatch, views: Views | None, plans: tuple[Plan, ...]
@@ -77,11 +80,9 @@ class PhaseOne(nn.Module):
     def _image_loss(self, head: nn.Module, encoded: Encoded, views: Views, plan: Plan) -> Tensor:
         """InfoNCE of the pictures' features where the descriptors project: the image branch learns long before the
         fusion makes use of it."""
-        frames, count = views.present.shape
-        finest = encoded.maps[0].features.unflatten(0, (frames, count))[:, 0]
         xyz = encoded.tokens.xyz
-        features = head(sample_at_points(xyz, views, finest, 1).to(finest.dtype))
-        mask = encoded.tokens.mask & seen_from(xyz, views, 0)
+        features, seen = picture_features(xyz, views, encoded.maps)
+        features, mask = head(features), encoded.tokens.mask & seen
         i, j = plan.source[:, 0], plan.target[:, 0]
         labels = label_pairs(xyz[i], xyz[j], plan.T_target_source, (mask[i], mask[j]))
         return info_nce(cosine(features[i], features[j]) / self.model.decoder.settings.temperature, labels, False)

@@ -14,11 +14,12 @@ from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Frame, Image
 from dpm2_core.geometry import se3
 from dpm2_core.network.config import PRESETS, preset
+from dpm2_core.network.convnext import FeatureMap
 from dpm2_core.network.encoder import Encoder, collate_views, resize
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pointnext import argmax_neighbour
 from dpm2_core.network.pyramid import build_pyramid, collate, crop
-from dpm2_core.network.spatial import Views
+from dpm2_core.network.spatial import Views, picture_features
 
 
 def frame(cloud: np.ndarray, *images: Image) -> Frame:
@@ -187,3 +188,25 @@ def test_argmax_neighbour() -> None:
         best = argmax_neighbour(sums)
         found = sums.gather(2, best[:, :, None])[:, :, 0]
         torch.testing.assert_close(found, sums.amax(2), atol=1e-4, rtol=1e-4)  # float32 loses 8 bits to the index
+
+
+def test_the_feature_of_the_own_pixel_begins_as_nothing(tiny: Callable, noise: np.random.Generator) -> None:
+    """At first a network with it is the network without, and stays so where no view sees; several are averaged."""
+    torch.manual_seed(0)
+    features = [FeatureMap(torch.randn(2, 8, 4, 6), 8)]
+    T = torch.tensor([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]]).expand(1, 2, 4, 4).clone()
+    K = torch.tensor([[20, 0, 24], [0, 20, 16], [0, 0, 1.0]]).expand(1, 2, 3, 3)
+    pixels = torch.zeros(1, 2, 3, 32, 48, dtype=torch.uint8)
+    points = torch.tensor([[[10.0, 1, 0], [-10, 0, 0]]])
+    both = Views(pixels, K, T, torch.tensor([[True, True]]))
+    found, seen = picture_features(points, both, features)
+    one, other = (
+        picture_features(points, both._replace(present=torch.tensor([present])), features)[0]
+        for present in ([True, False], [False, True])
+    )
+    assert seen.tolist() == [[True, False]]
+    torch.testing.assert_close(found, (one + other) / 2)
+    assert found[0, 1].abs().max() == 0
+    fusion = Encoder(tiny()).fusion
+    assert fusion is not None
+    assert fusion.pixel_in.weight.abs().max() == 0

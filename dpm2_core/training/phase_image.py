@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Before phase one with pictures: the image branch alone, on points that two pictures both show.
+
+Inside the whole network the image branch learns last: its way into the pose is long. Alone it learns in minutes,
+because every LiDAR point that both cameras see is an exact correspondence, and a step costs no point cloud network.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pydantic import Field
+from torch import Tensor, nn
+
+from dpm2_core.config import Settings
+from dpm2_core.errors import UsageError
+from dpm2_core.frame import Camera, Image
+from dpm2_core.geometry import se3
+from dpm2_core.network.config import NetworkSettings, preset
+from dpm2_core.network.encoder import collate_views, to_device
+from dpm2_core.network.losses import cosine, info_nce, label_distances
+from dpm2_core.network.model import DeepPointMap2
+from dpm2_core.network.spatial import Views, picture_features
+from dpm2_core.network.weights import load_weights, save_weights
+from dpm2_core.training.augment import augment_image
+from dpm2_core.training.checkpoint import load_checkpoint
+from dpm2_core.training.dataset import DataSettings, GroupDataset
+from dpm2_core.training.trainer import OptimiserSettings, process_group, train
+
+NEUTRAL = 1.5  # m, within which a point's neighbours are neither right nor wrong
+
+
+class PicturePairs(NamedTuple):
+    """Pictures two by two, first and second of each pair.
+
+    Attributes:
+        views: of 2 P frames. points: (2 P, n, 3) m, the same points in both LiDAR frames of a pair.
+    """
+
+    views: Views
+    points: Tensor
+
+
+class PhaseImageSettings(Settings):
+    """A training of the image branch."""
+
+    preset: str = "small"
+    """Network preset."""
+    network: dict[str, Any] = Field({})
+    """Changes to the preset."""
+    data: DataSettings = DataSettings(images=True)
+    """`radius` is the largest distance between two pictures."""
+    points: int = Field(256, gt=0)
+    """Points drawn for each pair."""
+    shift: float = Field(0.3, ge=0)
+    """Deviation of the second picture's points from the true ones, m: descriptors never sit at the very same place."""
+    optimiser: OptimiserSettings = OptimiserSettings()
+    start: str = ""
+    """Weights (safetensors) of the network, whose other parts stay as they are; empty: random."""
+
+
+class PictureDataset(GroupDataset):
+    """Pairs of pictures of a place and the points that the first of them shows."""
+
+    def pairs(self, points: int) -> Iterator[PicturePairs]:
+        """An endless stream, as deterministic as the batches of phase one.
+
+        Raises:
+            UsageError: a drive without pictures, or whose pictures show too few points.
+        """
+        step = self.start
+        while True:
+            noise = np.random.default_rng([self.seed, step, self.shard[0]])
+            step += 1
+            images: list[list[Image]] = []
+            drawn: list[NDArray[np.float32]] = []
+            for _ in range(100 * self.settings.groups):
+                if len(images) == 2 * self.settings.groups:
+                    break
+                drive = self.drives[noise.choice(len(self.drives), p=self.chances)]
+                a, b = (drive[i] for i in self.draw(drive.poses, 2, self.settings.radius, noise))
+                if not (a.images and b.images):
+                    raise UsageError(f"{drive.folder}: a drive without pictures; pack it with them or leave it out")
+                seen = a.cloud[shown(a.cloud, a.images[0].camera)]
+                if len(seen) < points:
+                    continue
+                chosen = seen[noise.choice(len(seen), points, replace=False)]
+                drawn += [chosen, se3.transform(se3.inverse(b.pose) @ a.pose, chosen).astype(np.float32)]
+                images += [[augment_image(s.images[0], np.eye(4), self.settings.augment, noise)] for s in (a, b)]
+            views = collate_views(images, self.network.image)
+            if views is None or len(images) < 2 * self.settings.groups:
+                raise UsageError(f"data.packed: hardly any picture shows {points} points; lower `points`")
+            yield PicturePairs(views, torch.from_numpy(np.stack(drawn)))
+
+
+def shown(points: NDArray[np.float32], camera: Camera) -> NDArray[np.bool_]:
+    """Which points (N, 3), m, in the LiDAR frame project into the camera's picture."""
+    moved = se3.transform(se3.inverse(camera.T_lidar_cam), points)
+    ahead = moved[:, 2] > 0.1
+    uv = (moved @ camera.K.T)[:, :2] / np.where(ahead, moved[:, 2], 1.0)[:, None]
+    return ahead & (uv >= 0).all(1) & (uv < camera.size).all(1)
+
+
+class PhaseImage(nn.Module):
+    """Image branch with its loss."""
+
+    def __init__(self, network: NetworkSettings, shift: float) -> None:
+        super().__init__()
+        self.model = DeepPointMap2(network)
+        self.temperature, self.shift = network.decoder.temperature, shift
+        encoder = self.model.encoder
+        if encoder.image is None or encoder.fusion is None or encoder.fusion.pixel is None:
+            raise UsageError(f"preset {network.preset}: has no picture features of its own to train (fusion.pixel)")
+        self.image, self.head = encoder.image, encoder.fusion.pixel
+        self.requires_grad_(False)
+        for part in (self.image, self.head):
+            part.requires_grad_(True)
+
+    def forward(self, batch: PicturePairs) -> tuple[Tensor, dict[str, Tensor]]:
+        """Mean InfoNCE of the points that both pictures of a pair show."""
+        maps = self.image(batch.views.pixels.flatten(0, 1))
+        points = batch.points.clone()
+        points[1::2] += torch.randn_like(points[1::2]) * self.shift
+        features, seen = picture_features(points, batch.views, maps)
+        features = self.head(features)
+        valid = seen[::2, :, None] & seen[1::2, None]
+        distance = torch.cdist(batch.points[1::2], points[1::2], compute_mode="donot_use_mm_for_euclid_dist")
+        labels = label_distances(distance.masked_fill(~valid, torch.inf), NEUTRAL)
+        scores = cosine(features[::2], features[1::2]) / self.temperature
+        loss = info_nce(scores, labels, False)
+        best = scores.detach().masked_fill(~valid, -1e4).argmax(2, keepdim=True)
+        used = labels.forward >= 0
+        right = ((distance.gather(2, best)[..., 0] <= NEUTRAL) & used).sum() / used.sum().clamp(min=1)
+        return loss, {"loss": loss.detach(), "right": right}
+
+
+def phase_image(settings: PhaseImageSettings, out: Path, resume: bool = False, until: int | None = None) -> Path:
+    """Train; checkpoint, log and the whole network's weights go to `out`. `until`: stop after this step."""
+    with process_group() as (rank, world, device):
+        torch.manual_seed(settings.optimiser.seed)
+        network = preset(settings.preset, settings.network)
+        module = PhaseImage(network, settings.shift).to(device)
+        if settings.start:
+            load_weights(module.model, Path(settings.start))
+        ema = copy.deepcopy(module).requires_grad_(False)
+        start = load_checkpoint(out / "checkpoint.pt", module, ema, None) if resume else 0
+        data = PictureDataset(settings.data, network, settings.optimiser.seed, start, (rank, world))
+
+        def loss(run: nn.Module, batch: PicturePairs, step: int) -> tuple[Tensor, dict[str, Tensor]]:
+            return run(to_device(batch, device))
+
+        batches = data.pairs(settings.points)
+        train(module, ema, batches, loss, settings.optimiser, out, resume, None, start, rank, device, until)
+        if rank == 0:
+            about = {"phase": "image", "steps": str(settings.optimiser.steps)}
+            save_weights(ema.model, out / "weights.safetensors", about)
+    return out / "weights.safetensors"
