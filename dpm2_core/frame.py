@@ -93,6 +93,7 @@ class Registration:
         rmse: root mean square residual of the inliers, m.
         method: who answered.
         ok: False: do not use it; `reason` says why in words.
+        overlap: probability that both saw the same place, 0..1; NaN where nobody judged it.
     """
 
     T_target_source: Array
@@ -102,6 +103,7 @@ class Registration:
     method: str
     ok: bool = True
     reason: str = ""
+    overlap: float = float("nan")
 
     @property
     def worst_sigma(self) -> float:

@@ -71,6 +71,7 @@ class Decoder(nn.Module):
         self.similarity = PointMLP(width)
         self.offset = OffsetHead(width, decoder.precision)
         self.overlap = OverlapHead(width)
+        self.judges_overlap = False  # until phase two has trained the head
         self.coarse = PointMLP(settings.channels)
         self._kept: tuple[Descriptors, Tokens, _Alone] | None = None
 
@@ -137,9 +138,15 @@ class Decoder(nn.Module):
         at_source, at_target = pairs.source[0, half:].double().cpu(), pairs.target[0, :half].double().cpu()
         return at_source.numpy(), at_target.numpy(), pairs.weight[0, :half].double().cpu().numpy()
 
+    def judge_overlap(self, source: Tokens, target: Tokens, correlated: Correlated) -> Tensor:
+        """Probability (B,) that each pair was seen from within 20 m; NaN while the head is untrained."""
+        if not self.judges_overlap:
+            return torch.full(source.mask.shape[:1], torch.nan)
+        return self.overlap(*correlated, source.mask, target.mask).float().sigmoid()
+
     @torch.inference_mode()
     def overlap_probability(self, sources: list[Descriptors], targets: list[Descriptors]) -> list[float]:
-        """Probability that each pair was seen from within 20 m."""
+        """Probability that each pair was seen from within 20 m, by the head as it is."""
         device = next(self.parameters()).device
         source = to_tokens(sources, self.view_aligned, device)
         target = to_tokens(targets, self.view_aligned, device)

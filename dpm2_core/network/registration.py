@@ -203,10 +203,9 @@ def register_batch(decoder: Decoder, source: Tokens, target: Tokens, correlated:
     rmse = ((error**2 * inliers).sum(1) / count.clamp(min=1)).sqrt()
     covariance = decoder.settings.covariance_scale * torch.linalg.inv(information)
     confidence = _confidence(unguided, T)
-    return [
-        _answer(*row)
-        for row in zip(T.cpu(), covariance.cpu(), confidence.tolist(), rmse.tolist(), count.tolist(), strict=True)
-    ]
+    overlap = decoder.judge_overlap(source, target, correlated)
+    figures = (field.tolist() for field in (confidence, rmse, count, overlap))
+    return [_answer(*row) for row in zip(T.cpu(), covariance.cpu(), *figures, strict=True)]
 
 
 def _solve_precise(pairs: Correspondences, T: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -234,12 +233,12 @@ def _confidence(unguided: Correspondences, T: Tensor) -> Tensor:
     return weight.topk(min(CONFIDENT, weight.shape[1]))[0].mean(1)
 
 
-def _answer(T: Tensor, covariance: Tensor, confidence: float, rmse: float, count: int) -> Registration:
+def _answer(T: Tensor, covariance: Tensor, confidence: float, rmse: float, count: int, overlap: float) -> Registration:
     if not bool(T.isfinite().all() and covariance.isfinite().all()):
         return _nothing("no finite pose")
     if count < 3:
         return _nothing(f"{count} matching descriptors, want 3")
-    return Registration(T.numpy(), covariance.numpy(), confidence, rmse, "neural")
+    return Registration(T.numpy(), covariance.numpy(), confidence, rmse, "neural", overlap=overlap)
 
 
 def _nothing(reason: str) -> Registration:

@@ -83,5 +83,5 @@ def load_model(path: Path) -> DeepPointMap2:
     if "network" not in metadata:
         raise UsageError(f"{path}: safetensors without a network description")
     model = DeepPointMap2(settings_from(NetworkSettings, json.loads(metadata["network"]), default=str(path)))
-    load_weights(model, path)
+    model.decoder.judges_overlap = load_weights(model, path).get("phase") == "2"
     return model.eval().requires_grad_(False)

@@ -21,6 +21,7 @@ TABLE_4: dict[str, dict[str, Any]] = {
     "scale-dot attention": {"fusion": {"kind": "scale_dot"}},
     "without learnable": {"fusion": {"kind": "without_learnable"}},
     "without spatial": {"fusion": {"kind": "without_spatial"}},
+    "biased attention, own pixel": {"fusion": {"pixel": True}},
     "no camera": {"image": {"backbone": "none"}},
 }
 

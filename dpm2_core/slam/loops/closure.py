@@ -13,6 +13,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from pydantic import Field
 
 from dpm2_core.config import Settings
 from dpm2_core.frame import Array, Keyframe, Points, Registration
@@ -44,6 +45,8 @@ class LoopSettings(Settings):
     """...and so many of them, the most confident first, by their points."""
     min_confidence: float = 0.15
     """Of the network's registration, below which the points are not asked."""
+    min_overlap: float = Field(0.2, ge=0, le=1)
+    """Probability of the network's overlap head, below which the points are not asked either."""
     radius: float = 8.0
     """The keyframe nearest by the pose is a candidate, too, if nearer than this, m; `drift` widens it."""
     drift: float = 0.01
@@ -124,6 +127,8 @@ class LoopCloser:
                     refusals.append(loop)
                 elif r.confidence < s.min_confidence:
                     refusals.append(refused(loop, f"descriptors match with a confidence of only {r.confidence:.2f}"))
+                elif r.overlap < s.min_overlap:  # NaN of an untrained head refuses nothing
+                    refusals.append(refused(loop, f"the places overlap with a probability of only {r.overlap:.2f}"))
                 else:
                     proposals.append(loop)
         if nearest is not None and all(abs(loop.from_node - nearest) > 1 for loop in proposals):

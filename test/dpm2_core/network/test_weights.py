@@ -7,10 +7,12 @@ import pickle
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
 
+from dpm2_core.descriptors import Descriptors
 from dpm2_core.errors import UsageError
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.weights import load_model, load_weights, save_weights
@@ -30,6 +32,21 @@ def test_round_trip(model: DeepPointMap2, saved: Path) -> None:
     for name, value in model.state_dict().items():
         torch.testing.assert_close(loaded.state_dict()[name], value, atol=1e-3, rtol=1e-3)
     assert load_weights(model, saved)["steps"] == "3"
+
+
+def test_overlap_is_judged_after_phase_two_alone(model: DeepPointMap2, saved: Path, tmp_path: Path) -> None:
+    """An untrained head says NaN, never a figure that a gate would believe."""
+    noise = np.random.default_rng(0)
+    descriptors = Descriptors(
+        noise.uniform(-9, 9, (40, 3)).astype(np.float32), noise.normal(size=(40, 32)).astype("f2")
+    )
+    save_weights(model, tmp_path / "two.safetensors", {"phase": "2"})
+    untrained, trained = (
+        load_model(path).decoder.register_many([descriptors], [descriptors])[0].overlap
+        for path in (saved, tmp_path / "two.safetensors")
+    )
+    assert np.isnan(untrained)
+    assert 0 < trained < 1
 
 
 def test_wrong_preset_is_refused(saved: Path, tiny: Callable) -> None:

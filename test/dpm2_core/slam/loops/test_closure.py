@@ -3,15 +3,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 
 import numpy as np
 import pytest
+import torch
 
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.frame import Array, Keyframe, Points, Registration
 from dpm2_core.geometry import se3
+from dpm2_core.network.decoder import Correlated
+from dpm2_core.network.descriptors import Tokens
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.sim.config import LidarConfig
 from dpm2_core.sim.lidar import Lidar
@@ -131,3 +134,23 @@ def test_disabled_it_closes_nothing_and_a_cloud_too_small_for_descriptors_is_no_
     tiny = Keyframe(0, 0, 0, np.eye(4), np.zeros((3, 4), np.float32), None)
     assert search.described(tiny).descriptors is None
     assert search.close([tiny, tiny], [tiny.cloud] * 2, np.array([np.eye(4)] * 2)) == []
+
+
+def test_places_that_hardly_overlap_are_left_to_no_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the overlap head doubts is refused in words, even where descriptors match; its silence refuses nothing."""
+    places = [(s, 2.5, 0.0) for s in (62.0, 67.0)]
+    jump = se3.exp(np.array([0, 0, 0, 12.0, 0, 0]))  # the nearest by pose is no help
+
+    def probability(value: float) -> Callable:
+        def judge(source: Tokens, target: Tokens, correlated: Correlated) -> torch.Tensor:
+            return torch.full(source.mask.shape[:1], value)
+
+        return judge
+
+    reasons = []
+    for value in (0.1, float("nan")):
+        monkeypatch.setattr(network().decoder, "judge_overlap", probability(value))
+        loops, _ = drive(places, jump, gap=30.0, consistency={"drift": 0.5})
+        reasons.append([loop.registration.reason for loop in loops])
+    assert any("overlap with a probability of only 0.10" in reason for reason in reasons[0])
+    assert not any("overlap" in reason for reason in reasons[1])
