@@ -57,8 +57,9 @@ train-data: setup  ## the synthetic worlds that train-small and ablation learn f
 
 TRAIN = OMP_WAIT_POLICY=active $(BIN)/python -m dpm2_core.cli train
 RESUMED = $(if $(wildcard out/$(1)/checkpoint.pt),--resume)
-train-small: train-data  ## train the weights that are shipped: registration, camera, overlap (2 cores: 2.5 hours; continues)
+train-small: train-data  ## train the weights that are shipped: registration, image branch, both, overlap (2 cores: 2.5 hours; continues)
 	$(TRAIN) phase1 --config config/train_small.yaml --out out/phase1 $(call RESUMED,phase1)
+	$(TRAIN) image --config config/train_small_image.yaml --out out/image $(call RESUMED,image)
 	$(TRAIN) phase1 --config config/train_small_camera.yaml --out out/camera $(call RESUMED,camera)
 	$(TRAIN) phase2 --config config/train_small_phase2.yaml --out out/phase2 $(call RESUMED,phase2)
 
