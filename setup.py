@@ -37,6 +37,8 @@ ROS = [
 EXTRAS = {
     "test": ["pytest>=8,<10", "pytest-timeout>=2.3,<3", "hypothesis>=6.100,<7"],
     "las": ["laspy>=2.5,<3"],  # dpm2 map export MAP OUT.las
+    "timm": ["timm>=1,<2"],  # image backbones timm:NAME
+    "train": ["tensorboard>=2.16,<3"],  # curves beside log.jsonl
     "bench": ["kiss-icp>=1.2,<2"],  # the baseline of the benchmarks
 }
 EXTRAS["dev"] = [*EXTRAS["test"], *EXTRAS["bench"], "ruff>=0.9", "mypy>=1.13", "types-PyYAML"]

@@ -107,3 +107,22 @@ def test_command_and_mixture(kitti: Path, packed: Path, tiny: Callable, tmp_path
     again = CliRunner().invoke(app, arguments)
     assert isinstance(again.exception, UsageError)
     assert "is there already" in str(again.exception)
+
+
+def test_a_bag_with_poses_packs_like_its_drive(kitti: Path, tmp_path: Path) -> None:
+    """Ground truth in an Odometry topic is as good as a poses.txt."""
+    runner = CliRunner()
+    bag, drive = tmp_path / "bag", str(kitti)
+    arguments = {
+        "bag": ["train", "pack", str(bag), str(tmp_path / "of_bag")],
+        "drive": ["train", "pack", drive, str(tmp_path / "of_drive"), "--set", "sequence=03"],
+    }
+    made = runner.invoke(app, ["convert", "kitti", drive, str(bag), "--sequence", "03"])
+    assert made.exit_code == 0, made.output
+    for command in arguments.values():
+        done = runner.invoke(app, command)
+        assert done.exit_code == 0, done.output
+    one, other = PackedDrive(tmp_path / "of_bag"), PackedDrive(tmp_path / "of_drive")
+    assert len(one) == len(other) == 4
+    motions = [se3.inverse(d.poses[0]) @ d.poses[3] for d in (one, other)]
+    np.testing.assert_allclose(motions[0], motions[1], atol=1e-6)
