@@ -1,0 +1,19 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Differentiable LiDAR odometry as a training signal: `SlamLoss()(pred_clouds, target_clouds, weights)`.
+
+After "Differentiable SLAM Helps Deep Learning-based LiDAR Perception Tasks" (BMVC 2023). Pure torch, CPU and GPU.
+"""
+
+from dpm2_core.diffslam.schedule import ScheduleSettings, is_slam_epoch, total_loss
+from dpm2_core.diffslam.trajectory_loss import SlamLoss, SlamLossSettings, trajectory_loss
+from dpm2_core.diffslam.windows import ContiguousWindows
+
+__all__ = [
+    "ContiguousWindows",
+    "ScheduleSettings",
+    "SlamLoss",
+    "SlamLossSettings",
+    "is_slam_epoch",
+    "total_loss",
+    "trajectory_loss",
+]

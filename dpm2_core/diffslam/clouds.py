@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A window of clouds as users have them, checked, thinned and padded to one tensor."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from dpm2_core.errors import UsageError
+
+MIN_POINTS = 50
+"""A scan of fewer is refused: ten of them make one normal."""
+_CELLS = 2**20  # along each axis; a cell index of three axes fits into 63 bits
+
+
+def window(
+    clouds: Sequence[Tensor] | Tensor, weights: Sequence[Tensor] | Tensor | None, count: int, voxel: float, name: str
+) -> tuple[Tensor, Tensor]:
+    """Points (T, N, 3) and weights (T, N) float64 of T clouds, N <= `count`, padded with weight zero.
+
+    A cloud of more than `count` points keeps one point of each occupied voxel and of these a random choice, the same in
+    every call; points of weight zero are not chosen. The gradient of the points and weights kept passes through.
+
+    Args:
+        clouds: T tensors (N_t, 3), m, or one (T, N, 3). weights: the same without the last axis, 0..1; None is one.
+        voxel: edge, m. name: of the clouds, for messages.
+
+    Raises:
+        UsageError: fewer than 2 scans or `MIN_POINTS` points, a wrong shape, a value not finite, a weight outside 0..1.
+    """
+    if len(clouds) < 2:
+        raise UsageError(f"{name}: a window of {len(clouds)} scans has no motion; want at least 2")
+    if weights is not None and len(weights) != len(clouds):
+        raise UsageError(f"{name}: weights of {len(weights)} scans for clouds of {len(clouds)}")
+    pairs = []
+    for t, cloud in enumerate(clouds):
+        weight = cloud.new_ones(cloud.shape[:1]) if weights is None else weights[t]
+        _check(cloud, weight, f"{name}, scan {t}")
+        keep = _thinned(cloud.detach(), weight.detach(), count, voxel)
+        # A scan without any weight keeps one point, so that it keeps its place and its weights their (zero) gradient.
+        kept = cloud[keep] if len(keep) else cloud[:1].nan_to_num(0.0, 0.0, 0.0)
+        pairs.append((kept.double(), (weight[keep] if len(keep) else weight[:1]).double()))
+    pad = torch.nn.utils.rnn.pad_sequence
+    return pad([points for points, _ in pairs], batch_first=True), pad(
+        [weight for _, weight in pairs], batch_first=True
+    )
+
+
+def _check(cloud: Tensor, weight: Tensor, where: str) -> None:
+    if cloud.ndim != 2 or cloud.shape[1] != 3 or not cloud.is_floating_point():
+        raise UsageError(f"{where}: want floating-point points (N, 3), found {tuple(cloud.shape)} {cloud.dtype}")
+    if len(cloud) < MIN_POINTS:
+        raise UsageError(f"{where}: {len(cloud)} points; want at least {MIN_POINTS}")
+    if weight.shape != cloud.shape[:1]:
+        raise UsageError(f"{where}: weights {tuple(weight.shape)} for {len(cloud)} points")
+    # Padding may hold anything; the common case costs one look at the device.
+    bad = ~cloud.detach().isfinite().all(1) & (weight.detach() != 0)
+    wrong = ~((weight.detach() >= 0) & (weight.detach() <= 1))
+    if bool((bad | wrong).any()):
+        if bool(bad.any()):
+            raise UsageError(f"{where}: {int(bad.sum())} of its {len(cloud)} points are not finite")
+        raise UsageError(f"{where}: {int(wrong.sum())} of its {len(cloud)} weights are not in 0..1")
+
+
+def _thinned(points: Tensor, weight: Tensor, count: int, voxel: float) -> Tensor:
+    """Indices of the points to keep, in their own order."""
+    index = weight.nonzero()[:, 0]
+    if len(index) <= count:
+        return index
+    generator = torch.Generator().manual_seed(len(points))
+    index = index[torch.randperm(len(index), generator=generator).to(index.device)]
+    cell = (points[index] / voxel).floor().long().clamp(-_CELLS // 2, _CELLS // 2 - 1) + _CELLS // 2
+    key, order = ((cell[:, 0] * _CELLS + cell[:, 1]) * _CELLS + cell[:, 2]).sort(stable=True)
+    first = torch.ones_like(key, dtype=torch.bool)
+    first[1:] = key[1:] != key[:-1]
+    return index[order[first].sort()[0][:count]].sort()[0]

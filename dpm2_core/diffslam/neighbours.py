@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Nearest neighbours in a batch of padded clouds, without gradient: a k-d tree on the CPU, all distances on a GPU."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import copy
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+_CHUNK = 2**27  # distances at once, 1 GiB in float64
+
+
+class NeighbourSearch:
+    """Finds the points of clouds (B, N, 3) whose `valid` (B, N) is true; the first is used where there is none."""
+
+    def __init__(self, points: Tensor, valid: Tensor) -> None:
+        """Index the clouds; their gradient is not followed."""
+        self._points = torch.where(valid[..., None], points.detach(), points.new_tensor(torch.inf))
+        self._trees: list[tuple[cKDTree, np.ndarray]] = []
+        if not points.is_cuda:
+            for cloud, mask in zip(points.detach().numpy(), valid.numpy(), strict=True):
+                index = np.flatnonzero(mask) if mask.any() else np.zeros(1, np.int64)
+                self._trees.append((cKDTree(cloud[index], balanced_tree=False), index))
+
+    def select(self, index: Sequence[int]) -> NeighbourSearch:
+        """Of the clouds of the batch at these places."""
+        out = copy(self)
+        out._points = self._points[torch.tensor(index, device=self._points.device)]
+        out._trees = [self._trees[i] for i in index] if self._trees else []
+        return out
+
+    def nearest(self, queries: Tensor, k: int = 1) -> Tensor:
+        """(B, M, k) indices of the k points nearest to queries (B, M, 3); a cloud of fewer repeats its nearest."""
+        queries = queries.detach()
+        return self._by_tree(queries, k) if self._trees else self._by_distance(queries, k)
+
+    def _by_tree(self, queries: Tensor, k: int) -> Tensor:
+        out = torch.empty(*queries.shape[:2], k, dtype=torch.int64)
+        for b, (tree, index) in enumerate(self._trees):
+            found = tree.query(queries[b].numpy(), [*range(1, k + 1)], workers=torch.get_num_threads())[1]
+            out[b] = torch.from_numpy(index[np.where(found < tree.n, found, found[:, :1])])
+        return out
+
+    def _by_distance(self, queries: Tensor, k: int) -> Tensor:
+        B, N = self._points.shape[:2]
+        rows = max(1, _CHUNK // (B * N))
+        found = []
+        for part in queries.split(rows, 1):
+            # The fast form, |a|^2 + |b|^2 - 2ab, loses centimetres 100 m away.
+            distance = torch.cdist(part, self._points, compute_mode="donot_use_mm_for_euclid_dist")
+            distance, index = distance.topk(min(k, N), largest=False) if k > 1 else distance.min(-1, keepdim=True)
+            found.append(torch.where(distance.isfinite(), index, index[..., :1]))
+        index = torch.cat(found, 1)
+        return torch.cat([index, index[..., :1].expand(-1, -1, k - index.shape[-1])], -1)

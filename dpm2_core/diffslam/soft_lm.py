@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Levenberg-Marquardt on SE(3) without its hard decisions, so that a gradient passes through every iteration.
+
+BMVC 2023, section 3: instead of accepting a step or not, its look-ahead error sets the damping of the next step (eq. 4)
+and the part of this step that is taken (eq. 5). Equation 5 is printed with its sign turned round: it takes the more of
+a step the worse it is. The gate here has the sign corrected; the printed one remains for comparison.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Literal, Protocol
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from dpm2_core.config import Settings
+from dpm2_core.geometry import se3_torch
+
+_SATURATION = 70.0  # of the exponent: beyond it a sigmoid in float64 has no gradient left
+_FLOOR = 1e-8  # m2: a fit better than 0.1 mm is perfect; keeps the relative change finite there
+_GRADSLAM_NU = 200.0
+
+
+class SoftLmSettings(Settings):
+    """The solver of `icp` and `pose_graph`."""
+
+    iterations: int = Field(default=8, ge=1)
+    """Steps, each with one association of the points."""
+    lambda_min: float = Field(default=1e-5, gt=0)
+    """Least damping, in units of the mean squared Jacobian of a residual: holds directions without evidence."""
+    lambda_max: float = Field(default=1e-3, gt=0)
+    """Greatest damping, the same units."""
+    steepness: float = Field(default=1.0, gt=0)
+    """Sigma of eq. 4."""
+    offset: float = Field(default=1.0, gt=0)
+    """D of eq. 4: at 1 an unchanged error gives the mean of both dampings."""
+    gate: Literal["soft", "paper", "gradslam", "none"] = "soft"
+    """Part of a step that is taken: eq. 5 with its sign corrected; as printed; as in gradslam (power 1/200); all."""
+    sensitivity: float = Field(default=10.0, gt=0)
+    """Gates soft and none: the exponent for an error that doubles. Sums saturate it, means leave it at zero."""
+    gradient: Literal["unrolled", "implicit"] = "unrolled"
+    """Through all iterations, or by the implicit function theorem at the last: less memory, exact once converged."""
+
+
+class Residuals(Protocol):
+    """A least-squares problem over K poses in each of B independent batch entries, with its associations fixed."""
+
+    def cost(self, T: Tensor) -> Tensor:
+        """(B,) mean squared residual, m2, at T (B, K, 4, 4)."""
+
+    def normal_equations(self, T: Tensor) -> tuple[Tensor, Tensor]:
+        """J^T W J (B, 6K, 6K) and J^T W r (B, 6K), both means, for steps T @ exp(delta)."""
+
+    @property
+    def total(self) -> Tensor:
+        """(B,) sum of the weights that `cost` is the mean over."""
+
+
+class Problem(Protocol):
+    """What `solve` minimises."""
+
+    def associate(self, T: Tensor) -> Residuals:
+        """The residuals around T (B, K, 4, 4); which points belong together is found without gradient."""
+
+
+def retract(T: Tensor, step: Tensor) -> Tensor:
+    """T (B, K, 4, 4) moved by step (B, 6K)."""
+    return T @ se3_torch.exp(step.unflatten(-1, (-1, 6)))
+
+
+def next_damping(change: Tensor, settings: SoftLmSettings) -> Tensor:
+    """Eq. 4: from `lambda_min` (the error fell) to `lambda_max` (it rose), for change (B,)."""
+    low, high = settings.lambda_min, settings.lambda_max
+    exponent = (-settings.steepness * change).clamp(-_SATURATION, _SATURATION)
+    return low + (high - low) / (1 + settings.offset * exponent.exp())
+
+
+def step_gate(change: Tensor, settings: SoftLmSettings) -> Tensor:
+    """Part of the step that is taken, 0..1, for the change of error (B,) that the whole step would bring."""
+    if settings.gate == "soft":
+        return torch.sigmoid(-change)
+    if settings.gate == "paper":
+        return torch.sigmoid(change)
+    if settings.gate == "gradslam":
+        return torch.sigmoid(change) ** (1 / _GRADSLAM_NU)
+    return torch.ones_like(change)
+
+
+def error_change(before: Tensor, after: Tensor, total: Tensor, settings: SoftLmSettings) -> Tensor:
+    """(B,) exponent of both rules, negative where the step helps.
+
+    Relative to the error before, so that it depends neither on the number of points nor on the scale of the scene; the
+    rules as printed take the difference of the sums of squares.
+    """
+    if settings.gate in ("paper", "gradslam"):
+        change = total * (after - before)
+    else:
+        change = settings.sensitivity * (after - before) / (before + _FLOOR)
+    return change.clamp(-_SATURATION, _SATURATION)
+
+
+def iterates(problem: Problem, T: Tensor, settings: SoftLmSettings) -> Iterator[Tensor]:
+    """The estimate (B, K, 4, 4) after each iteration, starting at T; differentiable where the problem is."""
+    damping = T.new_full((len(T),), settings.lambda_min)
+    for _ in range(settings.iterations):
+        residuals = problem.associate(T)
+        H, g = residuals.normal_equations(T)
+        eye = torch.eye(H.shape[-1], dtype=H.dtype, device=H.device)
+        factor = torch.linalg.cholesky(H + damping[:, None, None] * eye)
+        step = -torch.cholesky_solve(g[..., None], factor)[..., 0]
+        before, after = residuals.cost(T), residuals.cost(retract(T, step))
+        change = error_change(before, after, residuals.total, settings)
+        damping = next_damping(change, settings)
+        T = retract(T, step_gate(change, settings)[:, None] * step)
+        yield T
+
+
+def solve(problem: Problem, T: Tensor, settings: SoftLmSettings) -> Tensor:
+    """The minimum (B, K, 4, 4) found from T, with the gradient that `settings.gradient` names."""
+    if settings.gradient == "unrolled" or not torch.is_grad_enabled():
+        return list(iterates(problem, T, settings))[-1]
+    with torch.no_grad():
+        T = list(iterates(problem, T, settings))[-1]
+    return _attach(problem.associate(T), T, settings.lambda_min)
+
+
+def _attach(residuals: Residuals, T: Tensor, floor: float) -> Tensor:
+    """T with the gradient of the minimum: one Newton step, of length zero where T is the minimum.
+
+    At the minimum g(T, clouds) = 0, hence dT = -(dg/dT)^-1 dg. The Jacobian is that of g itself and not J^T W J: the
+    iterations, too, converge to its solution, and the two differ by as much as the residuals are not zero.
+    """
+    step = torch.zeros(len(T), 6 * T.shape[1], dtype=T.dtype, device=T.device, requires_grad=True)
+    g = residuals.normal_equations(retract(T, step))[1]
+    rows = [torch.autograd.grad(g[:, d].sum(), step, retain_graph=True)[0] for d in range(g.shape[1])]
+    K = torch.stack(rows, 1) + floor * torch.eye(g.shape[1], dtype=T.dtype, device=T.device)
+    return retract(T, -torch.linalg.solve(K, g[..., None])[..., 0])

@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The SLAM loss (BMVC 2023, eq. 3): how far the trajectory of the predicted scans is from that of the target scans."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from dpm2_core.config import Settings
+from dpm2_core.diffslam.clouds import window
+from dpm2_core.diffslam.icp import Cloud, IcpSettings, register
+from dpm2_core.diffslam.pose_graph import relax
+from dpm2_core.diffslam.soft_lm import SoftLmSettings
+from dpm2_core.errors import UsageError
+from dpm2_core.geometry import se3_torch
+
+Clouds = Sequence[Tensor] | Tensor
+"""T tensors (N_t, 3), m, or one (T, N, 3)."""
+Weights = Sequence[Tensor] | Tensor | None
+"""T tensors (N_t,), or one (T, N), in 0..1; zero is padding; None is one everywhere."""
+
+
+class SlamLossSettings(Settings):
+    """Odometry over a window of scans, and what its errors cost."""
+
+    icp: IcpSettings = IcpSettings()
+    """Registration of two scans."""
+    points: int = Field(default=2048, ge=50)
+    """Of a scan, at most."""
+    voxel: float = Field(default=0.5, gt=0)
+    """A scan of more points is thinned to one in each voxel of this edge first, m."""
+    spans: tuple[int, ...] = Field(default=(1,), min_length=1)
+    """Scans this far apart are registered. More than one span makes a pose graph, which is relaxed."""
+    graph: SoftLmSettings = SoftLmSettings(iterations=5)
+    """Of that relaxation."""
+    rotation_weight: float = Field(default=25.0, ge=0)
+    """Squared metres that a squared radian counts for, m2 / rad2."""
+    truncate: int = Field(default=0, ge=0)
+    """Gradients do not pass beyond every so many scans of the trajectory: long windows do not explode. 0: they pass."""
+
+
+def trajectory_loss(poses: Tensor, reference: Tensor, rotation_weight: float = 25.0) -> Tensor:
+    """Eq. 3: mean of |t - t_ref|^2 + rotation_weight |Log(R_ref^T R)|^2 over all poses but the first; a scalar, m2.
+
+    Args:
+        poses, reference: (T, 4, 4) T_map_scan of the same scans, both relative to their first. The reference has no
+            gradient. rotation_weight: m2 / rad2.
+
+    Raises:
+        UsageError: shapes differ, or there is no second pose.
+    """
+    if poses.shape != reference.shape or poses.ndim != 3 or poses.shape[1:] != (4, 4) or len(poses) < 2:
+        raise UsageError(
+            f"trajectory loss: poses {tuple(poses.shape)} against {tuple(reference.shape)}; want (T, 4, 4)"
+        )
+    poses, reference = poses[1:].double(), reference[1:].detach().double()
+    translation = (poses[:, :3, 3] - reference[:, :3, 3]).square().sum(-1)
+    rotation = se3_torch.log_rotation(reference[:, :3, :3].mT @ poses[:, :3, :3]).square().sum(-1)
+    return (translation + rotation_weight * rotation).mean()
+
+
+def odometry(clouds: Clouds, weights: Weights = None, guess: Tensor | None = None,
+             settings: SlamLossSettings | None = None, name: str = "scans") -> Tensor:  # fmt: skip
+    """Trajectory (T, 4, 4) T_first_scan float64 of T contiguous scans, differentiable in points and weights.
+
+    All pairs are registered at once, each from the guess. A pair without evidence (weights of zero) keeps its guess.
+
+    Args:
+        guess: (4, 4) or (T - 1, 4, 4) motion from a scan to the next, T_scan_next, without gradient; identity if None.
+
+    Raises:
+        UsageError: see `clouds.window`; or the guess has another shape.
+    """
+    settings = settings or SlamLossSettings()
+    points, w = window(clouds, weights, settings.points, settings.voxel, name)
+    scans = Cloud(points, w, settings.icp.normal_neighbours)
+    steps = _guessed_steps(guess, points)
+    guessed = _chain(steps, 0)
+    spans = sorted({1, *settings.spans})
+    edges = torch.tensor([(i, i + span) for span in spans for i in range(len(points) - span)])
+    target, source = edges[:, 0].to(points.device), edges[:, 1].to(points.device)
+    found = register(scans.select(source.tolist()), scans.select(target.tolist()),
+                     se3_torch.inverse(guessed[target]) @ guessed[source], settings.icp)  # fmt: skip
+    poses = _chain(found[: len(points) - 1], settings.truncate)
+    if len(edges) == len(points) - 1:
+        return poses
+    return relax(poses.detach(), edges, found, None, settings.rotation_weight, settings.graph)
+
+
+class SlamLoss(torch.nn.Module):
+    """`loss = SlamLoss()(pred_clouds, target_clouds, weights)`; add it to the loss of the task, never alone.
+
+    The reference is the trajectory of the same SLAM on the target scans: no ground truth is needed.
+    """
+
+    def __init__(self, settings: SlamLossSettings | None = None) -> None:
+        """Default settings if None."""
+        super().__init__()
+        self.settings = settings or SlamLossSettings()
+        self._references: dict[tuple[tuple[str, int], ...], Tensor] = {}
+
+    def forward(
+        self,
+        pred_clouds: Clouds,
+        target_clouds: Clouds,
+        weights: Weights = None,
+        target_weights: Weights = None,
+        *,
+        guess: Tensor | None = None,
+        frames: Sequence[tuple[str, int]] | None = None,
+    ) -> Tensor:
+        """Scalar float64, m2; zero, with zero gradient, where prediction and target are the same.
+
+        Args:
+            pred_clouds, target_clouds: windows of the same T scans; the counts of points may differ.
+            weights: of the predicted points, with gradient: how a selection reaches the loss. target_weights: without.
+            guess: see `odometry`, for both. frames: (sequence, number) of each scan: checks that the window is
+                contiguous, and the reference is computed once and kept. Only where the targets are always the same.
+
+        Raises:
+            UsageError: see `clouds.window`; the windows differ in length; or they are not contiguous.
+        """
+        if len(pred_clouds) != len(target_clouds):
+            raise UsageError(f"SLAM loss: {len(pred_clouds)} predicted scans for {len(target_clouds)} targets")
+        if frames is not None:
+            check_contiguous(frames, len(pred_clouds))
+        reference = self._reference(target_clouds, target_weights, guess, frames)
+        poses = odometry(pred_clouds, weights, guess, self.settings, "predicted clouds")
+        return trajectory_loss(poses, reference.to(poses.device), self.settings.rotation_weight)
+
+    @torch.no_grad()
+    def _reference(self, clouds: Clouds, weights: Weights, guess: Tensor | None,
+                   frames: Sequence[tuple[str, int]] | None) -> Tensor:  # fmt: skip
+        key = tuple(frames) if frames is not None else ()
+        if key and key in self._references:
+            return self._references[key]
+        poses = odometry(clouds, weights, guess, self.settings, "target clouds")
+        if key:
+            self._references[key] = poses
+        return poses
+
+
+def check_contiguous(frames: Sequence[tuple[str, int]], length: int) -> None:
+    """Raise UsageError unless the scans belong to one sequence, equally far apart and in their order."""
+    if len(frames) != length:
+        raise UsageError(f"window: {len(frames)} frames are named for {length} scans")
+    names, numbers = zip(*frames, strict=True)
+    if len(set(names)) > 1:
+        raise UsageError(f"window: crosses the border of sequences {names[0]} and {names[-1]}")
+    gaps = {b - a for a, b in pairwise(numbers)}
+    if len(gaps) != 1 or min(gaps) < 1:
+        raise UsageError(f"window: frames {list(numbers)} of sequence {names[0]} are not contiguous")
+
+
+def _guessed_steps(guess: Tensor | None, points: Tensor) -> Tensor:
+    steps = torch.eye(4, dtype=points.dtype, device=points.device) if guess is None else guess.detach().to(points)
+    if steps.shape not in ((4, 4), (len(points) - 1, 4, 4)):
+        raise UsageError(f"guess: shape {tuple(steps.shape)}; want (4, 4) or ({len(points) - 1}, 4, 4)")
+    return steps.expand(len(points) - 1, 4, 4)
+
+
+def _chain(steps: Tensor, truncate: int) -> Tensor:
+    """Poses (T, 4, 4) from the motions (T - 1, 4, 4) between them, the first the identity."""
+    poses = [torch.eye(4, dtype=steps.dtype, device=steps.device)]
+    for i, step in enumerate(steps):
+        last = poses[-1].detach() if truncate and i % truncate == 0 else poses[-1]
+        poses.append(last @ step)
+    return torch.stack(poses)
