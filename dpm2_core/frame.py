@@ -112,13 +112,19 @@ class Registration:
 
 
 class State(StrEnum):
-    """Health of the odometry, as published in /diagnostics."""
+    """Health of the odometry and of the localisation in a map, as published in /diagnostics."""
 
     INITIALISING = "initialising"
     TRACKING = "tracking"
     DEGRADED = "degraded"
     LOST = "lost"
     RELOCALISING = "relocalising"
+    RELOCALISED = "relocalised"
+
+    @property
+    def located(self) -> bool:
+        """Whether a place in a map goes with it."""
+        return self in (State.TRACKING, State.DEGRADED, State.RELOCALISED)
 
 
 @dataclass(frozen=True, eq=False)

@@ -155,6 +155,7 @@ def to_base(tracked: Tracked, T_base_lidar: Array) -> Tracked:
             T_odom_kf=T_base_lidar @ keyframe.T_odom_kf @ T_lidar_base,
             cloud=se3.transform(T_base_lidar, keyframe.cloud).astype(np.float32),
             edge=None if keyframe.edge is None else seen(keyframe.edge),
+            descriptors=None if keyframe.descriptors is None else keyframe.descriptors.moved(T_base_lidar),
         )
     return replace(
         tracked,

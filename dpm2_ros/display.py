@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import time
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import Point, PoseStamped, Vector3
@@ -52,3 +54,28 @@ def pose_graph_to_msg(mapper: Mapper, stamp: int, frame_id: str) -> MarkerArray:
 def _ends(positions: Array, pairs: Iterable[tuple[int, int]]) -> Array:
     """(2 E, 3) end points of E edges between nodes."""
     return positions[np.array(list(pairs), np.intp).reshape(-1)]
+
+
+class Display:
+    """Something large that is built only for those who look: when somebody listens, it has changed, and it is time."""
+
+    def __init__(self, publisher: Any, period: float, make: Callable[[], Any]) -> None:
+        self._publisher, self._period, self._make = publisher, period, make
+        self._shown = 0
+        self._last = -np.inf
+        self._working = False
+
+    def due(self, changes: int) -> bool:
+        """Whether to publish now; if so, `publish` is expected to follow."""
+        waited = time.monotonic() - self._last >= self._period
+        if self._working or changes == self._shown or not waited or not self._publisher.get_subscription_count():
+            return False
+        self._working, self._shown, self._last = True, changes, time.monotonic()
+        return True
+
+    def publish(self) -> None:
+        """Build and send it."""
+        try:
+            self._publisher.publish(self._make())
+        finally:
+            self._working = False

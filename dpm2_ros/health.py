@@ -22,7 +22,14 @@ OK, WARN, ERROR, STALE = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticS
 SILENT = 2.0
 """Seconds without a message after which a sensor counts as silent."""
 
-_LEVEL = {State.TRACKING: OK, State.INITIALISING: OK, State.DEGRADED: WARN, State.RELOCALISING: WARN, State.LOST: ERROR}
+_LEVEL = {
+    State.TRACKING: OK,
+    State.INITIALISING: OK,
+    State.DEGRADED: WARN,
+    State.RELOCALISING: WARN,
+    State.RELOCALISED: OK,
+    State.LOST: ERROR,
+}
 
 
 class Health:
@@ -93,7 +100,9 @@ class Diagnostics:
         """Send it now."""
         status = [self._odometry()]
         status += [self._camera(camera) for camera in self._inputs.synchronizer.cameras]
-        if self._mapper is not None:
+        if self._mapper is not None and self._mapper.localising:
+            status.append(self._localisation(self._mapper))
+        elif self._mapper is not None:
             accepted, tried = self._mapper.loops
             figures = {"keyframes": self._mapper.keyframes, "loops accepted": accepted, "loops tried": tried}
             level, text = OK, f"{self._mapper.keyframes} keyframes, {accepted} loops"
@@ -135,6 +144,17 @@ class Diagnostics:
         if synchronizer.dropped and len(synchronizer):
             level, text = max(level, WARN), f"{text}; cannot keep up, {synchronizer.dropped} clouds dropped"
         return self._status("odometry", level, text, figures)
+
+    def _localisation(self, mapper: MapperThread) -> DiagnosticStatus:
+        located, figures = mapper.located, {"keyframes of the map": str(mapper.keyframes)}
+        if located is None:
+            return self._status("localisation", WARN, f"{State.RELOCALISING}: no keyframe yet", figures)
+        found, text = located.registration, str(located.state)
+        if found.ok:
+            figures |= {"confidence": f"{found.confidence:.2f}", "worst sigma (m)": f"{found.worst_sigma:.3f}"}
+        else:
+            text += f": {found.reason}"
+        return self._status("localisation", _LEVEL[located.state], text, figures)
 
     def _camera(self, camera: CameraState) -> DiagnosticStatus:
         figures = {"received": camera.received, "used": camera.matched, "late": camera.late}

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import count
@@ -21,14 +20,15 @@ from visualization_msgs.msg import MarkerArray
 
 from dpm2_core.config import dump_settings
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.frame import Keyframe
+from dpm2_core.frame import Array, Keyframe, State
+from dpm2_core.slam.loops.localiser import Localiser, Located
 from dpm2_core.slam.map.mapper import Mapper
-from dpm2_core.slam.map.session import open_session
+from dpm2_core.slam.map.session import open_for_localisation, open_session
 from dpm2_core.slam.map.store import MapStore
 from dpm2_core.slam.output import save_map
-from dpm2_core.slam.system import make_mapper
+from dpm2_core.slam.system import make_localiser, make_mapper
 from dpm2_ros.conversions import cloud_to_msg, edge_to_msg, keyframe_name
-from dpm2_ros.display import path_to_msg, pose_graph_to_msg
+from dpm2_ros.display import Display, path_to_msg, pose_graph_to_msg
 from dpm2_ros.settings import NodeConfig
 from dpm2_ros.subscriptions import STEADY
 from dpm2_ros.tf import TransformBroadcaster
@@ -46,10 +46,14 @@ class MapperThread:
     def __init__(self, node: Node, config: NodeConfig, robot: str) -> None:
         self._node, self._config, self._robot = node, config, robot
         self._store: MapStore | None = None
-        self._mapper = self._new_mapper()
+        self._localiser: Localiser | None = None
+        self._located: Located | None = None
+        self._map_file = Path(config.ros.map_file)  # written, or to be found in
+        self._mapper = self._load() if config.ros.localization_mode else self._new_mapper()
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="mapper")
         self._stamp = 0  # of the last keyframe, ns
-        self._changes = 0
+        self._last: Future[None] | None = None  # of the keyframes taken in
+        self._changes = len(self._mapper.keyframes)
         self._displays: list[Display] = []
         ros = config.ros
         self._tf = TransformBroadcaster(node, ros.map_frame, ros.publish_tf_map)
@@ -85,16 +89,61 @@ class MapperThread:
         base = self._config.ros.map_directory
         return Path(base) / self._robot if base else None
 
+    @property
+    def localising(self) -> bool:
+        """Whether the map stays as it is."""
+        return self._localiser is not None
+
+    @property
+    def located(self) -> Located | None:
+        """What became of the last keyframe in a map that stays as it is."""
+        return self._located
+
+    def state(self, odometry: State) -> State:
+        """That of the robot: of its odometry, or, where that is well, of its place in a map that stays as it is."""
+        localiser = self._localiser
+        if localiser is None or odometry in (State.LOST, State.INITIALISING) or localiser.state is State.TRACKING:
+            return odometry
+        return localiser.state
+
+    def wants_keyframe(self, stamp: int) -> bool:
+        """Whether one is looked for that the odometry would not make of its own (ns)."""
+        idle = self._last is None or self._last.done()
+        return self._localiser is not None and idle and self._localiser.wants(stamp)
+
     def broadcast(self, stamp: int) -> None:
-        """Send map -> odom, valid at that stamp (ns)."""
-        self._tf.send(self._mapper.T_map_odom, stamp, self._config.ros.odom_frame)
+        """Send map -> odom, valid at that stamp (ns), if it is known."""
+        localiser = self._localiser
+        if localiser is None:
+            self._tf.send(self._mapper.T_map_odom, stamp, self._config.ros.odom_frame)
+        elif localiser.state.located:
+            self._tf.send(localiser.T_map_odom, stamp, self._config.ros.odom_frame)
 
     def add(self, keyframe: Keyframe) -> None:
         """Take a keyframe in."""
-        self._submit(lambda: self._add(keyframe))
+        self._last = self._submit(lambda: self._add(keyframe) if self._localiser is None else self._locate(keyframe))
+
+    def hint(self, T_map_base: Array) -> str:
+        """The robot is about there (4, 4), somebody says; returns why that is of no use, if it is not."""
+        localiser = self._localiser
+        if localiser is None:
+            return "a map is being made: a pose is of use only with localization_mode"
+        self._submit(lambda: localiser.hint(T_map_base))
+        return ""
+
+    def localise(self) -> Future[str]:
+        """End the map that is being made, if one is, and look for the robot in the map file; the answer in words."""
+        return self._thread.submit(self._localise)
+
+    def extend(self) -> Future[str]:
+        """Let the map grow from now on: that in which the robot was looked for, by a new session."""
+        return self._thread.submit(self._extend)
 
     def reset(self, save: bool) -> None:
         """Begin an empty map; `save` keeps the present one on disk."""
+        if self._localiser is not None:
+            self._submit(self._localiser.restart)
+            return
         if save and self.directory is not None:
             self._submit(self._save)
         self._submit(self._reset)
@@ -106,7 +155,7 @@ class MapperThread:
             Dpm2Error: the map could not be written.
         """
         last: Future[str] | None = None
-        if self.directory is not None:
+        if self.directory is not None and self._localiser is None:
             last = self._thread.submit(self._save)
         self._submit(self._finish_file)
         self._thread.shutdown(wait=True)
@@ -127,6 +176,20 @@ class MapperThread:
             self._node.get_logger().error(str(error))
         elif error is not None:
             self._node.get_logger().error(f"mapper: {type(error).__name__}: {error}")
+
+    def _locate(self, keyframe: Keyframe) -> None:
+        """In a map that stays as it is."""
+        assert self._localiser is not None
+        before = self._localiser.state
+        located = self._located = self._localiser.add(keyframe)
+        if located.state is before:
+            return
+        if located.jumped:
+            x, y, z = located.T_map_kf[:3, 3].tolist()
+            kind = "kidnapped; found again" if before.located else "found"
+            self._node.get_logger().info(f"{kind} at ({x:.1f}, {y:.1f}, {z:.1f}) m of {self._config.ros.map_frame}")
+        elif located.state in (State.LOST, State.DEGRADED):
+            self._node.get_logger().warning(f"{located.state}: {located.registration.reason}")
 
     def _add(self, keyframe: Keyframe) -> None:
         self._stamp = keyframe.stamp
@@ -151,19 +214,74 @@ class MapperThread:
             path = free_path(Path(ros.map_file), self._robot)
             try:
                 self._store = open_session(path, self._config.slam, dump_settings(self._config), resume=False)
+                self._map_file = path
             except Dpm2Error as error:
                 self._node.get_logger().error(f"no map file: {error}")
         return make_mapper(self._config.slam, self._store)
 
+    def _load(self) -> Mapper:
+        """The map file, to find oneself in.
+
+        Raises:
+            UsageError: there is none that would serve.
+        """
+        if not self._config.ros.map_file:
+            raise UsageError("no map to find oneself in: ros.map_file is empty")
+        store = open_for_localisation(self._map_file, self._config.slam)
+        try:
+            mapper = make_mapper(self._config.slam, store)
+            localiser = make_localiser(self._config.slam, mapper)
+        except BaseException:
+            store.close()
+            raise
+        self._finish_file()
+        self._store, self._localiser, self._located = store, localiser, None
+        return mapper
+
+    def _localise(self) -> str:
+        if self._localiser is None:
+            if self._store is None:
+                raise UsageError("no map to find oneself in: ros.map_file is empty, or could not be written")
+            self._finish_file()  # what is in memory is in the file
+        try:
+            self._mapper = self._load()
+        except Dpm2Error:
+            if self._localiser is None:  # the drive goes on as before
+                self._mapper = self._resumed()
+            raise
+        self._changes += 1
+        return f"looking for the robot in {self._map_file}, {self.keyframes} keyframes"
+
+    def _extend(self) -> str:
+        localiser = self._localiser
+        if localiser is None:
+            return f"a map is being made already, {self.keyframes} keyframes"
+        if not localiser.state.located:
+            raise UsageError(f"not extended: the robot is {localiser.state} in {self._map_file}")
+        assert self._store is not None
+        self._store.close()
+        self._store, self._mapper = None, self._resumed()
+        self._mapper.start_session(localiser.T_map_odom)
+        self._localiser = self._located = None
+        return f"{self._map_file} grows by a new session"
+
+    def _resumed(self) -> Mapper:
+        """The mapper that goes on with the map file."""
+        self._store = open_session(self._map_file, self._config.slam, dump_settings(self._config), resume=True)
+        return make_mapper(self._config.slam, self._store)
+
     def _finish_file(self) -> None:
         if self._store is not None:
-            self._mapper.finish()
+            if not self._store.read_only:
+                self._mapper.finish()
             self._store.close()
             self._store = None
 
     def _save(self) -> str:
         if self.directory is None:
             raise UsageError("no map is saved: ros.map_directory is empty")
+        if self._localiser is not None:
+            raise UsageError("no map is saved: in localization_mode the map stays as it is, in its file")
         if not self._mapper.keyframes:
             raise UsageError("no map is saved: there is no keyframe yet")
         try:
@@ -173,13 +291,7 @@ class MapperThread:
         return f"map of {self.keyframes} keyframes saved in {self.directory.resolve()}"
 
     async def _on_save(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        future = self._thread.submit(self._save)
-        while not future.done():
-            await _OtherCallbacks()
-        try:
-            response.success, response.message = True, future.result()
-        except Dpm2Error as error:
-            response.success, response.message = False, str(error)
+        await answer(self._thread.submit(self._save), response)
         return response
 
     def _show(self) -> None:
@@ -202,29 +314,14 @@ class MapperThread:
         return cloud_to_msg(points, self._stamp, self._config.ros.map_frame)
 
 
-class Display:
-    """Something large that is built only for those who look: when somebody listens, it has changed, and it is time."""
-
-    def __init__(self, publisher: Any, period: float, make: Callable[[], Any]) -> None:
-        self._publisher, self._period, self._make = publisher, period, make
-        self._shown = 0
-        self._last = -np.inf
-        self._working = False
-
-    def due(self, changes: int) -> bool:
-        """Whether to publish now; if so, `publish` is expected to follow."""
-        waited = time.monotonic() - self._last >= self._period
-        if self._working or changes == self._shown or not waited or not self._publisher.get_subscription_count():
-            return False
-        self._working, self._shown, self._last = True, changes, time.monotonic()
-        return True
-
-    def publish(self) -> None:
-        """Build and send it."""
-        try:
-            self._publisher.publish(self._make())
-        finally:
-            self._working = False
+async def answer(work: Future[str], response: Any) -> None:
+    """Fill the response of a service with what comes of work in another thread: success, or why not, in words."""
+    while not work.done():
+        await _OtherCallbacks()
+    try:
+        response.success, response.message = True, work.result()
+    except Dpm2Error as error:
+        response.success, response.message = False, str(error)
 
 
 class _OtherCallbacks:

@@ -63,7 +63,10 @@ class RosSettings(Settings):
     map_file: str = ""
     """Map file, such as drive.dpm2map, that is written as the drive goes on, so that a crash costs no more than a
     keyframe; `dpm2 map` reads it. The namespace, if any, and a number, if it is there already, are added to its name.
-    Empty: none."""
+    Empty: none. With `localization_mode`: the map to find oneself in."""
+
+    localization_mode: bool = False
+    """slam_node finds itself in `map_file`, which stays as it is, and makes no map of its own."""
 
 
 class NodeConfig(Config):

@@ -6,21 +6,25 @@ from __future__ import annotations
 import threading
 import time
 import traceback
+from dataclasses import replace
 
 import numpy as np
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from sensor_msgs.msg import PointCloud2
-from std_srvs.srv import Trigger
+from std_srvs.srv import SetBool, Trigger
 
+from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.errors import UsageError
-from dpm2_core.frame import Array, Keyframe, Tracked
+from dpm2_core.frame import Array, Keyframe, State, Tracked
 from dpm2_core.geometry import se3
+from dpm2_core.slam.loops.localiser import LOST
 from dpm2_core.slam.system import make_odometry
 from dpm2_ros.conversions import cloud_to_msg, edge_to_msg, keyframe_name, odometry_to_msg, to_base
 from dpm2_ros.frames import FrameBuilder
 from dpm2_ros.health import Diagnostics, Health
-from dpm2_ros.mapping import KEEP_ALL, MapperThread, robot_name
+from dpm2_ros.mapping import KEEP_ALL, MapperThread, answer, robot_name
 from dpm2_ros.parameters import load_parameters
 from dpm2_ros.settings import NodeConfig
 from dpm2_ros.subscriptions import Inputs
@@ -39,6 +43,8 @@ class SlamNode(Node):
         super().__init__("slam_node", automatically_declare_parameters_from_overrides=True)
         self._config = load_parameters(self, NodeConfig)
         ros, self._robot = self._config.ros, robot_name(self)
+        if ros.localization_mode and not ros.embed_mapper:
+            raise UsageError("ros.localization_mode: needs ros.embed_mapper")
         self._odometry = make_odometry(self._config.slam, self._robot)
         self._inputs = Inputs(self, self._config.input, ros)
         self._frames = FrameBuilder(self._config.input, self._inputs, self.get_logger().error)
@@ -50,6 +56,9 @@ class SlamNode(Node):
         self._keyframe_odom = self.create_publisher(Odometry, "dpm2/keyframe_odom", KEEP_ALL)
         self._tf = TransformBroadcaster(self, ros.odom_frame, ros.publish_tf_odom)
         self.create_service(Trigger, "~/reset", self._on_reset)
+        self.create_service(Trigger, "~/load_map", self._on_load_map)
+        self.create_service(SetBool, "~/localization_mode", self._on_localization_mode)
+        self.create_subscription(PoseWithCovarianceStamped, "initialpose", self._on_initial_pose, 10)
         self._reset_wanted = threading.Event()
         self._stopping = threading.Event()
         self._begin()
@@ -106,7 +115,12 @@ class SlamNode(Node):
             self._restart(save=True)
         if not self._base_frame:
             self._choose_base(bundle.cloud.header.frame_id or "lidar")
+        mapper = self._mapper
+        if mapper is not None and mapper.wants_keyframe(bundle.stamp):
+            self._odometry.request_keyframe()
         tracked = self._odometry.process(self._frames.frame(bundle, self._index))
+        if mapper is not None:
+            tracked = replace(tracked, state=mapper.state(tracked.state))
         self._index += 1
         if not np.array_equal(self._T_base_lidar, np.eye(4)):
             tracked = to_base(tracked, self._T_base_lidar)
@@ -137,8 +151,10 @@ class SlamNode(Node):
             self._covariance = A @ self._covariance @ A.T + tracked.covariance
             seconds = max((tracked.stamp - before.stamp) * 1e-9, 1e-3)
         self._before = tracked
-        ros = self._config.ros
-        self._odom.publish(odometry_to_msg(tracked, self._covariance, seconds, ros.odom_frame, self._base_frame))
+        ros, covariance = self._config.ros, self._covariance
+        if tracked.state is State.LOST:
+            covariance = covariance + LOST
+        self._odom.publish(odometry_to_msg(tracked, covariance, seconds, ros.odom_frame, self._base_frame))
         self._tf.send(tracked.T_odom_lidar, tracked.stamp, self._base_frame)
         if tracked.keyframe is not None:
             self._publish_keyframe(tracked.keyframe)
@@ -161,3 +177,29 @@ class SlamNode(Node):
         if self._mapper is None:
             response.message = "odometry starts again with the next cloud; so does the map of the mapper that listens"
         return response
+
+    async def _on_load_map(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if self._mapper is None or not self._mapper.localising:
+            response.success, response.message = False, "no map is loaded: localization_mode is off"
+        else:
+            await answer(self._mapper.localise(), response)
+        return response
+
+    async def _on_localization_mode(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        if self._mapper is None:
+            response.success, response.message = False, "the mapper is another node's: ros.embed_mapper is off"
+        else:
+            await answer(self._mapper.localise() if request.data else self._mapper.extend(), response)
+        return response
+
+    def _on_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
+        frame, wanted = message.header.frame_id.lstrip("/"), self._config.ros.map_frame
+        try:
+            if frame != wanted:
+                raise UsageError(f"want it in frame {wanted}, not in {frame!r}")
+            T_map_base = transform_matrix(message.pose.pose)
+            problem = "no map here" if self._mapper is None else self._mapper.hint(T_map_base)
+        except UsageError as error:
+            problem = str(error)
+        if problem:
+            self.get_logger().warning(f"initialpose not used: {problem}")

@@ -15,6 +15,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from dpm2_core.commands.localise import parse_hint, run_localised
 from dpm2_core.config import dump_settings, load_settings
 from dpm2_core.data.corrupt import CorruptedSource, CorruptionSettings, parse_corruption
 from dpm2_core.data.ply import write_ply
@@ -53,6 +54,13 @@ def run(
         Path | None, typer.Option("--map", help="Map file, such as drive.dpm2map, written as the drive goes on.")
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on where --map ends: a run was cut off.")] = False,
+    extend: Annotated[bool, typer.Option("--extend", help="Add this drive, another one, to --map.")] = False,
+    localise: Annotated[
+        Path | None, typer.Option("--localise", help="Find the drive in this map file, which stays as it is.")
+    ] = None,
+    hint: Annotated[
+        str | None, typer.Option(help="About where in --localise it begins: x,y,yaw in m and degrees.")
+    ] = None,
     config: ConfigFile = None,
     settings: Overrides = None,
 ) -> None:
@@ -60,11 +68,24 @@ def run(
     overrides = [*(settings or []), *(["input.images=false"] if no_image else [])]
     chosen = load_settings(Config, config, overrides)
     corruption = None if corrupt is None else parse_corruption(corrupt)
-    start, stop = parse_range(frames)
+    span = parse_range(frames)
+    if resume and extend:
+        raise UsageError("--resume goes on with the same drive, --extend adds another one: not both")
+    if localise is not None:
+        if gt is not None or map_file is not None:
+            raise UsageError("--localise: the map stays as it is, and its frame is its own: without --map and --gt")
+        T_hint = None if hint is None else parse_hint(hint)
+        source, start, stop = _open(src, span, corruption, chosen, chosen.slam.registration != "geometric")
+        run_localised(source, (start, stop), out, localise, T_hint, chosen)
+        return
+    if hint is not None:
+        raise UsageError("--hint: only with --localise")
     console = Console(stderr=True)
-    store = None if map_file is None else open_session(map_file, chosen.slam, dump_settings(chosen), resume)
+    store = None
+    if map_file is not None:
+        store = open_session(map_file, chosen.slam, dump_settings(chosen), resume or extend)
     with nullcontext() if store is None else store:
-        _run(src, out, gt, (start, stop), corruption, chosen, store, resume, console)
+        _run(src, out, gt, span, corruption, chosen, store, resume, console)
 
 
 def _run(
@@ -79,18 +100,13 @@ def _run(
     console: Console,
 ) -> None:
     """The drive, when it is clear what is wanted."""
-    start, stop = span
     system, recorder = SlamSystem(chosen.slam, store=store), TrajectoryRecorder()
-    # Decoding images that nobody looks at would only cost time.
-    images = chosen.input.images and (system.odometry.uses_images or chosen.slam.map.thumbnail > 0)
-    source = open_source(src, chosen.input.model_copy(update={"images": images}))
-    if corruption is not None:
-        source = CorruptedSource(source, corruption)
-    stop = len(source) if stop is None else min(stop, len(source))
+    source, start, stop = _open(
+        src, span, corruption, chosen, system.odometry.uses_images or chosen.slam.map.thumbnail > 0
+    )
     if resume:
         start = resume_at(system.mapper, source, start)
-    if start >= stop:
-        raise UsageError(f"--frames {span[0]}:{'' if span[1] is None else span[1]}: {src} has {len(source)} frames")
+        _check_span(span, start, stop, source, src)
     truth = _ground_truth(source, gt, start, stop)
     out.mkdir(parents=True, exist_ok=True)
     with atomic_write(out / "config.yaml") as file:
@@ -99,6 +115,9 @@ def _run(
     for note in source.notes:
         console.print(note, style="yellow", soft_wrap=True)
     system.mapper.finish()
+    first = system.mapper.session_start
+    if first > 0 and not any(a < first <= b for a, b, _, _ in system.mapper.edges):
+        console.print("no place of this drive was found in the map: it stands in a frame of its own", style="yellow")
     if problem := system.mapper.store_problem:
         console.print(f"map file incomplete: {problem}", style="red", soft_wrap=True)
     metrics = _write(out, source, system, recorder, truth, answers, seconds, wall)
@@ -106,6 +125,28 @@ def _run(
         sensor = "LiDAR" if source.T_cam_lidar is None else "left camera"
         Console().print(metrics_table(metrics, title=f"{source.name}, {len(recorder)} frames", frame=sensor))
     console.print(f"Results in {out}", soft_wrap=True)
+
+
+def _open(
+    src: Path, span: tuple[int, int | None], corruption: CorruptionSettings | None, chosen: Config, images: bool
+) -> tuple[Source, int, int]:
+    """The recording, and the first of its frames and the one after the last; `images` False leaves those out.
+
+    Raises:
+        UsageError: no such recording, or no frames in that span.
+    """
+    # Decoding images that nobody looks at would only cost time.
+    source = open_source(src, chosen.input.model_copy(update={"images": images and chosen.input.images}))
+    if corruption is not None:
+        source = CorruptedSource(source, corruption)
+    stop = len(source) if span[1] is None else min(span[1], len(source))
+    _check_span(span, span[0], stop, source, src)
+    return source, span[0], stop
+
+
+def _check_span(span: tuple[int, int | None], start: int, stop: int, source: Source, src: Path) -> None:
+    if start >= stop:
+        raise UsageError(f"--frames {span[0]}:{'' if span[1] is None else span[1]}: {src} has {len(source)} frames")
 
 
 def parse_range(text: str) -> tuple[int, int | None]:

@@ -42,6 +42,11 @@ class KeyframeSelector:
     def reset(self) -> None:
         self._last: Keyframe | None = None
         self._doubt = np.zeros((6, 6))
+        self._requested = False
+
+    def request(self) -> None:
+        """Make a keyframe of the next registered scan, however short the way: somebody is lost, and may be standing."""
+        self._requested = True
 
     def doubt(self, covariance: Array) -> None:
         """The odometry was broken by that much (6, 6): the next edge is to be no firmer."""
@@ -55,7 +60,7 @@ class KeyframeSelector:
         if last is not None:
             T_last_this = se3.inverse(last.T_odom_kf) @ T_odom_lidar
             metres, radians = np.linalg.norm(T_last_this[:3, 3]), se3.angle(T_last_this)
-            if metres < s.distance and radians < np.radians(s.angle):
+            if not self._requested and metres < s.distance and radians < np.radians(s.angle):
                 return None
             sigma = np.repeat([np.radians(s.drift_rotation), s.drift_translation], 3) * max(metres, 1.0)
             covariance = registration.covariance + np.diag(sigma**2) + self._doubt
@@ -66,5 +71,5 @@ class KeyframeSelector:
         keyframe = Keyframe(
             keyframe_id, frame.stamp, frame.index, T_odom_lidar, cloud, edge, self._robot, scan.descriptors
         )
-        self._last, self._doubt = keyframe, np.zeros((6, 6))
+        self._last, self._doubt, self._requested = keyframe, np.zeros((6, 6)), False
         return keyframe

@@ -53,6 +53,10 @@ class Odometry:
         """Whether frames should come with their pictures."""
         return self._registration.uses_images
 
+    def request_keyframe(self) -> None:
+        """Make a keyframe of the next registered scan, however short the way."""
+        self._keyframes.request()
+
     def reset(self) -> None:
         """Forget everything; the next scan is the first."""
         self._T = np.eye(4)

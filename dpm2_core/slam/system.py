@@ -15,7 +15,8 @@ from dpm2_core.slam.graph.pose_graph import PoseGraph, PoseGraphSettings
 from dpm2_core.slam.keyframes import KeyframeSelector, KeyframeSettings
 from dpm2_core.slam.local_map import LocalMap, LocalMapSettings
 from dpm2_core.slam.loops.closure import LoopCloser, LoopSettings
-from dpm2_core.slam.loops.relocalise import RelocaliseSettings
+from dpm2_core.slam.loops.localiser import Localiser, Located
+from dpm2_core.slam.loops.relocalise import Relocaliser, RelocaliseSettings
 from dpm2_core.slam.map.mapper import Mapper, MapSettings, thumbnail
 from dpm2_core.slam.map.store import MapStore
 from dpm2_core.slam.neural import NeuralScanRegistration, NeuralSettings, load_network
@@ -76,6 +77,29 @@ class SlamSystem:
         self.mapper = make_mapper(self._settings)
 
 
+class LocalisationSystem:
+    """One robot in a map that stays as it is: `odometry` runs on every frame, `localiser` on every keyframe."""
+
+    def __init__(self, settings: SlamSettings, store: MapStore, robot: str = "") -> None:
+        """`store`: the map file, open for reading only, see `open_for_localisation`."""
+        self.odometry = make_odometry(settings, robot)
+        self.mapper = make_mapper(settings, store)
+        self.localiser = make_localiser(settings, self.mapper)
+
+    def process(self, frame: Frame) -> tuple[Tracked, Located | None]:
+        """Take one frame in: its pose in the odometry frame, and, when it became a keyframe, its place in the map.
+
+        While the localiser's `state.located`, `T_map_odom @ T_odom_lidar` is the frame's pose in the map.
+        """
+        if self.localiser.wants(frame.stamp):
+            self.odometry.request_keyframe()
+        tracked = self.odometry.process(frame)
+        started = perf_counter()
+        located = None if tracked.keyframe is None else self.localiser.add(tracked.keyframe)
+        tracked.seconds["localise"] = perf_counter() - started
+        return tracked, located
+
+
 def make_odometry(s: SlamSettings, robot: str = "") -> Odometry:
     """The odometry with its collaborators."""
     return Odometry(s.odometry, make_registration(s), KeyframeSelector(s.keyframes, robot))
@@ -101,6 +125,19 @@ def make_registration(s: SlamSettings) -> ScanRegistration:
 def make_mapper(s: SlamSettings, store: MapStore | None = None) -> Mapper:
     """The mapper with its collaborators; with a map file, if there is one."""
     return Mapper(s.map, PoseGraph(s.pose_graph), make_loops(s), store)
+
+
+def make_localiser(s: SlamSettings, mapper: Mapper) -> Localiser:
+    """Finds keyframes in the map that a mapper has loaded.
+
+    Raises:
+        UsageError: the network has no weights to run with.
+    """
+    network = load_network(s.neural.weights, s.threads, s.neural.preset)
+    relocaliser = Relocaliser(
+        s.relocalise, s.geometric, network, mapper.keyframes, mapper.clouds, mapper.poses, s.threads
+    )
+    return Localiser(relocaliser, s.relocalise.max_failures)
 
 
 def make_loops(s: SlamSettings) -> LoopCloser:

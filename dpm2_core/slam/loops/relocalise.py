@@ -85,7 +85,9 @@ class Relocaliser:
         descriptors = descriptors or self._places.describe(cloud)
         if descriptors is None:
             return nowhere(f"{len(cloud)} points: too few for descriptors")
-        allowed = np.ones(len(self), bool) if hint is None else self._distance(hint) <= s.hint_radius
+        allowed = np.ones(len(self), bool)
+        if hint is not None:  # as on a plan: who points at a map on a screen gives no height
+            allowed = np.linalg.norm(self._poses[:, :2, 3] - hint[:2, 3], axis=1) <= s.hint_radius
         nodes = self._places.similar(descriptors, allowed, s.candidates)
         proposals = [p for p in self._proposals(descriptors, nodes) if p.confidence >= s.min_confidence]
         refusals = [f"no keyframe of {int(allowed.sum())} matches the descriptors"] if not proposals else []

@@ -105,6 +105,8 @@ class Mapper:
     def add(self, keyframe: Keyframe, thumbnail: bytes | None = None) -> list[LoopClosure]:
         """Take a keyframe in, with a JPEG if wanted; returns the loops that were tried, accepted or not."""
         node, cloud = len(self.keyframes), keyframe.cloud
+        if node == self.session_start:
+            keyframe = replace(keyframe, edge=None)  # to one that is not in the map
         keyframe = self._loops.described(keyframe)
         keyframe = replace(keyframe, id=keyframe.id + self._first_id.get(keyframe.robot, 0), cloud=NO_POINTS)
         edges = self._add_node(keyframe)

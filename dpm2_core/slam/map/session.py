@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A drive into a map file: a new one, or on from where an earlier run was cut off."""
+"""A drive and a map file: a new one, on from where an earlier run was cut off, or one only to find oneself in."""
 
 from __future__ import annotations
 
@@ -34,14 +34,36 @@ def open_session(path: Path, settings: SlamSettings, config: str, resume: bool) 
         raise UsageError(f"--map {path}: there is a file already; --resume goes on with it")
     store = MapStore.open(path, read_only=False) if path.exists() else MapStore.create(path)
     try:
-        for row in store.rows("sessions"):
-            if (before := Session(*row).weights) and weights and before != weights:
-                raise UsageError(f"--map {path}: made with weights {before}, not with {weights}")
+        _check_weights(store, weights)
         store.begin_session(config, weights)
     except BaseException:
         store.close()
         raise
     return store
+
+
+def open_for_localisation(path: Path, settings: SlamSettings) -> MapStore:
+    """The map file to find oneself in, open for reading only.
+
+    Raises:
+        UsageError: no map, one without descriptors, or with those of other weights. Dpm2Error: it cannot be read.
+    """
+    store = MapStore.open(path)
+    try:
+        _check_weights(store, weights_id(weights_path(settings.neural.weights)))
+        if not any(store.payload(node, "descriptors") for node, *_ in store.rows("keyframes", "node")):
+            raise UsageError(f"{path}: no keyframe has descriptors (made with slam.loops.descriptors off?)")
+    except BaseException:
+        store.close()
+        raise
+    return store
+
+
+def _check_weights(store: MapStore, weights: str) -> None:
+    """Descriptors of different weights have nothing in common; `weights` "": none are made."""
+    for row in store.rows("sessions"):
+        if (before := Session(*row).weights) and weights and before != weights:
+            raise UsageError(f"{store.path}: made with weights {before}, not with {weights}")
 
 
 def resume_at(mapper: Mapper, source: Source, start: int) -> int:

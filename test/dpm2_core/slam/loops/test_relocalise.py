@@ -89,7 +89,7 @@ def test_localisation_tracks_notices_kidnapping_and_admits_being_lost(relocalise
     localiser = Localiser(relocaliser)
     origin = se3.exp(np.array([0, 0, 1.0, 30, -20, 0.5]))
     first = localiser.add(keyframe(0, 55.0, origin))
-    assert first.state is State.TRACKING
+    assert first.state is State.RELOCALISED
     np.testing.assert_allclose(localiser.T_map_odom[:3, 3], origin[:3, 3], atol=1.0)  # 0.1 deg at the lever's 60 m
     # five metres on, the odometry errs by 0.3 m: taken up
     tracked = localiser.add(keyframe(1, 60.0, origin @ se3.make(np.eye(3), np.array([0.3, 0, 0]))))
@@ -99,7 +99,7 @@ def test_localisation_tracks_notices_kidnapping_and_admits_being_lost(relocalise
     # the odometry was lost, and goes on somewhere: found at once
     broken = se3.exp(np.array([0, 0, -0.5, 5, 5, 0]))
     again = localiser.add(keyframe(2, 95.0, broken, LOST))
-    assert again.state is State.TRACKING
+    assert again.state is State.RELOCALISED
     assert again.jumped
     assert np.linalg.norm(again.T_map_kf[:3, 3] - world().pose_at(95.0)[:3, 3]) < 0.1
     # a place that the map does not show: doubted, then lost, and said so in the covariance
@@ -112,4 +112,4 @@ def test_localisation_tracks_notices_kidnapping_and_admits_being_lost(relocalise
     assert states[-1] is State.LOST
     assert sigmas[-1] >= 100.0**2 * 0.99
     # back again
-    assert localiser.add(keyframe(7, 70.0, broken)).state is State.TRACKING
+    assert localiser.add(keyframe(7, 70.0, broken)).state is State.RELOCALISED

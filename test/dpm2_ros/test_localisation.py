@@ -1,0 +1,235 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A slam_node process that finds itself, over real DDS, in a map that `dpm2 run --map` made; it stays as it is."""
+
+from __future__ import annotations
+
+import hashlib
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import PointCloud2
+from std_srvs.srv import SetBool, Trigger
+
+from dpm2_core.data import topics
+from dpm2_core.data.source import InputSettings, open_source
+from dpm2_core.data.transforms import transform_matrix
+from dpm2_core.frame import Array
+from dpm2_core.geometry import se3
+from dpm2_core.sim.config import LidarConfig
+from dpm2_core.sim.drive import simulate
+from dpm2_ros.conversions import cloud_to_msg, header, pose_to_msg
+from dpm2_ros.replay import ros_environment, start
+from dpm2_ros.tf import TFMessage
+
+FRAMES = 24
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A short simulated drive."""
+    root = tmp_path_factory.mktemp("drive") / "sim"
+    simulate(root, FRAMES, seed=2, road="straight", preset="suburb", images=False, lidar=LidarConfig(columns=900))
+    return root
+
+
+@pytest.fixture(scope="module")
+def made(drive: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Its map, as the command makes it."""
+    folder = tmp_path_factory.mktemp("map")
+    arguments = ["run", drive, "--out", folder / "out", "--map", folder / "drive.dpm2map"]
+    command = [sys.executable, "-m", "dpm2_core.cli", *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    return folder / "drive.dpm2map"
+
+
+def digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+class Robot:
+    """A slam_node process, its LiDAR, and ears."""
+
+    def __init__(self, harness: Any, drive: Path, log: Path, *parameters: str) -> None:
+        self.harness, self.log, self._stamp = harness, log, 0
+        self._source = open_source(drive, InputSettings(images=False))
+        self.lidar = harness.publisher(PointCloud2, topics.POINTS)
+        self.odom = harness.hear(Odometry, "/dpm2/odom")
+        self.diagnostics = harness.hear(DiagnosticArray, "/diagnostics")
+        self.tf = harness.hear(TFMessage, "/tf")
+        pairs = ["input.images:=false", "ros.map_directory:=''", *parameters]
+        arguments = ["--ros-args", *(part for pair in pairs for part in ("-p", pair))]
+        self.process = start("slam_node", arguments, ros_environment(harness.node.context.get_domain_id()), log)
+        harness.wait(lambda: self.lidar.get_subscription_count() and self.said(""), "slam_node", timeout=60)
+
+    def send(self, *frames: int) -> None:
+        """Scans, 0.1 s apart whatever their place in the drive, each when the one before has come out."""
+        for n in frames:
+            frame = next(iter(self._source.frames(n, n + 1)))
+            self._stamp += 100_000_000
+            before = len(self.odom)
+            self.lidar.publish(cloud_to_msg(frame.points, self._stamp, "lidar"))
+            self.harness.wait(lambda before=before: len(self.odom) > before, f"the odometry of scan {n}")
+
+    def stand(self, frame: int, condition: Callable[[], Any], what: str) -> None:
+        """The same scan again and again, until something holds."""
+
+        def again() -> Any:
+            self.send(frame)
+            return condition()
+
+        self.harness.wait(again, what, timeout=40)
+
+    def said(self, part: str) -> str:
+        """The last status of a part."""
+        statuses = [s for m in self.diagnostics for s in m.status if s.name.endswith(part)]
+        return f"{statuses[-1].message} " if statuses else ""
+
+    def off(self, T_map_lidar: Array) -> float:
+        """Distance from a place to where the last transforms put the robot, m; infinite before map -> odom is known."""
+        last = {t.child_frame_id: transform_matrix(t.transform) for m in self.tf for t in m.transforms}
+        if "odom" not in last:
+            return np.inf
+        return float(np.linalg.norm((last["odom"] @ last["lidar"] - T_map_lidar)[:3, 3]))
+
+    def call(self, kind: type, name: str, **fields: Any) -> Any:
+        client = self.harness.node.create_client(kind, name)
+        assert client.wait_for_service(timeout_sec=10)
+        future = client.call_async(kind.Request(**fields))
+        self.harness.wait(future.done, name, timeout=30)
+        return future.result()
+
+    def point(self, T_map_lidar: Array, frame: str) -> None:
+        """As RViz does."""
+        message = PoseWithCovarianceStamped(header=header(0, frame))
+        message.pose.pose = pose_to_msg(T_map_lidar)
+        publisher = self.harness.publisher(PoseWithCovarianceStamped, "/initialpose")
+        self.harness.wait(publisher.get_subscription_count, "slam_node's ears")
+        publisher.publish(message)
+
+    def close(self) -> int:
+        self.process.send_signal(signal.SIGINT)
+        try:
+            return self.process.wait(30)
+        finally:
+            self.process.kill()
+
+
+@pytest.fixture
+def robot(ros: Callable[..., Any], drive: Path, tmp_path: Path) -> Iterator[Callable[..., Robot]]:
+    robots: list[Robot] = []
+
+    def make(*parameters: str) -> Robot:
+        robots.append(Robot(ros(), drive, tmp_path / "log", *parameters))
+        return robots[-1]
+
+    yield make
+    for r in robots:
+        r.process.kill()
+        r.process.wait()
+
+
+def place(drive: Path, n: int) -> Array:
+    """T_map_lidar of a scan, (4, 4): the map's frame is that of the first one."""
+    poses = open_source(drive, InputSettings(images=False)).poses
+    assert poses is not None
+    return np.asarray(se3.inverse(poses[0]) @ poses[n])
+
+
+def test_finds_itself_tracks_and_notices_being_carried_off(
+    robot: Callable[..., Robot], drive: Path, made: Path, tmp_path: Path
+) -> None:
+    """From the middle of the map; carried back while it runs; and all through the file stays as it is."""
+    before = digest(made)
+    r = robot(f"ros.map_file:={made}", "ros.localization_mode:=true", "slam.keyframes.distance:=2.0")
+    assert "relocalising" in r.said("slam_node: localisation")
+    r.send(*range(8, 17))
+    r.harness.wait(
+        lambda: r.said("slam_node: localisation").startswith(("relocalised", "tracking")), "an answer", timeout=30
+    )
+    r.send(17, 18)
+    r.harness.wait(lambda: r.off(place(drive, 18)) < 0.1, "its place in the map")
+    r.harness.wait(lambda: r.said("slam_node: odometry").startswith("track"), "the state")
+    # carried off: scans from 15 m behind, which the odometry cannot follow
+    r.stand(3, lambda: r.off(place(drive, 3)) < 0.2, "the robot where it was put")
+    assert r.close() == 0
+    log = r.log.read_text()
+    assert "found at" in log
+    assert "Traceback" not in log
+    assert digest(made) == before
+    assert sorted(path.name for path in made.parent.iterdir()) == ["drive.dpm2map", "out"]
+
+
+def test_hints_and_services_answer_in_words(robot: Callable[..., Robot], made: Path, tmp_path: Path) -> None:
+    """A hint in another frame, a map saved that stays as it is, a file that is gone: refused, and the drive goes on."""
+    r = robot(f"ros.map_file:={made}", "ros.localization_mode:=true")
+    r.stand(0, lambda: r.off(np.eye(4)) < 0.2, "map -> odom")
+    r.point(np.eye(4), "odom")
+    r.harness.wait(lambda: "want it in frame map, not in 'odom'" in r.log.read_text(), "the warning")
+    saved = r.call(Trigger, "/slam_node/save_map")
+    assert not saved.success
+    # the file goes: it cannot be loaded again, and the robot keeps what it has
+    made_elsewhere = made.rename(made.with_name("gone.dpm2map"))
+    try:
+        answer = r.call(Trigger, "/slam_node/load_map")
+        assert not answer.success
+        assert "no such map file" in answer.message
+    finally:
+        made_elsewhere.rename(made)
+    loaded = r.call(Trigger, "/slam_node/load_map")
+    assert loaded.success, loaded.message
+    r.harness.wait(lambda: "relocalising" in r.said("slam_node: localisation"), "the new search")
+    r.point(np.eye(4), "map")
+    seen = len(r.tf)
+    again = lambda: any(t.header.frame_id == "map" for m in r.tf[seen:] for t in m.transforms)  # noqa: E731
+    r.stand(1, again, "the robot in the map again")
+
+
+def test_from_mapping_to_localising_and_back(robot: Callable[..., Robot], tmp_path: Path) -> None:
+    """One node makes a map, finds itself in it, and lets it grow by a session; each answer is in words."""
+    path = tmp_path / "own.dpm2map"
+    r = robot(f"ros.map_file:={path}", "slam.keyframes.distance:=2.0")
+    assert not r.call(Trigger, "/slam_node/load_map").success
+    growing = r.call(SetBool, "/slam_node/localization_mode", data=False)
+    assert growing.success
+    assert "already" in growing.message
+    r.send(*range(8))
+    localising = r.call(SetBool, "/slam_node/localization_mode", data=True)
+    assert localising.success, localising.message
+    before = digest(path)
+    early = r.call(SetBool, "/slam_node/localization_mode", data=False)
+    assert not early.success
+    assert "relocalising" in early.message
+
+    def extended() -> bool:
+        r.send(8, 9)
+        assert digest(path) == before
+        return r.call(SetBool, "/slam_node/localization_mode", data=False).success
+
+    r.harness.wait(extended, "the robot in its map", timeout=30)
+    r.send(*range(10, 20))
+    assert r.close() == 0
+    from dpm2_core.slam.map.data import load_map
+    from dpm2_core.slam.map.store import MapStore
+
+    with MapStore.open(path) as store:
+        data = load_map(store)
+    assert set(data.session) == {1, 2}
+    assert len({(k.robot, k.id) for k in data.keyframes}) == len(data)
+
+
+def test_a_map_that_is_not_there_ends_the_node_in_words(run: Callable[..., Any], tmp_path: Path) -> None:
+    pairs = [f"ros.map_file:={tmp_path / 'none'}", "ros.localization_mode:=true"]
+    done = run("slam_node", "--ros-args", *(part for pair in pairs for part in ("-p", pair)))
+    assert done.returncode == 2
+    assert "no such map file" in done.stderr
+    assert "Traceback" not in done.stderr
