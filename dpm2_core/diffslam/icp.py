@@ -97,7 +97,7 @@ class _PlaneResiduals:
 
     def __init__(self, p: Tensor, q: Tensor, n: Tensor, weights: Tensor, settings: IcpSettings) -> None:
         self._p, self._q, self._n, self._settings = p, q, n, settings
-        self.total = weights.detach().sum(1)
+        self.total = weights.sum(1)
         self._share = weights / self.total.clamp(min=1e-9)[:, None]
 
     def _residual(self, T: Tensor) -> Tensor:

@@ -31,8 +31,10 @@ def relax(
     Raises:
         UsageError: an edge names a pose that is not there, or the counts differ.
     """
-    if edges.shape != (len(measured), 2) or (weights is not None and weights.shape != (len(measured),)):
-        raise UsageError(f"pose graph: {tuple(edges.shape)} edges for {len(measured)} measured poses")
+    if edges.shape != (len(measured), 2):
+        raise UsageError(f"pose graph: edges {tuple(edges.shape)} for {len(measured)} measured poses")
+    if weights is not None and weights.shape != (len(measured),):
+        raise UsageError(f"pose graph: weights {tuple(weights.shape)} for {len(measured)} measured poses")
     if len(edges) and not 0 <= int(edges.min()) <= int(edges.max()) < len(poses):
         raise UsageError(f"pose graph: an edge names pose {int(edges.max())} of {len(poses)}")
     if len(poses) < 2 or not len(edges):
@@ -49,7 +51,7 @@ class _Graph:
 
     def __init__(self, first: Tensor, edges: Tensor, measured: Tensor, weights: Tensor, rotation_weight: float) -> None:
         self._first, self._edges, self._measured = first, edges.to(measured.device), measured
-        self.total = weights.detach().sum()[None]
+        self.total = weights.sum()[None]
         self._share = weights / self.total.clamp(min=1e-9)
         self._scale = measured.new_tensor([rotation_weight**0.5] * 3 + [1.0] * 3)
 

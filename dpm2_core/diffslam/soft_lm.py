@@ -40,6 +40,9 @@ class SoftLmSettings(Settings):
     """Part of a step that is taken: eq. 5 with its sign corrected; as printed; as in gradslam (power 1/200); all."""
     sensitivity: float = Field(default=10.0, gt=0)
     """Gates soft and none: the exponent for an error that doubles. Sums saturate it, means leave it at zero."""
+    lenience: float = 4.0
+    """Gate soft: half of a step is taken where the exponent is this, nearly all of one that changes nothing. At 0, as
+    in eq. 5, the last steps are halves: after 8 iterations poses and gradients are still on their way."""
     gradient: Literal["unrolled", "implicit"] = "unrolled"
     """Through all iterations, or by the implicit function theorem at the last: less memory, exact once converged."""
 
@@ -80,7 +83,7 @@ def next_damping(change: Tensor, settings: SoftLmSettings) -> Tensor:
 def step_gate(change: Tensor, settings: SoftLmSettings) -> Tensor:
     """Part of the step that is taken, 0..1, for the change of error (B,) that the whole step would bring."""
     if settings.gate == "soft":
-        return torch.sigmoid(-change)
+        return torch.sigmoid(settings.lenience - change)
     if settings.gate == "paper":
         return torch.sigmoid(change)
     if settings.gate == "gradslam":

@@ -67,9 +67,9 @@ def test_batch_and_padding_change_nothing(noisy: list[Tensor]) -> None:
 
 
 def test_gradcheck_in_double(noisy: list[Tensor]) -> None:
-    """Of the pose by points and weights of both clouds, 30 points, unrolled and implicit.
+    """Of the pose by points and weights of both clouds, 30 points, through 2 iterations.
 
-    Associations and normals are fixed, as they are for the gradient: the points of both clouds are 1 m apart or more.
+    Normals are fixed, as they are for the gradient; so are the associations, since the points are far apart.
     """
     generator = torch.Generator().manual_seed(1)
     p = torch.randn(1, 30, 3, generator=generator, dtype=torch.float64) * 5
@@ -77,7 +77,7 @@ def test_gradcheck_in_double(noisy: list[Tensor]) -> None:
     q = p + 0.05 * torch.randn(1, 30, 3, generator=generator, dtype=torch.float64)
     w = torch.rand(1, 30, generator=generator, dtype=torch.float64) * 0.8 + 0.1
 
-    for solver in (settings(3), settings(3, gate="none"), IcpSettings(kernel="geman_mcclure")):
+    for solver in (settings(2), settings(2).model_copy(update={"kernel": "geman_mcclure", "kernel_scale": 0.5})):
 
         def pose(p: Tensor, q: Tensor, w: Tensor, v: Tensor, how: IcpSettings = solver) -> Tensor:
             target = Cloud(q.detach(), v.detach())

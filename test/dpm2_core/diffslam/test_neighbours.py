@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Trees and distances find the same neighbours, never padding, also far from the origin."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dpm2_core.diffslam.neighbours import NeighbourSearch
+
+
+def clouds(offset: float = 0.0) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(3, 80, 3, generator=generator, dtype=torch.float64) * 10 + offset
+    valid = torch.rand(3, 80, generator=generator) < 0.6
+    return points, valid
+
+
+def by_distance(points: Tensor, valid: Tensor) -> NeighbourSearch:
+    """The way of the GPU, here."""
+    search = NeighbourSearch(points, valid)
+    search._trees = []
+    return search
+
+
+def test_tree_and_distance_agree_with_brute_force() -> None:
+    """Indices of the 5 nearest valid points, in their order, 100 m off too: no cancellation."""
+    for offset in (0.0, 100.0):
+        points, valid = clouds(offset)
+        queries = points + 0.3
+        distance = (queries[:, :, None] - points[:, None]).norm(dim=-1).masked_fill(~valid[:, None], torch.inf)
+        wanted = distance.argsort(-1)[..., :5]
+        torch.testing.assert_close(NeighbourSearch(points, valid).nearest(queries, 5), wanted)
+        torch.testing.assert_close(by_distance(points, valid).nearest(queries, 5), wanted)
+        torch.testing.assert_close(by_distance(points, valid).nearest(queries), wanted[..., :1])
+
+
+def test_fewer_points_than_asked_repeat_the_nearest() -> None:
+    """And a cloud without any gives its first."""
+    points, valid = clouds()
+    valid[0] = False
+    valid[1] = False
+    valid[1, 7] = True
+    for search in (NeighbourSearch(points, valid), by_distance(points, valid)):
+        found = search.nearest(points, 4)
+        assert bool((found[1] == 7).all())
+        assert bool((found[0] == found[0, :, :1]).all())
+    short = by_distance(points[:, :3], torch.ones(3, 3, dtype=torch.bool)).nearest(points, 5)
+    assert short.shape == (3, 80, 5)
+    assert int(short.max()) <= 2
+
+
+def test_select_keeps_each_cloud_with_its_points() -> None:
+    """In the order asked for, repeated too."""
+    points, valid = clouds()
+    for search in (NeighbourSearch(points, valid), by_distance(points, valid)):
+        both = search.select([2, 0, 2]).nearest(points[[2, 0, 2]], 3)
+        torch.testing.assert_close(both, search.nearest(points, 3)[[2, 0, 2]])

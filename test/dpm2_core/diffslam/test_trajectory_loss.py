@@ -1,0 +1,217 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The SLAM loss: zero where nothing differs, right slopes, selections, truncation, graphs, the cache and bad input."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from dpm2_core.diffslam import SlamLoss, SlamLossSettings, trajectory_loss
+from dpm2_core.diffslam.icp import IcpSettings
+from dpm2_core.diffslam.soft_lm import SoftLmSettings
+from dpm2_core.diffslam.trajectory_loss import odometry
+from dpm2_core.errors import UsageError
+from dpm2_core.geometry import se3
+
+CONVERGED = SlamLossSettings(icp=IcpSettings(solver=SoftLmSettings(iterations=30)))
+
+
+def leaves(clouds: list[Tensor]) -> list[Tensor]:
+    return [cloud.clone().requires_grad_() for cloud in clouds]
+
+
+def test_odometry_follows_the_scans(scans: list[Tensor], motion: Tensor) -> None:
+    """Each pose to 1 mm, from identity as from a guess, for a list as for a padded tensor with its mask."""
+    wanted = torch.stack([torch.linalg.matrix_power(motion, t) for t in range(4)])
+    padded = torch.nn.functional.pad(torch.stack(scans), (0, 0, 0, 50), value=torch.nan)
+    mask = torch.nn.functional.pad(torch.ones(4, 600), (0, 50))
+    for found in (odometry(scans), odometry(scans, guess=motion), odometry(padded, mask)):
+        torch.testing.assert_close(found, wanted, atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize("gradient", ["unrolled", "implicit"])
+def test_equal_clouds_have_no_loss_and_no_gradient(noisy: list[Tensor], gradient: str) -> None:
+    """Exactly, also when a graph is relaxed."""
+    icp = IcpSettings(solver=SoftLmSettings(gradient=gradient))
+    for spans in ((1,), (1, 2)):
+        pred = leaves(noisy)
+        loss = SlamLoss(SlamLossSettings(icp=icp, spans=spans))(pred, noisy)
+        loss.backward()
+        # The attached Newton step rounds differently with a graph: 1e-14 m at most, and its square.
+        assert float(loss.detach()) < 1e-20
+        assert max(float(cloud.grad.abs().max()) for cloud in pred) < 1e-12  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("gradient", ["unrolled", "implicit"])
+def test_slope_by_one_point_is_the_finite_difference(noisy: list[Tensor], scans: list[Tensor], gradient: str) -> None:
+    """Within 1 %: for the point with the largest slope, moved by 0.1 mm along it."""
+    loss = SlamLoss(SlamLossSettings(icp=IcpSettings(solver=SoftLmSettings(iterations=30, gradient=gradient))))
+    pred = leaves(noisy)
+    slope = torch.autograd.grad(loss(pred, scans), pred[3])[0]
+    i = int(slope.norm(dim=1).argmax())
+    direction = slope[i] / slope[i].norm()
+
+    def at(step: float) -> float:
+        last = noisy[3].clone()
+        last[i] += step * direction
+        with torch.no_grad():
+            return float(loss([*noisy[:3], last], scans))
+
+    assert (at(1e-4) - at(-1e-4)) / 2e-4 == pytest.approx(float(slope[i].norm()), rel=0.01)
+
+
+def test_descending_the_loss_repairs_a_cloud(noisy: list[Tensor], scans: list[Tensor]) -> None:
+    """A scan that was shifted as a whole by 5 cm is pulled back: the slope points the right way."""
+    shift = torch.tensor([0.05, 0.0, 0.0], dtype=torch.float64, requires_grad=True)
+    loss = SlamLoss()
+    before = loss([scans[0], scans[1] + shift, *scans[2:]], scans)
+    (slope,) = torch.autograd.grad(before, shift)
+    step = 0.02 * slope / slope.norm()
+    assert float(slope[0]) > 0
+    assert float(loss([scans[0], scans[1] + shift.detach() - step, *scans[2:]], scans)) < float(before.detach())
+
+
+def test_removing_a_moving_object_reduces_the_loss(scans: list[Tensor]) -> None:
+    """A fifth of the points drives along with the sensor; the loss falls with their weight, and its slope says so."""
+    generator = torch.Generator().manual_seed(5)
+    box = torch.rand(150, 3, generator=generator, dtype=torch.float64) * torch.tensor([4, 2, 1.5]) + torch.tensor(
+        [8.0, 3.0, -1.6]
+    )
+    pred = [torch.cat([scan, box]) for scan in scans]
+    loss, values = SlamLoss(), []
+    for level in (1.0, 0.3, 0.0):
+        weight = torch.full((150,), level, dtype=torch.float64, requires_grad=True)
+        value = loss(pred, scans, [torch.cat([torch.ones(600).double(), weight])] * 4)
+        values.append(float(value.detach()))
+        if level:
+            assert float(torch.autograd.grad(value, weight)[0].sum()) > 0
+    assert values[0] > values[1] > values[2]
+    assert values[2] < 1e-4 * values[0]
+
+
+def test_float32_clouds_get_float32_gradients(noisy: list[Tensor], scans: list[Tensor]) -> None:
+    """What networks predict; the solve itself is in double."""
+    pred = leaves([cloud.float() for cloud in noisy])
+    loss = SlamLoss()(pred, [scan.float() for scan in scans])
+    assert loss.dtype == torch.float64
+    loss.backward()
+    assert all(cloud.grad is not None and cloud.grad.dtype == torch.float32 for cloud in pred)
+
+
+def test_truncation_stops_the_gradient_and_not_the_value(noisy: list[Tensor], scans: list[Tensor]) -> None:
+    """With truncate = 1 the last pose depends on the last pair alone."""
+    whole = odometry(leaves(noisy))
+    pred = leaves(noisy)
+    cut = odometry(pred, settings=SlamLossSettings(truncate=1))
+    torch.testing.assert_close(cut, whole)
+    slopes = torch.autograd.grad(cut[3, :3, 3].sum(), pred)
+    assert float(slopes[1].abs().max()) == 0.0
+    assert float(slopes[2].abs().max()) > 0
+
+
+def test_spans_make_a_graph_that_averages_noise(noisy: list[Tensor], motion: Tensor) -> None:
+    """Scans two apart add measurements: the trajectory stays right, and differs from the chain alone."""
+    wanted = torch.stack([torch.linalg.matrix_power(motion, t) for t in range(4)])
+    chain = odometry(noisy, settings=CONVERGED)
+    graph = odometry(noisy, settings=CONVERGED.model_copy(update={"spans": (1, 2)}))
+    assert float((graph - chain).abs().max()) > 1e-6
+    torch.testing.assert_close(graph, wanted, atol=0.02, rtol=0)  # noise of 1 cm on 600 points, three steps
+
+
+def test_reference_is_kept_by_frame(noisy: list[Tensor], scans: list[Tensor]) -> None:
+    """Named frames: the second call does not look at the targets. Without names it does."""
+    loss, frames = SlamLoss(), [("00", t) for t in range(4)]
+    first = loss(noisy, scans, frames=frames)
+    other = [scan + 0.5 * t for t, scan in enumerate(scans)]
+    assert float(loss(noisy, other, frames=frames)) == float(first)
+    assert float(loss(noisy, other)) != float(first)
+
+
+def test_windows_that_are_not_contiguous_are_refused(scans: list[Tensor]) -> None:
+    """The border of two sequences, a gap, the wrong order, too few names."""
+    loss = SlamLoss()
+    for frames, message in (
+        ([("00", 8), ("00", 9), ("01", 0), ("01", 1)], "border of sequences 00 and 01"),
+        ([("00", 1), ("00", 2), ("00", 4), ("00", 5)], "not contiguous"),
+        ([("00", 4), ("00", 3), ("00", 2), ("00", 1)], "not contiguous"),
+        ([("00", 4), ("00", 4), ("00", 4), ("00", 4)], "not contiguous"),
+        ([("00", 1)], "1 frames are named for 4"),
+    ):
+        with pytest.raises(UsageError, match=message):
+            loss(scans, scans, frames=frames)
+    loss(scans, scans, frames=[("00", 2 * t) for t in range(4)])  # every second scan is a window
+
+
+@pytest.mark.parametrize("side", ["predicted", "target"])
+def test_unusable_clouds_are_named(scans: list[Tensor], side: str) -> None:
+    """Which of the two, which scan, what is wrong."""
+
+    def refused(clouds: list[Tensor], message: str) -> None:
+        with pytest.raises(UsageError, match=f"{side}.*{message}"):
+            SlamLoss()(*((clouds, scans) if side == "predicted" else (scans, clouds)))
+
+    broken = scans[2].clone()
+    broken[3, 1] = torch.nan
+    refused([*scans[:2], broken, scans[3]], "scan 2: 1 of its 600 points are not finite")
+    refused([*scans[:3], scans[3][:49]], "scan 3: 49 points; want at least 50")
+    refused([*scans[:3], scans[3][:, :2]], r"scan 3: want floating-point points \(N, 3\)")
+    refused([*scans[:3], scans[3].long()], "scan 3: want floating-point")
+
+
+def test_unusable_weights_and_windows_are_refused(scans: list[Tensor]) -> None:
+    """Negative, above one, NaN, of another length; windows of different or too few scans; a guess of another shape."""
+    for value in (-0.1, 1.1, float("nan")):
+        with pytest.raises(UsageError, match=r"scan 0: 600 of its 600 weights are not in 0\.\.1"):
+            SlamLoss()(scans, scans, [torch.full((600,), value)] * 4)
+    with pytest.raises(UsageError, match=r"scan 0: weights \(7,\) for 600 points"):
+        SlamLoss()(scans, scans, [torch.ones(7)] * 4)
+    with pytest.raises(UsageError, match="weights of 1 scans"):
+        SlamLoss()(scans, scans, [torch.ones(600)])
+    with pytest.raises(UsageError, match="3 predicted scans for 4"):
+        SlamLoss()(scans[:3], scans)
+    with pytest.raises(UsageError, match="window of 1 scans"):
+        SlamLoss()(scans[:1], scans[:1])
+    with pytest.raises(UsageError, match="guess"):
+        SlamLoss()(scans, scans, guess=torch.eye(3))
+
+
+def test_zero_weights_give_a_finite_loss_and_no_gradient(noisy: list[Tensor], motion: Tensor) -> None:
+    """The predicted scans stand still, as guessed; nothing becomes NaN."""
+    weights = [torch.zeros(600, dtype=torch.float64, requires_grad=True) for _ in noisy]
+    pred = leaves(noisy)
+    loss = SlamLoss()(pred, noisy, weights)
+    steps = np.stack([se3.log(np.linalg.matrix_power(motion.numpy(), t)) for t in (1, 2, 3)])
+    travelled = np.stack([np.linalg.matrix_power(motion.numpy(), t)[:3, 3] for t in (1, 2, 3)])
+    wanted = ((travelled**2).sum(1) + 25 * (steps[:, :3] ** 2).sum(1)).mean()
+    assert float(loss.detach()) == pytest.approx(wanted, rel=0.02)  # the reference is that of noisy scans
+    loss.backward()
+    assert all(float(x.grad.abs().max()) == 0.0 for x in (*pred, *weights))  # type: ignore[union-attr]
+
+
+def test_large_clouds_are_thinned_alike(noise: np.random.Generator, scans: list[Tensor]) -> None:
+    """More than `points` are thinned, the same in each call; gradients go to those that were kept."""
+    big = [torch.cat([scan, scan + 0.01, scan - 0.01]) for scan in scans]
+    pred = leaves(big)
+    loss = SlamLoss(SlamLossSettings(points=500))(pred, big)
+    assert float(loss.detach()) == 0.0
+    loss = SlamLoss(SlamLossSettings(points=500))(pred, scans)
+    slopes = torch.autograd.grad(loss, pred)
+    assert all(0 < int((slope.abs().sum(1) > 0).sum()) <= 500 for slope in slopes)
+
+
+def test_trajectory_loss_by_hand() -> None:
+    """Eq. 3: one pose 3 m off, one 0.1 rad; no gradient into the reference; shapes are checked."""
+    reference = torch.eye(4).double().repeat(3, 1, 1).requires_grad_()
+    poses = torch.eye(4).double().repeat(3, 1, 1)
+    poses[1, 0, 3] = 3.0
+    poses[2] = torch.from_numpy(se3.exp(np.array([0, 0, 0.1, 0, 0, 0])))
+    value = trajectory_loss(poses.requires_grad_(), reference, rotation_weight=25.0)
+    assert float(value.detach()) == pytest.approx((9.0 + 25 * 0.01) / 2)
+    value.backward()
+    assert reference.grad is None
+    with pytest.raises(UsageError, match="trajectory loss"):
+        trajectory_loss(poses, poses[:2])
+    with pytest.raises(UsageError, match="trajectory loss"):
+        trajectory_loss(poses[:1], poses[:1])
