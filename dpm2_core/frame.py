@@ -156,6 +156,8 @@ class LoopClosure:
     from_id: int
     to_id: int
     registration: Registration
+    from_robot: str = ""
+    to_robot: str = ""
 
 
 @dataclass(frozen=True, eq=False)

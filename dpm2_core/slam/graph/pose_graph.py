@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Array
@@ -54,12 +55,15 @@ class PoseGraph:
     def __init__(self, settings: PoseGraphSettings) -> None:
         self._settings = settings
         self._poses: list[Array] = []
-        self._chained: list[bool] = []
+        self._before: list[int] = []  # by odometry; -1 where a trajectory begins
+        self._trajectory: list[int] = []  # number of each node's
+        self._ends: list[int] = []  # last node of each trajectory
         self._steps: list[Array] = []
         self._step_covariances: list[Array] = []
         self._loops: list[tuple[int, int, Array, Array]] = []
         self._verdicts: list[LoopVerdict] = []
         self._worker = GraphWorker()
+        self._moved = False  # a part, since a graph was sent: its solution is of no use
         self._sent = 0  # loops in the graph that is being solved
         self._failures = 0
         self.problem = ""
@@ -72,13 +76,17 @@ class PoseGraph:
         """(N, 4, 4) T_map_kf."""
         return np.array(self._poses).reshape(-1, 4, 4)
 
+    def pose(self, node: int) -> Array:
+        """(4, 4) T_map_kf of one node."""
+        return self._poses[node]
+
     @property
     def edges(self) -> list[tuple[int, int, Array, Array]]:
         """Odometry edges, then the loops that are kept or not judged yet: from, to, T_from_to, covariance."""
         chain = [
-            (node - 1, node, self._steps[node], self._step_covariances[node])
-            for node, chained in enumerate(self._chained)
-            if chained
+            (before, node, self._steps[node], self._step_covariances[node])
+            for node, before in enumerate(self._before)
+            if before >= 0
         ]
         return chain + [loop for loop, told in zip(self._loops, self._verdicts, strict=True) if told.kept]
 
@@ -92,21 +100,54 @@ class PoseGraph:
         """Whether another process is optimising."""
         return self._worker.busy
 
-    def add_node(self, T_map_kf: Array, T_before_this: Array | None, covariance: Array | None) -> None:
+    def add_node(
+        self, T_map_kf: Array, T_before_this: Array | None, covariance: Array | None, before: int | None = None
+    ) -> None:
         """Append a keyframe: with an edge to the one before, or as the start of a trajectory of its own.
 
         A part of the graph that nothing ties to another keeps the pose of its first node.
+
+        Args:
+            before: the last node of its trajectory, where several grow at a time; None: the last node of all.
+
+        Raises:
+            ValueError: odometry goes on from there already.
         """
-        chained = T_before_this is not None and covariance is not None
+        node = len(self)
+        if T_before_this is None or covariance is None:
+            before, T_before_this, covariance = -1, np.eye(4), np.zeros((6, 6))
+            self._trajectory.append(len(self._ends))
+            self._ends.append(node)
+        else:
+            before = node - 1 if before is None else before
+            number = self._trajectory[before]
+            if self._ends[number] != before:
+                raise ValueError(f"node {before} is not the last of its trajectory")
+            self._trajectory.append(number)
+            self._ends[number] = node
+        self._before.append(before)
         self._poses.append(T_map_kf)
-        self._chained.append(chained)
-        self._steps.append(T_before_this if T_before_this is not None and chained else np.eye(4))
-        self._step_covariances.append(covariance if covariance is not None and chained else np.zeros((6, 6)))
+        self._steps.append(T_before_this)
+        self._step_covariances.append(covariance)
 
     def add_loop(self, from_node: int, to_node: int, T_from_to: Array, covariance: Array) -> None:
-        """Tie two keyframes that saw the same place."""
+        """Tie two keyframes that saw the same place.
+
+        Where it is the first between two parts of the graph, the younger one is moved there as it is: from any other
+        start an optimisation would take the loop for a wrong one.
+        """
+        parts = self._parts()
+        a, b = parts[self._trajectory[from_node]], parts[self._trajectory[to_node]]
+        if a != b:
+            T_to = self._poses[from_node] @ T_from_to  # where the loop has that node
+            T = T_to @ se3.inverse(self._poses[to_node])
+            self._move(max(a, b), T if b > a else se3.inverse(T), parts)
         self._loops.append((from_node, to_node, T_from_to, covariance))
         self._verdicts.append(LoopVerdict(from_node, to_node, True, ""))
+
+    def part(self, node: int) -> int:
+        """Number of the part of the graph that a node is in: nodes of two parts have nothing to do with each other."""
+        return self._parts()[self._trajectory[node]]
 
     def optimise(self) -> None:
         """Move the poses to the optimum and judge the loops: here and now, or (`background`) in another process.
@@ -148,6 +189,9 @@ class PoseGraph:
                 continue
             if solution is None:
                 break
+            if self._moved:
+                self._submit()
+                continue
             self._apply(solution, self._sent)
             self.problem, self._failures, changed = "", 0, True
             if len(self._loops) > self._sent:
@@ -177,35 +221,63 @@ class PoseGraph:
     def write_g2o(self, path: Path) -> None:
         """All vertices, the odometry and the loops that are kept, in g2o's SE3:QUAT format at full precision."""
         kept = np.array([told.kept for told in self._verdicts], np.bool_)
-        write_g2o(path, G2o(self._data(), np.arange(len(self)), planar=False), kept)
+        write_g2o(path, G2o(self._data(), self._order(), planar=False), kept)
 
     def _joint(self, nodes: list[int]) -> Array:
-        kept = np.array([told.kept for told in self._verdicts], np.bool_)
-        return robust.joint_covariance(self._data(), self.poses, kept, np.array(nodes, np.intp))
+        kept, data = np.array([told.kept for told in self._verdicts], np.bool_), self._data()
+        return robust.joint_covariance(data, data.poses, kept, self._places()[nodes])
+
+    def _order(self) -> NDArray[np.intp]:
+        """(N,) nodes as the solver has them: one trajectory after the other, so that each is a chain."""
+        return np.argsort(self._trajectory, kind="stable")
+
+    def _places(self) -> NDArray[np.intp]:
+        """(N,) place of each node in that order."""
+        return np.argsort(self._order())
 
     def _data(self) -> GraphData:
+        order = self._order()
+        ends = np.array([loop[:2] for loop in self._loops], np.intp).reshape(-1, 2)
         return GraphData(
-            self.poses,
-            np.array(self._chained, np.bool_),
-            np.array(self._steps).reshape(-1, 4, 4),
-            np.array(self._step_covariances).reshape(-1, 6, 6),
-            np.array([loop[:2] for loop in self._loops], np.intp).reshape(-1, 2),
+            self.poses[order],
+            np.array(self._before, np.intp)[order] >= 0,
+            np.array(self._steps).reshape(-1, 4, 4)[order],
+            np.array(self._step_covariances).reshape(-1, 6, 6)[order],
+            self._places()[ends],
             np.array([loop[2] for loop in self._loops]).reshape(-1, 4, 4),
             np.array([loop[3] for loop in self._loops]).reshape(-1, 6, 6),
         )
 
+    def _parts(self) -> list[int]:
+        """Of each trajectory, the oldest one that loops tie it to."""
+        parts = list(range(len(self._ends)))
+        for (a, b, *_), told in zip(self._loops, self._verdicts, strict=True):
+            one, other = sorted((parts[self._trajectory[a]], parts[self._trajectory[b]]))
+            if told.kept and one != other:
+                parts = [one if part == other else part for part in parts]
+        return parts
+
+    def _move(self, part: int, T: Array, parts: list[int]) -> None:
+        """All of a part to T @ T_map_kf."""
+        for node, number in enumerate(self._trajectory):
+            if parts[number] == part:
+                self._poses[node] = T @ self._poses[node]
+        self._moved = True
+
     def _submit(self) -> None:
+        self._moved = False
         self._sent = len(self._loops)
         self._worker.submit(self._data(), self._settings)
 
     def _apply(self, solution: Solution, loops: int) -> None:
         count = len(solution.poses)
-        follow = solution.poses[-1] @ se3.inverse(self._poses[count - 1])
-        self._poses[:count] = list(solution.poses)
-        for node in range(count, len(self._poses)):
-            if not self._chained[node]:
-                break  # another trajectory: nothing ties it to what moved
-            self._poses[node] = follow @ self._poses[node]
+        places = np.argsort(np.argsort(self._trajectory[:count], kind="stable"))
+        old, self._poses[:count] = self._poses[:count], list(solution.poses[places])
+        last = dict(zip(self._trajectory[:count], range(count), strict=True))  # solved for, of each trajectory
+        for node in range(count, len(self)):
+            at = last.get(self._trajectory[node])
+            if at is not None:  # else another trajectory: nothing ties it to what moved
+                self._poses[node] = self._poses[at] @ se3.inverse(old[at]) @ self._poses[node]
         for loop in range(loops):
             a, b = self._loops[loop][:2]
             self._verdicts[loop] = LoopVerdict(a, b, bool(solution.kept[loop]), solution.reason(loop))

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -81,10 +81,11 @@ def _load(store: MapStore, descriptors: bool) -> MapData:
         for node, loan in loans.items():
             keyframes[node] = borrowing(keyframes[node], keyframes, loan)
     edges = [edge_of(row) for row in store.rows("edges")]
-    for edge in edges:
-        if edge.kind == "odometry" and _follows(edge) and edge.to_node < count:
+    owner = [(keyframe.robot, number) for keyframe, number in zip(keyframes, session, strict=True)]
+    for node, edge in _chain(edge for edge in edges if max(edge.from_node, edge.to_node) < count).items():
+        if owner[edge.from_node] == owner[node]:
             known = (edge.T_from_to, edge.covariance, edge.confidence, edge.rmse, edge.method)
-            keyframes[edge.to_node] = replace(keyframes[edge.to_node], edge=Registration(*known))
+            keyframes[node] = replace(keyframes[node], edge=Registration(*known))
     poses = {node: bytes_array(T, 4) for node, T in store.rows("poses")}
     if missing := set(range(count)) - poses.keys():
         raise ValueError(f"keyframe {min(missing)} has no pose")
@@ -186,10 +187,10 @@ def trajectory(data: MapData) -> tuple[list[int], Array]:
 
 def restore(graph: PoseGraph, data: MapData) -> None:
     """Fill an empty pose graph with the nodes and constraints of a map."""
-    chain = {edge.to_node: edge for edge in data.constraints if edge.kind == "odometry" and _follows(edge)}
+    chain = _chain(data.constraints)
     for node, T_map_kf in enumerate(data.poses):
         if (edge := chain.get(node)) is not None:
-            graph.add_node(T_map_kf, edge.T_from_to, edge.covariance)
+            graph.add_node(T_map_kf, edge.T_from_to, edge.covariance, edge.from_node)
         else:
             graph.add_node(T_map_kf, None, None)
     for edge in data.constraints:
@@ -197,5 +198,14 @@ def restore(graph: PoseGraph, data: MapData) -> None:
             graph.add_loop(edge.from_node, edge.to_node, edge.T_from_to, edge.covariance)
 
 
-def _follows(edge: Edge) -> bool:
-    return edge.to_node == edge.from_node + 1
+def _chain(edges: Iterable[Edge]) -> dict[int, Edge]:
+    """The odometry by the node that it leads to: no node has two before it, or two after it."""
+    chain: dict[int, Edge] = {}
+    left: set[int] = set()
+    # Nearest nodes first: what pruning has left goes round about.
+    odometry = (edge for edge in edges if edge.ok and edge.kind == "odometry" and edge.from_node < edge.to_node)
+    for edge in sorted(odometry, key=lambda edge: edge.to_node - edge.from_node):
+        if edge.to_node not in chain and edge.from_node not in left:
+            chain[edge.to_node] = edge
+            left.add(edge.from_node)
+    return chain

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -39,14 +39,31 @@ class MapSettings(Settings):
     redundancy: RedundancySettings = RedundancySettings()
 
 
-class Mapper:
-    """Holds keyframes and pose graph; the odometry runs on untouched, `T_map_odom` carries every correction.
+@dataclass(eq=False)
+class _Robot:
+    """One that has sent keyframes.
 
     Attributes:
-        keyframes: all, without their clouds; a node is a position among them. ids count on over the sessions.
+        window: of its clouds. last: node of its last keyframe in this session, None before the first.
+        ids: so many are given. offset: of those of its present drive.
+    """
+
+    window: MovingWindow
+    last: int | None = None
+    ids: int = 0
+    offset: int = 0
+
+
+class Mapper:
+    """Holds keyframes and pose graph of one robot or several; their odometry runs on untouched.
+
+    Every robot has an odometry frame of its own. The map's frame is that of the first; where another one is in it is
+    not known before a loop ties the two.
+
+    Attributes:
+        keyframes: all, without their clouds; a node is a position among them. ids count on over a robot's sessions.
         session_start: node of the first keyframe of this session: those before are of a map that was loaded.
         closures: loops tried in this session.
-        T_map_odom: (4, 4).
     """
 
     def __init__(
@@ -58,15 +75,15 @@ class Mapper:
         self._loops = loops
         self.keyframes: list[Keyframe] = []
         self.closures: list[LoopClosure] = []
-        self.T_map_odom: Array = np.eye(4)
         self._clouds = CloudStore()
         self._writer: MapWriter | None = None
-        self._first_id: dict[str, int] = {}  # of a robot's first keyframe in this session, where it was here before
+        self._robots: dict[str, _Robot] = {}
+        self._placed = {0}  # nodes whose pose in the map is known from the start
+        self._T_start: Array = np.eye(4)  # T_map_odom of the first robot of the session
         self._tie: Array | None = None  # covariance of the session's first keyframe relative to the last of the map
         if store is not None:
             self._load(store)
         self.session_start = len(self.keyframes)
-        self._moving = MovingWindow(settings.moving)
 
     @property
     def poses(self) -> Array:
@@ -77,6 +94,25 @@ class Mapper:
     def edges(self) -> list[tuple[int, int, Array, Array]]:
         """Odometry edges and accepted loops: from, to, T_from_to, covariance."""
         return self._graph.edges
+
+    @property
+    def T_map_odom(self) -> Array:
+        """(4, 4) of the robot whose keyframe came last, which carries every correction."""
+        if len(self.keyframes) == self.session_start:
+            return self._T_start
+        return se3.orthonormalised(self._graph.pose(-1) @ se3.inverse(self.keyframes[-1].T_odom_kf))
+
+    def T_map_odom_of(self, robot: str) -> Array | None:
+        """(4, 4) of a robot; None before it is known where in the map it is."""
+        last = self._robots[robot].last if robot in self._robots else None
+        if last is None or self._graph.part(last) not in {self._graph.part(node) for node in self._placed}:
+            return None
+        return se3.orthonormalised(self._graph.pose(last) @ se3.inverse(self.keyframes[last].T_odom_kf))
+
+    @property
+    def robots(self) -> list[str]:
+        """Names of those that have sent keyframes in this session."""
+        return [name for name, robot in self._robots.items() if robot.last is not None]
 
     @property
     def clouds(self) -> Sequence[Points]:
@@ -100,16 +136,19 @@ class Mapper:
             covariance: (6, 6) of the first keyframe's pose relative to the last one of the map, which are then joined
                 by an edge; None: the new session is not tied to the map before a loop is found.
         """
-        self.T_map_odom, self._tie = T_map_odom, covariance
+        self._T_start, self._tie = T_map_odom, covariance
 
     def add(self, keyframe: Keyframe, thumbnail: bytes | None = None) -> list[LoopClosure]:
         """Take a keyframe in, with a JPEG if wanted; returns the loops that were tried, accepted or not."""
         node, cloud = len(self.keyframes), keyframe.cloud
-        if node == self.session_start:
-            keyframe = replace(keyframe, edge=None)  # to one that is not in the map
+        robot = self._robot(keyframe.robot)
+        if robot.last is None or keyframe.edge is None:
+            keyframe, robot.last = replace(keyframe, edge=None), None  # no edge to one that is not in the map
+            robot.offset = robot.ids
         keyframe = self._loops.described(keyframe)
-        keyframe = replace(keyframe, id=keyframe.id + self._first_id.get(keyframe.robot, 0), cloud=NO_POINTS)
-        edges = self._add_node(keyframe)
+        keyframe = replace(keyframe, id=keyframe.id + robot.offset, cloud=NO_POINTS)
+        edges = self._add_node(keyframe, robot.last)
+        robot.last, robot.ids = node, keyframe.id + 1
         self._clouds.append(pack_cloud(cloud))
         self.keyframes.append(keyframe)
         closures, loops = self._close_loops(node)
@@ -119,7 +158,7 @@ class Mapper:
             self._clouds.borrow(node, loan)
             self.keyframes[node] = borrowing(keyframe, self.keyframes, loan)
         poses = self.poses
-        self._mark_moving(self._moving.add(node, cloud, poses))
+        self._mark_moving(robot.window.add(node, cloud, poses))
         if self._writer is not None:
             self._writer.add(node, self.keyframes[node], thumbnail)
             for edge in (*edges, *loops):
@@ -131,7 +170,8 @@ class Mapper:
         """At the end of a drive: wait for the solver, judge the last clouds, bring the map file up to date."""
         self._optimise(changed=False, wait=True)
         self._graph.close()
-        self._mark_moving(self._moving.finish(self.poses))
+        for robot in self._robots.values():
+            self._mark_moving(robot.window.finish(self.poses))
         if self._writer is not None:
             self._writer.sync(self.poses)
 
@@ -148,35 +188,43 @@ class Mapper:
         self.keyframes, self._clouds = data.keyframes, data.clouds
         restore(self._graph, data)
         for keyframe in data.keyframes:
-            self._first_id[keyframe.robot] = max(self._first_id.get(keyframe.robot, 0), keyframe.id + 1)
+            robot = self._robot(keyframe.robot)
+            robot.ids = max(robot.ids, keyframe.id + 1)
         if not store.read_only:
             self._writer = MapWriter(store, self._clouds, data.poses)
 
-    def _add_node(self, keyframe: Keyframe) -> list[Edge]:
-        """A node with an edge to the keyframe before, also when some between them never arrived."""
-        T_map_kf, node = self.T_map_odom @ keyframe.T_odom_kf, len(self.keyframes)
-        if node == self.session_start and self._tie is not None:
-            T_before_this, covariance = se3.inverse(self.poses[-1]) @ T_map_kf, self._tie
-        elif keyframe.edge is None or node == self.session_start:
-            self._graph.add_node(T_map_kf, None, None)
-            return []
-        else:
-            before = self.keyframes[-1]
+    def _robot(self, name: str) -> _Robot:
+        return self._robots.setdefault(name, _Robot(MovingWindow(self._settings.moving)))
+
+    def _add_node(self, keyframe: Keyframe, last: int | None) -> list[Edge]:
+        """A node with an edge to its robot's `last` one, also when some between them never arrived."""
+        node, found = len(self.keyframes), keyframe.edge
+        if node == self.session_start:
+            self._placed.add(node)
+        if found is not None and last is not None:
+            before, T_before = self.keyframes[last], self._graph.pose(last)
             T_before_this = se3.inverse(before.T_odom_kf) @ keyframe.T_odom_kf
-            covariance = keyframe.edge.covariance * max(keyframe.id - before.id, 1)
-        self._graph.add_node(T_map_kf, T_before_this, covariance)
-        edge = Edge("odometry", node - 1, node, T_before_this, covariance)
-        found = keyframe.edge
-        if found is not None:
+            covariance = found.covariance * max(keyframe.id - before.id, 1)
+            edge = Edge("odometry", last, node, T_before_this, covariance)
             edge = replace(edge, confidence=found.confidence, rmse=found.rmse, method=found.method)
+        elif node == self.session_start and self._tie is not None:
+            last, T_before = node - 1, self._graph.pose(-1)
+            T_before_this = se3.inverse(T_before) @ self._T_start @ keyframe.T_odom_kf
+            edge = Edge("odometry", last, node, T_before_this, self._tie)
+        else:
+            T_map_odom = self._T_start if node == self.session_start else np.eye(4)
+            self._graph.add_node(T_map_odom @ keyframe.T_odom_kf, None, None)
+            return []
+        self._graph.add_node(T_before @ T_before_this, T_before_this, edge.covariance, last)
         return [edge]
 
     def _close_loops(self, node: int) -> tuple[list[LoopClosure], list[Edge]]:
         """Loops of the last keyframe, as they are published and as they are stored."""
         tried = self._loops.close(self.keyframes, self._clouds, self.poses)
         closures = [
-            LoopClosure(self.keyframes[loop.from_node].id, self.keyframes[loop.to_node].id, loop.registration)
+            LoopClosure(a.id, b.id, loop.registration, a.robot, b.robot)
             for loop in tried
+            for a, b in [(self.keyframes[loop.from_node], self.keyframes[loop.to_node])]
         ]
         self.closures += closures
         accepted = [loop for loop in tried if loop.registration.ok]
@@ -188,15 +236,12 @@ class Mapper:
 
     def _optimise(self, changed: bool, wait: bool = False) -> None:
         """Solve the graph if it has `changed`, take in what another process has solved; `wait` for that."""
-        moved = self._graph.collect(wait)
+        self._graph.collect(wait)
         if changed:
             try:
                 self._graph.optimise()
-                moved = True
             except Dpm2Error as error:  # the drive goes on, with the poses as they were
                 self._graph.problem = str(error)
-        if moved:
-            self.T_map_odom = se3.orthonormalised(self.poses[-1] @ se3.inverse(self.keyframes[-1].T_odom_kf))
 
     def _kept(self, loops: Sequence[Edge]) -> list[Edge]:
         """Those that the graph believes, too: on another's word no cloud is given up."""

@@ -124,7 +124,8 @@ class MovingWindow:
         """
         if self._settings.window:
             self._seen.append((node, cloud, RangeImage(cloud)))
-            yield from self._judge(node - self._settings.window, poses)
+            if len(self._seen) > self._settings.window:
+                yield from self._judge(self._seen[-1 - self._settings.window][0], poses)
 
     def finish(self, poses: Array) -> Iterator[tuple[int, NDArray[np.bool_]]]:
         """Judge those at the end of the drive by what there is."""
