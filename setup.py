@@ -39,7 +39,7 @@ EXTRAS = {
     "las": ["laspy>=2.5,<3"],  # dpm2 map export MAP OUT.las
     "timm": ["timm>=1,<2"],  # image backbones timm:NAME
     "train": ["tensorboard>=2.16,<3"],  # curves beside log.jsonl
-    "bench": ["kiss-icp>=1.2,<2"],  # the baseline of the benchmarks
+    "bench": ["kiss-icp>=1.2,<2", "pypose>=0.9,<1"],  # what the benchmarks compare with
 }
 EXTRAS["dev"] = [*EXTRAS["test"], *EXTRAS["bench"], "ruff>=0.9", "mypy>=1.13", "types-PyYAML"]
 

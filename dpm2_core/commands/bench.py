@@ -15,7 +15,9 @@ from dpm2_core.errors import UsageError
 def bench(
     names: Annotated[
         list[str] | None,
-        typer.Argument(help="geometric (default), loop-cost, map, memory, neural, pose-graph, relocalise, roads."),
+        typer.Argument(
+            help="diffslam, geometric (default), loop-cost, map, memory, neural, pose-graph, relocalise, roads."
+        ),
     ] = None,
     source: Annotated[
         list[Path] | None, typer.Option(help="A KITTI sequence or bag with ground truth, instead of the excerpt.")

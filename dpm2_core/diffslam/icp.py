@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Point-to-plane ICP for a batch of pairs, differentiable in the points and weights of both clouds.
 
-Which points belong together, and the normals, are found without gradient: the first is piecewise constant, the second
-moves the planes by less than the points do. Selections reach the pose through weights; a boolean mask would have none.
+Which points belong together is found without gradient: it is piecewise constant. Coordinates, normals and weights have
+theirs. Selections reach the pose through weights; a boolean mask would have no gradient.
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ from dpm2_core.config import Settings
 from dpm2_core.diffslam.neighbours import NeighbourSearch
 from dpm2_core.diffslam.soft_lm import SoftLmSettings, solve
 from dpm2_core.geometry import se3_torch
+
+_LEAST_GAP = 1e-3  # of eigenvalues, in units of their sum
 
 
 class IcpSettings(Settings):
@@ -40,7 +42,7 @@ class Cloud:
     """A batch of clouds, prepared to be registered to.
 
     Attributes:
-        points: (B, N, 3) float64, m. weights: (B, N) 0..1, zero for padding. normals: (B, N, 3) unit, detached.
+        points: (B, N, 3) float64, m. weights: (B, N) 0..1, zero for padding. normals: (B, N, 3) unit.
     """
 
     def __init__(self, points: Tensor, weights: Tensor | None = None, neighbours: int = 10) -> None:
@@ -48,7 +50,7 @@ class Cloud:
         self.points = points.double()
         self.weights = self.points.new_ones(points.shape[:2]) if weights is None else weights.double()
         self.search = NeighbourSearch(self.points, self.weights.detach() > 0)
-        self.normals = _normals(self.points.detach(), self.weights.detach(), self.search, neighbours)
+        self.normals = _normals(self.points, self.weights, self.search, neighbours)
 
     def select(self, index: Sequence[int]) -> Cloud:
         """The clouds of the batch at these places, prepared as they are."""
@@ -141,11 +143,23 @@ def _irls_weight(r: Tensor, settings: IcpSettings) -> Tensor:
 
 
 def _normals(points: Tensor, weights: Tensor, search: NeighbourSearch, k: int) -> Tensor:
-    """Unit normals (B, N, 3) by weighted PCA over the k nearest of each point; z where a point has no neighbours."""
-    index = search.nearest(torch.where(weights[..., None] > 0, points, torch.zeros_like(points)), k)
+    """Unit normals (B, N, 3) by weighted PCA over the k nearest of each point; z where a point has no neighbours.
+
+    With the gradient of the eigenvector to first order: without it the slope by one point is a third off. The gap to
+    the other eigenvalues is kept from zero, where a neighbourhood is a line and has no normal.
+    """
+    at = points.detach()
+    index = search.nearest(torch.where(weights.detach()[..., None] > 0, at, torch.zeros_like(at)), k)
     flat = index.flatten(1)
     near = _gather(points, flat).unflatten(1, index.shape[1:])
     w = weights.gather(1, flat).unflatten(1, index.shape[1:])[..., None]
     w = w / w.sum(-2, keepdim=True).clamp(min=1e-12)
     centred = near - (w * near).sum(-2, keepdim=True)
-    return torch.linalg.eigh((w * centred).mT @ centred)[1][..., 0]
+    C = (w * centred).mT @ centred
+    with torch.no_grad():
+        values, vectors = torch.linalg.eigh(C)
+        gap = values[..., :1] - values[..., 1:]
+        inverse_gap = gap / (gap**2 + (_LEAST_GAP * values.sum(-1, keepdim=True)) ** 2).clamp(min=1e-18)
+        normal, others = vectors[..., :1], vectors[..., 1:]
+    turn = inverse_gap[..., None] * (others.mT @ (C - C.detach()) @ normal)  # zero, but for its gradient
+    return (normal + others @ turn)[..., 0]

@@ -10,6 +10,13 @@ from dpm2_core.evaluation.bench.harness import Options, Report
 from dpm2_core.evaluation.bench.memory import bench_memory
 
 
+def bench_diffslam(options: Options) -> Report:
+    """See `diffslam.bench_diffslam`; the simulator and torch are imported only for it."""
+    from dpm2_core.evaluation.bench import diffslam
+
+    return diffslam.bench_diffslam(options)
+
+
 def bench_loop_cost(options: Options) -> Report:
     """See `loop_cost.bench_loop_cost`."""
     from dpm2_core.evaluation.bench import loop_cost
@@ -53,6 +60,7 @@ def bench_pose_graph(options: Options) -> Report:
 
 
 BENCHES: dict[str, Callable[[Options], Report]] = {
+    "diffslam": bench_diffslam,
     "geometric": bench_geometric,
     "loop-cost": bench_loop_cost,
     "map": bench_map,

@@ -69,7 +69,7 @@ def test_batch_and_padding_change_nothing(noisy: list[Tensor]) -> None:
 def test_gradcheck_in_double(noisy: list[Tensor]) -> None:
     """Of the pose by points and weights of both clouds, 30 points, through 2 iterations.
 
-    Normals are fixed, as they are for the gradient; so are the associations, since the points are far apart.
+    Normals are given; associations do not change, since the points are far apart.
     """
     generator = torch.Generator().manual_seed(1)
     p = torch.randn(1, 30, 3, generator=generator, dtype=torch.float64) * 5

@@ -46,20 +46,22 @@ def test_equal_clouds_have_no_loss_and_no_gradient(noisy: list[Tensor], gradient
 
 @pytest.mark.parametrize("gradient", ["unrolled", "implicit"])
 def test_slope_by_one_point_is_the_finite_difference(noisy: list[Tensor], scans: list[Tensor], gradient: str) -> None:
-    """Within 1 %: for the point with the largest slope, moved by 0.1 mm along it."""
+    """Within 1 %: for the points with the largest slope, of the last scan, which is a source, and of one that is a
+    target too, whose normals turn with it; moved by 0.1 mm along it."""
     loss = SlamLoss(SlamLossSettings(icp=IcpSettings(solver=SoftLmSettings(iterations=30, gradient=gradient))))
     pred = leaves(noisy)
-    slope = torch.autograd.grad(loss(pred, scans), pred[3])[0]
-    i = int(slope.norm(dim=1).argmax())
-    direction = slope[i] / slope[i].norm()
+    slopes = torch.autograd.grad(loss(pred, scans), pred)
+    for t in (1, 3):
+        i = int(slopes[t].norm(dim=1).argmax())
+        length = float(slopes[t][i].norm())
 
-    def at(step: float) -> float:
-        last = noisy[3].clone()
-        last[i] += step * direction
-        with torch.no_grad():
-            return float(loss([*noisy[:3], last], scans))
+        def at(step: float, t: int = t, i: int = i, direction: Tensor = slopes[t][i] / length) -> float:
+            moved = [scan.clone() for scan in noisy]
+            moved[t][i] += step * direction
+            with torch.no_grad():
+                return float(loss(moved, scans))
 
-    assert (at(1e-4) - at(-1e-4)) / 2e-4 == pytest.approx(float(slope[i].norm()), rel=0.01)
+        assert (at(1e-4) - at(-1e-4)) / 2e-4 == pytest.approx(length, rel=0.01)
 
 
 def test_descending_the_loss_repairs_a_cloud(noisy: list[Tensor], scans: list[Tensor]) -> None:

@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""pypose where it does the same as `diffslam`: registration of a known motion, by its ICP and by its LM optimiser."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dpm2_core.diffslam.icp import Cloud, register
+from dpm2_core.diffslam.trajectory_loss import SlamLossSettings
+from dpm2_core.geometry import se3, se3_torch
+
+_REPETITIONS = 3
+
+
+def beside_pypose(scan: Tensor, T_target_source: Tensor, settings: SlamLossSettings) -> dict[str, Any]:
+    """Error and time of each for a scan (N, 3) registered to itself, moved by T_target_source (4, 4), from identity.
+
+    pypose's ICP is point-to-point with all distances at once, its LM is given our matches and residuals; neither has
+    weights of points, and the optimiser has no gradient and finds its Jacobian by autograd. All do `iterations` steps.
+    """
+    try:
+        import pypose
+    except ImportError:
+        return {"skipped": "pypose is not installed: pip install pypose"}
+    source = se3_torch.transform(se3_torch.inverse(T_target_source), scan)
+    iterations = settings.icp.solver.iterations
+
+    @torch.no_grad()
+    def ours() -> Tensor:
+        return register(Cloud(source[None]), Cloud(scan[None]), torch.eye(4)[None], settings.icp)[0]
+
+    def icp() -> Tensor:
+        stepper = pypose.utils.ReduceToBason(steps=iterations, patience=iterations)
+        return pypose.module.ICP(stepper=stepper)(source, scan).matrix()
+
+    def lm() -> Tensor:
+        return _by_optimiser(pypose, source, scan, iterations)
+
+    timed: dict[str, Callable[[], Tensor]] = {"dpm2": ours, "pypose_icp": icp, "pypose_lm": lm}
+    rows = {name: _row(run, T_target_source.numpy()) for name, run in timed.items()}
+    return {"version": pypose.__version__, "iterations": iterations, **rows}
+
+
+def _row(run: Callable[[], Tensor], wanted: np.ndarray) -> dict[str, float]:
+    seconds = []
+    for _ in range(_REPETITIONS):
+        begin = time.perf_counter()
+        found = run()
+        seconds.append(time.perf_counter() - begin)
+    error = se3.inverse(wanted) @ found.detach().double().numpy()
+    figures = {
+        "mm": 1e3 * float(np.linalg.norm(error[:3, 3])),
+        "deg": float(np.degrees(se3.angle(error))),
+        "ms": 1e3 * float(np.median(seconds)),
+    }
+    return {name: float(f"{x:.4g}") for name, x in figures.items()}
+
+
+def _by_optimiser(pypose: Any, source: Tensor, target: Tensor, iterations: int) -> Tensor:
+    """Point-to-plane by `pypose.optim.LM`: its adaptive damping (up 2, down 0.5), each step matched anew."""
+    cloud = Cloud(target[None])
+
+    class Plane(torch.nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.T = pypose.Parameter(pypose.identity_SE3(dtype=torch.float64))
+
+        def forward(self, q: Tensor, n: Tensor) -> Tensor:
+            return (n * (self.T.Act(source) - q)).sum(-1, keepdim=True)
+
+    model = Plane()
+    optimiser = pypose.optim.LM(model, strategy=pypose.optim.strategy.Adaptive(damping=1e-6))
+    for _ in range(iterations):
+        with torch.no_grad():
+            moved = model.T.Act(source)
+        index = cloud.search.nearest(moved[None])[0, :, 0]
+        optimiser.step((target[index], cloud.normals[0, index]))
+    return model.T.matrix()
