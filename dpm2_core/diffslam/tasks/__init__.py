@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Perception tasks that the SLAM loss is tried on."""
