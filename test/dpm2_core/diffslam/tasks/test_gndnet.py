@@ -136,7 +136,7 @@ def test_the_slam_loss_reaches_the_network(scans: list[Tensor]) -> None:
 
 
 def test_it_learns_slopes() -> None:
-    """Of up to 20 %, from single scans, in 200 steps; on others 95 % of its variance are explained, and obstacles found."""
+    """Up to 20 %, in 200 steps; of others 95 % of the variance are explained, and what stands on them is found."""
     torch.manual_seed(0)
     net = GroundNet(SMALL)
     optimiser = torch.optim.Adam(net.parameters(), 1e-2)
