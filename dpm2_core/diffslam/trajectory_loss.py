@@ -31,7 +31,7 @@ class SlamLossSettings(Settings):
     """Registration of two scans."""
     points: int = Field(default=2048, ge=50)
     """Of a scan, at most."""
-    voxel: float = Field(default=1.0, gt=0)
+    voxel: float = Field(default=0.5, gt=0)
     """A scan of more points is thinned to one in each voxel of this edge first, m."""
     spans: tuple[int, ...] = Field(default=(1,), min_length=1)
     """Scans this far apart are registered. More than one span makes a pose graph, which is relaxed."""
