@@ -92,8 +92,7 @@ def cloud_to_msg(points: Points, stamp: int, frame_id: str) -> PointCloud2:
     """(N, 4) float32 to sensor_msgs/PointCloud2 with x, y, z, intensity."""
     points = np.ascontiguousarray(points, "<f4")
     # array.frombytes takes 0.1 ms for 2 MB, assigning bytes twice that, a numpy array 100 ms (each byte is checked).
-    data = array.array("B")
-    data.frombytes(points.data.cast("B") if len(points) else b"")
+    data = bytes_to_array(points.data.cast("B") if len(points) else b"")
     return PointCloud2(
         header=header(stamp, frame_id),
         height=1,
@@ -110,21 +109,30 @@ def cloud_to_msg(points: Points, stamp: int, frame_id: str) -> PointCloud2:
     )
 
 
-def keyframe_name(robot: str, id: int) -> str:
-    """`kf_12`, or `robot/kf_12`: the frame_id of what a keyframe sends."""
-    return f"{robot}/kf_{id}" if robot else f"kf_{id}"
+def bytes_to_array(data: bytes | memoryview) -> array.array[int]:
+    """What the data of a message is set to fastest."""
+    out = array.array("B")
+    out.frombytes(data)
+    return out
 
 
-def parse_keyframe_name(name: str) -> tuple[str, int]:
-    """Robot and id.
+def keyframe_name(robot: str, id: int, session: str = "") -> str:
+    """`kf_12`, in a namespace `robot/kf_12`, of one drive `robot/kf_12.5f3a9c01`: what a keyframe is called."""
+    last = f"kf_{id}.{session}" if session else f"kf_{id}"
+    return f"{robot}/{last}" if robot else last
+
+
+def parse_keyframe_name(name: str) -> tuple[str, int, str]:
+    """Robot, id and session.
 
     Raises:
         UsageError: it is no name of a keyframe.
     """
     robot, _, last = name.rpartition("/")
-    if not last.startswith("kf_") or not last[3:].isdecimal():
-        raise UsageError(f"{name!r} is no keyframe; want ROBOT/kf_NUMBER or kf_NUMBER")
-    return robot, int(last[3:])
+    number, _, session = last.removeprefix("kf_").partition(".")
+    if not last.startswith("kf_") or not (number.isascii() and number.isdecimal()):
+        raise UsageError(f"{name!r} is no keyframe; want ROBOT/kf_NUMBER.SESSION")
+    return robot, int(number), session
 
 
 def edge_to_msg(T: Array, covariance: Array, stamp: int, parent: str, child: str) -> Odometry:
@@ -139,29 +147,32 @@ def to_base(tracked: Tracked, T_base_lidar: Array) -> Tracked:
     """The same motion seen from the base: odom then starts at the base's first pose, and the keyframe's cloud,
     pose and edge are those of the base. The LiDAR's own names (`T_odom_lidar`) then mean the base."""
     A = se3.adjoint(T_base_lidar)
-    T_lidar_base = se3.inverse(T_base_lidar)
-
-    def seen(registration: Registration) -> Registration:
-        return replace(
-            registration,
-            T_target_source=T_base_lidar @ registration.T_target_source @ T_lidar_base,
-            covariance=A @ registration.covariance @ A.T,
-        )
-
-    keyframe: Keyframe | None = tracked.keyframe
-    if keyframe is not None:
-        keyframe = replace(
-            keyframe,
-            T_odom_kf=T_base_lidar @ keyframe.T_odom_kf @ T_lidar_base,
-            cloud=se3.transform(T_base_lidar, keyframe.cloud).astype(np.float32),
-            edge=None if keyframe.edge is None else seen(keyframe.edge),
-            descriptors=None if keyframe.descriptors is None else keyframe.descriptors.moved(T_base_lidar),
-        )
+    keyframe = None if tracked.keyframe is None else keyframe_to_base(tracked.keyframe, T_base_lidar)
     return replace(
         tracked,
-        T_odom_lidar=T_base_lidar @ tracked.T_odom_lidar @ T_lidar_base,
+        T_odom_lidar=T_base_lidar @ tracked.T_odom_lidar @ se3.inverse(T_base_lidar),
         covariance=A @ tracked.covariance @ A.T,
         twist=A @ tracked.twist,
-        registration=seen(tracked.registration),
+        registration=_registration_to_base(tracked.registration, T_base_lidar),
         keyframe=keyframe,
+    )
+
+
+def keyframe_to_base(keyframe: Keyframe, T_base_lidar: Array) -> Keyframe:
+    """The same place seen from the base: its pose, cloud, descriptors and edge."""
+    return replace(
+        keyframe,
+        T_odom_kf=T_base_lidar @ keyframe.T_odom_kf @ se3.inverse(T_base_lidar),
+        cloud=se3.transform(T_base_lidar, keyframe.cloud).astype(np.float32),
+        edge=None if keyframe.edge is None else _registration_to_base(keyframe.edge, T_base_lidar),
+        descriptors=None if keyframe.descriptors is None else keyframe.descriptors.moved(T_base_lidar),
+    )
+
+
+def _registration_to_base(registration: Registration, T_base_lidar: Array) -> Registration:
+    A = se3.adjoint(T_base_lidar)
+    return replace(
+        registration,
+        T_target_source=T_base_lidar @ registration.T_target_source @ se3.inverse(T_base_lidar),
+        covariance=A @ registration.covariance @ A.T,
     )

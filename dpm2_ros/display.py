@@ -8,12 +8,13 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Point, PoseStamped, Vector3
 from nav_msgs.msg import Path
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
-from dpm2_core.frame import Array
+from dpm2_core.frame import Array, LoopClosure
 from dpm2_core.slam.map.mapper import Mapper
 from dpm2_ros.conversions import header, pose_to_msg
 
@@ -30,9 +31,11 @@ def path_to_msg(poses: Array, stamps: Sequence[int], frame_id: str) -> Path:
 def pose_graph_to_msg(mapper: Mapper, stamp: int, frame_id: str) -> MarkerArray:
     """Nodes gray, odometry edges green, accepted loops blue, refused ones red."""
     positions = mapper.poses[:, :3, 3]
-    node = {keyframe.id: n for n, keyframe in enumerate(mapper.keyframes)}
-    loops = [(node[c.from_id], node[c.to_id], c.registration.ok) for c in mapper.closures]
-    steps = [(a, b) for a, b, _, _ in mapper.edges if b == a + 1]
+    node = {(keyframe.robot, keyframe.id): n for n, keyframe in enumerate(mapper.keyframes)}
+    ends = [((c.from_robot, c.from_id), (c.to_robot, c.to_id), c.registration.ok) for c in mapper.closures]
+    loops = [(node[a], node[b], ok) for a, b, ok in ends]
+    closed = {(a, b) for a, b, _ in loops}
+    steps = [(a, b) for a, b, _, _ in mapper.edges if (a, b) not in closed]
     parts = (
         (Marker.SPHERE_LIST, GRAY, 0.6, positions),
         (Marker.LINE_LIST, GREEN, 0.15, _ends(positions, steps)),
@@ -49,6 +52,21 @@ def pose_graph_to_msg(mapper: Mapper, stamp: int, frame_id: str) -> MarkerArray:
         marker.points = [Point(x=x, y=y, z=z) for x, y, z in points.tolist()]
         markers.append(marker)
     return MarkerArray(markers=markers)
+
+
+def loop_to_msg(closure: LoopClosure, stamp: int, from_name: str, to_name: str) -> DiagnosticArray:
+    """What became of a loop candidate, and why: OK for an accepted one, WARN for one refused."""
+    found = closure.registration
+    numbers = {"confidence": found.confidence, "overlap": found.overlap, "rmse (m)": found.rmse}
+    values = [KeyValue(key="method", value=found.method)]
+    values += [KeyValue(key=key, value=f"{value:.3f}") for key, value in numbers.items()]
+    status = DiagnosticStatus(
+        level=DiagnosticStatus.OK if found.ok else DiagnosticStatus.WARN,
+        name=f"loop: {from_name} - {to_name}",
+        message="accepted" if found.ok else found.reason,
+        values=values,
+    )
+    return DiagnosticArray(header=header(stamp, from_name), status=[status])
 
 
 def _ends(positions: Array, pairs: Iterable[tuple[int, int]]) -> Array:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMsg
 from rclpy.node import Node
@@ -20,7 +21,7 @@ from visualization_msgs.msg import MarkerArray
 
 from dpm2_core.config import dump_settings
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.frame import Array, Keyframe, State
+from dpm2_core.frame import Array, Keyframe, LoopClosure, State
 from dpm2_core.slam.loops.localiser import Localiser, Located
 from dpm2_core.slam.map.mapper import Mapper
 from dpm2_core.slam.map.session import open_for_localisation, open_session
@@ -28,7 +29,7 @@ from dpm2_core.slam.map.store import MapStore
 from dpm2_core.slam.output import save_map
 from dpm2_core.slam.system import make_localiser, make_mapper
 from dpm2_ros.conversions import cloud_to_msg, edge_to_msg, keyframe_name
-from dpm2_ros.display import Display, path_to_msg, pose_graph_to_msg
+from dpm2_ros.display import Display, loop_to_msg, path_to_msg, pose_graph_to_msg
 from dpm2_ros.settings import NodeConfig
 from dpm2_ros.subscriptions import STEADY
 from dpm2_ros.tf import TransformBroadcaster
@@ -44,6 +45,8 @@ class MapperThread:
     """
 
     def __init__(self, node: Node, config: NodeConfig, robot: str) -> None:
+        graph = config.slam.pose_graph.model_copy(update={"background": True})  # gtsam holds Python's lock
+        config = config.model_copy(update={"slam": config.slam.model_copy(update={"pose_graph": graph})})
         self._node, self._config, self._robot = node, config, robot
         self._store: MapStore | None = None
         self._localiser: Localiser | None = None
@@ -51,12 +54,14 @@ class MapperThread:
         self._map_file = Path(config.ros.map_file)  # written, or to be found in
         self._mapper = self._load() if config.ros.localization_mode else self._new_mapper()
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="mapper")
+        self._T_map_odom: dict[str, Array] = {}  # by robot
         self._stamp = 0  # of the last keyframe, ns
         self._last: Future[None] | None = None  # of the keyframes taken in
         self._changes = len(self._mapper.keyframes)
         self._displays: list[Display] = []
         ros = config.ros
         self._tf = TransformBroadcaster(node, ros.map_frame, ros.publish_tf_map)
+        self._loop_candidates = node.create_publisher(DiagnosticArray, "dpm2/loop_candidates", KEEP_ALL)
         self._loop_closures = node.create_publisher(Odometry, "dpm2/loop_closure", KEEP_ALL)
         for kind, topic, period, make in (
             (PathMsg, "dpm2/path", ros.path_period, self._path),
@@ -111,17 +116,21 @@ class MapperThread:
         idle = self._last is None or self._last.done()
         return self._localiser is not None and idle and self._localiser.wants(stamp)
 
-    def broadcast(self, stamp: int) -> None:
-        """Send map -> odom, valid at that stamp (ns), if it is known."""
+    def broadcast(self, stamp: int, robot: str, odom_frame: str) -> None:
+        """Send map -> odom of a robot, valid at that stamp (ns), if it is known."""
         localiser = self._localiser
         if localiser is None:
-            self._tf.send(self._mapper.T_map_odom, stamp, self._config.ros.odom_frame)
-        elif localiser.state.located:
-            self._tf.send(localiser.T_map_odom, stamp, self._config.ros.odom_frame)
+            T_map_odom = self._T_map_odom.get(robot)
+            if T_map_odom is None and robot == self._robot and not self._T_map_odom:
+                T_map_odom = self._mapper.T_map_odom  # nobody has sent a keyframe
+        else:
+            T_map_odom = localiser.T_map_odom if localiser.state.located else None
+        if T_map_odom is not None:
+            self._tf.send(T_map_odom, stamp, odom_frame)
 
-    def add(self, keyframe: Keyframe) -> None:
-        """Take a keyframe in."""
-        self._last = self._submit(lambda: self._add(keyframe) if self._localiser is None else self._locate(keyframe))
+    def add(self, make: Callable[[], Keyframe]) -> None:
+        """Take in the keyframe that `make`, called in this thread, returns."""
+        self._last = self._submit(lambda: self._add(make()) if self._localiser is None else self._locate(make()))
 
     def hint(self, T_map_base: Array) -> str:
         """The robot is about there (4, 4), somebody says; returns why that is of no use, if it is not."""
@@ -155,8 +164,10 @@ class MapperThread:
             Dpm2Error: the map could not be written.
         """
         last: Future[str] | None = None
-        if self.directory is not None and self._localiser is None:
-            last = self._thread.submit(self._save)
+        if self._localiser is None:
+            self._submit(lambda: self._mapper.finish())
+            if self.directory is not None:
+                last = self._thread.submit(self._save)
         self._submit(self._finish_file)
         self._thread.shutdown(wait=True)
         if last is not None:
@@ -192,19 +203,26 @@ class MapperThread:
             self._node.get_logger().warning(f"{located.state}: {located.registration.reason}")
 
     def _add(self, keyframe: Keyframe) -> None:
-        self._stamp = keyframe.stamp
+        self._stamp, before = keyframe.stamp, self._T_map_odom.keys()
         for closure in self._mapper.add(keyframe):
-            found = closure.registration
-            if found.ok:
-                names = (keyframe_name(self._robot, id) for id in (closure.from_id, closure.to_id))
-                self._loop_closures.publish(
-                    edge_to_msg(found.T_target_source, found.covariance, keyframe.stamp, *names)
-                )
+            self._publish_loop(closure, keyframe.stamp)
+        placed = {robot: self._mapper.T_map_odom_of(robot) for robot in self._mapper.robots}
+        self._T_map_odom = {robot: T for robot, T in placed.items() if T is not None}
+        for robot in self._T_map_odom.keys() - before:
+            self._node.get_logger().info(f"robot {robot or '/'}: its place in the map is known")
         self._changes += 1
+
+    def _publish_loop(self, closure: LoopClosure, stamp: int) -> None:
+        found = closure.registration
+        ends = (closure.from_robot, closure.from_id), (closure.to_robot, closure.to_id)
+        names = [keyframe_name(robot, id) for robot, id in ends]
+        self._loop_candidates.publish(loop_to_msg(closure, stamp, *names))
+        if found.ok:
+            self._loop_closures.publish(edge_to_msg(found.T_target_source, found.covariance, stamp, *names))
 
     def _reset(self) -> None:
         self._finish_file()
-        self._mapper = self._new_mapper()
+        self._mapper, self._T_map_odom = self._new_mapper(), {}
         self._changes += 1
 
     def _new_mapper(self) -> Mapper:
@@ -271,9 +289,9 @@ class MapperThread:
         return make_mapper(self._config.slam, self._store)
 
     def _finish_file(self) -> None:
+        if self._localiser is None:
+            self._mapper.finish()
         if self._store is not None:
-            if not self._store.read_only:
-                self._mapper.finish()
             self._store.close()
             self._store = None
 

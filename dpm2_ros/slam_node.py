@@ -6,13 +6,14 @@ from __future__ import annotations
 import threading
 import time
 import traceback
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
-from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import SetBool, Trigger
 
 from dpm2_core.data.transforms import transform_matrix
@@ -20,11 +21,12 @@ from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Keyframe, State, Tracked
 from dpm2_core.geometry import se3
 from dpm2_core.slam.loops.localiser import LOST
-from dpm2_core.slam.system import make_odometry
-from dpm2_ros.conversions import cloud_to_msg, edge_to_msg, keyframe_name, odometry_to_msg, to_base
+from dpm2_core.slam.system import make_loops, make_odometry
+from dpm2_ros.conversions import keyframe_to_base, odometry_to_msg, to_base
 from dpm2_ros.frames import FrameBuilder
 from dpm2_ros.health import Diagnostics, Health
-from dpm2_ros.mapping import KEEP_ALL, MapperThread, answer, robot_name
+from dpm2_ros.keyframes import KeyframeSender
+from dpm2_ros.mapping import MapperThread, answer, robot_name
 from dpm2_ros.parameters import load_parameters
 from dpm2_ros.settings import NodeConfig
 from dpm2_ros.subscriptions import Inputs
@@ -52,8 +54,9 @@ class SlamNode(Node):
         self._health = Health()
         self._diagnostics = Diagnostics(self, self._inputs, self._frames, self._health, self._mapper)
         self._odom = self.create_publisher(Odometry, "dpm2/odom", 10)
-        self._keyframe = self.create_publisher(PointCloud2, "dpm2/keyframe", KEEP_ALL)
-        self._keyframe_odom = self.create_publisher(Odometry, "dpm2/keyframe_odom", KEEP_ALL)
+        self._sender = KeyframeSender(self, self._robot, ros.odom_frame, keep=not ros.embed_mapper)
+        self._described = make_loops(self._config.slam).described
+        self._line = ThreadPoolExecutor(1, thread_name_prefix="keyframes")  # idle with the mapper, which has its own
         self._tf = TransformBroadcaster(self, ros.odom_frame, ros.publish_tf_odom)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(Trigger, "~/load_map", self._on_load_map)
@@ -75,6 +78,7 @@ class SlamNode(Node):
         """
         self._stopping.set()
         self._worker.join()
+        self._line.shutdown(wait=True)
         self.get_logger().info(
             f"{self._health.processed} clouds processed, {self._inputs.synchronizer.dropped} dropped"
         )
@@ -105,6 +109,7 @@ class SlamNode(Node):
 
     def _restart(self, save: bool) -> None:
         self._begin()
+        self._line.submit(self._sender.restart)
         if self._mapper is not None:
             self._mapper.reset(save)
 
@@ -122,6 +127,12 @@ class SlamNode(Node):
         if mapper is not None:
             tracked = replace(tracked, state=mapper.state(tracked.state))
         self._index += 1
+        if tracked.keyframe is not None:
+            make = partial(self._finished, tracked.keyframe, self._T_base_lidar)
+            if mapper is not None:
+                mapper.add(make)
+            else:
+                self._line.submit(make).add_done_callback(self._report)
         if not np.array_equal(self._T_base_lidar, np.eye(4)):
             tracked = to_base(tracked, self._T_base_lidar)
         self._publish(tracked)
@@ -156,26 +167,30 @@ class SlamNode(Node):
             covariance = covariance + LOST
         self._odom.publish(odometry_to_msg(tracked, covariance, seconds, ros.odom_frame, self._base_frame))
         self._tf.send(tracked.T_odom_lidar, tracked.stamp, self._base_frame)
-        if tracked.keyframe is not None:
-            self._publish_keyframe(tracked.keyframe)
         if self._mapper is not None:
-            self._mapper.broadcast(tracked.stamp)
+            self._mapper.broadcast(tracked.stamp, self._robot, ros.odom_frame)
 
-    def _publish_keyframe(self, keyframe: Keyframe) -> None:
-        name = keyframe_name(self._robot, keyframe.id)
-        covariance = np.zeros((6, 6)) if keyframe.edge is None else keyframe.edge.covariance
-        odom_frame = self._config.ros.odom_frame
-        self._keyframe_odom.publish(edge_to_msg(keyframe.T_odom_kf, covariance, keyframe.stamp, odom_frame, name))
-        self._keyframe.publish(cloud_to_msg(keyframe.cloud, keyframe.stamp, name))
-        if self._mapper is not None:
-            self._mapper.add(keyframe)
+    def _finished(self, keyframe: Keyframe, T_base_lidar: Array) -> Keyframe:
+        """Not in the worker's thread: the keyframe in the base's frame, sent; with descriptors as the LiDAR sees it."""
+        keyframe = self._described(keyframe)
+        if not np.array_equal(T_base_lidar, np.eye(4)):
+            keyframe = keyframe_to_base(keyframe, T_base_lidar)
+        self._sender.send(keyframe)
+        return keyframe
+
+    def _report(self, done: Future[Keyframe]) -> None:
+        if (error := done.exception()) is not None:
+            self._health.errors += 1
+            self.get_logger().error(f"keyframe: {''.join(traceback.format_exception(error))}")
 
     def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._reset_wanted.set()
         response.success = True
         response.message = "odometry and map start again with the next cloud"
         if self._mapper is None:
-            response.message = "odometry starts again with the next cloud; so does the map of the mapper that listens"
+            response.message = (
+                "odometry starts again with the next cloud, and its keyframes as a new session of the mapper's map"
+            )
         return response
 
     async def _on_load_map(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:

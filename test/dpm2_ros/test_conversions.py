@@ -116,7 +116,9 @@ def test_odometry_message() -> None:
 @pytest.mark.parametrize(("robot", "id", "name"), [("", 0, "kf_0"), ("r1", 12, "r1/kf_12"), ("a/b", 3, "a/b/kf_3")])
 def test_keyframe_names(robot: str, id: int, name: str) -> None:
     assert conversions.keyframe_name(robot, id) == name
-    assert conversions.parse_keyframe_name(name) == (robot, id)
+    assert conversions.parse_keyframe_name(name) == (robot, id, "")
+    session = conversions.keyframe_name(robot, id, "5f3a9c01")
+    assert conversions.parse_keyframe_name(session) == (robot, id, "5f3a9c01")
 
 
 @pytest.mark.parametrize("name", ["", "odom", "kf_", "kf_-1", "kf_x", "robot/12", "kf_1/odom"])

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import UInt8MultiArray
 
 from dpm2_core.data.trajectory import read_trajectory
 from dpm2_core.data.transforms import transform_matrix
@@ -18,7 +19,8 @@ from dpm2_core.frame import Keyframe
 from dpm2_core.geometry import se3
 from dpm2_core.slam.map.data import load_map
 from dpm2_core.slam.map.store import MapStore
-from dpm2_ros.conversions import cloud_to_msg, edge_to_msg, keyframe_name
+from dpm2_ros.conversions import edge_to_msg, keyframe_name
+from dpm2_ros.keyframes import payload_to_msgs
 from dpm2_ros.mapper_node import MapperNode, keyframe_from
 from dpm2_ros.mapping import KEEP_ALL
 from dpm2_ros.tf import TFMessage
@@ -29,14 +31,15 @@ def mapper(ros: Callable[..., Any], tmp_path: Path) -> Any:
     """Harness with a mapper_node that saves to tmp_path/map, and `send(name, T, cloud)` for keyframes."""
     harness = ros(f"ros.map_directory:={tmp_path / 'map'}")
     harness.mapper = harness.add(MapperNode())
-    clouds = harness.node.create_publisher(PointCloud2, "/dpm2/keyframe", KEEP_ALL)
-    poses = harness.node.create_publisher(Odometry, "/dpm2/keyframe_odom", KEEP_ALL)
-    harness.wait(lambda: clouds.get_subscription_count() and poses.get_subscription_count(), "the mapper's ears")
+    kinds = ((Odometry, "odom"), (PointCloud2, ""), (UInt8MultiArray, "cloud"))
+    wires = [harness.node.create_publisher(kind, f"/dpm2/keyframe_{end}".rstrip("_"), KEEP_ALL) for kind, end in kinds]
+    harness.wait(lambda: all(wire.get_subscription_count() for wire in wires), "the mapper's ears")
 
     def send(id: int, T: np.ndarray, points: np.ndarray, cloud_first: bool = False, name: str = "") -> None:
         name = name or keyframe_name("", id)
         pose = edge_to_msg(T, np.eye(6) * 1e-4, 1000 + id, "odom", name)
-        messages = [(poses, pose), (clouds, cloud_to_msg(points, 1000 + id, name))]
+        keyframe = Keyframe(id, 1000 + id, id, T, points.astype(np.float32))
+        messages = list(zip(wires, (pose, *payload_to_msgs(keyframe, name)), strict=True))
         for publisher, message in reversed(messages) if cloud_first else messages:
             publisher.publish(message)
 
@@ -69,9 +72,12 @@ def test_a_map_file_is_written_as_the_drive_goes_on(mapper: Any, tmp_path: Path)
     ros = thread._config.ros.model_copy(update={"map_file": str(tmp_path / "drive.dpm2map")})
     thread._config = thread._config.model_copy(update={"ros": ros})
     thread.reset(save=False)
-    for id in (0, 1, 2, 0):
-        mapper.send(id, se3.exp([0, 0, 0, 5.0 * id, 0, 0]), points(id).astype(np.float32))
+    for id in (0, 1, 2):
+        mapper.send(id, se3.exp([0, 0, 0, 5.0 * id, 0, 0]), points(id))
         mapper.wait(lambda expected=id + 1: thread.keyframes == expected, "the keyframe")
+    thread.reset(save=False)
+    mapper.wait(lambda: thread.keyframes == 0, "the empty map")
+    mapper.send(0, np.eye(4), points(0))
     assert thread.store_problem == ""
 
     def stored(name: str) -> int:
@@ -89,12 +95,15 @@ def test_a_keyframe_of_another_name_is_refused_and_the_rest_goes_on(mapper: Any)
     mapper.wait(lambda: mapper.mapper._mapper.keyframes == 2, "two keyframes")
 
 
-def test_a_restarted_odometry_starts_a_new_map(mapper: Any, tmp_path: Path) -> None:
+def test_a_restarted_odometry_goes_on_in_the_same_map(mapper: Any) -> None:
+    """As a trajectory of its own, which nothing ties to the first; ids count on."""
     for id in (0, 1, 2, 0):
-        mapper.send(id, se3.exp([0, 0, 0, 5.0 * id, 0, 0]), points(id).astype(np.float32))
-    saved = tmp_path / "map" / "trajectory.tum"
-    mapper.wait(lambda: saved.is_file() and mapper.mapper._mapper.keyframes == 1, "the old map on disk and the new one")
-    assert len(read_trajectory(saved)) == 3
+        mapper.send(id, se3.exp([0, 0, 0, 5.0 * id, 0, 0]), points(id))
+    mapper.wait(lambda: mapper.mapper._mapper.keyframes == 4, "all four")
+    core = mapper.mapper._mapper._mapper
+    assert [keyframe.id for keyframe in core.keyframes] == [0, 1, 2, 3]
+    assert [(a, b) for a, b, _, _ in core.edges] == [(0, 1), (1, 2)]
+    assert core.T_map_odom_of("") is None
 
 
 def test_map_to_odom_goes_out_with_every_odometry(mapper: Any) -> None:

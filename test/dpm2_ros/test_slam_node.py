@@ -113,11 +113,10 @@ def test_keyframes_map_path_and_tf(rig: Callable[..., Rig], drive: Any) -> None:
     assert [k.header.frame_id for k in keyframes] == [f"kf_{n}" for n in range(len(keyframes))]
     assert [stamp_ns(k.header) for k in keyframes] == [stamp_ns(p.header) for p in poses]
     assert poses[1].child_frame_id == "kf_1"
-    points, _ = decode_points(keyframes[1], intensity_max=1.0)
-    assert points.shape[0] > 1000
+    assert keyframes[1].width == 256
     r.wait(lambda: maps and stamp_ns(maps[-1].header) == stamp_ns(poses[-1].header), "the map of the last keyframe")
     assert maps[-1].header.frame_id == "map"
-    assert maps[-1].width > points.shape[0]
+    assert maps[-1].width > 1000
     r.wait(lambda: paths and len(paths[-1].poses) == len(poses), "the path")
     r.wait(lambda: graphs and len(graphs[-1].markers[0].points) == len(poses), "the pose graph")
     pairs = {(t.header.frame_id, t.child_frame_id): t for message in tf for t in message.transforms}

@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Keyframes on the wire: three messages each, at most 100 kB together, sent again until the mapper has them.
+
+A robot keeps all keyframes of its drive, in a temporary file, and announces its last one every two seconds. The mapper
+answers with what it has: all below a number, and some above. So it costs nothing to be out of reach for a while, to
+join late, or to start the mapper again; DDS' own reliability ends with either process, and forgets what is too old.
+"""
+
+from __future__ import annotations
+
+import secrets
+import threading
+import time
+from collections.abc import Sequence
+
+import numpy as np
+from nav_msgs.msg import Odometry
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import PointCloud2, PointField
+from std_msgs.msg import MultiArrayDimension, MultiArrayLayout, UInt8MultiArray, UInt32MultiArray
+
+from dpm2_core.descriptors import Descriptors
+from dpm2_core.errors import UsageError
+from dpm2_core.frame import Keyframe
+from dpm2_core.geometry.voxel import voxel_first
+from dpm2_core.slam.map.cloud_codec import pack_cloud
+from dpm2_core.slam.map.cloud_store import SpillFile
+from dpm2_ros.conversions import bytes_to_array, edge_to_msg, header, keyframe_name
+from dpm2_ros.subscriptions import STEADY
+
+WIRE = QoSProfile(depth=64, reliability=ReliabilityPolicy.RELIABLE)
+"""Of keyframes; what falls out of the queue is sent again."""
+BUDGET = 99_000
+"""Bytes of a keyframe's cloud and descriptors on the wire; its pose and the protocol's own have the rest of 100 kB."""
+
+_TICK, _PATIENCE, _ANNOUNCE, _BURST = 0.25, 1.5, 2.0, 8  # s; s until sent again; s; keyframes a tick
+
+
+class KeyframeSender:
+    """Publishes a robot's keyframes, keeps them, and sends those again that the mapper misses. Any thread may call."""
+
+    def __init__(self, node: Node, robot: str, odom_frame: str, keep: bool) -> None:
+        """`keep`: for a mapper elsewhere; else each is sent once, to whoever looks."""
+        self._robot, self._odom_frame, self._keep = robot, odom_frame, keep
+        self._lock = threading.Lock()
+        self._descriptors = node.create_publisher(PointCloud2, "dpm2/keyframe", WIRE)
+        self._cloud = node.create_publisher(UInt8MultiArray, "dpm2/keyframe_cloud", WIRE)
+        self._pose = node.create_publisher(Odometry, "dpm2/keyframe_odom", WIRE)
+        self.restart()
+        if keep:
+            node.create_subscription(UInt32MultiArray, "dpm2/keyframes_received", self._on_received, 10)
+            node.create_timer(_TICK, self._repeat, clock=STEADY)
+
+    @property
+    def missing(self) -> int:
+        """Keyframes that the mapper has not said it has."""
+        with self._lock:
+            return len(self._kept) - self._below - len(self._above)
+
+    def restart(self) -> None:
+        """A new drive begins: a session of its own."""
+        with self._lock:
+            self.session = secrets.token_hex(4) if self._keep else ""
+            self._kept: list[list[int]] = []  # numbers in the file of the three messages, by id
+            self._file = SpillFile()
+            self._sent: list[float] = []  # when each was sent last
+            self._below, self._above = 0, frozenset[int]()
+            self._announced = 0.0
+
+    def send(self, keyframe: Keyframe) -> None:
+        """A new one, in the frame whose pose is published."""
+        covariance = np.zeros((6, 6)) if keyframe.edge is None else keyframe.edge.covariance
+        name = keyframe_name(self._robot, keyframe.id, self.session)
+        pose = edge_to_msg(keyframe.T_odom_kf, covariance, keyframe.stamp, self._odom_frame, name)
+        parts = [bytes(serialize_message(part)) for part in (pose, *payload_to_msgs(keyframe, name))]
+        with self._lock:
+            if self._keep:
+                self._kept.append([self._file.append(part) for part in parts])
+                self._sent.append(time.monotonic())
+                self._announced = time.monotonic()
+        self._publish(parts)
+
+    def _publish(self, parts: Sequence[bytes]) -> None:
+        for publisher, message in zip((self._pose, self._descriptors, self._cloud), parts, strict=True):
+            publisher.publish(message)
+
+    def _on_received(self, message: UInt32MultiArray) -> None:
+        with self._lock:
+            if message.layout.dim and message.layout.dim[0].label == self.session and len(message.data):
+                below, *above = (int(id) for id in message.data)
+                self._below, self._above = min(below, len(self._kept)), frozenset(a for a in above if a >= below)
+
+    def _repeat(self) -> None:
+        """Send a few of those again that have been missed for long; announce the last one."""
+        now = time.monotonic()
+        with self._lock:
+            wanted = range(self._below, len(self._kept))
+            late = [id for id in wanted if id not in self._above and now - self._sent[id] > _PATIENCE][:_BURST]
+            for id in late:
+                self._sent[id] = now
+            again = [[self._file.read(number) for number in self._kept[id]] for id in late]
+            last = None
+            if self._kept and now - self._announced > _ANNOUNCE:
+                self._announced, last = now, self._file.read(self._kept[-1][0])
+        for parts in again:
+            self._publish(parts)
+        if last is not None:
+            self._pose.publish(last)
+
+
+def received_to_msg(session: str, below: int, above: Sequence[int]) -> UInt32MultiArray:
+    """What a mapper has of a session: all ids below one, and some above."""
+    dimension = MultiArrayDimension(label=session, size=1 + len(above), stride=1 + len(above))
+    return UInt32MultiArray(layout=MultiArrayLayout(dim=[dimension]), data=[below, *above])
+
+
+def payload_to_msgs(keyframe: Keyframe, name: str) -> tuple[PointCloud2, UInt8MultiArray]:
+    """Descriptors and packed cloud of a keyframe, the cloud thinned until both are within `BUDGET`."""
+    d = keyframe.descriptors
+    descriptors = descriptors_to_msg(d, keyframe.stamp, name)
+    room = BUDGET - len(descriptors.data)
+    cloud, voxel = keyframe.cloud, 0.3
+    while len(packed := pack_cloud(cloud)) > room:
+        voxel *= 1.15
+        cloud = keyframe.cloud[voxel_first(keyframe.cloud, voxel)]
+    dimension = MultiArrayDimension(label=name, size=len(packed), stride=len(packed))
+    return descriptors, UInt8MultiArray(layout=MultiArrayLayout(dim=[dimension]), data=bytes_to_array(packed))
+
+
+def descriptors_to_msg(d: Descriptors | None, stamp: int, name: str) -> PointCloud2:
+    """A cloud of points x, y, z, axis_x, axis_y and the bits of 128 half floats `feature`; empty for None."""
+    channels = 0 if d is None else d.features.shape[1]
+    dtype = np.dtype([("xyz", "<f4", 3), ("axis", "<f4", 2), ("feature", "<f2", max(channels, 1))])
+    rows = np.zeros(0 if d is None else len(d), dtype)
+    if d is not None:
+        rows["xyz"], rows["axis"], rows["feature"] = d.xyz, d.axes, d.features
+    names = ("x", "y", "z", "axis_x", "axis_y")
+    fields = [PointField(name=n, offset=4 * i, datatype=PointField.FLOAT32, count=1) for i, n in enumerate(names)]
+    fields.append(PointField(name="feature", offset=20, datatype=PointField.UINT16, count=max(channels, 1)))
+    return PointCloud2(
+        header=header(stamp, name),
+        height=1,
+        width=len(rows),
+        fields=fields,
+        point_step=dtype.itemsize,
+        row_step=dtype.itemsize * len(rows),
+        data=bytes_to_array(rows.tobytes()),
+        is_dense=True,
+    )
+
+
+def descriptors_from_msg(message: PointCloud2) -> Descriptors | None:
+    """The inverse of `descriptors_to_msg`.
+
+    Raises:
+        UsageError: it is something else.
+    """
+    if not message.width:
+        return None
+    channels = next((f.count for f in message.fields if f.name == "feature"), 0)
+    dtype = np.dtype([("xyz", "<f4", 3), ("axis", "<f4", 2), ("feature", "<f2", channels)])
+    if not channels or message.point_step != dtype.itemsize or len(message.data) != dtype.itemsize * message.width:
+        raise UsageError(f"{message.header.frame_id}: no descriptors")
+    rows = np.frombuffer(message.data, dtype)
+    xyz, features, axis = (np.ascontiguousarray(rows[name]) for name in ("xyz", "feature", "axis"))
+    if not all(np.isfinite(part).all() for part in (xyz, features, axis)):
+        raise UsageError(f"{message.header.frame_id}: descriptors that are not finite")
+    return Descriptors(xyz, features, axis)

@@ -1,0 +1,205 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Two real slam_node processes and a mapper_node over real DDS: one map, whoever starts late, dies or is cut off."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from nav_msgs.msg import Odometry
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import UInt8MultiArray
+
+from dpm2_core.data.source import InputSettings, open_source
+from dpm2_core.data.transforms import transform_matrix
+from dpm2_core.errors import Dpm2Error
+from dpm2_core.frame import Array, Keyframe
+from dpm2_core.geometry import se3
+from dpm2_core.sim.config import LidarConfig
+from dpm2_core.sim.drive import simulate
+from dpm2_core.slam.map.data import MapData, load_map
+from dpm2_core.slam.map.store import MapStore
+from dpm2_ros.conversions import cloud_to_msg
+from dpm2_ros.keyframes import descriptors_from_msg, payload_to_msgs
+from dpm2_ros.replay import ros_environment, start
+from dpm2_ros.tf import TFMessage
+
+FRAMES = 30
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """28 m of a street."""
+    root = tmp_path_factory.mktemp("drive") / "sim"
+    simulate(root, FRAMES, seed=2, road="straight", preset="suburb", images=False, lidar=LidarConfig(columns=900))
+    return root
+
+
+class Fleet:
+    """Processes of robots and of their mapper; scans for each."""
+
+    def __init__(self, harness: Any, drive: Path, folder: Path) -> None:
+        self.harness, self.folder = harness, folder
+        self.source = open_source(drive, InputSettings(images=False))
+        self.environment = ros_environment(harness.node.context.get_domain_id())
+        self.tf = harness.hear(TFMessage, "/tf")
+        self.processes: list[subprocess.Popen[bytes]] = []
+        self._lidars: dict[str, Any] = {}
+        self._odom: dict[str, list[Any]] = {}
+        self._stamp = 0
+
+    def _start(self, name: str, log: str, *arguments: str) -> subprocess.Popen[bytes]:
+        process = start(name, ["--ros-args", *arguments], self.environment, self.folder / log)
+        self.processes.append(process)
+        return process
+
+    def mapper(self, file: str = "map.dpm2map") -> subprocess.Popen[bytes]:
+        """A mapper_node for all robots."""
+        parameters = ("-p", "ros.map_directory:=''", "-p", f"ros.map_file:={self.folder / file}")
+        return self._start("mapper_node", "mapper.log", *parameters)
+
+    def robot(self, name: str) -> subprocess.Popen[bytes]:
+        """A slam_node in a namespace."""
+        pairs = ["input.points_topic:=points", "input.images:=false", "ros.embed_mapper:=false",
+                 f"ros.odom_frame:={name}/odom", "slam.keyframes.distance:=2.0"]  # fmt: skip
+        process = self._start(
+            "slam_node", f"{name}.log", "-r", f"__ns:=/{name}", *(x for p in pairs for x in ("-p", p))
+        )
+        if name not in self._lidars:
+            self._lidars[name] = self.harness.publisher(PointCloud2, f"/{name}/points")
+            self._odom[name] = self.harness.hear(Odometry, f"/{name}/dpm2/odom")
+        count = self.harness.node.count_publishers
+        self.harness.wait(lambda: count(f"/{name}/dpm2/keyframe_odom") and self._lidars[name].get_subscription_count(),
+                          name, timeout=60)  # fmt: skip
+        return process
+
+    def drive(self, name: str, *frames: int) -> None:
+        """Scans, each when the one before has come out."""
+        for n in frames:
+            frame = next(iter(self.source.frames(n, n + 1)))
+            self._stamp += 100_000_000
+            before = len(self._odom[name])
+            self._lidars[name].publish(cloud_to_msg(frame.points, self._stamp, f"{name}/lidar"))
+            self.harness.wait(lambda before=before: len(self._odom[name]) > before, f"{name}: scan {n}", timeout=30)
+
+    def map(self, file: str = "map.dpm2map") -> MapData:
+        """As it is in the file now."""
+        with MapStore.open(self.folder / file) as store:
+            return load_map(store, descriptors=False)
+
+    def ids(self, name: str, file: str = "map.dpm2map") -> list[int]:
+        """Of a robot's keyframes that are in the map."""
+        try:
+            return [keyframe.id for keyframe in self.map(file).keyframes if keyframe.robot == name]
+        except Dpm2Error:  # the file is being made
+            return []
+
+    def T_map_lidar(self, name: str) -> Array | None:
+        """By the last transforms; None before map -> odom is known."""
+        last = {t.child_frame_id: transform_matrix(t.transform) for m in list(self.tf) for t in m.transforms}
+        if f"{name}/odom" not in last:
+            return None
+        return last[f"{name}/odom"] @ last[f"{name}/lidar"]
+
+    def close(self) -> None:
+        for process in self.processes:
+            process.send_signal(signal.SIGCONT)
+            process.kill()
+            process.wait()
+
+
+@pytest.fixture
+def fleet(ros: Callable[..., Any], drive: Path, tmp_path: Path) -> Iterator[Fleet]:
+    made = Fleet(ros(), drive, tmp_path)
+    yield made
+    made.close()
+
+
+def test_two_robots_one_map_each_with_its_own_correction(fleet: Fleet) -> None:
+    """The second joins late, in the middle of what the first has seen, and is told where it is in the map."""
+    fleet.mapper()
+    fleet.robot("red")
+    fleet.drive("red", *range(20))
+    wait = fleet.harness.wait
+    wait(lambda: fleet.ids("red") == list(range(7)), "red's keyframes", timeout=40)
+    assert fleet.T_map_lidar("red") is not None
+    fleet.robot("blue")
+    fleet.drive("blue", *range(6, 24))
+    wait(lambda: fleet.ids("blue") == list(range(6)), "blue's keyframes", timeout=40)
+    wait(lambda: "blue: its place" in (fleet.folder / "mapper.log").read_text(), "blue in red's map", timeout=40)
+    fleet.drive("blue", 24, 25)
+    poses = fleet.source.poses
+    assert poses is not None
+    truth = se3.inverse(poses[0]) @ poses[25]
+    wait(lambda: fleet.T_map_lidar("blue") is not None, "map -> blue/odom")
+    wait(lambda: np.linalg.norm(fleet.T_map_lidar("blue")[:3, 3] - truth[:3, 3]) < 0.3, "blue's place")
+    data = fleet.map()
+    robots = [keyframe.robot for keyframe in data.keyframes]
+    assert any(robots[edge.from_node] != robots[edge.to_node] for edge in data.constraints)
+    assert all(robots[e.from_node] == robots[e.to_node] for e in data.constraints if e.kind == "odometry")
+    parents = {t.child_frame_id: t.header.frame_id for m in fleet.tf for t in m.transforms}
+    assert parents == {"red/odom": "map", "blue/odom": "map", "red/lidar": "red/odom", "blue/lidar": "blue/odom"}
+
+
+def test_an_outage_costs_nothing(fleet: Fleet) -> None:
+    """The mapper stands still while the robot drives, dies, and another one takes its place: all are sent again."""
+    first = fleet.mapper("first.dpm2map")
+    fleet.robot("red")
+    fleet.drive("red", *range(6))
+    wait = fleet.harness.wait
+    wait(lambda: fleet.ids("red", "first.dpm2map"), "the first keyframe", timeout=40)
+    first.send_signal(signal.SIGSTOP)
+    fleet.drive("red", *range(6, 18))
+    first.send_signal(signal.SIGCONT)
+    # 2 m between keyframes, 0.93 m between scans
+    wait(lambda: fleet.ids("red", "first.dpm2map") == list(range(6)), "what it missed", timeout=40)
+    first.kill()
+    first.wait()
+    fleet.drive("red", *range(18, 24))
+    fleet.mapper("second.dpm2map")
+    wait(lambda: fleet.ids("red", "second.dpm2map") == list(range(8)), "the whole drive", timeout=60)
+
+
+def test_a_robot_that_is_killed_and_comes_back(fleet: Fleet) -> None:
+    """Its new drive is a session of its own in the same map: ids count on, no odometry leads from one to the other."""
+    fleet.mapper()
+    red = fleet.robot("red")
+    fleet.drive("red", *range(9))
+    wait = fleet.harness.wait
+    wait(lambda: len(fleet.ids("red")) == 3, "the keyframes of the first drive", timeout=40)
+    red.kill()
+    red.wait()
+    wait(lambda: not fleet.harness.node.count_publishers("/red/dpm2/keyframe_odom"), "the end of it", timeout=60)
+    fleet.robot("red")
+    fleet.drive("red", *range(4, 13))
+    wait(lambda: fleet.ids("red") == list(range(6)), "those of the second", timeout=40)
+    odometry = [(e.from_node, e.to_node) for e in fleet.map().constraints if e.kind == "odometry"]
+    assert odometry == [(0, 1), (1, 2), (3, 4), (4, 5)]
+
+
+def test_a_keyframe_is_at_most_100_kB_on_the_wire(drive: Path) -> None:
+    """Descriptors come out as they went in; a cloud too large is thinned until it fits, a small one is not touched."""
+    from dpm2_core.slam.loops.place_recognition import PlaceRecognition
+    from dpm2_core.slam.map.cloud_codec import unpack_cloud
+    from dpm2_core.slam.neural import load_network
+
+    points = next(iter(open_source(drive, InputSettings(images=False)).frames(0, 1))).points
+    descriptors = PlaceRecognition(load_network("small", 1)).describe(points)
+    assert descriptors is not None
+    for cloud in (points, points[::50]):
+        seen, packed = payload_to_msgs(Keyframe(1, 2, 3, np.eye(4), cloud, None, "", descriptors), "red/kf_1.00000000")
+        size = len(serialize_message(seen)) + len(serialize_message(packed))
+        assert size < 99_500  # the pose is another 0.7 kB
+        again = descriptors_from_msg(seen)
+        assert again is not None
+        np.testing.assert_array_equal(again.features, descriptors.features)
+        np.testing.assert_array_equal(again.xyz, descriptors.xyz)
+        assert isinstance(packed, UInt8MultiArray)
+        count = len(unpack_cloud(bytes(packed.data)))
+        assert count == len(cloud) if len(cloud) < 3000 else 4000 < count < len(cloud)
