@@ -165,3 +165,31 @@ def test_a_covariance_that_is_none_is_an_error_of_the_work() -> None:
     with pytest.raises(Dpm2Error, match="pose graph"):
         graph.optimise()
     assert np.array_equal(graph.poses, np.tile(np.eye(4), (2, 1, 1)))
+
+
+def test_trajectories_that_grow_side_by_side_are_tied_by_loops() -> None:
+    """Two robots on the same circle, their nodes interleaved, the second in a frame of its own; a third stays alone."""
+    turn = np.linspace(0, np.pi, 12)
+    truth = se3.exp(np.array([0, 0, 1.0, 20.0, 0, 0]) * turn[:, None])
+    own = se3.exp(np.array([0.0, 0.0, 2.5, 300.0, -40.0, 0.0]))  # of the second robot's frame
+    sigma = np.diag([1e-3] * 3 + [0.02] * 3) ** 2
+    graph, last = PoseGraph(PoseGraphSettings()), {}
+    for k in range(len(truth)):
+        for robot, frame in enumerate((np.eye(4), own)):
+            step = None if k == 0 else se3.inverse(truth[k - 1]) @ truth[k]
+            graph.add_node(frame @ truth[k], step, None if k == 0 else sigma, last.get(robot))
+            last[robot] = len(graph) - 1
+    graph.add_node(own, None, None)
+    assert [graph.part(node) for node in (0, 1, 23, 24)] == [0, 1, 1, 2]
+    with pytest.raises(ValueError, match="not the last"):
+        graph.add_node(np.eye(4), np.eye(4), sigma, 3)
+    for k in (4, 9):
+        graph.add_loop(2 * k, 2 * k + 1, np.eye(4), sigma)
+    graph.optimise()
+    np.testing.assert_allclose(graph.poses[0:24:2], truth, atol=1e-6)
+    np.testing.assert_allclose(graph.poses[1:24:2], truth, atol=1e-6)
+    np.testing.assert_array_equal(graph.poses[24], own)
+    assert [graph.part(node) for node in (0, 1, 23, 24)] == [0, 0, 0, 2]
+    assert {(a, b) for a, b, *_ in graph.edges} == {(n, n + 2) for n in range(22)} | {(8, 9), (18, 19)}
+    np.testing.assert_allclose(graph.covariance(0), graph.covariance(0).T)
+    assert np.trace(graph.relative_covariance(8, 9)) < np.trace(graph.relative_covariance(0, 23))

@@ -16,6 +16,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.network.decoder import Correlated
 from dpm2_core.network.descriptors import Tokens
 from dpm2_core.network.model import DeepPointMap2
+from dpm2_core.network.registration import Solved
 from dpm2_core.sim.config import LidarConfig
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.world import World, build_world
@@ -142,7 +143,7 @@ def test_places_that_hardly_overlap_are_left_to_no_one(monkeypatch: pytest.Monke
     jump = se3.exp(np.array([0, 0, 0, 12.0, 0, 0]))  # the nearest by pose is no help
 
     def probability(value: float) -> Callable:
-        def judge(source: Tokens, target: Tokens, correlated: Correlated) -> torch.Tensor:
+        def judge(source: Tokens, target: Tokens, correlated: Correlated, solved: Solved) -> torch.Tensor:
             return torch.full(source.mask.shape[:1], value)
 
         return judge

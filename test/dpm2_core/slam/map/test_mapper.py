@@ -192,3 +192,21 @@ def test_saved_map_holds_all_of_it(tmp_path: Path, lap: tuple[list[Keyframe], Ar
     header = (tmp_path / "map" / "map.ply").read_bytes()[:200].decode("ascii", "replace")
     assert f"element vertex {len(mapper.cloud())}" in header
     assert (tmp_path / "map" / "pose_graph.g2o").read_text().count("EDGE_SE3:QUAT") == 3
+
+
+def test_each_robot_has_its_own_odometry_and_is_placed_when_tied() -> None:
+    """Interleaved keyframes of two robots and a restart of one: edges lead within a drive, ids count on."""
+    mapper = make_mapper(BY_POSE)
+    poses, cloud = circle(6), np.zeros((0, 4), np.float32)
+    for one in drifting(poses, np.zeros(6), cloud):
+        for robot in ("red", "blue"):
+            mapper.add(replace(one, robot=robot))
+    assert [(a, b) for a, b, *_ in mapper.edges] == [(n, n + 2) for n in range(10)]
+    np.testing.assert_allclose(mapper.T_map_odom_of("red"), np.eye(4), atol=1e-9)
+    assert mapper.T_map_odom_of("blue") is None  # nothing says where it is in red's map
+    assert mapper.T_map_odom_of("green") is None
+    for one in drifting(poses, np.zeros(6), cloud)[:2]:  # red again
+        mapper.add(replace(one, robot="red"))
+    assert [k.id for k in mapper.keyframes if k.robot == "red"] == list(range(8))
+    assert mapper.edges[-1][:2] == (12, 13)
+    assert mapper.T_map_odom_of("red") is None
