@@ -137,6 +137,8 @@ class DecoderSettings(Settings):
     """Pairs with a longer predicted offset are dropped, m."""
     guided: int = Field(2, ge=0)
     """Times that descriptors are matched anew with the pose at hand. 0: the paper's single matching."""
+    overlap_pose: bool = True
+    """Tell the overlap head how sure the registration is and how far apart it puts the pair. False: the paper's."""
     covariance_scale: float = Field(4.0, gt=0)
     """Factor on the covariance of the pose: both directions of a pair and neighbouring pairs err alike."""
 
@@ -173,7 +175,7 @@ _V1: dict[str, Any] = {
     "points": {"view_aligned": False, "moments": False, "pool_first": False, "stages": _V1_STAGES, "upsample": 2},
     "image": {"backbone": "none"},
     "fusion": {"kind": "none"},
-    "decoder": {"width": 256, "heads": 8, "position": "sine", "precision": False, "guided": 0},
+    "decoder": {"width": 256, "heads": 8, "position": "sine", "precision": False, "guided": 0, "overlap_pose": False},
 }
 _PAPER: dict[str, Any] = {
     **_V1,

@@ -15,7 +15,7 @@ from dpm2_core.network.attention import Attention, RelativeBias, sine_code
 from dpm2_core.network.config import NetworkSettings
 from dpm2_core.network.descriptors import Tokens, to_tokens
 from dpm2_core.network.heads import OffsetHead, OverlapHead, PointMLP
-from dpm2_core.network.registration import correspond, match_scores, register_batch
+from dpm2_core.network.registration import Solved, correspond, evidence, match_scores, register_batch
 
 
 class Correlated(NamedTuple):
@@ -70,7 +70,7 @@ class Decoder(nn.Module):
         self.relative = RelativeBias(decoder.layers, decoder.heads) if decoder.position == "relative" else None
         self.similarity = PointMLP(width)
         self.offset = OffsetHead(width, decoder.precision)
-        self.overlap = OverlapHead(width)
+        self.overlap = OverlapHead(width, decoder.overlap_pose)
         self.judges_overlap = False  # until phase two has trained the head
         self.coarse = PointMLP(settings.channels)
         self._kept: tuple[Descriptors, Tokens, _Alone] | None = None
@@ -138,18 +138,8 @@ class Decoder(nn.Module):
         at_source, at_target = pairs.source[0, half:].double().cpu(), pairs.target[0, :half].double().cpu()
         return at_source.numpy(), at_target.numpy(), pairs.weight[0, :half].double().cpu().numpy()
 
-    def judge_overlap(self, source: Tokens, target: Tokens, correlated: Correlated) -> Tensor:
+    def judge_overlap(self, source: Tokens, target: Tokens, correlated: Correlated, solved: Solved) -> Tensor:
         """Probability (B,) that each pair was seen from within 20 m; NaN while the head is untrained."""
         if not self.judges_overlap:
             return torch.full(source.mask.shape[:1], torch.nan)
-        return self.overlap(*correlated, source.mask, target.mask).float().sigmoid()
-
-    @torch.inference_mode()
-    def overlap_probability(self, sources: list[Descriptors], targets: list[Descriptors]) -> list[float]:
-        """Probability that each pair was seen from within 20 m, by the head as it is."""
-        device = next(self.parameters()).device
-        source = to_tokens(sources, self.view_aligned, device)
-        target = to_tokens(targets, self.view_aligned, device)
-        with torch.autocast(device.type, torch.bfloat16):
-            logits = self.overlap(*self(source, target), source.mask, target.mask)
-        return logits.sigmoid().tolist()
+        return self.overlap(*correlated, source.mask, target.mask, evidence(solved)).sigmoid()

@@ -61,19 +61,28 @@ class OffsetHead(nn.Module):
 
 
 class OverlapHead(nn.Module):
-    """Probability that two frames are within 20 m: point-wise layers, mean over the valid points, classifier."""
+    """Probability that two frames are within 20 m: point-wise layers, mean over the valid points, classifier.
 
-    def __init__(self, width: int) -> None:
+    `pose`: the classifier is also told how confident the registration of the pair is and how far apart it puts them.
+    Means over the points alone know little of either, and the paper's head, trained alike, hardly got off the ground.
+    """
+
+    def __init__(self, width: int, pose: bool) -> None:
         super().__init__()
         self.points = PointMLP(width)
-        self.classify = nn.Sequential(nn.Linear(2 * width, 2 * width), nn.ReLU(), nn.Linear(2 * width, 1))
+        self.pose = pose
+        self.classify = nn.Sequential(nn.Linear(2 * width + 2 * pose, 2 * width), nn.ReLU(), nn.Linear(2 * width, 1))
 
-    def forward(self, source: Tensor, target: Tensor, source_mask: Tensor, target_mask: Tensor) -> Tensor:
-        """source (B, N, C), target (B, M, C) with masks (B, N), (B, M): logits (B,)."""
+    def forward(
+        self, source: Tensor, target: Tensor, source_mask: Tensor, target_mask: Tensor, evidence: Tensor
+    ) -> Tensor:
+        """source (B, N, C), target (B, M, C) with masks (B, N), (B, M), `registration.evidence` (B, 2): logits (B,)."""
         pooled = []
         for features, mask in ((source, source_mask), (target, target_mask)):
             weight = mask[..., None].to(features.dtype)
             pooled.append((self.points(features) * weight).sum(1) / weight.sum(1).clamp(min=1))
+        if self.pose:
+            pooled.append(evidence.to(pooled[0].dtype))
         return self.classify(torch.cat(pooled, -1))[..., 0].float()
 
 

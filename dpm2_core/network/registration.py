@@ -186,25 +186,54 @@ def exp(xi: Tensor) -> Tensor:
     return torch.linalg.matrix_exp(out)
 
 
-def register_batch(decoder: Decoder, source: Tokens, target: Tokens, correlated: Correlated) -> list[Registration]:
-    """The registrations of a batch, T_target_source each."""
+class Solved(NamedTuple):
+    """Poses of a batch.
+
+    Attributes:
+        T: (B, 4, 4) float64. information: (B, 6, 6) of xi in T exp(xi). inliers: (B, 2K) of `pairs`.
+        confidence: (B,) 0..1.
+    """
+
+    T: Tensor
+    information: Tensor
+    pairs: Correspondences
+    inliers: Tensor
+    confidence: Tensor
+
+
+def solve_batch(decoder: Decoder, source: Tokens, target: Tokens, correlated: Correlated) -> Solved | None:
+    """Match and solve; None where there is nothing to match."""
     scores = match_scores(decoder, correlated)
     unguided = pairs = correspond(decoder, source, target, correlated, scores)
     if pairs.weight.shape[1] == 0:
-        return [_nothing("0 matching descriptors, want 3")] * len(scores)
+        return None
     T = first_pose(pairs)
     solve = _solve_precise if decoder.settings.precision else _solve_svd
     T, information, inliers = solve(pairs, T)
     for _ in range(decoder.settings.guided):
         pairs = correspond(decoder, source, target, correlated, guided_scores(scores, T, source, target))
         T, information, inliers = solve(pairs, T)
-    error = (transform(T, pairs.source.double()) - pairs.target).norm(dim=-1)
+    return Solved(T, information, pairs, inliers, _confidence(unguided, T))
+
+
+def evidence(solved: Solved) -> Tensor:
+    """What the pose of a pair says about its overlap (B, 2): its confidence, and the distance in units of 20 m."""
+    distance = (solved.T[:, :3, 3].norm(dim=-1) / 20).clamp(max=3).nan_to_num(3.0)
+    return torch.stack([solved.confidence.nan_to_num(0.0), distance.to(solved.confidence.dtype)], -1).float()
+
+
+def register_batch(decoder: Decoder, source: Tokens, target: Tokens, correlated: Correlated) -> list[Registration]:
+    """The registrations of a batch, T_target_source each."""
+    solved = solve_batch(decoder, source, target, correlated)
+    if solved is None:
+        return [_nothing("0 matching descriptors, want 3")] * len(source.xyz)
+    T, inliers = solved.T, solved.inliers
+    error = (transform(T, solved.pairs.source.double()) - solved.pairs.target).norm(dim=-1)
     count = inliers.sum(1)
     rmse = ((error**2 * inliers).sum(1) / count.clamp(min=1)).sqrt()
-    covariance = decoder.settings.covariance_scale * torch.linalg.inv(information)
-    confidence = _confidence(unguided, T)
-    overlap = decoder.judge_overlap(source, target, correlated)
-    figures = (field.tolist() for field in (confidence, rmse, count, overlap))
+    covariance = decoder.settings.covariance_scale * torch.linalg.inv(solved.information)
+    overlap = decoder.judge_overlap(source, target, correlated, solved)
+    figures = (field.tolist() for field in (solved.confidence, rmse, count, overlap))
     return [_answer(*row) for row in zip(T.cpu(), covariance.cpu(), *figures, strict=True)]
 
 

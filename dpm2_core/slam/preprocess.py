@@ -10,7 +10,7 @@ from pydantic import model_validator
 
 from dpm2_core.config import Settings
 from dpm2_core.descriptors import Descriptors
-from dpm2_core.frame import Array, Frame, Points
+from dpm2_core.frame import Array, Frame, Image, Points
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.voxel import voxel_first
 
@@ -49,12 +49,14 @@ class Scan:
         cloud: (M, 4) float32, those for the local map. source: (N, 3) float64, those to register. Both are empty where
             the registration works on descriptors alone.
         descriptors: neural ones; None where there are none.
+        image: the picture that was taken with it, where the registration asks for one.
     """
 
     points: Points
     cloud: Points = field(default_factory=lambda: np.zeros((0, 4), np.float32))
     source: Array = field(default_factory=lambda: np.zeros((0, 3)))
     descriptors: Descriptors | None = None
+    image: Image | None = None
 
 
 class Preprocessor:

@@ -25,6 +25,7 @@ from dpm2_core.slam.preprocess import Preprocessor, PreprocessSettings
 from dpm2_core.slam.refined import RefinedScanRegistration
 from dpm2_core.slam.registration import GeometricRegistration, GeometricSettings
 from dpm2_core.slam.scan_registration import GeometricScanRegistration, ScanRegistration
+from dpm2_core.slam.visual import VisualScanRegistration, VisualSettings
 
 
 class SlamSettings(Settings):
@@ -37,6 +38,7 @@ class SlamSettings(Settings):
     preprocess: PreprocessSettings = PreprocessSettings()
     geometric: GeometricSettings = GeometricSettings()
     neural: NeuralSettings = NeuralSettings()
+    visual: VisualSettings = VisualSettings()
     local_map: LocalMapSettings = LocalMapSettings()
     odometry: OdometrySettings = OdometrySettings()
     keyframes: KeyframeSettings = KeyframeSettings()
@@ -115,11 +117,12 @@ def make_registration(s: SlamSettings) -> ScanRegistration:
     geometric = GeometricScanRegistration(
         preprocessor, GeometricRegistration(s.geometric), LocalMap(s.local_map, s.threads)
     )
-    if s.registration == "geometric":
-        return geometric
-    network = load_network(s.neural.weights, s.threads, s.neural.preset)
-    neural = NeuralScanRegistration(s.neural, preprocessor, network)
-    return neural if s.registration == "neural" else RefinedScanRegistration(neural, geometric)
+    chosen: ScanRegistration = geometric
+    if s.registration != "geometric":
+        network = load_network(s.neural.weights, s.threads, s.neural.preset)
+        neural = NeuralScanRegistration(s.neural, preprocessor, network)
+        chosen = neural if s.registration == "neural" else RefinedScanRegistration(neural, geometric)
+    return VisualScanRegistration(s.visual, chosen) if s.visual.enabled else chosen
 
 
 def make_mapper(s: SlamSettings, store: MapStore | None = None) -> Mapper:

@@ -19,6 +19,7 @@ from dpm2_core.network.encoder import to_device
 from dpm2_core.network.losses import overlap_loss
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pyramid import PointBatch
+from dpm2_core.network.registration import evidence, solve_batch
 from dpm2_core.network.spatial import Views
 from dpm2_core.network.weights import load_weights, save_weights
 from dpm2_core.training.checkpoint import load_checkpoint
@@ -83,7 +84,9 @@ class PhaseTwo(nn.Module):
             source = tokens._replace(**{name: getattr(tokens, name)[first] for name in tokens._fields})
             target = tokens._replace(**{name: getattr(tokens, name)[other] for name in tokens._fields})
             correlated = self.model.decoder(source, target)
-        logits = self.model.decoder.overlap(*correlated, source.mask, target.mask)
+            solved = solve_batch(self.model.decoder, source, target, correlated)
+            posed = torch.zeros(len(distance), 2, device=distance.device) if solved is None else evidence(solved)
+        logits = self.model.decoder.overlap(*correlated, source.mask, target.mask, posed)
         return overlap_loss(logits, distance, OVERLAP), logits
 
 

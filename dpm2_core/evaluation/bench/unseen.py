@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from dpm2_core.data.corrupt import hidden_by, random_box
+from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.bench.geometric import BASELINE, kiss_config
 from dpm2_core.evaluation.bench.harness import Options
 from dpm2_core.evaluation.bench.pairs import kiss_from_identity, summarised
@@ -149,7 +150,13 @@ def _turned(pairs: PairSet, key: tuple[int, int, float]) -> Frame:
 
 
 def overlap(network: DeepPointMap2, options: Options) -> dict[str, Any]:
-    """Average precision of the overlap head: half of the pairs within 20 m, a quarter 20-40 m, a quarter farther."""
+    """Average precision of the overlap head: half of the pairs within 20 m, a quarter 20-40 m, a quarter farther.
+
+    Raises:
+        UsageError: the head is untrained.
+    """
+    if not network.decoder.judges_overlap:
+        raise UsageError("overlap: the head of these weights is untrained; dpm2 train phase2 trains it")
     pairs = _pairs(network, options, "mixed", 1)
     noise = np.random.default_rng(3)
     groups = max(1, options.pairs // (FRAMES - 1))
@@ -165,9 +172,8 @@ def overlap(network: DeepPointMap2, options: Options) -> dict[str, Any]:
     scores: list[float] = []
     for at in range(0, len(chosen), 32):
         part = chosen[at : at + 32]
-        scores += network.decoder.overlap_probability(
-            [descriptors[a] for a, _ in part], [descriptors[b] for _, b in part]
-        )
+        answers = network.decoder.register_many([descriptors[a] for a, _ in part], [descriptors[b] for _, b in part])
+        scores += [answer.overlap for answer in answers]
     near = np.array(distances) <= OVERLAP
     hard = (np.array(distances) > OVERLAP) & (np.array(distances) <= 40)
     return {
