@@ -65,15 +65,17 @@ class _Picture:
     def project(self, points: Array) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Pixels (..., N, 2) of points (..., N, 3) of the camera frame, m, and which of them the picture shows."""
         ahead = points[..., 2] > _NEAR / 2
-        uv = points @ self.K.T
-        uv = (uv[..., :2] / np.where(ahead, points[..., 2], 1.0)[..., None]).astype(np.float32)
+        image = points @ self.K.T
+        uv = np.asarray(image[..., :2] / np.where(ahead, points[..., 2], 1.0)[..., None], np.float32)
         height, width = self.texture[0].shape
-        return uv, ahead & (uv >= 0).all(-1) & (uv[..., 0] <= width - 1) & (uv[..., 1] <= height - 1)
+        shown: NDArray[np.bool_] = ahead & (uv >= 0).all(-1) & (uv[..., 0] <= width - 1) & (uv[..., 1] <= height - 1)
+        return uv, shown
 
     def sample(self, points: Array, level: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Texture (S, N) at points (S, N, 3) of the camera frame, m, and which of them the picture shows."""
         uv, shown = self.project(points)
-        return cv2.remap(self.texture[level], uv[..., 0], uv[..., 1], cv2.INTER_LINEAR), shown
+        found = cv2.remap(self.texture[level], uv[..., 0], uv[..., 1], cv2.INTER_LINEAR)
+        return np.asarray(found, np.float32), shown
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,9 +20,11 @@ from typing import Any
 
 from rich.console import Group
 
+from dpm2_core.config import load_settings
 from dpm2_core.data.source import Source, open_source
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.files import atomic_write
+from dpm2_core.slam.system import Config, SlamSettings
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 _PACKAGES = ("numpy", "scipy", "small_gicp", "gtsam", "torch", "kiss-icp")
@@ -56,6 +58,17 @@ class Options:
     only: str | None = None
     out: Path = Path("benchmarks")
     cache: Path = Path("out/bench")
+
+
+def overrides_of(options: Options, registration: str) -> list[str]:
+    """Settings of the SLAM with that registration and the weights that were asked for."""
+    weights = [] if options.weights is None else [f"slam.neural.weights={options.weights}"]
+    return [f"slam.threads={options.threads}", *weights, *options.overrides, f"slam.registration={registration}"]
+
+
+def settings_of(options: Options, registration: str) -> SlamSettings:
+    """Those settings, read."""
+    return load_settings(Config, None, overrides_of(options, registration)).slam
 
 
 @dataclass(frozen=True)

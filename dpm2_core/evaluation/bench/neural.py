@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from rich.progress import Progress
 
-from dpm2_core.config import load_settings
 from dpm2_core.data.source import Source
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.bench.geometric import BASELINE, Method, dpm2, kiss_config, kiss_icp, quantiles_ms, summary
@@ -22,8 +21,10 @@ from dpm2_core.evaluation.bench.harness import (
     Report,
     drives,
     git_commit,
+    overrides_of,
     processors,
     read_parts,
+    settings_of,
     unique_name,
     write_report,
 )
@@ -42,7 +43,7 @@ from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pyramid import build_pyramid, collate, crop
 from dpm2_core.network.weights import read_metadata
 from dpm2_core.slam.neural import load_network, weights_path
-from dpm2_core.slam.system import Config, SlamSettings, make_registration
+from dpm2_core.slam.system import make_registration
 
 Part = Callable[[DeepPointMap2, Options], dict[str, Any]]
 
@@ -55,7 +56,7 @@ def bench_neural(options: Options) -> Report:
     """
     if options.only and options.only not in PARTS:
         raise UsageError(f"--only {options.only}: no such part; choose from {', '.join(PARTS)}")
-    s = _settings(options, "neural")
+    s = settings_of(options, "neural")
     network = load_network(s.neural.weights, options.threads, s.neural.preset)
     weights = _weights(s.neural.weights)
     path = options.out / "neural.json"
@@ -74,16 +75,6 @@ def bench_neural(options: Options) -> Report:
             progress.advance(task)
             progress.console.print(f"{name}: {parts[name]['seconds']} s")
     return Report({"weights": weights, "parts": parts}, view(parts))
-
-
-def _settings(options: Options, registration: str) -> SlamSettings:
-    """Of the SLAM with that registration and the weights that were asked for."""
-    return load_settings(Config, None, _overrides(options, registration)).slam
-
-
-def _overrides(options: Options, registration: str) -> list[str]:
-    weights = [] if options.weights is None else [f"slam.neural.weights={options.weights}"]
-    return [f"slam.threads={options.threads}", *weights, *options.overrides, f"slam.registration={registration}"]
 
 
 def _weights(name: str) -> dict[str, Any]:
@@ -113,10 +104,10 @@ def _of_drives(one: Callable[[Source, list[Frame], DeepPointMap2, Options], Any]
 
 def real_pairs(source: Source, frames: list[Frame], network: DeepPointMap2, options: Options) -> dict[str, Any]:
     """Near pairs by the network alone; those 10-20 m apart by every method, none with a prior."""
-    neural = {"neural": by_registration(make_registration(_settings(options, "neural")))}
+    neural = {"neural": by_registration(make_registration(settings_of(options, "neural")))}
     methods: dict[str, PairMethod] = {
         **neural,
-        **{n: by_registration(make_registration(_settings(options, n))) for n in ("refined", "geometric")},
+        **{n: by_registration(make_registration(settings_of(options, n))) for n in ("refined", "geometric")},
         "small_gicp": gicp_from_identity(options.threads),
     }
     if (config := kiss_config(options)) is not None:
@@ -129,7 +120,8 @@ def real_pairs(source: Source, frames: list[Frame], network: DeepPointMap2, opti
 def odometry(source: Source, frames: list[Frame], network: DeepPointMap2, options: Options) -> dict[str, Any]:
     """As `dpm2 run` does it, by the network, refined and by the points alone, and KISS-ICP."""
     methods: dict[str, Method] = {
-        name: dpm2(replace(options, overrides=_overrides(options, name))) for name in ("neural", "refined", "geometric")
+        name: dpm2(replace(options, overrides=overrides_of(options, name)))
+        for name in ("neural", "refined", "geometric")
     }
     if (kiss := kiss_icp(options)) is not None:
         methods[BASELINE] = kiss

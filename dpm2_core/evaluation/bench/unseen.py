@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +13,13 @@ import numpy as np
 from dpm2_core.data.corrupt import hidden_by, random_box
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.bench.geometric import BASELINE, kiss_config
-from dpm2_core.evaluation.bench.harness import Options
-from dpm2_core.evaluation.bench.pairs import kiss_from_identity, summarised
+from dpm2_core.evaluation.bench.harness import Options, settings_of
+from dpm2_core.evaluation.bench.pairs import PairMethod, by_registration, kiss_from_identity, summarised
 from dpm2_core.frame import Array, Frame, Image
 from dpm2_core.geometry import se3
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.sim.config import PresetName
+from dpm2_core.slam.system import make_registration
 from dpm2_core.training.generate import GenerateSettings, generate
 from dpm2_core.training.packed import PackedDrive, Sample
 from dpm2_core.training.phase_two import FRAMES, OVERLAP, average_precision, draw_overlap
@@ -106,33 +108,39 @@ def corruption(network: DeepPointMap2, options: Options) -> dict[str, Any]:
 
 
 def image_matters(network: DeepPointMap2, options: Options) -> dict[str, Any]:
-    """Highway and tunnel, whose geometry does not tell the motion: with the camera, without, and KISS-ICP."""
+    """Highway and tunnel, whose geometry does not tell the motion: with the camera, without, and KISS-ICP.
+
+    `descriptors` is the network alone; `neural` and `refined` are what the SLAM runs, the picture along the open
+    direction included.
+    """
     camera = network.encoder.image is not None
     config = kiss_config(options)
     out: dict[str, Any] = {"pairs": {}}
     for kind in ("highway", "tunnel"):
         pairs = _pairs(network, options, kind, options.pairs)
         methods: dict[str, Array] = {}
-        if camera:
-            methods["neural with camera"] = pairs.errors(network)[:, [0, 2, 3]]
-            pairs.images = False
-        methods["neural without camera"] = pairs.errors(network)[:, [0, 2, 3]]
+        for images in (True, False) if camera else (False,):
+            pairs.images = images
+            word = "with camera" if images else "without camera"
+            methods[f"descriptors {word}"] = pairs.errors(network)[:, [0, 2, 3]]
+            for name in ("neural", "refined"):
+                registered = by_registration(make_registration(settings_of(options, name)))
+                methods[f"{name} {word}"] = _near_errors(pairs, registered)
         if config is not None:
-            methods[BASELINE] = _kiss_errors(pairs, config)
-        near = methods["neural without camera"][:, 0] <= NEAR
+            methods[BASELINE] = _near_errors(pairs, kiss_from_identity(config))
+        near = methods["descriptors without camera"][:, 0] <= NEAR
         out["pairs"][f"{kind}, up to 5 m"] = {name: summarised(rows[near, 1:]) for name, rows in methods.items()}
     if not camera:
         out["with the camera"] = _NO_CAMERA
     return out
 
 
-def _kiss_errors(pairs: PairSet, config: Any) -> Array:
-    """(pairs, 3) distance m, translation error m, rotation error deg; far pairs, which it cannot do, are left out."""
-    register = kiss_from_identity(config)
-    clouds = {i: _turned(pairs, key) for key, i in pairs.frames.items()}
+def _near_errors(pairs: PairSet, register: PairMethod) -> Array:
+    """(pairs, 3) distance m, translation error m, rotation error deg; infinite without an answer and for far pairs."""
+    frames = {i: _turned(pairs, key, i) for key, i in pairs.frames.items()}
     rows = []
     for source, target, T, distance in pairs.pairs:
-        found = register(clouds[target], clouds[source]) if distance <= NEAR else None
+        found = register(frames[target], frames[source]) if distance <= NEAR else None
         off = se3.inverse(T) @ found if found is not None else None
         rows.append(
             (distance, np.inf, np.inf)
@@ -142,11 +150,17 @@ def _kiss_errors(pairs: PairSet, config: Any) -> Array:
     return np.array(rows)
 
 
-def _turned(pairs: PairSet, key: tuple[int, int, float]) -> Frame:
+def _turned(pairs: PairSet, key: tuple[int, int, float], number: int) -> Frame:
     """The frame of a pair as `PairSet` shows it to the network."""
     drive, index, yaw = key
-    cloud = se3.transform(se3.exp([0, 0, yaw, 0, 0, 0]), pairs.drives[drive][index].cloud)
-    return Frame(0, np.c_[cloud, np.zeros(len(cloud))].astype(np.float32))
+    turn, sample = se3.exp([0, 0, yaw, 0, 0, 0]), pairs.drives[drive][index]
+    cloud = se3.transform(turn, sample.cloud)
+    images = tuple(
+        Image(image.pixels, replace(image.camera, T_lidar_cam=turn @ image.camera.T_lidar_cam))
+        for image in sample.images
+        if pairs.images
+    )
+    return Frame(number, np.c_[cloud, np.zeros(len(cloud))].astype(np.float32), images=images, index=number)
 
 
 def overlap(network: DeepPointMap2, options: Options) -> dict[str, Any]:
