@@ -69,7 +69,11 @@ class Robot:
         pairs = ["input.images:=false", "ros.map_directory:=''", *parameters]
         arguments = ["--ros-args", *(part for pair in pairs for part in ("-p", pair))]
         self.process = start("slam_node", arguments, ros_environment(harness.node.context.get_domain_id()), log)
-        harness.wait(lambda: self.lidar.get_subscription_count() and self.said(""), "slam_node", timeout=60)
+        harness.wait(self._ready, "slam_node", timeout=60)
+
+    def _ready(self) -> bool:
+        assert self.process.poll() is None, self.log.read_text()
+        return bool(self.lidar.get_subscription_count() and self.said(""))
 
     def send(self, *frames: int) -> None:
         """Scans, 0.1 s apart whatever their place in the drive, each when the one before has come out."""

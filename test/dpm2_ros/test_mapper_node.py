@@ -69,8 +69,9 @@ def test_keyframes_become_a_map_in_either_order_of_messages(mapper: Any, tmp_pat
 def test_a_map_file_is_written_as_the_drive_goes_on(mapper: Any, tmp_path: Path) -> None:
     """All keyframes are in it before the node ends; a new map gets a file of its own."""
     thread = mapper.mapper._mapper
-    ros = thread._config.ros.model_copy(update={"map_file": str(tmp_path / "drive.dpm2map")})
-    thread._config = thread._config.model_copy(update={"ros": ros})
+    active = thread._active
+    ros = active._config.ros.model_copy(update={"map_file": str(tmp_path / "drive.dpm2map")})
+    active._config = active._config.model_copy(update={"ros": ros})
     thread.reset(save=False)
     for id in (0, 1, 2):
         mapper.send(id, se3.exp([0, 0, 0, 5.0 * id, 0, 0]), points(id))
@@ -100,7 +101,7 @@ def test_a_restarted_odometry_goes_on_in_the_same_map(mapper: Any) -> None:
     for id in (0, 1, 2, 0):
         mapper.send(id, se3.exp([0, 0, 0, 5.0 * id, 0, 0]), points(id))
     mapper.wait(lambda: mapper.mapper._mapper.keyframes == 4, "all four")
-    core = mapper.mapper._mapper._mapper
+    core = mapper.mapper._mapper._active.mapper
     assert [keyframe.id for keyframe in core.keyframes] == [0, 1, 2, 3]
     assert [(a, b) for a, b, _, _ in core.edges] == [(0, 1), (1, 2)]
     assert core.T_map_odom_of("") is None
