@@ -48,15 +48,18 @@ def unseen_drives(network: DeepPointMap2, options: Options, kind: str = "mixed")
 
 
 def synthetic(network: DeepPointMap2, options: Options) -> dict[str, Any]:
-    """Pairs up to 5 m and up to 20 m apart, straight and with any yaw."""
+    """Pairs up to 5 m and 20 m apart, straight and with any yaw; highways and tunnels apart, see `image_matters`."""
     pairs = _pairs(network, options, "mixed", 2 * options.pairs)
     rows = pairs.errors(network)
     near, turned = rows[:, 0] <= NEAR, rows[:, 1] > 0
+    drive_of = {i: pairs.drives[key[0]] for key, i in pairs.frames.items()}
+    shaped = np.array([drive_of[pair[0]].about.get("preset") not in ("highway", "tunnel") for pair in pairs.pairs])
     kinds = {
-        "up to 5 m": near & ~turned,
-        "up to 20 m": ~turned,
-        "up to 5 m, any yaw": near & turned,
-        "up to 20 m, any yaw": turned,
+        "up to 5 m": near & ~turned & shaped,
+        "up to 20 m": ~turned & shaped,
+        "up to 5 m, any yaw": near & turned & shaped,
+        "up to 20 m, any yaw": turned & shaped,
+        "up to 20 m, highway and tunnel": ~shaped,
     }
     good = rows[:, 2] < 0.6
     return {

@@ -146,7 +146,7 @@ def test_the_neural_benchmark_measures_pairs_odometry_and_stages(
     picture: Callable[..., Image],
 ) -> None:
     """With random weights: the classical methods beside it are right, and refined falls back on points."""
-    save_weights(model, tmp_path / "tiny.safetensors", {"steps": "0", "images": "true"})
+    save_weights(model, tmp_path / "tiny.safetensors", {"steps": "0", "images": "true", "phase": "2"})
     poses = se3.exp(np.outer(np.arange(4.0), [0, 0, 0.1, 3, 0, 0]))
     samples = [Sample(street(noise), T, (picture(noise),)) for T in poses]
     write_packed(tmp_path / "unseen" / "world", samples, {})
