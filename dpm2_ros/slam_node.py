@@ -48,8 +48,11 @@ class SlamNode(Node):
         if ros.localization_mode and not ros.embed_mapper:
             raise UsageError("ros.localization_mode: needs ros.embed_mapper")
         self._odometry = make_odometry(self._config.slam, self._robot)
-        self._inputs = Inputs(self, self._config.input, ros)
-        self._frames = FrameBuilder(self._config.input, self._inputs, self.get_logger().error)
+        reading = self._config.input.model_copy(
+            update={"images": self._config.input.images and self._odometry.uses_images}
+        )
+        self._inputs = Inputs(self, reading, ros)
+        self._frames = FrameBuilder(reading, self._inputs, self.get_logger().error)
         self._mapper = MapperThread(self, self._config, self._robot) if ros.embed_mapper else None
         self._health = Health()
         self._diagnostics = Diagnostics(self, self._inputs, self._frames, self._health, self._mapper)

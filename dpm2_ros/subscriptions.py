@@ -147,6 +147,8 @@ class Inputs:
 
     def _on_cloud(self, message: PointCloud2) -> None:
         with self._arrived:
+            for camera in self.synchronizer.cameras:
+                camera.present = bool(self._node.count_publishers(self.subscriptions[1].topic))
             verdict = self.synchronizer.add_cloud(self._stamp(message), message, time.monotonic())
             self._arrived.notify()
         if verdict is not Verdict.ACCEPTED:

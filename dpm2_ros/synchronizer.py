@@ -53,6 +53,8 @@ class CameraState:
     missed: int = 0
     """Clouds in a row that left without its image."""
     last_arrival: float | None = None
+    present: bool = True
+    """Whether anybody is there who could deliver; nobody waits for a camera that is not."""
     images: deque[tuple[int, Any]] = field(default_factory=lambda: deque(maxlen=BUFFER))
 
     @property
@@ -124,7 +126,7 @@ class Synchronizer:
         head = self._queue[0]
         found = [self._match(state, head.stamp) for state in self.cameras]
         pending = any(
-            match is None and state.awaited and not self._passed(state, head.stamp)
+            match is None and state.present and state.awaited and not self._passed(state, head.stamp)
             for match, state in zip(found, self.cameras, strict=True)
         )
         if pending and now < head.arrival + self._timeout:

@@ -129,7 +129,9 @@ def test_two_robots_one_map_each_with_its_own_correction(fleet: Fleet) -> None:
     fleet.drive("red", *range(19))
     wait = fleet.harness.wait
     wait(lambda: fleet.ids("red") == list(range(7)), "red's keyframes", timeout=40)
-    fleet.drive("red", 19)  # the mapper may have come when the drive was over: keyframes are sent again, odometry is not
+    fleet.drive(
+        "red", 19
+    )  # the mapper may have come when the drive was over: keyframes are sent again, odometry is not
     wait(lambda: fleet.T_map_lidar("red") is not None, "map -> red/odom")
     fleet.robot("blue")
     fleet.drive("blue", *range(6, 24))

@@ -260,6 +260,21 @@ def test_a_camera_that_never_comes_comes_late_and_stops(rig: Callable[..., Rig],
     assert "no image" in r.status("camera").message
 
 
+def test_without_a_camera_no_cloud_waits_for_one(rig: Callable[..., Rig], drive: Any) -> None:
+    """Images are wanted by default; a drive without any is as fast from its first cloud on as one that wants none."""
+    r = rig("input.images:=true", "ros.sync_timeout:=5.0")
+    assert r.node._odometry.uses_images
+    began = time.monotonic()
+    r.send_and_wait(*range(drive.frames))
+    assert time.monotonic() - began < 5.0  # a single wait would last that long; without any it is under a second
+
+
+def test_images_that_nothing_looks_at_are_not_received(rig: Callable[..., Rig]) -> None:
+    r = rig("input.images:=true", "slam.visual.enabled:=false")
+    assert r.node.count_subscribers(IMAGE) == 0
+    r.send_and_wait(0)
+
+
 def record_frames(r: Rig) -> list[Any]:
     """What the odometry is given."""
     frames: list[Any] = []

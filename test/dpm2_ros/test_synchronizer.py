@@ -26,6 +26,17 @@ def test_without_a_camera_nothing_waits() -> None:
     assert [bundle.cloud for bundle in drain(synchronizer, 0.0)] == ["a"]
 
 
+def test_a_camera_that_nobody_publishes_is_not_waited_for() -> None:
+    """Nor is a camera that goes away; what it has delivered is used all the same."""
+    synchronizer = make()
+    synchronizer.cameras[0].present = False
+    synchronizer.add_cloud(100 * MS, "a", now=0.0)
+    assert [bundle.cloud for bundle in drain(synchronizer, 0.0)] == ["a"]
+    synchronizer.add_image(0, 200 * MS, "image", now=0.1)
+    synchronizer.add_cloud(200 * MS, "b", now=0.1)
+    assert [bundle.images for bundle in drain(synchronizer, 0.1)] == [{0: "image"}]
+
+
 @pytest.mark.parametrize(
     ("image_stamp_ms", "arrives_s", "joins"),
     [
