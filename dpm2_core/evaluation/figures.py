@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The picture of a run: map, estimated and true trajectory from above."""
+"""Pictures: a run (map, estimated and true trajectory from above), and how often methods register pairs."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,6 +59,35 @@ def trajectory_png(
     axes.legend(loc="upper right", facecolor=_BACKGROUND, edgecolor="none", labelcolor=_INK, framealpha=0.7)
     _scale_bar(axes, low, high)
     figure.text(0.02, 0.955, title, color=_INK, fontsize=14)
+    with atomic_write(path, "wb") as file:
+        FigureCanvasAgg(figure).print_png(file)
+
+
+def success_png(path: Path | str, kinds: Mapping[str, Mapping[str, Mapping[str, Any]]], title: str = "") -> None:
+    """Bars of the share of pairs that each method registers, one group a kind of pair, with the median errors.
+
+    Args:
+        kinds: kind, method, and its figures `success` 0..1 and `median_m`, m (None where most have no answer).
+
+    Raises:
+        Dpm2Error: the file could not be written.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    rows = [(kind, method, figures) for kind, methods in kinds.items() for method, figures in methods.items()]
+    figure = Figure(figsize=(9, 0.36 * len(rows) + 1.4), dpi=120, facecolor=_BACKGROUND)
+    axes = figure.add_axes((0.38, 0.12, 0.58, 0.8), facecolor=_BACKGROUND)
+    for y, (_, method, figures) in enumerate(rows):
+        axes.barh(y, 100 * figures["success"], color=_ESTIMATE if "with camera" in method else _HEIGHTS[0])
+        median = figures["median_m"]
+        said = "no answer for most" if median is None else f"{median:.2f} m"
+        axes.text(100 * figures["success"] + 1, y, said, color=_INK, va="center", fontsize=8)
+    axes.set_yticks(range(len(rows)), [f"{kind}: {method}" for kind, method, _ in rows], color=_INK, fontsize=8)
+    axes.set(xlim=(0, 115), ylim=(len(rows) - 0.4, -0.6))
+    axes.set_xlabel("pairs registered, %; median error beside the bar", color=_INK)
+    axes.tick_params(colors=_INK)
+    figure.text(0.02, 0.95, title, color=_INK, fontsize=11)
     with atomic_write(path, "wb") as file:
         FigureCanvasAgg(figure).print_png(file)
 

@@ -37,6 +37,7 @@ from dpm2_core.evaluation.bench.pairs import (
     kiss_from_identity,
 )
 from dpm2_core.evaluation.bench.unseen import corruption, image_matters, overlap, synthetic
+from dpm2_core.evaluation.figures import success_png
 from dpm2_core.frame import Frame
 from dpm2_core.network.encoder import collate_views
 from dpm2_core.network.model import DeepPointMap2
@@ -72,6 +73,9 @@ def bench_neural(options: Options) -> Report:
             parts = {known: parts[known] for known in PARTS if known in parts}
             report = Report({"weights": weights, "parts": parts}, view(parts))
             write_report(path, "neural", report, options)
+            if name == "image":
+                title = "Highway and tunnel, pairs without a prior"
+                success_png(options.out / "neural_image.png", found["pairs"], title)
             progress.advance(task)
             progress.console.print(f"{name}: {parts[name]['seconds']} s")
     return Report({"weights": weights, "parts": parts}, view(parts))

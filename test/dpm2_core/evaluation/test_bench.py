@@ -167,6 +167,7 @@ def test_the_neural_benchmark_measures_pairs_odometry_and_stages(
     assert parts["odometry"]["drives"][drive.name]["geometric"]["ape_rmse_m"] < 0.02
     assert set(parts["corruption"]["error_ratio"]) == {"LiDAR obstruction 100 %", "camera failure 100 %"}
     assert {"neural with camera", "neural without camera"} <= set(parts["image"]["pairs"]["tunnel, up to 5 m"])
+    assert (tmp_path / "neural_image.png").read_bytes().startswith(b"\x89PNG")
     assert 0 <= parts["overlap"]["average_precision"] <= 1
     speed = parts["speed"]["drives"][drive.name]
     assert speed["stages_ms"]["total"]["median"] > 0
