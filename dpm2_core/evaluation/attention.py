@@ -131,7 +131,7 @@ def draw_attention(axes: Any, looked: ImageAttention) -> None:
     x, y = looked.uv[looked.chosen]
     axes.plot(x, y, "o", markersize=16, markerfacecolor="none", markeredgecolor=_CHOSEN, markeredgewidth=2)
     axes.set_title(
-        f"reference points, near ones dark; attention of point {looked.chosen}, {near[looked.chosen]:.1f} m away",
+        f"reference points, near ones light; attention of point {looked.chosen}, {near[looked.chosen]:.1f} m away",
         color=_INK,
     )
     axes.set_axis_off()
