@@ -127,7 +127,7 @@ def test_an_odometry_that_brakes_in_a_tunnel() -> None:
 
 
 def test_points_and_pictures_of_a_real_drive_agree(kitti_root: Path) -> None:
-    """Asked where nothing is open, the picture moves the points' answer by centimetres: two measurements of one motion."""
+    """Asked where nothing is open, the picture moves the answer by centimetres: two measurements of one motion."""
     frames = list(open_source(kitti_root / "sequences" / "04").frames(0, 12))
     tracks = []
     for sigma in (0.08, 1e-4):
