@@ -12,7 +12,7 @@ EXTRAS ?= test
 # The environment is self-contained: a sourced ROS 2, another environment's bootstrap or its libraries must not leak in.
 unexport PYTHONPATH PYTHONHOME VIRTUAL_ENV AMENT_PREFIX_PATH ROS_DISTRO LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: help setup demo test lint bench bench-ros bench-memory train-data train-small ablation sim parameters clean
+.PHONY: help setup demo test lint bench bench-ros bench-robots bench-memory train-data train-small ablation sim parameters clean
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:[^#]*##/\t/' | expand -t 16
 
@@ -42,6 +42,9 @@ bench: setup  ## the figures of benchmarks/, beside KISS-ICP
 
 bench-ros: setup  ## the KITTI excerpt through bag, player and slam_node at 10 Hz
 	$(BIN)/python -m dpm2_ros.bench $(ARGS)
+
+bench-robots: setup  ## three robots and one mapper_node that is halted for 30 s: what is in the map, and where
+	$(BIN)/python -m dpm2_ros.bench_robots $(ARGS)
 
 bench-memory: setup  ## resident memory over a synthetic drive of 2,000 frames (8 GB on disk)
 	$(BIN)/python -m dpm2_core.cli sim out/memory --frames 2000 --seed 3 --no-images

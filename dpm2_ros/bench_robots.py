@@ -1,0 +1,220 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`make bench-robots`: three slam_nodes on overlapping parts of a street, and one mapper_node, halted for 30 s.
+
+Halted by SIGSTOP: nobody acknowledges anything, and all queues run full. Single packets are not dropped: between
+processes of one machine DDS uses shared memory.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.box import SIMPLE
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from dpm2_core.config import load_settings
+from dpm2_core.data.source import InputSettings, Source, open_source
+from dpm2_core.errors import Dpm2Error
+from dpm2_core.evaluation.bench.harness import write_record
+from dpm2_core.evaluation.metrics import align, ape_rmse
+from dpm2_core.frame import Array
+from dpm2_core.sim.config import LidarConfig
+from dpm2_core.sim.drive import simulate
+from dpm2_core.slam.map.data import MapData, load_map
+from dpm2_core.slam.map.store import MapStore
+from dpm2_core.slam.system import Config, SlamSystem
+from dpm2_ros.conversions import cloud_to_msg, parse_keyframe_name
+from dpm2_ros.replay import ros_environment, start, stop
+from dpm2_ros.runtime import exit_code
+
+SPANS = {"red": (0, 60), "blue": (30, 90), "green": (60, 120)}
+"""Frames of each robot; they drive at the same time."""
+OUTAGE = (10, 40)
+"""Of the mapper, s after the robots set off; they take a scan a second, so that this is half of their drive."""
+SETTINGS = ("slam.keyframes.distance=2.0",)
+_START, _PERIOD = 1_000_000_000, 100_000_000  # ns: stamps; the scans were taken at 10 Hz
+
+
+class _Scans:
+    """Publishes the scans of all robots; notes the keyframes that they make."""
+
+    def __init__(self, source: Source) -> None:
+        import rclpy
+        from nav_msgs.msg import Odometry
+        from rclpy.executors import SingleThreadedExecutor
+        from rclpy.signals import SignalHandlerOptions
+        from sensor_msgs.msg import PointCloud2
+
+        from dpm2_ros.mapping import KEEP_ALL
+
+        rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+        self._source, self.made = source, {name: set[int]() for name in SPANS}
+        self._node = rclpy.create_node("scans")
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self._node)
+        self._lidars = {name: self._node.create_publisher(PointCloud2, f"/{name}/points", 10) for name in SPANS}
+        for name in SPANS:
+            self._node.create_subscription(Odometry, f"/{name}/dpm2/keyframe_odom", self._on_keyframe, KEEP_ALL)
+
+    def _on_keyframe(self, message: Any) -> None:
+        robot, id, _ = parse_keyframe_name(message.child_frame_id)
+        self.made[robot].add(id)
+
+    def connected(self) -> bool:
+        """Whether all robots and the mapper are there."""
+        heard = [self._node.count_publishers(f"/{name}/dpm2/keyframe_odom") for name in SPANS]
+        mapper = [self._node.count_publishers(f"/{name}/dpm2/keyframes_received") for name in SPANS]
+        return all(heard) and all(mapper) and all(lidar.get_subscription_count() for lidar in self._lidars.values())
+
+    def send(self, tick: int) -> None:
+        """The next scan of each robot."""
+        for name, (first, _) in SPANS.items():
+            n = first + tick
+            points = next(iter(self._source.frames(n, n + 1))).points
+            self._lidars[name].publish(cloud_to_msg(points, _START + n * _PERIOD, f"{name}/lidar"))
+
+    def spin(self, seconds: float) -> None:
+        """Take what arrives during that time."""
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0:
+            self._executor.spin_once(timeout_sec=left)
+
+    def close(self) -> None:
+        import rclpy
+
+        self._executor.shutdown()
+        self._node.destroy_node()
+        rclpy.try_shutdown()
+
+
+def bench(out: Annotated[Path, typer.Option(help="Folder for robots.json.")] = Path("benchmarks")) -> int:
+    """All keyframes in one map, and each robot's trajectory in it beside that of the robot alone."""
+    with tempfile.TemporaryDirectory(prefix="dpm2_bench_robots_") as folder:
+        root = Path(folder)
+        simulate(root / "sim", 120, seed=2, road="straight", preset="suburb", images=False, lidar=LidarConfig())
+        source = open_source(root / "sim", InputSettings(images=False))
+        data, made, missed = _drive(source, root)
+        robots = {name: _judge(source, data, name, made[name]) for name in SPANS}
+    edges = np.array([(edge.from_node, edge.to_node) for edge in data.constraints]).T
+    maps, _ = connected_components(coo_array((np.ones(edges.shape[1]), edges), shape=(len(data), len(data))))
+    results = {
+        "outage": {"seconds": OUTAGE[1] - OUTAGE[0], "keyframes_made_meanwhile": missed, "packet_loss": "not applied"},
+        "maps": int(maps),
+        "loops_between_robots": sum(data.keyframes[a].robot != data.keyframes[b].robot for a, b in edges.T),
+        "robots": robots,
+    }
+    write_record(out / "robots.json", "robots", results, "python -m dpm2_ros.bench_robots")
+    columns = list(next(iter(robots.values())))
+    table = Table("robot", *columns, title=f"{maps} map, mapper halted for {OUTAGE[1] - OUTAGE[0]} s", box=SIMPLE)
+    for name, row in robots.items():
+        table.add_row(name, *(f"{row[column]:.4g}" for column in columns))
+    Console().print(table)
+    return 1 if maps > 1 or any(row["keyframes_missing"] for row in robots.values()) else 0
+
+
+def _drive(source: Source, root: Path) -> tuple[MapData, dict[str, set[int]], int]:
+    """The map of all robots, the ids of the keyframes that each made, and how many of them during the outage.
+
+    Raises:
+        Dpm2Error: they did not start, or the map did not get all keyframes.
+    """
+    environment, path = ros_environment(), root / "town.dpm2map"
+    processes: list[subprocess.Popen[bytes]] = []
+    scans: _Scans | None = None
+    try:
+        os.environ.update(environment)  # rclpy in this process reads it when it starts
+        scans = _Scans(source)
+        for name in SPANS:
+            processes.append(start("slam_node", _arguments(name), environment, root / f"{name}.log"))
+        parameters = ["--ros-args", "-p", "ros.map_directory:=''", "-p", f"ros.map_file:={path}"]
+        mapper = start("mapper_node", parameters, environment, root / "mapper.log")
+        processes.append(mapper)
+        _wait(scans, scans.connected, "robots and mapper to start")
+        count = [0, 0]
+        for tick in track(range(60), "driving"):
+            if tick in OUTAGE:
+                count[OUTAGE.index(tick)] = sum(map(len, scans.made.values()))
+                mapper.send_signal(signal.SIGSTOP if tick == OUTAGE[0] else signal.SIGCONT)
+            scans.send(tick)
+            scans.spin(1.0)
+        scans.spin(2.0)
+        made = scans.made
+        _wait(scans, lambda: len(_read(path)) >= sum(map(len, made.values())), "the map to be complete")
+        stop(mapper)
+        return _read(path), made, count[1] - count[0]
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+        if scans is not None:
+            scans.close()
+
+
+def _arguments(name: str) -> list[str]:
+    given = ["input.points_topic:=points", "input.images:=false", "ros.embed_mapper:=false",
+             f"ros.odom_frame:={name}/odom", *(s.replace("=", ":=") for s in SETTINGS)]  # fmt: skip
+    return ["--ros-args", "-r", f"__ns:=/{name}", *(part for pair in given for part in ("-p", pair))]
+
+
+def _wait(scans: _Scans, condition: Any, what: str, seconds: float = 120.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        if time.monotonic() > end:
+            raise Dpm2Error(f"waited {seconds:.0f} s for {what}")
+        scans.spin(0.5)
+
+
+def _read(path: Path) -> MapData:
+    with MapStore.open(path) as store:
+        return load_map(store, descriptors=False)
+
+
+def _judge(source: Source, data: MapData, name: str, made: set[int]) -> dict[str, float]:
+    """Position errors of a robot's keyframes: in the common map, aligned as a whole, and of the robot alone (m)."""
+    truth = source.poses
+    assert truth is not None
+    frames = np.array([(keyframe.stamp - _START) // _PERIOD for keyframe in data.keyframes])
+    own = np.array([keyframe.robot == name for keyframe in data.keyframes])
+    T_world_map = align(data.poses[:, :3, 3], truth[frames][:, :3, 3])
+    errors = (T_world_map @ data.poses[own] - truth[frames[own]])[:, :3, 3]
+    ids = {keyframe.id for keyframe in data.keyframes if keyframe.robot == name}
+    return {
+        "keyframes": len(made),
+        "keyframes_missing": len(made - ids),
+        "ape_rmse_m": float(np.sqrt((errors**2).sum(1).mean())),
+        "alone_ape_rmse_m": _alone(source, truth, *SPANS[name]),
+    }
+
+
+def _alone(source: Source, truth: Array, first: int, end: int) -> float:
+    """APE of the keyframes of the same drive in one process, without ROS and without the others, m."""
+    system = SlamSystem(load_settings(Config, None, SETTINGS).slam)
+    for frame in source.frames(first, end):
+        system.process(frame)
+    system.mapper.finish()
+    frames = [keyframe.index for keyframe in system.mapper.keyframes]
+    return ape_rmse(truth[frames], system.mapper.poses)
+
+
+def main() -> int:
+    """Entry point of `python -m dpm2_ros.bench_robots`."""
+    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+    app.command()(bench)
+    return exit_code(lambda: app(standalone_mode=False))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
