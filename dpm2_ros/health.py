@@ -14,6 +14,7 @@ from rclpy.node import Node
 
 from dpm2_core.frame import State, Tracked
 from dpm2_ros.frames import FrameBuilder
+from dpm2_ros.keyframes import BEHIND, KeyframeSender
 from dpm2_ros.mapping import MapperThread
 from dpm2_ros.subscriptions import STEADY, Inputs
 from dpm2_ros.synchronizer import CameraState, Verdict
@@ -88,9 +89,16 @@ class Diagnostics:
     """Publishes the state of odometry, camera and mapper."""
 
     def __init__(
-        self, node: Node, inputs: Inputs, frames: FrameBuilder, health: Health, mapper: MapperThread | None
+        self,
+        node: Node,
+        inputs: Inputs,
+        frames: FrameBuilder,
+        health: Health,
+        mapper: MapperThread | None,
+        sender: KeyframeSender,
     ) -> None:
-        self._node, self._inputs, self._frames, self._health, self._mapper = node, inputs, frames, health, mapper
+        self._node, self._inputs, self._frames, self._health = node, inputs, frames, health
+        self._mapper, self._sender = mapper, sender
         self.frame_problem = ""
         """Set while the pose is not that of the frame that was asked for."""
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
@@ -100,9 +108,14 @@ class Diagnostics:
         """Send it now."""
         status = [self._odometry()]
         status += [self._camera(camera) for camera in self._inputs.synchronizer.cameras]
-        if self._mapper is not None and self._mapper.localising:
+        if self._mapper is None:
+            delivered, made = self._sender.delivered
+            text = f"{delivered} of {made} keyframes have arrived at the mapper"
+            level = WARN if made - delivered > BEHIND else OK
+            status.append(self._status("mapper", level, text, {"keyframes": made, "delivered": delivered}))
+        elif self._mapper.localising:
             status.append(self._localisation(self._mapper))
-        elif self._mapper is not None:
+        else:
             accepted, tried = self._mapper.loops
             figures = {"keyframes": self._mapper.keyframes, "loops accepted": accepted, "loops tried": tried}
             level, text = OK, f"{self._mapper.keyframes} keyframes, {accepted} loops"

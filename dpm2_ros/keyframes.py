@@ -34,6 +34,8 @@ WIRE = QoSProfile(depth=64, reliability=ReliabilityPolicy.RELIABLE)
 """Of keyframes; what falls out of the queue is sent again."""
 BUDGET = 99_000
 """Bytes of a keyframe's cloud and descriptors on the wire; its pose and the protocol's own have the rest of 100 kB."""
+BEHIND = 10
+"""Keyframes that the mapper may lack before /diagnostics warns; a few are always on their way."""
 
 _TICK, _PATIENCE, _ANNOUNCE, _BURST = 0.25, 1.5, 2.0, 8  # s; s until sent again; s; keyframes a tick
 
@@ -54,10 +56,10 @@ class KeyframeSender:
             node.create_timer(_TICK, self._repeat, clock=STEADY)
 
     @property
-    def missing(self) -> int:
-        """Keyframes that the mapper has not said it has."""
+    def delivered(self) -> tuple[int, int]:
+        """Keyframes that the mapper has said it has, and all."""
         with self._lock:
-            return len(self._kept) - self._below - len(self._above)
+            return self._below + len(self._above), len(self._kept)
 
     def restart(self) -> None:
         """A new drive begins: a session of its own."""

@@ -55,9 +55,9 @@ class SlamNode(Node):
         self._frames = FrameBuilder(reading, self._inputs, self.get_logger().error)
         self._mapper = MapperThread(self, self._config, self._robot) if ros.embed_mapper else None
         self._health = Health()
-        self._diagnostics = Diagnostics(self, self._inputs, self._frames, self._health, self._mapper)
-        self._odom = self.create_publisher(Odometry, "dpm2/odom", 10)
         self._sender = KeyframeSender(self, self._robot, ros.odom_frame, keep=not ros.embed_mapper)
+        self._diagnostics = Diagnostics(self, self._inputs, self._frames, self._health, self._mapper, self._sender)
+        self._odom = self.create_publisher(Odometry, "dpm2/odom", 10)
         self._described = make_loops(self._config.slam).described
         self._line = ThreadPoolExecutor(1, thread_name_prefix="keyframes")  # idle with the mapper, which has its own
         self._tf = TransformBroadcaster(self, ros.odom_frame, ros.publish_tf_odom)

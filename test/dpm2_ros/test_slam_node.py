@@ -16,6 +16,7 @@ from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMsg
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from std_msgs.msg import UInt32MultiArray
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
@@ -24,6 +25,7 @@ from dpm2_core.data.topics import CAMERA_INFO, IMAGE, POINTS
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.geometry import se3
 from dpm2_ros.conversions import cloud_to_msg, stamp_to_msg, transform_to_msg
+from dpm2_ros.keyframes import received_to_msg
 from dpm2_ros.slam_node import SlamNode
 from dpm2_ros.tf import TFMessage
 
@@ -273,6 +275,18 @@ def test_images_that_nothing_looks_at_are_not_received(rig: Callable[..., Rig]) 
     r = rig("input.images:=true", "slam.visual.enabled:=false")
     assert r.node.count_subscribers(IMAGE) == 0
     r.send_and_wait(0)
+
+
+def test_keyframes_that_no_mapper_has_received_are_counted(rig: Callable[..., Rig], drive: Any) -> None:
+    """Without a mapper that answers all are missing, a warning; once one says it has some, they are not."""
+    r = rig("ros.embed_mapper:=false", "slam.keyframes.distance:=0.5")
+    received = r.harness.publisher(UInt32MultiArray, "/dpm2/keyframes_received")
+    r.send_and_wait(*range(drive.frames))
+    r.wait(lambda: r.status("mapper").message.startswith(f"0 of {drive.frames} keyframes"), "the count")
+    assert r.status("mapper").level == DiagnosticStatus.WARN
+    received.publish(received_to_msg(r.node._sender.session, 5, [7]))
+    r.wait(lambda: r.status("mapper").message.startswith(f"6 of {drive.frames} keyframes"), "the answer to count")
+    assert r.status("mapper").level == DiagnosticStatus.OK
 
 
 def record_frames(r: Rig) -> list[Any]:
