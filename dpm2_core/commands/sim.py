@@ -23,6 +23,9 @@ def sim(
     ] = "loop",
     preset: Annotated[PresetName, typer.Option(help="city, suburb, rural, highway or tunnel.")] = "city",
     images: Annotated[bool, typer.Option("--images/--no-images", help="With image_2.")] = True,
+    traffic: Annotated[
+        float, typer.Option(help="Times the preset's; above 1 in columns on every lane, 20 is full.")
+    ] = 1.0,
     beams: Annotated[int, typer.Option(help="Of the LiDAR: 16, 32, 64 or 128.")] = 64,
     height: Annotated[float, typer.Option(help="Of the LiDAR above the ground, m.")] = 1.73,
     reach: Annotated[float, typer.Option("--range", help="Of the LiDAR, m.")] = 80.0,
@@ -38,6 +41,6 @@ def sim(
         task = bar.add_task(f"{preset} -> {out}", total=None)
         made = simulate(
             out, frames, seed, road, preset, images, lidar, workers=workers,
-            progress=lambda done, total: bar.update(task, completed=done, total=total),
+            progress=lambda done, total: bar.update(task, completed=done, total=total), traffic=traffic,
         )  # fmt: skip
     console.print(f"{out}: {'written' if made else 'is there already'}", highlight=False, markup=False)

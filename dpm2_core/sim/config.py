@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from dpm2_core.config import Settings
+from dpm2_core.errors import UsageError
 
 PresetName = Literal["city", "suburb", "rural", "highway", "tunnel"]
 PRESET_NAMES: tuple[PresetName, ...] = ("city", "suburb", "rural", "highway", "tunnel")
@@ -89,6 +90,8 @@ class Preset(Settings):
     """Walking or cycling, per 100 m."""
     traffic: float = 0.0
     """Moving cars per 100 m."""
+    columns: bool = False
+    """Two lanes each way, and bumper to bumper on them as `traffic` says; else single cars on one or two."""
     speed: float = 10.0
     """Of the drive on a straight, m/s."""
     hills: float = 1.0
@@ -137,3 +140,20 @@ def varied(preset: Preset, rng: np.random.Generator) -> Preset:
     own["lane"] = float(np.clip(half_width - (3.0 if preset.parked else 1.7), 0.3, 1.8))
     own["setback"] = max(preset.setback * rng.uniform(0.5, 1.5), sidewalk + 0.5)
     return preset.model_copy(update=own)
+
+
+def with_traffic(own: Preset, nominal: Preset, factor: float) -> Preset:
+    """A world's own preset with `factor` times the traffic: 0 for none, of 20 on every lane is full.
+
+    Above 1 the cars drive in columns, ahead, behind, alongside and oncoming, on a road that is wide enough for them,
+    and as many of them in each world: then the world is not the one of factor 1.
+
+    Raises:
+        UsageError: a factor that cannot be.
+    """
+    if not 0 <= factor <= 1000:
+        raise UsageError(f"--traffic {factor:g}: want 0 to 1000 times the preset's")
+    if factor <= 1:
+        return own.model_copy(update={"traffic": own.traffic * factor, "people": own.people * factor})
+    wide = {} if own.half_width > 10 else {"lane": 1.8, "half_width": 9.4 if own.parked else 7.2}
+    return own.model_copy(update={"traffic": nominal.traffic * factor, "columns": True, **wide})

@@ -46,13 +46,15 @@ def simulate(
     camera: CameraConfig | None = None,
     workers: int = 2,
     progress: Callable[[int, int], None] = lambda done, total: None,
+    traffic: float = 1.0,
 ) -> bool:
     """Write a drive to `out`, which appears when it is complete and not before.
 
     Args:
         out: root of the KITTI layout: sequences/00/{velodyne,image_2,labels,static,...}, poses/00.txt.
         frames: at 10 Hz; None for 150, or all of a file of poses. The result does not depend on `workers`.
-        road, preset, seed: see `build_world`. The lap of a closed road is chosen so that the drive ends where it began.
+        road, preset, seed, traffic: see `build_world`. The lap of a closed road is chosen so that the drive ends where
+            it began.
         progress: called with frames done and frames in all.
 
     Returns:
@@ -64,9 +66,12 @@ def simulate(
     lidar, camera = lidar or LidarConfig(), camera or CameraConfig()
     frames = _frames(road, frames)
     recipe = _recipe(frames, seed, road, preset, images, lidar, camera)
+    if traffic != 1:
+        recipe["traffic"] = traffic
     if _is_there(out, recipe):
         return False
-    world = build_world(road, preset, seed, fitting_length(road, preset, seed, frames) if road in ROAD_KINDS else 400.0)
+    length = fitting_length(road, preset, seed, frames, traffic) if road in ROAD_KINDS else 400.0
+    world = build_world(road, preset, seed, length, traffic)
     drive = _Drive(world, Lidar(lidar), camera if images else None, frames)
     with _whole(out) as part:
         drive.write(part, recipe, workers, progress)
@@ -84,9 +89,9 @@ def _frames(road: str, frames: int | None) -> int:
     return known if frames is None else frames
 
 
-def fitting_length(road: str, preset: PresetName, seed: int, frames: int) -> float:
+def fitting_length(road: str, preset: PresetName, seed: int, frames: int, traffic: float = 1.0) -> float:
     """Of the road, m, that a drive of so many frames just fills."""
-    kind = own_preset(preset, seed)
+    kind = own_preset(preset, seed, traffic)
     end = (frames - 1) * FRAME_PERIOD
     length = float(np.clip(end * kind.speed, 60, 20000))
     for _ in range(12):  # how far it goes depends on the curves, and these on the length
@@ -128,6 +133,7 @@ def _is_there(out: Path, recipe: dict[str, Any]) -> bool:
         raise UsageError(f"{out}: is there already and is no simulated drive; choose another folder") from None
     if found != recipe:
         differ = [key for key in recipe if not isinstance(found, dict) or found.get(key) != recipe[key]]
+        differ += [key for key in found if key not in recipe] if isinstance(found, dict) else []
         raise UsageError(
             f"{out}: holds a drive with other {', '.join(differ) or 'settings'}; remove it or choose another"
         )

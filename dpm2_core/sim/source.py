@@ -35,15 +35,16 @@ class SimulatedDrive:
         lidar: LidarConfig | None = None,
         workers: int = 1,
         name: str = "",
+        traffic: float = 1.0,
     ) -> None:
-        """`road`, `preset` and `seed` as in `build_world`, `name` what reports call it.
+        """`road`, `preset`, `seed` and `traffic` as in `build_world`, `name` what reports call it.
 
         Raises:
             UsageError: no such road or preset.
         """
         self.name = name or f"{road} {preset} {seed}"
         self.notes: list[str] = []
-        self.world = build_world(road, preset, seed)
+        self.world = build_world(road, preset, seed, traffic=traffic)
         self.times = self.world.road.times
         self._lidar = Lidar(lidar or LidarConfig())
         self._workers = workers

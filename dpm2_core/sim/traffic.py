@@ -20,6 +20,8 @@ SIGHT = 110.0
 """Movers farther from the sensor are left out, m."""
 GAP = 6.5
 """Movers nearer to the sensor are left out, m: a drive that leaves its lane must not find itself inside a car."""
+ALONGSIDE = 2.4
+"""The same for the columns of dense traffic, which keep to lanes 3.5 m apart, m."""
 
 
 @dataclass(eq=False)
@@ -28,7 +30,8 @@ class Traffic:
 
     Attributes:
         models: one mesh each. start, speed, lateral: (M,) m, m/s and m to the left of the drive; a negative speed is
-            against it. follows: (M,) keeps its distance ahead of the car instead. phase: (M,) of its small variations.
+            against it. follows: (M,) it is `start` ahead of the car instead, and `speed` is relative to the car's.
+            phase: (M,) of its small variations. gap: m, (M,) or for all; nearer to the sensor it is left out.
     """
 
     road: Road
@@ -39,15 +42,16 @@ class Traffic:
     lateral: Array
     follows: NDArray[np.bool_]
     phase: Array
+    gap: Array | float = GAP
 
     def poses(self, time: float) -> tuple[Array, Array]:
         """Places (M, 2) and headings (M,) at a time, s."""
         drive = self.road.drive
         own = float(self.road.distance(time))
-        s = self.start + np.where(self.follows, own + 2.0 * np.sin(0.3 * time + self.phase), self.speed * time)
+        s = self.start + self.speed * time + np.where(self.follows, own + 2.0 * np.sin(0.3 * time + self.phase), 0.0)
         s = np.mod(s, drive.length)
         xy, yaw = drive.at(s, self.lateral)
-        return xy, yaw + np.where(self.speed < 0, np.pi, 0.0)
+        return xy, yaw + np.where((self.speed < 0) & ~self.follows, np.pi, 0.0)
 
     def movers(self, time: float, around: ArrayLike) -> Movers | None:
         """What is in sight of a place (2 or 3,) at a time, s; None if nothing is."""
@@ -55,7 +59,7 @@ class Traffic:
             return None
         xy, yaw = self.poses(time)
         away = np.linalg.norm(xy - np.asarray(around)[:2], axis=1)
-        seen = np.flatnonzero((away < SIGHT) & (away > GAP))
+        seen = np.flatnonzero((away < SIGHT) & (away > self.gap))
         if not len(seen):
             return None
         poses = pose(xy[seen], self.terrain.surface_at(xy[seen]), yaw[seen])
@@ -98,6 +102,9 @@ def _towards(mesh: Mesh, origin: Float, directions: Float) -> NDArray[np.intp]:
 
 def make_traffic(road: Road, terrain: Terrain, preset: Preset, rng: np.random.Generator) -> Traffic:
     """As many movers as the preset has on that length."""
+    if preset.columns:
+        walking = make_traffic(road, terrain, preset.model_copy(update={"traffic": 0.0, "columns": False}), rng)
+        return _with_columns(walking, preset, rng)
     length = road.drive.length
     n_cars = int(rng.poisson(preset.traffic * length / 100 * rng.uniform(0.3, 1.7)))
     n_people = int(rng.poisson(preset.people * length / 100 * rng.uniform(0.3, 1.7)))
@@ -124,7 +131,7 @@ def make_traffic(road: Road, terrain: Terrain, preset: Preset, rng: np.random.Ge
         np.concatenate([start, rng.uniform(0, length, n_people)]),
         np.concatenate(
             [
-                np.where(oncoming & ~follows, -pace, pace),
+                np.where(follows, 0.0, np.where(oncoming, -pace, pace)),
                 rng.choice([-1, 1], n_people) * rng.uniform(0.8, 1.9, n_people),
             ]
         ),
@@ -132,3 +139,51 @@ def make_traffic(road: Road, terrain: Terrain, preset: Preset, rng: np.random.Ge
         np.concatenate([follows, np.zeros(n_people, bool)]),
         rng.uniform(0, 6.3, n_cars + n_people),
     )
+
+
+def _with_columns(others: Traffic, preset: Preset, rng: np.random.Generator) -> Traffic:
+    """The same and columns on two lanes each way: ahead and behind, alongside at nearly the car's speed, oncoming."""
+    length, lane = others.road.drive.length, 3.5
+    library = [car(rng) for _ in range(12)] + [truck(rng) for _ in range(8)]
+    lengths = np.array([np.ptp(mesh.vertices[:, 0]) for mesh in library])
+    across = 2 * preset.lane
+    beside, oncoming = (lane, (across, across - lane)) if preset.half_width > 10 else (-lane, (across, across + lane))
+    parts = []
+    for lane_at, trucks in ((0.0, 0.4), (beside, 0.7), (oncoming[0], 0.4), (oncoming[1], 0.4)):
+        kind, at = _queue(lengths, trucks, 400 / preset.traffic, length, rng)
+        same_way = lane_at in (0.0, beside)
+        pace = rng.uniform(-1.5, 1.5) if same_way else -preset.speed * rng.uniform(0.7, 1.0)
+        if lane_at == 0:  # room for the car itself, and for those ahead and behind to come 2 m nearer
+            pace = 0.0
+            at = np.remainder(at + length / 2, length) - length / 2
+            apart = np.abs(at) > 9 + lengths[kind] / 2
+            kind, at = kind[apart], at[apart]
+        parts.append((kind, at, *(np.full(len(at), value) for value in (pace, lane_at, same_way))))
+    kind, at, speed, lateral, follows = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return Traffic(
+        others.road,
+        others.terrain,
+        [library[k] for k in kind] + others.models,
+        np.concatenate([at, others.start]),
+        np.concatenate([speed, others.speed]),
+        np.concatenate([lateral, others.lateral]),
+        np.concatenate([follows, others.follows]).astype(bool),
+        np.concatenate([rng.uniform(0, 6.3, len(at)), others.phase]),
+        np.concatenate([np.full(len(at), ALONGSIDE), np.full(len(others.start), GAP)]),
+    )
+
+
+def _queue(
+    lengths: Array, trucks: float, spacing: float, road: float, rng: np.random.Generator
+) -> tuple[NDArray[np.intp], Array]:
+    """Which of 12 cars and then trucks with those `lengths`, and where (K,) m, on a lane of `road` m.
+
+    `trucks` is their share; from one middle to the next it is `spacing` m on average, and never so close that they
+    touch when both are 2 m off their places.
+    """
+    n = int(road / 5) + 1  # more than fit
+    kind = np.where(rng.random(n) < trucks, rng.integers(12, len(lengths), n), rng.integers(0, 12, n))
+    slack = max(spacing - 5 - lengths[kind].mean(), 1.0)
+    ends = np.cumsum(lengths[kind] + 5 + rng.exponential(slack, n))
+    keep = ends < road
+    return kind[keep], (ends - lengths[kind] / 2)[keep]

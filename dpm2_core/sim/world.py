@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from dpm2_core.errors import UsageError
 from dpm2_core.geometry import se3
 from dpm2_core.sim import sections
-from dpm2_core.sim.config import PRESET_NAMES, PRESETS, Preset, PresetName, varied
+from dpm2_core.sim.config import PRESET_NAMES, PRESETS, Preset, PresetName, varied, with_traffic
 from dpm2_core.sim.layout import Layout
 from dpm2_core.sim.light import Light
 from dpm2_core.sim.mesh import Mesh, Scene, merge
@@ -94,20 +94,23 @@ class World:
         return self.traffic.movers(time, around)
 
 
-def build_world(road: str = "random", preset: PresetName = "city", seed: int = 0, length: float = 400.0) -> World:
+def build_world(
+    road: str = "random", preset: PresetName = "city", seed: int = 0, length: float = 400.0, traffic: float = 1.0
+) -> World:
     """A world, the same for the same arguments.
 
     Args:
         road: straight, loop, figure8, random, or a file of KITTI poses.
         preset: city, suburb, rural, highway or tunnel.
         length: of the road (a lap, where it is closed), m; a file has its own.
+        traffic: times that of the preset; see `with_traffic`.
 
     Raises:
-        UsageError: no such road or preset, or a length or seed that cannot be.
+        UsageError: no such road or preset, or a length, seed or traffic that cannot be.
     """
     if not 60 <= length <= 20000:
         raise UsageError(f"length {length:g} m of road: want 60 to 20000")
-    kind = own_preset(preset, seed)
+    kind = own_preset(preset, seed, traffic)
     rngs = [random_stream(seed, preset, k) for k in range(4)]
     streets = make_road(road, kind, rngs[0], length)
     terrain = Terrain(streets, kind, rngs[1])
@@ -118,21 +121,22 @@ def build_world(road: str = "random", preset: PresetName = "city", seed: int = 0
         meshes += sections.clear(sections.tunnel(streets, terrain, rngs[2]), streets, terrain)
     else:
         meshes += Layout(streets, terrain, kind, rngs[2]).meshes()
-    traffic = make_traffic(streets, terrain, kind, rngs[3])
-    return World(preset, seed, streets, terrain, traffic, Scene(merge(meshes)), Light(seed, preset == "tunnel"))
+    moving = make_traffic(streets, terrain, kind, rngs[3])
+    return World(preset, seed, streets, terrain, moving, Scene(merge(meshes)), Light(seed, preset == "tunnel"))
 
 
-def own_preset(preset: PresetName, seed: int) -> Preset:
-    """The preset as the world of a seed has it.
+def own_preset(preset: PresetName, seed: int, traffic: float = 1.0) -> Preset:
+    """The preset as the world of a seed has it, with that many times its traffic.
 
     Raises:
-        UsageError: no such preset, or a negative seed.
+        UsageError: no such preset, or a seed or traffic that cannot be.
     """
     if preset not in PRESETS:
         raise UsageError(f"--preset {preset}: want one of {', '.join(PRESET_NAMES)}")
     if seed < 0:
         raise UsageError(f"--seed {seed}: want 0 or more")
-    return varied(PRESETS[preset], random_stream(seed, preset, 4))
+    own = varied(PRESETS[preset], random_stream(seed, preset, 4))
+    return with_traffic(own, PRESETS[preset], traffic)
 
 
 def random_stream(seed: int, preset: PresetName, part: int) -> np.random.Generator:
