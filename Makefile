@@ -43,7 +43,7 @@ bench: setup  ## the figures of benchmarks/, beside KISS-ICP
 bench-ros: setup  ## the KITTI excerpt through bag, player and slam_node at 10 Hz
 	$(BIN)/python -m dpm2_ros.bench $(ARGS)
 
-bench-robots: setup  ## three robots and one mapper_node that is halted for 30 s: what is in the map, and where
+bench-robots: setup  ## three robots and one mapper_node behind a link that loses packets and is cut for 30 s (root, nftables)
 	$(BIN)/python -m dpm2_ros.bench_robots $(ARGS)
 
 bench-memory: setup  ## resident memory over a synthetic drive of 2,000 frames (8 GB on disk)

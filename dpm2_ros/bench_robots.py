@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`make bench-robots`: three slam_nodes on overlapping parts of a street, and one mapper_node, halted for 30 s.
+"""`make bench-robots`: three slam_nodes on overlapping parts of a real road, and one mapper_node behind a bad network.
 
-Halted by SIGSTOP: nobody acknowledges anything, and all queues run full. Single packets are not dropped: between
-processes of one machine DDS uses shared memory.
+The mapper has a network of its own, joined to the robots' by one link that loses packets and is gone for 30 s
+(`bench_network`). The robots drive at the same time, along KITTI's sequence 07 in the synthetic city.
 """
 
 from __future__ import annotations
 
 import os
-import signal
 import subprocess
 import sys
 import tempfile
@@ -26,32 +25,34 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from dpm2_core.config import load_settings
-from dpm2_core.data.source import InputSettings, Source, open_source
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.evaluation.bench.harness import write_record
+from dpm2_core.evaluation.bench.harness import Options, write_record
+from dpm2_core.evaluation.bench.roads import open_road, road_files
 from dpm2_core.evaluation.metrics import align, ape_rmse
 from dpm2_core.frame import Array
-from dpm2_core.sim.config import LidarConfig
-from dpm2_core.sim.drive import simulate
+from dpm2_core.sim.source import SimulatedDrive
 from dpm2_core.slam.map.data import MapData, load_map
 from dpm2_core.slam.map.store import MapStore
 from dpm2_core.slam.system import Config, SlamSystem
+from dpm2_ros.bench_network import LOSS, Link, inside
 from dpm2_ros.conversions import cloud_to_msg, parse_keyframe_name
 from dpm2_ros.replay import ros_environment, start, stop
 from dpm2_ros.runtime import exit_code
 
-SPANS = {"red": (0, 60), "blue": (30, 90), "green": (60, 120)}
-"""Frames of each robot; they drive at the same time."""
-OUTAGE = (10, 40)
-"""Of the mapper, s after the robots set off; they take a scan a second, so that this is half of their drive."""
-SETTINGS = ("slam.keyframes.distance=2.0",)
+ROAD = "07"
+SPANS = {"red": (0, 420), "blue": (340, 760), "green": (680, 1100)}
+"""Frames of each robot; green ends where red began."""
+EVERY = 2
+"""Frames from one scan of a robot to the next, which is sent a second later: all four nodes share a machine."""
+OUTAGE = (60, 90)
+"""Of the link, s after the robots set off."""
 _START, _PERIOD = 1_000_000_000, 100_000_000  # ns: stamps; the scans were taken at 10 Hz
 
 
 class _Scans:
     """Publishes the scans of all robots; notes the keyframes that they make."""
 
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: SimulatedDrive) -> None:
         import rclpy
         from nav_msgs.msg import Odometry
         from rclpy.executors import SingleThreadedExecutor
@@ -82,8 +83,8 @@ class _Scans:
     def send(self, tick: int) -> None:
         """The next scan of each robot."""
         for name, (first, _) in SPANS.items():
-            n = first + tick
-            points = next(iter(self._source.frames(n, n + 1))).points
+            n = first + EVERY * tick
+            points = self._source.frame(n).points
             self._lidars[name].publish(cloud_to_msg(points, _START + n * _PERIOD, f"{name}/lidar"))
 
     def spin(self, seconds: float) -> None:
@@ -100,54 +101,64 @@ class _Scans:
         rclpy.try_shutdown()
 
 
-def bench(out: Annotated[Path, typer.Option(help="Folder for robots.json.")] = Path("benchmarks")) -> int:
-    """All keyframes in one map, and each robot's trajectory in it beside that of the robot alone."""
+def bench(
+    out: Annotated[Path, typer.Option(help="Folder for robots.json.")] = Path("benchmarks"),
+    kitti: Annotated[Path | None, typer.Option(help="Folder of the KITTI excerpt; by default as `dpm2 bench`.")] = None,
+) -> int:
+    """All keyframes in one map, and its error beside that of one robot that drives all of the road alone."""
+    path = next(path for path in road_files(Options(kitti=kitti)) if path.stem == ROAD)
+    source = open_road(path)
     with tempfile.TemporaryDirectory(prefix="dpm2_bench_robots_") as folder:
-        root = Path(folder)
-        simulate(root / "sim", 120, seed=2, road="straight", preset="suburb", images=False, lidar=LidarConfig())
-        source = open_source(root / "sim", InputSettings(images=False))
-        data, made, missed = _drive(source, root)
-        robots = {name: _judge(source, data, name, made[name]) for name in SPANS}
+        data, made, missed = _drive(source, Path(folder))
     edges = np.array([(edge.from_node, edge.to_node) for edge in data.constraints]).T
     maps, _ = connected_components(coo_array((np.ones(edges.shape[1]), edges), shape=(len(data), len(data))))
+    errors, alone = _errors(source, data), _alone(source)
+    robots = {name: _judge(data, name, made[name], errors) for name in SPANS}
     results = {
-        "outage": {"seconds": OUTAGE[1] - OUTAGE[0], "keyframes_made_meanwhile": missed, "packet_loss": "not applied"},
+        "road": ROAD,
+        "packet_loss": LOSS,
+        "outage": {"seconds": OUTAGE[1] - OUTAGE[0], "keyframes_made_meanwhile": missed},
         "maps": int(maps),
         "loops_between_robots": sum(data.keyframes[a].robot != data.keyframes[b].robot for a, b in edges.T),
+        "ape_rmse_m": _rms(errors),
+        "single_robot_ape_rmse_m": alone,
         "robots": robots,
     }
     write_record(out / "robots.json", "robots", results, "python -m dpm2_ros.bench_robots")
     columns = list(next(iter(robots.values())))
-    table = Table("robot", *columns, title=f"{maps} map, mapper halted for {OUTAGE[1] - OUTAGE[0]} s", box=SIMPLE)
+    title = f"{maps} map, APE {_rms(errors):.3f} m; of one robot alone {alone:.3f} m"
+    table = Table("robot", *columns, title=title, box=SIMPLE)
     for name, row in robots.items():
         table.add_row(name, *(f"{row[column]:.4g}" for column in columns))
     Console().print(table)
     return 1 if maps > 1 or any(row["keyframes_missing"] for row in robots.values()) else 0
 
 
-def _drive(source: Source, root: Path) -> tuple[MapData, dict[str, set[int]], int]:
+def _drive(source: SimulatedDrive, root: Path) -> tuple[MapData, dict[str, set[int]], int]:
     """The map of all robots, the ids of the keyframes that each made, and how many of them during the outage.
 
     Raises:
         Dpm2Error: they did not start, or the map did not get all keyframes.
     """
-    environment, path = ros_environment(), root / "town.dpm2map"
+    environment, path = ros_environment() | {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}, root / "town.dpm2map"
     processes: list[subprocess.Popen[bytes]] = []
     scans: _Scans | None = None
     try:
         os.environ.update(environment)  # rclpy in this process reads it when it starts
+        link = Link()
+        parameters = ["--ros-args", "-p", "ros.map_directory:=''", "-p", f"ros.map_file:={path}"]
+        mapper = link.start_mapper(parameters, environment, root / "mapper.log")
+        processes.append(mapper)
         scans = _Scans(source)
         for name in SPANS:
             processes.append(start("slam_node", _arguments(name), environment, root / f"{name}.log"))
-        parameters = ["--ros-args", "-p", "ros.map_directory:=''", "-p", f"ros.map_file:={path}"]
-        mapper = start("mapper_node", parameters, environment, root / "mapper.log")
-        processes.append(mapper)
         _wait(scans, scans.connected, "robots and mapper to start")
         count = [0, 0]
-        for tick in track(range(60), "driving"):
+        first, end = SPANS["red"]
+        for tick in track(range((end - first) // EVERY), "driving"):
             if tick in OUTAGE:
                 count[OUTAGE.index(tick)] = sum(map(len, scans.made.values()))
-                mapper.send_signal(signal.SIGSTOP if tick == OUTAGE[0] else signal.SIGCONT)
+                link.set(up=tick != OUTAGE[0])
             scans.send(tick)
             scans.spin(1.0)
         scans.spin(2.0)
@@ -165,7 +176,7 @@ def _drive(source: Source, root: Path) -> tuple[MapData, dict[str, set[int]], in
 
 def _arguments(name: str) -> list[str]:
     given = ["input.points_topic:=points", "input.images:=false", "ros.embed_mapper:=false",
-             f"ros.odom_frame:={name}/odom", *(s.replace("=", ":=") for s in SETTINGS)]  # fmt: skip
+             f"ros.odom_frame:={name}/odom"]  # fmt: skip
     return ["--ros-args", "-r", f"__ns:=/{name}", *(part for pair in given for part in ("-p", pair))]
 
 
@@ -182,35 +193,38 @@ def _read(path: Path) -> MapData:
         return load_map(store, descriptors=False)
 
 
-def _judge(source: Source, data: MapData, name: str, made: set[int]) -> dict[str, float]:
-    """Position errors of a robot's keyframes: in the common map, aligned as a whole, and of the robot alone (m)."""
-    truth = source.poses
-    assert truth is not None
+def _errors(source: SimulatedDrive, data: MapData) -> Array:
+    """How far the keyframes (K, 3) of the map, aligned as a whole, are from where they were made, m."""
     frames = np.array([(keyframe.stamp - _START) // _PERIOD for keyframe in data.keyframes])
+    truth = source.poses[frames]
+    T_world_map = align(data.poses[:, :3, 3], truth[:, :3, 3])
+    return np.asarray((T_world_map @ data.poses - truth)[:, :3, 3])
+
+
+def _rms(errors: Array) -> float:
+    return float(np.sqrt((errors**2).sum(1).mean()))
+
+
+def _judge(data: MapData, name: str, made: set[int], errors: Array) -> dict[str, float]:
     own = np.array([keyframe.robot == name for keyframe in data.keyframes])
-    T_world_map = align(data.poses[:, :3, 3], truth[frames][:, :3, 3])
-    errors = (T_world_map @ data.poses[own] - truth[frames[own]])[:, :3, 3]
     ids = {keyframe.id for keyframe in data.keyframes if keyframe.robot == name}
-    return {
-        "keyframes": len(made),
-        "keyframes_missing": len(made - ids),
-        "ape_rmse_m": float(np.sqrt((errors**2).sum(1).mean())),
-        "alone_ape_rmse_m": _alone(source, truth, *SPANS[name]),
-    }
+    return {"keyframes": len(made), "keyframes_missing": len(made - ids), "ape_rmse_m": _rms(errors[own])}
 
 
-def _alone(source: Source, truth: Array, first: int, end: int) -> float:
-    """APE of the keyframes of the same drive in one process, without ROS and without the others, m."""
-    system = SlamSystem(load_settings(Config, None, SETTINGS).slam)
-    for frame in source.frames(first, end):
-        system.process(frame)
+def _alone(source: SimulatedDrive) -> float:
+    """APE of the keyframes of one robot that drives all of the road in one process, without ROS, m."""
+    system = SlamSystem(load_settings(Config).slam)
+    for n in range(0, SPANS["green"][1], EVERY):
+        system.process(source.frame(n))
     system.mapper.finish()
     frames = [keyframe.index for keyframe in system.mapper.keyframes]
-    return ape_rmse(truth[frames], system.mapper.poses)
+    return ape_rmse(source.poses[frames], system.mapper.poses)
 
 
 def main() -> int:
     """Entry point of `python -m dpm2_ros.bench_robots`."""
+    if not inside():
+        return Link.own_network("dpm2_ros.bench_robots")
     app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
     app.command()(bench)
     return exit_code(lambda: app(standalone_mode=False))
