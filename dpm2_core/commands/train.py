@@ -82,7 +82,7 @@ def image(
     """The image branch alone, before phase one with pictures."""
     from dpm2_core.training.phase_image import PhaseImageSettings, phase_image
 
-    _refuse_overwriting(out, resume)
+    refuse_overwriting(out, resume)
     phase_image(load_settings(PhaseImageSettings, config, settings or []), out, resume)
 
 
@@ -96,7 +96,7 @@ def phase1(
     """Registration: encoder, decoder, similarity and offset heads."""
     from dpm2_core.training.phase_one import PhaseOneSettings, phase_one
 
-    _refuse_overwriting(out, resume)
+    refuse_overwriting(out, resume)
     phase_one(load_settings(PhaseOneSettings, config, settings or []), out, resume)
 
 
@@ -110,7 +110,7 @@ def phase2(
     """Overlap head alone, on the network of phase one."""
     from dpm2_core.training.phase_two import PhaseTwoSettings, phase_two
 
-    _refuse_overwriting(out, resume)
+    refuse_overwriting(out, resume)
     phase_two(load_settings(PhaseTwoSettings, config, settings or []), out, resume)
 
 
@@ -143,7 +143,8 @@ def ablation(
     Console().print(table, f"written to {report}")
 
 
-def _refuse_overwriting(out: Path, resume: bool) -> None:
+def refuse_overwriting(out: Path, resume: bool) -> None:
+    """Raise UsageError where a new training would replace another, or there is none to resume."""
     if (out / "checkpoint.pt").exists() and not resume:
         raise UsageError(f"{out}: holds a training; --resume continues it, another --out keeps it")
     if resume and not (out / "checkpoint.pt").exists():

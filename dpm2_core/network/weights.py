@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Mapping
 from pathlib import Path
 
 import torch
@@ -24,17 +25,27 @@ def fingerprint(settings: NetworkSettings) -> str:
 
 def save_weights(model: DeepPointMap2, path: Path, about: dict[str, str], half: bool = True) -> None:
     """Write all parameters with the network's settings; `half` stores fp16, half the size."""
-    state = {
-        name: (value.half() if half and value.is_floating_point() else value).contiguous().cpu()
-        for name, value in model.state_dict().items()
-    }
     metadata = {**about, "preset": model.settings.preset, "network": model.settings.model_dump_json()}
+    write_tensors(model.state_dict(), path, metadata, half)
+
+
+def write_tensors(state: Mapping[str, torch.Tensor], path: Path, metadata: dict[str, str], half: bool) -> None:
+    """Write tensors and what is to be known of them, whole or not at all; `half` stores fp16."""
+    stored = {
+        name: (value.half() if half and value.is_floating_point() else value).contiguous().cpu()
+        for name, value in state.items()
+    }
     part = path.with_suffix(".part")
-    save_file(state, part, metadata)
+    save_file(stored, part, metadata)
     part.replace(path)
 
 
-def _read(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
+def read_tensors(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
+    """Tensors of a safetensors file, and what was written about them.
+
+    Raises:
+        UsageError: missing file, or another format.
+    """
     try:
         with safe_open(path, "pt") as file:
             return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
@@ -50,7 +61,7 @@ def read_metadata(path: Path) -> dict[str, str]:
     Raises:
         UsageError: missing file, or another format.
     """
-    return _read(path)[1]
+    return read_tensors(path)[1]
 
 
 def load_weights(model: DeepPointMap2, path: Path) -> dict[str, str]:
@@ -59,7 +70,7 @@ def load_weights(model: DeepPointMap2, path: Path) -> dict[str, str]:
     Raises:
         UsageError: missing file, another format, weights of another preset or shape.
     """
-    state, metadata = _read(path)
+    state, metadata = read_tensors(path)
     stored = metadata.get("preset", "unknown")
     if stored != model.settings.preset:
         raise UsageError(f"{path}: weights of preset {stored}, the network is preset {model.settings.preset}")
@@ -79,7 +90,7 @@ def load_model(path: Path) -> DeepPointMap2:
     Raises:
         UsageError: as `load_weights`.
     """
-    _, metadata = _read(path)
+    _, metadata = read_tensors(path)
     if "network" not in metadata:
         raise UsageError(f"{path}: safetensors without a network description")
     model = DeepPointMap2(settings_from(NetworkSettings, json.loads(metadata["network"]), default=str(path)))

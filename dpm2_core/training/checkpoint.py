@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from pathlib import Path
 from typing import Any
@@ -67,8 +68,9 @@ class Log:
             self.board = None
 
     def write(self, step: int, figures: dict[str, float]) -> None:
-        """Log figures of a step."""
-        self.file.write(json.dumps({"step": step, **{k: round(v, 6) for k, v in figures.items()}}) + "\n")
+        """Log figures of a step; one that is not finite is null, which JSON has a word for."""
+        known = {k: round(v, 6) if math.isfinite(v) else None for k, v in figures.items()}
+        self.file.write(json.dumps({"step": step, **known}) + "\n")
         if self.board is not None:
             for name, value in figures.items():
                 self.board.add_scalar(name, value, step)

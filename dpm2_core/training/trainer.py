@@ -99,8 +99,10 @@ def parameter_groups(module: nn.Module, decay: float) -> list[dict[str, Any]]:
 
 @torch.no_grad()
 def update_ema(ema: nn.Module, module: nn.Module, decay: float, step: int) -> None:
-    """Averaged weights, with a shorter memory at the start."""
+    """Averaged weights, with a shorter memory at the start; buffers, such as running means, as they are."""
     decay = min(decay, (1 + step) / (10 + step))
+    for average, value in zip(ema.buffers(), module.buffers(), strict=True):
+        average.copy_(value)
     averaged: list[Tensor] = list(ema.parameters())
     now: list[Tensor] = list(module.parameters())
     torch._foreach_mul_(averaged, decay)
@@ -152,6 +154,7 @@ def train(
             for group in optimiser.param_groups:
                 group["lr"] = rate
             torch.manual_seed(settings.seed * 1_000_003 + step)
+            buffers = [value.clone() for value in module.buffers()]
             with torch.autocast(device.type, torch.bfloat16, enabled=settings.bf16):
                 value, figures = loss(wrapped, batch, step)
             optimiser.zero_grad(set_to_none=True)
@@ -160,6 +163,9 @@ def train(
             if norm.isfinite():
                 optimiser.step()
                 update_ema(ema, module, settings.ema, step)
+            else:  # nothing of such a step stays, running means included
+                for value, before in zip(module.buffers(), buffers, strict=True):
+                    value.data.copy_(before)
             seconds = time.perf_counter() - begin
             described = {name: float(v) for name, v in figures.items()}
             progress.update(task, advance=1, description=f"loss {described['loss']:.3f}")

@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`dpm2 train TASK` and `dpm2 eval-task`: the perception tasks of the differentiable SLAM paper."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from dpm2_core.commands.train import ConfigOption, OutOption, ResumeOption, SetOption, refuse_overwriting, train
+from dpm2_core.config import load_settings
+
+SourceArgument = Annotated[
+    Path,
+    typer.Argument(help="SemanticKITTI, a drive of `dpm2 sim`, a folder of such, or the pairs of DSLR."),
+]
+
+
+@train.command("tasks-data")
+def tasks_data(
+    out: Annotated[Path, typer.Argument(help="Folder to fill with train/NN and val/NN; what is there stays.")],
+    config: ConfigOption = None,
+    settings: SetOption = None,
+    workers: Annotated[int, typer.Option(min=1, help="Threads; they do not change the result.")] = 2,
+) -> None:
+    """Synthetic drives for gndnet, dslr and ae_lidar, with exact labels and twins without traffic."""
+    from dpm2_core.diffslam.tasks.drives import TaskDriveSettings, make_task_drives
+
+    chosen = load_settings(TaskDriveSettings, config, settings or [])
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True)) as bar:
+        task = bar.add_task(f"{out}")
+        make_task_drives(out, chosen, workers, lambda name, done, total: bar.update(
+            task, description=f"{out}/{name}", completed=done, total=total))  # fmt: skip
+
+
+def _add(name: str, help_: str) -> None:
+    """`dpm2 train NAME`, the same for every task."""
+
+    def run(
+        src: SourceArgument,
+        config: ConfigOption = None,
+        settings: SetOption = None,
+        out: OutOption = Path("out") / name,
+        resume: ResumeOption = False,
+        val: Annotated[Path | None, typer.Option(help="Scans to measure on during training, as SRC.")] = None,
+        slam_weight: Annotated[
+            float | None,
+            typer.Option(min=0, help="gamma: weight of the SLAM loss; 0 without. Same as slam.gamma."),
+        ] = None,
+        slam_every: Annotated[
+            int | None, typer.Option(min=1, help="The SLAM loss counts in every K-th epoch. Same as slam.every.")
+        ] = None,
+    ) -> None:
+        from dpm2_core.diffslam.tasks.data import open_scans  # torch is slow to import
+        from dpm2_core.diffslam.tasks.task import task_type
+        from dpm2_core.diffslam.tasks.training import WEIGHTS, train_task
+
+        refuse_overwriting(out, resume)
+        kind = task_type(name)
+        short = {"slam.gamma": slam_weight, "slam.every": slam_every}
+        overrides = [*(settings or []), *(f"{key}={value}" for key, value in short.items() if value is not None)]
+        chosen = load_settings(kind.training_type, config, overrides)
+        scans = open_scans(src, kind.needs)
+        train_task(name, chosen, scans, out, resume, None if val is None else open_scans(val, kind.needs))
+        typer.echo(f"{out / WEIGHTS}: written", err=True)
+
+    command: Callable[..., None] = run
+    command.__doc__ = help_
+    train.command(name)(command)
+
+
+_add("gndnet", "GndNet: the height of the ground around the sensor, from one scan.")
+
+
+def eval_task(
+    name: Annotated[str, typer.Argument(metavar="TASK", help="gndnet, dslr or ae_lidar.")],
+    weights: Annotated[Path, typer.Argument(help="What `dpm2 train TASK` wrote: weights.safetensors.")],
+    src: SourceArgument,
+    as_json: Annotated[bool, typer.Option("--json", help="Figures as JSON on stdout.")] = False,
+    picture: Annotated[Path | None, typer.Option(help="PNG of one scan to write.")] = None,
+    frame: Annotated[int, typer.Option(min=0, help="Scan of the picture, counted through all sequences.")] = 0,
+) -> None:
+    """Measure a trained task on scans that it has not learned from."""
+    from dpm2_core.diffslam.tasks.data import open_scans
+    from dpm2_core.diffslam.tasks.task import task_type
+    from dpm2_core.diffslam.tasks.training import draw, load_task, measure
+
+    needs = task_type(name).needs
+    task = load_task(name, weights)
+    scans = open_scans(src, needs)
+    if picture is not None:
+        draw(task, scans, frame, picture)
+        typer.echo(f"{picture}: written", err=True)
+    figures = measure(task, scans)
+    if as_json:
+        typer.echo(json.dumps({"task": name, "weights": str(weights), "scans": len(scans), **figures}))
+        return
+    table = Table("figure", "value", title=f"{name}, {len(scans)} scans of {src}")
+    for figure, value in figures.items():
+        table.add_row(figure, f"{value:.4g}")
+    Console().print(table)

@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Synthetic drives for the tasks: classes, twins without movers and poses are exact."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from pydantic import Field
+
+from dpm2_core.config import Settings
+from dpm2_core.sim.config import LidarConfig, PresetName
+
+
+class TaskDriveSettings(Settings):
+    """Worlds, each driven through once. Training and validation never share one."""
+
+    train: int = Field(default=8, ge=1)
+    """Drives to learn from."""
+    train_frames: int = Field(default=60, ge=2)
+    """Scans of each."""
+    val: int = Field(default=3, ge=1)
+    """Drives to be judged on."""
+    val_frames: int = Field(default=40, ge=2)
+    """Scans of each."""
+    first_seed: int = Field(default=7000, ge=0)
+    """Of the training worlds, counting up; those of validation begin 100,000 later."""
+    presets: tuple[PresetName, ...] = Field(default=("city", "suburb", "rural"), min_length=1)
+    """Kinds of places, in turn."""
+    lidar: LidarConfig = LidarConfig(columns=512)
+    """512 columns: the width of DSLR's range images."""
+
+
+def make_task_drives(
+    out: Path,
+    settings: TaskDriveSettings,
+    workers: int = 2,
+    progress: Callable[[str, int, int], None] = lambda name, done, total: None,
+) -> None:
+    """Write out/train/NN and out/val/NN, each in the layout of `dpm2 sim`; those that are there already stay.
+
+    Args:
+        progress: called with the name of a drive, its frames done and its frames in all.
+
+    Raises:
+        UsageError: a folder holds another drive. Dpm2Error: it could not be written.
+    """
+    from dpm2_core.sim.drive import simulate  # embree is slow to import
+
+    kinds = (("train", settings.train, settings.train_frames, 0), ("val", settings.val, settings.val_frames, 100_000))
+    for kind, drives, frames, offset in kinds:
+        for i in range(drives):
+            name, preset = f"{kind}/{i:02d}", settings.presets[i % len(settings.presets)]
+            simulate(
+                out / name, frames, settings.first_seed + offset + i, "random", preset, images=False,
+                lidar=settings.lidar, workers=workers, progress=partial(progress, name),
+            )  # fmt: skip

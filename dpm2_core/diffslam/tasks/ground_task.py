@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""GndNet as a task: the height of the ground from labelled scans, and from a SLAM on what stands above it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from pydantic import Field
+from scipy.ndimage import distance_transform_edt
+from torch import Tensor
+
+from dpm2_core.diffslam.tasks.data import TaskScan, TaskScans
+from dpm2_core.diffslam.tasks.gndnet import (
+    GroundNet,
+    GroundSettings,
+    elevation_labels,
+    ground_loss,
+    ground_metrics,
+    obstacle_weight,
+)
+from dpm2_core.diffslam.tasks.task import Task, TaskTraining
+from dpm2_core.diffslam.tasks.training import mean_figures
+from dpm2_core.diffslam.trajectory_loss import SlamLoss
+from dpm2_core.errors import UsageError
+
+GROUND = (40, 44, 48, 49, 60, 72)
+"""Road, parking, sidewalk, other ground, lane marking, terrain: SemanticKITTI's classes of the ground."""
+UNCOUNTED = (0, 1)
+"""Unlabelled, outlier."""
+
+
+class GroundTraining(TaskTraining):
+    """A training of GndNet."""
+
+    network: GroundSettings = GroundSettings()
+    """Grid, network and loss."""
+    tilt: float = Field(default=3.0, ge=0, lt=45)
+    """Each window is rolled and pitched by up to this, deg (the original: 10)."""
+
+
+class GroundTask(Task):
+    """Elevation of the ground; above it, the clouds of the SLAM loss."""
+
+    name = "gndnet"
+    training_type = GroundTraining
+    needs = ("labels",)
+    settings: GroundTraining
+
+    def __init__(self, settings: GroundTraining) -> None:
+        super().__init__(settings)
+        self.net = GroundNet(settings.network)
+        self.slam_loss = SlamLoss(settings.slam_loss)
+
+    def losses(self, window: list[TaskScan]) -> tuple[Tensor, Callable[[], Tensor]]:
+        """Loss of the elevation; SLAM on all points, weighted by how far they are above the predicted ground.
+
+        The reference sees the same points by their height above the true ground.
+        """
+        network = self.settings.network
+        turn = _tilt(math.radians(self.settings.tilt)).to(self.device)
+        clouds = [torch.cat([scan.points[:, :3] @ turn.T, scan.points[:, 3:]], 1) for scan in window]
+        pairs = [elevation_labels(c, ground_of(scan)[0], network) for c, scan in zip(clouds, window, strict=True)]
+        labels, known = torch.stack([label for label, _ in pairs]), torch.stack([known for _, known in pairs])
+        elevation = self.net(clouds)
+
+        def slam() -> Tensor:
+            xyz = [cloud[:, :3] for cloud in clouds]
+            truth = [filled(label, k) for label, k in zip(labels, known, strict=True)]
+            found = [obstacle_weight(c, e, network) for c, e in zip(xyz, elevation, strict=True)]
+            wanted = [obstacle_weight(c, e, network) for c, e in zip(xyz, truth, strict=True)]
+            return self.slam_loss(xyz, xyz, found, wanted)
+
+        return ground_loss(elevation, labels, known, network), slam
+
+    def evaluate(self, scans: TaskScans) -> dict[str, float]:
+        """Means over the scans of `ground_metrics`: mse (m2), miou, precision, recall."""
+        rows = []
+        for i in range(len(scans)):
+            scan = scans[i].to(self.device)
+            ground, counted = ground_of(scan)
+            elevation = self.net([scan.points])[0]
+            rows.append(ground_metrics(scan.points, ground, counted, elevation, self.settings.network))
+        return mean_figures(rows)
+
+    def picture(self, scan: TaskScan, path: Path) -> None:
+        """Predicted elevation beside the true one, both with what stands on it, seen from above."""
+        from dpm2_core.evaluation.task_figures import ground_png  # matplotlib is slow to import
+
+        labels, known = elevation_labels(scan.points, ground_of(scan)[0], self.settings.network)
+        truth = torch.where(known, labels, torch.nan)
+        ground_png(path, self.net([scan.points])[0], truth, scan.points, self.settings.network)
+
+
+def ground_of(scan: TaskScan) -> tuple[Tensor, Tensor]:
+    """Which points (N,) are of the ground, and which have a class at all (N,).
+
+    Raises:
+        UsageError: the scan has no labels.
+    """
+    if scan.labels is None:
+        raise UsageError(f"{scan.sequence}, scan {scan.number}: no labels; the ground is not known")
+    classes = scan.labels
+    return torch.isin(classes, classes.new_tensor(GROUND)), ~torch.isin(classes, classes.new_tensor(UNCOUNTED))
+
+
+def filled(elevation: Tensor, known: Tensor) -> Tensor:
+    """The elevation (cells, cells), where it is not known that of the nearest cell where it is; zero if none is."""
+    if not bool(known.any()):
+        return torch.zeros_like(elevation)
+    nearest = distance_transform_edt(~known.cpu().numpy(), return_distances=False, return_indices=True)
+    x, y = torch.from_numpy(nearest).long().to(elevation.device)
+    return elevation[x, y]
+
+
+def _tilt(largest: float) -> Tensor:
+    """Rotation (3, 3) by a random roll and pitch of up to `largest`, rad."""
+    roll, pitch = ((2 * torch.rand(2) - 1) * largest).tolist()
+    a, b, c, d = math.cos(roll), math.sin(roll), math.cos(pitch), math.sin(pitch)
+    return torch.tensor([[c, b * d, a * d], [0, a, -b], [-d, b * c, a * c]])

@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a task is: a network, its losses on a window of scans, and how it is judged."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import ClassVar
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+
+from dpm2_core.config import Settings
+from dpm2_core.diffslam.schedule import ScheduleSettings
+from dpm2_core.diffslam.tasks.data import Need, TaskScan, TaskScans
+from dpm2_core.diffslam.trajectory_loss import SlamLossSettings
+from dpm2_core.errors import UsageError
+
+TASKS = {
+    "gndnet": "dpm2_core.diffslam.tasks.ground_task:GroundTask",
+}
+"""Where the task of each name is; imported when it is asked for."""
+
+
+class TaskTraining(Settings):
+    """A training of a task; each task adds what is its own."""
+
+    network: Settings = Settings()
+    """Of the network."""
+    slam: ScheduleSettings = ScheduleSettings(gamma=0.0)
+    """When and how much the SLAM loss counts; gamma 0: never."""
+    slam_loss: SlamLossSettings = SlamLossSettings()
+    """Odometry of the SLAM loss."""
+    epochs: int = Field(default=20, ge=1)
+    """Passes over the windows."""
+    window: int = Field(default=5, ge=2)
+    """Contiguous scans of a step."""
+    every: int = Field(default=2, ge=1)
+    """Distance of these scans (the paper: every second)."""
+    rate: float = Field(default=1e-3, gt=0)
+    """Peak learning rate of AdamW."""
+    final_rate: float = Field(default=1e-5, ge=0)
+    """At the end of the cosine."""
+    warmup: int = Field(default=20, ge=0)
+    """Steps of linear warm-up."""
+    decay: float = Field(default=1e-4, ge=0)
+    """Weight decay."""
+    clip: float = Field(default=1.0, gt=0)
+    """Largest norm of the gradient."""
+    seed: int = 0
+    """Of the weights, the order of the windows and everything random."""
+    validate_every: int = Field(default=5, ge=1)
+    """Epochs between validations."""
+
+
+class Task(nn.Module, ABC):
+    """A task that is trained with and without the SLAM loss. All that is trained and stored is in its parameters."""
+
+    name: ClassVar[str]
+    """As in `TASKS`."""
+    training_type: ClassVar[type[TaskTraining]]
+    """Its settings."""
+    needs: ClassVar[Sequence[Need]] = ()
+    """What its scans must have."""
+
+    def __init__(self, settings: TaskTraining) -> None:
+        super().__init__()
+        self.settings = settings
+
+    @abstractmethod
+    def losses(self, window: list[TaskScan]) -> tuple[Tensor, Callable[[], Tensor] | None]:
+        """Loss of the task, a scalar, and a function that gives the SLAM loss, m2; None where it has no meaning.
+
+        `window` holds contiguous scans. What is random here is drawn from torch's generator, so that a resumed
+        training draws the same.
+        """
+
+    @abstractmethod
+    def evaluate(self, scans: TaskScans) -> dict[str, float]:
+        """Figures over all scans; called in eval mode without gradient, see `training.measure`."""
+
+    @abstractmethod
+    def picture(self, scan: TaskScan, path: Path) -> None:
+        """Draw what the network makes of a scan beside what it should; called as `evaluate`."""
+
+    def start_epoch(self, epoch: int) -> None:  # noqa: B027
+        """Get ready for an epoch, the first being 0: a task of several stages freezes what does not learn in this."""
+
+    def forward(self, window: list[TaskScan]) -> tuple[Tensor, Callable[[], Tensor] | None]:
+        """`losses`."""
+        return self.losses(window)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the network is."""
+        return next(self.parameters()).device
+
+
+def task_type(name: str) -> type[Task]:
+    """The task of that name.
+
+    Raises:
+        UsageError: there is none.
+    """
+    if name not in TASKS:
+        raise UsageError(f"{name}: no such task; choose from {', '.join(TASKS)}")
+    module, _, kind = TASKS[name].partition(":")
+    found: type[Task] = getattr(import_module(module), kind)
+    return found

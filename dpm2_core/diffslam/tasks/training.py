@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Training and measuring of the tasks: windows of contiguous scans, eq. 1 and its schedule, on the common trainer."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from dpm2_core.config import settings_from
+from dpm2_core.diffslam.schedule import total_loss
+from dpm2_core.diffslam.tasks.data import TaskScan, TaskScans
+from dpm2_core.diffslam.tasks.task import Task, TaskTraining, task_type
+from dpm2_core.diffslam.windows import ContiguousWindows
+from dpm2_core.errors import UsageError
+from dpm2_core.network.weights import read_tensors, write_tensors
+from dpm2_core.training.checkpoint import load_checkpoint
+from dpm2_core.training.trainer import OptimiserSettings, train
+
+WEIGHTS = "weights.safetensors"
+"""What a training leaves in its folder, beside checkpoint.pt and log.jsonl."""
+
+
+def train_task(
+    name: str,
+    settings: TaskTraining,
+    scans: TaskScans,
+    out: Path,
+    resume: bool = False,
+    val: TaskScans | None = None,
+    until: int | None = None,
+) -> Task:
+    """Train; checkpoint, log and at the end `WEIGHTS` go to `out`. The same seed gives the same weights.
+
+    Args:
+        settings: of the type that `task_type(name)` names. val: scans to measure on as the training goes on.
+        until: stop after this epoch, with a checkpoint; `resume` goes on from there as if nothing had been.
+
+    Raises:
+        UsageError: no window fits into the scans, or there is nothing to resume.
+    """
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    torch.manual_seed(settings.seed)
+    task = task_type(name)(settings).to(device)
+    twin = copy.deepcopy(task).requires_grad_(False)
+    start = load_checkpoint(out / "checkpoint.pt", task, twin, None) if resume else 0
+    windows = ContiguousWindows(scans.lengths, settings.window, settings.every, settings.seed)
+    epoch = len(windows)
+
+    def loss(module: nn.Module, batch: _Batch, step: int) -> tuple[Tensor, dict[str, Tensor]]:
+        return eq1(task, batch.scans, batch.epoch, settings)
+
+    optimiser = OptimiserSettings(
+        steps=settings.epochs * epoch, rate=settings.rate, final_rate=settings.final_rate, warmup=settings.warmup,
+        decay=settings.decay, clip=settings.clip, ema=0.0, seed=settings.seed, compile=False, bf16=False,
+        save_every=epoch, validate_every=settings.validate_every * epoch,
+    )  # fmt: skip
+    batches = _batches(task, scans, windows, start, device)
+    measured = None if val is None else lambda module: measure(module, val)
+    train(task, twin, batches, loss, optimiser, out, resume, measured, start, 0, device,
+          None if until is None else until * epoch)  # fmt: skip
+    save_task(task, out / WEIGHTS, {"epochs": str(settings.epochs if until is None else until)})
+    return task.eval()
+
+
+def eq1(task: Task, window: list[TaskScan], epoch: int, settings: TaskTraining) -> tuple[Tensor, dict[str, Tensor]]:
+    """Eq. 1 and its parts, `task_loss` and, in the epochs where it counts, `slam_loss` (without gamma)."""
+    model_loss, slam_loss = task.losses(window)
+    parts = {"task_loss": model_loss}
+
+    def slam() -> Tensor:
+        assert slam_loss is not None
+        parts["slam_loss"] = slam_loss()
+        return parts["slam_loss"].to(model_loss)
+
+    # A prediction that is not finite has no trajectory; its step is skipped, and the log shows it.
+    counts = slam_loss is not None and bool(model_loss.isfinite())
+    total = total_loss(model_loss, slam, epoch, settings.slam) if counts else model_loss
+    return total, {"loss": total.detach()} | {name: value.detach() for name, value in parts.items()}
+
+
+@torch.no_grad()
+def measure(module: nn.Module, scans: TaskScans) -> dict[str, float]:
+    """`Task.evaluate` in eval mode; the mode is put back.
+
+    Raises:
+        UsageError: there are no scans, or they lack what the task needs.
+    """
+    assert isinstance(module, Task)
+    was = module.training
+    module.eval()
+    try:
+        return module.evaluate(scans)
+    finally:
+        module.train(was)
+
+
+@torch.no_grad()
+def draw(task: Task, scans: TaskScans, index: int, path: Path) -> None:
+    """`Task.picture` of a scan.
+
+    Raises:
+        UsageError: there is no such scan.
+    """
+    if not 0 <= index < len(scans):
+        raise UsageError(f"scan {index}: there are {len(scans)}, counted from 0")
+    task.eval().picture(scans[index].to(task.device), path)
+
+
+def save_task(task: Task, path: Path, about: dict[str, str], half: bool = False) -> None:
+    """Parameters with the task's name and the settings of its network; `half` stores fp16."""
+    about = {**about, "task": task.name, "network": task.settings.network.model_dump_json()}
+    write_tensors(task.state_dict(), path, about, half)
+
+
+def load_task(name: str, path: Path) -> Task:
+    """A trained task on the CPU, ready to be measured.
+
+    Raises:
+        UsageError: no such file, a pickle, weights of another task, other settings or shapes.
+    """
+    state, metadata = read_tensors(path)
+    if metadata.get("task") != name:
+        raise UsageError(f"{path}: weights of {metadata.get('task', 'no task')}, not of {name}")
+    kind = task_type(name)
+    try:
+        network = json.loads(metadata["network"])
+    except (KeyError, ValueError):
+        raise UsageError(f"{path}: safetensors without the settings of its network") from None
+    task = kind(settings_from(kind.training_type, {"network": network}, default=str(path)))
+    load_strictly(task, state, path)
+    return task.eval().requires_grad_(False)
+
+
+def load_strictly(module: nn.Module, state: dict[str, Tensor], path: Path) -> None:
+    """Put tensors read from `path` into a module.
+
+    Raises:
+        UsageError: names or shapes differ, or a value is not finite.
+    """
+    own = module.state_dict()
+    wrong = sorted(own.keys() ^ state.keys())
+    wrong += sorted(n for n in own.keys() & state.keys() if own[n].shape != state[n].shape)
+    if wrong:
+        raise UsageError(f"{path}: does not fit its settings: {len(wrong)} tensors differ, such as {wrong[0]}")
+    if bad := [n for n, value in state.items() if not bool(value.isfinite().all())]:
+        raise UsageError(f"{path}: {bad[0]} holds values that are not finite")
+    module.load_state_dict(state)
+
+
+@dataclass(frozen=True)
+class _Batch:
+    """A step's window of scans, and its epoch."""
+
+    epoch: int
+    scans: list[TaskScan]
+
+
+def _batches(
+    task: Task, scans: TaskScans, windows: ContiguousWindows, start: int, device: torch.device
+) -> Iterator[_Batch]:
+    """Windows from step `start` on, for ever."""
+    epoch, skip = divmod(start, len(windows))
+    while True:
+        windows.set_epoch(epoch)
+        task.train()
+        task.start_epoch(epoch)
+        for place in list(windows)[skip:]:
+            yield _Batch(epoch, [scans[i].to(device) for i in place])
+        epoch, skip = epoch + 1, 0
+
+
+def mean_figures(rows: list[dict[str, float]]) -> dict[str, float]:
+    """Mean of each figure over the scans that have it; NaN where none has."""
+    out = {}
+    for name in rows[0] if rows else ():
+        values = [row[name] for row in rows if not math.isnan(row[name])]
+        out[name] = sum(values) / len(values) if values else math.nan
+    return out
