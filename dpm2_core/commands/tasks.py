@@ -77,6 +77,8 @@ def _add(name: str, help_: str) -> None:
 
 
 _add("gndnet", "GndNet: the height of the ground around the sensor, from one scan.")
+_add("dslr", "DSLR: a scan without what moves, from one with it.")
+_add("ae_lidar", "AE_lidar: a scan as a short code and back.")
 
 
 def eval_task(

@@ -28,6 +28,8 @@ class TaskDriveSettings(Settings):
     """Of the training worlds, counting up; those of validation begin 100,000 later."""
     presets: tuple[PresetName, ...] = Field(default=("city", "suburb", "rural"), min_length=1)
     """Kinds of places, in turn."""
+    traffic: float = Field(default=1.0, ge=0)
+    """Times the traffic of the preset; above 1 in columns, of 20 on about a third of the points lie on what moves."""
     lidar: LidarConfig = LidarConfig(columns=512)
     """512 columns: the width of DSLR's range images."""
 
@@ -54,5 +56,5 @@ def make_task_drives(
             name, preset = f"{kind}/{i:02d}", settings.presets[i % len(settings.presets)]
             simulate(
                 out / name, frames, settings.first_seed + offset + i, "random", preset, images=False,
-                lidar=settings.lidar, workers=workers, progress=partial(progress, name),
+                lidar=settings.lidar, workers=workers, traffic=settings.traffic, progress=partial(progress, name),
             )  # fmt: skip

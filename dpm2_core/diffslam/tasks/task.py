@@ -21,6 +21,8 @@ from dpm2_core.errors import UsageError
 
 TASKS = {
     "gndnet": "dpm2_core.diffslam.tasks.ground_task:GroundTask",
+    "dslr": "dpm2_core.diffslam.tasks.dslr_task:DslrTask",
+    "ae_lidar": "dpm2_core.diffslam.tasks.ae_lidar_task:AeLidarTask",
 }
 """Where the task of each name is; imported when it is asked for."""
 
@@ -38,6 +40,8 @@ class TaskTraining(Settings):
     """Passes over the windows."""
     window: int = Field(default=5, ge=2)
     """Contiguous scans of a step."""
+    batch: int = Field(default=1, ge=1)
+    """Windows of a step."""
     every: int = Field(default=2, ge=1)
     """Distance of these scans (the paper: every second)."""
     rate: float = Field(default=1e-3, gt=0)
@@ -74,8 +78,8 @@ class Task(nn.Module, ABC):
     def losses(self, window: list[TaskScan]) -> tuple[Tensor, Callable[[], Tensor] | None]:
         """Loss of the task, a scalar, and a function that gives the SLAM loss, m2; None where it has no meaning.
 
-        `window` holds contiguous scans. What is random here is drawn from torch's generator, so that a resumed
-        training draws the same.
+        `window` holds contiguous scans, those of `settings.batch` windows one after the other: see `windows`. What is
+        random here is drawn from torch's generator, so that a resumed training draws the same.
         """
 
     @abstractmethod
@@ -86,12 +90,16 @@ class Task(nn.Module, ABC):
     def picture(self, scan: TaskScan, path: Path) -> None:
         """Draw what the network makes of a scan beside what it should; called as `evaluate`."""
 
-    def start_epoch(self, epoch: int) -> None:  # noqa: B027
+    def start_epoch(self, epoch: int) -> None:
         """Get ready for an epoch, the first being 0: a task of several stages freezes what does not learn in this."""
 
     def forward(self, window: list[TaskScan]) -> tuple[Tensor, Callable[[], Tensor] | None]:
         """`losses`."""
         return self.losses(window)
+
+    def windows(self, scans: int) -> list[slice]:
+        """Where each window is among so many scans."""
+        return [slice(i, i + self.settings.window) for i in range(0, scans, self.settings.window)]
 
     @property
     def device(self) -> torch.device:

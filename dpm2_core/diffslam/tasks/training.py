@@ -51,7 +51,7 @@ def train_task(
     twin = copy.deepcopy(task).requires_grad_(False)
     start = load_checkpoint(out / "checkpoint.pt", task, twin, None) if resume else 0
     windows = ContiguousWindows(scans.lengths, settings.window, settings.every, settings.seed)
-    epoch = len(windows)
+    epoch = max(1, len(windows) // settings.batch)
 
     def loss(module: nn.Module, batch: _Batch, step: int) -> tuple[Tensor, dict[str, Tensor]]:
         return eq1(task, batch.scans, batch.epoch, settings)
@@ -61,7 +61,7 @@ def train_task(
         decay=settings.decay, clip=settings.clip, ema=0.0, seed=settings.seed, compile=False, bf16=False,
         save_every=epoch, validate_every=settings.validate_every * epoch,
     )  # fmt: skip
-    batches = _batches(task, scans, windows, start, device)
+    batches = _batches(task, scans, windows, settings.batch, start, device)
     measured = None if val is None else lambda module: measure(module, val)
     train(task, twin, batches, loss, optimiser, out, resume, measured, start, 0, device,
           None if until is None else until * epoch)  # fmt: skip
@@ -156,23 +156,26 @@ def load_strictly(module: nn.Module, state: dict[str, Tensor], path: Path) -> No
 
 @dataclass(frozen=True)
 class _Batch:
-    """A step's window of scans, and its epoch."""
+    """The scans of a step's windows, one window after the other, and its epoch."""
 
     epoch: int
     scans: list[TaskScan]
 
 
 def _batches(
-    task: Task, scans: TaskScans, windows: ContiguousWindows, start: int, device: torch.device
+    task: Task, scans: TaskScans, windows: ContiguousWindows, batch: int, start: int, device: torch.device
 ) -> Iterator[_Batch]:
-    """Windows from step `start` on, for ever."""
-    epoch, skip = divmod(start, len(windows))
+    """So many windows a step, from step `start` on, for ever; what is left of an epoch's windows is not used."""
+    steps = max(1, len(windows) // batch)
+    epoch, skip = divmod(start, steps)
     while True:
         windows.set_epoch(epoch)
         task.train()
         task.start_epoch(epoch)
-        for place in list(windows)[skip:]:
-            yield _Batch(epoch, [scans[i].to(device) for i in place])
+        order = list(windows)
+        for step in range(skip, steps):
+            places = [i for place in order[step * batch : (step + 1) * batch] for i in place]
+            yield _Batch(epoch, [scans[i].to(device) for i in places])
         epoch, skip = epoch + 1, 0
 
 

@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: Apache-2.0
+"""DSLR (Kumar et al., AAAI 2021): a scan without what moves, from one with it, by an adversarially trained autoencoder.
+
+An autoencoder learns static scans; a discriminator learns to tell a pair of static codes from a static and a dynamic
+one; then a copy of the encoder learns to give dynamic scans codes that pass for static and decode to the static twin.
+"""
+
+from __future__ import annotations
+
+import copy
+from itertools import pairwise
+from pathlib import Path
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+
+from dpm2_core.config import Settings
+from dpm2_core.diffslam.tasks.range_image import (
+    CHANNELS,
+    RangeImageSettings,
+    fill,
+    project,
+    to_points,
+)
+from dpm2_core.errors import UsageError
+
+_TALLEST = 42  # rows that the decoder makes; the image is cut from them
+
+
+class DslrSettings(Settings):
+    """Range image and size of the network; the default is the paper's."""
+
+    image: RangeImageSettings = RangeImageSettings()
+    """Geometry of the scans, at most 42 rows."""
+    channels: int = Field(default=64, ge=4)
+    """Of the first layer; the innermost has eight times as many."""
+    latent: int = Field(default=160, ge=8, multiple_of=8)
+    """Length of the code of a scan."""
+
+
+class RangeEncoder(nn.Module):
+    """Images (B, 2, rows, columns) to codes (B, latent). The layers see the points that the slots stand for."""
+
+    def __init__(self, settings: DslrSettings) -> None:
+        """Default settings: 2.544 million parameters."""
+        super().__init__()
+        c, image = settings.channels, settings.image
+        height = image.rows
+        for kernel in (4, 4, 3, 3, 3):
+            height = (height + 2 - kernel) // 2 + 1
+        self.layers = nn.Sequential(
+            *_down(3, c, 4, norm=False),
+            *_down(c, 2 * c, 4, norm=False),
+            *_down(2 * c, 2 * c, 3),
+            *_down(2 * c, 4 * c, 3, norm=False),
+            *_down(4 * c, 4 * c, 3),
+            nn.Conv2d(4 * c, 8 * c, (height, 4), 2, (0, 1), bias=False),
+            nn.BatchNorm2d(8 * c),
+            nn.LeakyReLU(0.2),
+            nn.Conv2d(8 * c, settings.latent, (1, image.columns // 64), bias=False),
+        )
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Codes."""
+        points = to_points(images, 1.0).mT.unflatten(2, images.shape[2:])
+        return self.layers(points)[:, :, 0, 0]
+
+
+class RangeDecoder(nn.Module):
+    """Codes (B, latent) to images (B, 2, rows, columns) in -1..1."""
+
+    def __init__(self, settings: DslrSettings) -> None:
+        """Default settings: 2.987 million parameters."""
+        super().__init__()
+        c, self.rows = settings.channels, settings.image.rows
+        self.layers = nn.Sequential(
+            *_up(settings.latent, 8 * c, (1, settings.image.columns // 64), 1, 0),
+            *_up(8 * c, 4 * c, (2, 4), 2, (0, 1)),
+            *_up(4 * c, 4 * c, (4, 4), 2, 1),
+            *_up(4 * c, 2 * c, (3, 4), 2, 1),
+            *_up(2 * c, 2 * c, (2, 4), 2, 1),
+            *_up(2 * c, c, (1, 4), 2, 1),
+            nn.ConvTranspose2d(c, CHANNELS, 4, 2, 1, bias=False),
+            nn.Tanh(),
+        )
+
+    def forward(self, codes: Tensor) -> Tensor:
+        """Images; the rows that the layers make beyond those of the image are cut off."""
+        return self.layers(codes[:, :, None, None])[:, :, : self.rows]
+
+
+class PairDiscriminator(nn.Module):
+    """Two codes (B, latent) each to a logit (B,): positive where both are taken for static scans.
+
+    With leaky units within; sigmoids, as in the original, barely pass a gradient through five layers.
+    """
+
+    def __init__(self, settings: DslrSettings) -> None:
+        """Default settings: 68 thousand parameters."""
+        super().__init__()
+        n = settings.latent
+        widths = (2 * n, n, n // 2, n // 4, n // 8)
+        hidden = [m for a, b in pairwise(widths) for m in (nn.Linear(a, b), nn.LeakyReLU(0.2))]
+        self.layers = nn.Sequential(*hidden, nn.Linear(n // 8, 1))
+
+    def forward(self, first: Tensor, second: Tensor) -> Tensor:
+        """Logits."""
+        return self.layers(torch.cat([first, second], 1))[:, 0]
+
+
+class Dslr(nn.Module):
+    """The networks: the static encoder and the decoder are an autoencoder, the dynamic encoder learns from them."""
+
+    def __init__(self, settings: DslrSettings | None = None) -> None:
+        """Default settings if None.
+
+        Raises:
+            UsageError: an image of more than 42 rows.
+        """
+        super().__init__()
+        self.settings = settings = settings or DslrSettings()
+        if settings.image.rows > _TALLEST:
+            raise UsageError(f"DSLR: images of {settings.image.rows} rows; want at most {_TALLEST}")
+        self.static_encoder, self.decoder = RangeEncoder(settings), RangeDecoder(settings)
+        self.discriminator = PairDiscriminator(settings)
+        self.apply(initialise)
+        self.dynamic_encoder = copy.deepcopy(self.static_encoder)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Static images (B, 2, rows, columns) of dynamic ones, filled, in units of their scale."""
+        return self.decoder(self.dynamic_encoder(images))
+
+    @torch.no_grad()
+    def translate(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Image (2, rows, columns) of the static scan, and (rows, columns) bool which slots the scan has a point in.
+
+        Args:
+            points: (N, 3+) m; those outside the image are not used.
+        """
+        image, mask = project(points.float(), self.settings.image)
+        return self(fill(image, mask)[None])[0], mask
+
+    def static_points(self, points: Tensor) -> Tensor:
+        """The translated scan (M, 3), m: one point for each slot that the scan (N, 3+) has a point in."""
+        image, mask = self.translate(points)
+        return to_points(image, self.settings.image.scale)[mask.flatten()]
+
+
+def load(path: Path) -> Dslr:
+    """A trained translator, ready for inference on the CPU.
+
+    Raises:
+        UsageError: no such file, a pickle, weights of another task, other settings or shapes, values not finite.
+    """
+    from dpm2_core.diffslam.tasks.dslr_task import DslrTask
+    from dpm2_core.diffslam.tasks.training import load_task
+
+    task = load_task("dslr", path)
+    assert isinstance(task, DslrTask)
+    return task.network
+
+
+def initialise(module: nn.Module) -> None:
+    """Weights of the original: normal, 0.02 wide."""
+    if isinstance(module, (nn.Conv2d, nn.ConvTranspose2d)):
+        nn.init.normal_(module.weight, 0.0, 0.02)
+    elif isinstance(module, nn.BatchNorm2d):
+        nn.init.normal_(module.weight, 1.0, 0.02)
+        nn.init.zeros_(module.bias)
+
+
+def _down(inputs: int, outputs: int, kernel: int, norm: bool = True) -> list[nn.Module]:
+    """Half the size."""
+    between: list[nn.Module] = [nn.BatchNorm2d(outputs)] if norm else []
+    return [nn.Conv2d(inputs, outputs, kernel, 2, 1, bias=False), *between, nn.LeakyReLU(0.2)]
+
+
+def _up(
+    inputs: int, outputs: int, kernel: tuple[int, int], stride: int, padding: int | tuple[int, int]
+) -> list[nn.Module]:
+    """Twice the size, or what the kernel makes of it."""
+    return [
+        nn.ConvTranspose2d(inputs, outputs, kernel, stride, padding, bias=False),
+        nn.BatchNorm2d(outputs),
+        nn.ReLU(),
+    ]

@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""DSLR as a task: its three stages, the SLAM loss in the third, and what it is judged by."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from pydantic import Field
+from torch import Tensor
+from torch.nn import functional
+
+from dpm2_core.diffslam.tasks.data import TaskScan, TaskScans
+from dpm2_core.diffslam.tasks.dslr import Dslr, DslrSettings
+from dpm2_core.diffslam.tasks.range_scans import RangeReader, RangeScans, chamfer_figures, clouds, image_error, slam_of
+from dpm2_core.diffslam.tasks.task import Task, TaskTraining
+from dpm2_core.diffslam.tasks.training import mean_figures
+from dpm2_core.diffslam.trajectory_loss import SlamLoss
+
+_BATCH = 16
+_MOVED = 0.5
+"""A slot whose distance differs by more from that of the static twin has something moving in it, m."""
+
+
+class DslrTraining(TaskTraining):
+    """A training of DSLR: epochs of the autoencoder, then of the discriminator, and the rest adversarial."""
+
+    network: DslrSettings = DslrSettings()
+    """Range image and size of the networks."""
+    autoencoder_epochs: int = Field(default=40, ge=0)
+    """Epochs in which encoder and decoder learn static scans (the original: up to 700)."""
+    discriminator_epochs: int = Field(default=4, ge=0)
+    """Epochs after these, in which the discriminator learns with them (the original: 50)."""
+    epochs: int = Field(default=60, ge=1)
+    """All, those of the third stage included; only there does the SLAM loss count."""
+    adversarial: float = Field(default=10.0, ge=0)
+    """What the discriminator's cross entropy counts for, beside the sum of absolute errors of an image."""
+    batch: int = Field(default=4, ge=1)
+    """Windows of a step: pairs of codes are of different places, and means are over more than one place."""
+    clip: float = Field(default=1000.0, gt=0)
+    """Largest norm of the gradient; the loss is a sum over 20 thousand values."""
+
+
+class DslrTask(Task):
+    """Dynamic scans to static ones."""
+
+    name = "dslr"
+    training_type = DslrTraining
+    needs = ("static",)
+    settings: DslrTraining
+
+    def __init__(self, settings: DslrTraining) -> None:
+        super().__init__(settings)
+        self.network = Dslr(settings.network)
+        self.slam_loss = SlamLoss(settings.slam_loss)
+        self.stage = 1
+        self._reader = RangeReader(settings.network.image)
+
+    def start_epoch(self, epoch: int) -> None:
+        """Choose the stage; in the third, everything but the dynamic encoder is frozen, running means included."""
+        s, network = self.settings, self.network
+        third = s.autoencoder_epochs + s.discriminator_epochs
+        self.stage = 1 if epoch < s.autoencoder_epochs else 2 if epoch < third else 3
+        if epoch == third:
+            network.dynamic_encoder.load_state_dict(network.static_encoder.state_dict())
+        for module in (network.static_encoder, network.decoder, network.discriminator):
+            module.requires_grad_(self.stage < 3).train(self.stage < 3)
+        network.dynamic_encoder.requires_grad_(self.stage == 3)
+
+    def losses(self, window: list[TaskScan]) -> tuple[Tensor, Callable[[], Tensor] | None]:
+        """Loss of the stage; SLAM on the translated scans against that on the static twins."""
+        static = self._reader.read(window, static=True)
+        network = self.network
+        if self.stage == 1:
+            return image_error(network.decoder(network.static_encoder(static.images)), static.images), None
+        dynamic = self._reader.read(window)
+        other = torch.randperm(len(window))
+        if self.stage == 2:
+            codes, moved = network.static_encoder(torch.cat([static.images, dynamic.images])).chunk(2)
+            made = network.decoder(torch.cat([codes, moved]))
+            pairs = _verdict(network.discriminator(codes, codes[other]), 1.0)
+            pairs = pairs + _verdict(network.discriminator(codes[other], moved), 0.0)
+            return image_error(
+                made, torch.cat([static.images, dynamic.images])
+            ) + self.settings.adversarial * pairs, None
+        with torch.no_grad():
+            codes = network.static_encoder(static.images)
+        moved = network.dynamic_encoder(dynamic.images)
+        made = network.decoder(moved)
+        passes = _verdict(network.discriminator(codes[other], moved), 1.0)
+
+        def slam() -> Tensor:
+            return slam_of(self.slam_loss, made, static, self.settings.network.image.scale, self.windows(len(made)))
+
+        return image_error(made, static.images) + self.settings.adversarial * passes, slam
+
+    def evaluate(self, scans: TaskScans) -> dict[str, float]:
+        """Means over the scans.
+
+        `chamfer_m` (mean distance, m) and `chamfer` (as DSLR gives it) of the translated scans to the static twins, and
+        where something moves, `moved_m`, the mean error of the distance; `input_...` the same without translation.
+        """
+        rows = []
+        for begin in range(0, len(scans), _BATCH):
+            part = [scans[i].to(self.device) for i in range(begin, min(begin + _BATCH, len(scans)))]
+            dynamic, static = self._reader.read(part), self._reader.read(part, static=True)
+            made = RangeScans(self.network(dynamic.images), dynamic.masks, dynamic.frames)
+            for i in range(len(part)):
+                of = static.part(i, i + 1)
+                row = self._judged(made.part(i, i + 1), dynamic.part(i, i + 1), of)
+                before = self._judged(dynamic.part(i, i + 1), dynamic.part(i, i + 1), of)
+                rows.append(row | {f"input_{name}": value for name, value in before.items()})
+        return mean_figures(rows)
+
+    def _judged(self, found: RangeScans, dynamic: RangeScans, static: RangeScans) -> dict[str, float]:
+        scale = self.settings.network.image.scale
+        moved = dynamic.masks & static.masks & ((dynamic.images - static.images)[:, 0].abs() * scale > _MOVED)
+        error = (found.images - static.images)[:, 0].abs()[moved] * scale
+        return chamfer_figures(clouds(found, scale)[0], clouds(static, scale)[0]) | {"moved_m": float(error.mean())}
+
+    def clouds(self, scan: TaskScan) -> dict[str, Tensor]:
+        """The translated scan, the scan and its static twin, (N, 3) m each, all as range images show them."""
+        scale = self.settings.network.image.scale
+        dynamic, static = self._reader.read([scan]), self._reader.read([scan], static=True)
+        made = RangeScans(self.network(dynamic.images), dynamic.masks, dynamic.frames)
+        kinds = {"output": made, "input": dynamic, "target": static}
+        return {name: clouds(of, scale)[0] for name, of in kinds.items()}
+
+    def picture(self, scan: TaskScan, path: Path) -> None:
+        """The scan, its translation and its static twin: range images, and seen from above."""
+        from dpm2_core.evaluation.range_figures import range_png  # matplotlib is slow to import
+
+        dynamic, static = self._reader.read([scan]), self._reader.read([scan], static=True)
+        rows = {
+            "scan": (dynamic.images[0], dynamic.masks[0]),
+            "translated": (self.network(dynamic.images)[0], dynamic.masks[0]),
+            "static twin": (static.images[0], static.masks[0]),
+        }
+        range_png(path, rows, self.settings.network.image.scale, f"DSLR: {scan.sequence}, scan {scan.number}")
+
+
+def _verdict(logits: Tensor, wanted: float) -> Tensor:
+    return functional.binary_cross_entropy_with_logits(logits, torch.full_like(logits, wanted))

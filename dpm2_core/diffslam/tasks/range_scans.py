@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scans as range images, for the tasks that learn on them, and how clouds made from images are judged."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dpm2_core.diffslam.tasks.chamfer import nearest_distances
+from dpm2_core.diffslam.tasks.data import TaskScan
+from dpm2_core.diffslam.tasks.dslr_data import SCALE, ImageScan
+from dpm2_core.diffslam.tasks.range_image import RangeImageSettings, fill, project, to_points
+from dpm2_core.diffslam.trajectory_loss import SlamLoss
+from dpm2_core.errors import UsageError
+
+_KEPT = 1000
+"""Scans whose images are kept: about 160 kB each, and projecting one takes as long as half a step of training."""
+
+
+@dataclass(frozen=True, eq=False)
+class RangeScans:
+    """B scans.
+
+    Attributes:
+        images: (B, 2, rows, columns) filled, in units of the scale. masks: (B, rows, columns), where there was a point.
+        frames: (sequence, number) of each.
+    """
+
+    images: Tensor
+    masks: Tensor
+    frames: list[tuple[str, int]]
+
+    def part(self, begin: int, end: int) -> RangeScans:
+        """Some of them."""
+        return RangeScans(self.images[begin:end], self.masks[begin:end], self.frames[begin:end])
+
+
+class RangeReader:
+    """Makes range images of scans, and keeps the latest."""
+
+    def __init__(self, settings: RangeImageSettings) -> None:
+        """Images of that geometry."""
+        self._settings = settings
+        self._kept: dict[tuple[str, int, str], tuple[Tensor, Tensor]] = {}
+
+    def read(self, scans: Sequence[TaskScan], static: bool = False) -> RangeScans:
+        """The scans, or their twins without what moves.
+
+        Raises:
+            UsageError: a scan has no twin, no point in the image, or is an image of other rows and columns.
+        """
+        pairs = [self._of(scan, static) for scan in scans]
+        frames = [(scan.sequence, scan.number) for scan in scans]
+        return RangeScans(torch.stack([image for image, _ in pairs]), torch.stack([mask for _, mask in pairs]), frames)
+
+    def _of(self, scan: TaskScan, static: bool) -> tuple[Tensor, Tensor]:
+        key = (scan.sequence, scan.number, "static" if static else "")
+        if key not in self._kept:
+            if len(self._kept) >= 2 * _KEPT:
+                self._kept.pop(next(iter(self._kept)))
+            self._kept[key] = self._made(scan, static)
+        return self._kept[key]
+
+    def _made(self, scan: TaskScan, static: bool) -> tuple[Tensor, Tensor]:
+        where = f"{scan.sequence}, scan {scan.number}"
+        if static and scan.static is None:
+            raise UsageError(f"{where}: no static twin")
+        if isinstance(scan, ImageScan):
+            image, mask = (scan.static_image, scan.static_mask) if static else (scan.image, scan.mask)
+            return self._cut(image, mask, where)
+        points = scan.static if static and scan.static is not None else scan.points
+        image, mask = project(points, self._settings)
+        if not bool(mask.any()):
+            raise UsageError(f"{where}: no point in the range image")
+        return fill(image, mask), mask
+
+    def _cut(self, image: Tensor, mask: Tensor, where: str) -> tuple[Tensor, Tensor]:
+        """The rows from `first` on, and as many of the columns as the settings say, evenly."""
+        s, (rows, columns) = self._settings, mask.shape
+        if rows < s.first + s.rows or columns % s.columns:
+            raise UsageError(
+                f"{where}: an image of {rows} x {columns} has no rows {s.first} to {s.first + s.rows - 1} "
+                f"and every so many columns of {s.columns}"
+            )
+        every = columns // s.columns
+        image, mask = image[:, s.first :, ::every][:, : s.rows], mask[s.first :, ::every][: s.rows]
+        return image * (SCALE / s.scale), mask
+
+
+def clouds(scans: RangeScans, scale: float) -> list[Tensor]:
+    """The points (N_b, 3), m, of the slots that had one."""
+    points = to_points(scans.images, scale)
+    return [cloud[mask.flatten()] for cloud, mask in zip(points, scans.masks, strict=True)]
+
+
+def image_error(made: Tensor, true: Tensor) -> Tensor:
+    """Sum of the absolute errors of an image (B, 2, rows, columns), the mean over the images; a scalar."""
+    return (made - true).abs().sum((1, 2, 3)).mean()
+
+
+def slam_of(slam_loss: SlamLoss, made: Tensor, true: RangeScans, scale: float, windows: Sequence[slice]) -> Tensor:
+    """SLAM loss of images (B, 2, rows, columns) against the true ones, m2; the mean over the windows.
+
+    Slots that are empty in the true scan do not count.
+    """
+    found, wanted, weights = to_points(made, scale), to_points(true.images, scale), true.masks.flatten(1).to(made)
+    values = []
+    for part in windows:
+        w = weights[part]
+        values.append(slam_loss(found[part], wanted[part], w, w, frames=true.frames[part]))
+    return torch.stack(values).mean()
+
+
+def chamfer_figures(found: Tensor, true: Tensor) -> dict[str, float]:
+    """Of two clouds (N, 3), (M, 3), m: `chamfer_m`, the mean distance, and `chamfer`, as DSLR gives it."""
+    forth, back = nearest_distances(found, true)
+    squares = float((forth**2).sum() + (back**2).sum())
+    return {"chamfer_m": float(forth.mean() + back.mean()) / 2, "chamfer": squares / SCALE**2}

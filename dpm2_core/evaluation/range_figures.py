@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures of range images: each as it is, and its points seen from above."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from torch import Tensor
+
+from dpm2_core.diffslam.tasks.range_image import to_points
+from dpm2_core.files import atomic_write
+
+_BACKGROUND, _INK = "#0d1117", "#c9d1d9"
+_FAR = 40.0  # m, the last colour, and the edge of the view from above
+
+
+def range_png(path: Path | str, rows: Mapping[str, tuple[Tensor, Tensor]], scale: float, title: str = "") -> None:
+    """Draw range images below each other, coloured by distance, black where a slot is empty.
+
+    Args:
+        rows: name, image (2, R, C) of d and z, and mask (R, C). scale: m that one stands for.
+
+    Raises:
+        Dpm2Error: the file could not be written.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # half a second to import: not for every command
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(14, 3.4 * len(rows) + 0.6), dpi=90, facecolor=_BACKGROUND)
+    figure.text(0.01, 1 - 0.3 / (3.4 * len(rows) + 0.6), title, color=_INK, fontsize=13, va="center")
+    for k, (name, (image, mask)) in enumerate(rows.items()):
+        bottom, height = (len(rows) - 1 - k) / len(rows) * 0.94, 0.94 / len(rows)
+        flat = figure.add_axes((0.01, bottom + 0.15 * height, 0.7, 0.7 * height), facecolor="black")
+        d = np.where(mask.cpu().numpy(), image[0].detach().cpu().numpy() * scale, np.nan)
+        half = d.shape[1] // 2
+        flat.imshow(np.roll(d, half, 1)[:, ::-1], aspect="auto", vmin=0, vmax=_FAR, cmap="turbo")  # ahead in the middle
+        flat.set_title(name, color=_INK, loc="left", fontsize=11)
+        flat.set(xticks=[], yticks=[])
+        above = figure.add_axes((0.73, bottom + 0.02, 0.26, height - 0.04), facecolor="black", aspect="equal")
+        points = to_points(image.detach().cpu(), scale)[mask.cpu().flatten()].numpy()
+        order = np.argsort(points[:, 2])
+        above.scatter(
+            points[order, 0], points[order, 1], c=points[order, 2], s=0.6, cmap="viridis", vmin=-2, vmax=2, lw=0
+        )
+        above.set(xlim=(-_FAR, _FAR), ylim=(-_FAR, _FAR), xticks=[], yticks=[])
+    with atomic_write(path, "wb") as file:
+        FigureCanvasAgg(figure).print_png(file)

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""CARLA-64 and ARD-16 in small: the names and shapes that DSLR's arrays have, and what is wrong with others."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from dpm2_core.diffslam.tasks.data import open_scans
+from dpm2_core.diffslam.tasks.dslr_data import SCALE, ImageScan
+from dpm2_core.diffslam.tasks.range_image import RangeImageSettings, to_points
+from dpm2_core.diffslam.tasks.range_scans import RangeReader, clouds
+from dpm2_core.errors import UsageError
+
+
+def images(scans: int, rows: int = 64, columns: int = 512, seed: int = 0) -> np.ndarray:
+    """(scans, 2, rows, columns): d of 5 to 65 m and z of -2 to 2 m, in units of 120 m."""
+    rng = np.random.default_rng(seed)
+    d, z = rng.uniform(5, 65, (scans, rows, columns)), rng.uniform(-2, 2, (scans, rows, columns))
+    return (np.stack([d, z], 1) / SCALE).astype(np.float32)
+
+
+def carla64(folder: Path, prefix: str = "") -> None:
+    """Two pairs, of 3 and 2 scans, named as in the processed data set."""
+    folder.mkdir(exist_ok=True)
+    for k, scans in ((0, 3), (8, 2)):
+        np.save(folder / f"{prefix}s{k}.npy", images(scans, seed=k))
+        np.save(folder / f"{prefix}d{k}.npy", images(scans, seed=k + 1))
+
+
+@pytest.mark.parametrize("prefix", ["", "test"])
+def test_carla64_is_read_as_pairs_of_range_images(tmp_path: Path, prefix: str) -> None:
+    """A sequence an array; the points are those of the image, and the tasks get the rows and columns they ask for."""
+    carla64(tmp_path, prefix)
+    scans = open_scans(tmp_path, needs=["static"])
+    assert scans.lengths == [3, 2]
+    scan = scans[4]
+    assert isinstance(scan, ImageScan)
+    assert (scan.sequence.rpartition("/")[2], scan.number) == (f"{prefix}d8", 1)
+    true = torch.from_numpy(np.load(tmp_path / f"{prefix}s8.npy")[1])
+    assert scan.static is not None
+    torch.testing.assert_close(scan.static[:, :3], to_points(true, SCALE))
+    settings = RangeImageSettings(first=0, rows=40, columns=256)
+    read = RangeReader(settings).read([scan], static=True)
+    torch.testing.assert_close(read.images[0], true[:, :40, ::2])
+    assert read.masks.all()
+
+
+def test_ard16_as_points_in_slots(tmp_path: Path) -> None:
+    """(N, 16, 512, 4) in two folders: empty slots are marked, and filled for the network."""
+    values = images(2, rows=16)
+    angle = (np.arange(512) + 0.5) * (2 * np.pi / 512)
+    d, z = values[:, 0] * SCALE, values[:, 1] * SCALE
+    xyz = np.stack([d * np.cos(angle), d * np.sin(angle), z, 0 * z], -1)
+    xyz[:, 3, 100:110] = 0
+    for name in ("static_out_npy", "dynamic_out_npy"):
+        (tmp_path / name).mkdir()
+        np.save(tmp_path / name / "0.npy", xyz)
+    scan = open_scans(tmp_path)[1]
+    assert isinstance(scan, ImageScan)
+    assert len(scan.points) == 16 * 512 - 10
+    assert (scan.image[0] > 0).all()
+    assert not scan.mask[3, 100:110].any()
+    settings = RangeImageSettings(beams=((15.0, -15.0, 16),), first=0, rows=16, columns=512, scale=60.0)
+    read = RangeReader(settings).read([scan])
+    np.testing.assert_allclose(read.images[0, 0][scan.mask] * 60.0, d[1][scan.mask.numpy()], rtol=1e-5)
+    found = clouds(read, 60.0)[0]  # the columns' own azimuths: the points are where they were
+    np.testing.assert_allclose(found.numpy(), xyz[1][scan.mask.numpy()][:, :3], atol=1e-3)
+
+
+def test_damage_is_named(tmp_path: Path) -> None:
+    """A missing twin, twins of different shapes, a pickle, another shape, NaN, and rows that are not there."""
+    carla64(tmp_path / "a")
+    (tmp_path / "a" / "s8.npy").unlink()
+    with pytest.raises(UsageError, match=r"d8.npy: no static twin"):
+        open_scans(tmp_path / "a")
+    np.save(tmp_path / "a" / "s8.npy", images(1))
+    with pytest.raises(UsageError, match=r"d8.npy: shape \(2, 2, 64, 512\), its static twin s8.npy has \(1, 2"):
+        open_scans(tmp_path / "a")
+    np.save(tmp_path / "a" / "s8.npy", np.array([{"code": 1}], dtype=object), allow_pickle=True)
+    with pytest.raises(UsageError, match=r"s8.npy: no array of numbers"):
+        open_scans(tmp_path / "a")
+    np.save(tmp_path / "a" / "s8.npy", np.zeros((4, 5), np.float32))
+    with pytest.raises(UsageError, match=r"s8.npy: shape \(4, 5\) float32; want"):
+        open_scans(tmp_path / "a")
+    (tmp_path / "a" / "s8.npy").write_bytes(b"nothing")
+    with pytest.raises(UsageError, match=r"s8.npy: no array of numbers"):
+        open_scans(tmp_path / "a")
+    bad = images(2)
+    bad[1, 0, 3, 3] = np.nan
+    carla64(tmp_path / "b")
+    np.save(tmp_path / "b" / "d8.npy", bad)
+    scans = open_scans(tmp_path / "b")
+    with pytest.raises(UsageError, match=r"d8.npy: scan 1 .* not finite"):
+        scans[4]
+    with pytest.raises(UsageError, match=r"no rows 50 to 89"):
+        RangeReader(RangeImageSettings(first=50)).read([scans[0]])
