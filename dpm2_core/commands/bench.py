@@ -16,7 +16,7 @@ def bench(
     names: Annotated[
         list[str] | None,
         typer.Argument(
-            help="diffslam, geometric (default), loop-cost, map, memory, neural, pose-graph, relocalise, roads."
+            help="diffslam, geometric (default), loop-cost, map, memory, neural, pose-graph, relocalise, roads, tasks."
         ),
     ] = None,
     source: Annotated[
@@ -37,7 +37,7 @@ def bench(
     ] = None,
     pairs: Annotated[int, typer.Option(min=1, help="neural: pairs of frames of each kind.")] = 60,
     only: Annotated[
-        str | None, typer.Option(help="neural: this part alone, again; else those that neural.json lacks.")
+        str | None, typer.Option(help="neural, tasks: this part alone; else those that NAME.json lacks.")
     ] = None,
 ) -> None:
     """Measure accuracy and speed beside KISS-ICP on the same scans, memory over a long drive, or the network."""

@@ -93,10 +93,6 @@ class Task(nn.Module, ABC):
     def start_epoch(self, epoch: int) -> None:
         """Get ready for an epoch, the first being 0: a task of several stages freezes what does not learn in this."""
 
-    def forward(self, window: list[TaskScan]) -> tuple[Tensor, Callable[[], Tensor] | None]:
-        """`losses`."""
-        return self.losses(window)
-
     def windows(self, scans: int) -> list[slice]:
         """Where each window is among so many scans."""
         return [slice(i, i + self.settings.window) for i in range(0, scans, self.settings.window)]

@@ -59,6 +59,13 @@ def bench_pose_graph(options: Options) -> Report:
     return pose_graph.bench_pose_graph(options)
 
 
+def bench_tasks(options: Options) -> Report:
+    """See `tasks.bench_tasks`; the simulator and torch are imported only for it."""
+    from dpm2_core.evaluation.bench import tasks
+
+    return tasks.bench_tasks(options)
+
+
 BENCHES: dict[str, Callable[[Options], Report]] = {
     "diffslam": bench_diffslam,
     "geometric": bench_geometric,
@@ -69,5 +76,6 @@ BENCHES: dict[str, Callable[[Options], Report]] = {
     "pose-graph": bench_pose_graph,
     "relocalise": bench_relocalise,
     "roads": bench_roads,
+    "tasks": bench_tasks,
 }
 """By the name that `dpm2 bench NAME` and `benchmarks/NAME.json` share."""

@@ -1,0 +1,194 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The tasks of the differentiable SLAM paper, each trained with and without the SLAM loss, all else being equal."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from statistics import mean, median, stdev
+from typing import Any, Literal
+
+import torch
+from rich.box import SIMPLE
+from rich.console import Group
+from rich.table import Table
+
+from dpm2_core.config import dump_settings, load_settings
+from dpm2_core.diffslam.tasks.data import TaskScans, open_scans
+from dpm2_core.diffslam.tasks.drives import TaskDriveSettings, make_task_drives
+from dpm2_core.diffslam.tasks.task import TaskTraining, task_type
+from dpm2_core.diffslam.tasks.training import WEIGHTS, load_task, measure, train_task
+from dpm2_core.errors import UsageError
+from dpm2_core.evaluation.bench.harness import Options, Report, git_commit, processors, write_report
+from dpm2_core.files import atomic_write
+
+Better = Literal["lower", "higher"]
+_DONE = "settings.yaml"  # beside the weights of a training that ended
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """How a task is trained for the comparison, and which of its figures count.
+
+    Attributes:
+        settings: `key=value` of its training, the arm without the SLAM loss being the same with gamma 0.
+        figures: of `Task.evaluate`, and which way is better.
+        drives: synthetic drives to learn from and to be judged on.
+    """
+
+    settings: tuple[str, ...]
+    figures: dict[str, Better]
+    drives: TaskDriveSettings = field(default_factory=TaskDriveSettings)
+
+
+COMPARISONS: dict[str, Comparison] = {
+    "gndnet": Comparison(
+        settings=(
+            "network.cells=64", "network.channels=16", "epochs=9", "rate=2e-3", "slam.gamma=1", "slam.every=3",
+            "slam_loss.points=1024",
+        ),
+        figures={"mse": "lower", "miou": "higher", "precision": "higher", "recall": "higher"},
+    ),
+}  # fmt: skip
+
+
+def bench_tasks(options: Options) -> Report:
+    """Every task, or the one that `--only` names; overrides are of its training, repetitions are seeds.
+
+    A training that ended in an earlier run with the same settings is not repeated, one that was stopped goes on, and
+    tasks.json is written after each.
+    """
+    if options.only is not None and options.only not in COMPARISONS:
+        raise UsageError(f"--only {options.only}: no such task; choose from {', '.join(COMPARISONS)}")
+    path = options.out / "tasks.json"
+    parts = _read(path)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(options.threads)
+    try:
+        with processors(options.threads):
+            for name in COMPARISONS if options.only is None else (options.only,):
+                if options.only is None and parts.get(name, {}).get("complete"):
+                    continue
+                for part in _compare(name, COMPARISONS[name], options):
+                    parts = {**_read(path), name: part}  # another process may have written its task
+                    write_report(path, "tasks", _report(parts), options)
+    finally:
+        torch.set_num_threads(threads)
+    return _report(parts)
+
+
+def _report(parts: dict[str, Any]) -> Report:
+    return Report({"parts": parts}, _view(parts))
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """Parts of an earlier run; none if the file is damaged or not there."""
+    try:
+        return dict(json.loads(path.read_text(encoding="utf-8"))["parts"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
+
+
+def _compare(name: str, comparison: Comparison, options: Options) -> Any:
+    """The part of a task, again after every training."""
+    kind = task_type(name)
+    folder = options.cache / "tasks"
+    make_task_drives(folder / "drives", comparison.drives, options.threads)
+    learn, judge = (open_scans(folder / "drives" / which, kind.needs) for which in ("train", "val"))
+    overrides = [*comparison.settings, *options.overrides]
+    chosen = load_settings(kind.training_type, None, overrides)
+    part: dict[str, Any] = {
+        "command": shlex.join(["dpm2", *sys.argv[1:]]),
+        "commit": git_commit(),
+        "threads": options.threads,
+        "settings": overrides,
+        "drives": comparison.drives.model_dump(mode="json"),
+        "scans": {"train": len(learn), "val": len(judge)},
+        "complete": False,
+        "runs": {"without": {}, "with": {}},
+    }
+    for seed in range(options.repetitions):
+        for arm, gamma in (("without", 0.0), ("with", chosen.slam.gamma)):
+            slam = chosen.slam.model_copy(update={"gamma": gamma})
+            settings = chosen.model_copy(update={"seed": seed, "slam": slam})
+            out = folder / name / f"{arm}_{seed}"
+            part["runs"][arm][str(seed)] = _run(name, settings, learn, judge, out)
+            part["summary"] = summary(part["runs"], comparison.figures)
+            part["complete"] = seed + 1 == options.repetitions and arm == "with"
+            yield part
+
+
+def _run(name: str, settings: TaskTraining, learn: TaskScans, judge: TaskScans, out: Path) -> dict[str, Any]:
+    """Figures of one training on the scans of other worlds, and how the SLAM loss stood beside the task's."""
+    text = dump_settings(settings)
+    begun = out / "begun.yaml"
+    if not (out / _DONE).is_file() or (out / _DONE).read_text() != text:
+        resume = (out / "checkpoint.pt").is_file() and begun.is_file() and begun.read_text() == text
+        with atomic_write(begun) as file:
+            file.write(text)
+        train_task(name, settings, learn, out, resume)
+        with atomic_write(out / _DONE) as file:
+            file.write(text)
+    figures = measure(load_task(name, out / WEIGHTS), judge)
+    logged = (json.loads(line) for line in (out / "log.jsonl").read_text().splitlines())
+    # A training that was stopped may have logged steps twice, and goes on after the last checkpoint.
+    rows = list({row["step"]: row for row in logged if "norm" in row}.values())
+    epoch = len(rows) // settings.epochs
+    first = [row for row in rows if row.get("slam_loss") is not None][:epoch]
+    return {
+        **{figure: _figure(value) for figure, value in figures.items()},
+        "last_task_loss": _figure(median(row["task_loss"] for row in rows[-epoch:])),
+        "slam_share_at_first": _figure(
+            settings.slam.gamma * median(row["slam_loss"] / row["task_loss"] for row in first)) if first else None,
+        "skipped_steps": sum(row["norm"] is None for row in rows),
+    }  # fmt: skip
+
+
+def summary(runs: dict[str, dict[str, dict[str, Any]]], figures: dict[str, Better]) -> dict[str, Any]:
+    """Mean and standard deviation over the seeds of every figure and arm, and what the SLAM loss gained.
+
+    `gain` is the relative improvement of the mean, positive where the arm with the SLAM loss is better; it is beyond
+    the spread where the means are farther apart than the two standard deviations together.
+    """
+    out = {}
+    for figure, better in figures.items():
+        arms = {arm: [run[figure] for run in of.values()] for arm, of in runs.items()}
+        row: dict[str, Any] = {
+            arm: {"mean": _figure(mean(values)), "std": _figure(stdev(values)) if len(values) > 1 else None}
+            for arm, values in arms.items()
+            if values
+        }
+        if arms["with"] and arms["without"]:
+            gap = mean(arms["with"]) - mean(arms["without"])
+            sign = -1 if better == "lower" else 1
+            row["gain"] = _figure(sign * gap / abs(mean(arms["without"])))
+            if min(map(len, arms.values())) > 1:
+                row["beyond_spread"] = abs(gap) > sum(stdev(values) for values in arms.values())
+        out[figure] = row
+    return out
+
+
+def _figure(x: float) -> float:
+    return float(f"{x:.4g}")
+
+
+def _view(parts: dict[str, Any]) -> Group:
+    tables = []
+    for name, part in parts.items():
+        table = Table("figure", "without", "with SLAM loss", "gain", "beyond the spread", box=SIMPLE)
+        table.title = f"{name}, {len(part['runs']['with'])} seeds"
+        for figure, row in part["summary"].items():
+            cells = [_cell(row.get(arm)) for arm in ("without", "with")]
+            gain = f"{row['gain']:+.1%}" if "gain" in row else ""
+            table.add_row(figure, *cells, gain, {True: "yes", False: "no"}.get(row.get("beyond_spread"), ""))
+        tables.append(table)
+    return Group(*tables)
+
+
+def _cell(row: dict[str, float | None] | None) -> str:
+    if row is None:
+        return ""
+    return f"{row['mean']:.4g}" + (f" ± {row['std']:.2g}" if row["std"] is not None else "")
