@@ -88,6 +88,7 @@ def eval_task(
     as_json: Annotated[bool, typer.Option("--json", help="Figures as JSON on stdout.")] = False,
     picture: Annotated[Path | None, typer.Option(help="PNG of one scan to write.")] = None,
     frame: Annotated[int, typer.Option(min=0, help="Scan of the picture, counted through all sequences.")] = 0,
+    slam: Annotated[bool, typer.Option("--slam", help="Odometry on what the task makes, too; needs poses.")] = False,
 ) -> None:
     """Measure a trained task on scans that it has not learned from."""
     from dpm2_core.diffslam.tasks.data import open_scans
@@ -101,6 +102,10 @@ def eval_task(
         draw(task, scans, frame, picture)
         typer.echo(f"{picture}: written", err=True)
     figures = measure(task, scans)
+    if slam:
+        from dpm2_core.evaluation.task_slam import slam_figures  # imports the whole SLAM
+
+        figures |= slam_figures(task, src)
     if as_json:
         typer.echo(json.dumps({"task": name, "weights": str(weights), "scans": len(scans), **figures}))
         return

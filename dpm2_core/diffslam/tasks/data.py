@@ -99,14 +99,14 @@ def open_scans(path: Path | str, needs: Sequence[Need] = ()) -> TaskScans:
     if not path.is_dir():
         raise UsageError(f"{path}: no such folder")
     sequences: list[ScanSequence] = list(open_pairs(path))
-    for folder in _sequence_folders(path):
+    for folder in sequence_folders(path):
         sequences += _runs(folder, path, needs)
     if not sequences:
         raise UsageError(f"{path}: no scans; want sequences/NN/velodyne/NNNNNN.bin in or below it, or DSLR's pairs")
     return TaskScans(sequences)
 
 
-def _sequence_folders(path: Path) -> list[Path]:
+def sequence_folders(path: Path) -> list[Path]:
     """Folders that hold velodyne/, at most three levels down: DRIVE/sequences/NN."""
     if (path / "velodyne").is_dir():
         return [path]

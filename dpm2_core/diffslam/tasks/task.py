@@ -90,6 +90,13 @@ class Task(nn.Module, ABC):
     def picture(self, scan: TaskScan, path: Path) -> None:
         """Draw what the network makes of a scan beside what it should; called as `evaluate`."""
 
+    def clouds(self, scan: TaskScan) -> dict[str, Tensor]:
+        """Clouds (N, 3), m, that SLAM can be run on, by name: `output`, `input`, `target`; called as `evaluate`.
+
+        None by default: not every task makes clouds.
+        """
+        return {}
+
     def start_epoch(self, epoch: int) -> None:
         """Get ready for an epoch, the first being 0: a task of several stages freezes what does not learn in this."""
 
