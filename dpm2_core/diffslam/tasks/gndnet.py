@@ -8,6 +8,7 @@ scattered into the grid by themselves, so that a pillar may have any number of t
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import torch
 from pydantic import Field
@@ -15,6 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dpm2_core.config import Settings
+from dpm2_core.diffslam.tasks.weights import load_strictly, read_weights
 from dpm2_core.errors import UsageError
 
 
@@ -90,6 +92,18 @@ class GroundNet(nn.Module):
         out = features.new_zeros(s.cells**2, features.shape[1])
         out = out.scatter_reduce(0, cell[:, None].expand_as(features), features, "amax")  # ReLU: zero is the least
         return out.T.unflatten(1, (s.cells, s.cells))
+
+
+def load(path: Path) -> GroundNet:
+    """A trained network on the CPU, ready for inference, from what `dpm2 train gndnet` wrote.
+
+    Raises:
+        UsageError: no such file, a pickle, weights of another task, other settings or shapes, values not finite.
+    """
+    state, settings = read_weights(path, "gndnet", GroundSettings)
+    net = GroundNet(settings)
+    load_strictly(nn.ModuleDict({"net": net}), state, path)  # as the task that was trained holds it
+    return net.eval().requires_grad_(False)
 
 
 def cell_of(points: Tensor, settings: GroundSettings) -> tuple[Tensor, Tensor]:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import copy
-import json
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,13 +12,12 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from dpm2_core.config import settings_from
 from dpm2_core.diffslam.schedule import total_loss
 from dpm2_core.diffslam.tasks.data import TaskScan, TaskScans
 from dpm2_core.diffslam.tasks.task import Task, TaskTraining, task_type
+from dpm2_core.diffslam.tasks.weights import load_strictly, read_weights, write_weights
 from dpm2_core.diffslam.windows import ContiguousWindows
 from dpm2_core.errors import UsageError
-from dpm2_core.network.weights import read_tensors, write_tensors
 from dpm2_core.training.checkpoint import load_checkpoint
 from dpm2_core.training.trainer import OptimiserSettings, train
 
@@ -115,8 +113,7 @@ def draw(task: Task, scans: TaskScans, index: int, path: Path) -> None:
 
 def save_task(task: Task, path: Path, about: dict[str, str], half: bool = False) -> None:
     """Parameters with the task's name and the settings of its network; `half` stores fp16."""
-    about = {**about, "task": task.name, "network": task.settings.network.model_dump_json()}
-    write_tensors(task.state_dict(), path, about, half)
+    write_weights(path, task.name, task.settings.network, task.state_dict(), about, half)
 
 
 def load_task(name: str, path: Path) -> Task:
@@ -125,33 +122,12 @@ def load_task(name: str, path: Path) -> Task:
     Raises:
         UsageError: no such file, a pickle, weights of another task, other settings or shapes.
     """
-    state, metadata = read_tensors(path)
-    if metadata.get("task") != name:
-        raise UsageError(f"{path}: weights of {metadata.get('task', 'no task')}, not of {name}")
     kind = task_type(name)
-    try:
-        network = json.loads(metadata["network"])
-    except (KeyError, ValueError):
-        raise UsageError(f"{path}: safetensors without the settings of its network") from None
-    task = kind(settings_from(kind.training_type, {"network": network}, default=str(path)))
+    network_type = type(kind.training_type().network)
+    state, network = read_weights(path, name, network_type)
+    task = kind(kind.training_type(network=network))
     load_strictly(task, state, path)
     return task.eval().requires_grad_(False)
-
-
-def load_strictly(module: nn.Module, state: dict[str, Tensor], path: Path) -> None:
-    """Put tensors read from `path` into a module.
-
-    Raises:
-        UsageError: names or shapes differ, or a value is not finite.
-    """
-    own = module.state_dict()
-    wrong = sorted(own.keys() ^ state.keys())
-    wrong += sorted(n for n in own.keys() & state.keys() if own[n].shape != state[n].shape)
-    if wrong:
-        raise UsageError(f"{path}: does not fit its settings: {len(wrong)} tensors differ, such as {wrong[0]}")
-    if bad := [n for n, value in state.items() if not bool(value.isfinite().all())]:
-        raise UsageError(f"{path}: {bad[0]} holds values that are not finite")
-    module.load_state_dict(state)
 
 
 @dataclass(frozen=True)

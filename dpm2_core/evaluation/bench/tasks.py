@@ -47,8 +47,8 @@ class Comparison:
 COMPARISONS: dict[str, Comparison] = {
     "gndnet": Comparison(
         settings=(
-            "network.cells=64", "network.channels=16", "epochs=9", "rate=2e-3", "slam.gamma=1", "slam.every=3",
-            "slam_loss.points=1024",
+            "network.cells=64", "network.channels=16", "epochs=6", "rate=2e-3", "tilt=6", "slam.gamma=1",
+            "slam.every=2", "slam_loss.points=1024",
         ),
         figures={"mse": "lower", "miou": "higher", "precision": "higher", "recall": "higher"},
     ),

@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Weights of a task as safetensors: they name the task and the settings of its network, and fit both or are refused."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TypeVar
+
+from torch import Tensor, nn
+
+from dpm2_core.config import Settings, settings_from
+from dpm2_core.errors import UsageError
+from dpm2_core.network.weights import read_tensors, write_tensors
+
+T = TypeVar("T", bound=Settings)
+
+
+def write_weights(
+    path: Path, name: str, network: Settings, state: Mapping[str, Tensor], about: dict[str, str], half: bool = False
+) -> None:
+    """Write the tensors of the task `name` and the settings of its network; `half` stores fp16."""
+    write_tensors(state, path, {**about, "task": name, "network": network.model_dump_json()}, half)
+
+
+def read_weights(path: Path, name: str, kind: type[T]) -> tuple[dict[str, Tensor], T]:
+    """The tensors, and the settings of the network that they are of.
+
+    Raises:
+        UsageError: no such file, a pickle, weights of another task, or settings that are missing or wrong.
+    """
+    state, metadata = read_tensors(path)
+    if metadata.get("task") != name:
+        raise UsageError(f"{path}: weights of {metadata.get('task', 'no task')}, not of {name}")
+    try:
+        tree = json.loads(metadata["network"])
+    except (KeyError, ValueError):
+        raise UsageError(f"{path}: safetensors without the settings of its network") from None
+    if not isinstance(tree, dict):
+        raise UsageError(f"{path}: the settings of its network are no mapping")
+    return state, settings_from(kind, tree, default=str(path))
+
+
+def load_strictly(module: nn.Module, state: Mapping[str, Tensor], path: Path) -> None:
+    """Put tensors read from `path` into a module.
+
+    Raises:
+        UsageError: names or shapes differ, or a value is not finite.
+    """
+    own = module.state_dict()
+    wrong = sorted(own.keys() ^ state.keys())
+    wrong += sorted(n for n in own.keys() & state.keys() if own[n].shape != state[n].shape)
+    if wrong:
+        raise UsageError(f"{path}: does not fit its settings: {len(wrong)} tensors differ, such as {wrong[0]}")
+    if bad := [n for n, value in state.items() if not bool(value.isfinite().all())]:
+        raise UsageError(f"{path}: {bad[0]} holds values that are not finite")
+    module.load_state_dict(state)

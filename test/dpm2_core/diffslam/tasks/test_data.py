@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scans of the tasks: layouts, classes, twins, gaps, and what is refused before a training begins."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from dpm2_core.diffslam.tasks.data import open_scans
+from dpm2_core.diffslam.tasks.drives import TaskDriveSettings, make_task_drives
+from dpm2_core.diffslam.tasks.ground_task import ground_of
+from dpm2_core.diffslam.windows import ContiguousWindows
+from dpm2_core.errors import UsageError
+
+SEMANTIC = Path(__file__).resolve().parents[4].parent / "shared" / "kitti" / "semantic"
+
+
+def test_a_scan_is_what_its_files_hold(write_drive: Callable[..., Path], tmp_path: Path) -> None:
+    """Points, classes without the number of the object, the twin, and which scan it is."""
+    write_drive(tmp_path / "sequences" / "08", range(3, 6))
+    scans = open_scans(tmp_path, ("labels", "static"))
+    assert len(scans) == 3
+    scan = scans[1]
+    assert scan.sequence == "sequences/08"
+    assert scan.number == 4
+    raw = np.fromfile(tmp_path / "sequences/08/velodyne/000004.bin", "<f4").reshape(-1, 4)
+    assert np.array_equal(scan.points.numpy(), raw)
+    assert scan.labels is not None
+    assert scan.labels.dtype == torch.int64
+    assert set(scan.labels.tolist()) == {0, 10, 40, 50}
+    assert scan.static is not None
+    assert np.array_equal(scan.static.numpy(), raw[:-100])
+
+
+def test_folders_of_every_depth_and_gaps(write_drive: Callable[..., Path], tmp_path: Path) -> None:
+    """A sequence, a data set, a folder of data sets; a missing number ends a window's sequence."""
+    one = write_drive(tmp_path / "a" / "sequences" / "00", [0, 1, 2, 5, 6])
+    write_drive(tmp_path / "b" / "sequences" / "00", range(4))
+    write_drive(tmp_path / "b" / "sequences" / "01", range(2))
+    assert open_scans(one).lengths == [3, 2]
+    assert open_scans(tmp_path / "b").lengths == [4, 2]
+    everything = open_scans(tmp_path)
+    assert everything.lengths == [3, 2, 4, 2]
+    for window in ContiguousWindows(everything.lengths, 2):
+        a, b = (everything[i] for i in window)
+        assert (a.sequence, a.number + 1) == (b.sequence, b.number)
+
+
+def test_without_labels_or_twins(write_drive: Callable[..., Path], tmp_path: Path) -> None:
+    """They are None, which a task that needs them says before it begins."""
+    folder = write_drive(tmp_path / "00")
+    for kind in ("labels", "static"):
+        for path in (folder / kind).iterdir():
+            path.unlink()
+        (folder / kind).rmdir()
+    scan = open_scans(folder)[0]
+    assert scan.labels is None
+    assert scan.static is None
+    for need in ("labels", "static"):
+        with pytest.raises(UsageError, match=f"00: no {need}/ beside velodyne/"):
+            open_scans(folder, (need,))
+    with pytest.raises(UsageError, match="scan 0: no labels"):
+        ground_of(scan)
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "keep", "message"),
+    [
+        ("labels", "000002.label", -4, "1599 labels for 1600 points"),
+        ("labels", "000002.label", -3, "not whole points"),
+        ("velodyne", "000001.bin", -16, "1600 labels for 1599 points"),
+        ("velodyne", "000001.bin", -7, "not whole points"),
+        ("static", "000005.bin", -1, "not whole points"),
+        ("labels", "000000.label", None, "No such file"),
+        ("static", "000003.bin", None, "No such file"),
+    ],
+)
+def test_damaged_files_are_named_at_once(
+    write_drive: Callable[..., Path], tmp_path: Path, kind: str, name: str, keep: int | None, message: str
+) -> None:
+    """A label file of the wrong length, a scan cut off, a missing twin: file and reason, when the folder is opened."""
+    folder = write_drive(tmp_path / "00")
+    path = folder / kind / name
+    data = path.read_bytes()
+    path.unlink()
+    if keep is not None:
+        path.write_bytes(data[:keep])
+    with pytest.raises(UsageError, match=message) as refused:
+        open_scans(tmp_path)
+    assert f"00/{'labels' if 'labels for' in message else kind}/{name[:6]}" in str(refused.value)
+
+
+def test_no_scans(tmp_path: Path) -> None:
+    """An empty folder, a folder that is not there, velodyne/ without scans."""
+    with pytest.raises(UsageError, match="no such folder"):
+        open_scans(tmp_path / "nowhere")
+    with pytest.raises(UsageError, match="no scans; want sequences"):
+        open_scans(tmp_path)
+    (tmp_path / "velodyne").mkdir()
+    with pytest.raises(UsageError, match=r"no scans \(velodyne"):
+        open_scans(tmp_path)
+
+
+def test_synthetic_drives(tmp_path: Path) -> None:
+    """Train and validation apart, of exact labels and twins; a second call changes nothing."""
+    settings = TaskDriveSettings.model_validate(
+        {"train": 2, "train_frames": 2, "val": 1, "val_frames": 2, "lidar": {"columns": 64, "beams": 16}}
+    )
+    told: list[tuple[str, int, int]] = []
+    make_task_drives(tmp_path, settings, 1, lambda *step: told.append(step))
+    assert told[-1] == ("val/00", 2, 2)
+    train, val = (open_scans(tmp_path / which, ("labels", "static")) for which in ("train", "val"))
+    assert (train.lengths, val.lengths) == ([2, 2], [2])
+    clouds = [train[0].points, train[2].points, val[0].points]
+    assert not any(a.shape == b.shape and torch.equal(a, b) for a in clouds for b in clouds if a is not b)
+    ground, counted = ground_of(train[0])
+    assert ground.float().mean() > 0.2
+    assert bool(counted.all())
+    told.clear()
+    make_task_drives(tmp_path, settings, 1, lambda *step: told.append(step))
+    assert told == []
+
+
+def test_two_real_scans(tmp_path: Path) -> None:
+    """Of SemanticKITTI, in its layout: the road under the car is labelled ground, 1.7 m below the sensor."""
+    if not SEMANTIC.is_dir():
+        pytest.skip("the two labelled scans are not beside this repository")
+    for kind, ending in (("velodyne", "bin"), ("labels", "label")):
+        (tmp_path / "sequences" / "00" / kind).mkdir(parents=True)
+        for path in SEMANTIC.glob(f"*.{ending}"):
+            (tmp_path / "sequences" / "00" / kind / path.name).symlink_to(path)
+    scans = open_scans(tmp_path, ("labels",))
+    assert scans.lengths == [2]
+    for i in range(2):
+        scan = scans[i]
+        ground, counted = ground_of(scan)
+        near = ground & (scan.points[:, :2].norm(dim=1) < 8)
+        assert float(scan.points[near, 2].median()) == pytest.approx(-1.7, abs=0.15)
+        assert 0.9 < float(counted.float().mean()) <= 1.0

@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The trainer of the tasks: it learns, resumes to the same curve, keeps the schedule, and never stores a NaN."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from dpm2_core.diffslam import SlamLoss
+from dpm2_core.diffslam.tasks import gndnet
+from dpm2_core.diffslam.tasks.data import TaskScan, TaskScans, open_scans
+from dpm2_core.diffslam.tasks.ground_task import GroundTask, GroundTraining
+from dpm2_core.diffslam.tasks.training import (
+    WEIGHTS,
+    draw,
+    load_task,
+    mean_figures,
+    measure,
+    save_task,
+    train_task,
+)
+from dpm2_core.errors import UsageError
+
+TINY = {"cells": 32, "cell": 2.0, "channels": 4}
+
+
+def settings(**changes: Any) -> GroundTraining:
+    """Two windows of three scans an epoch, a small network, the SLAM loss in every second epoch."""
+    tree = {
+        "network": TINY, "epochs": 4, "window": 3, "every": 1, "warmup": 2, "rate": 3e-3, "tilt": 2.0,
+        "slam": {"gamma": 0.5, "every": 2}, "slam_loss": {"points": 300},
+    }  # fmt: skip
+    return GroundTraining.model_validate({**tree, **changes})
+
+
+@pytest.fixture
+def scans(write_drive: Callable[..., Path], tmp_path: Path) -> TaskScans:
+    """Six labelled scans of one street."""
+    return open_scans(write_drive(tmp_path / "drive"))
+
+
+def rows(out: Path) -> list[dict[str, Any]]:
+    """The log."""
+    return [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
+
+
+def test_it_learns_and_logs(scans: TaskScans, tmp_path: Path) -> None:
+    """The loss of the task falls by half in 40 steps; both losses are logged, that of the SLAM where it counts."""
+    out = tmp_path / "out"
+    train_task("gndnet", settings(epochs=20), scans, out, val=scans)
+    log = rows(out)
+    steps = [row for row in log if "norm" in row]
+    assert [row["step"] for row in steps] == list(range(40))
+    losses = [row["task_loss"] for row in steps]
+    assert sum(losses[-4:]) < 0.5 * sum(losses[:4])
+    with_slam = [row["step"] for row in steps if "slam_loss" in row]
+    assert with_slam == [step for step in range(40) if step // 2 % 2 == 1]
+    for row in steps:
+        assert row["loss"] == pytest.approx(row["task_loss"] + 0.5 * row.get("slam_loss", 0), abs=2e-6)  # 6 decimals
+    assert [row["step"] for row in log if "miou" in row] == [9, 19, 29, 39]  # every fifth epoch
+
+
+def test_resumed_equals_uninterrupted(scans: TaskScans, tmp_path: Path) -> None:
+    """Stopped after 1 of 4 epochs and resumed: the same losses in the log and the same weights, bit for bit."""
+    whole, halves = tmp_path / "whole", tmp_path / "halves"
+    train_task("gndnet", settings(), scans, whole)
+    train_task("gndnet", settings(), scans, halves, until=1)
+    assert len(rows(halves)) == 2
+    train_task("gndnet", settings(), scans, halves, resume=True)
+    curve = [[(row["step"], row["loss"], row["norm"]) for row in rows(out)] for out in (whole, halves)]
+    assert curve[0] == curve[1]
+    one, other = (load_file(out / WEIGHTS) for out in (whole, halves))
+    assert all(torch.equal(one[name], other[name]) for name in one)
+
+
+def test_gamma_zero_is_the_task_alone(scans: TaskScans, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The SLAM is not even run."""
+    monkeypatch.setattr(SlamLoss, "forward", None)
+    train_task("gndnet", settings(slam={"gamma": 0.0, "every": 1}), scans, tmp_path / "out")
+    assert not any("slam_loss" in row for row in rows(tmp_path / "out"))
+
+
+@pytest.mark.parametrize("where", ["task", "slam", "gradient"])
+def test_what_is_not_finite_never_reaches_a_checkpoint(
+    scans: TaskScans, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str
+) -> None:
+    """A step whose loss or gradient is NaN is skipped, its running means included; the others go on learning."""
+    original = GroundTask.losses
+    calls = []
+
+    def losses(self: GroundTask, window: list[TaskScan]) -> tuple[Tensor, Callable[[], Tensor]]:
+        calls.append(len(window))
+        if len(calls) != 4:  # the second step of an epoch with the SLAM loss
+            return original(self, window)
+        if where == "task":
+            with torch.no_grad():  # what a damaged scan would do to the running means
+                next(b for b in self.buffers() if b.is_floating_point()).fill_(math.nan)
+        loss, slam = original(self, window)
+        if where == "slam":
+            return loss, lambda: slam() * math.nan
+        if where == "gradient":  # finite itself: the slope of a root at zero is not
+            return loss + (loss - loss.detach()).abs().sqrt(), slam
+        return loss * math.nan, slam
+
+    monkeypatch.setattr(GroundTask, "losses", losses)
+    out = tmp_path / "out"
+    train_task("gndnet", settings(), scans, out)
+    assert [row["step"] for row in rows(out) if row["norm"] is None] == [3]
+    assert all(row["loss"] is not None for row in rows(out) if row["step"] > 3)
+    state = torch.load(out / "checkpoint.pt", weights_only=True)
+    stored = [*state["module"].values(), *state["ema"].values(), *load_file(out / WEIGHTS).values()]
+    moments = [v for values in state["optimiser"]["state"].values() for v in values.values()]
+    assert all(bool(torch.as_tensor(value).isfinite().all()) for value in [*stored, *moments])
+
+
+def test_measuring_changes_nothing(scans: TaskScans) -> None:
+    """Running means and mode stay; figures are those of the scans."""
+    torch.manual_seed(0)
+    task = GroundTask(settings()).train()
+    before = {name: value.clone() for name, value in task.state_dict().items()}
+    figures = measure(task, scans)
+    assert task.training
+    assert all(torch.equal(value, before[name]) for name, value in task.state_dict().items())
+    assert figures.keys() == {"mse", "miou", "precision", "recall"}
+    assert mean_figures([{"a": 1.0, "b": math.nan}, {"a": 2.0, "b": 3.0}]) == {"a": 1.5, "b": 3.0}
+
+
+def test_weights_come_back(scans: TaskScans, tmp_path: Path) -> None:
+    """With the settings of the network, for the task and for the SLAM; in fp16 to its precision."""
+    task = train_task("gndnet", settings(), scans, tmp_path / "out")
+    wanted = measure(task, scans)
+    assert measure(load_task("gndnet", tmp_path / "out" / WEIGHTS), scans) == wanted
+    save_task(task, tmp_path / "half.safetensors", {}, half=True)
+    assert measure(load_task("gndnet", tmp_path / "half.safetensors"), scans)["mse"] == pytest.approx(
+        wanted["mse"], rel=0.05
+    )
+    net = gndnet.load(tmp_path / "out" / WEIGHTS)
+    assert net.settings == task.settings.network
+    with torch.no_grad():
+        found = net([scans[0].points])
+        torch.testing.assert_close(found, task.net([scans[0].points]))
+    draw(task, scans, 1, tmp_path / "ground.png")
+    assert (tmp_path / "ground.png").read_bytes().startswith(b"\x89PNG")
+    with pytest.raises(UsageError, match="scan 6: there are 6"):
+        draw(task, scans, 6, tmp_path / "none.png")
+
+
+def test_wrong_weights_are_refused(scans: TaskScans, tmp_path: Path) -> None:
+    """No file, a pickle, another task's, no settings, wrong ones, other shapes, NaN: each says so."""
+    path = tmp_path / "w.safetensors"
+    task = GroundTask(settings())
+    with pytest.raises(UsageError, match="no such weights"):
+        load_task("gndnet", path)
+    torch.save(task.state_dict(), path)
+    with pytest.raises(UsageError, match="pickled weights are never loaded"):
+        gndnet.load(path)
+    state = {name: value.contiguous() for name, value in task.state_dict().items()}
+    about = {"task": "gndnet", "network": task.settings.network.model_dump_json()}
+
+    def refused(tensors: dict[str, Tensor], metadata: dict[str, str], message: str) -> None:
+        save_file(tensors, path, metadata)
+        for load in (lambda: load_task("gndnet", path), lambda: gndnet.load(path)):
+            with pytest.raises(UsageError, match=message):
+                load()
+
+    refused(state, {**about, "task": "dslr"}, "weights of dslr, not of gndnet")
+    refused(state, {"preset": "small"}, "weights of no task, not of gndnet")
+    refused(state, {"task": "gndnet"}, "without the settings of its network")
+    refused(state, {**about, "network": '{"cell": 0}'}, "cell: input should be greater than 0")
+    refused(state, {**about, "network": '{"channels": 8, "cells": 32}'}, "tensors differ, such as net.down")
+    refused({name: v for name, v in state.items() if name != "net.pillar.bias"}, about, "such as net.pillar.bias")
+    broken = {**state, "net.head.bias": torch.tensor([math.nan])}
+    refused(broken, about, "net.head.bias holds values that are not finite")
+
+
+def test_windows_that_do_not_fit(scans: TaskScans, tmp_path: Path) -> None:
+    """Longer than any sequence; nothing to resume; a checkpoint of another network."""
+    with pytest.raises(UsageError, match="no sequence has the 13 scans"):
+        train_task("gndnet", settings(window=7, every=2), scans, tmp_path / "out")
+    with pytest.raises(UsageError, match="no checkpoint"):
+        train_task("gndnet", settings(), scans, tmp_path / "out", resume=True)
+    train_task("gndnet", settings(), scans, tmp_path / "out", until=1)
+    with pytest.raises(UsageError, match="checkpoint of another network"):
+        train_task("gndnet", settings(network={**TINY, "channels": 8}), scans, tmp_path / "out", resume=True)
