@@ -79,10 +79,11 @@ def _add(name: str, help_: str) -> None:
 _add("gndnet", "GndNet: the height of the ground around the sensor, from one scan.")
 _add("dslr", "DSLR: a scan without what moves, from one with it.")
 _add("ae_lidar", "AE_lidar: a scan as a short code and back.")
+_add("movers", "Movers: which points are of things that move or could.")
 
 
 def eval_task(
-    name: Annotated[str, typer.Argument(metavar="TASK", help="gndnet, dslr or ae_lidar.")],
+    name: Annotated[str, typer.Argument(metavar="TASK", help="gndnet, dslr, ae_lidar or movers.")],
     weights: Annotated[Path, typer.Argument(help="What `dpm2 train TASK` wrote: weights.safetensors.")],
     src: SourceArgument,
     as_json: Annotated[bool, typer.Option("--json", help="Figures as JSON on stdout.")] = False,

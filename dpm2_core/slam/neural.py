@@ -17,13 +17,14 @@ from dpm2_core.descriptors import Descriptors, merge
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Array, Frame, Registration
 from dpm2_core.geometry import se3
+from dpm2_core.slam import filters
 from dpm2_core.slam.preprocess import Preprocessor, Scan
 from dpm2_core.slam.scan_registration import Prediction
 
 if TYPE_CHECKING:  # torch takes seconds to import, and the geometric SLAM does without
     from dpm2_core.network.model import DeepPointMap2
 
-SHIPPED = Path(__file__).resolve().parents[1] / "weights"
+SHIPPED = filters.SHIPPED
 
 
 class NeuralSettings(Settings):
@@ -147,8 +148,8 @@ class NeuralScanRegistration:
 
 
 def shipped() -> Sequence[str]:
-    """Names of the weights that come with dpm2."""
-    return sorted(path.stem for path in SHIPPED.glob("*.safetensors"))
+    """Names of the weights of the network that come with dpm2."""
+    return sorted({path.stem for path in SHIPPED.glob("*.safetensors")} - set(filters.WEIGHTS.values()))
 
 
 def weights_path(weights: str) -> Path:

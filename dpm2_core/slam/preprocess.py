@@ -13,6 +13,7 @@ from dpm2_core.descriptors import Descriptors
 from dpm2_core.frame import Array, Frame, Image, Points
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.voxel import voxel_first
+from dpm2_core.slam.filters import PointFilter
 
 _DESKEW_STEPS = 64  # poses along a sweep: at 1 rad/s and 0.1 s the remaining error is 1 mm at 1 m, 8 cm at 100 m
 
@@ -45,7 +46,7 @@ class Scan:
     """A prepared scan in the LiDAR frame at its stamp.
 
     Attributes:
-        points: (P, 4) float32, all that were measured within range.
+        points: (P, 4) float32, all that were measured within range and that the filter, if any, left.
         cloud: (M, 4) float32, those for the local map. source: (N, 3) float64, those to register. Both are empty where
             the registration works on descriptors alone.
         descriptors: neural ones; None where there are none.
@@ -60,15 +61,16 @@ class Scan:
 
 
 class Preprocessor:
-    """Removes what is not a measurement, undoes the motion, thins out."""
+    """Removes what is not a measurement, undoes the motion, filters, thins out."""
 
-    def __init__(self, settings: PreprocessSettings) -> None:
+    def __init__(self, settings: PreprocessSettings, point_filter: PointFilter | None = None) -> None:
         self._settings = settings
+        self._filter = point_filter
 
     def measured(self, frame: Frame, twist: Array) -> Points:
         """The valid points (P, 4); `twist` (6,) [rad/s, m/s] is the motion that deskewing undoes.
 
-        NaN, inf and zero points are dropped, and those out of range.
+        NaN, inf and zero points are dropped, those out of range, and what the filter leaves out.
         """
         s = self._settings
         squared = np.einsum("ij,ij->i", frame.points[:, :3], frame.points[:, :3])
@@ -76,7 +78,7 @@ class Preprocessor:
         points = frame.points[used]
         if s.deskew and frame.time_offset is not None:
             points = deskew(points, frame.time_offset[used], twist)
-        return points
+        return points if self._filter is None else self._filter(points)
 
     def prepare(self, frame: Frame, twist: Array) -> Scan:
         """`measured`, thinned out for local map and registration."""

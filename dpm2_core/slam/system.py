@@ -11,6 +11,7 @@ from pydantic import Field
 from dpm2_core.config import Settings
 from dpm2_core.data.source import InputSettings
 from dpm2_core.frame import Frame, Tracked
+from dpm2_core.slam.filters import FilterSettings, make_filter
 from dpm2_core.slam.graph.pose_graph import PoseGraph, PoseGraphSettings
 from dpm2_core.slam.keyframes import KeyframeSelector, KeyframeSettings
 from dpm2_core.slam.local_map import LocalMap, LocalMapSettings
@@ -35,6 +36,7 @@ class SlamSettings(Settings):
     """How a scan finds its pose: by points, by neural descriptors, or by descriptors and then points."""
     threads: int = Field(2, ge=1)
     """Threads of the neighbour search and of the network."""
+    filter: FilterSettings = FilterSettings()
     preprocess: PreprocessSettings = PreprocessSettings()
     geometric: GeometricSettings = GeometricSettings()
     neural: NeuralSettings = NeuralSettings()
@@ -111,9 +113,9 @@ def make_registration(s: SlamSettings) -> ScanRegistration:
     """What `registration` names.
 
     Raises:
-        UsageError: the network has no weights to run with.
+        UsageError: the network, or that of the filter, has no weights to run with.
     """
-    preprocessor = Preprocessor(s.preprocess)
+    preprocessor = Preprocessor(s.preprocess, make_filter(s.filter, s.threads))
     geometric = GeometricScanRegistration(
         preprocessor, GeometricRegistration(s.geometric), LocalMap(s.local_map, s.threads)
     )

@@ -23,6 +23,7 @@ TASKS = {
     "gndnet": "dpm2_core.diffslam.tasks.ground_task:GroundTask",
     "dslr": "dpm2_core.diffslam.tasks.dslr_task:DslrTask",
     "ae_lidar": "dpm2_core.diffslam.tasks.ae_lidar_task:AeLidarTask",
+    "movers": "dpm2_core.diffslam.tasks.movers_task:MoverTask",
 }
 """Where the task of each name is; imported when it is asked for."""
 

@@ -20,6 +20,7 @@ from scipy.spatial import cKDTree
 from dpm2_core.config import Settings
 from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
+from dpm2_core.geometry.ground import height_above_ground
 
 Mask = NDArray[np.bool_]
 
@@ -138,18 +139,6 @@ class MovingWindow:
                 others = [(image, poses[n]) for n, _, image in self._seen if n != node]
                 yield node, find_moving(cloud, poses[node], others, self._settings)
                 self._next = node + 1
-
-
-def height_above_ground(points: Points, cell: float = 1.0, reach: int = 2) -> NDArray[np.float32]:
-    """(M,) m of (M, 3+) points above the lowest one within `reach` cells of `cell` m around them."""
-    if not len(points):
-        return np.zeros(0, np.float32)
-    at = np.floor(points[:, :2] / cell).astype(np.int64)
-    at -= at.min(0)
-    lowest = np.full(at.max(0) + 1, np.inf, np.float32)
-    np.minimum.at(lowest, (at[:, 0], at[:, 1]), points[:, 2])
-    around = minimum_filter(lowest, 2 * reach + 1, mode="constant", cval=np.inf)
-    return points[:, 2] - around[at[:, 0], at[:, 1]]
 
 
 def _spherical(xyz: Points) -> tuple[Points, NDArray[np.intp], NDArray[np.intp]]:

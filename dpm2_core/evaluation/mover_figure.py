@@ -1,0 +1,36 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Picture of the movers in a scan: what was found, what was missed, what was taken for one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dpm2_core.files import atomic_write
+
+
+def movers_png(path: Path, points: NDArray[np.float32], found: NDArray[np.bool_], truth: NDArray[np.bool_]) -> None:
+    """Points (N, 3+) from above, x upwards, with what was found to be a mover (N,) and what is one (N,).
+
+    Raises:
+        Dpm2Error: the file could not be written.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 8), dpi=120, layout="constrained")
+    axes = figure.subplots()
+    kinds = (
+        (~found & ~truth, "standing", "0.7"),
+        (found & truth, "mover, found", "tab:green"),
+        (~found & truth, "mover, missed", "tab:red"),
+        (found & ~truth, "standing, taken for one", "tab:blue"),
+    )
+    for which, name, colour in kinds:
+        axes.plot(points[which, 1], points[which, 0], ".", ms=1, mew=0, color=colour, label=f"{name}: {which.sum()}")
+    axes.set(xlim=(40, -40), ylim=(-40, 40), xlabel="y, m", ylabel="x (ahead), m", aspect="equal")
+    axes.legend(markerscale=12, loc="upper right")
+    with atomic_write(path, "wb") as file:
+        FigureCanvasAgg(figure).print_png(file)

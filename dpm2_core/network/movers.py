@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which points of one scan are of things that move, or could: a small encoder-decoder over a grid seen from above.
+
+A column of the grid says in which layers of height above the ground it has points; the answer has the same shape. Only
+occupancy goes in, no counts, no intensity and no height of the sensor: so that another LiDAR looks much the same.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pydantic import Field
+from torch import Tensor, nn
+from torch.nn import functional
+
+from dpm2_core.config import Settings
+from dpm2_core.geometry.ground import height_above_ground
+
+LAYERS = (0.25, 0.75, 1.25, 1.75, 2.5, 4.0)
+"""Bounds of the layers of height above the ground, m; one more layer below, one above."""
+
+
+class MoverNetSettings(Settings):
+    """Grid and network of the movers."""
+
+    cells: int = Field(default=200, ge=16, multiple_of=8)
+    """Of the grid along x and along y; the sensor is in its middle. What lies off it counts as standing."""
+    cell: float = Field(default=0.4, gt=0)
+    """Edge of a cell, m."""
+    channels: int = Field(default=24, ge=4)
+    """Of the finest layers; the coarser ones have two and three times as many."""
+
+
+class MoverNet(nn.Module):
+    """Occupancy (B, 7, cells, cells), 0 or 1, to the logit of being a mover in each of its voxels, the same shape."""
+
+    range: Tensor
+
+    def __init__(self, settings: MoverNetSettings | None = None) -> None:
+        """Default settings if None: 152 thousand parameters."""
+        super().__init__()
+        self.settings = settings = settings or MoverNetSettings()
+        c, planes = settings.channels, 4 * (len(LAYERS) + 1)  # 2 x 2 cells make one of the finest layers
+        self.stem = _block(planes + 1, c, c)
+        self.down = nn.ModuleList(_block(a * c, b * c, b * c, 2) for a, b in pairwise((1, 2, 3)))
+        self.lift = nn.ModuleList(nn.Conv2d(a * c, b * c, 1) for a, b in pairwise((3, 2, 1)))
+        self.up = nn.ModuleList(_layer(b * c, b * c) for b in (2, 1))
+        self.head = nn.Conv2d(c, planes, 1)
+        half = settings.cells // 2
+        axis = (torch.arange(half) + 0.5) / half * 2 - 1
+        away = torch.hypot(axis[:, None], axis[None])  # points are the fewer the farther away
+        self.register_buffer("range", away[None, None], persistent=False)
+
+    def forward(self, occupied: Tensor) -> Tensor:
+        x = functional.pixel_unshuffle(occupied, 2)
+        x = self.stem(torch.cat([x, self.range.to(x.dtype).expand(len(x), -1, -1, -1)], 1))
+        finer = []
+        for block in self.down:
+            finer.append(x)
+            x = block(x)
+        for lift, block in zip(self.lift, self.up, strict=True):
+            x = block(functional.interpolate(lift(x), scale_factor=2.0) + finer.pop())
+        return functional.pixel_shuffle(self.head(x), 2)
+
+    @torch.inference_mode()
+    def probability(self, points: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(N,) 0..1 of (N, 3+) points of one scan, m, in a frame whose z is about up; 0 off the grid."""
+        voxel, inside = voxels(points, self.settings)
+        logits = self(occupancy([voxel[inside]], self.settings).to(self.range.device))
+        out = np.zeros(len(points), np.float32)
+        out[inside] = logits.flatten().sigmoid().float().cpu().numpy()[voxel[inside]]
+        return out
+
+
+def voxels(points: NDArray[np.float32], settings: MoverNetSettings) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Number (N,) of the voxel of (N, 3+) finite points, by layer, x and y, and whether they are on the grid (N,)."""
+    n = settings.cells
+    grid = np.floor(points[:, :2] / settings.cell).astype(np.int64) + n // 2
+    inside = ((grid >= 0) & (grid < n)).all(1)
+    layer = np.searchsorted(np.array(LAYERS, np.float32), height_above_ground(points))
+    return (layer * n + grid[:, 0]) * n + grid[:, 1], inside
+
+
+def occupancy(scans: Sequence[NDArray[np.int64]], settings: MoverNetSettings) -> Tensor:
+    """(B, 7, cells, cells), 1 in the voxels (N_b,) of each scan, 0 elsewhere."""
+    shape = (len(LAYERS) + 1, settings.cells, settings.cells)
+    out = torch.zeros(len(scans), math.prod(shape))
+    for row, voxel in zip(out, scans, strict=True):
+        row[torch.from_numpy(voxel)] = 1
+    return out.view(len(scans), *shape)
+
+
+def _layer(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(inputs, outputs, 3, stride, 1, bias=False), nn.BatchNorm2d(outputs), nn.ReLU(inplace=True)
+    )
+
+
+def _block(inputs: int, middle: int, outputs: int, stride: int = 1) -> nn.Sequential:
+    return nn.Sequential(_layer(inputs, middle, stride), _layer(middle, outputs))

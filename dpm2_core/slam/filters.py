@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a trained network leaves of a scan before the SLAM looks at it: no movers, no ground, or a scan without traffic.
+
+All that follows works on what is left: the choice of reference points and their descriptors, the registration of the
+points, and the map.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, Protocol
+
+import numpy as np
+from pydantic import Field
+
+from dpm2_core.config import Settings
+from dpm2_core.errors import UsageError
+from dpm2_core.frame import Points
+
+if TYPE_CHECKING:  # torch takes seconds to import, and the geometric SLAM does without
+    from dpm2_core.diffslam.tasks.dslr import Dslr
+    from dpm2_core.diffslam.tasks.gndnet import GroundNet
+    from dpm2_core.network.movers import MoverNet
+
+FilterKind = Literal["none", "movers", "ground", "static"]
+WEIGHTS: dict[FilterKind, str] = {"movers": "movers", "ground": "gndnet", "static": "dslr"}
+"""Names of the weights of each kind, and of the task that trains them."""
+SHIPPED = Path(__file__).resolve().parents[1] / "weights"
+
+
+class FilterSettings(Settings):
+    """What is left of a scan, before anything else looks at it."""
+
+    kind: FilterKind = "none"
+    """movers: without things that move or could move. ground: without the ground, by GndNet. static: DSLR's translation
+    into a scan without traffic."""
+    weights: Path | None = None
+    """Path of a .safetensors file; unset: those that come with dpm2."""
+    threshold: float = Field(0.5, gt=0, lt=1)
+    """movers: probability from which a point is left out."""
+    most: float = Field(0.7, ge=0, le=1)
+    """movers: at most this share of a scan is left out, the likeliest ones."""
+
+
+class PointFilter(Protocol):
+    """Scan to scan, both (N, 4) float32 [x, y, z m, intensity 0..1] in the frame of the LiDAR; may be empty."""
+
+    def __call__(self, points: Points) -> Points: ...
+
+
+class MoverFilter:
+    """Leaves out what moves or could; see `network.movers`."""
+
+    def __init__(self, net: MoverNet, threshold: float, most: float) -> None:
+        self._net, self._threshold, self._most = net, threshold, most
+
+    def __call__(self, points: Points) -> Points:
+        if not len(points):
+            return points
+        probability = self._net.probability(points)
+        # A network that finds hardly anything else is wrong, or has nothing to go by: half a scan is still a scan.
+        bound = max(self._threshold, float(np.quantile(probability, 1 - self._most)))
+        return points[probability <= bound]
+
+
+class GroundFilter:
+    """Leaves out the ground, and what lies off the grid of GndNet."""
+
+    def __init__(self, net: GroundNet) -> None:
+        self._net = net
+
+    def __call__(self, points: Points) -> Points:
+        import torch
+
+        from dpm2_core.diffslam.tasks.gndnet import obstacle_weight
+
+        with torch.inference_mode():
+            scan = torch.from_numpy(points)
+            above = obstacle_weight(scan, self._net([scan])[0], self._net.settings) > 0.5
+        return points[above.numpy()]
+
+
+class StaticFilter:
+    """The scan as DSLR thinks that it would be without traffic: another one, with the points of its range image."""
+
+    def __init__(self, net: Dslr) -> None:
+        self._net = net
+
+    def __call__(self, points: Points) -> Points:
+        import torch
+
+        if not len(points):
+            return points
+        xyz = self._net.static_points(torch.from_numpy(points)).numpy()
+        return np.concatenate([xyz, np.zeros((len(xyz), 1), np.float32)], 1).astype(np.float32)
+
+
+def make_filter(settings: FilterSettings, threads: int) -> PointFilter | None:
+    """What the settings name; None for `none`. `threads` are torch's, of which there is one number for a process.
+
+    Raises:
+        UsageError: no weights, or of another task.
+    """
+    if settings.kind == "none":
+        return None
+    path = settings.weights or SHIPPED / f"{WEIGHTS[settings.kind]}.safetensors"
+    if not path.is_file():
+        why = "no such file" if settings.weights else "none come with this dpm2"
+        raise UsageError(f"slam.filter.weights: {why} ({path}); `dpm2 train {WEIGHTS[settings.kind]}` makes some")
+    import torch
+
+    torch.set_num_threads(threads)
+    if settings.kind == "movers":
+        from dpm2_core.diffslam.tasks import movers_task
+
+        return MoverFilter(movers_task.load(path), settings.threshold, settings.most)
+    if settings.kind == "ground":
+        from dpm2_core.diffslam.tasks import gndnet
+
+        return GroundFilter(gndnet.load(path))
+    from dpm2_core.diffslam.tasks import dslr
+
+    return StaticFilter(dslr.load(path))

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The movers' task: it learns to tell a car from a wall, its figures are counts, and what does not fit is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from dpm2_core.diffslam.tasks.data import TaskScan, TaskScans
+from dpm2_core.diffslam.tasks.gndnet import GroundSettings
+from dpm2_core.diffslam.tasks.movers_task import MOVABLE, MoverTask, MoverTraining, load
+from dpm2_core.diffslam.tasks.training import save_task, train_task
+from dpm2_core.diffslam.tasks.weights import write_weights
+from dpm2_core.errors import UsageError
+from dpm2_core.network.movers import MoverNetSettings
+
+SMALL = MoverTraining(network=MoverNetSettings(cells=32, cell=1.0, channels=8), epochs=12, every=1, batch=1, drop=0.3)
+
+
+class Drive:
+    """6 scans of a plane with boxes as low as cars, 10 or (moving) 252, and as high as houses, 50, at random places."""
+
+    def __init__(self, seed: int) -> None:
+        self.rng = np.random.default_rng(seed)
+        self.scans = [self._scan(i) for i in range(6)]
+
+    def _scan(self, number: int) -> TaskScan:
+        rng = self.rng
+        clouds, labels = [np.column_stack([rng.uniform(-16, 16, (4000, 2)), np.full(4000, -1.7), np.zeros(4000)])], [40]
+        for k in range(10):
+            label, height = ((10, 1.5), (252, 1.5), (50, 6.0))[k % 3]
+            middle = rng.uniform(-13, 13, 2)
+            box = np.column_stack([rng.uniform(-1, 1, (300, 2)) + middle, rng.uniform(-1.4, height - 1.7, 300)])
+            clouds.append(np.column_stack([box, np.zeros(300)]))
+            labels.append(label)
+        each = np.concatenate([np.full(len(c), label) for c, label in zip(clouds, labels, strict=True)])
+        points = torch.from_numpy(np.concatenate(clouds).astype(np.float32))
+        return TaskScan(points, torch.from_numpy(each), None, "drive", number)
+
+    def __len__(self) -> int:
+        return len(self.scans)
+
+    def __getitem__(self, index: int) -> TaskScan:
+        return self.scans[index]
+
+
+def test_it_learns_what_can_move_parked_or_not(tmp_path: Path) -> None:
+    """From an IoU of chance to over 0.7, on scans that it has not seen; saved and loaded it says the same."""
+    train, val = TaskScans([Drive(seed) for seed in range(4)]), TaskScans([Drive(99)])
+    untrained = MoverTask(SMALL).eval()
+    with torch.no_grad():
+        before = untrained.evaluate(val)
+    task = train_task("movers", SMALL, train, tmp_path / "run")
+    with torch.no_grad():
+        after = task.evaluate(val)
+    assert before["iou"] < 0.4
+    assert after["iou"] > 0.7
+    assert after["recall_moving"] > 0.7
+    save_task(task, tmp_path / "w.safetensors", {}, half=False)
+    points = val[0].points.numpy()
+    assert isinstance(task, MoverTask)
+    np.testing.assert_array_equal(load(tmp_path / "w.safetensors").probability(points), task.net.probability(points))
+
+
+def test_figures_are_counts_of_points() -> None:
+    """Everything found: precision is the share of what can move, unlabelled points apart; nothing can move: NaN."""
+    task, scan = MoverTask(SMALL).eval(), Drive(1)[0]
+    assert scan.labels is not None
+    with torch.no_grad():
+        task.net.head.weight.zero_()
+        task.net.head.bias.fill_(9.0)
+        found = task.evaluate(TaskScans([_One(scan)]))
+        inside = (scan.points[:, :2].abs() < 16).all(1)
+        movable = torch.isin(scan.labels, torch.tensor([*MOVABLE, 252]))
+        assert found["precision"] == pytest.approx(float(movable.double().mean() / inside.double().mean()), rel=1e-3)
+        assert found["recall"] == found["recall_moving"] == 1.0
+        task.net.head.bias.fill_(-9.0)
+        still = TaskScan(scan.points, torch.full_like(scan.labels, 50), None, "drive", 0)
+        assert all(np.isnan(value) for value in task.evaluate(TaskScans([_One(still)])).values())
+
+
+def test_scans_without_classes_and_weights_of_others_are_errors_of_use(tmp_path: Path) -> None:
+    scan = TaskScan(torch.zeros(10, 4), None, None, "drive", 3)
+    with pytest.raises(UsageError, match="drive, scan 3: no labels"):
+        MoverTask(SMALL).losses([scan])
+    task = MoverTask(SMALL)
+    write_weights(tmp_path / "g.safetensors", "gndnet", GroundSettings(), task.state_dict(), {})
+    with pytest.raises(UsageError, match="weights of gndnet, not of movers"):
+        load(tmp_path / "g.safetensors")
+    with torch.no_grad():
+        next(task.parameters()).fill_(torch.nan)
+    save_task(task, tmp_path / "n.safetensors", {})
+    with pytest.raises(UsageError, match="not finite"):
+        load(tmp_path / "n.safetensors")
+    with pytest.raises(UsageError, match="not a safetensors file"):
+        load(Path(__file__))
+
+
+def test_points_that_are_not_finite_teach_nothing() -> None:
+    torch.manual_seed(0)
+    scan = Drive(2)[0]
+    assert scan.labels is not None
+    points = torch.cat([scan.points, torch.full((5, 4), torch.nan)])
+    broken = TaskScan(points, torch.cat([scan.labels, torch.full((5,), 252)]), None, "drive", 0)
+    loss, slam = MoverTask(SMALL).losses([broken, broken])
+    assert slam is None
+    assert bool(loss.isfinite())
+
+
+class _One(Drive):
+    """A sequence of one scan."""
+
+    def __init__(self, scan: TaskScan) -> None:
+        self.scans = [scan]

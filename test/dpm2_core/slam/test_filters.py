@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Filters: what they leave is what everything else sees; without the right weights the SLAM does not start."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from dpm2_core.diffslam.tasks.dslr import Dslr, DslrSettings
+from dpm2_core.diffslam.tasks.gndnet import GroundNet, GroundSettings
+from dpm2_core.diffslam.tasks.movers_task import MoverTask, MoverTraining
+from dpm2_core.diffslam.tasks.training import save_task
+from dpm2_core.errors import UsageError
+from dpm2_core.frame import Frame
+from dpm2_core.network.movers import MoverNetSettings
+from dpm2_core.slam.filters import FilterSettings, GroundFilter, MoverFilter, StaticFilter, make_filter
+from dpm2_core.slam.preprocess import Preprocessor, PreprocessSettings
+from dpm2_core.slam.system import SlamSettings, SlamSystem
+
+
+@pytest.fixture
+def points() -> np.ndarray:
+    """(5000, 4): level ground 1.733 m below the sensor, and the first 1000 points up to 2 m above it."""
+    rng = np.random.default_rng(0)
+    out = rng.uniform(-15, 15, (5000, 4)).astype(np.float32)
+    out[:, 2] = -1.733
+    out[:1000, 2] += rng.uniform(0.5, 2, 1000).astype(np.float32)
+    return out
+
+
+class _High:
+    """As a `MoverNet`: what is at least so high moves."""
+
+    def __init__(self, height: float) -> None:
+        self.height = height
+
+    def probability(self, points: np.ndarray) -> np.ndarray:
+        return (points[:, 2] > self.height).astype(np.float32) * (0.6 + 0.1 * points[:, 2])
+
+
+def test_movers_are_left_out_but_never_more_than_the_limit(points: np.ndarray) -> None:
+    high = points[:, 2] > -1
+    left = MoverFilter(_High(-1.0), 0.5, 0.7)(points)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(left, points[~(high & (0.6 + 0.1 * points[:, 2] > 0.5))])
+    some = MoverFilter(_High(-9.0), 0.1, 0.3)(points)  # type: ignore[arg-type]
+    assert len(some) >= 0.7 * len(points)
+    assert some[:, 2].max() < points[:, 2].max()  # the likeliest went first
+    assert len(MoverFilter(_High(0), 0.5, 0.7)(points[:0])) == 0  # type: ignore[arg-type]
+
+
+def test_ground_is_left_out(points: np.ndarray) -> None:
+    """A network that says zero everywhere: the ground is where the sensor's height puts it."""
+    net = GroundNet(GroundSettings(cells=32, channels=4)).eval()
+    with torch.no_grad():
+        for parameter in net.head.parameters():
+            parameter.zero_()
+    np.testing.assert_array_equal(GroundFilter(net)(points), points[:1000])
+
+
+def test_a_translated_scan_is_a_scan(points: np.ndarray) -> None:
+    torch.manual_seed(0)
+    out = StaticFilter(Dslr(DslrSettings()).eval())(points)
+    assert out.shape[1] == 4
+    assert out.dtype == np.float32
+    assert 0 < len(out) <= 40 * 256
+    assert np.isfinite(out).all()
+    assert len(StaticFilter(Dslr(DslrSettings()).eval())(points[:0])) == 0
+
+
+def test_cloud_source_and_measured_are_what_the_filter_leaves(points: np.ndarray) -> None:
+    preprocessor = Preprocessor(PreprocessSettings(), lambda scan: scan[scan[:, 2] > -1.5])
+    scan = preprocessor.prepare(Frame(0, points), np.zeros(6))
+    assert len(scan.points) > 900
+    assert min(scan.points[:, 2].min(), scan.cloud[:, 2].min(), scan.source[:, 2].min()) > -1.5
+
+
+def test_a_slam_with_a_filter_runs_and_tells_what_is_missing(tmp_path: Path, points: np.ndarray) -> None:
+    task = MoverTask(MoverTraining(network=MoverNetSettings(cells=32, cell=1.0, channels=4)))
+    path = tmp_path / "movers.safetensors"
+    save_task(task, path, {})
+    system = SlamSystem(SlamSettings(filter=FilterSettings(kind="movers", weights=path), threads=1))
+    assert [system.process(Frame(i * 10**8, points)).registration.ok for i in range(3)] == [True] * 3
+    assert make_filter(FilterSettings(), 1) is None
+    with pytest.raises(UsageError, match="weights of movers, not of gndnet"):
+        make_filter(FilterSettings(kind="ground", weights=path), 1)
+    with pytest.raises(UsageError, match=r"slam\.filter\.weights: no such file .*dpm2 train dslr"):
+        make_filter(FilterSettings(kind="static", weights=tmp_path / "none.safetensors"), 1)
