@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The comparison with and without the SLAM loss: its arithmetic, and that it goes on where it was stopped."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from dpm2_core.diffslam.tasks.drives import TaskDriveSettings
+from dpm2_core.errors import UsageError
+from dpm2_core.evaluation.bench import tasks
+from dpm2_core.evaluation.bench.harness import Options
+
+
+def test_summary_by_hand() -> None:
+    """Gain is positive where the SLAM loss helps, whichever way is better; the spread is that of both arms together."""
+    runs = {
+        "without": {str(i): {"mse": mse, "recall": recall} for i, (mse, recall) in enumerate([(1, 0.8), (2, 0.8)])},
+        "with": {str(i): {"mse": mse, "recall": recall} for i, (mse, recall) in enumerate([(0.7, 0.6), (1.7, 0.6)])},
+    }
+    found = tasks.summary(runs, {"mse": "lower", "recall": "higher"})
+    assert found["mse"]["without"] == {"mean": 1.5, "std": pytest.approx(0.7071, abs=1e-4)}
+    assert found["mse"]["gain"] == pytest.approx(0.2)
+    assert found["mse"]["beyond_spread"] is False
+    assert found["recall"]["gain"] == pytest.approx(-0.25)
+    assert found["recall"]["beyond_spread"] is True
+    one = tasks.summary({"without": {"0": {"mse": 1.0}}, "with": {}}, {"mse": "lower"})
+    assert one == {"mse": {"without": {"mean": 1.0, "std": None}}}
+
+
+def test_comparison_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A training that ended is not repeated, one of other settings is; the file keeps the other tasks' parts."""
+    drives = TaskDriveSettings.model_validate(
+        {"train": 1, "train_frames": 3, "val": 1, "val_frames": 2, "lidar": {"columns": 48, "beams": 16}}
+    )
+    small = (
+        "network.cells=32", "network.cell=2", "network.channels=4", "epochs=2", "window=3", "every=1", "slam.gamma=0.1",
+        "slam.every=2", "slam_loss.points=200",
+    )  # fmt: skip
+    figures = tasks.COMPARISONS["gndnet"].figures
+    monkeypatch.setattr(tasks, "COMPARISONS", {"gndnet": tasks.Comparison(small, figures, drives)})
+    trained = []
+    original = tasks.train_task
+    monkeypatch.setattr(tasks, "train_task", lambda *a: trained.append(a[1].slam.gamma) or original(*a))
+    options = Options(threads=1, repetitions=1, only="gndnet", out=tmp_path / "out", cache=tmp_path / "cache")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "tasks.json").write_text('{"parts": {"dslr": {"summary": {}, "runs": {"with": {}}}}}')
+    tasks.bench_tasks(options)
+    assert trained == [0.0, 0.1]
+    record = json.loads((tmp_path / "out" / "tasks.json").read_text())
+    assert record["parts"].keys() == {"dslr", "gndnet"}
+    part = record["parts"]["gndnet"]
+    assert part["complete"]
+    run = part["runs"]["with"]["0"]
+    assert run["slam_share_at_first"] > 0
+    assert run["mse"] == pytest.approx(part["summary"]["mse"]["with"]["mean"])
+    assert part["runs"]["without"]["0"]["slam_share_at_first"] is None
+    tasks.bench_tasks(options)
+    assert trained == [0.0, 0.1]
+    tasks.bench_tasks(Options(**{**vars(options), "overrides": ("slam.gamma=0.2",)}))
+    assert trained == [0.0, 0.1, 0.2]
+    with pytest.raises(UsageError, match="--only nonsense: no such task"):
+        tasks.bench_tasks(Options(only="nonsense"))
