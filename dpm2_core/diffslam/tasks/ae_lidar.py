@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from dpm2_core.config import Settings
 from dpm2_core.diffslam.tasks.dslr import initialise
 from dpm2_core.diffslam.tasks.range_image import CHANNELS, RangeImageSettings
+from dpm2_core.diffslam.tasks.weights import load_strictly, read_weights
 from dpm2_core.errors import UsageError
 
 
@@ -89,12 +90,10 @@ def load(path: Path) -> LidarAutoencoder:
     Raises:
         UsageError: no such file, a pickle, weights of another task, other settings or shapes, values not finite.
     """
-    from dpm2_core.diffslam.tasks.ae_lidar_task import AeLidarTask
-    from dpm2_core.diffslam.tasks.training import load_task
-
-    task = load_task("ae_lidar", path)
-    assert isinstance(task, AeLidarTask)
-    return task.network
+    state, settings = read_weights(path, "ae_lidar", AeLidarSettings)
+    network = LidarAutoencoder(settings)
+    load_strictly(nn.ModuleDict({"network": network}), state, path)  # as the task that was trained holds it
+    return network.eval().requires_grad_(False)
 
 
 def _down(inputs: int, outputs: int, kernel: int | tuple[int, int], padding: int | tuple[int, int]) -> list[nn.Module]:

@@ -57,7 +57,7 @@ class AeLidarTask(Task):
 
     def losses(self, window: list[TaskScan]) -> tuple[Tensor, Callable[[], Tensor] | None]:
         """Sum of absolute errors, and divergence; SLAM on what was made against SLAM on the scans."""
-        scans = self._reader.read(window)
+        scans = self._reader.read(window, keep=True)
         made, divergence = self.network(scans.images)
         loss = image_error(made, scans.images)
         if self.settings.network.variational:

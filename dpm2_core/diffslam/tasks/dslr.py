@@ -23,6 +23,7 @@ from dpm2_core.diffslam.tasks.range_image import (
     project,
     to_points,
 )
+from dpm2_core.diffslam.tasks.weights import load_strictly, read_weights
 from dpm2_core.errors import UsageError
 
 _TALLEST = 42  # rows that the decoder makes; the image is cut from them
@@ -153,12 +154,10 @@ def load(path: Path) -> Dslr:
     Raises:
         UsageError: no such file, a pickle, weights of another task, other settings or shapes, values not finite.
     """
-    from dpm2_core.diffslam.tasks.dslr_task import DslrTask
-    from dpm2_core.diffslam.tasks.training import load_task
-
-    task = load_task("dslr", path)
-    assert isinstance(task, DslrTask)
-    return task.network
+    state, settings = read_weights(path, "dslr", DslrSettings)
+    network = Dslr(settings)
+    load_strictly(nn.ModuleDict({"network": network}), state, path)  # as the task that was trained holds it
+    return network.eval().requires_grad_(False)
 
 
 def initialise(module: nn.Module) -> None:

@@ -70,11 +70,11 @@ class DslrTask(Task):
 
     def losses(self, window: list[TaskScan]) -> tuple[Tensor, Callable[[], Tensor] | None]:
         """Loss of the stage; SLAM on the translated scans against that on the static twins."""
-        static = self._reader.read(window, static=True)
+        static = self._reader.read(window, static=True, keep=True)
         network = self.network
         if self.stage == 1:
             return image_error(network.decoder(network.static_encoder(static.images)), static.images), None
-        dynamic = self._reader.read(window)
+        dynamic = self._reader.read(window, keep=True)
         other = torch.randperm(len(window))
         if self.stage == 2:
             codes, moved = network.static_encoder(torch.cat([static.images, dynamic.images])).chunk(2)

@@ -29,7 +29,7 @@ class RangeImageSettings(Settings):
     VLP-16: ((15, -15, 16),)."""
     first: int = Field(default=5, ge=0)
     """Beam of the top row."""
-    rows: int = Field(default=40, ge=2)
+    rows: int = Field(default=40, ge=4)
     """Beams of the image."""
     columns: int = Field(default=256, ge=64, multiple_of=64)
     """Slots of a turn, from straight ahead to the left."""

@@ -39,25 +39,29 @@ class RangeScans:
 
 
 class RangeReader:
-    """Makes range images of scans, and keeps the latest."""
+    """Makes range images of scans, and keeps the latest of those that it is told to."""
 
     def __init__(self, settings: RangeImageSettings) -> None:
         """Images of that geometry."""
         self._settings = settings
-        self._kept: dict[tuple[str, int, str], tuple[Tensor, Tensor]] = {}
+        self._kept: dict[tuple[str, int, bool], tuple[Tensor, Tensor]] = {}
 
-    def read(self, scans: Sequence[TaskScan], static: bool = False) -> RangeScans:
+    def read(self, scans: Sequence[TaskScan], static: bool = False, keep: bool = False) -> RangeScans:
         """The scans, or their twins without what moves.
+
+        Args:
+            keep: the images, for the next time. Scans are told apart by sequence and number, so only those of one data
+                set may be kept.
 
         Raises:
             UsageError: a scan has no twin, no point in the image, or is an image of other rows and columns.
         """
-        pairs = [self._of(scan, static) for scan in scans]
+        pairs = [self._kept_or_made(scan, static) if keep else self._made(scan, static) for scan in scans]
         frames = [(scan.sequence, scan.number) for scan in scans]
         return RangeScans(torch.stack([image for image, _ in pairs]), torch.stack([mask for _, mask in pairs]), frames)
 
-    def _of(self, scan: TaskScan, static: bool) -> tuple[Tensor, Tensor]:
-        key = (scan.sequence, scan.number, "static" if static else "")
+    def _kept_or_made(self, scan: TaskScan, static: bool) -> tuple[Tensor, Tensor]:
+        key = (scan.sequence, scan.number, static)
         if key not in self._kept:
             if len(self._kept) >= 2 * _KEPT:
                 self._kept.pop(next(iter(self._kept)))

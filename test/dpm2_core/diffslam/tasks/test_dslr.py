@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+"""DSLR: sizes, what each stage trains and what it leaves alone, where the SLAM loss goes, and all of it in small."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from torch import nn
+
+from dpm2_core.diffslam import ScheduleSettings, SlamLossSettings
+from dpm2_core.diffslam.tasks.data import open_scans
+from dpm2_core.diffslam.tasks.dslr import Dslr, DslrSettings, PairDiscriminator, RangeDecoder, RangeEncoder, load
+from dpm2_core.diffslam.tasks.dslr_task import DslrTask, DslrTraining
+from dpm2_core.diffslam.tasks.range_image import RangeImageSettings
+from dpm2_core.diffslam.tasks.training import WEIGHTS, draw, measure, train_task
+from dpm2_core.errors import UsageError
+from dpm2_core.network.weights import read_tensors
+
+SENSOR = RangeImageSettings(beams=((2.0, -14.0, 16),), first=0, rows=16, columns=64, scale=60.0)
+NETWORK = DslrSettings(image=SENSOR, channels=8, latent=16)
+
+
+def training(**changes: object) -> DslrTraining:
+    """Small, and fast."""
+    small: dict[str, object] = {
+        "network": NETWORK, "window": 4, "every": 1, "batch": 2, "warmup": 5, "rate": 3e-3,
+        "slam_loss": SlamLossSettings(points=300), "autoencoder_epochs": 1, "discriminator_epochs": 1, "epochs": 3,
+    }  # fmt: skip
+    return DslrTraining.model_validate(small | changes)
+
+
+def parameters(module: nn.Module) -> int:
+    return sum(p.numel() for p in module.parameters())
+
+
+def test_sizes_are_those_of_the_paper() -> None:
+    """Encoder 2.544 M, decoder 2.987 M, discriminator 68 k parameters; 40 x 256 in and out."""
+    settings = DslrSettings()
+    assert parameters(RangeEncoder(settings)) == 2_544_384
+    assert parameters(RangeDecoder(settings)) == 2_986_624
+    assert parameters(PairDiscriminator(settings)) == 68_321
+    assert Dslr(settings).eval()(torch.rand(1, 2, 40, 256)).shape == (1, 2, 40, 256)
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(16, 64), (24, 512), (41, 128), (42, 64), (4, 64)])
+def test_other_sensors_fit(rows: int, columns: int) -> None:
+    """Whatever the rows up to 42 and the columns in steps of 64; the values are in -1..1."""
+    image = RangeImageSettings(beams=((2, -25, 64),), first=0, rows=rows, columns=columns)
+    made = Dslr(DslrSettings(image=image, channels=4, latent=8)).eval()(torch.rand(2, 2, rows, columns))
+    assert made.shape == (2, 2, rows, columns)
+    assert made.abs().max() <= 1
+
+
+def test_too_many_rows_are_refused() -> None:
+    """The decoder makes 42."""
+    with pytest.raises(UsageError, match="images of 64 rows; want at most 42"):
+        Dslr(DslrSettings(image=RangeImageSettings(first=0, rows=64)))
+
+
+def gradients(task: DslrTask) -> set[str]:
+    """Networks that the loss of one step reaches."""
+    return {
+        name
+        for name, part in task.network.named_children()
+        if any(p.grad is not None and bool(p.grad.any()) for p in part.parameters())
+    }
+
+
+@pytest.mark.parametrize(
+    ("epoch", "reached"),
+    [
+        (0, {"static_encoder", "decoder"}),
+        (1, {"static_encoder", "decoder", "discriminator"}),
+        (2, {"dynamic_encoder"}),
+    ],
+)
+def test_each_stage_trains_its_own_part(pairs: Path, epoch: int, reached: set[str]) -> None:
+    """Gradients, and in the third stage running means, of everything that is frozen stay as they were."""
+    torch.manual_seed(0)
+    task = DslrTask(training())
+    scans = open_scans(pairs)
+    task.train()
+    task.start_epoch(epoch)
+    before = {name: value.clone() for name, value in task.network.state_dict().items()}
+    loss, slam = task.losses([scans[i] for i in (0, 1, 2, 3, 8, 9, 10, 11)])
+    loss.backward()
+    assert gradients(task) == reached
+    assert (slam is not None) == (epoch == 2)
+    changed = {name for name, value in task.network.state_dict().items() if not torch.equal(value, before[name])}
+    assert {name.partition(".")[0] for name in changed} <= reached  # of batch normalisation
+
+
+def test_third_stage_begins_with_the_static_encoder(pairs: Path) -> None:
+    """Its copy, once: an epoch later the dynamic encoder is its own."""
+    task = DslrTask(training())
+    nn.init.ones_(task.network.static_encoder.layers[0].weight)
+    task.start_epoch(2)
+    assert bool((task.network.dynamic_encoder.layers[0].weight == 1).all())
+    nn.init.zeros_(task.network.dynamic_encoder.layers[0].weight)
+    task.start_epoch(3)
+    assert not task.network.dynamic_encoder.layers[0].weight.any()
+
+
+def test_slam_loss_reaches_the_dynamic_encoder_and_is_zero_for_the_truth(
+    pairs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By its gradient; and a translation that is right costs nothing."""
+    torch.manual_seed(0)
+    task = DslrTask(training())
+    scans = open_scans(pairs)
+    window = [scans[i] for i in range(8)]
+    task.start_epoch(2)
+    _, slam = task.losses(window)
+    assert slam is not None
+    value = slam()
+    value.backward()
+    assert value.item() > 0
+    assert gradients(task) == {"dynamic_encoder"}
+    truth = task._reader.read(window, static=True).images
+    monkeypatch.setattr(task.network.decoder, "forward", lambda codes: truth)
+    _, slam = task.losses(window)
+    assert slam is not None
+    assert slam().item() < 1e-20
+
+
+def test_learns_and_survives_being_stopped(pairs: Path, tmp_path: Path) -> None:
+    """The loss falls to less than half; stopped in its third stage and resumed it writes the same weights.
+
+    What it wrote can be loaded, measured and drawn, and translates a scan of points.
+    """
+    settings = training(
+        autoencoder_epochs=13, discriminator_epochs=1, epochs=22, batch=1, slam=ScheduleSettings(gamma=1.0, every=10)
+    )
+    scans = open_scans(pairs)
+    task = train_task("dslr", settings, scans, tmp_path / "whole")
+    log = [json.loads(line) for line in (tmp_path / "whole" / "log.jsonl").read_text().splitlines()]
+    assert log[51]["task_loss"] < 0.5 * log[0]["task_loss"]
+    assert [row["step"] for row in log if row.get("slam_loss") is not None] == [76, 77, 78, 79]
+    train_task("dslr", settings, scans, tmp_path / "parts", until=18)
+    train_task("dslr", settings, scans, tmp_path / "parts", resume=True)
+    weights = (tmp_path / "whole" / WEIGHTS, tmp_path / "parts" / WEIGHTS)
+    (whole, _), (parts, _) = (read_tensors(path) for path in weights)
+    assert all(torch.equal(value, parts[name]) for name, value in whole.items())
+
+    figures = measure(task, scans)
+    assert figures.keys() == {
+        "chamfer_m", "chamfer", "moved_m", "input_chamfer_m", "input_chamfer", "input_moved_m"
+    }  # fmt: skip
+    assert figures["moved_m"] < figures["input_moved_m"]  # the car is taken away
+    draw(task, scans, 3, tmp_path / "picture.png")
+    assert (tmp_path / "picture.png").read_bytes().startswith(b"\x89PNG")
+    network = load(weights[0])
+    points = network.static_points(scans[3].points)
+    assert points.shape[1] == 3
+    assert bool(points.isfinite().all())
+    with torch.no_grad():
+        torch.testing.assert_close(points, task.clouds(scans[3])["output"], atol=0.5, rtol=0)  # projected anew
+
+
+def test_what_is_no_dslr_is_refused(pairs: Path, tmp_path: Path) -> None:
+    """A pickle, another task's weights, a missing file, scans without twins."""
+    torch.save({"weights": torch.ones(1)}, tmp_path / "pickle.pt")
+    with pytest.raises(UsageError, match="pickled weights are never loaded"):
+        load(tmp_path / "pickle.pt")
+    with pytest.raises(UsageError, match="no such weights"):
+        load(tmp_path / "nothing.safetensors")
+    shipped = Path(__file__).parents[4] / "dpm2_core" / "weights" / "small.safetensors"
+    with pytest.raises(UsageError, match="weights of no task, not of dslr"):
+        load(shipped)
+    drive = tmp_path / "drive" / "velodyne"
+    drive.mkdir(parents=True)
+    for i in range(2):
+        torch.rand(100, 4).numpy().tofile(drive / f"{i:06d}.bin")
+    with pytest.raises(UsageError, match="no static/"):
+        open_scans(tmp_path / "drive", DslrTask.needs)
