@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""GndNet as a task: its SLAM loss says what the paper means it to say, and its figures are those of the labels."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from dpm2_core.diffslam.tasks.data import TaskScan, TaskScans, open_scans
+from dpm2_core.diffslam.tasks.gndnet import elevation_labels
+from dpm2_core.diffslam.tasks.ground_task import GroundTask, GroundTraining, _tilt, filled, ground_of
+from dpm2_core.diffslam.tasks.training import measure
+
+SETTINGS = GroundTraining.model_validate(
+    {"network": {"cells": 48, "cell": 2.0, "channels": 4}, "tilt": 0.0, "slam_loss": {"points": 500}}
+)
+
+
+class Known(nn.Module):
+    """In place of the network: an elevation that is the truth, raised by `offset`, m."""
+
+    def __init__(self, scans: list[TaskScan], offset: Tensor) -> None:
+        super().__init__()
+        network = SETTINGS.network
+        truth = [filled(*elevation_labels(s.points, ground_of(s)[0], network)) for s in scans]
+        self.truth, self.offset = torch.stack(truth), nn.Parameter(offset)
+
+    def forward(self, clouds: list[Tensor]) -> Tensor:
+        return self.truth[: len(clouds)] + self.offset
+
+
+@pytest.fixture
+def scans(write_drive: Callable[..., Path], tmp_path: Path) -> TaskScans:
+    """Three labelled scans of one street."""
+    return open_scans(write_drive(tmp_path / "drive", range(3), points=3000))
+
+
+def with_elevation(scans: TaskScans, offset: float) -> tuple[GroundTask, list[TaskScan], Any]:
+    """A task that finds the true elevation, raised; the window; its parameter."""
+    window = [scans[i] for i in range(3)]
+    task = GroundTask(SETTINGS)
+    known = Known(window, torch.tensor(offset))
+    task.net = known  # type: ignore[assignment]
+    return task, window, known.offset
+
+
+def test_the_true_elevation_costs_nothing(scans: TaskScans) -> None:
+    """Neither the task, but for its curvature, nor the SLAM; and no gradient."""
+    task, window, offset = with_elevation(scans, 0.0)
+    loss, slam = task.losses(window)
+    assert float(loss.detach()) < 0.01
+    value = slam()
+    value.backward()
+    assert float(value.detach()) == pytest.approx(0.0, abs=1e-18)
+    assert float(offset.grad) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_the_slam_loss_sees_a_wrong_elevation(scans: TaskScans) -> None:
+    """A ground 0.3 m too low turns the road into obstacles, and the trajectory is another one; with a finite slope."""
+    task, window, offset = with_elevation(scans, -0.3)
+    value = task.losses(window)[1]()
+    value.backward()
+    assert float(value.detach()) > 1e-6
+    assert math.isfinite(float(offset.grad))
+    assert float(offset.grad) != 0
+
+
+def test_figures_of_the_true_elevation(scans: TaskScans) -> None:
+    """No error of the height; what is not labelled ground is found, what is labelled ground is not."""
+    task, _, _ = with_elevation(scans, 0.0)
+
+    def of_its_own(clouds: list[Tensor]) -> Tensor:
+        return torch.full((1, 48, 48), -1.7)
+
+    task.net.forward = of_its_own  # type: ignore[method-assign]
+    found = measure(task, scans)
+    assert found["mse"] < 1e-4 + 2e-4  # the noise of 1 cm, of cells with few points
+    assert found["precision"] > 0.99
+    high = []  # half of the boxes is below the road, and cannot be found
+    for scan in (scans[i] for i in range(3)):
+        ground, counted = ground_of(scan)
+        inside = scan.points[:, :2].abs().amax(1) < 48
+        high.append(float((scan.points[~ground & counted & inside, 2] > -1.5).float().mean()))
+    assert found["recall"] == pytest.approx(sum(high) / 3, abs=1e-3)
+
+
+def test_tilt_is_a_rotation_of_the_whole_window(scans: TaskScans) -> None:
+    """By roll and pitch within the bound; the labels turn along, and it is another one each time."""
+    torch.manual_seed(0)
+    turns = [_tilt(0.1) for _ in range(20)]
+    for turn in turns:
+        torch.testing.assert_close(turn @ turn.T, torch.eye(3))
+        assert float(turn.det()) == pytest.approx(1.0, abs=1e-5)
+        assert abs(float(torch.atan2(turn[2, 1], turn[2, 2]))) <= 0.1
+        assert abs(float(torch.asin(turn[2, 0]))) <= 0.1
+    assert not torch.equal(turns[0], turns[1])
+    tilted = GroundTask(SETTINGS.model_copy(update={"tilt": 8.0}))
+    window = [scans[i] for i in range(3)]
+    torch.manual_seed(1)
+    a = float(tilted.losses(window)[0].detach())
+    torch.manual_seed(1)
+    assert float(tilted.losses(window)[0].detach()) == a
+    assert float(tilted.losses(window)[0].detach()) != a
+
+
+def test_gaps_take_the_nearest_cell_that_is_known() -> None:
+    """And stay zero where none is."""
+    elevation, known = torch.zeros(6, 6), torch.zeros(6, 6, dtype=torch.bool)
+    assert torch.equal(filled(elevation, known), elevation)
+    known[0, 0] = known[5, 5] = True
+    elevation[0, 0], elevation[5, 5], elevation[3, 3] = -1.7, -1.2, 99.0
+    found = filled(elevation, known)
+    assert float(found[1, 2]) == pytest.approx(-1.7)
+    assert float(found[3, 3]) == pytest.approx(-1.2)
