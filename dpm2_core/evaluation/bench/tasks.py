@@ -47,10 +47,11 @@ class Comparison:
 COMPARISONS: dict[str, Comparison] = {
     "gndnet": Comparison(
         settings=(
-            "network.cells=64", "network.channels=16", "epochs=6", "rate=2e-3", "tilt=6", "slam.gamma=1",
-            "slam.every=2", "slam_loss.points=1024",
+            "network.cells=64", "network.channels=16", "epochs=6", "rate=3e-3", "slam.gamma=2", "slam.every=2",
+            "slam_loss.points=1024",
         ),
         figures={"mse": "lower", "miou": "higher", "precision": "higher", "recall": "higher"},
+        drives=TaskDriveSettings(train=24, train_frames=20, val=6, val_frames=20),
     ),
 }  # fmt: skip
 
@@ -95,7 +96,7 @@ def _read(path: Path) -> dict[str, Any]:
 def _compare(name: str, comparison: Comparison, options: Options) -> Any:
     """The part of a task, again after every training."""
     kind = task_type(name)
-    folder = options.cache / "tasks"
+    folder = options.cache / "tasks" / name
     make_task_drives(folder / "drives", comparison.drives, options.threads)
     learn, judge = (open_scans(folder / "drives" / which, kind.needs) for which in ("train", "val"))
     overrides = [*comparison.settings, *options.overrides]
@@ -114,7 +115,7 @@ def _compare(name: str, comparison: Comparison, options: Options) -> Any:
         for arm, gamma in (("without", 0.0), ("with", chosen.slam.gamma)):
             slam = chosen.slam.model_copy(update={"gamma": gamma})
             settings = chosen.model_copy(update={"seed": seed, "slam": slam})
-            out = folder / name / f"{arm}_{seed}"
+            out = folder / f"{arm}_{seed}"
             part["runs"][arm][str(seed)] = _run(name, settings, learn, judge, out)
             part["summary"] = summary(part["runs"], comparison.figures)
             part["complete"] = seed + 1 == options.repetitions and arm == "with"
