@@ -39,6 +39,9 @@ class SlamLossSettings(Settings):
     """Of that relaxation."""
     rotation_weight: float = Field(default=25.0, ge=0)
     """Squared metres that a squared radian counts for, m2 / rad2."""
+    warm_start: bool = False
+    """Both trajectories start where that of the target scans has ended, instead of at the guess: for scans so far apart
+    that the iterations do not converge from there. What has not converged has a gradient that says little."""
     truncate: int = Field(default=0, ge=0)
     """Gradients do not pass beyond every so many scans of the trajectory: long windows do not explode. 0: they pass."""
 
@@ -101,7 +104,7 @@ class SlamLoss(torch.nn.Module):
         """Default settings if None."""
         super().__init__()
         self.settings = settings or SlamLossSettings()
-        self._references: dict[tuple[tuple[str, int], ...], Tensor] = {}
+        self._references: dict[tuple[tuple[str, int], ...], tuple[Tensor, Tensor | None]] = {}
 
     def forward(
         self,
@@ -128,20 +131,24 @@ class SlamLoss(torch.nn.Module):
             raise UsageError(f"SLAM loss: {len(pred_clouds)} predicted scans for {len(target_clouds)} targets")
         if frames is not None:
             check_contiguous(frames, len(pred_clouds))
-        reference = self._reference(target_clouds, target_weights, guess, frames)
+        reference, guess = self._reference(target_clouds, target_weights, guess, frames)
         poses = odometry(pred_clouds, weights, guess, self.settings, "predicted clouds")
         return trajectory_loss(poses, reference.to(poses.device), self.settings.rotation_weight)
 
     @torch.no_grad()
     def _reference(self, clouds: Clouds, weights: Weights, guess: Tensor | None,
-                   frames: Sequence[tuple[str, int]] | None) -> Tensor:  # fmt: skip
+                   frames: Sequence[tuple[str, int]] | None) -> tuple[Tensor, Tensor | None]:  # fmt: skip
+        """The trajectory of the target scans, and where both start from."""
         key = tuple(frames) if frames is not None else ()
         if key and key in self._references:
             return self._references[key]
         poses = odometry(clouds, weights, guess, self.settings, "target clouds")
+        if self.settings.warm_start:
+            guess = se3_torch.inverse(poses[:-1]) @ poses[1:]
+            poses = odometry(clouds, weights, guess, self.settings, "target clouds")
         if key:
-            self._references[key] = poses
-        return poses
+            self._references[key] = poses, guess
+        return poses, guess
 
 
 def check_contiguous(frames: Sequence[tuple[str, int]], length: int) -> None:

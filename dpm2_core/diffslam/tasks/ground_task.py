@@ -23,7 +23,7 @@ from dpm2_core.diffslam.tasks.gndnet import (
 )
 from dpm2_core.diffslam.tasks.task import Task, TaskTraining
 from dpm2_core.diffslam.tasks.training import mean_figures
-from dpm2_core.diffslam.trajectory_loss import SlamLoss
+from dpm2_core.diffslam.trajectory_loss import SlamLoss, SlamLossSettings
 from dpm2_core.errors import UsageError
 
 GROUND = (40, 44, 48, 49, 60, 72)
@@ -32,11 +32,20 @@ UNCOUNTED = (0, 1)
 """Unlabelled, outlier."""
 
 
+class AboveGroundSettings(SlamLossSettings):
+    """Odometry on what is above the ground, which is slow to converge from the identity."""
+
+    warm_start: bool = True
+    """Both trajectories start where that of the target scans has ended."""
+
+
 class GroundTraining(TaskTraining):
     """A training of GndNet."""
 
     network: GroundSettings = GroundSettings()
     """Grid, network and loss."""
+    slam_loss: AboveGroundSettings = AboveGroundSettings()
+    """Odometry of the SLAM loss."""
     tilt: float = Field(default=3.0, ge=0, lt=45)
     """Each window is rolled and pitched by up to this, deg (the original: 10)."""
 

@@ -75,6 +75,22 @@ def test_descending_the_loss_repairs_a_cloud(noisy: list[Tensor], scans: list[Te
     assert float(loss([scans[0], scans[1] + shift.detach() - step, *scans[2:]], scans)) < float(before.detach())
 
 
+def test_warm_start_measures_at_the_end_of_the_way(scans: list[Tensor], noisy: list[Tensor]) -> None:
+    """Two iterations from the identity are not enough for a step of 0.8 m, and leave both on their way; started where
+    the reference has ended, the loss comes near the converged one. Equal clouds have no loss; the reference is kept."""
+    two = IcpSettings(solver=SoftLmSettings(iterations=2))
+    with torch.no_grad():
+        wanted = float(SlamLoss(CONVERGED)(noisy, scans))
+        cold = float(SlamLoss(SlamLossSettings(icp=two))(noisy, scans))
+        loss = SlamLoss(SlamLossSettings(icp=two, warm_start=True))
+        warm = float(loss(noisy, scans))
+        assert abs(warm - wanted) < 0.5 * abs(cold - wanted)
+        assert float(loss(noisy, noisy)) < 1e-20
+        frames = [("drive", t) for t in range(4)]
+        assert float(loss(noisy, scans, frames=frames)) == warm
+        assert float(loss(noisy, noisy, frames=frames)) == warm  # of the frames' own targets, not of these
+
+
 def test_removing_a_moving_object_reduces_the_loss(scans: list[Tensor]) -> None:
     """A fifth of the points drives along with the sensor; the loss falls with their weight, and its slope says so."""
     generator = torch.Generator().manual_seed(5)
