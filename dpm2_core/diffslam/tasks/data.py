@@ -7,6 +7,7 @@ in static/ beside. The pairs of DSLR have a layout of their own: `dslr_data`.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -107,10 +108,12 @@ def open_scans(path: Path | str, needs: Sequence[Need] = ()) -> TaskScans:
 
 
 def sequence_folders(path: Path) -> list[Path]:
-    """Folders that hold velodyne/, at most three levels down: DRIVE/sequences/NN."""
-    if (path / "velodyne").is_dir():
-        return [path]
-    found = (p.parent for pattern in ("*", "*/*", "*/*/*") for p in path.glob(f"{pattern}/velodyne") if p.is_dir())
+    """Folders that hold velodyne/, themselves not searched further."""
+    found = []
+    for folder, inner, _ in os.walk(path, followlinks=True):
+        if "velodyne" in inner:
+            found.append(Path(folder))
+            inner.clear()
     return sorted(found)
 
 

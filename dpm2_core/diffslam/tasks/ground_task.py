@@ -48,6 +48,8 @@ class GroundTraining(TaskTraining):
     """Odometry of the SLAM loss."""
     tilt: float = Field(default=3.0, ge=0, lt=45)
     """Each window is rolled and pitched by up to this, deg (the original: 10)."""
+    lift: float = Field(default=0.0, ge=0)
+    """Each window is moved up or down by up to this, m: LiDARs on other cars are higher or lower."""
 
 
 class GroundTask(Task):
@@ -69,8 +71,8 @@ class GroundTask(Task):
         The reference sees the same points by their height above the true ground.
         """
         network = self.settings.network
-        turn = _tilt(math.radians(self.settings.tilt)).to(self.device)
-        clouds = [torch.cat([scan.points[:, :3] @ turn.T, scan.points[:, 3:]], 1) for scan in window]
+        turn, up = self._moved()
+        clouds = [scan.points @ turn.T + up for scan in window]
         pairs = [elevation_labels(c, ground_of(scan)[0], network) for c, scan in zip(clouds, window, strict=True)]
         labels, known = torch.stack([label for label, _ in pairs]), torch.stack([known for _, known in pairs])
         elevation = self.net(clouds)
@@ -84,6 +86,13 @@ class GroundTask(Task):
             return torch.stack([self.slam_loss(xyz[p], xyz[p], found[p], wanted[p]) for p in parts]).mean()
 
         return ground_loss(elevation, labels, known, network), slam
+
+    def _moved(self) -> tuple[Tensor, Tensor]:
+        """A random roll, pitch and lift: (4, 4) and (4,) that points (N, 4) are turned and moved by."""
+        turn = torch.eye(4)
+        turn[:3, :3] = _tilt(math.radians(self.settings.tilt))
+        up = torch.tensor([0.0, 0.0, (2 * float(torch.rand(1)) - 1) * self.settings.lift, 0.0])
+        return turn.to(self.device), up.to(self.device)
 
     def evaluate(self, scans: TaskScans) -> dict[str, float]:
         """Means over the scans of `ground_metrics`: mse (m2), miou, precision, recall."""
