@@ -21,6 +21,7 @@ from dpm2_core.diffslam.tasks.range_image import (
     RangeImageSettings,
     fill,
     project,
+    slots,
     to_points,
 )
 from dpm2_core.diffslam.tasks.weights import load_strictly, read_weights
@@ -141,6 +142,20 @@ class Dslr(nn.Module):
         """
         image, mask = project(points.float(), self.settings.image)
         return self(fill(image, mask)[None])[0], mask
+
+    def still(self, points: Tensor, share: float = 0.2, margin: float = 1.0) -> Tensor:
+        """(N,) bool: which points are where the static scan has something too, or are outside the image.
+
+        The others are nearer than the static scan is there: something stands in between that will not stay.
+
+        Args:
+            points: (N, 3+) m. share, margin: a point moves if its distance is less by this share and by this, m, more.
+        """
+        image, _ = self.translate(points)
+        slot, inside = slots(points, self.settings.image)
+        static = image[0].flatten()[slot] * self.settings.image.scale
+        moving = torch.hypot(points[:, 0], points[:, 1]) < (1 - share) * static - margin
+        return ~(moving & inside)
 
     def static_points(self, points: Tensor) -> Tensor:
         """The translated scan (M, 3), m: one point for each slot that the scan (N, 3+) has a point in."""

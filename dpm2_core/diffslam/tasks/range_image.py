@@ -66,28 +66,38 @@ def azimuths(columns: int) -> Tensor:
     return (torch.arange(columns) + 0.5) * (2 * math.pi / columns)
 
 
+def slots(points: Tensor, settings: RangeImageSettings) -> tuple[Tensor, Tensor]:
+    """Index (N,) of the slot of each point, row by row, and whether it is in the image at all (N,) bool.
+
+    Points that are not finite, too near, too far, or above or below the rows are not.
+
+    Args:
+        points: (N, 3+) m, of any dtype.
+    """
+    beams = elevations(settings).to(points)
+    d = torch.hypot(points[:, 0], points[:, 1])
+    inside = points[:, :3].isfinite().all(1) & (d >= settings.min_distance) & (d < settings.scale)
+    elevation = torch.atan2(points[:, 2], d)
+    middle = (beams[1:] + beams[:-1]) / 2
+    above, below = beams[0] - middle[0], middle[-1] - beams[-1]  # half of the distance to a beam beyond the image
+    inside &= (elevation <= beams[0] + above) & (elevation > beams[-1] - below)
+    row = torch.searchsorted(-middle, -elevation.nan_to_num())
+    turn = torch.remainder(torch.atan2(points[:, 1], points[:, 0]) / (2 * math.pi), 1).nan_to_num()
+    return row * settings.columns + (turn * settings.columns).long().clamp(max=settings.columns - 1), inside
+
+
 def project(points: Tensor, settings: RangeImageSettings) -> tuple[Tensor, Tensor]:
     """Image (2, rows, columns), zero where there is no point, and where there is one (rows, columns) bool.
 
-    Of several points in a slot the mean of d and z is taken. Points not finite, too near, too far, or above or below
-    the rows are left out.
+    Of several points in a slot the mean of d and z is taken. Points outside the image are left out, see `slots`.
 
     Args:
         points: (N, 3+) m, of any dtype.
     """
     rows, columns = settings.rows, settings.columns
-    beams = elevations(settings).to(points)
+    slot, inside = slots(points, settings)
+    points, slot = points[inside], slot[inside]
     d = torch.hypot(points[:, 0], points[:, 1])
-    keep = points[:, :3].isfinite().all(1) & (d >= settings.min_distance) & (d < settings.scale)
-    points, d = points[keep], d[keep]
-    elevation = torch.atan2(points[:, 2], d)
-    middle = (beams[1:] + beams[:-1]) / 2
-    row = torch.searchsorted(-middle, -elevation)
-    half = torch.stack([beams[0] - middle[0], middle[-1] - beams[-1]])  # of the distance to a beam beyond the image
-    keep = (elevation <= beams[0] + half[0]) & (elevation > beams[-1] - half[1])
-    points, d, row = points[keep], d[keep], row[keep]
-    turn = torch.atan2(points[:, 1], points[:, 0]) / (2 * math.pi)
-    slot = row * columns + (torch.remainder(turn, 1) * columns).long().clamp(max=columns - 1)
     total = points.new_zeros(CHANNELS, rows * columns)
     total.index_add_(1, slot, torch.stack([d, points[:, 2]]) / settings.scale)
     count = points.new_zeros(rows * columns).index_add_(0, slot, torch.ones_like(d))

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import shlex
+import shutil
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,6 +24,7 @@ from dpm2_core.diffslam.tasks.task import TaskTraining, task_type
 from dpm2_core.diffslam.tasks.training import WEIGHTS, load_task, measure, train_task
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.bench.harness import Options, Report, git_commit, processors, write_report
+from dpm2_core.evaluation.task_slam import slam_figures
 from dpm2_core.files import atomic_write
 
 Better = Literal["lower", "higher"]
@@ -36,22 +38,52 @@ class Comparison:
     Attributes:
         settings: `key=value` of its training, the arm without the SLAM loss being the same with gamma 0.
         figures: of `Task.evaluate`, and which way is better.
-        drives: synthetic drives to learn from and to be judged on.
+        drives: synthetic drives to learn from and to be judged on. drives_of: the task in whose folder they are.
+        shared_epochs: the first ones, in which the SLAM loss does not count, are trained once for both arms of a seed.
+        slam: odometry on the clouds that the task makes is judged as well.
     """
 
     settings: tuple[str, ...]
     figures: dict[str, Better]
     drives: TaskDriveSettings = field(default_factory=TaskDriveSettings)
+    drives_of: str | None = None
+    shared_epochs: int = 0
+    slam: bool = False
 
 
+_ODOMETRY = ("output_ate_m", "output_rpe_m", "output_rpe_deg")
 COMPARISONS: dict[str, Comparison] = {
     "gndnet": Comparison(
         settings=(
-            "network.cells=64", "network.channels=16", "epochs=6", "rate=3e-3", "slam.gamma=2", "slam.every=2",
+            "network.cells=64", "network.channels=16", "epochs=6", "rate=3e-3", "slam.gamma=1", "slam.every=2",
             "slam_loss.points=1024",
         ),
         figures={"mse": "lower", "miou": "higher", "precision": "higher", "recall": "higher"},
         drives=TaskDriveSettings(train=24, train_frames=20, val=6, val_frames=20),
+    ),
+    "dslr": Comparison(
+        settings=(
+            "network.image.columns=128", "network.channels=24", "autoencoder_epochs=9", "discriminator_epochs=1",
+            "epochs=18", "window=4", "every=1", "batch=2", "rate=2e-3", "final_rate=2e-4", "slam.gamma=10",
+            "slam.every=4", "slam_loss.points=1024",
+        ),
+        figures=dict.fromkeys(("chamfer_m", "chamfer", "moved_m", *_ODOMETRY), "lower"),
+        drives=TaskDriveSettings(
+            train=10, train_frames=48, val=3, val_frames=32, first_seed=7300, presets=("city", "suburb"), traffic=20
+        ),
+        shared_epochs=10,
+        slam=True,
+    ),
+    "ae_lidar": Comparison(
+        settings=(
+            "network.image.columns=128", "network.channels=16", "network.latent=160", "epochs=12", "window=4",
+            "every=1", "batch=2", "rate=2e-3", "final_rate=2e-4", "slam.gamma=10", "slam.every=5",
+            "slam_loss.points=1024",
+        ),
+        figures=dict.fromkeys(("chamfer_m", "chamfer", "d_error_m", *_ODOMETRY), "lower"),
+        drives=TaskDriveSettings(train=24, train_frames=20, val=6, val_frames=20),
+        drives_of="gndnet",
+        slam=True,
     ),
 }  # fmt: skip
 
@@ -97,8 +129,9 @@ def _compare(name: str, comparison: Comparison, options: Options) -> Any:
     """The part of a task, again after every training."""
     kind = task_type(name)
     folder = options.cache / "tasks" / name
-    make_task_drives(folder / "drives", comparison.drives, options.threads)
-    learn, judge = (open_scans(folder / "drives" / which, kind.needs) for which in ("train", "val"))
+    drives = options.cache / "tasks" / (comparison.drives_of or name) / "drives"
+    make_task_drives(drives, comparison.drives, options.threads)
+    learn, judge = (open_scans(drives / which, kind.needs) for which in ("train", "val"))
     overrides = [*comparison.settings, *options.overrides]
     chosen = load_settings(kind.training_type, None, overrides)
     part: dict[str, Any] = {
@@ -108,6 +141,7 @@ def _compare(name: str, comparison: Comparison, options: Options) -> Any:
         "settings": overrides,
         "drives": comparison.drives.model_dump(mode="json"),
         "scans": {"train": len(learn), "val": len(judge)},
+        "shared_epochs": comparison.shared_epochs,
         "complete": False,
         "runs": {"without": {}, "with": {}},
     }
@@ -116,23 +150,43 @@ def _compare(name: str, comparison: Comparison, options: Options) -> Any:
             slam = chosen.slam.model_copy(update={"gamma": gamma})
             settings = chosen.model_copy(update={"seed": seed, "slam": slam})
             out = folder / f"{arm}_{seed}"
-            part["runs"][arm][str(seed)] = _run(name, settings, learn, judge, out)
+            _train(name, settings, learn, out, comparison.shared_epochs)
+            figures = _judged(name, settings, judge, out)
+            if comparison.slam:
+                slam_on = slam_figures(load_task(name, out / WEIGHTS), drives / "val")
+                figures |= {figure: _figure(value) for figure, value in slam_on.items()}
+            part["runs"][arm][str(seed)] = figures
             part["summary"] = summary(part["runs"], comparison.figures)
             part["complete"] = seed + 1 == options.repetitions and arm == "with"
             yield part
 
 
-def _run(name: str, settings: TaskTraining, learn: TaskScans, judge: TaskScans, out: Path) -> dict[str, Any]:
-    """Figures of one training on the scans of other worlds, and how the SLAM loss stood beside the task's."""
-    text = dump_settings(settings)
+def _train(
+    name: str, settings: TaskTraining, learn: TaskScans, out: Path, shared: int = 0, until: int | None = None
+) -> None:
+    """Train, or go on, unless this very training has ended. The first `shared` epochs are those of both arms."""
+    text = dump_settings(settings) + ("" if until is None else f"until: {until}\n")
     begun = out / "begun.yaml"
-    if not (out / _DONE).is_file() or (out / _DONE).read_text() != text:
-        resume = (out / "checkpoint.pt").is_file() and begun.is_file() and begun.read_text() == text
-        with atomic_write(begun) as file:
-            file.write(text)
-        train_task(name, settings, learn, out, resume)
-        with atomic_write(out / _DONE) as file:
-            file.write(text)
+    if (out / _DONE).is_file() and (out / _DONE).read_text() == text:
+        return
+    resume = (out / "checkpoint.pt").is_file() and begun.is_file() and begun.read_text() == text
+    if shared and not resume:
+        common = out.with_name(f"shared_{settings.seed}")
+        without = settings.model_copy(update={"slam": settings.slam.model_copy(update={"gamma": 0.0})})
+        _train(name, without, learn, common, until=shared)
+        out.mkdir(parents=True, exist_ok=True)
+        for kept in ("checkpoint.pt", "log.jsonl"):
+            shutil.copy(common / kept, out / kept)
+        resume = True
+    with atomic_write(begun) as file:
+        file.write(text)
+    train_task(name, settings, learn, out, resume, until=until)
+    with atomic_write(out / _DONE) as file:
+        file.write(text)
+
+
+def _judged(name: str, settings: TaskTraining, judge: TaskScans, out: Path) -> dict[str, Any]:
+    """Figures of one training on the scans of other worlds, and how the SLAM loss stood beside the task's."""
     figures = measure(load_task(name, out / WEIGHTS), judge)
     logged = (json.loads(line) for line in (out / "log.jsonl").read_text().splitlines())
     # A training that was stopped may have logged steps twice, and goes on after the last checkpoint.

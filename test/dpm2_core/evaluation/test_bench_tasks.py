@@ -43,7 +43,7 @@ def test_comparison_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(tasks, "COMPARISONS", {"gndnet": tasks.Comparison(small, figures, drives)})
     trained = []
     original = tasks.train_task
-    monkeypatch.setattr(tasks, "train_task", lambda *a: trained.append(a[1].slam.gamma) or original(*a))
+    monkeypatch.setattr(tasks, "train_task", lambda *a, **k: trained.append(a[1].slam.gamma) or original(*a, **k))
     options = Options(threads=1, repetitions=1, only="gndnet", out=tmp_path / "out", cache=tmp_path / "cache")
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "tasks.json").write_text('{"parts": {"dslr": {"summary": {}, "runs": {"with": {}}}}}')
@@ -63,3 +63,37 @@ def test_comparison_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert trained == [0.0, 0.1, 0.2]
     with pytest.raises(UsageError, match="--only nonsense: no such task"):
         tasks.bench_tasks(Options(only="nonsense"))
+
+
+def test_arms_share_their_first_epochs_and_slam_is_judged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What comes before the SLAM loss is trained once; odometry on the clouds of both arms is in the figures."""
+    drives = TaskDriveSettings.model_validate(
+        {
+            "train": 1,
+            "train_frames": 3,
+            "val": 1,
+            "val_frames": 3,
+            "lidar": {"columns": 128, "beams": 16},
+            "traffic": 20,
+        }
+    )
+    small = (
+        "network.image={beams: [[15, -15, 16]], first: 0, rows: 16, columns: 64}", "network.channels=4",
+        "network.latent=8", "autoencoder_epochs=1", "discriminator_epochs=1", "epochs=4", "window=3", "every=1",
+        "batch=1", "slam.gamma=0.1", "slam.every=4", "slam_loss.points=200",
+    )  # fmt: skip
+    comparison = tasks.Comparison(small, {"chamfer_m": "lower"}, drives, shared_epochs=2, slam=True)
+    monkeypatch.setattr(tasks, "COMPARISONS", {"dslr": comparison})
+    trained = []
+    original = tasks.train_task
+    monkeypatch.setattr(
+        tasks, "train_task", lambda *a, **k: trained.append((a[1].slam.gamma, a[4], k["until"])) or original(*a, **k)
+    )
+    options = Options(threads=1, repetitions=1, only="dslr", out=tmp_path, cache=tmp_path / "cache")
+    runs = tasks.bench_tasks(options).results["parts"]["dslr"]["runs"]
+    assert trained == [(0.0, False, 2), (0.0, True, None), (0.1, True, None)]
+    assert runs["with"]["0"].keys() >= {"chamfer_m", "output_ate_m", "input_rpe_m", "target_rpe_deg"}
+    assert runs["with"]["0"]["slam_share_at_first"] > 0
+    logs = [(tmp_path / "cache/tasks/dslr" / arm / "log.jsonl").read_text() for arm in ("with_0", "without_0")]
+    first, second = ([json.loads(line)["task_loss"] for line in log.splitlines()][:3] for log in logs)
+    assert first == second

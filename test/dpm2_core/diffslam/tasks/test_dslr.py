@@ -160,6 +160,16 @@ def test_learns_and_survives_being_stopped(pairs: Path, tmp_path: Path) -> None:
         torch.testing.assert_close(points, task.clouds(scans[3])["output"], atol=0.5, rtol=0)  # projected anew
 
 
+def test_still_points_are_those_that_the_static_scan_has_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A wall at 20 m is predicted: it stays, a car at 8 m before it does not; what is outside the image stays too."""
+    network = Dslr(NETWORK)
+    static = torch.full((1, 2, 16, 64), 20.0 / SENSOR.scale)
+    monkeypatch.setattr(network, "forward", lambda images: static)
+    points = torch.tensor([[20.0, 1, -1, 0], [8.0, 0, -1, 0], [16.0, 3, -1, 0], [30.0, 0, -1, 0], [8.0, 0, 5, 0]])
+    assert network.still(points).tolist() == [True, False, True, True, True]
+    assert network.still(points, share=0.0, margin=3.0).tolist() == [True, False, False, True, True]
+
+
 def test_what_is_no_dslr_is_refused(pairs: Path, tmp_path: Path) -> None:
     """A pickle, another task's weights, a missing file, scans without twins."""
     torch.save({"weights": torch.ones(1)}, tmp_path / "pickle.pt")
