@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import typer
 
 from dpm2_core import __version__
-from dpm2_core.commands import bench, config, convert, eval, map, run, show, sim, tasks, train
+from dpm2_core.commands import bench, config, convert, eval, finetune, map, run, show, sim, tasks, train
 from dpm2_core.errors import Dpm2Error, UsageError
 
 app = typer.Typer(help="LiDAR-visual SLAM.", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
@@ -18,6 +18,7 @@ app.command("eval")(eval.eval_)
 app.command()(show.show)
 app.command()(sim.sim)
 app.command()(bench.bench)
+app.command()(finetune.finetune)
 app.command("eval-task")(tasks.eval_task)
 app.add_typer(convert.app, name="convert")
 app.add_typer(config.app, name="config")

@@ -16,7 +16,8 @@ def bench(
     names: Annotated[
         list[str] | None,
         typer.Argument(
-            help="diffslam, geometric (default), loop-cost, map, memory, neural, pose-graph, relocalise, roads, tasks."
+            help="diffslam, finetune, geometric (default), loop-cost, map, memory, neural, pose-graph, relocalise, "
+            "roads, tasks, traffic."
         ),
     ] = None,
     source: Annotated[

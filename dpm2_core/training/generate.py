@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
@@ -41,6 +42,10 @@ class GenerateSettings(Settings):
         {"city": 0.3, "suburb": 0.3, "rural": 0.28, "highway": 0.06, "tunnel": 0.06}
     )
     """Share of each kind of place."""
+    beams: Literal[16, 32, 64, 128] = 64
+    """Of the LiDAR."""
+    height: float = Field(1.73, gt=0.5, le=10)
+    """Of the LiDAR above the ground, m; each world's own is up to 0.2 m lower or 0.3 m higher."""
     images: bool = False
     """Render a picture with each scan."""
     preset: str = "small"
@@ -55,7 +60,8 @@ def generate_world(folder: Path, seed: int, settings: GenerateSettings) -> None:
     kind = kinds[noise.choice(len(kinds), p=weights / weights.sum())]
     network = preset(settings.preset)
     world = build_world("random", kind, seed, settings.length)
-    lidar = Lidar(LidarConfig(columns=int(noise.choice([1448, 1810, 2170])), height=1.73 + noise.uniform(-0.2, 0.3)))
+    columns, height = int(noise.choice([1448, 1810, 2170])), settings.height + noise.uniform(-0.2, 0.3)
+    lidar = Lidar(LidarConfig(beams=settings.beams, columns=columns, height=height))
     camera = _camera(network)
     samples = []
     for _ in range(settings.frames):

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from dpm2_core.config import Settings
 from dpm2_core.network.config import NetworkSettings, preset
+from dpm2_core.network.descriptors import Tokens
 from dpm2_core.network.encoder import Encoded, to_device
 from dpm2_core.network.losses import cosine, info_nce, label_pairs
 from dpm2_core.network.model import DeepPointMap2
@@ -51,14 +52,7 @@ class PhaseOne(nn.Module):
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Mean loss over the plans, and figures of the first."""
         encoded = self.model.encoder(points, views)
-        total = encoded.tokens.features.new_zeros((), dtype=torch.float32)
-        figures: dict[str, Tensor] = {}
-        for plan in plans:
-            source = merge_tokens(encoded.tokens, plan.source, plan.T_source)
-            target = merge_tokens(encoded.tokens, plan.target, plan.T_target)
-            loss, found = phase_one_loss(self.model.decoder, source, target, plan.T_target_source, self.loss)
-            total = total + loss / len(plans)
-            figures = figures or found
+        total, figures = self.pair_loss(encoded.tokens, plans)
         if self.loss.backbone:
             auxiliary = self._backbone_loss(encoded.scales[self.level], plans[0])
             total = total + self.loss.backbone * auxiliary
@@ -69,6 +63,18 @@ class PhaseOne(nn.Module):
             figures["image"] = auxiliary
         figures["loss"] = total
         return total, {name: value.detach().float() for name, value in figures.items()}
+
+    def pair_loss(self, tokens: Tokens, plans: tuple[Plan, ...]) -> tuple[Tensor, dict[str, Tensor]]:
+        """Mean over the plans of the losses on descriptors, and figures of the first."""
+        total = tokens.features.new_zeros((), dtype=torch.float32)
+        figures: dict[str, Tensor] = {}
+        for plan in plans:
+            source = merge_tokens(tokens, plan.source, plan.T_source)
+            target = merge_tokens(tokens, plan.target, plan.T_target)
+            loss, found = phase_one_loss(self.model.decoder, source, target, plan.T_target_source, self.loss)
+            total = total + loss / len(plans)
+            figures = figures or found
+        return total, figures
 
     def _backbone_loss(self, scale: Scale, plan: Plan) -> Tensor:
         """InfoNCE of the backbone's key-points of single frames."""

@@ -66,8 +66,23 @@ def bench_tasks(options: Options) -> Report:
     return tasks.bench_tasks(options)
 
 
+def bench_traffic(options: Options) -> Report:
+    """See `traffic.bench_traffic`; the simulator and torch are imported only for it."""
+    from dpm2_core.evaluation.bench import traffic
+
+    return traffic.bench_traffic(options)
+
+
+def bench_finetune(options: Options) -> Report:
+    """See `finetune.bench_finetune`."""
+    from dpm2_core.evaluation.bench import finetune
+
+    return finetune.bench_finetune(options)
+
+
 BENCHES: dict[str, Callable[[Options], Report]] = {
     "diffslam": bench_diffslam,
+    "finetune": bench_finetune,
     "geometric": bench_geometric,
     "loop-cost": bench_loop_cost,
     "map": bench_map,
@@ -77,5 +92,6 @@ BENCHES: dict[str, Callable[[Options], Report]] = {
     "relocalise": bench_relocalise,
     "roads": bench_roads,
     "tasks": bench_tasks,
+    "traffic": bench_traffic,
 }
 """By the name that `dpm2 bench NAME` and `benchmarks/NAME.json` share."""

@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`dpm2 finetune`: the network on a user's own drives and LiDAR, without ground truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from dpm2_core.commands.train import ConfigOption, OutOption, ResumeOption, SetOption, refuse_overwriting
+from dpm2_core.config import load_settings
+
+
+def finetune(
+    src: Annotated[
+        list[Path], typer.Argument(help="Drives: KITTI sequences or roots, rosbag2 folders, .mcap or .db3.")
+    ],
+    out: OutOption = Path("out/finetune"),
+    config: ConfigOption = None,
+    settings: SetOption = None,
+    resume: ResumeOption = False,
+) -> None:
+    """Fine-tune the network on drives without ground truth: the reference is the trajectory of the SLAM.
+
+    Run the result with --set slam.neural.weights=OUT/weights.safetensors.
+    """
+    from dpm2_core.data.source import InputSettings, open_source
+    from dpm2_core.slam.neural import load_network, weights_path  # torch is slow to import
+    from dpm2_core.slam.system import SlamSettings
+    from dpm2_core.training import finetune as work
+
+    refuse_overwriting(out, resume)
+    chosen = load_settings(work.FinetuneSettings, config, settings or [])
+    start = weights_path(chosen.weights)
+    network = load_network(chosen.weights, threads=2).settings
+    sources = [open_source(path, InputSettings(images=False)) for path in src]
+    console = Console(stderr=True)
+    with console.status("") as status:
+        work.prepare(sources, chosen, network, SlamSettings(), out, status.update)
+        status.update("measuring")
+        before = work.measure(start, chosen, out)
+    written = work.finetune(chosen, out, resume)
+    with console.status("measuring"):
+        after = work.measure(written, chosen, out)
+    table = Table("median error of pairs", "before", "after", title="Held-out parts: against the SLAM's trajectory")
+    for name, figures in before.items():
+        for figure in (figure for figure in figures if figure in after[name]):
+            table.add_row(f"{name}, {figure}", f"{figures[figure]:.3f}", f"{after[name][figure]:.3f}")
+    console.print(table, f"{written}: written", soft_wrap=True)

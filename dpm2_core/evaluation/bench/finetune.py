@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fine-tuning on drives with another LiDAR: errors on unseen worlds of it and of the old one, before and after."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from statistics import mean, pstdev
+from time import process_time
+from typing import Any
+
+import numpy as np
+import torch
+from rich.box import SIMPLE
+from rich.console import Group
+from rich.table import Table
+
+from dpm2_core.config import load_settings
+from dpm2_core.data.source import InputSettings, open_source
+from dpm2_core.evaluation.bench.harness import Options, Report, git_commit, write_report
+from dpm2_core.network.weights import load_model
+from dpm2_core.sim.config import LidarConfig, PresetName
+from dpm2_core.sim.drive import simulate
+from dpm2_core.slam.neural import weights_path
+from dpm2_core.slam.system import SlamSettings
+from dpm2_core.training.finetune import FinetuneSettings, finetune, prepare
+from dpm2_core.training.generate import GenerateSettings, generate
+from dpm2_core.training.validation import NEAR, SUCCESS, PairSet
+
+LIDAR = LidarConfig(beams=32, height=3.4, columns=1810)
+"""32 beams from +10.7 to -30.7 deg on the roof of a bus; the weights know 64 from +2 to -24.8 deg, at 1.5 to 2 m."""
+DRIVES: tuple[PresetName, ...] = ("city", "suburb", "rural")
+"""One of each is fine-tuned on: 12 s long, seeds from 950,000."""
+DRIVE_FRAMES = 120
+_TOWNS: dict[PresetName, float] = {"city": 0.35, "suburb": 0.35, "rural": 0.3}
+UNSEEN = {
+    "new": GenerateSettings(
+        worlds=8, first_seed=960_000, frames=16, beams=LIDAR.beams, height=LIDAR.height, mixture=_TOWNS
+    ),
+    "old": GenerateSettings(worlds=8, first_seed=970_000, frames=16, mixture=_TOWNS),
+}
+"""Worlds to be judged on, of the new LiDAR and of the old one."""
+ARMS: dict[str, tuple[str, ...]] = {"both": (), "pairs": ("trajectory=0",), "trajectory": ("pairs=0",)}
+"""Losses: both, as `dpm2 finetune` has it, for every seed; each alone for the first."""
+
+
+def bench_finetune(options: Options) -> Report:
+    """Repetitions are seeds, overrides are of the fine-tuning; a training that is in finetune.json is not repeated.
+
+    `--only` names one of the arms.
+    """
+    path, folder = options.out / "finetune.json", options.cache / "finetune"
+    threads = torch.get_num_threads()
+    torch.set_num_threads(options.threads)
+    try:
+        chosen = load_settings(FinetuneSettings, None, options.overrides)
+        network = load_model(weights_path(chosen.weights))
+        _prepare(folder, chosen, options)
+        judges = {name: PairSet(folder / name, 2 * options.pairs, network.settings, False) for name in UNSEEN}
+        results = _read(path, chosen)
+        results.setdefault("before", {name: errors(judge, network) for name, judge in judges.items()})
+        for arm, seed in _wanted(options):
+            runs = results.setdefault("runs", {}).setdefault(arm, {})
+            if str(seed) in runs:
+                continue
+            runs[str(seed)] = _run(arm, seed, folder, options, judges, results["before"])
+            write_report(path, "finetune", _report(results, chosen), options)
+    finally:
+        torch.set_num_threads(threads)
+    return _report(results, chosen)
+
+
+def _wanted(options: Options) -> list[tuple[str, int]]:
+    first = [(arm, 0) for arm in ARMS]
+    rest = [("both", seed) for seed in range(1, options.repetitions)]
+    return [(arm, seed) for arm, seed in first + rest if options.only in (None, arm)]
+
+
+def _prepare(folder: Path, settings: FinetuneSettings, options: Options) -> None:
+    """Drives, their references, the rehearsal and the unseen worlds; what is there stays."""
+    sources = []
+    for k, preset in enumerate(DRIVES):
+        at = folder / "recorded" / preset
+        simulate(at, DRIVE_FRAMES, 950_000 + k, "random", preset, images=False, lidar=LIDAR, workers=options.threads)
+        sources.append(open_source(at, InputSettings(images=False)))
+    network = load_model(weights_path(settings.weights)).settings
+    prepare(sources, settings, network, SlamSettings(threads=options.threads), folder / "data")
+    for name, worlds in UNSEEN.items():
+        generate(folder / name, worlds.model_copy(update={"preset": network.preset}), options.threads)
+
+
+def _run(
+    arm: str, seed: int, folder: Path, options: Options, judges: dict[str, PairSet], before: dict[str, Any]
+) -> dict[str, Any]:
+    """One training, what it cost, and the errors that are left."""
+    overrides = [*options.overrides, *ARMS[arm], f"optimiser.seed={seed}"]
+    settings = load_settings(FinetuneSettings, None, overrides)
+    out = folder / f"{arm}_{seed}"
+    out.mkdir(parents=True, exist_ok=True)
+    cpu = process_time()
+    weights = finetune(settings, out, resume=(out / "checkpoint.pt").is_file(), data=folder / "data")
+    seconds = process_time() - cpu
+    model = load_model(weights)
+    after = {name: errors(judge, model) for name, judge in judges.items()}
+    ratio = {
+        name: {figure: after[name][figure] / before[name][figure] for figure in ("near_m", "far_m", "all_m", "all_deg")}
+        for name in judges
+    }
+    return {"after": after, "ratio": ratio, "steps": settings.optimiser.steps, "cpu_seconds": seconds}
+
+
+def errors(judge: PairSet, model: Any) -> dict[str, float]:
+    """Medians of the errors of translation, m, and rotation, deg, and the share that succeeds."""
+    rows = judge.errors(model)
+    near = rows[:, 0] <= NEAR
+    good = (rows[:, 2] < SUCCESS[0]) & (rows[:, 3] < SUCCESS[1])
+    return {
+        "pairs": len(rows),
+        "near_m": float(np.median(rows[near, 2])),
+        "far_m": float(np.median(rows[~near, 2])),
+        "all_m": float(np.median(rows[:, 2])),
+        "all_deg": float(np.median(rows[:, 3])),
+        "success": float(good.mean()),
+    }
+
+
+def _read(path: Path, settings: FinetuneSettings) -> dict[str, Any]:
+    """What an earlier run of the same settings has found."""
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+        same = record["settings"] == settings.model_dump(mode="json")
+        return {key: record[key] for key in ("before", "runs")} if same else {}
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
+
+
+def _report(results: dict[str, Any], settings: FinetuneSettings) -> Report:
+    before, runs = results["before"], results.get("runs", {})
+    summary: dict[str, Any] = {}
+    for arm, seeds in runs.items():
+        summary[arm] = {
+            name: {
+                figure: {"mean": mean(values), "spread": pstdev(values), "seeds": len(values)}
+                for figure in ("near_m", "far_m", "all_m", "all_deg")
+                if (values := [run["ratio"][name][figure] for run in seeds.values()])
+            }
+            for name in UNSEEN
+        }
+    table = Table(title="Median errors of pairs in unseen worlds", title_justify="left", box=SIMPLE)
+    for column in ("losses", "seed", "LiDAR", "up to 5 m", "5 to 20 m", "all", "deg", "success"):
+        table.add_column(column, justify="left" if column in ("losses", "LiDAR") else "right")
+    lines = [("before", "", before)]
+    lines += [(arm, seed, run["after"]) for arm, seeds in runs.items() for seed, run in seeds.items()]
+    for arm, seed, figures in lines:
+        for name, row in figures.items():
+            cells = [f"{row[figure]:.4f}" for figure in ("near_m", "far_m", "all_m", "all_deg")]
+            table.add_row(arm, seed, name, *cells, f"{row['success']:.1%}")
+    record = {
+        "lidar": LIDAR.model_dump(), "drives": {"presets": DRIVES, "frames": DRIVE_FRAMES},
+        "settings": settings.model_dump(mode="json"), "measured_at": git_commit(),
+        "ratios": summary, "before": before, "runs": runs,
+    }  # fmt: skip
+    return Report(record, Group(table))

@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+"""SLAM where a third of the points lie on what moves: as it is, with each filter, and with all that moves taken out."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from statistics import mean, median, pstdev
+from time import process_time
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from rich.box import SIMPLE
+from rich.console import Group
+from rich.table import Table
+
+from dpm2_core.config import load_settings
+from dpm2_core.errors import UsageError
+from dpm2_core.evaluation.bench.harness import Options, Report, git_commit, overrides_of, write_report
+from dpm2_core.evaluation.metrics import evaluate
+from dpm2_core.frame import Frame, Points
+from dpm2_core.sim.config import LidarConfig, PresetName
+from dpm2_core.sim.lidar import Lidar
+from dpm2_core.sim.world import World, build_world
+from dpm2_core.slam.filters import SHIPPED, WEIGHTS, FilterKind, FilterSettings, make_filter
+from dpm2_core.slam.odometry import Odometry
+from dpm2_core.slam.system import Config, SlamSettings, make_odometry
+
+PLACES: dict[PresetName, float] = {"city": 20.0, "suburb": 40.0, "rural": 40.0}
+"""Kinds of places, and how many times the usual traffic they have: 20 to 40 % of the points are on it."""
+FIRST_SEED = 900_001
+"""Of the worlds; training ends well below."""
+FRAMES = 60
+REGISTRATIONS = ("geometric", "neural", "refined")
+ORACLE = "true movers left out"
+_ERRORS = ("rpe_trans_m", "rpe_rot_deg", "ape_rmse_m")
+LOST = 0.1
+"""A drive with a larger RPE is one that went astray, m: it held on to the traffic."""
+
+Scans = list[tuple[Points, NDArray[np.bool_]]]
+"""Points (N, 4) and which of them move (N,), frame by frame."""
+
+
+def bench_traffic(options: Options) -> Report:
+    """Every registration in every place, repetitions being worlds of each; `--only` names one registration.
+
+    Goes on where traffic.json ends, if it is of the same settings; it is written after each drive.
+
+    Raises:
+        UsageError: no such registration.
+    """
+    if options.only is not None and options.only not in REGISTRATIONS:
+        raise UsageError(f"--only {options.only}: no such registration; choose from {', '.join(REGISTRATIONS)}")
+    wanted = REGISTRATIONS if options.only is None else (options.only,)
+    path = options.out / "traffic.json"
+    drives = _read(path, options)
+    for preset, traffic in PLACES.items():
+        for seed in range(FIRST_SEED, FIRST_SEED + options.repetitions):
+            name = f"{preset} {seed}"
+            runs = drives.get(name, {}).get("runs", {})
+            missing = {r: [m for m in _methods() if m not in runs.get(r, {})] for r in wanted}
+            if not any(missing.values()):
+                continue
+            world = build_world("straight", preset, seed, traffic=traffic)
+            scans = list(_scans(world))
+            truth = np.stack([world.drive_pose(0.1 * i) for i in range(FRAMES)])
+            share = mean(float(moving.mean()) for _, moving in scans)
+            drives[name] = {"traffic": traffic, "share_moving": share, "runs": runs}
+            for registration, methods in missing.items():
+                found = {m: _run(scans, truth, _settings(options, registration), m) for m in methods}
+                runs[registration] = runs.get(registration, {}) | found
+                write_report(path, "traffic", _report(drives, options), options)
+    return _report(drives, options)
+
+
+def _methods() -> list[str]:
+    """What is compared: `none`, the filters that have weights, the oracle."""
+    shipped = [kind for kind, name in WEIGHTS.items() if (SHIPPED / f"{name}.safetensors").is_file()]
+    return ["none", *shipped, ORACLE]
+
+
+def _settings(options: Options, registration: str) -> SlamSettings:
+    return load_settings(Config, None, overrides_of(options, registration)).slam
+
+
+def _scans(world: World) -> Iterator[tuple[Points, NDArray[np.bool_]]]:
+    """The first scans of the drive, at 10 Hz: it begins at full speed in the middle of the traffic."""
+    lidar = Lidar(LidarConfig())
+    for i in range(FRAMES):
+        scan = lidar.scan(world, world.drive_pose(0.1 * i), 0.1 * i, np.random.default_rng([world.seed, 12, i]))
+        yield scan.points, scan.moving
+
+
+def _run(scans: Scans, truth: NDArray[np.float64], settings: SlamSettings, method: str) -> dict[str, Any]:
+    """Errors and time of the odometry with a filter, and the time of the filter alone."""
+    kind: FilterKind = "none" if method == ORACLE else method  # type: ignore[assignment]
+    chosen = FilterSettings(kind=kind)
+    clouds = [points[~moving] if method == ORACLE else points for points, moving in scans]
+    found = _odometry(make_odometry(settings.model_copy(update={"filter": chosen})), clouds, truth)
+    if (point_filter := make_filter(chosen, settings.threads)) is not None:
+        cpu = process_time()
+        for cloud in clouds[:: len(clouds) // 6]:
+            point_filter(cloud)
+        found["filter_cpu_ms"] = 1e3 * (process_time() - cpu) / len(clouds[:: len(clouds) // 6])
+    return found
+
+
+def _odometry(odometry: Odometry, clouds: list[Points], truth: NDArray[np.float64]) -> dict[str, Any]:
+    """Errors of the odometry alone, without loops, and its time."""
+    poses, failed, cpu = np.zeros_like(truth), 0, process_time()
+    for i, cloud in enumerate(clouds):
+        tracked = odometry.process(Frame(i * 10**8, cloud, index=i))
+        poses[i] = tracked.T_odom_lidar
+        failed += not tracked.registration.ok
+    seconds = (process_time() - cpu) / len(clouds)
+    judged = evaluate(truth, poses, failed_frames=failed)
+    return {**{name: getattr(judged, name) for name in _ERRORS}, "failed_frames": failed, "cpu_ms": 1e3 * seconds}
+
+
+def _summary(drives: dict[str, Any]) -> dict[str, Any]:
+    """Of each registration and method, over the drives: mean, spread and median of the errors, drives astray, ratios.
+
+    `ratio`: of the mean and of the median RPE to those of `none`.
+    """
+    out: dict[str, Any] = {}
+    for registration in REGISTRATIONS:
+        rows = [d["runs"][registration] for d in drives.values() if registration in d["runs"]]
+        if not rows:
+            continue
+        out[registration] = {"drives": len(rows)}
+        for method in (m for m in rows[0] if all(m in row for row in rows)):
+            rpe = [row[method]["rpe_trans_m"] for row in rows]
+            turn = [row[method]["rpe_rot_deg"] for row in rows]
+            found = {
+                "rpe_m": mean(rpe), "spread_m": pstdev(rpe), "median_rpe_m": median(rpe),
+                "rpe_deg": mean(turn), "median_rpe_deg": median(turn), "astray": sum(e > LOST for e in rpe),
+                "cpu_ms": median(row[method]["cpu_ms"] for row in rows),
+            }  # fmt: skip
+            none = out[registration].get("none", found)
+            found["ratio"] = {k: found[k] / none[k] for k in ("rpe_m", "median_rpe_m", "rpe_deg", "median_rpe_deg")}
+            out[registration][method] = found
+    return out
+
+
+def _recipe(options: Options) -> dict[str, Any]:
+    return {"frames": FRAMES, "first_seed": FIRST_SEED, "places": PLACES, "overrides": list(options.overrides)}
+
+
+def _read(path: Path, options: Options) -> dict[str, Any]:
+    """Drives of an earlier run of the same settings; none if the file is of others, damaged or not there."""
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+        return dict(record["drives"]) if record["recipe"] == _recipe(options) else {}
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
+
+
+def _report(drives: dict[str, Any], options: Options) -> Report:
+    summary = _summary(drives)
+    results = {"recipe": _recipe(options), "summary": summary, "drives": drives, "torch": torch.__version__,
+               "measured_at": git_commit()}  # fmt: skip
+    table = Table(title="RPE in dense traffic, mean over drives (median)", title_justify="left", box=SIMPLE)
+    for column in ("registration", "filter", "RPE m", "RPE deg", "astray", "CPU ms"):
+        table.add_column(column, justify="left" if column in ("registration", "filter") else "right", no_wrap=True)
+    for registration, methods in summary.items():
+        for method, row in methods.items():
+            if method == "drives":
+                continue
+            table.add_row(
+                registration, method, f"{row['rpe_m']:.4f} ({row['median_rpe_m']:.4f})",
+                f"{row['rpe_deg']:.4f} ({row['median_rpe_deg']:.4f})", f"{row['astray']} of {methods['drives']}",
+                f"{row['cpu_ms']:.0f}",
+            )  # fmt: skip
+        table.add_section()
+    return Report(results, Group(table))

@@ -1,0 +1,275 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fine-tuning on a user's own drives without ground truth: the SLAM's trajectory is the reference.
+
+The network registers the scans of a stretch of road one to the next; the trajectory that follows is held to that of the
+SLAM (eq. 3 of "Differentiable SLAM Helps Deep Learning-based LiDAR Perception Tasks"), and pairs of scans are matched
+as in phase one. In every batch there are scans of the LiDAR that the weights come from, so that it is not forgotten.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+
+from dpm2_core.config import Settings
+from dpm2_core.data.source import Source
+from dpm2_core.diffslam.trajectory_loss import trajectory_loss
+from dpm2_core.errors import UsageError
+from dpm2_core.frame import Array, Frame
+from dpm2_core.network.config import NetworkSettings
+from dpm2_core.network.decoder import Decoder
+from dpm2_core.network.descriptors import Tokens
+from dpm2_core.network.encoder import to_device
+from dpm2_core.network.model import DeepPointMap2
+from dpm2_core.network.pyramid import PointBatch
+from dpm2_core.network.registration import correspond, guided_scores, match_scores, precision_solve, solve_batch
+from dpm2_core.network.weights import load_model, read_metadata, save_weights
+from dpm2_core.slam.neural import weights_path
+from dpm2_core.slam.output import TrajectoryRecorder
+from dpm2_core.slam.system import SlamSettings, SlamSystem
+from dpm2_core.training.augment import AugmentSettings
+from dpm2_core.training.checkpoint import load_checkpoint
+from dpm2_core.training.dataset import Batch, DataSettings, GroupDataset, draw_group
+from dpm2_core.training.generate import GenerateSettings, generate, pack
+from dpm2_core.training.objective import LossSettings
+from dpm2_core.training.phase_one import PhaseOne
+from dpm2_core.training.sets import Plan, plan_sets
+from dpm2_core.training.trainer import OptimiserSettings, process_group, train
+from dpm2_core.training.validation import NEAR, PairSet
+
+ASTRAY = 1.0
+"""A registration that is wrong by more than this has no gradient that leads back, m: the trajectory passes over it."""
+DRIVES, HELD_OUT, REHEARSAL = "drives", "held_out", "rehearsal"
+"""Folders of packed drives below the one of the training."""
+
+
+class FinetuneSettings(Settings):
+    """A fine-tuning."""
+
+    weights: str = "small"
+    """Name of weights that come with dpm2, or path of a .safetensors file: what to start from."""
+    reference: Literal["geometric", "refined"] = "geometric"
+    """Registration of the SLAM whose trajectory is the reference."""
+    trajectory: float = Field(default=1.0, ge=0)
+    """Weight of the trajectory loss, 1/m2."""
+    pairs: float = Field(default=1.0, ge=0)
+    """Weight of the losses of phase one, with the reference as truth."""
+    loss: LossSettings = LossSettings()
+    rehearsal: str = ""
+    """Folder of packed drives of the LiDAR that the weights come from; empty: synthetic worlds are made."""
+    rehearsal_share: float = Field(default=0.5, ge=0, lt=1)
+    """Of the places of the batches."""
+    rehearsal_worlds: GenerateSettings = GenerateSettings(worlds=6, first_seed=3000, frames=40)
+    """The synthetic worlds."""
+    held_out: float = Field(default=0.15, ge=0, lt=1)
+    """Last part of each drive, to be measured on before and after."""
+    groups: int = Field(default=2, gt=0)
+    """Places in a batch."""
+    frames: int = Field(default=4, ge=2)
+    """Scans of each place, in the order of the road."""
+    radius: float = Field(default=15.0, gt=0)
+    """Farthest from the first one drawn, m."""
+    augment: AugmentSettings = AugmentSettings(beams=0.0, drop=0.2)
+    optimiser: OptimiserSettings = OptimiserSettings(
+        steps=300, rate=2e-4, warmup=20, ema=0.99, compile=False, save_every=50
+    )
+
+
+class Finetuned(PhaseOne):
+    """The network with the losses of phase one and of the trajectory."""
+
+    def __init__(self, model: DeepPointMap2, settings: FinetuneSettings) -> None:
+        super().__init__(model.settings, settings.loss)
+        self.model = model.requires_grad_(True).train()
+        self.weights = settings.trajectory, settings.pairs
+        self.image_head = None  # LiDAR alone
+        self.loss = settings.loss.model_copy(update={"backbone": 0.0})  # its head is not part of the weights
+
+    def forward(  # type: ignore[override]
+        self, points: PointBatch, poses: Tensor, plans: tuple[Plan, ...]
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Loss and figures of G places of F scans with their reference poses (G, F, 4, 4)."""
+        by_trajectory, by_pairs = self.weights
+        total = poses.new_zeros(())
+        figures: dict[str, Tensor] = {}
+        tokens = self.model.encoder(points, None).tokens
+        if by_pairs:
+            loss, figures = self.pair_loss(tokens, plans)
+            total = total + by_pairs * loss
+        if by_trajectory:
+            found, astray = window_trajectories(self.model.decoder, tokens, poses)
+            reference = torch.linalg.inv(poses[:, :1]) @ poses
+            loss = torch.stack([trajectory_loss(a, b) for a, b in zip(found, reference, strict=True)]).mean()
+            figures |= {"trajectory": loss, "astray": astray}
+            total = total + by_trajectory * loss
+        figures["loss"] = total
+        return total, {name: value.detach().float() for name, value in figures.items()}
+
+
+def window_trajectories(decoder: Decoder, tokens: Tokens, poses: Tensor) -> tuple[Tensor, Tensor]:
+    """Trajectories (G, F, 4, 4) T_first_scan by registering each scan to the one before; the share that went astray.
+
+    Matches, offsets and their precisions have a gradient; the pose has it through the last steps of its least squares,
+    which start at the solution: as the implicit function theorem gives it, and without that of a decomposition, which
+    is infinite where singular values meet.
+
+    Args:
+        tokens: descriptors of G * F scans, place by place. poses: (G, F, 4, 4) reference, float64; where the network is
+            `ASTRAY`, its motion is taken.
+    """
+    groups, frames = poses.shape[:2]
+    number = torch.arange(groups * frames, device=poses.device).view(groups, frames)
+    source, target = (
+        Tokens(*(field[index.flatten()] for field in tokens)) for index in (number[:, 1:], number[:, :-1])
+    )
+    truth = (torch.linalg.inv(poses[:, :-1]) @ poses[:, 1:]).flatten(0, 1)
+    correlated = decoder(source, target)
+    scores = match_scores(decoder, correlated)
+    with torch.no_grad():
+        solved = solve_batch(decoder, source, target, correlated)
+    if solved is None:
+        return torch.linalg.inv(poses[:, :1]) @ poses, poses.new_ones(())
+    start = solved.T
+    off = (start[:, :3, 3] - truth[:, :3, 3]).norm(dim=-1)
+    usable = off < ASTRAY  # False for NaN
+    start = torch.where(usable[:, None, None], start, truth)
+    pairs = correspond(decoder, source, target, correlated, guided_scores(scores, start, source, target))
+    T, _ = precision_solve(start, pairs, rounds=2)
+    T = torch.where((usable & T.flatten(1).isfinite().all(1))[:, None, None], T, truth)
+    steps = T.unflatten(0, (groups, frames - 1))
+    chain = [torch.eye(4, dtype=steps.dtype, device=steps.device).expand(groups, 4, 4)]
+    for i in range(frames - 1):
+        chain.append(chain[-1] @ steps[:, i])
+    return torch.stack(chain, 1), (~usable).double().mean()
+
+
+def draw_stretch(poses: Array, frames: int, radius: float, noise: np.random.Generator) -> np.ndarray:
+    """`draw_group` in the order of the road, so that each scan follows the one before."""
+    chosen = draw_group(poses, frames, radius, noise)
+    at = poses[chosen, :3, 3] - poses[chosen, :3, 3].mean(0)
+    along = np.linalg.svd(at, full_matrices=False)[2][0]
+    return chosen[np.argsort(at @ along, kind="stable")]
+
+
+class Referenced:
+    """A source with the poses of a SLAM instead of the truth; NaN where it had none."""
+
+    def __init__(self, source: Source, poses: Array) -> None:
+        self.name, self.notes, self.poses = source.name, source.notes, poses
+        self.T_cam_lidar = None
+        self._source = source
+
+    def __len__(self) -> int:
+        return len(self._source)
+
+    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
+        yield from self._source.frames(start, stop)
+
+
+def refer(source: Source, settings: SlamSettings, advance: Callable[[], None] = lambda: None) -> Referenced:
+    """The source with the trajectory that the SLAM finds for it, loops closed."""
+    system, recorder, registered = SlamSystem(settings), TrajectoryRecorder(), []
+    for frame in source.frames():
+        tracked = system.process(frame)
+        recorder.add(tracked)
+        registered.append(tracked.registration.ok)
+        advance()
+    system.mapper.finish()
+    poses = recorder.poses(system.mapper.poses)
+    poses[~np.array(registered, bool)] = np.nan
+    return Referenced(source, poses)
+
+
+def prepare(
+    sources: Sequence[Source], settings: FinetuneSettings, network: NetworkSettings, slam: SlamSettings, out: Path,
+    advance: Callable[[str], None] = lambda what: None,
+) -> None:  # fmt: skip
+    """Drives with their references, their last parts and the rehearsal, packed below `out`; what is there stays.
+
+    Raises:
+        UsageError: the SLAM could hardly follow a drive.
+    """
+    slam = slam.model_copy(update={"registration": settings.reference})
+    for i, source in enumerate(sources):
+        name = f"{i:02d}_{source.name.replace('/', '_')}"
+        if (out / DRIVES / name).exists():  # the last to be written
+            continue
+        referenced = refer(source, slam, lambda name=name: advance(f"{name}: reference by SLAM"))  # type: ignore[misc]
+        known = np.flatnonzero(np.isfinite(referenced.poses[:, 0, 0]))
+        if len(known) < 2 * settings.frames:
+            raise UsageError(f"{source.name}: the SLAM followed {len(known)} of {len(source)} scans; nothing to learn")
+        cut = round(len(source) * (1 - settings.held_out))
+        for folder, part in ((HELD_OUT, range(cut, len(source))), (DRIVES, range(cut))):
+            if folder == DRIVES or _reaches_far(referenced.poses[part.start :]):
+                pack(referenced, out / folder / name, network, part, lambda name=name: advance(f"{name}: packing"))  # type: ignore[misc]
+    if settings.rehearsal_share > 0 and not settings.rehearsal:
+        worlds = settings.rehearsal_worlds.model_copy(update={"preset": network.preset})
+        generate(out / REHEARSAL, worlds, 1, lambda done, total: advance(f"rehearsal: world {done} of {total}"))
+
+
+def _reaches_far(poses: Array) -> bool:
+    """Whether pairs of every distance that `PairSet` wants can be drawn from a drive (N, 4, 4)."""
+    at = poses[np.isfinite(poses[:, 0, 0]), :3, 3]
+    return len(at) > 1 and float(np.linalg.norm(at - at[0], axis=1).max()) > 2 * NEAR
+
+
+def finetune(
+    settings: FinetuneSettings, out: Path, resume: bool = False, until: int | None = None, data: Path | None = None
+) -> Path:
+    """Train on what `prepare` left below `data`; checkpoint, log and `weights.safetensors` go to `out`.
+
+    until: stop after this step, with a checkpoint; `resume` goes on from there. data: `out`, if None.
+
+    Raises:
+        UsageError: no such weights, no drives, or nothing to resume.
+    """
+    path = weights_path(settings.weights)
+    with process_group() as (rank, world, device):
+        torch.manual_seed(settings.optimiser.seed)
+        module = Finetuned(load_model(path), settings).to(device)
+        ema = copy.deepcopy(module).requires_grad_(False)
+        start = load_checkpoint(out / "checkpoint.pt", module, ema, None) if resume else 0
+        places = _places(settings, data or out)
+        stretches = GroupDataset(places, module.model.settings, settings.optimiser.seed, start, (rank, world))
+        stretches.draw = draw_stretch
+
+        def loss(run: nn.Module, batch: Batch, step: int) -> tuple[Tensor, dict[str, Tensor]]:
+            noise = torch.Generator().manual_seed(settings.optimiser.seed * 1_000_003 + step)
+            plans = (plan_sets(batch.poses, settings.frames, (1, 1), 20.0, noise),)
+            return run(*to_device((batch.points, batch.poses, plans), device))
+
+        batches = iter(stretches.loader())
+        train(module, ema, batches, loss, settings.optimiser, out, resume, None, start, rank, device, until)
+        if rank == 0:
+            about = {k: v for k, v in read_metadata(path).items() if k not in ("preset", "network")}
+            about |= {"finetuned_from": path.stem, "finetuned_steps": str(settings.optimiser.steps)}
+            save_weights(ema.model, out / "weights.safetensors", about)
+    return out / "weights.safetensors"
+
+
+def measure(weights: Path, settings: FinetuneSettings, out: Path, pairs: int = 100) -> dict[str, dict[str, float]]:
+    """Errors of registration on the held-out parts and on the rehearsal, where there are any; see `PairSet.measure`."""
+    model = load_model(weights)
+    folders = {"held-out parts": out / HELD_OUT, "rehearsal": Path(settings.rehearsal or out / REHEARSAL)}
+    return {
+        name: PairSet(folder, pairs, model.settings, False).measure(model)
+        for name, folder in folders.items()
+        if folder.is_dir()
+    }
+
+
+def _places(settings: FinetuneSettings, out: Path) -> DataSettings:
+    packed = {str(out / DRIVES): 1 - settings.rehearsal_share}
+    if settings.rehearsal_share:
+        packed[settings.rehearsal or str(out / REHEARSAL)] = settings.rehearsal_share
+    return DataSettings(
+        packed=packed, groups=settings.groups, frames=settings.frames, radius=settings.radius,
+        workers=1, augment=settings.augment,
+    )  # fmt: skip

@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fine-tuning: gradients of the trajectory against differences, references by SLAM, resuming, what cannot be."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from dpm2_core.cli import main
+from dpm2_core.data.source import open_source
+from dpm2_core.diffslam.trajectory_loss import trajectory_loss
+from dpm2_core.errors import UsageError
+from dpm2_core.frame import Array
+from dpm2_core.geometry import se3
+from dpm2_core.network.config import NetworkSettings
+from dpm2_core.network.descriptors import Tokens
+from dpm2_core.network.model import DeepPointMap2
+from dpm2_core.network.weights import load_model, read_metadata, save_weights
+from dpm2_core.sim.config import LidarConfig
+from dpm2_core.sim.drive import simulate
+from dpm2_core.slam.system import SlamSettings
+from dpm2_core.training.finetune import (
+    FinetuneSettings,
+    draw_stretch,
+    finetune,
+    prepare,
+    refer,
+    window_trajectories,
+)
+from dpm2_core.training.packed import open_packed
+from dpm2_core.training.trainer import OptimiserSettings
+
+
+def descriptors(poses: torch.Tensor, channels: int) -> Tokens:
+    """Tokens of G * F scans of the same 60 places, each with its own feature in every scan; poses (G, F, 4, 4)."""
+    generator = torch.Generator().manual_seed(0)
+    places = torch.randn(60, 3, generator=generator, dtype=torch.float64) * torch.tensor([15.0, 15.0, 1.0])
+    features = torch.randn(60, channels, generator=generator)
+    inverse = torch.linalg.inv(poses.flatten(0, 1))
+    xyz = (places @ inverse[:, :3, :3].mT + inverse[:, None, :3, 3]).float()
+    axis = torch.nn.functional.normalize(xyz[..., :2], dim=-1)
+    scans = len(xyz)
+    return Tokens(xyz, features.expand(scans, 60, channels).clone(), axis, torch.ones(scans, 60, dtype=torch.bool))
+
+
+@pytest.fixture
+def road() -> torch.Tensor:
+    """(1, 3, 4, 4) poses along a bend."""
+    return torch.from_numpy(np.stack([se3.exp([0, 0, 0.05 * i, 2.0 * i, 0.1 * i, 0]) for i in range(3)])[None])
+
+
+def test_the_gradient_of_the_trajectory_is_that_of_differences(
+    tiny: Callable[..., NetworkSettings], road: torch.Tensor
+) -> None:
+    """With respect to one coordinate of one descriptor, to 2 %: the last least-squares steps carry it."""
+    torch.manual_seed(0)
+    model = DeepPointMap2(tiny()).eval()
+    tokens = descriptors(road, model.settings.channels)
+    reference = torch.linalg.inv(road[:, :1]) @ road
+    xyz = tokens.xyz.clone().requires_grad_(True)
+
+    def loss(xyz: torch.Tensor) -> torch.Tensor:
+        found, astray = window_trajectories(model.decoder, tokens._replace(xyz=xyz), road)
+        assert float(astray) == 0.0
+        return trajectory_loss(found[0], reference[0])
+
+    (slope,) = torch.autograd.grad(loss(xyz), xyz)
+    assert bool(slope.isfinite().all())
+    scan, place, axis = np.unravel_index(int(slope.abs().argmax()), slope.shape)
+    step = 2e-3
+    moved = [xyz.detach().clone() for _ in range(2)]
+    for sign, cloud in zip((1, -1), moved, strict=True):
+        cloud[scan, place, axis] += sign * step
+    with torch.no_grad():
+        difference = (loss(moved[0]) - loss(moved[1])) / (2 * step)
+    assert float(slope[scan, place, axis]) == pytest.approx(float(difference), rel=0.02)
+
+
+def test_a_scan_that_matches_nothing_goes_astray_without_a_gradient_or_nan(
+    tiny: Callable[..., NetworkSettings], road: torch.Tensor
+) -> None:
+    torch.manual_seed(0)
+    model = DeepPointMap2(tiny()).eval()
+    tokens = descriptors(road, model.settings.channels)
+    xyz = tokens.xyz.clone()
+    xyz[1] = 30 * torch.randn_like(xyz[1])
+    xyz.requires_grad_(True)
+    found, astray = window_trajectories(model.decoder, tokens._replace(xyz=xyz), road)
+    assert float(astray) > 0
+    torch.testing.assert_close(found[0, 1], (torch.linalg.inv(road[0, 0]) @ road[0, 1]), atol=1e-9, rtol=0)
+    found.sum().backward()
+    assert xyz.grad is not None
+    assert bool(xyz.grad.isfinite().all())
+
+
+def test_a_stretch_is_in_the_order_of_the_road() -> None:
+    poses = np.tile(np.eye(4), (50, 1, 1))
+    order = np.random.default_rng(1).permutation(50)
+    poses[:, 0, 3] = order
+    for seed in range(10):
+        along = order[draw_stretch(poses, 4, 15.0, np.random.default_rng(seed))]
+        steps = np.diff(along)
+        assert (steps > 0).all() or (steps < 0).all()
+        assert abs(along[-1] - along[0]) <= 30
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("finetune") / "drive"
+    simulate(out, 24, 5, "straight", "suburb", images=False, lidar=LidarConfig(beams=32, columns=600, height=2.2))
+    return out
+
+
+@pytest.fixture
+def settings(tmp_path: Path, packed: Path, tiny: Callable[..., NetworkSettings]) -> FinetuneSettings:
+    torch.manual_seed(0)
+    path = tmp_path / "start.safetensors"
+    save_weights(DeepPointMap2(tiny()), path, {"images": "false", "phase": "2"}, half=False)
+    optimiser = OptimiserSettings(steps=4, warmup=1, compile=False, bf16=False, save_every=2, rate=1e-3)
+    return FinetuneSettings(weights=str(path), rehearsal=str(packed), groups=1, frames=3, optimiser=optimiser)
+
+
+def _truth(drive: Path) -> Array:
+    poses = open_source(drive).poses
+    assert poses is not None
+    return poses
+
+
+def test_the_reference_is_the_trajectory_of_the_slam_and_frames_without_one_have_none(drive: Path) -> None:
+    """No ground truth goes in: from scan to scan it is within 2 cm of it."""
+    referenced = refer(open_source(drive), SlamSettings(threads=1))
+    truth = _truth(drive)
+    steps = [se3.inverse(poses[:-1]) @ poses[1:] for poses in (referenced.poses, truth)]
+    assert np.linalg.norm(steps[0][:, :3, 3] - steps[1][:, :3, 3], axis=1).max() < 0.02
+
+
+def test_a_stopped_training_goes_on_to_the_same_weights(
+    drive: Path, tmp_path: Path, settings: FinetuneSettings
+) -> None:
+    """And the weights carry what those that they started from said of themselves."""
+    data = tmp_path / "data"
+    network = load_model(Path(settings.weights)).settings
+    prepare([open_source(drive)], settings, network, SlamSettings(threads=1), data)
+    assert sum(len(packed) for packed in open_packed(data / "drives")) == 20
+    whole = finetune(settings, tmp_path / "whole", data=data)
+    finetune(settings, tmp_path / "parts", until=2, data=data)
+    parts = finetune(settings, tmp_path / "parts", resume=True, data=data)
+    one, other, start = (load_model(path).state_dict() for path in (whole, parts, Path(settings.weights)))
+    for name, value in one.items():
+        torch.testing.assert_close(value, other[name], atol=1e-6, rtol=0)
+    assert any(not torch.equal(value, start[name]) for name, value in one.items())
+    metadata = read_metadata(whole)
+    assert (metadata["phase"], metadata["finetuned_from"]) == ("2", "start")
+
+
+def test_a_drive_that_cannot_be_followed_is_an_error_of_use(
+    drive: Path, tmp_path: Path, settings: FinetuneSettings
+) -> None:
+    network = load_model(Path(settings.weights)).settings
+    source = open_source(drive)
+    blind = SlamSettings(threads=1, preprocess={"min_range": 79.0, "max_range": 80.0})  # type: ignore[arg-type]
+    with pytest.raises(UsageError, match="nothing to learn"):
+        prepare([source], settings, network, blind, tmp_path / "data")
+
+
+def test_errors_of_use_are_one_line(
+    drive: Path, tmp_path: Path, settings: FinetuneSettings, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for arguments, message in (
+        ([str(tmp_path / "none")], "none"),
+        ([str(drive), "--set", "weights=nowhere"], "nowhere: no such file"),
+        ([str(drive), "--set", "trajectry=1"], "unknown key trajectry"),
+        ([str(drive), "--resume"], "no checkpoint.pt to resume"),
+    ):
+        assert main_status([*arguments, "--out", str(tmp_path / "o")]) == 2
+        error = capsys.readouterr().err
+        assert message in error
+        assert error.count("\n") == 1
+
+
+def main_status(arguments: list[str]) -> int:
+    with pytest.raises(SystemExit) as exit_:
+        main(["finetune", *arguments])
+    return int(exit_.value.code or 0)
