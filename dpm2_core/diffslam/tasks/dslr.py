@@ -143,19 +143,17 @@ class Dslr(nn.Module):
         image, mask = project(points.float(), self.settings.image)
         return self(fill(image, mask)[None])[0], mask
 
-    def still(self, points: Tensor, share: float = 0.2, margin: float = 1.0) -> Tensor:
-        """(N,) bool: which points are where the static scan has something too, or are outside the image.
-
-        The others are nearer than the static scan is there: something stands in between that will not stay.
-
-        Args:
-            points: (N, 3+) m. share, margin: a point moves if its distance is less by this share and by this, m, more.
-        """
+    def still(self, points: Tensor) -> Tensor:
+        """(N,) bool: which points (N, 3+), m, are not `in_front` of the static scan, or are outside the image."""
         image, _ = self.translate(points)
         slot, inside = slots(points, self.settings.image)
-        static = image[0].flatten()[slot] * self.settings.image.scale
-        moving = torch.hypot(points[:, 0], points[:, 1]) < (1 - share) * static - margin
-        return ~(moving & inside)
+        d = torch.hypot(points[:, 0], points[:, 1]) / self.settings.image.scale
+        return ~(self.in_front(d, image[0].flatten()[slot]) & inside)
+
+    def in_front(self, d: Tensor, static: Tensor) -> Tensor:
+        """Where distances (...), in units of the scale, are so much less than those of the static scan that something
+        which will not stay stands in between: by a fifth and a metre, which is more than the translation errs."""
+        return d < 0.8 * static - 1.0 / self.settings.image.scale
 
     def static_points(self, points: Tensor) -> Tensor:
         """The translated scan (M, 3), m: one point for each slot that the scan (N, 3+) has a point in."""

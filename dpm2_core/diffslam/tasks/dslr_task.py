@@ -120,11 +120,14 @@ class DslrTask(Task):
         return chamfer_figures(clouds(found, scale)[0], clouds(static, scale)[0]) | {"moved_m": float(error.mean())}
 
     def clouds(self, scan: TaskScan) -> dict[str, Tensor]:
-        """The translated scan, the scan and its static twin, (N, 3) m each, all as range images show them."""
+        """Points (N, 3), m, as range images show them: `output`, the translated scan, `kept`, those of the scan that
+        stay by `Dslr.in_front`, `input`, the scan, and `target`, its static twin."""
         scale = self.settings.network.image.scale
         dynamic, static = self._reader.read([scan]), self._reader.read([scan], static=True)
         made = RangeScans(self.network(dynamic.images), dynamic.masks, dynamic.frames)
-        kinds = {"output": made, "input": dynamic, "target": static}
+        moving = self.network.in_front(dynamic.images[:, 0], made.images[:, 0])
+        kept = RangeScans(dynamic.images, dynamic.masks & ~moving, dynamic.frames)
+        kinds = {"output": made, "kept": kept, "input": dynamic, "target": static}
         return {name: clouds(of, scale)[0] for name, of in kinds.items()}
 
     def picture(self, scan: TaskScan, path: Path) -> None:

@@ -167,7 +167,6 @@ def test_still_points_are_those_that_the_static_scan_has_too(monkeypatch: pytest
     monkeypatch.setattr(network, "forward", lambda images: static)
     points = torch.tensor([[20.0, 1, -1, 0], [8.0, 0, -1, 0], [16.0, 3, -1, 0], [30.0, 0, -1, 0], [8.0, 0, 5, 0]])
     assert network.still(points).tolist() == [True, False, True, True, True]
-    assert network.still(points, share=0.0, margin=3.0).tolist() == [True, False, False, True, True]
 
 
 def test_what_is_no_dslr_is_refused(pairs: Path, tmp_path: Path) -> None:
