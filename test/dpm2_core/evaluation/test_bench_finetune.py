@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The fine-tuning benchmark: which trainings it wants, what it makes of their figures, what it takes from a file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from dpm2_core.evaluation.bench import finetune
+from dpm2_core.evaluation.bench.harness import Options, write_report
+from dpm2_core.training.finetune import FinetuneSettings
+
+BEFORE = {"near_m": 0.1, "far_m": 0.2, "all_m": 0.15, "all_deg": 0.1, "success": 0.9, "pairs": 10}
+
+
+def _run(factor: float) -> dict:
+    after = {key: value * factor for key, value in BEFORE.items()}
+    ratio = {name: dict.fromkeys(("near_m", "far_m", "all_m", "all_deg"), factor) for name in finetune.UNSEEN}
+    return {"after": dict.fromkeys(finetune.UNSEEN, after), "ratio": ratio, "steps": 1, "cpu_seconds": 1.0}
+
+
+def test_each_loss_alone_is_trained_once_and_both_for_every_seed() -> None:
+    assert finetune._wanted(Options(repetitions=3)) == [
+        ("both", 0), ("pairs", 0), ("trajectory", 0), ("both", 1), ("both", 2)
+    ]  # fmt: skip
+    assert finetune._wanted(Options(repetitions=3, only="pairs")) == [("pairs", 0)]
+
+
+def test_results_are_found_again_by_a_run_of_the_same_settings(tmp_path: Path) -> None:
+    settings, options = FinetuneSettings(), Options(out=tmp_path)
+    results = {"before": dict.fromkeys(finetune.UNSEEN, BEFORE), "runs": {"both": {"0": _run(0.6), "1": _run(0.8)}}}
+    report = finetune._report(results, settings)
+    found = report.results["ratios"]["both"]["new"]["all_m"]
+    assert found == {"mean": pytest.approx(0.7), "spread": pytest.approx(0.1), "seeds": 2}
+    path = tmp_path / "finetune.json"
+    write_report(path, "finetune", report, options)
+    assert finetune._read(path, settings) == results
+    assert finetune._read(path, FinetuneSettings(radius=3.0)) == {}
+    path.write_text("{")
+    assert finetune._read(path, settings) == {}

@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The traffic benchmark on a few scans: every method is judged, a second run goes on, strays are counted."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from dpm2_core.errors import UsageError
+from dpm2_core.evaluation.bench import traffic
+from dpm2_core.evaluation.bench.harness import Options
+from dpm2_core.sim.config import LidarConfig
+
+
+def test_a_short_drive_is_judged_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(traffic, "PLACES", {"suburb": 20.0})
+    monkeypatch.setattr(traffic, "FRAMES", 6)
+    monkeypatch.setattr(traffic, "LIDAR", LidarConfig(columns=512))
+    options = Options(repetitions=1, threads=1, only="geometric", out=tmp_path)
+    results = traffic.bench_traffic(options).results
+    row = results["summary"]["geometric"]
+    assert row["drives"] == 1
+    assert 0 <= row[traffic.ORACLE]["rpe_m"] < 0.05
+    assert row["movers"]["ratio"]["rpe_m"] == pytest.approx(row["movers"]["rpe_m"] / row["none"]["rpe_m"])
+    (drive,) = results["drives"].values()
+    assert 0.05 < drive["share_moving"] < 0.7
+    assert drive["runs"]["geometric"]["movers"]["filter_cpu_ms"] > 0
+    assert "filter_cpu_ms" not in drive["runs"]["geometric"]["none"]
+    monkeypatch.setattr(traffic, "build_world", None)  # all is in the file: no world is needed
+    assert (
+        traffic.bench_traffic(options).results["drives"]
+        == json.loads((tmp_path / "traffic.json").read_text())["drives"]
+    )
+    monkeypatch.setattr(traffic, "FRAMES", 7)  # of another recipe: begun anew
+    with pytest.raises(TypeError):
+        traffic.bench_traffic(options)
+
+
+def test_the_summary_is_of_means_and_medians_and_counts_drives_that_strayed() -> None:
+    def run(rpe: float) -> dict[str, float]:
+        return {"rpe_trans_m": rpe, "rpe_rot_deg": 0.01, "ape_rmse_m": 0.0, "failed_frames": 0, "cpu_ms": 20.0}
+
+    drives = {
+        str(i): {"runs": {"refined": {"none": run(none), "movers": run(movers)}}}
+        for i, (none, movers) in enumerate([(0.004, 0.002), (0.2, 0.003), (0.006, 0.004)])
+    }
+    found = traffic._summary(drives)["refined"]
+    assert found["none"]["astray"] == 1
+    assert found["movers"]["astray"] == 0
+    assert found["none"]["rpe_m"] == pytest.approx(0.07)
+    assert found["movers"]["ratio"]["rpe_m"] == pytest.approx(0.003 / 0.07)
+    assert found["movers"]["ratio"]["median_rpe_m"] == pytest.approx(0.5)
+
+
+def test_an_unknown_registration_is_an_error_of_use() -> None:
+    with pytest.raises(UsageError, match="geometric, neural, refined"):
+        traffic.bench_traffic(Options(only="visual"))
