@@ -24,6 +24,7 @@ from dpm2_core.sim.config import LidarConfig
 from dpm2_core.sim.drive import simulate
 from dpm2_core.slam.system import SlamSettings
 from dpm2_core.training.finetune import (
+    FinetuneOptimiser,
     FinetuneSettings,
     draw_stretch,
     finetune,
@@ -32,7 +33,6 @@ from dpm2_core.training.finetune import (
     window_trajectories,
 )
 from dpm2_core.training.packed import open_packed
-from dpm2_core.training.trainer import OptimiserSettings
 
 
 def descriptors(poses: torch.Tensor, channels: int) -> Tokens:
@@ -120,7 +120,7 @@ def settings(tmp_path: Path, packed: Path, tiny: Callable[..., NetworkSettings])
     torch.manual_seed(0)
     path = tmp_path / "start.safetensors"
     save_weights(DeepPointMap2(tiny()), path, {"images": "false", "phase": "2"}, half=False)
-    optimiser = OptimiserSettings(steps=4, warmup=1, compile=False, bf16=False, save_every=2, rate=1e-3)
+    optimiser = FinetuneOptimiser(steps=4, warmup=1, bf16=False, save_every=2, rate=1e-3)
     return FinetuneSettings(weights=str(path), rehearsal=str(packed), groups=1, frames=3, optimiser=optimiser)
 
 
