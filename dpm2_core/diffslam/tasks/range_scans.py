@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -54,7 +55,8 @@ class RangeReader:
                 set may be kept.
 
         Raises:
-            UsageError: a scan has no twin, no point in the image, or is an image of other rows and columns.
+            UsageError: a scan has no twin, or is an image of other rows and columns. One without any point in the image
+                is none: it happens beside a truck, and all its slots are empty.
         """
         pairs = [self._kept_or_made(scan, static) if keep else self._made(scan, static) for scan in scans]
         frames = [(scan.sequence, scan.number) for scan in scans]
@@ -77,8 +79,6 @@ class RangeReader:
             return self._cut(image, mask, where)
         points = scan.static if static and scan.static is not None else scan.points
         image, mask = project(points, self._settings)
-        if not bool(mask.any()):
-            raise UsageError(f"{where}: no point in the range image")
         return fill(image, mask), mask
 
     def _cut(self, image: Tensor, mask: Tensor, where: str) -> tuple[Tensor, Tensor]:
@@ -119,7 +119,10 @@ def slam_of(slam_loss: SlamLoss, made: Tensor, true: RangeScans, scale: float, w
 
 
 def chamfer_figures(found: Tensor, true: Tensor) -> dict[str, float]:
-    """Of two clouds (N, 3), (M, 3), m: `chamfer_m`, the mean distance, and `chamfer`, as DSLR gives it."""
+    """Of two clouds (N, 3), (M, 3), m: `chamfer_m`, the mean distance, and `chamfer`, as DSLR gives it; NaN if one is
+    empty."""
+    if not len(found) or not len(true):
+        return {"chamfer_m": math.nan, "chamfer": math.nan}
     forth, back = nearest_distances(found, true)
     squares = float((forth**2).sum() + (back**2).sum())
     return {"chamfer_m": float(forth.mean() + back.mean()) / 2, "chamfer": squares / SCALE**2}

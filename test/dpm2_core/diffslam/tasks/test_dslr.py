@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,7 @@ import torch
 from torch import nn
 
 from dpm2_core.diffslam import ScheduleSettings, SlamLossSettings
-from dpm2_core.diffslam.tasks.data import open_scans
+from dpm2_core.diffslam.tasks.data import TaskScan, TaskScans, open_scans
 from dpm2_core.diffslam.tasks.dslr import Dslr, DslrSettings, PairDiscriminator, RangeDecoder, RangeEncoder, load
 from dpm2_core.diffslam.tasks.dslr_task import DslrTask, DslrTraining
 from dpm2_core.diffslam.tasks.range_image import RangeImageSettings
@@ -167,6 +168,25 @@ def test_still_points_are_those_that_the_static_scan_has_too(monkeypatch: pytest
     monkeypatch.setattr(network, "forward", lambda images: static)
     points = torch.tensor([[20.0, 1, -1, 0], [8.0, 0, -1, 0], [16.0, 3, -1, 0], [30.0, 0, -1, 0], [8.0, 0, 5, 0]])
     assert network.still(points).tolist() == [True, False, True, True, True]
+
+
+def test_a_scan_without_points_in_the_image_is_none_and_spoils_nothing() -> None:
+    """Beside a truck nothing may be left: the losses stay finite, and figures are means over the others."""
+    generator = torch.Generator().manual_seed(0)
+    full = torch.rand(4000, 4, generator=generator) * torch.tensor([40.0, 40, 3, 1]) - torch.tensor([20.0, 20, 3, 0])
+    near = torch.rand(100, 4, generator=generator)
+    scans = [TaskScan(near if i == 1 else full, None, full, "00", i) for i in range(4)]
+    task = DslrTask(training())
+    for epoch in range(3):
+        task.start_epoch(epoch)
+        loss, slam = task.losses(scans)
+        assert loss.isfinite()
+        if slam is not None:
+            assert slam().isfinite()
+    rows = [measure(task, TaskScans([[scan]])) for scan in scans]
+    assert math.isnan(rows[1]["chamfer_m"])
+    found = measure(task, TaskScans([scans]))
+    assert found["chamfer_m"] == pytest.approx(sum(row["chamfer_m"] for row in rows if row is not rows[1]) / 3)
 
 
 def test_what_is_no_dslr_is_refused(pairs: Path, tmp_path: Path) -> None:
