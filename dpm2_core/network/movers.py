@@ -57,7 +57,7 @@ class MoverNet(nn.Module):
         self.register_buffer("range", away[None, None], persistent=False)
 
     def forward(self, occupied: Tensor) -> Tensor:
-        x = functional.pixel_unshuffle(occupied, 2)
+        x = functional.pixel_unshuffle(occupied, 2).contiguous(memory_format=torch.channels_last)
         x = self.stem(torch.cat([x, self.range.to(x.dtype).expand(len(x), -1, -1, -1)], 1))
         finer = []
         for block in self.down:
@@ -71,7 +71,9 @@ class MoverNet(nn.Module):
     def probability(self, points: NDArray[np.float32]) -> NDArray[np.float32]:
         """(N,) 0..1 of (N, 3+) points of one scan, m, in a frame whose z is about up; 0 off the grid."""
         voxel, inside = voxels(points, self.settings)
-        logits = self(occupancy([voxel[inside]], self.settings).to(self.range.device))
+        occupied = occupancy([voxel[inside]], self.settings).to(self.range.device)
+        with torch.autocast(occupied.device.type, torch.bfloat16):
+            logits = self(occupied)
         out = np.zeros(len(points), np.float32)
         out[inside] = logits.flatten().sigmoid().float().cpu().numpy()[voxel[inside]]
         return out
@@ -80,10 +82,10 @@ class MoverNet(nn.Module):
 def voxels(points: NDArray[np.float32], settings: MoverNetSettings) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Number (N,) of the voxel of (N, 3+) finite points, by layer, x and y, and whether they are on the grid (N,)."""
     n = settings.cells
-    grid = np.floor(points[:, :2] / settings.cell).astype(np.int64) + n // 2
-    inside = ((grid >= 0) & (grid < n)).all(1)
+    x, y = (np.floor(points[:, axis] / settings.cell).astype(np.int64) + n // 2 for axis in (0, 1))
+    inside = (x >= 0) & (x < n) & (y >= 0) & (y < n)
     layer = np.searchsorted(np.array(LAYERS, np.float32), height_above_ground(points))
-    return (layer * n + grid[:, 0]) * n + grid[:, 1], inside
+    return (layer * n + x) * n + y, inside
 
 
 def occupancy(scans: Sequence[NDArray[np.int64]], settings: MoverNetSettings) -> Tensor:
