@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a trained network leaves of a scan before the SLAM looks at it: no movers, no ground, or a scan without traffic.
+"""What a trained network leaves of a scan before the SLAM looks at it: no movers, no ground, or no traffic.
 
 All that follows works on what is left: the choice of reference points and their descriptors, the registration of the
 points, and the map.
@@ -32,8 +32,8 @@ class FilterSettings(Settings):
     """What is left of a scan, before anything else looks at it."""
 
     kind: FilterKind = "none"
-    """movers: without things that move or could move. ground: without the ground, by GndNet. static: DSLR's translation
-    into a scan without traffic."""
+    """movers: without things that move or could move. ground: without the ground, by GndNet. static: without what is
+    in front of DSLR's translation of the scan into one without traffic."""
     weights: Path | None = None
     """Path of a .safetensors file; unset: those that come with dpm2."""
     threshold: float = Field(0.5, gt=0, lt=1)
@@ -43,7 +43,7 @@ class FilterSettings(Settings):
 
 
 class PointFilter(Protocol):
-    """Scan to scan, both (N, 4) float32 [x, y, z m, intensity 0..1] in the frame of the LiDAR; may be empty."""
+    """Points (N, 4) float32 [x, y, z m, intensity 0..1] in the frame of the LiDAR to those that stay; may be none."""
 
     def __call__(self, points: Points) -> Points: ...
 
@@ -81,7 +81,7 @@ class GroundFilter:
 
 
 class StaticFilter:
-    """The scan as DSLR thinks that it would be without traffic: another one, with the points of its range image."""
+    """Leaves out what stands in front of the scan as DSLR thinks that it would be without traffic."""
 
     def __init__(self, net: Dslr) -> None:
         self._net = net
@@ -89,10 +89,7 @@ class StaticFilter:
     def __call__(self, points: Points) -> Points:
         import torch
 
-        if not len(points):
-            return points
-        xyz = self._net.static_points(torch.from_numpy(points)).numpy()
-        return np.concatenate([xyz, np.zeros((len(xyz), 1), np.float32)], 1).astype(np.float32)
+        return points[self._net.still(torch.from_numpy(points)).numpy()]
 
 
 def make_filter(settings: FilterSettings, threads: int) -> PointFilter | None:
