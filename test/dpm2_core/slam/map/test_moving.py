@@ -8,11 +8,11 @@ import pytest
 
 from dpm2_core.frame import Array, Keyframe, Points
 from dpm2_core.geometry import se3
+from dpm2_core.geometry.ground import height_above_ground
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.sim.config import LidarConfig
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.world import build_world
-from dpm2_core.geometry.ground import height_above_ground
 from dpm2_core.slam.map.moving import MovingSettings, MovingWindow, RangeImage, find_moving
 from dpm2_core.slam.system import SlamSettings, make_mapper
 
