@@ -12,7 +12,7 @@ EXTRAS ?= test
 # The environment is self-contained: a sourced ROS 2, another environment's bootstrap or its libraries must not leak in.
 unexport PYTHONPATH PYTHONHOME VIRTUAL_ENV AMENT_PREFIX_PATH ROS_DISTRO LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: help setup demo test lint bench bench-ros bench-robots bench-memory train-data train-small ablation sim parameters clean
+.PHONY: help setup demo test lint bench bench-ros bench-robots bench-memory train-data train-small train-movers ablation sim parameters clean
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:[^#]*##/\t/' | expand -t 16
 
@@ -65,6 +65,18 @@ train-small: train-data  ## train the weights that are shipped: registration, im
 	$(TRAIN) image --config config/train_small_image.yaml --out out/image $(call RESUMED,image)
 	$(TRAIN) phase1 --config config/train_small_camera.yaml --out out/camera $(call RESUMED,camera)
 	$(TRAIN) phase2 --config config/train_small_phase2.yaml --out out/phase2 $(call RESUMED,phase2)
+
+# Dense traffic and the usual one with 64 beams, and 32 beams higher up; the task learns from all of them.
+MOVERS = $(BIN)/python -m dpm2_core.cli train tasks-data out/movers/$(1) --set 'presets=[city, suburb, rural, highway]' \
+	--set train_frames=12 --set val=4 --set val_frames=6
+train-movers: setup  ## train the weights of slam.filter.kind=movers (2 cores: 15 minutes, 1.5 GB)
+	$(call MOVERS,dense) --set traffic=30 --set lidar.columns=1400 --set train=20 --set first_seed=7300
+	$(call MOVERS,usual) --set traffic=1 --set lidar.columns=2000 --set train=12 --set first_seed=7400
+	$(call MOVERS,sparse) --set traffic=15 --set lidar.beams=32 --set lidar.height=2.1 --set lidar.columns=1024 --set train=12 --set first_seed=7500
+	for part in train val; do mkdir -p out/movers/$$part; for set in dense usual sparse; do for drive in out/movers/$$set/$$part/*; do \
+		ln -sfn ../$$set/$$part/$$(basename $$drive) out/movers/$$part/$$set-$$(basename $$drive); done; done; done
+	$(BIN)/python -m dpm2_core.cli train movers out/movers/train --val out/movers/val --out out/movers/run \
+		$(call RESUMED,movers/run)
 
 ablation: train-data  ## Table 4: every fusion trained alike at a small budget
 	$(TRAIN) ablation --config config/ablation.yaml --out out/ablation

@@ -32,7 +32,7 @@ class MoverTraining(TaskTraining):
 
     network: MoverNetSettings = MoverNetSettings()
     """Grid and network."""
-    epochs: int = Field(default=20, ge=1)
+    epochs: int = Field(default=14, ge=1)
     window: int = Field(default=2, ge=2)
     batch: int = Field(default=4, ge=1)
     every: int = Field(default=5, ge=1)
