@@ -11,6 +11,8 @@ import pytest
 
 from dpm2_core.frame import Frame, State, Tracked
 from dpm2_core.geometry import se3
+from dpm2_core.sim.lidar import Lidar
+from dpm2_core.sim.world import build_world
 from dpm2_core.slam.system import SlamSettings, make_odometry
 
 from .conftest import Drive, make_drive
@@ -162,6 +164,18 @@ def test_fast_start(suburb: Drive) -> None:
     """Three metres between the first two scans: no velocity is known yet."""
     frames = [replace(f, stamp=i * 10**8) for i, f in enumerate(suburb[0][::3])]
     assert errors(run(frames), suburb[1][::3])[:, 0].max() < 0.06
+
+
+@pytest.mark.parametrize(("x", "yaw"), [(1.1, 7.0), (1.6, -9.0)])
+def test_a_drive_may_begin_in_a_curve(x: float, yaw: float) -> None:
+    """Round a corner at 5 Hz (35 and 45 deg/s), from the first scan on."""
+    world, lidar, rng = build_world("straight", "suburb", seed=11, length=200.0), Lidar(), np.random.default_rng(0)
+    T_world_lidar = [world.drive_pose(2.0) @ se3.exp([0, 0, np.radians(yaw * i), x * i, 0, 0]) for i in range(4)]
+    frames = [Frame(i * 2 * 10**8, lidar.scan(world, T, 0.0, rng).points) for i, T in enumerate(T_world_lidar)]
+    tracked = run(frames)
+    off = errors(tracked, se3.inverse(T_world_lidar[0]) @ np.array(T_world_lidar))
+    assert off[:, 0].max() < 0.05
+    assert tracked[1].state == State.TRACKING
 
 
 def test_real_scans_follow_the_ground_truth(kitti_root: object) -> None:
