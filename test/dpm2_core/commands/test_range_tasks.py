@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`dpm2 train dslr|ae_lidar` and `dpm2 eval-task` on pairs in DSLR's layout: figures, picture, and what cannot be."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dpm2_core.cli import _status
+
+SENSOR = "network.image={beams: [[2, -14, 16]], first: 0, rows: 16, columns: 64, scale: 120}"
+SMALL = [SENSOR, "network.channels=4", "network.latent=8", "window=3", "every=1", "batch=1", "slam_loss.points=200"]
+
+
+@pytest.fixture
+def pairs(tmp_path: Path) -> Path:
+    """One pair of arrays of 6 scans: range images of a room, with something in the middle of the dynamic ones."""
+    rng = np.random.default_rng(0)
+    d = np.broadcast_to(12 + 3 * np.sin(np.arange(64) / 5), (6, 16, 64)) + rng.normal(scale=0.02, size=(6, 16, 64))
+    z = d * np.tan(np.radians(np.linspace(2, -14, 16)))[None, :, None]
+    static = np.stack([d, z], 1).astype(np.float32) / 120
+    dynamic = static.copy()
+    dynamic[:, :, :, 20:30] *= 0.5
+    folder = tmp_path / "pairs"
+    folder.mkdir()
+    np.save(folder / "s0.npy", static)
+    np.save(folder / "d0.npy", dynamic)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("name", "stages", "figures"),
+    [
+        ("dslr", ["autoencoder_epochs=1", "discriminator_epochs=1"], {"chamfer_m", "chamfer", "moved_m"}),
+        ("ae_lidar", ["network.variational=true"], {"chamfer_m", "chamfer", "d_error_m"}),
+    ],
+)
+def test_train_and_measure(
+    pairs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, stages: list[str], figures: set[str]
+) -> None:
+    """The SLAM loss in the last of three epochs; weights of one task are none of the other; SLAM needs poses."""
+    out = tmp_path / "out"
+    settings = [word for setting in [*SMALL, *stages, "epochs=3"] for word in ("--set", setting)]
+    slam = ["--slam-weight", "0.5", "--slam-every", "3"]
+    assert _status(["train", name, str(pairs), "--out", str(out), *settings, *slam]) == 0
+    log = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
+    assert [row["step"] for row in log if "slam_loss" in row] == [4, 5]
+
+    capsys.readouterr()
+    weights, picture = str(out / "weights.safetensors"), tmp_path / "scan.png"
+    assert _status(["eval-task", name, weights, str(pairs), "--json", "--picture", str(picture), "--frame", "2"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["scans"] == 6
+    assert figures <= printed.keys()
+    assert picture.stat().st_size > 1000
+
+    assert _status(["eval-task", name, weights, str(pairs), "--slam"]) == 2
+    assert "no sequences with poses" in capsys.readouterr().err
+    other = "ae_lidar" if name == "dslr" else "dslr"
+    assert _status(["eval-task", other, weights, str(pairs)]) == 2
+    assert f"weights of {name}, not of {other}" in capsys.readouterr().err
