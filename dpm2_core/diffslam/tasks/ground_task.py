@@ -48,6 +48,11 @@ class GroundTraining(TaskTraining):
     """Odometry of the SLAM loss."""
     tilt: float = Field(default=3.0, ge=0, lt=45)
     """Each window is rolled and pitched by up to this, deg (the original: 10)."""
+    gaps: float = Field(default=0.0, ge=0, le=1)
+    """What a cell without ground points counts for in the loss; its label is that of the nearest cell with some."""
+    most: float = Field(default=0.5, gt=0)
+    """Largest share of the loss of the task that the SLAM loss, times gamma, may have in a step. Where the elevation
+    found hides nearly all that stands, the registration is lost, and its error would be the whole step."""
     lift: float = Field(default=0.0, ge=0)
     """Each window is moved up or down by up to this, m: LiDARs on other cars are higher or lower."""
 
@@ -74,18 +79,22 @@ class GroundTask(Task):
         turn, up = self._moved()
         clouds = [scan.points @ turn.T + up for scan in window]
         pairs = [elevation_labels(c, ground_of(scan)[0], network) for c, scan in zip(clouds, window, strict=True)]
-        labels, known = torch.stack([label for label, _ in pairs]), torch.stack([known for _, known in pairs])
+        known = torch.stack([known for _, known in pairs])
+        labels = torch.stack([filled(label, k) for label, k in pairs])
         elevation = self.net(clouds)
 
         def slam() -> Tensor:
             xyz = [cloud[:, :3] for cloud in clouds]
-            truth = [filled(label, k) for label, k in zip(labels, known, strict=True)]
             found = [obstacle_weight(c, e, network) for c, e in zip(xyz, elevation, strict=True)]
-            wanted = [obstacle_weight(c, e, network) for c, e in zip(xyz, truth, strict=True)]
+            wanted = [obstacle_weight(c, e, network) for c, e in zip(xyz, labels, strict=True)]
             parts = self.windows(len(xyz))
-            return torch.stack([self.slam_loss(xyz[p], xyz[p], found[p], wanted[p]) for p in parts]).mean()
+            value = torch.stack([self.slam_loss(xyz[p], xyz[p], found[p], wanted[p]) for p in parts]).mean()
+            counted = (self.settings.slam.gamma * value.detach()).clamp(min=1e-12)
+            return value * (self.settings.most * loss.detach() / counted).clamp(max=1)
 
-        return ground_loss(elevation, labels, known, network), slam
+        counts = known + self.settings.gaps * (~known & known.flatten(1).any(1)[:, None, None])
+        loss = ground_loss(elevation, labels, counts, network)
+        return loss, slam
 
     def _moved(self) -> tuple[Tensor, Tensor]:
         """A random roll, pitch and lift: (4, 4) and (4,) that points (N, 4) are turned and moved by."""

@@ -55,7 +55,7 @@ _ODOMETRY = ("output_ate_m", "output_rpe_m", "output_rpe_deg")
 COMPARISONS: dict[str, Comparison] = {
     "gndnet": Comparison(
         settings=(
-            "network.cells=64", "network.channels=16", "epochs=6", "rate=3e-3", "slam.gamma=1", "slam.every=2",
+            "network.cells=64", "network.channels=16", "epochs=6", "rate=3e-3", "slam.gamma=2", "slam.every=2",
             "slam_loss.points=1024",
         ),
         figures={"mse": "lower", "miou": "higher", "precision": "higher", "recall": "higher"},
