@@ -12,7 +12,7 @@ EXTRAS ?= test
 # The environment is self-contained: a sourced ROS 2, another environment's bootstrap or its libraries must not leak in.
 unexport PYTHONPATH PYTHONHOME VIRTUAL_ENV AMENT_PREFIX_PATH ROS_DISTRO LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: help setup demo test lint bench bench-ros bench-robots bench-memory train-data train-small train-movers ablation sim parameters clean
+.PHONY: help setup demo test lint bench bench-ros bench-robots bench-memory train-data train-small train-movers train-ground ablation sim parameters clean
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:[^#]*##/\t/' | expand -t 16
 
@@ -65,6 +65,13 @@ train-small: train-data  ## train the weights that are shipped: registration, im
 	$(TRAIN) image --config config/train_small_image.yaml --out out/image $(call RESUMED,image)
 	$(TRAIN) phase1 --config config/train_small_camera.yaml --out out/camera $(call RESUMED,camera)
 	$(TRAIN) phase2 --config config/train_small_phase2.yaml --out out/phase2 $(call RESUMED,phase2)
+
+train-ground: setup  ## train the weights of slam.filter.kind=ground (2 cores: 10 minutes, 1.5 GB)
+	$(BIN)/python -m dpm2_core.cli train tasks-data out/ground --set train=24 --set train_frames=20 --set val=6 --set val_frames=20
+	$(BIN)/python -m dpm2_core.cli train tasks-data out/ground/train/dense --set train=16 --set train_frames=10 --set val=1 \
+		--set val_frames=2 --set first_seed=8000 --set lidar.columns=2170
+	$(BIN)/python -m dpm2_core.cli train gndnet out/ground/train --val out/ground/val --out out/ground/run --set network.channels=16 \
+		--set epochs=10 --set rate=2e-3 --set lift=0.3 --set gaps=0.1 $(call RESUMED,ground/run)
 
 # Dense traffic and the usual one with 64 beams, and 32 beams higher up; the task learns from all of them.
 MOVERS = $(BIN)/python -m dpm2_core.cli train tasks-data out/movers/$(1) --set 'presets=[city, suburb, rural, highway]' \
