@@ -55,7 +55,7 @@ class FinetuneOptimiser(OptimiserSettings):
 
     steps: int = Field(default=300, gt=0)
     """Batches."""
-    rate: float = Field(default=5e-4, gt=0)
+    rate: float = Field(default=3e-4, gt=0)
     """Peak learning rate."""
     warmup: int = Field(default=20, ge=0)
     """Steps of linear warm-up."""
@@ -94,7 +94,7 @@ class FinetuneSettings(Settings):
     """Name of weights that come with dpm2, or path of a .safetensors file: what to start from."""
     reference: Literal["geometric", "refined"] = "geometric"
     """Registration of the SLAM whose trajectory is the reference."""
-    trajectory: float = Field(default=10.0, ge=0)
+    trajectory: float = Field(default=2.0, ge=0)
     """Weight of the trajectory loss, 1/m2."""
     pairs: float = Field(default=1.0, ge=0)
     """Weight of the losses of phase one, with the reference as truth."""
