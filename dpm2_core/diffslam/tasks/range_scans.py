@@ -17,8 +17,8 @@ from dpm2_core.diffslam.tasks.range_image import RangeImageSettings, fill, proje
 from dpm2_core.diffslam.trajectory_loss import SlamLoss
 from dpm2_core.errors import UsageError
 
-_KEPT = 1000
-"""Scans whose images are kept: about 160 kB each, and projecting one takes as long as half a step of training."""
+_KEPT = 2000
+"""Scans whose images are kept: about 180 kB each, and projecting one takes as long as half a step of training."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -64,7 +64,7 @@ COMPARISONS: dict[str, Comparison] = {
     "dslr": Comparison(
         settings=(
             "network.image.columns=128", "network.channels=24", "autoencoder_epochs=9", "discriminator_epochs=1",
-            "epochs=18", "window=4", "every=1", "batch=2", "rate=2e-3", "final_rate=2e-4", "slam.gamma=10",
+            "epochs=18", "window=4", "every=1", "batch=2", "rate=2e-3", "final_rate=2e-4", "slam.gamma=20",
             "slam.every=4", "slam_loss.points=1024",
         ),
         figures=dict.fromkeys(("chamfer_m", "chamfer", "moved_m", *_ODOMETRY), "lower"),
