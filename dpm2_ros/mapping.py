@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+import os
+import sys
+import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -30,6 +33,7 @@ from dpm2_ros.tf import TransformBroadcaster
 
 KEEP_ALL = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
 LAST_ONE = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+_NICER = 10  # steps of niceness: a tenth of the share of the odometry where both want a processor
 
 
 class MapperThread:
@@ -43,7 +47,7 @@ class MapperThread:
         config = config.model_copy(update={"slam": config.slam.model_copy(update={"pose_graph": graph})})
         self._node, self._config, self._robot = node, config, robot
         self._active = ActiveMap(config, robot, node.get_logger())
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="mapper")
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="mapper", initializer=yield_to_odometry)
         self._stamp = 0  # of the last keyframe, ns
         self._last: Future[None] | None = None  # of the keyframes taken in
         self._changes = self.keyframes
@@ -216,6 +220,13 @@ class MapperThread:
         if len(points) > most:
             points = points[np.linspace(0, len(points) - 1, most).astype(np.intp)]
         return cloud_to_msg(points, self._stamp, self._config.ros.map_frame)
+
+
+def yield_to_odometry() -> None:
+    """Give this thread, and those that it starts, a low priority: a map may wait, the next scan may not."""
+    if sys.platform == "linux":  # elsewhere a thread has no number of its own for this
+        thread = threading.get_native_id()
+        os.setpriority(os.PRIO_PROCESS, thread, os.getpriority(os.PRIO_PROCESS, thread) + _NICER)
 
 
 async def answer(work: Future[str], response: Any) -> None:

@@ -14,6 +14,9 @@ from typing import Any
 
 from dpm2_core.errors import Dpm2Error, UsageError
 
+_SWITCH = 5e-4
+"""s until a thread must hand Python's lock on. The odometry asks for it tens of times a frame, and with the usual 5 ms a
+network that runs in the mapper's thread keeps it waiting each time."""
 STOP = threading.Event()
 """Set by the first signal."""
 
@@ -68,6 +71,7 @@ def spin_node(make: Callable[[], Any], arguments: Sequence[str]) -> int:
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
 
+    sys.setswitchinterval(_SWITCH)
     ros_context(arguments)
     try:
         node = make()

@@ -26,7 +26,7 @@ from dpm2_ros.conversions import keyframe_to_base, odometry_to_msg, to_base
 from dpm2_ros.frames import FrameBuilder
 from dpm2_ros.health import Diagnostics, Health
 from dpm2_ros.keyframes import KeyframeSender
-from dpm2_ros.mapping import MapperThread, answer, robot_name
+from dpm2_ros.mapping import MapperThread, answer, robot_name, yield_to_odometry
 from dpm2_ros.parameters import load_parameters
 from dpm2_ros.settings import NodeConfig
 from dpm2_ros.subscriptions import Inputs
@@ -59,7 +59,8 @@ class SlamNode(Node):
         self._diagnostics = Diagnostics(self, self._inputs, self._frames, self._health, self._mapper, self._sender)
         self._odom = self.create_publisher(Odometry, "dpm2/odom", 10)
         self._described = make_loops(self._config.slam).described
-        self._line = ThreadPoolExecutor(1, thread_name_prefix="keyframes")  # idle with the mapper, which has its own
+        # Idle with the mapper, which has its own.
+        self._line = ThreadPoolExecutor(1, thread_name_prefix="keyframes", initializer=yield_to_odometry)
         self._tf = TransformBroadcaster(self, ros.odom_frame, ros.publish_tf_odom)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(Trigger, "~/load_map", self._on_load_map)
