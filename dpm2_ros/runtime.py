@@ -15,8 +15,8 @@ from typing import Any
 from dpm2_core.errors import Dpm2Error, UsageError
 
 _SWITCH = 5e-4
-"""s until a thread must hand Python's lock on. The odometry asks for it tens of times a frame, and with the usual 5 ms a
-network that runs in the mapper's thread keeps it waiting each time."""
+"""s until a thread must hand Python's lock on. The odometry asks for it tens of times a frame; with the usual 5 ms a
+network in the thread of the map keeps it waiting each time."""
 STOP = threading.Event()
 """Set by the first signal."""
 
