@@ -12,14 +12,19 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from dpm2_core.diffslam import ScheduleSettings
 from dpm2_core.diffslam.tasks.data import TaskScan, TaskScans, open_scans
-from dpm2_core.diffslam.tasks.gndnet import elevation_labels
+from dpm2_core.diffslam.tasks.drives import TaskDriveSettings, make_task_drives
+from dpm2_core.diffslam.tasks.gndnet import elevation_labels, load
 from dpm2_core.diffslam.tasks.ground_task import GroundTask, GroundTraining, _tilt, filled, ground_of
-from dpm2_core.diffslam.tasks.training import measure
+from dpm2_core.diffslam.tasks.training import load_task, measure
 
 SETTINGS = GroundTraining.model_validate(
     {"network": {"cells": 48, "cell": 2.0, "channels": 4}, "tilt": 0.0, "slam_loss": {"points": 500}}
 )
+
+
+SHIPPED = Path(__file__).resolve().parents[4] / "dpm2_core" / "weights" / "gndnet.safetensors"
 
 
 class Known(nn.Module):
@@ -90,6 +95,41 @@ def test_figures_of_the_true_elevation(scans: TaskScans) -> None:
     assert found["recall"] == pytest.approx(sum(high) / 3, abs=1e-3)
 
 
+def test_a_lost_registration_is_not_the_whole_step(scans: TaskScans) -> None:
+    """gamma L_slam is bounded by a share of the loss of the task, its slope along with it; below, it is as it is."""
+    values, slopes = [], []
+    for most in (1e9, 0.5, 1e-3):
+        task, window, offset = with_elevation(scans, -0.3)
+        task.settings = SETTINGS.model_copy(update={"most": most, "slam": ScheduleSettings(gamma=3.0)})
+        loss, slam = task.losses(window)
+        value = slam()
+        (slope,) = torch.autograd.grad(value, offset)
+        values.append(3.0 * float(value.detach()) / float(loss.detach()))
+        slopes.append(float(slope))
+    assert values[1] == pytest.approx(min(values[0], 0.5))
+    assert values[2] == pytest.approx(1e-3)
+    assert slopes[2] / slopes[0] == pytest.approx(values[2] / values[0])
+
+
+def test_gaps_count_as_much_as_they_are_told_to(scans: TaskScans) -> None:
+    """An elevation that is wrong where no ground was seen costs nothing, unless the gaps count."""
+    task, window, _ = with_elevation(scans, 0.0)
+    plain = float(task.losses(window)[0].detach())
+    known = torch.stack([elevation_labels(s.points, ground_of(s)[0], SETTINGS.network)[1] for s in window])
+    assert 0.05 < float(known.float().mean()) < 0.95
+    task.net.truth = task.net.truth + 2.0 * ~known  # type: ignore[operator]
+    costs = []
+    for gaps in (0.0, 0.1, 1.0):
+        # Without the curvature, which sees the steps at the borders of the gaps.
+        network = SETTINGS.network.model_copy(update={"smoothness": 0.0})
+        task.settings = SETTINGS.model_copy(update={"gaps": gaps, "network": network})
+        costs.append(float(task.losses(window)[0].detach()))
+    assert costs[0] <= plain
+    share = float((~known).sum() / known.sum())
+    assert costs[1] == pytest.approx(1.5 * 0.1 * share / (1 + 0.1 * share), rel=0.01)  # smooth L1 of 2 m is 1.5
+    assert costs[2] == pytest.approx(1.5 * share / (1 + share), rel=0.01)
+
+
 def test_tilt_is_a_rotation_of_the_whole_window(scans: TaskScans) -> None:
     """By roll and pitch within the bound; the labels turn along, and it is another one each time."""
     torch.manual_seed(0)
@@ -118,3 +158,15 @@ def test_gaps_take_the_nearest_cell_that_is_known() -> None:
     found = filled(elevation, known)
     assert float(found[1, 2]) == pytest.approx(-1.7)
     assert float(found[3, 3]) == pytest.approx(-1.2)
+
+
+def test_the_shipped_weights_know_an_unseen_suburb(tmp_path: Path) -> None:
+    """The file is small, loads strictly, finds the ground of another world to 30 cm (RMS, out to 50 m), and most of
+    what stands on it."""
+    assert SHIPPED.stat().st_size < 5e6
+    assert load(SHIPPED).settings.cells == 100
+    drives = {"train": 1, "train_frames": 2, "val": 1, "val_frames": 2, "first_seed": 31_000, "presets": ["suburb"]}
+    make_task_drives(tmp_path, TaskDriveSettings.model_validate(drives), 1)
+    found = measure(load_task("gndnet", SHIPPED), open_scans(tmp_path))
+    assert found["mse"] < 0.3**2
+    assert found["miou"] > 0.8
