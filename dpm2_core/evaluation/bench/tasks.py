@@ -77,7 +77,7 @@ COMPARISONS: dict[str, Comparison] = {
     "ae_lidar": Comparison(
         settings=(
             "network.image.columns=128", "network.channels=16", "network.latent=160", "epochs=12", "window=4",
-            "every=1", "batch=2", "rate=2e-3", "final_rate=2e-4", "slam.gamma=10", "slam.every=5",
+            "every=1", "batch=2", "rate=2e-3", "final_rate=2e-4", "slam.gamma=20", "slam.every=5",
             "slam_loss.points=1024",
         ),
         figures=dict.fromkeys(("chamfer_m", "chamfer", "d_error_m", *_ODOMETRY), "lower"),
