@@ -42,8 +42,13 @@ UNSEEN = {
     "old": GenerateSettings(worlds=8, first_seed=970_000, frames=16, mixture=_TOWNS),
 }
 """Worlds to be judged on, of the new LiDAR and of the old one."""
-ARMS: dict[str, tuple[str, ...]] = {"both": (), "pairs": ("trajectory=0",), "trajectory": ("pairs=0",)}
-"""Losses: both, as `dpm2 finetune` has it, for every seed; each alone for the first."""
+ARMS: dict[str, tuple[str, ...]] = {
+    "both": (),
+    "pairs": ("trajectory=0",),
+    "both, 300 steps": ("optimiser.steps=300",),
+    "trajectory": ("pairs=0",),
+}
+"""Losses: both, as `dpm2 finetune` has it, for every seed; each alone, and both for its 300 steps, for the first."""
 
 
 def bench_finetune(options: Options) -> Report:
@@ -97,7 +102,7 @@ def _run(
     """One training, what it cost, and the errors that are left."""
     overrides = [STEPS, *options.overrides, *ARMS[arm], f"optimiser.seed={seed}"]
     settings = load_settings(FinetuneSettings, None, overrides)
-    out = folder / f"{arm}_{seed}"
+    out = folder / f"{arm.replace(', ', '_').replace(' ', '_')}_{seed}"
     out.mkdir(parents=True, exist_ok=True)
     cpu = process_time()
     weights = finetune(settings, out, resume=(out / "checkpoint.pt").is_file(), data=folder / "data")
