@@ -123,28 +123,28 @@ def _odometry(odometry: Odometry, clouds: list[Points], truth: NDArray[np.float6
 
 
 def _summary(drives: dict[str, Any]) -> dict[str, Any]:
-    """Of each registration and method, over the drives: mean, spread and median of the errors, drives astray, ratios.
+    """Of each registration and method, over the drives that have it: mean, spread and median, drives astray, ratios.
 
-    `ratio`: of the mean and of the median RPE to those of `none`.
+    `ratio`: of means and medians to those of `none` on the same drives.
     """
     out: dict[str, Any] = {}
     for registration in REGISTRATIONS:
         rows = [d["runs"][registration] for d in drives.values() if registration in d["runs"]]
-        if not rows:
-            continue
-        out[registration] = {"drives": len(rows)}
-        for method in (m for m in rows[0] if all(m in row for row in rows)):
-            rpe = [row[method]["rpe_trans_m"] for row in rows]
-            turn = [row[method]["rpe_rot_deg"] for row in rows]
-            found = {
-                "rpe_m": mean(rpe), "spread_m": pstdev(rpe), "median_rpe_m": median(rpe),
-                "rpe_deg": mean(turn), "median_rpe_deg": median(turn), "astray": sum(e > LOST for e in rpe),
-                "cpu_ms": median(row[method]["cpu_ms"] for row in rows),
-            }  # fmt: skip
-            none = out[registration].get("none", found)
-            found["ratio"] = {k: found[k] / none[k] for k in ("rpe_m", "median_rpe_m", "rpe_deg", "median_rpe_deg")}
-            out[registration][method] = found
+        for method in dict.fromkeys(m for row in rows for m in row):
+            having = [row for row in rows if method in row]
+            found, none = (_figures([row[m] for row in having if m in row]) for m in (method, "none"))
+            found["ratio"] = {key: found[key] / none[key] for key in found if "rpe" in key}
+            out.setdefault(registration, {})[method] = found
     return out
+
+
+def _figures(runs: list[dict[str, Any]]) -> dict[str, Any]:
+    rpe, turn = [run["rpe_trans_m"] for run in runs], [run["rpe_rot_deg"] for run in runs]
+    return {
+        "drives": len(runs), "rpe_m": mean(rpe), "spread_m": pstdev(rpe), "median_rpe_m": median(rpe),
+        "rpe_deg": mean(turn), "median_rpe_deg": median(turn), "astray": sum(e > LOST for e in rpe),
+        "cpu_ms": median(run["cpu_ms"] for run in runs),
+    }  # fmt: skip
 
 
 def _recipe(options: Options) -> dict[str, Any]:
@@ -175,11 +175,9 @@ def _report(drives: dict[str, Any], options: Options) -> Report:
         table.add_column(column, justify="left" if column in ("registration", "filter") else "right", no_wrap=True)
     for registration, methods in summary.items():
         for method, row in methods.items():
-            if method == "drives":
-                continue
             table.add_row(
                 registration, method, f"{row['rpe_m']:.4f} ({row['median_rpe_m']:.4f})",
-                f"{row['rpe_deg']:.4f} ({row['median_rpe_deg']:.4f})", f"{row['astray']} of {methods['drives']}",
+                f"{row['rpe_deg']:.4f} ({row['median_rpe_deg']:.4f})", f"{row['astray']} of {row['drives']}",
                 f"{row['cpu_ms']:.0f}",
             )  # fmt: skip
         table.add_section()
