@@ -81,7 +81,7 @@ def test_divergence_counts_for_more_with_every_epoch(pairs: Path) -> None:
     for epoch in (0, 3, 9):
         torch.manual_seed(1)
         task.start_epoch(epoch)
-        values.append(float(task.losses(scans)[0]))
+        values.append(task.losses(scans)[0].item())
     assert values[0] < values[1]
     assert values[1] == pytest.approx(values[2])
     assert values[1] - values[0] == pytest.approx(0.75 * 5.0, rel=0.05)  # an untrained one is below the least
