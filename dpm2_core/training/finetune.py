@@ -96,8 +96,8 @@ class FinetuneSettings(Settings):
     """Registration of the SLAM whose trajectory is the reference."""
     trajectory: float = Field(default=2.0, ge=0)
     """Weight of the trajectory loss, 1/m2."""
-    pairs: float = Field(default=1.0, ge=0)
-    """Weight of the losses of phase one, with the reference as truth."""
+    pairs: float = Field(default=0.0, ge=0)
+    """Weight of the losses of phase one, with the reference as truth. They gained nothing, and took from the other."""
     loss: LossSettings = LossSettings()
     rehearsal: str = ""
     """Folder of packed drives of the LiDAR that the weights come from; empty: synthetic worlds are made."""

@@ -22,7 +22,7 @@ def _run(factor: float) -> dict:
 
 def test_each_loss_alone_is_trained_once_and_both_for_every_seed() -> None:
     assert finetune._wanted(Options(repetitions=3)) == [
-        ("both", 0), ("pairs", 0), ("both, 300 steps", 0), ("trajectory", 0), ("both", 1), ("both", 2)
+        ("trajectory", 0), ("pairs", 0), ("both", 0), ("trajectory", 1), ("trajectory", 2)
     ]  # fmt: skip
     assert finetune._wanted(Options(repetitions=3, only="pairs")) == [("pairs", 0)]
 
