@@ -121,7 +121,8 @@ def settings(tmp_path: Path, packed: Path, tiny: Callable[..., NetworkSettings])
     path = tmp_path / "start.safetensors"
     save_weights(DeepPointMap2(tiny()), path, {"images": "false", "phase": "2"}, half=False)
     optimiser = FinetuneOptimiser(steps=4, warmup=1, bf16=False, save_every=2, rate=1e-3)
-    return FinetuneSettings(weights=str(path), rehearsal=str(packed), pairs=1.0, groups=1, frames=3, optimiser=optimiser)
+    chosen = {"rehearsal": str(packed), "pairs": 1.0, "groups": 1, "frames": 3, "optimiser": optimiser}
+    return FinetuneSettings(weights=str(path), **chosen)  # type: ignore[arg-type]
 
 
 def _truth(drive: Path) -> Array:
