@@ -25,7 +25,9 @@ from dpm2_core.sim.source import SimulatedDrive
 from dpm2_core.slam.output import TrajectoryRecorder
 from dpm2_core.slam.system import Config, SlamSettings, SlamSystem
 
-ROADS: dict[str, PresetName] = {"00": "suburb", "05": "suburb", "06": "city", "07": "city", "09": "rural"}
+ROADS: dict[str, PresetName] = {
+    "00": "suburb", "05": "suburb", "06": "city", "07": "city", "08": "suburb", "09": "rural",
+}  # fmt: skip
 """Sequences, and what kind of place stands along them."""
 FIRST_SEED = 800_000
 """Worlds that no training has seen: the number of the sequence is added."""
