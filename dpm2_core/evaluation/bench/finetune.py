@@ -112,7 +112,8 @@ def _run(
         name: {figure: after[name][figure] / before[name][figure] for figure in ("near_m", "far_m", "all_m", "all_deg")}
         for name in judges
     }
-    return {"after": after, "ratio": ratio, "steps": settings.optimiser.steps, "cpu_seconds": seconds}
+    steps = settings.optimiser.steps
+    return {"after": after, "ratio": ratio, "steps": steps, "cpu_seconds": seconds, "commit": git_commit()}
 
 
 def errors(judge: PairSet, model: Any) -> dict[str, float]:
@@ -163,7 +164,7 @@ def _report(results: dict[str, Any], settings: FinetuneSettings) -> Report:
             table.add_row(arm, seed, name, *cells, f"{row['success']:.1%}")
     record = {
         "lidar": LIDAR.model_dump(), "drives": {"presets": DRIVES, "frames": DRIVE_FRAMES},
-        "settings": settings.model_dump(mode="json"), "measured_at": git_commit(),
+        "settings": settings.model_dump(mode="json"),
         "ratios": summary, "before": before, "runs": runs,
     }  # fmt: skip
     return Report(record, Group(table))
