@@ -71,7 +71,7 @@ train-ground: setup  ## train the weights of slam.filter.kind=ground (2 cores: 1
 	$(BIN)/python -m dpm2_core.cli train tasks-data out/ground/train/dense --set train=16 --set train_frames=10 --set val=1 \
 		--set val_frames=2 --set first_seed=8000 --set lidar.columns=2170
 	$(BIN)/python -m dpm2_core.cli train gndnet out/ground/train --val out/ground/val --out out/ground/run --set network.channels=16 \
-		--set epochs=10 --set rate=2e-3 --set lift=0.3 --set gaps=0.1 $(call RESUMED,ground/run)
+		--set epochs=8 --set rate=2e-3 --set lift=0.3 --set gaps=0.1 $(call RESUMED,ground/run)
 
 # Dense traffic and the usual one with 64 beams, and 32 beams higher up; the task learns from all of them.
 MOVERS = $(BIN)/python -m dpm2_core.cli train tasks-data out/movers/$(1) --set 'presets=[city, suburb, rural, highway]' \
