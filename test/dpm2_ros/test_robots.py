@@ -69,16 +69,23 @@ class Fleet:
         """A slam_node in a namespace."""
         pairs = ["input.points_topic:=points", "input.images:=false", "ros.embed_mapper:=false",
                  f"ros.odom_frame:={name}/odom", "slam.keyframes.distance:=2.0"]  # fmt: skip
-        process = self._start(
-            "slam_node", f"{name}.log", "-r", f"__ns:=/{name}", *(x for p in pairs for x in ("-p", p))
-        )
         if name not in self._lidars:
             self._lidars[name] = self.harness.publisher(PointCloud2, f"/{name}/points")
             self._odom[name] = self.harness.hear(Odometry, f"/{name}/dpm2/odom")
-        said, listening = self.folder / f"{name}.log", self._lidars[name].get_subscription_count
-        self.harness.wait(lambda: "waiting for clouds" in said.read_text() and listening(), name, timeout=60)
-        time.sleep(0.5)  # of one that was killed DDS knows for a while: the new one's subscription must be there, too
+        before = self._listeners(name)  # of one that was killed DDS knows for a while
+        process = self._start(
+            "slam_node", f"{name}.log", "-r", f"__ns:=/{name}", *(x for p in pairs for x in ("-p", p))
+        )
+        said = self.folder / f"{name}.log"
+        new = lambda: "waiting for clouds" in said.read_text() and self._listeners(name) - before  # noqa: E731
+        self.harness.wait(new, name, timeout=60)
+        time.sleep(0.5)  # until the new one knows of this end, too
         return process
+
+    def _listeners(self, name: str) -> set[bytes]:
+        """Who subscribes to the scans of a robot."""
+        infos = self.harness.node.get_subscriptions_info_by_topic(f"/{name}/points")
+        return {bytes(info.endpoint_gid) for info in infos}
 
     def drive(self, name: str, *frames: int) -> None:
         """Scans, each when the one before has come out."""

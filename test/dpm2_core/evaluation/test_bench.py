@@ -119,7 +119,7 @@ def test_a_packed_excerpt_is_unpacked_for_as_long_as_the_run_lasts(drive: Path, 
 
 
 def test_what_cannot_be_measured_is_refused(drive: Path, tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"speed: no such benchmark; choose from diffslam, geometric, .*, neural"):
+    with pytest.raises(UsageError, match=r"speed: no such benchmark; choose from .*geometric, .*neural"):
         bench(["geometric", "speed"])
     with pytest.raises(UsageError, match="none: no KITTI excerpt"):
         bench(kitti=tmp_path / "none")
