@@ -10,9 +10,9 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from dpm2_core.config import Settings
-from dpm2_core.diffslam.tasks.dslr import initialise
+from dpm2_core.diffslam.tasks.dslr import down, initialise, up
 from dpm2_core.diffslam.tasks.range_image import CHANNELS, RangeImageSettings
-from dpm2_core.diffslam.tasks.weights import load_strictly, read_weights
+from dpm2_core.diffslam.tasks.weights import load_network
 from dpm2_core.errors import UsageError
 
 
@@ -49,16 +49,16 @@ class LidarAutoencoder(nn.Module):
         self.encoder = nn.Sequential(
             nn.Conv2d(CHANNELS, c, 4, 2, 1, bias=False),
             nn.LeakyReLU(0.2),
-            *_down(c, 2 * c, 4, 1),
-            *_down(2 * c, 4 * c, 4, 1),
-            *_down(4 * c, 8 * c, kernel, (0, 1)),
+            *down(c, 2 * c, 4, 1),
+            *down(2 * c, 4 * c, 4, 1),
+            *down(4 * c, 8 * c, kernel, (0, 1)),
             nn.Conv2d(8 * c, settings.latent * (2 if settings.variational else 1), whole, bias=False),
         )
         self.decoder = nn.Sequential(
-            *_up(settings.latent, 8 * c, whole, 1, 0),
-            *_up(8 * c, 4 * c, kernel, 2, (0, 1)),
-            *_up(4 * c, 2 * c, 4, 2, 1),
-            *_up(2 * c, c, 4, 2, 1),
+            *up(settings.latent, 8 * c, whole, 1, 0),
+            *up(8 * c, 4 * c, kernel, 2, (0, 1)),
+            *up(4 * c, 2 * c, 4, 2, 1),
+            *up(2 * c, c, 4, 2, 1),
             nn.ConvTranspose2d(c, CHANNELS, 4, 2, 1, bias=False),
             nn.Tanh(),
         )
@@ -85,32 +85,5 @@ class LidarAutoencoder(nn.Module):
 
 
 def load(path: Path) -> LidarAutoencoder:
-    """A trained autoencoder, ready for inference on the CPU.
-
-    Raises:
-        UsageError: no such file, a pickle, weights of another task, other settings or shapes, values not finite.
-    """
-    state, settings = read_weights(path, "ae_lidar", AeLidarSettings)
-    network = LidarAutoencoder(settings)
-    load_strictly(nn.ModuleDict({"network": network}), state, path)  # as the task that was trained holds it
-    return network.eval().requires_grad_(False)
-
-
-def _down(inputs: int, outputs: int, kernel: int | tuple[int, int], padding: int | tuple[int, int]) -> list[nn.Module]:
-    """Half the size."""
-    return [
-        nn.Conv2d(inputs, outputs, kernel, 2, padding, bias=False),
-        nn.BatchNorm2d(outputs),
-        nn.LeakyReLU(0.2),
-    ]
-
-
-def _up(
-    inputs: int, outputs: int, kernel: int | tuple[int, int], stride: int, padding: int | tuple[int, int]
-) -> list[nn.Module]:
-    """Twice the size, or what the kernel makes of it."""
-    return [
-        nn.ConvTranspose2d(inputs, outputs, kernel, stride, padding, bias=False),
-        nn.BatchNorm2d(outputs),
-        nn.ReLU(),
-    ]
+    """A trained autoencoder, ready for inference on the CPU; raises as `weights.load_network`."""
+    return load_network(path, "ae_lidar", "network", AeLidarSettings, LidarAutoencoder)

@@ -24,7 +24,7 @@ from dpm2_core.diffslam.tasks.range_image import (
     slots,
     to_points,
 )
-from dpm2_core.diffslam.tasks.weights import load_strictly, read_weights
+from dpm2_core.diffslam.tasks.weights import load_network
 from dpm2_core.errors import UsageError
 
 _TALLEST = 42  # rows that the decoder makes; the image is cut from them
@@ -52,14 +52,12 @@ class RangeEncoder(nn.Module):
         for kernel in (4, 4, 3, 3, 3):
             height = (height + 2 - kernel) // 2 + 1
         self.layers = nn.Sequential(
-            *_down(3, c, 4, norm=False),
-            *_down(c, 2 * c, 4, norm=False),
-            *_down(2 * c, 2 * c, 3),
-            *_down(2 * c, 4 * c, 3, norm=False),
-            *_down(4 * c, 4 * c, 3),
-            nn.Conv2d(4 * c, 8 * c, (height, 4), 2, (0, 1), bias=False),
-            nn.BatchNorm2d(8 * c),
-            nn.LeakyReLU(0.2),
+            *down(3, c, 4, norm=False),
+            *down(c, 2 * c, 4, norm=False),
+            *down(2 * c, 2 * c, 3),
+            *down(2 * c, 4 * c, 3, norm=False),
+            *down(4 * c, 4 * c, 3),
+            *down(4 * c, 8 * c, (height, 4), (0, 1)),
             nn.Conv2d(8 * c, settings.latent, (1, image.columns // 64), bias=False),
         )
 
@@ -77,12 +75,12 @@ class RangeDecoder(nn.Module):
         super().__init__()
         c, self.rows = settings.channels, settings.image.rows
         self.layers = nn.Sequential(
-            *_up(settings.latent, 8 * c, (1, settings.image.columns // 64), 1, 0),
-            *_up(8 * c, 4 * c, (2, 4), 2, (0, 1)),
-            *_up(4 * c, 4 * c, (4, 4), 2, 1),
-            *_up(4 * c, 2 * c, (3, 4), 2, 1),
-            *_up(2 * c, 2 * c, (2, 4), 2, 1),
-            *_up(2 * c, c, (1, 4), 2, 1),
+            *up(settings.latent, 8 * c, (1, settings.image.columns // 64), 1, 0),
+            *up(8 * c, 4 * c, (2, 4), 2, (0, 1)),
+            *up(4 * c, 4 * c, (4, 4), 2, 1),
+            *up(4 * c, 2 * c, (3, 4), 2, 1),
+            *up(2 * c, 2 * c, (2, 4), 2, 1),
+            *up(2 * c, c, (1, 4), 2, 1),
             nn.ConvTranspose2d(c, CHANNELS, 4, 2, 1, bias=False),
             nn.Tanh(),
         )
@@ -162,15 +160,8 @@ class Dslr(nn.Module):
 
 
 def load(path: Path) -> Dslr:
-    """A trained translator, ready for inference on the CPU.
-
-    Raises:
-        UsageError: no such file, a pickle, weights of another task, other settings or shapes, values not finite.
-    """
-    state, settings = read_weights(path, "dslr", DslrSettings)
-    network = Dslr(settings)
-    load_strictly(nn.ModuleDict({"network": network}), state, path)  # as the task that was trained holds it
-    return network.eval().requires_grad_(False)
+    """A trained translator, ready for inference on the CPU; raises as `weights.load_network`."""
+    return load_network(path, "dslr", "network", DslrSettings, Dslr)
 
 
 def initialise(module: nn.Module) -> None:
@@ -182,16 +173,22 @@ def initialise(module: nn.Module) -> None:
         nn.init.zeros_(module.bias)
 
 
-def _down(inputs: int, outputs: int, kernel: int, norm: bool = True) -> list[nn.Module]:
-    """Half the size."""
-    between: list[nn.Module] = [nn.BatchNorm2d(outputs)] if norm else []
-    return [nn.Conv2d(inputs, outputs, kernel, 2, 1, bias=False), *between, nn.LeakyReLU(0.2)]
-
-
-def _up(
-    inputs: int, outputs: int, kernel: tuple[int, int], stride: int, padding: int | tuple[int, int]
+def down(
+    inputs: int,
+    outputs: int,
+    kernel: int | tuple[int, int],
+    padding: int | tuple[int, int] = 1,
+    norm: bool = True,
 ) -> list[nn.Module]:
-    """Twice the size, or what the kernel makes of it."""
+    """Layers of an encoder: half the size."""
+    between: list[nn.Module] = [nn.BatchNorm2d(outputs)] if norm else []
+    return [nn.Conv2d(inputs, outputs, kernel, 2, padding, bias=False), *between, nn.LeakyReLU(0.2)]
+
+
+def up(
+    inputs: int, outputs: int, kernel: int | tuple[int, int], stride: int, padding: int | tuple[int, int]
+) -> list[nn.Module]:
+    """Layers of a decoder: twice the size, or what the kernel makes of it."""
     return [
         nn.ConvTranspose2d(inputs, outputs, kernel, stride, padding, bias=False),
         nn.BatchNorm2d(outputs),

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dpm2_core.config import Settings
-from dpm2_core.diffslam.tasks.weights import load_strictly, read_weights
+from dpm2_core.diffslam.tasks.weights import load_network
 from dpm2_core.errors import UsageError
 
 
@@ -95,15 +95,8 @@ class GroundNet(nn.Module):
 
 
 def load(path: Path) -> GroundNet:
-    """A trained network on the CPU, ready for inference, from what `dpm2 train gndnet` wrote.
-
-    Raises:
-        UsageError: no such file, a pickle, weights of another task, other settings or shapes, values not finite.
-    """
-    state, settings = read_weights(path, "gndnet", GroundSettings)
-    net = GroundNet(settings)
-    load_strictly(nn.ModuleDict({"net": net}), state, path)  # as the task that was trained holds it
-    return net.eval().requires_grad_(False)
+    """A trained network on the CPU, ready for inference; raises as `weights.load_network`."""
+    return load_network(path, "gndnet", "net", GroundSettings, GroundNet)
 
 
 def cell_of(points: Tensor, settings: GroundSettings) -> tuple[Tensor, Tensor]:

@@ -17,7 +17,7 @@ from torch.nn import functional
 from dpm2_core.diffslam.tasks.data import TaskScan, TaskScans
 from dpm2_core.diffslam.tasks.ground_task import UNCOUNTED
 from dpm2_core.diffslam.tasks.task import Task, TaskTraining
-from dpm2_core.diffslam.tasks.weights import load_strictly, read_weights
+from dpm2_core.diffslam.tasks.weights import load_network
 from dpm2_core.errors import UsageError
 from dpm2_core.network.movers import MoverNet, MoverNetSettings, occupancy, voxels
 
@@ -98,15 +98,8 @@ class MoverTask(Task):
 
 
 def load(path: Path) -> MoverNet:
-    """A trained network on the CPU, ready for inference, from what `dpm2 train movers` wrote.
-
-    Raises:
-        UsageError: no such file, a pickle, weights of another task, other settings or shapes, values not finite.
-    """
-    state, settings = read_weights(path, "movers", MoverNetSettings)
-    task = MoverTask(MoverTraining(network=settings))
-    load_strictly(task, state, path)
-    return task.net.eval().requires_grad_(False)
+    """A trained network on the CPU, ready for inference; raises as `weights.load_network`."""
+    return load_network(path, "movers", "net", MoverNetSettings, MoverNet)
 
 
 def _arrays(scan: TaskScan) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]:

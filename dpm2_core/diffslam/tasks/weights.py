@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TypeVar
 
@@ -15,6 +15,7 @@ from dpm2_core.errors import UsageError
 from dpm2_core.network.weights import read_tensors, write_tensors
 
 T = TypeVar("T", bound=Settings)
+M = TypeVar("M", bound=nn.Module)
 
 
 def write_weights(
@@ -40,6 +41,21 @@ def read_weights(path: Path, name: str, kind: type[T]) -> tuple[dict[str, Tensor
     if not isinstance(tree, dict):
         raise UsageError(f"{path}: the settings of its network are no mapping")
     return state, settings_from(kind, tree, default=str(path))
+
+
+def load_network(path: Path, name: str, part: str, kind: type[T], make: Callable[[T], M]) -> M:
+    """The network of a trained task on the CPU, ready for inference, from what `dpm2 train NAME` wrote.
+
+    Args:
+        part: what the task that was trained calls it. kind: its settings; `make` builds it from them.
+
+    Raises:
+        UsageError: no such file, a pickle, weights of another task, other settings or shapes, values not finite.
+    """
+    state, settings = read_weights(path, name, kind)
+    network = make(settings)
+    load_strictly(nn.ModuleDict({part: network}), state, path)
+    return network.eval().requires_grad_(False)
 
 
 def load_strictly(module: nn.Module, state: Mapping[str, Tensor], path: Path) -> None:

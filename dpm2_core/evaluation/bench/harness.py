@@ -59,6 +59,11 @@ class Options:
     out: Path = Path("benchmarks")
     cache: Path = Path("out/bench")
 
+    @property
+    def excerpt(self) -> Path:
+        """Where the KITTI excerpt should be: as asked for, $DPM2_KITTI, or beside the repository."""
+        return self.kitti or Path(os.environ.get("DPM2_KITTI", REPOSITORY.parent / "shared" / "kitti"))
+
 
 def overrides_of(options: Options, registration: str) -> list[str]:
     """Settings of the SLAM with that registration and the weights that were asked for."""
@@ -89,7 +94,7 @@ def drives(options: Options) -> Iterator[list[Source]]:
     if options.sources:
         yield [open_source(path) for path in options.sources]
         return
-    kitti = options.kitti or Path(os.environ.get("DPM2_KITTI", REPOSITORY.parent / "shared" / "kitti"))
+    kitti = options.excerpt
     if not kitti.is_dir():
         raise UsageError(f"{kitti}: no KITTI excerpt; give --kitti, or --source with a drive such as `dpm2 sim` makes")
     with tempfile.TemporaryDirectory(prefix="dpm2_bench_") as folder:

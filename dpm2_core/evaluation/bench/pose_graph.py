@@ -3,11 +3,9 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import gtsam
@@ -19,7 +17,7 @@ from rich.table import Table
 from scipy.spatial import cKDTree
 
 from dpm2_core.errors import UsageError
-from dpm2_core.evaluation.bench.harness import REPOSITORY, Options, Report
+from dpm2_core.evaluation.bench.harness import Options, Report
 from dpm2_core.evaluation.metrics import ape_rmse
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
@@ -41,7 +39,7 @@ def bench_pose_graph(options: Options) -> Report:
     Raises:
         UsageError: there are no KITTI pose graphs.
     """
-    folder = options.kitti or Path(os.environ.get("DPM2_KITTI", REPOSITORY.parent / "shared" / "kitti"))
+    folder = options.excerpt
     folder = folder / "pose_graphs"
     if not (folder / "kitti_00_GT.g2o").is_file():
         raise UsageError(f"{folder}: no kitti_00_GT.g2o; give --kitti")

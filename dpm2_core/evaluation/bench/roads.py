@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from time import perf_counter
@@ -17,7 +16,7 @@ from rich.table import Table
 
 from dpm2_core.config import load_settings
 from dpm2_core.errors import UsageError
-from dpm2_core.evaluation.bench.harness import REPOSITORY, Options, Report
+from dpm2_core.evaluation.bench.harness import Options, Report
 from dpm2_core.evaluation.bench.loops import judge_loops
 from dpm2_core.evaluation.metrics import evaluate
 from dpm2_core.sim.config import PresetName
@@ -97,8 +96,7 @@ def road_files(options: Options) -> Sequence[Path]:
     """
     if options.sources:
         return options.sources
-    kitti = options.kitti or Path(os.environ.get("DPM2_KITTI", REPOSITORY.parent / "shared" / "kitti"))
-    found = [kitti / "gt_poses" / f"{name}.txt" for name in ROADS]
+    found = [options.excerpt / "gt_poses" / f"{name}.txt" for name in ROADS]
     if missing := [path for path in found if not path.is_file()]:
         raise UsageError(f"{missing[0]}: no such pose file; give --kitti, or --source with files of KITTI poses")
     return found
