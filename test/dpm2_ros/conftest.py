@@ -24,6 +24,8 @@ from sensor_msgs.msg import PointCloud2
 from dpm2_core.data.convert import convert_kitti
 from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
+from dpm2_core.sim.config import LidarConfig
+from dpm2_core.sim.drive import simulate
 from dpm2_ros.conversions import cloud_to_msg
 from dpm2_ros.replay import ros_environment
 
@@ -108,6 +110,14 @@ def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (root / "times.txt").write_text("".join(f"{n * PERIOD * 1e-9:.6e}\n" for n in range(FRAMES)))
     poses = [Tr @ se3.inverse(pose(0)) @ pose(n) @ se3.inverse(Tr) for n in range(FRAMES)]
     np.savetxt(root / "poses.txt", np.array(poses)[:, :3].reshape(-1, 12))
+    return root
+
+
+@pytest.fixture(scope="session")
+def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """28 m of a simulated street, 30 scans: more to see than in `sequence`, as places to be found again need it."""
+    root = tmp_path_factory.mktemp("street") / "sim"
+    simulate(root, 30, seed=2, road="straight", preset="suburb", images=False, lidar=LidarConfig(columns=900))
     return root
 
 

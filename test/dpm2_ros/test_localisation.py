@@ -24,28 +24,16 @@ from dpm2_core.data.source import InputSettings, open_source
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
-from dpm2_core.sim.config import LidarConfig
-from dpm2_core.sim.drive import simulate
 from dpm2_ros.conversions import cloud_to_msg, header, pose_to_msg
 from dpm2_ros.replay import ros_environment, start
 from dpm2_ros.tf import TFMessage
 
-FRAMES = 24
-
 
 @pytest.fixture(scope="module")
-def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A short simulated drive."""
-    root = tmp_path_factory.mktemp("drive") / "sim"
-    simulate(root, FRAMES, seed=2, road="straight", preset="suburb", images=False, lidar=LidarConfig(columns=900))
-    return root
-
-
-@pytest.fixture(scope="module")
-def made(drive: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Its map, as the command makes it."""
     folder = tmp_path_factory.mktemp("map")
-    arguments = ["run", drive, "--out", folder / "out", "--map", folder / "drive.dpm2map"]
+    arguments = ["run", street, "--out", folder / "out", "--map", folder / "drive.dpm2map"]
     command = [sys.executable, "-m", "dpm2_core.cli", *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stderr
@@ -59,9 +47,9 @@ def digest(path: Path) -> str:
 class Robot:
     """A slam_node process, its LiDAR, and ears."""
 
-    def __init__(self, harness: Any, drive: Path, log: Path, *parameters: str) -> None:
+    def __init__(self, harness: Any, street: Path, log: Path, *parameters: str) -> None:
         self.harness, self.log, self._stamp = harness, log, 0
-        self._source = open_source(drive, InputSettings(images=False))
+        self._source = open_source(street, InputSettings(images=False))
         self.lidar = harness.publisher(PointCloud2, topics.POINTS)
         self.odom = harness.hear(Odometry, "/dpm2/odom")
         self.diagnostics = harness.hear(DiagnosticArray, "/diagnostics")
@@ -129,11 +117,11 @@ class Robot:
 
 
 @pytest.fixture
-def robot(ros: Callable[..., Any], drive: Path, tmp_path: Path) -> Iterator[Callable[..., Robot]]:
+def robot(ros: Callable[..., Any], street: Path, tmp_path: Path) -> Iterator[Callable[..., Robot]]:
     robots: list[Robot] = []
 
     def make(*parameters: str) -> Robot:
-        robots.append(Robot(ros(), drive, tmp_path / "log", *parameters))
+        robots.append(Robot(ros(), street, tmp_path / "log", *parameters))
         return robots[-1]
 
     yield make
@@ -142,15 +130,15 @@ def robot(ros: Callable[..., Any], drive: Path, tmp_path: Path) -> Iterator[Call
         r.process.wait()
 
 
-def place(drive: Path, n: int) -> Array:
+def place(street: Path, n: int) -> Array:
     """T_map_lidar of a scan, (4, 4): the map's frame is that of the first one."""
-    poses = open_source(drive, InputSettings(images=False)).poses
+    poses = open_source(street, InputSettings(images=False)).poses
     assert poses is not None
     return np.asarray(se3.inverse(poses[0]) @ poses[n])
 
 
 def test_finds_itself_tracks_and_notices_being_carried_off(
-    robot: Callable[..., Robot], drive: Path, made: Path, tmp_path: Path
+    robot: Callable[..., Robot], street: Path, made: Path, tmp_path: Path
 ) -> None:
     """From the middle of the map; carried back while it runs; and all through the file stays as it is."""
     before = digest(made)
@@ -161,10 +149,10 @@ def test_finds_itself_tracks_and_notices_being_carried_off(
         lambda: r.said("slam_node: localisation").startswith(("relocalised", "tracking")), "an answer", timeout=30
     )
     r.send(17, 18)
-    r.harness.wait(lambda: r.off(place(drive, 18)) < 0.1, "its place in the map")
+    r.harness.wait(lambda: r.off(place(street, 18)) < 0.1, "its place in the map")
     r.harness.wait(lambda: r.said("slam_node: odometry").startswith("track"), "the state")
     # carried off: scans from 15 m behind, which the odometry cannot follow
-    r.stand(3, lambda: r.off(place(drive, 3)) < 0.2, "the robot where it was put")
+    r.stand(3, lambda: r.off(place(street, 3)) < 0.2, "the robot where it was put")
     assert r.close() == 0
     log = r.log.read_text()
     assert "found at" in log

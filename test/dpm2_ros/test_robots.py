@@ -22,8 +22,6 @@ from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Array, Keyframe
 from dpm2_core.geometry import se3
-from dpm2_core.sim.config import LidarConfig
-from dpm2_core.sim.drive import simulate
 from dpm2_core.slam.map.data import MapData, load_map
 from dpm2_core.slam.map.store import MapStore
 from dpm2_ros.conversions import cloud_to_msg
@@ -31,23 +29,13 @@ from dpm2_ros.keyframes import descriptors_from_msg, payload_to_msgs
 from dpm2_ros.replay import ros_environment, start
 from dpm2_ros.tf import TFMessage
 
-FRAMES = 30
-
-
-@pytest.fixture(scope="module")
-def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """28 m of a street."""
-    root = tmp_path_factory.mktemp("drive") / "sim"
-    simulate(root, FRAMES, seed=2, road="straight", preset="suburb", images=False, lidar=LidarConfig(columns=900))
-    return root
-
 
 class Fleet:
     """Processes of robots and of their mapper; scans for each."""
 
-    def __init__(self, harness: Any, drive: Path, folder: Path) -> None:
+    def __init__(self, harness: Any, street: Path, folder: Path) -> None:
         self.harness, self.folder = harness, folder
-        self.source = open_source(drive, InputSettings(images=False))
+        self.source = open_source(street, InputSettings(images=False))
         self.environment = ros_environment(harness.node.context.get_domain_id())
         self.tf = harness.hear(TFMessage, "/tf")
         self.processes: list[subprocess.Popen[bytes]] = []
@@ -123,8 +111,8 @@ class Fleet:
 
 
 @pytest.fixture
-def fleet(ros: Callable[..., Any], drive: Path, tmp_path: Path) -> Iterator[Fleet]:
-    made = Fleet(ros(), drive, tmp_path)
+def fleet(ros: Callable[..., Any], street: Path, tmp_path: Path) -> Iterator[Fleet]:
+    made = Fleet(ros(), street, tmp_path)
     yield made
     made.close()
 
@@ -193,13 +181,13 @@ def test_a_robot_that_is_killed_and_comes_back(fleet: Fleet) -> None:
     assert odometry == [(0, 1), (1, 2), (3, 4), (4, 5)]
 
 
-def test_a_keyframe_is_at_most_100_kB_on_the_wire(drive: Path) -> None:
+def test_a_keyframe_is_at_most_100_kB_on_the_wire(street: Path) -> None:
     """Descriptors come out as they went in; a cloud too large is thinned until it fits, a small one is not touched."""
     from dpm2_core.slam.loops.place_recognition import PlaceRecognition
     from dpm2_core.slam.map.cloud_codec import unpack_cloud
     from dpm2_core.slam.neural import load_network
 
-    points = next(iter(open_source(drive, InputSettings(images=False)).frames(0, 1))).points
+    points = next(iter(open_source(street, InputSettings(images=False)).frames(0, 1))).points
     descriptors = PlaceRecognition(load_network("small", 1)).describe(points)
     assert descriptors is not None
     for cloud in (points, points[::50]):
