@@ -29,7 +29,6 @@ from dpm2_core.network.descriptors import Tokens
 from dpm2_core.network.encoder import to_device
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pyramid import PointBatch
-from dpm2_core.network.registration import correspond, guided_scores, match_scores, precision_solve, solve_batch
 from dpm2_core.network.weights import load_model, read_metadata, save_weights
 from dpm2_core.slam.neural import weights_path
 from dpm2_core.slam.output import TrajectoryRecorder
@@ -40,12 +39,11 @@ from dpm2_core.training.dataset import Batch, DataSettings, GroupDataset, draw_g
 from dpm2_core.training.generate import GenerateSettings, generate, pack
 from dpm2_core.training.objective import LossSettings
 from dpm2_core.training.phase_one import PhaseOne
+from dpm2_core.training.pose_loss import differentiable_poses
 from dpm2_core.training.sets import Plan, plan_sets
 from dpm2_core.training.trainer import OptimiserSettings, process_group, train
 from dpm2_core.training.validation import NEAR, PairSet
 
-ASTRAY = 1.0
-"""A registration that is wrong by more than this has no gradient that leads back, m: the trajectory passes over it."""
 DRIVES, HELD_OUT, REHEARSAL = "drives", "held_out", "rehearsal"
 """Folders of packed drives below the one of the training."""
 
@@ -151,13 +149,9 @@ class Finetuned(PhaseOne):
 def window_trajectories(decoder: Decoder, tokens: Tokens, poses: Tensor) -> tuple[Tensor, Tensor]:
     """Trajectories (G, F, 4, 4) T_first_scan by registering each scan to the one before; the share that went astray.
 
-    Matches, offsets and their precisions have a gradient; the pose has it through the last steps of its least squares,
-    which start at the solution: as the implicit function theorem gives it, and without that of a decomposition, which
-    is infinite where singular values meet.
-
     Args:
         tokens: descriptors of G * F scans, place by place. poses: (G, F, 4, 4) reference, float64; where the network is
-            `ASTRAY`, its motion is taken.
+            astray, its motion is taken. See `differentiable_poses` for the gradient.
     """
     groups, frames = poses.shape[:2]
     number = torch.arange(groups * frames, device=poses.device).view(groups, frames)
@@ -165,19 +159,7 @@ def window_trajectories(decoder: Decoder, tokens: Tokens, poses: Tensor) -> tupl
         Tokens(*(field[index.flatten()] for field in tokens)) for index in (number[:, 1:], number[:, :-1])
     )
     truth = (torch.linalg.inv(poses[:, :-1]) @ poses[:, 1:]).flatten(0, 1)
-    correlated = decoder(source, target)
-    scores = match_scores(decoder, correlated)
-    with torch.no_grad():
-        solved = solve_batch(decoder, source, target, correlated)
-    if solved is None:
-        return torch.linalg.inv(poses[:, :1]) @ poses, poses.new_ones(())
-    start = solved.T
-    off = (start[:, :3, 3] - truth[:, :3, 3]).norm(dim=-1)
-    usable = off < ASTRAY  # False for NaN
-    start = torch.where(usable[:, None, None], start, truth)
-    pairs = correspond(decoder, source, target, correlated, guided_scores(scores, start, source, target))
-    T, _ = precision_solve(start, pairs, rounds=2)
-    T = torch.where((usable & T.flatten(1).isfinite().all(1))[:, None, None], T, truth)
+    T, usable = differentiable_poses(decoder, source, target, decoder(source, target), truth)
     steps = T.unflatten(0, (groups, frames - 1))
     chain = [torch.eye(4, dtype=steps.dtype, device=steps.device).expand(groups, 4, 4)]
     for i in range(frames - 1):

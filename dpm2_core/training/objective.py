@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Phase-one objective: pairing, coarse, backbone and offset losses of one batch of encoded frames."""
+"""Phase-one objective: pairing, coarse, backbone, offset and pose losses of one batch of encoded frames."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from dpm2_core.network.descriptors import Tokens
 from dpm2_core.network.heads import residuals_in_view
 from dpm2_core.network.losses import Labels, cosine, info_nce, label_pairs, mahalanobis_offset, student_offset
 from dpm2_core.network.registration import softmax_both, take
+from dpm2_core.training.pose_loss import differentiable_poses, pose_loss
 
 
 class LossSettings(Settings):
@@ -30,6 +31,8 @@ class LossSettings(Settings):
     offset: float = 0.2
     """On predicted offsets. The likelihood's gradient is that of a distance divided by its deviation, some 0.1 m: with
     weight 1 it drowns the pairing."""
+    pose: float = Field(0.0, ge=0)
+    """On the error of the pose, 1/m; for weights that register already. See `pose_loss`."""
     near: int = Field(128, gt=0)
     """Pairs drawn per set pair among those within `offset_limit` of each other."""
     own: int = Field(128, ge=0)
@@ -58,6 +61,11 @@ def phase_one_loss(
     offset, error = offset_loss(decoder, source, target, T_target_source, correlated, scores.detach(), labels, settings)
     total = settings.pairing * pairing + settings.coarse * coarse + settings.offset * offset
     figures = {"pairing": pairing, "coarse": coarse, "offset": offset, "offset_m": error}
+    if settings.pose:
+        truth = T_target_source.double()
+        T, usable = differentiable_poses(decoder, source, target, correlated, truth)
+        figures |= {"pose": pose_loss(T, truth), "astray": 1 - usable.double().mean()}
+        total = total + settings.pose * figures["pose"]
     return total, {**figures, "right": matches_right(scores.detach(), labels, decoder.settings.offset_limit)}
 
 

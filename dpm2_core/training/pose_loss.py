@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The error of the pose that the network finds, with a gradient: what losses on descriptors and offsets never see.
+
+Beyond the paper, whose phase one stops at the matches. It is eq. 3 of "Differentiable SLAM Helps Deep Learning-based
+LiDAR Perception Tasks" for single pairs.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dpm2_core.geometry import se3_torch
+from dpm2_core.network.decoder import Correlated, Decoder
+from dpm2_core.network.descriptors import Tokens
+from dpm2_core.network.registration import correspond, guided_scores, match_scores, precision_solve, solve_batch
+
+ASTRAY = 1.0
+"""A registration that is wrong by more than this has no gradient that leads back, m."""
+ROTATION = 25.0
+"""What the square of an angle counts for beside that of a distance, m2 / rad2: an error of 5 m lever."""
+FINE = 0.05
+"""Errors well above this count as they are, not squared: the tail does not rule the step, m."""
+
+
+def differentiable_poses(
+    decoder: Decoder, source: Tokens, target: Tokens, correlated: Correlated, truth: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Poses (B, 4, 4) T_target_source float64 with gradients, and which of them (B,) are not astray.
+
+    Matches, offsets and their precisions have a gradient; the pose has it through the last steps of its least squares,
+    which start at the solution: as the implicit function theorem gives it, and without that of a decomposition, which
+    is infinite where singular values meet.
+
+    Args:
+        truth: (B, 4, 4) float64; where the network is `ASTRAY`, it is the pose.
+    """
+    with torch.no_grad():
+        solved = solve_batch(decoder, source, target, correlated)
+    if solved is None:
+        return truth, torch.zeros(len(truth), dtype=torch.bool, device=truth.device)
+    off = (solved.T[:, :3, 3] - truth[:, :3, 3]).norm(dim=-1)
+    usable = off < ASTRAY  # False for NaN
+    start = torch.where(usable[:, None, None], solved.T, truth)
+    scores = guided_scores(match_scores(decoder, correlated), start, source, target)
+    T, _ = precision_solve(start, correspond(decoder, source, target, correlated, scores), rounds=2)
+    usable = usable & T.detach().flatten(1).isfinite().all(1)
+    return torch.where(usable[:, None, None], T, truth), usable
+
+
+def pose_loss(T: Tensor, truth: Tensor) -> Tensor:
+    """Mean over poses (B, 4, 4) of sqrt(|t|^2 + ROTATION |r|^2 + FINE^2) - FINE of their errors, m."""
+    t = T[:, :3, 3] - truth[:, :3, 3]
+    r = se3_torch.log_rotation(truth[:, :3, :3].mT @ T[:, :3, :3])
+    squared = t.square().sum(-1) + ROTATION * r.square().sum(-1)
+    return ((squared + FINE**2).sqrt() - FINE).mean()
