@@ -4,7 +4,7 @@
 After "Differentiable SLAM Helps Deep Learning-based LiDAR Perception Tasks" (BMVC 2023). Pure torch, CPU and GPU.
 """
 
-from dpm2_core.diffslam.schedule import ScheduleSettings, is_slam_epoch, total_loss
+from dpm2_core.diffslam.schedule import ScheduleSettings, is_due, total_loss
 from dpm2_core.diffslam.trajectory_loss import SlamLoss, SlamLossSettings, trajectory_loss
 from dpm2_core.diffslam.windows import ContiguousWindows
 
@@ -13,7 +13,7 @@ __all__ = [
     "ScheduleSettings",
     "SlamLoss",
     "SlamLossSettings",
-    "is_slam_epoch",
+    "is_due",
     "total_loss",
     "trajectory_loss",
 ]

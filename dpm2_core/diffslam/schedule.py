@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the SLAM loss joins the loss of the task: eq. 1 and the schedule of the paper."""
+"""How the SLAM loss joins the loss of the task: eq. 1 and the schedule of the paper, and a bound."""
 
 from __future__ import annotations
 
@@ -10,22 +10,36 @@ from torch import Tensor
 
 from dpm2_core.config import Settings
 
+_LEAST = 1e-12  # a SLAM loss of zero needs no bound
+
 
 class ScheduleSettings(Settings):
-    """L = L_model + gamma L_slam in every k-th epoch."""
+    """L = L_model + gamma L_slam in every k-th epoch, the second term bounded by a share of the first."""
 
-    gamma: float = Field(default=1.0, ge=0)
-    """Weight of the SLAM loss; choose it so that gamma L_slam is a tenth to a half of L_model when it first counts."""
+    gamma: float = Field(default=0.0, ge=0)
+    """Weight of the SLAM loss; choose it so that gamma L_slam is a tenth to a half of L_model when it first counts.
+    0: it never counts."""
     every: int = Field(default=5, ge=1)
     """k: the last of every k epochs has the SLAM loss (the paper: 27 of 150 epochs for GndNet)."""
+    begin: int = Field(default=0, ge=0)
+    """Epochs before the first k: a network that knows nothing yet makes no clouds that a SLAM could run on."""
+    most: float | None = Field(default=0.5, gt=0)
+    """Largest share of L_model that gamma L_slam may have in a step. Where a registration is lost, its error would be
+    the whole step, and it is heavy-tailed. None: no bound, eq. 1 as it is in the paper."""
 
 
-def is_slam_epoch(epoch: int, settings: ScheduleSettings) -> bool:
-    """Whether the SLAM loss counts in this epoch, the first being 0."""
-    return settings.gamma > 0 and epoch % settings.every == settings.every - 1
+def is_due(epoch: int, settings: ScheduleSettings) -> bool:
+    """Whether this epoch, the first being 0, is one of those that the SLAM loss counts in, whatever its weight."""
+    since = epoch - settings.begin
+    return since >= 0 and since % settings.every == settings.every - 1
 
 
 def total_loss(model_loss: Tensor, slam_loss: Callable[[], Tensor], epoch: int, settings: ScheduleSettings) -> Tensor:
-    """Eq. 1. `slam_loss` is called only where it counts, and never replaces the loss of the task: equal motion alone
-    would be satisfied by any pair of clouds."""
-    return model_loss + settings.gamma * slam_loss() if is_slam_epoch(epoch, settings) else model_loss
+    """Eq. 1, bounded. `slam_loss` is called only where it counts, and never replaces the loss of the task: equal motion
+    alone would be satisfied by any pair of clouds."""
+    if settings.gamma == 0 or not is_due(epoch, settings):
+        return model_loss
+    weighted = settings.gamma * slam_loss()
+    if settings.most is not None:
+        weighted = weighted * (settings.most * model_loss / weighted.clamp(min=_LEAST)).detach().clamp(max=1)
+    return model_loss + weighted

@@ -16,11 +16,19 @@ from dpm2_core.diffslam.tasks.weights import load_network
 from dpm2_core.errors import UsageError
 
 
+class AeLidarImage(RangeImageSettings):
+    """Range image of AE_lidar."""
+
+    scale: float = Field(default=50.0, gt=0)
+    """Distance that counts as one, m; points farther away are not used. The paper cuts KITTI at percentiles that lie
+    50 m from the sensor at most."""
+
+
 class AeLidarSettings(Settings):
     """Range image and size of the network; the default is the paper's."""
 
-    image: RangeImageSettings = RangeImageSettings(scale=50.0)
-    """Geometry of the scans. The paper cuts KITTI at percentiles that lie 50 m from the sensor at most."""
+    image: AeLidarImage = AeLidarImage()
+    """Geometry of the scans."""
     channels: int = Field(default=64, ge=4)
     """Of the first layer; the innermost has eight times as many."""
     latent: int = Field(default=512, ge=8)

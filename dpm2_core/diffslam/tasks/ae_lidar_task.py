@@ -11,7 +11,15 @@ from torch import Tensor
 
 from dpm2_core.diffslam.tasks.ae_lidar import AeLidarSettings, LidarAutoencoder
 from dpm2_core.diffslam.tasks.data import TaskScan, TaskScans
-from dpm2_core.diffslam.tasks.range_scans import RangeReader, RangeScans, chamfer_figures, clouds, image_error, slam_of
+from dpm2_core.diffslam.tasks.range_scans import (
+    RangeReader,
+    RangeScans,
+    chamfer_figures,
+    clouds,
+    image_error,
+    slam_of,
+    variety,
+)
 from dpm2_core.diffslam.tasks.task import Task, TaskTraining
 from dpm2_core.diffslam.tasks.training import mean_figures
 from dpm2_core.diffslam.trajectory_loss import SlamLoss
@@ -67,16 +75,19 @@ class AeLidarTask(Task):
 
     def evaluate(self, scans: TaskScans) -> dict[str, float]:
         """Means over the scans: `chamfer_m` (mean distance, m) and `chamfer` (as DSLR gives it) to the scan, and
-        `d_error_m`, the mean error of the distance over ground."""
-        rows = []
-        scale = self.settings.network.image.scale
+        `d_error_m`, the mean error of the distance over ground. And the `variety` of what is made and of the scans,
+        `varies_m` and `target_varies_m`."""
+        rows, scale = [], self.settings.network.image.scale
+        images: dict[str, list[Tensor]] = {"varies_m": [], "target_varies_m": []}
         for index in range(len(scans)):
             true = self._reader.read([scans[index].to(self.device)])
             made = self._made(true)
+            images["varies_m"].append(made.images)
+            images["target_varies_m"].append(true.images)
             error = (made.images - true.images)[:, 0].abs()[true.masks] * scale
             row = chamfer_figures(clouds(made, scale)[0], clouds(true, scale)[0])
             rows.append(row | {"d_error_m": float(error.mean())})
-        return mean_figures(rows)
+        return mean_figures(rows) | {name: variety(of, scale) for name, of in images.items()}
 
     def clouds(self, scan: TaskScan) -> dict[str, Tensor]:
         """The reconstruction and the scan, as range images show them."""

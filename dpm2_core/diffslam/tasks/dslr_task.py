@@ -13,7 +13,15 @@ from torch.nn import functional
 
 from dpm2_core.diffslam.tasks.data import TaskScan, TaskScans
 from dpm2_core.diffslam.tasks.dslr import Dslr, DslrSettings
-from dpm2_core.diffslam.tasks.range_scans import RangeReader, RangeScans, chamfer_figures, clouds, image_error, slam_of
+from dpm2_core.diffslam.tasks.range_scans import (
+    RangeReader,
+    RangeScans,
+    chamfer_figures,
+    clouds,
+    image_error,
+    slam_of,
+    variety,
+)
 from dpm2_core.diffslam.tasks.task import Task, TaskTraining
 from dpm2_core.diffslam.tasks.training import mean_figures
 from dpm2_core.diffslam.trajectory_loss import SlamLoss
@@ -41,6 +49,15 @@ class DslrTraining(TaskTraining):
     clip: float = Field(default=1000.0, gt=0)
     """Largest norm of the gradient; the loss is a sum over 20 thousand values."""
 
+    @property
+    def third(self) -> int:
+        """First epoch of the third stage."""
+        return self.autoencoder_epochs + self.discriminator_epochs
+
+    def has_windows(self, epoch: int) -> bool:
+        """In the third stage only."""
+        return epoch >= self.third and super().has_windows(epoch)
+
 
 class DslrTask(Task):
     """Dynamic scans to static ones."""
@@ -60,9 +77,8 @@ class DslrTask(Task):
     def start_epoch(self, epoch: int) -> None:
         """Choose the stage; in the third, everything but the dynamic encoder is frozen, running means included."""
         s, network = self.settings, self.network
-        third = s.autoencoder_epochs + s.discriminator_epochs
-        self.stage = 1 if epoch < s.autoencoder_epochs else 2 if epoch < third else 3
-        if epoch == third:
+        self.stage = 1 if epoch < s.autoencoder_epochs else 2 if epoch < s.third else 3
+        if epoch == s.third:
             network.dynamic_encoder.load_state_dict(network.static_encoder.state_dict())
         for module in (network.static_encoder, network.decoder, network.discriminator):
             module.requires_grad_(self.stage < 3).train(self.stage < 3)
@@ -100,18 +116,22 @@ class DslrTask(Task):
 
         `chamfer_m` (mean distance, m) and `chamfer` (as DSLR gives it) of the translated scans to the static twins, and
         where something moves, `moved_m`, the mean error of the distance; `input_...` the same without translation.
+        And the `variety` of the translated scans and of the twins, `varies_m` and `target_varies_m`.
         """
-        rows = []
+        rows, scale = [], self.settings.network.image.scale
+        images: dict[str, list[Tensor]] = {"varies_m": [], "target_varies_m": []}
         for begin in range(0, len(scans), _BATCH):
             part = [scans[i].to(self.device) for i in range(begin, min(begin + _BATCH, len(scans)))]
             dynamic, static = self._reader.read(part), self._reader.read(part, static=True)
             made = RangeScans(self.network(dynamic.images), dynamic.masks, dynamic.frames)
+            images["varies_m"].append(made.images)
+            images["target_varies_m"].append(static.images)
             for i in range(len(part)):
                 of = static.part(i, i + 1)
                 row = self._judged(made.part(i, i + 1), dynamic.part(i, i + 1), of)
                 before = self._judged(dynamic.part(i, i + 1), dynamic.part(i, i + 1), of)
                 rows.append(row | {f"input_{name}": value for name, value in before.items()})
-        return mean_figures(rows)
+        return mean_figures(rows) | {name: variety(of, scale) for name, of in images.items()}
 
     def _judged(self, found: RangeScans, dynamic: RangeScans, static: RangeScans) -> dict[str, float]:
         scale = self.settings.network.image.scale

@@ -50,9 +50,6 @@ class GroundTraining(TaskTraining):
     """Each window is rolled and pitched by up to this, deg (the original: 10)."""
     gaps: float = Field(default=0.0, ge=0, le=1)
     """What a cell without ground points counts for in the loss; its label is that of the nearest cell with some."""
-    most: float = Field(default=0.5, gt=0)
-    """Largest share of the loss of the task that the SLAM loss, times gamma, may have in a step. Where the elevation
-    found hides nearly all that stands, the registration is lost, and its error would be the whole step."""
     lift: float = Field(default=0.0, ge=0)
     """Each window is moved up or down by up to this, m: LiDARs on other cars are higher or lower."""
 
@@ -88,9 +85,7 @@ class GroundTask(Task):
             found = [obstacle_weight(c, e, network) for c, e in zip(xyz, elevation, strict=True)]
             wanted = [obstacle_weight(c, e, network) for c, e in zip(xyz, labels, strict=True)]
             parts = self.windows(len(xyz))
-            value = torch.stack([self.slam_loss(xyz[p], xyz[p], found[p], wanted[p]) for p in parts]).mean()
-            counted = (self.settings.slam.gamma * value.detach()).clamp(min=1e-12)
-            return value * (self.settings.most * loss.detach() / counted).clamp(max=1)
+            return torch.stack([self.slam_loss(xyz[p], xyz[p], found[p], wanted[p]) for p in parts]).mean()
 
         counts = known + self.settings.gaps * (~known & known.flatten(1).any(1)[:, None, None])
         loss = ground_loss(elevation, labels, counts, network)

@@ -118,6 +118,12 @@ def slam_of(slam_loss: SlamLoss, made: Tensor, true: RangeScans, scale: float, w
     return torch.stack(values).mean()
 
 
+def variety(images: Sequence[Tensor], scale: float) -> float:
+    """How much the distances in images (B, 2, rows, columns) differ from scan to scan: their standard deviation in a
+    slot, m, the mean over the slots. Zero if a network makes one picture of everything."""
+    return float(torch.cat([image[:, 0] for image in images]).std(0, correction=0).mean()) * scale
+
+
 def chamfer_figures(found: Tensor, true: Tensor) -> dict[str, float]:
     """Of two clouds (N, 3), (M, 3), m: `chamfer_m`, the mean distance, and `chamfer`, as DSLR gives it; NaN if one is
     empty."""

@@ -14,7 +14,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from dpm2_core.config import Settings
-from dpm2_core.diffslam.schedule import ScheduleSettings
+from dpm2_core.diffslam.schedule import ScheduleSettings, is_due
 from dpm2_core.diffslam.tasks.data import Need, TaskScan, TaskScans
 from dpm2_core.diffslam.trajectory_loss import SlamLossSettings
 from dpm2_core.errors import UsageError
@@ -33,12 +33,12 @@ class TaskTraining(Settings):
 
     network: Settings = Settings()
     """Of the network."""
-    slam: ScheduleSettings = ScheduleSettings(gamma=0.0)
+    slam: ScheduleSettings = ScheduleSettings()
     """When and how much the SLAM loss counts; gamma 0: never."""
     slam_loss: SlamLossSettings = SlamLossSettings()
     """Odometry of the SLAM loss."""
     epochs: int = Field(default=20, ge=1)
-    """Passes over the windows."""
+    """Passes over the scans."""
     window: int = Field(default=5, ge=2)
     """Contiguous scans of a step."""
     batch: int = Field(default=1, ge=1)
@@ -60,6 +60,11 @@ class TaskTraining(Settings):
     validate_every: int = Field(default=5, ge=1)
     """Epochs between validations."""
 
+    def has_windows(self, epoch: int) -> bool:
+        """Whether the scans of a step are contiguous in this epoch, for the SLAM loss, also where its weight is zero:
+        trainings that differ in it alone see the same scans. In the other epochs they are of all places, shuffled."""
+        return is_due(epoch, self.slam)
+
 
 class Task(nn.Module, ABC):
     """A task that is trained with and without the SLAM loss. All that is trained and stored is in its parameters."""
@@ -79,8 +84,9 @@ class Task(nn.Module, ABC):
     def losses(self, window: list[TaskScan]) -> tuple[Tensor, Callable[[], Tensor] | None]:
         """Loss of the task, a scalar, and a function that gives the SLAM loss, m2; None where it has no meaning.
 
-        `window` holds contiguous scans, those of `settings.batch` windows one after the other: see `windows`. What is
-        random here is drawn from torch's generator, so that a resumed training draws the same.
+        `window` holds the scans of `settings.batch` windows one after the other, see `windows`; they are contiguous in
+        the epochs that `TaskTraining.has_windows` tells, and the SLAM loss has a meaning only there. What is random
+        here is drawn from torch's generator, so that a resumed training draws the same.
         """
 
     @abstractmethod

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Training and measuring of the tasks: windows of contiguous scans, eq. 1 and its schedule, on the common trainer."""
+"""Training and measuring of the tasks: scans shuffled or in windows, eq. 1 and its schedule, on the common trainer."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def load_task(name: str, path: Path) -> Task:
 
 @dataclass(frozen=True)
 class _Batch:
-    """The scans of a step's windows, one window after the other, and its epoch."""
+    """The scans of a step, if contiguous one window after the other, and its epoch."""
 
     epoch: int
     scans: list[TaskScan]
@@ -141,17 +141,22 @@ class _Batch:
 def _batches(
     task: Task, scans: TaskScans, windows: ContiguousWindows, batch: int, start: int, device: torch.device
 ) -> Iterator[_Batch]:
-    """So many windows a step, from step `start` on, for ever; what is left of an epoch's windows is not used."""
+    """The scans of so many windows a step, from step `start` on, for ever; what is left of an epoch is not used."""
     steps = max(1, len(windows) // batch)
     epoch, skip = divmod(start, steps)
     while True:
-        windows.set_epoch(epoch)
         task.train()
         task.start_epoch(epoch)
-        order = list(windows)
+        settings = task.settings
+        if settings.has_windows(epoch):
+            windows.set_epoch(epoch)
+            order = [i for window in windows for i in window]
+        else:  # neighbours in a step would be nearly one scan: batch statistics and gradients want many places
+            generator = torch.Generator().manual_seed(settings.seed * 1_000_003 + epoch)
+            order = torch.randperm(len(scans), generator=generator).tolist()
+        size = batch * settings.window
         for step in range(skip, steps):
-            places = [i for place in order[step * batch : (step + 1) * batch] for i in place]
-            yield _Batch(epoch, [scans[i].to(device) for i in places])
+            yield _Batch(epoch, [scans[i].to(device) for i in order[step * size : (step + 1) * size]])
         epoch, skip = epoch + 1, 0
 
 

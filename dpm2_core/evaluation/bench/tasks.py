@@ -39,7 +39,6 @@ class Comparison:
         settings: `key=value` of its training, the arm without the SLAM loss being the same with gamma 0.
         figures: of `Task.evaluate`, and which way is better.
         drives: synthetic drives to learn from and to be judged on. drives_of: the task in whose folder they are.
-        shared_epochs: the first ones, in which the SLAM loss does not count, are trained once for both arms of a seed.
         slam: odometry on the clouds that the task makes is judged as well.
     """
 
@@ -47,7 +46,6 @@ class Comparison:
     figures: dict[str, Better]
     drives: TaskDriveSettings = field(default_factory=TaskDriveSettings)
     drives_of: str | None = None
-    shared_epochs: int = 0
     slam: bool = False
 
 
@@ -71,7 +69,6 @@ COMPARISONS: dict[str, Comparison] = {
         drives=TaskDriveSettings(
             train=10, train_frames=48, val=3, val_frames=32, first_seed=7300, presets=("city", "suburb"), traffic=20
         ),
-        shared_epochs=10,
         slam=True,
     ),
     "ae_lidar": Comparison(
@@ -134,6 +131,7 @@ def _compare(name: str, comparison: Comparison, options: Options) -> Any:
     learn, judge = (open_scans(drives / which, kind.needs) for which in ("train", "val"))
     overrides = [*comparison.settings, *options.overrides]
     chosen = load_settings(kind.training_type, None, overrides)
+    shared = next((epoch for epoch in range(chosen.epochs) if chosen.has_windows(epoch)), 0)
     part: dict[str, Any] = {
         "command": shlex.join(["dpm2", *sys.argv[1:]]),
         "commit": git_commit(),
@@ -141,7 +139,7 @@ def _compare(name: str, comparison: Comparison, options: Options) -> Any:
         "settings": overrides,
         "drives": comparison.drives.model_dump(mode="json"),
         "scans": {"train": len(learn), "val": len(judge)},
-        "shared_epochs": comparison.shared_epochs,
+        "shared_epochs": shared,
         "complete": False,
         "runs": {"without": {}, "with": {}},
     }
@@ -150,7 +148,7 @@ def _compare(name: str, comparison: Comparison, options: Options) -> Any:
             slam = chosen.slam.model_copy(update={"gamma": gamma})
             settings = chosen.model_copy(update={"seed": seed, "slam": slam})
             out = folder / f"{arm}_{seed}"
-            _train(name, settings, learn, out, comparison.shared_epochs)
+            _train(name, settings, learn, out, shared)
             figures = _judged(name, settings, judge, out)
             if comparison.slam:
                 slam_on = slam_figures(load_task(name, out / WEIGHTS), drives / "val")
@@ -164,7 +162,8 @@ def _compare(name: str, comparison: Comparison, options: Options) -> Any:
 def _train(
     name: str, settings: TaskTraining, learn: TaskScans, out: Path, shared: int = 0, until: int | None = None
 ) -> None:
-    """Train, or go on, unless this very training has ended. The first `shared` epochs are those of both arms."""
+    """Train, or go on, unless this very training has ended. The first `shared` epochs, before the SLAM loss counts for
+    the first time, are trained once for both arms."""
     text = dump_settings(settings) + ("" if until is None else f"until: {until}\n")
     begun = out / "begun.yaml"
     if (out / _DONE).is_file() and (out / _DONE).read_text() == text:
@@ -206,7 +205,9 @@ def summary(runs: dict[str, dict[str, dict[str, Any]]], figures: dict[str, Bette
     """Mean and standard deviation over the seeds of every figure and arm, and what the SLAM loss gained.
 
     `gain` is the relative improvement of the mean, positive where the arm with the SLAM loss is better; it is beyond
-    the spread where the means are farther apart than the two standard deviations together.
+    the spread where the means are farther apart than the two standard deviations together. `paired` has the gains seed
+    by seed, both arms of which share all but the SLAM loss: their mean and its standard error, relative to the mean of
+    the arm without, and how many seeds are better with it.
     """
     out = {}
     for figure, better in figures.items():
@@ -219,9 +220,19 @@ def summary(runs: dict[str, dict[str, dict[str, Any]]], figures: dict[str, Bette
         if arms["with"] and arms["without"]:
             gap = mean(arms["with"]) - mean(arms["without"])
             sign = -1 if better == "lower" else 1
-            row["gain"] = _figure(sign * gap / abs(mean(arms["without"])))
+            size = abs(mean(arms["without"]))
+            row["gain"] = _figure(sign * gap / size)
             if min(map(len, arms.values())) > 1:
                 row["beyond_spread"] = abs(gap) > sum(stdev(values) for values in arms.values())
+            seeds = sorted(runs["with"].keys() & runs["without"].keys())
+            better_by = [sign * (runs["with"][s][figure] - runs["without"][s][figure]) for s in seeds]
+            if len(seeds) > 1:
+                row["paired"] = {
+                    "mean": _figure(mean(better_by) / size),
+                    "standard_error": _figure(stdev(better_by) / len(seeds) ** 0.5 / size),
+                    "better": sum(value > 0 for value in better_by),
+                    "seeds": len(seeds),
+                }
         out[figure] = row
     return out
 
@@ -233,14 +244,21 @@ def _figure(x: float) -> float:
 def _view(parts: dict[str, Any]) -> Group:
     tables = []
     for name, part in parts.items():
-        table = Table("figure", "without", "with SLAM loss", "gain", "beyond the spread", box=SIMPLE)
+        table = Table("figure", "without", "with SLAM loss", "gain", "paired", "beyond the spread", box=SIMPLE)
         table.title = f"{name}, {len(part['runs']['with'])} seeds"
         for figure, row in part["summary"].items():
             cells = [_cell(row.get(arm)) for arm in ("without", "with")]
             gain = f"{row['gain']:+.1%}" if "gain" in row else ""
-            table.add_row(figure, *cells, gain, {True: "yes", False: "no"}.get(row.get("beyond_spread"), ""))
+            beyond = {True: "yes", False: "no"}.get(row.get("beyond_spread"), "")
+            table.add_row(figure, *cells, gain, _paired(row.get("paired")), beyond)
         tables.append(table)
     return Group(*tables)
+
+
+def _paired(row: dict[str, float] | None) -> str:
+    if row is None:
+        return ""
+    return f"{row['mean']:+.1%} ± {row['standard_error']:.1%}, {row['better']} of {row['seeds']} better"
 
 
 def _cell(row: dict[str, float | None] | None) -> str:

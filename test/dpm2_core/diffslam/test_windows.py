@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.utils.data import DataLoader
 
-from dpm2_core.diffslam import ContiguousWindows, ScheduleSettings, is_slam_epoch, total_loss
+from dpm2_core.diffslam import ContiguousWindows, ScheduleSettings, is_due, total_loss
 from dpm2_core.errors import UsageError
 
 
@@ -62,9 +62,10 @@ def test_windows_without_motion_are_refused(bad: tuple[int, int]) -> None:
 
 def test_every_kth_epoch_has_the_slam_loss() -> None:
     """k = 5: epochs 4, 9, ... as in the paper, 30 of 150; elsewhere it is not even computed."""
-    settings = ScheduleSettings(gamma=0.5, every=5)
-    assert [epoch for epoch in range(12) if is_slam_epoch(epoch, settings)] == [4, 9]
-    assert sum(is_slam_epoch(epoch, settings) for epoch in range(150)) == 30
+    settings = ScheduleSettings(gamma=0.5, every=5, most=None)
+    assert [epoch for epoch in range(12) if is_due(epoch, settings)] == [4, 9]
+    assert sum(is_due(epoch, settings) for epoch in range(150)) == 30
+    assert [epoch for epoch in range(20) if is_due(epoch, ScheduleSettings(every=5, begin=7))] == [11, 16]
     calls = []
 
     def slam() -> torch.Tensor:
@@ -74,4 +75,18 @@ def test_every_kth_epoch_has_the_slam_loss() -> None:
     values = [float(total_loss(torch.tensor(1.0), slam, epoch, settings)) for epoch in range(5)]
     assert values == [1.0, 1.0, 1.0, 1.0, 3.0]
     assert len(calls) == 1
-    assert not is_slam_epoch(4, ScheduleSettings(gamma=0.0))
+    assert float(total_loss(torch.tensor(1.0), slam, 4, ScheduleSettings(gamma=0.0))) == 1.0
+    assert len(calls) == 1
+
+
+def test_a_lost_registration_is_not_the_whole_step() -> None:
+    """gamma L_slam is bounded by a share of L_model, its slope along with it; below, it is as it is. That of the task
+    stays as it is."""
+    for error, share in ((0.05, 0.05), (0.1, 0.1), (1.0, 0.1), (100.0, 0.1), (0.0, 0.0)):
+        task, slam = (torch.tensor(value, requires_grad=True) for value in (4.0, 2 * error))
+        settings = ScheduleSettings(gamma=2.0, every=1, most=0.1)
+        total = total_loss(task, lambda x=slam: x, 0, settings)  # gamma L_slam is `error` times L_model
+        total.backward()
+        assert float(total.detach()) == pytest.approx(4.0 * (1 + share))
+        assert float(task.grad) == 1.0
+        assert float(slam.grad) == pytest.approx(2.0 * (share / error if error else 1.0))

@@ -24,6 +24,11 @@ def test_summary_by_hand() -> None:
     assert found["mse"]["without"] == {"mean": 1.5, "std": pytest.approx(0.7071, abs=1e-4)}
     assert found["mse"]["gain"] == pytest.approx(0.2)
     assert found["mse"]["beyond_spread"] is False
+    # Each seed is better by 0.3 of 1.5: what the seeds differ by does not hide it.
+    assert found["mse"]["paired"] == {
+        "mean": pytest.approx(0.2), "standard_error": pytest.approx(0, abs=1e-9), "better": 2, "seeds": 2
+    }  # fmt: skip
+    assert found["recall"]["paired"]["better"] == 0
     assert found["recall"]["gain"] == pytest.approx(-0.25)
     assert found["recall"]["beyond_spread"] is True
     one = tasks.summary({"without": {"0": {"mse": 1.0}}, "with": {}}, {"mse": "lower"})
@@ -48,7 +53,7 @@ def test_comparison_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "tasks.json").write_text('{"parts": {"dslr": {"summary": {}, "runs": {"with": {}}}}}')
     tasks.bench_tasks(options)
-    assert trained == [0.0, 0.1]
+    assert trained == [0.0, 0.0, 0.1]  # the first epoch, which both share, and each arm from there
     record = json.loads((tmp_path / "out" / "tasks.json").read_text())
     assert record["parts"].keys() == {"dslr", "gndnet"}
     part = record["parts"]["gndnet"]
@@ -58,9 +63,9 @@ def test_comparison_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert run["mse"] == pytest.approx(part["summary"]["mse"]["with"]["mean"])
     assert part["runs"]["without"]["0"]["slam_share_at_first"] is None
     tasks.bench_tasks(options)
-    assert trained == [0.0, 0.1]
+    assert trained == [0.0, 0.0, 0.1]
     tasks.bench_tasks(Options(**{**vars(options), "overrides": ("slam.gamma=0.2",)}))
-    assert trained == [0.0, 0.1, 0.2]
+    assert trained == [0.0, 0.0, 0.1, 0.2]
     with pytest.raises(UsageError, match="--only nonsense: no such task"):
         tasks.bench_tasks(Options(only="nonsense"))
 
@@ -82,7 +87,7 @@ def test_arms_share_their_first_epochs_and_slam_is_judged(tmp_path: Path, monkey
         "network.latent=8", "autoencoder_epochs=1", "discriminator_epochs=1", "epochs=4", "window=3", "every=1",
         "batch=1", "slam.gamma=0.1", "slam.every=4", "slam_loss.points=200",
     )  # fmt: skip
-    comparison = tasks.Comparison(small, {"chamfer_m": "lower"}, drives, shared_epochs=2, slam=True)
+    comparison = tasks.Comparison(small, {"chamfer_m": "lower"}, drives, slam=True)
     monkeypatch.setattr(tasks, "COMPARISONS", {"dslr": comparison})
     trained = []
     original = tasks.train_task
@@ -91,7 +96,7 @@ def test_arms_share_their_first_epochs_and_slam_is_judged(tmp_path: Path, monkey
     )
     options = Options(threads=1, repetitions=1, only="dslr", out=tmp_path, cache=tmp_path / "cache")
     runs = tasks.bench_tasks(options).results["parts"]["dslr"]["runs"]
-    assert trained == [(0.0, False, 2), (0.0, True, None), (0.1, True, None)]
+    assert trained == [(0.0, False, 3), (0.0, True, None), (0.1, True, None)]
     assert runs["with"]["0"].keys() >= {"chamfer_m", "output_ate_m", "input_rpe_m", "target_rpe_deg"}
     assert runs["with"]["0"]["slam_share_at_first"] > 0
     logs = [(tmp_path / "cache/tasks/dslr" / arm / "log.jsonl").read_text() for arm in ("with_0", "without_0")]

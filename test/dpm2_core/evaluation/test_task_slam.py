@@ -9,10 +9,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from dpm2_core.diffslam.tasks.ae_lidar import AeLidarSettings
+from dpm2_core.diffslam.tasks.ae_lidar import AeLidarImage, AeLidarSettings
 from dpm2_core.diffslam.tasks.ae_lidar_task import AeLidarTask, AeLidarTraining
 from dpm2_core.diffslam.tasks.ground_task import GroundTask, GroundTraining
-from dpm2_core.diffslam.tasks.range_image import RangeImageSettings
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.task_slam import slam_figures
 from dpm2_core.sim.config import LidarConfig
@@ -32,7 +31,7 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def task() -> AeLidarTask:
     """Untrained."""
     torch.manual_seed(0)
-    image = RangeImageSettings(columns=128)
+    image = AeLidarImage(columns=128)
     return AeLidarTask(AeLidarTraining(network=AeLidarSettings(image=image, channels=4, latent=8))).eval()
 
 

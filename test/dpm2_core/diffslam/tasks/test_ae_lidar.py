@@ -11,14 +11,13 @@ import torch
 from torch.distributions import Normal, kl_divergence
 
 from dpm2_core.diffslam import ScheduleSettings, SlamLossSettings
-from dpm2_core.diffslam.tasks.ae_lidar import AeLidarSettings, LidarAutoencoder, load
+from dpm2_core.diffslam.tasks.ae_lidar import AeLidarImage, AeLidarSettings, LidarAutoencoder, load
 from dpm2_core.diffslam.tasks.ae_lidar_task import AeLidarTask, AeLidarTraining
 from dpm2_core.diffslam.tasks.data import open_scans
-from dpm2_core.diffslam.tasks.range_image import RangeImageSettings
 from dpm2_core.diffslam.tasks.training import WEIGHTS, draw, measure, train_task
 from dpm2_core.errors import UsageError
 
-SENSOR = RangeImageSettings(beams=((2.0, -14.0, 16),), first=0, rows=16, columns=64, scale=60.0)
+SENSOR = AeLidarImage(beams=((2.0, -14.0, 16),), first=0, rows=16, columns=64, scale=60.0)
 
 
 def network(**changes: object) -> AeLidarSettings:
@@ -43,7 +42,7 @@ def test_size_is_that_of_the_paper() -> None:
 @pytest.mark.parametrize(("rows", "columns"), [(16, 64), (24, 128), (32, 512), (64, 64)])
 def test_other_sensors_fit(rows: int, columns: int) -> None:
     """An odd and an even number of rows after three halvings."""
-    image = RangeImageSettings(beams=((2, -25, 64),), first=0, rows=rows, columns=columns)
+    image = AeLidarImage(beams=((2, -25, 64),), first=0, rows=rows, columns=columns)
     assert LidarAutoencoder(network(image=image)).eval()(torch.rand(2, 2, rows, columns))[0].shape[2:] == (
         rows,
         columns,
@@ -53,7 +52,7 @@ def test_other_sensors_fit(rows: int, columns: int) -> None:
 @pytest.mark.parametrize("rows", [8, 41])
 def test_rows_that_cannot_be_halved_are_refused(rows: int) -> None:
     """The message gives the number."""
-    image = RangeImageSettings(first=0, rows=rows)
+    image = AeLidarImage(first=0, rows=rows)
     with pytest.raises(UsageError, match=f"images of {rows} rows; want a multiple of 8"):
         LidarAutoencoder(network(image=image))
 
@@ -97,7 +96,7 @@ def test_learns_and_can_be_loaded(pairs: Path, tmp_path: Path, variational: bool
     assert log[-1]["task_loss"] < 0.5 * log[0]["task_loss"]
     assert [row["step"] for row in log if row.get("slam_loss") is not None] == [8, 9, 18, 19]
     figures = measure(task, scans)
-    assert figures.keys() == {"chamfer_m", "chamfer", "d_error_m"}
+    assert figures.keys() == {"chamfer_m", "chamfer", "d_error_m", "varies_m", "target_varies_m"}
     assert all(value > 0 for value in figures.values())
     with torch.no_grad():
         assert task.clouds(scans[0])["output"].shape == task.clouds(scans[0])["input"].shape

@@ -148,9 +148,13 @@ def test_learns_and_survives_being_stopped(pairs: Path, tmp_path: Path) -> None:
 
     figures = measure(task, scans)
     assert figures.keys() == {
-        "chamfer_m", "chamfer", "moved_m", "input_chamfer_m", "input_chamfer", "input_moved_m"
+        "chamfer_m", "chamfer", "moved_m", "input_chamfer_m", "input_chamfer", "input_moved_m", "varies_m",
+        "target_varies_m",
     }  # fmt: skip
     assert figures["moved_m"] < figures["input_moved_m"]  # the car is taken away
+    twins = torch.stack([task._reader.read([scans[i]], static=True).images[0, 0] for i in range(len(scans))])
+    assert figures["target_varies_m"] == pytest.approx(float(twins.std(0, correction=0).mean()) * 60.0, rel=1e-5)
+    assert 0 < figures["varies_m"] < 2 * figures["target_varies_m"]
     draw(task, scans, 3, tmp_path / "picture.png")
     assert (tmp_path / "picture.png").read_bytes().startswith(b"\x89PNG")
     network = load(weights[0])

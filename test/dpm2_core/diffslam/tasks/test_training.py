@@ -36,7 +36,7 @@ def settings(**changes: Any) -> GroundTraining:
     """Two windows of three scans an epoch, a small network, the SLAM loss in every second epoch."""
     tree = {
         "network": TINY, "epochs": 4, "window": 3, "every": 1, "warmup": 2, "rate": 3e-3, "tilt": 2.0,
-        "slam": {"gamma": 0.5, "every": 2}, "slam_loss": {"points": 300},
+        "slam": {"gamma": 0.5, "every": 2, "most": None}, "slam_loss": {"points": 300},
     }  # fmt: skip
     return GroundTraining.model_validate({**tree, **changes})
 
@@ -66,6 +66,33 @@ def test_it_learns_and_logs(scans: TaskScans, tmp_path: Path) -> None:
     for row in steps:
         assert row["loss"] == pytest.approx(row["task_loss"] + 0.5 * row.get("slam_loss", 0), abs=2e-6)  # 6 decimals
     assert [row["step"] for row in log if "miou" in row] == [9, 19, 29, 39]  # every fifth epoch
+
+
+def test_scans_are_contiguous_only_where_the_slam_loss_counts(
+    scans: TaskScans, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Elsewhere a step has scans of all places, all different ones within an epoch, in another order in each; and the
+    weight of the SLAM loss, zero included, changes nothing about which scans a training sees."""
+    original = GroundTask.losses
+    seen: list[list[int]] = []
+
+    def losses(self: GroundTask, window: list[TaskScan]) -> tuple[Tensor, Callable[[], Tensor]]:
+        seen.append([scan.number for scan in window])
+        return original(self, window)
+
+    monkeypatch.setattr(GroundTask, "losses", losses)
+    orders = []
+    for gamma in (0.5, 0.0):
+        seen.clear()
+        train_task("gndnet", settings(epochs=8, slam={"gamma": gamma, "every": 2}), scans, tmp_path / f"{gamma}")
+        orders.append([*seen])
+    assert orders[0] == orders[1]
+    epochs = [orders[0][i : i + 2] for i in range(0, 16, 2)]
+    assert all(sorted(epoch) == [[0, 1, 2], [3, 4, 5]] for epoch in epochs[1::2])
+    shuffled = [(*one, *other) for one, other in epochs[::2]]
+    assert all(sorted(order) == [0, 1, 2, 3, 4, 5] for order in shuffled)
+    assert len(set(shuffled)) == 4  # of 720 orders; the seed is fixed
+    assert (0, 1, 2, 3, 4, 5) not in shuffled
 
 
 def test_resumed_equals_uninterrupted(scans: TaskScans, tmp_path: Path) -> None:
