@@ -54,16 +54,19 @@ bench-memory: setup  ## resident memory over a synthetic drive of 2,000 frames (
 train-data: setup  ## the synthetic worlds that train-small and ablation learn from (2 cores: 40 minutes, 1.5 GB)
 	$(BIN)/python -m dpm2_core.cli train data out/train/lidar --set worlds=64
 	$(BIN)/python -m dpm2_core.cli train data out/train/camera --config config/worlds_camera.yaml
+	$(BIN)/python -m dpm2_core.cli train data out/train/traffic --set worlds=20 --set first_seed=6000 --set frames=32 --set traffic=20 \
+		--set 'mixture={city: 0.4, suburb: 0.3, rural: 0.3}'
 	$(BIN)/python -m dpm2_core.cli train data out/train/val --set first_seed=900000 --set worlds=12 --set frames=30 --set images=true
 	$(BIN)/python -m dpm2_core.cli train data out/train/val_degenerate --set first_seed=900100 --set worlds=6 --set frames=30 \
 		--set images=true --set 'mixture={highway: 0.5, tunnel: 0.5}'
 
 TRAIN = OMP_WAIT_POLICY=active $(BIN)/python -m dpm2_core.cli train
 RESUMED = $(if $(wildcard out/$(1)/checkpoint.pt),--resume)
-train-small: train-data  ## train the weights that are shipped: registration, image branch, both, overlap (2 cores: 2.5 hours; continues)
+train-small: train-data  ## train the weights that are shipped: registration, image branch, both, poses, overlap (2 cores: 3 hours; continues)
 	$(TRAIN) phase1 --config config/train_small.yaml --out out/phase1 $(call RESUMED,phase1)
 	$(TRAIN) image --config config/train_small_image.yaml --out out/image $(call RESUMED,image)
 	$(TRAIN) phase1 --config config/train_small_camera.yaml --out out/camera $(call RESUMED,camera)
+	$(TRAIN) phase1 --config config/train_small_pose.yaml --out out/pose $(call RESUMED,pose)
 	$(TRAIN) phase2 --config config/train_small_phase2.yaml --out out/phase2 $(call RESUMED,phase2)
 
 train-ground: setup  ## train the weights of slam.filter.kind=ground (2 cores: 10 minutes, 1.5 GB)

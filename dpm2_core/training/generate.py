@@ -46,6 +46,8 @@ class GenerateSettings(Settings):
     """Of the LiDAR."""
     height: float = Field(1.73, gt=0.5, le=10)
     """Of the LiDAR above the ground, m; each world's own is up to 0.2 m lower or 0.3 m higher."""
+    traffic: float = Field(1.0, ge=0, le=1000)
+    """Times that of the preset; of 20 on every lane is full."""
     images: bool = False
     """Render a picture with each scan."""
     preset: str = "small"
@@ -59,7 +61,7 @@ def generate_world(folder: Path, seed: int, settings: GenerateSettings) -> None:
     weights = np.array([settings.mixture[kind] for kind in kinds])
     kind = kinds[noise.choice(len(kinds), p=weights / weights.sum())]
     network = preset(settings.preset)
-    world = build_world("random", kind, seed, settings.length)
+    world = build_world("random", kind, seed, settings.length, settings.traffic)
     columns, height = int(noise.choice([1448, 1810, 2170])), settings.height + noise.uniform(-0.2, 0.3)
     lidar = Lidar(LidarConfig(beams=settings.beams, columns=columns, height=height))
     camera = _camera(network)
