@@ -49,36 +49,37 @@ class Comparison:
     slam: bool = False
 
 
+_USUAL = TaskDriveSettings(train=80, train_frames=12, val=12, val_frames=20)
 _ODOMETRY = ("output_ate_m", "output_rpe_m", "output_rpe_deg")
 COMPARISONS: dict[str, Comparison] = {
     "gndnet": Comparison(
         settings=(
-            "network.cells=64", "network.channels=16", "epochs=6", "rate=3e-3", "slam.gamma=2", "slam.every=2",
-            "slam_loss.points=1024",
+            "network.cells=64", "network.channels=16", "gaps=0.1", "epochs=8", "rate=2e-3", "slam.gamma=1",
+            "slam.begin=4", "slam.every=2", "slam_loss.points=1024",
         ),
         figures={"mse": "lower", "miou": "higher", "precision": "higher", "recall": "higher"},
-        drives=TaskDriveSettings(train=24, train_frames=20, val=6, val_frames=20),
+        drives=_USUAL,
     ),
     "dslr": Comparison(
         settings=(
-            "network.image.columns=128", "network.channels=24", "autoencoder_epochs=9", "discriminator_epochs=1",
-            "epochs=18", "window=4", "every=1", "batch=2", "rate=2e-3", "final_rate=2e-4", "slam.gamma=20",
-            "slam.every=4", "slam_loss.points=1024",
+            "network.image.columns=128", "network.channels=24", "autoencoder_epochs=26", "discriminator_epochs=1",
+            "epochs=40", "window=3", "every=1", "batch=3", "rate=2e-3", "final_rate=1e-4", "slam.gamma=4",
+            "slam.begin=28", "slam.every=3", "slam_loss.points=1024",
         ),
         figures=dict.fromkeys(("chamfer_m", "chamfer", "moved_m", *_ODOMETRY), "lower"),
         drives=TaskDriveSettings(
-            train=10, train_frames=48, val=3, val_frames=32, first_seed=7300, presets=("city", "suburb"), traffic=20
+            train=80, train_frames=12, val=8, val_frames=20, first_seed=7300, presets=("city", "suburb"), traffic=20
         ),
         slam=True,
     ),
     "ae_lidar": Comparison(
         settings=(
-            "network.image.columns=128", "network.channels=16", "network.latent=160", "epochs=12", "window=4",
-            "every=1", "batch=2", "rate=2e-3", "final_rate=2e-4", "slam.gamma=20", "slam.every=5",
+            "network.image.columns=128", "network.channels=16", "network.latent=160", "epochs=24", "window=3",
+            "every=1", "batch=3", "rate=2e-3", "final_rate=1e-4", "slam.gamma=30", "slam.begin=12", "slam.every=3",
             "slam_loss.points=1024",
         ),
         figures=dict.fromkeys(("chamfer_m", "chamfer", "d_error_m", *_ODOMETRY), "lower"),
-        drives=TaskDriveSettings(train=24, train_frames=20, val=6, val_frames=20),
+        drives=_USUAL,
         drives_of="gndnet",
         slam=True,
     ),
