@@ -122,13 +122,12 @@ class Odometry:
 
     def _registered_from_rest(self, scan: Scan, T: Array) -> Registration:
         """While the velocity is unknown: the best of many starts."""
-        found: list[Registration] = []
-        for motions in (_AHEAD, _CURVES):
+        for motions in (_AHEAD, _AHEAD + _CURVES):
             starts = [T @ se3.exp([0, 0, np.radians(yaw), x, 0, 0]) for x, yaw in motions]
-            found.append(self._registration.register(scan, Prediction(starts, widen=2.0)))
-            if found[-1].ok and found[-1].confidence >= _FITS_WELL:
+            answer = self._registration.register(scan, Prediction(starts, widen=2.0))
+            if answer.ok and answer.confidence >= _FITS_WELL:
                 break
-        return max(found, key=lambda r: (r.ok, r.confidence))
+        return answer
 
     def _gated(self, answer: Registration, T_predicted: Array, dt: float) -> Registration:
         """Refuse what no vehicle can do; the allowance grows while nothing has been registered."""

@@ -11,13 +11,7 @@ from dpm2_core.frame import Array, Frame, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.slam.neural import NeuralScanRegistration
 from dpm2_core.slam.preprocess import Scan
-from dpm2_core.slam.scan_registration import GeometricScanRegistration, Prediction
-
-CHI2 = 22.46
-"""99.9 % quantile of chi2 with 6 degrees of freedom: a refinement that is farther off is refused."""
-
-# What the covariances of both leave out, rad and m: the poses of the frames that make up the two maps.
-_MAP_NOISE = np.diag(np.repeat([np.radians(0.1), 0.03], 3) ** 2)
+from dpm2_core.slam.scan_registration import MAP_NOISE, GeometricScanRegistration, Prediction, agree
 
 
 class RefinedScanRegistration:
@@ -59,7 +53,7 @@ class RefinedScanRegistration:
         if not refined.ok:
             return replace(neural, reason=f"not refined: {refined.reason}")
         xi = se3.log(se3.inverse(refined.T_target_source) @ neural.T_target_source)
-        if _mahalanobis(xi, neural, refined) <= CHI2:
+        if agree(neural, refined):
             return _mean(refined, neural, xi)
         return self._disputed(scan, prediction, neural, refined, f"neural and points {_apart(xi)} apart")
 
@@ -68,8 +62,7 @@ class RefinedScanRegistration:
     ) -> Registration:
         """The points have it if the prediction leads them to the same pose; else the network, with its doubt."""
         again = self._geometric.register(scan, prediction)
-        xi = se3.log(se3.inverse(refined.T_target_source) @ again.T_target_source)
-        if again.ok and _mahalanobis(xi, refined, again) <= CHI2:
+        if again.ok and agree(refined, again):
             return _because(again, why)
         xi = se3.log(se3.inverse(neural.T_target_source) @ refined.T_target_source)
         return replace(neural, covariance=neural.covariance + np.outer(xi, xi), reason=why)
@@ -79,13 +72,9 @@ class RefinedScanRegistration:
         self._neural.update(scan, T_odom_lidar)
 
 
-def _mahalanobis(xi: Array, a: Registration, b: Registration) -> float:
-    return float(xi @ np.linalg.solve(a.covariance + b.covariance + _MAP_NOISE, xi))
-
-
 def _mean(refined: Registration, neural: Registration, xi: Array) -> Registration:
     """Both by their information; xi (6,) leads from the refined pose to the neural one."""
-    of_points, of_network = np.linalg.inv(refined.covariance), np.linalg.inv(neural.covariance + _MAP_NOISE)
+    of_points, of_network = np.linalg.inv(refined.covariance), np.linalg.inv(neural.covariance + MAP_NOISE)
     covariance = np.linalg.inv(of_points + of_network)
     T = se3.orthonormalised(refined.T_target_source @ se3.exp(covariance @ of_network @ xi))
     return replace(refined, T_target_source=T, covariance=covariance, method="refined")

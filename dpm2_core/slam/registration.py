@@ -26,9 +26,13 @@ class GeometricSettings(Settings):
     """Fewer inliers than this are no answer."""
     min_inliers: float = 0.5
     """A smaller share of inliers among the points is no answer."""
+    min_inliers_expected: float = 0.3
+    """The same where the answer is what the motion so far led to expect, to 0.3 m and 2 degrees: two sources then say
+    the same. A young map, of which traffic hides ever other parts, has counterparts for no more."""
 
 
 _COARSE, _FINE = (1e-3, 0.02), (1e-4, 1e-3)  # rad and m: a smaller step ends the pass
+_EXPECTED = (np.radians(2), 0.3)  # rad and m from the prediction; hard braking makes 0.1 m in 0.1 s
 _CORRELATED = 10
 _NORMAL_NOISE = 0.09  # rad, of fitted normals; measured rms along smooth tunnels: 0.02 to 0.12, in towns over 0.25
 
@@ -61,6 +65,7 @@ class GeometricRegistration:
         H = np.zeros((6, 6))
         inliers, rmse, coarse = 0, np.inf, len(source) > 4 * s.min_points
         # Points that share a plane are not independent: the information of `_CORRELATED` of them counts as one.
+        predicted = prior is not None
         prior = 1e-6 * np.eye(6) if prior is None else _CORRELATED * prior
         for _ in range(s.iterations):
             points = source[::4] if coarse else source
@@ -77,19 +82,23 @@ class GeometricRegistration:
                     break
                 coarse, gate = False, s.final_gate
         share = inliers / len(points)
-        ok = inliers >= s.min_points and share >= s.min_inliers
+        least = s.min_inliers_expected if predicted and _close(T_guess, T) else s.min_inliers
+        ok = inliers >= s.min_points and share >= least
         reason = "" if ok else f"{inliers} of {len(points)} points fit the map"
         return Registration(T, _covariance(H), share, rmse, "geometric", ok, reason)
 
+    def likelihood(self, source: Array, target: LocalMap, T: Array) -> float:
+        """Mean log likelihood of the (N, 3) points at a pose T_target_source: tells which of two poses fits better.
+
+        Distances along the normals are Cauchy distributed; a point without a counterpart has a density of 1 per metre.
+        """
+        _, _, residual, variance = self._matched(source, target, T, self._settings.final_gate)
+        log_density = -0.5 * np.log(variance) - np.log1p(residual * residual / variance)
+        return float(np.maximum(log_density, 0).sum() / len(source))
+
     def _linearise(self, source: Array, target: LocalMap, T: Array, gate: float) -> tuple[Array, Array, int, float]:
         """Hessian (6, 6) and gradient (6,) for a step on the right of T, number of inliers, their rmse in m."""
-        moved = source @ T[:3, :3].T + T[:3, 3]
-        index, squared = target.nearest(moved)
-        near = squared < gate * gate
-        index, moved, source = index[near], moved[near], source[near]
-        normals, spread = target.planes(index)
-        residual = np.einsum("ij,ij->i", moved - target.points[index], normals)
-        variance = self._settings.noise**2 + spread
+        source, normals, residual, variance = self._matched(source, target, T, gate)
         normalised = residual * residual / variance
         weight = 1 / (variance * (1 + normalised))  # Cauchy kernel
         normals_body = normals @ T[:3, :3]
@@ -98,6 +107,22 @@ class GeometricRegistration:
         fits = normalised < 9
         rmse = float(np.sqrt(np.mean(residual[fits] ** 2))) if fits.any() else np.inf
         return H, J.T @ (weight * residual), int(fits.sum()), rmse
+
+    def _matched(self, source: Array, target: LocalMap, T: Array, gate: float) -> tuple[Array, Array, Array, Array]:
+        """Points (K, 3) with a counterpart within the gate; normals (K, 3), distances (K,) m and variances (K,) m2."""
+        moved = source @ T[:3, :3].T + T[:3, 3]
+        index, squared = target.nearest(moved)
+        near = squared < gate * gate
+        index, moved = index[near], moved[near]
+        normals, spread = target.planes(index)
+        residual = np.einsum("ij,ij->i", moved - target.points[index], normals)
+        return source[near], normals, residual, self._settings.noise**2 + spread
+
+
+def _close(T: Array, T_other: Array) -> bool:
+    off = se3.inverse(T) @ T_other
+    radians, metres = _EXPECTED
+    return bool(np.linalg.norm(off[:3, 3]) <= metres and se3.angle(off) <= radians)
 
 
 def _covariance(H: Array) -> Array:

@@ -7,10 +7,25 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+
 from dpm2_core.frame import Array, Frame, Registration
+from dpm2_core.geometry import se3
 from dpm2_core.slam.local_map import LocalMap
 from dpm2_core.slam.preprocess import Preprocessor, Scan
 from dpm2_core.slam.registration import GeometricRegistration
+
+CHI2 = 22.46
+"""99.9 % quantile of chi2 with 6 degrees of freedom: two poses that are farther apart contradict each other."""
+
+# What the covariances of two registrations leave out, rad and m: the poses of the frames that make up the maps.
+MAP_NOISE = np.diag(np.repeat([np.radians(0.1), 0.03], 3) ** 2)
+
+
+def agree(a: Registration, b: Registration) -> bool:
+    """Whether two answers may be one pose: xi^T (S_a + S_b + S_map)^-1 xi <= `CHI2`, xi (6,) being their difference."""
+    xi = se3.log(se3.inverse(a.T_target_source) @ b.T_target_source)
+    return bool(xi @ np.linalg.solve(a.covariance + b.covariance + MAP_NOISE, xi) <= CHI2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +104,11 @@ class GeometricScanRegistration:
     def register(self, scan: Scan, prediction: Prediction) -> Registration:
         p = prediction
         found = [self._registration.register(scan.source, self._local_map, T, p.widen, p.information) for T in p.starts]
-        return max(found, key=lambda r: (r.ok, round(20 * r.confidence)))  # the first of equals: least motion
+        if len(found) == 1:
+            return found[0]
+        fit = [self._registration.likelihood(scan.source, self._local_map, r.T_target_source) for r in found]
+        best = max(zip(found, fit, strict=True), key=lambda of: (of[0].ok, of[1]))[0]
+        return next(r for r in found if r.ok == best.ok and agree(r, best))  # the first of equals: least motion
 
     def update(self, scan: Scan, T_odom_lidar: Array) -> None:
         if self._local_map.wants(T_odom_lidar):
