@@ -19,7 +19,7 @@ from dpm2_core.frame import Array, Frame, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.slam import filters
 from dpm2_core.slam.preprocess import Preprocessor, Scan
-from dpm2_core.slam.scan_registration import Prediction
+from dpm2_core.slam.scan_registration import Prediction, agree
 
 if TYPE_CHECKING:  # torch takes seconds to import, and the geometric SLAM does without
     from dpm2_core.network.model import DeepPointMap2
@@ -140,6 +140,10 @@ class NeuralScanRegistration:
             return replace(found, ok=False, reason=f"matches with a confidence of only {found.confidence:.2f}")
         if (sigma := found.worst_sigma) > self._settings.max_sigma:
             return replace(found, ok=False, reason=f"position uncertain by {sigma:.2f} m")
+        if prediction.information is not None:
+            covariance = np.linalg.inv(prediction.information).astype(np.float64)
+            if not agree(found, Registration(T_predicted, covariance, 0.0, np.inf, "predicted")):
+                return replace(found, ok=False, reason="contradicts the motion so far")
         return found
 
     def update(self, scan: Scan, T_odom_lidar: Array) -> None:

@@ -67,6 +67,7 @@ class Odometry:
         self._twist: Array | None = None  # unknown until two scans are registered
         self._covariance = np.zeros((6, 6))
         self._stamp: int | None = None
+        self._registered = np.eye(4), 0.0  # the last registered pose, and the seconds since
         self._failures = 0
         self._first: Frame | None = None
         self._registration.clear()
@@ -153,13 +154,16 @@ class Odometry:
 
     def _update(self, scan: Scan, registration: Registration, dt: float) -> None:
         """Move on: to the registered pose, or to the predicted one with the doubt that it deserves."""
+        T_registered, seconds = self._registered
         if not registration.ok:
+            self._registered = T_registered, seconds + dt
             self._coast(scan, dt)
             return
         if registration.method != "first":
-            moved = se3.inverse(self._T) @ registration.T_target_source
-            self._twist = se3.log(moved) / dt
+            # Not from the predicted pose of the frame before, of which an error would count as motion in one period.
+            self._twist = se3.log(se3.inverse(T_registered) @ registration.T_target_source) / (seconds + dt)
         self._T = registration.T_target_source
+        self._registered = self._T, 0.0
         self._covariance = registration.covariance
         self._failures = 0
         self._registration.update(scan, self._T)
@@ -176,7 +180,7 @@ class Odometry:
             self._keyframes.doubt(self._covariance)
             self._registration.clear()
             self._registration.update(scan, self._T)
-            self._twist, self._failures = None, 0
+            self._registered, self._twist, self._failures = (self._T, 0.0), None, 0
 
     def _state(self, registration: Registration) -> State:
         if self._failures >= self._settings.lost_after:

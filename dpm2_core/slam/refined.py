@@ -15,12 +15,12 @@ from dpm2_core.slam.scan_registration import MAP_NOISE, GeometricScanRegistratio
 
 
 class RefinedScanRegistration:
-    """The pose of the network, refined on the points where the two agree.
+    """The points as the geometric registration has them, and the network where it knows more.
 
-    The points are registered from the pose of the network, and by nothing else held to it. The difference xi of both is
-    tested: xi^T (S_neural + S_geometric + S_map)^-1 xi <= `CHI2`. If it passes, the answer is their mean, each weighed
-    with its information: in town the points have it, along a tunnel the network. If it does not, or one of the two has
-    no answer, the other answers alone and `reason` says why.
+    Where both have an answer and agree (see `agree`), it is their mean, each weighed with its information: in town the
+    points have it, along a tunnel the network. Where they contradict each other, the points have it: they are many, and
+    led there by the motion so far. Where the points have no answer they try again from the pose of the network; if they
+    have none there, or another, the network answers alone, with its doubt. `reason` says who did not agree, and why.
     """
 
     def __init__(self, neural: NeuralScanRegistration, geometric: GeometricScanRegistration) -> None:
@@ -45,26 +45,27 @@ class RefinedScanRegistration:
         return self._geometric.refusal(scan)
 
     def register(self, scan: Scan, prediction: Prediction) -> Registration:
-        neural = self._neural.register(scan, prediction) if len(self._neural) else None
-        if neural is None or not neural.ok:
-            why = "neural: no descriptors yet" if neural is None else f"neural: {neural.reason}"
-            return _because(self._geometric.register(scan, prediction), why)
-        refined = self._geometric.register(scan, Prediction([neural.T_target_source]))
-        if not refined.ok:
-            return replace(neural, reason=f"not refined: {refined.reason}")
-        xi = se3.log(se3.inverse(refined.T_target_source) @ neural.T_target_source)
-        if agree(neural, refined):
-            return _mean(refined, neural, xi)
-        return self._disputed(scan, prediction, neural, refined, f"neural and points {_apart(xi)} apart")
+        points = self._geometric.register(scan, prediction)
+        if not len(self._neural):
+            return _because(points, "neural: no descriptors yet")
+        neural = self._neural.register(scan, prediction)
+        if not neural.ok:
+            return _because(points, f"neural: {neural.reason}")
+        if not points.ok:
+            return self._led(scan, neural)
+        if not agree(points, neural):
+            return _because(points, f"neural and points {_apart(points, neural)} apart")
+        return _mean(points, neural, prediction.information)
 
-    def _disputed(
-        self, scan: Scan, prediction: Prediction, neural: Registration, refined: Registration, why: str
-    ) -> Registration:
-        """The points have it if the prediction leads them to the same pose; else the network, with its doubt."""
-        again = self._geometric.register(scan, prediction)
-        if again.ok and agree(refined, again):
-            return _because(again, why)
-        xi = se3.log(se3.inverse(neural.T_target_source) @ refined.T_target_source)
+    def _led(self, scan: Scan, neural: Registration) -> Registration:
+        """The points from the pose of the network, when the motion so far did not lead them to an answer."""
+        points = self._geometric.register(scan, Prediction([neural.T_target_source]))
+        if not points.ok:
+            return replace(neural, reason=f"not refined: {points.reason}")
+        if agree(points, neural):
+            return _mean(points, neural, None)
+        xi = _difference(points, neural)
+        why = f"neural and points {_apart(points, neural)} apart"
         return replace(neural, covariance=neural.covariance + np.outer(xi, xi), reason=why)
 
     def update(self, scan: Scan, T_odom_lidar: Array) -> None:
@@ -72,15 +73,22 @@ class RefinedScanRegistration:
         self._neural.update(scan, T_odom_lidar)
 
 
-def _mean(refined: Registration, neural: Registration, xi: Array) -> Registration:
-    """Both by their information; xi (6,) leads from the refined pose to the neural one."""
-    of_points, of_network = np.linalg.inv(refined.covariance), np.linalg.inv(neural.covariance + MAP_NOISE)
-    covariance = np.linalg.inv(of_points + of_network)
-    T = se3.orthonormalised(refined.T_target_source @ se3.exp(covariance @ of_network @ xi))
-    return replace(refined, T_target_source=T, covariance=covariance, method="refined")
+def _mean(points: Registration, neural: Registration, prior: Array | None) -> Registration:
+    """Both by their information; that of the prediction, prior (6, 6), holds the points but is no part of the doubt."""
+    of_points, of_network = np.linalg.inv(points.covariance), np.linalg.inv(neural.covariance + MAP_NOISE)
+    held = of_points if prior is None else of_points + prior
+    step = np.linalg.solve(held + of_network, of_network @ _difference(points, neural))
+    T = se3.orthonormalised(points.T_target_source @ se3.exp(step))
+    return replace(points, T_target_source=T, covariance=np.linalg.inv(of_points + of_network), method="refined")
 
 
-def _apart(xi: Array) -> str:
+def _difference(a: Registration, b: Registration) -> Array:
+    """xi (6,) [rad, m] that leads from one answer to the other."""
+    return se3.log(se3.inverse(a.T_target_source) @ b.T_target_source)
+
+
+def _apart(a: Registration, b: Registration) -> str:
+    xi = _difference(a, b)
     return f"{np.linalg.norm(xi[3:]):.2f} m, {np.degrees(np.linalg.norm(xi[:3])):.1f} deg"
 
 

@@ -33,7 +33,7 @@ class SlamSettings(Settings):
     """The SLAM, stage by stage."""
 
     registration: Literal["geometric", "neural", "refined"] = "geometric"
-    """How a scan finds its pose: by points, by neural descriptors, or by descriptors and then points."""
+    """How a scan finds its pose: by points, by neural descriptors, or by both."""
     threads: int = Field(2, ge=1)
     """Threads of the neighbour search and of the network."""
     filter: FilterSettings = FilterSettings()

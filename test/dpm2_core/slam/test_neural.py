@@ -104,6 +104,10 @@ def test_a_frame_seen_again_is_found_without_any_prior(
     assert (found.ok, found.method) == (True, "neural")
     np.testing.assert_allclose(found.T_target_source, place, atol=1e-3)  # fp16 features, bf16 arithmetic
     assert np.linalg.eigvalsh(found.covariance)[0] > 0
+    # but where the velocity is known, to 1 m/s, what contradicts it is refused
+    known = registration.register(scan, Prediction([wrong], information=np.eye(6) / 0.1**2))
+    assert (known.ok, known.reason) == (False, "contradicts the motion so far")
+    assert registration.register(scan, Prediction([place], information=np.eye(6) / 0.1**2)).ok
 
 
 def test_standing_still_from_the_first_frame_to_a_keyframe_with_descriptors(
