@@ -63,7 +63,7 @@ def bench_traffic(options: Options) -> Report:
         for seed in range(FIRST_SEED, FIRST_SEED + options.repetitions):
             name = f"{preset} {seed}"
             runs = drives.get(name, {}).get("runs", {})
-            missing = {r: [m for m in _methods() if m not in runs.get(r, {})] for r in wanted}
+            missing = {r: [m for m in _methods(r) if m not in runs.get(r, {})] for r in wanted}
             if not any(missing.values()):
                 continue
             world = build_world("straight", preset, seed, traffic=traffic)
@@ -78,10 +78,10 @@ def bench_traffic(options: Options) -> Report:
     return _report(drives, options)
 
 
-def _methods() -> list[str]:
-    """What is compared: `none`, the filters that have weights, the oracle."""
+def _methods(registration: str) -> list[str]:
+    """What is compared: `none`, the filters that have weights (with a network `movers` alone), the oracle."""
     shipped = [kind for kind, name in WEIGHTS.items() if (SHIPPED / f"{name}.safetensors").is_file()]
-    return ["none", *shipped, ORACLE]
+    return ["none", *(kind for kind in shipped if registration == "geometric" or kind == "movers"), ORACLE]
 
 
 def _settings(options: Options, registration: str) -> SlamSettings:
