@@ -31,6 +31,7 @@ class Oracle:
     T: Array = np.eye(4)
     ok = True
     size = 1
+    scale = 1.0
 
     def __len__(self) -> int:
         return self.size
@@ -46,7 +47,7 @@ class Oracle:
 
     def register(self, scan: Scan, prediction: Prediction) -> Registration:
         reason = "" if self.ok else "no idea"
-        return Registration(self.T, np.diag(SIGMA**2), 0.9, 0.1, "neural", self.ok, reason)
+        return Registration(self.T, np.diag((self.scale * SIGMA) ** 2), 0.9, 0.1, "neural", self.ok, reason)
 
 
 class Case:
@@ -83,6 +84,13 @@ def test_points_refine_the_network_where_both_agree(case: Case) -> None:
     answer, error = case.register([0, 0, 0.001, 0.05, -0.03, 0])
     assert (answer.ok, answer.method, answer.reason) == (True, "refined", "")
     assert error < 0.02  # the network was off by 6 cm
+
+
+def test_a_network_that_knows_much_less_moves_nothing(case: Case) -> None:
+    answer, _ = case.register([0, 0, 0.005, 0.3, -0.2, 0], scale=6.0)
+    assert (answer.ok, answer.method) == (True, "refined")
+    alone, _ = case.register([0, 0, 0, 0, 0, 0], size=0)
+    np.testing.assert_allclose(answer.T_target_source, alone.T_target_source, atol=1e-9)
 
 
 @pytest.mark.parametrize("silent", [{"ok": False}, {"size": 0}])
