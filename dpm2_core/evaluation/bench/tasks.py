@@ -54,8 +54,8 @@ _ODOMETRY = ("output_ate_m", "output_rpe_m", "output_rpe_deg")
 COMPARISONS: dict[str, Comparison] = {
     "gndnet": Comparison(
         settings=(
-            "network.cells=64", "network.channels=16", "gaps=0.1", "epochs=8", "rate=2e-3", "slam.gamma=1",
-            "slam.begin=4", "slam.every=2", "slam_loss.points=1024",
+            "network.cells=64", "network.channels=16", "gaps=0.1", "epochs=6", "rate=2e-3", "slam.gamma=1",
+            "slam.begin=2", "slam.every=2", "slam_loss.points=1024",
         ),
         figures={"mse": "lower", "miou": "higher", "precision": "higher", "recall": "higher"},
         drives=_USUAL,
@@ -63,10 +63,10 @@ COMPARISONS: dict[str, Comparison] = {
     "dslr": Comparison(
         settings=(
             "network.image.columns=128", "network.channels=24", "autoencoder_epochs=26", "discriminator_epochs=1",
-            "epochs=40", "window=3", "every=1", "batch=3", "rate=2e-3", "final_rate=1e-4", "slam.gamma=4",
+            "epochs=40", "window=3", "every=1", "batch=3", "rate=2e-3", "final_rate=1e-4", "slam.gamma=8",
             "slam.begin=28", "slam.every=3", "slam_loss.points=1024",
         ),
-        figures=dict.fromkeys(("chamfer_m", "chamfer", "moved_m", *_ODOMETRY), "lower"),
+        figures=dict.fromkeys(("chamfer_m", "chamfer", "moved_m", *_ODOMETRY, "kept_ate_m", "kept_rpe_m"), "lower"),
         drives=TaskDriveSettings(
             train=80, train_frames=12, val=8, val_frames=20, first_seed=7300, presets=("city", "suburb"), traffic=20
         ),
