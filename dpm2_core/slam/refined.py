@@ -16,13 +16,17 @@ from dpm2_core.slam.scan_registration import MAP_NOISE, GeometricScanRegistratio
 
 _ADDS = 0.1  # less information would lower a standard deviation by less than 5 %, and brings the errors of the network
 
+_LED = np.diag(np.repeat([np.radians(2), 0.5], 3) ** -2.0)
+"""How well the network's pose is known at least, rad and m: what the points need to be led by it, and no more."""
+
 
 class RefinedScanRegistration:
     """The points as the geometric registration has them, and the network where it knows more.
 
     Where both have an answer and agree (see `agree`), it is their mean, each weighed with its information: in town the
     points have it, along a tunnel the network. Where they contradict each other, the points have it: they are many, and
-    led there by the motion so far. Where the points have no answer they try again from the pose of the network; if they
+    led there by the motion so far. While no motion is known the pose of the network is one more start for them, and the
+    likeliest wins. Where the points have no answer they try again from the pose of the network; if they
     have none there, or another, the network answers alone, with its doubt. `reason` says who did not agree, and why.
     """
 
@@ -48,10 +52,12 @@ class RefinedScanRegistration:
         return self._geometric.refusal(scan)
 
     def register(self, scan: Scan, prediction: Prediction) -> Registration:
+        neural = self._neural.register(scan, prediction) if len(self._neural) else None
+        if neural is not None and neural.ok and prediction.information is None:
+            prediction = replace(prediction, starts=[neural.T_target_source, *prediction.starts])
         points = self._geometric.register(scan, prediction)
-        if not len(self._neural):
+        if neural is None:
             return _because(points, "neural: no descriptors yet")
-        neural = self._neural.register(scan, prediction)
         if not neural.ok:
             return _because(points, f"neural: {neural.reason}")
         if not points.ok:
@@ -62,7 +68,7 @@ class RefinedScanRegistration:
 
     def _led(self, scan: Scan, neural: Registration) -> Registration:
         """The points from the pose of the network, when the motion so far did not lead them to an answer."""
-        points = self._geometric.register(scan, Prediction([neural.T_target_source]))
+        points = self._geometric.register(scan, Prediction([neural.T_target_source], 1.0, _LED))
         if not points.ok:
             return replace(neural, reason=f"not refined: {points.reason}")
         if agree(points, neural):

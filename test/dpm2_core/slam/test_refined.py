@@ -132,6 +132,16 @@ def test_a_contradiction_that_nothing_settles_is_answered_with_doubt(case: Case)
     assert answer.worst_sigma > 0.5  # it covers its error of 0.63 m; beyond 0.08 m the state is `degraded`
 
 
+def test_while_no_motion_is_known_the_network_gives_one_more_start(case: Case) -> None:
+    """Points that start 12 m off settle elsewhere; from a network that is 0.6 m off, and sure of it, they do not."""
+    case.prediction = Prediction([case.truth @ se3.exp([0, 0, 0, 12, 0, 0])], widen=2.0)
+    _, lost = case.register([0, 0, 0, 0, 0, 0], size=0)
+    assert lost > 5
+    answer, error = case.register([0, 0, 0, 0.6, 0.2, 0], size=1)
+    assert (answer.ok, answer.method) == (True, "geometric")
+    assert error < 0.02
+
+
 def test_along_a_tunnel_the_network_has_it(tunnel: Drive) -> None:
     """There the points know every direction but one."""
     case = Case(tunnel)
