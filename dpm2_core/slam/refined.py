@@ -14,8 +14,6 @@ from dpm2_core.slam.neural import NeuralScanRegistration
 from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.scan_registration import MAP_NOISE, GeometricScanRegistration, Prediction, agree
 
-_ADDS = 0.1  # less information would lower a standard deviation by less than 5 %, and brings the errors of the network
-
 _LED = np.diag(np.repeat([np.radians(2), 0.5], 3) ** -2.0)
 """How well the network's pose is known at least, rad and m: what the points need to be led by it, and no more."""
 
@@ -23,11 +21,12 @@ _LED = np.diag(np.repeat([np.radians(2), 0.5], 3) ** -2.0)
 class RefinedScanRegistration:
     """The points as the geometric registration has them, and the network where it knows more.
 
-    Where both have an answer and agree (see `agree`), it is their mean, each weighed with its information: in town the
-    points have it, along a tunnel the network. Where they contradict each other, the points have it: they are many, and
-    led there by the motion so far. While no motion is known the pose of the network is one more start for them, and the
-    likeliest wins. Where the points have no answer they try again from the pose of the network; if they
-    have none there, or another, the network answers alone, with its doubt. `reason` says who did not agree, and why.
+    Where both have an answer and agree (see `agree`), it is that of the points, and along directions that the network
+    knows better the mean by information: in town the points have it, along a tunnel the network. Where they contradict
+    each other, the points have it: they are many, and led there by the motion so far. While no motion is known the pose
+    of the network is one more start for them, and the likeliest wins. Where the points have no answer they try again
+    from the pose of the network; if they have none there, or another, the network answers alone, with its doubt.
+    `reason` says who did not agree, and why.
     """
 
     def __init__(self, neural: NeuralScanRegistration, geometric: GeometricScanRegistration) -> None:
@@ -83,15 +82,16 @@ class RefinedScanRegistration:
 
 
 def _mean(points: Registration, neural: Registration, prior: Array | None) -> Registration:
-    """Both by their information; that of the prediction, prior (6, 6), holds the points but is no part of the doubt.
+    """Both by their information, along the directions that the network claims to know better than the points.
 
-    The network counts along those directions where it has at least `_ADDS` of the information of the points.
+    Elsewhere its errors would count for more than it adds: it judges itself too well and the points judge themselves
+    too badly. The information of the prediction, prior (6, 6), holds the points but is no part of the doubt.
     """
     of_points, of_network = np.linalg.inv(points.covariance), np.linalg.inv(neural.covariance + MAP_NOISE)
     held = of_points if prior is None else of_points + prior
-    ratio, axes = eigh(of_network, held)
-    dual = held @ axes
-    of_network = (dual * np.where(ratio < _ADDS, 0, ratio)) @ dual.T
+    ratio, axes = eigh(of_network, of_points)
+    dual = of_points @ axes
+    of_network = (dual * np.where(ratio < 1, 0, ratio)) @ dual.T
     step = np.linalg.solve(held + of_network, of_network @ _difference(points, neural))
     T = se3.orthonormalised(points.T_target_source @ se3.exp(step))
     return replace(points, T_target_source=T, covariance=np.linalg.inv(of_points + of_network), method="refined")
