@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from pathlib import Path
 from statistics import mean, pstdev
@@ -46,8 +47,10 @@ ARMS: dict[str, tuple[str, ...]] = {
     "trajectory": (),
     "pairs": ("trajectory=0", "pairs=1"),
     "both": ("pairs=1",),
+    "poses": ("trajectory=0", "pairs=1", "loss.pose=10"),
 }
-"""Losses: that of the trajectory, as `dpm2 finetune` has it, for every seed; with the pairs for the first."""
+"""Losses: that of the trajectory, as `dpm2 finetune` has it, for every seed; with the pairs for the first, alone, and
+with the error of their poses."""
 
 
 def bench_finetune(options: Options) -> Report:
@@ -60,20 +63,24 @@ def bench_finetune(options: Options) -> Report:
     torch.set_num_threads(options.threads)
     try:
         chosen = load_settings(FinetuneSettings, None, [STEPS, *options.overrides])
-        network = load_model(weights_path(chosen.weights))
+        weights = weights_path(chosen.weights)
+        network, digest = load_model(weights), hashlib.sha256(weights.read_bytes()).hexdigest()
         _prepare(folder, chosen, options)
         judges = {name: PairSet(folder / name, 2 * options.pairs, network.settings, False) for name in UNSEEN}
-        results = _read(path, chosen)
+        results = _read(path, chosen, digest)
         results.setdefault("before", {name: errors(judge, network) for name, judge in judges.items()})
         for arm, seed in _wanted(options):
             runs = results.setdefault("runs", {}).setdefault(arm, {})
             if str(seed) in runs:
                 continue
-            runs[str(seed)] = _run(arm, seed, folder, options, judges, results["before"])
-            write_report(path, "finetune", _report(results, chosen), options)
+            out = (
+                folder / f"{arm}_{seed}_{digest[:8]}"
+            )  # a training that was stopped goes on from its own weights alone
+            runs[str(seed)] = _run(arm, seed, folder / "data", out, options, judges, results["before"])
+            write_report(path, "finetune", _report(results, chosen, digest), options)
     finally:
         torch.set_num_threads(threads)
-    return _report(results, chosen)
+    return _report(results, chosen, digest)
 
 
 def _wanted(options: Options) -> list[tuple[str, int]]:
@@ -96,15 +103,14 @@ def _prepare(folder: Path, settings: FinetuneSettings, options: Options) -> None
 
 
 def _run(
-    arm: str, seed: int, folder: Path, options: Options, judges: dict[str, PairSet], before: dict[str, Any]
+    arm: str, seed: int, data: Path, out: Path, options: Options, judges: dict[str, PairSet], before: dict[str, Any]
 ) -> dict[str, Any]:
     """One training, what it cost, and the errors that are left."""
     overrides = [STEPS, *options.overrides, *ARMS[arm], f"optimiser.seed={seed}"]
     settings = load_settings(FinetuneSettings, None, overrides)
-    out = folder / f"{arm}_{seed}"
     out.mkdir(parents=True, exist_ok=True)
     cpu = process_time()
-    weights = finetune(settings, out, resume=(out / "checkpoint.pt").is_file(), data=folder / "data")
+    weights = finetune(settings, out, resume=(out / "checkpoint.pt").is_file(), data=data)
     seconds = process_time() - cpu
     model = load_model(weights)
     after = {name: errors(judge, model) for name, judge in judges.items()}
@@ -131,17 +137,17 @@ def errors(judge: PairSet, model: Any) -> dict[str, float]:
     }
 
 
-def _read(path: Path, settings: FinetuneSettings) -> dict[str, Any]:
-    """What an earlier run of the same settings has found."""
+def _read(path: Path, settings: FinetuneSettings, digest: str) -> dict[str, Any]:
+    """What an earlier run of the same settings and weights has found."""
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
-        same = record["settings"] == settings.model_dump(mode="json")
+        same = record["settings"] == settings.model_dump(mode="json") and record["weights_sha256"] == digest
         return {key: record[key] for key in ("before", "runs")} if same else {}
     except (OSError, ValueError, KeyError, TypeError):
         return {}
 
 
-def _report(results: dict[str, Any], settings: FinetuneSettings) -> Report:
+def _report(results: dict[str, Any], settings: FinetuneSettings, digest: str) -> Report:
     before, runs = results["before"], results.get("runs", {})
     summary: dict[str, Any] = {}
     for arm, seeds in runs.items():
@@ -164,7 +170,7 @@ def _report(results: dict[str, Any], settings: FinetuneSettings) -> Report:
             table.add_row(arm, seed, name, *cells, f"{row['success']:.1%}")
     record = {
         "lidar": LIDAR.model_dump(), "drives": {"presets": DRIVES, "frames": DRIVE_FRAMES},
-        "settings": settings.model_dump(mode="json"),
+        "settings": settings.model_dump(mode="json"), "weights_sha256": digest,
         "ratios": summary, "before": before, "runs": runs,
     }  # fmt: skip
     return Report(record, Group(table))
