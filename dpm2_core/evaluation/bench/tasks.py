@@ -54,8 +54,8 @@ _ODOMETRY = ("output_ate_m", "output_rpe_m", "output_rpe_deg")
 COMPARISONS: dict[str, Comparison] = {
     "gndnet": Comparison(
         settings=(
-            "network.cells=64", "network.channels=16", "gaps=0.1", "epochs=6", "rate=2e-3", "slam.gamma=1",
-            "slam.begin=2", "slam.every=2", "slam_loss.points=1024",
+            "network.cells=64", "network.channels=16", "gaps=0.1", "epochs=5", "rate=2e-3", "final_rate=2e-4",
+            "slam.gamma=1", "slam.begin=1", "slam.every=4", "slam_loss.points=1024",
         ),
         figures={"mse": "lower", "miou": "higher", "precision": "higher", "recall": "higher"},
         drives=_USUAL,
