@@ -17,8 +17,8 @@ class ScheduleSettings(Settings):
     """L = L_model + gamma L_slam in every k-th epoch, the second term bounded by a share of the first."""
 
     gamma: float = Field(default=0.0, ge=0)
-    """Weight of the SLAM loss; choose it so that gamma L_slam is a tenth to a half of L_model when it first counts.
-    0: it never counts."""
+    """Weight of the SLAM loss; choose it so that the gradient of gamma L_slam is about half of that of L_model when it
+    first counts. The losses themselves compare only where both are means. 0: it never counts."""
     every: int = Field(default=5, ge=1)
     """k: the last of every k epochs has the SLAM loss (the paper: 27 of 150 epochs for GndNet)."""
     begin: int = Field(default=0, ge=0)
