@@ -34,7 +34,8 @@ def train_task(
     val: TaskScans | None = None,
     until: int | None = None,
 ) -> Task:
-    """Train; checkpoint, log and at the end `WEIGHTS` go to `out`. The same seed gives the same weights.
+    """Train; checkpoint, log and at the end `WEIGHTS` go to `out`. The same seed gives the same weights,
+    on one thread to the last bit.
 
     Args:
         settings: of the type that `task_type(name)` names. val: scans to measure on as the training goes on.

@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from dpm2_core.diffslam.tasks.range_image import RangeImageSettings
 from dpm2_core.geometry import se3
@@ -16,6 +17,15 @@ MOTION = se3.exp([0, 0, 0.01, 0.6, 0.0, 0.0])
 BUILDING, CAR, ROAD, UNLABELLED = 50, 10, 40, 0
 SENSOR = RangeImageSettings(beams=((2.0, -14.0, 16),), first=0, rows=16, columns=64, scale=60.0)
 """Small enough for tests; what `pairs` writes fits it."""
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    """With several, gradients of indexing are summed in any order: equal weights, bit for bit, are for one alone."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
 def street_image(along: float, car: bool) -> np.ndarray:
