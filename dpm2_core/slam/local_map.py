@@ -13,6 +13,8 @@ from dpm2_core.geometry import se3
 from dpm2_core.geometry.planes import fit_planes
 from dpm2_core.geometry.voxel import voxel_first
 
+_YOUNG = 3  # scans
+
 
 class LocalMapSettings(Settings):
     """The local map of the odometry."""
@@ -45,6 +47,11 @@ class LocalMap:
 
     def __len__(self) -> int:
         return len(self.points)
+
+    @property
+    def is_young(self) -> bool:
+        """Whether few scans have entered: another one may well see what none of them did."""
+        return self._inserted <= _YOUNG
 
     def wants(self, T_odom_lidar: Array) -> bool:
         """Whether a scan taken at that pose would show enough that is new."""

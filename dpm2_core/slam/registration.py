@@ -27,8 +27,9 @@ class GeometricSettings(Settings):
     min_inliers: float = 0.5
     """A smaller share of inliers among the points is no answer."""
     min_inliers_expected: float = 0.3
-    """The same where the answer is what the motion so far led to expect, to 0.3 m and 2 degrees: two sources then say
-    the same. A young map, of which traffic hides ever other parts, has counterparts for no more."""
+    """The same in a map of at most 3 scans, where the answer is what the motion so far led to expect, to 0.3 m and
+    2 degrees: two sources then say the same, and such a map, of which traffic hides ever other parts, has counterparts
+    for no more. Of a map that has grown a scan without counterparts is another place."""
 
 
 _COARSE, _FINE = (1e-3, 0.02), (1e-4, 1e-3)  # rad and m: a smaller step ends the pass
@@ -82,7 +83,8 @@ class GeometricRegistration:
                     break
                 coarse, gate = False, s.final_gate
         share = inliers / len(points)
-        least = s.min_inliers_expected if predicted and _close(T_guess, T) else s.min_inliers
+        expected = predicted and target.is_young and _close(T_guess, T)
+        least = s.min_inliers_expected if expected else s.min_inliers
         ok = inliers >= s.min_points and share >= least
         reason = "" if ok else f"{inliers} of {len(points)} points fit the map"
         return Registration(T, _covariance(H), share, rmse, "geometric", ok, reason)

@@ -21,6 +21,9 @@ CHI2 = 22.46
 # What the covariances of two registrations leave out, rad and m: the poses of the frames that make up the maps.
 MAP_NOISE = np.diag(np.repeat([np.radians(0.1), 0.03], 3) ** 2)
 
+_EQUAL = 0.02
+"""Mean log likelihoods of the points that differ by less say nothing, such as along a tunnel."""
+
 
 def agree(a: Registration, b: Registration) -> bool:
     """Whether two answers may be one pose: xi^T (S_a + S_b + S_map)^-1 xi <= `CHI2`, xi (6,) being their difference."""
@@ -107,8 +110,10 @@ class GeometricScanRegistration:
         if len(found) == 1:
             return found[0]
         fit = [self._registration.likelihood(scan.source, self._local_map, r.T_target_source) for r in found]
-        best = max(zip(found, fit, strict=True), key=lambda of: (of[0].ok, of[1]))[0]
-        return next(r for r in found if r.ok == best.ok and agree(r, best))  # the first of equals: least motion
+        ok = max(r.ok for r in found)
+        best = max(value for r, value in zip(found, fit, strict=True) if r.ok == ok)
+        # The first of equals: least motion, where a tunnel fits anywhere.
+        return next(r for r, value in zip(found, fit, strict=True) if r.ok == ok and value >= best - _EQUAL)
 
     def update(self, scan: Scan, T_odom_lidar: Array) -> None:
         if self._local_map.wants(T_odom_lidar):
