@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Neural registration first, then the points; the one vouches for the other, and what differs is said."""
+"""The points, and the network where it knows more; the one vouches for the other, and what differs is said."""
 
 from __future__ import annotations
 

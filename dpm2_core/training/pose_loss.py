@@ -18,7 +18,7 @@ from dpm2_core.network.registration import correspond, guided_scores, match_scor
 ASTRAY = 1.0
 """A registration that is wrong by more than this has no gradient that leads back, m."""
 ROTATION = 25.0
-"""What the square of an angle counts for beside that of a distance, m2 / rad2: an error of 5 m lever."""
+"""What the square of an angle counts for beside that of a distance, m2 / rad2: as at a distance of 5 m."""
 FINE = 0.05
 """Errors well above this count as they are, not squared: the tail does not rule the step, m."""
 
