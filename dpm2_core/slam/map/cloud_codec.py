@@ -3,6 +3,8 @@
 
 A keyframe cloud of 18 thousand points takes 64 kB instead of 280: 3.6 bytes a point. Points keep their order, in which
 neighbours of a LiDAR's beam follow each other; that is what makes the differences small.
+
+What is unpacked comes from a file or over a network: its size is bounded before it is inflated.
 """
 
 from __future__ import annotations
@@ -13,24 +15,37 @@ import zlib
 import numpy as np
 from numpy.typing import NDArray
 
+from dpm2_core.errors import UsageError
 from dpm2_core.frame import Points
 
 QUANTUM = 0.01
 """Step of the coordinates, m: half the noise of a good LiDAR, so that the rounding (sigma 3 mm) is lost in it."""
+COARSEST = 1.0
+"""Largest step, m: what reaches beyond 32 km is no LiDAR's cloud."""
+_FINEST = 1e-4
+MAX_POINTS = 1 << 21
+"""Of one cloud: eight sensors with 128 beams of 2,048 points together."""
 _HEADER = struct.Struct("<If")  # points, quantum
+_BYTES = 7  # of a point, inflated
 _LARGEST = 32767
+
+
+class CodecError(UsageError, ValueError):
+    """Bytes that are not what they should be, or a cloud that cannot be packed; one line."""
 
 
 def pack_cloud(points: Points) -> bytes:
     """(M, 4) [x, y, z in m, intensity 0..1] as bytes; what reaches beyond 327 m is rounded more coarsely.
 
     Raises:
-        ValueError: coordinates that are not finite.
+        CodecError: values that are not finite, points beyond 32 km, or more than `MAX_POINTS`.
     """
     if not np.isfinite(points).all():
-        raise ValueError("a cloud with coordinates that are not finite")
+        raise CodecError("a cloud with coordinates that are not finite")
     reach = float(np.abs(points[:, :3]).max(initial=0.0))
     quantum = float(np.float32(max(QUANTUM, reach * 1.0001 / _LARGEST)))
+    if quantum > COARSEST or len(points) > MAX_POINTS:
+        raise CodecError(f"a cloud of {len(points)} points that reaches {reach:.0f} m: too large")
     steps = np.rint(points[:, :3].astype(np.float64) / quantum).astype(np.int64)
     # Differences wrap around at 16 bits, and unwrap when they are summed at 16 bits.
     delta = np.diff(steps, axis=0, prepend=0).astype("<i2")
@@ -40,18 +55,19 @@ def pack_cloud(points: Points) -> bytes:
 
 
 def unpack_cloud(data: bytes) -> Points:
-    """(M, 4) float32 of `pack_cloud`, its own array.
+    """(M, 4) float32 of `pack_cloud`, finite, its own array.
 
     Raises:
-        ValueError: the bytes are no packed cloud.
+        CodecError: the bytes are not a packed cloud.
     """
-    try:
-        count, quantum = _HEADER.unpack_from(data)
-        raw = zlib.decompress(data[_HEADER.size :])
-    except (struct.error, zlib.error) as error:
-        raise ValueError(f"no packed cloud: {error}") from None
-    if len(raw) != 7 * count:
-        raise ValueError(f"no packed cloud: {len(raw)} bytes for {count} points")
+    if len(data) < _HEADER.size:
+        raise CodecError(f"not a packed cloud: {len(data)} bytes")
+    count, quantum = _HEADER.unpack_from(data)
+    if count > MAX_POINTS:
+        raise CodecError(f"not a packed cloud: {count} points, at most {MAX_POINTS} are allowed")
+    if not _FINEST <= quantum <= COARSEST:  # neither is NaN
+        raise CodecError(f"not a packed cloud: a step of {quantum:g} m, {_FINEST:g} to {COARSEST:g} are allowed")
+    raw = _inflated(data[_HEADER.size :], _BYTES * count, f"packed cloud of {count} points")
     planes = np.frombuffer(raw, np.uint8, 6 * count).reshape(3, 2, count)
     delta = np.ascontiguousarray(planes.transpose(0, 2, 1)).view("<i2")[..., 0]
     points = np.empty((count, 4), np.float32)
@@ -69,12 +85,21 @@ def unpack_mask(data: bytes, count: int) -> NDArray[np.bool_]:
     """(count,) booleans of `pack_mask`.
 
     Raises:
-        ValueError: the bytes are no mask of so many.
+        CodecError: the bytes are not a mask of so many.
     """
+    raw = _inflated(data, (count + 7) // 8, f"packed mask of {count} points")
+    return np.unpackbits(np.frombuffer(raw, np.uint8))[:count].astype(bool)
+
+
+def _inflated(data: bytes, size: int, what: str) -> bytes:
+    """Exactly `size` bytes, and never more than one beyond them in memory."""
+    inflater = zlib.decompressobj()
     try:
-        bits = np.unpackbits(np.frombuffer(zlib.decompress(data), np.uint8))
+        raw = inflater.decompress(data, size + 1)
     except zlib.error as error:
-        raise ValueError(f"no packed mask: {error}") from None
-    if not count <= len(bits) < count + 8:
-        raise ValueError(f"no packed mask of {count}: {len(bits)} bits")
-    return bits[:count].astype(bool)
+        raise CodecError(f"not a {what}: {error}") from None
+    if len(raw) > size:
+        raise CodecError(f"not a {what}: more than its {size} bytes")
+    if len(raw) < size or not inflater.eof or inflater.unused_data:
+        raise CodecError(f"not a {what}: {len(raw)} of {size} bytes, cut off or followed by others")
+    return raw

@@ -3,14 +3,18 @@
 
 from __future__ import annotations
 
+import struct
 import subprocess
 import sys
+import tracemalloc
+import zlib
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dpm2_core.errors import UsageError
 from dpm2_core.geometry import se3
 from dpm2_core.slam.map.cloud_codec import QUANTUM, pack_cloud, pack_mask, unpack_cloud, unpack_mask
 from dpm2_core.slam.map.cloud_store import CloudStore, Loan
@@ -35,13 +39,37 @@ def test_rounding_is_half_a_step(count: int, reach: float, seed: int) -> None:
     np.testing.assert_allclose(back[:, 3], cloud[:, 3], atol=0.502 / 255)
 
 
-def test_what_is_no_cloud_is_refused() -> None:
-    with pytest.raises(ValueError, match="not finite"):
-        pack_cloud(np.full((1, 4), np.nan, np.float32))
+def test_what_is_no_cloud_is_rejected() -> None:
+    for bad in (np.full((1, 4), np.nan, np.float32), np.full((1, 4), 1e5, np.float32)):
+        with pytest.raises(UsageError, match="a cloud .*(not finite|too large)"):
+            pack_cloud(bad)
     good = pack_cloud(clouds()[0])
-    for bad in (b"", good[:-5], good[:8] + b"garbage", b"\xff" + good[1:]):
-        with pytest.raises(ValueError, match="no packed cloud"):
+    for bad in (b"", good[:-5], good[:8] + b"garbage", good[:8], b"\xff" + good[1:], good + b"more"):
+        with pytest.raises(UsageError, match="^not a packed cloud") as error:
             unpack_cloud(bad)
+        assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("quantum", [np.inf, -np.inf, np.nan, 0.0, -0.01, 1e-5, 1.1, 3e38])
+def test_a_step_that_no_cloud_has_is_rejected(quantum: float) -> None:
+    good = pack_cloud(clouds()[0])
+    with pytest.raises(UsageError, match="a step of .* m, 0.0001 to 1 are allowed"):
+        unpack_cloud(good[:4] + struct.pack("<f", quantum) + good[8:])
+
+
+@pytest.mark.parametrize("count", [10, 1_000_000, 0xFFFFFFFF])
+def test_a_bomb_is_not_inflated(count: int) -> None:
+    """200 kB that would become 200 MB: no more memory is taken than so many points need, whatever is claimed."""
+    bomb = zlib.compress(bytes(200_000_000), 9)
+    tracemalloc.start()
+    try:
+        with pytest.raises(UsageError, match="^not a packed cloud"):
+            unpack_cloud(struct.pack("<If", count, 0.01) + bomb)
+        with pytest.raises(UsageError, match="^not a packed mask"):
+            unpack_mask(bomb, min(count, 1_000_000))
+        assert tracemalloc.get_traced_memory()[1] < 3 * 7 * 1_000_000 + 1_000_000  # zlib doubles its buffer
+    finally:
+        tracemalloc.stop()
 
 
 @given(st.lists(st.booleans(), max_size=40))
