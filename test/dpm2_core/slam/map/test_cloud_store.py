@@ -41,11 +41,11 @@ def test_rounding_is_half_a_step(count: int, reach: float, seed: int) -> None:
 
 def test_what_is_no_cloud_is_rejected() -> None:
     for bad in (np.full((1, 4), np.nan, np.float32), np.full((1, 4), 1e5, np.float32)):
-        with pytest.raises(UsageError, match="a cloud .*(not finite|too large)"):
+        with pytest.raises(UsageError, match=r"a cloud .*(not finite|too large)"):
             pack_cloud(bad)
     good = pack_cloud(clouds()[0])
     for bad in (b"", good[:-5], good[:8] + b"garbage", good[:8], b"\xff" + good[1:], good + b"more"):
-        with pytest.raises(UsageError, match="^not a packed cloud") as error:
+        with pytest.raises(UsageError, match=r"^not a packed cloud") as error:
             unpack_cloud(bad)
         assert "\n" not in str(error.value)
 
@@ -53,7 +53,7 @@ def test_what_is_no_cloud_is_rejected() -> None:
 @pytest.mark.parametrize("quantum", [np.inf, -np.inf, np.nan, 0.0, -0.01, 1e-5, 1.1, 3e38])
 def test_a_step_that_no_cloud_has_is_rejected(quantum: float) -> None:
     good = pack_cloud(clouds()[0])
-    with pytest.raises(UsageError, match="a step of .* m, 0.0001 to 1 are allowed"):
+    with pytest.raises(UsageError, match=r"a step of .* m, 0.0001 to 1 are allowed"):
         unpack_cloud(good[:4] + struct.pack("<f", quantum) + good[8:])
 
 
@@ -63,9 +63,9 @@ def test_a_bomb_is_not_inflated(count: int) -> None:
     bomb = zlib.compress(bytes(200_000_000), 9)
     tracemalloc.start()
     try:
-        with pytest.raises(UsageError, match="^not a packed cloud"):
+        with pytest.raises(UsageError, match=r"^not a packed cloud"):
             unpack_cloud(struct.pack("<If", count, 0.01) + bomb)
-        with pytest.raises(UsageError, match="^not a packed mask"):
+        with pytest.raises(UsageError, match=r"^not a packed mask"):
             unpack_mask(bomb, min(count, 1_000_000))
         assert tracemalloc.get_traced_memory()[1] < 3 * 7 * 1_000_000 + 1_000_000  # zlib doubles its buffer
     finally:
