@@ -87,6 +87,15 @@ def orthonormalised(T: Array) -> Array:
     return make(U @ Vt, T[..., :3, 3])
 
 
+def is_rigid(T: Array, tolerance: float = 1e-3) -> bool:
+    """Whether (4, 4) is a finite rigid transform; what is off by more than `tolerance` is damage, not rounding."""
+    if not np.isfinite(T).all():
+        return False
+    R = T[:3, :3]
+    off = np.abs(R @ R.T - np.eye(3)).max() + np.abs(T[3] - [0, 0, 0, 1]).max()
+    return bool(off < tolerance and np.linalg.det(R) > 0)
+
+
 def quaternion(T: Array) -> Array:
     """Rotation of (4, 4) as the unit quaternion x, y, z, w with w >= 0."""
     q = Rotation.from_matrix(T[:3, :3]).as_quat()

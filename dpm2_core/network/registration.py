@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from dpm2_core.frame import Registration
+from dpm2_core.geometry import se3
 from dpm2_core.geometry.kabsch import transform, weighted_kabsch
 from dpm2_core.network.consensus import TOLERANCE, consensus
 from dpm2_core.network.descriptors import Tokens
@@ -267,7 +268,9 @@ def _answer(T: Tensor, covariance: Tensor, confidence: float, rmse: float, count
         return _nothing("no finite pose")
     if count < 3:
         return _nothing(f"{count} matching descriptors, want 3")
-    return Registration(T.numpy(), covariance.numpy(), confidence, rmse, "neural", overlap=overlap)
+    # Rigid to float64: the solver composes many steps, and an exponential of a large one leaves 1 + 2e-15 behind.
+    rigid = se3.orthonormalised(T.double().numpy())
+    return Registration(rigid, covariance.numpy(), confidence, rmse, "neural", overlap=overlap)
 
 
 def _nothing(reason: str) -> Registration:

@@ -23,7 +23,6 @@ from dpm2_core.slam.map.cloud_store import CloudStore, Loan
 from dpm2_core.slam.map.data import NO_POINTS, MapData, save_as, subset
 from dpm2_core.slam.map.rows import Edge, Session, bytes_array, edge_of, pruned_of, unpack_descriptors
 
-_RIGID = 1e-3  # a rotation matrix that is off by more is damage, not rounding
 _DOUBT = np.diag([0.05] * 3 + [0.5] * 3) ** 2  # of an edge that bridges a lost keyframe, rad and m
 
 
@@ -141,7 +140,7 @@ class _Salvage:
         session: dict[int, int] = {}
         loans: dict[int, Loan] = {}
         for node, id, robot, number, stamp, frame, T, lender, T_lent in self._rows("keyframes"):
-            if not _rigid(T_odom_kf := bytes_array(T, 4)):
+            if not se3.is_rigid(T_odom_kf := bytes_array(T, 4)):
                 self._problem(f"keyframe {node}: its odometry pose is no finite rigid transform")
                 continue
             keyframes[node] = Keyframe(id, stamp, frame, T_odom_kf, NO_POINTS, None, robot)
@@ -184,7 +183,7 @@ class _Salvage:
         T_map_odom = np.eye(4)
         for node in sorted(keyframes):
             T = stored.get(node)
-            if T is None or not _rigid(T):
+            if T is None or not se3.is_rigid(T):
                 what = "lost" if T is None else "no finite rigid transform"
                 self._problem(f"keyframe {node}: its optimised pose is {what}")
                 T = T_map_odom @ keyframes[node].T_odom_kf
@@ -198,7 +197,7 @@ class _Salvage:
             edge = edge_of(row)
             if edge.from_node not in new or edge.to_node not in new:
                 self._problem(f"edge {row[0]}: leads from {edge.from_node} to {edge.to_node}, which are not both there")
-            elif not _rigid(edge.T_from_to) or (edge.ok and not _positive(edge.covariance)):
+            elif not se3.is_rigid(edge.T_from_to) or (edge.ok and not _positive(edge.covariance)):
                 self._problem(f"edge {row[0]}: not a finite rigid transform with a positive covariance")
             else:
                 edges.append(replace(edge, from_node=new[edge.from_node], to_node=new[edge.to_node]))
@@ -267,11 +266,6 @@ class _Salvage:
 
     def _problem(self, text: str) -> None:
         self._findings.problems.append(text)
-
-
-def _rigid(T: Array) -> bool:
-    R = T[:3, :3]
-    return bool(np.isfinite(T).all() and np.abs(R @ R.T - np.eye(3)).max() < _RIGID and (T[3] == [0, 0, 0, 1]).all())
 
 
 def _positive(covariance: Array) -> bool:

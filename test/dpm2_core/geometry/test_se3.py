@@ -112,3 +112,19 @@ def test_transform_moves_points_and_keeps_what_else_they_carry() -> None:
     assert out[1, 3] == np.float32(0.7)
     assert points[0, 0] == 1, "the input must stay"
     assert se3.transform(T, points[:0]).shape == (0, 4)
+
+
+def test_what_is_rigid() -> None:
+    """Rounding passes, wherever it is; damage, reflections and what is not finite do not."""
+    T = se3.exp([0.1, -2.0, 0.3, 1e5, 2, -3])
+    assert se3.is_rigid(T)
+    assert se3.is_rigid(T.astype(np.float32).astype(np.float64))
+    for at, value in (((3, 3), 1 + 2e-15), ((0, 0), T[0, 0] + 1e-7)):
+        rounded = T.copy()
+        rounded[at] = value
+        assert se3.is_rigid(rounded)
+    for at, value in (((3, 3), 1.1), ((3, 0), 0.1), ((0, 0), T[0, 0] + 0.1), ((0, 3), np.nan), ((1, 1), np.inf)):
+        bad = T.copy()
+        bad[at] = value
+        assert not se3.is_rigid(bad)
+    assert not se3.is_rigid(np.diag([1.0, 1, -1, 1]))

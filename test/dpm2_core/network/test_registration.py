@@ -205,6 +205,18 @@ def test_registration_of_sets_of_different_sizes(model: DeepPointMap2, noise: np
         assert alone.confidence == pytest.approx(answer.confidence, abs=0.05)
 
 
+def test_every_pose_is_rigid_to_float64(model: DeepPointMap2, noise: np.random.Generator) -> None:
+    """Also where nothing fits and the solver has gone far astray: a map keeps rejected loops, too."""
+    for scale in (1, 10, 100):
+        sets = [described(model, noise, 90) for _ in range(12)]
+        sets = [Descriptors(d.xyz * np.float32(scale), d.features) for d in sets]
+        for found in model.decoder.register_many(sets[:6], sets[6:]):
+            assert (found.T_target_source[3] == [0, 0, 0, 1]).all()
+            R = found.T_target_source[:3, :3]
+            np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-14)
+            assert np.linalg.det(R) > 0
+
+
 def test_too_few_descriptors_are_no_registration(model: DeepPointMap2, noise: np.random.Generator) -> None:
     """Not ok, with a reason, and no exception."""
     answer = model.decoder.register(described(model, noise, 1), described(model, noise, 1))

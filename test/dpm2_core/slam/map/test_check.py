@@ -45,6 +45,15 @@ def test_a_sound_map_has_no_problems(map_file: Path, drive: list[Keyframe]) -> N
     np.testing.assert_array_equal(data.poses[11], drive[11].T_odom_kf)
 
 
+def test_rounding_is_no_damage(map_file: Path) -> None:
+    """A loop that was rejected, as dpm2 0.1 wrote it: 1 + 2e-15 in its last corner."""
+    T = np.eye(4)
+    T[3, 3] = 1.0000000000000016
+    row = (90, "loop", 1, 5, T.tobytes(), np.eye(6).tobytes(), 0, 0.0, 1.9, "neural", "too unlike")
+    execute(map_file, ("INSERT INTO edges VALUES (?,?,?,?,?,?,?,?,?,?,?,?)", with_crc(*row)))
+    assert check_map(map_file).problems == []
+
+
 def test_each_kind_of_damage_is_named(map_file: Path, drive: list[Keyframe]) -> None:
     nan, eye6 = np.full((4, 4), np.nan).tobytes(), np.eye(6).tobytes()
     execute(
