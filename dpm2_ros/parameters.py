@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T", bound=Settings)
 CONFIG_FILE = "config_file"
-_OF_RCLPY = ("use_sim_time", "start_type_description_service", "qos_overrides.")
+_OF_RCLPY = ("use_sim_time", "start_type_description_service")
 
 
 def load_parameters(node: Node, kind: type[T]) -> T:
@@ -41,12 +41,17 @@ def load_parameters(node: Node, kind: type[T]) -> T:
         UsageError: an unknown parameter or a value that is not allowed.
     """
     fields = dict(flat_fields(kind))
-    given = {
+    declared = {
         name: parameter.value
         for name, parameter in node.get_parameters_by_prefix("").items()
-        if not name.startswith(_OF_RCLPY) and parameter.value is not None
+        if not name.startswith(_OF_RCLPY)
     }
+    given = {name: value for name, value in declared.items() if value is not None}
     file = given.pop(CONFIG_FILE, "")
+    if not isinstance(file, str):
+        raise UsageError(f"ROS parameter: {CONFIG_FILE}: want the path of a file, got {file!r}")
+    if any(name.startswith("qos_overrides.") for name in given):
+        raise UsageError("qos_overrides is not supported; ros.reliability and ros.queue_depth are the inputs' QoS")
     if unknown := sorted(set(given) - set(fields)):
         raise UsageError(f"unknown parameter {', '.join(unknown)}; docs/parameters.md lists them")
     tree = load_settings(kind, Path(file) if file else None).model_dump()
@@ -57,9 +62,9 @@ def load_parameters(node: Node, kind: type[T]) -> T:
             branch = branch[part]
         branch[leaf] = value.tolist() if hasattr(value, "tolist") else value
     config = settings_from(kind, tree, dict.fromkeys(given, "ROS parameter"))
-    for name in (*given, *([CONFIG_FILE] if file else [])):
+    for name in declared:
         node.undeclare_parameter(name)
-    _declare(node, CONFIG_FILE, str(file), "YAML file with settings, as for `dpm2 run --config`.", None)
+    _declare(node, CONFIG_FILE, file, "YAML file with settings, as for `dpm2 run --config`.", None)
     for name, info in fields.items():
         _declare(node, name, _plain(functools.reduce(getattr, name.split("."), config)), _text(info), info)
     return config

@@ -17,6 +17,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 from std_msgs.msg import Float64
 
 from dpm2_core.data import topics
+from dpm2_core.data.kitti import checked_correction
 from dpm2_core.data.messages import stamp_ns
 from dpm2_core.data.source import InputSettings
 from dpm2_core.data.transforms import TransformTree
@@ -36,12 +37,15 @@ class MatchedSubscription:
 
     A reliable subscriber never connects to a best-effort publisher, and a best-effort one loses data that a reliable
     publisher would have sent again. So it starts reliable, and `refresh`, called often, follows the publishers.
+
+    Attributes:
+        topic: its full name, after remapping.
     """
 
     def __init__(self, node: Node, kind: type, topic: str, callback: Callable[[Any], None], ros: RosSettings) -> None:
         self._node, self._kind, self._callback = node, kind, callback
         self._setting, self._depth = ros.reliability, ros.queue_depth
-        self.topic: str = node.resolve_topic_name(topic)
+        self._given, self.topic = topic, node.resolve_topic_name(topic)
         self.reliability = ReliabilityPolicy.RELIABLE
         self._subscription: Any = None
         self.refresh()
@@ -58,7 +62,7 @@ class MatchedSubscription:
             return
         before, self.reliability = self._subscription, wanted
         qos = QoSProfile(depth=self._depth, history=HistoryPolicy.KEEP_LAST, reliability=wanted)
-        self._subscription = self._node.create_subscription(self._kind, self.topic, self._callback, qos)
+        self._subscription = self._node.create_subscription(self._kind, self._given, self._callback, qos)
         if before is not None:
             self._node.destroy_subscription(before)
             self._node.get_logger().info(f"{self.topic}: {wanted.name.lower()}, as its publisher")
@@ -69,13 +73,14 @@ class StaticTransforms:
 
     def __init__(self, node: Node) -> None:
         self._node = node
+        self._topic = node.resolve_topic_name(topics.TF_STATIC)
         self.tree = TransformTree()
         if TFMessage is not None:
             node.create_subscription(TFMessage, topics.TF_STATIC, self._on_message, LATCHED)
 
     def knows(self, frame: str) -> bool:
         """Whether the frame is in the tree, or nobody is there who could put it in."""
-        return frame.lstrip("/") in self.tree.frames or not self._node.count_publishers(topics.TF_STATIC)
+        return frame.lstrip("/") in self.tree.frames or not self._node.count_publishers(self._topic)
 
     def _on_message(self, message: Any) -> None:
         tree = copy.deepcopy(self.tree)  # the worker may be reading the present one
@@ -87,12 +92,17 @@ class StaticTransforms:
 
 
 class Inputs:
-    """Clouds, images and calibration as they come in. The callbacks only put them into the synchroniser's queue."""
+    """Clouds, images and calibration as they come in. The callbacks only put them into the synchroniser's queue.
+
+    Attributes:
+        points_topic, image_topic: full names, after remapping; no image_topic where images are not wanted.
+    """
 
     def __init__(self, node: Node, settings: InputSettings, ros: RosSettings) -> None:
         self._node = node
-        self.points_topic = settings.points_topic or topics.POINTS
-        self.image_topic = (settings.image_topic or topics.IMAGE) if settings.images else ""
+        points_topic, image_topic = settings.points_topic or topics.POINTS, settings.image_topic or topics.IMAGE
+        self.points_topic = node.resolve_topic_name(points_topic)
+        self.image_topic = node.resolve_topic_name(image_topic) if settings.images else ""
         self._image_shift = round(settings.image_time_offset * 1e9)
         self._arrived = threading.Condition()
         self.synchronizer = Synchronizer(
@@ -104,15 +114,15 @@ class Inputs:
         self.camera_info: CameraInfo | None = None
         self.angle_correction_deg: float | None = None
         self.static = StaticTransforms(node)
-        self.subscriptions = [MatchedSubscription(node, PointCloud2, self.points_topic, self._on_cloud, ros)]
+        self.subscriptions = [MatchedSubscription(node, PointCloud2, points_topic, self._on_cloud, ros)]
         if self.image_topic:
             image_type = CompressedImage if self.image_topic.endswith("/compressed") else Image
-            beside = self.image_topic.removesuffix("/compressed").rpartition("/")[0]
-            info_topic = settings.camera_info_topic or f"{beside}/camera_info".removeprefix("" if beside else "/")
+            info_topic = settings.camera_info_topic or _camera_info_beside(node, image_topic)
             self.subscriptions += [
-                MatchedSubscription(node, image_type, self.image_topic, self._on_image, ros),
+                MatchedSubscription(node, image_type, image_topic, self._on_image, ros),
                 MatchedSubscription(node, CameraInfo, info_topic, self._on_camera_info, ros),
             ]
+        self._correction_topic = node.resolve_topic_name(topics.VERTICAL_ANGLE_CORRECTION)
         node.create_subscription(Float64, topics.VERTICAL_ANGLE_CORRECTION, self._on_correction, LATCHED)
         node.create_timer(0.1, self._refresh, clock=STEADY)
 
@@ -131,7 +141,7 @@ class Inputs:
         """Whether everything latched that somebody publishes about the LiDAR has arrived."""
         correction = self.angle_correction_deg is not None
         return self.static.knows(lidar_frame) and (
-            correction or not self._node.count_publishers(topics.VERTICAL_ANGLE_CORRECTION)
+            correction or not self._node.count_publishers(self._correction_topic)
         )
 
     def candidates(self) -> list[str]:
@@ -170,8 +180,24 @@ class Inputs:
         self.camera_info = message
 
     def _on_correction(self, message: Float64) -> None:
-        self.angle_correction_deg = message.data
+        try:
+            self.angle_correction_deg = checked_correction(message.data, self._correction_topic)
+        except UsageError as error:
+            self._node.get_logger().error(f"{error}; ignored", throttle_duration_sec=5)
 
     def _refresh(self) -> None:
         for subscription in self.subscriptions:
             subscription.refresh()
+
+
+def _camera_info_beside(node: Node, image_topic: str) -> str:
+    """The camera_info beside the images where they really come from, unless it has a remapping of its own."""
+    usual = _beside(image_topic)
+    if node.resolve_topic_name(usual) != node.resolve_topic_name(usual, only_expand=True):
+        return usual
+    return _beside(node.resolve_topic_name(image_topic))
+
+
+def _beside(image_topic: str) -> str:
+    folder = image_topic.removesuffix("/compressed").rpartition("/")[0]
+    return f"{folder}/camera_info".removeprefix("" if folder or image_topic.startswith("/") else "/")

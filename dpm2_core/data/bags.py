@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from dpm2_core.data import topics
 from dpm2_core.data.bag_file import open_bag
-from dpm2_core.data.kitti import HDL64_CORRECTION_DEG, correct_vertical_angle
+from dpm2_core.data.kitti import HDL64_CORRECTION_DEG, checked_correction, correct_vertical_angle
 from dpm2_core.data.messages import MessageError, decode_camera, decode_image, decode_points, stamp_ns
 from dpm2_core.data.source import InputSettings
 from dpm2_core.data.transforms import TransformTree, transform_matrix
@@ -152,7 +152,7 @@ class BagSource:
             return wanted
         said = self._bag.first(topics.VERTICAL_ANGLE_CORRECTION)
         if said is not None:
-            return float(said.data)
+            return checked_correction(float(said.data), f"{self.path}: {topics.VERTICAL_ANGLE_CORRECTION}")
         return HDL64_CORRECTION_DEG if self.points_topic.startswith("/kitti/") else 0.0
 
     def _pairs(self) -> Iterator[tuple[int, bytes, bytes | None]]:

@@ -23,7 +23,19 @@ from dpm2_core.geometry import se3
 HDL64_CORRECTION_DEG = 0.205
 """What KITTI's scans lack in elevation: the intrinsic calibration of its HDL-64 (J.-E. Deschaud, "IMLS-SLAM", 2018)."""
 
+_MAX_CORRECTION_DEG = 5.0
 _PERIOD = 0.1  # s between scans, where times.txt does not say
+
+
+def checked_correction(value: float, where: str) -> float:
+    """A correction from a file or a message, within the bounds of the setting.
+
+    Raises:
+        UsageError: it is not; the message begins with `where`.
+    """
+    if not abs(value) <= _MAX_CORRECTION_DEG:
+        raise UsageError(f"{where}: want a vertical angle correction of -5 to 5 degrees, got {value}")
+    return value
 
 
 def correct_vertical_angle(points: Points, degrees: float) -> Points:
@@ -94,11 +106,12 @@ class KittiSource:
             return wanted
         note = self.path / "dpm2_sim.json"  # a simulated sensor has no such error, and says so
         try:
-            return float(json.loads(note.read_text(encoding="utf-8"))["vertical_angle_correction_deg"])
+            said = float(json.loads(note.read_text(encoding="utf-8"))["vertical_angle_correction_deg"])
         except FileNotFoundError:
             return HDL64_CORRECTION_DEG
         except (OSError, ValueError, TypeError, KeyError) as error:
             raise UsageError(f"{note}: no number vertical_angle_correction_deg ({error})") from None
+        return checked_correction(said, str(note))
 
     def _stamps(self) -> NDArray[np.int64]:
         """(len,) ns, continued at a steady pace where times.txt ends early."""

@@ -86,6 +86,14 @@ def test_parameters_override_the_file(tmp_path: Path) -> None:
     assert node.get_parameter("config_file").value == str(file)
 
 
+def test_empty_texts_are_defaults_where_the_default_is_empty() -> None:
+    """As a parameter file or a launch file gives them."""
+    empty = [name for name, info in flat_fields(NodeConfig) if info.get_default(call_default_factory=True) == ""]
+    config, node = load("config_file:=''", *(f"{name}:=''" for name in empty))
+    assert config == NodeConfig()
+    assert node.get_parameter("config_file").value == ""
+
+
 @pytest.mark.parametrize(
     ("parameter", "message"),
     [
@@ -98,6 +106,8 @@ def test_parameters_override_the_file(tmp_path: Path) -> None:
         ("ros.map_frame:=''", "ros.map_frame"),
         ("input.T_lidar_cam:=[1.0, 2.0]", "input.T_lidar_cam"),
         ("config_file:=/no/such.yaml", "/no/such.yaml: No such file"),
+        ("config_file:=5", "config_file: want the path of a file, got 5"),
+        ("qos_overrides./points.subscription.depth:=3", "qos_overrides is not supported; ros.reliability"),
     ],
 )
 def test_mistakes_are_named(parameter: str, message: str) -> None:

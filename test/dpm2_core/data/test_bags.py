@@ -199,6 +199,9 @@ def test_vertical_angle_correction_is_what_the_recording_says(bags: Any, tmp_pat
     assert BagSource(simulated).vertical_angle_correction_deg == 0
     assert BagSource(other).vertical_angle_correction_deg == 0
     assert BagSource(other, InputSettings(vertical_angle_correction_deg=0.3)).vertical_angle_correction_deg == 0.3
+    absurd = (1, "/kitti/vertical_angle_correction_deg", bags.new("std_msgs/Float64", data=90.0))
+    with pytest.raises(UsageError, match=r"_deg: want a vertical angle correction of -5 to 5 degrees, got 90"):
+        BagSource(bags.write(tmp_path / "absurd", [*clouds(bags, [1]), absurd]))
     raw, corrected = (next(BagSource(path).frames()).points for path in (simulated, kitti))
     assert corrected[0, 2] - raw[0, 2] == pytest.approx(np.hypot(raw[0, 0], raw[0, 1]) * np.radians(0.205), rel=5e-3)
 

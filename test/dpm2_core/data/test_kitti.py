@@ -127,6 +127,11 @@ def test_correction_is_on_for_kitti_and_off_where_the_simulator_says_so(kitti_fo
     (folder / "dpm2_sim.json").write_text("{}")
     with pytest.raises(UsageError, match=r"dpm2_sim.json: no number vertical_angle_correction_deg"):
         KittiSource(folder)
+    (folder / "dpm2_sim.json").write_text('{"vertical_angle_correction_deg": NaN}')
+    with pytest.raises(
+        UsageError, match=r"dpm2_sim.json: want a vertical angle correction of -5 to 5 degrees, got nan"
+    ):
+        KittiSource(folder)
 
 
 def test_intensities_of_other_recorders_become_one_at_most(kitti_folder: MakeFolder) -> None:
