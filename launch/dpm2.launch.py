@@ -1,77 +1,116 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`ros2 launch dpm2_ros dpm2.launch.py [bag:=FOLDER] [params:=FILE] [rviz:=false] [embed_mapper:=false] ...`."""
+"""`ros2 launch dpm2_ros dpm2.launch.py [bag:=FOLDER] [params_file:=FILE] [rviz:=false] ...`; `--show-args` lists all.
 
+An argument that is left empty is not given to the nodes: files and defaults decide.
+"""
+
+import re
 from pathlib import Path
 
-from ament_index_python.packages import get_package_share_directory
+from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, SetEnvironmentVariable
-from launch.conditions import IfCondition, UnlessCondition
-from launch.substitutions import LaunchConfiguration, PythonExpression
+from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction, Shutdown
+from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
-
-SHARE = Path(get_package_share_directory("dpm2_ros"))
 
 ARGUMENTS = {
     "bag": ("", "rosbag2 folder or .mcap to play; empty: live sensors"),
     "rate": ("1.0", "speed of the bag"),
+    "params_file": ("", "ROS parameter file of the nodes"),
     "config_file": ("", "YAML file with settings, as for `dpm2 run --config`"),
-    "points_topic": ("/kitti/velo/pointcloud", "point clouds"),
-    "image_topic": ("/kitti/camera_color_left/image_raw", "images"),
-    "embed_mapper": ("true", "the mapper within slam_node; false starts mapper_node beside it"),
-    "map_directory": ("dpm2_map", "where the map is saved at the end; empty: nowhere"),
+    "points_topic": ("", "point clouds; empty: /kitti/velo/pointcloud"),
+    "image_topic": ("", "images; empty: /kitti/camera_color_left/image_raw"),
+    "base_frame": ("", "frame whose pose is published; empty: the root above the LiDAR in /tf_static"),
+    "odom_frame": ("", "frame of the odometry; empty: odom"),
+    "embed_mapper": ("", "true: the mapper within slam_node; false: mapper_node beside it; empty: true"),
+    "map_directory": ("", "where the map is saved at the end; empty: ros.map_directory"),
+    "map_file": ("", "map file that is written, or, with localization_mode, read; empty: ros.map_file"),
+    "localization_mode": ("", "true: slam_node finds itself in map_file"),
     "namespace": ("", "of all nodes: one a robot"),
-    "rviz": ("true", "show the map in RViz"),
+    "rviz": ("true", "show the map in RViz, if it is installed"),
     "use_sim_time": ("auto", "follow /clock; auto: with a bag"),
 }
+CHOICES = {
+    "embed_mapper": ["", "true", "false"],
+    "localization_mode": ["", "true", "false"],
+    "rviz": ["true", "false"],
+    "use_sim_time": ["auto", "true", "false"],
+}
+PARAMETERS = {
+    "config_file": "config_file",
+    "points_topic": "input.points_topic",
+    "image_topic": "input.image_topic",
+    "base_frame": "ros.base_frame",
+    "odom_frame": "ros.odom_frame",
+    "embed_mapper": "ros.embed_mapper",
+    "map_directory": "ros.map_directory",
+    "map_file": "ros.map_file",
+    "localization_mode": "ros.localization_mode",
+}
+SHOWN = {"points_topic": "/kitti/velo/pointcloud", "image_topic": "/kitti/camera_color_left/image_raw"}
+
+
+def parameters(value: dict[str, str]) -> dict[str, bool | str]:
+    """What the nodes are given, by the arguments' values."""
+    given = {parameter: value[argument] for argument, parameter in PARAMETERS.items()}
+    given["use_sim_time"] = value["use_sim_time"]
+    if value["use_sim_time"] == "auto":
+        given["use_sim_time"] = "true" if value["bag"] else ""
+    return {name: {"true": True, "false": False}.get(text, text) for name, text in given.items() if text}
+
+
+def rviz_remappings(value: dict[str, str], layout: str) -> dict[str, str]:
+    """From the topics of the layout, which are those of a robot without namespace and of KITTI's, to this robot's."""
+    here = "/" + "".join(f"{part}/" for part in value["namespace"].split("/") if part)
+    rules = {topic: here + topic[1:] for topic in re.findall(r"/(?:dpm2/\w+|initialpose)", layout)}
+    for argument, topic in SHOWN.items():
+        if wanted := value[argument]:
+            rules[topic] = wanted if wanted.startswith("/") else here + wanted
+    return {topic: target for topic, target in rules.items() if topic != target}
+
+
+def _typed(given: dict[str, bool | str]) -> list[dict[str, bool | ParameterValue]]:
+    """Texts stay texts, whatever YAML would take them for."""
+    typed = {n: ParameterValue(v, value_type=str) if isinstance(v, str) else v for n, v in given.items()}
+    return [typed] if typed else []
+
+
+def _actions(context) -> list:
+    value = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
+    given = parameters(value)
+    common = {"package": "dpm2_ros", "namespace": value["namespace"], "output": "screen"}
+    common["parameters"] = [*([value["params_file"]] if value["params_file"] else []), *_typed(given)]
+    actions = [Node(executable="slam_node", on_exit=Shutdown(), **common)]
+    if value["embed_mapper"] == "false":
+        actions.append(Node(executable="mapper_node", **common))
+    if value["bag"]:
+        options = [value["bag"], "--rate", value["rate"], "--wait", "30"]
+        actions.append(Node(package="dpm2_ros", executable="bag_player", output="screen", arguments=options))
+    if value["rviz"] == "true":
+        actions.append(_rviz(value, bool(given.get("use_sim_time"))))
+    return actions
+
+
+def _rviz(value: dict[str, str], sim_time: bool) -> Node | LogInfo:
+    try:
+        get_package_share_directory("rviz2")
+    except PackageNotFoundError:
+        return LogInfo(msg="rviz2 is not installed: nothing is shown")
+    layout = Path(get_package_share_directory("dpm2_ros")) / "config" / "dpm2.rviz"
+    return Node(
+        package="rviz2",
+        executable="rviz2",
+        arguments=["-d", str(layout)],
+        parameters=[{"use_sim_time": sim_time}],
+        remappings=list(rviz_remappings(value, layout.read_text()).items()),
+    )
 
 
 def generate_launch_description() -> LaunchDescription:
-    """slam_node, and as asked for: mapper_node, bag_player, RViz. All with the Fast DDS profile for large messages."""
-    value = {name: LaunchConfiguration(name) for name in ARGUMENTS}
-    with_bag = ["'", value["bag"], "' != ''"]
-    asked = ["'", value["use_sim_time"], "' == "]
-    sim_time = ParameterValue(
-        PythonExpression([*asked, "'true' or (", *asked, "'auto' and ", *with_bag, ")"]), value_type=bool
-    )
-    parameters = {
-        "use_sim_time": sim_time,
-        # Typed, since an empty text would otherwise be read as YAML's null.
-        "config_file": ParameterValue(value["config_file"], value_type=str),
-        "input.points_topic": ParameterValue(value["points_topic"], value_type=str),
-        "input.image_topic": ParameterValue(value["image_topic"], value_type=str),
-        "ros.embed_mapper": ParameterValue(value["embed_mapper"], value_type=bool),
-        "ros.map_directory": ParameterValue(value["map_directory"], value_type=str),
-    }
-    common = {"package": "dpm2_ros", "namespace": value["namespace"], "output": "screen"}
-    return LaunchDescription(
-        [
-            *(
-                DeclareLaunchArgument(name, default_value=default, description=text)
-                for name, (default, text) in ARGUMENTS.items()
-            ),
-            SetEnvironmentVariable("FASTRTPS_DEFAULT_PROFILES_FILE", str(SHARE / "config" / "fastdds.xml")),
-            Node(executable="slam_node", parameters=[parameters], **common),
-            Node(
-                executable="mapper_node",
-                parameters=[parameters],
-                condition=UnlessCondition(value["embed_mapper"]),
-                **common,
-            ),
-            Node(
-                package="dpm2_ros",
-                executable="bag_player",
-                output="screen",
-                arguments=[value["bag"], "--rate", value["rate"], "--wait", "30"],
-                condition=IfCondition(PythonExpression(with_bag)),
-            ),
-            Node(
-                package="rviz2",
-                executable="rviz2",
-                arguments=["-d", str(SHARE / "config" / "dpm2.rviz")],
-                parameters=[{"use_sim_time": sim_time}],
-                condition=IfCondition(value["rviz"]),
-            ),
-        ]
-    )
+    """slam_node, and as asked for: mapper_node, bag_player, RViz. It ends when slam_node does."""
+    declared = [
+        DeclareLaunchArgument(name, default_value=default, description=text, choices=CHOICES.get(name))
+        for name, (default, text) in ARGUMENTS.items()
+    ]
+    return LaunchDescription([*declared, OpaqueFunction(function=_actions)])

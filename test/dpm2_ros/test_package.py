@@ -18,7 +18,6 @@ from rclpy.node import Node
 
 from dpm2_ros import build_tf2_msgs
 from dpm2_ros.replay import ros_environment
-from dpm2_ros.settings import NodeConfig
 from dpm2_ros.share import share_directory
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -130,27 +129,6 @@ def test_the_rviz_layout_shows_topics_that_exist() -> None:
     ours = {topic for topic in shown if topic.startswith("/dpm2/")}
     assert {"/dpm2/map", "/dpm2/path", "/dpm2/odom"} <= ours
     assert all(f'"{topic[1:]}"' in code for topic in ours)
-
-
-def test_the_launch_file_gives_parameters_and_options_that_exist() -> None:
-    """launch_ros is in no package registry: the file is read, not run."""
-    tree = ast.parse((ROOT / "launch" / "dpm2.launch.py").read_text())
-    dictionaries = [node for node in ast.walk(tree) if isinstance(node, ast.Dict)]
-    keys = {key.value for node in dictionaries for key in node.keys if isinstance(key, ast.Constant)}
-    parameters = {key for key in keys if key.startswith(("ros.", "input.", "slam."))}
-    assert len(parameters) >= 4
-    for name in parameters:
-        section, field = name.split(".")
-        assert field in type(getattr(NodeConfig(), section)).model_fields
-    executables = {
-        word.value.value
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Call)
-        for word in node.keywords
-        if word.arg == "executable"
-    }
-    assert executables == {*EXECUTABLES, "rviz2"}
-    assert any(isinstance(node, ast.FunctionDef) and node.name == "generate_launch_description" for node in tree.body)
 
 
 def test_tf2_msgs_built_here_talks_to_those_of_ros(tmp_path: Path) -> None:
