@@ -21,6 +21,7 @@ from dpm2_core.slam.map import schema
 from dpm2_core.slam.map.cloud_codec import pack_cloud, unpack_cloud
 from dpm2_core.slam.map.cloud_store import CloudStore, Loan
 from dpm2_core.slam.map.data import NO_POINTS, MapData, save_as, subset
+from dpm2_core.slam.map.database import connect
 from dpm2_core.slam.map.rows import Edge, Session, bytes_array, edge_of, pruned_of, unpack_descriptors
 
 _DOUBT = np.diag([0.05] * 3 + [0.5] * 3) ** 2  # of an edge that bridges a lost keyframe, rad and m
@@ -68,9 +69,9 @@ def check_map(path: Path, recover: Path | None = None) -> Findings:
 def _opened(copy: Path, path: Path, findings: Findings) -> sqlite3.Connection:
     """The copy of the map as a database; with a new first page where the old one makes no sense."""
     try:
-        sql = sqlite3.connect(copy, isolation_level=None)
+        sql: sqlite3.Connection = connect(copy, "rw")
         version = schema.version_of(sql, path)
-        sql.execute("SELECT count(*) FROM sqlite_master").fetchone()
+        schema.check(sql, version)
     except sqlite3.DatabaseError as error:
         findings.problems.append(f"header: {error}")
         sql = _with_new_header(copy)
@@ -88,7 +89,7 @@ def _opened(copy: Path, path: Path, findings: Findings) -> sqlite3.Connection:
 def _with_new_header(copy: Path) -> sqlite3.Connection:
     """The first page holds the schema, which is the same in all maps: that of an empty one serves."""
     empty = copy.with_name("empty")
-    with closing(sqlite3.connect(empty, isolation_level=None)) as sql:
+    with closing(connect(empty, "rwc")) as sql:
         schema.create(sql)
         size = sql.execute("PRAGMA page_size").fetchone()[0]
     Path(f"{copy}-wal").unlink(missing_ok=True)
@@ -97,7 +98,7 @@ def _with_new_header(copy: Path) -> sqlite3.Connection:
     page[32:40] = bytes(8)  # no free pages
     with copy.open("r+b") as file:
         file.write(page)
-    return sqlite3.connect(copy, isolation_level=None)
+    return connect(copy, "rw")
 
 
 class _Salvage:

@@ -13,6 +13,7 @@ import zlib
 from pathlib import Path
 
 from dpm2_core.errors import UsageError
+from dpm2_core.slam.map.database import check_schema, statements
 
 APPLICATION_ID = 0x64706D32
 """The bytes `dpm2` at offset 68 of the file."""
@@ -93,6 +94,12 @@ CONTENT = {
 }  # fmt: skip
 """Columns of the tables with checksums, in the order in which the checksum takes them."""
 
+_SCHEMA_1 = """
+CREATE TABLE about (program TEXT, created TEXT, config TEXT, weights TEXT);
+CREATE TABLE keyframes (node INTEGER PRIMARY KEY, robot TEXT, stamp INTEGER, frame INTEGER, T_odom_kf BLOB,
+  T_map_kf BLOB, cloud BLOB, descriptors BLOB);
+CREATE TABLE edges (kind TEXT, from_node INTEGER, to_node INTEGER, T_from_to BLOB, covariance BLOB);
+"""
 # Version 1 kept payloads beside the keyframes, without checksums, masks or refused loops.
 _TO_2 = """
 ALTER TABLE keyframes RENAME TO keyframes_1;
@@ -147,6 +154,15 @@ def version_of(connection: sqlite3.Connection, path: Path) -> int:
     if version > VERSION:
         raise UsageError(f"{path}: written by a later dpm2 (map version {version}, this one reads up to {VERSION})")
     return version
+
+
+def check(connection: sqlite3.Connection, version: int) -> None:
+    """Whether the database has the tables of that version and nothing else.
+
+    Raises:
+        sqlite3.DatabaseError: it has not, or cannot be read.
+    """
+    check_schema(connection, statements(_SCHEMA_1 if version < 2 else SCHEMA))
 
 
 def migrate(connection: sqlite3.Connection, version: int) -> None:

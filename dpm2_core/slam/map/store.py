@@ -17,13 +17,13 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 from dpm2_core import __version__
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Array, Keyframe
 from dpm2_core.slam.map import schema
 from dpm2_core.slam.map.cloud_store import Loan
+from dpm2_core.slam.map.database import Connection, connect
 from dpm2_core.slam.map.rows import (
     Edge,
     Pruned,
@@ -37,6 +37,7 @@ from dpm2_core.slam.map.rows import (
 )
 
 _BUSY_S = 5.0  # a reader never blocks the writer for long, another writer is an error
+_HEAD = b"SQLite format 3"
 
 
 @dataclass
@@ -74,11 +75,13 @@ class MapStore:
         Raises:
             UsageError: there is a file already. Dpm2Error: it cannot be made.
         """
-        if path.exists():
-            raise UsageError(f"{path}: there is a file already")
         with _explained(path):
             path.parent.mkdir(parents=True, exist_ok=True)
-            store = cls(path, _connect(f"file:{quote(str(path))}?mode=rwc"), False)
+            try:
+                path.touch(exist_ok=False)  # of two programs that want the same name, one gets it
+            except FileExistsError:
+                raise UsageError(f"{path}: there is a file already") from None
+            store = cls(path, _connect(path, "rw"), False)
             _durable(store._connection)
             schema.create(store._connection)
             return store
@@ -93,11 +96,12 @@ class MapStore:
         if not path.is_file():
             raise UsageError(f"{path}: no such map file")
         with _explained(path):
-            if _head(path)[:15] != b"SQLite format 3":
+            if _head(path)[:15] != _HEAD:
                 raise UsageError(f"{path}: not a dpm2 map")
-            store = _open_read_only(path) if read_only else cls(path, _connect(_uri(path, "rw")), False)
+            store = _open_read_only(path) if read_only else cls(path, _connect(path, "rw"), False)
             try:
                 version = schema.version_of(store._connection, path)
+                schema.check(store._connection, version)
                 if version < schema.VERSION and not read_only:
                     schema.migrate(store._connection, version)
                 elif version < schema.VERSION:
@@ -150,19 +154,20 @@ class MapStore:
             _insert(sql, "trail", [pruned_row(p) for p in change.trail])
 
     def rows(self, table: str, columns: str = "", checked: bool = True) -> Iterator[tuple[Any, ...]]:
-        """Rows of a table in the order of its first column, without checksums.
+        """Rows of a table in their order, without checksums.
 
         Raises:
             Dpm2Error: damage; `dpm2 map check` says how much.
         """
-        names = schema.CONTENT.get(table)
-        if names is None or columns:
-            with _explained(self.path):
-                yield from self._connection.execute(f"SELECT {columns or '*'} FROM {table} ORDER BY 1")
-            return
+        names = () if columns else schema.CONTENT.get(table, ())
+        wanted = ", ".join((*names, "crc")) if names else columns or "*"
         with _explained(self.path):
-            for *row, crc in self._connection.execute(f"SELECT {', '.join(names)}, crc FROM {table} ORDER BY 1"):
-                if checked and schema.row_crc(*row) != crc:
+            before = None
+            for key, *row in self._connection.execute(f"SELECT rowid, {wanted} FROM {table} ORDER BY rowid"):
+                if before is not None and key <= before:  # a tree whose pages lead in a circle has no end
+                    raise sqlite3.DatabaseError(f"malformed: {table} {key} comes after {before}")
+                before = key
+                if names and row.pop() != schema.row_crc(*row) and checked:
                     raise Dpm2Error(f"{self.path}: {table} {row[0]} is damaged; see dpm2 map check")
                 yield tuple(row)
 
@@ -228,13 +233,8 @@ def _insert(sql: sqlite3.Connection, table: str, rows: Sequence[tuple[Any, ...]]
         sql.executemany(f"INSERT OR REPLACE INTO {table} VALUES ({','.join('?' * len(rows[0]))})", rows)
 
 
-def _uri(path: Path, mode: str) -> str:
-    return f"file:{quote(str(path))}?mode={mode}"
-
-
-def _connect(uri: str) -> sqlite3.Connection:
-    # The mapper of a ROS node is made in one thread and used in another, never in two at once.
-    return sqlite3.connect(uri, _BUSY_S, isolation_level=None, check_same_thread=False, uri=True)
+def _connect(path: Path, mode: str) -> Connection:
+    return connect(path, mode, _BUSY_S)
 
 
 def _durable(connection: sqlite3.Connection) -> None:
@@ -247,11 +247,11 @@ def _open_read_only(path: Path) -> MapStore:
     wal = Path(f"{path}-wal")
     if not wal.exists() or not wal.stat().st_size:
         if _head(path)[18] == 1:  # closed, with a journal on rollback: a reader leaves no trace
-            return MapStore(path, _connect(_uri(path, "ro")), True)
-        return MapStore(path, _connect(_uri(path, "ro") + "&immutable=1"), True)
-    connection = _connect(_uri(path, "ro"))
+            return MapStore(path, _connect(path, "ro"), True)
+        return MapStore(path, _connect(path, "ro&immutable=1"), True)
+    connection = _connect(path, "ro")
     try:
-        connection.execute("SELECT count(*) FROM sqlite_master").fetchone()
+        connection.execute("SELECT name FROM sqlite_master LIMIT 1").fetchone()
         return MapStore(path, connection, True)
     except sqlite3.OperationalError:  # a folder that cannot be written: SQLite needs FILE-shm to read FILE-wal
         connection.close()
@@ -270,14 +270,15 @@ def _copied(path: Path) -> MapStore:
     for suffix in ("", "-wal"):
         with suppress(FileNotFoundError):
             shutil.copyfile(f"{path}{suffix}", f"{copy}{suffix}")
-    store = MapStore(path, _connect(_uri(copy, "rw")), True)
+    store = MapStore(path, _connect(copy, "rw"), True)
     store._copy = folder
     return store
 
 
 def _migrated_copy(store: MapStore, version: int) -> MapStore:
     """An older map, read-only: brought up to date in memory."""
-    memory = sqlite3.connect(":memory:", isolation_level=None, check_same_thread=False)
+    size = store.path.stat().st_size
+    memory = Connection(":memory:", isolation_level=None, check_same_thread=False, size=size)
     with closing(store._connection) as source:
         source.backup(memory)
     schema.migrate(memory, version)

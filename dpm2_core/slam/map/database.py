@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An SQLite file of unknown origin: nothing in it is executed, and nothing in it keeps a query busy without end.
+
+What sqlite.org/security.html asks of whoever opens such files. A map is tables and nothing else, so the text of its
+schema is compared with ours, and a view, a trigger or an expression in it is an error before any row is read.
+"""
+
+from __future__ import annotations
+
+import re
+import sqlite3
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+MAX_VALUE = 64 << 20
+"""Bytes of one value or row: the largest cloud is a quarter of it."""
+_EVERY = 100_000  # steps of SQLite's virtual machine between two calls of the handler
+_STEPS = 30_000_000  # of one statement, besides one a byte of the file: a second or two
+
+
+class Connection(sqlite3.Connection):
+    """Ends every statement that takes more steps than a map of the file's size can need."""
+
+    def __init__(self, database: str | Path, *arguments: Any, size: int = 0, **options: Any) -> None:
+        """As `sqlite3.connect`; `size`: of the file, bytes."""
+        super().__init__(database, *arguments, **options)
+        self._steps = _Steps((_STEPS + size) // _EVERY)
+        self.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_VALUE)
+        self.setlimit(sqlite3.SQLITE_LIMIT_ATTACHED, 0)
+        self.execute("PRAGMA trusted_schema = OFF")
+        self.execute("PRAGMA cell_size_check = ON")
+        self.set_progress_handler(self._steps, _EVERY)
+
+    def execute(self, *arguments: Any) -> sqlite3.Cursor:
+        self._steps.taken = 0
+        return super().execute(*arguments)
+
+    def executemany(self, *arguments: Any) -> sqlite3.Cursor:
+        self._steps.taken = 0
+        return super().executemany(*arguments)
+
+    def executescript(self, *arguments: Any) -> sqlite3.Cursor:
+        self._steps.taken = 0
+        return super().executescript(*arguments)
+
+
+class _Steps:
+    """Counts calls; the one beyond `most` tells SQLite to stop."""
+
+    def __init__(self, most: int) -> None:
+        self.taken, self._most = 0, most
+
+    def __call__(self) -> bool:
+        self.taken += 1
+        return self.taken > self._most
+
+
+def connect(path: Path, mode: str, timeout: float = 5.0, size: int | None = None) -> Connection:
+    """Open a database file.
+
+    Args:
+        mode: of SQLite's file URIs: ro, rw, rwc; `ro&immutable=1` for a file that nobody writes to.
+        size: of the file where it is to be another than that of `path` now, bytes.
+    """
+    if size is None:
+        size = sum(file.stat().st_size for suffix in ("", "-wal") if (file := Path(f"{path}{suffix}")).exists())
+    # The mapper of a ROS node is made in one thread and used in another, never in two at once.
+    return Connection(
+        f"file:{quote(str(path))}?mode={mode}", timeout, isolation_level=None, check_same_thread=False, uri=True,
+        size=size,
+    )  # fmt: skip
+
+
+def check_schema(connection: sqlite3.Connection, tables: Mapping[str, str]) -> None:
+    """Compare what is in a database with the tables that belong there, CREATE statement by name.
+
+    Raises:
+        sqlite3.DatabaseError: one is missing, is there besides, or is not as it should be; or nothing can be read.
+    """
+    left = dict(tables)
+    for kind, name, sql in connection.execute("SELECT type, name, sql FROM sqlite_master"):
+        if kind != "table" or name not in left:
+            raise sqlite3.DatabaseError(f"malformed: {kind} {name} does not belong into a dpm2 map")
+        if not isinstance(sql, str) or _bare(sql) != _bare(left.pop(name)):
+            raise sqlite3.DatabaseError(f"malformed: table {name} is not that of a dpm2 map")
+    if left:
+        raise sqlite3.DatabaseError(f"malformed: no table {', '.join(left)}")
+
+
+def statements(script: str) -> dict[str, str]:
+    """The CREATE TABLE statements of a script by the name of their table."""
+    found: Sequence[str] = re.findall(r"CREATE TABLE [^;]*", script)
+    return {statement.split(None, 3)[2]: statement for statement in found}
+
+
+def _bare(sql: str) -> str:
+    """Without comments and needless spaces. What equals a text without quotes has none: all its `--` are comments."""
+    return re.sub(r" ?([(),]) ?", r"\1", re.sub(r"\s+", " ", re.sub(r"--[^\n]*", " ", sql))).strip()
