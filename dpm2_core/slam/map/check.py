@@ -17,13 +17,14 @@ import numpy as np
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Array, Keyframe
 from dpm2_core.geometry import se3
-from dpm2_core.slam.map import schema
+from dpm2_core.slam.map import rows, schema
 from dpm2_core.slam.map.cloud_codec import pack_cloud, unpack_cloud
 from dpm2_core.slam.map.cloud_store import CloudStore, Loan
 from dpm2_core.slam.map.data import NO_POINTS, MapData, save_as, subset
 from dpm2_core.slam.map.database import connect
-from dpm2_core.slam.map.rows import Edge, Session, bytes_array, edge_of, pruned_of, unpack_descriptors
+from dpm2_core.slam.map.rows import Edge, Pruned, Session
 
+_SMALLEST = 20  # bytes of a row: a file has at most so many as fit, and nobody waits for the row 2^62 of a small one
 _DOUBT = np.diag([0.05] * 3 + [0.5] * 3) ** 2  # of an edge that bridges a lost keyframe, rad and m
 
 
@@ -57,7 +58,7 @@ def check_map(path: Path, recover: Path | None = None) -> Findings:
             with suppress(FileNotFoundError):
                 shutil.copyfile(f"{path}{suffix}", f"{copy}{suffix}")
         with closing(_opened(copy, path, findings)) as sql:
-            data = _Salvage(sql, findings).run()
+            data = _Salvage(sql, copy.stat().st_size // _SMALLEST, findings).run()
             findings.keyframes = len(data)
             if recover is not None:
                 if not len(data):
@@ -104,8 +105,9 @@ def _with_new_header(copy: Path) -> sqlite3.Connection:
 class _Salvage:
     """Reads what can be read of a map."""
 
-    def __init__(self, sql: sqlite3.Connection, findings: Findings) -> None:
-        self._sql, self._findings = sql, findings
+    def __init__(self, sql: sqlite3.Connection, most: int, findings: Findings) -> None:
+        """`most`: rows that a table can have."""
+        self._sql, self._most, self._findings = sql, most, findings
 
     def run(self) -> MapData:
         """All that is good, without gaps."""
@@ -116,11 +118,11 @@ class _Salvage:
         last = max(good, default=-1) + 1
         moving: list[bytes | None] = [None] * last
         for node, mask in self._rows("moving"):
-            if node in keyframes:
+            if node in keyframes and isinstance(mask, bytes):
                 moving[node] = mask
         edges = self._edges(new)
         edges = self._bridged(edges, [keyframes[node] for node in good], [session[node] for node in good])
-        trail = [pruned_of((*row[:4], new[row[4]], row[5])) for row in self._rows("trail", "rowid") if row[4] in new]
+        trail = self._trail(new)
         # A map in the old numbers with holes, of which the good nodes are then taken.
         nothing = pack_cloud(NO_POINTS)
         filler = Keyframe(0, 0, 0, np.eye(4), NO_POINTS)
@@ -140,27 +142,27 @@ class _Salvage:
         keyframes: dict[int, Keyframe] = {}
         session: dict[int, int] = {}
         loans: dict[int, Loan] = {}
-        for node, id, robot, number, stamp, frame, T, lender, T_lent in self._rows("keyframes"):
-            if not se3.is_rigid(T_odom_kf := bytes_array(T, 4)):
-                self._problem(f"keyframe {node}: its odometry pose is no finite rigid transform")
+        for row in self._rows("keyframes"):
+            try:
+                node, keyframes[row[0]], session[row[0]], loan = rows.keyframe_of(row)
+            except ValueError as error:
+                self._problem(f"keyframe {row[0]}: {error}")
                 continue
-            keyframes[node] = Keyframe(id, stamp, frame, T_odom_kf, NO_POINTS, None, robot)
-            session[node] = number
-            if lender is not None:
-                loans[node] = Loan(lender, bytes_array(T_lent, 4))
+            if loan is not None:
+                loans[node] = loan
         end = self._end()
         if missing := sorted(set(range(end)) - keyframes.keys()):
             self._problem(f"keyframes lost: {_listed(missing)}")
             self._findings.lost = len(missing)
         for node, loan in list(loans.items()):
-            if loan.lender not in keyframes:
-                self._problem(f"keyframe {node}: borrows the cloud of {loan.lender}, which is lost")
+            if loan.lender not in keyframes or loan.lender in loans:
+                self._problem(f"keyframe {node}: borrows the cloud of {loan.lender}, which is lost or has none")
                 del loans[node]
         without = [node for node in keyframes if node not in loans and self._payload(node, complain=True)[0] is None]
         self._findings.lost_clouds = len(without)
         for node in keyframes.keys() - set(without) - loans.keys():
             packed = self._payload(node)[1]
-            descriptors = None if packed is None else unpack_descriptors(packed)
+            descriptors = None if packed is None else rows.unpack_descriptors(packed)
             keyframes[node] = replace(keyframes[node], descriptors=descriptors)
         return keyframes, session, loans
 
@@ -171,22 +173,26 @@ class _Salvage:
             if row is None:
                 raise ValueError("none there")
             unpack_cloud(row[1])
+            if row[2] is not None:
+                rows.unpack_descriptors(row[2])
             return row[1], row[2], row[3]
-        except ValueError as error:
+        except (ValueError, TypeError) as error:
             if complain:
                 self._problem(f"keyframe {node}: its payload is lost: {error}")
             return None, None, None
 
     def _poses(self, keyframes: dict[int, Keyframe]) -> dict[int, Array]:
         """T_map_kf by node; one that is lost follows from the keyframe before, by odometry."""
-        stored = {node: bytes_array(T, 4) for node, T in self._rows("poses")}
+        stored = dict(self._rows("poses"))
         poses: dict[int, Array] = {}
         T_map_odom = np.eye(4)
         for node in sorted(keyframes):
-            T = stored.get(node)
-            if T is None or not se3.is_rigid(T):
-                what = "lost" if T is None else "no finite rigid transform"
-                self._problem(f"keyframe {node}: its optimised pose is {what}")
+            try:
+                if node not in stored:
+                    raise ValueError("lost")
+                T = rows.pose_of(stored[node])
+            except ValueError as error:
+                self._problem(f"keyframe {node}: its optimised pose is {error}")
                 T = T_map_odom @ keyframes[node].T_odom_kf
             poses[node] = T
             T_map_odom = T @ se3.inverse(keyframes[node].T_odom_kf)
@@ -195,14 +201,24 @@ class _Salvage:
     def _edges(self, new: dict[int, int]) -> list[Edge]:
         edges = []
         for row in self._rows("edges"):
-            edge = edge_of(row)
-            if edge.from_node not in new or edge.to_node not in new:
-                self._problem(f"edge {row[0]}: leads from {edge.from_node} to {edge.to_node}, which are not both there")
-            elif not se3.is_rigid(edge.T_from_to) or (edge.ok and not _positive(edge.covariance)):
-                self._problem(f"edge {row[0]}: not a finite rigid transform with a positive covariance")
+            try:
+                edge = rows.edge_of(row)
+                rows.check_ends(edge, new)
+            except ValueError as error:
+                self._problem(f"edge {row[0]}: {error}")
             else:
                 edges.append(replace(edge, from_node=new[edge.from_node], to_node=new[edge.to_node]))
         return edges
+
+    def _trail(self, new: dict[int, int]) -> list[Pruned]:
+        trail = []
+        for row in self._rows("trail", "rowid"):
+            try:
+                pruned = rows.pruned_of(row)
+                trail.append(replace(pruned, node=new[pruned.node]))
+            except (ValueError, KeyError):
+                self._problem(f"trail {row[0]}: not a pose beside a keyframe that is there")
+        return trail
 
     def _bridged(self, edges: list[Edge], keyframes: list[Keyframe], session: list[int]) -> list[Edge]:
         """With odometry edges over the holes that lost keyframes and edges have left."""
@@ -217,8 +233,8 @@ class _Salvage:
 
     def _sessions(self, session: dict[int, int]) -> list[Session]:
         try:
-            return [Session(*row) for row in self._sql.execute("SELECT * FROM sessions ORDER BY session")]
-        except sqlite3.DatabaseError as error:
+            return [rows.session_of(row) for row in self._sql.execute("SELECT * FROM sessions ORDER BY session")]
+        except (sqlite3.DatabaseError, ValueError) as error:
             self._problem(f"sessions: {error}")
             return [Session(number, "", "", "", "") for number in sorted(set(session.values()))]
 
@@ -253,9 +269,12 @@ class _Salvage:
 
     def _last(self, table: str, key: str) -> int:
         try:
-            return int(self._sql.execute(f"SELECT coalesce(max({key}), -1) FROM {table}").fetchone()[0])
+            last = int(self._sql.execute(f"SELECT coalesce(max({key}), -1) FROM {table}").fetchone()[0])
         except (sqlite3.DatabaseError, TypeError, ValueError):
-            return self._end() * 10  # of edges there are several a keyframe
+            return min(self._end() * 10, self._most)  # of edges there are several a keyframe
+        if last > self._most:
+            self._problem(f"{table}: a row {last} in a file of at most {self._most}")
+        return min(last, self._most)
 
     def _end(self) -> int:
         """One more than the last node that any table knows."""
@@ -263,14 +282,10 @@ class _Salvage:
         for table in ("keyframes", "payloads", "poses"):
             with suppress(sqlite3.DatabaseError, TypeError, ValueError):
                 last = max(last, int(self._sql.execute(f"SELECT coalesce(max(node), -1) FROM {table}").fetchone()[0]))
-        return min(last, 10_000_000) + 1
+        return min(last, self._most) + 1
 
     def _problem(self, text: str) -> None:
         self._findings.problems.append(text)
-
-
-def _positive(covariance: Array) -> bool:
-    return bool(np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance)[0] > 0)
 
 
 def _listed(numbers: list[int]) -> str:

@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -15,10 +17,22 @@ from dpm2_core.geometry import se3
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.map.cloud_store import CloudStore, Loan
-from dpm2_core.slam.map.rows import Edge, Pruned, Session, bytes_array, edge_of, pruned_of, unpack_descriptors
+from dpm2_core.slam.map.rows import NO_POINTS as NO_POINTS
+from dpm2_core.slam.map.rows import (
+    Edge,
+    Pruned,
+    Session,
+    check_ends,
+    edge_of,
+    keyframe_of,
+    pose_of,
+    pruned_of,
+    session_of,
+    unpack_descriptors,
+)
 from dpm2_core.slam.map.store import Change, MapStore
 
-NO_POINTS: Points = np.zeros((0, 4), np.float32)
+_T = TypeVar("_T")
 Thumbnail = Callable[[int], bytes | None]
 
 
@@ -65,41 +79,80 @@ def load_map(store: MapStore, descriptors: bool = True) -> MapData:
 
 
 def _load(store: MapStore, descriptors: bool) -> MapData:
-    keyframes, session, loans = [], [], {}
-    for position, (node, id, robot, number, stamp, frame, T, lender, T_lent) in enumerate(store.rows("keyframes")):
-        if node != position:
-            raise ValueError(f"keyframe {position} is missing")
-        keyframes.append(Keyframe(id, stamp, frame, bytes_array(T, 4), NO_POINTS, None, robot))
-        session.append(number)
-        if lender is not None:
-            loans[node] = Loan(lender, bytes_array(T_lent, 4))
-    count = len(keyframes)
-    if descriptors:
-        for node in range(count):
-            if (data := store.payload(node, "descriptors")) is not None:
-                keyframes[node] = replace(keyframes[node], descriptors=unpack_descriptors(data))
-        for node, loan in loans.items():
-            keyframes[node] = borrowing(keyframes[node], keyframes, loan)
-    edges = [edge_of(row) for row in store.rows("edges")]
+    keyframes, session, loans = _load_keyframes(store, descriptors)
+    nodes = range(len(keyframes))
+    edges = []
+    for number, edge in _made(store, "edges", edge_of):
+        with _of("edge", number):
+            check_ends(edge, nodes)
+        edges.append(edge)
     owner = [(keyframe.robot, number) for keyframe, number in zip(keyframes, session, strict=True)]
-    for node, edge in _chain(edge for edge in edges if max(edge.from_node, edge.to_node) < count).items():
+    for node, edge in _chain(edges).items():
         if owner[edge.from_node] == owner[node]:
             known = (edge.T_from_to, edge.covariance, edge.confidence, edge.rmse, edge.method)
             keyframes[node] = replace(keyframes[node], edge=Registration(*known))
-    poses = {node: bytes_array(T, 4) for node, T in store.rows("poses")}
-    if missing := set(range(count)) - poses.keys():
+    poses = dict(_made(store, "poses", lambda row: pose_of(row[1])))
+    if missing := set(nodes) - poses.keys():
         raise ValueError(f"keyframe {min(missing)} has no pose")
     moving: dict[int, bytes] = dict(store.rows("moving"))
+    if not all(isinstance(mask, bytes) for mask in moving.values()):
+        raise ValueError("a mask of moving points that is none")
+    trail = [pruned for _, pruned in _made(store, "trail", pruned_of)]
+    if any(pruned.node not in nodes for pruned in trail):
+        raise ValueError("a pruned keyframe that belongs to none")
     return MapData(
         keyframes,
         session,
-        np.array([poses[node] for node in range(count)]).reshape(-1, 4, 4),
+        np.array([poses[node] for node in nodes]).reshape(-1, 4, 4),
         edges,
-        [pruned_of(row) for row in store.rows("trail")],
-        [Session(*row) for row in store.rows("sessions")],
-        CloudStore(store.cloud, [moving.get(node) for node in range(count)], loans),
+        trail,
+        [made for _, made in _made(store, "sessions", session_of)],
+        CloudStore(store.cloud, [moving.get(node) for node in nodes], loans),
         lambda node: store.payload(node, "thumbnail"),
     )
+
+
+def _load_keyframes(store: MapStore, descriptors: bool) -> tuple[list[Keyframe], list[int], dict[int, Loan]]:
+    """Keyframes with their odometry's pose, and descriptors if wanted; their sessions; those that borrow."""
+    keyframes, session, loans = [], [], {}
+    for position, (_, (node, keyframe, number, loan)) in enumerate(_made(store, "keyframes", keyframe_of)):
+        if node != position:
+            raise ValueError(f"keyframe {position} is missing")
+        keyframes.append(keyframe)
+        session.append(number)
+        if loan is not None:
+            loans[node] = loan
+    for node, loan in loans.items():  # a lender has a cloud of its own: there are no chains, and so no circles
+        if not 0 <= loan.lender < len(keyframes) or loan.lender in loans:
+            raise ValueError(f"keyframe {node} borrows the cloud of {loan.lender}, which has none")
+    if descriptors:
+        widths = set()
+        for node in range(len(keyframes)):
+            if (data := store.payload(node, "descriptors")) is not None:
+                with _of("keyframe", node):
+                    keyframes[node] = replace(keyframes[node], descriptors=(made := unpack_descriptors(data)))
+                    widths.add(made.features.shape[1])
+        if len(widths) > 1:
+            raise ValueError(f"descriptors of {', '.join(map(str, sorted(widths)))} channels, which cannot be compared")
+        for node, loan in loans.items():
+            keyframes[node] = borrowing(keyframes[node], keyframes, loan)
+    return keyframes, session, loans
+
+
+def _made(store: MapStore, table: str, make: Callable[[tuple[Any, ...]], _T]) -> Iterator[tuple[int, _T]]:
+    """Number and noun of each row of a table; which row an error is about is added to it."""
+    for row in store.rows(table):
+        with _of(table.removesuffix("s"), row[0]):
+            made = make(row)
+        yield row[0], made
+
+
+@contextmanager
+def _of(what: str, number: int) -> Iterator[None]:
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{what} {number}: {error}") from None
 
 
 def borrowing(keyframe: Keyframe, keyframes: Sequence[Keyframe], loan: Loan) -> Keyframe:
