@@ -18,7 +18,7 @@ from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Array, Keyframe
 from dpm2_core.geometry import se3
 from dpm2_core.slam.map import rows, schema
-from dpm2_core.slam.map.cloud_codec import pack_cloud, unpack_cloud
+from dpm2_core.slam.map.cloud_codec import pack_cloud, unpack_cloud, unpack_mask
 from dpm2_core.slam.map.cloud_store import CloudStore, Loan
 from dpm2_core.slam.map.data import NO_POINTS, MapData, save_as, subset
 from dpm2_core.slam.map.database import connect
@@ -78,8 +78,8 @@ def _opened(copy: Path, path: Path, findings: Findings) -> sqlite3.Connection:
         sql = _with_new_header(copy)
         version = schema.VERSION
     with suppress(sqlite3.DatabaseError):
-        rows = [row[0] for row in sql.execute("PRAGMA integrity_check(20)")]
-        findings.problems += [f"database: {' '.join(line.split())}" for line in rows if line != "ok"]
+        told = [row[0] for row in sql.execute("PRAGMA integrity_check(20)")]
+        findings.problems += [f"database: {' '.join(line.split())}" for line in told if line != "ok"]
     try:
         schema.migrate(sql, version)
     except sqlite3.DatabaseError as error:
@@ -118,8 +118,12 @@ class _Salvage:
         last = max(good, default=-1) + 1
         moving: list[bytes | None] = [None] * last
         for node, mask in self._rows("moving"):
-            if node in keyframes and isinstance(mask, bytes):
-                moving[node] = mask
+            try:
+                if node in keyframes and (cloud := self._payload(node)[0]) is not None:
+                    unpack_mask(mask, len(unpack_cloud(cloud)))
+                    moving[node] = mask
+            except (ValueError, TypeError) as error:
+                self._problem(f"keyframe {node}: which points move is lost: {error}")
         edges = self._edges(new)
         edges = self._bridged(edges, [keyframes[node] for node in good], [session[node] for node in good])
         trail = self._trail(new)

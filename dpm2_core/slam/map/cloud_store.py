@@ -4,17 +4,18 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import BinaryIO, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
-from dpm2_core.slam.map.cloud_codec import pack_mask, unpack_cloud, unpack_mask
+from dpm2_core.slam.map.cloud_codec import CodecError, pack_mask, unpack_cloud, unpack_mask
 
 Reader = Callable[[int], bytes | None]
 
@@ -72,7 +73,11 @@ class CloudStore(Sequence[Points]):
     """
 
     def __init__(
-        self, stored: Reader | None = None, moving: Sequence[bytes | None] = (), loans: Mapping[int, Loan] | None = None
+        self,
+        stored: Reader | None = None,
+        moving: Sequence[bytes | None] = (),
+        loans: Mapping[int, Loan] | None = None,
+        name: str = "map",
     ) -> None:
         """Empty, or with the clouds of a map file.
 
@@ -80,7 +85,9 @@ class CloudStore(Sequence[Points]):
             stored: reads a packed cloud from the file.
             moving: packed mask, or None, of each that is in the file.
             loans: those among them that have no cloud of their own.
+            name: of the map, for errors.
         """
+        self._name = name
         self._stored = stored
         self._spill = SpillFile()
         self._where: list[int | bytes | None] = [None] * len(moving)  # number in the temporary file; None: map file
@@ -125,9 +132,21 @@ class CloudStore(Sequence[Points]):
         return where if where is not None or self._stored is None else self._stored(index)
 
     def whole(self, index: int) -> Points:
-        """(M, 4) with all its points; a borrowed one has none."""
+        """(M, 4) with all its points; a borrowed one has none.
+
+        Raises:
+            Dpm2Error: it is damaged.
+        """
         data = self.packed(range(len(self))[index])
-        return np.zeros((0, 4), np.float32) if data is None else unpack_cloud(data)
+        with self._named(index):
+            return np.zeros((0, 4), np.float32) if data is None else unpack_cloud(data)
+
+    @contextmanager
+    def _named(self, index: int) -> Iterator[None]:
+        try:
+            yield
+        except CodecError as error:
+            raise Dpm2Error(f"{self._name}: keyframe {index}: {error}; see dpm2 map check") from None
 
     def __len__(self) -> int:
         return len(self._where)
@@ -146,4 +165,5 @@ class CloudStore(Sequence[Points]):
             return se3.transform(loan.T_kf_lender, self[loan.lender])
         cloud = self.whole(index)
         moving = self._moving.get(index)
-        return cloud if moving is None or not len(cloud) else cloud[~unpack_mask(moving, len(cloud))]
+        with self._named(index):
+            return cloud if moving is None or not len(cloud) else cloud[~unpack_mask(moving, len(cloud))]

@@ -107,7 +107,7 @@ def _load(store: MapStore, descriptors: bool) -> MapData:
         edges,
         trail,
         [made for _, made in _made(store, "sessions", session_of)],
-        CloudStore(store.cloud, [moving.get(node) for node in nodes], loans),
+        CloudStore(store.cloud, [moving.get(node) for node in nodes], loans, str(store.path)),
         lambda node: store.payload(node, "thumbnail"),
     )
 

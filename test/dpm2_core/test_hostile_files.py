@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files that attack: each is rejected with one line that names it, within 2 s, and without much memory."""
+
+from __future__ import annotations
+
+import sqlite3
+import struct
+import time
+import tracemalloc
+import zlib
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dpm2_core.cli import main
+from dpm2_core.slam.map.check import check_map
+from dpm2_core.slam.map.rows import array_bytes, with_crc
+
+ENDLESS = "WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n) SELECT x, '', '', '', '' FROM n"
+BOMB = zlib.compress(bytes(300_000_000), 9)
+I4 = array_bytes(np.eye(4))
+NAN = array_bytes(np.full((4, 4), np.nan))
+
+
+def sql(path: Path, *statements: str | tuple[str, tuple[object, ...]]) -> None:
+    """Execute statements on a map file, which is closed."""
+    with closing(sqlite3.connect(path, isolation_level=None)) as connection:
+        for statement in statements:
+            connection.execute(*([statement] if isinstance(statement, str) else statement))
+
+
+def keyframe(node: int, id: object = 0, robot: object = "", T: bytes = I4, lender: object = None) -> tuple[object, ...]:
+    return with_crc(node, id, robot, 1, 0, 0, T, lender, None if lender is None else I4)
+
+
+def put_keyframe(*row: object, **columns: object) -> Callable[[Path], None]:
+    return lambda path: sql(path, ("REPLACE INTO keyframes VALUES (?,?,?,?,?,?,?,?,?,?)", keyframe(*row, **columns)))  # type: ignore[arg-type]
+
+
+def put_payload(node: int, cloud: bytes, descriptors: bytes | None = None) -> Callable[[Path], None]:
+    return lambda path: sql(
+        path, ("REPLACE INTO payloads VALUES (?,?,?,?,?)", with_crc(node, cloud, descriptors, None))
+    )
+
+
+def lender_circle(path: Path) -> None:
+    put_keyframe(3, lender=4)(path)
+    put_keyframe(4, lender=3)(path)
+
+
+def endless_view(path: Path) -> None:
+    columns = "session, program, started, config, weights"
+    sql(path, "DROP TABLE sessions", f"CREATE VIEW sessions({columns}) AS {ENDLESS}")
+
+
+def trigger(path: Path) -> None:
+    sql(path, f"CREATE TRIGGER t AFTER INSERT ON sessions BEGIN INSERT INTO trail SELECT * FROM ({ENDLESS}); END")
+
+
+def computed_column(path: Path) -> None:
+    columns = "node INTEGER PRIMARY KEY, mask BLOB AS (zeroblob(60000000)) VIRTUAL, crc INTEGER NOT NULL"
+    sql(path, "DROP TABLE moving", f"CREATE TABLE moving ({columns})", "INSERT INTO moving VALUES (1, 2)")
+
+
+def tree_in_a_circle(path: Path) -> None:
+    """The pages below the root of `edges` are all the same one, many times over."""
+    T, C = I4, array_bytes(np.eye(6))
+    rows = [with_crc(i, "loop", 0, 1, T, C, 1, 1.0, 0.1, "", "") for i in range(20, 400)]
+    with closing(sqlite3.connect(path)) as connection, connection:
+        connection.executemany("INSERT INTO edges VALUES (?,?,?,?,?,?,?,?,?,?,?,?)", rows)
+        root, size = connection.execute("SELECT rootpage FROM sqlite_master WHERE name = 'edges'").fetchone()[0], 4096
+    data = bytearray(path.read_bytes())
+    start = (root - 1) * size
+    assert data[start] == 5  # an inner page
+    cells = struct.unpack_from(">H", data, start + 3)[0]
+    first = struct.unpack_from(">H", data, start + 12)[0]
+    child = data[start + first : start + first + 4]
+    for cell in range(cells):
+        at = struct.unpack_from(">H", data, start + 12 + 2 * cell)[0]
+        data[start + at : start + at + 4] = child
+    path.write_bytes(data)
+
+
+def cut_off(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size * 4 // 5])
+
+
+MAPS: dict[str, Callable[[Path], None]] = {
+    "a view without end": endless_view,
+    "a trigger": trigger,
+    "another table": lambda path: sql(path, "CREATE TABLE more (x)"),
+    "an index": lambda path: sql(path, "CREATE INDEX i ON edges (abs(ok))"),
+    "a computed column": computed_column,
+    "a tree in a circle": tree_in_a_circle,
+    "cut off": cut_off,
+    "a pose that is not a number": lambda path: sql(
+        path, ("REPLACE INTO poses VALUES (?,?,?)", with_crc(4, NAN))
+    ),
+    "an odometry pose that is not a number": put_keyframe(4, T=NAN),
+    "a pose of two numbers": put_keyframe(4, T=I4[:16]),
+    "an id in words": put_keyframe(4, id="four"),
+    "a name of a million letters": put_keyframe(4, robot="x" * 1_000_000),
+    "lenders in a circle": lender_circle,
+    "a lender that is not there": put_keyframe(4, lender=99),
+    "a lender in words": put_keyframe(4, lender="keyframe 1"),
+    "an edge to nowhere": lambda path: sql(
+        path,
+        ("INSERT INTO edges VALUES (?,?,?,?,?,?,?,?,?,?,?,?)",
+         with_crc(90, "loop", 0, 2**62, I4, array_bytes(np.eye(6)), 1, 1.0, 0.1, "", "")),
+    ),
+    "a covariance below zero": lambda path: sql(
+        path,
+        ("INSERT INTO edges VALUES (?,?,?,?,?,?,?,?,?,?,?,?)",
+         with_crc(90, "loop", 0, 2, I4, array_bytes(-np.eye(6)), 1, 1.0, 0.1, "", "")),
+    ),
+    "a cloud that is a bomb": put_payload(4, struct.pack("<If", 2**21, 0.01) + BOMB),
+    "a cloud of 4e9 points": put_payload(4, struct.pack("<If", 2**32 - 1, 0.01) + BOMB),
+    "a cloud with infinite steps": put_payload(4, struct.pack("<If", 1, np.inf) + zlib.compress(bytes(7))),
+    "a mask that is a bomb": lambda path: sql(path, ("REPLACE INTO moving VALUES (?,?,?)", with_crc(4, BOMB))),
+    "descriptors of 1.8e19 values": put_payload(
+        4, struct.pack("<If", 0, 0.01) + zlib.compress(b""), struct.pack("<IIB", 2**32 - 1, 2**32 - 1, 1)
+    ),
+    "a row that is numbered 2^62": lambda path: sql(path, ("INSERT INTO poses VALUES (?,?,?)", with_crc(2**62, I4))),
+}  # fmt: skip
+
+
+def rejected(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """What `dpm2` says of a file that it does not take; CPU time, since the machine may be busy."""
+    tracemalloc.start()
+    began = time.process_time()
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    seconds, memory = time.process_time() - began, tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert ended.value.code in (1, 2)
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1, told
+    assert seconds < 2 * 3  # tracemalloc takes two thirds of it
+    assert memory < 64e6
+    return told
+
+
+@pytest.mark.parametrize("attack", MAPS)
+def test_a_hostile_map(tmp_path: Path, map_file: Path, attack: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Writing its cloud needs everything but descriptors, pruning those too; both leave nothing behind."""
+    MAPS[attack](map_file)
+    # Of descriptors and of rows that nothing asks for only the check can know.
+    only_checked = attack in ("descriptors of 1.8e19 values", "a row that is numbered 2^62")
+    if not only_checked:
+        told = rejected(["map", "export", str(map_file), str(tmp_path / "out.ply")], capsys)
+        assert str(map_file) in told
+    told = rejected(["map", "check", str(map_file)], capsys)
+    assert str(map_file) in told
+    assert sorted(path.name for path in tmp_path.iterdir()) == [map_file.name]
+
+
+@pytest.mark.parametrize("attack", MAPS)
+def test_what_is_good_of_a_hostile_map_can_be_recovered(tmp_path: Path, map_file: Path, attack: str) -> None:
+    """Eleven of its twelve keyframes at least, in a sound map; of one that was cut off what there is."""
+    MAPS[attack](map_file)
+    found = check_map(map_file, tmp_path / "good.dpm2map")
+    assert found.problems
+    assert found.keyframes >= (1 if attack == "cut off" else 10)
+    assert check_map(tmp_path / "good.dpm2map").problems == []
