@@ -7,7 +7,7 @@ PYTHON ?= $(firstword $(shell for p in python3.11 python3.12 python3; do \
 	$$p -c 'import sys; sys.exit(sys.version_info[:2] not in ((3, 11), (3, 12)))' 2>/dev/null && echo $$p; done))
 BIN := .venv/bin
 READY := .venv/.ready
-EXTRAS ?= test
+EXTRAS ?= plot,sim,test
 
 # The environment is self-contained: a sourced ROS 2, another environment's bootstrap or its libraries must not leak in.
 unexport PYTHONPATH PYTHONHOME VIRTUAL_ENV AMENT_PREFIX_PATH ROS_DISTRO LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
@@ -24,14 +24,18 @@ $(READY): setup.py pyproject.toml
 	@$(BIN)/python -m dpm2_ros.build_tf2_msgs || echo "continuing without /tf" >&2
 	@touch $@
 
-demo: setup  ## simulate a drive, replay it into slam_node, check and show what comes out; SRC=<KITTI sequence or bag> for your own
+demo: setup ros  ## simulate a drive, replay it into slam_node, check and show what comes out; SRC=<KITTI sequence or bag> for your own
 	$(BIN)/python -m dpm2_ros.demo $(if $(SRC),"$(SRC)") --out out/demo
+
+.PHONY: ros
+ros:  # of all targets the demo alone is nothing without it
+	@$(BIN)/python -c 'import rclpy' 2>/dev/null || { echo "rclpy has no wheel for $$(uname -m): docs/ros2.md says how to run the demo with an installed ROS 2" >&2; exit 2; }
 
 test: setup  ## all tests
 	$(BIN)/python -m pytest $(ARGS)
 
 lint: setup  ## style and types
-	@$(BIN)/python -c 'import ruff, mypy' 2>/dev/null || $(BIN)/python -m pip install -qq -e '.[dev]'
+	@$(BIN)/python -c 'import ruff, mypy' 2>/dev/null || $(BIN)/python -m pip install -qq --disable-pip-version-check -e '.[lint]'
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy

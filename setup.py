@@ -13,35 +13,42 @@ EXECUTABLES = ("slam_node", "mapper_node", "bag_player")
 REQUIREMENTS = [
     "numpy>=1.26,<3",  # every array
     "scipy>=1.11,<2",  # rotations, nearest neighbours
-    "torch>=2.6,<2.14",  # the network; CPU wheels serve
+    "torch>=2.6,<2.14",  # the network; its CPU wheels serve, README.md
     "safetensors>=0.4,<1",  # weights: data that cannot execute code
     "small_gicp>=1.0,<2",  # scan registration, multi-threaded, without the GIL
     "gtsam>=4.3,<4.4",  # pose graph; the first with wheels for numpy 2
     "pydantic>=2.7,<3",  # typed configuration
+    "annotated-types>=0.6,<1",  # the bounds of its fields, as ROS parameters
     "PyYAML>=6,<7",  # configuration files
     "typer>=0.12,<1",  # command line
     "rich>=13,<16",  # progress bars and tables
     "rosbags>=0.11,<0.12",  # bags without ROS; 0.x releases change the interface
     "mcap>=1.2,<2",  # salvages bags whose recording was cut off
     "opencv-python-headless>=4.9,<6",  # image decoding; headless: no Qt beside RViz
-    "matplotlib>=3.8,<4",  # trajectory pictures
-    "trimesh>=4,<6",  # meshes of the synthetic city
-    "embreex>=2.17.7,<5",  # ray casting in the synthetic city
-    "fpsample>=1.0,<2",  # farthest point sampling at native speed
+    # Farthest point sampling at native speed. For aarch64 0.3.3 is the last with wheels; it gives the same indices.
+    "fpsample>=1.0,<2; platform_machine != 'aarch64'",
+    "fpsample==0.3.3; platform_machine == 'aarch64'",
 ]
-ROS = [
-    "ros-jazzy-rclpy>=7.1,<8",  # ROS 2 Jazzy itself
-    "ros-rclpy[fastrtps]>=7.1.6,<8",  # its DDS
-    "ros-jazzy-common-interfaces>=5.3,<6",  # sensor_msgs, nav_msgs, ...
+ROS = [  # wheels for x86_64 alone; elsewhere ROS 2 itself must be installed
+    "ros-jazzy-rclpy>=7.1,<8; platform_machine == 'x86_64'",  # ROS 2 Jazzy itself
+    "ros-rclpy[fastrtps]>=7.1.6,<8; platform_machine == 'x86_64'",  # its DDS
+    "ros-jazzy-common-interfaces>=5.3,<6; platform_machine == 'x86_64'",  # sensor_msgs, nav_msgs, ...
 ]
 EXTRAS = {
+    "plot": ["matplotlib>=3.8,<4"],  # trajectory.png, dpm2 show
+    "sim": [  # dpm2 sim, and the synthetic worlds of training and benchmarks
+        "trimesh>=4,<6",  # meshes
+        "embreex>=2.17.7,<5; platform_machine == 'x86_64'",  # ray casting; on aarch64 there is none for Linux
+        "contourpy>=1.2,<2",  # lines along the kerbs
+    ],
     "test": ["pytest>=8,<10", "pytest-timeout>=2.3,<3", "hypothesis>=6.100,<7"],
+    "lint": ["ruff>=0.9,<0.18", "mypy>=1.13,<3", "types-PyYAML"],
     "las": ["laspy>=2.5,<3"],  # dpm2 map export MAP OUT.las
     "timm": ["timm>=1,<2"],  # image backbones timm:NAME
     "train": ["tensorboard>=2.16,<3"],  # curves beside log.jsonl
     "bench": ["kiss-icp>=1.2,<2", "pypose>=0.9,<1"],  # what the benchmarks compare with
 }
-EXTRAS["dev"] = [*EXTRAS["test"], *EXTRAS["bench"], "ruff>=0.9", "mypy>=1.13", "types-PyYAML"]
+EXTRAS["dev"] = [line for name in ("plot", "sim", "test", "lint", "bench") for line in EXTRAS[name]]
 
 
 def ros2_run_stubs() -> list[str]:
@@ -63,6 +70,8 @@ data_files = [
 ]
 if "bdist_wheel" in sys.argv:  # pip; under colcon the options below put the console scripts themselves there
     data_files.append(("lib/dpm2_ros", ros2_run_stubs()))
+else:  # colcon puts a folder bin on PATH
+    data_files.append(("bin", ["resource/bin/dpm2"]))
 
 setup(
     name="dpm2_ros",

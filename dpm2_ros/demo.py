@@ -24,6 +24,7 @@ from dpm2_core.data.trajectory import read_trajectory
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.evaluation.figures import trajectory_png
 from dpm2_core.evaluation.metrics import evaluate
+from dpm2_core.extras import MissingPackageError
 from dpm2_core.files import atomic_write
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
@@ -164,7 +165,10 @@ def _judge_poses(
         if metrics.ape_rmse_m is not None and metrics.path_length_m is not None:
             checks["the trajectory is right to 1 % of its length"] = metrics.ape_rmse_m < 0.01 * metrics.path_length_m
     seen = None if truth is None else truth[rows]
-    trajectory_png(out / "trajectory.png", est[rows], seen, result.map, title=f"{source.name}: {len(found)} frames")
+    try:
+        trajectory_png(out / "trajectory.png", est[rows], seen, result.map, title=f"{source.name}: {len(found)} frames")
+    except MissingPackageError as error:
+        typer.echo(f"no trajectory.png: {error}", err=True)
 
 
 def map_poses(source: BagSource, result: Replay, out: Path, found: list[int]) -> Array:

@@ -10,6 +10,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Sequence
+from importlib.util import find_spec
 from typing import Any
 
 from dpm2_core.errors import Dpm2Error, UsageError
@@ -37,6 +38,11 @@ def exit_code(work: Callable[[], int | None]) -> int:
     except Dpm2Error as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
+    except ModuleNotFoundError:
+        if find_spec("rclpy") is not None:
+            raise
+        print("error: no ROS 2 here: install it and source its setup.bash, see docs/ros2.md", file=sys.stderr)
+        return 2
     except Exception as error:
         # click's own errors of use (an unknown option, a missing argument); typer may carry a click of its own
         message = getattr(error, "format_message", None)

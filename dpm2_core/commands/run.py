@@ -25,6 +25,7 @@ from dpm2_core.data.trajectory import Trajectory, matched, read_trajectory, writ
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.metrics import Metrics, evaluate
 from dpm2_core.evaluation.report import metrics_table
+from dpm2_core.extras import MissingPackageError
 from dpm2_core.files import atomic_write
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
@@ -253,9 +254,12 @@ def _write(
         T = source.T_cam_lidar
         judged = truth if T is None else _in_other_frame(truth, T)
         metrics = evaluate(judged, sensor, failed_frames=failed, fps=fps)
-    trajectory_png(out / "trajectory.png", poses, truth, cloud, title=f"{source.name}: {len(recorder)} frames")
     if metrics is not None:
         _write_json(out / "metrics.json", metrics.model_dump())
+    try:
+        trajectory_png(out / "trajectory.png", poses, truth, cloud, title=f"{source.name}: {len(recorder)} frames")
+    except MissingPackageError as error:
+        typer.echo(f"no trajectory.png: {error}", err=True)
     return metrics
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dpm2_core.errors import UsageError
+from dpm2_core.extras import needs
 from dpm2_core.files import atomic_write
 from dpm2_core.frame import Points
 
@@ -40,12 +40,11 @@ def write_las(path: Path | str, points: Points) -> None:
     """Write (N, 4) as LAS 1.4, point format 6: millimetres, intensities scaled to 0..65535.
 
     Raises:
-        UsageError: the package laspy is not there. Dpm2Error: the file could not be written.
+        MissingPackageError: laspy is not installed. Dpm2Error: the file could not be written.
     """
-    try:
+    with needs("las", "LAS"):
         import laspy
-    except ImportError:
-        raise UsageError("LAS needs the package laspy: pip install 'dpm2[las]'") from None
+
     las = laspy.create(point_format=6, file_version="1.4")
     las.header.scales = [1e-3, 1e-3, 1e-3]
     las.header.offsets = np.floor(points[:, :3].min(0)) if len(points) else np.zeros(3)

@@ -13,6 +13,7 @@ from scipy.spatial import KDTree
 
 from dpm2_core.evaluation.kitti_metric import known
 from dpm2_core.evaluation.metrics import align
+from dpm2_core.extras import needs
 from dpm2_core.files import atomic_write
 from dpm2_core.frame import Array, Points
 
@@ -38,8 +39,9 @@ def trajectory_png(
     Raises:
         Dpm2Error: the file could not be written.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # half a second to import: not for every command
-    from matplotlib.figure import Figure
+    with needs("plot", "drawing"):
+        from matplotlib.backends.backend_agg import FigureCanvasAgg  # half a second to import: not for every command
+        from matplotlib.figure import Figure
 
     est = est[known(est)]
     truth = None if gt is None else _aligned(gt, est)
@@ -72,8 +74,9 @@ def success_png(path: Path | str, kinds: Mapping[str, Mapping[str, Mapping[str, 
     Raises:
         Dpm2Error: the file could not be written.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+    with needs("plot", "drawing"):
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
 
     rows = [(kind, method, figures) for kind, methods in kinds.items() for method, figures in methods.items()]
     figure = Figure(figsize=(9, 0.36 * len(rows) + 1.4), dpi=120, facecolor=_BACKGROUND)
@@ -117,7 +120,8 @@ def _raster(cloud: Points, positions: Array, low: Array, high: Array) -> NDArray
     Heights count from the nearest of the (N, 3) positions of the LiDAR: a street on a hill must not outshine houses
     in the valley. Pixels are no finer than the spacing of the points, so that surfaces look like surfaces.
     """
-    from matplotlib.colors import LinearSegmentedColormap, to_rgb
+    with needs("plot", "drawing"):
+        from matplotlib.colors import LinearSegmentedColormap, to_rgb
 
     cloud = cloud[np.logical_and.reduce((cloud[:, :2] > low) & (cloud[:, :2] < high), axis=1), :3]
     if not len(cloud):

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from dpm2_core.evaluation.attention import ImageAttention, draw_attention
+from dpm2_core.extras import needs
 from dpm2_core.files import atomic_write
 from dpm2_core.frame import Array, Points, Registration
 from dpm2_core.geometry import se3
@@ -36,9 +37,10 @@ def matches_png(
     Raises:
         Dpm2Error: the file could not be written.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # half a second to import: not for every command
-    from matplotlib.collections import LineCollection
-    from matplotlib.figure import Figure
+    with needs("plot", "drawing"):
+        from matplotlib.backends.backend_agg import FigureCanvasAgg  # half a second to import: not for every command
+        from matplotlib.collections import LineCollection
+        from matplotlib.figure import Figure
 
     low = 0.0 if looked is None else 0.43  # the picture's share of the height, below the scans
     figure = Figure(figsize=(18, 7.2 / (1 - low)), dpi=110, facecolor=_BACKGROUND)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from dpm2_core.extras import needs
 from dpm2_core.files import atomic_write
 
 
@@ -17,8 +18,9 @@ def movers_png(path: Path, points: NDArray[np.float32], found: NDArray[np.bool_]
     Raises:
         Dpm2Error: the file could not be written.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+    with needs("plot", "drawing"):
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8, 8), dpi=120, layout="constrained")
     axes = figure.subplots()

@@ -10,6 +10,7 @@ import numpy as np
 from torch import Tensor
 
 from dpm2_core.diffslam.tasks.range_image import to_points
+from dpm2_core.extras import needs
 from dpm2_core.files import atomic_write
 
 _BACKGROUND, _INK = "#0d1117", "#c9d1d9"
@@ -25,8 +26,9 @@ def range_png(path: Path | str, rows: Mapping[str, tuple[Tensor, Tensor]], scale
     Raises:
         Dpm2Error: the file could not be written.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # half a second to import: not for every command
-    from matplotlib.figure import Figure
+    with needs("plot", "drawing"):
+        from matplotlib.backends.backend_agg import FigureCanvasAgg  # half a second to import: not for every command
+        from matplotlib.figure import Figure
 
     figure = Figure(figsize=(14, 3.4 * len(rows) + 0.6), dpi=90, facecolor=_BACKGROUND)
     figure.text(0.01, 1 - 0.3 / (3.4 * len(rows) + 0.6), title, color=_INK, fontsize=13, va="center")

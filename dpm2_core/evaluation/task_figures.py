@@ -9,6 +9,7 @@ import numpy as np
 from torch import Tensor
 
 from dpm2_core.diffslam.tasks.gndnet import GroundSettings, cell_of, height_above
+from dpm2_core.extras import needs
 from dpm2_core.files import atomic_write
 
 
@@ -20,8 +21,9 @@ def ground_png(path: Path, found: Tensor, truth: Tensor, points: Tensor, setting
     Raises:
         Dpm2Error: the file could not be written.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+    with needs("plot", "drawing"):
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
 
     above = (height_above(points, found, settings) > settings.threshold) & cell_of(points, settings)[1]
     half = settings.cells * settings.cell / 2

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from torch import Tensor, nn
 
 from dpm2_core.errors import UsageError
+from dpm2_core.extras import needs
 from dpm2_core.network.config import ImageSettings, PointsSettings
 from dpm2_core.network.convnext import ConvNeXt, ImagePyramid
 from dpm2_core.network.pointnext import PointNeXt
@@ -53,10 +54,9 @@ class TimmBackbone(nn.Module):
 
     def __init__(self, name: str) -> None:
         super().__init__()
-        try:
+        with needs("timm", f"image.backbone timm:{name}"):
             import timm
-        except ImportError:
-            raise UsageError(f"image.backbone timm:{name}: timm is not installed; pip install timm") from None
+
         try:
             self.model = timm.create_model(name, features_only=True, pretrained=False)
         except (RuntimeError, ValueError) as error:

@@ -7,10 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
-from embreex.mesh_construction import TriangleMesh
-from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import ArrayLike, NDArray
 
+from dpm2_core.extras import needs
 from dpm2_core.sim.materials import Label, Material
 
 Float = NDArray[np.float32]
@@ -158,6 +157,10 @@ class Scene:
     """A mesh ready for ray casting. Casting is thread-safe and runs without the interpreter lock."""
 
     def __init__(self, mesh: Mesh) -> None:
+        with needs("sim", "the synthetic city"):
+            from embreex.mesh_construction import TriangleMesh
+            from embreex.rtcore_scene import EmbreeScene
+
         self.mesh = mesh
         self._scene = EmbreeScene()
         TriangleMesh(self._scene, np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(mesh.faces))

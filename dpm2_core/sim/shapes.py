@@ -4,9 +4,9 @@
 from __future__ import annotations
 
 import numpy as np
-import trimesh
 from numpy.typing import ArrayLike
 
+from dpm2_core.extras import needs
 from dpm2_core.sim.materials import Label, Material
 from dpm2_core.sim.mesh import Mesh, make
 
@@ -59,6 +59,9 @@ def blob(
     detail: int = 1,
 ) -> Mesh:
     """An ellipsoid of 20 * 4**detail triangles with its vertices moved in and out by the share `rough`."""
+    with needs("sim", "the synthetic city"):
+        import trimesh
+
     sphere = trimesh.creation.icosphere(subdivisions=detail)
     points = sphere.vertices * (1 + rng.normal(0, rough, (len(sphere.vertices), 1))) * np.asarray(radii) + np.asarray(
         centre

@@ -11,13 +11,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import cast
 
-import contourpy
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 from scipy.spatial import cKDTree
 
+from dpm2_core.extras import needs
 from dpm2_core.sim.config import Preset
 from dpm2_core.sim.materials import Label, Material
 from dpm2_core.sim.mesh import Mesh, make, merge
@@ -171,6 +171,9 @@ class Terrain:
 
     def contour(self, level: float) -> Iterator[Kerbline]:
         """The lines `level` m outside the kerb (negative: on the road), streets' ends included."""
+        with needs("sim", "the synthetic city"):
+            import contourpy
+
         x = self.origin[0] + np.arange(self.edge.shape[1]) * RESOLUTION
         y = self.origin[1] + np.arange(self.edge.shape[0]) * RESOLUTION
         for line in cast("list[Array]", contourpy.contour_generator(x, y, self.edge).lines(level)):

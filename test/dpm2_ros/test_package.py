@@ -6,6 +6,7 @@ from __future__ import annotations
 import ast
 import os
 import re
+import shutil
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
@@ -33,7 +34,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
     for name in filter(None, files):
         if not name.startswith(("test/", "benchmarks/")) and (ROOT / name).is_file():
             (copy / name).parent.mkdir(parents=True, exist_ok=True)
-            (copy / name).write_bytes((ROOT / name).read_bytes())
+            shutil.copy(ROOT / name, copy / name)
     command = [sys.executable, "setup.py", "-q", "bdist_wheel", "-d", str(out)]
     environment = {name: value for name, value in os.environ.items() if name != "ROS_DISTRO"}
     subprocess.run(command, cwd=copy, env=environment, check=True, capture_output=True)
@@ -71,6 +72,20 @@ def test_ros2_run_starts_the_console_script_of_its_own_environment(wheel: zipfil
     assert done.stdout == "script: a b|c\n"
 
 
+def test_dpm2_is_on_the_path_of_a_workspace(wheel: zipfile.ZipFile, tmp_path: Path) -> None:
+    """As colcon installs: console scripts in lib/dpm2_ros for `ros2 run`, and its environment has bin on PATH."""
+    source = Path(str(wheel.filename)).parent / "source"
+    command = [sys.executable, "setup.py", "-q", "install", "--prefix", str(tmp_path), "--no-compile"]
+    command += ["--single-version-externally-managed", "--record", str(tmp_path / "record")]
+    subprocess.run(command, cwd=source, check=True, capture_output=True)
+    (packages,) = tmp_path.glob("**/site-packages")
+    environment = os.environ | {"PATH": f"{tmp_path / 'bin'}:{os.environ['PATH']}", "PYTHONPATH": str(packages)}
+    done = subprocess.run(["dpm2", "version"], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() in wheel.filename
+    assert (tmp_path / "lib" / "dpm2_ros" / "slam_node").is_file()
+    assert not any(name.endswith("/bin/dpm2") for name in wheel.namelist())  # pip makes its own
+
+
 def test_console_scripts_lead_to_functions(wheel: zipfile.ZipFile) -> None:
     import importlib
 
@@ -90,6 +105,15 @@ def test_ros_wheels_are_required_unless_ros_is_there(tmp_path: Path) -> None:
         subprocess.run(command, cwd=ROOT, env=environment, check=True, capture_output=True)
         (requires,) = tmp_path.glob("*.egg-info/requires.txt")
         assert ("ros-rclpy" in requires.read_text()) is wanted
+
+
+@pytest.mark.parametrize("name", EXECUTABLES)
+def test_without_ros_an_executable_says_so_in_one_line(name: str) -> None:
+    absent = "dict.fromkeys(['rclpy', 'builtin_interfaces', 'sensor_msgs', 'nav_msgs', 'std_msgs', 'rosgraph_msgs'])"
+    code = f"import sys; sys.modules.update({absent}); from dpm2_ros import executables as e; sys.exit(e.{name}([]))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr == "error: no ROS 2 here: install it and source its setup.bash, see docs/ros2.md\n"
 
 
 def test_package_xml_agrees_with_setup_py(wheel: zipfile.ZipFile) -> None:

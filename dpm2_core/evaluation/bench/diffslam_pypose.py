@@ -27,7 +27,7 @@ def beside_pypose(scan: Tensor, T_target_source: Tensor, settings: SlamLossSetti
     try:
         import pypose
     except ImportError:
-        return {"skipped": "pypose is not installed: pip install pypose"}
+        return {"skipped": "pypose is not installed: pip install 'dpm2_ros[bench]'"}
     source = se3_torch.transform(se3_torch.inverse(T_target_source), scan)
     iterations = settings.icp.solver.iterations
 

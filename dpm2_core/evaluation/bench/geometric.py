@@ -137,7 +137,7 @@ def bench_geometric(options: Options) -> Report:
                     progress.advance(task)
             results[unique_name(source, results)] = {name: summary(source, outcomes[name]) for name in methods}
             del frames
-    notes = [] if BASELINE in methods else ["kiss-icp is not installed (pip install kiss-icp): no comparison."]
+    notes = [] if BASELINE in methods else ["kiss-icp is not installed (pip install 'dpm2_ros[bench]'): no comparison."]
     for methods_of_drive in results.values():
         _compare(methods_of_drive)
     view = Group(_table(results), *(_stages(name, result) for name, result in results.items()), *notes)

@@ -3,14 +3,13 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from dpm2_core.data.pcd import write_las, write_pcd
-from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.errors import Dpm2Error
 
 POINTS = np.random.default_rng(0).uniform(0, 1, (50, 4)).astype(np.float32) * np.float32([300, 400, 5, 1])
 
@@ -36,12 +35,6 @@ def test_las(tmp_path: Path, count: int) -> None:
     xyz = np.column_stack([las.x, las.y, las.z])
     np.testing.assert_allclose(xyz.reshape(-1, 3), POINTS[:count, :3], atol=6e-4)  # millimetres
     np.testing.assert_allclose(np.asarray(las.intensity) / 65535, POINTS[:count, 3], atol=1e-5)
-
-
-def test_without_laspy_the_error_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "laspy", None)
-    with pytest.raises(UsageError, match="pip install"):
-        write_las(tmp_path / "a.las", POINTS)
 
 
 def test_a_folder_in_the_way(tmp_path: Path) -> None:
