@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,12 +14,6 @@ from safetensors.torch import save_file
 from dpm2_core.errors import UsageError
 from dpm2_core.network.config import NetworkSettings, settings_from
 from dpm2_core.network.model import DeepPointMap2
-
-
-def fingerprint(settings: NetworkSettings) -> str:
-    """Short hash of everything that gives the network its shape and meaning."""
-    text = json.dumps(settings.model_dump(mode="json", exclude={"preset"}), sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def save_weights(model: DeepPointMap2, path: Path, about: dict[str, str], half: bool = True) -> None:
@@ -84,15 +77,24 @@ def load_weights(model: DeepPointMap2, path: Path) -> dict[str, str]:
     return metadata
 
 
+def network_settings(path: Path) -> NetworkSettings:
+    """Settings of the network that a weights file describes.
+
+    Raises:
+        UsageError: missing file, another format, no or invalid settings in it.
+    """
+    metadata = read_metadata(path)
+    if "network" not in metadata:
+        raise UsageError(f"{path}: safetensors without a network description")
+    return settings_from(NetworkSettings, json.loads(metadata["network"]), default=str(path))
+
+
 def load_model(path: Path) -> DeepPointMap2:
     """The network that a weights file describes, with its weights, ready for inference.
 
     Raises:
         UsageError: as `load_weights`.
     """
-    _, metadata = read_tensors(path)
-    if "network" not in metadata:
-        raise UsageError(f"{path}: safetensors without a network description")
-    model = DeepPointMap2(settings_from(NetworkSettings, json.loads(metadata["network"]), default=str(path)))
+    model = DeepPointMap2(network_settings(path))
     model.decoder.judges_overlap = load_weights(model, path).get("phase") == "2"
     return model.eval().requires_grad_(False)

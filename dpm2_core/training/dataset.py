@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from pydantic import Field
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
@@ -23,8 +25,8 @@ from dpm2_core.training.augment import AugmentSettings, augment
 from dpm2_core.training.packed import PackedDrive, Sample, open_packed
 
 
-class DataSettings(Settings):
-    """What to train on."""
+class PackedSettings(Settings):
+    """Which packed drives to train on."""
 
     packed: dict[str, float] = Field({})
     """Folders of packed drives (`dpm2 train pack`) and the weight of each in the mixture."""
@@ -32,15 +34,33 @@ class DataSettings(Settings):
     """Factor on the weight of drives of a preset of the synthetic city, such as {tunnel: 3}."""
     groups: int = Field(4, gt=0)
     """Places in a batch, per process."""
+    workers: int = Field(1, ge=0)
+    """Processes that load and sample; 0 loads in the training process."""
+    augment: AugmentSettings = AugmentSettings()
+
+
+class GroupSettings(PackedSettings, ABC):
+    """Packed drives, and how the frames of a place are drawn from one."""
+
+    images: bool = False
+    """Read the images."""
+
+    @abstractmethod
+    def draw(self, poses: Array, noise: np.random.Generator) -> NDArray[np.intp]:
+        """Indices (F,) of the frames of a place in a drive with these poses (n, 4, 4), NaN where unknown."""
+
+
+class DataSettings(GroupSettings):
+    """What to train registration on."""
+
     frames: int = Field(4, ge=2)
     """Frames of each place: one, and others within `radius` of it."""
     radius: float = Field(20.0, gt=0)
     """m."""
-    images: bool = False
-    """Read the pictures."""
-    workers: int = Field(1, ge=0)
-    """Processes that load and sample; 0 loads in the training process."""
-    augment: AugmentSettings = AugmentSettings()
+
+    def draw(self, poses: Array, noise: np.random.Generator) -> NDArray[np.intp]:
+        """See `draw_group`."""
+        return draw_group(poses, self.frames, self.radius, noise)
 
 
 class Batch(NamedTuple):
@@ -56,7 +76,7 @@ class Batch(NamedTuple):
     poses: Tensor
 
 
-def draw_group(poses: Array, frames: int, radius: float, noise: np.random.Generator) -> np.ndarray:
+def draw_group(poses: Array, frames: int, radius: float, noise: np.random.Generator) -> NDArray[np.intp]:
     """Indices (frames,) of one frame and others whose distance from it is about uniform in 0..radius m.
 
     poses (n, 4, 4), NaN where unknown; frames repeat where the neighbourhood holds too few.
@@ -77,19 +97,14 @@ def draw_group(poses: Array, frames: int, radius: float, noise: np.random.Genera
     return np.array(chosen)
 
 
-class GroupDataset(IterableDataset):
-    """An endless stream of batches; batch `n` depends on seed and `n` alone, so a resumed run sees the same."""
+class Mixture:
+    """Packed drives, chosen at random by their weights.
 
-    def __init__(
-        self,
-        settings: DataSettings,
-        network: NetworkSettings,
-        seed: int,
-        start: int = 0,
-        shard: tuple[int, int] = (0, 1),
-    ) -> None:
-        self.settings, self.network, self.seed, self.start, self.shard = settings, network, seed, start, shard
-        self.draw = draw_group
+    Attributes:
+        drives: all of them. chances: (len,) probability of each.
+    """
+
+    def __init__(self, settings: PackedSettings) -> None:
         drives: list[PackedDrive] = []
         chances: list[float] = []
         for folder, weight in settings.packed.items():
@@ -100,6 +115,25 @@ class GroupDataset(IterableDataset):
             chances += [weight * factor * len(drive) / frames for drive, factor in zip(found, factors, strict=True)]
         self.drives: Sequence[PackedDrive] = drives
         self.chances = np.array(chances) / sum(chances)
+
+    def choose(self, noise: np.random.Generator) -> PackedDrive:
+        """One of the drives."""
+        return self.drives[noise.choice(len(self.drives), p=self.chances)]
+
+
+class GroupDataset(IterableDataset):
+    """An endless stream of batches; batch `n` depends on seed and `n` alone, so a resumed run sees the same."""
+
+    def __init__(
+        self,
+        settings: GroupSettings,
+        network: NetworkSettings,
+        seed: int,
+        start: int = 0,
+        shard: tuple[int, int] = (0, 1),
+    ) -> None:
+        self.settings, self.network, self.seed, self.start, self.shard = settings, network, seed, start, shard
+        self.drives = Mixture(settings)
 
     def __iter__(self) -> Iterator[Batch]:
         info = get_worker_info()
@@ -118,14 +152,14 @@ class GroupDataset(IterableDataset):
         images = []
         poses = []
         for _ in range(settings.groups):
-            drive = self.drives[noise.choice(len(self.drives), p=self.chances)]
-            for index in self.draw(drive.poses, settings.frames, settings.radius, noise):
+            drive = self.drives.choose(noise)
+            for index in settings.draw(drive.poses, noise):
                 sample: Sample = augment(drive[index], settings.augment, noise)
                 pyramids.append(build_pyramid(sample.cloud, self.network.points))
                 images.append(sample.images if settings.images else ())
                 poses.append(sample.pose)
         views = collate_views(images, self.network.image) if settings.images else None
-        shaped = torch.from_numpy(np.stack(poses)).view(settings.groups, settings.frames, 4, 4)
+        shaped = torch.from_numpy(np.stack(poses)).view(settings.groups, -1, 4, 4)
         return Batch(collate(pyramids), views, shaped)
 
     def loader(self) -> DataLoader:

@@ -15,6 +15,7 @@ from typing import Literal
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from pydantic import Field
 from torch import Tensor, nn
 
@@ -167,12 +168,20 @@ def window_trajectories(decoder: Decoder, tokens: Tokens, poses: Tensor) -> tupl
     return torch.stack(chain, 1), (~usable).double().mean()
 
 
-def draw_stretch(poses: Array, frames: int, radius: float, noise: np.random.Generator) -> np.ndarray:
+def draw_stretch(poses: Array, frames: int, radius: float, noise: np.random.Generator) -> NDArray[np.intp]:
     """`draw_group` in the order of the road, so that each scan follows the one before."""
     chosen = draw_group(poses, frames, radius, noise)
     at = poses[chosen, :3, 3] - poses[chosen, :3, 3].mean(0)
     along = np.linalg.svd(at, full_matrices=False)[2][0]
     return chosen[np.argsort(at @ along, kind="stable")]
+
+
+class StretchSettings(DataSettings):
+    """Packed drives, of which scans are drawn in the order of the road."""
+
+    def draw(self, poses: Array, noise: np.random.Generator) -> NDArray[np.intp]:
+        """See `draw_stretch`."""
+        return draw_stretch(poses, self.frames, self.radius, noise)
 
 
 class Referenced:
@@ -255,7 +264,6 @@ def finetune(
         start = load_checkpoint(out / "checkpoint.pt", module, ema, None) if resume else 0
         places = _places(settings, data or out)
         stretches = GroupDataset(places, module.model.settings, settings.optimiser.seed, start, (rank, world))
-        stretches.draw = draw_stretch
 
         def loss(run: nn.Module, batch: Batch, step: int) -> tuple[Tensor, dict[str, Tensor]]:
             noise = torch.Generator().manual_seed(settings.optimiser.seed * 1_000_003 + step)
@@ -282,11 +290,11 @@ def measure(weights: Path, settings: FinetuneSettings, out: Path, pairs: int = 1
     }
 
 
-def _places(settings: FinetuneSettings, out: Path) -> DataSettings:
+def _places(settings: FinetuneSettings, out: Path) -> StretchSettings:
     packed = {str(out / DRIVES): 1 - settings.rehearsal_share}
     if settings.rehearsal_share:
         packed[settings.rehearsal or str(out / REHEARSAL)] = settings.rehearsal_share
-    return DataSettings(
+    return StretchSettings(
         packed=packed, groups=settings.groups, frames=settings.frames, radius=settings.radius,
         workers=1, augment=settings.augment,
     )  # fmt: skip

@@ -30,7 +30,7 @@ from dpm2_core.network.spatial import Views, picture_features
 from dpm2_core.network.weights import load_weights, save_weights
 from dpm2_core.training.augment import augment_image
 from dpm2_core.training.checkpoint import load_checkpoint
-from dpm2_core.training.dataset import DataSettings, GroupDataset
+from dpm2_core.training.dataset import Mixture, PackedSettings, draw_group
 from dpm2_core.training.trainer import OptimiserSettings, process_group, train
 
 NEUTRAL = 1.5  # m, within which a point's neighbours are neither right nor wrong
@@ -47,6 +47,13 @@ class PicturePairs(NamedTuple):
     points: Tensor
 
 
+class PictureSettings(PackedSettings):
+    """Packed drives, and how far apart the images of a pair are."""
+
+    radius: float = Field(20.0, gt=0)
+    """Largest distance between two images, m."""
+
+
 class PhaseImageSettings(Settings):
     """A training of the image branch."""
 
@@ -54,8 +61,8 @@ class PhaseImageSettings(Settings):
     """Network preset."""
     network: dict[str, Any] = Field({})
     """Changes to the preset."""
-    data: DataSettings = DataSettings(images=True)
-    """`radius` is the largest distance between two pictures."""
+    data: PictureSettings = PictureSettings()
+    """Drives with images."""
     points: int = Field(256, gt=0)
     """Points drawn for each pair."""
     shift: float = Field(0.3, ge=0)
@@ -65,8 +72,14 @@ class PhaseImageSettings(Settings):
     """Weights (safetensors) of the network, whose other parts stay as they are; empty: random."""
 
 
-class PictureDataset(GroupDataset):
+class PictureDataset:
     """Pairs of pictures of a place and the points that the first of them shows."""
+
+    def __init__(
+        self, settings: PictureSettings, network: NetworkSettings, seed: int, start: int, shard: tuple[int, int]
+    ) -> None:
+        self._settings, self._network, self._seed, self._start, self._shard = settings, network, seed, start, shard
+        self._drives = Mixture(settings)
 
     def pairs(self, points: int) -> Iterator[PicturePairs]:
         """An endless stream, as deterministic as the batches of phase one.
@@ -74,17 +87,17 @@ class PictureDataset(GroupDataset):
         Raises:
             UsageError: a drive without pictures, or whose pictures show too few points.
         """
-        step = self.start
+        step, settings = self._start, self._settings
         while True:
-            noise = np.random.default_rng([self.seed, step, self.shard[0]])
+            noise = np.random.default_rng([self._seed, step, self._shard[0]])
             step += 1
             images: list[list[Image]] = []
             drawn: list[NDArray[np.float32]] = []
-            for _ in range(100 * self.settings.groups):
-                if len(images) == 2 * self.settings.groups:
+            for _ in range(100 * settings.groups):
+                if len(images) == 2 * settings.groups:
                     break
-                drive = self.drives[noise.choice(len(self.drives), p=self.chances)]
-                a, b = (drive[i] for i in self.draw(drive.poses, 2, self.settings.radius, noise))
+                drive = self._drives.choose(noise)
+                a, b = (drive[i] for i in draw_group(drive.poses, 2, settings.radius, noise))
                 if not (a.images and b.images):
                     raise UsageError(f"{drive.folder}: a drive without pictures; pack it with them or leave it out")
                 seen = a.cloud[shown(a.cloud, a.images[0].camera)]
@@ -92,9 +105,9 @@ class PictureDataset(GroupDataset):
                     continue
                 chosen = seen[noise.choice(len(seen), points, replace=False)]
                 drawn += [chosen, se3.transform(se3.inverse(b.pose) @ a.pose, chosen).astype(np.float32)]
-                images += [[augment_image(s.images[0], np.eye(4), self.settings.augment, noise)] for s in (a, b)]
-            views = collate_views(images, self.network.image)
-            if views is None or len(images) < 2 * self.settings.groups:
+                images += [[augment_image(s.images[0], np.eye(4), settings.augment, noise)] for s in (a, b)]
+            views = collate_views(images, self._network.image)
+            if views is None or len(images) < 2 * settings.groups:
                 raise UsageError(f"data.packed: hardly any picture shows {points} points; lower `points`")
             yield PicturePairs(views, torch.from_numpy(np.stack(drawn)))
 

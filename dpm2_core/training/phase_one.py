@@ -68,9 +68,10 @@ class PhaseOne(nn.Module):
         """Mean over the plans of the losses on descriptors, and figures of the first."""
         total = tokens.features.new_zeros((), dtype=torch.float32)
         figures: dict[str, Tensor] = {}
+        view_aligned = self.model.settings.points.view_aligned
         for plan in plans:
-            source = merge_tokens(tokens, plan.source, plan.T_source)
-            target = merge_tokens(tokens, plan.target, plan.T_target)
+            source = merge_tokens(tokens, plan.source, plan.T_source, view_aligned)
+            target = merge_tokens(tokens, plan.target, plan.T_target, view_aligned)
             loss, found = phase_one_loss(self.model.decoder, source, target, plan.T_target_source, self.loss)
             total = total + loss / len(plans)
             figures = figures or found

@@ -9,21 +9,22 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from pydantic import Field
 from torch import Tensor, nn
 
 from dpm2_core.config import Settings
 from dpm2_core.frame import Array
-from dpm2_core.network.config import NetworkSettings, preset
+from dpm2_core.network.config import NetworkSettings
 from dpm2_core.network.encoder import to_device
 from dpm2_core.network.losses import overlap_loss
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pyramid import PointBatch
 from dpm2_core.network.registration import evidence, solve_batch
 from dpm2_core.network.spatial import Views
-from dpm2_core.network.weights import load_weights, save_weights
+from dpm2_core.network.weights import load_weights, network_settings, save_weights
 from dpm2_core.training.checkpoint import load_checkpoint
-from dpm2_core.training.dataset import Batch, DataSettings, GroupDataset
+from dpm2_core.training.dataset import Batch, GroupDataset, GroupSettings
 from dpm2_core.training.trainer import OptimiserSettings, process_group, train
 
 OVERLAP = 20.0  # m: nearer pairs are positive
@@ -31,25 +32,39 @@ HARD = 40.0  # m: half of the negatives lie between OVERLAP and this
 FRAMES = 5  # a reference, two near it, one hard negative, one far
 
 
-class PhaseTwoSettings(Settings):
-    """A training of phase two."""
+class OverlapSettings(GroupSettings):
+    """Packed drives, of which frames are drawn that overlap and that do not, see `draw_overlap`."""
 
-    preset: str = "small"
-    """Network preset."""
+    def draw(self, poses: Array, noise: np.random.Generator) -> NDArray[np.intp]:
+        return draw_overlap(poses, noise)
+
+
+class OverlapOptimiserSettings(OptimiserSettings):
+    """Optimisation at a tenth of the rate and weight decay of phase one (section 5.1)."""
+
+    steps: int = Field(600, gt=0)
+    rate: float = Field(1e-4, gt=0)
+    decay: float = Field(1e-5, ge=0)
+    warmup: int = Field(20, ge=0)
+
+
+class PhaseTwoSettings(Settings):
+    """A training of phase two; the network is that of phase one, with all its settings."""
+
     start: str
     """Weights of phase one (safetensors)."""
-    data: DataSettings = DataSettings()
+    data: OverlapSettings = OverlapSettings()
     validation: str = ""
     """Folder of packed drives of other worlds; empty: none."""
     validation_batches: int = Field(25, gt=0)
     """Batches of a validation."""
-    optimiser: OptimiserSettings = OptimiserSettings(steps=600, rate=1e-4, decay=1e-5, warmup=20)
+    optimiser: OverlapOptimiserSettings = OverlapOptimiserSettings()
 
 
-def draw_overlap(poses: Array, frames: int, radius: float, noise: np.random.Generator) -> np.ndarray:
-    """Indices of a frame, two within OVERLAP m of it, one within HARD m and one beyond.
+def draw_overlap(poses: Array, noise: np.random.Generator) -> NDArray[np.intp]:
+    """Indices (FRAMES,) of a frame, two within OVERLAP m of it, one within HARD m and one beyond.
 
-    The signature is that of `draw_group`; `frames` is FRAMES. A kind that the drive does not have repeats another kind.
+    poses (n, 4, 4), NaN where unknown. A kind that the drive does not have repeats another kind.
     """
     known = np.flatnonzero(np.isfinite(poses[:, :3, 3]).all(1))
     for _ in range(20):
@@ -108,14 +123,13 @@ def phase_two(settings: PhaseTwoSettings, out: Path, resume: bool = False) -> Pa
     """Train; writes checkpoint, log and `weights.safetensors`, phase one's with the new head, to `out`."""
     with process_group() as (rank, world, device):
         torch.manual_seed(settings.optimiser.seed)
-        network = preset(settings.preset)
+        network = network_settings(Path(settings.start))
         module = PhaseTwo(network).to(device)
         about = load_weights(module.model, Path(settings.start))
         ema = copy.deepcopy(module).requires_grad_(False)
         start = load_checkpoint(out / "checkpoint.pt", module, ema, None) if resume else 0
         seed = settings.optimiser.seed
-        data = GroupDataset(settings.data.model_copy(update={"frames": FRAMES}), network, seed, start, (rank, world))
-        data.draw = draw_overlap
+        data = GroupDataset(settings.data, network, seed, start, (rank, world))
 
         def loss(run: nn.Module, batch: Batch, step: int) -> tuple[Tensor, dict[str, Tensor]]:
             value, _ = run(*to_device((batch.points, batch.views, pair_distances(batch)), device))
@@ -133,9 +147,8 @@ def validator(
     settings: PhaseTwoSettings, network: NetworkSettings, device: torch.device
 ) -> Callable[[nn.Module], dict[str, float]]:
     """A function that measures the average precision on fixed batches of unseen worlds."""
-    options = settings.data.model_copy(update={"packed": {settings.validation: 1.0}, "frames": FRAMES})
+    options = settings.data.model_copy(update={"packed": {settings.validation: 1.0}})
     data = GroupDataset(options, network, seed=1)
-    data.draw = draw_overlap
     batches = [data.batch(i) for i in range(settings.validation_batches)]
 
     @torch.inference_mode()

@@ -62,16 +62,22 @@ def plan_sets(poses: Tensor, per_group: int, sides: tuple[int, int], radius: flo
     )
 
 
-def merge_tokens(tokens: Tokens, index: Tensor, T: Tensor) -> Tokens:
-    """Sets (B, S * N) of frames index (B, S) of a batch of tokens, moved by T (B, S, 4, 4)."""
+def merge_tokens(tokens: Tokens, index: Tensor, T: Tensor, view_aligned: bool) -> Tokens:
+    """Sets (B, S * N) of frames index (B, S) of a batch of tokens, moved by T (B, S, 4, 4).
+
+    Where the network is not `view_aligned` the offsets are in the axes of the set, and so `axis` stays (1, 0), as
+    `to_tokens` has it in use.
+    """
     batch, size = index.shape
     flat = index.flatten()
     if size == 1:  # its own frame
         return Tokens(*(field[flat] for field in tokens))
     T = T.flatten(0, 1)
     xyz = transform(T, tokens.xyz[flat])
-    axis = tokens.axis[flat] @ T[:, :2, :2].transpose(1, 2)
-    axis = axis / axis.norm(dim=-1, keepdim=True).clamp(min=1e-6)
+    axis = tokens.axis[flat]
+    if view_aligned:
+        axis = axis @ T[:, :2, :2].transpose(1, 2)
+        axis = axis / axis.norm(dim=-1, keepdim=True).clamp(min=1e-6)
 
     def joined(x: Tensor) -> Tensor:
         return x.reshape(batch, -1, *x.shape[2:])

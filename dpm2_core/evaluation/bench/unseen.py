@@ -181,7 +181,7 @@ def overlap(network: DeepPointMap2, options: Options) -> dict[str, Any]:
     for g in range(groups):
         d = g % len(pairs.drives)
         poses = pairs.drives[d].poses
-        index = draw_overlap(poses, FRAMES, OVERLAP, noise)
+        index = draw_overlap(poses, noise)
         rows = [pairs.frames.setdefault((d, int(i), 0.0), len(pairs.frames)) for i in index]
         chosen += [(rows[0], row) for row in rows[1:]]
         distances += np.linalg.norm(poses[index[1:], :3, 3] - poses[index[0], :3, 3], axis=1).tolist()

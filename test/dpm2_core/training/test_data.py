@@ -12,8 +12,10 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
+from dpm2_core.descriptors import Descriptors, merge
 from dpm2_core.errors import UsageError
 from dpm2_core.geometry import se3
+from dpm2_core.network.descriptors import to_tokens
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.training.augment import AugmentSettings, augment
 from dpm2_core.training.dataset import DataSettings, GroupDataset, draw_group
@@ -122,7 +124,7 @@ def test_overlap_groups_have_half_positives_and_hard_negatives() -> None:
     poses[:, 0, 3] = np.arange(200)
     noise = np.random.default_rng(0)
     for _ in range(50):
-        chosen = draw_overlap(poses, 5, 20, noise)
+        chosen = draw_overlap(poses, noise)
         distance = np.abs(poses[chosen[1:], 0, 3] - poses[chosen[0], 0, 3])
         assert (distance[:2] <= 20).all()
         assert 20 < distance[2] <= 40 < distance[3]
@@ -164,6 +166,22 @@ def test_plans_hold_the_truth(model: DeepPointMap2, packed: Path, sides: tuple[i
                 first_target @ plan.T_target[row, k], flat[plan.target[row, k]], atol=1e-3, rtol=0
             )
     tokens = model.encoder(batch.points).tokens
-    merged = merge_tokens(tokens, plan.target, plan.T_target)
+    merged = merge_tokens(tokens, plan.target, plan.T_target, True)
     assert merged.xyz.shape == (4, 48 * sides[1], 3)
     torch.testing.assert_close(merged.axis.norm(dim=-1), torch.ones(4, 48 * sides[1]))
+
+
+@pytest.mark.parametrize("view_aligned", [True, False])
+def test_merged_sets_have_the_same_axes_in_training_and_in_use(view_aligned: bool) -> None:
+    """Offsets are trained in the axes in which the decoder reads them: turned with the member, or those of the set."""
+    noise = np.random.default_rng(0)
+    axes = noise.normal(size=(2, 5, 2))
+    axes = (axes / np.linalg.norm(axes, axis=-1, keepdims=True)).astype(np.float32)
+    xyz, features = noise.normal(size=(2, 5, 3)).astype(np.float32), np.zeros((2, 5, 4), np.float16)
+    members = [Descriptors(*parts) for parts in zip(xyz, features, axes, strict=True)]
+    T = np.stack([np.eye(4), se3.exp([0, 0, 1.2, 3, -1, 0])])
+    used = to_tokens([merge([m.moved(t) for m, t in zip(members, T, strict=True)])], view_aligned)
+    tokens = to_tokens(members, view_aligned)
+    trained = merge_tokens(tokens, torch.tensor([[0, 1]]), torch.from_numpy(T).float()[None], view_aligned)
+    torch.testing.assert_close(trained.xyz, used.xyz)
+    torch.testing.assert_close(trained.axis, used.axis)

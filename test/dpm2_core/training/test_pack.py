@@ -14,7 +14,7 @@ from dpm2_core.cli import app
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
-from dpm2_core.training.dataset import DataSettings, GroupDataset
+from dpm2_core.training.dataset import DataSettings, GroupDataset, Mixture
 from dpm2_core.training.generate import pack
 from dpm2_core.training.packed import PackedDrive
 
@@ -100,10 +100,11 @@ def test_command_and_mixture(kitti: Path, packed: Path, tiny: Callable, tmp_path
     assert done.exit_code == 0, done.output
     assert PackedDrive(out).about["source"] == "03"
     assert len(PackedDrive(out)) == 3
-    data = GroupDataset(DataSettings(packed={str(out.parent): 0.9, str(packed): 0.1}, workers=0), tiny(), seed=0)
-    chances = dict(zip((drive.name for drive in data.drives), data.chances, strict=True))
+    settings = DataSettings(packed={str(out.parent): 0.9, str(packed): 0.1}, workers=0)
+    mixture = Mixture(settings)
+    chances = dict(zip((drive.name for drive in mixture.drives), mixture.chances, strict=True))
     assert chances == pytest.approx({"03": 0.9, "world": 0.1})
-    assert np.isfinite(data.batch(0).poses.numpy()).all()
+    assert np.isfinite(GroupDataset(settings, tiny(), seed=0).batch(0).poses.numpy()).all()
     again = CliRunner().invoke(app, arguments)
     assert isinstance(again.exception, UsageError)
     assert "is there already" in str(again.exception)

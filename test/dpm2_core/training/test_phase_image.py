@@ -17,9 +17,8 @@ from dpm2_core.frame import Camera
 from dpm2_core.network.config import PRESETS, NetworkSettings
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.weights import save_weights
-from dpm2_core.training.dataset import DataSettings
 from dpm2_core.training.packed import Sample, write_packed
-from dpm2_core.training.phase_image import PhaseImageSettings, PictureDataset, phase_image, shown
+from dpm2_core.training.phase_image import PhaseImageSettings, PictureDataset, PictureSettings, phase_image, shown
 from dpm2_core.training.trainer import OptimiserSettings
 
 
@@ -38,7 +37,7 @@ def settings(packed: Path, network: NetworkSettings, tmp_path: Path) -> PhaseIma
     save_weights(DeepPointMap2(network), start, {})
     return PhaseImageSettings(
         preset="tiny",
-        data=DataSettings(packed={str(packed): 1.0}, groups=2, radius=3, images=True),
+        data=PictureSettings(packed={str(packed): 1.0}, groups=2, radius=3),
         points=32,
         optimiser=OptimiserSettings(steps=4, compile=False, bf16=False, save_every=2, warmup=1),
         start=str(start),

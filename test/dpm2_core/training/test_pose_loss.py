@@ -79,7 +79,7 @@ def test_phase_one_trains_by_it(packed: Path, tiny: Callable[..., NetworkSetting
         module.model.decoder.offset.out.weight.normal_(std=0.1)
     plan = plans_of(batch.poses, PhaseOneSettings(data=data, loss=loss, pairs=2, sets=0), 0)[0]
     tokens = module.model.encoder(batch.points, None).tokens
-    source, target = (merge_tokens(tokens, side, plan.T_source) for side in (plan.source, plan.target))
+    source, target = (merge_tokens(tokens, side, plan.T_source, True) for side in (plan.source, plan.target))
     with torch.no_grad():
         solved = solve_batch(module.model.decoder, source, target, module.model.decoder(source, target))
     assert solved is not None

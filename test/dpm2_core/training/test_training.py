@@ -14,13 +14,15 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from dpm2_core.config import settings_from
 from dpm2_core.errors import UsageError
 from dpm2_core.network.config import PRESETS
-from dpm2_core.network.weights import read_metadata
+from dpm2_core.network.weights import network_settings, read_metadata
 from dpm2_core.training.augment import AugmentSettings
 from dpm2_core.training.checkpoint import Log
 from dpm2_core.training.dataset import DataSettings, GroupDataset
 from dpm2_core.training.objective import LossSettings
+from dpm2_core.training.phase_image import PhaseImageSettings
 from dpm2_core.training.phase_one import PhaseOne, PhaseOneSettings, phase_one, plans_of
 from dpm2_core.training.phase_two import PhaseTwoSettings, phase_two
 from dpm2_core.training.trainer import OptimiserSettings, learning_rate
@@ -98,14 +100,44 @@ def test_a_checkpoint_of_another_network_is_refused(settings: PhaseOneSettings, 
 def test_phase_two_changes_the_overlap_head_alone(settings: PhaseOneSettings, tmp_path: Path) -> None:
     """Every other tensor of the weights stays as phase one left it."""
     start = phase_one(settings, tmp_path / "one")
-    second = PhaseTwoSettings(
-        preset="tiny", start=str(start), data=settings.data, validation=settings.validation, validation_batches=1,
-        optimiser=settings.optimiser.model_copy(update={"rate": 1e-2}),
-    )  # fmt: skip
+    second = _overlap(settings, start, rate=1e-2, steps=4)
+    second = second.model_copy(update={"validation": settings.validation, "validation_batches": 1})
     before, after = load_file(start), load_file(phase_two(second, tmp_path / "two"))
     changed = {name for name in before if not torch.equal(before[name], after[name])}
     assert changed
     assert all(name.startswith("decoder.overlap.") for name in changed)
+
+
+def _overlap(settings: PhaseOneSettings, start: Path, **optimiser: float) -> PhaseTwoSettings:
+    """Phase two on the drives of phase one, as if from a YAML file that sets these keys alone."""
+    data = {"packed": settings.data.packed, "groups": 1, "workers": 0, "images": True}
+    tree = {"start": str(start), "data": data, "optimiser": {"compile": False, "bf16": False, **optimiser}}
+    return settings_from(PhaseTwoSettings, tree)
+
+
+def test_phase_two_keeps_a_tenth_of_the_rate_whatever_else_is_set() -> None:
+    """The paper's 1e-4 and 1e-5 hold beside other keys of the optimizer; one that is set itself counts."""
+    chosen = settings_from(PhaseTwoSettings, {"start": "w", "optimiser": {"steps": 2000, "decay": 3e-5}}).optimiser
+    assert (chosen.steps, chosen.rate, chosen.decay, chosen.warmup) == (2000, 1e-4, 3e-5, 20)
+
+
+def test_phase_two_keeps_the_network_of_phase_one(settings: PhaseOneSettings, tmp_path: Path) -> None:
+    """Also settings that change no shape and differ from the preset: the weights that it writes tell them again."""
+    changed = {"decoder": {"temperature": 0.5}, "fusion": {"image_mask": "front"}}
+    start = phase_one(settings.model_copy(update={"network": changed}), tmp_path / "one")
+    after = network_settings(phase_two(_overlap(settings, start, steps=1), tmp_path / "two"))
+    assert after == network_settings(start)
+    assert (after.decoder.temperature, after.fusion.image_mask) == (0.5, "front")
+
+
+@pytest.mark.parametrize(("kind", "key"), [
+    (PhaseTwoSettings, "frames"), (PhaseTwoSettings, "radius"), (PhaseImageSettings, "frames"),
+    (PhaseImageSettings, "images"),
+])  # fmt: skip
+def test_a_setting_that_a_phase_does_not_use_is_refused(kind: type, key: str) -> None:
+    """Frames of a place are fixed in phase two, two images of one in the image branch."""
+    with pytest.raises(UsageError, match=f"unknown key data.{key}"):
+        settings_from(kind, {"start": "w", "data": {key: 3}})
 
 
 def test_it_overfits_four_pairs_to_two_centimetres(packed: Path, tiny: Callable) -> None:
@@ -148,8 +180,8 @@ def _errors(module: PhaseOne, batch: object, plans: tuple) -> list[float]:
     with torch.inference_mode():
         tokens = module.model.encoder(batch.points).tokens  # type: ignore[attr-defined]
         (plan,) = plans
-        source = merge_tokens(tokens, plan.source, plan.T_source)
-        target = merge_tokens(tokens, plan.target, plan.T_target)
+        source = merge_tokens(tokens, plan.source, plan.T_source, True)
+        target = merge_tokens(tokens, plan.target, plan.T_target, True)
         answers = register_batch(module.model.decoder, source, target, module.model.decoder(source, target))
     return [
         float((torch.from_numpy(answer.T_target_source[:3, 3]) - T[:3, 3]).norm())
@@ -169,6 +201,7 @@ from dpm2_core.config import settings_from
 from dpm2_core.network.config import NetworkSettings
 from dpm2_core.training.dataset import DataSettings, GroupDataset
 from dpm2_core.training.objective import LossSettings
+from dpm2_core.training.phase_image import PhaseImageSettings
 from dpm2_core.training.phase_one import PhaseOne, PhaseOneSettings, plans_of
 from dpm2_core.training.trainer import process_group
 from torch.nn.parallel import DistributedDataParallel
@@ -230,10 +263,7 @@ def test_without_tensorboard_the_log_alone_is_written(tmp_path: Path, monkeypatc
 def test_phase_two_keeps_what_the_weights_say_of_phase_one(settings: PhaseOneSettings, tmp_path: Path) -> None:
     """Steps and pictures of phase one, by which the SLAM knows whether to use the camera, stay; the phase is two."""
     start = phase_one(settings, tmp_path / "one")
-    second = PhaseTwoSettings(
-        preset="tiny", start=str(start), data=settings.data,
-        optimiser=settings.optimiser.model_copy(update={"steps": 1}),
-    )  # fmt: skip
+    second = _overlap(settings, start, steps=1)
     before, after = read_metadata(start), read_metadata(phase_two(second, tmp_path / "two"))
     assert before["images"] == "true"
     assert before["phase"] == "1"
@@ -244,6 +274,7 @@ LOOP = """
 import sys
 from pathlib import Path
 from dpm2_core.network.config import PRESETS
+from dpm2_core.training.phase_image import PhaseImageSettings
 from dpm2_core.training.phase_one import PhaseOneSettings, phase_one
 import json
 out, settings, network = sys.argv[1:]
