@@ -4,12 +4,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-
-from dpm2_core.errors import UsageError
 
 
 def bench(
@@ -27,30 +25,42 @@ def bench(
         Path | None, typer.Option(help="KITTI excerpt, packed or in KITTI layout; else $DPM2_KITTI, ../shared/kitti.")
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder for NAME.json.")] = Path("benchmarks"),
-    repetitions: Annotated[int, typer.Option(min=1, help="Runs of every method on every drive.")] = 3,
-    threads: Annotated[int, typer.Option(min=1, help="Processors that every method may use.")] = 2,
+    repetitions: Annotated[
+        int | None, typer.Option(min=1, help="Runs of every method on every drive, or seeds [3].")
+    ] = None,
+    threads: Annotated[int | None, typer.Option(min=1, help="Processors that every method may use [2].")] = None,
     settings: Annotated[
         list[str] | None, typer.Option("--set", help="KEY=VALUE of the configuration; repeat for more.")
     ] = None,
-    weights: Annotated[str | None, typer.Option(help="neural: shipped weights, or a .safetensors file.")] = None,
+    weights: Annotated[
+        str | None, typer.Option(help="neural, traffic: shipped weights, or a .safetensors file.")
+    ] = None,
     unseen: Annotated[
         Path | None, typer.Option(help="neural: packed drives (`dpm2 train data`) instead of new unseen worlds.")
     ] = None,
-    pairs: Annotated[int, typer.Option(min=1, help="neural: pairs of frames of each kind.")] = 60,
+    pairs: Annotated[
+        int | None, typer.Option(min=1, help="finetune, neural: pairs of each kind; relocalise: visits [60].")
+    ] = None,
     only: Annotated[
-        str | None, typer.Option(help="neural, tasks: this part alone; else those that NAME.json lacks.")
+        str | None,
+        typer.Option(help="finetune, neural, tasks, traffic: this part alone; else those that NAME.json lacks."),
     ] = None,
 ) -> None:
     """Measure accuracy and speed beside KISS-ICP on the same scans, memory over a long drive, or the network."""
-    from dpm2_core.evaluation.bench import BENCHES  # imports the whole SLAM
+    from dpm2_core.evaluation.bench import BENCHES, check_options  # imports the whole SLAM
     from dpm2_core.evaluation.bench.harness import Options, write_report
 
     names = names or ["geometric"]
-    if unknown := [name for name in names if name not in BENCHES]:
-        raise UsageError(f"{unknown[0]}: no such benchmark; choose from {', '.join(BENCHES)}")
-    options = Options(source or (), kitti, repetitions, threads, settings or (), weights, unseen, pairs, only, out)
+    every: dict[str, Any] = {
+        "source": source, "kitti": kitti, "repetitions": repetitions, "threads": threads, "set": settings,
+        "weights": weights, "unseen": unseen, "pairs": pairs, "only": only,
+    }  # fmt: skip
+    given = {option: value for option, value in every.items() if value is not None}
+    check_options(names, given)
+    fields = {"source": "sources", "set": "overrides"}
+    options = Options(out=out, **{fields.get(option, option): value for option, value in given.items()})
     for name in names:
-        report = BENCHES[name](options)
+        report = BENCHES[name].run(options)
         path = out / f"{name}.json"
         write_report(path, name, report, options)
         Console().print(report.view, f"written to {path}")

@@ -52,7 +52,7 @@ def eval_(
     estimate = read_trajectory(est)
     if calib is not None:
         estimate = in_camera_frame(estimate, calib)
-    metrics = evaluate(*matched(truth, estimate), chosen)
+    metrics = evaluate(*matched(truth, estimate), chosen).model_copy(update={"truth": str(gt)})
     frame = FRAME_CAMERA if calib else FRAME_AS_GIVEN
     Console().print(metrics_table(metrics, title=f"{est} against {gt}", frame=frame))
     if json_file is not None:

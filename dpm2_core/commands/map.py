@@ -71,18 +71,22 @@ def export(
     format: Annotated[
         str, typer.Option(help="ply, pcd, las, occupancy (YAML and PGM for Nav2), tum, kitti or g2o.")
     ] = "",
-    voxel: Annotated[float, typer.Option(min=0.01, help="Spacing of the points of a cloud, m.")] = 0.3,
-    resolution: Annotated[float, typer.Option(min=0.01, help="Cell of the occupancy grid, m.")] = 0.1,
+    voxel: Annotated[float | None, typer.Option(min=0.01, help="Spacing of the points of a cloud, m [0.3].")] = None,
+    resolution: Annotated[float | None, typer.Option(min=0.01, help="Cell of the occupancy grid, m [0.1].")] = None,
 ) -> None:
     """Write a map as a point cloud, an occupancy grid, a trajectory of its keyframes, or a pose graph."""
     kind = format or _ENDINGS.get(out.suffix.lower(), "")
     if kind not in _EXPORTS:
         raise UsageError(f"{out}: choose --format from {', '.join(_EXPORTS)}")
+    spacing = {"voxel": voxel, "resolution": resolution}
+    write, wanted = _EXPORTS[kind]
+    if ignored := [name for name, value in spacing.items() if value is not None and name != wanted]:
+        raise UsageError(f"--{ignored[0]}: a map as {kind} has no use for it")
     with MapStore.open(path) as store:
         data = load_map(store, descriptors=False)
         if not len(data):
             raise UsageError(f"{path}: no keyframe in it yet")
-        _EXPORTS[kind](data, out, voxel, resolution)
+        write(data, out, spacing.get(wanted) or _SPACING[wanted])
     Console(stderr=True).print(f"{out} written", highlight=False, soft_wrap=True)
 
 
@@ -107,6 +111,8 @@ def merge(
     given = [parse_transform(text) for text in transform or ()]
     if len(paths) < 2 or align == bool(given) or (given and len(given) != len(paths) - 1):
         raise UsageError("merge: want two or more maps, and either --align or a --transform for each but the first")
+    if given and (config is not None or settings):
+        raise UsageError("merge: --config and --set are for --align; known transforms need no settings")
     chosen = load_settings(Config, config, settings or ()).slam
     with ExitStack() as stack:
         first, *others = (load_map(stack.enter_context(MapStore.open(path)), descriptors=True) for path in paths)
@@ -192,7 +198,7 @@ def _extent(data: MapData) -> str:
     return f"{size[0]:.1f} x {size[1]:.1f} x {size[2]:.1f} m, of the keyframes"
 
 
-def _export_g2o(data: MapData, out: Path, voxel: float, resolution: float) -> None:
+def _export_g2o(data: MapData, out: Path) -> None:
     from dpm2_core.slam.graph.pose_graph import PoseGraph, PoseGraphSettings
 
     graph = PoseGraph(PoseGraphSettings())
@@ -200,22 +206,24 @@ def _export_g2o(data: MapData, out: Path, voxel: float, resolution: float) -> No
     graph.write_g2o(out)
 
 
-def _export_occupancy(data: MapData, out: Path, voxel: float, resolution: float) -> None:
+def _export_occupancy(data: MapData, out: Path, resolution: float) -> None:
     from dpm2_core.slam.map.occupancy import OccupancySettings, occupancy_grid, write_grid
 
     write_grid(out, occupancy_grid(data.clouds, data.poses, OccupancySettings(resolution=resolution)))
 
 
-_Export = Callable[[MapData, Path, float, float], None]
-_EXPORTS: dict[str, _Export] = {
-    "ply": lambda data, out, voxel, _: write_ply(out, map_cloud(data.clouds, data.poses, voxel)),
-    "pcd": lambda data, out, voxel, _: write_pcd(out, map_cloud(data.clouds, data.poses, voxel)),
-    "las": lambda data, out, voxel, _: write_las(out, map_cloud(data.clouds, data.poses, voxel)),
-    "occupancy": _export_occupancy,
-    "tum": lambda data, out, *_: write_tum(out, *trajectory(data)),
-    "kitti": lambda data, out, *_: write_kitti(out, trajectory(data)[1]),
-    "g2o": _export_g2o,
+_SPACING = {"voxel": 0.3, "resolution": 0.1, "": 0.0}
+"""Default of each option that is a spacing, m."""
+_EXPORTS: dict[str, tuple[Callable[[MapData, Path, float], None], str]] = {
+    "ply": (lambda data, out, voxel: write_ply(out, map_cloud(data.clouds, data.poses, voxel)), "voxel"),
+    "pcd": (lambda data, out, voxel: write_pcd(out, map_cloud(data.clouds, data.poses, voxel)), "voxel"),
+    "las": (lambda data, out, voxel: write_las(out, map_cloud(data.clouds, data.poses, voxel)), "voxel"),
+    "occupancy": (_export_occupancy, "resolution"),
+    "tum": (lambda data, out, _: write_tum(out, *trajectory(data)), ""),
+    "kitti": (lambda data, out, _: write_kitti(out, trajectory(data)[1]), ""),
+    "g2o": (lambda data, out, _: _export_g2o(data, out), ""),
 }
+"""How each kind is written, and the option that is its spacing."""
 _ENDINGS = {
     ".ply": "ply", ".pcd": "pcd", ".las": "las", ".yaml": "occupancy", ".pgm": "occupancy", ".tum": "tum",
     ".g2o": "g2o",

@@ -72,6 +72,8 @@ def run(
     span = parse_range(frames)
     if resume and extend:
         raise UsageError("--resume goes on with the same drive, --extend adds another one: not both")
+    if (resume or extend) and map_file is None:
+        raise UsageError(f"--{'resume' if resume else 'extend'}: in which map? give --map FILE")
     if localise is not None:
         if gt is not None or map_file is not None:
             raise UsageError("--localise: the map stays as it is, and its frame is its own: without --map and --gt")
@@ -121,7 +123,8 @@ def _run(
         console.print("no place of this drive was found in the map: it stands in a frame of its own", style="yellow")
     if problem := system.mapper.store_problem:
         console.print(f"map file incomplete: {problem}", style="red", soft_wrap=True)
-    metrics = _write(out, source, system, recorder, truth, answers, seconds, wall)
+    of_truth = truth, source.truth if gt is None else str(gt)
+    metrics = _write(out, source, system, recorder, of_truth, answers, seconds, wall)
     if metrics is not None:
         sensor = "LiDAR" if source.T_cam_lidar is None else "left camera"
         Console().print(metrics_table(metrics, title=f"{source.name}, {len(recorder)} frames", frame=sensor))
@@ -222,12 +225,12 @@ def _write(
     source: Source,
     system: SlamSystem,
     recorder: TrajectoryRecorder,
-    truth: Array | Trajectory | None,
+    of_truth: tuple[Array | Trajectory | None, str],
     answers: Counter[str],
     seconds: dict[str, list[float]],
     wall: float,
 ) -> Metrics | None:
-    """All result files; the metrics when there is ground truth."""
+    """All result files; the metrics when there is ground truth, given with what it was read from."""
     from dpm2_core.evaluation.figures import trajectory_png
 
     poses = recorder.poses(system.mapper.poses[system.mapper.session_start :])
@@ -242,7 +245,7 @@ def _write(
     stages = {stage: _summary(times) for stage, times in [*seconds.items(), ("total", total.tolist())]}
     timing = {"frames": len(recorder), "fps": fps, "wall_s": wall, "answers": dict(answers), "stages_ms": stages}
     _write_json(out / "timing.json", timing)
-    metrics, failed = None, answers["failed"]
+    metrics, failed, (truth, truth_name) = None, answers["failed"], of_truth
     if isinstance(truth, Trajectory):
         own = Trajectory(poses, np.array(recorder.stamps), "tum")
         if truth.kind == "kitti-indexed":
@@ -255,6 +258,7 @@ def _write(
         judged = truth if T is None else _in_other_frame(truth, T)
         metrics = evaluate(judged, sensor, failed_frames=failed, fps=fps)
     if metrics is not None:
+        metrics = metrics.model_copy(update={"truth": truth_name})
         _write_json(out / "metrics.json", metrics.model_dump())
     try:
         trajectory_png(out / "trajectory.png", poses, truth, cloud, title=f"{source.name}: {len(recorder)} frames")

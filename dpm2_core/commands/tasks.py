@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -40,8 +40,11 @@ def tasks_data(
             task, description=f"{out}/{name}", completed=done, total=total))  # fmt: skip
 
 
+ValOption = Annotated[Path | None, typer.Option("--val", help="Scans to measure on during training, as SRC.")]
+
+
 def _add(name: str, help_: str) -> None:
-    """`dpm2 train NAME`, the same for every task."""
+    """`dpm2 train NAME`, the same for every task that the SLAM loss can be added to."""
 
     def run(
         src: SourceArgument,
@@ -49,7 +52,7 @@ def _add(name: str, help_: str) -> None:
         settings: SetOption = None,
         out: OutOption = Path("out") / name,
         resume: ResumeOption = False,
-        val: Annotated[Path | None, typer.Option(help="Scans to measure on during training, as SRC.")] = None,
+        val: ValOption = None,
         slam_weight: Annotated[
             float | None,
             typer.Option(min=0, help="gamma: weight of the SLAM loss; 0 without. Same as slam.gamma."),
@@ -58,18 +61,9 @@ def _add(name: str, help_: str) -> None:
             int | None, typer.Option(min=1, help="The SLAM loss counts in every K-th epoch. Same as slam.every.")
         ] = None,
     ) -> None:
-        from dpm2_core.diffslam.tasks.data import open_scans  # torch is slow to import
-        from dpm2_core.diffslam.tasks.task import task_type
-        from dpm2_core.diffslam.tasks.training import WEIGHTS, train_task
-
-        refuse_overwriting(out, resume)
-        kind = task_type(name)
         short = {"slam.gamma": slam_weight, "slam.every": slam_every}
         overrides = [*(settings or []), *(f"{key}={value}" for key, value in short.items() if value is not None)]
-        chosen = load_settings(kind.training_type, config, overrides)
-        scans = open_scans(src, kind.needs)
-        train_task(name, chosen, scans, out, resume, None if val is None else open_scans(val, kind.needs))
-        typer.echo(f"{out / WEIGHTS}: written", err=True)
+        _train(name, src, (config, overrides), out, resume, val)
 
     command: Callable[..., None] = run
     command.__doc__ = help_
@@ -79,7 +73,35 @@ def _add(name: str, help_: str) -> None:
 _add("gndnet", "GndNet: the height of the ground around the sensor, from one scan.")
 _add("dslr", "DSLR: a scan without what moves, from one with it.")
 _add("ae_lidar", "AE_lidar: a scan as a short code and back.")
-_add("movers", "Movers: which points are of things that move or could.")
+
+
+@train.command()
+def movers(
+    src: SourceArgument,
+    config: ConfigOption = None,
+    settings: SetOption = None,
+    out: OutOption = Path("out/movers"),
+    resume: ResumeOption = False,
+    val: ValOption = None,
+) -> None:
+    """Movers: which points are of things that move or could. It has no SLAM loss."""
+    _train("movers", src, (config, settings or []), out, resume, val)
+
+
+def _train(
+    name: str, src: Path, settings: tuple[Path | None, Sequence[str]], out: Path, resume: bool, val: Path | None
+) -> None:
+    """Train a task with the settings of a YAML file and of overrides."""
+    from dpm2_core.diffslam.tasks.data import open_scans  # torch is slow to import
+    from dpm2_core.diffslam.tasks.task import task_type
+    from dpm2_core.diffslam.tasks.training import WEIGHTS, train_task
+
+    refuse_overwriting(out, resume)
+    kind = task_type(name)
+    chosen = load_settings(kind.training_type, *settings)
+    scans = open_scans(src, kind.needs)
+    train_task(name, chosen, scans, out, resume, None if val is None else open_scans(val, kind.needs))
+    typer.echo(f"{out / WEIGHTS}: written", err=True)
 
 
 def eval_task(

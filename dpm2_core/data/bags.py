@@ -88,12 +88,15 @@ class BagSource:
     @cached_property
     def poses(self) -> Array | None:
         """(len, 4, 4) T_world_lidar ground truth interpolated at the stamps, NaN where there is none; None without."""
-        asked = self._settings.ground_truth_topic
-        found = self._bag.topics(*_TRUTH)
+        return interpolate(*self._truth(self.truth), self.stamps) if self.truth else None
+
+    @cached_property
+    def truth(self) -> str:
+        """Topic of the ground truth; empty without any."""
+        asked, found = self._settings.ground_truth_topic, self._bag.topics(*_TRUTH)
         if asked and asked not in found:
             raise UsageError(f"{self.path}: no Odometry or Path messages on {asked}; {self._contents()}")
-        topic = next((topic for topic in (asked, topics.ODOMETRY, topics.PATH) if topic in found), None)
-        return None if topic is None else interpolate(*self._truth(topic), self.stamps)
+        return next((topic for topic in (asked, topics.ODOMETRY, topics.PATH) if topic in found), "")
 
     def _choose_points(self) -> str:
         asked, found = self._settings.points_topic, self._bag.topics(_CLOUD)

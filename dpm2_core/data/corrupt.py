@@ -93,7 +93,7 @@ class CorruptedSource:
     def __init__(self, source: Source, settings: CorruptionSettings) -> None:
         self._source = source
         self._settings = settings
-        self.name, self.notes = source.name, source.notes
+        self.name, self.notes, self.truth = source.name, source.notes, source.truth
         turn, shift = self._rng(_EXTRINSIC).normal(size=(2, 3))
         turn *= np.radians(settings.extrinsic_deg) / np.linalg.norm(turn)
         shift *= settings.extrinsic_m / np.linalg.norm(shift)

@@ -70,6 +70,7 @@ class KittiSource:
         self.path = _sequence_folder(Path(path), self._settings.sequence)
         self.name = self.path.resolve().name
         self.notes: list[str] = []
+        self.truth = ""
         scans = sorted((self.path / "velodyne").glob("*.bin"))
         self._scans = [scan for scan in scans if scan.stem.isdecimal()]
         if not self._scans:
@@ -141,6 +142,7 @@ class KittiSource:
         if self.T_cam_lidar is None:
             self.notes.append(f"{path} is of the camera: without Tr it is no ground truth for the LiDAR")
             return None
+        self.truth = "/".join(path.parts[-2:])  # poses/04.txt, or SemanticKITTI's 04/poses.txt
         rows = self._of_each_scan(read_numbers(path, 12)).reshape(-1, 3, 4)
         known = np.isfinite(rows).all((1, 2))
         if not known.all():

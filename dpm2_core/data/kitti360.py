@@ -40,6 +40,7 @@ class Kitti360Source:
         self.root, self.drive = _find(Path(path), self._settings.sequence)
         self.name = self.drive
         self.notes: list[str] = []
+        self.truth = ""
         velodyne = self.root / "data_3d_raw" / self.drive / "velodyne_points"
         scans = sorted((velodyne / "data").glob("*.bin"))
         self._scans = [scan for scan in scans if scan.stem.isdecimal()]
@@ -97,6 +98,7 @@ class Kitti360Source:
             T_sensor_lidar = self._T_rect_cam @ self._T_cam_lidar
         else:
             return None
+        self.truth = "/".join(file.parts[-3:])
         poses = np.full((len(self), 4, 4), np.nan)
         at = {int(number): k for k, number in enumerate(self.numbers)}
         for row in rows:

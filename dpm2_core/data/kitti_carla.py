@@ -41,6 +41,7 @@ class KittiCarlaSource:
         self.folder = _find(Path(path), self._settings.sequence)
         self.name = self.folder.parent.resolve().name
         self.notes: list[str] = []
+        self.truth = ""
         self._sweeps = sorted((self.folder / "frames").glob("frame_*.ply"), key=lambda p: int(p.stem[6:]))
         if not self._sweeps:
             raise UsageError(f"{self.folder}: no sweeps (frames/frame_NNNN.ply) in this folder")
@@ -75,6 +76,7 @@ class KittiCarlaSource:
         if not len(rows):
             self.notes.append(f"{path}: missing: no ground truth, and frames are taken to be {_PERIOD} s apart")
             return np.round(seconds * 1e9).astype(np.int64), None
+        self.truth = path.name
         times = rows[:, 12]
         seconds = times[0] + seconds
         at = np.clip(np.searchsorted(times, seconds - 1e-6), 0, len(times) - 1)

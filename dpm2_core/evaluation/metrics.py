@@ -34,6 +34,8 @@ class Metrics(BaseModel):
 
     model_config = ConfigDict(frozen=True, use_attribute_docstrings=True)
 
+    truth: str | None = None
+    """What the true poses were read from: a file or a topic; None where that is not known."""
     frames: int
     """Frames of the drive."""
     failed_frames: int

@@ -13,7 +13,8 @@ from dpm2_core.evaluation.metrics import Metrics
 
 def metrics_table(metrics: Metrics, title: str, frame: str) -> Table:
     """The figures, each row with its definition; `frame` says which sensor's poses were compared."""
-    table = Table(title=title, title_justify="left", caption=f"Sensor frame: {frame}.", caption_justify="left")
+    caption = f"Sensor frame: {frame}." + (f" Truth: {metrics.truth}." if metrics.truth else "")
+    table = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
     table.add_column("figure")
     table.add_column("value", justify="right")
     table.add_column("how it is measured")

@@ -26,6 +26,7 @@ class SimulatedDrive:
     """
 
     T_cam_lidar = None
+    truth = "simulation"
 
     def __init__(
         self,

@@ -188,7 +188,7 @@ class Referenced:
     """A source with the poses of a SLAM instead of the truth; NaN where it had none."""
 
     def __init__(self, source: Source, poses: Array) -> None:
-        self.name, self.notes, self.poses = source.name, source.notes, poses
+        self.name, self.notes, self.poses, self.truth = source.name, source.notes, poses, "SLAM"
         self.T_cam_lidar = None
         self._source = source
 

@@ -20,7 +20,7 @@ from dpm2_core.diffslam.tasks.range_scans import (
     slam_of,
     variety,
 )
-from dpm2_core.diffslam.tasks.task import Task, TaskTraining
+from dpm2_core.diffslam.tasks.task import SlamTaskTraining, Task
 from dpm2_core.diffslam.tasks.training import mean_figures
 from dpm2_core.diffslam.trajectory_loss import SlamLoss
 
@@ -28,7 +28,7 @@ _LEAST_DIVERGENCE = 5.0
 """Below this the divergence of a VAE costs no less, nats: the codes keep something to say."""
 
 
-class AeLidarTraining(TaskTraining):
+class AeLidarTraining(SlamTaskTraining):
     """A training of AE_lidar."""
 
     network: AeLidarSettings = AeLidarSettings()

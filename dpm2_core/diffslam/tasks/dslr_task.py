@@ -22,7 +22,7 @@ from dpm2_core.diffslam.tasks.range_scans import (
     slam_of,
     variety,
 )
-from dpm2_core.diffslam.tasks.task import Task, TaskTraining
+from dpm2_core.diffslam.tasks.task import SlamTaskTraining, Task
 from dpm2_core.diffslam.tasks.training import mean_figures
 from dpm2_core.diffslam.trajectory_loss import SlamLoss
 
@@ -31,7 +31,7 @@ _MOVED = 0.5
 """A slot whose distance differs by more from that of the static twin has something moving in it, m."""
 
 
-class DslrTraining(TaskTraining):
+class DslrTraining(SlamTaskTraining):
     """A training of DSLR: epochs of the autoencoder, then of the discriminator, and the rest adversarial."""
 
     network: DslrSettings = DslrSettings()

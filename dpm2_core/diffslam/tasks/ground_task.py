@@ -21,7 +21,7 @@ from dpm2_core.diffslam.tasks.gndnet import (
     ground_metrics,
     obstacle_weight,
 )
-from dpm2_core.diffslam.tasks.task import Task, TaskTraining
+from dpm2_core.diffslam.tasks.task import SlamTaskTraining, Task
 from dpm2_core.diffslam.tasks.training import mean_figures
 from dpm2_core.diffslam.trajectory_loss import SlamLoss, SlamLossSettings
 from dpm2_core.errors import UsageError
@@ -39,7 +39,7 @@ class AboveGroundSettings(SlamLossSettings):
     """Both trajectories start where that of the target scans has ended."""
 
 
-class GroundTraining(TaskTraining):
+class GroundTraining(SlamTaskTraining):
     """A training of GndNet."""
 
     network: GroundSettings = GroundSettings()

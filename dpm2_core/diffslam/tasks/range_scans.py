@@ -91,7 +91,9 @@ class RangeReader:
             )
         every = columns // s.columns
         image, mask = image[:, s.first :, ::every][:, : s.rows], mask[s.first :, ::every][: s.rows]
-        return image * (SCALE / s.scale), mask
+        image = image * (SCALE / s.scale)
+        near = image[0] < 1  # as in `project`: what lies beyond the scale could not be reached by a network
+        return fill(image * near, near), mask & near
 
 
 def clouds(scans: RangeScans, scale: float) -> list[Tensor]:

@@ -33,10 +33,6 @@ class TaskTraining(Settings):
 
     network: Settings = Settings()
     """Of the network."""
-    slam: ScheduleSettings = ScheduleSettings()
-    """When and how much the SLAM loss counts; gamma 0: never."""
-    slam_loss: SlamLossSettings = SlamLossSettings()
-    """Odometry of the SLAM loss."""
     epochs: int = Field(default=20, ge=1)
     """Passes over the scans."""
     window: int = Field(default=5, ge=2)
@@ -61,8 +57,22 @@ class TaskTraining(Settings):
     """Epochs between validations."""
 
     def has_windows(self, epoch: int) -> bool:
-        """Whether the scans of a step are contiguous in this epoch, for the SLAM loss, also where its weight is zero:
-        trainings that differ in it alone see the same scans. In the other epochs they are of all places, shuffled."""
+        """Whether the scans of a step are contiguous in this epoch, for the SLAM loss. In the other epochs, which are
+        all for a task without it, they are of all places, shuffled."""
+        return False
+
+
+class SlamTaskTraining(TaskTraining):
+    """A training of a task that the SLAM loss can be added to."""
+
+    slam: ScheduleSettings = ScheduleSettings()
+    """When and how much the SLAM loss counts; gamma 0: never."""
+    slam_loss: SlamLossSettings = SlamLossSettings()
+    """Odometry of the SLAM loss."""
+
+    def has_windows(self, epoch: int) -> bool:
+        """In the epochs of the SLAM loss, also where its weight is zero: trainings that differ in it alone see the same
+        scans."""
         return is_due(epoch, self.slam)
 
 

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from dpm2_core.diffslam.schedule import total_loss
 from dpm2_core.diffslam.tasks.data import TaskScan, TaskScans
-from dpm2_core.diffslam.tasks.task import Task, TaskTraining, task_type
+from dpm2_core.diffslam.tasks.task import SlamTaskTraining, Task, TaskTraining, task_type
 from dpm2_core.diffslam.tasks.weights import load_strictly, read_weights, write_weights
 from dpm2_core.diffslam.windows import ContiguousWindows
 from dpm2_core.errors import UsageError
@@ -79,8 +79,9 @@ def eq1(task: Task, window: list[TaskScan], epoch: int, settings: TaskTraining) 
         return parts["slam_loss"].to(model_loss)
 
     # A prediction that is not finite has no trajectory; its step is skipped, and the log shows it.
-    counts = slam_loss is not None and bool(model_loss.isfinite())
-    total = total_loss(model_loss, slam, epoch, settings.slam) if counts else model_loss
+    total = model_loss
+    if isinstance(settings, SlamTaskTraining) and slam_loss is not None and bool(model_loss.isfinite()):
+        total = total_loss(model_loss, slam, epoch, settings.slam)
     return total, {"loss": total.detach()} | {name: value.detach() for name, value in parts.items()}
 
 

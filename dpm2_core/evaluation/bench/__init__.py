@@ -3,95 +3,63 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Collection
+from dataclasses import dataclass
+from importlib import import_module
 
-from dpm2_core.evaluation.bench.geometric import bench_geometric
+from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.bench.harness import Options, Report
-from dpm2_core.evaluation.bench.memory import bench_memory
 
 
-def bench_diffslam(options: Options) -> Report:
-    """See `diffslam.bench_diffslam`; the simulator and torch are imported only for it."""
-    from dpm2_core.evaluation.bench import diffslam
+@dataclass(frozen=True)
+class Bench:
+    """A benchmark.
 
-    return diffslam.bench_diffslam(options)
+    Attributes:
+        function: "module:function" below this package, imported when it runs: what one needs is slow to import.
+        options: what of `Options` it makes use of beside `out`, by the names of the command line.
+    """
 
+    function: str
+    options: frozenset[str]
 
-def bench_loop_cost(options: Options) -> Report:
-    """See `loop_cost.bench_loop_cost`."""
-    from dpm2_core.evaluation.bench import loop_cost
-
-    return loop_cost.bench_loop_cost(options)
-
-
-def bench_map(options: Options) -> Report:
-    """See `map.bench_map`; the simulator is imported only for it."""
-    from dpm2_core.evaluation.bench import map
-
-    return map.bench_map(options)
+    def run(self, options: Options) -> Report:
+        """The benchmark's outcome."""
+        module, _, name = self.function.partition(":")
+        report: Report = getattr(import_module(f"{__name__}.{module}"), name)(options)
+        return report
 
 
-def bench_neural(options: Options) -> Report:
-    """See `neural.bench_neural`; torch is imported only for it."""
-    from dpm2_core.evaluation.bench import neural
-
-    return neural.bench_neural(options)
+def _bench(function: str, options: str) -> Bench:
+    return Bench(function, frozenset(options.split()))
 
 
-def bench_relocalise(options: Options) -> Report:
-    """See `relocalise.bench_relocalise`."""
-    from dpm2_core.evaluation.bench import relocalise
-
-    return relocalise.bench_relocalise(options)
-
-
-def bench_roads(options: Options) -> Report:
-    """See `roads.bench_roads`; the simulator and torch are imported only for it."""
-    from dpm2_core.evaluation.bench import roads
-
-    return roads.bench_roads(options)
-
-
-def bench_pose_graph(options: Options) -> Report:
-    """See `pose_graph.bench_pose_graph`; gtsam is imported only for it."""
-    from dpm2_core.evaluation.bench import pose_graph
-
-    return pose_graph.bench_pose_graph(options)
-
-
-def bench_tasks(options: Options) -> Report:
-    """See `tasks.bench_tasks`; the simulator and torch are imported only for it."""
-    from dpm2_core.evaluation.bench import tasks
-
-    return tasks.bench_tasks(options)
-
-
-def bench_traffic(options: Options) -> Report:
-    """See `traffic.bench_traffic`; the simulator and torch are imported only for it."""
-    from dpm2_core.evaluation.bench import traffic
-
-    return traffic.bench_traffic(options)
-
-
-def bench_finetune(options: Options) -> Report:
-    """See `finetune.bench_finetune`."""
-    from dpm2_core.evaluation.bench import finetune
-
-    return finetune.bench_finetune(options)
-
-
-BENCHES: dict[str, Callable[[Options], Report]] = {
-    "diffslam": bench_diffslam,
-    "finetune": bench_finetune,
-    "geometric": bench_geometric,
-    "loop-cost": bench_loop_cost,
-    "map": bench_map,
-    "memory": bench_memory,
-    "neural": bench_neural,
-    "pose-graph": bench_pose_graph,
-    "relocalise": bench_relocalise,
-    "roads": bench_roads,
-    "tasks": bench_tasks,
-    "traffic": bench_traffic,
+BENCHES: dict[str, Bench] = {
+    "diffslam": _bench("diffslam:bench_diffslam", "repetitions threads set"),
+    "finetune": _bench("finetune:bench_finetune", "repetitions threads set pairs only"),
+    "geometric": _bench("geometric:bench_geometric", "source kitti repetitions threads set"),
+    "loop-cost": _bench("loop_cost:bench_loop_cost", "threads set"),
+    "map": _bench("map:bench_map", "set"),
+    "memory": _bench("memory:bench_memory", "source threads set"),
+    "neural": _bench("neural:bench_neural", "source kitti repetitions threads set weights unseen pairs only"),
+    "pose-graph": _bench("pose_graph:bench_pose_graph", "kitti repetitions"),
+    "relocalise": _bench("relocalise:bench_relocalise", "source kitti threads set pairs"),
+    "roads": _bench("roads:bench_roads", "source kitti threads set"),
+    "tasks": _bench("tasks:bench_tasks", "repetitions threads set only"),
+    "traffic": _bench("traffic:bench_traffic", "repetitions threads set weights only"),
 }
 """By the name that `dpm2 bench NAME` and `benchmarks/NAME.json` share."""
+
+
+def check_options(names: Collection[str], given: Collection[str]) -> None:
+    """Refuse names of benchmarks that do not exist, and options that one of them would ignore.
+
+    Raises:
+        UsageError: says which.
+    """
+    for name in names:
+        if name not in BENCHES:
+            raise UsageError(f"{name}: no such benchmark; choose from {', '.join(BENCHES)}")
+        if ignored := sorted(set(given) - BENCHES[name].options):
+            takes = ", ".join(f"--{option}" for option in sorted(BENCHES[name].options))
+            raise UsageError(f"--{ignored[0]}: benchmark {name} has no use for it; it takes {takes}")

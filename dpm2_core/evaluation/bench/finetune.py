@@ -18,6 +18,7 @@ from rich.table import Table
 
 from dpm2_core.config import load_settings
 from dpm2_core.data.source import InputSettings, open_source
+from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.bench.harness import Options, Report, git_commit, write_report
 from dpm2_core.network.weights import load_model
 from dpm2_core.sim.config import LidarConfig, PresetName
@@ -58,6 +59,8 @@ def bench_finetune(options: Options) -> Report:
 
     `--only` names one of the arms.
     """
+    if options.only is not None and options.only not in ARMS:
+        raise UsageError(f"--only {options.only}: no such training; choose from {', '.join(ARMS)}")
     path, folder = options.out / "finetune.json", options.cache / "finetune"
     threads = torch.get_num_threads()
     torch.set_num_threads(options.threads)

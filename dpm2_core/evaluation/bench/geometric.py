@@ -123,6 +123,7 @@ def bench_geometric(options: Options) -> Report:
     runs = {OURS: dpm2(options), NO_LOOPS: dpm2(no_loops), BASELINE: kiss_icp(options)}
     methods = {name: run for name, run in runs.items() if run is not None}
     results: dict[str, Any] = {}
+    truth: dict[str, str] = {}
     with drives(options) as sources, processors(options.threads), Progress(transient=True) as progress:
         task = progress.add_task("benchmark", total=len(sources) * options.repetitions * len(methods))
         for source in sources:
@@ -135,13 +136,15 @@ def bench_geometric(options: Options) -> Report:
                     progress.update(task, description=f"{source.name}: {name}")
                     outcomes[name].append(run(frames))
                     progress.advance(task)
-            results[unique_name(source, results)] = {name: summary(source, outcomes[name]) for name in methods}
+            name = unique_name(source, results)
+            results[name] = {method: summary(source, outcomes[method]) for method in methods}
+            truth[name] = source.truth
             del frames
     notes = [] if BASELINE in methods else ["kiss-icp is not installed (pip install 'dpm2_ros[bench]'): no comparison."]
     for methods_of_drive in results.values():
         _compare(methods_of_drive)
     view = Group(_table(results), *(_stages(name, result) for name, result in results.items()), *notes)
-    return Report({"segment_lengths_m": LENGTHS, "drives": results}, view)
+    return Report({"segment_lengths_m": LENGTHS, "truth": truth, "drives": results}, view)
 
 
 def summary(source: Source, outcomes: Sequence[Outcome]) -> dict[str, Any]:

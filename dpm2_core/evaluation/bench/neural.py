@@ -93,6 +93,7 @@ def _of_drives(one: Callable[[Source, list[Frame], DeepPointMap2, Options], Any]
 
     def part(network: DeepPointMap2, options: Options) -> dict[str, Any]:
         found: dict[str, Any] = {}
+        truth: dict[str, str] = {}
         with drives(options) as sources:
             for source in sources:
                 if source.poses is None:
@@ -100,8 +101,9 @@ def _of_drives(one: Callable[[Source, list[Frame], DeepPointMap2, Options], Any]
                 frames = list(source.frames())
                 if network.encoder.image is None:
                     frames = [replace(frame, images=()) for frame in frames]
-                found[unique_name(source, found)] = one(source, frames, network, options)
-        return {"drives": found}
+                name = unique_name(source, found)
+                found[name], truth[name] = one(source, frames, network, options), source.truth
+        return {"drives": found, "truth": truth}
 
     return part
 

@@ -20,7 +20,7 @@ from rich.table import Table
 from dpm2_core.config import dump_settings, load_settings
 from dpm2_core.diffslam.tasks.data import TaskScans, open_scans
 from dpm2_core.diffslam.tasks.drives import TaskDriveSettings, make_task_drives
-from dpm2_core.diffslam.tasks.task import TaskTraining, task_type
+from dpm2_core.diffslam.tasks.task import SlamTaskTraining, task_type
 from dpm2_core.diffslam.tasks.training import WEIGHTS, load_task, measure, train_task
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.bench.harness import Options, Report, git_commit, processors, write_report
@@ -132,6 +132,7 @@ def _compare(name: str, comparison: Comparison, options: Options) -> Any:
     learn, judge = (open_scans(drives / which, kind.needs) for which in ("train", "val"))
     overrides = [*comparison.settings, *options.overrides]
     chosen = load_settings(kind.training_type, None, overrides)
+    assert isinstance(chosen, SlamTaskTraining)
     shared = next((epoch for epoch in range(chosen.epochs) if chosen.has_windows(epoch)), 0)
     part: dict[str, Any] = {
         "command": shlex.join(["dpm2", *sys.argv[1:]]),
@@ -161,7 +162,7 @@ def _compare(name: str, comparison: Comparison, options: Options) -> Any:
 
 
 def _train(
-    name: str, settings: TaskTraining, learn: TaskScans, out: Path, shared: int = 0, until: int | None = None
+    name: str, settings: SlamTaskTraining, learn: TaskScans, out: Path, shared: int = 0, until: int | None = None
 ) -> None:
     """Train, or go on, unless this very training has ended. The first `shared` epochs, before the SLAM loss counts for
     the first time, are trained once for both arms."""
@@ -185,7 +186,7 @@ def _train(
         file.write(text)
 
 
-def _judged(name: str, settings: TaskTraining, judge: TaskScans, out: Path) -> dict[str, Any]:
+def _judged(name: str, settings: SlamTaskTraining, judge: TaskScans, out: Path) -> dict[str, Any]:
     """Figures of one training on the scans of other worlds, and how the SLAM loss stood beside the task's."""
     figures = measure(load_task(name, out / WEIGHTS), judge)
     logged = (json.loads(line) for line in (out / "log.jsonl").read_text().splitlines())

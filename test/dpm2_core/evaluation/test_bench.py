@@ -66,7 +66,9 @@ def test_the_geometric_benchmark_records_errors_speed_and_origin(drive: Path, tm
 def test_kiss_icp_runs_beside_it_on_the_same_scans(drive: Path, tmp_path: Path) -> None:
     pytest.importorskip("kiss_icp")
     bench(None, source=[drive], out=tmp_path, repetitions=1, threads=2)
-    methods = json.loads((tmp_path / "geometric.json").read_text())["drives"][drive.name]
+    record = json.loads((tmp_path / "geometric.json").read_text())
+    assert record["truth"] == {drive.name: f"{drive.name}/poses.txt"}
+    methods = record["drives"][drive.name]
     assert methods["kiss-icp"]["rpe_trans_m"] < 0.02
     ratio = methods["ratio"]
     assert ratio["fps"] == pytest.approx(methods["dpm2"]["fps"] / methods["kiss-icp"]["fps"], rel=0.01)
@@ -121,6 +123,12 @@ def test_a_packed_excerpt_is_unpacked_for_as_long_as_the_run_lasts(drive: Path, 
 def test_what_cannot_be_measured_is_refused(drive: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"speed: no such benchmark; choose from .*geometric, .*neural"):
         bench(["geometric", "speed"])
+    for name, ignored in (("tasks", "source"), ("geometric", "weights"), ("pose-graph", "set"), ("map", "pairs")):
+        argument = {"settings" if ignored == "set" else ignored: [drive]}
+        with pytest.raises(UsageError, match=f"--{ignored}: benchmark {name} has no use for it; it takes --"):
+            bench([name], out=tmp_path, **argument)
+    with pytest.raises(UsageError, match="--only tasks: no such training"):
+        bench(["finetune"], out=tmp_path, only="tasks")
     with pytest.raises(UsageError, match="none: no KITTI excerpt"):
         bench(kitti=tmp_path / "none")
     with pytest.raises(UsageError, match=r"neither unpack\.py nor sequences"):

@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every argument and option that a command of `dpm2` accepts has an effect: its function makes use of it."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import dpm2_core.commands
+from dpm2_core.cli import _status
+
+COMMANDS = sorted(Path(dpm2_core.commands.__path__[0]).glob("*.py"))
+
+
+@pytest.mark.parametrize("module", COMMANDS, ids=lambda path: path.stem)
+def test_no_parameter_of_a_command_is_ignored(module: Path) -> None:
+    """A parameter whose name the body never reads would be accepted and do nothing."""
+    for function in ast.walk(ast.parse(module.read_text(encoding="utf-8"))):
+        if isinstance(function, ast.FunctionDef):
+            read = {node.id for part in function.body for node in ast.walk(part) if isinstance(node, ast.Name)}
+            arguments = {argument.arg for argument in (*function.args.args, *function.args.kwonlyargs)}
+            assert arguments <= read | {"self"}, f"{module.name}: {function.name}"
+
+
+@pytest.mark.parametrize(("command", "words"), [
+    (["run", ".", "--out", "o", "--resume"], "--resume: in which map?"),
+    (["run", ".", "--out", "o", "--extend"], "--extend: in which map?"),
+    (["run", ".", "--out", "o", "--localise", "m", "--extend"], "--extend: in which map?"),
+    (["map", "export", "m", "a.g2o", "--voxel", "1"], "--voxel: a map as g2o has no use for it"),
+    (["map", "export", "m", "a.ply", "--resolution", "1"], "--resolution: a map as ply has no use for it"),
+    (["map", "merge", "a", "b", "--out", "c", "--transform", "1 2 3 4", "--set", "slam.threads=1"],
+     "--config and --set are for --align"),
+])  # fmt: skip
+def test_an_option_without_effect_is_refused(
+    command: list[str], words: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before any file is opened, and none is made."""
+    monkeypatch.chdir(tmp_path)
+    assert _status(command) == 2
+    assert words in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_task_without_slam_loss_takes_no_weight_for_it(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    """Neither as an option nor as a setting."""
+    movers = ["train", "movers", str(tmp_path), "--out", str(tmp_path / "out")]
+    assert _status([*movers, "--slam-weight", "1"]) == 2
+    assert "--slam-weight" in capsys.readouterr().err
+    assert _status([*movers, "--set", "slam.gamma=1"]) == 2
+    assert "unknown key slam" in capsys.readouterr().err
