@@ -76,7 +76,12 @@ class PictureDataset:
     """Pairs of pictures of a place and the points that the first of them shows."""
 
     def __init__(
-        self, settings: PictureSettings, network: NetworkSettings, seed: int, start: int, shard: tuple[int, int]
+        self,
+        settings: PictureSettings,
+        network: NetworkSettings,
+        seed: int,
+        start: int = 0,
+        shard: tuple[int, int] = (0, 1),
     ) -> None:
         self._settings, self._network, self._seed, self._start, self._shard = settings, network, seed, start, shard
         self._drives = Mixture(settings)

@@ -57,8 +57,8 @@ def test_writes_everything_and_is_right(drive: Path, tmp_path: Path) -> None:
     assert {path.name for path in out.iterdir()} == RESULTS
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["frames"] == FRAMES
-    assert metrics["truth"] == "poses/00.txt"
-    assert "Truth: poses/00.txt" in done.stdout
+    assert metrics["truth"] == "00/poses.txt"
+    assert "Truth: 00/poses.txt" in done.stdout
     assert metrics["failed_frames"] == 0
     assert metrics["t_err_percent"] is None  # 12 m are too short for 100 m segments
     assert metrics["ape_rmse_m"] < 0.03
