@@ -40,7 +40,7 @@ class ActiveMap:
         self._store: MapStore | None = None
         self.localiser: Localiser | None = None
         self.located: Located | None = None
-        self._T_map_odom: dict[str, Array] = {}  # by robot, while the map grows
+        self._T_map_odom: dict[str, Array] | None = None  # by robot, while the map grows; None before any keyframe
         if config.ros.localization_mode:
             self._load()
         else:
@@ -51,8 +51,8 @@ class ActiveMap:
         if (localiser := self.localiser) is not None:
             return localiser.T_map_odom if localiser.state.located else None
         placed = self._T_map_odom
-        if not placed and robot == self._robot:
-            return self.mapper.T_map_odom  # nobody has sent a keyframe
+        if placed is None:
+            return self.mapper.T_map_odom if robot == self._robot else None
         return placed.get(robot)
 
     def add(self, keyframe: Keyframe) -> list[LoopClosure]:
@@ -60,10 +60,10 @@ class ActiveMap:
         if self.localiser is not None:
             self._locate(self.localiser, keyframe)
             return []
-        closures, before = self.mapper.add(keyframe), self._T_map_odom.keys()
-        placed = {robot: self.mapper.T_map_odom_of(robot) for robot in self.mapper.robots}
-        self._T_map_odom = {robot: T for robot, T in placed.items() if T is not None}
-        for robot in self._T_map_odom.keys() - before:
+        closures, before = self.mapper.add(keyframe), self._T_map_odom or {}
+        found = {robot: self.mapper.T_map_odom_of(robot) for robot in self.mapper.robots}
+        placed = self._T_map_odom = {robot: T for robot, T in found.items() if T is not None}
+        for robot in placed.keys() - before.keys():
             self._log.info(f"robot {robot or '/'}: its place in the map is known")
         return closures
 
@@ -99,8 +99,15 @@ class ActiveMap:
         self.close()
         self._resume()
         self.mapper.start_session(localiser.T_map_odom)
-        self._T_map_odom, self.localiser, self.located = {}, None, None
+        self._T_map_odom, self.localiser, self.located = None, None, None
         return f"{self._path} grows by a new session"
+
+    def restart(self) -> None:
+        """The robot's odometry has started again: where it is, a loop or a search has to tell."""
+        placed = self._T_map_odom or {}
+        self._T_map_odom = {robot: T for robot, T in placed.items() if robot != self._robot}
+        if self.localiser is not None:
+            self.localiser.restart()
 
     def reset(self) -> None:
         """Begin an empty map; or, in a map that stays as it is, look for the robot anew."""
@@ -148,7 +155,7 @@ class ActiveMap:
                 self._path = path
             except Dpm2Error as error:
                 self._log.error(f"no map file: {error}")
-        self.mapper, self._T_map_odom = make_mapper(self._config.slam, self._store), {}
+        self.mapper, self._T_map_odom = make_mapper(self._config.slam, self._store), None
 
     def _load(self) -> None:
         """The file, to find oneself in; what was before stays if that fails."""

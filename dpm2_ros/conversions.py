@@ -146,15 +146,20 @@ def edge_to_msg(T: Array, covariance: Array, stamp: int, parent: str, child: str
 def to_base(tracked: Tracked, T_base_lidar: Array) -> Tracked:
     """The same motion seen from the base: odom then starts at the base's first pose, and the keyframe's cloud,
     pose and edge are those of the base. The LiDAR's own names (`T_odom_lidar`) then mean the base."""
-    A = se3.adjoint(T_base_lidar)
     keyframe = None if tracked.keyframe is None else keyframe_to_base(tracked.keyframe, T_base_lidar)
+    moved = of_body(tracked, T_base_lidar)
+    return replace(moved, T_odom_lidar=T_base_lidar @ moved.T_odom_lidar, keyframe=keyframe)
+
+
+def of_body(tracked: Tracked, T_new_old: Array) -> Tracked:
+    """The pose of another frame of the same rigid body in the same odom; the keyframe stays as it is."""
+    A = se3.adjoint(T_new_old)
     return replace(
         tracked,
-        T_odom_lidar=T_base_lidar @ tracked.T_odom_lidar @ se3.inverse(T_base_lidar),
+        T_odom_lidar=tracked.T_odom_lidar @ se3.inverse(T_new_old),
         covariance=A @ tracked.covariance @ A.T,
         twist=A @ tracked.twist,
-        registration=_registration_to_base(tracked.registration, T_base_lidar),
-        keyframe=keyframe,
+        registration=_registration_to_base(tracked.registration, T_new_old),
     )
 
 

@@ -7,6 +7,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Mapping
+from datetime import UTC, datetime
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -20,6 +21,8 @@ from dpm2_ros.subscriptions import STEADY, Inputs
 from dpm2_ros.synchronizer import CameraState, Verdict
 
 OK, WARN, ERROR, STALE = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR, DiagnosticStatus.STALE
+OTHER_CLOCK = 1.0
+"""Seconds between a cloud's stamp and the node's clock beyond which they are not of the same clock."""
 SILENT = 2.0
 """Seconds without a message after which a sensor counts as silent."""
 
@@ -100,7 +103,7 @@ class Diagnostics:
         self._node, self._inputs, self._frames, self._health = node, inputs, frames, health
         self._mapper, self._sender = mapper, sender
         self.frame_problem = ""
-        """Set while the pose is not that of the frame that was asked for."""
+        """Set while there is no pose of the frame that was asked for."""
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         node.create_timer(1.0, self.publish, clock=STEADY)
 
@@ -134,9 +137,14 @@ class Diagnostics:
             "dropped (queue full)": str(synchronizer.dropped),
             "refused (stamp repeated)": str(counts[Verdict.REPEATED]),
             "refused (stamp out of order)": str(counts[Verdict.OUT_OF_ORDER]),
+            "rejected (stray stamp)": str(counts[Verdict.STRAY]),
             "restarts": str(counts[Verdict.RESTARTED]),
             "waiting": str(len(synchronizer)),
         }
+        if times := self._inputs.times:
+            figures |= {
+                name: f"{ns * 1e-9:.3f}" for name, ns in zip(("cloud stamp (s)", "clock (s)"), times, strict=True)
+            }
         silence = _silence(synchronizer.last_arrival)
         last = health.last
         if silence is None:
@@ -153,10 +161,25 @@ class Diagnostics:
         if last.registration.reason:
             text += f": {last.registration.reason}"
         if self.frame_problem:
-            level, text = max(level, WARN), f"{text}; {self.frame_problem}"
+            level, text = ERROR, f"{text}; {self.frame_problem}"
         if synchronizer.dropped and len(synchronizer):
             level, text = max(level, WARN), f"{text}; cannot keep up, {synchronizer.dropped} clouds dropped"
+        if problem := self._clock_problem():
+            self._node.get_logger().warning(problem, once=True)
+            level, text = max(level, WARN), f"{text}; {problem}"
         return self._status("odometry", level, text, figures)
+
+    def _clock_problem(self) -> str:
+        """How the clouds' clock is not that of the node, in words; empty where it is."""
+        stamp, now = self._inputs.times or (0, 0)
+        if abs(now - stamp) <= OTHER_CLOCK * 1e9:
+            return ""
+        if not self._node.get_parameter("use_sim_time").value:
+            text = f"clouds are stamped {_date(stamp)}, the clock of this machine says {_date(now)}"
+            return f"{text}: a sensor's clock has to be set, a recording wants use_sim_time and /clock"
+        if not now:
+            return "use_sim_time is on, and nobody publishes /clock"
+        return f"clouds are stamped {_date(stamp)}, /clock says {_date(now)}"
 
     def _localisation(self, mapper: MapperThread) -> DiagnosticStatus:
         located, figures = mapper.located, {"keyframes of the map": str(mapper.keyframes)}
@@ -188,6 +211,12 @@ class Diagnostics:
         values = [KeyValue(key=key, value=str(value)) for key, value in figures.items()]
         name = f"{self._node.get_fully_qualified_name().lstrip('/')}: {part}"
         return DiagnosticStatus(level=level, name=name, message=text, hardware_id="", values=values)
+
+
+def _date(stamp: int) -> str:
+    """A stamp in ns, for people."""
+    date = datetime.fromtimestamp(stamp // 10**9, UTC)
+    return f"{stamp * 1e-9:.3f} s ({date:%Y-%m-%d %H:%M:%S} UTC)"
 
 
 def _silence(last_arrival: float | None) -> float | None:

@@ -50,8 +50,10 @@ class MapperThread:
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="mapper", initializer=yield_to_odometry)
         self._stamp = 0  # of the last keyframe, ns
         self._last: Future[None] | None = None  # of the keyframes taken in
+        self._restarted: Future[None] | None = None  # since when the odometry's start is known here
         self._changes = self.keyframes
         ros = config.ros
+        self._ahead = round(ros.transform_tolerance * 1e9)
         self._tf = TransformBroadcaster(node, ros.map_frame, ros.publish_tf_map)
         self._loop_candidates = node.create_publisher(DiagnosticArray, "dpm2/loop_candidates", KEEP_ALL)
         self._loop_closures = node.create_publisher(Odometry, "dpm2/loop_closure", KEEP_ALL)
@@ -111,10 +113,11 @@ class MapperThread:
         return localiser is not None and idle and localiser.wants(stamp)
 
     def broadcast(self, stamp: int, robot: str, odom_frame: str) -> None:
-        """Send map -> odom of a robot, valid at that stamp (ns), if it is known."""
-        T_map_odom = self._active.T_map_odom(robot)
+        """Send map -> odom of a robot, valid from that stamp (ns) on, if it is known."""
+        restarting = robot == self._robot and self._restarted is not None and not self._restarted.done()
+        T_map_odom = None if restarting else self._active.T_map_odom(robot)
         if T_map_odom is not None:
-            self._tf.send(T_map_odom, stamp, odom_frame)
+            self._tf.send(T_map_odom, stamp + self._ahead, odom_frame)
 
     def add(self, make: Callable[[], Keyframe]) -> None:
         """Take in the keyframe that `make`, called in this thread, returns."""
@@ -135,6 +138,10 @@ class MapperThread:
     def extend(self) -> Future[str]:
         """Let the map grow from now on: that in which the robot was looked for, by a new session."""
         return self._thread.submit(self._change, self._active.extend)
+
+    def restart(self) -> None:
+        """The odometry has started again: the map stays, the robot's place in it is no longer known."""
+        self._restarted = self._submit(self._active.restart)
 
     def reset(self, save: bool) -> None:
         """Begin an empty map; `save` keeps the present one on disk."""

@@ -33,10 +33,15 @@ class RosSettings(Settings):
     """Frame of the continuous odometry."""
 
     base_frame: str = ""
-    """Frame whose pose is published; empty takes the root above the LiDAR in /tf_static, else the LiDAR's own frame."""
+    """Frame whose pose is published. Before /tf_static connects it with the LiDAR no pose is; up to 300 are kept. Empty
+    takes the root above the LiDAR in /tf_static, also one that comes late, else the LiDAR's own frame."""
 
     tf_timeout: float = Field(default=0.5, ge=0, le=60)
-    """How long the first cloud waits for /tf_static, if anybody publishes it, s."""
+    """How long the first cloud waits for all who publish /tf_static, s."""
+
+    transform_tolerance: float = Field(default=0.5, ge=0, le=10)
+    """Added to the stamp of map -> odom, so that it is valid until the next one comes, s. Poses at the latest stamps of
+    odometry or sensors can be looked up then without an extrapolation into the future."""
 
     publish_tf_odom: bool = True
     """slam_node publishes odom -> base on /tf."""

@@ -22,7 +22,8 @@ from dpm2_core.frame import Array, Keyframe, State, Tracked
 from dpm2_core.geometry import se3
 from dpm2_core.slam.loops.localiser import LOST
 from dpm2_core.slam.system import make_loops, make_odometry
-from dpm2_ros.conversions import keyframe_to_base, odometry_to_msg, to_base
+from dpm2_ros.base_frame import BaseFrame
+from dpm2_ros.conversions import keyframe_to_base, odometry_to_msg, of_body, to_base
 from dpm2_ros.frames import FrameBuilder
 from dpm2_ros.health import Diagnostics, Health
 from dpm2_ros.keyframes import KeyframeSender
@@ -32,6 +33,9 @@ from dpm2_ros.settings import NodeConfig
 from dpm2_ros.subscriptions import Inputs
 from dpm2_ros.synchronizer import Bundle
 from dpm2_ros.tf import TransformBroadcaster
+
+HELD = 300
+"""Poses kept while the base frame is not known."""
 
 
 class SlamNode(Node):
@@ -68,6 +72,8 @@ class SlamNode(Node):
         self.create_subscription(PoseWithCovarianceStamped, "initialpose", self._on_initial_pose, 10)
         self._reset_wanted = threading.Event()
         self._stopping = threading.Event()
+        self._base = BaseFrame(ros.base_frame, (ros.odom_frame, ros.map_frame))
+        self._waited = False  # for the base frame
         self._begin()
         self._index = 0
         self._worker = threading.Thread(target=self._work, name="worker")
@@ -92,8 +98,8 @@ class SlamNode(Node):
     def _begin(self) -> None:
         """The state of a drive at its start."""
         self._odometry.reset()
-        self._base_frame = ""  # decided with the first cloud
-        self._T_base_lidar = np.eye(4)
+        self._base.restart()
+        self._held: list[Tracked] = []  # until the base frame is known
         self._covariance = np.zeros((6, 6))
         self._before: Tracked | None = None
 
@@ -102,7 +108,7 @@ class SlamNode(Node):
             bundle = self._inputs.take(timeout=0.1)
             if self._reset_wanted.is_set():
                 self._reset_wanted.clear()
-                self._restart(save=False)
+                self._restart()
             if bundle is None:
                 continue
             try:
@@ -111,53 +117,75 @@ class SlamNode(Node):
                 self._health.errors += 1
                 self.get_logger().error(f"cloud at {bundle.stamp} ns: {traceback.format_exc()}")
 
-    def _restart(self, save: bool) -> None:
+    def _restart(self) -> None:
         self._begin()
         self._line.submit(self._sender.restart)
         if self._mapper is not None:
-            self._mapper.reset(save)
+            self._mapper.reset(save=False)
 
     def _process(self, bundle: Bundle) -> None:
         """One frame, from messages to messages."""
-        if bundle.restarted and self._before is not None:
-            self.get_logger().warning("time went back by more than a second (a looped bag?): starting again")
-            self._restart(save=True)
-        if not self._base_frame:
-            self._choose_base(bundle.cloud.header.frame_id or "lidar")
+        if bundle.restarted and (self._before is not None or self._held):
+            self.get_logger().warning(
+                "time went back by more than a second (a looped bag, a clock that was set): the odometry starts again, "
+                "its place in the map is unknown before a loop is found"
+            )
+            self._begin()
+            self._line.submit(self._sender.restart)
+            if self._mapper is not None:
+                self._mapper.restart()
+        self._look_for_base(bundle.cloud.header.frame_id or "lidar")
         mapper = self._mapper
-        if mapper is not None and mapper.wants_keyframe(bundle.stamp):
+        if mapper is not None and self._base.name and mapper.wants_keyframe(bundle.stamp):
             self._odometry.request_keyframe()
         tracked = self._odometry.process(self._frames.frame(bundle, self._index))
+        self._index += 1
+        self._held.append(tracked)
+        if self._base.name:
+            for held in self._held:
+                tracked = self._hand_on(held)
+            self._held = []
+        elif len(self._held) > HELD:
+            self.get_logger().error(f"{len(self._held)} poses are given up, the drive begins with the next cloud")
+            self._begin()
+        self._health.add(tracked, time.monotonic() - bundle.arrival)
+
+    def _look_for_base(self, lidar_frame: str) -> None:
+        """Before the first pose wait for what is latched, while clouds may still queue; then follow what comes."""
+        base, inputs, ros = self._base, self._inputs, self._config.ros
+        end, room = time.monotonic() + ros.tf_timeout, max(ros.queue_depth - 1, 1)
+        while not self._waited:
+            found = inputs.calibrated(lidar_frame) and (base.optional or base.look(inputs.static.tree, lidar_frame))
+            full = len(inputs.synchronizer) >= room
+            self._waited = found or full or self._stopping.is_set() or time.monotonic() >= end
+            if not self._waited:
+                time.sleep(0.01)
+        before = base.name
+        if base.look(inputs.static.tree, lidar_frame) and before:
+            self.get_logger().warning(
+                f"/tf_static has put {base.name} above {before}: the pose is that of {base.name} from now on, in the "
+                f"same odom; set ros.base_frame to wait for it"
+            )
+        if base.problem:
+            self.get_logger().error(base.problem, throttle_duration_sec=10)
+        self._diagnostics.frame_problem = base.problem
+
+    def _hand_on(self, tracked: Tracked) -> Tracked:
+        """The keyframe to the map, pose and transforms to everybody; returns what was published."""
+        mapper, T_start_lidar = self._mapper, self._base.T_start_lidar
         if mapper is not None:
             tracked = replace(tracked, state=mapper.state(tracked.state))
-        self._index += 1
         if tracked.keyframe is not None:
-            make = partial(self._finished, tracked.keyframe, self._T_base_lidar)
+            make = partial(self._finished, tracked.keyframe, T_start_lidar)
             if mapper is not None:
                 mapper.add(make)
             else:
                 self._line.submit(make).add_done_callback(self._report)
-        if not np.array_equal(self._T_base_lidar, np.eye(4)):
-            tracked = to_base(tracked, self._T_base_lidar)
+        tracked = replace(tracked, keyframe=None)
+        if not np.array_equal(T_start_lidar, np.eye(4)):
+            tracked = to_base(tracked, T_start_lidar)
         self._publish(tracked)
-        self._health.add(tracked, time.monotonic() - bundle.arrival)
-
-    def _choose_base(self, lidar_frame: str) -> None:
-        """Which frame's pose is published, and where the LiDAR is in it: known, or the LiDAR's own; never assumed."""
-        end = time.monotonic() + self._config.ros.tf_timeout
-        while not (self._inputs.calibrated(lidar_frame) or self._stopping.is_set() or time.monotonic() > end):
-            time.sleep(0.01)
-        tree, wanted = self._inputs.static.tree, self._config.ros.base_frame
-        problem = ""
-        base = wanted or tree.root(lidar_frame)
-        try:
-            T_base_lidar: Array = np.eye(4) if base == lidar_frame else tree.lookup(base, lidar_frame)
-        except UsageError as error:
-            problem = f"{error}; the pose is that of {lidar_frame}"
-            self.get_logger().error(f"ros.base_frame: {problem}")
-            base, T_base_lidar = lidar_frame, np.eye(4)
-        self._diagnostics.frame_problem = problem
-        self._base_frame, self._T_base_lidar = base, T_base_lidar
+        return tracked
 
     def _publish(self, tracked: Tracked) -> None:
         before, seconds = self._before, 0.1
@@ -169,8 +197,12 @@ class SlamNode(Node):
         ros, covariance = self._config.ros, self._covariance
         if tracked.state is State.LOST:
             covariance = covariance + LOST
-        self._odom.publish(odometry_to_msg(tracked, covariance, seconds, ros.odom_frame, self._base_frame))
-        self._tf.send(tracked.T_odom_lidar, tracked.stamp, self._base_frame)
+        base, T_base_start = self._base.name, self._base.T_base_start
+        if not np.array_equal(T_base_start, np.eye(4)):
+            A = se3.adjoint(T_base_start)
+            tracked, covariance = of_body(tracked, T_base_start), A @ covariance @ A.T
+        self._odom.publish(odometry_to_msg(tracked, covariance, seconds, ros.odom_frame, base))
+        self._tf.send(tracked.T_odom_lidar, tracked.stamp, base)
         if self._mapper is not None:
             self._mapper.broadcast(tracked.stamp, self._robot, ros.odom_frame)
 
@@ -217,7 +249,7 @@ class SlamNode(Node):
             if frame != wanted:
                 raise UsageError(f"want it in frame {wanted}, not in {frame!r}")
             T_map_base = transform_matrix(message.pose.pose)
-            problem = "no map here" if self._mapper is None else self._mapper.hint(T_map_base)
+            problem = "no map here" if self._mapper is None else self._mapper.hint(T_map_base @ self._base.T_base_start)
         except UsageError as error:
             problem = str(error)
         if problem:

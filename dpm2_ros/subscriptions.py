@@ -6,6 +6,7 @@ from __future__ import annotations
 import copy
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from typing import Any
 
@@ -75,12 +76,14 @@ class StaticTransforms:
         self._node = node
         self._topic = node.resolve_topic_name(topics.TF_STATIC)
         self.tree = TransformTree()
+        self._messages = 0
         if TFMessage is not None:
             node.create_subscription(TFMessage, topics.TF_STATIC, self._on_message, LATCHED)
 
-    def knows(self, frame: str) -> bool:
-        """Whether the frame is in the tree, or nobody is there who could put it in."""
-        return frame.lstrip("/") in self.tree.frames or not self._node.count_publishers(self._topic)
+    def complete(self, frame: str) -> bool:
+        """Whether all who publish it have been heard, and the frame is in the tree if anybody does."""
+        publishers = self._node.count_publishers(self._topic)
+        return not publishers or (frame.lstrip("/") in self.tree.frames and self._messages >= publishers)
 
     def _on_message(self, message: Any) -> None:
         tree = copy.deepcopy(self.tree)  # the worker may be reading the present one
@@ -88,7 +91,7 @@ class StaticTransforms:
             tree.add(message)
         except UsageError as error:
             self._node.get_logger().error(str(error))
-        self.tree = tree
+        self.tree, self._messages = tree, self._messages + 1
 
 
 class Inputs:
@@ -114,6 +117,7 @@ class Inputs:
         self.camera_info: CameraInfo | None = None
         self.angle_correction_deg: float | None = None
         self.static = StaticTransforms(node)
+        self._times: deque[tuple[int, int]] = deque(maxlen=5)
         self.subscriptions = [MatchedSubscription(node, PointCloud2, points_topic, self._on_cloud, ros)]
         if self.image_topic:
             image_type = CompressedImage if self.image_topic.endswith("/compressed") else Image
@@ -140,9 +144,18 @@ class Inputs:
     def calibrated(self, lidar_frame: str) -> bool:
         """Whether everything latched that somebody publishes about the LiDAR has arrived."""
         correction = self.angle_correction_deg is not None
-        return self.static.knows(lidar_frame) and (
+        return self.static.complete(lidar_frame) and (
             correction or not self._node.count_publishers(self._correction_topic)
         )
+
+    @property
+    def times(self) -> tuple[int, int] | None:
+        """ns: a late cloud's stamp, and what the node's clock said when it came; None before there are some.
+
+        Of the last five the one with the median difference: /clock and clouds may change places on their way.
+        """
+        times = sorted(self._times, key=lambda pair: pair[1] - pair[0])
+        return times[len(times) // 2] if len(times) >= 3 else None
 
     def candidates(self) -> list[str]:
         """Topics on which somebody else publishes point clouds."""
@@ -156,6 +169,8 @@ class Inputs:
         )
 
     def _on_cloud(self, message: PointCloud2) -> None:
+        if stamped := stamp_ns(message.header):
+            self._times.append((stamped, self._node.get_clock().now().nanoseconds))
         with self._arrived:
             for camera in self.synchronizer.cameras:
                 camera.present = bool(self._node.count_publishers(self.subscriptions[1].topic))

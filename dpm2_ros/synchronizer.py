@@ -11,8 +11,11 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
-JUMP_BACK = 1.0
-"""A stamp that goes back by more than this (s) means that the source started again: a looped bag."""
+JUMP = 1.0
+"""A stamp that goes back by more than this (s), or ahead by more than this beyond the time that has passed, jumps. It
+may be wrong, or time itself has jumped: a looped bag, a clock that was set, a recording with a gap."""
+HOLD = 0.5
+"""Longest wait (s) for the next stamp, which tells."""
 PATIENCE = 5
 """Clouds in a row that a camera may miss before nobody waits for it any more (until it delivers again)."""
 BUFFER = 16
@@ -24,11 +27,15 @@ class Verdict(StrEnum):
 
     ACCEPTED = "accepted"
     RESTARTED = "restarted"
-    """Accepted, and its source has started again."""
+    """Accepted, and time has gone back."""
     REPEATED = "repeated"
     """Refused: its stamp is that of the cloud before."""
     OUT_OF_ORDER = "out of order"
     """Refused: a later cloud has been accepted already."""
+    JUMPED = "the stamp jumps; the next one tells whether it is true"
+    """Neither accepted nor rejected yet; counted as what becomes of it."""
+    STRAY = "stray"
+    """Rejected: its stamp jumped, and the next one did not."""
 
 
 @dataclass(eq=False)
@@ -82,6 +89,8 @@ class Synchronizer:
         self._queue: deque[Bundle] = deque()
         self._depth = depth
         self._newest: int | None = None  # stamp of the last cloud accepted
+        self._arrival = 0.0  # of that cloud
+        self._jumped: Bundle | None = None
         self._left: Bundle | None = None  # the last cloud that went
 
     def __len__(self) -> int:
@@ -90,16 +99,15 @@ class Synchronizer:
     def add_cloud(self, stamp: int, cloud: Any, now: float) -> Verdict:
         """Take a cloud with its stamp (ns); `now` is when it arrived."""
         self.last_arrival = now
-        verdict = self._judge(stamp)
-        self.counts[verdict] += 1
-        if verdict in (Verdict.REPEATED, Verdict.OUT_OF_ORDER):
+        if self._jumped is not None and self._newest is not None:
+            self._settle(abs(stamp - self._jumped.stamp) <= abs(stamp - self._newest))
+        verdict = self._judge(stamp, now)
+        if verdict is Verdict.JUMPED:
+            self._jumped = Bundle(stamp, cloud, now, restarted=False)
             return verdict
-        self._newest = stamp
-        self._queue.append(Bundle(stamp, cloud, now, verdict is Verdict.RESTARTED))
-        if len(self._queue) > self._depth:
-            oldest = self._queue.popleft()
-            self._queue[0].restarted |= oldest.restarted  # not lost with the cloud that announced it
-            self.dropped += 1
+        self.counts[verdict] += 1
+        if verdict is Verdict.ACCEPTED:
+            self._accept(Bundle(stamp, cloud, now, restarted=False))
         return verdict
 
     def add_image(self, camera: int, stamp: int, image: Any, now: float) -> None:
@@ -107,10 +115,10 @@ class Synchronizer:
         state = self.cameras[camera]
         state.received += 1
         state.last_arrival = now
-        if state.images and stamp < state.images[-1][0] - JUMP_BACK * 1e9:
+        if state.images and stamp < state.images[-1][0] - JUMP * 1e9:
             state.images.clear()
         left = self._left
-        gone = left is not None and -JUMP_BACK * 1e9 < stamp - left.stamp <= self._tolerance
+        gone = left is not None and -JUMP * 1e9 < stamp - left.stamp <= self._tolerance
         if left is not None and gone and (state.missed or stamp < left.stamp - self._tolerance):
             state.late += 1
             if now <= left.arrival + self._timeout:
@@ -121,6 +129,8 @@ class Synchronizer:
 
     def pop(self, now: float) -> Bundle | None:
         """The next cloud that has its images or has waited long enough; None if there is none yet."""
+        if self._jumped is not None and now >= self._jumped.arrival + HOLD:
+            self._settle(true=True)
         if not self._queue:
             return None
         head = self._queue[0]
@@ -143,15 +153,38 @@ class Synchronizer:
         return head
 
     def deadline(self) -> float | None:
-        """When the cloud at the head will have waited long enough; None if none waits."""
-        return self._queue[0].arrival + self._timeout if self._queue else None
+        """When the next cloud will have waited long enough; None if none waits."""
+        if self._queue:
+            return self._queue[0].arrival + self._timeout
+        return self._jumped.arrival + HOLD if self._jumped is not None else None
 
-    def _judge(self, stamp: int) -> Verdict:
-        if self._newest is None or stamp > self._newest:
+    def _judge(self, stamp: int, now: float) -> Verdict:
+        if self._newest is None:
             return Verdict.ACCEPTED
-        if stamp == self._newest:
-            return Verdict.REPEATED
-        return Verdict.RESTARTED if stamp < self._newest - JUMP_BACK * 1e9 else Verdict.OUT_OF_ORDER
+        step = (stamp - self._newest) * 1e-9
+        if step < -JUMP or step > JUMP + now - self._arrival:
+            return Verdict.JUMPED
+        if step > 0:
+            return Verdict.ACCEPTED
+        return Verdict.OUT_OF_ORDER if step else Verdict.REPEATED
+
+    def _settle(self, true: bool) -> None:
+        """Accept or reject the cloud whose stamp jumped."""
+        bundle, self._jumped = self._jumped, None
+        if bundle is None or self._newest is None:
+            return
+        bundle.restarted = true and bundle.stamp < self._newest
+        self.counts[Verdict.RESTARTED if bundle.restarted else Verdict.ACCEPTED if true else Verdict.STRAY] += 1
+        if true:
+            self._accept(bundle)
+
+    def _accept(self, bundle: Bundle) -> None:
+        self._newest, self._arrival = bundle.stamp, bundle.arrival
+        self._queue.append(bundle)
+        if len(self._queue) > self._depth:
+            oldest = self._queue.popleft()
+            self._queue[0].restarted |= oldest.restarted  # not lost with the cloud that announced it
+            self.dropped += 1
 
     def _match(self, state: CameraState, stamp: int) -> tuple[int, Any] | None:
         nearest = min(state.images, key=lambda image: abs(image[0] - stamp), default=None)
@@ -159,9 +192,9 @@ class Synchronizer:
 
     def _passed(self, state: CameraState, stamp: int) -> bool:
         """Whether the camera is already beyond this cloud, so that waiting is useless."""
-        return bool(state.images) and stamp + self._tolerance < state.images[-1][0] < stamp + JUMP_BACK * 1e9
+        return bool(state.images) and stamp + self._tolerance < state.images[-1][0] < stamp + JUMP * 1e9
 
     def _forget(self, state: CameraState, stamp: int) -> None:
         """Images too old for the next cloud, or left over from before a restart."""
-        while state.images and not 0 <= state.images[0][0] - stamp + self._tolerance < JUMP_BACK * 1e9:
+        while state.images and not 0 <= state.images[0][0] - stamp + self._tolerance < JUMP * 1e9:
             state.images.popleft()

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+from itertools import takewhile
 from typing import Any
 
 import numpy as np
@@ -64,9 +66,10 @@ class TransformTree:
             raise UsageError(f"no transform from {source_frame!r} to {target_frame!r}; frames known: {known}")
         return se3.inverse(up_target[common]) @ up_source[common]
 
-    def root(self, frame: str) -> str:
-        """The topmost frame above `frame`; itself where nothing is."""
-        return list(self._ancestors(_name(frame)))[-1]
+    def root(self, frame: str, below: Collection[str] = ()) -> str:
+        """The topmost frame above `frame`, `below` none of those named; itself where nothing is."""
+        first, *above = self._ancestors(_name(frame))
+        return [first, *takewhile(lambda name: name not in below, above)][-1]
 
     @property
     def frames(self) -> list[str]:

@@ -15,6 +15,7 @@ from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMsg
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_msgs.msg import UInt32MultiArray
 from std_srvs.srv import Trigger
@@ -86,8 +87,12 @@ def rig(ros: Callable[..., Any], drive: Any) -> Callable[..., Rig]:
 @pytest.mark.parametrize("reliable", [True, False], ids=["reliable", "best effort"])
 def test_every_cloud_gives_its_pose(rig: Callable[..., Rig], drive: Any, reliable: bool) -> None:
     """Also from a best-effort publisher, which a reliable subscription would never hear."""
-    r = rig(reliable=reliable)
-    r.send_and_wait(*range(drive.frames))
+    r = rig("use_sim_time:=true", reliable=reliable)
+    clock = r.harness.publisher(Clock, "/clock")
+    r.wait(clock.get_subscription_count, "the ear for /clock")
+    for n in range(drive.frames):
+        clock.publish(Clock(clock=stamp_to_msg(drive.stamp(n))))
+        r.send_and_wait(n)
     assert r.stamps() == [drive.stamp(n) for n in range(drive.frames)]
     for n, message in enumerate(r.odom):
         T = transform_matrix(message.pose.pose)
@@ -125,7 +130,8 @@ def test_keyframes_map_path_and_tf(rig: Callable[..., Rig], drive: Any) -> None:
     assert set(pairs) == {("map", "odom"), ("odom", "lidar")}
     moved = transform_matrix(pairs["odom", "lidar"].transform)
     np.testing.assert_allclose(moved, transform_matrix(r.odom[-1].pose.pose), atol=1e-9)
-    assert stamp_ns(pairs["map", "odom"].header) == drive.stamp(drive.frames - 1)
+    assert stamp_ns(pairs["odom", "lidar"].header) == drive.stamp(drive.frames - 1)
+    assert stamp_ns(pairs["map", "odom"].header) == drive.stamp(drive.frames - 1) + 500_000_000  # until the next one
 
 
 def test_the_map_is_bounded_and_built_only_for_listeners(rig: Callable[..., Rig], drive: Any) -> None:
@@ -169,13 +175,90 @@ def test_the_base_is_the_root_of_tf_static(rig: Callable[..., Rig], drive: Any) 
         assert np.linalg.norm(transform_matrix(message.pose.pose)[:3, 3] - expected[:3, 3]) < ACCURATE
 
 
-def test_a_base_frame_that_nobody_knows_is_said_and_never_assumed(rig: Callable[..., Rig]) -> None:
+T_BASE_SENSOR, T_SENSOR_LIDAR = se3.exp([0.0, 0.05, 0.4, 1.0, 0.2, 1.5]), se3.exp([0.1, 0.0, 0.0, 0.0, 0.0, 0.04])
+
+
+def publish_static(r: Rig, parent: str, child: str, T: Any) -> None:
+    """By a publisher of its own, as drivers and robot_state_publisher are."""
+    publisher = r.harness.publisher(TFMessage, "/tf_static", latched=True)
+    publisher.publish(TFMessage(transforms=[transform_to_msg(T, 0, parent, child)]))
+    r.wait(lambda: child in r.node._inputs.static.tree.frames, "/tf_static")
+
+
+def test_nothing_is_published_before_the_base_is_reachable_and_nothing_is_lost(
+    rig: Callable[..., Rig], drive: Any
+) -> None:
+    """The driver's part of /tf_static comes first, that of the robot with the base three clouds later."""
     r = rig("ros.base_frame:=base_link", "ros.tf_timeout:=0.1")
+    keyframes, tf = r.harness.hear(Odometry, "/dpm2/keyframe_odom"), r.harness.hear(TFMessage, "/tf")
+    r.wait(lambda: r.node.count_subscribers("/tf") and r.node.count_subscribers("/dpm2/keyframe_odom"), "ears")
+    publish_static(r, "os_sensor", "lidar", T_SENSOR_LIDAR)
+    for n in range(3):
+        r.send(n)
+    told = "no transform from 'lidar' to 'base_link'; frames known: lidar, os_sensor"
+    r.wait(lambda: any(told in s.message for d in r.diagnostics for s in d.status), "what is missing")
+    status = next(s for d in r.diagnostics for s in d.status if told in s.message)
+    assert status.level == DiagnosticStatus.ERROR
+    r.wait(lambda: r.values()["processed"] == "3", "three clouds to be processed")
+    assert (r.odom, tf, keyframes) == ([], [], [])
+    publish_static(r, "base_link", "os_sensor", T_BASE_SENSOR)
+    r.send(3)
+    r.wait(lambda: len(r.odom) == 4 and keyframes, "the poses that were held back")
+    assert r.stamps() == [drive.stamp(n) for n in range(4)]
+    T_base_lidar = T_BASE_SENSOR @ T_SENSOR_LIDAR
+    for n, message in enumerate(r.odom):
+        assert message.child_frame_id == "base_link"
+        expected = T_base_lidar @ drive.pose(n) @ se3.inverse(T_base_lidar)
+        assert np.linalg.norm(transform_matrix(message.pose.pose)[:3, 3] - expected[:3, 3]) < ACCURATE
+    np.testing.assert_allclose(transform_matrix(keyframes[0].pose.pose), np.eye(4), atol=1e-9)
+    children = {t.child_frame_id for message in tf for t in message.transforms}
+    assert children == {"odom", "base_link"}
+
+
+def test_a_parent_that_comes_late_becomes_the_base(rig: Callable[..., Rig], drive: Any) -> None:
+    """No base is asked for, and the driver's part of /tf_static comes first. odom and map go on as they are."""
+    r = rig()
+    tf = r.harness.hear(TFMessage, "/tf")
+    publish_static(r, "os_sensor", "lidar", T_SENSOR_LIDAR)
+    r.send_and_wait(*range(4))
+    publish_static(r, "base_link", "os_sensor", T_BASE_SENSOR)
+    seen = len(tf)
+    r.send_and_wait(*range(4, 8))
+    for n, message in enumerate(r.odom):
+        T_odom_sensor = T_SENSOR_LIDAR @ drive.pose(n) @ se3.inverse(T_SENSOR_LIDAR)
+        expected = T_odom_sensor if n < 4 else T_odom_sensor @ se3.inverse(T_BASE_SENSOR)
+        assert message.child_frame_id == ("os_sensor" if n < 4 else "base_link")
+        np.testing.assert_allclose(transform_matrix(message.pose.pose), expected, atol=ACCURATE)
+    r.wait(lambda: any(t.child_frame_id == "base_link" for m in tf[seen:] for t in m.transforms), "/tf")
+    assert "os_sensor" not in {t.child_frame_id for m in tf[seen:] for t in m.transforms}  # it has a parent
+
+
+def test_the_lidars_own_frame_is_the_base_where_tf_static_does_not_name_it(rig: Callable[..., Rig]) -> None:
+    r = rig("ros.tf_timeout:=0.2")
+    publish_static(r, "base_link", "camera", np.eye(4))
     r.send_and_wait(0, 1)
-    assert r.odom[-1].child_frame_id == "lidar"
+    assert [message.child_frame_id for message in r.odom] == ["lidar", "lidar"]
+
+
+def test_stamps_of_another_clock_are_told(rig: Callable[..., Rig]) -> None:
+    """A recording without /clock, or a sensor whose clock nobody has set: a warning with both values."""
+    r = rig()
+    r.send_and_wait(0, 1, 2)
     status = r.status()
     assert status.level == DiagnosticStatus.WARN
-    assert "no transform from 'lidar' to 'base_link'" in status.message
+    stamp, _, message = status.message.partition(" s (2023-11-14 22:13:20 UTC), the clock of this machine says")
+    assert stamp.startswith("tracking; clouds are stamped 1700000000.")
+    assert message.endswith("a recording wants use_sim_time and /clock")
+    values = {value.key: value.value for value in status.values}
+    assert stamp.endswith(values["cloud stamp (s)"])
+    assert abs(float(values["clock (s)"]) - time.time()) < 60
+
+
+def test_sim_time_without_a_clock_is_told(rig: Callable[..., Rig]) -> None:
+    r = rig("use_sim_time:=true")
+    r.send_and_wait(0, 1, 2)
+    assert r.status().message.endswith("use_sim_time is on, and nobody publishes /clock")
+    assert r.status().level == DiagnosticStatus.WARN
 
 
 class Camera:
@@ -337,15 +420,37 @@ def test_stamps_that_repeat_or_go_back(rig: Callable[..., Rig], drive: Any) -> N
     assert (values["refused (stamp repeated)"], values["refused (stamp out of order)"]) == ("1", "1")
 
 
-def test_a_looped_bag_starts_again(rig: Callable[..., Rig], drive: Any, tmp_path: Path) -> None:
-    """Odometry and map begin anew, and the map of the first round is on disk."""
-    r = rig(f"ros.map_directory:={tmp_path / 'map'}")
+@pytest.mark.parametrize("back", [1.5, 20.0], ids=["looped bag", "clock that was set"])
+def test_time_that_goes_back_restarts_the_odometry_and_keeps_the_map(
+    rig: Callable[..., Rig], drive: Any, back: float
+) -> None:
+    """Where the robot is in the map is not known then before a loop is found, and not told."""
+    r = rig("slam.loops.enabled:=false")
+    tf = r.harness.hear(TFMessage, "/tf")
     r.send_and_wait(*range(drive.frames))
-    r.send_and_wait(0, 1)
+    before = r.node._mapper.keyframes
+    assert before >= 3
+    seen = len(tf)
+    for n in range(2):  # together: the second tells that the first is true
+        r.send(n, stamp=drive.stamp(n + drive.frames) - round(back * 1e9) - drive.period)
+    r.wait(lambda: len(r.odom) == drive.frames + 2, "the clouds after the jump")
     assert transform_matrix(r.odom[-2].pose.pose)[:3, 3] == pytest.approx([0, 0, 0], abs=1e-9)
-    r.wait(lambda: r.node._mapper.keyframes == 1, "the new map")
-    assert (tmp_path / "map" / "map.ply").is_file()
+    r.wait(lambda: r.node._mapper.keyframes == before + 1, "the keyframe after the jump")
+    r.send_and_wait(2, stamp=drive.stamp(2 + drive.frames) - round(back * 1e9) - drive.period)
     assert r.values()["restarts"] == "1"
+    assert "map" not in {t.header.frame_id for m in tf[seen:] for t in m.transforms}
+
+
+def test_one_cloud_stamped_far_ahead_costs_that_cloud_alone(rig: Callable[..., Rig], drive: Any) -> None:
+    r = rig()
+    r.send_and_wait(*range(5))
+    r.send(5, stamp=drive.stamp(5) + 86_400 * 10**9)
+    r.send_and_wait(*range(6, drive.frames))
+    assert r.stamps() == [drive.stamp(n) for n in range(drive.frames) if n != 5]
+    values = r.values()
+    assert (values["rejected (stray stamp)"], values["restarts"]) == ("1", "0")
+    end = transform_matrix(r.odom[-1].pose.pose)[:3, 3]
+    assert np.linalg.norm(end - drive.pose(drive.frames - 1)[:3, 3]) < ACCURATE
 
 
 def test_clouds_that_stop_are_noticed(rig: Callable[..., Rig]) -> None:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dpm2_ros.synchronizer import PATIENCE, Bundle, Synchronizer, Verdict
+from dpm2_ros.synchronizer import HOLD, PATIENCE, Bundle, Synchronizer, Verdict
 
 MS = 1_000_000
 
@@ -152,9 +152,10 @@ def test_a_full_queue_drops_the_oldest_and_counts() -> None:
         (10_000, Verdict.REPEATED),
         (9_900, Verdict.OUT_OF_ORDER),
         (9_000, Verdict.OUT_OF_ORDER),
-        (8_999, Verdict.RESTARTED),
+        (8_999, Verdict.JUMPED),
         (10_001, Verdict.ACCEPTED),
-        (99_000, Verdict.ACCEPTED),
+        (11_100, Verdict.ACCEPTED),  # a second beyond the 0.1 s that have passed
+        (11_101, Verdict.JUMPED),
     ],
 )
 def test_stamps_that_repeat_jump_back_or_forward(stamp_ms: int, verdict: Verdict) -> None:
@@ -162,10 +163,64 @@ def test_stamps_that_repeat_jump_back_or_forward(stamp_ms: int, verdict: Verdict
     synchronizer.add_cloud(10_000 * MS, "before", now=0.0)
     assert synchronizer.add_cloud(stamp_ms * MS, "after", now=0.1) is verdict
     left = drain(synchronizer, 0.1)
-    accepted = verdict in (Verdict.ACCEPTED, Verdict.RESTARTED)
-    assert [bundle.cloud for bundle in left] == ["before"] + ["after"] * accepted
-    assert [bundle.restarted for bundle in left] == [False] + [verdict is Verdict.RESTARTED] * accepted
-    assert synchronizer.counts[verdict] == 1 + (verdict is Verdict.ACCEPTED)
+    assert [bundle.cloud for bundle in left] == ["before"] + ["after"] * (verdict is Verdict.ACCEPTED)
+    if verdict is not Verdict.JUMPED:
+        assert synchronizer.counts[verdict] == 1 + (verdict is Verdict.ACCEPTED)
+
+
+def feed(synchronizer: Synchronizer, *stamps_ms: int, period: float = 0.1) -> list[tuple[int, bool]]:
+    """Clouds that arrive at a steady pace; stamp (ms) and `restarted` of those that leave."""
+    out = []
+    for n, stamp in enumerate(stamps_ms):
+        synchronizer.add_cloud(stamp * MS, stamp, now=period * n)
+        out += drain(synchronizer, period * n)
+    return [(bundle.cloud, bundle.restarted) for bundle in out]
+
+
+@pytest.mark.parametrize("stray", [10_000 + 86_400_000, 12_000, 0, 8_000])
+def test_one_stamp_far_off_costs_its_cloud_alone(stray: int) -> None:
+    """Ahead or behind: what follows goes on from what was before, and nothing starts again."""
+    synchronizer = make(cameras=0)
+    assert feed(synchronizer, 9_900, 10_000, stray, 10_200, 10_300) == [
+        (stamp, False) for stamp in (9_900, 10_000, 10_200, 10_300)
+    ]
+    assert synchronizer.counts[Verdict.STRAY] == 1
+    assert synchronizer.counts[Verdict.RESTARTED] == 0
+
+
+def test_a_jump_back_that_lasts_is_a_restart_and_loses_nothing() -> None:
+    """A looped bag, or a clock that was set: a step of 1.5 s is enough."""
+    for first in (0, 8_600):
+        synchronizer = make(cameras=0)
+        stamps = (9_900, 10_000, first, first + 100, first + 200)
+        assert feed(synchronizer, *stamps) == [(stamp, stamp == first) for stamp in stamps]
+        assert synchronizer.counts[Verdict.RESTARTED] == 1
+        assert sum(synchronizer.counts.values()) == 5
+
+
+def test_a_jump_ahead_that_lasts_loses_nothing() -> None:
+    """A recording with a gap, played without it; or a clock that was set."""
+    stamps = (9_900, 10_000, 15_000, 15_100)
+    assert feed(make(cameras=0), *stamps) == [(stamp, False) for stamp in stamps]
+
+
+def test_a_pause_of_the_sensor_is_no_jump() -> None:
+    synchronizer = make(cameras=0)
+    synchronizer.add_cloud(10_000 * MS, "a", now=0.0)
+    assert synchronizer.add_cloud(20_000 * MS, "b", now=10.1) is Verdict.ACCEPTED
+
+
+def test_a_jump_that_nothing_follows_is_believed_after_a_while() -> None:
+    """Whoever waits for the answer to one cloud before sending the next is answered."""
+    synchronizer = make(cameras=0)
+    synchronizer.add_cloud(10_000 * MS, "a", now=0.0)
+    drain(synchronizer, 0.0)
+    synchronizer.add_cloud(1_000 * MS, "b", now=0.1)
+    assert synchronizer.pop(0.1 + HOLD - 0.01) is None
+    assert synchronizer.deadline() == pytest.approx(0.1 + HOLD)
+    bundle = synchronizer.pop(0.1 + HOLD)
+    assert bundle is not None
+    assert (bundle.cloud, bundle.restarted) == ("b", True)
 
 
 def test_a_restart_survives_the_drop_of_its_cloud() -> None:
@@ -178,10 +233,10 @@ def test_a_restart_survives_the_drop_of_its_cloud() -> None:
 def test_images_join_again_after_a_restart() -> None:
     synchronizer = make()
     joined = []
-    for stamp in (10_000, 10_100, 1_000, 1_100):
-        synchronizer.add_image(0, stamp * MS, stamp, now=0.0)
-        synchronizer.add_cloud(stamp * MS, stamp, now=0.0)
-        joined += [bundle.images for bundle in drain(synchronizer, 0.0)]
+    for n, stamp in enumerate((10_000, 10_100, 1_000, 1_100)):
+        synchronizer.add_image(0, stamp * MS, stamp, now=0.1 * n)
+        synchronizer.add_cloud(stamp * MS, stamp, now=0.1 * n)
+        joined += [bundle.images for bundle in drain(synchronizer, 0.1 * n)]
     assert joined == [{0: stamp} for stamp in (10_000, 10_100, 1_000, 1_100)]
 
 
@@ -197,15 +252,16 @@ def test_every_cloud_leaves_once_or_is_counted(events: list[tuple[str, int, floa
     for what, stamp, pause in events:
         now += pause
         if what == "cloud":
-            verdict = synchronizer.add_cloud(stamp * 50 * MS, stamp * 50 * MS, now)
-            if verdict in (Verdict.ACCEPTED, Verdict.RESTARTED):
-                given_in.append(stamp * 50 * MS)
+            synchronizer.add_cloud(stamp * 50 * MS, stamp * 50 * MS, now)
+            given_in.append(stamp * 50 * MS)
         else:
             synchronizer.add_image(what == "right", stamp * 50 * MS, stamp * 50 * MS, now)
         out += drain(synchronizer, now)
     out += drain(synchronizer, now + 1)
     assert len(synchronizer) == 0
-    assert len(out) + synchronizer.dropped == len(given_in)
+    counts = synchronizer.counts
+    assert sum(counts.values()) == len(given_in)
+    assert len(out) + synchronizer.dropped == counts[Verdict.ACCEPTED] + counts[Verdict.RESTARTED]
     remaining = iter(given_in)
     assert all(bundle.cloud in remaining for bundle in out)  # a subsequence: same order, none twice
     assert all(abs(image - bundle.stamp) <= 50 * MS for bundle in out for image in bundle.images.values())

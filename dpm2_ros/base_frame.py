@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which frame's pose is published, and where the LiDAR is in it: known from /tf_static, never assumed."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dpm2_core.data.transforms import TransformTree
+from dpm2_core.errors import UsageError
+from dpm2_core.frame import Array
+from dpm2_core.geometry import se3
+
+
+class BaseFrame:
+    """The frame that was asked for, once it is reachable; else the root above the LiDAR, also where that changes.
+
+    /tf_static has several publishers, which come in any order: a driver's knows the parts of the sensor, that of the
+    robot where the sensor is. A frame with a parent in /tf_static must have no second one in /tf.
+
+    Attributes:
+        name: whose pose it is; empty before it is known.
+        problem: why it is not known, in words.
+        T_start_lidar: (4, 4) LiDAR in the frame with which the drive began: its first pose is the origin of odom.
+        T_base_start: (4, 4) that frame in the one of `name`: identity, unless a parent came later.
+    """
+
+    def __init__(self, wanted: str, own: tuple[str, ...]) -> None:
+        """`wanted`: the frame that was asked for, or empty; `own`: frames that this node is a parent with."""
+        self._wanted, self._own = wanted.lstrip("/"), own
+        self._tree: TransformTree | None = None  # that of the last look
+        self.name = self.problem = ""
+        self.T_start_lidar = self.T_base_start = np.eye(4)
+
+    @property
+    def optional(self) -> bool:
+        """Whether the LiDAR's own frame would do."""
+        return not self._wanted
+
+    def restart(self) -> None:
+        """A new drive begins, in the frame of this moment."""
+        self.T_start_lidar, self.T_base_start = self.T_base_start @ self.T_start_lidar, np.eye(4)
+
+    def look(self, tree: TransformTree, lidar_frame: str) -> bool:
+        """Find the frame, or see whether it has changed; returns whether it has."""
+        if tree is self._tree or (self.name and self._wanted):
+            return False
+        self._tree = tree
+        lidar_frame = lidar_frame.lstrip("/")
+        name = self._wanted or tree.root(lidar_frame, self._own)
+        if name == self.name:
+            return False
+        try:
+            T_base_lidar: Array = np.eye(4) if name == lidar_frame else tree.lookup(name, lidar_frame)
+        except UsageError as error:
+            self.problem = f"ros.base_frame: {error}; neither dpm2/odom nor /tf before /tf_static has it"
+            return False
+        if self.name:
+            self.T_base_start = T_base_lidar @ se3.inverse(self.T_start_lidar)
+        else:
+            self.T_start_lidar = T_base_lidar
+        self.name, self.problem = name, ""
+        return True

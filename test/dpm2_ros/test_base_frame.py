@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The frame whose pose is published, in whatever order /tf_static comes: one that has no parent, and what was asked."""
+
+from __future__ import annotations
+
+from itertools import accumulate, permutations
+
+import numpy as np
+import pytest
+
+from dpm2_core.data.transforms import TransformTree
+from dpm2_core.geometry import se3
+from dpm2_ros.base_frame import BaseFrame
+
+LINKS = {
+    ("sensor", "lidar"): se3.exp([0.1, 0.2, 0.3, 0.4, 0.5, 0.6]),
+    ("base", "sensor"): se3.exp([0.0, -0.1, 0.2, 1.0, 0.0, 1.5]),
+    ("footprint", "base"): se3.exp([0.0, 0.0, 0.0, 0.0, 0.0, 0.2]),
+    ("base", "camera"): se3.exp([0.0, 0.0, 1.0, 0.0, 0.3, 0.2]),
+}
+ORDERS = list(permutations(LINKS))
+
+
+def trees(order: tuple[tuple[str, str], ...]) -> list[TransformTree]:
+    """After nothing, one, two, ... of the links."""
+    out = []
+    for known in [(), *accumulate((link,) for link in order)]:
+        out.append(TransformTree())
+        for link in known:
+            out[-1].set(*link, LINKS[link])
+    return out
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_a_base_that_was_asked_for_is_known_once_it_is_reachable(order: tuple[tuple[str, str], ...]) -> None:
+    base, reachable = BaseFrame("base", ("odom",)), {("sensor", "lidar"), ("base", "sensor")}
+    for n, tree in enumerate(trees(order)):
+        base.look(tree, "lidar")
+        assert bool(base.name) == (reachable <= set(order[:n]))
+        assert bool(base.problem) == (not base.name)
+    np.testing.assert_allclose(base.T_start_lidar, LINKS["base", "sensor"] @ LINKS["sensor", "lidar"])
+    np.testing.assert_array_equal(base.T_base_start, np.eye(4))
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_without_one_it_never_has_a_parent_and_its_pose_is_consistent(order: tuple[tuple[str, str], ...]) -> None:
+    base = BaseFrame("", ("odom",))
+    whole = trees(order)[-1]
+    for tree in trees(order):
+        base.look(tree, "/lidar")
+        assert base.name == tree.root("lidar")
+        T_base_lidar = base.T_base_start @ base.T_start_lidar
+        expected = np.eye(4) if base.name == "lidar" else whole.lookup(base.name, "lidar")
+        np.testing.assert_allclose(T_base_lidar, expected, atol=1e-12)
+        np.testing.assert_array_equal(base.T_start_lidar, np.eye(4))  # odom is where it was
+    base.restart()
+    np.testing.assert_array_equal(base.T_base_start, np.eye(4))
+    np.testing.assert_allclose(base.T_start_lidar, whole.lookup("footprint", "lidar"), atol=1e-12)
+
+
+def test_a_frame_that_this_node_moves_is_no_base() -> None:
+    """Somebody publishes map -> odom -> base as static: odom -> map would be a circle."""
+    tree = TransformTree()
+    for parent, child in (("map", "odom"), ("odom", "base"), ("base", "lidar")):
+        tree.set(parent, child, np.eye(4))
+    base = BaseFrame("", ("odom", "map"))
+    base.look(tree, "lidar")
+    assert base.name == "base"
+
+
+def test_the_lidar_itself_may_be_asked_for() -> None:
+    base = BaseFrame("/lidar", ())
+    assert base.look(TransformTree(), "lidar")
+    assert (base.name, base.problem) == ("lidar", "")
