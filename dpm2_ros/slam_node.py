@@ -88,6 +88,7 @@ class SlamNode(Node):
         """
         self._stopping.set()
         self._worker.join()
+        self._give_up()
         self._line.shutdown(wait=True)
         self.get_logger().info(
             f"{self._health.processed} clouds processed, {self._inputs.synchronizer.dropped} dropped"
@@ -146,9 +147,14 @@ class SlamNode(Node):
                 tracked = self._hand_on(held)
             self._held = []
         elif len(self._held) > HELD:
-            self.get_logger().error(f"{len(self._held)} poses are given up, the drive begins with the next cloud")
+            self._give_up()
             self._begin()
         self._health.add(tracked, time.monotonic() - bundle.arrival)
+
+    def _give_up(self) -> None:
+        """Say that the poses that are kept will not be published."""
+        if self._held:
+            self.get_logger().error(f"{len(self._held)} poses not published; {self._base.problem}")
 
     def _look_for_base(self, lidar_frame: str) -> None:
         """Before the first pose wait for what is latched, while clouds may still queue; then follow what comes."""

@@ -48,7 +48,7 @@ class Robot:
     """A slam_node process, its LiDAR, and ears."""
 
     def __init__(self, harness: Any, street: Path, log: Path, *parameters: str) -> None:
-        self.harness, self.log, self._stamp = harness, log, 0
+        self.harness, self.log, self._stamp = harness, log, 100_000_000_000
         self._source = open_source(street, InputSettings(images=False))
         self.lidar = harness.publisher(PointCloud2, topics.POINTS)
         self.odom = harness.hear(Odometry, "/dpm2/odom")
@@ -71,6 +71,10 @@ class Robot:
             before = len(self.odom)
             self.lidar.publish(cloud_to_msg(frame.points, self._stamp, "lidar"))
             self.harness.wait(lambda before=before: len(self.odom) > before, f"the odometry of scan {n}")
+
+    def go_back(self, seconds: float) -> None:
+        """Set the LiDAR's clock back."""
+        self._stamp -= round(seconds * 1e9)
 
     def stand(self, frame: int, condition: Callable[[], Any], what: str) -> None:
         """The same scan again and again, until something holds."""
@@ -161,7 +165,9 @@ def test_finds_itself_tracks_and_notices_being_carried_off(
     assert sorted(path.name for path in made.parent.iterdir()) == ["drive.dpm2map", "out"]
 
 
-def test_hints_and_services_answer_in_words(robot: Callable[..., Robot], made: Path, tmp_path: Path) -> None:
+def test_hints_and_services_answer_in_words(
+    robot: Callable[..., Robot], street: Path, made: Path, tmp_path: Path
+) -> None:
     """A hint in another frame, a map saved that stays as it is, a file that is gone: refused, and the drive goes on."""
     r = robot(f"ros.map_file:={made}", "ros.localization_mode:=true")
     r.stand(0, lambda: r.off(np.eye(4)) < 0.2, "map -> odom")
@@ -184,6 +190,10 @@ def test_hints_and_services_answer_in_words(robot: Callable[..., Robot], made: P
     seen = len(r.tf)
     again = lambda: any(t.header.frame_id == "map" for m in r.tf[seen:] for t in m.transforms)  # noqa: E731
     r.stand(1, again, "the robot in the map again")
+    r.go_back(20.0)  # its clock is set: odom begins anew, so that the place in the map has to be found anew
+    r.stand(3, lambda: "time went back" in r.log.read_text(), "the restart")
+    seen = len(r.tf)
+    r.stand(3, lambda: again() and r.off(place(street, 3)) < 0.2, "the robot in the map after the jump")
 
 
 def test_from_mapping_to_localising_and_back(robot: Callable[..., Robot], tmp_path: Path) -> None:

@@ -215,6 +215,22 @@ def test_nothing_is_published_before_the_base_is_reachable_and_nothing_is_lost(
     assert children == {"odom", "base_link"}
 
 
+def test_poses_kept_for_a_base_are_bounded(
+    rig: Callable[..., Rig], drive: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Then the drive begins anew: what is published at last is a whole drive from its first pose on."""
+    monkeypatch.setattr("dpm2_ros.slam_node.HELD", 3)
+    r = rig("ros.base_frame:=base_link", "ros.tf_timeout:=0.0")
+    for n in range(5):
+        r.send(n)
+    r.wait(lambda: r.values()["processed"] == "5", "five clouds to be processed")
+    publish_static(r, "base_link", "lidar", np.eye(4))
+    r.send(5)
+    r.wait(lambda: len(r.odom) == 2, "the poses")
+    assert r.stamps() == [drive.stamp(4), drive.stamp(5)]
+    np.testing.assert_allclose(transform_matrix(r.odom[0].pose.pose), np.eye(4), atol=1e-9)
+
+
 def test_a_parent_that_comes_late_becomes_the_base(rig: Callable[..., Rig], drive: Any) -> None:
     """No base is asked for, and the driver's part of /tf_static comes first. odom and map go on as they are."""
     r = rig()
