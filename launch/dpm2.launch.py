@@ -60,6 +60,14 @@ def parameters(value: dict[str, str]) -> dict[str, bool | str]:
     return {name: {"true": True, "false": False}.get(text, text) for name, text in given.items() if text}
 
 
+def parameter_files(value: dict[str, str]) -> list[str]:
+    """That of the user, if any; launch_ros itself only warns of one that is missing."""
+    file = value["params_file"]
+    if file and not Path(file).is_file():
+        raise RuntimeError(f"params_file: no such file: {file}")
+    return [file] if file else []
+
+
 def rviz_remappings(value: dict[str, str], layout: str) -> dict[str, str]:
     """From the topics of the layout, which are those of a robot without namespace and of KITTI's, to this robot's."""
     here = "/" + "".join(f"{part}/" for part in value["namespace"].split("/") if part)
@@ -80,7 +88,7 @@ def _actions(context) -> list:
     value = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
     given = parameters(value)
     common = {"package": "dpm2_ros", "namespace": value["namespace"], "output": "screen"}
-    common["parameters"] = [*([value["params_file"]] if value["params_file"] else []), *_typed(given)]
+    common["parameters"] = [*parameter_files(value), *_typed(given)]
     actions = [Node(executable="slam_node", on_exit=Shutdown(), **common)]
     if value["embed_mapper"] == "false":
         actions.append(Node(executable="mapper_node", **common))

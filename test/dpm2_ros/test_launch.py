@@ -122,6 +122,14 @@ def test_use_sim_time(launch_file: ModuleType, bag: str, asked: str, given: bool
     assert launch_file.parameters(value).get("use_sim_time") is given
 
 
+def test_a_parameter_file_that_is_missing_ends_the_launch(launch_file: ModuleType, tmp_path: Path) -> None:
+    file = write({}, tmp_path / "p.yaml")
+    assert launch_file.parameter_files({"params_file": ""}) == []
+    assert launch_file.parameter_files({"params_file": str(file)}) == [str(file)]
+    with pytest.raises(RuntimeError, match=r"params_file: no such file: .*/none.yaml"):
+        launch_file.parameter_files({"params_file": str(tmp_path / "none.yaml")})
+
+
 def test_rviz_shows_the_topics_of_the_robot(launch_file: ModuleType) -> None:
     layout = (share_directory() / "config" / "dpm2.rviz").read_text()
     assert launch_file.rviz_remappings(defaults(launch_file), layout) == {}
