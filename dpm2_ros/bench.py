@@ -10,9 +10,7 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from rich.box import SIMPLE
 from rich.console import Console, Group
-from rich.table import Table
 
 from dpm2_core.data import topics
 from dpm2_core.data.bags import BagSource
@@ -20,6 +18,7 @@ from dpm2_core.data.convert import convert_kitti
 from dpm2_core.data.kitti import KittiSource
 from dpm2_core.data.source import InputSettings
 from dpm2_core.evaluation.bench.harness import Options, Report, drives, write_report
+from dpm2_core.tables import FigureTable
 from dpm2_ros.demo import judge
 from dpm2_ros.replay import replay
 from dpm2_ros.runtime import exit_code
@@ -46,9 +45,8 @@ def bench(
             results[drive.name] = {
                 name: _median([run.summary[name] for run in runs], worst=name == "dropped") for name in FIGURES
             } | {"failed_checks": sum(not holds for run in runs for holds in run.checks.values())}
-    table = Table(title="Bag -> bag_player -> slam_node -> /dpm2/odom", title_justify="left", box=SIMPLE)
-    for column in ("drive", *FIGURES, "failed checks"):
-        table.add_column(column, justify="right")
+    title = "Bag -> bag_player -> slam_node -> /dpm2/odom"
+    table = FigureTable(title, names=["drive"], figures=[*FIGURES, "failed checks"])
     for name, row in results.items():
         table.add_row(name, *("-" if value is None else f"{value:.4g}" for value in row.values()))
     write_report(

@@ -17,10 +17,8 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-from rich.box import SIMPLE
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -34,6 +32,7 @@ from dpm2_core.sim.source import SimulatedDrive
 from dpm2_core.slam.map.data import MapData, load_map
 from dpm2_core.slam.map.store import MapStore
 from dpm2_core.slam.system import Config, SlamSystem
+from dpm2_core.tables import FigureTable
 from dpm2_ros.bench_network import LOSS, Link, inside
 from dpm2_ros.conversions import cloud_to_msg, parse_keyframe_name
 from dpm2_ros.replay import ros_environment, start, stop
@@ -127,7 +126,7 @@ def bench(
     write_record(out / "robots.json", "robots", results, "python -m dpm2_ros.bench_robots")
     columns = list(next(iter(robots.values())))
     title = f"{maps} map, APE {_rms(errors):.3f} m; of one robot alone {alone:.3f} m"
-    table = Table("robot", *columns, title=title, box=SIMPLE)
+    table = FigureTable(title, names=["robot"], figures=columns)
     for name, row in robots.items():
         table.add_row(name, *(f"{row[column]:.4g}" for column in columns))
     Console().print(table)

@@ -15,7 +15,6 @@ import numpy as np
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Table
 
 from dpm2_core.data.bags import BagSource
 from dpm2_core.data.convert import convert_kitti
@@ -29,6 +28,7 @@ from dpm2_core.files import atomic_write
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.slam.output import corrected
+from dpm2_core.tables import FigureTable
 from dpm2_ros.replay import Replay, replay
 from dpm2_ros.runtime import exit_code
 from dpm2_ros.tf import TFMessage
@@ -187,12 +187,10 @@ def map_poses(source: BagSource, result: Replay, out: Path, found: list[int]) ->
     return se3.inverse(T_base_lidar) @ T_odom_base @ T_base_lidar
 
 
-def _table(source: BagSource, result: Replay, outcome: Outcome, out: Path) -> Table:
+def _table(source: BagSource, result: Replay, outcome: Outcome, out: Path) -> FigureTable:
     s = outcome.summary
-    table = Table(title=f"{source.name} through ROS 2", title_justify="left", show_header=False)
-    table.add_column()
-    table.add_column(justify="right")
-    table.add_column()
+    title = f"{source.name} through ROS 2"
+    table = FigureTable(title, names=["what"], figures=["value"], text=["how"], header=False)
     table.add_row("clouds in", str(s["frames_in"]), f"{source.points_topic}")
     table.add_row("poses out", str(s["frames_out"]), "/dpm2/odom, of the same stamp")
     table.add_row("dropped", str(s["dropped"]), f"queue of {QUEUE}; the node counts {_said(result, 'dropped')}")

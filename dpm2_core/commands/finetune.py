@@ -8,10 +8,10 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.table import Table
 
 from dpm2_core.commands.train import ConfigOption, OutOption, ResumeOption, SetOption, refuse_overwriting
 from dpm2_core.config import load_settings
+from dpm2_core.tables import FigureTable
 
 
 def finetune(
@@ -45,8 +45,10 @@ def finetune(
     written = work.finetune(chosen, out, resume)
     with console.status("measuring"):
         after = work.measure(written, chosen, out)
-    table = Table("median error of pairs", "before", "after", title="Held-out parts: against the SLAM's trajectory")
+    title = "Held-out parts: against the SLAM's trajectory"
+    table = FigureTable(title, names=["median error of pairs"], figures=["before", "after"])
     for name, figures in before.items():
         for figure in (figure for figure in figures if figure in after[name]):
             table.add_row(f"{name}, {figure}", f"{figures[figure]:.3f}", f"{after[name][figure]:.3f}")
-    console.print(table, f"{written}: written", soft_wrap=True)
+    console.print(table)
+    console.print(f"{written}: written", soft_wrap=True)

@@ -10,9 +10,7 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from rich.box import SIMPLE
 from rich.console import Console
-from rich.table import Table
 from scipy.spatial.transform import Rotation
 
 from dpm2_core.commands.map_graph import optimize
@@ -25,6 +23,7 @@ from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.slam.map.data import MapData, load_map, map_cloud, restore, save_as, trajectory
 from dpm2_core.slam.map.store import MapStore
+from dpm2_core.tables import FigureTable
 
 app = typer.Typer(help="Map files: info, export, merge, prune, check; pose graphs: optimize.", no_args_is_help=True)
 app.command()(optimize)
@@ -44,7 +43,7 @@ def info(path: MapFile) -> None:
     size = sum(file.stat().st_size for suffix in ("", "-wal") if (file := Path(f"{path}{suffix}")).exists())
     loops = [edge for edge in data.edges if edge.kind == "loop"]
     own = sum(data.clouds.loan(node) is None for node in range(len(data)))
-    table = Table(title=str(path), title_justify="left", box=SIMPLE, show_header=False)
+    table = FigureTable(str(path), names=["what"], text=["value"], header=False)
     robots = ", ".join(sorted({keyframe.robot or "(one)" for keyframe in data.keyframes})) or "-"
     rows = (
         ("keyframes", f"{len(data)}, {own} of them with their own cloud, {with_descriptors} with descriptors"),

@@ -11,12 +11,11 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-from rich.box import SIMPLE
 from rich.console import Console
-from rich.table import Table
 
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.files import atomic_write
+from dpm2_core.tables import FigureTable
 
 
 def optimize(
@@ -65,7 +64,7 @@ def optimize(
 
 
 def _show(graph: Path, figures: dict[str, Any], ignored: dict[str, int], settled: bool) -> None:
-    table = Table(title=str(graph), title_justify="left", box=SIMPLE, show_header=False)
+    table = FigureTable(str(graph), names=["what"], text=["value"], header=False)
     for name, value in figures.items():
         note = {"chi2_before": ", with every loop", "chi2_after": ", with the loops kept"}.get(name, "")
         text = f"{value:.4g}" if isinstance(value, float) and np.isfinite(value) else str(value)

@@ -11,10 +11,10 @@ from typing import Annotated
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from rich.table import Table
 
 from dpm2_core.commands.train import ConfigOption, OutOption, ResumeOption, SetOption, refuse_overwriting, train
 from dpm2_core.config import load_settings
+from dpm2_core.tables import FigureTable
 
 SourceArgument = Annotated[
     Path,
@@ -132,7 +132,7 @@ def eval_task(
     if as_json:
         typer.echo(json.dumps({"task": name, "weights": str(weights), "scans": len(scans), **figures}))
         return
-    table = Table("figure", "value", title=f"{name}, {len(scans)} scans of {src}")
+    table = FigureTable(f"{name}, {len(scans)} scans of {src}", names=["figure"], figures=["value"])
     for figure, value in figures.items():
         table.add_row(figure, f"{value:.4g}")
     Console().print(table)

@@ -123,9 +123,9 @@ def ablation(
 ) -> None:
     """The paper's Table 4: alternatives of the fusion, trained alike; continues where it was stopped."""
     from rich.console import Console
-    from rich.table import Table
 
     from dpm2_core.evaluation.bench.harness import write_record
+    from dpm2_core.tables import FigureTable
     from dpm2_core.training.ablation import AblationSettings
     from dpm2_core.training.ablation import ablation as compare
 
@@ -133,9 +133,8 @@ def ablation(
     if not chosen.measure:
         raise UsageError("measure: want the folders of packed drives to measure on, such as {unseen: out/train/val}")
     found = compare(chosen, out)
-    table = Table(
-        "fusion", *(f"{drives}: {what}" for drives in chosen.measure for what in ("near m", "success", "far"))
-    )
+    columns = [f"{drives}: {what}" for drives in chosen.measure for what in ("near m", "success", "far")]
+    table = FigureTable("Fusions trained alike", names=["fusion"], figures=columns)
     for name, rows in found.items():
         cells = [f"{r['near_m']:.3f} {r['near_success']:.0%} {r['far_success']:.0%}".split() for r in rows.values()]
         table.add_row(name, *(cell for row in cells for cell in row))

@@ -5,19 +5,16 @@ from __future__ import annotations
 
 import math
 
-from rich.table import Table
-
 from dpm2_core.evaluation.kitti_metric import OFFICIAL_LENGTHS
 from dpm2_core.evaluation.metrics import Metrics
+from dpm2_core.tables import FigureTable
 
 
-def metrics_table(metrics: Metrics, title: str, frame: str) -> Table:
+def metrics_table(metrics: Metrics, title: str, frame: str) -> FigureTable:
     """The figures, each row with its definition; `frame` says which sensor's poses were compared."""
     caption = f"Sensor frame: {frame}." + (f" Truth: {metrics.truth}." if metrics.truth else "")
-    table = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
-    table.add_column("figure")
-    table.add_column("value", justify="right")
-    table.add_column("how it is measured")
+    how_measured = ["how it is measured"]
+    table = FigureTable(title, names=["figure"], figures=["value"], text=how_measured, caption=caption)
     t_err, r_err = metrics.t_err_percent, metrics.r_err_deg_per_100m
     how = f"the path is shorter than {min(metrics.lengths_m):g} m; choose shorter --lengths"
     if t_err is not None and r_err is not None:

@@ -8,9 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from rich.box import SIMPLE
 from rich.console import Group
-from rich.table import Table
 from torch import Tensor
 
 from dpm2_core.config import load_settings
@@ -23,6 +21,7 @@ from dpm2_core.evaluation.bench.harness import Options, Report, processors
 from dpm2_core.geometry import se3, se3_torch
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.world import build_world
+from dpm2_core.tables import FigureTable
 
 SCANS, POINTS = 8, 2048
 MOTION = se3.exp(np.array([0.002, -0.003, np.radians(1.2), 0.8, 0.1, 0.02]))
@@ -215,12 +214,13 @@ def _figure(x: float) -> float:
 
 
 def _view(results: dict[str, Any]) -> Group:
-    known = Table("gate", *(str(i + 1) for i in range(len(results["known_motion"]["soft"]["mm"]))), box=SIMPLE)
-    known.title = "Known motion: mm left after each iteration"
+    iterations = [str(i + 1) for i in range(len(results["known_motion"]["soft"]["mm"]))]
+    known = FigureTable("Known motion: mm left after each iteration", names=["gate"], figures=iterations)
     for gate, row in results["known_motion"].items():
         known.add_row(gate, *(f"{x:.3g}" if x >= 1e-3 else "<0.001" for x in row["mm"]))
-    rows = Table("gate", "gradient", "mm to converged", "cosine to its gradient", box=SIMPLE)
-    rows.title = f"Eight scans, {results['gates']['iterations']} iterations"
+    title = f"Eight scans, {results['gates']['iterations']} iterations"
+    figures = ["mm to converged", "cosine to its gradient"]
+    rows = FigureTable(title, names=["gate", "gradient"], figures=figures)
     for gate, row in results["gates"]["rows"].items():
         for gradient, of in row.items():
             rows.add_row(gate, gradient, f"{of['to_converged_mm']:.3g}", f"{of['gradient_cosine']:.4f}")

@@ -12,9 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from rich.box import SIMPLE
 from rich.console import Group
-from rich.table import Table
 
 from dpm2_core.config import load_settings
 from dpm2_core.data.source import InputSettings, open_source
@@ -25,6 +23,7 @@ from dpm2_core.sim.config import LidarConfig, PresetName
 from dpm2_core.sim.drive import simulate
 from dpm2_core.slam.neural import weights_path
 from dpm2_core.slam.system import SlamSettings
+from dpm2_core.tables import FigureTable
 from dpm2_core.training.finetune import FinetuneSettings, finetune, prepare
 from dpm2_core.training.generate import GenerateSettings, generate
 from dpm2_core.training.validation import NEAR, SUCCESS, PairSet
@@ -162,13 +161,13 @@ def _report(results: dict[str, Any], settings: FinetuneSettings, digest: str) ->
             }
             for name in UNSEEN
         }
-    table = Table(title="Median errors of pairs in unseen worlds", title_justify="left", box=SIMPLE)
-    for column in ("losses", "seed", "LiDAR", "up to 5 m", "5 to 20 m", "all", "deg", "success"):
-        table.add_column(column, justify="left" if column in ("losses", "LiDAR") else "right")
+    figures = ("up to 5 m", "5 to 20 m", "all", "deg", "success")
+    title = "Median errors of pairs in unseen worlds, m"
+    table = FigureTable(title, names=["losses", "seed", "LiDAR"], figures=figures)
     lines = [("before", "", before)]
     lines += [(arm, seed, run["after"]) for arm, seeds in runs.items() for seed, run in seeds.items()]
-    for arm, seed, figures in lines:
-        for name, row in figures.items():
+    for arm, seed, measured in lines:
+        for name, row in measured.items():
             cells = [f"{row[figure]:.4f}" for figure in ("near_m", "far_m", "all_m", "all_deg")]
             table.add_row(arm, seed, name, *cells, f"{row['success']:.1%}")
     record = {

@@ -10,10 +10,8 @@ from time import perf_counter, process_time
 from typing import Any
 
 import numpy as np
-from rich.box import SIMPLE
 from rich.console import Group
 from rich.progress import Progress
-from rich.table import Table
 
 from dpm2_core.config import load_settings
 from dpm2_core.data.source import Source
@@ -23,6 +21,7 @@ from dpm2_core.evaluation.metrics import Metrics, evaluate
 from dpm2_core.frame import Array, Frame
 from dpm2_core.slam.output import TrajectoryRecorder
 from dpm2_core.slam.system import Config, SlamSystem
+from dpm2_core.tables import FigureTable
 
 LENGTHS = (10.0, 20.0, 30.0, 40.0, 50.0)
 """Segments of the KITTI metric, m: the excerpts are too short for those of the benchmark."""
@@ -143,8 +142,8 @@ def bench_geometric(options: Options) -> Report:
     notes = [] if BASELINE in methods else ["kiss-icp is not installed (pip install 'dpm2_ros[bench]'): no comparison."]
     for methods_of_drive in results.values():
         _compare(methods_of_drive)
-    view = Group(_table(results), *(_stages(name, result) for name, result in results.items()), *notes)
-    return Report({"segment_lengths_m": LENGTHS, "truth": truth, "drives": results}, view)
+    shown = Group(view(results), *notes)
+    return Report({"segment_lengths_m": LENGTHS, "truth": truth, "drives": results}, shown)
 
 
 def summary(source: Source, outcomes: Sequence[Outcome]) -> dict[str, Any]:
@@ -201,17 +200,18 @@ def _compare(methods: dict[str, Any]) -> None:
         methods[row] = {**ratios, "fps": float(np.median(pairs))}
 
 
-def _table(results: dict[str, Any]) -> Table:
-    table = Table(
-        title="RPE: mean. APE: after SE(3) alignment. Drift: aligned at the start.", title_justify="left", box=SIMPLE
-    )
-    for column in ("drive", "method"):
-        table.add_column(column, no_wrap=True)
-    for column in ("RPE m", "RPE deg", "APE m", "drift %", "Hz", "p95 ms", "CPU ms"):
-        table.add_column(column, justify="right", no_wrap=True)
+def view(results: dict[str, Any]) -> Group:
+    """The tables: figures of all drives, and stages of each."""
+    return Group(_table(results), *(_stages(name, result) for name, result in results.items()))
+
+
+def _table(results: dict[str, Any]) -> FigureTable:
+    figures = ("RPE m", "RPE deg", "APE m", "drift %", "t_err %", "Hz", "p95 ms", "CPU ms")
+    title = "RPE: mean. APE: after SE(3) alignment. Drift: aligned at the start. t_err: KITTI metric."
+    table = FigureTable(title, names=["drive", "method"], figures=figures)
     for drive, methods in results.items():
         for method, row in methods.items():
-            errors = ["-" if row[name] is None else f"{row[name]:.3f}" for name in _ERRORS[:4]]
+            errors = ["-" if row[name] is None else f"{row[name]:.3f}" for name in _ERRORS[:5]]
             if method.startswith("ratio"):
                 speed = [f"{row['fps']:.2f}", "", f"{row['cpu_ms']:.2f}"]
             else:
@@ -221,10 +221,8 @@ def _table(results: dict[str, Any]) -> Table:
     return table
 
 
-def _stages(drive: str, methods: dict[str, Any]) -> Table:
-    table = Table(title=f"Stages of {OURS} on {drive}, ms", title_justify="left", box=SIMPLE)
-    for column in ("stage", "median", "p95"):
-        table.add_column(column, justify="left" if column == "stage" else "right")
+def _stages(drive: str, methods: dict[str, Any]) -> FigureTable:
+    table = FigureTable(f"Stages of {OURS} on {drive}, ms", names=["stage"], figures=["median", "p95"])
     for stage, quantiles in methods[OURS]["stages_ms"].items():
         table.add_row(stage, f"{quantiles['median']:.1f}", f"{quantiles['p95']:.1f}")
     return table

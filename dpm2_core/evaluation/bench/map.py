@@ -15,10 +15,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.box import SIMPLE
 from rich.console import Console, Group
 from rich.progress import track
-from rich.table import Table
 
 from dpm2_core.config import load_settings
 from dpm2_core.data.source import open_source
@@ -39,6 +37,7 @@ from dpm2_core.slam.map.mapper import Mapper
 from dpm2_core.slam.map.prune import prune, redundant_nodes
 from dpm2_core.slam.map.store import MapStore
 from dpm2_core.slam.system import Config, SlamSettings, make_mapper
+from dpm2_core.tables import FigureTable
 
 Mask = NDArray[np.bool_]
 
@@ -236,8 +235,8 @@ def _moving(data: MapData, labels: list[Mask], settings: SlamSettings) -> dict[s
     }
 
 
-def _crash_table(crash: dict[str, Any]) -> Table:
-    table = Table(title="Kills of a running drive", title_justify="left", box=SIMPLE, show_header=False)
+def _crash_table(crash: dict[str, Any]) -> FigureTable:
+    table = FigureTable("Kills of a running drive", text=["what", "figures"], header=False)
     ape = crash["ape_m"]
     for row in (
         ("kills, maps that open", f"{crash['kills']}, {crash['maps_that_open']}"),
@@ -249,17 +248,16 @@ def _crash_table(crash: dict[str, Any]) -> Table:
     return table
 
 
-def _laps_table(laps: dict[str, Any]) -> Table:
-    table = Table(title=f"Laps of {laps['lap_m']:.0f} m", title_justify="left", box=SIMPLE)
-    for column in ("lap", "keyframes", "with own cloud", "MB", "loops"):
-        table.add_column(column, justify="right")
-    for row in laps["laps"]:
-        figures = (row["lap"], row["keyframes"], row["with_own_cloud"], f"{row['bytes'] / 1e6:.2f}", row["loops"])
-        table.add_row(*map(str, figures))
-    table.add_row("pruned", str(laps["keyframes_pruned"]), "", f"{laps['bytes_pruned'] / 1e6:.2f}", "")
+def _laps_table(laps: dict[str, Any]) -> FigureTable:
     m = laps["moving"]
-    table.caption = (
+    caption = (
         f"points of moving things: {m['share_before']:.2%} of the map before, {m['share_after']:.2%} after; "
         f"{m['removed']:.0%} of them removed, and {m['static_removed']:.3%} of the static ones"
     )
+    figures = ("keyframes", "with own cloud", "MB", "loops")
+    table = FigureTable(f"Laps of {laps['lap_m']:.0f} m", names=["lap"], figures=figures, caption=caption)
+    for row in laps["laps"]:
+        cells = (row["lap"], row["keyframes"], row["with_own_cloud"], f"{row['bytes'] / 1e6:.2f}", row["loops"])
+        table.add_row(*map(str, cells))
+    table.add_row("pruned", str(laps["keyframes_pruned"]), "", f"{laps['bytes_pruned'] / 1e6:.2f}", "")
     return table

@@ -8,15 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.box import SIMPLE
 from rich.console import Group
 from rich.progress import track
-from rich.table import Table
 
 from dpm2_core.config import load_settings
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.evaluation.bench.harness import Options, Report, drives, unique_name
 from dpm2_core.slam.system import Config, SlamSystem
+from dpm2_core.tables import FigureTable
 
 _EVERY = 50  # frames between two samples
 
@@ -70,12 +69,11 @@ def resident_mb() -> float:
     return round(pages * os.sysconf("SC_PAGE_SIZE") / 2**20, 1)
 
 
-def _table(results: dict[str, Any]) -> Table:
-    table = Table(title="Resident memory, MB", title_justify="left", box=SIMPLE)
-    for column in ("drive", "frames", "keyframes", "start", "half way", "end", "growth a 1000 frames, second half"):
-        table.add_column(column, justify="left" if column == "drive" else "right")
+def _table(results: dict[str, Any]) -> FigureTable:
+    figures = ("frames", "keyframes", "start", "half way", "end", "growth per 1000 frames, second half")
+    table = FigureTable("Resident memory, MB", names=["drive"], figures=figures)
     for drive, row in results.items():
         rss, slope = row["rss_mb"], row["growth_mb_per_1000_frames_second_half"]
-        figures = [f"{rss[when]:.0f}" for when in ("start", "half", "end")] + ["-" if slope is None else f"{slope:.1f}"]
-        table.add_row(drive, str(row["frames"]), str(row["keyframes"]), *figures)
+        cells = [f"{rss[when]:.0f}" for when in ("start", "half", "end")] + ["-" if slope is None else f"{slope:.1f}"]
+        table.add_row(drive, str(row["frames"]), str(row["keyframes"]), *cells)
     return table

@@ -3,12 +3,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
-from rich.box import SIMPLE
 from rich.console import Group, RenderableType
-from rich.table import Table
+
+from dpm2_core.tables import FigureTable
 
 
 def view(parts: Mapping[str, Any]) -> Group:
@@ -45,18 +45,9 @@ def view(parts: Mapping[str, Any]) -> Group:
     return Group(*shown)
 
 
-def _new_table(title: str, words: Sequence[str], figures: Sequence[str]) -> Table:
-    table = Table(title=title, title_justify="left", box=SIMPLE)
-    for column in words:
-        table.add_column(column, no_wrap=True)
-    for column in figures:
-        table.add_column(column, justify="right", no_wrap=True)
-    return table
-
-
-def _pair_table(title: str, kinds: Mapping[str, Any]) -> Table:
+def _pair_table(title: str, kinds: Mapping[str, Any]) -> FigureTable:
     figures = ("pairs", "median m", "deg", "success %")
-    table = _new_table(f"{title}. Success: 0.6 m, 1.5 deg.", ("kind", "method"), figures)
+    table = FigureTable(f"{title}. Success: 0.6 m, 1.5 deg.", names=["kind", "method"], figures=figures)
     for kind, methods in kinds.items():
         for method, row in methods.items():
             values = (("median_m", 1, 3), ("median_deg", 1, 3), ("success", 100, 1))
@@ -66,9 +57,9 @@ def _pair_table(title: str, kinds: Mapping[str, Any]) -> Table:
     return table
 
 
-def _odometry_table(drive: str, methods: Mapping[str, Any]) -> Table:
+def _odometry_table(drive: str, methods: Mapping[str, Any]) -> FigureTable:
     figures = ("RPE m", "deg", "APE m", "drift %", "failed", "ms", "p95", "ratio")
-    table = _new_table(f"{drive}: odometry. Ratio: of median times to KISS-ICP's.", ("method",), figures)
+    table = FigureTable(f"{drive}: odometry. Ratio: of median times to KISS-ICP's.", names=["method"], figures=figures)
     for method, row in methods.items():
         keys = ("rpe_trans_m", "rpe_rot_deg", "ape_rmse_m", "final_drift_percent")
         errors = ["-" if row[key] is None else f"{row[key]:.3f}" for key in keys]
@@ -78,9 +69,10 @@ def _odometry_table(drive: str, methods: Mapping[str, Any]) -> Table:
     return table
 
 
-def _stage_table(drive: str, row: Mapping[str, Any]) -> Table:
+def _stage_table(drive: str, row: Mapping[str, Any]) -> FigureTable:
     ratio = f" Ratio of medians to KISS-ICP's: {row['ratio']:.2f}." if "ratio" in row else ""
-    table = _new_table(f"{drive}: encode and register, ms a frame.{ratio}", ("stage",), ("median", "p95"))
+    title = f"{drive}: encode and register, ms a frame.{ratio}"
+    table = FigureTable(title, names=["stage"], figures=["median", "p95"])
     extra = {name: row[name] for name in ("without_camera_ms", "kiss-icp") if name in row}
     for stage, ms in {**row["stages_ms"], **extra}.items():
         table.add_row(stage, f"{ms['median']:.1f}", f"{ms['p95']:.1f}")

@@ -11,9 +11,7 @@ from typing import Any
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from rich.box import SIMPLE
 from rich.console import Group
-from rich.table import Table
 from scipy.spatial import cKDTree
 
 from dpm2_core.errors import UsageError
@@ -25,6 +23,7 @@ from dpm2_core.slam.graph.data import GraphData, integrate
 from dpm2_core.slam.graph.g2o import read_g2o
 from dpm2_core.slam.graph.robust import RobustSettings, least_squares, optimise
 from dpm2_core.slam.graph.worker import GraphWorker
+from dpm2_core.tables import FigureTable
 
 _STEP = np.array([4e-4, 4e-4, 2e-3, 0.02, 0.02, 0.02])  # rad, m: noise of the made drive's odometry
 _LOOP = np.array([5e-3, 5e-3, 5e-3, 0.05, 0.05, 0.05])
@@ -188,10 +187,9 @@ def _beside(truth: Array, graph: GraphData) -> dict[str, Any]:
     return out
 
 
-def _table(title: str, rows: dict[str, Any]) -> Table:
-    table = Table(title=title, title_justify="left", box=SIMPLE)
-    for column in ("", "loops", "right kept", "wrong kept", "odometry ATE, m", "ATE, m", "s"):
-        table.add_column(column, justify="right")
+def _table(title: str, rows: dict[str, Any]) -> FigureTable:
+    figures = ("loops", "right kept", "wrong kept", "odometry ATE, m", "ATE, m", "s")
+    table = FigureTable(title, names=[""], figures=figures)
     for name, row in rows.items():
         kept = f"{row['right_kept']} of {row['right']}"
         ate = (f"{row['odometry_ate_m']:.2f}", f"{row['ate_m']:.3f}", f"{row['seconds']:.2f}")

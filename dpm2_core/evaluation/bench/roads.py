@@ -9,10 +9,8 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-from rich.box import SIMPLE
 from rich.console import Group
 from rich.progress import Progress
-from rich.table import Table
 
 from dpm2_core.config import load_settings
 from dpm2_core.errors import UsageError
@@ -23,6 +21,7 @@ from dpm2_core.sim.config import PresetName
 from dpm2_core.sim.source import SimulatedDrive
 from dpm2_core.slam.output import TrajectoryRecorder
 from dpm2_core.slam.system import Config, SlamSettings, SlamSystem
+from dpm2_core.tables import FigureTable
 
 ROADS: dict[str, PresetName] = {
     "00": "suburb", "05": "suburb", "06": "city", "07": "city", "08": "suburb", "09": "rural",
@@ -119,10 +118,10 @@ def _quantiles(seconds: Sequence[float]) -> dict[str, float]:
     return {"median": round(float(median), 1), "p95": round(float(p95), 1)}
 
 
-def _table(roads: dict[str, Any]) -> Table:
-    table = Table(title="Odometry alone -> SLAM; KITTI metric, APE after alignment", title_justify="left", box=SIMPLE)
-    for column in ("road", "t_err %", "r_err deg/100 m", "APE m", "loops", "wrong", "same", "reverse", "cross"):
-        table.add_column(column, justify="right", no_wrap=True)
+def _table(roads: dict[str, Any]) -> FigureTable:
+    figures = ("t_err %", "r_err deg/100 m", "APE m", "loops", "wrong", "same", "reverse", "cross")
+    title = "Odometry alone -> SLAM; KITTI metric, APE after alignment"
+    table = FigureTable(title, names=["road"], figures=figures)
     for name, road in roads.items():
         errors = [f"{road['odometry'][e]:.3f} -> {road['slam'][e]:.3f}" for e in _ERRORS[:3]]
         loops = road["loops"]

@@ -13,9 +13,7 @@ from statistics import mean, median, stdev
 from typing import Any, Literal
 
 import torch
-from rich.box import SIMPLE
 from rich.console import Group
-from rich.table import Table
 
 from dpm2_core.config import dump_settings, load_settings
 from dpm2_core.diffslam.tasks.data import TaskScans, open_scans
@@ -26,6 +24,7 @@ from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.bench.harness import Options, Report, git_commit, processors, write_report
 from dpm2_core.evaluation.task_slam import slam_figures
 from dpm2_core.files import atomic_write
+from dpm2_core.tables import FigureTable
 
 Better = Literal["lower", "higher"]
 _DONE = "settings.yaml"  # beside the weights of a training that ended
@@ -246,8 +245,8 @@ def _figure(x: float) -> float:
 def _view(parts: dict[str, Any]) -> Group:
     tables = []
     for name, part in parts.items():
-        table = Table("figure", "without", "with SLAM loss", "gain", "paired", "beyond the spread", box=SIMPLE)
-        table.title = f"{name}, {len(part['runs']['with'])} seeds"
+        columns = ["without", "with SLAM loss", "gain", "paired", "beyond the spread"]
+        table = FigureTable(f"{name}, {len(part['runs']['with'])} seeds", names=["figure"], figures=columns)
         for figure, row in part["summary"].items():
             cells = [_cell(row.get(arm)) for arm in ("without", "with")]
             gain = f"{row['gain']:+.1%}" if "gain" in row else ""

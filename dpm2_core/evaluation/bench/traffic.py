@@ -13,9 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from rich.box import SIMPLE
 from rich.console import Group
-from rich.table import Table
 
 from dpm2_core.config import load_settings
 from dpm2_core.errors import UsageError
@@ -28,6 +26,7 @@ from dpm2_core.sim.world import World, build_world
 from dpm2_core.slam.filters import SHIPPED, WEIGHTS, FilterKind, FilterSettings, make_filter
 from dpm2_core.slam.odometry import Odometry
 from dpm2_core.slam.system import Config, SlamSettings, make_odometry
+from dpm2_core.tables import FigureTable
 
 PLACES: dict[PresetName, float] = {"city": 20.0, "suburb": 40.0, "rural": 40.0}
 """Kinds of places, and how many times the usual traffic they have: 20 to 40 % of the points are on it."""
@@ -170,9 +169,8 @@ def _report(drives: dict[str, Any], options: Options) -> Report:
     summary = _summary(drives)
     results = {"recipe": _recipe(options), "summary": summary, "drives": drives, "torch": torch.__version__,
                "measured_at": git_commit()}  # fmt: skip
-    table = Table(title="RPE in dense traffic, mean over drives (median)", title_justify="left", box=SIMPLE)
-    for column in ("registration", "filter", "RPE m", "RPE deg", "astray", "CPU ms"):
-        table.add_column(column, justify="left" if column in ("registration", "filter") else "right", no_wrap=True)
+    title, figures = "RPE in dense traffic, mean over drives (median)", ["RPE m", "RPE deg", "astray", "CPU ms"]
+    table = FigureTable(title, names=["registration", "filter"], figures=figures)
     for registration, methods in summary.items():
         for method, row in methods.items():
             table.add_row(

@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tables for people that lose nothing on a narrow terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from rich.box import SIMPLE
+from rich.cells import cell_len
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.table import Table
+from rich.text import Text
+
+_PROSE = 24
+"""Characters a line that text needs to be read with ease."""
+
+
+class FigureTable:
+    """Names, figures and text in columns, in this order. What is too wide for the terminal is turned.
+
+    Text is wrapped, names and figures are not, and nothing is cut. In a turned table a row is a column, and as many
+    rows of a section as fit are beside each other. Cells are printed as they are: what looks like rich's markup comes
+    from a file or a topic.
+    """
+
+    def __init__(
+        self,
+        title: str,
+        *,
+        names: Sequence[str] = (),
+        figures: Sequence[str] = (),
+        text: Sequence[str] = (),
+        caption: str = "",
+        header: bool = True,
+    ) -> None:
+        """Headings of the columns of each kind; `header` False leaves them out."""
+        self._title, self._caption, self._header = title, caption, header
+        self._headings = [*names, *figures, *text]
+        self._text = len(names) + len(figures)  # the first column of text
+        self._names = len(names)
+        self._rows: list[list[str]] = []
+        self._sections: set[int] = set()
+
+    def add_row(self, *cells: str) -> None:
+        """A cell for each column.
+
+        Raises:
+            ValueError: more or fewer cells than columns.
+        """
+        if len(cells) != len(self._headings):
+            raise ValueError(f"{len(cells)} cells for {len(self._headings)} columns")
+        self._rows.append(list(cells))
+
+    def add_section(self) -> None:
+        """A gap after the last row."""
+        self._sections.add(len(self._rows))
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        yield Text(self._title, style="italic")
+        columns = [*zip(self._headings, *self._rows, strict=True)]
+        widths = [max(map(cell_len, column if self._header else column[1:]), default=0) for column in columns]
+        least = [*widths[: self._text], *(min(width, _PROSE) for width in widths[self._text :])]
+        if _total(least) <= options.max_width or not self._rows:
+            yield self._upright()
+        else:
+            yield from self._turned(options.max_width)
+        if self._caption:
+            yield Text(self._caption, style="dim italic")
+
+    def _upright(self) -> Table:
+        table = Table(box=SIMPLE, show_header=self._header)
+        for number, heading in enumerate(self._headings):
+            figure = self._names <= number < self._text
+            prose = number >= self._text
+            table.add_column(Text(heading), justify="right" if figure else "left", no_wrap=not prose, overflow="fold")
+        for number, row in enumerate(self._rows, 1):
+            table.add_row(*map(Text, row), end_section=number in self._sections)
+        return table
+
+    def _turned(self, width: int) -> Iterator[Table]:
+        label = max(map(cell_len, self._headings))
+        first = 0
+        while first < len(self._rows):
+            last = first + 1
+            while last < len(self._rows) and last not in self._sections:
+                if _total([label, *(max(map(cell_len, row)) for row in self._rows[first : last + 1])]) > width:
+                    break
+                last += 1
+            table = Table(box=SIMPLE, show_header=False)
+            table.add_column(no_wrap=True)
+            for _ in range(first, last):
+                table.add_column(justify="right", overflow="fold")
+            for number, heading in enumerate(self._headings):
+                cells = (Text(row[number]) for row in self._rows[first:last])
+                table.add_row(Text(heading, style="bold"), *cells, end_section=number == self._names - 1)
+            yield table
+            first = last
+
+
+def _total(widths: Sequence[int]) -> int:
+    """Width of a table of such columns: a blank on either side of each, and one between, before and after them."""
+    return sum(widths) + 3 * len(widths) + 1
