@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import suppress
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -17,6 +19,10 @@ from dpm2_core.slam.map.store import MapStore
 from dpm2_core.slam.output import save_map
 from dpm2_core.slam.system import make_localiser, make_mapper
 from dpm2_ros.settings import NodeConfig
+
+AUTO = "auto"
+_NAME = "drive"
+_SUFFIX = ".dpm2map"
 
 
 class ActiveMap:
@@ -36,7 +42,10 @@ class ActiveMap:
     def __init__(self, config: NodeConfig, robot: str, log: Any) -> None:
         """`robot`: whose node it is; `log`: a ROS logger."""
         self._config, self._robot, self._log = config, robot, log
-        self._path = Path(config.ros.map_file)  # written, or to be found in
+        ros = config.ros
+        self._directory = Path(ros.map_directory) if ros.map_directory else None
+        self._path = Path(ros.map_file) if ros.map_file not in ("", AUTO) else None  # written, or to be found in
+        self._folder: Path | None = None  # of the clouds of this drive
         self._store: MapStore | None = None
         self.localiser: Localiser | None = None
         self.located: Located | None = None
@@ -109,29 +118,58 @@ class ActiveMap:
         if self.localiser is not None:
             self.localiser.restart()
 
-    def reset(self) -> None:
-        """Begin an empty map; or, in a map that stays as it is, look for the robot anew."""
+    def reset(self) -> str:
+        """Save the map and begin an empty one; or, in a map that stays as it is, look for the robot anew.
+
+        Raises:
+            Dpm2Error: it could not be saved, and goes on.
+        """
+        self.restart()
         if self.localiser is not None:
-            self.localiser.restart()
-            return
+            return ""
+        self.finish()
+        if self.mapper.store_problem:
+            raise Dpm2Error(f"no reset: {self.mapper.store_problem}")
+        told = self.save() if self.mapper.keyframes and self._directory is not None else ""
         self.close()
         self._begin()
+        return told
 
-    def save(self, directory: Path) -> str:
-        """Cloud, trajectory and pose graph into a folder; says so in words.
+    @property
+    def saves(self) -> bool:
+        """Whether `save` has a folder to write into."""
+        return self._directory is not None and self.localiser is None
+
+    def save(self) -> str:
+        """Cloud, trajectory and pose graph into the drive's own folder; says so in words.
 
         Raises:
             UsageError: there is nothing to save. Dpm2Error: it cannot be written.
         """
+        if self._directory is None:
+            raise UsageError("no map is saved: ros.map_directory is empty")
         if self.localiser is not None:
             raise UsageError("no map is saved: in localization_mode the map stays as it is, in its file")
         if not self.mapper.keyframes:
             raise UsageError("no map is saved: there is no keyframe yet")
+        folder = self._directory
         try:
-            save_map(self.mapper, directory)
+            folder = self._folder = self._folder or self._claimed(self._directory)
+            save_map(self.mapper, folder)
         except OSError as error:
-            raise Dpm2Error(f"{directory}: no map saved: {error.strerror}") from None
-        return f"map of {len(self.mapper.keyframes)} keyframes saved in {directory.resolve()}"
+            raise Dpm2Error(f"{folder}: no map saved: {error.strerror}") from None
+        file = f", and as {self._path.resolve()}" if self._store is not None and self._path is not None else ""
+        return f"map of {len(self.mapper.keyframes)} keyframes saved in {folder.resolve()}{file}"
+
+    def _claimed(self, directory: Path) -> Path:
+        """A new folder of the drive's name: the same folder again for each save of the same drive, never another's."""
+        for folder in _numbered(
+            directory / (self._path.stem if self._path is not None else _named(_NAME, self._robot))
+        ):
+            with suppress(FileExistsError):
+                folder.mkdir(parents=True)
+                return folder
+        raise AssertionError
 
     def finish(self) -> None:
         """Do what still waits; the file stays open."""
@@ -139,28 +177,47 @@ class ActiveMap:
             self.mapper.finish()
 
     def close(self) -> None:
-        """Everything that is known is in the file, which is closed."""
+        """Everything that is known is in the file, which is closed; one without a keyframe is not kept."""
         self.finish()
         if self._store is not None:
             self._store.close()
+            if self._path is not None and not self._store.read_only and not self.mapper.keyframes:
+                self._path.unlink(missing_ok=True)
+                with suppress(OSError):  # it is not empty
+                    self._path.parent.rmdir()
             self._store = None
 
     def _begin(self) -> None:
         """An empty map, with a file if there is to be one. A file that cannot be made is no reason not to map."""
-        ros = self._config.ros
-        if ros.map_file:
-            path = free_path(Path(ros.map_file), self._robot)
+        ros, self._folder = self._config.ros, None
+        wanted = Path(ros.map_file)
+        if ros.map_file == AUTO:
+            wanted = self._directory / f"{_NAME}{_SUFFIX}" if self._directory is not None else Path()
+        if wanted.name:
             try:
-                self._store = open_session(path, self._config.slam, dump_settings(self._config), resume=False)
-                self._path = path
+                self._path, self._store = self._created(wanted)
+                self._log.info(f"map file: {self._path}")
             except Dpm2Error as error:
                 self._log.error(f"no map file: {error}")
         self.mapper, self._T_map_odom = make_mapper(self._config.slam, self._store), None
 
+    def _created(self, wanted: Path) -> tuple[Path, MapStore]:
+        """A new map file whose name, and folder for its clouds, nobody has."""
+        for path in _numbered(wanted.with_name(_named(wanted.stem, self._robot) + wanted.suffix)):
+            if path.exists() or (self._directory is not None and (self._directory / path.stem).exists()):
+                continue
+            try:
+                return path, open_session(path, self._config.slam, dump_settings(self._config), resume=False)
+            except UsageError:
+                if not path.exists():
+                    raise
+                continue  # another node has just taken the name
+        raise AssertionError
+
     def _load(self) -> None:
         """The file, to find oneself in; what was before stays if that fails."""
-        if not self._config.ros.map_file:
-            raise UsageError("no map to find oneself in: ros.map_file is empty")
+        if self._path is None:
+            raise UsageError("no map to find oneself in: ros.map_file does not name one" + self._hint())
         store = open_for_localisation(self._path, self._config.slam)
         try:
             mapper = make_mapper(self._config.slam, store)
@@ -172,8 +229,15 @@ class ActiveMap:
             self._store.close()
         self._store, self.mapper, self.localiser, self.located = store, mapper, localiser, None
 
+    def _hint(self) -> str:
+        """The youngest map in the folder, where somebody may look for one."""
+        found = sorted(self._directory.glob(f"*{_SUFFIX}"), key=_age) if self._directory is not None else []
+        return f"; the youngest in {self._directory} is {found[-1]}" if found else ""
+
     def _resume(self) -> None:
         """Go on with the file."""
+        assert self._path is not None
+        self._folder = None
         self._store = open_session(self._path, self._config.slam, dump_settings(self._config), resume=True)
         self.mapper = make_mapper(self._config.slam, self._store)
 
@@ -190,8 +254,15 @@ class ActiveMap:
             self._log.warning(f"{located.state}: {located.registration.reason}")
 
 
-def free_path(path: Path, robot: str) -> Path:
-    """The path with the robot's name, and with -2, -3, ... while there is a file of that name."""
-    stem = f"{path.stem}_{robot.replace('/', '_')}" if robot else path.stem
-    names = (stem if n == 1 else f"{stem}-{n}" for n in count(1))
-    return next(p for name in names if not (p := path.with_name(name + path.suffix)).exists())
+def _age(path: Path) -> float:
+    return path.stat().st_mtime
+
+
+def _named(stem: str, robot: str) -> str:
+    return f"{stem}_{robot.replace('/', '_')}" if robot else stem
+
+
+def _numbered(path: Path) -> Iterator[Path]:
+    """The path, and without end the same with -2, -3, ... before its suffix."""
+    yield path
+    yield from (path.with_name(f"{path.stem}-{n}{path.suffix}") for n in count(2))

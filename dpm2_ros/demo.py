@@ -132,7 +132,7 @@ def judge(source: BagSource, result: Replay, out: Path) -> Outcome:
         "every cloud has its odometry, with the same stamp": len(found) == len(result.published) > 0,
         "no odometry without its cloud": len(found) == len(result.poses),
         "the map arrived, with points in it": result.map is not None and len(result.map) > 0,
-        "the map was saved": (out / "map" / "map.ply").is_file(),
+        "the map was saved": result.saved is not None,
         "/diagnostics arrived": bool(result.diagnostics),
         "slam_node and bag_player ended cleanly": set(result.exit_codes.values()) == {0},
     }
@@ -156,7 +156,7 @@ def _judge_poses(
     position = {stamp: n for n, stamp in reversed(list(enumerate(stamps)))}
     rows = [position[stamp] for stamp in found]
     est = np.full((len(stamps), 4, 4), np.nan)
-    est[rows] = map_poses(source, result, out, found)
+    est[rows] = map_poses(source, result, found)
     truth = source.poses
     if truth is not None and np.isfinite(truth[:, 0, 0]).sum() > 1:
         metrics = evaluate(truth, est)
@@ -171,12 +171,11 @@ def _judge_poses(
         typer.echo(f"no trajectory.png: {error}", err=True)
 
 
-def map_poses(source: BagSource, result: Replay, out: Path, found: list[int]) -> Array:
+def map_poses(source: BagSource, result: Replay, found: list[int]) -> Array:
     """(N, 4, 4) poses of the LiDAR for the stamps `found`, corrected as the saved map's keyframes were."""
     T_odom_base = np.array([result.poses[stamp] for stamp in found])
-    saved = out / "map" / "trajectory.tum"
-    if saved.is_file():
-        keyframes = read_trajectory(saved)
+    if result.saved is not None:
+        keyframes = read_trajectory(result.saved / "trajectory.tum")
         position = {stamp: n for n, stamp in enumerate(found)}
         known = [n for n, stamp in enumerate(keyframes.keys.tolist()) if stamp in position]
         at = np.array([position[keyframes.keys[n]] for n in known], np.intp)
@@ -204,7 +203,7 @@ def _table(source: BagSource, result: Replay, outcome: Outcome, out: Path) -> Fi
         "map", f"{0 if result.map is None else len(result.map)}", f"points in the last of {result.maps} /dpm2/map"
     )
     table.add_row("checks", f"{sum(outcome.checks.values())} of {len(outcome.checks)}", "hold")
-    table.add_row("files", "", f"{out / 'map' / 'map.ply'}\n{out / 'summary.json'}\n{out / 'trajectory.png'}")
+    table.add_row("files", "", f"{result.saved}\n{out / 'summary.json'}\n{out / 'trajectory.png'}")
     return table
 
 

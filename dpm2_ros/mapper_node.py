@@ -67,10 +67,10 @@ class MapperNode(Node):
             feed.acknowledge()
 
     def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self._mapper.reset(save=False)
+        self._mapper.reset()
         for feed in self._feeds.values():
             feed.forget()
-        response.success, response.message = True, "the map is empty"
+        response.success, response.message = True, "the map is saved, and begins again empty"
         return response
 
 

@@ -8,7 +8,6 @@ import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -85,12 +84,6 @@ class MapperThread:
         return self._active.mapper.store_problem
 
     @property
-    def directory(self) -> Path | None:
-        """Where the map is saved; None where it is not."""
-        base = self._config.ros.map_directory
-        return Path(base) / self._robot if base else None
-
-    @property
     def localising(self) -> bool:
         """Whether the map stays as it is."""
         return self._active.localiser is not None
@@ -143,11 +136,9 @@ class MapperThread:
         """The odometry has started again: the map stays, the robot's place in it is no longer known."""
         self._restarted = self._submit(self._active.restart)
 
-    def reset(self, save: bool) -> None:
-        """Begin an empty map; `save` keeps the present one on disk."""
-        if save and self.directory is not None and not self.localising:
-            self._submit(self._save)
-        self._submit(lambda: self._change(self._active.reset))
+    def reset(self) -> None:
+        """Save the map and begin an empty one; where it cannot be saved, it goes on."""
+        self._submit(self._reset)
 
     def close(self) -> None:
         """Finish what is waiting, save the map, end the thread.
@@ -156,7 +147,7 @@ class MapperThread:
             Dpm2Error: the map could not be written.
         """
         self._submit(self._active.finish)
-        saved = None if self.directory is None or self.localising else self._thread.submit(self._save)
+        saved = self._thread.submit(self._active.save) if self._active.saves else None
         self._submit(self._active.close)
         self._thread.shutdown(wait=True)
         if saved is not None:
@@ -200,13 +191,12 @@ class MapperThread:
         if found.ok:
             self._loop_closures.publish(edge_to_msg(found.T_target_source, found.covariance, stamp, *names))
 
-    def _save(self) -> str:
-        if self.directory is None:
-            raise UsageError("no map is saved: ros.map_directory is empty")
-        return self._active.save(self.directory)
+    def _reset(self) -> None:
+        if told := self._change(self._active.reset):
+            self._node.get_logger().info(told)
 
     async def _on_save(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        await answer(self._thread.submit(self._save), response)
+        await answer(self._thread.submit(self._active.save), response)
         return response
 
     def _show(self) -> None:

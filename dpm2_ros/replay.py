@@ -41,6 +41,7 @@ class Replay:
         tf: "parent -> child" seen on /tf.
         diagnostics: the last values of the odometry's status.
         base_frame: child_frame_id of the odometry.
+        saved: folder of the map that the node has saved; None if it has not.
         exit_codes: of the processes, by name.
     """
 
@@ -54,6 +55,7 @@ class Replay:
     tf: set[str] = field(default_factory=set)
     diagnostics: dict[str, str] = field(default_factory=dict)
     base_frame: str = ""
+    saved: Path | None = None
     exit_codes: dict[str, int] = field(default_factory=dict)
 
 
@@ -112,7 +114,7 @@ def replay(
     times = out / "published.csv"
     slam = start("slam_node", arguments, environment, out / "slam_node.log")
     player: subprocess.Popen[bytes] | None = None
-    result = Replay()
+    result, maps = Replay(), set((out / "map").glob("*/map.ply"))
     try:
         with _Listener(result) as listener:
             alive = _watch(slam, "slam_node", out)
@@ -134,6 +136,7 @@ def replay(
         if player is not None:
             result.exit_codes["bag_player"] = stop(player) if player.poll() is None else player.returncode
         result.exit_codes["slam_node"] = stop(slam)
+    result.saved = next((ply.parent for ply in set((out / "map").glob("*/map.ply")) - maps), None)
     return result
 
 

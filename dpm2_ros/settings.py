@@ -62,13 +62,14 @@ class RosSettings(Settings):
     """Least time between two /dpm2/path and two /dpm2/pose_graph, s."""
 
     map_directory: str = "dpm2_map"
-    """Folder that ~/save_map and the end of the node save into; relative to the working directory, and within it one
-    named after the namespace, if any. Empty: nothing is saved at the end, and ~/save_map refuses."""
+    """Folder of the maps, relative to the working directory. Every drive has a name of its own in it: `drive`, with the
+    namespace, if any, and a number, if it is taken; nothing is overwritten. NAME.dpm2map grows as the drive goes on;
+    ~/save_map, ~/reset and the end of the node write a folder NAME with PLY, TUM and g2o. Empty: none of these."""
 
-    map_file: str = ""
-    """Map file, such as drive.dpm2map, that is written as the drive goes on, so that a crash costs no more than a
-    keyframe; `dpm2 map` reads it. The namespace, if any, and a number, if it is there already, are added to its name.
-    Empty: none. With `localization_mode`: the map to find oneself in."""
+    map_file: str = "auto"
+    """Map file that is written as the drive goes on, so that a crash costs no more than a keyframe; `dpm2 map` reads
+    it. auto: in `map_directory`; else a path such as town.dpm2map, to which namespace and number are added likewise.
+    Empty: none. With `localization_mode`: the path of the map to find oneself in."""
 
     localization_mode: bool = False
     """slam_node finds itself in `map_file`, which stays as it is, and makes no map of its own."""

@@ -122,7 +122,7 @@ class SlamNode(Node):
         self._begin()
         self._line.submit(self._sender.restart)
         if self._mapper is not None:
-            self._mapper.reset(save=False)
+            self._mapper.reset()
 
     def _process(self, bundle: Bundle) -> None:
         """One frame, from messages to messages."""
@@ -228,7 +228,7 @@ class SlamNode(Node):
     def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._reset_wanted.set()
         response.success = True
-        response.message = "odometry and map start again with the next cloud"
+        response.message = "the map is saved; odometry and map start again with the next cloud"
         if self._mapper is None:
             response.message = (
                 "odometry starts again with the next cloud, and its keyframes as a new session of the mapper's map"

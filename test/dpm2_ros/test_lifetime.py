@@ -53,8 +53,9 @@ def test_slam_node_saves_its_map_when_stopped(
         process.kill()
     output = (tmp_path / "log").read_text()
     assert "Traceback" not in output
-    assert f"saved in {tmp_path / 'map'}" in output
-    assert sorted(path.name for path in (tmp_path / "map").iterdir()) == SAVED
+    assert f"saved in {tmp_path / 'map' / 'drive'}" in output
+    assert sorted(path.name for path in (tmp_path / "map").iterdir()) == ["drive", "drive.dpm2map"]
+    assert sorted(path.name for path in (tmp_path / "map" / "drive").iterdir()) == SAVED
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.6])
@@ -159,7 +160,7 @@ def test_replay_is_judged_by_what_arrived(bag: Path, drive: Any, tmp_path: Path)
     assert 0 < summary["latency_p50_ms"] <= summary["latency_p95_ms"]
     assert summary["ape_rmse_m"] < 0.05
     assert (tmp_path / "trajectory.png").is_file()
-    poses = map_poses(source, result, tmp_path, source.stamps.tolist())
+    poses = map_poses(source, result, source.stamps.tolist())
     assert ape_rmse(source.poses, poses) == pytest.approx(summary["ape_rmse_m"])
     lost = result.poses.pop(source.stamps.tolist()[3])
     outcome = judge(source, result, tmp_path)

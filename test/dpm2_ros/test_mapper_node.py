@@ -12,6 +12,7 @@ import pytest
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import UInt8MultiArray
+from std_srvs.srv import Trigger
 
 from dpm2_core.data.trajectory import read_trajectory
 from dpm2_core.data.transforms import transform_matrix
@@ -59,34 +60,36 @@ def test_keyframes_become_a_map_in_either_order_of_messages(mapper: Any, tmp_pat
     mapper.wait(lambda: mapper.mapper._mapper.keyframes == 4, "four keyframes")
     mapper.mapper.close()
     mapper._closing.remove(mapper.mapper)
-    saved = read_trajectory(tmp_path / "map" / "trajectory.tum")
+    saved = read_trajectory(tmp_path / "map" / "drive" / "trajectory.tum")
     assert saved.keys.tolist() == [1000, 1001, 1002, 1003]
     np.testing.assert_allclose(saved.poses, T, atol=1e-6)
-    header = (tmp_path / "map" / "map.ply").read_bytes()[:300].decode("ascii", "replace")
+    header = (tmp_path / "map" / "drive" / "map.ply").read_bytes()[:300].decode("ascii", "replace")
     assert int(header.split("element vertex ")[1].split()[0]) > 1000
 
 
 def test_a_map_file_is_written_as_the_drive_goes_on(mapper: Any, tmp_path: Path) -> None:
-    """All keyframes are in it before the node ends; a new map gets a file of its own."""
+    """By default; all keyframes are in it before the node ends. A reset saves it, and a new map gets its own files."""
     thread = mapper.mapper._mapper
-    active = thread._active
-    ros = active._config.ros.model_copy(update={"map_file": str(tmp_path / "drive.dpm2map")})
-    active._config = active._config.model_copy(update={"ros": ros})
-    thread.reset(save=False)
+
+    def stored(name: str) -> int:
+        with MapStore.open(tmp_path / "map" / name) as store:
+            return len(load_map(store))
+
     for id in (0, 1, 2):
         mapper.send(id, se3.exp([0, 0, 0, 5.0 * id, 0, 0]), points(id))
         mapper.wait(lambda expected=id + 1: thread.keyframes == expected, "the keyframe")
-    thread.reset(save=False)
-    mapper.wait(lambda: thread.keyframes == 0, "the empty map")
+    mapper.wait(lambda: stored("drive.dpm2map") == 3, "all of them in the file")
+    client = mapper.node.create_client(Trigger, "/mapper_node/reset")
+    assert client.wait_for_service(10)
+    answer = client.call_async(Trigger.Request())
+    mapper.wait(answer.done, "the reset")
+    assert answer.result().success
+    mapper.wait(lambda: thread.keyframes == 0, "the empty map")  # which comes after the save
+    assert read_trajectory(tmp_path / "map" / "drive" / "trajectory.tum").keys.tolist() == [1000, 1001, 1002]
     mapper.send(0, np.eye(4), points(0))
-    assert thread.store_problem == ""
-
-    def stored(name: str) -> int:
-        with MapStore.open(tmp_path / name) as store:
-            return len(load_map(store))
-
+    mapper.wait(lambda: thread.keyframes == 1 and stored("drive-2.dpm2map") == 1, "the keyframe in the new file")
     assert stored("drive.dpm2map") == 3
-    mapper.wait(lambda: stored("drive-2.dpm2map") == 1, "the keyframe in the new file")
+    assert thread.store_problem == ""
 
 
 def test_a_keyframe_of_another_name_is_refused_and_the_rest_goes_on(mapper: Any) -> None:

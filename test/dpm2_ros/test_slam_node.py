@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -516,14 +517,21 @@ def test_save_map_answers_in_words(rig: Callable[..., Rig], drive: Any, tmp_path
     r.send_and_wait(0, 1)
     answer = call(r, "/slam_node/save_map")
     assert answer.success
-    assert answer.message == f"map of 1 keyframes saved in {tmp_path / 'map'}"
-    assert sorted(path.name for path in (tmp_path / "map").iterdir()) == ["map.ply", "pose_graph.g2o", "trajectory.tum"]
+    assert answer.message == (
+        f"map of 1 keyframes saved in {tmp_path / 'map' / 'drive'}, and as {tmp_path / 'map' / 'drive.dpm2map'}"
+    )
+    assert sorted(path.name for path in (tmp_path / "map" / "drive").iterdir()) == [
+        "map.ply",
+        "pose_graph.g2o",
+        "trajectory.tum",
+    ]
 
 
 def test_a_map_that_cannot_be_saved_is_an_answer(rig: Callable[..., Rig], drive: Any, tmp_path: Path) -> None:
     """The disk is full as far as the file system goes: the map's folder is a file."""
     r = rig(f"ros.map_directory:={tmp_path / 'map'}")
     r.send_and_wait(0)
+    shutil.rmtree(tmp_path / "map")
     (tmp_path / "map").write_text("in the way")
     answer = call(r, "/slam_node/save_map")
     assert not answer.success

@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every drive leaves a map that can be loaded, and takes nothing from those before it."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dpm2_core.cli import main
+from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.frame import Keyframe, Registration
+from dpm2_core.geometry import se3
+from dpm2_core.slam.map.check import check_map
+from dpm2_ros.active_map import ActiveMap
+from dpm2_ros.settings import NodeConfig
+
+LOG = logging.getLogger("test")
+
+
+def config(**ros: Any) -> NodeConfig:
+    return NodeConfig.model_validate({"ros": ros, "slam": {"loops": {"descriptors": False}}})
+
+
+def keyframes(count: int) -> list[Keyframe]:
+    noise = np.random.default_rng(0)
+    step, out = se3.exp([0, 0, 0.02, 3.0, 0, 0]), []
+    for id in range(count):
+        cloud = np.column_stack([noise.uniform(-30, 30, (500, 2)), noise.uniform(-2, 4, 500), noise.random(500)])
+        edge = Registration(step, np.eye(6) * 1e-4, 1.0, 0.01, "test") if id else None
+        T = np.linalg.matrix_power(step, id)
+        out.append(Keyframe(id, id, id, T, cloud.astype(np.float32), edge))
+    return out
+
+
+def drive(directory: Path, count: int = 3, robot: str = "", **ros: Any) -> None:
+    """From the start of a node to its end."""
+    active = ActiveMap(config(map_directory=str(directory), **ros), robot, LOG)
+    for keyframe in keyframes(count):
+        active.add(keyframe)
+    if count:
+        active.save()
+    active.close()
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def test_nothing_is_overwritten(tmp_path: Path) -> None:
+    """Drives of one robot and of another, into one folder; each map is sound, and none changes any more."""
+    before: dict[str, bytes] = {}
+    for robot, name in (("", "drive"), ("", "drive-2"), ("blue/one", "drive_blue_one"), ("", "drive-3")):
+        drive(tmp_path, robot=robot)
+        after = contents(tmp_path)
+        files = {f"{name}.dpm2map", *(f"{name}/{kind}" for kind in ("map.ply", "pose_graph.g2o", "trajectory.tum"))}
+        assert after.keys() - before.keys() == files
+        assert {path: after[path] for path in before} == before
+        found = check_map(tmp_path / f"{name}.dpm2map")
+        assert (found.problems, found.keyframes) == ([], 3)
+        before = after
+
+
+def test_a_folder_without_its_map_file_keeps_its_name(tmp_path: Path) -> None:
+    """As `ros.map_file:=''` leaves one, or dpm2 0.1."""
+    drive(tmp_path, map_file="")
+    assert sorted(contents(tmp_path)) == ["drive/map.ply", "drive/pose_graph.g2o", "drive/trajectory.tum"]
+    drive(tmp_path)
+    drive(tmp_path, map_file="")
+    assert {path.name for path in tmp_path.iterdir()} == {"drive", "drive-2", "drive-2.dpm2map", "drive-3"}
+
+
+def test_a_second_save_of_one_drive_replaces_the_first(tmp_path: Path) -> None:
+    active = ActiveMap(config(map_directory=str(tmp_path)), "", LOG)
+    for keyframe in keyframes(3):
+        active.add(keyframe)
+        told = active.save()
+    assert told == f"map of 3 keyframes saved in {tmp_path / 'drive'}, and as {tmp_path / 'drive.dpm2map'}"
+    active.close()
+    assert {path.name for path in tmp_path.iterdir()} == {"drive", "drive.dpm2map"}
+    assert len((tmp_path / "drive" / "trajectory.tum").read_text().splitlines()) == 1 + 3
+
+
+def test_an_empty_value_says_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither folder nor file, also where the other is given; a drive without a keyframe leaves nothing either."""
+    monkeypatch.chdir(tmp_path)
+    for ros in ({"map_directory": ""}, {"map_directory": "", "map_file": ""}):
+        active = ActiveMap(config(**ros), "", LOG)
+        active.add(keyframes(1)[0])
+        with pytest.raises(UsageError, match=r"no map is saved: ros.map_directory is empty"):
+            active.save()
+        assert active.reset() == ""
+        active.close()
+    drive(tmp_path / "maps", count=0)
+    assert list(tmp_path.iterdir()) == []
+    active = ActiveMap(config(map_directory="", map_file="town.dpm2map"), "", LOG)
+    active.add(keyframes(1)[0])
+    active.close()
+    assert list(tmp_path.iterdir()) == [tmp_path / "town.dpm2map"]
+
+
+def test_a_reset_saves_first(tmp_path: Path) -> None:
+    active = ActiveMap(config(map_directory=str(tmp_path)), "", LOG)
+    for keyframe in keyframes(3):
+        active.add(keyframe)
+    assert "map of 3 keyframes saved" in active.reset()
+    assert len(active.mapper.keyframes) == 0
+    active.add(keyframes(1)[0])
+    active.close()
+    assert [check_map(tmp_path / f"{name}.dpm2map").keyframes for name in ("drive", "drive-2")] == [3, 1]
+    assert (tmp_path / "drive" / "map.ply").is_file()
+
+
+def test_a_reset_that_cannot_save_keeps_the_map(tmp_path: Path) -> None:
+    active = ActiveMap(config(map_directory=str(tmp_path / "maps"), map_file=str(tmp_path / "a.dpm2map")), "", LOG)
+    for keyframe in keyframes(2):
+        active.add(keyframe)
+    (tmp_path / "maps").write_text("in the way")
+    with pytest.raises(Dpm2Error, match=r"maps.*no map saved"):
+        active.reset()
+    active.add(keyframes(1)[0])  # the odometry has begun anew
+    active.close()
+    found = check_map(tmp_path / "a.dpm2map")
+    assert (found.problems, found.keyframes) == ([], 3)
+
+
+def test_an_odometry_that_starts_again_goes_on_in_the_same_map(tmp_path: Path) -> None:
+    """A looped bag, a clock that was set back: a stretch of its own, whose ids count on."""
+    active = ActiveMap(config(map_directory=str(tmp_path)), "", LOG)
+    for keyframe in [*keyframes(3), *keyframes(2)]:
+        active.add(keyframe)
+    active.close()
+    found = check_map(tmp_path / "drive.dpm2map")
+    assert (found.problems, found.keyframes) == ([], 5)
+
+
+def test_what_was_saved_by_default_can_be_used(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """`dpm2 map check`, `export` for Nav2, and the hint where a map to find oneself in is not named."""
+    drive(tmp_path)
+    for arguments in (["check"], ["export", str(tmp_path / "grid.yaml")], ["info"]):
+        with pytest.raises(SystemExit) as ended:
+            main(["map", arguments[0], str(tmp_path / "drive.dpm2map"), *arguments[1:]])
+        assert ended.value.code == 0
+    assert "3 keyframes, sound" in capsys.readouterr().out
+    assert (tmp_path / "grid.pgm").is_file()
+    with pytest.raises(UsageError, match=r"ros.map_file does not name one; the youngest in .* is .*drive\.dpm2map"):
+        ActiveMap(config(map_directory=str(tmp_path), localization_mode=True), "", LOG)
+
+
+def test_two_nodes_that_start_together_do_not_share_a_file(tmp_path: Path) -> None:
+    """Eight at once, in one folder and of one name."""
+    made: list[ActiveMap] = []
+
+    def start() -> None:
+        made.append(ActiveMap(config(map_directory=str(tmp_path)), "", LOG))
+
+    threads = [threading.Thread(target=start) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for active in made:
+        active.add(keyframes(1)[0])
+        active.save()
+        active.close()
+    assert len(list(tmp_path.glob("*.dpm2map"))) == len(list(tmp_path.glob("*/map.ply"))) == 8
