@@ -9,6 +9,7 @@ body's own position, so that a rotation of each block by R, and a swap, leads fr
 from __future__ import annotations
 
 import array
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -19,10 +20,12 @@ from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Header
 
-from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Keyframe, Points, Registration, Tracked
 from dpm2_core.geometry import se3
+from dpm2_core.slam.map.admission import MAX_ID, RejectedError
 
+_KEYFRAME = re.compile(r"(?:(?P<robot>[\w/]{1,200})/)?kf_(?P<id>[0-9]{1,10})(?:\.(?P<session>[0-9a-f]{8}))?", re.ASCII)
+_FRAME = re.compile(r"[^\s\x00-\x1f\x7f]{1,200}")
 _SWAP = np.roll(np.eye(6), 3, axis=0)  # [rotation, translation] to [translation, rotation], and its own inverse
 
 
@@ -126,13 +129,18 @@ def parse_keyframe_name(name: str) -> tuple[str, int, str]:
     """Robot, id and session.
 
     Raises:
-        UsageError: it is no name of a keyframe.
+        RejectedError: it is not the name of a keyframe.
     """
-    robot, _, last = name.rpartition("/")
-    number, _, session = last.removeprefix("kf_").partition(".")
-    if not last.startswith("kf_") or not (number.isascii() and number.isdecimal()):
-        raise UsageError(f"{name!r} is no keyframe; want ROBOT/kf_NUMBER.SESSION")
-    return robot, int(number), session
+    found = _KEYFRAME.fullmatch(name)
+    if found is None or int(found["id"]) > MAX_ID:
+        raise RejectedError("name", f"{name[:80]!r} is no keyframe; want ROBOT/kf_NUMBER.SESSION")
+    return found["robot"] or "", int(found["id"]), found["session"] or ""
+
+
+def check_frame(name: str) -> None:
+    """Raises RejectedError unless it can be the name of a frame."""
+    if not _FRAME.fullmatch(name):
+        raise RejectedError("frame", f"{name[:80]!r} is not the name of a frame")
 
 
 def edge_to_msg(T: Array, covariance: Array, stamp: int, parent: str, child: str) -> Odometry:

@@ -10,17 +10,17 @@ from collections.abc import Mapping
 from datetime import UTC, datetime
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.node import Node
+from diagnostic_msgs.msg import DiagnosticStatus
 
 from dpm2_core.frame import State, Tracked
+from dpm2_ros.diagnostics import ERROR, OK, STALE, WARN, DiagnosticsPublisher, mapper_status, message_status, status
 from dpm2_ros.frames import FrameBuilder
+from dpm2_ros.guard import GuardedNode
 from dpm2_ros.keyframes import BEHIND, KeyframeSender
 from dpm2_ros.mapping import MapperThread
-from dpm2_ros.subscriptions import STEADY, Inputs
+from dpm2_ros.subscriptions import Inputs
 from dpm2_ros.synchronizer import CameraState, Verdict
 
-OK, WARN, ERROR, STALE = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR, DiagnosticStatus.STALE
 OTHER_CLOCK = 1.0
 """Seconds between a cloud's stamp and the node's clock beyond which they are not of the same clock."""
 SILENT = 2.0
@@ -93,7 +93,7 @@ class Diagnostics:
 
     def __init__(
         self,
-        node: Node,
+        node: GuardedNode,
         inputs: Inputs,
         frames: FrameBuilder,
         health: Health,
@@ -104,30 +104,25 @@ class Diagnostics:
         self._mapper, self._sender = mapper, sender
         self.frame_problem = ""
         """Set while there is no pose of the frame that was asked for."""
-        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        node.create_timer(1.0, self.publish, clock=STEADY)
+        self._publisher = DiagnosticsPublisher(node, self._statuses)
 
     def publish(self) -> None:
         """Send it now."""
-        status = [self._odometry()]
-        status += [self._camera(camera) for camera in self._inputs.synchronizer.cameras]
+        self._publisher.publish()
+
+    def _statuses(self) -> list[DiagnosticStatus]:
+        out = [self._odometry()]
+        out += [self._camera(camera) for camera in self._inputs.synchronizer.cameras]
         if self._mapper is None:
             delivered, made = self._sender.delivered
             text = f"{delivered} of {made} keyframes have arrived at the mapper"
             level = WARN if made - delivered > BEHIND else OK
-            status.append(self._status("mapper", level, text, {"keyframes": made, "delivered": delivered}))
+            out.append(self._status("mapper", level, text, {"keyframes": made, "delivered": delivered}))
         elif self._mapper.localising:
-            status.append(self._localisation(self._mapper))
+            out.append(self._localisation(self._mapper))
         else:
-            accepted, tried = self._mapper.loops
-            figures = {"keyframes": self._mapper.keyframes, "loops accepted": accepted, "loops tried": tried}
-            level, text = OK, f"{self._mapper.keyframes} keyframes, {accepted} loops"
-            if problem := self._mapper.store_problem:
-                level, text = WARN, f"{text}; map file incomplete: {problem}"
-            status.append(self._status("mapper", level, text, figures))
-        message = DiagnosticArray(status=status)
-        message.header.stamp = self._node.get_clock().now().to_msg()
-        self._publisher.publish(message)
+            out.append(mapper_status(self._node, self._mapper))
+        return [*out, message_status(self._node)]
 
     def _odometry(self) -> DiagnosticStatus:
         synchronizer, health = self._inputs.synchronizer, self._health
@@ -208,9 +203,7 @@ class Diagnostics:
         return self._status("camera", level, text, figures)
 
     def _status(self, part: str, level: bytes, text: str, figures: Mapping[str, object]) -> DiagnosticStatus:
-        values = [KeyValue(key=key, value=str(value)) for key, value in figures.items()]
-        name = f"{self._node.get_fully_qualified_name().lstrip('/')}: {part}"
-        return DiagnosticStatus(level=level, name=name, message=text, hardware_id="", values=values)
+        return status(self._node, part, level, text, figures)
 
 
 def _date(stamp: int) -> str:

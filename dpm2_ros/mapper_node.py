@@ -3,32 +3,26 @@
 
 from __future__ import annotations
 
-from typing import Any
+import time
 
-from nav_msgs.msg import Odometry
-from rclpy.node import Node
-from sensor_msgs.msg import PointCloud2
-from std_msgs.msg import UInt8MultiArray, UInt32MultiArray
+from diagnostic_msgs.msg import DiagnosticStatus
 from std_srvs.srv import Trigger
 
-from dpm2_core.data.messages import stamp_ns
-from dpm2_core.data.transforms import transform_matrix
-from dpm2_core.descriptors import Descriptors
 from dpm2_core.errors import UsageError
-from dpm2_core.frame import Keyframe, Points, Registration
-from dpm2_core.geometry import se3
-from dpm2_core.slam.map.cloud_codec import unpack_cloud
-from dpm2_ros.conversions import covariance_from_ros, parse_keyframe_name
-from dpm2_ros.keyframes import WIRE, descriptors_from_msg, received_to_msg
+from dpm2_ros.diagnostics import OK, WARN, DiagnosticsPublisher, mapper_status, message_status, status
+from dpm2_ros.feed import ODOM, Feed
+from dpm2_ros.guard import GuardedNode
+from dpm2_ros.keyframes import weights_identity
 from dpm2_ros.mapping import MapperThread, robot_name
 from dpm2_ros.parameters import load_parameters
 from dpm2_ros.settings import NodeConfig
 from dpm2_ros.subscriptions import STEADY
 
-_ODOM = "/dpm2/keyframe_odom"
+_MOST_ROBOTS = 64
+_PATIENCE = 10.0  # s that a topic has to bring a keyframe before another may take its place
 
 
-class MapperNode(Node):
+class MapperNode(GuardedNode):
     """Listens to every robot in its namespace and below, also to those that come later, and makes one map of all.
 
     map -> odom of each goes out for the odometry frame that the robot itself names.
@@ -39,12 +33,15 @@ class MapperNode(Node):
         config = load_parameters(self, NodeConfig)
         if config.ros.localization_mode:
             raise UsageError("ros.localization_mode: is for slam_node")
+        self._weights = weights_identity(config.slam)
         self._mapper = MapperThread(self, config, robot_name(self))
         self._feeds: dict[str, Feed] = {}
+        self._own = self.get_namespace().rstrip("/")
         self._discover()
         self.create_timer(0.5, self._discover, clock=STEADY)
-        self.create_timer(0.5, self._acknowledge, clock=STEADY)
+        self.create_timer(0.5, self._tick, clock=STEADY)
         self.create_service(Trigger, "~/reset", self._on_reset)
+        self._diagnostics = DiagnosticsPublisher(self, self._statuses)
 
     def close(self) -> None:
         """Save the map.
@@ -56,15 +53,31 @@ class MapperNode(Node):
 
     def _discover(self) -> None:
         """Listen to the robots that are there, and to the one of this very namespace in any case."""
-        own = self.get_namespace().rstrip("/")
-        topics = [topic for topic, _ in self.get_topic_names_and_types() if topic.endswith(_ODOM)]
-        for namespace in {own, *(topic.removesuffix(_ODOM) for topic in topics)}:
-            if namespace not in self._feeds and f"{namespace}/".startswith(f"{own}/"):
-                self._feeds[namespace] = Feed(self, self._mapper, namespace)
+        topics = [topic for topic, _ in self.get_topic_names_and_types() if topic.endswith(ODOM)]
+        for namespace in (self._own, *(topic.removesuffix(ODOM) for topic in topics)):
+            if namespace in self._feeds or not f"{namespace}/".startswith(f"{self._own}/"):
+                continue
+            if len(self._feeds) >= _MOST_ROBOTS and not self._make_room():
+                self.reject(ODOM, "too many robots", f"{namespace}: not listened to, {_MOST_ROBOTS} others are")
+                return
+            self._feeds[namespace] = Feed(self, self._mapper, namespace, self._weights)
+        for namespace, feed in list(self._feeds.items()):
+            if self._idle(namespace, feed) and not self.count_publishers(namespace + ODOM):
+                self._feeds.pop(namespace).close()
 
-    def _acknowledge(self) -> None:
+    def _idle(self, namespace: str, feed: Feed) -> bool:
+        """Whether nothing is lost without that feed."""
+        return namespace != self._own and not feed.proven and time.monotonic() - feed.made > _PATIENCE
+
+    def _make_room(self) -> bool:
+        oldest = next((namespace for namespace, feed in self._feeds.items() if self._idle(namespace, feed)), None)
+        if oldest is not None:
+            self._feeds.pop(oldest).close()
+        return oldest is not None
+
+    def _tick(self) -> None:
         for feed in self._feeds.values():
-            feed.acknowledge()
+            feed.tick()
 
     def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._mapper.reset()
@@ -73,108 +86,14 @@ class MapperNode(Node):
         response.success, response.message = True, "the map is saved, and begins again empty"
         return response
 
-
-class Feed:
-    """One robot: joins its messages into keyframes, in their order, and tells it which have arrived."""
-
-    def __init__(self, node: Node, mapper: MapperThread, namespace: str) -> None:
-        self._node, self._mapper, self._robot = node, mapper, namespace.strip("/")
-        self._parts: dict[str, dict[str, Any]] = {}  # halves of keyframes, by name
-        self._session: str | None = None
-        self._ended: set[str] = set()  # sessions
-        self._next = 0  # all ids below have gone to the mapper
-        self._above: dict[int, Any] = {}  # messages that came before their turn, by id
-        self._last: Keyframe | None = None
-        listen = node.create_subscription
-        listen(Odometry, namespace + _ODOM, lambda m: self._on_part("pose", m.child_frame_id, m), WIRE)
-        listen(PointCloud2, f"{namespace}/dpm2/keyframe", lambda m: self._on_part("seen", m.header.frame_id, m), WIRE)
-        listen(UInt8MultiArray, f"{namespace}/dpm2/keyframe_cloud", self._on_cloud, WIRE)
-        listen(Odometry, f"{namespace}/dpm2/odom", self._on_odom, 10)
-        self._received = node.create_publisher(UInt32MultiArray, f"{namespace}/dpm2/keyframes_received", 10)
-
-    def acknowledge(self) -> None:
-        """Tell the robot what has arrived."""
-        if self._session:
-            self._received.publish(received_to_msg(self._session, self._next, sorted(self._above)[:1000]))
-
-    def forget(self) -> None:
-        """The map is empty: the next keyframe is the first."""
-        self._last = None
-
-    def _on_odom(self, message: Odometry) -> None:
-        self._mapper.broadcast(stamp_ns(message.header), self._robot, message.header.frame_id)
-
-    def _on_cloud(self, message: UInt8MultiArray) -> None:
-        if message.layout.dim:
-            self._on_part("cloud", message.layout.dim[0].label, message)
-
-    def _on_part(self, part: str, name: str, message: Any) -> None:
-        """Of a keyframe, which may come in any order, twice, or after the robot has begun anew."""
-        try:
-            _, id, session = parse_keyframe_name(name)
-        except UsageError as error:
-            self._complain(str(error))
-            return
-        if session in self._ended:
-            return
-        if session != self._session:
-            self._begin(session)
-        if session and (id < self._next or id in self._above):
-            return
-        parts = self._parts.setdefault(name, {})
-        parts[part] = message
-        if len(parts) == 3:
-            del self._parts[name]
-            self._take(id, parts)
-        while len(self._parts) > 100:  # they are sent again
-            self._parts.pop(next(iter(self._parts)))
-
-    def _begin(self, session: str) -> None:
-        """A new drive. What the one before has sent is all that will ever come of it."""
-        if self._session is not None:
-            self._node.get_logger().warning(f"robot {self._robot or '/'} has started again: a new session of its own")
-            self._ended.add(self._session)
-            for id in sorted(self._above):
-                self._add(id, self._above[id])
-        self._session, self._next, self._last = session, 0, None
-        self._parts, self._above = {}, {}
-
-    def _take(self, id: int, parts: dict[str, Any]) -> None:
-        """Hand on what is complete up to the first gap; without a session nothing is sent again: at once."""
-        if not self._session:
-            self._add(id, parts)
-            return
-        self._above[id] = parts
-        while self._next in self._above:
-            self._add(self._next, self._above.pop(self._next))
-            self._next += 1
-
-    def _add(self, id: int, parts: dict[str, Any]) -> None:
-        try:
-            points, descriptors = unpack_cloud(bytes(parts["cloud"].data)), descriptors_from_msg(parts["seen"])
-            keyframe = keyframe_from(parts["pose"], points, self._robot, id, self._last, descriptors)
-        except (UsageError, ValueError) as error:
-            self._complain(f"keyframe {id}: {error}")
-            return
-        self._last = keyframe
-        self._mapper.add(lambda: keyframe)
-
-    def _complain(self, text: str) -> None:
-        self._node.get_logger().error(f"robot {self._robot or '/'}: {text}", throttle_duration_sec=5)
-
-
-def keyframe_from(
-    pose: Odometry, points: Points, robot: str, id: int, before: Keyframe | None, descriptors: Descriptors | None = None
-) -> Keyframe:
-    """A keyframe from its messages; its edge leads to the last one that arrived (the mapper reckons with those missed).
-
-    Raises:
-        UsageError: the pose is no rigid transform.
-    """
-    T_odom_kf = transform_matrix(pose.pose.pose)
-    edge = None
-    if before is not None and id > before.id:
-        covariance = covariance_from_ros(pose.pose.covariance, T_odom_kf[:3, :3])
-        T_before_this = se3.inverse(before.T_odom_kf) @ T_odom_kf
-        edge = Registration(T_before_this, covariance, confidence=1.0, rmse=0.0, method="odometry")
-    return Keyframe(id, stamp_ns(pose.header), id, T_odom_kf, points, edge, robot, descriptors)
+    def _statuses(self) -> list[DiagnosticStatus]:
+        now, figures = time.monotonic(), {}
+        beside = [name for feed in self._feeds.values() for name in feed.beside]
+        for feed in self._feeds.values():
+            for robot, stream in feed.robots.items():
+                figures[robot or "/"] = f"{stream.taken} keyframes, heard {now - stream.heard:.0f} s ago"
+        text = f"{len(figures)} robots"
+        if beside:
+            text += f"; two in one namespace: {', '.join(beside)} kept apart"
+        robots = status(self, "robots", WARN if beside else OK, text, figures)
+        return [mapper_status(self, self._mapper), robots, message_status(self)]

@@ -23,9 +23,11 @@ from visualization_msgs.msg import MarkerArray
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Array, Keyframe, LoopClosure, State
 from dpm2_core.slam.loops.localiser import Located
+from dpm2_core.slam.map.admission import RejectedError
 from dpm2_ros.active_map import ActiveMap
 from dpm2_ros.conversions import cloud_to_msg, edge_to_msg, keyframe_name
 from dpm2_ros.display import Display, loop_to_msg, path_to_msg, pose_graph_to_msg
+from dpm2_ros.guard import GuardedNode
 from dpm2_ros.settings import NodeConfig
 from dpm2_ros.subscriptions import STEADY
 from dpm2_ros.tf import TransformBroadcaster
@@ -41,7 +43,7 @@ class MapperThread:
     Every method may be called from any thread, and returns at once.
     """
 
-    def __init__(self, node: Node, config: NodeConfig, robot: str) -> None:
+    def __init__(self, node: GuardedNode, config: NodeConfig, robot: str) -> None:
         graph = config.slam.pose_graph.model_copy(update={"background": True})  # gtsam holds Python's lock
         config = config.model_copy(update={"slam": config.slam.model_copy(update={"pose_graph": graph})})
         self._node, self._config, self._robot = node, config, robot
@@ -50,6 +52,7 @@ class MapperThread:
         self._stamp = 0  # of the last keyframe, ns
         self._last: Future[None] | None = None  # of the keyframes taken in
         self._restarted: Future[None] | None = None  # since when the odometry's start is known here
+        self._lock, self._waiting = threading.Lock(), 0
         self._changes = self.keyframes
         ros = config.ros
         self._ahead = round(ros.transform_tolerance * 1e9)
@@ -77,6 +80,21 @@ class MapperThread:
         """Loops accepted, and loops tried."""
         closures = list(self._active.mapper.closures)
         return sum(closure.registration.ok for closure in closures), len(closures)
+
+    @property
+    def waiting(self) -> int:
+        """Keyframes that are not in the map yet."""
+        return self._waiting
+
+    @property
+    def channels(self) -> int | None:
+        """Width of the features that the map's network makes; None without a network."""
+        return self._active.mapper.channels
+
+    @property
+    def graph_problem(self) -> str:
+        """Why the poses are not optimised, in words; empty since they were."""
+        return self._active.mapper.graph_problem
 
     @property
     def store_problem(self) -> str:
@@ -114,7 +132,9 @@ class MapperThread:
 
     def add(self, make: Callable[[], Keyframe]) -> None:
         """Take in the keyframe that `make`, called in this thread, returns."""
-        self._last = self._submit(lambda: self._add(make()))
+        with self._lock:
+            self._waiting += 1
+        self._last = self._submit(lambda: self._take_in(make))
 
     def hint(self, T_map_base: Array) -> str:
         """The robot is about there (4, 4), somebody says; returns why that is of no use, if it is not."""
@@ -163,16 +183,25 @@ class MapperThread:
 
     def _report(self, future: Future[Any]) -> None:
         error = future.exception()
-        if isinstance(error, Dpm2Error):
+        if isinstance(error, RejectedError):
+            self._node.reject("map", error.reason, f"keyframe: {error}")
+        elif isinstance(error, Dpm2Error):
             self._node.get_logger().error(str(error))
         elif error is not None:
-            self._node.get_logger().error(f"mapper: {type(error).__name__}: {error}")
+            self._node.fail("mapper", error)
 
     def _change(self, work: Callable[[], Any]) -> Any:
         """Work after which there is another map to show."""
         answer = work()
         self._changes += 1
         return answer
+
+    def _take_in(self, make: Callable[[], Keyframe]) -> None:
+        try:
+            self._add(make())
+        finally:
+            with self._lock:
+                self._waiting -= 1
 
     def _add(self, keyframe: Keyframe) -> None:
         closures = self._active.add(keyframe)

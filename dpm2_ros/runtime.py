@@ -71,7 +71,7 @@ def spin_node(make: Callable[[], Any], arguments: Sequence[str]) -> int:
     """Make a node, spin it until a signal comes, close it.
 
     Args:
-        make: returns a node with `close()`, which saves what must be saved and may raise Dpm2Error.
+        make: returns a `GuardedNode` with `close()`, which saves what must be saved and may raise Dpm2Error.
         arguments: those of the process, without its name.
     """
     import rclpy
@@ -85,7 +85,11 @@ def spin_node(make: Callable[[], Any], arguments: Sequence[str]) -> int:
         executor.add_node(node)
         try:
             while not STOP.is_set():
-                executor.spin_once(timeout_sec=0.1)
+                try:
+                    executor.spin_once(timeout_sec=0.1)
+                except Exception as error:  # of a service, or of rclpy itself; callbacks are guarded
+                    node.fail("executor", error)
+                    STOP.wait(0.01)  # what fails each time leaves the rest some time
         finally:
             try:
                 node.close()

@@ -13,7 +13,6 @@ from functools import partial
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
-from rclpy.node import Node
 from std_srvs.srv import SetBool, Trigger
 
 from dpm2_core.data.transforms import transform_matrix
@@ -21,12 +20,14 @@ from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Keyframe, State, Tracked
 from dpm2_core.geometry import se3
 from dpm2_core.slam.loops.localiser import LOST
+from dpm2_core.slam.map.admission import check_pose
 from dpm2_core.slam.system import make_loops, make_odometry
 from dpm2_ros.base_frame import BaseFrame
 from dpm2_ros.conversions import keyframe_to_base, odometry_to_msg, of_body, to_base
 from dpm2_ros.frames import FrameBuilder
+from dpm2_ros.guard import GuardedNode
 from dpm2_ros.health import Diagnostics, Health
-from dpm2_ros.keyframes import KeyframeSender
+from dpm2_ros.keyframes import KeyframeSender, weights_identity
 from dpm2_ros.mapping import MapperThread, answer, robot_name, yield_to_odometry
 from dpm2_ros.parameters import load_parameters
 from dpm2_ros.settings import NodeConfig
@@ -38,7 +39,7 @@ HELD = 300
 """Poses kept while the base frame is not known."""
 
 
-class SlamNode(Node):
+class SlamNode(GuardedNode):
     """The executor's thread only fills a queue; a worker empties it; the mapper has a thread of its own.
 
     Raises:
@@ -59,7 +60,8 @@ class SlamNode(Node):
         self._frames = FrameBuilder(reading, self._inputs, self.get_logger().error)
         self._mapper = MapperThread(self, self._config, self._robot) if ros.embed_mapper else None
         self._health = Health()
-        self._sender = KeyframeSender(self, self._robot, ros.odom_frame, keep=not ros.embed_mapper)
+        weights = weights_identity(self._config.slam)
+        self._sender = KeyframeSender(self, self._robot, ros.odom_frame, not ros.embed_mapper, weights)
         self._diagnostics = Diagnostics(self, self._inputs, self._frames, self._health, self._mapper, self._sender)
         self._odom = self.create_publisher(Odometry, "dpm2/odom", 10)
         self._described = make_loops(self._config.slam).described
@@ -251,12 +253,10 @@ class SlamNode(Node):
 
     def _on_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
         frame, wanted = message.header.frame_id.lstrip("/"), self._config.ros.map_frame
-        try:
-            if frame != wanted:
-                raise UsageError(f"want it in frame {wanted}, not in {frame!r}")
-            T_map_base = transform_matrix(message.pose.pose)
-            problem = "no map here" if self._mapper is None else self._mapper.hint(T_map_base @ self._base.T_base_start)
-        except UsageError as error:
-            problem = str(error)
-        if problem:
-            self.get_logger().warning(f"initialpose not used: {problem}")
+        if frame != wanted:
+            raise UsageError(f"initialpose not used: want it in frame {wanted}, not in {frame[:80]!r}")
+        T_map_base = transform_matrix(message.pose.pose)
+        check_pose(T_map_base)
+        T_map_start = T_map_base @ self._base.T_base_start
+        if problem := "no map here" if self._mapper is None else self._mapper.hint(T_map_start):
+            raise UsageError(f"initialpose not used: {problem}")

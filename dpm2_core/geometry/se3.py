@@ -89,7 +89,7 @@ def orthonormalised(T: Array) -> Array:
 
 def is_rigid(T: Array, tolerance: float = 1e-3) -> bool:
     """Whether (4, 4) is a finite rigid transform; what is off by more than `tolerance` is damage, not rounding."""
-    if not np.isfinite(T).all():
+    if T.shape != (4, 4) or not np.isfinite(T).all() or np.abs(T[:3, :3]).max() > 2:
         return False
     R = T[:3, :3]
     off = np.abs(R @ R.T - np.eye(3)).max() + np.abs(T[3] - [0, 0, 0, 1]).max()
@@ -100,3 +100,21 @@ def quaternion(T: Array) -> Array:
     """Rotation of (4, 4) as the unit quaternion x, y, z, w with w >= 0."""
     q = Rotation.from_matrix(T[:3, :3]).as_quat()
     return q if q[3] >= 0 else -q
+
+
+def is_covariance(covariance: Array, smallest: float = 1e-18, largest: float = 1e15) -> bool:
+    """Whether (N, N) is finite, symmetric, positive definite, with variances that a solver can invert."""
+    if covariance.ndim != 2 or not np.isfinite(covariance).all():
+        return False
+    variances = np.diag(covariance)
+    if variances.min() < smallest or variances.max() > largest:
+        return False
+    sigma = np.sqrt(variances)
+    correlation = covariance / np.outer(sigma, sigma)  # so that rad and m, however different, are judged alike
+    if np.abs(correlation - correlation.T).max() > 1e-6:
+        return False
+    try:
+        np.linalg.cholesky(correlation)
+    except np.linalg.LinAlgError:
+        return False
+    return True

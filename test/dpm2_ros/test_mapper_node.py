@@ -3,26 +3,35 @@
 
 from __future__ import annotations
 
+import copy
+import struct
+import time
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import PointCloud2
-from std_msgs.msg import UInt8MultiArray
+from std_msgs.msg import MultiArrayDimension, MultiArrayLayout, UInt8MultiArray
 from std_srvs.srv import Trigger
 
 from dpm2_core.data.trajectory import read_trajectory
 from dpm2_core.data.transforms import transform_matrix
+from dpm2_core.descriptors import Descriptors
 from dpm2_core.frame import Keyframe
 from dpm2_core.geometry import se3
 from dpm2_core.slam.map.data import load_map
 from dpm2_core.slam.map.store import MapStore
+from dpm2_ros import feed
 from dpm2_ros.conversions import edge_to_msg, keyframe_name
-from dpm2_ros.keyframes import payload_to_msgs
-from dpm2_ros.mapper_node import MapperNode, keyframe_from
+from dpm2_ros.feed import keyframe_from
+from dpm2_ros.keyframes import descriptors_to_msg, payload_to_msgs
+from dpm2_ros.mapper_node import MapperNode
 from dpm2_ros.mapping import KEEP_ALL
 from dpm2_ros.tf import TFMessage
 
@@ -44,7 +53,7 @@ def mapper(ros: Callable[..., Any], tmp_path: Path) -> Any:
         for publisher, message in reversed(messages) if cloud_first else messages:
             publisher.publish(message)
 
-    harness.send = send
+    harness.send, harness.wires = send, wires
     return harness
 
 
@@ -137,3 +146,156 @@ def test_the_first_keyframe_and_one_that_goes_back_have_no_edge(before: int | No
     last = None if before is None else Keyframe(before, 0, 0, np.eye(4), np.zeros((0, 4), np.float32))
     pose = edge_to_msg(np.eye(4), np.eye(6), 9, "odom", "kf_5")
     assert keyframe_from(pose, np.zeros((0, 4), np.float32), "", 5, last).edge is None
+
+
+S, OTHER = "5f3a9c01", "00000bad"  # sessions
+
+
+def send_all(mapper: Any, *ids: int, session: str = S, shift: float = 0.0) -> None:
+    for id in ids:
+        T = se3.exp([0, 0, 0, 5.0 * id + shift, 0, 0])
+        mapper.send(id, T, points(id), name=keyframe_name("", id, session))
+
+
+def core(mapper: Any) -> Any:
+    return mapper.mapper._mapper._active.mapper
+
+
+def rejections(mapper: Any) -> dict[str, int]:
+    """As they are published."""
+    for message in reversed(mapper.received["/diagnostics"]):
+        for status in message.status:
+            if status.name == "mapper_node: messages":
+                return {value.key: int(value.value) for value in status.values if value.value != "0"}
+    return {}
+
+
+def hostile_parts(id: int) -> list[Any]:
+    """Messages under the name of a keyframe that a robot is about to send, each unsound in its way."""
+    name, T = keyframe_name("", id, S), np.eye(4)
+    poses = [edge_to_msg(T, np.eye(6) * variance, 5, "odom", name) for variance in (-1.0, 1e300)]
+    for value in (np.nan, np.inf):
+        poses.append(copy.deepcopy(poses[0]))
+        poses[-1].pose.covariance[7] = value
+    for value in (np.nan, np.inf, 1e9):
+        poses.append(edge_to_msg(T, np.eye(6), 5, "odom", name))
+        poses[-1].pose.pose.position.x = value
+    poses.append(edge_to_msg(T, np.eye(6), 5, "o" * 5000, name))
+    clouds = [
+        UInt8MultiArray(layout=MultiArrayLayout(dim=[MultiArrayDimension(label=name)]), data=data)
+        for data in (
+            b"",
+            bytes(50),
+            struct.pack("<If", 2**32 - 1, 0.01),
+            struct.pack("<If", 1, np.inf) + zlib.compress(bytes(7)),
+            struct.pack("<If", 1, np.nan) + zlib.compress(bytes(7)),
+            struct.pack("<If", 10**7, 0.01) + zlib.compress(bytes(7 * 10**7), 9)[:90_000],
+            bytes(200_000),
+        )
+    ]
+    seen = descriptors_to_msg(Descriptors(np.zeros((9, 3), "f4"), np.zeros((9, 8), "f2")), 5, name, "weights")
+    short, wide = copy.deepcopy(seen), copy.deepcopy(seen)
+    short.width, wide.fields[-1].count = 2**32 - 1, 2**32 - 1
+    return [*poses, *clouds, short, wide]
+
+
+def test_nothing_under_the_name_of_a_keyframe_displaces_it(mapper: Any) -> None:
+    """Unsound messages are rejected one by one, and counted by their reason; the robot's own then make its map."""
+    mapper.hear(DiagnosticArray, "/diagnostics")
+    wires = dict(zip((Odometry, PointCloud2, UInt8MultiArray), mapper.wires, strict=True))
+    bad = hostile_parts(1)
+    for message in bad:
+        wires[type(message)].publish(message)
+    mapper.wait(lambda: sum(rejections(mapper).values()) == len(bad), "all of them rejected")
+    kinds = {kind.partition(": ")[2] for kind in rejections(mapper)}
+    assert kinds == {"covariance", "pose", "frame", "cloud", "size", "descriptors"}
+    send_all(mapper, 0, 1, 2)
+    mapper.wait(lambda: mapper.mapper._mapper.keyframes == 3, "the map")
+    np.testing.assert_allclose(core(mapper).poses[:, 0, 3], [0, 5, 10], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["kf_" + "9" * 5000, f"kf_5000000000.{S}", f"kf_{2**31}.{S}", f"kf_1.{'a' * 5000}", "../" * 50 + "kf_1", "kf_१"],
+)
+def test_no_name_ends_the_mapper(mapper: Any, name: str) -> None:
+    mapper.send(1, np.eye(4), points(1), name=name)
+    mapper.wait(lambda: sum(mapper.mapper.rejections.values()) == 3, "three messages rejected")
+    send_all(mapper, 0)
+    mapper.wait(lambda: mapper.mapper._mapper.keyframes == 1, "the keyframe after it")
+
+
+def test_descriptors_of_other_weights_are_made_anew(mapper: Any) -> None:
+    """The keyframe is used, and what is compared with others comes from the mapper's own network."""
+    name, cloud = keyframe_name("", 0, S), points(0)
+    foreign = Descriptors(np.ones((256, 3), "f4"), np.ones((256, 128), "f2"))
+    pose, wire = edge_to_msg(np.eye(4), np.zeros((6, 6)), 9, "odom", name), mapper.wires
+    seen, packed = payload_to_msgs(Keyframe(0, 9, 0, np.eye(4), cloud, descriptors=foreign), name, "0123456789abcdef")
+    for publisher, message in zip(wire, (pose, seen, packed), strict=True):
+        publisher.publish(message)
+    mapper.wait(lambda: mapper.mapper._mapper.keyframes == 1, "the keyframe", timeout=60)
+    assert mapper.mapper.rejections == {"/dpm2/keyframe: descriptors of other weights": 1}
+    own = core(mapper).keyframes[0].descriptors
+    assert own is None or not np.array_equal(own.features, foreign.features)
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drives count as over after a second."""
+    monkeypatch.setattr(feed, "SILENT", 1.0)
+    monkeypatch.setattr(feed, "_BESIDE", 0.3)
+
+
+@pytest.mark.usefixtures("quick")
+def test_two_drives_in_one_namespace_are_kept_apart(mapper: Any) -> None:
+    """A forged session, or a second robot by accident: it is said, and each gets on as if alone."""
+    mapper.hear(DiagnosticArray, "/diagnostics")
+    send_all(mapper, 0, 1)
+    mapper.wait(lambda: mapper.mapper._mapper.keyframes == 2, "the drive")
+    send_all(mapper, 0, 1, session=OTHER, shift=100.0)
+
+    def apart() -> bool:
+        send_all(mapper, 2)  # again and again, as a robot does
+        time.sleep(0.1)
+        return mapper.mapper._mapper.keyframes == 5
+
+    mapper.wait(apart, "both drives")
+    send_all(mapper, 2, session=OTHER, shift=100.0)
+    send_all(mapper, 3)
+    mapper.wait(lambda: mapper.mapper._mapper.keyframes == 7, "both go on")
+    drives = {name: [k.id for k in core(mapper).keyframes if k.robot == name] for name in core(mapper).robots}
+    assert drives == {"": [0, 1, 2, 3], f".{OTHER}": [0, 1, 2]}
+    assert len(core(mapper).edges) == 5  # none between the two
+
+    def told() -> bool:
+        send_all(mapper, 2, session=OTHER)
+        time.sleep(0.1)
+        heard = [status for m in mapper.received["/diagnostics"] for status in m.status]
+        return any(f"two in one namespace: .{OTHER} kept apart" in status.message for status in heard)
+
+    mapper.wait(told, "the diagnostics")
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_drive_that_another_one_has_replaced_comes_back(mapper: Any) -> None:
+    """The robot was out of reach, somebody began a session in its name meanwhile: nothing that it sends is lost."""
+    for session, ids in ((S, (0, 1)), (OTHER, (0,)), (S, (2, 3))):
+        time.sleep(1.2)
+        expected = mapper.mapper._mapper.keyframes + len(ids)
+        send_all(mapper, *ids, session=session)
+        mapper.wait(lambda n=expected: mapper.mapper._mapper.keyframes == n, f"{ids} of {session}")
+    assert [k.robot for k in core(mapper).keyframes] == [""] * 5
+    assert [(a, b) for a, b, *_ in core(mapper).edges] == [(0, 1), (3, 4)]
+
+
+def test_topics_that_bring_nothing_are_forgotten(mapper: Any) -> None:
+    """A thousand namespaces cannot make a thousand subscriptions; a robot that comes after them is heard."""
+    node = mapper.mapper
+    many = rclpy.create_node("many", use_global_arguments=False)
+    for n in range(80):
+        many.create_publisher(Odometry, f"/x{n}/dpm2/keyframe_odom", 1)
+    mapper.wait(lambda: len(node._feeds) == 64, "as many as there may be")
+    for topic in list(node._feeds.values()):
+        topic.made -= 60.0  # a minute ago
+    many.destroy_node()
+    mapper.wait(lambda: list(node._feeds) == [""], "those without a publisher to go")

@@ -194,11 +194,13 @@ def test_a_keyframe_is_at_most_100_kB_on_the_wire(street: Path) -> None:
     descriptors = PlaceRecognition(load_network("small", 1)).describe(points)
     assert descriptors is not None
     for cloud in (points, points[::50]):
-        seen, packed = payload_to_msgs(Keyframe(1, 2, 3, np.eye(4), cloud, None, "", descriptors), "red/kf_1.00000000")
+        keyframe = Keyframe(1, 2, 3, np.eye(4), cloud, None, "", descriptors)
+        seen, packed = payload_to_msgs(keyframe, "red/kf_1.00000000", "0123456789abcdef")
         size = len(serialize_message(seen)) + len(serialize_message(packed))
         assert size < 99_500  # the pose is another 0.7 kB
-        again = descriptors_from_msg(seen)
+        again, weights = descriptors_from_msg(seen)
         assert again is not None
+        assert weights == "0123456789abcdef"
         np.testing.assert_array_equal(again.features, descriptors.features)
         np.testing.assert_array_equal(again.xyz, descriptors.xyz)
         assert isinstance(packed, UInt8MultiArray)

@@ -49,7 +49,7 @@ class PoseGraph:
     """Keyframe poses T_map_kf, odometry edges and loop edges; node n is the n-th one added.
 
     Attributes:
-        problem: what last went wrong in the background, in words; empty since it went well.
+        problem: why the last optimisation failed, in words; empty since one went well.
     """
 
     def __init__(self, settings: PoseGraphSettings) -> None:
@@ -112,13 +112,16 @@ class PoseGraph:
 
         Raises:
             ValueError: odometry goes on from there already.
+            Dpm2Error: the pose or the edge is not sound; nothing was appended.
         """
+        _check("node", len(self), T_map_kf)
         node = len(self)
         if T_before_this is None or covariance is None:
             before, T_before_this, covariance = -1, np.eye(4), np.zeros((6, 6))
             self._trajectory.append(len(self._ends))
             self._ends.append(node)
         else:
+            _check("edge to node", node, T_before_this, covariance)
             before = node - 1 if before is None else before
             number = self._trajectory[before]
             if self._ends[number] != before:
@@ -135,7 +138,11 @@ class PoseGraph:
 
         Where it is the first between two parts of the graph, the younger one is moved there as it is: from any other
         start an optimisation would take the loop for a wrong one.
+
+        Raises:
+            Dpm2Error: the loop is not sound; nothing was added.
         """
+        _check("loop to node", to_node, T_from_to, covariance)
         parts = self._parts()
         a, b = parts[self._trajectory[from_node]], parts[self._trajectory[to_node]]
         if a != b:
@@ -162,6 +169,7 @@ class PoseGraph:
             return
         try:
             self._apply(robust.optimise(self._data(), self._settings), len(self._loops))
+            self.problem = ""
         except (RuntimeError, np.linalg.LinAlgError) as error:  # gtsam's or numpy's: the system is singular
             raise Dpm2Error(f"pose graph: {' '.join(str(error).split())}") from None
 
@@ -281,3 +289,11 @@ class PoseGraph:
         for loop in range(loops):
             a, b = self._loops[loop][:2]
             self._verdicts[loop] = LoopVerdict(a, b, bool(solution.kept[loop]), solution.reason(loop))
+
+
+def _check(what: str, node: int, T: Array, covariance: Array | None = None) -> None:
+    """One NaN would reach every pose with the next optimisation."""
+    if not se3.is_rigid(T):
+        raise Dpm2Error(f"pose graph: {what} {node}: not a finite rigid transform")
+    if covariance is not None and not se3.is_covariance(covariance):
+        raise Dpm2Error(f"pose graph: {what} {node}: its covariance is not finite, symmetric and positive definite")

@@ -73,6 +73,11 @@ class LoopCloser:
         self._path = Path()
         self._consistency = Consistency(settings.consistency, self._path)
 
+    @property
+    def channels(self) -> int | None:
+        """Width of the features that the network makes; None without a network."""
+        return None if self._places is None else self._places.channels
+
     def described(self, keyframe: Keyframe) -> Keyframe:
         """The keyframe with descriptors, of its cloud where its registration made none."""
         if keyframe.descriptors is not None or self._places is None:

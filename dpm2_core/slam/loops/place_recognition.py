@@ -26,6 +26,11 @@ class PlaceRecognition:
         self._network = network
         self._index = PlaceIndex()
 
+    @property
+    def channels(self) -> int:
+        """Width of the features that it makes."""
+        return self._network.settings.channels
+
     def describe(self, points: Points) -> Descriptors | None:
         """Descriptors of a cloud (M, 4); None if it has too few points.
 

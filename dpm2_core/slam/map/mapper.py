@@ -17,7 +17,8 @@ from dpm2_core.frame import Array, Frame, Keyframe, LoopClosure, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.loops.closure import LoopCloser
-from dpm2_core.slam.loops.consistency import Loop
+from dpm2_core.slam.loops.consistency import Loop, refused
+from dpm2_core.slam.map.admission import check_keyframe
 from dpm2_core.slam.map.cloud_codec import pack_cloud
 from dpm2_core.slam.map.cloud_store import CloudStore
 from dpm2_core.slam.map.data import NO_POINTS, borrowing, load_map, map_cloud, restore
@@ -26,6 +27,8 @@ from dpm2_core.slam.map.redundancy import RedundancySettings, lender
 from dpm2_core.slam.map.rows import Edge
 from dpm2_core.slam.map.store import MapStore
 from dpm2_core.slam.map.writer import MapWriter
+
+_MOST_MISSED = 1000  # keyframes between two, for which an edge is made less certain
 
 
 class MapSettings(Settings):
@@ -128,6 +131,16 @@ class Mapper:
         """Why the map file is behind, in words; empty when it is not, or when there is none."""
         return "" if self._writer is None else self._writer.problem
 
+    @property
+    def channels(self) -> int | None:
+        """Width of the features that its network makes; None without a network."""
+        return self._loops.channels
+
+    @property
+    def graph_problem(self) -> str:
+        """Why the poses are not optimised, in words; empty since they were."""
+        return self._graph.problem
+
     def start_session(self, T_map_odom: Array, covariance: Array | None = None) -> None:
         """Before the first keyframe of a session in a loaded map: where its odometry begins.
 
@@ -139,32 +152,49 @@ class Mapper:
         self._T_start, self._tie = T_map_odom, covariance
 
     def add(self, keyframe: Keyframe, thumbnail: bytes | None = None) -> list[LoopClosure]:
-        """Take a keyframe in, with a JPEG if wanted; returns the loops that were tried, accepted or not."""
+        """Take a keyframe in, with a JPEG if wanted; returns the loops that were tried, accepted or not.
+
+        Raises:
+            RejectedError: it is not sound. Whatever is raised before the search for loops, the map is as it was before;
+                after that the keyframe is in, with what was found until then.
+        """
+        check_keyframe(keyframe, self._loops.channels)
         node, cloud = len(self.keyframes), keyframe.cloud
         robot = self._robot(keyframe.robot)
-        if robot.last is None or keyframe.edge is None:
-            keyframe, robot.last = replace(keyframe, edge=None), None  # no edge to one that is not in the map
-            robot.offset = robot.ids
-        keyframe = self._loops.described(keyframe)
-        keyframe = replace(keyframe, id=keyframe.id + robot.offset, cloud=NO_POINTS)
-        edges = self._add_node(keyframe, robot.last)
-        robot.last, robot.ids = node, keyframe.id + 1
-        self._clouds.append(pack_cloud(cloud))
+        follows = robot.last is not None and keyframe.edge is not None
+        offset = robot.offset if follows else robot.ids
+        keyframe = self._loops.described(keyframe if follows else replace(keyframe, edge=None))
+        keyframe = replace(keyframe, id=keyframe.id + offset, cloud=NO_POINTS)
+        packed = pack_cloud(cloud)
+        edges = self._add_node(keyframe, robot.last if follows else None)
+        self._clouds.append(packed)
         self.keyframes.append(keyframe)
-        closures, loops = self._close_loops(node)
+        robot.last, robot.ids, robot.offset = node, keyframe.id + 1, offset
+        closures: list[LoopClosure] = []
+        loops: list[Edge] = []
+        try:
+            closures, loops = self._close_loops(node)
+            self._lend(node, edges, loops)
+            self._mark_moving(robot.window.add(node, cloud, self.poses))
+        finally:
+            self._store(node, thumbnail, [*edges, *loops])
+        return closures
+
+    def _lend(self, node: int, edges: list[Edge], loops: list[Edge]) -> None:
+        """Give up the cloud of a keyframe that came back to an older one for that one's."""
         again = edges if node == self.session_start else []  # the frame with which the session before ended
         loan = lender(node, [*again, *self._kept(loops)], self._clouds.loan, self._settings.redundancy)
         if loan is not None:
             self._clouds.borrow(node, loan)
-            self.keyframes[node] = borrowing(keyframe, self.keyframes, loan)
-        poses = self.poses
-        self._mark_moving(robot.window.add(node, cloud, poses))
+            self.keyframes[node] = borrowing(self.keyframes[node], self.keyframes, loan)
+
+    def _store(self, node: int, thumbnail: bytes | None, edges: list[Edge]) -> None:
+        """Bring the map file, if there is one, up to date with a new keyframe."""
         if self._writer is not None:
             self._writer.add(node, self.keyframes[node], thumbnail)
-            for edge in (*edges, *loops):
+            for edge in edges:
                 self._writer.add_edge(edge)
-            self._writer.sync(poses)
-        return closures
+            self._writer.sync(self.poses)
 
     def finish(self) -> None:
         """At the end of a drive: wait for the solver, judge the last clouds, bring the map file up to date."""
@@ -186,7 +216,10 @@ class Mapper:
     def _load(self, store: MapStore) -> None:
         data = load_map(store)
         self.keyframes, self._clouds = data.keyframes, data.clouds
-        restore(self._graph, data)
+        try:
+            restore(self._graph, data)
+        except (ValueError, Dpm2Error) as error:
+            raise Dpm2Error(f"{store.path}: {error}; see dpm2 map check") from None
         for keyframe in data.keyframes:
             robot = self._robot(keyframe.robot)
             robot.ids = max(robot.ids, keyframe.id + 1)
@@ -204,7 +237,7 @@ class Mapper:
         if found is not None and last is not None:
             before, T_before = self.keyframes[last], self._graph.pose(last)
             T_before_this = se3.inverse(before.T_odom_kf) @ keyframe.T_odom_kf
-            covariance = found.covariance * max(keyframe.id - before.id, 1)
+            covariance = found.covariance * np.clip(keyframe.id - before.id, 1, _MOST_MISSED)
             edge = Edge("odometry", last, node, T_before_this, covariance)
             edge = replace(edge, confidence=found.confidence, rmse=found.rmse, method=found.method)
         elif node == self.session_start and self._tie is not None:
@@ -220,19 +253,25 @@ class Mapper:
 
     def _close_loops(self, node: int) -> tuple[list[LoopClosure], list[Edge]]:
         """Loops of the last keyframe, as they are published and as they are stored."""
-        tried = self._loops.close(self.keyframes, self._clouds, self.poses)
+        tried = [self._tied(loop) for loop in self._loops.close(self.keyframes, self._clouds, self.poses)]
         closures = [
             LoopClosure(a.id, b.id, loop.registration, a.robot, b.robot)
             for loop in tried
             for a, b in [(self.keyframes[loop.from_node], self.keyframes[loop.to_node])]
         ]
         self.closures += closures
-        accepted = [loop for loop in tried if loop.registration.ok]
-        for loop in accepted:
-            found = loop.registration
-            self._graph.add_loop(loop.from_node, loop.to_node, found.T_target_source, found.covariance)
-        self._optimise(bool(accepted))
+        self._optimise(any(loop.registration.ok for loop in tried))
         return closures, [_loop_edge(loop) for loop in tried]
+
+    def _tied(self, loop: Loop) -> Loop:
+        """A loop that was tried, in the graph if it was accepted; rejected if the graph does not take it."""
+        found = loop.registration
+        if found.ok:
+            try:
+                self._graph.add_loop(loop.from_node, loop.to_node, found.T_target_source, found.covariance)
+            except Dpm2Error as error:
+                return refused(loop, str(error))
+        return loop
 
     def _optimise(self, changed: bool, wait: bool = False) -> None:
         """Solve the graph if it has `changed`, take in what another process has solved; `wait` for that."""

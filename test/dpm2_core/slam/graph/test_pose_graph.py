@@ -156,17 +156,6 @@ def test_a_loop_makes_the_far_end_certain() -> None:
     assert np.trace(after) < np.trace(LOOP)
 
 
-def test_a_covariance_that_is_none_is_an_error_of_the_work() -> None:
-    """A singular covariance says so in one line; the poses stay."""
-    graph = PoseGraph(PoseGraphSettings())
-    graph.add_node(np.eye(4), None, None)
-    graph.add_node(np.eye(4), np.eye(4), np.eye(6))
-    graph.add_loop(0, 1, np.eye(4), np.zeros((6, 6)))
-    with pytest.raises(Dpm2Error, match="pose graph"):
-        graph.optimise()
-    assert np.array_equal(graph.poses, np.tile(np.eye(4), (2, 1, 1)))
-
-
 def test_trajectories_that_grow_side_by_side_are_tied_by_loops() -> None:
     """Two robots on the same circle, their nodes interleaved, the second in a frame of its own; a third stays alone."""
     turn = np.linspace(0, np.pi, 12)
@@ -193,3 +182,25 @@ def test_trajectories_that_grow_side_by_side_are_tied_by_loops() -> None:
     assert {(a, b) for a, b, *_ in graph.edges} == {(n, n + 2) for n in range(22)} | {(8, 9), (18, 19)}
     np.testing.assert_allclose(graph.covariance(0), graph.covariance(0).T)
     assert np.trace(graph.relative_covariance(8, 9)) < np.trace(graph.relative_covariance(0, 23))
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -1.0, 0.0])
+def test_an_unsound_edge_is_rejected_and_the_graph_stays_as_it_was(bad: float) -> None:
+    """One of them would turn all poses to NaN with the next loop."""
+    graph = PoseGraph(PoseGraphSettings())
+    drive(graph, 55)
+    covariance = STEP.copy()
+    covariance[4, 4] = bad
+    T_last = graph.pose(54)
+    with pytest.raises(Dpm2Error, match="edge to node 55: its covariance"):
+        graph.add_node(T_last @ T_STEP, T_STEP, covariance)
+    with pytest.raises(Dpm2Error, match="loop to node 50: its covariance"):
+        graph.add_loop(0, 50, np.eye(4), covariance)
+    with pytest.raises(Dpm2Error, match="node 55: not a finite rigid transform"):
+        graph.add_node(T_last * bad, T_STEP, STEP)
+    assert len(graph) == 55
+    graph.add_node(T_last @ T_STEP, T_STEP, STEP)  # node 54 is still the last of its trajectory
+    graph.add_loop(0, 50, np.eye(4), LOOP)
+    graph.optimise()
+    assert np.isfinite(graph.poses).all()
+    assert [told.kept for told in graph.verdicts] == [True]

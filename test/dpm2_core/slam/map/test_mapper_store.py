@@ -27,6 +27,8 @@ LAP = 20
 class KnownLoops(LoopCloser):
     """Finds each keyframe of the lap before: the search itself is tested elsewhere."""
 
+    channels = None
+
     def __init__(self) -> None:
         pass
 

@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What every node reports on /diagnostics: the state of its map, and the messages that it could not use."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.node import Node
+
+from dpm2_ros.guard import GuardedNode
+from dpm2_ros.mapping import MapperThread
+from dpm2_ros.subscriptions import STEADY
+
+OK, WARN, ERROR, STALE = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR, DiagnosticStatus.STALE
+_RECENT = 10.0  # s
+
+
+class DiagnosticsPublisher:
+    """Asks for the statuses once a second, and sends them."""
+
+    def __init__(self, node: Node, statuses: Callable[[], list[DiagnosticStatus]]) -> None:
+        self._node, self._statuses = node, statuses
+        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        node.create_timer(1.0, self.publish, clock=STEADY)
+
+    def publish(self) -> None:
+        """Send them now."""
+        message = DiagnosticArray(status=self._statuses())
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        self._publisher.publish(message)
+
+
+def status(node: Node, part: str, level: bytes, text: str, figures: Mapping[str, object]) -> DiagnosticStatus:
+    """Of a part of a node."""
+    values = [KeyValue(key=key, value=str(value)) for key, value in figures.items()]
+    name = f"{node.get_fully_qualified_name().lstrip('/')}: {part}"
+    return DiagnosticStatus(level=level, name=name, message=text, hardware_id="", values=values)
+
+
+def mapper_status(node: Node, mapper: MapperThread) -> DiagnosticStatus:
+    """A map that grows: how large it is, and what is wrong with its file or its poses."""
+    accepted, tried = mapper.loops
+    figures = {"keyframes": mapper.keyframes, "loops accepted": accepted, "loops tried": tried}
+    problems = []
+    if mapper.store_problem:
+        problems.append(f"map file incomplete: {mapper.store_problem}")
+    if mapper.graph_problem:
+        problems.append(f"poses not optimised: {mapper.graph_problem}")
+    text = "; ".join([f"{mapper.keyframes} keyframes, {accepted} loops", *problems])
+    return status(node, "mapper", WARN if problems else OK, text, figures | {"waiting": mapper.waiting})
+
+
+def message_status(node: GuardedNode) -> DiagnosticStatus:
+    """What came in and could not be used, by topic and reason."""
+    rejections = node.rejections
+    total = sum(rejections.values())
+    level, text = OK, f"{total} messages rejected"
+    if node.since_rejection < _RECENT:
+        level, text = WARN, f"{text}, the last {node.since_rejection:.0f} s ago"
+    if node.errors:
+        level, text = WARN, f"{text}; {node.errors} internal errors"
+    return status(node, "messages", level, text, {**rejections, "internal errors": node.errors})

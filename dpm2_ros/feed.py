@@ -1,0 +1,270 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The keyframes of one namespace: checked, in order, those of every drive apart from those of any other."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
+
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import UInt8MultiArray, UInt32MultiArray
+
+from dpm2_core.data.messages import stamp_ns
+from dpm2_core.data.transforms import transform_matrix
+from dpm2_core.descriptors import Descriptors
+from dpm2_core.errors import UsageError
+from dpm2_core.frame import Keyframe, Points, Registration
+from dpm2_core.geometry import se3
+from dpm2_core.slam.map.admission import RejectedError, check_covariance, check_descriptors, check_pose
+from dpm2_core.slam.map.cloud_codec import CodecError, unpack_cloud
+from dpm2_core.slam.map.data import NO_POINTS
+from dpm2_ros.conversions import check_frame, covariance_from_ros, parse_keyframe_name
+from dpm2_ros.guard import GuardedNode
+from dpm2_ros.keyframes import BUDGET, WIRE, descriptors_from_msg, received_to_msg
+from dpm2_ros.mapping import MapperThread
+from dpm2_ros.streams import Parts, Stream
+
+ODOM = "/dpm2/keyframe_odom"
+"""Topic by which robots are found."""
+SILENT = 5.0
+"""s without a message after which a drive counts as over; a robot announces its last keyframe every 2 s."""
+_BESIDE = 2.5  # s for which both of two drives must be heard to be two robots
+_STREAMS = 256  # drives that are known, most of them over
+_APART = 8  # robots beside the one whose namespace it is
+_HELD = 16_000_000  # bytes that may wait
+_ANSWERS = 50  # between two ticks, to drives that are not known yet
+_BACKLOG = 32  # keyframes that may wait for the mapper
+
+
+class Feed:
+    """One namespace: joins messages to keyframes, hands them to the mapper, and tells the robot which have arrived.
+
+    A new session is that of the robot that was started again, once the old one has been silent for `SILENT` s. If both
+    are heard they are two robots, and the second gets a name of its own, `robot.session`. So no session ends another.
+    """
+
+    def __init__(self, node: GuardedNode, mapper: MapperThread, namespace: str, weights: str) -> None:
+        """`weights`: the identity of the mapper's network."""
+        self._node, self._mapper, self._robot, self._weights = node, mapper, namespace.strip("/"), weights
+        self.made = time.monotonic()
+        self._streams: dict[str, Stream] = {}  # by session, the one that was heard last at the end
+        self._main: Stream | None = None
+        self._answers = 0
+        self._cloud_topic, self._seen_topic = f"{namespace}/dpm2/keyframe_cloud", f"{namespace}/dpm2/keyframe"
+        self._pose_topic = namespace + ODOM
+        self._subscriptions = [
+            node.create_subscription(Odometry, self._pose_topic, self._on_pose, WIRE),
+            node.create_subscription(PointCloud2, self._seen_topic, self._on_seen, WIRE),
+            node.create_subscription(UInt8MultiArray, self._cloud_topic, self._on_cloud, WIRE),
+            node.create_subscription(Odometry, f"{namespace}/dpm2/odom", self._on_odom, 10),
+        ]
+        self._received = node.create_publisher(UInt32MultiArray, f"{namespace}/dpm2/keyframes_received", 10)
+
+    @property
+    def robots(self) -> dict[str, Stream]:
+        """The drives that are in the map, by the robot's name there."""
+        return {stream.robot: stream for stream in self._streams.values() if stream.robot is not None}
+
+    @property
+    def proven(self) -> bool:
+        """Whether a keyframe has come of it."""
+        return any(stream.taken for stream in self._streams.values())
+
+    @property
+    def beside(self) -> list[str]:
+        """Names of further robots in this namespace that are heard now."""
+        recent = time.monotonic() - SILENT
+        return [name for name, s in self.robots.items() if name != self._robot and s.heard > recent]
+
+    def tick(self) -> None:
+        """Twice a second: decide what waits, and tell the robots what has arrived."""
+        now = time.monotonic()
+        self._answers = 0
+        for stream in list(self._streams.values())[-_ANSWERS:]:
+            if (id := stream.give_up(now)) is not None:
+                self._node.reject(self._pose_topic, "keyframe given up", f"keyframe {id} of {self._robot or '/'}")
+            self._hand_on(stream, now)
+            if now - stream.heard < 2 * SILENT and (stream.robot is not None or stream.holds):
+                self._answer(stream, now)
+
+    def forget(self) -> None:
+        """The map is empty: the next keyframe of each drive is its first."""
+        for stream in self._streams.values():
+            stream.last = None
+
+    def close(self) -> None:
+        """Listen no more."""
+        for subscription in self._subscriptions:
+            self._node.destroy_subscription(subscription)
+        self._node.destroy_publisher(self._received)
+
+    def _on_odom(self, message: Odometry) -> None:
+        frame = message.header.frame_id
+        check_frame(frame)
+        known = self.robots
+        if not known:
+            self._mapper.broadcast(stamp_ns(message.header), self._robot, frame)
+            return
+        main = [self._robot] if self._robot in known else []
+        for robot in (*main, *reversed(known)):  # of two that use the same frame the first
+            if known[robot].odom_frame == frame:
+                self._mapper.broadcast(stamp_ns(message.header), robot, frame)
+                return
+
+    def _on_pose(self, message: Odometry) -> None:
+        stream, id = self._hear(message.child_frame_id)
+        if stream.wants(id, "pose"):
+            with _noted(stream, id):
+                check_frame(message.header.frame_id)
+                keyframe_from(message, NO_POINTS, "", id, None)
+            self._put(stream, id, "pose", message)
+
+    def _on_cloud(self, message: UInt8MultiArray) -> None:
+        if not message.layout.dim:
+            raise RejectedError("name", "a cloud without the name of its keyframe")
+        stream, id = self._hear(message.layout.dim[0].label)
+        if stream.wants(id, "cloud"):
+            with _noted(stream, id):
+                if len(message.data) > BUDGET:
+                    raise RejectedError("size", f"keyframe {id}: {len(message.data)} bytes; at most {BUDGET} are sent")
+                packed = bytes(message.data)
+                try:
+                    unpack_cloud(packed)
+                except CodecError as error:
+                    raise RejectedError("cloud", f"keyframe {id}: {error}") from None
+            self._put(stream, id, "cloud", packed)
+
+    def _on_seen(self, message: PointCloud2) -> None:
+        stream, id = self._hear(message.header.frame_id)
+        if stream.wants(id, "seen"):
+            with _noted(stream, id):
+                if len(message.data) > BUDGET:
+                    raise RejectedError("size", f"keyframe {id}: {len(message.data)} bytes; at most {BUDGET} are sent")
+                descriptors, weights = descriptors_from_msg(message)
+            self._put(stream, id, "seen", True, self._usable(id, descriptors, weights))
+
+    def _usable(self, id: int, descriptors: Descriptors | None, weights: str) -> Descriptors | None:
+        """Descriptors that the mapper's network can compare; without, it makes its own of the keyframe's cloud."""
+        if descriptors is None or self._mapper.channels is None:
+            return None
+        try:
+            if weights != self._weights:
+                text = f"weights {weights or 'unnamed'}, the mapper's are {self._weights}"
+                raise RejectedError("descriptors of other weights", text)
+            check_descriptors(descriptors, self._mapper.channels)
+        except RejectedError as error:
+            text = f"keyframe {id}: {error}; it is used, described anew by its cloud"
+            self._node.reject(self._seen_topic, error.reason, text)
+            return None
+        return descriptors
+
+    def _hear(self, name: str) -> tuple[Stream, int]:
+        """The drive of a keyframe with that name, and its id."""
+        _, id, session = parse_keyframe_name(name)
+        now = time.monotonic()
+        stream = self._streams.pop(session, None) or Stream(session, now)
+        self._streams[session] = stream
+        stream.hear(now)
+        while len(self._streams) > _STREAMS:
+            unknown = (s for s in self._streams.values() if not s.taken)
+            oldest = next(unknown, None) or next(s for s in self._streams.values() if s is not self._main)
+            del self._streams[oldest.session]
+        if session and stream.robot is None and now - stream.answered > 0.4 and self._answers < _ANSWERS:
+            self._answers += 1
+            self._answer(stream, now)
+        return stream, id
+
+    def _put(self, stream: Stream, id: int, part: str, value: Any, descriptors: Descriptors | None = None) -> None:
+        if stream.put(id, part, value, descriptors):
+            self._hand_on(stream, time.monotonic())
+        if stream is not self._main and stream.holds:
+            self._bound()
+
+    def _bound(self) -> None:
+        """Drives that nobody knows may not fill the memory: what was heard of longest ago is dropped."""
+        held = {session: s.holds for session, s in self._streams.items() if s is not self._main}
+        total = sum(held.values())
+        for session, size in held.items():
+            if total <= _HELD:
+                return
+            self._streams[session].drop()
+            total -= size
+
+    def _hand_on(self, stream: Stream, now: float) -> None:
+        """To the mapper: what is complete up to the first gap, once it is known whose it is."""
+        while self._mapper.waiting < _BACKLOG and (stream.robot is not None or self._place(stream, now)):
+            taken = stream.take()
+            if taken is None:
+                return
+            self._add(stream, *taken)
+
+    def _place(self, stream: Stream, now: float) -> bool:
+        """Whose drive it is, if that can be told: the robot's, or that of another one in the same namespace."""
+        main, name = self._main, self._robot or "/"
+        if not stream.ready:
+            return False
+        if main is None or main is stream or now - main.heard > SILENT:
+            if main is not None and main is not stream:
+                self._node.get_logger().warning(f"robot {name} has started again: a new session of its own")
+                main.replaced()
+            self._main, stream.robot = stream, self._robot
+            return True
+        if main.heard < stream.since + _BESIDE:
+            return False
+        if len(self.beside) >= _APART:
+            raise RejectedError("too many robots", f"more than {_APART} robots beside {name} in its namespace")
+        stream.robot = f"{self._robot}.{stream.session or 'none'}"
+        self._node.get_logger().error(f"two robots in namespace {name}: the second one is {stream.robot} in the map")
+        return True
+
+    def _add(self, stream: Stream, id: int, parts: Parts) -> None:
+        assert stream.robot is not None
+        keyframe = keyframe_from(parts.pose, NO_POINTS, stream.robot, id, stream.last, parts.descriptors)
+        stream.last, stream.odom_frame = replace(keyframe, descriptors=None), parts.pose.header.frame_id
+        stream.taken += 1
+        packed = parts.cloud
+        assert packed is not None
+        self._mapper.add(lambda: replace(keyframe, cloud=unpack_cloud(packed)))
+
+    def _answer(self, stream: Stream, now: float) -> None:
+        if stream.session:
+            stream.answered = now
+            self._received.publish(received_to_msg(stream.session, stream.next, stream.above))
+
+
+@contextmanager
+def _noted(stream: Stream, id: int) -> Iterator[None]:
+    """The stream takes note of a part that is rejected within."""
+    try:
+        yield
+    except Exception:
+        stream.reject(id, time.monotonic())
+        raise
+
+
+def keyframe_from(
+    pose: Odometry, points: Points, robot: str, id: int, before: Keyframe | None, descriptors: Descriptors | None = None
+) -> Keyframe:
+    """A keyframe from its messages; its edge leads to the last one that arrived (the mapper reckons with those missed).
+
+    A covariance of zeros says that the odometry began anew: there is no edge.
+
+    Raises:
+        RejectedError: the pose is not a rigid transform, or the covariance not one.
+    """
+    try:
+        T_odom_kf = transform_matrix(pose.pose.pose)
+    except UsageError as error:
+        raise RejectedError("pose", f"keyframe {id}: {error}") from None
+    check_pose(T_odom_kf)
+    covariance, edge = covariance_from_ros(pose.pose.covariance, T_odom_kf[:3, :3]), None
+    if covariance.any():
+        check_covariance(covariance)
+        if before is not None and id > before.id:
+            T_before_this = se3.inverse(before.T_odom_kf) @ T_odom_kf
+            edge = Registration(T_before_this, covariance, confidence=1.0, rmse=0.0, method="odometry")
+    return Keyframe(id, stamp_ns(pose.header), id, T_odom_kf, points, edge, robot, descriptors)

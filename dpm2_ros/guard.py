@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A node that no message ends: what it cannot use is rejected, counted by its reason, and said now and then."""
+
+from __future__ import annotations
+
+import functools
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.node import Node
+
+from dpm2_core.errors import Dpm2Error
+from dpm2_core.slam.map.admission import RejectedError
+
+_QUIET = 5.0  # s between two lines about the same reason
+_MOST_KINDS = 200  # of topic and reason; more are counted together
+_LENGTH = 300  # characters of a line, whatever is in the message
+
+
+class GuardedNode(Node):
+    """Every callback of a subscription or a timer is guarded; services answer, so they say themselves what is wrong.
+
+    Attributes:
+        errors: exceptions that were nobody's intention: bugs, but the node goes on.
+    """
+
+    def __init__(self, name: str, **options: Any) -> None:
+        self.errors = 0
+        self._rejections: dict[str, int] = {}
+        self._said: dict[str, float] = {}
+        self._last_rejection = -float("inf")
+        self._guard_lock = threading.Lock()
+        super().__init__(name, **options)  # subscribes to /clock, perhaps
+
+    def create_subscription(
+        self, msg_type: Any, topic: str, callback: Callable[..., Any], *args: Any, **kw: Any
+    ) -> Any:
+        """As of `Node`; an exception in the callback rejects the message."""
+        return super().create_subscription(msg_type, topic, self._guarded(callback, topic), *args, **kw)
+
+    def create_timer(self, period: float, callback: Callable[..., Any], *args: Any, **kw: Any) -> Any:
+        """As of `Node`; an exception in the callback is counted, and the timer goes on."""
+        return super().create_timer(period, self._guarded(callback, "timer"), *args, **kw)
+
+    @property
+    def rejections(self) -> dict[str, int]:
+        """Number of messages that were rejected, by topic and reason."""
+        with self._guard_lock:
+            return dict(self._rejections)
+
+    @property
+    def since_rejection(self) -> float:
+        """s since a message was rejected; inf if none was."""
+        return time.monotonic() - self._last_rejection
+
+    def reject(self, where: str, reason: str, text: str) -> None:
+        """Count something that cannot be used, and say why; any thread may call.
+
+        Args:
+            where: the topic it came from.
+            reason: one of a few words, never a text from the message.
+            text: one line; what it quotes of the message may be anything.
+        """
+        kind = f"{where}: {reason}"
+        with self._guard_lock:
+            if kind not in self._rejections and len(self._rejections) >= _MOST_KINDS:
+                kind = "others"
+            self._rejections[kind] = self._rejections.get(kind, 0) + 1
+            self._last_rejection = now = time.monotonic()
+            quiet = now - self._said.get(kind, -float("inf")) < _QUIET
+            if not quiet:
+                self._said[kind] = now
+        if not quiet:
+            self.get_logger().warning(f"{where}: rejected: {one_line(text)}")
+
+    def fail(self, where: str, error: BaseException) -> None:
+        """Count an exception that is a bug; any thread may call."""
+        with self._guard_lock:
+            self.errors += 1
+            kind = f"{where} {type(error).__name__}"
+            now = time.monotonic()
+            quiet = now - self._said.get(kind, -float("inf")) < _QUIET or len(self._said) > 2 * _MOST_KINDS
+            if not quiet:
+                self._said[kind] = now
+        if not quiet:
+            lines = "".join(traceback.format_exception(error))
+            self.get_logger().error(f"{where}: {lines[-3000:]}")
+
+    def _guarded(self, callback: Callable[..., Any], where: str) -> Callable[..., Any]:
+        @functools.wraps(callback)  # rclpy asks for its signature
+        def call(*args: Any) -> None:
+            try:
+                callback(*args)
+            except RejectedError as error:
+                self.reject(where, error.reason, str(error))
+            except Dpm2Error as error:
+                self.reject(where, "cannot be used", str(error))
+            except Exception as error:
+                self.fail(where, error)
+
+        return call
+
+
+def one_line(text: str, length: int = _LENGTH) -> str:
+    """A text of unknown origin for a terminal: what does not print is escaped, what is too long is cut."""
+    text = text if len(text) <= length else f"{text[:length]}..."
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)

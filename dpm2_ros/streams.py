@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Keyframes of one drive put together from their messages, in their order; whatever comes, memory is bounded."""
+
+from __future__ import annotations
+
+from collections import OrderedDict, deque
+from dataclasses import dataclass
+from typing import Any
+
+from dpm2_core.descriptors import Descriptors
+from dpm2_core.frame import Keyframe
+
+AHEAD = 64
+"""Keyframes that may wait for one before them; those beyond are sent again."""
+_HALVES = 64  # keyframes of which some messages are missing; also sent again
+_STUCK = 6.0  # s in which a robot sends a keyframe four times
+_TIMES = 3
+
+
+@dataclass(eq=False)
+class Parts:
+    """What has come of a keyframe, each part checked: its pose, its packed cloud, its descriptors."""
+
+    pose: Any = None
+    cloud: bytes | None = None
+    seen: bool = False
+    descriptors: Descriptors | None = None
+
+    @property
+    def complete(self) -> bool:
+        """Whether nothing is missing."""
+        return self.pose is not None and self.cloud is not None and self.seen
+
+    @property
+    def nbytes(self) -> int:
+        """Roughly."""
+        return 2000 + len(self.cloud or b"") + (0 if self.descriptors is None else self.descriptors.nbytes)
+
+
+class Stream:
+    """One drive, told from others by its session; without a session nothing is sent again, and order is arrival.
+
+    Attributes:
+        next: all ids below have gone on to the map, or were given up.
+        heard: when the last message came, s. since: when the first one came, since another drive took its place.
+        robot: what the map calls it; None while that is not decided.
+        last: its keyframe that went on last, without the cloud.
+        odom_frame: that its keyframes name.
+        taken: keyframes that went on.
+    """
+
+    def __init__(self, session: str, now: float) -> None:
+        self.session, self.next, self.taken = session, 0, 0
+        self.heard = self.since = now
+        self.answered = -float("inf")
+        self.robot: str | None = None
+        self.last: Keyframe | None = None
+        self.odom_frame = ""
+        self._parts: OrderedDict[int, Parts] = OrderedDict()
+        self._above: dict[int, Parts] = {}
+        self._queue: deque[tuple[int, Parts]] = deque(maxlen=AHEAD)  # without a session
+        self._bad: tuple[float, int] | None = None  # since when, and how often, messages of the next one were rejected
+
+    @property
+    def above(self) -> list[int]:
+        """Ids that are complete, and wait for one before them."""
+        return sorted(self._above)
+
+    @property
+    def holds(self) -> int:
+        """Bytes."""
+        queued = (parts for _, parts in self._queue)
+        return sum(parts.nbytes for held in (self._parts.values(), self._above.values(), queued) for parts in held)
+
+    @property
+    def ready(self) -> bool:
+        """Whether the next keyframe is there."""
+        return self.next in self._above if self.session else bool(self._queue)
+
+    def wants(self, id: int, part: str) -> bool:
+        """Whether a message would add anything: pose, cloud, or seen."""
+        if self.session and (not self.next <= id < self.next + AHEAD or id in self._above):
+            return False
+        parts = self._parts.get(id)
+        return parts is None or not getattr(parts, part)
+
+    def put(self, id: int, part: str, value: Any, descriptors: Descriptors | None = None) -> bool:
+        """A part that is sound; whether its keyframe is complete now."""
+        parts = self._parts.setdefault(id, Parts())
+        setattr(parts, part, value)
+        if descriptors is not None:
+            parts.descriptors = descriptors
+        if not parts.complete:
+            while len(self._parts) > _HALVES:
+                self._parts.popitem(last=False)
+            return False
+        del self._parts[id]
+        if self.session:
+            self._above[id] = parts
+        else:
+            self._queue.append((id, parts))
+        return True
+
+    def take(self) -> tuple[int, Parts] | None:
+        """The next keyframe, if it is there."""
+        if not self.ready:
+            return None
+        if not self.session:
+            return self._queue.popleft()
+        id, self.next, self._bad = self.next, self.next + 1, None
+        return id, self._above.pop(id)
+
+    def reject(self, id: int, now: float) -> None:
+        """A message of a keyframe was not sound."""
+        if id == self.next:
+            since, times = self._bad or (now, 0)
+            self._bad = since, times + 1
+
+    def give_up(self, now: float) -> int | None:
+        """The id of the next keyframe if it came again and again and was never sound: those after it go on."""
+        if self._bad is None or not self._above or now - self._bad[0] < _STUCK or self._bad[1] < _TIMES:
+            return None
+        self._bad, self.next = None, self.next + 1
+        self._parts.pop(self.next - 1, None)
+        return self.next - 1
+
+    def drop(self) -> None:
+        """Forget what waits: it is sent again."""
+        self._parts.clear()
+        self._above.clear()
+        self._queue.clear()
+
+    def replaced(self) -> None:
+        """Another drive has taken its place; should it be heard again, its place is decided anew."""
+        self.robot, self.last, self.since = None, None, float("inf")
+        self.drop()
+
+    def hear(self, now: float) -> None:
+        """A message came."""
+        self.heard, self.since = now, min(self.since, now)
