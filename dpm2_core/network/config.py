@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -27,7 +27,7 @@ class StageSettings(Settings):
     """Neighbours in the set abstraction."""
     channels: int = Field(gt=0)
     """Channels out."""
-    residual_radii: tuple[float, ...] = ()
+    residual_radii: tuple[float, ...] = Field((), max_length=64)
     """Radius of each inverted residual block, m."""
     residual_neighbours: int = Field(16, gt=0)
     """Neighbours in the inverted residual blocks."""
@@ -60,7 +60,7 @@ class PointsSettings(Settings):
         StageSettings(points=64, radius=24, neighbours=24, channels=192),
     )
     """From fine to coarse; the points of each are the first ones of the stage before."""
-    upsample: int = Field(0, ge=0)
+    upsample: int = Field(0, ge=0, le=16)
     """Feature propagation steps from the coarsest stage back up."""
 
 
@@ -71,7 +71,7 @@ class ImageSettings(Settings):
     """Name in the registry of image backbones, `timm:NAME` with the optional extra, or `none`: LiDAR only."""
     size: tuple[int, int] = (128, 416)
     """Height and width that pictures are resized to, pixels."""
-    depths: tuple[int, ...] = (1, 1, 2, 1)
+    depths: tuple[Annotated[int, Field(gt=0, le=64)], ...] = Field((1, 1, 2, 1), max_length=16)
     """ConvNeXt blocks of each stage."""
     channels: tuple[int, ...] = (24, 48, 96, 128)
     """ConvNeXt channels of each stage."""
@@ -93,9 +93,9 @@ class FusionSettings(Settings):
     """Number of reference points."""
     reference_features: bool = True
     """Start a reference point from the backbone's features where it is one of its points; False: from xyz alone."""
-    layers: int = Field(3, gt=0)
+    layers: int = Field(3, gt=0, le=64)
     """Multi-modal transformer layers."""
-    heads: int = Field(4, gt=0)
+    heads: int = Field(4, gt=0, le=256)
     """Attention heads."""
     alpha_lidar: float = Field(0.1, gt=0)
     """Decay of the point-to-point bias, 1/m."""
@@ -120,9 +120,9 @@ class DecoderSettings(Settings):
 
     width: int = Field(128, gt=0)
     """Channels."""
-    layers: int = Field(3, gt=0)
+    layers: int = Field(3, gt=0, le=64)
     """Self and cross attention layers."""
-    heads: int = Field(4, gt=0)
+    heads: int = Field(4, gt=0, le=256)
     """Attention heads."""
     position: Literal["sine", "relative"] = "relative"
     """`sine`: code of absolute coordinates added before each attention, as in DeepPointMap. `relative`: a learned bias
@@ -135,7 +135,7 @@ class DecoderSettings(Settings):
     """Pairs used for the pose: floor(ratio * (M + N)) // 2 of the most similar."""
     offset_limit: float = Field(2.0, gt=0)
     """Pairs with a longer predicted offset are dropped, m."""
-    guided: int = Field(2, ge=0)
+    guided: int = Field(2, ge=0, le=64)
     """Times that descriptors are matched anew with the pose at hand. 0: the paper's single matching."""
     overlap_pose: bool = True
     """Tell the overlap head how sure the registration is and how far apart it puts the pair. False: the paper's."""

@@ -1,19 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Weights as safetensors: nothing that is loaded can execute code, and nothing is loaded into the wrong network."""
+"""Weights as safetensors: nothing that is loaded can execute code, and nothing is loaded into the wrong network.
+
+The network that a file describes is compared with the tensors that it holds before any memory is taken for it.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import re
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any, TypeVar
 
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
+from torch import nn
 
+from dpm2_core.config import Settings
 from dpm2_core.errors import UsageError
 from dpm2_core.network.config import NetworkSettings, settings_from
 from dpm2_core.network.model import DeepPointMap2
+
+T = TypeVar("T", bound=Settings)
+_LARGEST = 1 << 16  # no number in a description is greater: channels, points, pixels
+_TIMM = re.compile(r"timm:[\w.]+")  # a network that timm itself builds; other names of it are addresses
 
 
 def save_weights(model: DeepPointMap2, path: Path, about: dict[str, str], half: bool = True) -> None:
@@ -67,12 +78,9 @@ def load_weights(model: DeepPointMap2, path: Path) -> dict[str, str]:
     stored = metadata.get("preset", "unknown")
     if stored != model.settings.preset:
         raise UsageError(f"{path}: weights of preset {stored}, the network is preset {model.settings.preset}")
-    own = model.state_dict()
-    wrong = list(own.keys() ^ state.keys()) + [
-        name for name in own.keys() & state.keys() if own[name].shape != state[name].shape
-    ]
-    if wrong:
-        raise UsageError(f"{path}: does not fit preset {stored}: {len(wrong)} tensors differ, such as {min(wrong)}")
+    _check_shapes(model, state, f"{path}: does not fit preset {stored}")
+    if bad := [name for name, value in state.items() if not bool(value.isfinite().all())]:
+        raise UsageError(f"{path}: {bad[0]} holds values that are not finite")
     model.load_state_dict(state)
     return metadata
 
@@ -83,10 +91,7 @@ def network_settings(path: Path) -> NetworkSettings:
     Raises:
         UsageError: missing file, another format, no or invalid settings in it.
     """
-    metadata = read_metadata(path)
-    if "network" not in metadata:
-        raise UsageError(f"{path}: safetensors without a network description")
-    return settings_from(NetworkSettings, json.loads(metadata["network"]), default=str(path))
+    return _network_settings(path, read_metadata(path))
 
 
 def load_model(path: Path) -> DeepPointMap2:
@@ -95,6 +100,69 @@ def load_model(path: Path) -> DeepPointMap2:
     Raises:
         UsageError: as `load_weights`.
     """
-    model = DeepPointMap2(network_settings(path))
+    state, metadata = read_tensors(path)
+    settings = _network_settings(path, metadata)
+    check_fit(path, state, lambda: DeepPointMap2(settings))
+    model = DeepPointMap2(settings)
     model.decoder.judges_overlap = load_weights(model, path).get("phase") == "2"
     return model.eval().requires_grad_(False)
+
+
+def _network_settings(path: Path, metadata: Mapping[str, str]) -> NetworkSettings:
+    settings = described(path, metadata, NetworkSettings)
+    backbone = settings.image.backbone
+    if backbone.startswith("timm:") and not _TIMM.fullmatch(backbone):
+        raise UsageError(f"{path}: image.backbone {backbone}: weights do not choose what is downloaded")
+    return settings
+
+
+def described(path: Path, metadata: Mapping[str, str], kind: type[T]) -> T:
+    """The settings of the network that a weights file describes.
+
+    Raises:
+        UsageError: none, or values that no network has.
+    """
+    if "network" not in metadata:
+        raise UsageError(f"{path}: safetensors without a network description")
+    try:
+        tree = json.loads(metadata["network"])
+    except (ValueError, RecursionError):
+        raise UsageError(f"{path}: its network description is not JSON") from None
+    if not isinstance(tree, dict):
+        raise UsageError(f"{path}: its network description is not a mapping")
+    _check_numbers(path, tree)
+    return settings_from(kind, tree, default=str(path))
+
+
+def check_fit(path: Path, state: Mapping[str, torch.Tensor], make: Callable[[], nn.Module]) -> None:
+    """Whether the tensors of a file are those of the network that `make` builds, before it takes memory.
+
+    Raises:
+        UsageError: names or shapes differ, or there is no such network.
+    """
+    try:
+        with torch.device("meta"):
+            network = make()
+    except (ArithmeticError, AssertionError, IndexError, RuntimeError, TypeError, ValueError) as error:
+        raise UsageError(f"{path}: describes a network that cannot be: {' '.join(str(error).split())}") from None
+    _check_shapes(network, state, f"{path}: does not fit the network that it describes")
+
+
+def _check_shapes(model: nn.Module, state: Mapping[str, torch.Tensor], what: str) -> None:
+    own = model.state_dict()
+    wrong = list(own.keys() ^ state.keys())
+    wrong += [name for name in own.keys() & state.keys() if own[name].shape != state[name].shape]
+    if wrong:
+        raise UsageError(f"{what}: {len(wrong)} tensors differ, such as {min(wrong)}")
+
+
+def _check_numbers(path: Path, value: Any, name: str = "network") -> None:
+    """Raises UsageError for a number or a list beyond all bounds, anywhere in a description."""
+    if isinstance(value, dict):
+        for key, item in value.items():
+            _check_numbers(path, item, f"{name}.{key}")
+    elif isinstance(value, list):
+        for item in [len(value), *value[:_LARGEST]]:
+            _check_numbers(path, item, name)
+    elif isinstance(value, int | float) and not abs(value) <= _LARGEST:
+        raise UsageError(f"{path}: {name} is {value}; at most {_LARGEST} makes sense")

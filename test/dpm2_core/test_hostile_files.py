@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import json
+import resource
 import sqlite3
 import struct
 import time
@@ -14,8 +16,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from safetensors.torch import save_file
 
 from dpm2_core.cli import main
+from dpm2_core.errors import UsageError
+from dpm2_core.network.model import DeepPointMap2
+from dpm2_core.network.weights import load_model
 from dpm2_core.slam.map.check import check_map
 from dpm2_core.slam.map.rows import array_bytes, with_crc
 
@@ -165,3 +172,62 @@ def test_what_is_good_of_a_hostile_map_can_be_recovered(tmp_path: Path, map_file
     assert found.problems
     assert found.keyframes >= (1 if attack == "cut off" else 10)
     assert check_map(tmp_path / "good.dpm2map").problems == []
+
+
+def changed(**sections: object) -> Callable[[DeepPointMap2], dict[str, str]]:
+    """A description of the network with other values; the tensors stay."""
+
+    def make(model: DeepPointMap2) -> dict[str, str]:
+        tree = model.settings.model_dump(mode="json")
+        for name, values in sections.items():
+            tree[name] = {**tree[name], **values} if isinstance(values, dict) else values
+        return {"preset": "tiny", "network": json.dumps(tree)}
+
+    return make
+
+
+WEIGHTS: dict[str, tuple[Callable[[DeepPointMap2], dict[str, str]], str]] = {
+    "a hub's name": (changed(image={"backbone": "timm:hf-hub:somebody/something"}), "do not choose what is downloaded"),
+    "an address": (changed(image={"backbone": "timm:local-dir:/etc"}), "do not choose what is downloaded"),
+    "1e12 channels": (changed(channels=10**12), "network.channels is 1000000000000; at most 65536"),
+    "65,536 channels": (changed(decoder={"width": 65536}), "does not fit the network that it describes"),
+    "a billion layers": (changed(decoder={"layers": 10**9}), "layers is 1000000000; at most"),
+    "65,536 layers": (changed(fusion={"layers": 65536}), "less than or equal to 64"),
+    "a picture of a terapixel": (changed(image={"size": [10**6, 10**6]}), "image.size is 1000000"),
+    "a number without end": (changed(points={"far": float("inf")}), "points.far is inf"),
+    "heads that do not divide": (changed(decoder={"heads": 7}), "cannot be"),
+    "no JSON": (lambda model: {"preset": "tiny", "network": "{" * 100}, "not JSON"),
+    "JSON without end": (lambda model: {"preset": "tiny", "network": "[" * 200_000}, "not JSON"),
+    "a list": (lambda model: {"preset": "tiny", "network": "[1]"}, "not a mapping"),
+}
+
+
+@pytest.mark.parametrize("attack", WEIGHTS)
+def test_hostile_weights(tmp_path: Path, model: DeepPointMap2, attack: str) -> None:
+    """Before any memory is taken for what they describe, and without a word to the network."""
+    path = tmp_path / "a.safetensors"
+    describe, words = WEIGHTS[attack]
+    save_file({name: value.contiguous() for name, value in model.state_dict().items()}, path, describe(model))
+    before, began = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.process_time()
+    with pytest.raises(UsageError) as caught:
+        load_model(path)
+    assert time.process_time() - began < 2
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 256e3  # kB; 65,536 x 65,536 numbers are 17 GB
+    told = str(caught.value)
+    assert words in told
+    assert str(path) in told or attack == "65,536 layers"
+    assert "\n" not in told
+
+
+def test_weights_that_are_cut_off_or_not_finite(tmp_path: Path, model: DeepPointMap2) -> None:
+    path = tmp_path / "a.safetensors"
+    state = {name: value.contiguous() for name, value in model.state_dict().items()}
+    about = changed()(model)
+    save_file(state, path, about)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(UsageError, match="not a safetensors file"):
+        load_model(path)
+    name = min(name for name, value in state.items() if value.is_floating_point())
+    save_file({**state, name: torch.full_like(state[name], torch.nan)}, path, about)
+    with pytest.raises(UsageError, match="values that are not finite"):
+        load_model(path)

@@ -3,16 +3,15 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TypeVar
 
 from torch import Tensor, nn
 
-from dpm2_core.config import Settings, settings_from
+from dpm2_core.config import Settings
 from dpm2_core.errors import UsageError
-from dpm2_core.network.weights import read_tensors, write_tensors
+from dpm2_core.network.weights import check_fit, described, read_tensors, write_tensors
 
 T = TypeVar("T", bound=Settings)
 M = TypeVar("M", bound=nn.Module)
@@ -34,13 +33,7 @@ def read_weights(path: Path, name: str, kind: type[T]) -> tuple[dict[str, Tensor
     state, metadata = read_tensors(path)
     if metadata.get("task") != name:
         raise UsageError(f"{path}: weights of {metadata.get('task', 'no task')}, not of {name}")
-    try:
-        tree = json.loads(metadata["network"])
-    except (KeyError, ValueError):
-        raise UsageError(f"{path}: safetensors without the settings of its network") from None
-    if not isinstance(tree, dict):
-        raise UsageError(f"{path}: the settings of its network are no mapping")
-    return state, settings_from(kind, tree, default=str(path))
+    return state, described(path, metadata, kind)
 
 
 def load_network(path: Path, name: str, part: str, kind: type[T], make: Callable[[T], M]) -> M:
@@ -53,6 +46,7 @@ def load_network(path: Path, name: str, part: str, kind: type[T], make: Callable
         UsageError: no such file, a pickle, weights of another task, other settings or shapes, values not finite.
     """
     state, settings = read_weights(path, name, kind)
+    check_fit(path, state, lambda: nn.ModuleDict({part: make(settings)}))
     network = make(settings)
     load_strictly(nn.ModuleDict({part: network}), state, path)
     return network.eval().requires_grad_(False)

@@ -200,7 +200,7 @@ def test_wrong_weights_are_refused(scans: TaskScans, tmp_path: Path) -> None:
 
     refused(state, {**about, "task": "dslr"}, "weights of dslr, not of gndnet")
     refused(state, {"preset": "small"}, "weights of no task, not of gndnet")
-    refused(state, {"task": "gndnet"}, "without the settings of its network")
+    refused(state, {"task": "gndnet"}, "without a network description")
     refused(state, {**about, "network": '{"cell": 0}'}, "cell: input should be greater than 0")
     refused(state, {**about, "network": '{"channels": 8, "cells": 32}'}, "tensors differ, such as net.down")
     refused({name: v for name, v in state.items() if name != "net.pillar.bias"}, about, "such as net.pillar.bias")
