@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What README and cards say is what the records in benchmarks/ say."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from decimal import Decimal
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+CARD = "dpm2_core/weights/small.md"
+METHODS = {
+    "dpm2, odometry": "dpm2 without loops",
+    "dpm2, with loops by descriptors": "dpm2",
+    "KISS-ICP": "kiss-icp",
+    "neural": "neural",
+    "refined": "refined",
+    "geometric": "geometric",
+}
+
+
+def record(name: str) -> Any:
+    return json.loads((ROOT / "benchmarks" / name).read_text(encoding="utf-8"))
+
+
+def text(path: str) -> str:
+    """A document in one line."""
+    return " ".join((ROOT / path).read_text(encoding="utf-8").split())
+
+
+def rows(path: str, heading: str) -> Iterator[list[str]]:
+    """Cells of the table in a Markdown file that begins with this heading."""
+    lines = iter((ROOT / path).read_text(encoding="utf-8").splitlines())
+    assert any(line == heading for line in lines), f"{path}: no table {heading}"
+    next(lines)
+    for line in lines:
+        if not line.startswith("|"):
+            return
+        yield [cell.strip() for cell in line.strip("|").split("|")]
+
+
+def equals(said: str, true: float) -> bool:
+    """Whether a figure in a text is the true one, rounded to as many digits."""
+    digits = -int(Decimal(said).as_tuple().exponent)
+    return abs(float(said) - true) <= 0.5001 * 10.0**-digits
+
+
+def test_the_figures_beside_kiss_icp_are_those_of_the_record() -> None:
+    heading = "| drive | method | RPE m | RPE deg | ATE m | t_err % | drift % | frames/s | CPU ms a frame |"
+    keys = ("rpe_trans_m", "rpe_rot_deg", "ape_rmse_m", "t_err_percent", "final_drift_percent", "fps", "cpu_ms")
+    drives, seen, drive = record("geometric.json")["drives"], [], ""
+    for cells in rows("README.md", heading):
+        drive = cells[0].partition(",")[0] or drive
+        method = METHODS[cells[1]]
+        seen.append((drive, method))
+        for key, cell in zip(keys, cells[2:], strict=True):
+            assert equals(cell.strip("*"), drives[drive][method][key]), (drive, method, key)
+    assert sorted(seen) == sorted((d, m) for d in drives for m in METHODS.values() if m in drives[d])
+
+
+def test_bold_is_what_is_best() -> None:
+    """Of each drive and figure, and nothing else: the reader looks at what is bold."""
+    heading = "| drive | method | RPE m | RPE deg | ATE m | t_err % | drift % | frames/s | CPU ms a frame |"
+    drives: dict[str, list[list[str]]] = {}
+    for cells in rows("README.md", heading):
+        drives.setdefault(cells[0] or list(drives)[-1], []).append(cells[2:])
+    for table in drives.values():
+        for number, column in enumerate(zip(*table, strict=True)):
+            values = [float(cell.strip("*")) for cell in column]
+            best = max(values) if number == 5 else min(values)
+            assert [cell.startswith("**") for cell in column] == [value == best for value in values]
+
+
+def test_where_kiss_icp_is_ahead_is_said() -> None:
+    names = {"t_err_percent": "KITTI's metric", "ape_rmse_m": "the ATE", "final_drift_percent": "the drift"}
+    (said,) = re.findall(r"KISS-ICP is slightly ahead in [^;]*;", text("README.md"))
+    drives = record("geometric.json")["drives"]
+    for key in ("rpe_trans_m", "rpe_rot_deg", *names):
+        ahead = [drive for drive, row in drives.items() if row["kiss-icp"][key] < row["dpm2 without loops"][key]]
+        if ahead:
+            where = "both drives" if len(ahead) == len(drives) else ahead[0]
+            assert f"{names[key]} on {where}" in said, (key, ahead)
+        else:
+            assert names.get(key, "RPE") not in said
+
+
+def test_the_card_has_the_figures_of_the_odometry() -> None:
+    heading = "| drive | registration | RPE m, deg | ATE m | drift % | t_err % | ms a frame |"
+    drives, seen = record("neural.json")["parts"]["odometry"]["drives"], 0
+    for drive, registration, rpe, ate, drift, t_err, _ in rows(CARD, heading):
+        true = drives[drive][METHODS[registration]]
+        said = (*rpe.split(", "), ate, drift, t_err)
+        keys = ("rpe_trans_m", "rpe_rot_deg", "ape_rmse_m", "final_drift_percent", "t_err_percent")
+        for key, cell in zip(keys, said, strict=True):
+            assert equals(cell, true[key]), (drive, registration, key)
+        seen += 1
+    assert seen == sum(map(len, drives.values()))
+
+
+def test_what_refined_adds_on_these_drives_is_said() -> None:
+    for methods in record("neural.json")["parts"]["odometry"]["drives"].values():
+        for key in ("rpe_trans_m", "rpe_rot_deg", "ape_rmse_m", "final_drift_percent", "t_err_percent"):
+            assert abs(methods["refined"][key] / methods["geometric"][key] - 1) <= 0.002
+    for path in ("README.md", CARD):
+        assert re.search(r"`refined` is the points: its errors (equal|are) those of `geometric` to 0.2 %", text(path))
+
+
+def test_what_the_camera_adds_to_the_descriptors_is_said() -> None:
+    ratios = record("neural.json")["parts"]["corruption"]["error_ratio"]
+    (ratio,) = (value for name, value in ratios.items() if "camera" in name)
+    (said,) = re.findall(r"every image black the shipped weights err ([\d.]+) times", text("README.md"))
+    assert equals(said, ratio)
+    (said,) = re.findall(r"\| every image black[^|]*\| ([\d.]+) \|", text(CARD))
+    assert equals(said, ratio)
