@@ -62,7 +62,7 @@ def image_attention(model: DeepPointMap2, frame: Frame, point: int | None = None
     views = collate_views([frame.images[:1]], encoder.settings.image)
     if views is None:
         raise UsageError(f"frame {frame.index} has no picture")
-    points = collate([build_pyramid(crop(frame.points, encoder.settings.points), encoder.settings.points)])
+    points = collate([build_pyramid(crop(frame.points, encoder.settings.points), encoder.settings)])
     given: list[Any] = []
     hook = attention.register_forward_pre_hook(lambda module, arguments: given.append(arguments))
     device = next(model.parameters()).device

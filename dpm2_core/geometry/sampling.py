@@ -31,6 +31,19 @@ def farthest_points(points: Points, count: int) -> Index:
     return fpsample.bucket_fps_kdline_sampling(points, count, h=height, start_idx=0).astype(np.int64)
 
 
+def interleaved(points: Points, special: Points, first: int) -> Points:
+    """The (N, 3) points with (k, 3) special ones spread evenly among the `first` of them; the last ones fall out.
+
+    Any prefix within `first` holds both in the same ratio. k is at most `first` and N.
+    """
+    out = np.empty_like(points)
+    slot = np.zeros(len(points), bool)
+    every = min(first, len(points)) / max(len(special), 1)
+    slot[((np.arange(len(special)) + 0.5) * every).astype(np.int64)] = True
+    out[slot], out[~slot] = special, points[: len(points) - len(special)]
+    return out
+
+
 def neighbours(tree: cKDTree, queries: Points, k: int, radius: float) -> Index:
     """(M, k) indices of the neighbours of each query, nearest first; those beyond `radius` m repeat the nearest.
 

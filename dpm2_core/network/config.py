@@ -87,8 +87,11 @@ class FusionSettings(Settings):
     kind: FusionKind = "biased"
     """How LiDAR and image features reach the reference points; none is DeepPointMap v1, the backbone's own points.
     The others than biased are the alternatives of the paper's Table 4."""
-    reference: Literal["fps", "uniform", "normal"] = "fps"
-    """How reference points are chosen: farthest point sampling of the cloud, or random positions (Table 3)."""
+    reference: Literal["salient", "fps", "uniform", "normal"] = "salient"
+    """How reference points are chosen: vertical edges and poles of the cloud among its farthest points, farthest points
+    alone, or random positions. The last three are those of the paper's Table 3."""
+    edges: float = Field(0.5, ge=0, le=1)
+    """Ratio of the reference points that `salient` puts on vertical edges; fewer where a scan shows fewer."""
     points: int = Field(256, gt=0)
     """Number of reference points."""
     reference_features: bool = True
@@ -174,7 +177,7 @@ _V1: dict[str, Any] = {
     "preset": "v1",
     "points": {"view_aligned": False, "moments": False, "pool_first": False, "stages": _V1_STAGES, "upsample": 2},
     "image": {"backbone": "none"},
-    "fusion": {"kind": "none"},
+    "fusion": {"kind": "none", "reference": "fps"},
     "decoder": {"width": 256, "heads": 8, "position": "sine", "precision": False, "guided": 0, "overlap_pose": False},
 }
 _PAPER: dict[str, Any] = {

@@ -69,7 +69,7 @@ class Encoder(nn.Module):
             Dpm2Error: too few points in range.
         """
         device = next(self.parameters()).device
-        points = collate([build_pyramid(crop(frame.points, self.settings.points), self.settings.points)])
+        points = collate([build_pyramid(crop(frame.points, self.settings.points), self.settings)])
         views = collate_views([frame.images], self.settings.image) if self.image is not None else None
         return self.encode_batch(points, views, device)[0]
 

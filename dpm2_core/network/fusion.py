@@ -22,13 +22,14 @@ class ReferencePoints(nn.Module):
     def __init__(self, settings: NetworkSettings, scale_channels: list[int]) -> None:
         super().__init__()
         fusion, points = settings.fusion, settings.points
-        self.n, self.far, self.kind = fusion.points, points.far, fusion.reference
+        self.n, self.far = fusion.points, points.far
+        self.sampled = sampled = fusion.reference in ("salient", "fps")
         self.levels = [
             i
             for i, stage in enumerate(points.stages)
-            if fusion.reference_features and fusion.reference == "fps" and stage.points >= fusion.points
+            if fusion.reference_features and sampled and stage.points >= fusion.points
         ]
-        if fusion.reference != "fps":
+        if not sampled:
             noise = torch.Generator().manual_seed(0)  # the same places in every frame, as descriptors must recur
             if fusion.reference == "uniform":
                 xyz = torch.rand(self.n, 3, generator=noise) * 2 - 1
@@ -41,9 +42,9 @@ class ReferencePoints(nn.Module):
         self.view_aligned = points.view_aligned
 
     def forward(self, scales: list[Scale]) -> Tokens:
-        """The finest scale's points are the farthest point sampling of the cloud, so a prefix of them is one, too."""
+        """Sampled reference points are the first ones of the finest scale; see `build_pyramid`."""
         finest = scales[0]
-        if self.kind == "fps":
+        if self.sampled:
             xyz, mask = finest.xyz[:, : self.n], finest.mask[:, : self.n]
         else:
             xyz = self.fixed.expand(len(finest.xyz), -1, -1)  # type: ignore[operator]

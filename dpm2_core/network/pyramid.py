@@ -13,9 +13,10 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.geometry.sampling import farthest_points, in_range, neighbours
+from dpm2_core.geometry.edges import vertical_edges
+from dpm2_core.geometry.sampling import farthest_points, in_range, interleaved, neighbours
 from dpm2_core.geometry.voxel import voxel_first
-from dpm2_core.network.config import PointsSettings
+from dpm2_core.network.config import NetworkSettings, PointsSettings
 
 MIN_POINTS = 32  # below this a scan says nothing about the pose
 
@@ -25,7 +26,7 @@ class Pyramid:
     """Levels of one scan; the points of a level are a prefix of those of the level before.
 
     Attributes:
-        xyz: (n_0, 3) float32 m, farthest-first; zeros after `count`.
+        xyz: (n_0, 3) float32 m, farthest-first, the reference points as `fusion.reference` says; zeros after `count`.
         count: valid points of the first level; that of level i is min(count, n_i).
         patches: (n_0, k_0, 3) float16 m, input points around each first-level point, relative to it.
         groups: per further level (n_i, k_i) int16, neighbours in the level before.
@@ -60,19 +61,24 @@ def crop(points: NDArray[np.float32], settings: PointsSettings) -> NDArray[np.fl
     return xyz[np.argsort(xyz[:, 0])]
 
 
-def build_pyramid(cloud: NDArray[np.float32], settings: PointsSettings) -> Pyramid:
+def build_pyramid(cloud: NDArray[np.float32], network: NetworkSettings) -> Pyramid:
     """The pyramid of a cropped (M, 3) cloud.
 
     Raises:
         Dpm2Error: fewer than `MIN_POINTS` points.
     """
+    settings, fusion = network.points, network.fusion
     if len(cloud) < MIN_POINTS:
         raise Dpm2Error(f"scan has {len(cloud)} points within {settings.near}-{settings.far} m, want {MIN_POINTS}")
     stages = settings.stages
     first = stages[0]
+    tree = _tree(cloud)
     xyz = cloud[farthest_points(cloud, first.points)]
+    if fusion.reference == "salient":
+        edges = vertical_edges(cloud, tree, int(fusion.edges * min(fusion.points, len(xyz))))
+        xyz = interleaved(xyz, edges, fusion.points)
     count = len(xyz)
-    index = neighbours(_tree(cloud), xyz, first.neighbours, first.radius)
+    index = neighbours(tree, xyz, first.neighbours, first.radius)
     patches = np.zeros((first.points, first.neighbours, 3), np.float16)
     patches[:count] = cloud[index] - xyz[:, None]
 

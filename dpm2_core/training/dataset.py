@@ -155,7 +155,7 @@ class GroupDataset(IterableDataset):
             drive = self.drives.choose(noise)
             for index in settings.draw(drive.poses, noise):
                 sample: Sample = augment(drive[index], settings.augment, noise)
-                pyramids.append(build_pyramid(sample.cloud, self.network.points))
+                pyramids.append(build_pyramid(sample.cloud, self.network))
                 images.append(sample.images if settings.images else ())
                 poses.append(sample.pose)
         views = collate_views(images, self.network.image) if settings.images else None

@@ -58,7 +58,7 @@ class PairSet:
             for drive, index, yaw in keys[begin : begin + batch]:
                 sample = self.drives[drive][index]
                 turn = se3.exp([0, 0, yaw, 0, 0, 0])
-                pyramids.append(build_pyramid(se3.transform(turn, sample.cloud), self.network.points))
+                pyramids.append(build_pyramid(se3.transform(turn, sample.cloud), self.network))
                 turned = [
                     type(i)(i.pixels, type(i.camera)(i.camera.K, turn @ i.camera.T_lidar_cam, i.camera.size))
                     for i in sample.images

@@ -170,7 +170,7 @@ def stage_times(network: DeepPointMap2, frames: Sequence[Frame]) -> dict[str, An
         clock = [perf_counter()]
         cloud = crop(frame.points, points)
         clock.append(perf_counter())
-        pyramid = build_pyramid(cloud, points)
+        pyramid = build_pyramid(cloud, network.settings)
         clock.append(perf_counter())
         views = collate_views([frame.images], network.settings.image) if encoder.image is not None else None
         clock.append(perf_counter())

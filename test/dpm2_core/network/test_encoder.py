@@ -70,7 +70,7 @@ def test_order_of_points_changes_nothing(model: DeepPointMap2, noise: np.random.
 
 def test_heading_changes_nothing(model: DeepPointMap2, noise: np.random.Generator, street: Callable) -> None:
     """Turned about the vertical, the same samples get the same features: what `view_aligned` promises."""
-    pyramid = build_pyramid(street(noise, 1500), model.settings.points)
+    pyramid = build_pyramid(street(noise, 1500), model.settings)
     R = se3.exp([0, 0, 2.1, 0, 0, 0])[:3, :3].astype(np.float32)
     turned = replace(pyramid, xyz=pyramid.xyz @ R.T, patches=(pyramid.patches @ R.T).astype(np.float16))
     one, other = (model.encoder(collate([p])).tokens for p in (pyramid, turned))
@@ -79,7 +79,7 @@ def test_heading_changes_nothing(model: DeepPointMap2, noise: np.random.Generato
 
 def test_padding_changes_nothing(model: DeepPointMap2, noise: np.random.Generator, street: Callable) -> None:
     """A sparse scan encodes alike alone and in a batch with a full one; its padding is masked."""
-    settings = model.settings.points
+    settings = model.settings
     sparse, full = build_pyramid(street(noise, 100)[:40], settings), build_pyramid(street(noise), settings)
     alone = model.encoder(collate([sparse])).tokens
     together = model.encoder(collate([full, sparse])).tokens
@@ -121,7 +121,7 @@ def test_missing_picture_equals_no_camera(
     model: DeepPointMap2, noise: np.random.Generator, street: Callable, picture: Callable
 ) -> None:
     """Exactly: in a batch whose other frame has a picture, the one without gives what the LiDAR alone gives."""
-    pyramid = build_pyramid(street(noise), model.settings.points)
+    pyramid = build_pyramid(street(noise), model.settings)
     alone = model.encoder(collate([pyramid])).tokens.features
     both = model.encoder(collate([pyramid, pyramid]), views_of(model, [], [picture(noise)])).tokens.features
     assert torch.equal(both[0], alone[0])
@@ -132,7 +132,7 @@ def test_only_reference_points_in_view_read_the_picture(
     model: DeepPointMap2, noise: np.random.Generator, street: Callable, picture: Callable
 ) -> None:
     """With one fusion layer, what lies behind the camera does not depend on the pixels."""
-    pyramid = build_pyramid(street(noise), model.settings.points)
+    pyramid = build_pyramid(street(noise), model.settings)
     points = collate([pyramid])
     one, other = (model.encoder(points, views_of(model, [picture(noise)])).tokens for _ in range(2))
     behind = one.xyz[0, :, 0] < 0
@@ -142,7 +142,7 @@ def test_only_reference_points_in_view_read_the_picture(
 
 def test_several_cameras(model: DeepPointMap2, noise: np.random.Generator, street: Callable, picture: Callable) -> None:
     """Their order does not matter."""
-    pyramid = build_pyramid(street(noise), model.settings.points)
+    pyramid = build_pyramid(street(noise), model.settings)
     a, b = picture(noise), picture(noise)
     one = model.encoder(collate([pyramid]), views_of(model, [a, b])).tokens.features
     other = model.encoder(collate([pyramid]), views_of(model, [b, a])).tokens.features
@@ -159,7 +159,7 @@ def test_alternatives_of_the_ablations(
     """Every choice of Tables 3 and 4 runs, uses the picture, and gives each parameter of its own a gradient."""
     torch.manual_seed(0)
     model = DeepPointMap2(tiny(fusion={"kind": kind, "reference": reference}))
-    points = collate([build_pyramid(street(noise), model.settings.points)])
+    points = collate([build_pyramid(street(noise), model.settings)])
     features = model.encoder(points, views_of(model, [picture(noise)])).tokens.features
     features.square().sum().backward()
     fusion = model.encoder.fusion

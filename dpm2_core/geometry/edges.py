@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Vertical edges and poles of a cloud: places that are found again from elsewhere, unlike farthest points."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from dpm2_core.geometry.sampling import Index, Points
+from dpm2_core.geometry.voxel import voxel_first
+
+SPACING = 1.5  # m between two edges
+_NEIGHBOURS, _RADIUS = 16, 1.5  # m
+_LENGTH = 1.0  # m that the neighbourhood of an edge spans vertically, at least
+_GAP = 0.5  # m between heights seen of an edge, at most: between sparser beams it is a guess where an edge is
+_SCORE = 0.2  # least of an edge: an upright patch five points high and four wide
+_CELL = 0.45  # m, of the columns that may hold an edge, and of the grid that thins them: an edge has many candidates
+_KEPT = 16  # best candidates for each edge wanted: more than are within the spacing of one
+
+
+def vertical_edges(cloud: Points, tree: cKDTree, most: int) -> Points:
+    """Up to `most` (k, 3) places on vertical edges and poles, the clearest first, `SPACING` m apart.
+
+    A place is the mean of 16 neighbours whose extent is linear and vertical. Sparse beams, and places without vertical
+    structure, give fewer or none: each must have been seen at heights no farther apart than 0.5 m, over 1 m.
+
+    Args:
+        cloud: (N, 3) m, of one point a voxel of about 0.3 m. tree: of the cloud.
+    """
+    candidates = cloud[_in_tall_columns(cloud)]
+    candidates = candidates[voxel_first(candidates, _CELL)]
+    if most <= 0 or not len(candidates):
+        return np.zeros((0, 3), np.float32)
+    distance, index = tree.query(candidates, _NEIGHBOURS)
+    index = np.where(distance <= _RADIUS, index, index[:, :1])  # a missing neighbour has distance inf
+    height = np.sort(cloud[index, 2], 1)
+    known = (height[:, -1] - height[:, 0] >= _LENGTH) & (np.diff(height, axis=1).max(1) <= _GAP)
+    around = cloud[index[known]] - candidates[known, None]
+    mean = around.mean(1)
+    score = verticality(around - mean[:, None])
+    order = np.argsort(-score, kind="stable")[: _KEPT * most]
+    order = order[score[order] >= _SCORE]
+    at = (candidates[known] + mean)[order]
+    return at[spaced(at, SPACING)[:most]]
+
+
+def verticality(centred: NDArray[np.floating]) -> NDArray[np.float64]:
+    """(N,) 0..1 of (N, k, 3) neighbourhoods about their means: 1 is a vertical line, 0 a patch without a direction.
+
+    (sqrt l1 - sqrt l2) / sqrt l1 with the largest eigenvalues of the covariance, times the vertical part of the axis.
+    """
+    C = (centred.transpose(0, 2, 1) @ centred).astype(np.float64) / centred.shape[1]
+    xx, xy, xz, yy, yz, zz = C[:, 0, 0], C[:, 0, 1], C[:, 0, 2], C[:, 1, 1], C[:, 1, 2], C[:, 2, 2]
+    mean = (xx + yy + zz) / 3
+    a, d, f = xx - mean, yy - mean, zz - mean
+    spread = np.sqrt((a * a + d * d + f * f + 2 * (xy * xy + xz * xz + yz * yz)) / 6)
+    det = a * (d * f - yz * yz) - xy * (xy * f - yz * xz) + xz * (xy * yz - d * xz)
+    angle = np.arccos(np.clip(det / np.maximum(2 * spread**3, 1e-300), -1, 1)) / 3
+    largest = mean + 2 * spread * np.cos(angle)
+    middle = mean + 2 * spread * np.cos(angle - 2 * np.pi / 3)
+    a, d, f = xx - largest, yy - largest, zz - largest
+    # The adjugate of C - l1 I is a multiple of the outer product of the axis with itself.
+    minors = np.stack([d * f - yz * yz, a * f - xz * xz, a * d - xy * xy])
+    total = minors.sum(0)
+    vertical = np.sqrt(np.clip(minors[2] / np.where(total > 0, total, 1.0), 0, 1)) * (total > 0)
+    ratio = np.sqrt(np.maximum(middle, 0) / np.maximum(largest, 1e-12))
+    return np.clip(1 - ratio, 0, 1) * vertical
+
+
+def spaced(points: Points, spacing: float) -> Index:
+    """Ascending indices of the (N, 3) points that stay if, in order, each drops those closer than `spacing` m."""
+    near = cKDTree(points).query_pairs(spacing, output_type="ndarray") if len(points) else np.zeros((0, 2), np.int64)
+    first, second = near.min(1, initial=len(points)), near.max(1, initial=0)
+    stays = np.ones(len(points), bool)
+    while len(first):  # at once all that no open point before them is close to; a few rounds decide all
+        blocked = np.zeros(len(points), bool)
+        blocked[second] = True
+        dropped = second[~blocked[first]]
+        stays[dropped] = False
+        open_ = stays[first] & stays[second]
+        first, second = first[open_], second[open_]
+    return np.flatnonzero(stays)
+
+
+def _in_tall_columns(cloud: Points) -> NDArray[np.bool_]:
+    """Mask of the points of columns that span at least the length of an edge: what is not ground or roof."""
+    cell = np.floor(cloud[:, :2] / _CELL).astype(np.int64)
+    cell -= cell.min(0, initial=0)
+    width = int(cell[:, 1].max(initial=0)) + 1
+    column = cell[:, 0] * width + cell[:, 1]
+    low = np.full(column.max(initial=-1) + 1, np.inf, np.float32)
+    high = -low
+    np.minimum.at(low, column, cloud[:, 2])
+    np.maximum.at(high, column, cloud[:, 2])
+    return (high - low >= _LENGTH)[column]

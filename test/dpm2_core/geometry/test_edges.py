@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Vertical edges: what is one, how far apart they lie, that they are found again, and scans that show none."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from dpm2_core.data.kitti import KittiSource
+from dpm2_core.geometry import se3
+from dpm2_core.geometry.edges import SPACING, spaced, vertical_edges, verticality
+from dpm2_core.geometry.sampling import Points, farthest_points, interleaved
+from dpm2_core.network.config import preset
+from dpm2_core.network.pyramid import build_pyramid, crop
+
+POLES = np.array([[8.0, 4.0], [-11.0, 6.0], [3.0, -14.0], [20.0, -9.0], [-6.0, -8.0]])
+
+
+def ground() -> Points:
+    """A square of 60 m, 1.7 m below the sensor, a point each 0.4 m."""
+    x, y = np.meshgrid(np.arange(-30, 30, 0.4), np.arange(-30, 30, 0.4))
+    return np.stack([x.ravel(), y.ravel(), np.full(x.size, -1.7)], 1).astype(np.float32)
+
+
+def poles(step: float, noise: np.random.Generator) -> Points:
+    """5 m high, a point each `step` m, 1 cm of noise."""
+    z = np.arange(-1.7, 3.3, step)
+    at = [np.column_stack([np.tile(pole, (len(z), 1)), z]) for pole in POLES]
+    points = np.concatenate(at)
+    return (points + noise.normal(0, 0.01, points.shape)).astype(np.float32)
+
+
+def wall() -> Points:
+    """20 m long, 5 m high, along x, a point each 0.3 m."""
+    x, z = np.meshgrid(np.arange(-10, 10, 0.3), np.arange(-1.7, 3.3, 0.3))
+    return np.stack([x.ravel(), np.full(x.size, 18.0), z.ravel()], 1).astype(np.float32)
+
+
+def edges_of(cloud: Points, most: int = 128) -> Points:
+    return vertical_edges(cloud, cKDTree(cloud), most)
+
+
+def horizontally(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Distance of each of a to the nearest of b, seen from above."""
+    return np.linalg.norm(a[:, None, :2] - b[None, :, :2], axis=2).min(1)
+
+
+def test_poles_are_found_first(noise: np.random.Generator) -> None:
+    """Beside a wall and on ground: every pole, to 10 cm, before any place on the wall; none on the ground."""
+    cloud = np.concatenate([ground(), wall(), poles(0.3, noise)])
+    found = edges_of(cloud)
+    assert found.dtype == np.float32
+    on_pole = horizontally(found, POLES) < 0.25  # the ground at its foot is among a pole's neighbours
+    assert horizontally(POLES, found).max() < 0.1
+    assert on_pole[: 2 * len(POLES)].all()  # each is long enough for two places
+    assert (np.abs(found[~on_pole, 1] - 18) < 0.1).all()
+    between = np.linalg.norm(found[:, None] - found, axis=2) + np.eye(len(found)) * 9
+    assert between.min() >= SPACING
+    assert np.array_equal(edges_of(cloud, 3), found[:3])
+
+
+def test_found_again_from_elsewhere(noise: np.random.Generator) -> None:
+    """After a turn and a drive the same places on the poles: horizontally exact, along them to a voxel or two."""
+    cloud = np.concatenate([ground(), poles(0.3, noise)])
+    T = se3.exp([0, 0, 2.0, 7.0, -3.0, 0.2])
+    one, other = edges_of(cloud), edges_of(se3.transform(T, cloud).astype(np.float32))
+    assert horizontally(se3.transform(T, one), other).max() < 0.25
+    assert abs(len(one) - len(other)) <= len(POLES)
+
+
+@pytest.mark.parametrize(
+    "cloud",
+    [ground(), wall() * [1, 1, 0.15], np.zeros((0, 3)), np.ones((50, 3)), poles(0.3, np.random.default_rng(0))[:3]],
+)
+def test_nothing_vertical_gives_none(cloud: np.ndarray) -> None:
+    """Ground, a kerb, no points, one place, too few."""
+    assert edges_of(cloud.astype(np.float32)).shape == (0, 3)
+
+
+def test_sparse_beams_give_none(noise: np.random.Generator) -> None:
+    """A pole that is hit each 0.7 m, as by 16 beams 20 m away, is a guess; its place is left to farthest points."""
+    assert len(edges_of(np.concatenate([ground(), poles(0.7, noise)]))) == 0
+    assert len(edges_of(np.concatenate([ground(), poles(0.4, noise)]))) >= len(POLES)
+
+
+def test_verticality_is_that_of_the_eigenvectors(noise: np.random.Generator) -> None:
+    """Against `eigh`; a line is 1 or 0 by its direction, a point 0."""
+    local = noise.normal(size=(200, 16, 3)) * noise.uniform(0.01, 1, (200, 1, 3))
+    local -= local.mean(1, keepdims=True)
+    values, vectors = np.linalg.eigh(local.transpose(0, 2, 1) @ local / 16)
+    s = np.sqrt(values)
+    expected = (s[:, 2] - s[:, 1]) / s[:, 2] * np.abs(vectors[:, 2, 2])
+    np.testing.assert_allclose(verticality(local), expected, atol=1e-6)
+    line = np.zeros((3, 16, 3))
+    line[0, :, 2] = line[1, :, 0] = np.linspace(-1, 1, 16)
+    np.testing.assert_allclose(verticality(line), [1, 0, 0], atol=1e-6)
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 600])
+def test_spacing_is_that_of_one_after_the_other(noise: np.random.Generator, n: int) -> None:
+    """The rounds give what a loop in order gives."""
+    points = noise.uniform(0, 12, (n, 3)).astype(np.float32)
+    stays: list[int] = []
+    for i, point in enumerate(points):
+        if all(np.linalg.norm(point - points[j]) > SPACING for j in stays):
+            stays.append(i)
+    assert spaced(points, SPACING).tolist() == stays
+
+
+@pytest.mark.parametrize(("n", "k", "first"), [(100, 0, 40), (100, 20, 40), (100, 13, 40), (30, 15, 40), (40, 40, 40)])
+def test_any_prefix_holds_the_mixture(n: int, k: int, first: int) -> None:
+    """Both kinds keep their order, and every prefix of the first has the same ratio of them, to one point."""
+    points, special = np.zeros((n, 3), np.float32), np.ones((k, 3), np.float32)
+    points[:, 1], special[:, 1] = np.arange(n), np.arange(k)
+    out = interleaved(points, special, first)
+    is_special = out[:, 0] == 1
+    assert out[is_special, 1].tolist() == list(range(k))
+    assert out[~is_special, 1].tolist() == list(range(n - k))
+    first = min(n, first)
+    assert not is_special[first:].any()
+    assert np.abs(is_special[:first].cumsum() - k / first * np.arange(1, first + 1)).max() <= 1
+
+
+def test_farthest_points_take_the_place_of_missing_edges(noise: np.random.Generator) -> None:
+    """Reference points are edges in turns with farthest points; on bare ground they are farthest points alone."""
+    salient, farthest = (preset("small", {"fusion": {"reference": kind}}) for kind in ("salient", "fps"))
+    assert np.array_equal(build_pyramid(ground(), salient).xyz, build_pyramid(ground(), farthest).xyz)
+    cloud = np.concatenate([ground(), poles(0.3, noise)])
+    edges = edges_of(cloud)
+    pyramid, plain = build_pyramid(cloud, salient), build_pyramid(cloud, farthest)
+    of_edge = (pyramid.xyz[:, None] == edges).all(2).any(1)
+    assert of_edge.sum() == of_edge[: salient.fusion.points].sum() == len(edges)
+    assert of_edge[: salient.fusion.points // 2].sum() == pytest.approx(len(edges) / 2, abs=1)
+    assert np.array_equal(pyramid.xyz[~of_edge], plain.xyz[: pyramid.count - len(edges)])
+
+
+def test_edges_of_real_scans_meet_again(kitti_root: Path) -> None:
+    """4 m farther along KITTI 04, five times as many as of farthest points lie within 0.4 m of another scan's."""
+    sequence = KittiSource(kitti_root / "sequences" / "04")
+    settings = preset("small").points
+    frames = list(sequence.frames())
+    one, other = (crop(frames[i].points, settings) for i in (10, 13))
+    assert sequence.poses is not None
+    T = se3.inverse(sequence.poses[10]) @ sequence.poses[13]
+
+    def met(a: Points, b: Points) -> float:
+        return float((cKDTree(a).query(se3.transform(T, b))[0] < 0.4).mean())
+
+    edges = met(edges_of(one), edges_of(other))
+    assert edges > 0.2
+    assert edges > 5 * met(one[farthest_points(one, 256)], other[farthest_points(other, 256)])
