@@ -36,7 +36,7 @@ from dpm2_core.tables import FigureTable
 from dpm2_ros.bench_network import LOSS, Link, inside
 from dpm2_ros.conversions import cloud_to_msg, parse_keyframe_name
 from dpm2_ros.replay import ros_environment, start, stop
-from dpm2_ros.runtime import exit_code
+from dpm2_ros.runtime import exit_code, ros_context
 
 ROAD = "07"
 SPANS = {"red": (0, 420), "blue": (340, 760), "green": (680, 1100)}
@@ -55,12 +55,11 @@ class _Scans:
         import rclpy
         from nav_msgs.msg import Odometry
         from rclpy.executors import SingleThreadedExecutor
-        from rclpy.signals import SignalHandlerOptions
         from sensor_msgs.msg import PointCloud2
 
         from dpm2_ros.mapping import KEEP_ALL
 
-        rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+        ros_context([])
         self._source, self.made = source, {name: set[int]() for name in SPANS}
         self._node = rclpy.create_node("scans")
         self._executor = SingleThreadedExecutor()

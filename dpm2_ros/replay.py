@@ -23,7 +23,7 @@ from dpm2_core.data.messages import decode_points, stamp_ns
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Array, Points
-from dpm2_ros.share import share_directory
+from dpm2_ros.runtime import ros_context
 
 Nanoseconds = NDArray[np.int64]
 
@@ -60,9 +60,8 @@ class Replay:
 
 
 def ros_environment(domain: int | None = None) -> dict[str, str]:
-    """This process' environment with the DDS profile, on this machine only, in a domain that others hardly use."""
+    """This process' environment, on this machine only, in a domain that others hardly use."""
     return os.environ | {
-        "FASTRTPS_DEFAULT_PROFILES_FILE": str(share_directory() / "config" / "fastdds.xml"),
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
         "ROS_DOMAIN_ID": str(random.randint(1, 100) if domain is None else domain),
         "PYTHONUNBUFFERED": "1",
@@ -174,13 +173,12 @@ class _Listener:
         from diagnostic_msgs.msg import DiagnosticArray
         from nav_msgs.msg import Odometry
         from rclpy.executors import SingleThreadedExecutor
-        from rclpy.signals import SignalHandlerOptions
         from sensor_msgs.msg import PointCloud2
 
         from dpm2_ros.mapping import KEEP_ALL, LAST_ONE
         from dpm2_ros.tf import TFMessage
 
-        rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+        ros_context([])
         self._node = rclpy.create_node("replay_listener")
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self._node)

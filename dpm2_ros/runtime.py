@@ -6,18 +6,22 @@ rclpy's own handlers give up at the second SIGINT, which `ros2 launch` sends, an
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import threading
 from collections.abc import Callable, Sequence
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_ros.share import share_directory
 
 _SWITCH = 5e-4
 """s until a thread must hand Python's lock on. The odometry asks for it tens of times a frame; with the usual 5 ms a
 network in the thread of the map keeps it waiting each time."""
+_PROFILE, _NEW_NAME = "FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE"
 STOP = threading.Event()
 """Set by the first signal."""
 
@@ -52,8 +56,22 @@ def exit_code(work: Callable[[], int | None]) -> int:
         return 2
 
 
-def ros_context(arguments: Sequence[str]) -> None:
-    """rclpy.init without its signal handlers.
+def use_dds_profile() -> None:
+    """From here on Fast DDS has the shared memory that clouds need, unless the user has configured it.
+
+    It reads the variable when the process makes its first participant; that of Jazzy knows only the older name.
+    """
+    configured = os.environ.get("FASTDDS_BUILTIN_TRANSPORTS") or Path("DEFAULT_FASTRTPS_PROFILES.xml").is_file()
+    if os.environ.get(_PROFILE) or (configured and not os.environ.get(_NEW_NAME)):
+        return
+    try:
+        os.environ[_PROFILE] = os.environ.get(_NEW_NAME) or str(share_directory() / "config" / "fastdds.xml")
+    except Dpm2Error as error:
+        print(f"large messages may be lost, without the DDS profile: {error}", file=sys.stderr)
+
+
+def ros_context(arguments: Sequence[str], domain: int | None = None) -> None:
+    """rclpy.init with the DDS profile and without its signal handlers; `domain`: None takes that of the environment.
 
     Raises:
         UsageError: `--ros-args` that ROS does not understand.
@@ -61,8 +79,9 @@ def ros_context(arguments: Sequence[str]) -> None:
     import rclpy
     from rclpy.signals import SignalHandlerOptions
 
+    use_dds_profile()
     try:
-        rclpy.init(args=list(arguments), signal_handler_options=SignalHandlerOptions.NO)
+        rclpy.init(args=list(arguments), domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # rclpy raises RCLError, UnknownROSArgsError and RuntimeError by the kind of mistake
         raise UsageError(f"ROS arguments: {str(error).splitlines()[0]}") from None
 

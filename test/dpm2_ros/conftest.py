@@ -18,7 +18,6 @@ import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import PointCloud2
 
 from dpm2_core.data.convert import convert_kitti
@@ -28,11 +27,9 @@ from dpm2_core.sim.config import LidarConfig
 from dpm2_core.sim.drive import simulate
 from dpm2_ros.conversions import cloud_to_msg
 from dpm2_ros.replay import ros_environment
+from dpm2_ros.runtime import ros_context
 
-ENVIRONMENT = ros_environment(domain=1)
-os.environ.update(
-    {name: ENVIRONMENT[name] for name in ("FASTRTPS_DEFAULT_PROFILES_FILE", "ROS_AUTOMATIC_DISCOVERY_RANGE")}
-)
+os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = ros_environment()["ROS_AUTOMATIC_DISCOVERY_RANGE"]
 _domains = iter(range(1, 10**6))
 
 FRAMES, PERIOD, STEP = 16, 100_000_000, 0.8  # scans, ns and m between them
@@ -135,9 +132,7 @@ class Harness:
     def __init__(self, parameters: Sequence[str], domain: int, namespace: str) -> None:
         pairs = [part for pair in ("ros.map_directory:=''", *parameters) for part in ("-p", pair)]
         remap = ["-r", f"__ns:={namespace}"] if namespace else []
-        rclpy.init(
-            args=["--ros-args", *pairs, *remap], domain_id=domain, signal_handler_options=SignalHandlerOptions.NO
-        )
+        ros_context(["--ros-args", *pairs, *remap], domain)
         self.node = rclpy.create_node("tester", use_global_arguments=False)
         self.received: dict[str, list[Any]] = {}
         self._executor = SingleThreadedExecutor()
