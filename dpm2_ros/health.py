@@ -104,6 +104,7 @@ class Diagnostics:
         self._mapper, self._sender = mapper, sender
         self.frame_problem = ""
         """Set while there is no pose of the frame that was asked for."""
+        self._lost_before = 0
         self._publisher = DiagnosticsPublisher(node, self._statuses)
 
     def publish(self) -> None:
@@ -124,11 +125,27 @@ class Diagnostics:
             out.append(mapper_status(self._node, self._mapper))
         return [*out, message_status(self._node)]
 
+    def account(self) -> str:
+        """What became of all clouds that were sent since the first that arrived, in words; for when none is at work."""
+        synchronizer, lost = self._inputs.synchronizer, self._inputs.losses.count
+        received, waiting, processed = synchronizer.received, len(synchronizer), self._health.processed
+        rejected = sum(synchronizer.counts[why] for why in (Verdict.REPEATED, Verdict.OUT_OF_ORDER, Verdict.STRAY))
+        rare = {
+            "rejected for their stamps": rejected,
+            "still waiting": waiting,
+            "ended by an internal error": received - rejected - synchronizer.dropped - waiting - processed,
+        }
+        return (
+            f"{received + lost} clouds sent: {processed} processed, {synchronizer.dropped} dropped (queue full), "
+            f"{lost} lost on the way" + "".join(f", {count} {what}" for what, count in rare.items() if count)
+        )
+
     def _odometry(self) -> DiagnosticStatus:
-        synchronizer, health = self._inputs.synchronizer, self._health
+        synchronizer, health, losses = self._inputs.synchronizer, self._health, self._inputs.losses
         counts = synchronizer.counts
         figures = health.figures() | {
-            "received": str(sum(counts.values())),
+            "received": str(synchronizer.received),
+            "lost on the way": str(losses.count),
             "dropped (queue full)": str(synchronizer.dropped),
             "refused (stamp repeated)": str(counts[Verdict.REPEATED]),
             "refused (stamp out of order)": str(counts[Verdict.OUT_OF_ORDER]),
@@ -162,6 +179,9 @@ class Diagnostics:
         if problem := self._clock_problem():
             self._node.get_logger().warning(problem, once=True)
             level, text = max(level, WARN), f"{text}; {problem}"
+        if losses.count > self._lost_before:
+            level, text = max(level, WARN), f"{text}; {losses.count} clouds lost on the way"
+        self._lost_before = losses.count
         return self._status("odometry", level, text, figures)
 
     def _clock_problem(self) -> str:

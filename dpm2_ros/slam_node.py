@@ -34,6 +34,7 @@ from dpm2_ros.settings import NodeConfig
 from dpm2_ros.subscriptions import Inputs
 from dpm2_ros.synchronizer import Bundle
 from dpm2_ros.tf import TransformBroadcaster
+from dpm2_ros.warm_up import warm_up
 
 HELD = 300
 """Poses kept while the base frame is not known."""
@@ -53,16 +54,10 @@ class SlamNode(GuardedNode):
         if ros.localization_mode and not ros.embed_mapper:
             raise UsageError("ros.localization_mode: needs ros.embed_mapper")
         self._odometry = make_odometry(self._config.slam, self._robot)
-        reading = self._config.input.model_copy(
-            update={"images": self._config.input.images and self._odometry.uses_images}
-        )
-        self._inputs = Inputs(self, reading, ros)
-        self._frames = FrameBuilder(reading, self._inputs, self.get_logger().error)
         self._mapper = MapperThread(self, self._config, self._robot) if ros.embed_mapper else None
         self._health = Health()
         weights = weights_identity(self._config.slam)
         self._sender = KeyframeSender(self, self._robot, ros.odom_frame, not ros.embed_mapper, weights)
-        self._diagnostics = Diagnostics(self, self._inputs, self._frames, self._health, self._mapper, self._sender)
         self._odom = self.create_publisher(Odometry, "dpm2/odom", 10)
         self._described = make_loops(self._config.slam).described
         # Idle with the mapper, which has its own.
@@ -76,6 +71,14 @@ class SlamNode(GuardedNode):
         self._stopping = threading.Event()
         self._base = BaseFrame(ros.base_frame, (ros.odom_frame, ros.map_frame))
         self._waited = False  # for the base frame
+        warm_up(self._config.slam)
+        # Last of all: who is subscribed is ready, and whoever waits for subscribers loses nothing.
+        reading = self._config.input.model_copy(
+            update={"images": self._config.input.images and self._odometry.uses_images}
+        )
+        self._inputs = Inputs(self, reading, ros)
+        self._frames = FrameBuilder(reading, self._inputs, self.get_logger().error)
+        self._diagnostics = Diagnostics(self, self._inputs, self._frames, self._health, self._mapper, self._sender)
         self._begin()
         self._index = 0
         self._worker = threading.Thread(target=self._work, name="worker")
@@ -92,9 +95,7 @@ class SlamNode(GuardedNode):
         self._worker.join()
         self._give_up()
         self._line.shutdown(wait=True)
-        self.get_logger().info(
-            f"{self._health.processed} clouds processed, {self._inputs.synchronizer.dropped} dropped"
-        )
+        self.get_logger().info(self._diagnostics.account())
         if self._mapper is not None:
             self._mapper.close()
 

@@ -7,7 +7,7 @@ import copy
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from rclpy.clock import Clock
@@ -23,6 +23,7 @@ from dpm2_core.data.messages import stamp_ns
 from dpm2_core.data.source import InputSettings
 from dpm2_core.data.transforms import TransformTree
 from dpm2_core.errors import UsageError
+from dpm2_ros.losses import Losses
 from dpm2_ros.settings import RosSettings
 from dpm2_ros.synchronizer import Bundle, Synchronizer, Verdict
 from dpm2_ros.tf import TFMessage
@@ -43,13 +44,20 @@ class MatchedSubscription:
         topic: its full name, after remapping.
     """
 
-    def __init__(self, node: Node, kind: type, topic: str, callback: Callable[[Any], None], ros: RosSettings) -> None:
+    def __init__(self, node: Node, kind: type, topic: str, callback: Callable[..., None], ros: RosSettings) -> None:
         self._node, self._kind, self._callback = node, kind, callback
         self._setting, self._depth = ros.reliability, ros.queue_depth
         self._given, self.topic = topic, node.resolve_topic_name(topic)
         self.reliability = ReliabilityPolicy.RELIABLE
         self._subscription: Any = None
         self.refresh()
+
+    def take(self) -> None:
+        """Call back, in the executor's thread, with all that has arrived; it would take one of each topic in turn."""
+        handle = self._subscription.handle
+        with handle:  # not to be destroyed meanwhile
+            while (taken := handle.take_message(self._kind, False)) is not None:
+                self._subscription.callback(taken[0])
 
     def refresh(self) -> None:
         """Follow the publishers of this moment."""
@@ -114,6 +122,8 @@ class Inputs:
             timeout=ros.sync_timeout,
             tolerance=settings.image_tolerance,
         )
+        self.losses = Losses()
+        """Clouds that were sent, and never arrived."""
         self.camera_info: CameraInfo | None = None
         self.angle_correction_deg: float | None = None
         self.static = StaticTransforms(node)
@@ -168,14 +178,25 @@ class Inputs:
             if kind in kinds and topic not in own and self._node.count_publishers(topic)
         )
 
-    def _on_cloud(self, message: PointCloud2) -> None:
+    def _on_cloud(self, message: PointCloud2, info: Mapping[str, Any]) -> None:
+        cloud, *others = self.subscriptions
+        for other in reversed(others):  # what was sent before the cloud is to be there before it; calibration first
+            other.take()
         if stamped := stamp_ns(message.header):
             self._times.append((stamped, self._node.get_clock().now().nanoseconds))
+        stamp = self._stamp(message)
+        # Several publishers count each for themselves.
+        number = info.get("publication_sequence_number") if self._node.count_publishers(cloud.topic) < 2 else None
         with self._arrived:
             for camera in self.synchronizer.cameras:
-                camera.present = bool(self._node.count_publishers(self.subscriptions[1].topic))
-            verdict = self.synchronizer.add_cloud(self._stamp(message), message, time.monotonic())
+                camera.present = bool(self._node.count_publishers(others[0].topic))
+            lost = self.losses.add(stamp, number)
+            verdict = self.synchronizer.add_cloud(stamp, message, time.monotonic())
             self._arrived.notify()
+        if lost:
+            self._node.get_logger().warning(
+                f"{lost} clouds before that at {stamp / 1e9:.3f} s were lost on the way", throttle_duration_sec=5
+            )
         if verdict is not Verdict.ACCEPTED:
             self._node.get_logger().warning(
                 f"cloud at {stamp_ns(message.header) / 1e9:.3f} s: {verdict}", throttle_duration_sec=5

@@ -94,7 +94,13 @@ class Synchronizer:
         self._left: Bundle | None = None  # the last cloud that went
 
     def __len__(self) -> int:
-        return len(self._queue)
+        """Clouds that are waiting."""
+        return len(self._queue) + (self._jumped is not None)
+
+    @property
+    def received(self) -> int:
+        """Clouds that have come in."""
+        return sum(self.counts.values()) + (self._jumped is not None)
 
     def add_cloud(self, stamp: int, cloud: Any, now: float) -> Verdict:
         """Take a cloud with its stamp (ns); `now` is when it arrived."""

@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What never arrived is counted: exactly by the publisher's numbers, else by the rhythm of the stamps."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dpm2_ros.losses import Losses
+
+PERIOD = 103_600_000  # ns: KITTI's LiDAR
+
+
+def count(stamps: list[int], numbers: list[int] | None = None) -> int:
+    losses = Losses()
+    each = [losses.add(stamp, number) for stamp, number in zip(stamps, numbers or [None] * len(stamps), strict=True)]
+    assert sum(each) == losses.count
+    return losses.count
+
+
+@given(arrived=st.sets(st.integers(0, 300), min_size=1), first=st.integers(1, 10**6), seed=st.integers(0, 9))
+def test_numbers_are_exact_whatever_the_stamps_say(arrived: set[int], first: int, seed: int) -> None:
+    """From the first that arrives to the last; a publisher has numbered others before."""
+    kept = sorted(arrived)
+    stamps = np.cumsum(np.random.default_rng(seed).integers(0, 10**10, kept[-1] + 1))[kept]
+    assert count(stamps.tolist(), [first + n for n in kept]) == kept[-1] - kept[0] + 1 - len(kept)
+
+
+def test_another_publisher_begins_anew() -> None:
+    stamps = [n * PERIOD for n in range(6)]
+    assert count(stamps, [7, 8, 10, 1, 2, 3]) == 1
+
+
+def test_several_publishers_have_no_common_numbers() -> None:
+    """Without a number in between nothing can be said of the numbers around it."""
+    losses = Losses()
+    for n, number in enumerate([1, 2, None, 40, 41]):
+        losses.add(n * PERIOD, number)
+    assert losses.count == 0
+
+
+@pytest.mark.parametrize("missing", [{10}, {10, 11, 12}, {9, 15, 16, 40}, set(range(20, 35)), set(range(8, 60, 3))])
+def test_the_rhythm_of_the_stamps_tells_what_is_missing(missing: set[int]) -> None:
+    """With the jitter of a spinning LiDAR: a twentieth of a period."""
+    jitter = np.random.default_rng(0).integers(-PERIOD // 20, PERIOD // 20, 60)
+    stamps = [n * PERIOD + int(jitter[n]) for n in range(60) if n not in missing]
+    assert count(stamps) == len(missing - {59})
+
+
+@pytest.mark.parametrize(
+    "periods",
+    [
+        pytest.param(3.5, id="no whole number of periods"),
+        pytest.param(100.0, id="a real pause"),
+        pytest.param(0.0, id="repeated"),
+        pytest.param(-30.0, id="a looped bag"),
+    ],
+)
+def test_other_gaps_of_the_stamps_are_no_losses(periods: float) -> None:
+    before = [n * PERIOD for n in range(20)]
+    after = [before[-1] + round((periods + n) * PERIOD) for n in range(20)]
+    assert count(before + after) == 0
+
+
+def test_nothing_is_said_before_the_rhythm_is_known() -> None:
+    assert count([0, PERIOD, 5 * PERIOD]) == 0
