@@ -19,16 +19,19 @@ from rosgraph_msgs.msg import Clock
 
 from dpm2_core.data import topics
 from dpm2_core.data.bag_file import Bag, open_bag
+from dpm2_core.data.bags import CLOUD
 from dpm2_core.data.prefetch import prefetch
 from dpm2_core.errors import UsageError
 from dpm2_core.files import atomic_write
 from dpm2_ros.conversions import stamp_to_msg
+from dpm2_ros.lockstep import ODOMETRY, Lockstep
 from dpm2_ros.runtime import STOP, ros_context
 
 LATCHED = (topics.TF_STATIC, topics.VERTICAL_ANGLE_CORRECTION)
 CLOCK_PERIOD = 0.01
 """Seconds between two /clock messages."""
-_CLOUD = "sensor_msgs/msg/PointCloud2"
+DELIVERY = 5.0
+"""Seconds that the end of a recording may take to arrive: a receipt that is lost is asked for again after three."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,7 @@ class Options:
     subscribers: int
     clock: bool
     log: Path | None
+    lockstep: bool = False
 
 
 class BagPlayer:
@@ -63,13 +67,15 @@ class BagPlayer:
             raise UsageError(f"{options.bag}: no topic {', '.join(missing)}; topics: {', '.join(self._bag.types)}")
         self._publishers = self._make_publishers()
         self._clock = node.create_publisher(Clock, "/clock", 10) if options.clock else None
+        self._lockstep = Lockstep(node, self._bag, self._publishers) if options.lockstep else None
         self._published: list[str] = []  # lines of the log
+        self._clouds = 0
 
-    def play(self) -> int:
-        """Play to the end, or until a signal; returns the number of messages.
+    def play(self) -> None:
+        """Play to the end, or until a signal, and say how much it was.
 
         Raises:
-            Dpm2Error: the log cannot be written.
+            Dpm2Error: the log cannot be written; in lockstep, no odometry answers, or not every cloud was answered.
         """
         self._publish_latched()
         self._await_subscribers()
@@ -79,19 +85,24 @@ class BagPlayer:
             if STOP.is_set() or not self._options.loop:
                 break
             self._node.get_logger().info(f"{self._options.bag}: again from the start")
-        self._await_delivery(seconds=0.0 if STOP.is_set() else 1.0)
+        self._await_delivery()
         for note in self._bag.notes:
             self._node.get_logger().warning(note)
         if self._options.log is not None:
             with atomic_write(self._options.log) as file:
                 file.writelines(["topic,log_time_ns,published_ns\n", *self._published])
-        return count
+        if self._lockstep is not None:
+            self._lockstep.conclude()
+        self._node.get_logger().info(f"{self._options.bag}: {count} messages played, {self._clouds} of them clouds")
 
     def _make_publishers(self) -> dict[str, Any]:
         """Latched topics first: whoever knows of a later one then knows of these."""
         wanted = self._options.topics or tuple(self._bag.types)
         publishers = {}
         for topic in sorted(wanted, key=lambda topic: topic not in LATCHED):
+            if self._options.lockstep and topic == self._node.resolve_topic_name(ODOMETRY):
+                self._node.get_logger().warning(f"{topic} is left out: the odometry of now is to answer")
+                continue
             kind = self._bag.types[topic]
             package, _, name = kind.replace("/msg/", "/").partition("/")
             try:
@@ -112,46 +123,67 @@ class BagPlayer:
             self._publishers[topic].publish(bytes(data))
 
     def _await_subscribers(self) -> None:
-        """Until the clouds (or, without any, everything) have their subscribers; not for ever."""
-        options = self._options
-        clouds = [topic for topic in self._publishers if self._bag.types[topic] == _CLOUD] or list(self._publishers)
-        end = time.monotonic() + options.wait
-        while waiting := [t for t in clouds if self._publishers[t].get_subscription_count() < options.subscribers]:
-            if time.monotonic() >= end:
-                self._node.get_logger().warning(f"playing, though nobody listens to {', '.join(waiting)} yet")
-                return
+        """Until the clouds (or, without any, anything) have their subscribers; not for ever."""
+        options, log = self._options, self._node.get_logger()
+        clouds = [topic for topic in self._publishers if self._bag.types[topic] == CLOUD] or list(self._publishers)
+        began, told = time.monotonic(), False
+        while sum(self._publishers[topic].get_subscription_count() for topic in clouds) < options.subscribers:
+            waited = time.monotonic() - began
+            if waited >= options.wait:
+                log.warning(f"playing, though nobody listens to {', '.join(clouds)} yet")
+                break
+            if waited > 1.0 and not told:
+                log.info(f"waiting {options.wait:g} s at most for somebody to listen to {', '.join(clouds)}")
+                told = True
             if STOP.wait(0.02):
                 return
+        if self._lockstep is not None:
+            self._lockstep.find(began + options.wait)
         STOP.wait(0.2)  # other topics of the same subscriber are matched within moments of each other
 
-    def _await_delivery(self, seconds: float) -> None:
-        """What is on its way must not end with the process. A last receipt may come only seconds later."""
-        end = time.monotonic() + seconds
-        for publisher in self._publishers.values():
-            publisher.wait_for_all_acked(Duration(seconds=max(0.0, end - time.monotonic())))
+    def _await_delivery(self) -> None:
+        """What is on its way must not end with the process: clouds above all, which are told when they do not arrive.
+
+        A receipt for the last message, if it is small, may come only seconds after the message.
+        """
+        began = time.monotonic()
+        for topic in sorted(self._publishers, key=lambda topic: self._bag.types[topic] != CLOUD):
+            cloud = self._bag.types[topic] == CLOUD
+            end = began + (DELIVERY if cloud else 1.0)
+            while not STOP.is_set() and not self._publishers[topic].wait_for_all_acked(Duration(seconds=0.1)):
+                if time.monotonic() >= end:
+                    if cloud:
+                        self._node.get_logger().warning(f"{topic}: not every cloud has arrived within {DELIVERY:g} s")
+                    break
 
     def _play_once(self) -> int:
-        count, origin, began, ticked = 0, None, 0.0, 0.0
-        for topic, log_time, data in prefetch(self._selected()):
-            if origin is None:
-                origin, began = log_time, time.monotonic()
-            due = began + (log_time - origin) * 1e-9 / self._options.rate
-            while (left := due - time.monotonic()) > 0:
-                now = log_time - round(left * self._options.rate * 1e9)
-                self._tick(now)
-                if STOP.wait(min(left, CLOCK_PERIOD)):
-                    return count
-            if time.monotonic() - ticked > CLOCK_PERIOD or topic not in LATCHED:
-                self._tick(log_time)
-                ticked = time.monotonic()
+        count, now, origin = 0, 0, (0, 0.0)
+        messages = self._selected()
+        for topic, log_time, data in prefetch(messages if self._lockstep is None else self._lockstep.order(messages)):
+            if not count:
+                origin = log_time, time.monotonic()
+            if self._lockstep is None:
+                self._pace(log_time, *origin)
+            else:
+                self._lockstep.turn(topic, data)
             if STOP.is_set():
                 return count
+            now = max(now, log_time)  # in lockstep a cloud comes later than it was recorded
+            self._tick(now)
             published = time.monotonic_ns()
             self._publishers[topic].publish(data)
             count += 1
+            self._clouds += self._bag.types[topic] == CLOUD
             if self._options.log is not None:
                 self._published.append(f"{topic},{log_time},{published}\n")
         return count
+
+    def _pace(self, log_time: int, origin: int, began: float) -> None:
+        """Until a message is due, of a recording that begins at `origin` ns and was begun at `began` s."""
+        due = began + (log_time - origin) * 1e-9 / self._options.rate
+        while (left := due - time.monotonic()) > 0 and not STOP.is_set():
+            self._tick(log_time - round(left * self._options.rate * 1e9))
+            STOP.wait(min(left, CLOCK_PERIOD))
 
     def _selected(self) -> Iterator[tuple[str, int, bytes]]:
         """The messages of the stretch that is asked for."""
@@ -189,17 +221,23 @@ def _play(
     duration: Annotated[float | None, typer.Option(help="seconds to play, of the recording's time", min=0)] = None,
     loop: Annotated[bool, typer.Option("--loop", help="start again at the end, until stopped")] = False,
     topics: Annotated[list[str] | None, typer.Option(help="only these topics; may be repeated")] = None,
-    wait: Annotated[float, typer.Option(help="longest wait for somebody to listen to the clouds, s", min=0)] = 2.0,
+    wait: Annotated[float, typer.Option(help="longest wait for somebody to listen to the clouds, s", min=0)] = 30.0,
     subscribers: Annotated[int, typer.Option(help="how many listeners to wait for", min=1)] = 1,
     clock: Annotated[bool, typer.Option(help="publish /clock, for nodes with use_sim_time")] = True,
     log: Annotated[Path | None, typer.Option(help="CSV file for the moment at which each message went out")] = None,
+    lockstep: Annotated[
+        bool, typer.Option("--lockstep", help="no timing: each cloud when dpm2/odom has answered the one before")
+    ] = False,
 ) -> int:
     """Publish a recording. Exit code 2 for one that cannot be read."""
+    if lockstep and rate != 1.0:
+        raise UsageError("--lockstep goes as fast as it is answered: without --rate")
     node = rclpy.create_node("bag_player")
     try:
-        options = Options(bag, rate, start, duration, loop, tuple(topics or ()), wait, subscribers, clock, log)
-        count = BagPlayer(node, options).play()
-        node.get_logger().info(f"{bag}: {count} messages played")
+        options = Options(
+            bag, rate, start, duration, loop, tuple(topics or ()), wait, subscribers, clock, log, lockstep
+        )
+        BagPlayer(node, options).play()
     finally:
         node.destroy_node()
     return 0

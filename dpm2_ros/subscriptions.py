@@ -128,16 +128,18 @@ class Inputs:
         self.angle_correction_deg: float | None = None
         self.static = StaticTransforms(node)
         self._times: deque[tuple[int, int]] = deque(maxlen=5)
-        self.subscriptions = [MatchedSubscription(node, PointCloud2, points_topic, self._on_cloud, ros)]
+        beside: list[MatchedSubscription] = []
         if self.image_topic:
             image_type = CompressedImage if self.image_topic.endswith("/compressed") else Image
             info_topic = settings.camera_info_topic or _camera_info_beside(node, image_topic)
-            self.subscriptions += [
+            beside = [
                 MatchedSubscription(node, image_type, image_topic, self._on_image, ros),
                 MatchedSubscription(node, CameraInfo, info_topic, self._on_camera_info, ros),
             ]
         self._correction_topic = node.resolve_topic_name(topics.VERTICAL_ANGLE_CORRECTION)
         node.create_subscription(Float64, topics.VERTICAL_ANGLE_CORRECTION, self._on_correction, LATCHED)
+        # The last to be announced: who waits for it has found the others.
+        self.subscriptions = [MatchedSubscription(node, PointCloud2, points_topic, self._on_cloud, ros), *beside]
         node.create_timer(0.1, self._refresh, clock=STEADY)
 
     def take(self, timeout: float) -> Bundle | None:

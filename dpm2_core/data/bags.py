@@ -26,11 +26,12 @@ from dpm2_core.geometry import se3
 
 Stamps = NDArray[np.int64]
 
-_CLOUD = "sensor_msgs/msg/PointCloud2"
-_IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
-_INFO = "sensor_msgs/msg/CameraInfo"
+CLOUD = "sensor_msgs/msg/PointCloud2"
+IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 _TRUTH = ("nav_msgs/msg/Odometry", "nav_msgs/msg/Path")
-_LATE = 500_000_000  # ns of log time that a cloud waits for its image
+LATE = 500_000_000
+"""ns of log time that a cloud waits for its image."""
 _BUFFERED_IMAGES = 32  # bounds memory where their stamps are of no use
 _TRUTH_GAP = 1_000_000_000  # ns between two true poses beyond which nothing is known in between
 
@@ -83,7 +84,9 @@ class BagSource:
     @cached_property
     def stamps(self) -> Stamps:
         """(len,) ns: the header's stamp, or the time of recording where it is 0. Reads the clouds through once."""
-        return np.array([_stamp(data, time) for _, time, data in self._bag.messages([self.points_topic])], np.int64)
+        return np.array(
+            [serialized_stamp(data, time) for _, time, data in self._bag.messages([self.points_topic])], np.int64
+        )
 
     @cached_property
     def poses(self) -> Array | None:
@@ -99,7 +102,7 @@ class BagSource:
         return next((topic for topic in (asked, topics.ODOMETRY, topics.PATH) if topic in found), "")
 
     def _choose_points(self) -> str:
-        asked, found = self._settings.points_topic, self._bag.topics(_CLOUD)
+        asked, found = self._settings.points_topic, self._bag.topics(CLOUD)
         if asked or not found:
             if asked in found:
                 return asked
@@ -114,14 +117,14 @@ class BagSource:
 
     def _choose_image(self) -> str:
         """An image topic, empty for none."""
-        asked, found = self._settings.image_topic, self._bag.topics(*_IMAGES)
+        asked, found = self._settings.image_topic, self._bag.topics(*IMAGES)
         if not self._settings.images:
             return ""
         if asked:
             if asked not in found:
                 raise UsageError(f"{self.path}: no images on {asked}; {self._contents()}")
             return asked
-        silent = [topic for topic, kind in self._bag.types.items() if kind in _IMAGES and topic not in found]
+        silent = [topic for topic, kind in self._bag.types.items() if kind in IMAGES and topic not in found]
         if silent:
             self.notes.append(f"no message on the image topic {', '.join(silent)}")
         if len(found) > 1 and topics.IMAGE not in found:
@@ -132,7 +135,7 @@ class BagSource:
     def _camera(self) -> Camera | None:
         namespace = self.image_topic.removesuffix("/compressed").rpartition("/")[0]
         info_topic = self._settings.camera_info_topic or f"{namespace}/camera_info"
-        info = self._bag.first(info_topic) if self._bag.types.get(info_topic) == _INFO else None
+        info = self._bag.first(info_topic) if self._bag.types.get(info_topic) == CAMERA_INFO else None
         if info is None:
             if self._settings.image_topic or self._settings.camera_info_topic:
                 raise UsageError(
@@ -165,11 +168,11 @@ class BagSource:
         shift = round(self._settings.image_time_offset * 1e9)
         for topic, time, data in self._bag.messages([self.points_topic, self.image_topic][: 2 if self.camera else 1]):
             if topic == self.points_topic:
-                clouds.append((_stamp(data, time), time, data))
+                clouds.append((serialized_stamp(data, time), time, data))
             else:
-                images.append((_stamp(data, time) + shift, data))
+                images.append((serialized_stamp(data, time) + shift, data))
             while clouds and (
-                not self.camera or (images and images[-1][0] >= clouds[0][0]) or time - clouds[0][1] > _LATE
+                not self.camera or (images and images[-1][0] >= clouds[0][0]) or time - clouds[0][1] > LATE
             ):
                 stamp, _, cloud = clouds.popleft()
                 yield stamp, cloud, self._nearest(stamp, images)
@@ -243,7 +246,7 @@ def interpolate(stamps: Stamps, poses: Array, at: Stamps) -> Array:
     return out
 
 
-def _stamp(data: bytes, time: int) -> int:
+def serialized_stamp(data: bytes, time: int) -> int:
     """Stamp in ns of a serialized message that begins with a header, without decoding the rest; `time` if it is 0."""
     if len(data) < 12:
         return time

@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`python -m dpm2_ros.bench_replay BAG`: slam_node and bag_player started together; what becomes of each cloud."""
+
+from __future__ import annotations
+
+import re
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.box import SIMPLE
+from rich.console import Console
+from rich.table import Table
+
+from dpm2_core.errors import Dpm2Error
+from dpm2_ros.replay import ros_environment, start, stop
+from dpm2_ros.runtime import exit_code
+
+PLAYED = (("--rate", "1"), ("--rate", "2"), ("--lockstep",))
+_ACCOUNT = re.compile(r"(\d+) clouds sent: (\d+) processed, (\d+) dropped \(queue full\), (\d+) lost on the way(.*)")
+
+
+def bench(
+    bag: Annotated[Path, typer.Argument(help="rosbag2 folder or .mcap, such as that of `make demo`")],
+    times: Annotated[int, typer.Option(min=1, help="Replays of each kind.")] = 5,
+) -> int:
+    """Play a bag at its own speed, at twice that, and in lockstep. Exit code 1 if a cloud is not accounted for."""
+    table = Table(title=f"{bag}, node and player started together", title_justify="left", box=SIMPLE)
+    for column in ("played", "sent", "processed", "dropped", "lost", "sum", "playing s", ""):
+        table.add_column(column, justify="right")
+    wrong = 0
+    for played in PLAYED:
+        for _ in range(times):
+            sent, (_, *counts), rest, seconds = together(bag, played)
+            wrong += sum(counts) != sent
+            row = (sent, *counts, sum(counts), f"{seconds:.1f}", rest.strip(", "))
+            table.add_row(" ".join(played), *map(str, row))
+    Console().print(table)
+    return 1 if wrong else 0
+
+
+def together(bag: Path, played: tuple[str, ...]) -> tuple[int, tuple[int, ...], str, float]:
+    """One replay into a node with its defaults, which saves nothing.
+
+    Returns:
+        Clouds that the player sent; those that the node knows of, processed, dropped, lost; what else it says of them;
+        seconds from the first message to the last.
+
+    Raises:
+        Dpm2Error: a process failed.
+    """
+    with tempfile.TemporaryDirectory(prefix="dpm2_replay_") as folder:
+        environment, logs = ros_environment(), Path(folder)
+        quiet = ["--ros-args", "-p", "ros.map_directory:=''", "-p", "use_sim_time:=true"]
+        node = start("slam_node", quiet, environment, logs / "slam_node")
+        times = logs / "times.csv"
+        player = start("bag_player", [str(bag), *played, "--log", str(times)], environment, logs / "bag_player")
+        try:
+            code = player.wait()
+            time.sleep(3.0)  # the queue of the node: ten clouds
+        finally:
+            player.kill()
+            ended = stop(node)
+        said = {name: (logs / name).read_text(errors="replace") for name in ("slam_node", "bag_player")}
+        account = _ACCOUNT.search(said["slam_node"])
+        sent = re.search(r"(\d+) of them clouds", said["bag_player"])
+        if code or ended or account is None or sent is None:
+            raise Dpm2Error("a replay failed:\n" + "\n".join(said.values()))
+        published = [int(line.rsplit(",", 1)[1]) for line in times.read_text().splitlines()[1:]]
+        counts = tuple(int(number) for number in account.groups()[:4])
+        return int(sent[1]), counts, account[5], (published[-1] - published[0]) * 1e-9
+
+
+def main() -> int:
+    """Entry point of `python -m dpm2_ros.bench_replay`."""
+    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+    app.command()(bench)
+    return exit_code(lambda: app(standalone_mode=False))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,267 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A replay loses nothing, and what is lost all the same is counted; in lockstep it is exact."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from nav_msgs.msg import Odometry
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+from sensor_msgs.msg import PointCloud2
+
+from dpm2_core.commands.run import run
+from dpm2_core.config import load_settings
+from dpm2_core.data import topics
+from dpm2_core.data.bag_file import open_bag
+from dpm2_core.data.bags import BagSource
+from dpm2_core.data.messages import stamp_ns
+from dpm2_core.data.trajectory import read_trajectory
+from dpm2_core.data.transforms import transform_matrix
+from dpm2_core.errors import Dpm2Error
+from dpm2_core.slam.system import Config, SlamSystem
+from dpm2_ros import lockstep
+from dpm2_ros.bag_player import BagPlayer, Options
+from dpm2_ros.conversions import pose_to_msg
+from dpm2_ros.replay import ros_environment, start, stop
+from dpm2_ros.slam_node import SlamNode
+
+OPTIONS = Options(
+    bag=Path(), rate=1.0, start=0.0, duration=None, loop=False, topics=(), wait=20.0, subscribers=1, clock=False,
+    log=None, lockstep=True,
+)  # fmt: skip
+PROFILE, SEGMENT = "FASTRTPS_DEFAULT_PROFILES_FILE", 32 * 2**20
+
+
+@pytest.fixture
+def processes() -> Iterator[list[subprocess.Popen[bytes]]]:
+    """To be killed at the end."""
+    started: list[subprocess.Popen[bytes]] = []
+    yield started
+    for process in started:
+        process.kill()
+        process.wait()
+
+
+def test_started_at_the_same_moment_nothing_is_lost(
+    processes: list[Any], bag: Path, drive: Any, domain: int, tmp_path: Path
+) -> None:
+    """The node subscribes when it is ready; no cloud waits for an import. Then too fast: what is dropped is counted."""
+    imports = {"PYTHONPROFILEIMPORTTIME": "1"}  # each is a line of the log
+    arguments, environment = ["--ros-args", "-p", "ros.map_directory:=''"], ros_environment(domain)
+    node = start("slam_node", arguments, environment | imports, tmp_path / "node")
+    processes.append(node)
+    for rate, name in (("1", "in time"), ("100", "too fast")):
+        processes.append(start("bag_player", [str(bag), "--rate", rate], environment, tmp_path / name))
+        assert processes[-1].wait(60) == 0
+        assert f"{drive.frames} of them clouds" in (tmp_path / name).read_text()
+        if rate == "1":
+            ready, _, driving = (tmp_path / "node").read_text().partition("waiting for clouds")
+    assert "import time:" in ready
+    assert "import time:" not in driving
+    time.sleep(1.5)  # the last clouds are on their way through the node
+    assert stop(node) == 0
+    account = re.search(r"(\d+) clouds sent: (\d+) processed, (.*)", (tmp_path / "node").read_text())
+    assert account is not None
+    parts = [int(number) for number in re.findall(r"\d+", account[3])]
+    assert int(account[1]) == int(account[2]) + sum(parts) == 2 * drive.frames
+    assert drive.frames < int(account[2]) < 2 * drive.frames  # all of the first time
+    assert "lost on the way" in account[3]
+
+
+def test_losses_are_in_diagnostics(ros: Callable[..., Any], drive: Any) -> None:
+    """Real ones: while the executor is held up, DDS keeps as many clouds as the queue may hold, and no more."""
+    harness = ros("input.images:=false", "ros.queue_depth:=2")
+    lidar, odometry = harness.publisher(PointCloud2, topics.POINTS), harness.hear(Odometry, "/dpm2/odom")
+    diagnostics = harness.hear(DiagnosticArray, "/diagnostics")
+    node = harness.add(SlamNode())
+    harness.wait(lambda: lidar.get_subscription_count() and node.count_subscribers("/dpm2/odom"), "the node")
+    lidar.publish(drive.cloud(0))
+    harness.wait(lambda: odometry, "the first")
+    holding = threading.Event()
+    held = harness.node.create_timer(0.0, lambda: (held.cancel(), holding.set(), time.sleep(1.0)))
+    harness.wait(holding.is_set, "the executor to be held up")
+    for n in range(1, drive.frames):
+        lidar.publish(drive.cloud(n))
+        time.sleep(0.02)
+    harness.wait(lambda: stamp_ns(odometry[-1].header) == drive.stamp(drive.frames - 1), "the last")
+    seen = len(diagnostics)
+    harness.wait(lambda: len(diagnostics) > seen + 1, "diagnostics of the end")
+    (status,) = [one for one in diagnostics[-1].status if one.name.endswith("odometry")]
+    values = {value.key: value.value for value in status.values}
+    dropped, lost = int(values["dropped (queue full)"]), int(values["lost on the way"])
+    assert int(values["processed"]) + dropped + lost == int(values["received"]) + lost == drive.frames
+    assert lost >= 5
+    told = [one.message for message in diagnostics for one in message.status]
+    assert any(f"{lost} clouds lost on the way" in text for text in told)
+
+
+@pytest.fixture(scope="module")
+def fast_camera(bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The drive with three images a cloud, recorded 30 ms after their stamps: the nearest is the second, which comes
+    after the cloud; and with a calibration that comes only after the first cloud."""
+    types = get_typestore(Stores.ROS2_JAZZY)
+    source, rng = open_bag(bag), np.random.default_rng(2)
+    out: list[tuple[int, str, str, bytes]] = []
+    for topic, log_time, data in source.messages(list(source.types)):
+        kind = source.types[topic]
+        if topic == topics.CAMERA_INFO:
+            out.append((log_time + 45_000_000, topic, kind, data))
+        elif topic == topics.IMAGE:
+            image = source.decode(topic, data)
+            for shift in (-20_000_000, 12_000_000, 45_000_000):
+                stamp = log_time + shift
+                image.header.stamp.sec, image.header.stamp.nanosec = stamp // 10**9, stamp % 10**9
+                grey = cv2.GaussianBlur(rng.integers(0, 255, (40, 120), np.uint8), (0, 0), 2)
+                pixels = np.repeat(cv2.normalize(grey, None, 0, 255, cv2.NORM_MINMAX)[..., None], 3, 2)
+                image = replace(image, data=pixels.reshape(-1))
+                out.append((stamp + 30_000_000, topic, kind, bytes(types.serialize_cdr(image, kind))))
+        else:
+            out.append((log_time, topic, kind, data))
+    folder = tmp_path_factory.mktemp("fast") / "camera"
+    with Writer(folder, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP) as writer:
+        connections = {t: writer.add_connection(t, kind, typestore=types) for t, kind in source.types.items()}
+        for log_time, topic, _, data in sorted(out, key=lambda message: message[0]):
+            writer.write(connections[topic], log_time, data)
+    return folder
+
+
+def test_lockstep_gives_the_trajectory_of_dpm2_run(
+    ros: Callable[..., Any], processes: list[Any], fast_camera: Path, drive: Any, tmp_path: Path
+) -> None:
+    """Bit for bit, pictures included: here every answer is moved by what the picture of its cloud says."""
+    settings = ["slam.visual.sigma=0.0001", "slam.visual.min_correlation=0.0", "slam.visual.distinct=0.0"]
+    harness = ros()
+    odometry = harness.hear(Odometry, "/dpm2/odom")
+    environment = ros_environment(harness.node.context.get_domain_id())
+    given = [*(text.replace("=", ":=") for text in settings), "ros.base_frame:=velo_link", "ros.map_directory:=''"]
+    arguments = ["--ros-args", *(part for one in given for part in ("-p", one))]
+    processes.append(start("slam_node", arguments, environment, tmp_path / "node"))
+    player = start("bag_player", [str(fast_camera), "--lockstep"], environment, tmp_path / "player")
+    processes.append(player)
+    assert player.wait(60) == 0, (tmp_path / "player").read_text()
+    assert f"each of {drive.frames} clouds had its odometry" in (tmp_path / "player").read_text()
+    harness.wait(lambda: len(odometry) == drive.frames, "the odometry")
+
+    def expected(*more: str) -> list[Any]:
+        config = load_settings(Config, None, [*settings, *more])
+        system = SlamSystem(config.slam)
+        tracked = [system.process(frame) for frame in BagSource(fast_camera, config.input).frames()]
+        return [pose_to_msg(one.T_odom_lidar) for one in tracked]
+
+    assert [message.pose.pose for message in odometry] == expected()
+    assert [message.pose.pose for message in odometry] != expected("input.image_time_offset=-0.03")  # other pictures
+    run(fast_camera, tmp_path / "out", settings=settings)
+    written = read_trajectory(tmp_path / "out" / "trajectory.tum")
+    assert written.keys.tolist() == [stamp_ns(message.header) for message in odometry]
+    poses = [transform_matrix(message.pose.pose) for message in odometry]
+    np.testing.assert_allclose(written.poses, poses, rtol=0, atol=1e-10)  # it has 12 digits
+
+
+class Answerer:
+    """Publishes an odometry for clouds, as slam_node does, but only for those that it is told to."""
+
+    def __init__(self, harness: Any, answers: Callable[[int], bool]) -> None:
+        self.harness, self._answers = harness, answers
+        self.stamps: list[int] = []
+        self.publisher = harness.publisher(Odometry, "/dpm2/odom")
+        harness.node.create_subscription(PointCloud2, topics.POINTS, self._on_cloud, 10)
+        self.player = rclpy.create_node("player", use_global_arguments=False)
+
+    def _on_cloud(self, message: PointCloud2) -> None:
+        self.stamps.append(stamp_ns(message.header))
+        if self._answers(len(self.stamps)):
+            self.publisher.publish(Odometry(header=message.header))
+
+    def play(self, **options: Any) -> None:
+        try:
+            BagPlayer(self.player, replace(OPTIONS, **options)).play()
+        finally:
+            self.player.destroy_node()
+
+
+def test_a_cloud_without_an_answer_is_said_and_the_next_goes_out(
+    ros: Callable[..., Any], bag: Path, drive: Any, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(lockstep, "TIMEOUT", 0.5)
+    node = Answerer(ros(), lambda n: n != 5)
+    with pytest.raises(Dpm2Error, match=f"1 of {drive.frames} clouds had no odometry"):
+        node.play(bag=bag)
+    stamps = BagSource(bag).stamps.tolist()
+    assert node.stamps == stamps
+    assert f"no odometry within 0.5 s for the cloud at {stamps[4] * 1e-9:.3f} s" in capfd.readouterr().err
+
+
+def test_a_node_that_goes_away_ends_it(ros: Callable[..., Any], bag: Path) -> None:
+    harness = ros()
+
+    def answers(n: int) -> bool:
+        if n == 5:
+            harness.node.destroy_publisher(node.publisher)
+        return n < 5
+
+    node = Answerer(harness, answers)
+    with pytest.raises(Dpm2Error, match="nobody publishes /dpm2/odom any more"):
+        node.play(bag=bag)
+
+
+def test_without_a_node_that_answers_it_ends(run: Callable[..., Any], bag: Path) -> None:
+    ended = run("bag_player", str(bag), "--lockstep", "--wait", "0.5")
+    assert ended.returncode == 1
+    assert f"error: lockstep: no node turns {topics.POINTS} into /dpm2/odom" in ended.stderr
+
+
+def segments(process: subprocess.Popen[bytes]) -> list[int]:
+    """Bytes of the shared memory that Fast DDS has in a process."""
+    maps = Path(f"/proc/{process.pid}/maps").read_text().splitlines()
+    spans = [line.split()[0].split("-") for line in maps if "/dev/shm/fastrtps_" in line and "port" not in line]
+    return [int(end, 16) - int(begin, 16) for begin, end in spans]
+
+
+def test_the_dds_profile_is_used_unless_the_user_has_one(
+    processes: list[Any], bag: Path, domain: int, tmp_path: Path
+) -> None:
+    """The user's may be named by either variable, or Fast DDS be configured by another."""
+    shipped = Path(__file__).parents[2] / "config" / "fastdds.xml"
+    own = tmp_path / "own.xml"
+    own.write_text(shipped.read_text().replace(str(SEGMENT), str(SEGMENT // 2)))
+    inherited = {name: value for name, value in ros_environment(domain).items() if name != PROFILE}
+    found: dict[str, list[int]] = {}
+    environments: dict[str, dict[str, str]] = {
+        "none": {},
+        "own": {PROFILE: str(own)},
+        "newer name": {"FASTDDS_DEFAULT_PROFILES_FILE": str(own)},
+        "transports": {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"},
+    }
+    for n, (name, more) in enumerate(environments.items()):
+        alone = {"ROS_DOMAIN_ID": str(1 + (domain + n) % 100)}  # each sees the memory of those in its domain
+        processes.append(start("bag_player", [str(bag)], inherited | alone | more, tmp_path / name))
+    for name, process in zip(environments, processes, strict=True):
+        end = time.monotonic() + 30
+        while "waiting 30 s" not in (tmp_path / name).read_text() and time.monotonic() < end:
+            time.sleep(0.05)
+        found[name] = segments(process)
+        process.send_signal(signal.SIGINT)
+    assert max(found["none"]) >= SEGMENT, found
+    for name in ("own", "newer name"):  # there may be others, of whoever else is in that domain
+        assert any(SEGMENT // 2 <= size < SEGMENT for size in found[name]), found
+    assert max(found["transports"], default=0) < SEGMENT // 2, found
+
+
+def test_this_process_uses_it_too(ros: Callable[..., Any]) -> None:
+    ros()
+    assert Path(os.environ[PROFILE]).name == "fastdds.xml"
