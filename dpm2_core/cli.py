@@ -10,7 +10,7 @@ import typer
 
 from dpm2_core import __version__
 from dpm2_core.commands import bench, config, convert, eval, finetune, map, run, show, sim, tasks, train
-from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.errors import Dpm2Error, UsageError, printable
 
 app = typer.Typer(help="LiDAR-visual SLAM.", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 app.command()(run.run)
@@ -41,10 +41,10 @@ def _status(arguments: Sequence[str] | None) -> int:
     try:
         return app(args=list(arguments) if arguments is not None else None, standalone_mode=False) or 0
     except UsageError as error:
-        print(f"dpm2: {error}", file=sys.stderr)
+        print(f"dpm2: {printable(str(error))}", file=sys.stderr)
         return 2
     except Dpm2Error as error:
-        print(f"dpm2: {error}", file=sys.stderr)
+        print(f"dpm2: {printable(str(error))}", file=sys.stderr)
         return 1
     except Exception as error:
         # click's own errors of use (an unknown option, a missing argument) know their exit code and their message.

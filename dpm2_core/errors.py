@@ -8,3 +8,8 @@ class Dpm2Error(Exception):
 
 class UsageError(Dpm2Error):
     """The request cannot be carried out as given: no such file, an unknown key, a missing extrinsic. Exit code 2."""
+
+
+def printable(text: str) -> str:
+    """Text from a file or a message as one line for a terminal: what would steer it is shown, not sent."""
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)

@@ -11,6 +11,8 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 from rich.text import Text
 
+from dpm2_core.console import lines
+
 _PROSE = 24
 """Characters a line that text needs to be read with ease."""
 
@@ -34,7 +36,7 @@ class FigureTable:
         header: bool = True,
     ) -> None:
         """Headings of the columns of each kind; `header` False leaves them out."""
-        self._title, self._caption, self._header = title, caption, header
+        self._title, self._caption, self._header = lines(title), caption, header
         self._headings = [*names, *figures, *text]
         self._text = len(names) + len(figures)  # the first column of text
         self._names = len(names)
@@ -49,7 +51,7 @@ class FigureTable:
         """
         if len(cells) != len(self._headings):
             raise ValueError(f"{len(cells)} cells for {len(self._headings)} columns")
-        self._rows.append(list(cells))
+        self._rows.append([lines(cell) for cell in cells])
 
     def add_section(self) -> None:
         """A gap after the last row."""

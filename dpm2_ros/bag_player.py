@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import importlib
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -21,10 +20,11 @@ from dpm2_core.data import topics
 from dpm2_core.data.bag_file import Bag, open_bag
 from dpm2_core.data.bags import CLOUD
 from dpm2_core.data.prefetch import prefetch
-from dpm2_core.errors import UsageError
+from dpm2_core.errors import UsageError, printable
 from dpm2_core.files import atomic_write
 from dpm2_ros.conversions import stamp_to_msg
 from dpm2_ros.lockstep import ODOMETRY, Lockstep
+from dpm2_ros.message_types import message_type
 from dpm2_ros.runtime import STOP, ros_context
 
 LATCHED = (topics.TF_STATIC, topics.VERTICAL_ANGLE_CORRECTION)
@@ -104,15 +104,12 @@ class BagPlayer:
                 self._node.get_logger().warning(f"{topic} is left out: the odometry of now is to answer")
                 continue
             kind = self._bag.types[topic]
-            package, _, name = kind.replace("/msg/", "/").partition("/")
-            try:
-                message_type = getattr(importlib.import_module(f"{package}.msg"), name)
-            except (ImportError, AttributeError):
-                self._node.get_logger().warning(f"{topic} is left out: no message type {kind} here")
+            if (known := message_type(kind)) is None:
+                self._node.get_logger().warning(f"{printable(topic)} is left out: no message type {printable(kind)}")
                 continue
             durability = DurabilityPolicy.TRANSIENT_LOCAL if topic in LATCHED else DurabilityPolicy.VOLATILE
             qos = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=durability)
-            publishers[topic] = self._node.create_publisher(message_type, topic, qos)
+            publishers[topic] = self._node.create_publisher(known, topic, qos)
         if not publishers:
             raise UsageError(f"{self._options.bag}: nothing to publish")
         return publishers

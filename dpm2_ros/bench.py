@@ -10,8 +10,9 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from rich.console import Console, Group
+from rich.console import Group
 
+from dpm2_core.console import Console
 from dpm2_core.data import topics
 from dpm2_core.data.bags import BagSource
 from dpm2_core.data.convert import convert_kitti

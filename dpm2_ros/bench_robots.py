@@ -17,12 +17,12 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-from rich.console import Console
 from rich.progress import track
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from dpm2_core.config import load_settings
+from dpm2_core.console import Console
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.evaluation.bench.harness import Options, write_record
 from dpm2_core.evaluation.bench.roads import open_road, road_files

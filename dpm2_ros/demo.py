@@ -13,9 +13,9 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from dpm2_core.console import Console
 from dpm2_core.data.bags import BagSource
 from dpm2_core.data.convert import convert_kitti
 from dpm2_core.data.source import InputSettings
@@ -70,7 +70,7 @@ def demo(
     console.print(_table(source, result, outcome, out))
     failed = [check for check, holds in outcome.checks.items() if not holds]
     for check in failed:
-        console.print(f"[red]failed:[/red] {check}")
+        console.print(f"failed: {check}", style="red")
     if failed:
         console.print(f"logs: {out / 'slam_node.log'}, {out / 'bag_player.log'}")
     return 1 if failed else 0

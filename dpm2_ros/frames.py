@@ -56,7 +56,7 @@ class FrameBuilder:
             frame_id = self._inputs.camera_info.header.frame_id or message.header.frame_id
             T_lidar_cam = self._extrinsic(bundle.cloud.header.frame_id, frame_id)
             camera = decode_camera(self._inputs.camera_info, T_lidar_cam, frame_id or self._inputs.image_topic)
-            images = (Image(decode_image(message), camera),)
+            images = (Image(decode_image(message, camera.size), camera),)
         except (UsageError, ValueError) as error:
             self.image_problem = str(error)
             self._tell(f"{self._inputs.image_topic}: {error}; images are left out")

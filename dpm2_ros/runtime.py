@@ -15,7 +15,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.errors import Dpm2Error, UsageError, printable
 from dpm2_ros.share import share_directory
 
 _SWITCH = 5e-4
@@ -37,10 +37,10 @@ def exit_code(work: Callable[[], int | None]) -> int:
     try:
         return work() or 0
     except UsageError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {printable(str(error))}", file=sys.stderr)
         return 2
     except Dpm2Error as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {printable(str(error))}", file=sys.stderr)
         return 1
     except ModuleNotFoundError:
         if find_spec("rclpy") is not None:

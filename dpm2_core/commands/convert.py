@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from dpm2_core.console import Console
 
 app = typer.Typer(no_args_is_help=True, help="Convert a recording to a rosbag2 (MCAP) folder.")
 
@@ -41,4 +42,4 @@ def kitti(
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )  # fmt: skip
     for note in notes:
-        console.print(f"note: {note}", highlight=False, markup=False)
+        console.print(f"note: {note}", highlight=False)

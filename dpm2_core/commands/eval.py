@@ -9,9 +9,9 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from rich.console import Console
 
 from dpm2_core.config import load_settings
+from dpm2_core.console import Console
 from dpm2_core.data.kitti import read_calib
 from dpm2_core.data.source import InputSettings, open_source
 from dpm2_core.data.trajectory import Trajectory, matched, read_trajectory

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from dpm2_core.commands.train import ConfigOption, OutOption, ResumeOption, SetOption, refuse_overwriting
 from dpm2_core.config import load_settings
+from dpm2_core.console import Console
 from dpm2_core.tables import FigureTable
 
 

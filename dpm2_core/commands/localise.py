@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from dpm2_core.config import dump_settings
+from dpm2_core.console import Console
 from dpm2_core.data.prefetch import prefetch
 from dpm2_core.data.source import Source
 from dpm2_core.data.trajectory import write_tum

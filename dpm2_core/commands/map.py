@@ -10,11 +10,11 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from rich.console import Console
 from scipy.spatial.transform import Rotation
 
 from dpm2_core.commands.map_graph import optimize
 from dpm2_core.config import load_settings
+from dpm2_core.console import Console
 from dpm2_core.data.pcd import write_las, write_pcd
 from dpm2_core.data.ply import write_ply
 from dpm2_core.data.trajectory import write_kitti, write_tum
@@ -153,7 +153,7 @@ def check(
     from dpm2_core.slam.map.check import check_map
 
     found = check_map(path, recover)
-    console = Console(soft_wrap=True, highlight=False, markup=False)
+    console = Console(soft_wrap=True, highlight=False)
     for problem in found.problems:
         console.print(problem)
     if recover is not None:

@@ -11,8 +11,8 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-from rich.console import Console
 
+from dpm2_core.console import Console
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.files import atomic_write
 from dpm2_core.tables import FigureTable

@@ -12,11 +12,11 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from dpm2_core.commands.localise import parse_hint, run_localised
 from dpm2_core.config import dump_settings, load_settings
+from dpm2_core.console import Console
 from dpm2_core.data.corrupt import CorruptedSource, CorruptionSettings, parse_corruption
 from dpm2_core.data.ply import write_ply
 from dpm2_core.data.prefetch import prefetch

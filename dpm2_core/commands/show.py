@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
+from dpm2_core.console import Console
 from dpm2_core.data.source import InputSettings, Source, open_source
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Frame

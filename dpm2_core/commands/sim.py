@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from dpm2_core.config import settings_from
+from dpm2_core.console import Console
 from dpm2_core.sim.config import LidarConfig, PresetName
 
 
@@ -43,4 +43,4 @@ def sim(
             out, frames, seed, road, preset, images, lidar, workers=workers,
             progress=lambda done, total: bar.update(task, completed=done, total=total), traffic=traffic,
         )  # fmt: skip
-    console.print(f"{out}: {'written' if made else 'is there already'}", highlight=False, markup=False)
+    console.print(f"{out}: {'written' if made else 'is there already'}", highlight=False)

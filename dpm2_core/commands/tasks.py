@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from dpm2_core.commands.train import ConfigOption, OutOption, ResumeOption, SetOption, refuse_overwriting, train
 from dpm2_core.config import load_settings
+from dpm2_core.console import Console
 from dpm2_core.tables import FigureTable
 
 SourceArgument = Annotated[

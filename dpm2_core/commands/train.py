@@ -122,8 +122,7 @@ def ablation(
     report: Annotated[Path, typer.Option("--json", help="Table to write.")] = Path("benchmarks/ablation.json"),
 ) -> None:
     """The paper's Table 4: alternatives of the fusion, trained alike; continues where it was stopped."""
-    from rich.console import Console
-
+    from dpm2_core.console import Console
     from dpm2_core.evaluation.bench.harness import write_record
     from dpm2_core.tables import FigureTable
     from dpm2_core.training.ablation import AblationSettings

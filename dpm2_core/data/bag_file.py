@@ -1,24 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""rosbag2 recordings without ROS: what is in them, their messages in order, and what is left of damaged ones."""
+"""rosbag2 recordings without ROS: what is in them, their messages in order, and what is left of damaged ones.
+
+A bag defines its own message types; they are not used: a reader for them would be code made of what the file says.
+Types that ROS 2 Jazzy defines are read, others are only named.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
-from contextlib import suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cache, partial
+from heapq import merge
 from io import BufferedReader, FileIO
 from pathlib import Path
 from typing import Any
 
 from mcap.records import Channel, Message, Schema
 from mcap.stream_reader import StreamReader
-from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
 from dpm2_core.data.messages import MessageError
+from dpm2_core.database import check_plain
 from dpm2_core.errors import UsageError
 
 RawMessages = Iterator[tuple[str, int, bytes]]
@@ -40,7 +46,6 @@ class Bag:
     types: dict[str, str]
     counts: dict[str, int]
     _read: Callable[[Collection[str]], RawMessages]
-    _typestore: Typestore
     notes: list[str] = field(default_factory=list)
 
     def messages(self, topics: Collection[str]) -> RawMessages:
@@ -66,7 +71,7 @@ class Bag:
             MessageError: the bytes are no message of the topic's type.
         """
         try:
-            return self._typestore.deserialize_cdr(data, self.types[topic])
+            return _jazzy().deserialize_cdr(data, self.types[topic])
         except Exception as error:  # overwritten bytes raise anything from SerdeError to UnicodeDecodeError
             raise MessageError(f"{topic}: message of {len(data)} bytes is damaged ({_reason(error)})") from None
 
@@ -113,20 +118,36 @@ def _reason(error: Exception) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
+@cache
+def _jazzy() -> Typestore:
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+@contextmanager
+def _opened(paths: list[Path]) -> Iterator[list[Reader]]:
+    for path in paths:
+        for file in path.glob("*.db3") if path.is_dir() else [path]:
+            if file.suffix == ".db3":
+                check_plain(file)
+    with ExitStack() as stack:
+        yield [stack.enter_context(Reader(path)) for path in paths]
+
+
 def _open_indexed(path: Path, paths: list[Path]) -> Bag:
-    jazzy = get_typestore(Stores.ROS2_JAZZY)  # for recordings older than Iron, which carry no definitions
-    with AnyReader(paths, default_typestore=jazzy) as reader:
-        types = {connection.topic: connection.msgtype for connection in reader.connections}
-        counts = Counter(dict.fromkeys(types, 0))
-        for connection in reader.connections:
-            counts[connection.topic] += connection.msgcount
-        return Bag(path, types, dict(counts), partial(_read_indexed, paths, jazzy), reader.typestore)
+    with _opened(paths) as readers:
+        connections = [connection for reader in readers for connection in reader.connections]
+    types = {connection.topic: connection.msgtype for connection in connections}
+    counts = Counter(dict.fromkeys(types, 0))
+    for connection in connections:
+        counts[connection.topic] += connection.msgcount
+    return Bag(path, types, dict(counts), partial(_read_indexed, paths))
 
 
-def _read_indexed(paths: list[Path], jazzy: Typestore, topics: Collection[str]) -> RawMessages:
-    with AnyReader(paths, default_typestore=jazzy) as reader:
-        wanted = [connection for connection in reader.connections if connection.topic in topics]
-        for connection, time, data in reader.messages(wanted):
+def _read_indexed(paths: list[Path], topics: Collection[str]) -> RawMessages:
+    with _opened(paths) as readers:
+        wanted = [[c for c in reader.connections if c.topic in topics] for reader in readers]
+        streams = [reader.messages(connections=c) for reader, c in zip(readers, wanted, strict=True) if c]
+        for connection, time, data in merge(*streams, key=lambda message: message[1]):
             yield connection.topic, time, data
 
 
@@ -147,7 +168,7 @@ def _salvage(path: Path, files: list[Path], reason: str) -> Bag:
         counts[topic] += 1
     if not types:
         raise UsageError(f"{path}: truncated before its first message ({reason})")
-    bag = Bag(path, types, dict(counts), partial(_read_whole, files), get_typestore(Stores.ROS2_JAZZY))
+    bag = Bag(path, types, dict(counts), partial(_read_whole, files))
     bag.notes.append(f"{path}: truncated or never closed ({reason}); {counts.total()} messages of it could be saved")
     return bag
 

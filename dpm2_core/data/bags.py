@@ -200,7 +200,7 @@ class BagSource:
         if data is None or self.camera is None:
             return ()
         try:
-            return (Image(decode_image(self._bag.decode(self.image_topic, data)), self.camera),)
+            return (Image(decode_image(self._bag.decode(self.image_topic, data), self.camera.size), self.camera),)
         except (MessageError, ValueError) as error:
             self._note_once(f"images of {self.image_topic} that cannot be used are left out", f"the first: {error}")
             return ()

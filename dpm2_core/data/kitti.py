@@ -10,10 +10,10 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from dpm2_core.data.compressed import decode_compressed
 from dpm2_core.data.messages import scale_intensity
 from dpm2_core.data.source import InputSettings
 from dpm2_core.errors import UsageError
@@ -214,10 +214,9 @@ def read_scan(path: Path) -> tuple[Points, str | None]:
 def read_image(path: Path) -> NDArray[np.uint8] | None:
     """An image file to (H, W, 3) uint8 RGB; None if it cannot be decoded."""
     try:
-        pixels = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    except cv2.error:
+        return decode_compressed(path.read_bytes())
+    except (OSError, ValueError):
         return None
-    return None if pixels is None else cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB, dst=pixels)
 
 
 def read_calib(path: Path) -> dict[str, Array]:

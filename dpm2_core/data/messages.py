@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from dpm2_core.data.compressed import decode_compressed
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Camera, Points
 
@@ -260,14 +261,18 @@ def point_columns(points: Points) -> dict[str, Points]:
     return {name: points[:, i] for i, name in enumerate(("x", "y", "z", "intensity"))}
 
 
-def decode_image(msg: Any) -> NDArray[np.uint8]:
+def decode_image(msg: Any, size: tuple[int, int] | None = None) -> NDArray[np.uint8]:
     """sensor_msgs/Image or CompressedImage to (H, W, 3) uint8 RGB; of 16 bits the upper 8 count.
+
+    Args:
+        msg: the message.
+        size: width and height of the camera: a JPEG or PNG of another size is not decoded.
 
     Raises:
         MessageError: an encoding that is not supported, data shorter than declared, or a JPEG or PNG that is damaged.
     """
     if not hasattr(msg, "encoding"):
-        return _decode_compressed(msg)
+        return _decode_compressed(msg, size)
     encoding = str(msg.encoding)
     if encoding.lower() not in _IMAGE_ENCODINGS:
         raise MessageError(f"image encoding {encoding!r} is not supported; supported: {', '.join(_IMAGE_ENCODINGS)}")
@@ -286,17 +291,14 @@ def decode_image(msg: Any) -> NDArray[np.uint8]:
     return pixels if conversion is None else cv2.cvtColor(pixels, conversion)
 
 
-def _decode_compressed(msg: Any) -> NDArray[np.uint8]:
+def _decode_compressed(msg: Any, size: tuple[int, int] | None) -> NDArray[np.uint8]:
     if "compresseddepth" in msg.format.lower():
-        raise MessageError(f"compressed image format {msg.format!r} is not supported; supported: jpeg, png")
-    data = np.frombuffer(msg.data, np.uint8) if len(msg.data) else None
+        raise MessageError(f"compressed image format {msg.format[:40]!r} is not supported; supported: jpeg, png")
     try:
-        pixels = None if data is None else cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    except cv2.error:
-        pixels = None
-    if pixels is None:
-        raise MessageError(f"compressed image of format {msg.format!r} and {len(msg.data)} bytes cannot be decoded")
-    return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)
+        return decode_compressed(bytes(msg.data), size)
+    except ValueError as error:
+        what = f"compressed image of format {msg.format[:40]!r} and {len(msg.data)} bytes"
+        raise MessageError(f"{what} cannot be decoded: {error}") from None
 
 
 def decode_camera(info: Any, T_lidar_cam: Array, name: str) -> Camera:

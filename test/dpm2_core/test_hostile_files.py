@@ -231,3 +231,21 @@ def test_weights_that_are_cut_off_or_not_finite(tmp_path: Path, model: DeepPoint
     save_file({**state, name: torch.full_like(state[name], torch.nan)}, path, about)
     with pytest.raises(UsageError, match="values that are not finite"):
         load_model(path)
+
+
+def test_names_in_a_map_are_printed_and_not_interpreted(
+    tmp_path: Path, map_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Neither rich's markup nor what a terminal obeys."""
+    evil = "[red]x[/nope] :boom: \x1b]0;title\x07\x1b[2J\u202e\r"
+    for node in range(12):
+        put_keyframe(node, robot=evil)(map_file)
+    sql(map_file, ("UPDATE sessions SET program = ?, weights = ?", (evil, evil)))
+    with pytest.raises(SystemExit) as ended:
+        main(["map", "info", str(map_file)])
+    assert ended.value.code == 0
+    told = capsys.readouterr().out
+    assert "[red]x[/nope] :boom: \\x1b]0;title\\x07\\x1b[2J\\u202e\\r" in told
+    assert not any(ord(c) < 32 and c != "\n" for c in told)
+    sql(map_file, f'CREATE TABLE "{evil}" (x)')
+    assert "[red]x[/nope]" in rejected(["map", "info", str(map_file)], capsys)

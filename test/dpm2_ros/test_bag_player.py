@@ -6,6 +6,7 @@ from __future__ import annotations
 import csv
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rosbags.rosbag2 import StoragePlugin, Writer
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
@@ -162,3 +164,26 @@ def test_a_truncated_bag_plays_what_is_left(ears: Ears, bag: Path, tmp_path: Pat
     time.sleep(0.5)
     assert 0 < len(ears.clouds) < drive.frames
     assert "truncated" in ears.output()
+
+
+def test_a_type_is_imported_from_the_packages_of_ros_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """A bag that names a module which lies in the working directory: it is left out, and said so."""
+    package = tmp_path / "evil" / "msg"
+    package.mkdir(parents=True)
+    (package.parent / "__init__.py").write_text("")
+    (package / "__init__.py").write_text("print('imported')\nclass Thing: pass\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    writer = Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP)
+    with writer:
+        for topic, kind in (("/evil", "evil/msg/Thing"), ("/os", "os/msg/path"), ("/said", "std_msgs/msg/String")):
+            connection = writer.add_connection(topic, kind, msgdef="string data\n", rihs01="RIHS01_" + 64 * "0")
+            writer.write(connection, 1, b"\0\1\0\0\2\0\0\0a\0")
+    assert play_here(str(tmp_path / "bag"), "--wait", "0") == 0
+    told = capfd.readouterr()
+    assert "/evil is left out: no message type evil/msg/Thing" in told.err
+    assert "/os is left out: no message type os/msg/path" in told.err
+    assert "1 messages played" in told.err
+    assert "imported" not in told.out
+    assert "evil" not in sys.modules

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from dpm2_core.database import connect
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Array, Keyframe
 from dpm2_core.geometry import se3
@@ -21,7 +22,6 @@ from dpm2_core.slam.map import rows, schema
 from dpm2_core.slam.map.cloud_codec import pack_cloud, unpack_cloud, unpack_mask
 from dpm2_core.slam.map.cloud_store import CloudStore, Loan
 from dpm2_core.slam.map.data import NO_POINTS, MapData, save_as, subset
-from dpm2_core.slam.map.database import connect
 from dpm2_core.slam.map.rows import Edge, Pruned, Session
 
 _SMALLEST = 20  # bytes of a row: a file has at most so many as fit, and nobody waits for the row 2^62 of a small one

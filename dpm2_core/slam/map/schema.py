@@ -12,8 +12,8 @@ import struct
 import zlib
 from pathlib import Path
 
+from dpm2_core.database import check_schema, statements
 from dpm2_core.errors import UsageError
-from dpm2_core.slam.map.database import check_schema, statements
 
 APPLICATION_ID = 0x64706D32
 """The bytes `dpm2` at offset 68 of the file."""

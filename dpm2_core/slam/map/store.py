@@ -19,11 +19,11 @@ from pathlib import Path
 from typing import Any
 
 from dpm2_core import __version__
+from dpm2_core.database import Connection, connect
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Array, Keyframe
 from dpm2_core.slam.map import schema
 from dpm2_core.slam.map.cloud_store import Loan
-from dpm2_core.slam.map.database import Connection, connect
 from dpm2_core.slam.map.rows import (
     Edge,
     Pruned,

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from dpm2_core.slam.map.database import check_schema, connect
+from dpm2_core.database import check_schema, connect
 
 
 def test_a_query_without_end_is_ended(tmp_path: Path) -> None:

@@ -2,7 +2,8 @@
 """An SQLite file of unknown origin: nothing in it is executed, and nothing in it keeps a query busy without end.
 
 What sqlite.org/security.html asks of whoever opens such files. A map is tables and nothing else, so the text of its
-schema is compared with ours, and a view, a trigger or an expression in it is an error before any row is read.
+schema is compared with ours, and a view, a trigger or an expression in it is an error before any row is read; of a bag,
+which others wrote, only that it is plain tables.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ MAX_VALUE = 64 << 20
 """Bytes of one value or row: the largest cloud is a quarter of it."""
 _EVERY = 100_000  # steps of SQLite's virtual machine between two calls of the handler
 _STEPS = 30_000_000  # of one statement, besides one a byte of the file: a second or two
+
+_COMPUTED = re.compile(r"\b(AS|VIRTUAL|CHECK|WHERE)\b", re.IGNORECASE)
 
 
 class Connection(sqlite3.Connection):
@@ -82,11 +85,26 @@ def check_schema(connection: sqlite3.Connection, tables: Mapping[str, str]) -> N
     left = dict(tables)
     for kind, name, sql in connection.execute("SELECT type, name, sql FROM sqlite_master"):
         if kind != "table" or name not in left:
-            raise sqlite3.DatabaseError(f"malformed: {kind} {name} does not belong into a dpm2 map")
+            raise sqlite3.DatabaseError(f"malformed: {kind} {name} does not belong into it")
         if not isinstance(sql, str) or _bare(sql) != _bare(left.pop(name)):
-            raise sqlite3.DatabaseError(f"malformed: table {name} is not that of a dpm2 map")
+            raise sqlite3.DatabaseError(f"malformed: table {name} has other columns")
     if left:
         raise sqlite3.DatabaseError(f"malformed: no table {', '.join(left)}")
+
+
+def check_plain(path: Path) -> None:
+    """Whether a database has tables of values and ordinary indices only: nothing that is computed when it is read.
+
+    Raises:
+        sqlite3.DatabaseError: it has not, or cannot be read.
+    """
+    connection = connect(path, "ro")
+    try:
+        for kind, name, sql in connection.execute("SELECT type, name, sql FROM sqlite_master"):
+            if kind not in ("table", "index") or _COMPUTED.search(_bare(sql or "")):
+                raise sqlite3.DatabaseError(f"malformed: {kind} {name} does not belong into it")
+    finally:
+        connection.close()
 
 
 def statements(script: str) -> dict[str, str]:

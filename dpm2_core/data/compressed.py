@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""JPEG and PNG, whose size is read from their first bytes before anything is decoded: 100 kB can be 3 GB of pixels."""
+
+from __future__ import annotations
+
+import struct
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+MAX_PIXELS = 1 << 26
+"""Of an image whose camera is not known: 67 million."""
+_PNG = b"\x89PNG\r\n\x1a\n"
+_JPEG = b"\xff\xd8"
+_FRAMES = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # JPEG segments that give the size
+_BARE = {0x01, *range(0xD0, 0xD8)}  # and those without a length
+
+
+def compressed_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height of a JPEG or PNG; None for anything else, and where it is cut off before they are told."""
+    if data.startswith(_PNG) and data[12:16] == b"IHDR" and len(data) >= 24:
+        width, height = struct.unpack_from(">II", data, 16)
+        return int(width), int(height)
+    at = 2 if data.startswith(_JPEG) else len(data)
+    while at + 9 <= len(data) and data[at] == 0xFF:
+        kind = data[at + 1]
+        if kind in _FRAMES:
+            height, width = struct.unpack_from(">HH", data, at + 5)
+            return int(width), int(height)
+        if kind == 0xFF:  # filling
+            at += 1
+        else:
+            at += 2 + (0 if kind in _BARE else struct.unpack_from(">H", data, at + 2)[0])
+    return None
+
+
+def decode_compressed(data: bytes, size: tuple[int, int] | None = None) -> NDArray[np.uint8]:
+    """A JPEG or PNG to (H, W, 3) uint8 RGB.
+
+    Args:
+        size: width and height that it must have; None takes any up to `MAX_PIXELS`.
+
+    Raises:
+        ValueError: another format, another size, too large, or damaged.
+    """
+    found = compressed_size(data)
+    if found is None:
+        raise ValueError("neither JPEG nor PNG, or cut off")
+    if size is not None and found != size:
+        raise ValueError(f"{found[0]} x {found[1]} pixels, the camera has {size[0]} x {size[1]}")
+    if not 0 < found[0] * found[1] <= MAX_PIXELS:
+        raise ValueError(f"{found[0]} x {found[1]} pixels, at most {MAX_PIXELS} are decoded")
+    try:
+        flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error:
+        pixels = None
+    if pixels is None:
+        raise ValueError("damaged")
+    return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB, dst=pixels), np.uint8)
