@@ -12,7 +12,7 @@ EXTRAS ?= plot,sim,test
 # The environment is self-contained: a sourced ROS 2, another environment's bootstrap or its libraries must not leak in.
 unexport PYTHONPATH PYTHONHOME VIRTUAL_ENV AMENT_PREFIX_PATH ROS_DISTRO LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: help setup demo test lint bench bench-ros bench-robots bench-memory train-data train-small train-movers train-ground ablation sim parameters clean
+.PHONY: help setup demo test fuzz lint bench bench-ros bench-robots bench-memory train-data train-small train-movers train-ground ablation sim parameters clean
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:[^#]*##/\t/' | expand -t 16
 
@@ -33,6 +33,9 @@ ros:  # of all targets the demo alone is nothing without it
 
 test: setup  ## all tests
 	$(BIN)/python -m pytest $(ARGS)
+
+fuzz: setup  ## a minute of random messages, a thousand per second, on all that the nodes listen to, beside a drive
+	DPM2_FUZZ_SECONDS=60 DPM2_FUZZ_RATE=1000 $(BIN)/python -m pytest -s test/dpm2_ros/test_fuzz.py $(ARGS)
 
 lint: setup  ## style and types
 	@$(BIN)/python -c 'import ruff, mypy' 2>/dev/null || $(BIN)/python -m pip install -qq --disable-pip-version-check -e '.[lint]'

@@ -8,12 +8,13 @@ from collections.abc import Callable, Mapping
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
-from dpm2_ros.guard import GuardedNode
+from dpm2_ros.guard import GuardedNode, one_line
 from dpm2_ros.mapping import MapperThread
 from dpm2_ros.subscriptions import STEADY
 
 OK, WARN, ERROR, STALE = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR, DiagnosticStatus.STALE
 _RECENT = 10.0  # s
+_LONGEST = 1000  # characters of a text, some of which quote messages
 
 
 class DiagnosticsPublisher:
@@ -33,9 +34,9 @@ class DiagnosticsPublisher:
 
 def status(node: Node, part: str, level: bytes, text: str, figures: Mapping[str, object]) -> DiagnosticStatus:
     """Of a part of a node."""
-    values = [KeyValue(key=key, value=str(value)) for key, value in figures.items()]
+    values = [KeyValue(key=key, value=one_line(str(value), _LONGEST)) for key, value in figures.items()]
     name = f"{node.get_fully_qualified_name().lstrip('/')}: {part}"
-    return DiagnosticStatus(level=level, name=name, message=text, hardware_id="", values=values)
+    return DiagnosticStatus(level=level, name=name, message=one_line(text, _LONGEST), hardware_id="", values=values)
 
 
 def mapper_status(node: Node, mapper: MapperThread) -> DiagnosticStatus:

@@ -12,6 +12,7 @@ from dpm2_core.data.messages import MessageError, decode_camera, decode_image, d
 from dpm2_core.data.source import InputSettings
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Frame, Image
+from dpm2_ros.guard import one_line
 from dpm2_ros.subscriptions import Inputs
 from dpm2_ros.synchronizer import Bundle
 
@@ -42,7 +43,7 @@ class FrameBuilder:
             )
         except MessageError as error:
             self._tell(f"{self._inputs.points_topic}: {error}")
-            return Frame(bundle.stamp, np.empty((0, 4), np.float32), index=index, problem=str(error))
+            return Frame(bundle.stamp, np.empty((0, 4), np.float32), index=index, problem=one_line(str(error)))
         points = correct_vertical_angle(points, self._correction())
         return Frame(bundle.stamp, points, offset, self._images(bundle), index)
 
@@ -82,6 +83,7 @@ class FrameBuilder:
         return HDL64_CORRECTION_DEG if self._inputs.points_topic.startswith("/kitti/") else 0.0
 
     def _tell(self, text: str) -> None:
+        text = one_line(text)
         if text not in self._told and len(self._told) < 100:  # damaged data may be damaged in endless ways
             self._told.add(text)
             self._complain(text)

@@ -43,6 +43,13 @@ class Losses:
         self.count += lost
         return lost
 
+    def skip(self, number: int | None) -> None:
+        """A message with that number arrived, and is not used; so it is not lost."""
+        if number is not None:
+            if self._number is not None:
+                self.count += max(0, number - self._number - 1)
+            self._number = number
+
     def _step(self, stamp: int) -> int:
         """By the stamps alone."""
         before, self._stamp = self._stamp, stamp

@@ -3,13 +3,13 @@
 
 from __future__ import annotations
 
-import copy
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import numpy as np
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
@@ -19,15 +19,18 @@ from std_msgs.msg import Float64
 
 from dpm2_core.data import topics
 from dpm2_core.data.kitti import checked_correction
-from dpm2_core.data.messages import stamp_ns
+from dpm2_core.data.messages import decode_camera, stamp_ns
 from dpm2_core.data.source import InputSettings
 from dpm2_core.data.transforms import TransformTree
 from dpm2_core.errors import UsageError
+from dpm2_core.slam.map.admission import RejectedError
+from dpm2_ros.checks import check_header, check_size, extended, unreadable
 from dpm2_ros.losses import Losses
 from dpm2_ros.settings import RosSettings
 from dpm2_ros.synchronizer import Bundle, Synchronizer, Verdict
 from dpm2_ros.tf import TFMessage
 
+_OTHER_FRAME = 2.0  # s without a cloud after which one in another frame begins another drive
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 """For timers that must go on when /clock stops at the end of a bag."""
 
@@ -56,7 +59,9 @@ class MatchedSubscription:
         """Call back, in the executor's thread, with all that has arrived; it would take one of each topic in turn."""
         handle = self._subscription.handle
         with handle:  # not to be destroyed meanwhile
-            while (taken := handle.take_message(self._kind, False)) is not None:
+            for _ in range(self._depth):
+                if (taken := handle.take_message(self._kind, False)) is None:
+                    return
                 self._subscription.callback(taken[0])
 
     def refresh(self) -> None:
@@ -94,12 +99,10 @@ class StaticTransforms:
         return not publishers or (frame.lstrip("/") in self.tree.frames and self._messages >= publishers)
 
     def _on_message(self, message: Any) -> None:
-        tree = copy.deepcopy(self.tree)  # the worker may be reading the present one
-        try:
-            tree.add(message)
-        except UsageError as error:
-            self._node.get_logger().error(str(error))
-        self.tree, self._messages = tree, self._messages + 1
+        self._messages += 1
+        self.tree, problem = extended(self.tree, message)  # another tree: the worker may be reading the present one
+        if problem:
+            raise RejectedError("transform", problem)
 
 
 class Inputs:
@@ -125,6 +128,8 @@ class Inputs:
         self.losses = Losses()
         """Clouds that were sent, and never arrived."""
         self.camera_info: CameraInfo | None = None
+        self._calibrated = False  # by it
+        self._frame: str | None = None  # of the clouds
         self.angle_correction_deg: float | None = None
         self.static = StaticTransforms(node)
         self._times: deque[tuple[int, int]] = deque(maxlen=5)
@@ -180,15 +185,33 @@ class Inputs:
             if kind in kinds and topic not in own and self._node.count_publishers(topic)
         )
 
+    def _check_cloud(self, message: PointCloud2) -> None:
+        """An unreadable cloud counts as a failed scan where one was due; any other is not of this drive."""
+        now, frame = time.monotonic(), message.header.frame_id
+        check_header(message.header)
+        check_size(message, message.width * message.height)
+        last = self.synchronizer.last_arrival
+        if self._frame not in (None, frame) and last is not None and now - last < _OTHER_FRAME:
+            raise RejectedError("another frame", f"a cloud in frame {frame[:80]!r}; the drive's is {self._frame!r}")
+        problem, stamp = unreadable(message), stamp_ns(message.header)
+        if problem and not self.synchronizer.due(stamp, now):
+            raise RejectedError("unreadable", problem)
+        self._frame = frame
+
     def _on_cloud(self, message: PointCloud2, info: Mapping[str, Any]) -> None:
         cloud, *others = self.subscriptions
         for other in reversed(others):  # what was sent before the cloud is to be there before it; calibration first
             other.take()
+        # Several publishers count each for themselves.
+        number = info.get("publication_sequence_number") if self._node.count_publishers(cloud.topic) < 2 else None
+        try:
+            self._check_cloud(message)
+        except RejectedError:
+            self.losses.skip(number)
+            raise
         if stamped := stamp_ns(message.header):
             self._times.append((stamped, self._node.get_clock().now().nanoseconds))
         stamp = self._stamp(message)
-        # Several publishers count each for themselves.
-        number = info.get("publication_sequence_number") if self._node.count_publishers(cloud.topic) < 2 else None
         with self._arrived:
             for camera in self.synchronizer.cameras:
                 camera.present = bool(self._node.count_publishers(others[0].topic))
@@ -205,6 +228,8 @@ class Inputs:
             )
 
     def _on_image(self, message: Any) -> None:
+        check_header(message.header)
+        check_size(message)
         with self._arrived:
             stamp = self._stamp(message) + self._image_shift
             self.synchronizer.add_image(0, stamp, message, time.monotonic())
@@ -215,13 +240,18 @@ class Inputs:
         return stamp_ns(message.header) or self._node.get_clock().now().nanoseconds
 
     def _on_camera_info(self, message: CameraInfo) -> None:
+        check_header(message.header)
+        try:
+            decode_camera(message, np.eye(4), "camera")
+        except UsageError:
+            if self._calibrated:
+                raise  # what is known stays
+        else:
+            self._calibrated = True
         self.camera_info = message
 
     def _on_correction(self, message: Float64) -> None:
-        try:
-            self.angle_correction_deg = checked_correction(message.data, self._correction_topic)
-        except UsageError as error:
-            self._node.get_logger().error(f"{error}; ignored", throttle_duration_sec=5)
+        self.angle_correction_deg = checked_correction(message.data, self._correction_topic)
 
     def _refresh(self) -> None:
         for subscription in self.subscriptions:

@@ -116,6 +116,10 @@ class Synchronizer:
             self._accept(Bundle(stamp, cloud, now, restarted=False))
         return verdict
 
+    def due(self, stamp: int, now: float) -> bool:
+        """Whether a cloud of that stamp (ns) would be accepted as the next one of the drive."""
+        return self._newest is not None and self._judge(stamp, now) is Verdict.ACCEPTED
+
     def add_image(self, camera: int, stamp: int, image: Any, now: float) -> None:
         """Take an image of one camera with its stamp (ns)."""
         state = self.cameras[camera]

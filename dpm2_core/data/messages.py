@@ -33,6 +33,7 @@ _TIME_NAMES = (
     "stamp",
     "timestamps",
 )
+_XYZ = ("x", "y", "z")
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 # No sweep is longer, no useful one a thousand times shorter: so exactly one unit puts the span of a scan in this range.
 _LONGEST_SCAN = 2.0
@@ -61,6 +62,11 @@ _IMAGE_ENCODINGS: dict[str, tuple[str, int, int | None]] = {
 }
 
 
+_LARGEST_POINT = 1 << 16
+_DISTORTIONS = (0, 4, 5, 8, 12, 14)  # numbers of coefficients that OpenCV knows
+_WIDEST_IMAGE = 1 << 15
+
+
 class MessageError(UsageError):
     """A message that cannot be understood, in one line naming the field or encoding."""
 
@@ -83,6 +89,8 @@ def cloud_view(msg: Any, names: Collection[str] | None = None) -> NDArray[np.voi
         MessageError: the data is shorter than declared, or the layout contradicts itself.
     """
     step, width, height = int(msg.point_step), int(msg.width), int(msg.height)
+    if step > _LARGEST_POINT:
+        raise MessageError(f"PointCloud2: point_step {step}; at most {_LARGEST_POINT} bytes are read")
     order = ">" if msg.is_bigendian else "<"
     layout: dict[str, tuple[Any, int]] = {}
     for field in msg.fields:
@@ -114,6 +122,15 @@ def cloud_view(msg: Any, names: Collection[str] | None = None) -> NDArray[np.voi
     return np.ndarray((height, width), dtype, memoryview(msg.data), strides=(row, step)).reshape(-1)
 
 
+def check_cloud(msg: Any) -> None:
+    """Raises MessageError unless a sensor_msgs/PointCloud2 has points that can be read; takes microseconds."""
+    available = [field.name for field in msg.fields]
+    if missing := [name for name in _XYZ if name not in available]:
+        named = ", ".join(available[:20]) or "none"
+        raise MessageError(f"PointCloud2 has no field {', '.join(missing)}; fields: {named[:200]}")
+    cloud_view(msg, _XYZ)
+
+
 def decode_points(
     msg: Any, time_field: str | None = None, time_unit: TimeUnit = "auto", intensity_max: float | None = None
 ) -> tuple[Points, Points | None]:
@@ -139,15 +156,13 @@ def decode_points(
         MessageError: x, y or z, or the time field asked for, is missing (the message lists the fields there are), or
             `cloud_view` refused the layout.
     """
+    check_cloud(msg)
     available = [field.name for field in msg.fields]
-    xyz = ["x", "y", "z"]
-    if missing := [name for name in xyz if name not in available]:
-        raise MessageError(f"PointCloud2 has no field {', '.join(missing)}; fields: {', '.join(available) or 'none'}")
     if time_field and time_field not in available:
         raise MessageError(f"PointCloud2 has no time field {time_field}; fields: {', '.join(available)}")
     intensity = _usual(available, _INTENSITY_NAMES)
     time = _usual(available, _TIME_NAMES) if time_field is None else time_field
-    view = cloud_view(msg, [name for name in (*xyz, intensity, time) if name])
+    view = cloud_view(msg, [name for name in (*_XYZ, intensity, time) if name])
     points = _points(view, intensity, intensity_max)
     return points, _time_offset(view[time], points, stamp_ns(msg.header), time_unit) if time else None
 
@@ -211,7 +226,9 @@ def _time_offset(time: NDArray[Any], points: Points, stamp: int, unit: TimeUnit)
         origin = stamp * 1e-9 / scale
         if max(abs(first - origin), abs(last - origin)) * scale > _LONGEST_SCAN:
             origin = first  # the sensor's clock is not that of the stamps: the first point is all that can be known
-    return np.where(seen, (value - origin) * scale, 0.0).astype(np.float32)
+    with np.errstate(invalid="ignore", over="ignore"):
+        offset = (value - origin) * scale
+    return np.where(seen & (np.abs(offset) <= _LONGEST_SCAN), offset, 0.0).astype(np.float32)  # else it means nothing
 
 
 def _time_scale(first: float, last: float, floating: bool) -> float:
@@ -275,7 +292,9 @@ def decode_image(msg: Any, size: tuple[int, int] | None = None) -> NDArray[np.ui
         return _decode_compressed(msg, size)
     encoding = str(msg.encoding)
     if encoding.lower() not in _IMAGE_ENCODINGS:
-        raise MessageError(f"image encoding {encoding!r} is not supported; supported: {', '.join(_IMAGE_ENCODINGS)}")
+        raise MessageError(
+            f"image encoding {encoding[:40]!r} is not supported; supported: {', '.join(_IMAGE_ENCODINGS)}"
+        )
     kind, channels, conversion = _IMAGE_ENCODINGS[encoding.lower()]
     dtype = np.dtype((">" if msg.is_bigendian else "<") + kind)
     height, width, pixel = int(msg.height), int(msg.width), channels * dtype.itemsize
@@ -317,10 +336,12 @@ def decode_camera(info: Any, T_lidar_cam: Array, name: str) -> Camera:
     if not D.any():
         D, K = D[:0], P[:, :3].copy() if P[0, 0] else K
     elif info.distortion_model not in ("plumb_bob", "rational_polynomial"):
-        raise MessageError(f"{name}: distortion model {info.distortion_model!r} is not supported; "
+        raise MessageError(f"{name}: distortion model {info.distortion_model[:40]!r} is not supported; "
                            "supported: plumb_bob, rational_polynomial")  # fmt: skip
     if not (K[0, 0] > 0 and K[1, 1] > 0 and np.isfinite(K).all()):
         raise MessageError(f"{name}: CameraInfo has no focal length (the camera is not calibrated)")
-    if not (info.width and info.height):
-        raise MessageError(f"{name}: CameraInfo has no image size")
+    if len(D) not in _DISTORTIONS or not np.isfinite(D).all():
+        raise MessageError(f"{name}: CameraInfo has {len(D)} distortion coefficients, or some that are not finite")
+    if not (0 < info.width <= _WIDEST_IMAGE and 0 < info.height <= _WIDEST_IMAGE):
+        raise MessageError(f"{name}: CameraInfo has no image size, or one beyond {_WIDEST_IMAGE} pixels")
     return Camera(K, T_lidar_cam, (int(info.width), int(info.height)), tuple(D.tolist()), name)

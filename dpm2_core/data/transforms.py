@@ -14,6 +14,8 @@ from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 
+_LISTED = 20  # frames that an error names
+
 
 def transform_matrix(transform: Any) -> Array:
     """geometry_msgs/Transform or Pose to (4, 4).
@@ -48,6 +50,19 @@ class TransformTree:
                 raise UsageError(f"tf {stamped.header.frame_id} -> {stamped.child_frame_id}: {error}") from None
             self.set(stamped.header.frame_id, stamped.child_frame_id, T)
 
+    def copy(self) -> TransformTree:
+        """Another tree, of the same frames now."""
+        tree = TransformTree()
+        tree._parents = dict(self._parents)
+        return tree
+
+    def __len__(self) -> int:
+        return len(self._parents)
+
+    def has(self, frame: str) -> bool:
+        """Whether the frame has a parent."""
+        return _name(frame) in self._parents
+
     def set(self, parent: str, child: str, T_parent_child: Array) -> None:
         """Place `child` in `parent`; a later call replaces an earlier one."""
         self._parents[_name(child)] = (_name(parent), np.asarray(T_parent_child, np.float64))
@@ -62,7 +77,9 @@ class TransformTree:
         up_target, up_source = self._ancestors(target), self._ancestors(source)
         common = next((frame for frame in up_source if frame in up_target), None)
         if common is None or (target == source and target not in self.frames):
-            known = ", ".join(self.frames) or "none"
+            frames = self.frames
+            more = f" and {len(frames) - _LISTED} more" if len(frames) > _LISTED else ""
+            known = (", ".join(frames[:_LISTED]) or "none") + more
             raise UsageError(f"no transform from {source_frame!r} to {target_frame!r}; frames known: {known}")
         return se3.inverse(up_target[common]) @ up_source[common]
 

@@ -19,6 +19,7 @@ from dpm2_core.data.source import InputSettings
 from dpm2_core.frame import Points
 from dpm2_ros.conversions import cloud_to_msg
 from dpm2_ros.frames import FrameBuilder
+from dpm2_ros.guard import GuardedNode
 from dpm2_ros.settings import RosSettings
 from dpm2_ros.subscriptions import LATCHED, Inputs
 from dpm2_ros.synchronizer import Bundle
@@ -33,7 +34,7 @@ def node(domain: int) -> Iterator[Callable[..., Node]]:
     def make(*remappings: str, namespace: str = "") -> Node:
         arguments = [part for rule in remappings for part in ("-r", rule)]
         rclpy.init(args=["--ros-args", *arguments], domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
-        return rclpy.create_node("listener", namespace=namespace)
+        return GuardedNode("listener", namespace=namespace)
 
     yield make
     rclpy.try_shutdown()

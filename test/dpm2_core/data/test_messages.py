@@ -347,3 +347,27 @@ def test_real_rclpy_messages_decode_alike() -> None:
     np.testing.assert_allclose(time, np.arange(50) * 2e-3, atol=1e-8)
     camera = messages.decode_camera(sensor_msgs.CameraInfo(k=info().k, p=info().p, width=64, height=48), np.eye(4), "c")
     assert camera.K[0, 0] == 480
+
+
+def test_times_that_no_sweep_can_have_are_left_out() -> None:
+    """They would move the points to anywhere; the other points keep theirs."""
+    _, offset = messages.decode_points(cloud(xyz(5, t=np.array([0.0, 0.05, 0.1, 1e300, np.nan]))), time_unit="s")
+    assert offset is not None
+    assert np.isfinite(offset).all()
+    assert np.abs(offset).max() <= 2.0
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"d": [np.nan] * 5},
+        {"d": [0.1] * 7},
+        {"d": [0.1] * 100_000},
+        {"width": 2**32 - 1},
+        {"k": [np.nan] * 9, "p": [np.nan] * 12},
+    ],
+)
+def test_a_calibration_that_no_camera_has_is_rejected(changes: dict[str, Any]) -> None:
+    with pytest.raises(MessageError) as error:
+        messages.decode_camera(info(distortion_model="plumb_bob", **changes), np.eye(4), "camera")
+    assert len(str(error.value)) < 300

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is asked of sensor messages before they may wait for the worker: whatever else is on their topics stays out."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from dpm2_core.data.messages import MessageError, check_cloud
+from dpm2_core.data.transforms import TransformTree, transform_matrix
+from dpm2_core.errors import UsageError
+from dpm2_core.slam.map.admission import RejectedError, check_pose
+from dpm2_core.slam.map.cloud_codec import MAX_POINTS
+from dpm2_ros.conversions import check_frame
+
+_MOST_BYTES = 1 << 28
+_MOST_FRAMES = 2000
+_MOST_TRANSFORMS = 500  # in a message
+
+
+def check_header(header: Any) -> None:
+    """Raises RejectedError unless stamp and frame can be what they say."""
+    if header.stamp.sec < 0 or header.stamp.nanosec >= 10**9:
+        raise RejectedError("stamp", f"a stamp of {header.stamp.sec} s and {header.stamp.nanosec} ns")
+    if header.frame_id:
+        check_frame(header.frame_id)
+
+
+def check_size(message: Any, points: int = 0) -> None:
+    """Raises RejectedError for what is larger than any sensor's."""
+    if len(message.data) > _MOST_BYTES or points > MAX_POINTS:
+        raise RejectedError("size", f"{len(message.data)} bytes, {points} points")
+
+
+def unreadable(message: Any) -> str:
+    """Why a PointCloud2 cannot be read; empty if it can."""
+    try:
+        check_cloud(message)
+    except (MessageError, ValueError, TypeError, OverflowError) as error:
+        return str(error)
+    return ""
+
+
+def extended(tree: TransformTree, message: Any) -> tuple[TransformTree, str]:
+    """A tree with the transforms of a TFMessage that are sound, and what is wrong with the last of the others.
+
+    Raises:
+        RejectedError: there are too many.
+    """
+    if len(message.transforms) > _MOST_TRANSFORMS:
+        raise RejectedError("size", f"{len(message.transforms)} transforms; at most {_MOST_TRANSFORMS} are read")
+    tree, problem = tree.copy(), ""
+    for stamped in message.transforms:
+        parent, child = stamped.header.frame_id, stamped.child_frame_id
+        try:
+            check_frame(parent)
+            check_frame(child)
+            T_parent_child = transform_matrix(stamped.transform)
+            check_pose(T_parent_child)
+            if len(tree) >= _MOST_FRAMES and not tree.has(child):
+                raise RejectedError("frame", f"there are {_MOST_FRAMES} frames already")
+        except UsageError as error:
+            problem = f"tf {parent[:80]!r} -> {child[:80]!r}: {error}"
+        else:
+            tree.set(parent, child, T_parent_child)
+    return tree, problem

@@ -1,0 +1,347 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Random messages on every topic that slam_node and mapper_node listen to, beside a drive that must not notice them.
+
+The fuzzer asks the ROS graph for topics and types, and knows neither. Left out is what is a command if it is well
+formed, whoever sends it: transforms of real frames. A readable cloud on the very topic of a drive is part of that
+drive; what is made here is hardly ever readable, and never in the drive's frame.
+
+Six seconds in the suite; `make fuzz` takes a minute, with a thousand messages per second, and looks at the memory too.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray
+from nav_msgs.msg import Odometry
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import PointCloud2
+
+from dpm2_core.data.messages import stamp_ns
+from dpm2_core.data.source import InputSettings, open_source
+from dpm2_core.data.transforms import transform_matrix
+from dpm2_core.frame import Frame, Tracked
+from dpm2_core.slam.map.cloud_codec import pack_cloud, unpack_cloud
+from dpm2_core.slam.map.data import load_map
+from dpm2_core.slam.map.store import MapStore
+from dpm2_core.slam.system import SlamSettings, make_odometry
+from dpm2_ros.conversions import cloud_to_msg
+from dpm2_ros.replay import ros_environment, start
+
+SECONDS = float(os.environ.get("DPM2_FUZZ_SECONDS", "6"))
+RATE = float(os.environ.get("DPM2_FUZZ_RATE", "400"))
+LONG = SECONDS >= 30  # then memory is level: everything is imported, every queue full
+GROWTH = 20_000_000  # bytes
+START = 1_700_000_000_000_000_000
+SETTINGS = {"keyframes": {"distance": 2.0}}
+
+
+FLOATS = (0.0, -0.0, 1.0, -1.0, np.nan, np.inf, -np.inf, 1e308, -1e308, 5e-324, 1e-9, 12345.678)
+TEXTS = (
+    *("", "a", "x", "y", "z", "/", "//", " ", "../../../etc/passwd", "C:\\con", "%s%n%x", "\n\r\t\x1b[31m", "<script>"),
+    *(
+        "\u00fcn\u00efc\u00f6d\u00e9 \u96ea",
+        "x" * 10_000,
+        "a/" * 500,
+        "{}",
+        "None",
+        "map",
+        "odom",
+        "rgb8",
+        "jpeg",
+        "plumb_bob",
+    ),
+    *("kf_", "kf_" + "9" * 4000, "kf_-1.5f3a9c01", "kf_4294967296.5f3a9c01", "kf_0.00000000", "robot/kf_0", "feature"),
+)
+LENGTHS = (0, 0, 1, 1, 2, 3, 7, 40, 500)
+KEPT = 60  # messages of each topic; one in ten that are sent is new
+
+
+def message_class(name: str) -> Any:
+    """sensor_msgs/msg/PointCloud2 as a class."""
+    package, kind, message = name.split("/")
+    return getattr(importlib.import_module(f"{package}.{kind}"), message)
+
+
+class Maker:
+    """Random messages of any type; `names` are texts that mean something to those who listen."""
+
+    def __init__(self, seed: int, names: Callable[[], Sequence[str]]) -> None:
+        self.random = np.random.default_rng(seed)
+        self._names = names
+
+    def message(self, kind: Any, names: bool = True) -> Any:
+        """One, all of its fields at random."""
+        out = kind()
+        for field, type_name in kind.get_fields_and_field_types().items():
+            value = self.value(type_name, getattr(out, field), names)
+            try:
+                setattr(out, field, value)
+            except (AssertionError, ValueError, TypeError, OverflowError):
+                continue  # bounded strings and the like keep their default
+        return out
+
+    def value(self, type_name: str, default: Any, names: bool) -> Any:
+        if type_name.startswith("sequence<"):
+            inner = type_name[len("sequence<") : -1].split(",")[0]
+            return self.many(inner, int(self.random.choice(LENGTHS)), names)
+        if type_name.endswith("]"):
+            return self.many(type_name[: type_name.index("[")], len(default), names)
+        return self.one(type_name, names)
+
+    def many(self, inner: str, count: int, names: bool) -> Any:
+        if inner in ("uint8", "octet", "char"):
+            return self.random.bytes(count * (100 if self.random.random() < 0.1 else 1))
+        return [self.one(inner, names) for _ in range(min(count, 40 if "/" in inner else 500))]
+
+    def one(self, type_name: str, names: bool) -> Any:
+        r = self.random
+        if type_name == "builtin_interfaces/Time" and r.random() < 0.7:  # most others end there
+            seconds = (0, 1, 2**31 - 1, START // 10**9 + int(r.integers(-5, 5)))
+            return Time(sec=seconds[r.integers(4)], nanosec=int(r.integers(10**9)))
+        if "/" in type_name:
+            package, message = type_name.split("/")
+            return self.message(message_class(f"{package}/msg/{message}"), names)
+        if type_name.startswith(("string", "wstring")):
+            real = self._names() if names else ()
+            return str(r.choice(real)) if real and r.random() < 0.5 else str(TEXTS[r.integers(len(TEXTS))])
+        if type_name in ("float", "double", "float32", "float64"):
+            value = FLOATS[r.integers(len(FLOATS))] if r.random() < 0.5 else float(r.normal(0, 10 ** r.uniform(-3, 6)))
+            with np.errstate(over="ignore"):
+                return float(np.float32(value)) if type_name in ("float", "float32") else value
+        if type_name in ("bool", "boolean"):
+            return bool(r.integers(2))
+        if type_name in ("octet", "byte", "char"):
+            return r.bytes(1) if type_name != "char" else int(r.integers(256))
+        bits = int("".join(filter(str.isdigit, type_name)))
+        low, high = (0, 2**bits - 1) if type_name.startswith("u") else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
+        extreme = (low, high, 0, 1, high // 2, low + 1)
+        return (
+            int(extreme[r.integers(6)])
+            if r.random() < 0.5
+            else int(r.integers(low, high, dtype=np.int64 if low else np.uint64))
+        )
+
+    def mangled(self, data: bytes) -> bytes:
+        """A message that is damaged on its way."""
+        r, out = self.random, bytearray(data)
+        for _ in range(int(r.integers(1, 8))):
+            at = int(r.integers(4, max(len(out), 5)))
+            if at < len(out):
+                out[at] = int(r.choice((0, 255, int(r.integers(256)))))
+        return bytes(out[: int(r.integers(4, len(out) + 1))] if r.random() < 0.5 else out)
+
+
+class Fuzzer:
+    """A thread that publishes; `names` as of `Maker`."""
+
+    def __init__(
+        self, node: Node, targets: Sequence[tuple[str, str]], names: Callable[[], Sequence[str]], rate: float
+    ) -> None:
+        """`targets`: name and namespace of the nodes. `rate`: messages per second in all."""
+        self._node, self._rate = node, rate
+        self._maker = Maker(1, names)
+        self.sent: dict[str, int] = {}
+        self._topics: list[tuple[str, Any, Any, list[bytes]]] = []
+        for topic, kinds in sorted(
+            {(t, tuple(k)) for n, s in targets for t, k in node.get_subscriber_names_and_types_by_node(n, s)}
+        ):
+            kind = message_class(kinds[0])
+            self._topics.append((topic, kind, node.create_publisher(kind, topic, self._qos(topic)), []))
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+
+    @property
+    def topics(self) -> list[str]:
+        """Those that are fuzzed."""
+        return [topic for topic, *_ in self._topics]
+
+    def __enter__(self) -> Fuzzer:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._thread.join()
+
+    def _qos(self, topic: str) -> QoSProfile:
+        """Reliable, and latched where that is asked for: so it reaches every subscriber."""
+        wanted = [info.qos_profile.durability for info in self._node.get_subscriptions_info_by_topic(topic)]
+        latched = DurabilityPolicy.TRANSIENT_LOCAL in wanted
+        durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
+        return QoSProfile(depth=5, reliability=ReliabilityPolicy.RELIABLE, durability=durability)
+
+    def _run(self) -> None:
+        began, count = time.monotonic(), 0
+        while not self._ended.is_set():
+            topic, kind, publisher, kept = self._topics[count % len(self._topics)]
+            publisher.publish(self._next(kind, kept))
+            self.sent[topic] = self.sent.get(topic, 0) + 1
+            count += 1
+            if (early := began + count / self._rate - time.monotonic()) > 0:
+                self._ended.wait(early)
+
+    def _next(self, kind: Any, kept: list[bytes]) -> bytes:
+        r = self._maker.random
+        if len(kept) < KEPT or r.random() < 0.1:
+            transforms = kind.__name__ == "TFMessage"
+            new = bytes(serialize_message(self._maker.message(kind, names=not transforms)))
+            if len(kept) < KEPT:
+                kept.append(new)
+            else:
+                kept[r.integers(KEPT)] = new
+        data = kept[r.integers(len(kept))]
+        return self._maker.mangled(data) if r.random() < 0.2 else data
+
+
+@pytest.fixture(scope="module")
+def scans(street: Path) -> list[np.ndarray]:
+    """Of a street."""
+    return [frame.points[::2] for frame in open_source(street, InputSettings(images=False)).frames(0, 24)]
+
+
+@pytest.fixture(scope="module")
+def alone(scans: list[np.ndarray]) -> list[Tracked]:
+    """What the odometry makes of the drive with nobody else about."""
+    odometry = make_odometry(SlamSettings.model_validate(SETTINGS), "red")
+    return [odometry.process(Frame(START + n * 10**8, points, index=n)) for n, points in enumerate(scans)]
+
+
+class Nodes:
+    """slam_node of robot red, and a mapper_node, as processes; a LiDAR."""
+
+    def __init__(self, harness: Any, folder: Path) -> None:
+        self.harness, self.file = harness, folder / "map.dpm2map"
+        environment = ros_environment(harness.node.context.get_domain_id())
+        common = ("-p", "ros.map_directory:=''")
+        robot = ["input.points_topic:=points", "ros.embed_mapper:=false", "slam.keyframes.distance:=2.0",
+                 "input.vertical_angle_correction_deg:='0.0'"]  # fmt: skip
+        pairs = [part for pair in robot for part in ("-p", pair)]
+        mapper = ("-p", f"ros.map_file:={self.file}")
+        self.logs = {name: folder / f"{name}.log" for name in ("slam_node", "mapper_node")}
+        self.processes: dict[str, subprocess.Popen[bytes]] = {
+            "slam_node": start(
+                "slam_node", ["--ros-args", "-r", "__ns:=/red", *common, *pairs], environment, self.logs["slam_node"]
+            ),
+            "mapper_node": start(
+                "mapper_node", ["--ros-args", *common, *mapper], environment, self.logs["mapper_node"]
+            ),
+        }
+        self.lidar = harness.publisher(PointCloud2, "/red/points")
+        self.odom = harness.hear(Odometry, "/red/dpm2/odom")
+        self.poses = harness.hear(Odometry, "/red/dpm2/keyframe_odom")
+        self.diagnostics = harness.hear(DiagnosticArray, "/diagnostics")
+        harness.wait(
+            lambda: self.lidar.get_subscription_count() and self.status("mapper_node: messages"), "the nodes", 90
+        )
+
+    def names(self) -> list[str]:
+        """What a curious participant can learn: frames, keyframes that were, and will be, sessions."""
+        real = {
+            m.child_frame_id
+            for m in self.poses[-500:]
+            if m.child_frame_id.startswith("red/kf_") and len(m.child_frame_id) < 30
+        }
+        sessions = {name.rpartition(".")[2] for name in real if "." in name}
+        future = [f"red/kf_{n}.{session}" for session in sessions for n in range(14)]
+        return [*sorted(real), *sorted(sessions), *future, "red/odom", "base_link", "red"]
+
+    def pose(self, n: int) -> np.ndarray | None:
+        """The node's answer to scan n: what others send on that topic has other stamps."""
+        found = [m for m in list(self.odom) if stamp_ns(m.header) == START + n * 10**8]
+        return transform_matrix(found[0].pose.pose) if found else None
+
+    def status(self, name: str) -> dict[str, str]:
+        """The last one."""
+        for message in reversed(list(self.diagnostics)):
+            for status in message.status:
+                if status.name == name:
+                    return {value.key: value.value for value in status.values}
+        return {}
+
+    def resident(self) -> dict[str, int]:
+        """Bytes of each process."""
+        page = os.sysconf("SC_PAGE_SIZE")
+        return {n: int(Path(f"/proc/{p.pid}/statm").read_text().split()[1]) * page for n, p in self.processes.items()}
+
+    def close(self) -> None:
+        for process in self.processes.values():
+            process.kill()
+            process.wait()
+
+
+@pytest.fixture
+def nodes(ros: Callable[..., Any], tmp_path: Path) -> Iterator[Nodes]:
+    made = Nodes(ros(), tmp_path)
+    yield made
+    made.close()
+
+
+def test_a_drive_does_not_notice_what_else_is_sent(nodes: Nodes, scans: list[np.ndarray], alone: list[Tracked]) -> None:
+    wait, resident = nodes.harness.wait, []
+
+    def drive(n: int) -> None:
+        nodes.lidar.publish(cloud_to_msg(scans[n], START + n * 10**8, "red/lidar"))
+        wait(lambda: nodes.pose(n) is not None, f"scan {n}", 60)
+
+    drive(0)
+    wait(lambda: nodes.names()[0].startswith("red/kf_0"), "the first keyframe")
+    targets = [("slam_node", "/red"), ("mapper_node", "/")]
+    with Fuzzer(nodes.harness.node, targets, nodes.names, RATE) as fuzzer:
+        assert {"/red/points", "/red/initialpose", "/red/dpm2/keyframe", "/red/dpm2/keyframes_received"} <= set(
+            fuzzer.topics
+        )
+        began = time.monotonic()
+        for n in range(1, len(scans)):
+            drive(n)
+            time.sleep(max(0.0, began + n * SECONDS / len(scans) - time.monotonic()))
+            resident.append(nodes.resident())
+        sent = sum(fuzzer.sent.values())
+    print(f"{sent} messages in {time.monotonic() - began:.1f} s on {len(fuzzer.topics)} topics")
+    logs = {name: log.read_text(errors="replace")[-3000:] for name, log in nodes.logs.items()}
+    assert all(process.poll() is None for process in nodes.processes.values()), logs
+
+    np.testing.assert_allclose([nodes.pose(n) for n in range(len(scans))], [t.T_odom_lidar for t in alone], atol=1e-6)
+    keyframes = [tracked.keyframe for tracked in alone if tracked.keyframe is not None]
+
+    def stored() -> Any:
+        with MapStore.open(nodes.file) as store:
+            return load_map(store, descriptors=False)
+
+    wait(lambda: len(stored()) >= len(keyframes), "all keyframes in the map file", 60)
+    data = stored()
+    assert [(k.robot, k.id) for k in data.keyframes] == [("red", k.id) for k in keyframes]
+    np.testing.assert_allclose(data.poses, [k.T_odom_kf for k in keyframes], atol=1e-6)
+    with MapStore.open(nodes.file) as store:
+        clouds = load_map(store, descriptors=False).clouds
+        for node, keyframe in enumerate(keyframes):  # thinned to what a message may have, else as they were
+            measured = set(map(bytes, unpack_cloud(pack_cloud(keyframe.cloud))))
+            kept = set(map(bytes, clouds.whole(node)))
+            assert kept <= measured
+            assert len(kept) > 3000
+
+    for name in ("red/slam_node: messages", "mapper_node: messages"):
+        counts = {key: int(value) for key, value in nodes.status(name).items()}
+        print(name, counts)
+        assert counts.pop("internal errors") == 0, logs
+        assert sum(counts.values()) > 0.1 * sent
+    growth = {
+        name: max(r[name] for r in resident[-3:]) - resident[len(resident) // 3][name] for name in nodes.processes
+    }
+    print(
+        "growth of memory over the last two thirds, MB:",
+        {name: round(grown / 1e6, 1) for name, grown in growth.items()},
+    )
+    assert not LONG or max(growth.values()) < GROWTH
