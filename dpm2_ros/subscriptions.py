@@ -194,7 +194,7 @@ class Inputs:
         if self._frame not in (None, frame) and last is not None and now - last < _OTHER_FRAME:
             raise RejectedError("another frame", f"a cloud in frame {frame[:80]!r}; the drive's is {self._frame!r}")
         problem, stamp = unreadable(message), stamp_ns(message.header)
-        if problem and not self.synchronizer.due(stamp, now):
+        if problem and not (frame == self._frame and self.synchronizer.due(stamp, now)):
             raise RejectedError("unreadable", problem)
         self._frame = frame
 
