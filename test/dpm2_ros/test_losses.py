@@ -66,3 +66,14 @@ def test_other_gaps_of_the_stamps_are_no_losses(periods: float) -> None:
 
 def test_nothing_is_said_before_the_rhythm_is_known() -> None:
     assert count([0, PERIOD, 5 * PERIOD]) == 0
+
+
+def test_what_is_rejected_is_not_lost() -> None:
+    """Its number is known; what is missing before it is lost all the same."""
+    losses = Losses()
+    losses.add(0, 1)
+    losses.skip(2)
+    assert losses.add(10**8, 3) == 0
+    losses.skip(5)
+    assert losses.add(2 * 10**8, 6) == 0
+    assert losses.count == 1

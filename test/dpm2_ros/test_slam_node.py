@@ -426,6 +426,25 @@ def test_bad_clouds_among_good_ones(rig: Callable[..., Rig], drive: Any) -> None
     assert r.values()["internal errors"] == "0"
 
 
+def test_clouds_that_are_not_of_this_drive_leave_it_alone(rig: Callable[..., Rig], drive: Any) -> None:
+    """In another frame, or unreadable with a stamp from anywhere: rejected, counted by their reason, no restart."""
+    r = rig()
+    r.send_and_wait(*range(4))
+    for stamp in (drive.stamp(0) - 10**12, drive.stamp(3) + 10**12):
+        broken = drive.cloud(3)
+        broken.header.stamp, broken.fields = stamp_to_msg(stamp), broken.fields[1:]
+        r.lidar.publish(broken)
+    r.send(3, stamp=-(10**9))
+    r.send(4, frame_id="another")
+    r.wait(lambda: sum(r.node.rejections.values()) == 4, "the rejections")
+    r.send_and_wait(*range(4, 8))
+    assert r.stamps() == [drive.stamp(n) for n in range(8)]
+    figures = r.values("messages")
+    counts = {key.rpartition(": ")[2]: value for key, value in figures.items()}
+    assert counts == {"unreadable": "2", "stamp": "1", "another frame": "1", "internal errors": "0"}
+    assert r.values()["lost on the way"] == "0"
+
+
 def test_stamps_that_repeat_or_go_back(rig: Callable[..., Rig], drive: Any) -> None:
     r = rig()
     r.send_and_wait(0, 1, 2)
