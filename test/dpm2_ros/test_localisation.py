@@ -156,7 +156,7 @@ def test_finds_itself_tracks_and_notices_being_carried_off(
     r.harness.wait(lambda: r.off(place(street, 18)) < 0.1, "its place in the map")
     r.harness.wait(lambda: r.said("slam_node: localisation").startswith("tracking"), "the second answer")
     seen = len(r.diagnostics)
-    r.send(18)  # the state that is told is that at the last cloud
+    r.send(19)  # the state that is told is that at the last cloud
     told = lambda: [s.message for d in r.diagnostics[seen:] for s in d.status if s.name.endswith("odometry")]  # noqa: E731
     r.harness.wait(lambda: any(text.startswith("track") for text in told()), "the state")
     # carried off: scans from 15 m behind, which the odometry cannot follow
