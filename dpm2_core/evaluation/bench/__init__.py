@@ -39,7 +39,7 @@ BENCHES: dict[str, Bench] = {
     "finetune": _bench("finetune:bench_finetune", "repetitions threads set pairs only"),
     "geometric": _bench("geometric:bench_geometric", "source kitti repetitions threads set"),
     "loop-cost": _bench("loop_cost:bench_loop_cost", "threads set"),
-    "map": _bench("map:bench_map", "set"),
+    "map": _bench("map:bench_map", "source set"),
     "memory": _bench("memory:bench_memory", "source threads set"),
     "neural": _bench("neural:bench_neural", "source kitti repetitions threads set weights unseen pairs only"),
     "pose-graph": _bench("pose_graph:bench_pose_graph", "kitti repetitions"),

@@ -4,6 +4,9 @@
 from __future__ import annotations
 
 import hashlib
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +14,7 @@ import pytest
 
 from dpm2_core.cli import main
 from dpm2_core.data.trajectory import read_trajectory
+from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Array, Keyframe
 from dpm2_core.geometry import se3
 from dpm2_core.sim.config import LidarConfig
@@ -149,6 +153,35 @@ def test_run_writes_a_map_and_goes_on_with_it(
     assert max(np.linalg.norm(a[i][:3, 3] - b[i][:3, 3]) for i in common) < 0.05
     # Only the new frames are in the trajectory of the second run, the map has all.
     assert len(read_trajectory(tmp_path / "b" / "trajectory.tum")) == 60 - two.keyframes[before].index
+
+
+def test_a_drive_that_is_killed_leaves_a_sound_map(
+    tmp_path: Path, recording: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """kill -9 of a real drive, after the network has tried loops and had them rejected."""
+    path = tmp_path / "a.dpm2map"
+    doubting = ("--set", "slam.loops.gap=3", "--set", "slam.loops.min_confidence=2", "--set", "slam.loops.radius=0")
+    command = ["run", str(recording), "--out", str(tmp_path / "out"), "--map", str(path), *doubting]
+    child = subprocess.Popen([sys.executable, "-m", "dpm2_core.cli", *command], stderr=subprocess.DEVNULL)
+    try:
+        while child.poll() is None and not _rejected(path):
+            time.sleep(0.1)
+        assert child.poll() is None
+    finally:
+        child.kill()
+        child.wait()
+    assert dpm2("map", "check", path) == 0
+    assert "keyframes, sound" in capsys.readouterr().out
+    assert _rejected(path)
+
+
+def _rejected(path: Path) -> int:
+    """Loops that the network was asked about and that were rejected, so far."""
+    try:
+        with MapStore.open(path) as store:
+            return sum(ok == 0 for (ok,) in store.rows("edges", "ok"))
+    except Dpm2Error:  # it is just being made, or not there yet
+        return 0
 
 
 def test_a_map_of_another_drive_is_not_gone_on_with(

@@ -18,6 +18,7 @@ import pytest
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Keyframe
 from dpm2_core.slam.map import schema
+from dpm2_core.slam.map.check import check_map
 from dpm2_core.slam.map.cloud_codec import pack_cloud
 from dpm2_core.slam.map.cloud_store import Loan
 from dpm2_core.slam.map.data import load_map, save_as
@@ -115,6 +116,7 @@ def test_kill_at_any_instant_loses_no_keyframe_that_was_taken_in(tmp_path: Path,
     child.wait()
     child.stdout.close()
     assert acknowledged - 1 <= whole_prefix(path) <= acknowledged + 1  # the last line itself may be cut off
+    assert check_map(path).problems == []
     with MapStore.open(path, read_only=False) as store:  # and it can be written to again
         store.begin_session()
 
