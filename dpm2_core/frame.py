@@ -167,10 +167,12 @@ class Tracked:
     Attributes:
         stamp: ns, that of the cloud. index: `Frame.index`.
         T_odom_lidar: (4, 4), always finite; the prediction where `registration.ok` is False.
-        covariance: (6, 6) as in `Registration`, of T_odom_lidar relative to the frame before.
+        covariance: (6, 6) as in `Registration`, of T_odom_lidar relative to the last frame before that was registered.
         twist: (6,) [rad/s, m/s] in the LiDAR frame.
         registration: how it was found.
         keyframe: set when this frame became one.
+        breaks: pauses so far across which the way is not known; since the last one the pose is a guess, `covariance` of
+            the frame in which it was given up says how good.
         seconds: wall time of each stage.
     """
 
@@ -182,4 +184,5 @@ class Tracked:
     state: State
     registration: Registration
     keyframe: Keyframe | None = None
+    breaks: int = 0
     seconds: dict[str, float] = field(default_factory=dict)

@@ -75,6 +75,7 @@ class Health:
             }
             if self.last is not None:
                 out["confidence"] = f"{self.last.registration.confidence:.2f}"
+                out["breaks"] = str(self.last.breaks)
             if self._last_good is not None:
                 out["last good registration (s ago)"] = f"{now - self._last_good:.1f}"
             if self._latency:
@@ -172,6 +173,8 @@ class Diagnostics:
         level, text = _LEVEL[last.state], str(last.state)
         if last.registration.reason:
             text += f": {last.registration.reason}"
+        if last.breaks:
+            text += f"; the way across {last.breaks} pause(s) of the sensor is not known"
         if self.frame_problem:
             level, text = ERROR, f"{text}; {self.frame_problem}"
         if synchronizer.dropped and len(synchronizer):

@@ -105,7 +105,7 @@ class SlamNode(GuardedNode):
         self._base.restart()
         self._held: list[Tracked] = []  # until the base frame is known
         self._covariance = np.zeros((6, 6))
-        self._before: Tracked | None = None
+        self._before: Tracked | None = None  # the last registered frame, of which `_covariance` is
 
     def _work(self) -> None:
         while not self._stopping.is_set():
@@ -197,13 +197,13 @@ class SlamNode(GuardedNode):
         return tracked
 
     def _publish(self, tracked: Tracked) -> None:
-        before, seconds = self._before, 0.1
-        if before is not None:
+        ros, before, covariance, seconds = self._config.ros, self._before, self._covariance, 0.1
+        if before is not None:  # the last one that was registered
             A = se3.adjoint(se3.inverse(tracked.T_odom_lidar) @ before.T_odom_lidar)
-            self._covariance = A @ self._covariance @ A.T + tracked.covariance
+            covariance = A @ covariance @ A.T + tracked.covariance
             seconds = max((tracked.stamp - before.stamp) * 1e-9, 1e-3)
-        self._before = tracked
-        ros, covariance = self._config.ros, self._covariance
+        if before is None or tracked.registration.ok:
+            self._before, self._covariance = tracked, covariance
         if tracked.state is State.LOST:
             covariance = covariance + LOST
         base, T_base_start = self._base.name, self._base.T_base_start

@@ -251,12 +251,12 @@ def _write(
         if truth.kind == "kitti-indexed":
             own = Trajectory(sensor, np.array(recorder.index), "kitti-indexed")
         truth, poses = matched(truth, own)
-        metrics = evaluate(truth, poses, failed_frames=failed, fps=fps)
+        metrics = evaluate(truth, poses, failed_frames=failed, breaks=recorder.breaks, fps=fps)
     elif truth is not None and np.isfinite(truth[: len(poses), 0, 0]).sum() >= 2:
         truth = truth[: len(poses)]
         T = source.T_cam_lidar
         judged = truth if T is None else _in_other_frame(truth, T)
-        metrics = evaluate(judged, sensor, failed_frames=failed, fps=fps)
+        metrics = evaluate(judged, sensor, failed_frames=failed, breaks=recorder.breaks, fps=fps)
     if metrics is not None:
         metrics = metrics.model_copy(update={"truth": truth_name})
         _write_json(out / "metrics.json", metrics.model_dump())

@@ -40,6 +40,8 @@ class Metrics(BaseModel):
     """Frames of the drive."""
     failed_frames: int
     """Frames without an estimate of their own: missing, or only predicted."""
+    breaks: int = 0
+    """Pauses across which the way is not known: the poses after one go on from a guess."""
     fps: float | None = None
     """Frames a second of processing, reading excluded; None where it is not known."""
     path_length_m: float | None = None
@@ -70,6 +72,7 @@ def evaluate(
     lengths: Sequence[float] = OFFICIAL_LENGTHS,
     *,
     failed_frames: int | None = None,
+    breaks: int = 0,
     fps: float | None = None,
 ) -> Metrics:
     """Judge (N, 4, 4) poses against (N, 4, 4) ground truth of the same frames.
@@ -79,6 +82,7 @@ def evaluate(
         est: in the sensor frame of `gt` (the world frames may differ); rows of NaN where there is no estimate.
         lengths: of the KITTI metric's segments, m.
         failed_frames: as the SLAM system counted them; by default the frames without an estimate.
+        breaks: as the SLAM system counted them.
         fps: frames a second, to be reported along.
 
     Raises:
@@ -98,6 +102,7 @@ def evaluate(
     return Metrics(
         frames=len(est),
         failed_frames=int((~has_est).sum()) if failed_frames is None else failed_frames,
+        breaks=breaks,
         fps=fps,
         path_length_m=path_length(gt[has_gt]),
         t_err_percent=t_err,

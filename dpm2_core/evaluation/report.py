@@ -22,9 +22,8 @@ def metrics_table(metrics: Metrics, title: str, frame: str) -> FigureTable:
         start = "each 10th frame" if metrics.lengths_m == OFFICIAL_LENGTHS else "each frame"
         devkit = f"the development kit prints {t_err / 100:.6f} {math.radians(r_err / 100):.6f}"
         how = f"{metrics.segments} segments of {lengths} m from {start}, unaligned; {devkit}"
-    table.add_row(
-        "frames", str(metrics.frames), f"{metrics.failed_frames} failed; path {_value(metrics.path_length_m, 'm')}"
-    )
+    states = f"{metrics.failed_frames} failed, {metrics.breaks} breaks; path {_value(metrics.path_length_m, 'm')}"
+    table.add_row("frames", str(metrics.frames), states)
     table.add_row("KITTI t_err", _value(t_err, "%"), how)
     table.add_row("KITTI r_err", _value(r_err, "deg/100 m"), "the same segments")
     for part in metrics.per_length if metrics.segments else ():

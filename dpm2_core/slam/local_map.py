@@ -45,6 +45,10 @@ class LocalMap:
         self._inserted = 0
         self._T_last: Array | None = None
 
+    def fresh(self) -> LocalMap:
+        """Another one, empty."""
+        return LocalMap(self._settings, self._threads)
+
     def __len__(self) -> int:
         return len(self.points)
 

@@ -113,6 +113,9 @@ class NeuralScanRegistration:
     def clear(self) -> None:
         self._map.clear()
 
+    def fresh(self) -> NeuralScanRegistration:
+        return NeuralScanRegistration(self._settings, self._preprocessor, self._model)
+
     def prepare(self, frame: Frame, twist: Array) -> Scan:
         return self.described(frame, Scan(self._preprocessor.measured(frame, twist)))
 

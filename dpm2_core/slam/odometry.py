@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import replace
 from time import perf_counter
 
@@ -11,6 +12,7 @@ import numpy as np
 from dpm2_core.config import Settings
 from dpm2_core.frame import Array, Frame, Registration, State, Tracked
 from dpm2_core.geometry import se3
+from dpm2_core.slam.bridge import Bridge, Limits, covariance, predicted
 from dpm2_core.slam.keyframes import KeyframeSelector
 from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.scan_registration import Prediction, ScanRegistration
@@ -30,8 +32,12 @@ class OdometrySettings(Settings):
     """Standard deviation of the position in its worst direction above which the state is `degraded`, m."""
     lost_after: int = 5
     """Frames without a registration until the state is `lost`; `degraded` before."""
-    restart_after: int = 20
-    """Frames without a registration until a new map is begun at the predicted pose."""
+    restart_after: int = 10
+    """Frames after a pause that are registered to the map before it, until the odometry counts as broken: a new stretch
+    then goes on from the predicted pose, with the uncertainty that the pause deserves."""
+    pause: float = 0.65
+    """Seconds without a registration after which one scan is no longer believed alone; in a stream of fewer frames
+    per second 1.5 of its periods."""
 
 
 _PERIOD = 0.1  # s, assumed between two stamps that do not advance
@@ -40,7 +46,8 @@ _PERIOD = 0.1  # s, assumed between two stamps that do not advance
 _AHEAD = ((0.0, 0), (1.0, 0), (2.0, 0), (3.0, 0), (-1.0, 0))
 _CURVES = tuple((x, yaw) for yaw in (4, -4, 8, -8) for x in (0.5, 1.5, 2.5))
 _FITS_WELL = 0.7
-_UNKNOWN = np.diag([0.05, 0.05, 0.05, 0.5, 0.5, 0.5]) ** 2  # variance that a second without registration adds
+_SLOWEST = 2.0  # s: no stream has a longer period
+_RHYTHM = 9  # periods: their median is that of the stream
 
 
 class Odometry:
@@ -70,6 +77,11 @@ class Odometry:
         self._registered = np.eye(4), 0.0  # the last registered pose, and the seconds since
         self._failures = 0
         self._first: Frame | None = None
+        self._periods: deque[float] = deque(maxlen=_RHYTHM)
+        self._clock = 0.0  # s since the first frame
+        self._bridge: Bridge | None = None
+        self._left = 0.0  # `_clock` at the last pose before the pause that is being bridged
+        self._breaks = 0
         self._registration.clear()
         self._keyframes.reset()
 
@@ -80,7 +92,8 @@ class Odometry:
         twist = np.zeros(6) if self._twist is None else self._twist
         scan = self._registration.prepare(frame, twist)
         clock.append(perf_counter())
-        T_predicted = self._T @ se3.exp(twist * dt)
+        pauses = frame.problem is None and self._pauses(dt) and not self._registration.refusal(scan)
+        T_predicted = self._begin_stretch(dt) if pauses else predicted(self._T, twist, dt)
         registration = self._register(scan, T_predicted, dt, frame.problem)
         if self._first is not None and registration.ok:
             scan, registration = self._begin_again(self._first, frame, registration, dt)
@@ -88,41 +101,92 @@ class Odometry:
         self._update(scan, registration, dt)
         if registration.method == "first" and frame.time_offset is not None:
             self._first = frame
-        keyframe = self._keyframes.select(frame, scan, self._T, registration)
+        T = self._T
+        if self._bridge is not None and registration.ok:
+            registration = self._cross(self._bridge, scan, registration)
+            T = registration.T_target_source
+        keyframe = self._keyframes.select(frame, scan, T, registration)
         clock.append(perf_counter())
         return Tracked(
             stamp=frame.stamp,
             index=frame.index,
-            T_odom_lidar=self._T,
+            T_odom_lidar=T,
             covariance=self._covariance,
             twist=np.zeros(6) if self._twist is None else self._twist,
             state=self._state(registration),
             registration=registration,
             keyframe=keyframe,
+            breaks=self._breaks,
             seconds=dict(zip(("preprocess", "register", "update"), np.diff(clock).tolist(), strict=True)),
         )
 
     def _elapsed(self, stamp: int) -> float:
-        """Seconds since the frame before; stamps that repeat, jump back or pause count as one nominal period."""
-        dt = _PERIOD if self._stamp is None else (stamp - self._stamp) * 1e-9
+        """Seconds since the frame before; stamps that repeat or jump back count as one nominal period."""
+        dt = _PERIOD if self._stamp is None or stamp <= self._stamp else (stamp - self._stamp) * 1e-9
+        if self._stamp is not None:
+            self._periods.append(dt)
         self._stamp = stamp
-        return dt if 0 < dt < 2 else _PERIOD
+        self._clock += dt
+        return dt
+
+    def _pauses(self, dt: float) -> bool:
+        """Whether so much time has passed since the last registered scan that another one is not believed alone."""
+        if not len(self._registration):
+            return False
+        if len(self._periods) > 1:
+            limit = max(self._settings.pause, 1.5 * sorted(self._periods)[(len(self._periods) - 1) // 2])
+        else:
+            limit = _SLOWEST  # whether that is a pause or the rhythm of the stream is not known yet
+        return self._registered[1] + dt > limit
+
+    def _begin_stretch(self, dt: float) -> Array:
+        """After a pause: the scan begins a map of its own, at the predicted pose (4, 4), which it returns."""
+        T_registered, seconds = self._registered
+        if self._bridge is None:
+            limits = Limits(self._settings.steadiness, self._settings.degraded_sigma)
+            self._bridge = Bridge(self._registration, T_registered, self._twist, limits)
+            self._left = self._clock - seconds - dt
+        self._registration, self._twist, self._first = self._registration.fresh(), None, None
+        self._T = self._bridge.begin(self._clock - self._left)
+        return self._T
+
+    def _cross(self, bridge: Bridge, scan: Scan, own: Registration) -> Registration:
+        """A scan of the stretch after a pause, in the map before it if that is certain; after long enough, a break."""
+        found, certain = bridge.register(scan, self._T, self._twist, own)
+        if certain:
+            self._bridge, self._registration = None, bridge.registration
+            self._failures = 0
+            self._follow(scan, found)
+            return found
+        self._covariance = bridge.covariance(self._T) + own.covariance
+        if bridge.tries >= self._settings.restart_after and self._twist is not None:
+            self._keyframes.doubt(self._covariance)
+            self._bridge, self._failures, self._breaks = None, 0, self._breaks + 1
+            return replace(own, reason=f"broken by a pause: {found.reason}")
+        self._failures += 1
+        T = found.T_target_source if found.ok else self._T
+        return replace(found, T_target_source=T, ok=False, reason=found.reason or "after a pause: not confirmed yet")
 
     def _register(self, scan: Scan, T_predicted: Array, dt: float, problem: str | None) -> Registration:
         if problem is not None:
-            return Registration(T_predicted, _UNKNOWN, 0.0, np.inf, "none", False, problem)
+            return Registration(T_predicted, self._unknown(dt), 0.0, np.inf, "none", False, problem)
         if not len(self._registration):
             refusal = self._registration.refusal(scan)
             return Registration(T_predicted, np.zeros((6, 6)), float(not refusal), 0.0, "first", not refusal, refusal)
         if self._twist is None:
-            return self._registered_from_rest(scan, T_predicted)
-        widen = 1.0 + min(self._failures, 4)
-        information = np.eye(6) / (self._settings.steadiness * dt * dt * (1 + self._failures) ** 2) ** 2
+            return self._registered_from_rest(scan, T_predicted, dt)
+        seconds = self._registered[1] + dt
+        widen = min(seconds / dt, 5.0)
+        information = np.eye(6) / (self._settings.steadiness * seconds * seconds) ** 2
         answer = self._registration.register(scan, Prediction([T_predicted], widen, information))
         return self._gated(answer, T_predicted, dt)
 
-    def _registered_from_rest(self, scan: Scan, T: Array) -> Registration:
-        """While the velocity is unknown: the best of many starts."""
+    def _registered_from_rest(self, scan: Scan, T: Array, dt: float) -> Registration:
+        """While the velocity is unknown: the best of many starts; after a pause first as before it."""
+        if self._bridge is not None and self._bridge.twist is not None:
+            answer = self._registration.register(scan, self._bridge.expected(T, dt))
+            if answer.ok and answer.confidence >= _FITS_WELL:
+                return answer
         for motions in (_AHEAD, _AHEAD + _CURVES):
             starts = [T @ se3.exp([0, 0, np.radians(yaw), x, 0, 0]) for x, yaw in motions]
             answer = self._registration.register(scan, Prediction(starts, widen=2.0))
@@ -132,7 +196,7 @@ class Odometry:
 
     def _gated(self, answer: Registration, T_predicted: Array, dt: float) -> Registration:
         """Refuse what no vehicle can do; the allowance grows while nothing has been registered."""
-        time = dt * (1 + self._failures)
+        time = self._registered[1] + dt
         off = se3.inverse(T_predicted) @ answer.T_target_source
         metres, degrees = float(np.linalg.norm(off[:3, 3])), float(np.degrees(se3.angle(off)))
         if answer.ok and metres > 0.5 + self._settings.max_acceleration * time * time:
@@ -156,37 +220,44 @@ class Odometry:
         """Move on: to the registered pose, or to the predicted one with the doubt that it deserves."""
         T_registered, seconds = self._registered
         if not registration.ok:
-            self._registered = T_registered, seconds + dt
-            self._coast(scan, dt)
+            self._coast(dt)
             return
         if registration.method != "first":
             # Not from the predicted pose of the frame before, of which an error would count as motion in one period.
             self._twist = se3.log(se3.inverse(T_registered) @ registration.T_target_source) / (seconds + dt)
+        if self._bridge is None:
+            self._failures = 0
+        self._follow(scan, registration)
+
+    def _follow(self, scan: Scan, registration: Registration) -> None:
         self._T = registration.T_target_source
         self._registered = self._T, 0.0
         self._covariance = registration.covariance
-        self._failures = 0
         self._registration.update(scan, self._T)
 
-    def _coast(self, scan: Scan, dt: float) -> None:
-        """Nothing registered: follow the prediction with growing doubt; after long enough, begin a new map."""
+    def _coast(self, dt: float) -> None:
+        """Nothing registered: follow the prediction with growing uncertainty."""
         if not len(self._registration):
             return
         self._failures += 1
-        self._covariance = self._covariance + _UNKNOWN * dt * self._failures
-        if self._failures <= self._settings.restart_after and self._twist is not None:
-            self._T = self._T @ se3.exp(self._twist * dt)
-        if self._failures >= self._settings.restart_after and not self._registration.refusal(scan):
-            self._keyframes.doubt(self._covariance)
-            self._registration.clear()
-            self._registration.update(scan, self._T)
-            self._registered, self._twist, self._failures = (self._T, 0.0), None, 0
+        self._covariance = self._unknown(dt)
+        T_registered, seconds = self._registered
+        self._registered = T_registered, seconds + dt
+        if self._twist is not None:
+            self._T = predicted(T_registered, self._twist, seconds + dt)
+        if self._bridge is not None:
+            self._covariance = self._covariance + self._bridge.covariance(self._T)
+
+    def _unknown(self, dt: float) -> Array:
+        """Covariance (6, 6) of what is only predicted."""
+        speed = 0.0 if self._twist is None else float(np.linalg.norm(self._twist[3:]))
+        return covariance(speed, self._registered[1] + dt, self._settings.steadiness)
 
     def _state(self, registration: Registration) -> State:
         if self._failures >= self._settings.lost_after:
             return State.LOST
-        if self._twist is None:
+        if self._twist is None and self._bridge is None:
             return State.INITIALISING
-        if not registration.ok or registration.worst_sigma > self._settings.degraded_sigma:
+        if not registration.ok or registration.worst_sigma > self._settings.degraded_sigma or self._breaks:
             return State.DEGRADED
         return State.TRACKING

@@ -21,6 +21,7 @@ class TrajectoryRecorder:
     def __init__(self) -> None:
         self.stamps: list[int] = []
         self.index: list[int] = []
+        self.breaks = 0  # of the odometry, see `Tracked`
         self._T_odom_lidar: list[Array] = []
         self._keyframe: list[int] = []  # position of each keyframe among the frames
 
@@ -31,6 +32,7 @@ class TrajectoryRecorder:
         """Take in the result of the next frame."""
         if tracked.keyframe is not None:
             self._keyframe.append(len(self.stamps))
+        self.breaks = tracked.breaks
         self.stamps.append(tracked.stamp)
         self.index.append(tracked.index)
         self._T_odom_lidar.append(tracked.T_odom_lidar)

@@ -44,6 +44,9 @@ class RefinedScanRegistration:
         self._neural.clear()
         self._geometric.clear()
 
+    def fresh(self) -> RefinedScanRegistration:
+        return RefinedScanRegistration(self._neural.fresh(), self._geometric.fresh())
+
     def prepare(self, frame: Frame, twist: Array) -> Scan:
         return self._neural.described(frame, self._geometric.prepare(frame, twist))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, Self
 
 import numpy as np
 
@@ -64,6 +64,10 @@ class ScanRegistration(Protocol):
         """Forget everything."""
         ...
 
+    def fresh(self) -> Self:
+        """Another one like it that remembers nothing yet."""
+        ...
+
     def prepare(self, frame: Frame, twist: Array) -> Scan:
         """What it needs of a frame that was taken while moving at `twist` (6,) [rad/s, m/s]; never raises."""
         ...
@@ -96,6 +100,9 @@ class GeometricScanRegistration:
 
     def clear(self) -> None:
         self._local_map.clear()
+
+    def fresh(self) -> GeometricScanRegistration:
+        return GeometricScanRegistration(self._preprocessor, self._registration, self._local_map.fresh())
 
     def prepare(self, frame: Frame, twist: Array) -> Scan:
         return self._preprocessor.prepare(frame, twist)

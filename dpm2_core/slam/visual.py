@@ -105,6 +105,9 @@ class VisualScanRegistration:
         self._registration.clear()
         self._last = self._reference = None
 
+    def fresh(self) -> VisualScanRegistration:
+        return VisualScanRegistration(self._settings, self._registration.fresh())
+
     def prepare(self, frame: Frame, twist: Array) -> Scan:
         scan = self._registration.prepare(frame, twist)
         return replace(scan, image=frame.images[0]) if frame.images else scan

@@ -37,6 +37,7 @@ def _bench(function: str, options: str) -> Bench:
 BENCHES: dict[str, Bench] = {
     "diffslam": _bench("diffslam:bench_diffslam", "repetitions threads set"),
     "finetune": _bench("finetune:bench_finetune", "repetitions threads set pairs only"),
+    "gaps": _bench("gaps:bench_gaps", "source kitti threads set weights only"),
     "geometric": _bench("geometric:bench_geometric", "source kitti repetitions threads set"),
     "loop-cost": _bench("loop_cost:bench_loop_cost", "threads set"),
     "map": _bench("map:bench_map", "source set"),

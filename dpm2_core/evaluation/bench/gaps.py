@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Drives with a hole: is the odometry right after it, and does it say so where it is not?"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from rich.console import Group
+from rich.progress import Progress
+
+from dpm2_core.errors import UsageError
+from dpm2_core.evaluation.bench.harness import Options, Report, drives, processors, settings_of, unique_name
+from dpm2_core.frame import Array, Frame, State, Tracked
+from dpm2_core.geometry import se3
+from dpm2_core.slam.system import SlamSettings, make_odometry
+from dpm2_core.tables import FigureTable
+
+_SECONDS = (1.0, 2.0, 3.0, 5.0, 7.0, 10.0)
+_PLACES = 5
+_BEFORE, _WARM, _AFTER = 10, 40, 30  # frames: at least before a gap, at most before and after it
+_WRONG = 1.0  # m, across the gap
+_CHI2 = 14.16  # of 3 degrees of freedom: 3 sigma
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Frames first to stop - 1 of a drive are missing."""
+
+    first: int
+    stop: int
+    seconds: float
+
+
+def gaps(stamps: Sequence[int]) -> Iterator[Gap]:
+    """Those of each length that a drive with these stamps (ns) has room for, at places spread evenly over it."""
+    period = float(np.median(np.diff(np.array(stamps)))) * 1e-9
+    for seconds in _SECONDS:
+        missing = round(seconds / period)
+        last = len(stamps) - _BEFORE - missing
+        for first in sorted(set(np.linspace(_BEFORE, last, _PLACES).astype(int).tolist())) if last >= _BEFORE else ():
+            yield Gap(first, first + missing, seconds)
+
+
+def bench_gaps(options: Options) -> Report:
+    """Every gap on every drive with every registration; `--only` chooses one registration.
+
+    Raises:
+        UsageError: there is no drive, or one has no ground truth.
+    """
+    methods = [options.only] if options.only else ["geometric", "refined", "neural"]
+    results: dict[str, Any] = {}
+    with drives(options) as sources, processors(options.threads), Progress(transient=True) as progress:
+        for source in sources:
+            if source.poses is None:
+                raise UsageError(f"{source.name}: the drive has no ground truth to compare with")
+            frames = list(source.frames())
+            cases = list(gaps([frame.stamp for frame in frames]))
+            name, task = unique_name(source, results), progress.add_task(source.name, total=len(cases) * len(methods))
+            results[name] = {}
+            for method in methods:
+                settings, rows = settings_of(options, method), []
+                for gap in cases:
+                    rows.append(judged(frames, source.poses, gap, settings))
+                    progress.advance(task)
+                results[name][method] = {"summary": summary(rows), "gaps": rows}
+    return Report({"wrong_m": _WRONG, "drives": results}, Group(_table(results)))
+
+
+def judged(frames: Sequence[Frame], truth: Array, gap: Gap, settings: SlamSettings) -> dict[str, Any]:
+    """What the odometry does after one gap; errors are those of the way from the last pose before it."""
+    odometry = make_odometry(settings)
+    before = [odometry.process(frame) for frame in frames[max(gap.first - _WARM, 0) : gap.first]][-1]
+    last, base, errors, states, uncovered = before, np.zeros((6, 6)), [], [], 0
+    for i in range(gap.stop, min(gap.stop + _AFTER, len(frames))):
+        tracked = odometry.process(frames[i])
+        T_true = se3.inverse(truth[gap.first - 1]) @ truth[i]
+        error = se3.log(se3.inverse(T_true) @ se3.inverse(before.T_odom_lidar) @ tracked.T_odom_lidar)[3:]
+        errors.append(float(np.linalg.norm(error)))
+        states.append(tracked.state)
+        covariance = _since(last, base, tracked)
+        uncovered += int(errors[-1] > _WRONG and error @ np.linalg.solve(covariance[3:, 3:], error) > _CHI2)
+        if tracked.registration.ok:
+            last, base = tracked, covariance
+    tracking = [i for i, state in enumerate(states) if state is State.TRACKING]
+    wrong = sum(errors[i] > _WRONG for i in tracking)
+    moved = se3.inverse(truth[gap.first - 1]) @ truth[gap.stop]
+    return {
+        "first": gap.first,
+        "seconds": gap.seconds,
+        "moved_m": round(float(np.linalg.norm(moved[:3, 3])), 1),
+        "turned_deg": round(float(np.degrees(se3.angle(moved))), 1),
+        "silently_wrong_frames": wrong,
+        "uncovered_frames": uncovered,
+        "tracking_after_frames": tracking[0] + 1 if tracking and not wrong else None,
+        "breaks": tracked.breaks,
+        "error_m": {"first": round(errors[0], 3), "last": round(errors[-1], 3)},
+    }
+
+
+def _since(last: Tracked, base: Array, tracked: Tracked) -> Array:
+    """Covariance (6, 6) of a pose, that of the last registered one before it being `base`; as the ROS node adds up."""
+    A = se3.adjoint(se3.inverse(tracked.T_odom_lidar) @ last.T_odom_lidar)
+    return np.asarray(A @ base @ A.T + tracked.covariance)
+
+
+def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """How many gaps there are, are silently wrong, are bridged, and are broken; of each length and in all."""
+    parts = {f"{s:g} s": [row for row in rows if row["seconds"] == s] for s in _SECONDS} | {"all": list(rows)}
+    return {
+        name: {
+            "gaps": len(part),
+            "silently_wrong": sum(row["silently_wrong_frames"] > 0 for row in part),
+            "uncovered": sum(row["uncovered_frames"] > 0 for row in part),
+            "bridged": sum(row["tracking_after_frames"] is not None for row in part),
+            "broken": sum(row["breaks"] > 0 for row in part),
+        }
+        for name, part in parts.items()
+        if part
+    }
+
+
+def _table(results: dict[str, Any]) -> FigureTable:
+    figures = ("number", "silently wrong", "beyond 3 sigma", "bridged", "broken")
+    table = FigureTable("After a gap in the stream", names=["drive", "method", "gap"], figures=figures)
+    for drive, methods in results.items():
+        for method, result in methods.items():
+            for length, row in result["summary"].items():
+                table.add_row(drive, method, length, *(str(value) for value in row.values()))
+    return table
