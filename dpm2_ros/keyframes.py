@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from nav_msgs.msg import Odometry
+from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
@@ -47,6 +48,7 @@ _MOST_CHANNELS = 4096
 _MOST_ANSWERED = 1001  # numbers in an answer
 _SLOT, _MEMORY = 0.3, 0.8  # s; the mapper answers twice a second
 _TICK, _PATIENCE, _ANNOUNCE, _BURST = 0.25, 1.5, 2.0, 8  # s; s until sent again; s; keyframes a tick
+_FAREWELL = 4.0  # s; DDS asks after 3 s for a receipt that has not come
 
 
 class KeyframeSender:
@@ -93,6 +95,12 @@ class KeyframeSender:
                 self._sent.append(time.monotonic())
                 self._announced = time.monotonic()
         self._publish(parts)
+
+    def close(self) -> None:
+        """Before the node ends: wait until a mapper elsewhere has received what was sent last, or for `_FAREWELL`."""
+        end = time.monotonic() + (_FAREWELL if self._keep else 0.0)
+        for publisher in (self._pose, self._descriptors, self._cloud):
+            publisher.wait_for_all_acked(Duration(seconds=max(0.0, end - time.monotonic())))
 
     def _publish(self, parts: Sequence[bytes]) -> None:
         for publisher, message in zip((self._pose, self._descriptors, self._cloud), parts, strict=True):

@@ -95,6 +95,7 @@ class SlamNode(GuardedNode):
         self._worker.join()
         self._give_up()
         self._line.shutdown(wait=True)
+        self._sender.close()
         self.get_logger().info(self._diagnostics.account())
         if self._mapper is not None:
             self._mapper.close()

@@ -10,6 +10,7 @@ import numpy as np
 from dpm2_core.frame import Camera, Frame, Image, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.system import SlamSettings, SlamSystem
+from dpm2_ros.runtime import STOP
 
 _FRAMES = 3  # the first begins the map, the second finds the speed, the third is like all others
 _PERIOD = 100_000_000  # ns
@@ -26,6 +27,8 @@ def warm_up(settings: SlamSettings) -> None:
     """
     system = SlamSystem(settings)
     for n in range(_FRAMES):
+        if STOP.is_set():
+            return
         system.odometry.request_keyframe()  # so that the network and the map work on each
         frame = Frame(n * _PERIOD, _street(n * _SPEED), images=_image() if system.odometry.uses_images else (), index=n)
         system.process(frame)

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Odometry
+from nav_msgs.msg import Path as PathMsg
 from sensor_msgs.msg import PointCloud2
 
 from dpm2_core.data import topics
@@ -21,7 +22,7 @@ from dpm2_core.data.messages import stamp_ns
 from dpm2_core.data.source import InputSettings
 from dpm2_core.evaluation.metrics import ape_rmse
 from dpm2_ros.demo import judge, map_poses
-from dpm2_ros.mapping import KEEP_ALL
+from dpm2_ros.mapping import KEEP_ALL, LAST_ONE
 from dpm2_ros.replay import replay, ros_environment, start
 
 SAVED = ["map.ply", "pose_graph.g2o", "trajectory.tum"]
@@ -110,7 +111,7 @@ def test_a_drive_through_player_slam_node_and_mapper_node(
     """Three processes, the mapper apart: every cloud comes out, and the mapper saves the map of all keyframes."""
     harness = ros()
     odometry, keyframes = harness.hear(Odometry, "/dpm2/odom"), harness.hear(Odometry, "/dpm2/keyframe_odom", KEEP_ALL)
-    diagnostics = harness.hear(DiagnosticArray, "/diagnostics")
+    diagnostics, paths = harness.hear(DiagnosticArray, "/diagnostics"), harness.hear(PathMsg, "/dpm2/path", LAST_ONE)
     environment = ros_environment(harness.node.context.get_domain_id())
     apart = ["--ros-args", "-p", "ros.embed_mapper:=false", "-p", "ros.map_directory:=''", "-p", "use_sim_time:=true"]
     saving = ["--ros-args", "-p", f"ros.map_directory:={tmp_path / 'map'}"]
@@ -133,9 +134,11 @@ def test_a_drive_through_player_slam_node_and_mapper_node(
         processes["player"] = player
         assert player.wait(60) == 0
         harness.wait(lambda: len(odometry) == drive.frames, "every pose")
-        for process in (processes["slam_node"], processes["mapper_node"]):
-            process.send_signal(signal.SIGINT)
-            assert process.wait(30) == 0
+        processes["slam_node"].send_signal(signal.SIGINT)
+        assert processes["slam_node"].wait(30) == 0
+        harness.wait(lambda: paths and len(paths[-1].poses) == len(keyframes), "the last keyframe in the map")
+        processes["mapper_node"].send_signal(signal.SIGINT)
+        assert processes["mapper_node"].wait(30) == 0
     finally:
         for process in processes.values():
             process.kill()
