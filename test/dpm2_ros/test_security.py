@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The SROS2 policy allows what the nodes do, and nothing else."""
+
+from __future__ import annotations
+
+import time
+import xml.etree.ElementTree as ET
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dpm2_ros.mapper_node import MapperNode
+from dpm2_ros.replay import ros_environment, start, stop
+from dpm2_ros.slam_node import SlamNode
+
+POLICY = Path(__file__).parents[2] / "config" / "sros2_policy.xml"
+KINDS = {"publish": "publisher", "subscribe": "subscriber", "reply": "service", "request": "client"}
+Graph = dict[str, set[str]]
+
+
+def allowed(node: str) -> Graph:
+    """What the policy lets a node do, by kind, with names as the graph has them."""
+    (profile,) = ET.parse(POLICY).getroot().findall(f"enclaves/enclave[@path='/dpm2/{node}']/profiles/profile")
+    assert (profile.get("node"), profile.get("ns")) == (node, "/")
+    out: Graph = {kind: set() for kind in KINDS.values()}
+    for section in profile:
+        for rule, permission in section.attrib.items():
+            assert permission == "ALLOW"
+            names = [str(item.text).replace("~", node) for item in section]
+            assert len(set(names)) == len(names)
+            out[KINDS[rule]] |= {f"/{name.lstrip('/')}" for name in names}
+    return out
+
+
+def done(harness: Any, node: str, missing: Callable[[Graph], bool]) -> Graph:
+    """What a node does, by kind, as another one sees it, once nothing is missing."""
+
+    def look() -> Graph:
+        if node not in harness.node.get_node_names():
+            return {kind: set() for kind in KINDS.values()}
+        looks = {kind: getattr(harness.node, f"get_{kind}_names_and_types_by_node") for kind in KINDS.values()}
+        return {kind: {name for name, _ in find(node, "/")} for kind, find in looks.items()}
+
+    harness.wait(lambda: not missing(look()), f"all that {node} does")
+    time.sleep(0.5)  # for what it does besides
+    return look()
+
+
+EMBEDDED = {"subscriber": {"/clock", "/dpm2/keyframes_received"}}
+APART = {
+    "publisher": {f"/dpm2/{name}" for name in ("loop_candidates", "loop_closure", "map", "path", "pose_graph")},
+    "service": {"/slam_node/save_map"},
+}
+
+
+@pytest.mark.parametrize(
+    ("make", "parameters", "without"),
+    [
+        (SlamNode, (), EMBEDDED),
+        (SlamNode, ("ros.embed_mapper:=false", "use_sim_time:=true"), APART),
+        (MapperNode, ("use_sim_time:=true",), {}),
+    ],
+)
+def test_nodes_do_what_the_policy_allows(
+    ros: Callable[..., Any], make: Any, parameters: tuple[str, ...], without: Graph
+) -> None:
+    """All of it and nothing else, but for what one way of running them does without."""
+    harness = ros("slam.loops.descriptors:=false", *parameters)
+    node = harness.add(make()).get_name()
+    expected = {kind: names - without.get(kind, set()) for kind, names in allowed(node).items()}
+    assert done(harness, node, lambda graph: any(expected[kind] - graph[kind] for kind in graph)) == expected
+
+
+def test_the_player_does_what_the_policy_allows(ros: Callable[..., Any], bag: Path, tmp_path: Path) -> None:
+    """With a bag of `dpm2 convert kitti`."""
+    harness = ros()
+    environment = ros_environment(harness.node.context.get_domain_id())
+    player = start("bag_player", [str(bag), "--wait", "60", "--lockstep"], environment, tmp_path / "log")
+    expected = allowed("bag_player")
+    try:
+        found = done(harness, "bag_player", lambda graph: any(expected[kind] - graph[kind] for kind in graph))
+    finally:
+        stop(player)
+    assert found == expected
