@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from dpm2_core.config import Settings
-from dpm2_core.errors import Dpm2Error
+from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Array, Frame, Keyframe, LoopClosure, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.pose_graph import PoseGraph
@@ -214,7 +214,11 @@ class Mapper:
         self._graph.write_g2o(path)
 
     def _load(self, store: MapStore) -> None:
-        data = load_map(store)
+        data, channels = load_map(store), self._loops.channels
+        for d in (keyframe.descriptors for keyframe in data.keyframes):
+            if d is not None and channels is not None and d.features.shape[1] != channels:
+                width = d.features.shape[1]
+                raise UsageError(f"{store.path}: descriptors of {width} channels, the network makes {channels}")
         self.keyframes, self._clouds = data.keyframes, data.clouds
         try:
             restore(self._graph, data)

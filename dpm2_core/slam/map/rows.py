@@ -195,7 +195,7 @@ def edge_of(row: tuple[Any, ...]) -> Edge:
         raise ValueError("its confidence or rmse is no number")
     try:
         T, covariance = pose_of(T), bytes_array(covariance, 6)
-        if not np.isfinite(covariance).all() or (ok and np.linalg.eigvalsh(covariance)[0] <= 0):
+        if not np.isfinite(covariance).all() or (ok and not se3.is_covariance(covariance)):
             raise ValueError
     except ValueError:
         raise ValueError("not a finite rigid transform with a positive covariance") from None

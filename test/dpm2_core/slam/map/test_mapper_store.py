@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Keyframe, Points, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.pose_graph import PoseGraph, PoseGraphSettings
@@ -217,3 +218,16 @@ def test_thumbnails(tmp_path: Path, width: int) -> None:
     assert back.shape == (32, 64, 3)
     assert back[10, 10, 2] > 240  # BGR
     assert back[10, 10, 0] < 20
+
+
+def test_descriptors_that_the_network_cannot_compare_are_told(map_file: Path) -> None:
+    """Of 16 channels, whatever weights the file names; every search for loops would fail with them."""
+
+    class Network(KnownLoops):
+        channels = 128
+
+    for read_only in (True, False):
+        with MapStore.open(map_file, read_only) as store:
+            with pytest.raises(UsageError, match="descriptors of 16 channels, the network makes 128") as caught:
+                Mapper(MapSettings(), PoseGraph(PoseGraphSettings()), Network(), store)
+            assert str(map_file) in str(caught.value)
