@@ -30,6 +30,7 @@ class Drive:
     """Twenty frames of 2,000 points and one picture, whose brightness is its number."""
 
     name = "drive"
+    truth = "poses/drive.txt"
     poses = None
     T_cam_lidar = None
 
