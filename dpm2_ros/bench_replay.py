@@ -11,11 +11,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.box import SIMPLE
 from rich.console import Console
-from rich.table import Table
 
 from dpm2_core.errors import Dpm2Error
+from dpm2_core.tables import FigureTable
 from dpm2_ros.replay import ros_environment, start, stop
 from dpm2_ros.runtime import exit_code
 
@@ -28,9 +27,9 @@ def bench(
     times: Annotated[int, typer.Option(min=1, help="Replays of each kind.")] = 5,
 ) -> int:
     """Play a bag at its own speed, at twice that, and in lockstep. Exit code 1 if a cloud is not accounted for."""
-    table = Table(title=f"{bag}, node and player started together", title_justify="left", box=SIMPLE)
-    for column in ("played", "sent", "processed", "dropped", "lost", "sum", "playing s", ""):
-        table.add_column(column, justify="right")
+    figures = ("sent", "processed", "dropped", "lost", "sum", "playing s")
+    title = f"{bag}, node and player started together"
+    table = FigureTable(title, names=["played"], figures=figures, text=["remarks"])
     wrong = 0
     for played in PLAYED:
         for _ in range(times):
