@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
-from dpm2_core.diffslam.tasks.range_image import to_points
 from dpm2_core.extras import needs
 from dpm2_core.files import atomic_write
+from dpm2_core.network.perception.range_image import to_points
 
 _BACKGROUND, _INK = "#0d1117", "#c9d1d9"
 _FAR = 40.0  # m, the last colour, and the edge of the view from above

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
-from dpm2_core.diffslam.tasks.gndnet import GroundSettings, cell_of, height_above
 from dpm2_core.extras import needs
 from dpm2_core.files import atomic_write
+from dpm2_core.network.perception.gndnet import GroundSettings, cell_of, height_above
 
 
 def ground_png(path: Path, found: Tensor, truth: Tensor, points: Tensor, settings: GroundSettings) -> None:

@@ -18,9 +18,9 @@ from dpm2_core.errors import UsageError
 from dpm2_core.frame import Points
 
 if TYPE_CHECKING:  # torch takes seconds to import, and the geometric SLAM does without
-    from dpm2_core.diffslam.tasks.dslr import Dslr
-    from dpm2_core.diffslam.tasks.gndnet import GroundNet
-    from dpm2_core.network.movers import MoverNet
+    from dpm2_core.network.perception.dslr import Dslr
+    from dpm2_core.network.perception.dynamic_objects import MoverNet
+    from dpm2_core.network.perception.gndnet import GroundNet
 
 FilterKind = Literal["none", "movers", "ground", "static"]
 WEIGHTS: dict[FilterKind, str] = {"movers": "movers", "ground": "gndnet", "static": "dslr"}
@@ -72,7 +72,7 @@ class GroundFilter:
     def __call__(self, points: Points) -> Points:
         import torch
 
-        from dpm2_core.diffslam.tasks.gndnet import obstacle_weight
+        from dpm2_core.network.perception.gndnet import obstacle_weight
 
         with torch.inference_mode():
             scan = torch.from_numpy(points)
@@ -112,9 +112,9 @@ def make_filter(settings: FilterSettings, threads: int) -> PointFilter | None:
 
         return MoverFilter(movers_task.load(path), settings.threshold, settings.most)
     if settings.kind == "ground":
-        from dpm2_core.diffslam.tasks import gndnet
+        from dpm2_core.network.perception import gndnet
 
         return GroundFilter(gndnet.load(path))
-    from dpm2_core.diffslam.tasks import dslr
+    from dpm2_core.network.perception import dslr
 
     return StaticFilter(dslr.load(path))

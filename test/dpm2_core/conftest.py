@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 from dpm2_core.config import settings_from
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.frame import Camera, Image, Keyframe, Registration
-from dpm2_core.geometry import se3
+from dpm2_core.geometry import se3, se3_torch
 from dpm2_core.network.config import NetworkSettings
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.slam.map.cloud_codec import pack_cloud
@@ -125,3 +126,23 @@ def map_file(tmp_path: Path, drive: list[Keyframe]) -> Path:
         refused = Edge("loop", 0, 11, np.eye(4), np.eye(6), False, 0.1, np.inf, "test", "too far")
         store.write(Change(edges=[Edge("loop", 2, 11, T, np.eye(6) * 1e-4, method="test"), refused]))
     return path
+
+
+MOTION = se3.exp(np.array([0.002, -0.003, np.deg2rad(1.2), 0.8, 0.1, 0.02]))
+"""From a scan to the next: 0.8 m, 1.2 deg."""
+
+
+@pytest.fixture
+def motion() -> Tensor:
+    """(4, 4) T_scan_next."""
+    return torch.from_numpy(MOTION)
+
+
+@pytest.fixture
+def scans(street: Callable[..., np.ndarray], noise: np.random.Generator) -> list[Tensor]:
+    """Four scans (600, 3) float64 of the same points from poses `motion` apart."""
+    world = torch.from_numpy(street(noise, points=600)).double()
+    out = [world]
+    for _ in range(3):
+        out.append(se3_torch.transform(torch.from_numpy(se3.inverse(MOTION)), out[-1]))
+    return out

@@ -10,10 +10,10 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from dpm2_core.config import Settings
-from dpm2_core.diffslam.tasks.dslr import down, initialise, up
-from dpm2_core.diffslam.tasks.range_image import CHANNELS, RangeImageSettings
-from dpm2_core.diffslam.tasks.weights import load_network
 from dpm2_core.errors import UsageError
+from dpm2_core.network.perception.dslr import down, initialise, up
+from dpm2_core.network.perception.range_image import CHANNELS, RangeImageSettings
+from dpm2_core.network.perception.task_weights import load_network
 
 
 class AeLidarImage(RangeImageSettings):

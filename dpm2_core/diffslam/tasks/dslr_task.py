@@ -12,7 +12,6 @@ from torch import Tensor
 from torch.nn import functional
 
 from dpm2_core.diffslam.tasks.data import TaskScan, TaskScans
-from dpm2_core.diffslam.tasks.dslr import Dslr, DslrSettings
 from dpm2_core.diffslam.tasks.range_scans import (
     RangeReader,
     RangeScans,
@@ -25,6 +24,7 @@ from dpm2_core.diffslam.tasks.range_scans import (
 from dpm2_core.diffslam.tasks.task import SlamTaskTraining, Task
 from dpm2_core.diffslam.tasks.training import mean_figures
 from dpm2_core.diffslam.trajectory_loss import SlamLoss
+from dpm2_core.network.perception.dslr import Dslr, DslrSettings
 
 _BATCH = 16
 _MOVED = 0.5

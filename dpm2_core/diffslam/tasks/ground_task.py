@@ -13,7 +13,11 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from dpm2_core.diffslam.tasks.data import TaskScan, TaskScans
-from dpm2_core.diffslam.tasks.gndnet import (
+from dpm2_core.diffslam.tasks.task import SlamTaskTraining, Task
+from dpm2_core.diffslam.tasks.training import mean_figures
+from dpm2_core.diffslam.trajectory_loss import SlamLoss, SlamLossSettings
+from dpm2_core.errors import UsageError
+from dpm2_core.network.perception.gndnet import (
     GroundNet,
     GroundSettings,
     elevation_labels,
@@ -21,10 +25,6 @@ from dpm2_core.diffslam.tasks.gndnet import (
     ground_metrics,
     obstacle_weight,
 )
-from dpm2_core.diffslam.tasks.task import SlamTaskTraining, Task
-from dpm2_core.diffslam.tasks.training import mean_figures
-from dpm2_core.diffslam.trajectory_loss import SlamLoss, SlamLossSettings
-from dpm2_core.errors import UsageError
 
 GROUND = (40, 44, 48, 49, 60, 72)
 """Road, parking, sidewalk, other ground, lane marking, terrain: SemanticKITTI's classes of the ground."""

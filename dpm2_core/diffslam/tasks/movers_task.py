@@ -17,9 +17,9 @@ from torch.nn import functional
 from dpm2_core.diffslam.tasks.data import TaskScan, TaskScans
 from dpm2_core.diffslam.tasks.ground_task import UNCOUNTED
 from dpm2_core.diffslam.tasks.task import Task, TaskTraining
-from dpm2_core.diffslam.tasks.weights import load_network
 from dpm2_core.errors import UsageError
-from dpm2_core.network.movers import MoverNet, MoverNetSettings, occupancy, voxels
+from dpm2_core.network.perception.dynamic_objects import MoverNet, MoverNetSettings, occupancy, voxels
+from dpm2_core.network.perception.task_weights import load_network
 
 MOVABLE = (10, 11, 13, 15, 16, 18, 20, 30, 31, 32)
 """Cars, bicycles, buses, motorcycles, on rails, trucks, other vehicles, people, riders: SemanticKITTI's classes."""

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from dpm2_core.diffslam.tasks.dslr import Dslr, DslrSettings
-from dpm2_core.diffslam.tasks.gndnet import GroundNet, GroundSettings
 from dpm2_core.diffslam.tasks.movers_task import MoverTask, MoverTraining
 from dpm2_core.diffslam.tasks.training import save_task
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Frame
-from dpm2_core.network.movers import MoverNetSettings
+from dpm2_core.network.perception.dslr import Dslr, DslrSettings
+from dpm2_core.network.perception.dynamic_objects import MoverNetSettings
+from dpm2_core.network.perception.gndnet import GroundNet, GroundSettings
 from dpm2_core.slam.filters import FilterSettings, GroundFilter, MoverFilter, StaticFilter, make_filter
 from dpm2_core.slam.preprocess import Preprocessor, PreprocessSettings
 from dpm2_core.slam.system import SlamSettings, SlamSystem

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from dpm2_core.diffslam.tasks.range_image import RangeImageSettings
 from dpm2_core.geometry import se3
+from dpm2_core.network.perception.range_image import RangeImageSettings
 
 MOTION = se3.exp([0, 0, 0.01, 0.6, 0.0, 0.0])
 BUILDING, CAR, ROAD, UNLABELLED = 50, 10, 40, 0

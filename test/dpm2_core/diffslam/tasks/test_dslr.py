@@ -13,11 +13,11 @@ from torch import nn
 
 from dpm2_core.diffslam import ScheduleSettings, SlamLossSettings
 from dpm2_core.diffslam.tasks.data import TaskScan, TaskScans, open_scans
-from dpm2_core.diffslam.tasks.dslr import Dslr, DslrSettings, PairDiscriminator, RangeDecoder, RangeEncoder, load
 from dpm2_core.diffslam.tasks.dslr_task import DslrTask, DslrTraining
-from dpm2_core.diffslam.tasks.range_image import RangeImageSettings
 from dpm2_core.diffslam.tasks.training import WEIGHTS, draw, measure, train_task
 from dpm2_core.errors import UsageError
+from dpm2_core.network.perception.dslr import Dslr, DslrSettings, PairDiscriminator, RangeDecoder, RangeEncoder, load
+from dpm2_core.network.perception.range_image import RangeImageSettings
 from dpm2_core.network.weights import read_tensors
 
 SENSOR = RangeImageSettings(beams=((2.0, -14.0, 16),), first=0, rows=16, columns=64, scale=60.0)

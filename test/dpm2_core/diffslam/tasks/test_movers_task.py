@@ -10,12 +10,12 @@ import pytest
 import torch
 
 from dpm2_core.diffslam.tasks.data import TaskScan, TaskScans
-from dpm2_core.diffslam.tasks.gndnet import GroundSettings
 from dpm2_core.diffslam.tasks.movers_task import MOVABLE, MoverTask, MoverTraining, load
 from dpm2_core.diffslam.tasks.training import save_task, train_task
-from dpm2_core.diffslam.tasks.weights import write_weights
 from dpm2_core.errors import UsageError
-from dpm2_core.network.movers import MoverNetSettings
+from dpm2_core.network.perception.dynamic_objects import MoverNetSettings
+from dpm2_core.network.perception.gndnet import GroundSettings
+from dpm2_core.network.perception.task_weights import write_weights
 
 SMALL = MoverTraining(network=MoverNetSettings(cells=32, cell=1.0, channels=8), epochs=12, every=1, batch=1, drop=0.3)
 

@@ -15,7 +15,6 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from dpm2_core.diffslam import SlamLoss
-from dpm2_core.diffslam.tasks import gndnet
 from dpm2_core.diffslam.tasks.data import TaskScan, TaskScans, open_scans
 from dpm2_core.diffslam.tasks.ground_task import GroundTask, GroundTraining
 from dpm2_core.diffslam.tasks.training import (
@@ -28,6 +27,7 @@ from dpm2_core.diffslam.tasks.training import (
     train_task,
 )
 from dpm2_core.errors import UsageError
+from dpm2_core.network.perception import gndnet
 
 TINY = {"cells": 32, "cell": 2.0, "channels": 4}
 

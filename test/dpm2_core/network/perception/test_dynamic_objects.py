@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from dpm2_core.network.movers import LAYERS, MoverNet, MoverNetSettings, occupancy, voxels
+from dpm2_core.network.perception.dynamic_objects import LAYERS, MoverNet, MoverNetSettings, occupancy, voxels
 
 SMALL = MoverNetSettings(cells=16, cell=1.0, channels=4)
 

@@ -10,8 +10,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from dpm2_core.diffslam.tasks.range_image import RangeImageSettings, azimuths, elevations, fill, project, to_points
 from dpm2_core.errors import UsageError
+from dpm2_core.network.perception.range_image import RangeImageSettings, azimuths, elevations, fill, project, to_points
 from dpm2_core.sim.lidar import elevations as sensor_elevations
 
 SETTINGS = RangeImageSettings()

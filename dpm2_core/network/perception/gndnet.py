@@ -16,8 +16,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dpm2_core.config import Settings
-from dpm2_core.diffslam.tasks.weights import load_network
 from dpm2_core.errors import UsageError
+from dpm2_core.network.perception.task_weights import load_network
 
 
 class GroundSettings(Settings):

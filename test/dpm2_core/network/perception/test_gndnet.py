@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from dpm2_core.diffslam import SlamLoss
-from dpm2_core.diffslam.tasks.gndnet import (
+from dpm2_core.errors import UsageError
+from dpm2_core.network.perception.gndnet import (
     GroundNet,
     GroundSettings,
     elevation_labels,
@@ -17,7 +18,6 @@ from dpm2_core.diffslam.tasks.gndnet import (
     height_above,
     obstacle_weight,
 )
-from dpm2_core.errors import UsageError
 
 SMALL = GroundSettings(cells=16, channels=8)
 

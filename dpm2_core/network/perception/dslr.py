@@ -16,7 +16,8 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from dpm2_core.config import Settings
-from dpm2_core.diffslam.tasks.range_image import (
+from dpm2_core.errors import UsageError
+from dpm2_core.network.perception.range_image import (
     CHANNELS,
     RangeImageSettings,
     fill,
@@ -24,8 +25,7 @@ from dpm2_core.diffslam.tasks.range_image import (
     slots,
     to_points,
 )
-from dpm2_core.diffslam.tasks.weights import load_network
-from dpm2_core.errors import UsageError
+from dpm2_core.network.perception.task_weights import load_network
 
 _TALLEST = 42  # rows that the decoder makes; the image is cut from them
 
