@@ -108,9 +108,9 @@ def make_filter(settings: FilterSettings, threads: int) -> PointFilter | None:
 
     torch.set_num_threads(threads)
     if settings.kind == "movers":
-        from dpm2_core.diffslam.tasks import movers_task
+        from dpm2_core.network.perception import dynamic_objects
 
-        return MoverFilter(movers_task.load(path), settings.threshold, settings.most)
+        return MoverFilter(dynamic_objects.load(path), settings.threshold, settings.most)
     if settings.kind == "ground":
         from dpm2_core.network.perception import gndnet
 

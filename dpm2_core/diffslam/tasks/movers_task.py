@@ -19,7 +19,6 @@ from dpm2_core.diffslam.tasks.ground_task import UNCOUNTED
 from dpm2_core.diffslam.tasks.task import Task, TaskTraining
 from dpm2_core.errors import UsageError
 from dpm2_core.network.perception.dynamic_objects import MoverNet, MoverNetSettings, occupancy, voxels
-from dpm2_core.network.perception.task_weights import load_network
 
 MOVABLE = (10, 11, 13, 15, 16, 18, 20, 30, 31, 32)
 """Cars, bicycles, buses, motorcycles, on rails, trucks, other vehicles, people, riders: SemanticKITTI's classes."""
@@ -95,11 +94,6 @@ class MoverTask(Task):
 
         points, movable, counted = _arrays(scan)
         movers_png(path, points[counted], self.net.probability(points)[counted] > 0.5, movable[counted])
-
-
-def load(path: Path) -> MoverNet:
-    """A trained network on the CPU, ready for inference; raises as `weights.load_network`."""
-    return load_network(path, "movers", "net", MoverNetSettings, MoverNet)
 
 
 def _arrays(scan: TaskScan) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]:

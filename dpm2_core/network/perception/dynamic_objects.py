@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -20,6 +21,7 @@ from torch.nn import functional
 
 from dpm2_core.config import Settings
 from dpm2_core.geometry.ground import height_above_ground
+from dpm2_core.network.perception.task_weights import load_network
 
 LAYERS = (0.25, 0.75, 1.25, 1.75, 2.5, 4.0)
 """Bounds of the layers of height above the ground, m; one more layer below, one above."""
@@ -105,3 +107,8 @@ def _layer(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
 
 def _block(inputs: int, middle: int, outputs: int, stride: int = 1) -> nn.Sequential:
     return nn.Sequential(_layer(inputs, middle, stride), _layer(middle, outputs))
+
+
+def load(path: Path) -> MoverNet:
+    """A trained network on the CPU, ready for inference; raises as `weights.load_network`."""
+    return load_network(path, "movers", "net", MoverNetSettings, MoverNet)

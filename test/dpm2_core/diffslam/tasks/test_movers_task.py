@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from dpm2_core.diffslam.tasks.data import TaskScan, TaskScans
-from dpm2_core.diffslam.tasks.movers_task import MOVABLE, MoverTask, MoverTraining, load
+from dpm2_core.diffslam.tasks.movers_task import MOVABLE, MoverTask, MoverTraining
 from dpm2_core.diffslam.tasks.training import save_task, train_task
 from dpm2_core.errors import UsageError
-from dpm2_core.network.perception.dynamic_objects import MoverNetSettings
+from dpm2_core.network.perception.dynamic_objects import MoverNetSettings, load
 from dpm2_core.network.perception.gndnet import GroundSettings
 from dpm2_core.network.perception.task_weights import write_weights
 
