@@ -30,7 +30,7 @@ def show(
     """
     from dpm2_core.evaluation.attention import image_attention
     from dpm2_core.evaluation.matches import matches_png
-    from dpm2_core.slam.neural import load_network
+    from dpm2_core.network.pretrained import load_network
 
     first, second = _two(frames)
     model = load_network(weights, threads=2)

@@ -16,16 +16,15 @@ from pydantic import Field
 from dpm2_core.config import Settings
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Points
+from dpm2_core.network.pretrained import PERCEPTION_WEIGHTS, PRETRAINED_DIR
 
 if TYPE_CHECKING:  # torch takes seconds to import, and the geometric SLAM does without
     from dpm2_core.network.perception.dslr import Dslr
     from dpm2_core.network.perception.dynamic_objects import MoverNet
     from dpm2_core.network.perception.gndnet import GroundNet
 
+
 FilterKind = Literal["none", "movers", "ground", "static"]
-WEIGHTS: dict[FilterKind, str] = {"movers": "movers", "ground": "gndnet", "static": "dslr"}
-"""Names of the weights of each kind, and of the task that trains them."""
-SHIPPED = Path(__file__).resolve().parents[1] / "weights"
 
 
 class FilterSettings(Settings):
@@ -100,10 +99,12 @@ def make_filter(settings: FilterSettings, threads: int) -> PointFilter | None:
     """
     if settings.kind == "none":
         return None
-    path = settings.weights or SHIPPED / f"{WEIGHTS[settings.kind]}.safetensors"
+    path = settings.weights or PRETRAINED_DIR / f"{PERCEPTION_WEIGHTS[settings.kind]}.safetensors"
     if not path.is_file():
         why = "no such file" if settings.weights else "none come with this dpm2"
-        raise UsageError(f"slam.filter.weights: {why} ({path}); `dpm2 train {WEIGHTS[settings.kind]}` makes some")
+        raise UsageError(
+            f"slam.filter.weights: {why} ({path}); `dpm2 train {PERCEPTION_WEIGHTS[settings.kind]}` makes some"
+        )
     import torch
 
     torch.set_num_threads(threads)

@@ -4,9 +4,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,17 +12,14 @@ from pydantic import Field
 
 from dpm2_core.config import Settings
 from dpm2_core.descriptors import Descriptors, merge
-from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Array, Frame, Registration
 from dpm2_core.geometry import se3
-from dpm2_core.slam import filters
 from dpm2_core.slam.preprocess import Preprocessor, Scan
 from dpm2_core.slam.scan_registration import Prediction, agree
 
 if TYPE_CHECKING:  # torch takes seconds to import, and the geometric SLAM does without
     from dpm2_core.network.model import DeepPointMap2
-
-SHIPPED = filters.SHIPPED
 
 
 class NeuralSettings(Settings):
@@ -152,50 +147,6 @@ class NeuralScanRegistration:
     def update(self, scan: Scan, T_odom_lidar: Array) -> None:
         if scan.descriptors is not None and self._map.wants(T_odom_lidar):
             self._map.insert(scan.descriptors, T_odom_lidar)
-
-
-def shipped() -> Sequence[str]:
-    """Names of the weights of the network that come with dpm2."""
-    return sorted({path.stem for path in SHIPPED.glob("*.safetensors")} - set(filters.WEIGHTS.values()))
-
-
-def weights_path(weights: str) -> Path:
-    """The file of shipped weights by their name, or the file of that path.
-
-    Raises:
-        UsageError: there is neither.
-    """
-    if weights in shipped():
-        return SHIPPED / f"{weights}.safetensors"
-    if not Path(weights).is_file():
-        names = ", ".join(shipped()) or "none"
-        raise UsageError(f"slam.neural.weights {weights}: no such file; weights that come with dpm2: {names}")
-    return Path(weights)
-
-
-def load_network(weights: str, threads: int, preset: str = "") -> DeepPointMap2:
-    """The network with weights, ready to run on the CPU; without its camera if it was trained without pictures.
-
-    Args:
-        weights: name of shipped weights, or path of a .safetensors file.
-        threads: of torch, which has one number for the whole process.
-        preset: that the weights must be of; empty: any.
-
-    Raises:
-        UsageError: no such weights, or of another preset.
-    """
-    path = weights_path(weights)
-    import torch
-
-    from dpm2_core.network.weights import load_model, read_metadata
-
-    torch.set_num_threads(threads)
-    model = load_model(path)
-    if read_metadata(path).get("images") != "true":
-        model.encoder.image = None  # a branch that has never seen a picture would only disturb
-    if preset and model.settings.preset != preset:
-        raise UsageError(f"{path}: weights of preset {model.settings.preset}, slam.neural.preset is {preset}")
-    return model
 
 
 def _failed(T_predicted: Array, reason: str) -> Registration:

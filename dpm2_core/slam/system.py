@@ -11,6 +11,7 @@ from pydantic import Field
 from dpm2_core.config import Settings
 from dpm2_core.data.source import InputSettings
 from dpm2_core.frame import Frame, Tracked
+from dpm2_core.network.pretrained import load_network
 from dpm2_core.slam.filters import FilterSettings, make_filter
 from dpm2_core.slam.graph.pose_graph import PoseGraph, PoseGraphSettings
 from dpm2_core.slam.keyframes import KeyframeSelector, KeyframeSettings
@@ -20,7 +21,7 @@ from dpm2_core.slam.loops.localiser import Localiser, Located
 from dpm2_core.slam.loops.relocalise import Relocaliser, RelocaliseSettings
 from dpm2_core.slam.map.mapper import Mapper, MapSettings, thumbnail
 from dpm2_core.slam.map.store import MapStore
-from dpm2_core.slam.neural import NeuralScanRegistration, NeuralSettings, load_network
+from dpm2_core.slam.neural import NeuralScanRegistration, NeuralSettings
 from dpm2_core.slam.odometry import Odometry, OdometrySettings
 from dpm2_core.slam.preprocess import Preprocessor, PreprocessSettings
 from dpm2_core.slam.refined import RefinedScanRegistration

@@ -29,9 +29,9 @@ from dpm2_core.network.decoder import Decoder
 from dpm2_core.network.descriptors import Tokens
 from dpm2_core.network.encoder import to_device
 from dpm2_core.network.model import DeepPointMap2
+from dpm2_core.network.pretrained import weights_path
 from dpm2_core.network.pyramid import PointBatch
 from dpm2_core.network.weights import load_model, read_metadata, save_weights
-from dpm2_core.slam.neural import weights_path
 from dpm2_core.slam.output import TrajectoryRecorder
 from dpm2_core.slam.system import SlamSettings, SlamSystem
 from dpm2_core.training.augment import AugmentSettings

@@ -18,10 +18,10 @@ from dpm2_core.config import load_settings
 from dpm2_core.data.source import InputSettings, open_source
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.bench.harness import Options, Report, git_commit, write_report
+from dpm2_core.network.pretrained import weights_path
 from dpm2_core.network.weights import load_model
 from dpm2_core.sim.config import LidarConfig, PresetName
 from dpm2_core.sim.drive import simulate
-from dpm2_core.slam.neural import weights_path
 from dpm2_core.slam.system import SlamSettings
 from dpm2_core.tables import FigureTable
 from dpm2_core.training.finetune import FinetuneSettings, finetune, prepare

@@ -41,9 +41,9 @@ from dpm2_core.evaluation.figures import success_png
 from dpm2_core.frame import Frame
 from dpm2_core.network.encoder import collate_views
 from dpm2_core.network.model import DeepPointMap2
+from dpm2_core.network.pretrained import load_network, weights_path
 from dpm2_core.network.pyramid import build_pyramid, collate, crop
 from dpm2_core.network.weights import read_metadata
-from dpm2_core.slam.neural import load_network, weights_path
 from dpm2_core.slam.system import make_registration
 
 Part = Callable[[DeepPointMap2, Options], dict[str, Any]]

@@ -20,10 +20,11 @@ from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.bench.harness import Options, Report, git_commit, overrides_of, write_report
 from dpm2_core.evaluation.metrics import evaluate
 from dpm2_core.frame import Frame, Points
+from dpm2_core.network.pretrained import PERCEPTION_WEIGHTS, PRETRAINED_DIR
 from dpm2_core.sim.config import LidarConfig, PresetName
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.world import World, build_world
-from dpm2_core.slam.filters import SHIPPED, WEIGHTS, FilterKind, FilterSettings, make_filter
+from dpm2_core.slam.filters import FilterKind, FilterSettings, make_filter
 from dpm2_core.slam.odometry import Odometry
 from dpm2_core.slam.system import Config, SlamSettings, make_odometry
 from dpm2_core.tables import FigureTable
@@ -79,7 +80,7 @@ def bench_traffic(options: Options) -> Report:
 
 def _methods(registration: str) -> list[str]:
     """What is compared: `none`, the filters that have weights (with a network `movers` alone), the oracle."""
-    shipped = [kind for kind, name in WEIGHTS.items() if (SHIPPED / f"{name}.safetensors").is_file()]
+    shipped = [kind for kind, name in PERCEPTION_WEIGHTS.items() if (PRETRAINED_DIR / f"{name}.safetensors").is_file()]
     return ["none", *(kind for kind in shipped if registration == "geometric" or kind == "movers"), ORACLE]
 
 

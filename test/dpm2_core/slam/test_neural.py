@@ -19,8 +19,9 @@ from dpm2_core.geometry import se3
 from dpm2_core.network.config import NetworkSettings, preset
 from dpm2_core.network.descriptors import to_tokens
 from dpm2_core.network.model import DeepPointMap2
+from dpm2_core.network.pretrained import load_network
 from dpm2_core.network.weights import save_weights
-from dpm2_core.slam.neural import DescriptorMap, NeuralScanRegistration, NeuralSettings, load_network
+from dpm2_core.slam.neural import DescriptorMap, NeuralScanRegistration, NeuralSettings
 from dpm2_core.slam.preprocess import Preprocessor, PreprocessSettings
 from dpm2_core.slam.scan_registration import Prediction
 from dpm2_core.slam.system import SlamSettings, SlamSystem, make_registration

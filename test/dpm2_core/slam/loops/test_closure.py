@@ -16,13 +16,13 @@ from dpm2_core.geometry import se3
 from dpm2_core.network.decoder import Correlated
 from dpm2_core.network.descriptors import Tokens
 from dpm2_core.network.model import DeepPointMap2
+from dpm2_core.network.pretrained import load_network
 from dpm2_core.network.registration import Solved
 from dpm2_core.sim.config import LidarConfig
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.world import World, build_world
 from dpm2_core.slam.loops.closure import LoopCloser, LoopSettings
 from dpm2_core.slam.loops.consistency import Loop
-from dpm2_core.slam.neural import load_network
 from dpm2_core.slam.registration import GeometricSettings
 
 FIRM = np.diag([1e-3] * 3 + [0.02] * 3) ** 2

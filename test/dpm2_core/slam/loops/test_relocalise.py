@@ -10,13 +10,13 @@ import pytest
 
 from dpm2_core.frame import Array, Keyframe, Points, Registration, State
 from dpm2_core.geometry import se3
+from dpm2_core.network.pretrained import load_network
 from dpm2_core.sim.config import LidarConfig
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.world import World, build_world
 from dpm2_core.slam.loops.localiser import Localiser
 from dpm2_core.slam.loops.place_recognition import PlaceRecognition
 from dpm2_core.slam.loops.relocalise import Relocaliser, RelocaliseSettings
-from dpm2_core.slam.neural import load_network
 from dpm2_core.slam.registration import GeometricSettings
 
 FIRM, LOST = np.diag([1e-3] * 3 + [0.02] * 3) ** 2, np.eye(6)
