@@ -11,11 +11,9 @@ from pydantic import model_validator
 from dpm2_core.config import Settings
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.frame import Array, Frame, Image, Points
-from dpm2_core.geometry import se3
+from dpm2_core.geometry.deskew import deskew
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.slam.filters import PointFilter
-
-_DESKEW_STEPS = 64  # poses along a sweep: at 1 rad/s and 0.1 s the remaining error is 1 mm at 1 m, 8 cm at 100 m
 
 
 class PreprocessSettings(Settings):
@@ -86,17 +84,3 @@ class Preprocessor:
         cloud = points[voxel_first(points, self._settings.map_voxel)]
         source = cloud[voxel_first(cloud, self._settings.source_voxel), :3].astype(np.float64)
         return Scan(points, cloud, source)
-
-
-def deskew(points: Points, time_offset: Points, twist: Array) -> Points:
-    """(N, 4) points as if all had been taken at the stamp; `time_offset` (N,) s, `twist` (6,) [rad/s, m/s]."""
-    if len(points) == 0:
-        return points
-    start, end = float(time_offset.min()), float(time_offset.max())
-    if end - start < 1e-6:
-        return points
-    step = np.rint((time_offset - start) * ((_DESKEW_STEPS - 1) / (end - start))).astype(np.int64)
-    T = se3.exp(np.linspace(start, end, _DESKEW_STEPS)[:, None] * twist).astype(np.float32)
-    out = points.copy()
-    out[:, :3] = np.einsum("nij,nj->ni", T[step, :3, :3], points[:, :3]) + T[step, :3, 3]
-    return out

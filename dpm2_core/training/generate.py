@@ -16,6 +16,7 @@ from dpm2_core.data.source import Source
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Camera, Frame, Image
 from dpm2_core.geometry import se3
+from dpm2_core.geometry.deskew import deskew
 from dpm2_core.network.config import NetworkSettings, preset
 from dpm2_core.network.encoder import resize
 from dpm2_core.network.pyramid import crop
@@ -23,7 +24,6 @@ from dpm2_core.sim.camera import calibration, render
 from dpm2_core.sim.config import CameraConfig, LidarConfig, PresetName
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.world import build_world
-from dpm2_core.slam.preprocess import deskew
 from dpm2_core.training.packed import Sample, write_packed
 
 

@@ -12,7 +12,8 @@ from dpm2_core.config import load_settings
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Frame
 from dpm2_core.geometry import se3
-from dpm2_core.slam.preprocess import Preprocessor, PreprocessSettings, deskew
+from dpm2_core.geometry.deskew import deskew
+from dpm2_core.slam.preprocess import Preprocessor, PreprocessSettings
 
 
 def test_keeps_only_measurements_within_range() -> None:
