@@ -17,7 +17,7 @@ from dpm2_core.data import topics
 from dpm2_core.data.bags import BagSource
 from dpm2_core.data.convert import convert_kitti
 from dpm2_core.data.kitti import KittiSource
-from dpm2_core.data.source import InputSettings
+from dpm2_core.data.settings import InputSettings
 from dpm2_core.evaluation.bench.harness import Options, Report, drives, write_report
 from dpm2_core.tables import FigureTable
 from dpm2_ros.demo import judge

@@ -18,7 +18,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from dpm2_core.console import Console
 from dpm2_core.data.bags import BagSource
 from dpm2_core.data.convert import convert_kitti
-from dpm2_core.data.source import InputSettings
+from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.trajectory import read_trajectory
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.evaluation.figures import trajectory_png

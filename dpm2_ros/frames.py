@@ -7,9 +7,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from dpm2_core.data.kitti import HDL64_CORRECTION_DEG, correct_vertical_angle
 from dpm2_core.data.messages import MessageError, decode_camera, decode_image, decode_points
-from dpm2_core.data.source import InputSettings
+from dpm2_core.data.settings import InputSettings
+from dpm2_core.data.vertical_angle import HDL64_CORRECTION_DEG, correct_vertical_angle
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Frame, Image
 from dpm2_ros.guard import one_line

@@ -20,7 +20,7 @@ from std_msgs.msg import Float64
 from dpm2_core.data import topics
 from dpm2_core.data.kitti import checked_correction
 from dpm2_core.data.messages import decode_camera, stamp_ns
-from dpm2_core.data.source import InputSettings
+from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.transforms import TransformTree
 from dpm2_core.errors import UsageError
 from dpm2_core.slam.map.admission import RejectedError

@@ -13,7 +13,8 @@ import typer
 from dpm2_core.config import load_settings
 from dpm2_core.console import Console
 from dpm2_core.data.kitti import read_calib
-from dpm2_core.data.source import InputSettings, open_source
+from dpm2_core.data.open import open_source
+from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.trajectory import Trajectory, matched, read_trajectory
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.kitti_metric import OFFICIAL_LENGTHS

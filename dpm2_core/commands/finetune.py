@@ -27,7 +27,8 @@ def finetune(
 
     Run the result with --set slam.neural.weights=OUT/weights.safetensors.
     """
-    from dpm2_core.data.source import InputSettings, open_source
+    from dpm2_core.data.open import open_source
+    from dpm2_core.data.settings import InputSettings
     from dpm2_core.network.pretrained import load_network, weights_path  # torch is slow to import
     from dpm2_core.slam.system import SlamSettings
     from dpm2_core.training import finetune as work

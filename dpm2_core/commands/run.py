@@ -18,9 +18,10 @@ from dpm2_core.commands.localise import parse_hint, run_localised
 from dpm2_core.config import dump_settings, load_settings
 from dpm2_core.console import Console
 from dpm2_core.data.corrupt import CorruptedSource, CorruptionSettings, parse_corruption
+from dpm2_core.data.open import open_source
 from dpm2_core.data.ply import write_ply
 from dpm2_core.data.prefetch import prefetch
-from dpm2_core.data.source import Source, open_source
+from dpm2_core.data.source import Source
 from dpm2_core.data.trajectory import Trajectory, matched, read_trajectory, write_kitti, write_tum
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.metrics import Metrics, evaluate

@@ -10,7 +10,9 @@ from typing import Annotated
 import typer
 
 from dpm2_core.console import Console
-from dpm2_core.data.source import InputSettings, Source, open_source
+from dpm2_core.data.open import open_source
+from dpm2_core.data.settings import InputSettings
+from dpm2_core.data.source import Source
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Frame
 

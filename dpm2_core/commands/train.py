@@ -50,7 +50,8 @@ def pack(
 ) -> None:
     """A recorded drive with ground truth, packed for training."""
     from dpm2_core.commands.run import parse_range
-    from dpm2_core.data.source import InputSettings, open_source
+    from dpm2_core.data.open import open_source
+    from dpm2_core.data.settings import InputSettings
     from dpm2_core.network.config import preset as network_preset
     from dpm2_core.training.generate import pack as write  # torch and embree are slow to import
 

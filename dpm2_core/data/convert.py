@@ -20,7 +20,7 @@ from dpm2_core.data import topics
 from dpm2_core.data.kitti import KittiSource
 from dpm2_core.data.messages import cloud_fields, point_columns
 from dpm2_core.data.prefetch import prefetch
-from dpm2_core.data.source import InputSettings
+from dpm2_core.data.settings import InputSettings
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Array, Camera, Frame
 from dpm2_core.geometry import se3

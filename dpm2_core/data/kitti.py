@@ -13,15 +13,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dpm2_core.data.compressed import decode_compressed
 from dpm2_core.data.messages import scale_intensity
-from dpm2_core.data.source import InputSettings
+from dpm2_core.data.scan_file import read_image, read_scan
+from dpm2_core.data.settings import InputSettings
+from dpm2_core.data.text import parse_row, read_lines, read_numbers
+from dpm2_core.data.vertical_angle import HDL64_CORRECTION_DEG, correct_vertical_angle
 from dpm2_core.errors import UsageError
-from dpm2_core.frame import Array, Camera, Frame, Image, Points
+from dpm2_core.frame import Array, Camera, Frame, Image
 from dpm2_core.geometry import se3
-
-HDL64_CORRECTION_DEG = 0.205
-"""What KITTI's scans lack in elevation: the intrinsic calibration of its HDL-64 (J.-E. Deschaud, "IMLS-SLAM", 2018)."""
 
 _MAX_CORRECTION_DEG = 5.0
 _PERIOD = 0.1  # s between scans, where times.txt does not say
@@ -36,23 +35,6 @@ def checked_correction(value: float, where: str) -> float:
     if not abs(value) <= _MAX_CORRECTION_DEG:
         raise UsageError(f"{where}: want a vertical angle correction of -5 to 5 degrees, got {value}")
     return value
-
-
-def correct_vertical_angle(points: Points, degrees: float) -> Points:
-    """Raise the elevation of each of (N, 4) points by `degrees`, keeping range and azimuth; invalid ones stay so."""
-    if not degrees:
-        return points
-    cos, sin = np.float32(np.cos(np.radians(degrees))), np.float32(np.sin(np.radians(degrees)))
-    x, y, z = points[:, 0], points[:, 1], points[:, 2]
-    rho = np.sqrt(x * x + y * y)
-    out = np.empty_like(points)
-    with np.errstate(invalid="ignore"):  # infinite points become NaN, no less invalid
-        scale = cos - sin * z / np.maximum(rho, np.float32(1e-6))
-        np.multiply(x, scale, out=out[:, 0])
-        np.multiply(y, scale, out=out[:, 1])
-        np.add(z * cos, rho * sin, out=out[:, 2])
-    out[:, 3] = points[:, 3]
-    return out
 
 
 class KittiSource:
@@ -199,26 +181,6 @@ class KittiSource:
         return ()
 
 
-def read_scan(path: Path) -> tuple[Points, str | None]:
-    """A velodyne file to (N, 4) float32 [x, y, z in m, intensity 0..1], or an empty array and what is wrong."""
-    nothing = np.empty((0, 4), np.float32)
-    try:
-        values, size = np.fromfile(path, "<f4"), path.stat().st_size
-    except OSError as error:
-        return nothing, f"{path}: {error.strerror}"
-    if size % 16:
-        return nothing, f"{path}: {size} bytes are no whole number of points (16 bytes each)"
-    return values.reshape(-1, 4), None
-
-
-def read_image(path: Path) -> NDArray[np.uint8] | None:
-    """An image file to (H, W, 3) uint8 RGB; None if it cannot be decoded."""
-    try:
-        return decode_compressed(path.read_bytes())
-    except (OSError, ValueError):
-        return None
-
-
 def read_calib(path: Path) -> dict[str, Array]:
     """P0..P3 (3, 4) and Tr (4, 4, LiDAR to left grey camera), those that a calib.txt has; nothing if there is none.
 
@@ -242,41 +204,6 @@ def read_calib(path: Path) -> dict[str, Array]:
         else:
             calib[name] = matrix
     return calib
-
-
-def read_numbers(path: Path, columns: int, skip: int = 0) -> Array:
-    """(lines, columns) float64 of a text file below a header of `skip` lines; no rows if there is no such file.
-
-    Raises:
-        UsageError: a line has another number of numbers, or something else; the message names it.
-    """
-    rows = [
-        parse_row(line, columns, f"{path}:{i}")
-        for i, line in enumerate(read_lines(path)[skip:], 1 + skip)
-        if line.strip()
-    ]
-    return np.array(rows).reshape(-1, columns)
-
-
-def read_lines(path: Path) -> list[str]:
-    """Lines of a text file; none if there is no such file."""
-    try:
-        return path.read_text(encoding="utf-8").splitlines()
-    except FileNotFoundError:
-        return []
-    except (OSError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path}: {getattr(error, 'strerror', None) or 'not a text file'}") from None
-
-
-def parse_row(text: str, count: int, where: str) -> Array:
-    """(count,) finite numbers of a line; the UsageError of any other line begins with `where`."""
-    try:
-        row = np.array([float(word) for word in text.split()])
-    except ValueError as error:
-        raise UsageError(f"{where}: {error}") from None
-    if len(row) != count or not np.isfinite(row).all():
-        raise UsageError(f"{where}: {len(row)} numbers, want {count} finite ones")
-    return row
 
 
 def _sequence_folder(path: Path, sequence: str) -> Path:

@@ -14,9 +14,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dpm2_core.data.kitti import correct_vertical_angle, parse_row, read_image, read_lines, read_numbers, read_scan
 from dpm2_core.data.messages import scale_intensity
-from dpm2_core.data.source import InputSettings
+from dpm2_core.data.scan_file import read_image, read_scan
+from dpm2_core.data.settings import InputSettings
+from dpm2_core.data.text import parse_row, read_lines, read_numbers
+from dpm2_core.data.vertical_angle import correct_vertical_angle
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Camera, Frame, Image, Points
 from dpm2_core.geometry import se3

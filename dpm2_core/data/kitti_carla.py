@@ -12,9 +12,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dpm2_core.data.kitti import correct_vertical_angle, read_image, read_lines, read_numbers
 from dpm2_core.data.ply import read_ply
-from dpm2_core.data.source import InputSettings
+from dpm2_core.data.scan_file import read_image
+from dpm2_core.data.settings import InputSettings
+from dpm2_core.data.text import read_lines, read_numbers
+from dpm2_core.data.vertical_angle import correct_vertical_angle
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Camera, Frame, Image
 from dpm2_core.geometry import se3

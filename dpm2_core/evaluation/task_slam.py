@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from dpm2_core.data.source import open_source
+from dpm2_core.data.open import open_source
 from dpm2_core.diffslam.tasks.data import open_scans, sequence_folders
 from dpm2_core.diffslam.tasks.task import Task
 from dpm2_core.diffslam.tasks.training import mean_figures

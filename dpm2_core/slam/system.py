@@ -9,7 +9,7 @@ from typing import Literal
 from pydantic import Field
 
 from dpm2_core.config import Settings
-from dpm2_core.data.source import InputSettings
+from dpm2_core.data.settings import InputSettings
 from dpm2_core.frame import Frame, Tracked
 from dpm2_core.network.pretrained import load_network
 from dpm2_core.slam.filters import FilterSettings, make_filter

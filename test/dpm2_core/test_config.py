@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from pydantic import Field
 
 from dpm2_core.config import Settings, dump_settings, flat_fields, load_settings
-from dpm2_core.data.source import InputSettings
+from dpm2_core.data.settings import InputSettings
 from dpm2_core.errors import UsageError
 
 

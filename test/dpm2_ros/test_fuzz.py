@@ -30,7 +30,8 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import PointCloud2
 
 from dpm2_core.data.messages import stamp_ns
-from dpm2_core.data.source import InputSettings, open_source
+from dpm2_core.data.open import open_source
+from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.frame import Frame, Tracked
 from dpm2_core.slam.map.cloud_codec import pack_cloud, unpack_cloud

@@ -19,7 +19,7 @@ from sensor_msgs.msg import PointCloud2
 from dpm2_core.data import topics
 from dpm2_core.data.bags import BagSource
 from dpm2_core.data.messages import stamp_ns
-from dpm2_core.data.source import InputSettings
+from dpm2_core.data.settings import InputSettings
 from dpm2_core.evaluation.metrics import ape_rmse
 from dpm2_ros.demo import judge, map_poses
 from dpm2_ros.mapping import KEEP_ALL, LAST_ONE

@@ -20,7 +20,8 @@ from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import SetBool, Trigger
 
 from dpm2_core.data import topics
-from dpm2_core.data.source import InputSettings, open_source
+from dpm2_core.data.open import open_source
+from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3

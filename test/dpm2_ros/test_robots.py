@@ -18,7 +18,8 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import UInt8MultiArray
 
-from dpm2_core.data.source import InputSettings, open_source
+from dpm2_core.data.open import open_source
+from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Array, Keyframe

@@ -15,7 +15,7 @@ from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import Float64
 
-from dpm2_core.data.source import InputSettings
+from dpm2_core.data.settings import InputSettings
 from dpm2_core.frame import Points
 from dpm2_ros.conversions import cloud_to_msg
 from dpm2_ros.frames import FrameBuilder

@@ -15,7 +15,8 @@ import torch
 from rich.console import Group
 
 from dpm2_core.config import load_settings
-from dpm2_core.data.source import InputSettings, open_source
+from dpm2_core.data.open import open_source
+from dpm2_core.data.settings import InputSettings
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.bench.harness import Options, Report, git_commit, write_report
 from dpm2_core.network.pretrained import weights_path

@@ -21,7 +21,8 @@ from typing import Any
 from rich.console import Group
 
 from dpm2_core.config import load_settings
-from dpm2_core.data.source import Source, open_source
+from dpm2_core.data.open import open_source
+from dpm2_core.data.source import Source
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.files import atomic_write
 from dpm2_core.slam.system import Config, SlamSettings

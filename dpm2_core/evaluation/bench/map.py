@@ -19,7 +19,7 @@ from rich.console import Console, Group
 from rich.progress import track
 
 from dpm2_core.config import load_settings
-from dpm2_core.data.source import open_source
+from dpm2_core.data.open import open_source
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.evaluation.bench.harness import Options, Report
 from dpm2_core.evaluation.metrics import ape_rmse

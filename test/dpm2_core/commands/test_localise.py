@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dpm2_core.data.source import InputSettings, open_source
+from dpm2_core.data.open import open_source
+from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.trajectory import read_trajectory
 from dpm2_core.geometry import se3
 from dpm2_core.sim.config import LidarConfig

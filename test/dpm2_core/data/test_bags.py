@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from dpm2_core.data.bags import BagSource, interpolate
-from dpm2_core.data.kitti import HDL64_CORRECTION_DEG
-from dpm2_core.data.source import InputSettings
+from dpm2_core.data.settings import InputSettings
+from dpm2_core.data.vertical_angle import HDL64_CORRECTION_DEG
 from dpm2_core.errors import UsageError
 from dpm2_core.geometry import se3
 

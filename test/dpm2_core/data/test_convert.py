@@ -21,7 +21,7 @@ from dpm2_core.data.bag_file import open_bag
 from dpm2_core.data.bags import BagSource
 from dpm2_core.data.convert import EPOCH_NS, convert_kitti
 from dpm2_core.data.kitti import KittiSource
-from dpm2_core.data.source import InputSettings
+from dpm2_core.data.settings import InputSettings
 from dpm2_core.errors import UsageError
 from dpm2_core.geometry import se3
 

@@ -11,8 +11,9 @@ import cv2
 import numpy as np
 import pytest
 
-from dpm2_core.data.kitti import HDL64_CORRECTION_DEG, KittiSource, correct_vertical_angle
-from dpm2_core.data.source import InputSettings
+from dpm2_core.data.kitti import KittiSource
+from dpm2_core.data.settings import InputSettings
+from dpm2_core.data.vertical_angle import HDL64_CORRECTION_DEG, correct_vertical_angle
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Points
 

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from dpm2_core.data.kitti_carla import KittiCarlaSource
-from dpm2_core.data.source import InputSettings, open_source
+from dpm2_core.data.open import open_source
+from dpm2_core.data.settings import InputSettings
 from dpm2_core.errors import UsageError
 from dpm2_core.geometry import se3
 

@@ -13,8 +13,9 @@ import pytest
 from dpm2_core.config import settings_from
 from dpm2_core.data.bags import BagSource
 from dpm2_core.data.kitti import KittiSource
+from dpm2_core.data.open import open_source
 from dpm2_core.data.prefetch import prefetch
-from dpm2_core.data.source import InputSettings, open_source
+from dpm2_core.data.settings import InputSettings
 from dpm2_core.errors import UsageError
 
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
-from dpm2_core.data.source import open_source
+from dpm2_core.data.open import open_source
 from dpm2_core.evaluation.bench.gaps import gaps, judged, summary
 from dpm2_core.frame import Array, Frame, State, Tracked
 from dpm2_core.geometry import se3

@@ -202,7 +202,7 @@ def test_a_drive_may_begin_in_a_column() -> None:
 
 
 def test_real_scans_follow_the_ground_truth(kitti_root: object) -> None:
-    from dpm2_core.data.source import open_source
+    from dpm2_core.data.open import open_source
     from dpm2_core.evaluation.metrics import evaluate
 
     source = open_source(f"{kitti_root}/sequences/04")

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from dpm2_core.data.source import open_source
+from dpm2_core.data.open import open_source
 from dpm2_core.frame import Array, Camera, Frame, Image
 from dpm2_core.geometry import se3
 from dpm2_core.slam.scan_registration import Prediction

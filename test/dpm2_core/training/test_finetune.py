@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from dpm2_core.cli import main
-from dpm2_core.data.source import open_source
+from dpm2_core.data.open import open_source
 from dpm2_core.diffslam.trajectory_loss import trajectory_loss
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array

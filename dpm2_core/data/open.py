@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Finds the loader of a recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from dpm2_core.data.settings import InputSettings
+from dpm2_core.data.source import Source
+from dpm2_core.errors import UsageError
+
+
+def open_source(path: Path | str, settings: InputSettings | None = None) -> Source:
+    """Open whatever `path` is: a folder of KITTI odometry, KITTI-360 or KITTI-CARLA, or a rosbag2 recording.
+
+    Raises:
+        UsageError: there is nothing, or nothing that can be read; the message says what was found.
+    """
+    path, settings = Path(path), settings or InputSettings()
+    if not path.exists():
+        raise UsageError(f"{path}: no such file or folder")
+    if path.is_file() and path.suffix == ".bag":
+        raise UsageError(f"{path}: a ROS 1 bag; convert it first: rosbags-convert --src {path.name} --dst NEW_FOLDER")
+    # rosbags and its type store are slow to import, and of no use for a KITTI folder.
+    if path.is_file() or any(
+        file.suffix in (".mcap", ".db3") or file.name == "metadata.yaml" for file in path.iterdir()
+    ):
+        from dpm2_core.data.bags import BagSource
+
+        return BagSource(path, settings)
+    if (path / "data_3d_raw").is_dir() or (path / "velodyne_points").is_dir():
+        from dpm2_core.data.kitti360 import Kitti360Source
+
+        return Kitti360Source(path, settings)
+    if (path / "frames").is_dir() or (path / "generated").is_dir() or any(path.glob("*/generated/frames")):
+        from dpm2_core.data.kitti_carla import KittiCarlaSource
+
+        return KittiCarlaSource(path, settings)
+    from dpm2_core.data.kitti import KittiSource
+
+    return KittiSource(path, settings)

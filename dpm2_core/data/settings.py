@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How recordings and sensor messages are read."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, Field
+from scipy.spatial.transform import Rotation
+
+from dpm2_core.config import Settings
+from dpm2_core.frame import Array
+from dpm2_core.geometry import se3
+
+# x, y, z in m, then a quaternion x, y, z, w: the order of tf2_ros' static_transform_publisher.
+Place = tuple[float, float, float, float, float, float, float]
+
+
+def _unit(place: Place) -> Place:
+    if abs(sum(q * q for q in place[3:]) - 1) > 0.01:
+        raise ValueError("qx, qy, qz, qw are no unit quaternion")
+    return place
+
+
+class InputSettings(Settings):
+    """How recordings and sensor messages are read."""
+
+    sequence: str = ""
+    """Sequence of a root folder: 04 of KITTI odometry, 0009 of KITTI-360, Town01 of KITTI-CARLA; empty takes the only
+    one."""
+
+    kitti_poses: Literal["auto", "kitti", "semantic_kitti"] = "auto"
+    """Ground truth of KITTI odometry: poses/NN.txt (kitti), poses.txt in the sequence's folder, which SemanticKITTI
+    publishes (semantic_kitti), or the latter where it is there, else the former (auto)."""
+
+    points_topic: str = ""
+    """PointCloud2 topic of a bag; empty takes /kitti/velo/pointcloud, else the only one."""
+
+    images: bool = True
+    """Use the camera where there is one."""
+
+    image_topic: str = ""
+    """Image or CompressedImage topic of a bag; empty takes /kitti/camera_color_left/image_raw, else the only one."""
+
+    camera_info_topic: str = ""
+    """CameraInfo topic of that image; empty takes the camera_info beside it."""
+
+    T_lidar_cam: Annotated[Place, AfterValidator(_unit)] | None = None
+    """Pose of the camera's optical frame in the LiDAR frame, [x, y, z (m), qx, qy, qz, qw]; null asks /tf_static."""
+
+    image_tolerance: Annotated[float, Field(gt=0, le=10)] = 0.05
+    """Largest difference of time between a cloud and its image, s."""
+
+    image_time_offset: Annotated[float, Field(ge=-10, le=10)] = 0.0
+    """Added to the stamps of images before they are compared with those of clouds, s."""
+
+    time_field: str | None = None
+    """PointCloud2 field with the time of each point; null looks for a usual name (t, time, stamp...), "" is none."""
+
+    time_unit: Literal["auto", "s", "ms", "us", "ns"] = "auto"
+    """Unit of that field; auto takes the one in which a scan lasts 2 ms to 2 s."""
+
+    intensity_max: Annotated[float, Field(gt=0)] | None = None
+    """Intensity that becomes 1; null takes 1, 255 or 65535 by the largest value of each cloud."""
+
+    vertical_angle_correction_deg: Annotated[float, Field(ge=-5, le=5)] | Literal["auto"] = "auto"
+    """Added to the elevation of each point, degrees. auto: what the recording says (dpm2_sim.json of a folder, topic
+    /kitti/vertical_angle_correction_deg of a bag), else KITTI's 0.205 for folders and topics under /kitti/, else 0."""
+
+    ground_truth_topic: str = ""
+    """Odometry or Path topic with true poses; empty takes /kitti/ground_truth/odom, else /kitti/ground_truth/path."""
+
+    def extrinsic(self) -> Array | None:
+        """T_lidar_cam as (4, 4); None if it is not set here."""
+        place = self.T_lidar_cam
+        return None if place is None else se3.make(Rotation.from_quat(place[3:]).as_matrix(), place[:3])

@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Numbers in text files, with errors that name file and line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from dpm2_core.errors import UsageError
+from dpm2_core.frame import Array
+
+
+def read_numbers(path: Path, columns: int, skip: int = 0) -> Array:
+    """(lines, columns) float64 of a text file below a header of `skip` lines; no rows if there is no such file.
+
+    Raises:
+        UsageError: a line has another number of numbers, or something else; the message names it.
+    """
+    rows = [
+        parse_row(line, columns, f"{path}:{i}")
+        for i, line in enumerate(read_lines(path)[skip:], 1 + skip)
+        if line.strip()
+    ]
+    return np.array(rows).reshape(-1, columns)
+
+
+def read_lines(path: Path) -> list[str]:
+    """Lines of a text file; none if there is no such file."""
+    try:
+        return path.read_text(encoding="utf-8").splitlines()
+    except FileNotFoundError:
+        return []
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(f"{path}: {getattr(error, 'strerror', None) or 'not a text file'}") from None
+
+
+def parse_row(text: str, count: int, where: str) -> Array:
+    """(count,) finite numbers of a line; the UsageError of any other line begins with `where`."""
+    try:
+        row = np.array([float(word) for word in text.split()])
+    except ValueError as error:
+        raise UsageError(f"{where}: {error}") from None
+    if len(row) != count or not np.isfinite(row).all():
+        raise UsageError(f"{where}: {len(row)} numbers, want {count} finite ones")
+    return row

@@ -1,0 +1,28 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Correction of the elevation of LiDAR points, such as KITTI's scans need."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dpm2_core.frame import Points
+
+HDL64_CORRECTION_DEG = 0.205
+"""What KITTI's scans lack in elevation: the intrinsic calibration of its HDL-64 (J.-E. Deschaud, "IMLS-SLAM", 2018)."""
+
+
+def correct_vertical_angle(points: Points, degrees: float) -> Points:
+    """Raise the elevation of each of (N, 4) points by `degrees`, keeping range and azimuth; invalid ones stay so."""
+    if not degrees:
+        return points
+    cos, sin = np.float32(np.cos(np.radians(degrees))), np.float32(np.sin(np.radians(degrees)))
+    x, y, z = points[:, 0], points[:, 1], points[:, 2]
+    rho = np.sqrt(x * x + y * y)
+    out = np.empty_like(points)
+    with np.errstate(invalid="ignore"):  # infinite points become NaN, no less invalid
+        scale = cos - sin * z / np.maximum(rho, np.float32(1e-6))
+        np.multiply(x, scale, out=out[:, 0])
+        np.multiply(y, scale, out=out[:, 1])
+        np.add(z * cos, rho * sin, out=out[:, 2])
+    out[:, 3] = points[:, 3]
+    return out
