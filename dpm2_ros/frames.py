@@ -7,7 +7,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from dpm2_core.data.messages import MessageError, decode_camera, decode_image, decode_points
+from dpm2_core.data.image_messages import decode_camera, decode_image
+from dpm2_core.data.messages import MessageError, decode_points
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.vertical_angle import HDL64_CORRECTION_DEG, correct_vertical_angle
 from dpm2_core.errors import UsageError

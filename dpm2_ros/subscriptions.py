@@ -18,8 +18,9 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 from std_msgs.msg import Float64
 
 from dpm2_core.data import topics
+from dpm2_core.data.image_messages import decode_camera
 from dpm2_core.data.kitti import checked_correction
-from dpm2_core.data.messages import decode_camera, stamp_ns
+from dpm2_core.data.messages import stamp_ns
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.transforms import TransformTree
 from dpm2_core.errors import UsageError

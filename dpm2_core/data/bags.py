@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from dpm2_core.data import topics
 from dpm2_core.data.bag_file import open_bag
+from dpm2_core.data.image_messages import decode_camera, decode_image
 from dpm2_core.data.kitti import checked_correction
-from dpm2_core.data.messages import MessageError, decode_camera, decode_image, decode_points, stamp_ns
+from dpm2_core.data.messages import MessageError, decode_points, stamp_ns
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.transforms import TransformTree, transform_matrix
 from dpm2_core.data.vertical_angle import HDL64_CORRECTION_DEG, correct_vertical_angle

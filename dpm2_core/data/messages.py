@@ -9,13 +9,11 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping
 from typing import Any, Literal
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dpm2_core.data.compressed import decode_compressed
 from dpm2_core.errors import UsageError
-from dpm2_core.frame import Array, Camera, Points
+from dpm2_core.frame import Points
 
 TimeUnit = Literal["auto", "s", "ms", "us", "ns"]
 
@@ -37,29 +35,6 @@ _XYZ = ("x", "y", "z")
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 # No sweep is longer, no useful one a thousand times shorter: so exactly one unit puts the span of a scan in this range.
 _LONGEST_SCAN = 2.0
-
-# Encoding to (numpy type, channels, OpenCV conversion to RGB). 8UC3 and 8UC4 are BGR(A), as in cv_bridge.
-_IMAGE_ENCODINGS: dict[str, tuple[str, int, int | None]] = {
-    "rgb8": ("u1", 3, None),
-    "bgr8": ("u1", 3, cv2.COLOR_BGR2RGB),
-    "8uc3": ("u1", 3, cv2.COLOR_BGR2RGB),
-    "rgba8": ("u1", 4, cv2.COLOR_RGBA2RGB),
-    "bgra8": ("u1", 4, cv2.COLOR_BGRA2RGB),
-    "8uc4": ("u1", 4, cv2.COLOR_BGRA2RGB),
-    "mono8": ("u1", 1, cv2.COLOR_GRAY2RGB),
-    "8uc1": ("u1", 1, cv2.COLOR_GRAY2RGB),
-    "mono16": ("u2", 1, cv2.COLOR_GRAY2RGB),
-    "16uc1": ("u2", 1, cv2.COLOR_GRAY2RGB),
-    # OpenCV names a Bayer pattern by its second row, ROS by its first.
-    "bayer_rggb8": ("u1", 1, cv2.COLOR_BayerBG2RGB),
-    "bayer_bggr8": ("u1", 1, cv2.COLOR_BayerRG2RGB),
-    "bayer_gbrg8": ("u1", 1, cv2.COLOR_BayerGR2RGB),
-    "bayer_grbg8": ("u1", 1, cv2.COLOR_BayerGB2RGB),
-    "bayer_rggb16": ("u2", 1, cv2.COLOR_BayerBG2RGB),
-    "bayer_bggr16": ("u2", 1, cv2.COLOR_BayerRG2RGB),
-    "bayer_gbrg16": ("u2", 1, cv2.COLOR_BayerGR2RGB),
-    "bayer_grbg16": ("u2", 1, cv2.COLOR_BayerGB2RGB),
-}
 
 
 _LARGEST_POINT = 1 << 16
@@ -276,72 +251,3 @@ def cloud_fields(columns: Mapping[str, NDArray[Any]], point_field: Callable[...,
 def point_columns(points: Points) -> dict[str, Points]:
     """(N, 4) points as the x, y, z, intensity columns that `cloud_fields` takes."""
     return {name: points[:, i] for i, name in enumerate(("x", "y", "z", "intensity"))}
-
-
-def decode_image(msg: Any, size: tuple[int, int] | None = None) -> NDArray[np.uint8]:
-    """sensor_msgs/Image or CompressedImage to (H, W, 3) uint8 RGB; of 16 bits the upper 8 count.
-
-    Args:
-        msg: the message.
-        size: width and height of the camera: a JPEG or PNG of another size is not decoded.
-
-    Raises:
-        MessageError: an encoding that is not supported, data shorter than declared, or a JPEG or PNG that is damaged.
-    """
-    if not hasattr(msg, "encoding"):
-        return _decode_compressed(msg, size)
-    encoding = str(msg.encoding)
-    if encoding.lower() not in _IMAGE_ENCODINGS:
-        raise MessageError(
-            f"image encoding {encoding[:40]!r} is not supported; supported: {', '.join(_IMAGE_ENCODINGS)}"
-        )
-    kind, channels, conversion = _IMAGE_ENCODINGS[encoding.lower()]
-    dtype = np.dtype((">" if msg.is_bigendian else "<") + kind)
-    height, width, pixel = int(msg.height), int(msg.width), channels * dtype.itemsize
-    step = int(msg.step) or width * pixel
-    need, have = (height - 1) * step + width * pixel, len(msg.data)
-    if not height * width or step < width * pixel or have < need:
-        raise MessageError(f"image of {width} x {height} {encoding}, step {step}: {have} bytes of data, {need} needed")
-    shape, strides = (height, width, channels), (step, pixel, dtype.itemsize)
-    pixels = np.ndarray(shape, dtype, memoryview(msg.data), strides=strides)
-    if dtype.itemsize == 2:
-        pixels = (pixels >> 8).astype(np.uint8)
-    pixels = np.ascontiguousarray(pixels)
-    return pixels if conversion is None else cv2.cvtColor(pixels, conversion)
-
-
-def _decode_compressed(msg: Any, size: tuple[int, int] | None) -> NDArray[np.uint8]:
-    if "compresseddepth" in msg.format.lower():
-        raise MessageError(f"compressed image format {msg.format[:40]!r} is not supported; supported: jpeg, png")
-    try:
-        return decode_compressed(bytes(msg.data), size)
-    except ValueError as error:
-        what = f"compressed image of format {msg.format[:40]!r} and {len(msg.data)} bytes"
-        raise MessageError(f"{what} cannot be decoded: {error}") from None
-
-
-def decode_camera(info: Any, T_lidar_cam: Array, name: str) -> Camera:
-    """sensor_msgs/CameraInfo to `Camera`: K and D as they are; P's left block where D is zero, the image rectified.
-
-    Args:
-        info: with model plumb_bob or rational_polynomial (whose 8 coefficients stay in OpenCV's order).
-        T_lidar_cam: (4, 4) optical frame of the camera to LiDAR frame.
-        name: what messages call it.
-
-    Raises:
-        MessageError: another distortion model, no focal length, or no size.
-    """
-    K, P, D = (np.array(x, np.float64) for x in (info.k, info.p, info.d))
-    K, P = K.reshape(3, 3), P.reshape(3, 4)
-    if not D.any():
-        D, K = D[:0], P[:, :3].copy() if P[0, 0] else K
-    elif info.distortion_model not in ("plumb_bob", "rational_polynomial"):
-        raise MessageError(f"{name}: distortion model {info.distortion_model[:40]!r} is not supported; "
-                           "supported: plumb_bob, rational_polynomial")  # fmt: skip
-    if not (K[0, 0] > 0 and K[1, 1] > 0 and np.isfinite(K).all()):
-        raise MessageError(f"{name}: CameraInfo has no focal length (the camera is not calibrated)")
-    if len(D) not in _DISTORTIONS or not np.isfinite(D).all():
-        raise MessageError(f"{name}: CameraInfo has {len(D)} distortion coefficients, or some that are not finite")
-    if not (0 < info.width <= _WIDEST_IMAGE and 0 < info.height <= _WIDEST_IMAGE):
-        raise MessageError(f"{name}: CameraInfo has no image size, or one beyond {_WIDEST_IMAGE} pixels")
-    return Camera(K, T_lidar_cam, (int(info.width), int(info.height)), tuple(D.tolist()), name)

@@ -20,7 +20,8 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
 from dpm2_core.data import topics
 from dpm2_core.data.bags import BagSource
-from dpm2_core.data.messages import decode_image, decode_points, stamp_ns
+from dpm2_core.data.image_messages import decode_image
+from dpm2_core.data.messages import decode_points, stamp_ns
 from dpm2_core.data.settings import InputSettings
 from dpm2_ros.bag_player import main
 from dpm2_ros.replay import ros_environment, start

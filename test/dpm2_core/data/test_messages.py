@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dpm2_core.data import messages
+from dpm2_core.data import image_messages, messages
 from dpm2_core.data.messages import MessageError
 
 CODES = {1: "b", 2: "B", 3: "h", 4: "H", 5: "i", 6: "I", 7: "f", 8: "d"}
@@ -257,7 +257,7 @@ GRAY = RGB[..., 0].copy()
 )
 def test_image_encodings(encoding: str, pixels: np.ndarray, want: np.ndarray, padding: int) -> None:
     for big in (False, True):
-        decoded = messages.decode_image(image(pixels, encoding, padding, big))
+        decoded = image_messages.decode_image(image(pixels, encoding, padding, big))
         assert decoded.dtype == np.uint8
         np.testing.assert_array_equal(decoded, want)
 
@@ -271,7 +271,7 @@ def test_bayer_patterns_give_the_colour_they_were_made_from(pattern: str, bits: 
     for i, letter in enumerate(pattern):
         mosaic[i // 2 :: 2, i % 2 :: 2] = colour["rgb".index(letter)]
     pixels = mosaic if bits == 8 else mosaic.astype(np.uint16) << 8
-    decoded = messages.decode_image(image(pixels, f"bayer_{pattern}{bits}"))
+    decoded = image_messages.decode_image(image(pixels, f"bayer_{pattern}{bits}"))
     np.testing.assert_array_equal(decoded[2:-2, 2:-2], np.broadcast_to(colour, (4, 4, 3)))
 
 
@@ -279,7 +279,7 @@ def test_compressed_images() -> None:
     smooth = cv2.resize(picture(4, 4), (64, 48), interpolation=cv2.INTER_CUBIC)
     for form, tolerance in (("png", 0), ("jpeg", 30)):  # JPEG of a smooth picture, quality 95
         data = cv2.imencode(f".{form}", cv2.cvtColor(smooth, cv2.COLOR_RGB2BGR))[1].reshape(-1)
-        decoded = messages.decode_image(SimpleNamespace(header=header(), format=form, data=data))
+        decoded = image_messages.decode_image(SimpleNamespace(header=header(), format=form, data=data))
         assert np.abs(decoded.astype(int) - smooth).max() <= tolerance
 
 
@@ -297,7 +297,7 @@ def test_compressed_images() -> None:
 )
 def test_images_that_cannot_be_used_are_named(msg: SimpleNamespace, message: str) -> None:
     with pytest.raises(MessageError, match=message):
-        messages.decode_image(msg)
+        image_messages.decode_image(msg)
 
 
 def info(**changes: Any) -> SimpleNamespace:
@@ -307,17 +307,17 @@ def info(**changes: Any) -> SimpleNamespace:
 
 
 def test_camera_of_a_rectified_image_has_the_rectified_intrinsics() -> None:
-    camera = messages.decode_camera(info(), np.eye(4), "left")
+    camera = image_messages.decode_camera(info(), np.eye(4), "left")
     np.testing.assert_array_equal(camera.K, [[480, 0, 310], [0, 490, 230], [0, 0, 1]])
     assert (camera.size, camera.distortion, camera.name) == ((640, 480), (), "left")
-    unrectified = messages.decode_camera(info(p=np.zeros(12), d=[]), np.eye(4), "left")
+    unrectified = image_messages.decode_camera(info(p=np.zeros(12), d=[]), np.eye(4), "left")
     assert unrectified.K[0, 0] == 500
 
 
 @pytest.mark.parametrize(("model", "count"), [("plumb_bob", 5), ("rational_polynomial", 8)])
 def test_camera_with_distortion_keeps_it(model: str, count: int) -> None:
     D = [-0.3, 0.1, 0.001, -0.002, 0.01, 0.02, 0.03, 0.04][:count]
-    camera = messages.decode_camera(info(d=D, distortion_model=model), np.eye(4), "left")
+    camera = image_messages.decode_camera(info(d=D, distortion_model=model), np.eye(4), "left")
     assert camera.distortion == tuple(D)
     assert camera.K[0, 0] == 500
 
@@ -332,7 +332,7 @@ def test_camera_with_distortion_keeps_it(model: str, count: int) -> None:
 )
 def test_camera_that_cannot_be_used(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(MessageError, match=message):
-        messages.decode_camera(info(**changes), np.eye(4), "left")
+        image_messages.decode_camera(info(**changes), np.eye(4), "left")
 
 
 def test_real_rclpy_messages_decode_alike() -> None:
@@ -345,7 +345,9 @@ def test_real_rclpy_messages_decode_alike() -> None:
     points, time = messages.decode_points(msg)
     np.testing.assert_array_equal(points, np.stack([columns[k] for k in ("x", "y", "z", "intensity")], 1))
     np.testing.assert_allclose(time, np.arange(50) * 2e-3, atol=1e-8)
-    camera = messages.decode_camera(sensor_msgs.CameraInfo(k=info().k, p=info().p, width=64, height=48), np.eye(4), "c")
+    camera = image_messages.decode_camera(
+        sensor_msgs.CameraInfo(k=info().k, p=info().p, width=64, height=48), np.eye(4), "c"
+    )
     assert camera.K[0, 0] == 480
 
 
@@ -369,5 +371,5 @@ def test_times_that_no_sweep_can_have_are_left_out() -> None:
 )
 def test_a_calibration_that_no_camera_has_is_rejected(changes: dict[str, Any]) -> None:
     with pytest.raises(MessageError) as error:
-        messages.decode_camera(info(distortion_model="plumb_bob", **changes), np.eye(4), "camera")
+        image_messages.decode_camera(info(distortion_model="plumb_bob", **changes), np.eye(4), "camera")
     assert len(str(error.value)) < 300
