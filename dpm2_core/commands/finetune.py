@@ -29,9 +29,9 @@ def finetune(
     """
     from dpm2_core.data.open import open_source
     from dpm2_core.data.settings import InputSettings
+    from dpm2_core.learning import finetune as work
     from dpm2_core.network.pretrained import load_network, weights_path  # torch is slow to import
     from dpm2_core.slam.system import SlamSettings
-    from dpm2_core.training import finetune as work
 
     refuse_overwriting(out, resume)
     chosen = load_settings(work.FinetuneSettings, config, settings or [])

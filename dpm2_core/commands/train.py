@@ -28,7 +28,7 @@ def data(
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
 ) -> None:
     """Scans of many synthetic worlds, packed for training."""
-    from dpm2_core.training.generate import GenerateSettings, generate  # torch and embree are slow to import
+    from dpm2_core.learning.generate import GenerateSettings, generate  # torch and embree are slow to import
 
     chosen = load_settings(GenerateSettings, config, settings or [])
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
@@ -52,8 +52,8 @@ def pack(
     from dpm2_core.commands.run import parse_range
     from dpm2_core.data.open import open_source
     from dpm2_core.data.settings import InputSettings
+    from dpm2_core.learning.generate import pack as write  # torch and embree are slow to import
     from dpm2_core.network.config import preset as network_preset
-    from dpm2_core.training.generate import pack as write  # torch and embree are slow to import
 
     if out.exists():
         raise UsageError(f"{out}: is there already; remove it, or choose another folder")
@@ -81,7 +81,7 @@ def image(
     resume: ResumeOption = False,
 ) -> None:
     """The image branch alone, before phase one with pictures."""
-    from dpm2_core.training.phase_image import PhaseImageSettings, phase_image
+    from dpm2_core.learning.train_image import PhaseImageSettings, phase_image
 
     refuse_overwriting(out, resume)
     phase_image(load_settings(PhaseImageSettings, config, settings or []), out, resume)
@@ -95,7 +95,7 @@ def phase1(
     resume: ResumeOption = False,
 ) -> None:
     """Registration: encoder, decoder, similarity and offset heads."""
-    from dpm2_core.training.phase_one import PhaseOneSettings, phase_one
+    from dpm2_core.learning.train_registration import PhaseOneSettings, phase_one
 
     refuse_overwriting(out, resume)
     phase_one(load_settings(PhaseOneSettings, config, settings or []), out, resume)
@@ -109,7 +109,7 @@ def phase2(
     resume: ResumeOption = False,
 ) -> None:
     """Overlap head alone, on the network of phase one."""
-    from dpm2_core.training.phase_two import PhaseTwoSettings, phase_two
+    from dpm2_core.learning.train_overlap import PhaseTwoSettings, phase_two
 
     refuse_overwriting(out, resume)
     phase_two(load_settings(PhaseTwoSettings, config, settings or []), out, resume)
@@ -125,9 +125,9 @@ def ablation(
     """The paper's Table 4: alternatives of the fusion, trained alike; continues where it was stopped."""
     from dpm2_core.console import Console
     from dpm2_core.evaluation.bench.harness import write_record
+    from dpm2_core.experiments.ablation import AblationSettings
+    from dpm2_core.experiments.ablation import ablation as compare
     from dpm2_core.tables import FigureTable
-    from dpm2_core.training.ablation import AblationSettings
-    from dpm2_core.training.ablation import ablation as compare
 
     chosen = load_settings(AblationSettings, config, settings or [])
     if not chosen.measure:

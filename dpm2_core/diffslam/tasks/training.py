@@ -17,9 +17,9 @@ from dpm2_core.diffslam.tasks.data import TaskScan, TaskScans
 from dpm2_core.diffslam.tasks.task import SlamTaskTraining, Task, TaskTraining, task_type
 from dpm2_core.diffslam.windows import ContiguousWindows
 from dpm2_core.errors import UsageError
+from dpm2_core.learning.checkpoint import load_checkpoint
+from dpm2_core.learning.trainer import OptimiserSettings, train
 from dpm2_core.network.perception.task_weights import load_strictly, read_weights, write_weights
-from dpm2_core.training.checkpoint import load_checkpoint
-from dpm2_core.training.trainer import OptimiserSettings, train
 
 WEIGHTS = "weights.safetensors"
 """What a training leaves in its folder, beside checkpoint.pt and log.jsonl."""

@@ -19,15 +19,15 @@ from dpm2_core.data.open import open_source
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.bench.harness import Options, Report, git_commit, write_report
+from dpm2_core.evaluation.pair_set import NEAR, SUCCESS, PairSet
+from dpm2_core.learning.finetune import FinetuneSettings, finetune, prepare
+from dpm2_core.learning.generate import GenerateSettings, generate
 from dpm2_core.network.pretrained import weights_path
 from dpm2_core.network.weights import load_model
 from dpm2_core.sim.config import LidarConfig, PresetName
 from dpm2_core.sim.drive import simulate
 from dpm2_core.slam.system import SlamSettings
 from dpm2_core.tables import FigureTable
-from dpm2_core.training.finetune import FinetuneSettings, finetune, prepare
-from dpm2_core.training.generate import GenerateSettings, generate
-from dpm2_core.training.validation import NEAR, SUCCESS, PairSet
 
 LIDAR = LidarConfig(beams=32, height=3.4, columns=1810)
 """32 beams from +10.7 to -30.7 deg on the roof of a bus; the weights know 64 from +2 to -24.8 deg, at 1.5 to 2 m."""

@@ -11,19 +11,19 @@ from typing import Any
 import numpy as np
 
 from dpm2_core.data.corrupt import hidden_by, random_box
+from dpm2_core.data.packed import PackedDrive, Sample
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.bench.geometric import BASELINE, kiss_config
 from dpm2_core.evaluation.bench.harness import Options, settings_of
 from dpm2_core.evaluation.bench.pairs import PairMethod, by_registration, kiss_from_identity, summarised
+from dpm2_core.evaluation.pair_set import NEAR, PairSet
 from dpm2_core.frame import Array, Frame, Image
 from dpm2_core.geometry import se3
+from dpm2_core.learning.generate import GenerateSettings, generate
+from dpm2_core.learning.train_overlap import FRAMES, OVERLAP, average_precision, draw_overlap
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.sim.config import PresetName
 from dpm2_core.slam.system import make_registration
-from dpm2_core.training.generate import GenerateSettings, generate
-from dpm2_core.training.packed import PackedDrive, Sample
-from dpm2_core.training.phase_two import FRAMES, OVERLAP, average_precision, draw_overlap
-from dpm2_core.training.validation import NEAR, PairSet
 
 # Training begins at seed 1,000, validation at 900,000.
 _SEEDS = {"mixed": 910_000, "highway": 920_000, "tunnel": 930_000}

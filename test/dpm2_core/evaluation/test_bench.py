@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from dpm2_core.commands.bench import bench
+from dpm2_core.data.packed import Sample, write_packed
 from dpm2_core.data.trajectory import write_kitti
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.evaluation.bench.harness import Options, drives, processors
@@ -23,7 +24,6 @@ from dpm2_core.frame import Image
 from dpm2_core.geometry import se3
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.weights import save_weights
-from dpm2_core.training.packed import Sample, write_packed
 
 FRAMES = 6
 

@@ -12,18 +12,12 @@ import torch
 
 from dpm2_core.cli import main
 from dpm2_core.data.open import open_source
+from dpm2_core.data.packed import open_packed
 from dpm2_core.diffslam.trajectory_loss import trajectory_loss
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
-from dpm2_core.network.config import NetworkSettings
-from dpm2_core.network.descriptors import Tokens
-from dpm2_core.network.model import DeepPointMap2
-from dpm2_core.network.weights import load_model, read_metadata, save_weights
-from dpm2_core.sim.config import LidarConfig
-from dpm2_core.sim.drive import simulate
-from dpm2_core.slam.system import SlamSettings
-from dpm2_core.training.finetune import (
+from dpm2_core.learning.finetune import (
     FinetuneOptimiser,
     FinetuneSettings,
     draw_stretch,
@@ -32,7 +26,13 @@ from dpm2_core.training.finetune import (
     refer,
     window_trajectories,
 )
-from dpm2_core.training.packed import open_packed
+from dpm2_core.network.config import NetworkSettings
+from dpm2_core.network.descriptors import Tokens
+from dpm2_core.network.model import DeepPointMap2
+from dpm2_core.network.weights import load_model, read_metadata, save_weights
+from dpm2_core.sim.config import LidarConfig
+from dpm2_core.sim.drive import simulate
+from dpm2_core.slam.system import SlamSettings
 
 
 def descriptors(poses: torch.Tensor, channels: int) -> Tokens:

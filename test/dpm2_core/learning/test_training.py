@@ -16,16 +16,16 @@ from safetensors.torch import load_file
 
 from dpm2_core.config import settings_from
 from dpm2_core.errors import UsageError
+from dpm2_core.learning.augment import AugmentSettings
+from dpm2_core.learning.checkpoint import Log
+from dpm2_core.learning.dataset import DataSettings, GroupDataset
+from dpm2_core.learning.registration_loss import LossSettings
+from dpm2_core.learning.train_image import PhaseImageSettings
+from dpm2_core.learning.train_overlap import PhaseTwoSettings, phase_two
+from dpm2_core.learning.train_registration import PhaseOne, PhaseOneSettings, phase_one, plans_of
+from dpm2_core.learning.trainer import OptimiserSettings, learning_rate
 from dpm2_core.network.config import PRESETS
 from dpm2_core.network.weights import network_settings, read_metadata
-from dpm2_core.training.augment import AugmentSettings
-from dpm2_core.training.checkpoint import Log
-from dpm2_core.training.dataset import DataSettings, GroupDataset
-from dpm2_core.training.objective import LossSettings
-from dpm2_core.training.phase_image import PhaseImageSettings
-from dpm2_core.training.phase_one import PhaseOne, PhaseOneSettings, phase_one, plans_of
-from dpm2_core.training.phase_two import PhaseTwoSettings, phase_two
-from dpm2_core.training.trainer import OptimiserSettings, learning_rate
 
 STILL = AugmentSettings(drop=0, occlusion=0, beams=0, jitter=0, tilt=0, shift=(0, 0, 0), image_drop=0)
 
@@ -174,8 +174,8 @@ def _overfitted(packed: Path, tiny: Callable, seed: int) -> list[float]:
 
 def _errors(module: PhaseOne, batch: object, plans: tuple) -> list[float]:
     """Translation error of each pair, m."""
+    from dpm2_core.learning.pair_sampling import merge_tokens
     from dpm2_core.network.registration import register_batch
-    from dpm2_core.training.sets import merge_tokens
 
     with torch.inference_mode():
         tokens = module.model.encoder(batch.points).tokens  # type: ignore[attr-defined]
@@ -199,11 +199,11 @@ RANKS = """
 import sys, torch
 from dpm2_core.config import settings_from
 from dpm2_core.network.config import NetworkSettings
-from dpm2_core.training.dataset import DataSettings, GroupDataset
-from dpm2_core.training.objective import LossSettings
-from dpm2_core.training.phase_image import PhaseImageSettings
-from dpm2_core.training.phase_one import PhaseOne, PhaseOneSettings, plans_of
-from dpm2_core.training.trainer import process_group
+from dpm2_core.learning.dataset import DataSettings, GroupDataset
+from dpm2_core.learning.registration_loss import LossSettings
+from dpm2_core.learning.train_image import PhaseImageSettings
+from dpm2_core.learning.train_registration import PhaseOne, PhaseOneSettings, plans_of
+from dpm2_core.learning.trainer import process_group
 from torch.nn.parallel import DistributedDataParallel
 
 out, packed, network = sys.argv[1:]
@@ -274,8 +274,8 @@ LOOP = """
 import sys
 from pathlib import Path
 from dpm2_core.network.config import PRESETS
-from dpm2_core.training.phase_image import PhaseImageSettings
-from dpm2_core.training.phase_one import PhaseOneSettings, phase_one
+from dpm2_core.learning.train_image import PhaseImageSettings
+from dpm2_core.learning.train_registration import PhaseOneSettings, phase_one
 import json
 out, settings, network = sys.argv[1:]
 PRESETS["tiny"] = json.loads(network)

@@ -22,16 +22,16 @@ from dpm2_core.config import Settings
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Camera, Image
 from dpm2_core.geometry import se3
+from dpm2_core.learning.augment import augment_image
+from dpm2_core.learning.checkpoint import load_checkpoint
+from dpm2_core.learning.dataset import Mixture, PackedSettings, draw_group
+from dpm2_core.learning.trainer import OptimiserSettings, process_group, train
 from dpm2_core.network.config import NetworkSettings, preset
 from dpm2_core.network.encoder import collate_views, to_device
 from dpm2_core.network.losses import cosine, info_nce, label_distances
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.spatial import Views, picture_features
 from dpm2_core.network.weights import load_weights, save_weights
-from dpm2_core.training.augment import augment_image
-from dpm2_core.training.checkpoint import load_checkpoint
-from dpm2_core.training.dataset import Mixture, PackedSettings, draw_group
-from dpm2_core.training.trainer import OptimiserSettings, process_group, train
 
 NEUTRAL = 1.5  # m, within which a point's neighbours are neither right nor wrong
 

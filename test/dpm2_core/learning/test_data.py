@@ -12,16 +12,16 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
+from dpm2_core.data.packed import QUANTUM, PackedDrive, Sample, open_packed, write_packed
 from dpm2_core.descriptors import Descriptors, merge
 from dpm2_core.errors import UsageError
 from dpm2_core.geometry import se3
+from dpm2_core.learning.augment import AugmentSettings, augment
+from dpm2_core.learning.dataset import DataSettings, GroupDataset, draw_group
+from dpm2_core.learning.pair_sampling import merge_tokens, plan_sets
+from dpm2_core.learning.train_overlap import average_precision, draw_overlap
 from dpm2_core.network.descriptors import to_tokens
 from dpm2_core.network.model import DeepPointMap2
-from dpm2_core.training.augment import AugmentSettings, augment
-from dpm2_core.training.dataset import DataSettings, GroupDataset, draw_group
-from dpm2_core.training.packed import QUANTUM, PackedDrive, Sample, open_packed, write_packed
-from dpm2_core.training.phase_two import average_precision, draw_overlap
-from dpm2_core.training.sets import merge_tokens, plan_sets
 
 NOTHING = {"drop": 0, "occlusion": 0, "beams": 0, "jitter": 0, "yaw": 0, "tilt": 0, "shift": (0, 0, 0), "image_drop": 0}
 

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from dpm2_core.config import Settings
+from dpm2_core.data.packed import Sample
 from dpm2_core.frame import Array, Image
 from dpm2_core.geometry import se3
 from dpm2_core.network.pyramid import MIN_POINTS
-from dpm2_core.training.packed import Sample
 
 Cloud = NDArray[np.float32]
 

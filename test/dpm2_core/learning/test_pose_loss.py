@@ -10,15 +10,15 @@ import pytest
 import torch
 
 from dpm2_core.geometry import se3
+from dpm2_core.learning.dataset import DataSettings, GroupDataset
+from dpm2_core.learning.pair_sampling import merge_tokens
+from dpm2_core.learning.pose_loss import FINE, differentiable_poses, pose_loss
+from dpm2_core.learning.registration_loss import LossSettings
+from dpm2_core.learning.train_registration import PhaseOne, PhaseOneSettings, plans_of
 from dpm2_core.network.config import NetworkSettings
 from dpm2_core.network.descriptors import Tokens
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.registration import solve_batch
-from dpm2_core.training.dataset import DataSettings, GroupDataset
-from dpm2_core.training.objective import LossSettings
-from dpm2_core.training.phase_one import PhaseOne, PhaseOneSettings, plans_of
-from dpm2_core.training.pose_loss import FINE, differentiable_poses, pose_loss
-from dpm2_core.training.sets import merge_tokens
 
 TRUTH = torch.from_numpy(se3.exp([0.01, -0.02, 1.0, 3.0, 0.5, 0.1]))[None]
 

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
 from dpm2_core.config import Settings
-from dpm2_core.training.checkpoint import Log, load_checkpoint, save_checkpoint
+from dpm2_core.learning.checkpoint import Log, load_checkpoint, save_checkpoint
 
 
 class OptimiserSettings(Settings):

@@ -10,9 +10,9 @@ from typing import Any
 from pydantic import Field
 
 from dpm2_core.config import Settings, merged
+from dpm2_core.evaluation.pair_set import PairSet
+from dpm2_core.learning.train_registration import PhaseOneSettings, phase_one
 from dpm2_core.network.weights import load_model
-from dpm2_core.training.phase_one import PhaseOneSettings, phase_one
-from dpm2_core.training.validation import PairSet
 
 TABLE_4: dict[str, dict[str, Any]] = {
     "biased attention": {},

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dpm2_core.data.packed import Sample, write_packed
 from dpm2_core.geometry import se3
-from dpm2_core.training.packed import Sample, write_packed
 
 
 @pytest.fixture

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
+from dpm2_core.experiments.ablation import TABLE_4, AblationSettings, ablation
+from dpm2_core.learning.dataset import DataSettings
+from dpm2_core.learning.registration_loss import LossSettings
+from dpm2_core.learning.train_registration import PhaseOneSettings
+from dpm2_core.learning.trainer import OptimiserSettings
 from dpm2_core.network.config import PRESETS
-from dpm2_core.training.ablation import TABLE_4, AblationSettings, ablation
-from dpm2_core.training.dataset import DataSettings
-from dpm2_core.training.objective import LossSettings
-from dpm2_core.training.phase_one import PhaseOneSettings
-from dpm2_core.training.trainer import OptimiserSettings
 
 
 def test_every_alternative_is_trained_and_measured_once(

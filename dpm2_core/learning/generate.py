@@ -12,6 +12,7 @@ import numpy as np
 from pydantic import Field
 
 from dpm2_core.config import Settings
+from dpm2_core.data.packed import Sample, write_packed
 from dpm2_core.data.source import Source
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Camera, Frame, Image
@@ -24,7 +25,6 @@ from dpm2_core.sim.camera import calibration, render
 from dpm2_core.sim.config import CameraConfig, LidarConfig, PresetName
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.world import build_world
-from dpm2_core.training.packed import Sample, write_packed
 
 
 class GenerateSettings(Settings):

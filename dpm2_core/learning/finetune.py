@@ -23,7 +23,17 @@ from dpm2_core.config import Settings
 from dpm2_core.data.source import Source
 from dpm2_core.diffslam.trajectory_loss import trajectory_loss
 from dpm2_core.errors import UsageError
+from dpm2_core.evaluation.pair_set import NEAR, PairSet
 from dpm2_core.frame import Array, Frame
+from dpm2_core.learning.augment import AugmentSettings
+from dpm2_core.learning.checkpoint import load_checkpoint
+from dpm2_core.learning.dataset import Batch, DataSettings, GroupDataset, draw_group
+from dpm2_core.learning.generate import GenerateSettings, generate, pack
+from dpm2_core.learning.pair_sampling import Plan, plan_sets
+from dpm2_core.learning.pose_loss import differentiable_poses
+from dpm2_core.learning.registration_loss import LossSettings
+from dpm2_core.learning.train_registration import PhaseOne
+from dpm2_core.learning.trainer import OptimiserSettings, process_group, train
 from dpm2_core.network.config import NetworkSettings
 from dpm2_core.network.decoder import Decoder
 from dpm2_core.network.descriptors import Tokens
@@ -34,16 +44,6 @@ from dpm2_core.network.pyramid import PointBatch
 from dpm2_core.network.weights import load_model, read_metadata, save_weights
 from dpm2_core.slam.output import TrajectoryRecorder
 from dpm2_core.slam.system import SlamSettings, SlamSystem
-from dpm2_core.training.augment import AugmentSettings
-from dpm2_core.training.checkpoint import load_checkpoint
-from dpm2_core.training.dataset import Batch, DataSettings, GroupDataset, draw_group
-from dpm2_core.training.generate import GenerateSettings, generate, pack
-from dpm2_core.training.objective import LossSettings
-from dpm2_core.training.phase_one import PhaseOne
-from dpm2_core.training.pose_loss import differentiable_poses
-from dpm2_core.training.sets import Plan, plan_sets
-from dpm2_core.training.trainer import OptimiserSettings, process_group, train
-from dpm2_core.training.validation import NEAR, PairSet
 
 DRIVES, HELD_OUT, REHEARSAL = "drives", "held_out", "rehearsal"
 """Folders of packed drives below the one of the training."""

@@ -12,14 +12,14 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from dpm2_core.data.packed import Sample, write_packed
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Camera
+from dpm2_core.learning.train_image import PhaseImageSettings, PictureDataset, PictureSettings, phase_image, shown
+from dpm2_core.learning.trainer import OptimiserSettings
 from dpm2_core.network.config import PRESETS, NetworkSettings
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.weights import save_weights
-from dpm2_core.training.packed import Sample, write_packed
-from dpm2_core.training.phase_image import PhaseImageSettings, PictureDataset, PictureSettings, phase_image, shown
-from dpm2_core.training.trainer import OptimiserSettings
 
 
 @pytest.fixture

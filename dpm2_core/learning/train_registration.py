@@ -13,6 +13,12 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from dpm2_core.config import Settings
+from dpm2_core.evaluation.pair_set import PairSet
+from dpm2_core.learning.checkpoint import load_checkpoint
+from dpm2_core.learning.dataset import Batch, DataSettings, GroupDataset
+from dpm2_core.learning.pair_sampling import Plan, merge_tokens, plan_sets
+from dpm2_core.learning.registration_loss import LossSettings, phase_one_loss
+from dpm2_core.learning.trainer import OptimiserSettings, process_group, train
 from dpm2_core.network.config import NetworkSettings, preset
 from dpm2_core.network.descriptors import Tokens
 from dpm2_core.network.encoder import Encoded, to_device
@@ -22,12 +28,6 @@ from dpm2_core.network.pointnext import Scale
 from dpm2_core.network.pyramid import PointBatch
 from dpm2_core.network.spatial import Views, picture_features
 from dpm2_core.network.weights import load_weights, save_weights
-from dpm2_core.training.checkpoint import load_checkpoint
-from dpm2_core.training.dataset import Batch, DataSettings, GroupDataset
-from dpm2_core.training.objective import LossSettings, phase_one_loss
-from dpm2_core.training.sets import Plan, merge_tokens, plan_sets
-from dpm2_core.training.trainer import OptimiserSettings, process_group, train
-from dpm2_core.training.validation import PairSet
 
 
 class PhaseOne(nn.Module):

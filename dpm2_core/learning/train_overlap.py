@@ -15,6 +15,9 @@ from torch import Tensor, nn
 
 from dpm2_core.config import Settings
 from dpm2_core.frame import Array
+from dpm2_core.learning.checkpoint import load_checkpoint
+from dpm2_core.learning.dataset import Batch, GroupDataset, GroupSettings
+from dpm2_core.learning.trainer import OptimiserSettings, process_group, train
 from dpm2_core.network.config import NetworkSettings
 from dpm2_core.network.encoder import to_device
 from dpm2_core.network.losses import overlap_loss
@@ -23,9 +26,6 @@ from dpm2_core.network.pyramid import PointBatch
 from dpm2_core.network.registration import evidence, solve_batch
 from dpm2_core.network.spatial import Views
 from dpm2_core.network.weights import load_weights, network_settings, save_weights
-from dpm2_core.training.checkpoint import load_checkpoint
-from dpm2_core.training.dataset import Batch, GroupDataset, GroupSettings
-from dpm2_core.training.trainer import OptimiserSettings, process_group, train
 
 OVERLAP = 20.0  # m: nearer pairs are positive
 HARD = 40.0  # m: half of the negatives lie between OVERLAP and this

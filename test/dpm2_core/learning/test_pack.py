@@ -11,12 +11,12 @@ import pytest
 from typer.testing import CliRunner
 
 from dpm2_core.cli import app
+from dpm2_core.data.packed import PackedDrive
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
-from dpm2_core.training.dataset import DataSettings, GroupDataset, Mixture
-from dpm2_core.training.generate import pack
-from dpm2_core.training.packed import PackedDrive
+from dpm2_core.learning.dataset import DataSettings, GroupDataset, Mixture
+from dpm2_core.learning.generate import pack
 
 
 class Sweeps:
