@@ -24,9 +24,10 @@ from scipy.sparse.csgraph import connected_components
 from dpm2_core.config import load_settings
 from dpm2_core.console import Console
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.evaluation.bench.harness import Options, write_record
+from dpm2_core.evaluation.bench.harness import Options
 from dpm2_core.evaluation.bench.roads import open_road, road_files
 from dpm2_core.evaluation.metrics import align, ape_rmse
+from dpm2_core.evaluation.record import write_record
 from dpm2_core.frame import Array
 from dpm2_core.sim.source import SimulatedDrive
 from dpm2_core.slam.map.data import MapData, load_map

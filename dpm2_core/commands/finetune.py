@@ -30,17 +30,18 @@ def finetune(
     from dpm2_core.data.open import open_source
     from dpm2_core.data.settings import InputSettings
     from dpm2_core.learning import finetune as work
+    from dpm2_core.learning import finetune_data, finetune_settings
     from dpm2_core.network.pretrained import load_network, weights_path  # torch is slow to import
     from dpm2_core.slam.system import SlamSettings
 
     refuse_overwriting(out, resume)
-    chosen = load_settings(work.FinetuneSettings, config, settings or [])
+    chosen = load_settings(finetune_settings.FinetuneSettings, config, settings or [])
     start = weights_path(chosen.weights)
     network = load_network(chosen.weights, threads=2).settings
     sources = [open_source(path, InputSettings(images=False)) for path in src]
     console = Console(stderr=True)
     with console.status("") as status:
-        work.prepare(sources, chosen, network, SlamSettings(), out, status.update)
+        finetune_data.prepare(sources, chosen, network, SlamSettings(), out, status.update)
         status.update("measuring")
         before = work.measure(start, chosen, out)
     written = work.finetune(chosen, out, resume)

@@ -124,7 +124,7 @@ def ablation(
 ) -> None:
     """The paper's Table 4: alternatives of the fusion, trained alike; continues where it was stopped."""
     from dpm2_core.console import Console
-    from dpm2_core.evaluation.bench.harness import write_record
+    from dpm2_core.evaluation.record import write_record
     from dpm2_core.experiments.ablation import AblationSettings
     from dpm2_core.experiments.ablation import ablation as compare
     from dpm2_core.tables import FigureTable

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Training of the network: phase one (registration) and phase two (overlap)."""
+"""Training of the network: registration, overlap, image branch, and fine-tuning on a user's drives."""

@@ -9,32 +9,23 @@ as in phase one. In every batch there are scans of the LiDAR that the weights co
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from pydantic import Field
 from torch import Tensor, nn
 
-from dpm2_core.config import Settings
-from dpm2_core.data.source import Source
 from dpm2_core.diffslam.trajectory_loss import trajectory_loss
-from dpm2_core.errors import UsageError
-from dpm2_core.evaluation.pair_set import NEAR, PairSet
-from dpm2_core.frame import Array, Frame
-from dpm2_core.learning.augment import AugmentSettings
+from dpm2_core.evaluation.pair_set import PairSet
+from dpm2_core.frame import Array
 from dpm2_core.learning.checkpoint import load_checkpoint
 from dpm2_core.learning.dataset import Batch, DataSettings, GroupDataset, draw_group
-from dpm2_core.learning.generate import GenerateSettings, generate, pack
+from dpm2_core.learning.finetune_settings import DRIVES, HELD_OUT, REHEARSAL, FinetuneSettings
 from dpm2_core.learning.pair_sampling import Plan, plan_sets
 from dpm2_core.learning.pose_loss import differentiable_poses
-from dpm2_core.learning.registration_loss import LossSettings
 from dpm2_core.learning.train_registration import PhaseOne
-from dpm2_core.learning.trainer import OptimiserSettings, process_group, train
-from dpm2_core.network.config import NetworkSettings
+from dpm2_core.learning.trainer import process_group, train
 from dpm2_core.network.decoder import Decoder
 from dpm2_core.network.descriptors import Tokens
 from dpm2_core.network.encoder import to_device
@@ -42,78 +33,6 @@ from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pretrained import weights_path
 from dpm2_core.network.pyramid import PointBatch
 from dpm2_core.network.weights import load_model, read_metadata, save_weights
-from dpm2_core.slam.output import TrajectoryRecorder
-from dpm2_core.slam.system import SlamSettings, SlamSystem
-
-DRIVES, HELD_OUT, REHEARSAL = "drives", "held_out", "rehearsal"
-"""Folders of packed drives below the one of the training."""
-
-
-class FinetuneOptimiser(OptimiserSettings):
-    """Optimisation: a few small steps."""
-
-    steps: int = Field(default=300, gt=0)
-    """Batches."""
-    rate: float = Field(default=3e-4, gt=0)
-    """Peak learning rate."""
-    warmup: int = Field(default=20, ge=0)
-    """Steps of linear warm-up."""
-    ema: float = Field(default=0.98, ge=0, lt=1)
-    """Decay of the averaged weights, which are the ones that are kept."""
-    compile: bool = False
-    """torch.compile: takes minutes to start."""
-    save_every: int = Field(default=50, gt=0)
-    """Steps between checkpoints."""
-
-
-class FinetuneAugment(AugmentSettings):
-    """Augmentation; the beams stay those of the LiDAR that is learned."""
-
-    drop: float = Field(default=0.2, ge=0, lt=1)
-    """Points are dropped at a ratio drawn from 0 to this."""
-    beams: float = Field(default=0.0, ge=0, le=1)
-    """Probability that only every second or fourth elevation survives."""
-
-
-class RehearsalWorlds(GenerateSettings):
-    """Synthetic worlds with the LiDAR that the shipped weights come from."""
-
-    worlds: int = Field(default=6, gt=0)
-    """Worlds, each a folder."""
-    first_seed: int = Field(default=3000, ge=0)
-    """Seed of the first world; the others follow."""
-    frames: int = Field(default=40, gt=1)
-    """Scans of each world, at random places of its road."""
-
-
-class FinetuneSettings(Settings):
-    """A fine-tuning."""
-
-    weights: str = "small"
-    """Name of weights that come with dpm2, or path of a .safetensors file: what to start from."""
-    reference: Literal["geometric", "refined"] = "geometric"
-    """Registration of the SLAM whose trajectory is the reference."""
-    trajectory: float = Field(default=2.0, ge=0)
-    """Weight of the trajectory loss, 1/m2."""
-    pairs: float = Field(default=0.0, ge=0)
-    """Weight of the losses of phase one, with the reference as truth. They gained nothing, and took from the other."""
-    loss: LossSettings = LossSettings()
-    rehearsal: str = ""
-    """Folder of packed drives of the LiDAR that the weights come from; empty: synthetic worlds are made."""
-    rehearsal_share: float = Field(default=0.5, ge=0, lt=1)
-    """Of the places of the batches."""
-    rehearsal_worlds: RehearsalWorlds = RehearsalWorlds()
-    """The synthetic worlds."""
-    held_out: float = Field(default=0.15, ge=0, lt=1)
-    """Last part of each drive, to be measured on before and after."""
-    groups: int = Field(default=2, gt=0)
-    """Places in a batch."""
-    frames: int = Field(default=4, ge=2)
-    """Scans of each place, in the order of the road."""
-    radius: float = Field(default=15.0, gt=0)
-    """Farthest from the first one drawn, m."""
-    augment: FinetuneAugment = FinetuneAugment()
-    optimiser: FinetuneOptimiser = FinetuneOptimiser()
 
 
 class Finetuned(PhaseOne):
@@ -182,68 +101,6 @@ class StretchSettings(DataSettings):
     def draw(self, poses: Array, noise: np.random.Generator) -> NDArray[np.intp]:
         """See `draw_stretch`."""
         return draw_stretch(poses, self.frames, self.radius, noise)
-
-
-class Referenced:
-    """A source with the poses of a SLAM instead of the truth; NaN where it had none."""
-
-    def __init__(self, source: Source, poses: Array) -> None:
-        self.name, self.notes, self.poses, self.truth = source.name, source.notes, poses, "SLAM"
-        self.T_cam_lidar = None
-        self._source = source
-
-    def __len__(self) -> int:
-        return len(self._source)
-
-    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
-        yield from self._source.frames(start, stop)
-
-
-def refer(source: Source, settings: SlamSettings, advance: Callable[[], None] = lambda: None) -> Referenced:
-    """The source with the trajectory that the SLAM finds for it, loops closed."""
-    system, recorder, registered = SlamSystem(settings), TrajectoryRecorder(), []
-    for frame in source.frames():
-        tracked = system.process(frame)
-        recorder.add(tracked)
-        registered.append(tracked.registration.ok)
-        advance()
-    system.mapper.finish()
-    poses = recorder.poses(system.mapper.poses)
-    poses[~np.array(registered, bool)] = np.nan
-    return Referenced(source, poses)
-
-
-def prepare(
-    sources: Sequence[Source], settings: FinetuneSettings, network: NetworkSettings, slam: SlamSettings, out: Path,
-    advance: Callable[[str], None] = lambda what: None,
-) -> None:  # fmt: skip
-    """Drives with their references, their last parts and the rehearsal, packed below `out`; what is there stays.
-
-    Raises:
-        UsageError: the SLAM could hardly follow a drive.
-    """
-    slam = slam.model_copy(update={"registration": settings.reference})
-    for i, source in enumerate(sources):
-        name = f"{i:02d}_{source.name.replace('/', '_')}"
-        if (out / DRIVES / name).exists():  # the last to be written
-            continue
-        referenced = refer(source, slam, lambda name=name: advance(f"{name}: reference by SLAM"))  # type: ignore[misc]
-        known = np.flatnonzero(np.isfinite(referenced.poses[:, 0, 0]))
-        if len(known) < 2 * settings.frames:
-            raise UsageError(f"{source.name}: the SLAM followed {len(known)} of {len(source)} scans; nothing to learn")
-        cut = round(len(source) * (1 - settings.held_out))
-        for folder, part in ((HELD_OUT, range(cut, len(source))), (DRIVES, range(cut))):
-            if folder == DRIVES or _reaches_far(referenced.poses[part.start :]):
-                pack(referenced, out / folder / name, network, part, lambda name=name: advance(f"{name}: packing"))  # type: ignore[misc]
-    if settings.rehearsal_share > 0 and not settings.rehearsal:
-        worlds = settings.rehearsal_worlds.model_copy(update={"preset": network.preset})
-        generate(out / REHEARSAL, worlds, 1, lambda done, total: advance(f"rehearsal: world {done} of {total}"))
-
-
-def _reaches_far(poses: Array) -> bool:
-    """Whether pairs of every distance that `PairSet` wants can be drawn from a drive (N, 4, 4)."""
-    at = poses[np.isfinite(poses[:, 0, 0]), :3, 3]
-    return len(at) > 1 and float(np.linalg.norm(at - at[0], axis=1).max()) > 2 * NEAR
 
 
 def finetune(

@@ -18,9 +18,12 @@ from dpm2_core.config import load_settings
 from dpm2_core.data.open import open_source
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.errors import UsageError
-from dpm2_core.evaluation.bench.harness import Options, Report, git_commit, write_report
+from dpm2_core.evaluation.bench.harness import Options, Report, write_report
 from dpm2_core.evaluation.pair_set import NEAR, SUCCESS, PairSet
-from dpm2_core.learning.finetune import FinetuneSettings, finetune, prepare
+from dpm2_core.evaluation.record import git_commit
+from dpm2_core.learning.finetune import finetune
+from dpm2_core.learning.finetune_data import prepare
+from dpm2_core.learning.finetune_settings import FinetuneSettings
 from dpm2_core.learning.generate import GenerateSettings, generate
 from dpm2_core.network.pretrained import weights_path
 from dpm2_core.network.weights import load_model

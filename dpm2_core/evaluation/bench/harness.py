@@ -5,15 +5,12 @@ from __future__ import annotations
 
 import json
 import os
-import platform
-import shlex
 import subprocess
 import sys
 import tempfile
 from collections.abc import Container, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -24,11 +21,8 @@ from dpm2_core.config import load_settings
 from dpm2_core.data.open import open_source
 from dpm2_core.data.source import Source
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.files import atomic_write
+from dpm2_core.evaluation.record import REPOSITORY, write_record
 from dpm2_core.slam.system import Config, SlamSettings
-
-REPOSITORY = Path(__file__).resolve().parents[3]
-_PACKAGES = ("numpy", "scipy", "small_gicp", "gtsam", "torch", "kiss-icp")
 
 
 @dataclass(frozen=True)
@@ -137,24 +131,6 @@ def write_report(path: Path, name: str, report: Report, options: Options, progra
     write_record(path, name, results, program, options.threads)
 
 
-def write_record(path: Path, name: str, results: dict[str, Any], program: str = "dpm2", threads: int = 2) -> None:
-    """Results with everything that is needed to judge and repeat them, as JSON.
-
-    Raises:
-        Dpm2Error: the file could not be written.
-    """
-    record = {
-        "benchmark": name,
-        "command": shlex.join([*program.split(), *sys.argv[1:]]),
-        "commit": git_commit(),
-        "machine": {"processor": _processor(), "cpus": os.cpu_count(), "threads": threads},
-        "versions": {"python": platform.python_version(), **{p: _version(p) for p in _PACKAGES}},
-        **results,
-    }
-    with atomic_write(path) as file:
-        file.write(json.dumps(record, indent=1) + "\n")
-
-
 def read_parts(path: Path, weights: dict[str, Any]) -> dict[str, Any]:
     """Parts of an earlier, unfinished run with the same weights; none if it is of others, damaged or not there."""
     try:
@@ -162,33 +138,3 @@ def read_parts(path: Path, weights: dict[str, Any]) -> dict[str, Any]:
         return dict(record["parts"]) if record["weights"] == weights else {}
     except (OSError, ValueError, KeyError, TypeError):
         return {}
-
-
-def git_commit() -> str | None:
-    """The commit that was measured, with "+" where files differ from it; None outside a repository."""
-    try:
-        commit = _git("rev-parse", "--short=12", "HEAD")
-        return commit + ("+" if _git("status", "--porcelain", "--untracked-files=no", "--", "dpm2_core") else "")
-    except (OSError, subprocess.CalledProcessError):
-        return None
-
-
-def _git(*arguments: str) -> str:
-    done = subprocess.run(["git", *arguments], cwd=REPOSITORY, capture_output=True, text=True, check=True)
-    return done.stdout.strip()
-
-
-def _version(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None
-
-
-def _processor() -> str:
-    """Model of the processor, as Linux names it."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return platform.processor()
-    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.machine())

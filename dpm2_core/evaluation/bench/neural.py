@@ -20,7 +20,6 @@ from dpm2_core.evaluation.bench.harness import (
     Options,
     Report,
     drives,
-    git_commit,
     overrides_of,
     processors,
     read_parts,
@@ -38,6 +37,7 @@ from dpm2_core.evaluation.bench.pairs import (
 )
 from dpm2_core.evaluation.bench.unseen import corruption, image_matters, overlap, synthetic
 from dpm2_core.evaluation.figures import success_png
+from dpm2_core.evaluation.record import git_commit
 from dpm2_core.frame import Frame
 from dpm2_core.network.encoder import collate_views
 from dpm2_core.network.model import DeepPointMap2

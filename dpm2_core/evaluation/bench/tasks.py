@@ -21,7 +21,8 @@ from dpm2_core.diffslam.tasks.drives import TaskDriveSettings, make_task_drives
 from dpm2_core.diffslam.tasks.task import SlamTaskTraining, task_type
 from dpm2_core.diffslam.tasks.training import WEIGHTS, load_task, measure, train_task
 from dpm2_core.errors import UsageError
-from dpm2_core.evaluation.bench.harness import Options, Report, git_commit, processors, write_report
+from dpm2_core.evaluation.bench.harness import Options, Report, processors, write_report
+from dpm2_core.evaluation.record import git_commit
 from dpm2_core.evaluation.task_slam import slam_figures
 from dpm2_core.files import atomic_write
 from dpm2_core.tables import FigureTable

@@ -17,8 +17,9 @@ from rich.console import Group
 
 from dpm2_core.config import load_settings
 from dpm2_core.errors import UsageError
-from dpm2_core.evaluation.bench.harness import Options, Report, git_commit, overrides_of, write_report
+from dpm2_core.evaluation.bench.harness import Options, Report, overrides_of, write_report
 from dpm2_core.evaluation.metrics import evaluate
+from dpm2_core.evaluation.record import git_commit
 from dpm2_core.frame import Frame, Points
 from dpm2_core.network.pretrained import PERCEPTION_WEIGHTS, PRETRAINED_DIR
 from dpm2_core.sim.config import LidarConfig, PresetName

@@ -17,15 +17,9 @@ from dpm2_core.diffslam.trajectory_loss import trajectory_loss
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
-from dpm2_core.learning.finetune import (
-    FinetuneOptimiser,
-    FinetuneSettings,
-    draw_stretch,
-    finetune,
-    prepare,
-    refer,
-    window_trajectories,
-)
+from dpm2_core.learning.finetune import draw_stretch, finetune, window_trajectories
+from dpm2_core.learning.finetune_data import prepare, refer
+from dpm2_core.learning.finetune_settings import FinetuneOptimiser, FinetuneSettings
 from dpm2_core.network.config import NetworkSettings
 from dpm2_core.network.descriptors import Tokens
 from dpm2_core.network.model import DeepPointMap2

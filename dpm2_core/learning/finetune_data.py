@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Data of a fine-tuning: a user's drives with the SLAM's trajectory as reference, packed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from dpm2_core.data.source import Source
+from dpm2_core.errors import UsageError
+from dpm2_core.evaluation.pair_set import NEAR
+from dpm2_core.frame import Array, Frame
+from dpm2_core.learning.finetune_settings import DRIVES, HELD_OUT, REHEARSAL, FinetuneSettings
+from dpm2_core.learning.generate import generate, pack
+from dpm2_core.network.config import NetworkSettings
+from dpm2_core.slam.output import TrajectoryRecorder
+from dpm2_core.slam.system import SlamSettings, SlamSystem
+
+
+class Referenced:
+    """A source with the poses of a SLAM instead of the truth; NaN where it had none."""
+
+    def __init__(self, source: Source, poses: Array) -> None:
+        self.name, self.notes, self.poses, self.truth = source.name, source.notes, poses, "SLAM"
+        self.T_cam_lidar = None
+        self._source = source
+
+    def __len__(self) -> int:
+        return len(self._source)
+
+    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
+        yield from self._source.frames(start, stop)
+
+
+def refer(source: Source, settings: SlamSettings, advance: Callable[[], None] = lambda: None) -> Referenced:
+    """The source with the trajectory that the SLAM finds for it, loops closed."""
+    system, recorder, registered = SlamSystem(settings), TrajectoryRecorder(), []
+    for frame in source.frames():
+        tracked = system.process(frame)
+        recorder.add(tracked)
+        registered.append(tracked.registration.ok)
+        advance()
+    system.mapper.finish()
+    poses = recorder.poses(system.mapper.poses)
+    poses[~np.array(registered, bool)] = np.nan
+    return Referenced(source, poses)
+
+
+def prepare(
+    sources: Sequence[Source], settings: FinetuneSettings, network: NetworkSettings, slam: SlamSettings, out: Path,
+    advance: Callable[[str], None] = lambda what: None,
+) -> None:  # fmt: skip
+    """Drives with their references, their last parts and the rehearsal, packed below `out`; what is there stays.
+
+    Raises:
+        UsageError: the SLAM could hardly follow a drive.
+    """
+    slam = slam.model_copy(update={"registration": settings.reference})
+    for i, source in enumerate(sources):
+        name = f"{i:02d}_{source.name.replace('/', '_')}"
+        if (out / DRIVES / name).exists():  # the last to be written
+            continue
+        referenced = refer(source, slam, lambda name=name: advance(f"{name}: reference by SLAM"))  # type: ignore[misc]
+        known = np.flatnonzero(np.isfinite(referenced.poses[:, 0, 0]))
+        if len(known) < 2 * settings.frames:
+            raise UsageError(f"{source.name}: the SLAM followed {len(known)} of {len(source)} scans; nothing to learn")
+        cut = round(len(source) * (1 - settings.held_out))
+        for folder, part in ((HELD_OUT, range(cut, len(source))), (DRIVES, range(cut))):
+            if folder == DRIVES or _reaches_far(referenced.poses[part.start :]):
+                pack(referenced, out / folder / name, network, part, lambda name=name: advance(f"{name}: packing"))  # type: ignore[misc]
+    if settings.rehearsal_share > 0 and not settings.rehearsal:
+        worlds = settings.rehearsal_worlds.model_copy(update={"preset": network.preset})
+        generate(out / REHEARSAL, worlds, 1, lambda done, total: advance(f"rehearsal: world {done} of {total}"))
+
+
+def _reaches_far(poses: Array) -> bool:
+    """Whether pairs of every distance that `PairSet` wants can be drawn from a drive (N, 4, 4)."""
+    at = poses[np.isfinite(poses[:, 0, 0]), :3, 3]
+    return len(at) > 1 and float(np.linalg.norm(at - at[0], axis=1).max()) > 2 * NEAR
