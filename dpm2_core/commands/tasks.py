@@ -30,7 +30,7 @@ def tasks_data(
     workers: Annotated[int, typer.Option(min=1, help="Threads; they do not change the result.")] = 2,
 ) -> None:
     """Synthetic drives for gndnet, dslr and ae_lidar, with exact labels and twins without traffic."""
-    from dpm2_core.diffslam.tasks.drives import TaskDriveSettings, make_task_drives
+    from dpm2_core.tasks.drives import TaskDriveSettings, make_task_drives
 
     chosen = load_settings(TaskDriveSettings, config, settings or [])
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
@@ -92,9 +92,9 @@ def _train(
     name: str, src: Path, settings: tuple[Path | None, Sequence[str]], out: Path, resume: bool, val: Path | None
 ) -> None:
     """Train a task with the settings of a YAML file and of overrides."""
-    from dpm2_core.diffslam.tasks.data import open_scans  # torch is slow to import
-    from dpm2_core.diffslam.tasks.task import task_type
-    from dpm2_core.diffslam.tasks.training import WEIGHTS, train_task
+    from dpm2_core.tasks.scan import open_scans  # torch is slow to import
+    from dpm2_core.tasks.task import task_type
+    from dpm2_core.tasks.training import WEIGHTS, train_task
 
     refuse_overwriting(out, resume)
     kind = task_type(name)
@@ -114,9 +114,9 @@ def eval_task(
     slam: Annotated[bool, typer.Option("--slam", help="Odometry on what the task makes, too; needs poses.")] = False,
 ) -> None:
     """Measure a trained task on scans that it has not learned from."""
-    from dpm2_core.diffslam.tasks.data import open_scans
-    from dpm2_core.diffslam.tasks.task import task_type
-    from dpm2_core.diffslam.tasks.training import draw, load_task, measure
+    from dpm2_core.tasks.scan import open_scans
+    from dpm2_core.tasks.task import task_type
+    from dpm2_core.tasks.training import draw, load_task, measure
 
     needs = task_type(name).needs
     task = load_task(name, weights)
@@ -126,7 +126,7 @@ def eval_task(
         typer.echo(f"{picture}: written", err=True)
     figures = measure(task, scans)
     if slam:
-        from dpm2_core.evaluation.task_slam import slam_figures  # imports the whole SLAM
+        from dpm2_core.tasks.slam_figures import slam_figures  # imports the whole SLAM
 
         figures |= slam_figures(task, src)
     if as_json:

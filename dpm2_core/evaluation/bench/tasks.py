@@ -16,16 +16,16 @@ import torch
 from rich.console import Group
 
 from dpm2_core.config import dump_settings, load_settings
-from dpm2_core.diffslam.tasks.data import TaskScans, open_scans
-from dpm2_core.diffslam.tasks.drives import TaskDriveSettings, make_task_drives
-from dpm2_core.diffslam.tasks.task import SlamTaskTraining, task_type
-from dpm2_core.diffslam.tasks.training import WEIGHTS, load_task, measure, train_task
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.bench.harness import Options, Report, processors, write_report
 from dpm2_core.evaluation.record import git_commit
-from dpm2_core.evaluation.task_slam import slam_figures
 from dpm2_core.files import atomic_write
 from dpm2_core.tables import FigureTable
+from dpm2_core.tasks.drives import TaskDriveSettings, make_task_drives
+from dpm2_core.tasks.scan import TaskScans, open_scans
+from dpm2_core.tasks.slam_figures import slam_figures
+from dpm2_core.tasks.task import SlamTaskTraining, task_type
+from dpm2_core.tasks.training import WEIGHTS, load_task, measure, train_task
 
 Better = Literal["lower", "higher"]
 _DONE = "settings.yaml"  # beside the weights of a training that ended

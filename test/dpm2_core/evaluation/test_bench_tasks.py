@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from dpm2_core.diffslam.tasks.drives import TaskDriveSettings
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.bench import tasks
 from dpm2_core.evaluation.bench.harness import Options
+from dpm2_core.tasks.drives import TaskDriveSettings
 
 
 def test_summary_by_hand() -> None:

@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from dpm2_core.diffslam.tasks.movers_task import MoverTask, MoverTraining
-from dpm2_core.diffslam.tasks.training import save_task
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Frame
 from dpm2_core.network.perception.dslr import Dslr, DslrSettings
@@ -19,6 +17,8 @@ from dpm2_core.network.perception.gndnet import GroundNet, GroundSettings
 from dpm2_core.slam.filters import FilterSettings, GroundFilter, MoverFilter, StaticFilter, make_filter
 from dpm2_core.slam.preprocess import Preprocessor, PreprocessSettings
 from dpm2_core.slam.system import SlamSettings, SlamSystem
+from dpm2_core.tasks.dynamic_objects_task import MoverTask, MoverTraining
+from dpm2_core.tasks.training import save_task
 
 
 @pytest.fixture

@@ -3,4 +3,4 @@
 
 from __future__ import annotations
 
-from ...diffslam.tasks.conftest import one_thread  # noqa: F401
+from ...tasks.conftest import one_thread  # noqa: F401

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from dpm2_core.diffslam.tasks.data import TaskScan, TaskScans
-from dpm2_core.diffslam.tasks.movers_task import MOVABLE, MoverTask, MoverTraining
-from dpm2_core.diffslam.tasks.training import save_task, train_task
 from dpm2_core.errors import UsageError
 from dpm2_core.network.perception.dynamic_objects import MoverNetSettings, load
 from dpm2_core.network.perception.gndnet import GroundSettings
 from dpm2_core.network.perception.task_weights import write_weights
+from dpm2_core.tasks.dynamic_objects_task import MOVABLE, MoverTask, MoverTraining
+from dpm2_core.tasks.scan import TaskScan, TaskScans
+from dpm2_core.tasks.training import save_task, train_task
 
 SMALL = MoverTraining(network=MoverNetSettings(cells=32, cell=1.0, channels=8), epochs=12, every=1, batch=1, drop=0.3)
 

@@ -12,18 +12,18 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from dpm2_core.diffslam.tasks.data import TaskScan, TaskScans, open_scans
-from dpm2_core.diffslam.tasks.drives import TaskDriveSettings, make_task_drives
-from dpm2_core.diffslam.tasks.ground_task import GroundTask, GroundTraining, _tilt, filled, ground_of
-from dpm2_core.diffslam.tasks.training import load_task, measure
 from dpm2_core.network.perception.gndnet import elevation_labels, load
+from dpm2_core.tasks.drives import TaskDriveSettings, make_task_drives
+from dpm2_core.tasks.ground_task import GroundTask, GroundTraining, _tilt, filled, ground_of
+from dpm2_core.tasks.scan import TaskScan, TaskScans, open_scans
+from dpm2_core.tasks.training import load_task, measure
 
 SETTINGS = GroundTraining.model_validate(
     {"network": {"cells": 48, "cell": 2.0, "channels": 4}, "tilt": 0.0, "slam_loss": {"points": 500}}
 )
 
 
-SHIPPED = Path(__file__).resolve().parents[4] / "dpm2_core" / "weights" / "gndnet.safetensors"
+SHIPPED = Path(__file__).resolve().parents[3] / "dpm2_core" / "weights" / "gndnet.safetensors"
 
 
 class Known(nn.Module):

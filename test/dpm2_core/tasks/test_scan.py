@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 import torch
 
-from dpm2_core.diffslam.tasks.data import open_scans
-from dpm2_core.diffslam.tasks.drives import TaskDriveSettings, make_task_drives
-from dpm2_core.diffslam.tasks.ground_task import ground_of
 from dpm2_core.diffslam.windows import ContiguousWindows
 from dpm2_core.errors import UsageError
+from dpm2_core.tasks.drives import TaskDriveSettings, make_task_drives
+from dpm2_core.tasks.ground_task import ground_of
+from dpm2_core.tasks.scan import open_scans
 
-SEMANTIC = Path(__file__).resolve().parents[4].parent / "shared" / "kitti" / "semantic"
+SEMANTIC = Path(__file__).resolve().parents[3].parent / "shared" / "kitti" / "semantic"
 
 
 def test_a_scan_is_what_its_files_hold(write_drive: Callable[..., Path], tmp_path: Path) -> None:

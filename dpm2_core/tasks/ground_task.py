@@ -12,9 +12,6 @@ from pydantic import Field
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
-from dpm2_core.diffslam.tasks.data import TaskScan, TaskScans
-from dpm2_core.diffslam.tasks.task import SlamTaskTraining, Task
-from dpm2_core.diffslam.tasks.training import mean_figures
 from dpm2_core.diffslam.trajectory_loss import SlamLoss, SlamLossSettings
 from dpm2_core.errors import UsageError
 from dpm2_core.network.perception.gndnet import (
@@ -25,6 +22,9 @@ from dpm2_core.network.perception.gndnet import (
     ground_metrics,
     obstacle_weight,
 )
+from dpm2_core.tasks.scan import TaskScan, TaskScans
+from dpm2_core.tasks.task import SlamTaskTraining, Task
+from dpm2_core.tasks.training import mean_figures
 
 GROUND = (40, 44, 48, 49, 60, 72)
 """Road, parking, sidewalk, other ground, lane marking, terrain: SemanticKITTI's classes of the ground."""
@@ -110,7 +110,7 @@ class GroundTask(Task):
 
     def picture(self, scan: TaskScan, path: Path) -> None:
         """Predicted elevation beside the true one, both with what stands on it, seen from above."""
-        from dpm2_core.evaluation.task_figures import ground_png  # matplotlib is slow to import
+        from dpm2_core.tasks.ground_figure import ground_png  # matplotlib is slow to import
 
         labels, known = elevation_labels(scan.points, ground_of(scan)[0], self.settings.network)
         truth = torch.where(known, labels, torch.nan)

@@ -15,9 +15,11 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from dpm2_core.diffslam import SlamLoss
-from dpm2_core.diffslam.tasks.data import TaskScan, TaskScans, open_scans
-from dpm2_core.diffslam.tasks.ground_task import GroundTask, GroundTraining
-from dpm2_core.diffslam.tasks.training import (
+from dpm2_core.errors import UsageError
+from dpm2_core.network.perception import gndnet
+from dpm2_core.tasks.ground_task import GroundTask, GroundTraining
+from dpm2_core.tasks.scan import TaskScan, TaskScans, open_scans
+from dpm2_core.tasks.training import (
     WEIGHTS,
     draw,
     load_task,
@@ -26,8 +28,6 @@ from dpm2_core.diffslam.tasks.training import (
     save_task,
     train_task,
 )
-from dpm2_core.errors import UsageError
-from dpm2_core.network.perception import gndnet
 
 TINY = {"cells": 32, "cell": 2.0, "channels": 4}
 

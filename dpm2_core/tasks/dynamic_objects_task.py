@@ -14,11 +14,11 @@ from pydantic import Field
 from torch import Tensor
 from torch.nn import functional
 
-from dpm2_core.diffslam.tasks.data import TaskScan, TaskScans
-from dpm2_core.diffslam.tasks.ground_task import UNCOUNTED
-from dpm2_core.diffslam.tasks.task import Task, TaskTraining
 from dpm2_core.errors import UsageError
 from dpm2_core.network.perception.dynamic_objects import MoverNet, MoverNetSettings, occupancy, voxels
+from dpm2_core.tasks.ground_task import UNCOUNTED
+from dpm2_core.tasks.scan import TaskScan, TaskScans
+from dpm2_core.tasks.task import Task, TaskTraining
 
 MOVABLE = (10, 11, 13, 15, 16, 18, 20, 30, 31, 32)
 """Cars, bicycles, buses, motorcycles, on rails, trucks, other vehicles, people, riders: SemanticKITTI's classes."""
@@ -90,7 +90,7 @@ class MoverTask(Task):
 
     def picture(self, scan: TaskScan, path: Path) -> None:
         """The scan from above, what was found, missed and wrongly found in colours."""
-        from dpm2_core.evaluation.mover_figure import movers_png  # matplotlib is slow to import
+        from dpm2_core.tasks.dynamic_objects_figure import movers_png  # matplotlib is slow to import
 
         points, movable, counted = _arrays(scan)
         movers_png(path, points[counted], self.net.probability(points)[counted] > 0.5, movable[counted])

@@ -18,9 +18,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dpm2_core.diffslam.tasks.data import ScanSequence, TaskScan
 from dpm2_core.errors import UsageError
 from dpm2_core.network.perception.range_image import CHANNELS, RangeImageSettings, fill, to_points
+from dpm2_core.tasks.scan import ScanSequence, TaskScan
 
 SCALE = 120.0
 """What a value of one stands for in the preprocessed arrays, m."""

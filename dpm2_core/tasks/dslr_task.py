@@ -11,8 +11,9 @@ from pydantic import Field
 from torch import Tensor
 from torch.nn import functional
 
-from dpm2_core.diffslam.tasks.data import TaskScan, TaskScans
-from dpm2_core.diffslam.tasks.range_scans import (
+from dpm2_core.diffslam.trajectory_loss import SlamLoss
+from dpm2_core.network.perception.dslr import Dslr, DslrSettings
+from dpm2_core.tasks.range_scans import (
     RangeReader,
     RangeScans,
     chamfer_figures,
@@ -21,10 +22,9 @@ from dpm2_core.diffslam.tasks.range_scans import (
     slam_of,
     variety,
 )
-from dpm2_core.diffslam.tasks.task import SlamTaskTraining, Task
-from dpm2_core.diffslam.tasks.training import mean_figures
-from dpm2_core.diffslam.trajectory_loss import SlamLoss
-from dpm2_core.network.perception.dslr import Dslr, DslrSettings
+from dpm2_core.tasks.scan import TaskScan, TaskScans
+from dpm2_core.tasks.task import SlamTaskTraining, Task
+from dpm2_core.tasks.training import mean_figures
 
 _BATCH = 16
 _MOVED = 0.5
@@ -152,7 +152,7 @@ class DslrTask(Task):
 
     def picture(self, scan: TaskScan, path: Path) -> None:
         """The scan, its translation and its static twin: range images, and seen from above."""
-        from dpm2_core.evaluation.range_figures import range_png  # matplotlib is slow to import
+        from dpm2_core.tasks.range_figure import range_png  # matplotlib is slow to import
 
         dynamic, static = self._reader.read([scan]), self._reader.read([scan], static=True)
         rows = {

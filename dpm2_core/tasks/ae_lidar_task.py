@@ -9,9 +9,9 @@ from pathlib import Path
 from pydantic import Field
 from torch import Tensor
 
-from dpm2_core.diffslam.tasks.ae_lidar import AeLidarSettings, LidarAutoencoder
-from dpm2_core.diffslam.tasks.data import TaskScan, TaskScans
-from dpm2_core.diffslam.tasks.range_scans import (
+from dpm2_core.diffslam.trajectory_loss import SlamLoss
+from dpm2_core.tasks.ae_lidar import AeLidarSettings, LidarAutoencoder
+from dpm2_core.tasks.range_scans import (
     RangeReader,
     RangeScans,
     chamfer_figures,
@@ -20,9 +20,9 @@ from dpm2_core.diffslam.tasks.range_scans import (
     slam_of,
     variety,
 )
-from dpm2_core.diffslam.tasks.task import SlamTaskTraining, Task
-from dpm2_core.diffslam.tasks.training import mean_figures
-from dpm2_core.diffslam.trajectory_loss import SlamLoss
+from dpm2_core.tasks.scan import TaskScan, TaskScans
+from dpm2_core.tasks.task import SlamTaskTraining, Task
+from dpm2_core.tasks.training import mean_figures
 
 _LEAST_DIVERGENCE = 5.0
 """Below this the divergence of a VAE costs no less, nats: the codes keep something to say."""
@@ -96,7 +96,7 @@ class AeLidarTask(Task):
 
     def picture(self, scan: TaskScan, path: Path) -> None:
         """The scan and its reconstruction: range images, and seen from above."""
-        from dpm2_core.evaluation.range_figures import range_png  # matplotlib is slow to import
+        from dpm2_core.tasks.range_figure import range_png  # matplotlib is slow to import
 
         scans = self._reader.read([scan])
         rows = {

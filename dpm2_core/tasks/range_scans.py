@@ -10,12 +10,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dpm2_core.diffslam.tasks.chamfer import nearest_distances
-from dpm2_core.diffslam.tasks.data import TaskScan
-from dpm2_core.diffslam.tasks.dslr_data import SCALE, ImageScan
 from dpm2_core.diffslam.trajectory_loss import SlamLoss
 from dpm2_core.errors import UsageError
 from dpm2_core.network.perception.range_image import RangeImageSettings, fill, project, to_points
+from dpm2_core.tasks.chamfer import nearest_distances
+from dpm2_core.tasks.pairs import SCALE, ImageScan
+from dpm2_core.tasks.scan import TaskScan
 
 _KEPT = 2000
 """Scans whose images are kept: about 180 kB each, and projecting one takes as long as half a step of training."""

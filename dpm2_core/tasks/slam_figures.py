@@ -9,13 +9,13 @@ import numpy as np
 import torch
 
 from dpm2_core.data.open import open_source
-from dpm2_core.diffslam.tasks.data import open_scans, sequence_folders
-from dpm2_core.diffslam.tasks.task import Task
-from dpm2_core.diffslam.tasks.training import mean_figures
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.metrics import evaluate
 from dpm2_core.frame import Array, Frame
 from dpm2_core.slam.system import SlamSettings, make_odometry
+from dpm2_core.tasks.scan import open_scans, sequence_folders
+from dpm2_core.tasks.task import Task
+from dpm2_core.tasks.training import mean_figures
 
 _PERIOD = 100_000_000  # ns between scans
 

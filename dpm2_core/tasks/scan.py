@@ -94,7 +94,7 @@ def open_scans(path: Path | str, needs: Sequence[Need] = ()) -> TaskScans:
     Raises:
         UsageError: no scans, something needed is missing, or a file of the wrong length; it names file and reason.
     """
-    from dpm2_core.diffslam.tasks.dslr_data import open_pairs  # a sibling, which needs the types of this file
+    from dpm2_core.tasks.pairs import open_pairs  # a sibling, which needs the types of this file
 
     path = Path(path)
     if not path.is_dir():

@@ -15,15 +15,15 @@ from torch import Tensor, nn
 
 from dpm2_core.config import Settings
 from dpm2_core.diffslam.schedule import ScheduleSettings, is_due
-from dpm2_core.diffslam.tasks.data import Need, TaskScan, TaskScans
 from dpm2_core.diffslam.trajectory_loss import SlamLossSettings
 from dpm2_core.errors import UsageError
+from dpm2_core.tasks.scan import Need, TaskScan, TaskScans
 
 TASKS = {
-    "gndnet": "dpm2_core.diffslam.tasks.ground_task:GroundTask",
-    "dslr": "dpm2_core.diffslam.tasks.dslr_task:DslrTask",
-    "ae_lidar": "dpm2_core.diffslam.tasks.ae_lidar_task:AeLidarTask",
-    "movers": "dpm2_core.diffslam.tasks.movers_task:MoverTask",
+    "gndnet": "dpm2_core.tasks.ground_task:GroundTask",
+    "dslr": "dpm2_core.tasks.dslr_task:DslrTask",
+    "ae_lidar": "dpm2_core.tasks.ae_lidar_task:AeLidarTask",
+    "movers": "dpm2_core.tasks.dynamic_objects_task:MoverTask",
 }
 """Where the task of each name is; imported when it is asked for."""
 

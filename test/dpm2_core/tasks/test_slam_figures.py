@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from dpm2_core.diffslam.tasks.ae_lidar import AeLidarImage, AeLidarSettings
-from dpm2_core.diffslam.tasks.ae_lidar_task import AeLidarTask, AeLidarTraining
-from dpm2_core.diffslam.tasks.ground_task import GroundTask, GroundTraining
 from dpm2_core.errors import UsageError
-from dpm2_core.evaluation.task_slam import slam_figures
 from dpm2_core.sim.config import LidarConfig
 from dpm2_core.sim.drive import simulate
+from dpm2_core.tasks.ae_lidar import AeLidarImage, AeLidarSettings
+from dpm2_core.tasks.ae_lidar_task import AeLidarTask, AeLidarTraining
+from dpm2_core.tasks.ground_task import GroundTask, GroundTraining
+from dpm2_core.tasks.slam_figures import slam_figures
 
 
 @pytest.fixture(scope="module")

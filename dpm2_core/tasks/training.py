@@ -13,13 +13,13 @@ import torch
 from torch import Tensor, nn
 
 from dpm2_core.diffslam.schedule import total_loss
-from dpm2_core.diffslam.tasks.data import TaskScan, TaskScans
-from dpm2_core.diffslam.tasks.task import SlamTaskTraining, Task, TaskTraining, task_type
 from dpm2_core.diffslam.windows import ContiguousWindows
 from dpm2_core.errors import UsageError
 from dpm2_core.learning.checkpoint import load_checkpoint
 from dpm2_core.learning.trainer import OptimiserSettings, train
 from dpm2_core.network.perception.task_weights import load_strictly, read_weights, write_weights
+from dpm2_core.tasks.scan import TaskScan, TaskScans
+from dpm2_core.tasks.task import SlamTaskTraining, Task, TaskTraining, task_type
 
 WEIGHTS = "weights.safetensors"
 """What a training leaves in its folder, beside checkpoint.pt and log.jsonl."""

@@ -8,8 +8,8 @@ from typing import Literal
 import pytest
 import torch
 
-from dpm2_core.diffslam.tasks.chamfer import chamfer_distance
 from dpm2_core.errors import UsageError
+from dpm2_core.tasks.chamfer import chamfer_distance
 
 A = torch.rand(40, 3, generator=torch.Generator().manual_seed(0))
 B = torch.rand(55, 3, generator=torch.Generator().manual_seed(1)) + 0.2

@@ -11,11 +11,11 @@ import torch
 from torch.distributions import Normal, kl_divergence
 
 from dpm2_core.diffslam import ScheduleSettings, SlamLossSettings
-from dpm2_core.diffslam.tasks.ae_lidar import AeLidarImage, AeLidarSettings, LidarAutoencoder, load
-from dpm2_core.diffslam.tasks.ae_lidar_task import AeLidarTask, AeLidarTraining
-from dpm2_core.diffslam.tasks.data import open_scans
-from dpm2_core.diffslam.tasks.training import WEIGHTS, draw, measure, train_task
 from dpm2_core.errors import UsageError
+from dpm2_core.tasks.ae_lidar import AeLidarImage, AeLidarSettings, LidarAutoencoder, load
+from dpm2_core.tasks.ae_lidar_task import AeLidarTask, AeLidarTraining
+from dpm2_core.tasks.scan import open_scans
+from dpm2_core.tasks.training import WEIGHTS, draw, measure, train_task
 
 SENSOR = AeLidarImage(beams=((2.0, -14.0, 16),), first=0, rows=16, columns=64, scale=60.0)
 
@@ -109,6 +109,6 @@ def test_learns_and_can_be_loaded(pairs: Path, tmp_path: Path, variational: bool
 
 def test_weights_of_another_task_are_refused(tmp_path: Path) -> None:
     """The task's name is in the file."""
-    shipped = Path(__file__).parents[4] / "dpm2_core" / "weights" / "small.safetensors"
+    shipped = Path(__file__).parents[3] / "dpm2_core" / "weights" / "small.safetensors"
     with pytest.raises(UsageError, match="not of ae_lidar"):
         load(shipped)

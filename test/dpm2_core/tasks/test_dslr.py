@@ -12,13 +12,13 @@ import torch
 from torch import nn
 
 from dpm2_core.diffslam import ScheduleSettings, SlamLossSettings
-from dpm2_core.diffslam.tasks.data import TaskScan, TaskScans, open_scans
-from dpm2_core.diffslam.tasks.dslr_task import DslrTask, DslrTraining
-from dpm2_core.diffslam.tasks.training import WEIGHTS, draw, measure, train_task
 from dpm2_core.errors import UsageError
 from dpm2_core.network.perception.dslr import Dslr, DslrSettings, PairDiscriminator, RangeDecoder, RangeEncoder, load
 from dpm2_core.network.perception.range_image import RangeImageSettings
 from dpm2_core.network.weights import read_tensors
+from dpm2_core.tasks.dslr_task import DslrTask, DslrTraining
+from dpm2_core.tasks.scan import TaskScan, TaskScans, open_scans
+from dpm2_core.tasks.training import WEIGHTS, draw, measure, train_task
 
 SENSOR = RangeImageSettings(beams=((2.0, -14.0, 16),), first=0, rows=16, columns=64, scale=60.0)
 NETWORK = DslrSettings(image=SENSOR, channels=8, latent=16)
@@ -200,7 +200,7 @@ def test_what_is_no_dslr_is_refused(pairs: Path, tmp_path: Path) -> None:
         load(tmp_path / "pickle.pt")
     with pytest.raises(UsageError, match="no such weights"):
         load(tmp_path / "nothing.safetensors")
-    shipped = Path(__file__).parents[4] / "dpm2_core" / "weights" / "small.safetensors"
+    shipped = Path(__file__).parents[3] / "dpm2_core" / "weights" / "small.safetensors"
     with pytest.raises(UsageError, match="weights of no task, not of dslr"):
         load(shipped)
     drive = tmp_path / "drive" / "velodyne"
