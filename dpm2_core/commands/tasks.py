@@ -92,7 +92,7 @@ def _train(
     name: str, src: Path, settings: tuple[Path | None, Sequence[str]], out: Path, resume: bool, val: Path | None
 ) -> None:
     """Train a task with the settings of a YAML file and of overrides."""
-    from dpm2_core.tasks.scan import open_scans  # torch is slow to import
+    from dpm2_core.tasks.open import open_scans  # torch is slow to import
     from dpm2_core.tasks.task import task_type
     from dpm2_core.tasks.training import WEIGHTS, train_task
 
@@ -114,7 +114,7 @@ def eval_task(
     slam: Annotated[bool, typer.Option("--slam", help="Odometry on what the task makes, too; needs poses.")] = False,
 ) -> None:
     """Measure a trained task on scans that it has not learned from."""
-    from dpm2_core.tasks.scan import open_scans
+    from dpm2_core.tasks.open import open_scans
     from dpm2_core.tasks.task import task_type
     from dpm2_core.tasks.training import draw, load_task, measure
 

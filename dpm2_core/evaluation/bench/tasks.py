@@ -22,7 +22,8 @@ from dpm2_core.evaluation.record import git_commit
 from dpm2_core.files import atomic_write
 from dpm2_core.tables import FigureTable
 from dpm2_core.tasks.drives import TaskDriveSettings, make_task_drives
-from dpm2_core.tasks.scan import TaskScans, open_scans
+from dpm2_core.tasks.open import open_scans
+from dpm2_core.tasks.scan import TaskScans
 from dpm2_core.tasks.slam_figures import slam_figures
 from dpm2_core.tasks.task import SlamTaskTraining, task_type
 from dpm2_core.tasks.training import WEIGHTS, load_task, measure, train_task

@@ -14,7 +14,7 @@ from dpm2_core.diffslam import ScheduleSettings, SlamLossSettings
 from dpm2_core.errors import UsageError
 from dpm2_core.tasks.ae_lidar import AeLidarImage, AeLidarSettings, LidarAutoencoder, load
 from dpm2_core.tasks.ae_lidar_task import AeLidarTask, AeLidarTraining
-from dpm2_core.tasks.scan import open_scans
+from dpm2_core.tasks.open import open_scans
 from dpm2_core.tasks.training import WEIGHTS, draw, measure, train_task
 
 SENSOR = AeLidarImage(beams=((2.0, -14.0, 16),), first=0, rows=16, columns=64, scale=60.0)

@@ -17,7 +17,8 @@ from dpm2_core.network.perception.dslr import Dslr, DslrSettings, PairDiscrimina
 from dpm2_core.network.perception.range_image import RangeImageSettings
 from dpm2_core.network.weights import read_tensors
 from dpm2_core.tasks.dslr_task import DslrTask, DslrTraining
-from dpm2_core.tasks.scan import TaskScan, TaskScans, open_scans
+from dpm2_core.tasks.open import open_scans
+from dpm2_core.tasks.scan import TaskScan, TaskScans
 from dpm2_core.tasks.training import WEIGHTS, draw, measure, train_task
 
 SENSOR = RangeImageSettings(beams=((2.0, -14.0, 16),), first=0, rows=16, columns=64, scale=60.0)

@@ -15,7 +15,8 @@ from torch import Tensor, nn
 from dpm2_core.network.perception.gndnet import elevation_labels, load
 from dpm2_core.tasks.drives import TaskDriveSettings, make_task_drives
 from dpm2_core.tasks.ground_task import GroundTask, GroundTraining, _tilt, filled, ground_of
-from dpm2_core.tasks.scan import TaskScan, TaskScans, open_scans
+from dpm2_core.tasks.open import open_scans
+from dpm2_core.tasks.scan import TaskScan, TaskScans
 from dpm2_core.tasks.training import load_task, measure
 
 SETTINGS = GroundTraining.model_validate(

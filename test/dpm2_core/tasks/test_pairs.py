@@ -11,9 +11,9 @@ import torch
 
 from dpm2_core.errors import UsageError
 from dpm2_core.network.perception.range_image import RangeImageSettings, to_points
+from dpm2_core.tasks.open import open_scans
 from dpm2_core.tasks.pairs import SCALE, ImageScan
 from dpm2_core.tasks.range_scans import RangeReader, clouds
-from dpm2_core.tasks.scan import open_scans
 
 
 def images(scans: int, rows: int = 64, columns: int = 512, seed: int = 0) -> np.ndarray:

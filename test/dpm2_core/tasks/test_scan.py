@@ -14,7 +14,7 @@ from dpm2_core.diffslam.windows import ContiguousWindows
 from dpm2_core.errors import UsageError
 from dpm2_core.tasks.drives import TaskDriveSettings, make_task_drives
 from dpm2_core.tasks.ground_task import ground_of
-from dpm2_core.tasks.scan import open_scans
+from dpm2_core.tasks.open import open_scans
 
 SEMANTIC = Path(__file__).resolve().parents[3].parent / "shared" / "kitti" / "semantic"
 

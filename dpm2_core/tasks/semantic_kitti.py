@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scans in SemanticKITTI's layout (Behley et al., ICCV 2019): sequences/NN/{velodyne,labels};
+`dpm2 sim` writes static/ beside them.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import DTypeLike
+
+from dpm2_core.errors import UsageError
+from dpm2_core.tasks.scan import Need, TaskScan
+
+_BYTES = {"velodyne": 16, "static": 16, "labels": 4}
+"""Of a point in a file of that folder."""
+
+
+def sequence_folders(path: Path) -> list[Path]:
+    """Folders that hold velodyne/, themselves not searched further."""
+    found = []
+    for folder, inner, _ in os.walk(path, followlinks=True):
+        if "velodyne" in inner:
+            found.append(Path(folder))
+            inner.clear()
+    return sorted(found)
+
+
+def kitti_runs(folder: Path, root: Path, needs: Sequence[Need]) -> list[_KittiRun]:
+    """Its scans, cut where numbers are missing; the files are there and have the right length."""
+    numbers = sorted(int(p.stem) for p in (folder / "velodyne").glob("*.bin") if p.stem.isdecimal())
+    if not numbers:
+        raise UsageError(f"{folder}: no scans (velodyne/NNNNNN.bin)")
+    for need in needs:
+        if not (folder / need).is_dir():
+            raise UsageError(f"{folder}: no {need}/ beside velodyne/; this task learns from it")
+    name = str(folder.relative_to(root)) if folder != root else folder.resolve().name
+    run = _KittiRun(folder, name, (folder / "labels").is_dir(), (folder / "static").is_dir(), numbers)
+    for number in numbers:
+        run.check(number)
+    cuts = [0, *(i + 1 for i, (a, b) in enumerate(pairwise(numbers)) if b != a + 1), len(numbers)]
+    return [replace(run, numbers=numbers[a:b]) for a, b in pairwise(cuts)]
+
+
+@dataclass(frozen=True)
+class _KittiRun:
+    """Scans of one sequence folder whose numbers follow each other."""
+
+    folder: Path
+    name: str
+    labelled: bool
+    paired: bool
+    numbers: list[int]
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def __getitem__(self, index: int) -> TaskScan:
+        number = self.numbers[index]
+        points = self._values("velodyne", number, "<f4").reshape(-1, 4)
+        labels, static = None, None
+        if self.labelled:
+            labels = torch.from_numpy((self._values("labels", number, "<u4") & 0xFFFF).astype(np.int64))
+            if len(labels) != len(points):
+                raise UsageError(f"{self._path('labels', number)}: {len(labels)} labels for {len(points)} points")
+        if self.paired:
+            static = torch.from_numpy(self._values("static", number, "<f4").reshape(-1, 4))
+        return TaskScan(torch.from_numpy(points), labels, static, self.name, number)
+
+    def check(self, number: int) -> None:
+        """Raise UsageError unless the files of a scan are there and of the right length."""
+        points = self._count("velodyne", number)
+        if self.paired:
+            self._count("static", number)
+        if self.labelled and (labels := self._count("labels", number)) != points:
+            raise UsageError(f"{self._path('labels', number)}: {labels} labels for {points} points")
+
+    def _path(self, kind: str, number: int) -> Path:
+        return self.folder / kind / f"{number:06d}.{'label' if kind == 'labels' else 'bin'}"
+
+    def _count(self, kind: str, number: int) -> int:
+        path = self._path(kind, number)
+        try:
+            size = path.stat().st_size
+        except OSError as error:
+            raise UsageError(f"{path}: {error.strerror}") from None
+        if size % _BYTES[kind]:
+            raise UsageError(f"{path}: {size} bytes are not whole points of {_BYTES[kind]}; damaged or cut off")
+        return size // _BYTES[kind]
+
+    def _values(self, kind: str, number: int, dtype: DTypeLike) -> np.ndarray:
+        self._count(kind, number)
+        return np.fromfile(self._path(kind, number), dtype)
