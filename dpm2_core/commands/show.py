@@ -30,7 +30,7 @@ def show(
 
     With weights that have a camera, also what a reference point reads from the picture.
     """
-    from dpm2_core.evaluation.attention import image_attention
+    from dpm2_core.evaluation.image_attention import image_attention
     from dpm2_core.evaluation.matches import matches_png
     from dpm2_core.network.pretrained import load_network
 

@@ -53,7 +53,7 @@ def pack(
     from dpm2_core.data.open import open_source
     from dpm2_core.data.settings import InputSettings
     from dpm2_core.learning.generate import pack as write  # torch and embree are slow to import
-    from dpm2_core.network.config import preset as network_preset
+    from dpm2_core.network.settings import preset as network_preset
 
     if out.exists():
         raise UsageError(f"{out}: is there already; remove it, or choose another folder")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dpm2_core.evaluation.attention import ImageAttention, draw_attention
+from dpm2_core.evaluation.image_attention import ImageAttention, draw_attention
 from dpm2_core.extras import needs
 from dpm2_core.files import atomic_write
 from dpm2_core.frame import Array, Points, Registration

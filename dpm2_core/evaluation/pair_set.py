@@ -11,10 +11,10 @@ import torch
 from dpm2_core.data.packed import open_packed
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.geometry import se3
-from dpm2_core.network.config import NetworkSettings
 from dpm2_core.network.encoder import collate_views
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pyramid import build_pyramid, collate
+from dpm2_core.network.settings import NetworkSettings
 
 NEAR, FAR = 5.0, 20.0  # m, between the frames of a pair
 SUCCESS = (0.6, 1.5)  # m, deg

@@ -19,9 +19,9 @@ from dpm2_core.config import Settings
 from dpm2_core.data.packed import PackedDrive, Sample, open_packed
 from dpm2_core.frame import Array
 from dpm2_core.learning.augment import AugmentSettings, augment
-from dpm2_core.network.config import NetworkSettings
 from dpm2_core.network.encoder import collate_views
 from dpm2_core.network.pyramid import PointBatch, Pyramid, build_pyramid, collate
+from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.network.spatial import Views
 
 

@@ -27,11 +27,11 @@ from dpm2_core.learning.pose_loss import differentiable_poses
 from dpm2_core.learning.train_registration import PhaseOne
 from dpm2_core.learning.trainer import process_group, train
 from dpm2_core.network.decoder import Decoder
-from dpm2_core.network.descriptors import Tokens
 from dpm2_core.network.encoder import to_device
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pretrained import weights_path
 from dpm2_core.network.pyramid import PointBatch
+from dpm2_core.network.tokens import Tokens
 from dpm2_core.network.weights import load_model, read_metadata, save_weights
 
 

@@ -14,7 +14,7 @@ from dpm2_core.evaluation.pair_set import NEAR
 from dpm2_core.frame import Array, Frame
 from dpm2_core.learning.finetune_settings import DRIVES, HELD_OUT, REHEARSAL, FinetuneSettings
 from dpm2_core.learning.generate import generate, pack
-from dpm2_core.network.config import NetworkSettings
+from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.slam.output import TrajectoryRecorder
 from dpm2_core.slam.system import SlamSettings, SlamSystem
 

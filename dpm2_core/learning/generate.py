@@ -18,9 +18,9 @@ from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Camera, Frame, Image
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.deskew import deskew
-from dpm2_core.network.config import NetworkSettings, preset
 from dpm2_core.network.encoder import resize
 from dpm2_core.network.pyramid import crop
+from dpm2_core.network.settings import NetworkSettings, preset
 from dpm2_core.sim.camera import calibration, render
 from dpm2_core.sim.config import CameraConfig, LidarConfig, PresetName
 from dpm2_core.sim.lidar import Lidar

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dpm2_core.geometry.kabsch import transform
-from dpm2_core.network.descriptors import Tokens
+from dpm2_core.network.tokens import Tokens
 
 
 class Plan(NamedTuple):

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from dpm2_core.geometry import se3_torch
 from dpm2_core.network.decoder import Correlated, Decoder
-from dpm2_core.network.descriptors import Tokens
-from dpm2_core.network.registration import correspond, guided_scores, match_scores, precision_solve, solve_batch
+from dpm2_core.network.pose_solver import correspond, guided_scores, match_scores, precision_solve, solve_batch
+from dpm2_core.network.tokens import Tokens
 
 ASTRAY = 1.0
 """A registration that is wrong by more than this has no gradient that leads back, m."""

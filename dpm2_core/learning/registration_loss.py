@@ -11,10 +11,10 @@ from dpm2_core.config import Settings
 from dpm2_core.geometry.kabsch import transform
 from dpm2_core.learning.pose_loss import differentiable_poses, pose_loss
 from dpm2_core.network.decoder import Correlated, Decoder
-from dpm2_core.network.descriptors import Tokens
 from dpm2_core.network.heads import residuals_in_view
 from dpm2_core.network.losses import Labels, cosine, info_nce, label_pairs, mahalanobis_offset, student_offset
-from dpm2_core.network.registration import softmax_both, take
+from dpm2_core.network.pose_solver import softmax_both, take
+from dpm2_core.network.tokens import Tokens
 
 
 class LossSettings(Settings):

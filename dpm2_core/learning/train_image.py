@@ -26,10 +26,10 @@ from dpm2_core.learning.augment import augment_image
 from dpm2_core.learning.checkpoint import load_checkpoint
 from dpm2_core.learning.dataset import Mixture, PackedSettings, draw_group
 from dpm2_core.learning.trainer import OptimiserSettings, process_group, train
-from dpm2_core.network.config import NetworkSettings, preset
 from dpm2_core.network.encoder import collate_views, to_device
 from dpm2_core.network.losses import cosine, info_nce, label_distances
 from dpm2_core.network.model import DeepPointMap2
+from dpm2_core.network.settings import NetworkSettings, preset
 from dpm2_core.network.spatial import Views, picture_features
 from dpm2_core.network.weights import load_weights, save_weights
 

@@ -18,12 +18,12 @@ from dpm2_core.frame import Array
 from dpm2_core.learning.checkpoint import load_checkpoint
 from dpm2_core.learning.dataset import Batch, GroupDataset, GroupSettings
 from dpm2_core.learning.trainer import OptimiserSettings, process_group, train
-from dpm2_core.network.config import NetworkSettings
 from dpm2_core.network.encoder import to_device
 from dpm2_core.network.losses import overlap_loss
 from dpm2_core.network.model import DeepPointMap2
+from dpm2_core.network.pose_solver import evidence, solve_batch
 from dpm2_core.network.pyramid import PointBatch
-from dpm2_core.network.registration import evidence, solve_batch
+from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.network.spatial import Views
 from dpm2_core.network.weights import load_weights, network_settings, save_weights
 

@@ -19,14 +19,14 @@ from dpm2_core.learning.dataset import Batch, DataSettings, GroupDataset
 from dpm2_core.learning.pair_sampling import Plan, merge_tokens, plan_sets
 from dpm2_core.learning.registration_loss import LossSettings, phase_one_loss
 from dpm2_core.learning.trainer import OptimiserSettings, process_group, train
-from dpm2_core.network.config import NetworkSettings, preset
-from dpm2_core.network.descriptors import Tokens
 from dpm2_core.network.encoder import Encoded, to_device
 from dpm2_core.network.losses import cosine, info_nce, label_pairs
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pointnext import Scale
 from dpm2_core.network.pyramid import PointBatch
+from dpm2_core.network.settings import NetworkSettings, preset
 from dpm2_core.network.spatial import Views, picture_features
+from dpm2_core.network.tokens import Tokens
 from dpm2_core.network.weights import load_weights, save_weights
 
 

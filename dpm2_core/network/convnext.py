@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from dpm2_core.network.config import ImageSettings
+from dpm2_core.network.settings import ImageSettings
 
 
 class FeatureMap(NamedTuple):

@@ -12,10 +12,10 @@ from torch import Tensor, nn
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.frame import Array, Registration
 from dpm2_core.network.attention import Attention, RelativeBias, sine_code
-from dpm2_core.network.config import NetworkSettings
-from dpm2_core.network.descriptors import Tokens, to_tokens
 from dpm2_core.network.heads import OffsetHead, OverlapHead, PointMLP
-from dpm2_core.network.registration import Solved, correspond, evidence, match_scores, register_batch
+from dpm2_core.network.pose_solver import Solved, correspond, evidence, match_scores, register_batch
+from dpm2_core.network.settings import NetworkSettings
+from dpm2_core.network.tokens import Tokens, to_tokens
 
 
 class Correlated(NamedTuple):

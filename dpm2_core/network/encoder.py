@@ -13,14 +13,14 @@ from torch import Tensor, nn
 
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.frame import Frame, Image
-from dpm2_core.network.config import ImageSettings, NetworkSettings
 from dpm2_core.network.convnext import FeatureMap
-from dpm2_core.network.descriptors import Tokens
 from dpm2_core.network.fusion import Fusion
 from dpm2_core.network.pointnext import Scale, view_axes
 from dpm2_core.network.pyramid import PointBatch, build_pyramid, collate, crop
 from dpm2_core.network.registry import image_backbone, point_backbone
+from dpm2_core.network.settings import ImageSettings, NetworkSettings
 from dpm2_core.network.spatial import Views
+from dpm2_core.network.tokens import Tokens
 
 
 class Encoded(NamedTuple):

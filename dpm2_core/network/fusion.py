@@ -7,11 +7,11 @@ import torch
 from torch import Tensor, nn
 
 from dpm2_core.network.attention import Attention, RelativeBias, sine_code
-from dpm2_core.network.config import NetworkSettings
 from dpm2_core.network.convnext import FeatureMap
-from dpm2_core.network.descriptors import Tokens
 from dpm2_core.network.pointnext import Scale, to_view, view_axes
+from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.network.spatial import Views, picture_features, point_bias, ray_bias, sample_at_points, token_pixels
+from dpm2_core.network.tokens import Tokens
 
 SAMPLED = {"point_painting": 1, "roi_pooling": 3}  # side of the window that replaces the image attention
 

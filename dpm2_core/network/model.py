@@ -5,9 +5,9 @@ from __future__ import annotations
 
 from torch import nn
 
-from dpm2_core.network.config import NetworkSettings
 from dpm2_core.network.decoder import Decoder
 from dpm2_core.network.encoder import Encoder
+from dpm2_core.network.settings import NetworkSettings
 
 
 class DeepPointMap2(nn.Module):

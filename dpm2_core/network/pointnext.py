@@ -9,8 +9,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from dpm2_core.network.config import PointsSettings, StageSettings
 from dpm2_core.network.pyramid import PointBatch
+from dpm2_core.network.settings import PointsSettings, StageSettings
 
 MOMENTS = 9  # mean (3) and scatter matrix (6) of a neighbourhood
 

@@ -16,7 +16,7 @@ from dpm2_core.errors import Dpm2Error
 from dpm2_core.geometry.edges import vertical_edges
 from dpm2_core.geometry.sampling import farthest_points, in_range, interleaved, neighbours
 from dpm2_core.geometry.voxel import voxel_first
-from dpm2_core.network.config import NetworkSettings, PointsSettings
+from dpm2_core.network.settings import NetworkSettings, PointsSettings
 
 MIN_POINTS = 32  # below this a scan says nothing about the pose
 

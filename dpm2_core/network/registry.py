@@ -9,9 +9,9 @@ from torch import Tensor, nn
 
 from dpm2_core.errors import UsageError
 from dpm2_core.extras import needs
-from dpm2_core.network.config import ImageSettings, PointsSettings
 from dpm2_core.network.convnext import ConvNeXt, ImagePyramid
 from dpm2_core.network.pointnext import PointNeXt
+from dpm2_core.network.settings import ImageSettings, PointsSettings
 
 POINT_BACKBONES: dict[str, Callable[[PointsSettings], nn.Module]] = {"pointnext": PointNeXt}
 """Each has `channels`, a list with those of every scale it returns, fine to coarse."""

@@ -19,8 +19,8 @@ from torch import nn
 
 from dpm2_core.config import Settings
 from dpm2_core.errors import UsageError
-from dpm2_core.network.config import NetworkSettings, settings_from
 from dpm2_core.network.model import DeepPointMap2
+from dpm2_core.network.settings import NetworkSettings, settings_from
 
 T = TypeVar("T", bound=Settings)
 _LARGEST = 1 << 16  # no number in a description is greater: channels, points, pixels

@@ -15,8 +15,8 @@ from dpm2_core.config import settings_from
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.frame import Camera, Image, Keyframe, Registration
 from dpm2_core.geometry import se3, se3_torch
-from dpm2_core.network.config import NetworkSettings
 from dpm2_core.network.model import DeepPointMap2
+from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.slam.map.cloud_codec import pack_cloud
 from dpm2_core.slam.map.rows import Edge
 from dpm2_core.slam.map.store import Change, MapStore

@@ -13,7 +13,7 @@ from dpm2_core.learning.dataset import DataSettings
 from dpm2_core.learning.registration_loss import LossSettings
 from dpm2_core.learning.train_registration import PhaseOneSettings
 from dpm2_core.learning.trainer import OptimiserSettings
-from dpm2_core.network.config import PRESETS
+from dpm2_core.network.settings import PRESETS
 
 
 def test_every_alternative_is_trained_and_measured_once(

@@ -13,8 +13,8 @@ from dpm2_core.data.kitti import KittiSource
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.edges import SPACING, spaced, vertical_edges, verticality
 from dpm2_core.geometry.sampling import Points, farthest_points, interleaved
-from dpm2_core.network.config import preset
 from dpm2_core.network.pyramid import build_pyramid, crop
+from dpm2_core.network.settings import preset
 
 POLES = np.array([[8.0, 4.0], [-11.0, 6.0], [3.0, -14.0], [20.0, -9.0], [-6.0, -8.0]])
 

@@ -20,8 +20,8 @@ from dpm2_core.learning.augment import AugmentSettings, augment
 from dpm2_core.learning.dataset import DataSettings, GroupDataset, draw_group
 from dpm2_core.learning.pair_sampling import merge_tokens, plan_sets
 from dpm2_core.learning.train_overlap import average_precision, draw_overlap
-from dpm2_core.network.descriptors import to_tokens
 from dpm2_core.network.model import DeepPointMap2
+from dpm2_core.network.tokens import to_tokens
 
 NOTHING = {"drop": 0, "occlusion": 0, "beams": 0, "jitter": 0, "yaw": 0, "tilt": 0, "shift": (0, 0, 0), "image_drop": 0}
 

@@ -20,9 +20,9 @@ from dpm2_core.geometry import se3
 from dpm2_core.learning.finetune import draw_stretch, finetune, window_trajectories
 from dpm2_core.learning.finetune_data import prepare, refer
 from dpm2_core.learning.finetune_settings import FinetuneOptimiser, FinetuneSettings
-from dpm2_core.network.config import NetworkSettings
-from dpm2_core.network.descriptors import Tokens
 from dpm2_core.network.model import DeepPointMap2
+from dpm2_core.network.settings import NetworkSettings
+from dpm2_core.network.tokens import Tokens
 from dpm2_core.network.weights import load_model, read_metadata, save_weights
 from dpm2_core.sim.config import LidarConfig
 from dpm2_core.sim.drive import simulate

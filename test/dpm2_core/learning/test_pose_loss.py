@@ -15,10 +15,10 @@ from dpm2_core.learning.pair_sampling import merge_tokens
 from dpm2_core.learning.pose_loss import FINE, differentiable_poses, pose_loss
 from dpm2_core.learning.registration_loss import LossSettings
 from dpm2_core.learning.train_registration import PhaseOne, PhaseOneSettings, plans_of
-from dpm2_core.network.config import NetworkSettings
-from dpm2_core.network.descriptors import Tokens
 from dpm2_core.network.model import DeepPointMap2
-from dpm2_core.network.registration import solve_batch
+from dpm2_core.network.pose_solver import solve_batch
+from dpm2_core.network.settings import NetworkSettings
+from dpm2_core.network.tokens import Tokens
 
 TRUTH = torch.from_numpy(se3.exp([0.01, -0.02, 1.0, 3.0, 0.5, 0.1]))[None]
 

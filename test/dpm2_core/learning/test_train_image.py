@@ -17,8 +17,8 @@ from dpm2_core.errors import UsageError
 from dpm2_core.frame import Camera
 from dpm2_core.learning.train_image import PhaseImageSettings, PictureDataset, PictureSettings, phase_image, shown
 from dpm2_core.learning.trainer import OptimiserSettings
-from dpm2_core.network.config import PRESETS, NetworkSettings
 from dpm2_core.network.model import DeepPointMap2
+from dpm2_core.network.settings import PRESETS, NetworkSettings
 from dpm2_core.network.weights import save_weights
 
 

@@ -24,7 +24,7 @@ from dpm2_core.learning.train_image import PhaseImageSettings
 from dpm2_core.learning.train_overlap import PhaseTwoSettings, phase_two
 from dpm2_core.learning.train_registration import PhaseOne, PhaseOneSettings, phase_one, plans_of
 from dpm2_core.learning.trainer import OptimiserSettings, learning_rate
-from dpm2_core.network.config import PRESETS
+from dpm2_core.network.settings import PRESETS
 from dpm2_core.network.weights import network_settings, read_metadata
 
 STILL = AugmentSettings(drop=0, occlusion=0, beams=0, jitter=0, tilt=0, shift=(0, 0, 0), image_drop=0)
@@ -175,7 +175,7 @@ def _overfitted(packed: Path, tiny: Callable, seed: int) -> list[float]:
 def _errors(module: PhaseOne, batch: object, plans: tuple) -> list[float]:
     """Translation error of each pair, m."""
     from dpm2_core.learning.pair_sampling import merge_tokens
-    from dpm2_core.network.registration import register_batch
+    from dpm2_core.network.pose_solver import register_batch
 
     with torch.inference_mode():
         tokens = module.model.encoder(batch.points).tokens  # type: ignore[attr-defined]
@@ -198,7 +198,7 @@ def test_learning_rate() -> None:
 RANKS = """
 import sys, torch
 from dpm2_core.config import settings_from
-from dpm2_core.network.config import NetworkSettings
+from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.learning.dataset import DataSettings, GroupDataset
 from dpm2_core.learning.registration_loss import LossSettings
 from dpm2_core.learning.train_image import PhaseImageSettings
@@ -273,7 +273,7 @@ def test_phase_two_keeps_what_the_weights_say_of_phase_one(settings: PhaseOneSet
 LOOP = """
 import sys
 from pathlib import Path
-from dpm2_core.network.config import PRESETS
+from dpm2_core.network.settings import PRESETS
 from dpm2_core.learning.train_image import PhaseImageSettings
 from dpm2_core.learning.train_registration import PhaseOneSettings, phase_one
 import json

@@ -13,12 +13,12 @@ import torch
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Frame, Image
 from dpm2_core.geometry import se3
-from dpm2_core.network.config import PRESETS, preset
 from dpm2_core.network.convnext import FeatureMap
 from dpm2_core.network.encoder import Encoder, collate_views, resize
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pointnext import argmax_neighbour
 from dpm2_core.network.pyramid import build_pyramid, collate, crop
+from dpm2_core.network.settings import PRESETS, preset
 from dpm2_core.network.spatial import Views, picture_features
 
 

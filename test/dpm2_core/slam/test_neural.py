@@ -16,10 +16,10 @@ from dpm2_core.descriptors import Descriptors
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Frame, Image, State
 from dpm2_core.geometry import se3
-from dpm2_core.network.config import NetworkSettings, preset
-from dpm2_core.network.descriptors import to_tokens
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pretrained import load_network
+from dpm2_core.network.settings import NetworkSettings, preset
+from dpm2_core.network.tokens import to_tokens
 from dpm2_core.network.weights import save_weights
 from dpm2_core.slam.neural import DescriptorMap, NeuralScanRegistration, NeuralSettings
 from dpm2_core.slam.preprocess import Preprocessor, PreprocessSettings

@@ -14,10 +14,10 @@ from dpm2_core.descriptors import Descriptors
 from dpm2_core.frame import Array, Keyframe, Points, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.network.decoder import Correlated
-from dpm2_core.network.descriptors import Tokens
 from dpm2_core.network.model import DeepPointMap2
+from dpm2_core.network.pose_solver import Solved
 from dpm2_core.network.pretrained import load_network
-from dpm2_core.network.registration import Solved
+from dpm2_core.network.tokens import Tokens
 from dpm2_core.sim.config import LidarConfig
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.world import World, build_world

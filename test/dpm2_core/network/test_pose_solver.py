@@ -10,11 +10,10 @@ import torch
 from dpm2_core.descriptors import Descriptors, merge
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.kabsch import transform
-from dpm2_core.network.descriptors import Tokens, to_tokens
 from dpm2_core.network.heads import OffsetHead, into_set_frame
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pointnext import from_view, to_view
-from dpm2_core.network.registration import (
+from dpm2_core.network.pose_solver import (
     Correspondences,
     best_pairs,
     first_pose,
@@ -24,6 +23,7 @@ from dpm2_core.network.registration import (
     softmax_both,
     whitened,
 )
+from dpm2_core.network.tokens import Tokens, to_tokens
 
 
 def perfect(noise: np.random.Generator, batch: int = 2, pairs: int = 60) -> tuple[Correspondences, torch.Tensor]:

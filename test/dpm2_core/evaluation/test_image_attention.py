@@ -10,11 +10,11 @@ import pytest
 import torch
 
 from dpm2_core.errors import UsageError
-from dpm2_core.evaluation.attention import attention_weights, image_attention
+from dpm2_core.evaluation.image_attention import attention_weights, image_attention
 from dpm2_core.frame import Frame, Image
 from dpm2_core.network.attention import Attention
-from dpm2_core.network.config import NetworkSettings
 from dpm2_core.network.model import DeepPointMap2
+from dpm2_core.network.settings import NetworkSettings
 
 
 @pytest.mark.parametrize("learnable", [True, False])

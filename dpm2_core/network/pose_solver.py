@@ -17,9 +17,9 @@ from dpm2_core.frame import Registration
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.kabsch import transform, weighted_kabsch
 from dpm2_core.network.consensus import TOLERANCE, consensus
-from dpm2_core.network.descriptors import Tokens
 from dpm2_core.network.heads import into_set_frame
 from dpm2_core.network.losses import cosine
+from dpm2_core.network.tokens import Tokens
 
 if TYPE_CHECKING:
     from dpm2_core.network.decoder import Correlated, Decoder
