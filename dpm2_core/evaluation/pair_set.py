@@ -73,9 +73,7 @@ class PairSet:
         rows = []
         for begin in range(0, len(self.pairs), batch):
             chunk = self.pairs[begin : begin + batch]
-            answers = model.decoder.register_many(
-                [descriptors[p[0]] for p in chunk], [descriptors[p[1]] for p in chunk]
-            )
+            answers = model.register_many([descriptors[p[0]] for p in chunk], [descriptors[p[1]] for p in chunk])
             for i, ((_, _, T, distance), answer) in enumerate(zip(chunk, answers, strict=True), begin):
                 xi = se3.log(se3.inverse(answer.T_target_source) @ T)
                 error = np.linalg.norm(answer.T_target_source[:3, 3] - T[:3, 3])

@@ -12,7 +12,8 @@ from torch import Tensor
 
 from dpm2_core.geometry import se3_torch
 from dpm2_core.network.decoder import Correlated, Decoder
-from dpm2_core.network.pose_solver import correspond, guided_scores, match_scores, precision_solve, solve_batch
+from dpm2_core.network.matching import correspond, guided_scores, match_scores
+from dpm2_core.network.pose_solver import precision_solve, solve_batch
 from dpm2_core.network.tokens import Tokens
 
 ASTRAY = 1.0

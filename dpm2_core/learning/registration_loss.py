@@ -13,7 +13,7 @@ from dpm2_core.learning.pose_loss import differentiable_poses, pose_loss
 from dpm2_core.network.decoder import Correlated, Decoder
 from dpm2_core.network.heads import residuals_in_view
 from dpm2_core.network.losses import Labels, cosine, info_nce, label_pairs, mahalanobis_offset, student_offset
-from dpm2_core.network.pose_solver import softmax_both, take
+from dpm2_core.network.matching import softmax_both, take
 from dpm2_core.network.tokens import Tokens
 
 

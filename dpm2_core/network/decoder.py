@@ -1,21 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Two descriptor sets become correlated descriptors, and those a pose or an overlap probability."""
+"""Two descriptor sets become correlated descriptors: attention layers, and the heads that read them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import torch
 from torch import Tensor, nn
 
-from dpm2_core.descriptors import Descriptors
-from dpm2_core.frame import Array, Registration
 from dpm2_core.network.attention import Attention, RelativeBias, sine_code
 from dpm2_core.network.heads import OffsetHead, OverlapHead, PointMLP
-from dpm2_core.network.pose_solver import Solved, correspond, evidence, match_scores, register_batch
 from dpm2_core.network.settings import NetworkSettings
-from dpm2_core.network.tokens import Tokens, to_tokens
+from dpm2_core.network.tokens import Tokens
 
 
 class Correlated(NamedTuple):
@@ -25,7 +21,7 @@ class Correlated(NamedTuple):
     target: Tensor
 
 
-class _Alone(NamedTuple):
+class Prepared(NamedTuple):
     """A set after its first self-attention (B, N, C), its position code or attention bias per layer, and its mask."""
 
     features: Tensor
@@ -71,15 +67,14 @@ class Decoder(nn.Module):
         self.similarity = PointMLP(width)
         self.offset = OffsetHead(width, decoder.precision)
         self.overlap = OverlapHead(width, decoder.overlap_pose)
-        self.judges_overlap = False  # until phase two has trained the head
+        self.overlap_trained = False  # until phase two has trained the head
         self.coarse = PointMLP(settings.channels)
-        self._kept: tuple[Descriptors, Tokens, _Alone] | None = None
 
     def forward(self, source: Tokens, target: Tokens) -> Correlated:
         """Correlate two batches of sets."""
-        return self._correlate(self._alone(source), self._alone(target))
+        return self.correlate(self.prepare(source), self.prepare(target))
 
-    def _alone(self, tokens: Tokens) -> _Alone:
+    def prepare(self, tokens: Tokens) -> Prepared:
         """What a set's part in the correlation is before it has seen another one."""
         code: Tensor | None = None
         biases: Sequence[Tensor | None] = [None] * len(self.layers)
@@ -90,9 +85,10 @@ class Decoder(nn.Module):
         mask = tokens.mask[:, None, None]
         first = self.layers[0]
         assert isinstance(first, DecoderLayer)
-        return _Alone(first.alone(self.project(tokens.features), code, biases[0], mask), code, biases, mask)
+        return Prepared(first.alone(self.project(tokens.features), code, biases[0], mask), code, biases, mask)
 
-    def _correlate(self, source: _Alone, target: _Alone) -> Correlated:
+    def correlate(self, source: Prepared, target: Prepared) -> Correlated:
+        """Correlate two batches of sets that are prepared."""
         x, y = source.features, target.features
         for i, layer in enumerate(self.layers):
             assert isinstance(layer, DecoderLayer)
@@ -101,45 +97,3 @@ class Decoder(nn.Module):
                 y = layer.alone(y, target.code, target.biases[i], target.mask)
             x, y = layer.across(x, y, target.mask), layer.across(y, x, source.mask)
         return Correlated(x, y)
-
-    @torch.inference_mode()
-    def register(self, source: Descriptors, target: Descriptors) -> Registration:
-        """Pose of the source in the frame of the target; either may be merged from several frames.
-
-        The target's part of the work is kept for the next call with the same object, such as the map of an odometry.
-        """
-        device = next(self.parameters()).device
-        x = to_tokens([source], self.view_aligned, device)
-        with torch.autocast(device.type, torch.bfloat16):
-            if self._kept is None or self._kept[0] is not target:
-                y = to_tokens([target], self.view_aligned, device)
-                self._kept = (target, y, self._alone(y))
-            _, y, alone = self._kept
-            return register_batch(self, x, y, self._correlate(self._alone(x), alone))[0]
-
-    @torch.inference_mode()
-    def register_many(self, sources: list[Descriptors], targets: list[Descriptors]) -> list[Registration]:
-        """`register` for a batch of pairs; nothing is kept."""
-        device = next(self.parameters()).device
-        source = to_tokens(sources, self.view_aligned, device)
-        target = to_tokens(targets, self.view_aligned, device)
-        with torch.autocast(device.type, torch.bfloat16):
-            return register_batch(self, source, target, self(source, target))
-
-    @torch.inference_mode()
-    def matches(self, source: Descriptors, target: Descriptors) -> tuple[Array, Array, Array]:
-        """The descriptors that `register` pairs: positions (K, 3) in each frame, m, and confidence (K,) 0..1."""
-        device = next(self.parameters()).device
-        x, y = (to_tokens([descriptors], self.view_aligned, device) for descriptors in (source, target))
-        with torch.autocast(device.type, torch.bfloat16):
-            correlated = self(x, y)
-            pairs = correspond(self, x, y, correlated, match_scores(self, correlated))
-        half = pairs.weight.shape[1] // 2  # then the same pairs again, in the other direction
-        at_source, at_target = pairs.source[0, half:].double().cpu(), pairs.target[0, :half].double().cpu()
-        return at_source.numpy(), at_target.numpy(), pairs.weight[0, :half].double().cpu().numpy()
-
-    def judge_overlap(self, source: Tokens, target: Tokens, correlated: Correlated, solved: Solved) -> Tensor:
-        """Probability (B,) that each pair was seen from within 20 m; NaN while the head is untrained."""
-        if not self.judges_overlap:
-            return torch.full(source.mask.shape[:1], torch.nan)
-        return self.overlap(*correlated, source.mask, target.mask, evidence(solved)).sigmoid()

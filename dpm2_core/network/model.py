@@ -1,13 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Encoder and decoder as one model."""
+"""Encoder and decoder as one model, and what can be asked of it: descriptors, poses, overlap."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import torch
 from torch import nn
 
-from dpm2_core.network.decoder import Decoder
+from dpm2_core.descriptors import Descriptors
+from dpm2_core.frame import Array, Frame, Registration
+from dpm2_core.network.decoder import Decoder, Prepared
 from dpm2_core.network.encoder import Encoder
+from dpm2_core.network.matching import correspond, match_scores
+from dpm2_core.network.pose_solver import register_batch
 from dpm2_core.network.settings import NetworkSettings
+from dpm2_core.network.tokens import Tokens, to_tokens
 
 
 class DeepPointMap2(nn.Module):
@@ -18,3 +26,53 @@ class DeepPointMap2(nn.Module):
         self.settings = settings
         self.encoder = Encoder(settings)
         self.decoder = Decoder(settings)
+        self._target: tuple[Descriptors, Tokens, Prepared] | None = None  # of the last call of `register`
+
+    def describe(self, frame: Frame) -> Descriptors:
+        """Descriptors of a frame's points and, if the network has an image branch, its images.
+
+        Raises:
+            Dpm2Error: too few points.
+        """
+        return self.encoder.encode(frame)
+
+    @torch.inference_mode()
+    def register(self, source: Descriptors, target: Descriptors) -> Registration:
+        """Pose of the source in the frame of the target; either may be merged from several frames.
+
+        The target's part of the work is kept for the next call with the same object, such as the map of an odometry.
+        """
+        device = next(self.parameters()).device
+        decoder = self.decoder
+        x = to_tokens([source], decoder.view_aligned, device)
+        with torch.autocast(device.type, torch.bfloat16):
+            if self._target is None or self._target[0] is not target:
+                y = to_tokens([target], decoder.view_aligned, device)
+                self._target = (target, y, decoder.prepare(y))
+            _, y, prepared = self._target
+            return register_batch(decoder, x, y, decoder.correlate(decoder.prepare(x), prepared))[0]
+
+    @torch.inference_mode()
+    def register_many(self, sources: list[Descriptors], targets: list[Descriptors]) -> list[Registration]:
+        """`register` for a batch of pairs; nothing is kept."""
+        device = next(self.parameters()).device
+        source = to_tokens(sources, self.decoder.view_aligned, device)
+        target = to_tokens(targets, self.decoder.view_aligned, device)
+        with torch.autocast(device.type, torch.bfloat16):
+            return register_batch(self.decoder, source, target, self.decoder(source, target))
+
+    def overlap(self, sources: Sequence[Descriptors], targets: Sequence[Descriptors]) -> list[float]:
+        """Probability 0..1 that each pair was seen from within 20 m; NaN while the overlap head is untrained."""
+        return [found.overlap for found in self.register_many(list(sources), list(targets))]
+
+    @torch.inference_mode()
+    def matches(self, source: Descriptors, target: Descriptors) -> tuple[Array, Array, Array]:
+        """The descriptors that `register` pairs: positions (K, 3) in each frame, m, and confidence (K,) 0..1."""
+        device = next(self.parameters()).device
+        x, y = (to_tokens([descriptors], self.decoder.view_aligned, device) for descriptors in (source, target))
+        with torch.autocast(device.type, torch.bfloat16):
+            correlated = self.decoder(x, y)
+            pairs = correspond(self.decoder, x, y, correlated, match_scores(self.decoder, correlated))
+        half = pairs.weight.shape[1] // 2  # then the same pairs again, in the other direction
+        at_source, at_target = pairs.source[0, half:].double().cpu(), pairs.target[0, :half].double().cpu()
+        return at_source.numpy(), at_target.numpy(), pairs.weight[0, :half].double().cpu().numpy()

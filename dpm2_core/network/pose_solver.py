@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Correlated descriptors to a pose: dual softmax, offsets, consensus, precision-weighted solve or robust SVD.
+"""Pairs of points to a pose: consensus, precision-weighted solve or robust SVD, and its overlap probability.
 
 Beyond the paper: the first pose is a consensus of pairs that keep each other's distances, and with it the descriptors
 are matched again, each to what lies near it.
@@ -7,7 +7,7 @@ are matched again, each to what lies near it.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -17,96 +17,20 @@ from dpm2_core.frame import Registration
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.kabsch import transform, weighted_kabsch
 from dpm2_core.network.consensus import TOLERANCE, consensus
-from dpm2_core.network.heads import into_set_frame
-from dpm2_core.network.losses import cosine
+from dpm2_core.network.decoder import Correlated, Decoder
+from dpm2_core.network.matching import Correspondences, correspond, guided_scores, match_scores
 from dpm2_core.network.tokens import Tokens
-
-if TYPE_CHECKING:
-    from dpm2_core.network.decoder import Correlated, Decoder
 
 MIN_INLIERS = 30
 CONFIDENT = 30  # pairs whose mean confidence is that of the registration
-NEAR = 4.0  # m, what comes farther apart under a rough pose is no match
 CHI2 = 11.3  # 99 % quantile with 3 degrees of freedom: inliers of the precision-weighted solve
 SOFT = 3.0  # degrees of freedom of the Student weights in the precision-weighted solve
-
-
-class Correspondences(NamedTuple):
-    """Points that should coincide, both directions of each pair, most confident first.
-
-    Attributes:
-        source, target: (B, 2K, 3) m, in the source and in the target frame.
-        weight: (B, 2K) confidence 0..1, 0 where dropped.
-        L: (B, 2K, 3, 3), precision L L^T, the first K in the source frame, the others in the target frame.
-    """
-
-    source: Tensor
-    target: Tensor
-    weight: Tensor
-    L: Tensor
-
-
-def softmax_both(scores: Tensor, source_mask: Tensor, target_mask: Tensor) -> Tensor:
-    """Dual softmax of scores (B, N, M), over rows times over columns: probability of each match; 0 at padding."""
-    valid = source_mask[:, :, None] & target_mask[:, None]
-    scores = scores.masked_fill(~valid, -1e4)
-    return scores.softmax(2) * scores.softmax(1) * valid
-
-
-def best_pairs(probability: Tensor, ratio: float) -> tuple[Tensor, Tensor, Tensor]:
-    """The floor(ratio (N + M)) // 2 most probable pairs of (B, N, M): probability, row and column (B, K)."""
-    _, n, m = probability.shape
-    k = min(int(ratio * (n + m)) // 2, n * m)
-    value, flat = probability.flatten(1).topk(k)
-    return value, flat // m, flat % m
-
-
-def take(values: Tensor, index: Tensor) -> Tensor:
-    """values (B, N, C) at index (B, K): (B, K, C)."""
-    return values.gather(1, index[..., None].expand(-1, -1, values.shape[-1]))
-
-
-def match_scores(decoder: Decoder, correlated: Correlated) -> Tensor:
-    """Similarities (B, N, M) in units of the temperature."""
-    similarity = cosine(decoder.similarity(correlated.source), decoder.similarity(correlated.target))
-    return similarity / decoder.settings.temperature
-
-
-def correspond(
-    decoder: Decoder, source: Tokens, target: Tokens, correlated: Correlated, scores: Tensor
-) -> Correspondences:
-    """Choose pairs by their scores (B, N, M) and predict, for each, the offsets in both directions."""
-    settings = decoder.settings
-    probability = softmax_both(scores, source.mask, target.mask)
-    weight, i, j = best_pairs(probability, settings.pair_ratio)
-    x, y = take(source.xyz, i), take(target.xyz, j)
-    a, b = take(correlated.source, i), take(correlated.target, j)
-    there, L_there = decoder.offset(a, b)
-    back, L_back = decoder.offset(b, a)
-    there, L_there = into_set_frame(there, L_there, take(source.axis, i))
-    back, L_back = into_set_frame(back, L_back, take(target.axis, j))
-    short = [offset.norm(dim=-1) <= settings.offset_limit for offset in (there, back)]
-    return Correspondences(
-        torch.cat([x + there, x], 1),
-        torch.cat([y, y + back], 1),
-        torch.cat([weight * short[0], weight * short[1]], 1),
-        torch.cat([L_there, L_back], 1),
-    )
 
 
 def first_pose(pairs: Correspondences) -> Tensor:
     """The pose (B, 4, 4) that most pairs support, however many are wrong."""
     half = pairs.source.shape[1] // 2  # the other half are the same pairs, seen from the target
     return consensus(pairs.source[:, :half], pairs.target[:, :half], pairs.weight[:, :half])
-
-
-def guided_scores(scores: Tensor, T: Tensor, source: Tokens, target: Tokens) -> Tensor:
-    """Scores given a rough pose: only descriptors that it brings near each other can match.
-
-    The nearer ones are not preferred: that would confirm the rough pose, and made it worse where it was good.
-    """
-    distance = torch.cdist(transform(T, source.xyz), target.xyz)
-    return scores.masked_fill(distance > NEAR, -1e4)
 
 
 def robust_kabsch(pairs: Correspondences, T: Tensor, rounds: int = 3) -> tuple[Tensor, Tensor]:
@@ -223,6 +147,15 @@ def evidence(solved: Solved) -> Tensor:
     return torch.stack([solved.confidence.nan_to_num(0.0), distance.to(solved.confidence.dtype)], -1).float()
 
 
+def overlap_probability(
+    decoder: Decoder, source: Tokens, target: Tokens, correlated: Correlated, solved: Solved
+) -> Tensor:
+    """Probability (B,) that each pair was seen from within 20 m; NaN while the head is untrained."""
+    if not decoder.overlap_trained:
+        return torch.full(source.mask.shape[:1], torch.nan)
+    return decoder.overlap(*correlated, source.mask, target.mask, evidence(solved)).sigmoid()
+
+
 def register_batch(decoder: Decoder, source: Tokens, target: Tokens, correlated: Correlated) -> list[Registration]:
     """The registrations of a batch, T_target_source each."""
     solved = solve_batch(decoder, source, target, correlated)
@@ -233,7 +166,7 @@ def register_batch(decoder: Decoder, source: Tokens, target: Tokens, correlated:
     count = inliers.sum(1)
     rmse = ((error**2 * inliers).sum(1) / count.clamp(min=1)).sqrt()
     covariance = decoder.settings.covariance_scale * torch.linalg.inv(solved.information)
-    overlap = decoder.judge_overlap(source, target, correlated, solved)
+    overlap = overlap_probability(decoder, source, target, correlated, solved)
     figures = (field.tolist() for field in (solved.confidence, rmse, count, overlap))
     return [_answer(*row) for row in zip(T.cpu(), covariance.cpu(), *figures, strict=True)]
 

@@ -104,7 +104,7 @@ def load_model(path: Path) -> DeepPointMap2:
     settings = _network_settings(path, metadata)
     check_fit(path, state, lambda: DeepPointMap2(settings))
     model = DeepPointMap2(settings)
-    model.decoder.judges_overlap = load_weights(model, path).get("phase") == "2"
+    model.decoder.overlap_trained = load_weights(model, path).get("phase") == "2"
     return model.eval().requires_grad_(False)
 
 

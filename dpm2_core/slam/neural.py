@@ -118,7 +118,7 @@ class NeuralScanRegistration:
         """The scan with its descriptors; without, if it has too few points."""
         deskewed = replace(frame, points=scan.points, time_offset=None)
         try:
-            return replace(scan, descriptors=self._model.encoder.encode(deskewed))
+            return replace(scan, descriptors=self._model.describe(deskewed))
         except Dpm2Error:
             return scan
 
@@ -130,7 +130,7 @@ class NeuralScanRegistration:
         if scan.descriptors is None:
             return _failed(T_predicted, self.refusal(scan))
         T_odom_kf, target = self._map.around(T_predicted)
-        found = self._model.decoder.register(scan.descriptors, target)
+        found = self._model.register(scan.descriptors, target)
         if not found.ok:
             return _failed(T_predicted, found.reason)
         found = replace(found, T_target_source=se3.orthonormalised(T_odom_kf @ found.T_target_source))

@@ -176,7 +176,7 @@ def stage_times(network: DeepPointMap2, frames: Sequence[Frame]) -> dict[str, An
         clock.append(perf_counter())
         descriptors = encoder.encode_batch(collate([pyramid]), views, next(network.parameters()).device)[0]
         clock.append(perf_counter())
-        network.decoder.register(descriptors, before or descriptors)
+        network.register(descriptors, before or descriptors)
         clock.append(perf_counter())
         clocks.append([b - a for a, b in pairwise(clock)])
         before, size = descriptors, descriptors.nbytes

@@ -172,7 +172,7 @@ def overlap(network: DeepPointMap2, options: Options) -> dict[str, Any]:
     Raises:
         UsageError: the head is untrained.
     """
-    if not network.decoder.judges_overlap:
+    if not network.decoder.overlap_trained:
         raise UsageError("overlap: the head of these weights is untrained; dpm2 train phase2 trains it")
     pairs = _pairs(network, options, "mixed", 1)
     noise = np.random.default_rng(3)
@@ -189,7 +189,7 @@ def overlap(network: DeepPointMap2, options: Options) -> dict[str, Any]:
     scores: list[float] = []
     for at in range(0, len(chosen), 32):
         part = chosen[at : at + 32]
-        answers = network.decoder.register_many([descriptors[a] for a, _ in part], [descriptors[b] for _, b in part])
+        answers = network.register_many([descriptors[a] for a, _ in part], [descriptors[b] for _, b in part])
         scores += [answer.overlap for answer in answers]
     near = np.array(distances) <= OVERLAP
     hard = (np.array(distances) > OVERLAP) & (np.array(distances) <= 40)

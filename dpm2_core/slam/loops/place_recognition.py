@@ -37,7 +37,7 @@ class PlaceRecognition:
         A keyframe's cloud, thinned out as it is, gives descriptors that serve as well as those of the whole scan.
         """
         try:
-            return self._network.encoder.encode(Frame(0, points))
+            return self._network.describe(Frame(0, points))
         except Dpm2Error:
             return None
 
@@ -54,7 +54,7 @@ class PlaceRecognition:
         """The pose of a place in the frame of each of the others; no start is needed."""
         if not targets:
             return []
-        return self._network.decoder.register_many([source] * len(targets), list(targets))
+        return self._network.register_many([source] * len(targets), list(targets))
 
 
 def merged(keyframes: Sequence[Keyframe], poses: Array, nodes: Sequence[int], at: int) -> Descriptors:

@@ -58,11 +58,11 @@ def test_a_point_attends_around_where_it_is_seen(model: DeepPointMap2, frame: Fr
 
 def test_it_leaves_the_network_as_it_was(model: DeepPointMap2, frame: Frame) -> None:
     """No hook stays behind, and descriptors are the same as before."""
-    before = model.encoder.encode(frame).features
+    before = model.describe(frame).features
     image_attention(model, frame)
     assert model.encoder.fusion is not None
     assert not model.encoder.fusion.layers[-1].image._forward_pre_hooks
-    assert np.array_equal(model.encoder.encode(frame).features, before)
+    assert np.array_equal(model.describe(frame).features, before)
 
 
 def test_what_cannot_be_shown_is_said(

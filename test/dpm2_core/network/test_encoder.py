@@ -63,7 +63,7 @@ def test_unknown_preset_and_backbone_are_refused(tiny: Callable) -> None:
 def test_order_of_points_changes_nothing(model: DeepPointMap2, noise: np.random.Generator, street: Callable) -> None:
     """A scan of one point a voxel gives the same descriptors in any order of its points."""
     cloud = crop(street(noise, 1500), model.settings.points)
-    one, other = (model.encoder.encode(frame(c)) for c in (cloud, noise.permutation(cloud)))
+    one, other = (model.describe(frame(c)) for c in (cloud, noise.permutation(cloud)))
     assert np.array_equal(one.xyz, other.xyz)
     assert np.array_equal(one.features, other.features)
 
@@ -100,14 +100,14 @@ def test_sparse_sensors(model: DeepPointMap2, noise: np.random.Generator, beams:
     elevation = np.radians(np.linspace(-15, -3, beams))[:, None]
     reach = 1.7 / np.tan(-elevation)
     cloud = np.stack([reach * np.cos(azimuth), reach * np.sin(azimuth), -1.7 + 0 * reach * azimuth], -1).reshape(-1, 3)
-    assert np.isfinite(model.encoder.encode(frame(cloud)).features).all()
+    assert np.isfinite(model.describe(frame(cloud)).features).all()
 
 
 @pytest.mark.parametrize("cloud", [np.zeros((0, 3)), np.full((50, 3), np.nan), np.zeros((500, 3)), np.ones((5, 3)) * 9])
 def test_empty_scans_are_refused(model: DeepPointMap2, cloud: np.ndarray) -> None:
     """Nothing in range: an error that says how much there was."""
     with pytest.raises(Dpm2Error, match=r"scan has \d+ points within"):
-        model.encoder.encode(frame(cloud))
+        model.describe(frame(cloud))
 
 
 def views_of(model: DeepPointMap2, *frames: list[Image]) -> Views:

@@ -11,18 +11,10 @@ from dpm2_core.descriptors import Descriptors, merge
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.kabsch import transform
 from dpm2_core.network.heads import OffsetHead, into_set_frame
+from dpm2_core.network.matching import Correspondences, best_pairs, guided_scores, softmax_both
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pointnext import from_view, to_view
-from dpm2_core.network.pose_solver import (
-    Correspondences,
-    best_pairs,
-    first_pose,
-    guided_scores,
-    precision_solve,
-    robust_kabsch,
-    softmax_both,
-    whitened,
-)
+from dpm2_core.network.pose_solver import first_pose, precision_solve, robust_kabsch, whitened
 from dpm2_core.network.tokens import Tokens, to_tokens
 
 
@@ -194,13 +186,13 @@ def test_registration_of_sets_of_different_sizes(model: DeepPointMap2, noise: np
     sizes = [(48, 48), (48, 144), (30, 48)]
     sources = [described(model, noise, n) for n, _ in sizes]
     targets = [merge([described(model, noise, 48).moved(se3.exp(noise.normal(0, 1, 6)))] * (m // 48)) for _, m in sizes]
-    together = model.decoder.register_many(sources, targets)
+    together = model.register_many(sources, targets)
     for source, target, answer in zip(sources, targets, together, strict=True):
         assert answer.T_target_source.shape == (4, 4)
         assert np.linalg.eigvalsh(answer.covariance).min() > 0
         assert 0 <= answer.confidence <= 1
         assert answer.method == "neural"
-        alone = model.decoder.register(source, target)
+        alone = model.register(source, target)
         # padding adds columns to bf16 products, and more pairs are kept in the larger batch
         assert alone.confidence == pytest.approx(answer.confidence, abs=0.05)
 
@@ -210,7 +202,7 @@ def test_every_pose_is_rigid_to_float64(model: DeepPointMap2, noise: np.random.G
     for scale in (1, 10, 100):
         sets = [described(model, noise, 90) for _ in range(12)]
         sets = [Descriptors(d.xyz * np.float32(scale), d.features) for d in sets]
-        for found in model.decoder.register_many(sets[:6], sets[6:]):
+        for found in model.register_many(sets[:6], sets[6:]):
             assert (found.T_target_source[3] == [0, 0, 0, 1]).all()
             R = found.T_target_source[:3, :3]
             np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-14)
@@ -219,7 +211,7 @@ def test_every_pose_is_rigid_to_float64(model: DeepPointMap2, noise: np.random.G
 
 def test_too_few_descriptors_are_no_registration(model: DeepPointMap2, noise: np.random.Generator) -> None:
     """Not ok, with a reason, and no exception."""
-    answer = model.decoder.register(described(model, noise, 1), described(model, noise, 1))
+    answer = model.register(described(model, noise, 1), described(model, noise, 1))
     assert not answer.ok
     assert answer.confidence == 0
     assert "matching descriptors" in answer.reason
@@ -244,10 +236,8 @@ def test_a_target_that_stays_gives_the_same_answer_again(model: DeepPointMap2, n
         return Descriptors(noise.uniform(-20, 20, (n, 3)).astype(np.float32), features.astype(np.float16))
 
     target, other, sources = some(40), some(40), [some(30), some(30)]
-    together = model.decoder.register_many([sources[0], sources[1], sources[0]], [target, target, other])
-    one_by_one = [
-        model.decoder.register(s, t) for s, t in zip([*sources, sources[0]], [target, target, other], strict=True)
-    ]
+    together = model.register_many([sources[0], sources[1], sources[0]], [target, target, other])
+    one_by_one = [model.register(s, t) for s, t in zip([*sources, sources[0]], [target, target, other], strict=True)]
     for a, b in zip(together, one_by_one, strict=True):
         np.testing.assert_allclose(a.confidence, b.confidence, rtol=0.05)  # bf16: batches round differently
-    assert model.decoder.register(sources[0], target).confidence == one_by_one[0].confidence
+    assert model.register(sources[0], target).confidence == one_by_one[0].confidence

@@ -42,7 +42,7 @@ def test_overlap_is_judged_after_phase_two_alone(model: DeepPointMap2, saved: Pa
     )
     save_weights(model, tmp_path / "two.safetensors", {"phase": "2"})
     untrained, trained = (
-        load_model(path).decoder.register_many([descriptors], [descriptors])[0].overlap
+        load_model(path).register_many([descriptors], [descriptors])[0].overlap
         for path in (saved, tmp_path / "two.safetensors")
     )
     assert np.isnan(untrained)

@@ -34,7 +34,7 @@ def weights(tiny: Callable[..., NetworkSettings], street: Street, tmp_path: Path
     """The tiny network as a file: random weights, but similarities centred, so that equal descriptors match best."""
     torch.manual_seed(0)
     model = DeepPointMap2(tiny(decoder={"temperature": 0.01})).eval().requires_grad_(False)
-    some = model.encoder.encode(Frame(0, cloud(street(np.random.default_rng(1)))))
+    some = model.describe(Frame(0, cloud(street(np.random.default_rng(1)))))
     tokens = to_tokens([some], model.settings.points.view_aligned)
     last = model.decoder.similarity[-1]
     assert isinstance(last.bias, torch.Tensor)
@@ -176,7 +176,7 @@ def test_pictures_are_asked_for_and_used_where_the_network_has_a_camera(
 def test_descriptors_of_a_keyframe_take_70_kb(street: Street, noise: np.random.Generator) -> None:
     torch.manual_seed(0)
     model = DeepPointMap2(preset("small")).eval().requires_grad_(False)
-    found = model.encoder.encode(Frame(0, cloud(street(noise, 20_000))))
+    found = model.describe(Frame(0, cloud(street(noise, 20_000))))
     assert (len(found), found.features.dtype) == (256, np.float16)
     assert found.nbytes <= 70_000
 

@@ -13,7 +13,7 @@ import torch
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.frame import Array, Keyframe, Points, Registration
 from dpm2_core.geometry import se3
-from dpm2_core.network.decoder import Correlated
+from dpm2_core.network.decoder import Correlated, Decoder
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pose_solver import Solved
 from dpm2_core.network.pretrained import load_network
@@ -143,14 +143,16 @@ def test_places_that_hardly_overlap_are_left_to_no_one(monkeypatch: pytest.Monke
     jump = se3.exp(np.array([0, 0, 0, 12.0, 0, 0]))  # the nearest by pose is no help
 
     def probability(value: float) -> Callable:
-        def judge(source: Tokens, target: Tokens, correlated: Correlated, solved: Solved) -> torch.Tensor:
+        def judge(
+            decoder: Decoder, source: Tokens, target: Tokens, correlated: Correlated, solved: Solved
+        ) -> torch.Tensor:
             return torch.full(source.mask.shape[:1], value)
 
         return judge
 
     reasons = []
     for value in (0.1, float("nan")):
-        monkeypatch.setattr(network().decoder, "judge_overlap", probability(value))
+        monkeypatch.setattr("dpm2_core.network.pose_solver.overlap_probability", probability(value))
         loops, _ = drive(places, jump, gap=30.0, consistency={"drift": 0.5})
         reasons.append([loop.registration.reason for loop in loops])
     assert any("overlap with a probability of only 0.10" in reason for reason in reasons[0])
