@@ -29,9 +29,9 @@ from dpm2_core.evaluation.bench.roads import open_road, road_files
 from dpm2_core.evaluation.metrics import align, ape_rmse
 from dpm2_core.evaluation.record import write_record
 from dpm2_core.frame import Array
-from dpm2_core.sim.source import SimulatedDrive
-from dpm2_core.slam.map.data import MapData, load_map
-from dpm2_core.slam.map.store import MapStore
+from dpm2_core.sim.simulated_drive import SimulatedDrive
+from dpm2_core.slam.store.map_data import MapData, load_map
+from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.slam.system import Config, SlamSystem
 from dpm2_core.tables import FigureTable
 from dpm2_ros.bench_network import LOSS, Link, inside

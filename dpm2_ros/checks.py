@@ -8,8 +8,8 @@ from typing import Any
 from dpm2_core.data.messages import MessageError, check_cloud
 from dpm2_core.data.transforms import TransformTree, transform_matrix
 from dpm2_core.errors import UsageError
-from dpm2_core.slam.map.admission import RejectedError, check_pose
-from dpm2_core.slam.map.cloud_codec import MAX_POINTS
+from dpm2_core.slam.mapping.admission import RejectedError, check_pose
+from dpm2_core.slam.store.cloud_codec import MAX_POINTS
 from dpm2_ros.conversions import check_frame
 
 _MOST_BYTES = 1 << 28

@@ -22,7 +22,7 @@ from std_msgs.msg import Header
 
 from dpm2_core.frame import Array, Keyframe, Points, Registration, Tracked
 from dpm2_core.geometry import se3
-from dpm2_core.slam.map.admission import MAX_ID, RejectedError
+from dpm2_core.slam.mapping.admission import MAX_ID, RejectedError
 
 _KEYFRAME = re.compile(r"(?:(?P<robot>[\w/]{1,200})/)?kf_(?P<id>[0-9]{1,10})(?:\.(?P<session>[0-9a-f]{8}))?", re.ASCII)
 _FRAME = re.compile(r"[^\s\x00-\x1f\x7f]{1,200}")

@@ -15,7 +15,7 @@ from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
 from dpm2_core.frame import Array, LoopClosure
-from dpm2_core.slam.map.mapper import Mapper
+from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_ros.conversions import header, pose_to_msg
 
 GRAY, GREEN, BLUE, RED = (0.7, 0.7, 0.7), (0.1, 0.8, 0.2), (0.2, 0.5, 1.0), (1.0, 0.2, 0.2)

@@ -13,7 +13,7 @@ from typing import Any
 from rclpy.node import Node
 
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.slam.map.admission import RejectedError
+from dpm2_core.slam.mapping.admission import RejectedError
 
 _QUIET = 5.0  # s between two lines about the same reason
 _MOST_KINDS = 200  # of topic and reason; more are counted together

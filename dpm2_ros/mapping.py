@@ -22,8 +22,8 @@ from visualization_msgs.msg import MarkerArray
 
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Array, Keyframe, LoopClosure, State
-from dpm2_core.slam.loops.localiser import Located
-from dpm2_core.slam.map.admission import RejectedError
+from dpm2_core.slam.loops.localizer import Located
+from dpm2_core.slam.mapping.admission import RejectedError
 from dpm2_ros.active_map import ActiveMap
 from dpm2_ros.conversions import cloud_to_msg, edge_to_msg, keyframe_name
 from dpm2_ros.display import Display, loop_to_msg, path_to_msg, pose_graph_to_msg

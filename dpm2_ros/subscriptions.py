@@ -24,7 +24,7 @@ from dpm2_core.data.messages import stamp_ns
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.transforms import TransformTree
 from dpm2_core.errors import UsageError
-from dpm2_core.slam.map.admission import RejectedError
+from dpm2_core.slam.mapping.admission import RejectedError
 from dpm2_ros.checks import check_header, check_size, extended, unreadable
 from dpm2_ros.losses import Losses
 from dpm2_ros.settings import RosSettings

@@ -20,7 +20,7 @@ from dpm2_core.errors import UsageError
 from dpm2_core.files import atomic_write
 from dpm2_core.frame import Array, Frame, State
 from dpm2_core.geometry import se3
-from dpm2_core.slam.map.session import open_for_localisation
+from dpm2_core.slam.session import open_for_localisation
 from dpm2_core.slam.system import Config, LocalisationSystem
 
 

@@ -21,8 +21,8 @@ from dpm2_core.data.trajectory import write_kitti, write_tum
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
-from dpm2_core.slam.map.data import MapData, load_map, map_cloud, restore, save_as, trajectory
-from dpm2_core.slam.map.store import MapStore
+from dpm2_core.slam.store.map_data import MapData, load_map, map_cloud, restore, save_as, trajectory
+from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.tables import FigureTable
 
 app = typer.Typer(help="Map files: info, export, merge, prune, check; pose graphs: optimize.", no_args_is_help=True)
@@ -103,8 +103,8 @@ def merge(
 ) -> None:
     """Join maps, by known transforms or by the places that they share."""
     from dpm2_core.slam.graph.pose_graph import PoseGraph
-    from dpm2_core.slam.map.merge import align as aligned
-    from dpm2_core.slam.map.merge import loops_by, merge_maps, optimised
+    from dpm2_core.slam.mapping.merge import align as aligned
+    from dpm2_core.slam.mapping.merge import loops_by, merge_maps, optimised
     from dpm2_core.slam.system import Config, make_loops
 
     given = [parse_transform(text) for text in transform or ()]
@@ -134,8 +134,8 @@ def prune(
     angle: Annotated[float, typer.Option(min=0, max=180, help="Between their headings, degrees.")] = 30.0,
 ) -> None:
     """Take out the keyframes that revisits made redundant; what they constrain and where they were stays."""
-    from dpm2_core.slam.map.prune import prune as pruned
-    from dpm2_core.slam.map.prune import redundant_nodes
+    from dpm2_core.slam.mapping.prune import prune as pruned
+    from dpm2_core.slam.mapping.prune import redundant_nodes
 
     with MapStore.open(path) as store:
         data = load_map(store)
@@ -150,7 +150,7 @@ def check(
     recover: Annotated[Path | None, typer.Option(help="Write what is good to this new map file.")] = None,
 ) -> None:
     """Look for damage: database, checksum of every row, edges that lead nowhere, poses that are none."""
-    from dpm2_core.slam.map.check import check_map
+    from dpm2_core.slam.store.check import check_map
 
     found = check_map(path, recover)
     console = Console(soft_wrap=True, highlight=False)
@@ -206,7 +206,7 @@ def _export_g2o(data: MapData, out: Path) -> None:
 
 
 def _export_occupancy(data: MapData, out: Path, resolution: float) -> None:
-    from dpm2_core.slam.map.occupancy import OccupancySettings, occupancy_grid, write_grid
+    from dpm2_core.slam.mapping.occupancy import OccupancySettings, occupancy_grid, write_grid
 
     write_grid(out, occupancy_grid(data.clouds, data.poses, OccupancySettings(resolution=resolution)))
 

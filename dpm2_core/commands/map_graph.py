@@ -26,8 +26,8 @@ def optimize(
     ] = None,
 ) -> None:
     """Optimise a pose graph and reject the loops that cannot be true."""
-    from dpm2_core.slam.graph.data import total_chi2
     from dpm2_core.slam.graph.g2o import read_g2o, require_connected, write_g2o
+    from dpm2_core.slam.graph.graph_data import total_chi2
     from dpm2_core.slam.graph.robust import RobustSettings, least_squares, optimise
 
     file = read_g2o(graph)

@@ -30,9 +30,9 @@ from dpm2_core.extras import MissingPackageError
 from dpm2_core.files import atomic_write
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
-from dpm2_core.slam.map.session import open_session, resume_at
-from dpm2_core.slam.map.store import MapStore
 from dpm2_core.slam.output import TrajectoryRecorder
+from dpm2_core.slam.session import open_session, resume_at
+from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.slam.system import Config, SlamSystem
 
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="YAML file; `dpm2 config dump` shows every key.")]

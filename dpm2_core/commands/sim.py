@@ -11,7 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from dpm2_core.config import settings_from
 from dpm2_core.console import Console
-from dpm2_core.sim.config import LidarConfig, PresetName
+from dpm2_core.sim.settings import LidarConfig, PresetName
 
 
 def sim(

@@ -13,7 +13,7 @@ from torch import Tensor
 from dpm2_core.config import Settings
 from dpm2_core.diffslam.clouds import window
 from dpm2_core.diffslam.icp import Cloud, IcpSettings, register
-from dpm2_core.diffslam.pose_graph import relax
+from dpm2_core.diffslam.relaxation import relax
 from dpm2_core.diffslam.soft_lm import SoftLmSettings
 from dpm2_core.errors import UsageError
 from dpm2_core.geometry import se3_torch

@@ -22,8 +22,8 @@ from dpm2_core.network.encoder import resize
 from dpm2_core.network.pyramid import crop
 from dpm2_core.network.settings import NetworkSettings, preset
 from dpm2_core.sim.camera import calibration, render
-from dpm2_core.sim.config import CameraConfig, LidarConfig, PresetName
 from dpm2_core.sim.lidar import Lidar
+from dpm2_core.sim.settings import CameraConfig, LidarConfig, PresetName
 from dpm2_core.sim.world import build_world
 
 

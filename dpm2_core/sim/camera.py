@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from dpm2_core.frame import Camera
 from dpm2_core.geometry import se3
-from dpm2_core.sim.config import CameraConfig
 from dpm2_core.sim.materials import Material
 from dpm2_core.sim.mesh import Hits, Mesh, rotated
+from dpm2_core.sim.settings import CameraConfig
 from dpm2_core.sim.shading import Surface
 from dpm2_core.sim.traffic import Movers
 from dpm2_core.sim.world import World

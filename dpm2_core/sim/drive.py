@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.geometry import se3
 from dpm2_core.sim.camera import calibration, render
-from dpm2_core.sim.config import CameraConfig, LidarConfig, PresetName
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.road import FRAME_PERIOD, ROAD_KINDS, make_road, read_drive
+from dpm2_core.sim.settings import CameraConfig, LidarConfig, PresetName
 from dpm2_core.sim.world import World, build_world, own_preset, random_stream
 
 Array = NDArray[np.float64]

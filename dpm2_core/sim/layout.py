@@ -12,11 +12,11 @@ from scipy.spatial import cKDTree
 
 from dpm2_core.sim import plants
 from dpm2_core.sim.buildings import building
-from dpm2_core.sim.config import Preset
 from dpm2_core.sim.furniture import FURNITURE, street_box
 from dpm2_core.sim.materials import Label, Material
 from dpm2_core.sim.mesh import Mesh, merge, placed, pose
 from dpm2_core.sim.road import Road
+from dpm2_core.sim.settings import Preset
 from dpm2_core.sim.shapes import box, leaves
 from dpm2_core.sim.terrain import RESOLUTION, Kerbline, Terrain, kerbside_ribbon
 from dpm2_core.sim.vehicles import car, truck

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpm2_core.geometry import se3
-from dpm2_core.sim.config import LidarConfig
 from dpm2_core.sim.materials import DARK, MISS, MOVING_LABEL, REFLECTANCE, RETRO, ROUGHNESS, Label
 from dpm2_core.sim.mesh import Hits, Mesh, rotated
+from dpm2_core.sim.settings import LidarConfig
 from dpm2_core.sim.shading import road_marking
 from dpm2_core.sim.world import World
 

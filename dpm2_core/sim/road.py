@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
 from dpm2_core.errors import UsageError
-from dpm2_core.sim.config import Preset
+from dpm2_core.sim.settings import Preset
 
 Array = NDArray[np.float64]
 ROAD_KINDS = ("straight", "loop", "figure8", "random")

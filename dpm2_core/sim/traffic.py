@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dpm2_core.sim.config import Preset
 from dpm2_core.sim.mesh import Hits, Mesh, Scene, merge, placed, pose
 from dpm2_core.sim.road import Road
+from dpm2_core.sim.settings import Preset
 from dpm2_core.sim.terrain import Terrain
 from dpm2_core.sim.vehicles import car, cyclist, person, truck
 

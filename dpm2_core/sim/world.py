@@ -17,11 +17,11 @@ from scipy.spatial.transform import Rotation
 from dpm2_core.errors import UsageError
 from dpm2_core.geometry import se3
 from dpm2_core.sim import sections
-from dpm2_core.sim.config import PRESET_NAMES, PRESETS, Preset, PresetName, varied, with_traffic
 from dpm2_core.sim.layout import Layout
 from dpm2_core.sim.light import Light
 from dpm2_core.sim.mesh import Mesh, Scene, merge
 from dpm2_core.sim.road import Road, make_road
+from dpm2_core.sim.settings import PRESET_NAMES, PRESETS, Preset, PresetName, varied, with_traffic
 from dpm2_core.sim.terrain import Terrain
 from dpm2_core.sim.traffic import Movers, Traffic, make_traffic
 

@@ -17,7 +17,7 @@ import numpy as np
 from dpm2_core.frame import Array, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.slam.preprocess import Scan
-from dpm2_core.slam.scan_registration import Prediction, ScanRegistration, agree
+from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration, agree
 
 _TIES = 3
 """So many answers must agree: two meet by chance."""

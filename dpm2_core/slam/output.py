@@ -12,7 +12,7 @@ from dpm2_core.data.ply import write_ply
 from dpm2_core.data.trajectory import write_tum
 from dpm2_core.frame import Array, Tracked
 from dpm2_core.geometry import se3
-from dpm2_core.slam.map.mapper import Mapper
+from dpm2_core.slam.mapping.mapper import Mapper
 
 
 class TrajectoryRecorder:

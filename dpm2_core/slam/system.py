@@ -14,20 +14,20 @@ from dpm2_core.frame import Frame, Tracked
 from dpm2_core.network.pretrained import load_network
 from dpm2_core.slam.filters import FilterSettings, make_filter
 from dpm2_core.slam.graph.pose_graph import PoseGraph, PoseGraphSettings
-from dpm2_core.slam.keyframes import KeyframeSelector, KeyframeSettings
-from dpm2_core.slam.local_map import LocalMap, LocalMapSettings
 from dpm2_core.slam.loops.closure import LoopCloser, LoopSettings
-from dpm2_core.slam.loops.localiser import Localiser, Located
-from dpm2_core.slam.loops.relocalise import Relocaliser, RelocaliseSettings
-from dpm2_core.slam.map.mapper import Mapper, MapSettings, thumbnail
-from dpm2_core.slam.map.store import MapStore
-from dpm2_core.slam.neural import NeuralScanRegistration, NeuralSettings
-from dpm2_core.slam.odometry import Odometry, OdometrySettings
+from dpm2_core.slam.loops.localizer import Localiser, Located
+from dpm2_core.slam.loops.relocalization import Relocaliser, RelocaliseSettings
+from dpm2_core.slam.mapping.mapper import Mapper, MapSettings, thumbnail
+from dpm2_core.slam.odometry.keyframe_selection import KeyframeSelector, KeyframeSettings
+from dpm2_core.slam.odometry.odometry import Odometry, OdometrySettings
 from dpm2_core.slam.preprocess import Preprocessor, PreprocessSettings
-from dpm2_core.slam.refined import RefinedScanRegistration
-from dpm2_core.slam.registration import GeometricRegistration, GeometricSettings
-from dpm2_core.slam.scan_registration import GeometricScanRegistration, ScanRegistration
-from dpm2_core.slam.visual import VisualScanRegistration, VisualSettings
+from dpm2_core.slam.registration.fused import RefinedScanRegistration
+from dpm2_core.slam.registration.icp import GeometricRegistration, GeometricSettings
+from dpm2_core.slam.registration.local_map import LocalMap, LocalMapSettings
+from dpm2_core.slam.registration.neural import NeuralScanRegistration, NeuralSettings
+from dpm2_core.slam.registration.protocol import GeometricScanRegistration, ScanRegistration
+from dpm2_core.slam.registration.visual import VisualScanRegistration, VisualSettings
+from dpm2_core.slam.store.map_store import MapStore
 
 
 class SlamSettings(Settings):

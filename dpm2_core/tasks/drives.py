@@ -10,7 +10,7 @@ from pathlib import Path
 from pydantic import Field
 
 from dpm2_core.config import Settings
-from dpm2_core.sim.config import LidarConfig, PresetName
+from dpm2_core.sim.settings import LidarConfig, PresetName
 
 
 class TaskDriveSettings(Settings):

@@ -17,9 +17,9 @@ from dpm2_core.frame import Camera, Image, Keyframe, Registration
 from dpm2_core.geometry import se3, se3_torch
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.settings import NetworkSettings
-from dpm2_core.slam.map.cloud_codec import pack_cloud
-from dpm2_core.slam.map.rows import Edge
-from dpm2_core.slam.map.store import Change, MapStore
+from dpm2_core.slam.store.cloud_codec import pack_cloud
+from dpm2_core.slam.store.map_store import Change, MapStore
+from dpm2_core.slam.store.rows import Edge
 
 TINY = {
     "preset": "tiny",

@@ -23,8 +23,8 @@ from dpm2_core.cli import main
 from dpm2_core.errors import UsageError
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.weights import load_model
-from dpm2_core.slam.map.check import check_map
-from dpm2_core.slam.map.rows import array_bytes, with_crc
+from dpm2_core.slam.store.check import check_map
+from dpm2_core.slam.store.rows import array_bytes, with_crc
 
 ENDLESS = "WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n) SELECT x, '', '', '', '' FROM n"
 BOMB = zlib.compress(bytes(300_000_000), 9)

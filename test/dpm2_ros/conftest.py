@@ -26,8 +26,8 @@ from sensor_msgs.msg import PointCloud2
 from dpm2_core.data.convert import convert_kitti
 from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
-from dpm2_core.sim.config import LidarConfig
 from dpm2_core.sim.drive import simulate
+from dpm2_core.sim.settings import LidarConfig
 from dpm2_ros.conversions import cloud_to_msg
 from dpm2_ros.replay import ros_environment
 from dpm2_ros.runtime import ros_context

@@ -15,7 +15,7 @@ from dpm2_core.cli import main
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Keyframe, Registration
 from dpm2_core.geometry import se3
-from dpm2_core.slam.map.check import check_map
+from dpm2_core.slam.store.check import check_map
 from dpm2_ros.active_map import ActiveMap
 from dpm2_ros.settings import NodeConfig
 

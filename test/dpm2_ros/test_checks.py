@@ -13,7 +13,7 @@ from sensor_msgs.msg import PointField
 from std_msgs.msg import Header
 
 from dpm2_core.data.transforms import TransformTree
-from dpm2_core.slam.map.admission import RejectedError
+from dpm2_core.slam.mapping.admission import RejectedError
 from dpm2_ros.checks import check_header, check_size, extended, unreadable
 from dpm2_ros.conversions import cloud_to_msg
 from dpm2_ros.guard import one_line

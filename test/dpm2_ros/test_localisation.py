@@ -225,8 +225,8 @@ def test_from_mapping_to_localising_and_back(robot: Callable[..., Robot], tmp_pa
     r.harness.wait(extended, "the robot in its map", timeout=30)
     r.send(*range(10, 20))
     assert r.close() == 0
-    from dpm2_core.slam.map.data import load_map
-    from dpm2_core.slam.map.store import MapStore
+    from dpm2_core.slam.store.map_data import load_map
+    from dpm2_core.slam.store.map_store import MapStore
 
     with MapStore.open(path) as store:
         data = load_map(store)

@@ -25,8 +25,8 @@ from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.frame import Keyframe
 from dpm2_core.geometry import se3
-from dpm2_core.slam.map.data import load_map
-from dpm2_core.slam.map.store import MapStore
+from dpm2_core.slam.store.map_data import load_map
+from dpm2_core.slam.store.map_store import MapStore
 from dpm2_ros import feed
 from dpm2_ros.conversions import edge_to_msg, keyframe_name
 from dpm2_ros.feed import keyframe_from

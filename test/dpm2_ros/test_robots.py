@@ -24,8 +24,8 @@ from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Array, Keyframe
 from dpm2_core.geometry import se3
-from dpm2_core.slam.map.data import MapData, load_map
-from dpm2_core.slam.map.store import MapStore
+from dpm2_core.slam.store.map_data import MapData, load_map
+from dpm2_core.slam.store.map_store import MapStore
 from dpm2_ros.conversions import cloud_to_msg
 from dpm2_ros.keyframes import descriptors_from_msg, payload_to_msgs
 from dpm2_ros.replay import ros_environment, start
@@ -189,7 +189,7 @@ def test_a_keyframe_is_at_most_100_kB_on_the_wire(street: Path) -> None:
     """Descriptors come out as they went in; a cloud too large is thinned until it fits, a small one is not touched."""
     from dpm2_core.network.pretrained import load_network
     from dpm2_core.slam.loops.place_recognition import PlaceRecognition
-    from dpm2_core.slam.map.cloud_codec import unpack_cloud
+    from dpm2_core.slam.store.cloud_codec import unpack_cloud
 
     points = next(iter(open_source(street, InputSettings(images=False)).frames(0, 1))).points
     descriptors = PlaceRecognition(load_network("small", 1)).describe(points)

@@ -27,8 +27,8 @@ from dpm2_core.learning.finetune_settings import FinetuneSettings
 from dpm2_core.learning.generate import GenerateSettings, generate
 from dpm2_core.network.pretrained import weights_path
 from dpm2_core.network.weights import load_model
-from dpm2_core.sim.config import LidarConfig, PresetName
 from dpm2_core.sim.drive import simulate
+from dpm2_core.sim.settings import LidarConfig, PresetName
 from dpm2_core.slam.system import SlamSettings
 from dpm2_core.tables import FigureTable
 

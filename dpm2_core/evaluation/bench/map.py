@@ -26,16 +26,16 @@ from dpm2_core.evaluation.metrics import ape_rmse
 from dpm2_core.frame import Array, Keyframe, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.voxel import voxel_first
-from dpm2_core.sim.config import LidarConfig
 from dpm2_core.sim.drive import simulate
 from dpm2_core.sim.lidar import Lidar
+from dpm2_core.sim.settings import LidarConfig
 from dpm2_core.sim.world import World, build_world
-from dpm2_core.slam.map.check import check_map
-from dpm2_core.slam.map.cloud_codec import unpack_mask
-from dpm2_core.slam.map.data import MapData, load_map, map_cloud, save_as
-from dpm2_core.slam.map.mapper import Mapper
-from dpm2_core.slam.map.prune import prune, redundant_nodes
-from dpm2_core.slam.map.store import MapStore
+from dpm2_core.slam.mapping.mapper import Mapper
+from dpm2_core.slam.mapping.prune import prune, redundant_nodes
+from dpm2_core.slam.store.check import check_map
+from dpm2_core.slam.store.cloud_codec import unpack_mask
+from dpm2_core.slam.store.map_data import MapData, load_map, map_cloud, save_as
+from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.slam.system import Config, SlamSettings, make_mapper
 from dpm2_core.tables import FigureTable
 
@@ -51,7 +51,7 @@ _DRIFT = np.array([0, 0, 2e-4, 0.01, 0.005, 0.0])  # of the odometry, a keyframe
 _CHILD = """
 import os, sys
 from dpm2_core.cli import main
-from dpm2_core.slam.map.mapper import Mapper
+from dpm2_core.slam.mapping.mapper import Mapper
 os.write(int(sys.argv[1]), b"s")
 add = Mapper.add
 def told(self, *arguments):

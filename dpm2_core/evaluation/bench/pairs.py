@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
 from dpm2_core.slam.preprocess import Scan
-from dpm2_core.slam.scan_registration import Prediction, ScanRegistration
+from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration
 
 SUCCESS_M, SUCCESS_DEG = 0.6, 1.5
 """Errors below which a registration counts as a success."""

@@ -19,8 +19,8 @@ from dpm2_core.evaluation.bench.harness import Options, Report
 from dpm2_core.evaluation.metrics import ape_rmse
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
-from dpm2_core.slam.graph.data import GraphData, integrate
 from dpm2_core.slam.graph.g2o import read_g2o
+from dpm2_core.slam.graph.graph_data import GraphData, integrate
 from dpm2_core.slam.graph.robust import RobustSettings, least_squares, optimise
 from dpm2_core.slam.graph.worker import GraphWorker
 from dpm2_core.tables import FigureTable

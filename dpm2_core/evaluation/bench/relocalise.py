@@ -21,11 +21,11 @@ from dpm2_core.frame import Array, Frame, Keyframe, Points, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.network.pretrained import load_network
 from dpm2_core.sim.lidar import Lidar
-from dpm2_core.sim.source import SimulatedDrive
-from dpm2_core.slam.loops.relocalise import Relocaliser, thinned
-from dpm2_core.slam.map.data import load_map
-from dpm2_core.slam.map.store import MapStore
+from dpm2_core.sim.simulated_drive import SimulatedDrive
+from dpm2_core.slam.loops.relocalization import Relocaliser, thinned
 from dpm2_core.slam.preprocess import Preprocessor
+from dpm2_core.slam.store.map_data import load_map
+from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.slam.system import Config, SlamSettings, make_mapper
 
 RIGHT_M, RIGHT_DEG = 0.3, 1.0

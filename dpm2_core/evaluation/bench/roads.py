@@ -17,8 +17,8 @@ from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.bench.harness import Options, Report
 from dpm2_core.evaluation.bench.loops import judge_loops
 from dpm2_core.evaluation.metrics import evaluate
-from dpm2_core.sim.config import PresetName
-from dpm2_core.sim.source import SimulatedDrive
+from dpm2_core.sim.settings import PresetName
+from dpm2_core.sim.simulated_drive import SimulatedDrive
 from dpm2_core.slam.output import TrajectoryRecorder
 from dpm2_core.slam.system import Config, SlamSettings, SlamSystem
 from dpm2_core.tables import FigureTable

@@ -22,11 +22,11 @@ from dpm2_core.evaluation.metrics import evaluate
 from dpm2_core.evaluation.record import git_commit
 from dpm2_core.frame import Frame, Points
 from dpm2_core.network.pretrained import PERCEPTION_WEIGHTS, PRETRAINED_DIR
-from dpm2_core.sim.config import LidarConfig, PresetName
 from dpm2_core.sim.lidar import Lidar
+from dpm2_core.sim.settings import LidarConfig, PresetName
 from dpm2_core.sim.world import World, build_world
 from dpm2_core.slam.filters import FilterKind, FilterSettings, make_filter
-from dpm2_core.slam.odometry import Odometry
+from dpm2_core.slam.odometry.odometry import Odometry
 from dpm2_core.slam.system import Config, SlamSettings, make_odometry
 from dpm2_core.tables import FigureTable
 

@@ -24,7 +24,7 @@ from dpm2_core.errors import UsageError
 from dpm2_core.files import atomic_write
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
-from dpm2_core.slam.graph.data import GraphData, integrate
+from dpm2_core.slam.graph.graph_data import GraphData, integrate
 
 _VERTEX = {"VERTEX_SE2": 4, "VERTEX_SE3:QUAT": 8}  # numbers on a line
 _EDGE = {"EDGE_SE2": 11, "EDGE_SE3:QUAT": 30}

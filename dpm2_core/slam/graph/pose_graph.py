@@ -14,8 +14,8 @@ from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph import robust
-from dpm2_core.slam.graph.data import GraphData
 from dpm2_core.slam.graph.g2o import G2o, write_g2o
+from dpm2_core.slam.graph.graph_data import GraphData
 from dpm2_core.slam.graph.robust import RobustSettings, Solution
 from dpm2_core.slam.graph.worker import GraphWorker
 

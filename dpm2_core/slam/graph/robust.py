@@ -23,7 +23,7 @@ from scipy.sparse.csgraph import connected_components
 from dpm2_core.config import Settings
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
-from dpm2_core.slam.graph.data import (
+from dpm2_core.slam.graph.graph_data import (
     GraphData,
     Index,
     Stretches,

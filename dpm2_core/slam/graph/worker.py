@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.slam.graph.data import GraphData
+from dpm2_core.slam.graph.graph_data import GraphData
 from dpm2_core.slam.graph.robust import RobustSettings, Solution, optimise
 
 _NICE = 10  # it yields to the odometry where processors are few

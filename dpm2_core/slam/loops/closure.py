@@ -21,7 +21,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.slam.loops.consistency import Consistency, ConsistencySettings, Loop, Path, refused
 from dpm2_core.slam.loops.place_recognition import PlaceRecognition, merged
 from dpm2_core.slam.loops.verification import VerificationSettings, Verifier
-from dpm2_core.slam.registration import GeometricSettings
+from dpm2_core.slam.registration.icp import GeometricSettings
 
 if TYPE_CHECKING:  # torch takes seconds to import
     from dpm2_core.network.model import DeepPointMap2

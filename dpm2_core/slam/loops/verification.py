@@ -13,8 +13,8 @@ from dpm2_core.config import Settings
 from dpm2_core.frame import Array, Points, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.voxel import voxel_first
-from dpm2_core.slam.local_map import LocalMap, LocalMapSettings
-from dpm2_core.slam.registration import GeometricRegistration, GeometricSettings
+from dpm2_core.slam.registration.icp import GeometricRegistration, GeometricSettings
+from dpm2_core.slam.registration.local_map import LocalMap, LocalMapSettings
 
 _SOURCE_VOXEL = 0.8  # m, spacing of the points that are registered, as in the odometry
 _CELL = 2.0  # m, of the grid whose lowest points are the ground

@@ -16,10 +16,10 @@ from dpm2_core.data.open import open_source
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.trajectory import read_trajectory
 from dpm2_core.geometry import se3
-from dpm2_core.sim.config import LidarConfig
 from dpm2_core.sim.drive import simulate
-from dpm2_core.slam.map.data import load_map
-from dpm2_core.slam.map.store import MapStore
+from dpm2_core.sim.settings import LidarConfig
+from dpm2_core.slam.store.map_data import load_map
+from dpm2_core.slam.store.map_store import MapStore
 
 FRAMES, MAPPED = 30, 20
 

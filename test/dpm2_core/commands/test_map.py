@@ -17,10 +17,10 @@ from dpm2_core.data.trajectory import read_trajectory
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Array, Keyframe
 from dpm2_core.geometry import se3
-from dpm2_core.sim.config import LidarConfig
 from dpm2_core.sim.drive import simulate
-from dpm2_core.slam.map.data import MapData, load_map
-from dpm2_core.slam.map.store import MapStore
+from dpm2_core.sim.settings import LidarConfig
+from dpm2_core.slam.store.map_data import MapData, load_map
+from dpm2_core.slam.store.map_store import MapStore
 
 
 def dpm2(*words: object) -> int:

@@ -18,8 +18,8 @@ import pytest
 
 from dpm2_core.data.convert import convert_kitti
 from dpm2_core.data.trajectory import read_trajectory
-from dpm2_core.sim.config import LidarConfig
 from dpm2_core.sim.drive import simulate
+from dpm2_core.sim.settings import LidarConfig
 
 FRAMES = 12
 RESULTS = {

@@ -11,7 +11,7 @@ import pytest
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.bench import traffic
 from dpm2_core.evaluation.bench.harness import Options
-from dpm2_core.sim.config import LidarConfig
+from dpm2_core.sim.settings import LidarConfig
 
 
 def test_a_short_drive_is_judged_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -24,8 +24,8 @@ from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.network.tokens import Tokens
 from dpm2_core.network.weights import load_model, read_metadata, save_weights
-from dpm2_core.sim.config import LidarConfig
 from dpm2_core.sim.drive import simulate
+from dpm2_core.sim.settings import LidarConfig
 from dpm2_core.slam.system import SlamSettings
 
 

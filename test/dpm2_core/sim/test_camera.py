@@ -8,9 +8,9 @@ import pytest
 
 from dpm2_core.geometry import se3
 from dpm2_core.sim.camera import calibration, render
-from dpm2_core.sim.config import CameraConfig, LidarConfig
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.materials import Label, Material
+from dpm2_core.sim.settings import CameraConfig, LidarConfig
 from dpm2_core.sim.shading import Surface, Textures
 from dpm2_core.sim.world import World
 

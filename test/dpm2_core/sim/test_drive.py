@@ -16,9 +16,9 @@ import pytest
 from dpm2_core.data.kitti import KittiSource
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.geometry import se3
-from dpm2_core.sim.config import CameraConfig, LidarConfig
 from dpm2_core.sim.drive import simulate
 from dpm2_core.sim.materials import Label
+from dpm2_core.sim.settings import CameraConfig, LidarConfig
 
 LIDAR = LidarConfig(beams=16, columns=360)
 CAMERA = CameraConfig(width=160, height=48, focal=95)
@@ -108,7 +108,7 @@ def test_a_failure_leaves_nothing(tmp_path: Path) -> None:
 
 def test_a_killed_run_leaves_nothing_that_looks_whole_and_the_next_one_cleans_up(tmp_path: Path) -> None:
     program = (
-        "import sys, pathlib; from dpm2_core.sim.drive import simulate; from dpm2_core.sim.config import LidarConfig;"
+        "import sys, pathlib; from dpm2_core.sim.drive import simulate; from dpm2_core.sim.settings import LidarConfig;"
         "simulate(pathlib.Path(sys.argv[1]), frames=2000, images=False, lidar=LidarConfig(beams=16, columns=360))"
     )
     child = subprocess.Popen([sys.executable, "-c", program, str(tmp_path / "out")])

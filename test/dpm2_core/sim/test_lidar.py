@@ -10,9 +10,9 @@ import pytest
 from scipy.spatial import cKDTree
 
 from dpm2_core.geometry import se3
-from dpm2_core.sim.config import LidarConfig
 from dpm2_core.sim.lidar import Lidar, Scan, elevations
 from dpm2_core.sim.materials import Label
+from dpm2_core.sim.settings import LidarConfig
 from dpm2_core.sim.world import World, build_world
 
 

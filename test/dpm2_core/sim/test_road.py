@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from dpm2_core.errors import UsageError
-from dpm2_core.sim.config import PRESETS
 from dpm2_core.sim.drive import fitting_length
 from dpm2_core.sim.road import make_road, read_drive
+from dpm2_core.sim.settings import PRESETS
 from dpm2_core.sim.world import own_preset, random_stream
 
 

@@ -11,10 +11,10 @@ import pytest
 from scipy.spatial import cKDTree
 
 from dpm2_core.errors import UsageError
-from dpm2_core.sim.config import LidarConfig
 from dpm2_core.sim.drive import NOTE, simulate
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.materials import Label
+from dpm2_core.sim.settings import LidarConfig
 from dpm2_core.sim.world import World, build_world
 
 LIDAR = LidarConfig(columns=256)

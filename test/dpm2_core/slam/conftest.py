@@ -8,8 +8,8 @@ import pytest
 
 from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
-from dpm2_core.sim.config import LidarConfig
 from dpm2_core.sim.lidar import Lidar
+from dpm2_core.sim.settings import LidarConfig
 from dpm2_core.sim.world import build_world
 
 Drive = tuple[list[Frame], Array]

@@ -12,8 +12,8 @@ from dpm2_core.data.open import open_source
 from dpm2_core.evaluation.bench.gaps import gaps, judged, summary
 from dpm2_core.frame import Array, Frame, State, Tracked
 from dpm2_core.geometry import se3
-from dpm2_core.sim.config import LidarConfig
 from dpm2_core.sim.lidar import Lidar
+from dpm2_core.sim.settings import LidarConfig
 from dpm2_core.sim.world import World, build_world
 from dpm2_core.slam.output import TrajectoryRecorder
 from dpm2_core.slam.system import SlamSettings, make_odometry

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from dpm2_core.errors import UsageError
-from dpm2_core.sim.config import LidarConfig
 from dpm2_core.sim.drive import simulate
+from dpm2_core.sim.settings import LidarConfig
 from dpm2_core.tasks.ae_lidar import AeLidarImage, AeLidarSettings
 from dpm2_core.tasks.ae_lidar_task import AeLidarTask, AeLidarTraining
 from dpm2_core.tasks.ground_task import GroundTask, GroundTraining

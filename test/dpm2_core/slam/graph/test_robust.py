@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
-from dpm2_core.slam.graph.data import GraphData, Stretches, chain_chi2, integrate
+from dpm2_core.slam.graph.graph_data import GraphData, Stretches, chain_chi2, integrate
 from dpm2_core.slam.graph.robust import RobustSettings, joint_covariance, least_squares, optimise
 
 STEP = np.diag([2e-3, 2e-3, 2e-3, 0.02, 0.02, 0.02]) ** 2

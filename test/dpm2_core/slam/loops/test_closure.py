@@ -18,12 +18,12 @@ from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pose_solver import Solved
 from dpm2_core.network.pretrained import load_network
 from dpm2_core.network.tokens import Tokens
-from dpm2_core.sim.config import LidarConfig
 from dpm2_core.sim.lidar import Lidar
+from dpm2_core.sim.settings import LidarConfig
 from dpm2_core.sim.world import World, build_world
 from dpm2_core.slam.loops.closure import LoopCloser, LoopSettings
 from dpm2_core.slam.loops.consistency import Loop
-from dpm2_core.slam.registration import GeometricSettings
+from dpm2_core.slam.registration.icp import GeometricSettings
 
 FIRM = np.diag([1e-3] * 3 + [0.02] * 3) ** 2
 STREET = np.arange(40.0, 105.0, 5.0)

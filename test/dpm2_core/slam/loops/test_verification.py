@@ -8,11 +8,11 @@ import pytest
 
 from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
-from dpm2_core.sim.config import LidarConfig, PresetName
 from dpm2_core.sim.lidar import Lidar
+from dpm2_core.sim.settings import LidarConfig, PresetName
 from dpm2_core.sim.world import build_world
 from dpm2_core.slam.loops.verification import VerificationSettings, Verifier, above_ground
-from dpm2_core.slam.registration import GeometricSettings
+from dpm2_core.slam.registration.icp import GeometricSettings
 
 
 def street(preset: PresetName) -> tuple[list[Points], Array]:

@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where in a map am I? From one cloud, without any prior, from anywhere and whatever the heading.
+
+The descriptors find the keyframes that look alike and a pose in each; the points decide. Two places that both convince
+are no answer: it is better not to know than to be sure of the wrong one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from dpm2_core.config import Settings
+from dpm2_core.descriptors import Descriptors
+from dpm2_core.frame import Array, Keyframe, Points, Registration
+from dpm2_core.geometry import se3
+from dpm2_core.geometry.voxel import voxel_first
+from dpm2_core.slam.loops.place_recognition import PlaceRecognition
+from dpm2_core.slam.loops.verification import VerificationSettings, Verifier
+from dpm2_core.slam.registration.icp import GeometricSettings
+from dpm2_core.slam.registration.local_map import LocalMap
+
+if TYPE_CHECKING:  # torch takes seconds to import
+    from dpm2_core.network.model import DeepPointMap2
+
+_SAME_PLACE = 5.0  # m, candidates whose poses are nearer are one answer
+
+
+class RelocaliseSettings(Settings):
+    """Finding oneself in a map."""
+
+    candidates: int = Field(6, ge=1)
+    """So many keyframes that look like the scan are registered by the network..."""
+    verified: int = Field(3, ge=1)
+    """...and so many of the places that come out are judged by the points, the most confident first."""
+    min_confidence: float = Field(0.15, ge=0, le=1)
+    """Of the network's registration, below which the points are not asked."""
+    surroundings: float = Field(22.0, gt=0)
+    """Keyframes so near to a candidate make up the map to register to, m..."""
+    keyframes: int = Field(9, ge=1)
+    """...but no more than so many, the nearest."""
+    hint_radius: float = Field(20.0, gt=0)
+    """With a hint, keyframes farther from it than this are no candidates, m."""
+    max_failures: int = Field(3, ge=1)
+    """Keyframes in a row that do not fit the map where they are thought to be, after which one is lost."""
+    verification: VerificationSettings = VerificationSettings()
+
+
+class Relocaliser:
+    """A map to find oneself in. Reads it, never changes it."""
+
+    def __init__(
+        self,
+        settings: RelocaliseSettings,
+        registration: GeometricSettings,
+        network: DeepPointMap2,
+        keyframes: Sequence[Keyframe],
+        clouds: Sequence[Points],
+        poses: Array,
+        threads: int = 2,
+    ) -> None:
+        """`keyframes` with descriptors, their `clouds` (M, 4), and `poses` (N, 4, 4) T_map_kf."""
+        self._settings = settings
+        self._keyframes, self._clouds, self._poses = keyframes, clouds, poses
+        self._places = PlaceRecognition(network)
+        self._places.update(keyframes)
+        self._verifier = Verifier(settings.verification, registration, threads)
+
+    def __len__(self) -> int:
+        return len(self._keyframes)
+
+    def find(self, cloud: Points, hint: Array | None = None, descriptors: Descriptors | None = None) -> Registration:
+        """T_map_lidar of a cloud (M, 4), or why it is not known.
+
+        Args:
+            hint: T_map_lidar (4, 4) to look around; its heading does not matter.
+            descriptors: of the cloud, if they are known already.
+        """
+        s = self._settings
+        descriptors = descriptors or self._places.describe(cloud)
+        if descriptors is None:
+            return nowhere(f"{len(cloud)} points: too few for descriptors")
+        allowed = np.ones(len(self), bool)
+        if hint is not None:  # as on a plan: who points at a map on a screen gives no height
+            allowed = np.linalg.norm(self._poses[:, :2, 3] - hint[:2, 3], axis=1) <= s.hint_radius
+        nodes = self._places.similar(descriptors, allowed, s.candidates)
+        proposals = [p for p in self._proposals(descriptors, nodes) if p.confidence >= s.min_confidence]
+        refusals = [f"no keyframe of {int(allowed.sum())} matches the descriptors"] if not proposals else []
+        found: Registration | None = None
+        for proposal in proposals[: s.verified]:
+            answer = self.verify(cloud, proposal.T_target_source)
+            if not answer.ok:
+                refusals.append(answer.reason)
+            elif found is None:
+                found = answer
+            elif _metres(found.T_target_source, answer.T_target_source) > _SAME_PLACE:
+                return nowhere("two places of the map fit alike")
+        return nowhere("; ".join(refusals)) if found is None else found
+
+    def verify(self, cloud: Points, T_map_lidar: Array, widen: float = 1.0) -> Registration:
+        """The points' answer to a pose in the map: T_map_lidar, believed or not; `widen` as in `Verifier.verify`."""
+        distance = self._distance(T_map_lidar)
+        near = np.flatnonzero(distance <= self._settings.surroundings)
+        if not len(near):
+            return nowhere("outside the map")
+        nodes = near[np.argsort(distance[near])[: self._settings.keyframes]]
+        T_at_map = se3.inverse(self._poses[nodes[0]])
+        around = self._around(nodes, T_at_map)
+        found = self._verifier.verify(cloud, around, T_at_map @ T_map_lidar, widen).registration
+        T = se3.orthonormalised(self._poses[nodes[0]] @ found.T_target_source)
+        return replace(found, T_target_source=T, method="relocalisation")
+
+    def _around(self, nodes: NDArray[np.intp], T_at_map: Array) -> LocalMap:
+        return self._verifier.surroundings([self._clouds[n] for n in nodes.tolist()], T_at_map @ self._poses[nodes])
+
+    def _proposals(self, descriptors: Descriptors, nodes: Sequence[int]) -> list[Registration]:
+        """T_map_lidar by each keyframe, the most confident first, one for each place."""
+        known = [(node, d) for node in nodes if (d := self._keyframes[node].descriptors) is not None]
+        answers = self._places.register(descriptors, [d for _, d in known])
+        proposals: list[Registration] = []
+        in_map = [
+            replace(answer, T_target_source=self._poses[node] @ answer.T_target_source)
+            for (node, _), answer in zip(known, answers, strict=True)
+            if answer.ok
+        ]
+        for proposal in sorted(in_map, key=lambda r: -r.confidence):
+            T = proposal.T_target_source
+            if all(_metres(T, other.T_target_source) > _SAME_PLACE for other in proposals):
+                proposals.append(proposal)
+        return proposals
+
+    def _distance(self, T_map_lidar: Array) -> Array:
+        return np.linalg.norm(self._poses[:, :3, 3] - T_map_lidar[:3, 3], axis=1)
+
+
+def thinned(points: Points, voxel: float, reach: float) -> Points:
+    """The cloud (M, 4) that a keyframe would have of a scan (N, 4): a point in each voxel, none beyond `reach` m."""
+    near = points[np.einsum("ij,ij->i", points[:, :3], points[:, :3]) < reach**2]
+    return near[voxel_first(near, voxel)]
+
+
+def nowhere(reason: str) -> Registration:
+    """No pose, and why."""
+    return Registration(np.eye(4), np.eye(6) * 1e6, 0.0, np.inf, "relocalisation", False, reason)
+
+
+def _metres(a: Array, b: Array) -> float:
+    return float(np.linalg.norm(a[:3, 3] - b[:3, 3]))

@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which keyframes may enter a map: one that is not sound would spoil the poses, the clouds or the search of all others.
+
+Asked where a keyframe comes in over the network, and again before the graph is touched.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dpm2_core.descriptors import Descriptors
+from dpm2_core.errors import UsageError
+from dpm2_core.frame import Array, Keyframe, Points
+from dpm2_core.geometry import se3
+from dpm2_core.slam.store.cloud_codec import MAX_POINTS
+
+MAX_ID = 2**31 - 1
+FARTHEST = 1e7
+"""m from the origin: beyond that float64 poses and float32 clouds no longer agree on centimetres."""
+MAX_DESCRIPTORS = 4096
+_REACH = 32_000.0  # m: as far as a packed cloud reaches
+_LARGEST_VARIANCE = 1e12  # m^2: of a pose that is not known at all
+_LARGEST_FEATURE = 1000.0  # trained networks give less than 10; more would outweigh all other places in the search
+
+
+class RejectedError(UsageError):
+    """A keyframe that may not enter; `reason` is one of a few words to count it by, the text is one line."""
+
+    def __init__(self, reason: str, text: str) -> None:
+        super().__init__(text)
+        self.reason = reason
+
+
+def check_keyframe(keyframe: Keyframe, channels: int | None = None) -> None:
+    """Reject a keyframe that could do harm.
+
+    Args:
+        channels: width of the features that the map's network makes; None: any.
+
+    Raises:
+        RejectedError: id, pose, cloud, covariance of the edge, or descriptors.
+    """
+    if not 0 <= keyframe.id <= MAX_ID:
+        raise RejectedError("id", f"keyframe {keyframe.id}: want an id from 0 to {MAX_ID}")
+    check_pose(keyframe.T_odom_kf)
+    check_cloud(keyframe.cloud)
+    if keyframe.edge is not None:
+        check_covariance(keyframe.edge.covariance)
+    if keyframe.descriptors is not None:
+        check_descriptors(keyframe.descriptors, channels)
+
+
+def check_pose(T: Array) -> None:
+    """Raises RejectedError unless (4, 4) is a rigid transform to a place nearer than `FARTHEST`."""
+    if not se3.is_rigid(T):
+        raise RejectedError("pose", "its pose is not a finite rigid transform")
+    if np.abs(T[:3, 3]).max() > FARTHEST:
+        raise RejectedError("pose", f"its pose is farther than {FARTHEST / 1000:.0f} km from the origin")
+
+
+def check_covariance(covariance: Array) -> None:
+    """Raises RejectedError unless (6, 6) is the covariance of a measured pose."""
+    if not se3.is_covariance(covariance, largest=_LARGEST_VARIANCE):
+        raise RejectedError("covariance", "its covariance is not finite, symmetric and positive definite")
+
+
+def check_cloud(cloud: Points) -> None:
+    """Raises RejectedError unless (M, 4) is a cloud that can be kept."""
+    if cloud.ndim != 2 or cloud.shape[1] != 4 or len(cloud) > MAX_POINTS:
+        raise RejectedError("cloud", f"its cloud has shape {cloud.shape}; want (M, 4), at most {MAX_POINTS} points")
+    if not np.isfinite(cloud).all():
+        raise RejectedError("cloud", "its cloud has coordinates that are not finite")
+    if np.abs(cloud[:, :3]).max(initial=0.0) > _REACH:
+        raise RejectedError("cloud", f"its cloud reaches farther than {_REACH / 1000:.0f} km")
+
+
+def check_descriptors(d: Descriptors, channels: int | None = None) -> None:
+    """Raises RejectedError unless they can be compared with those of a network of so many `channels`."""
+    count, width = d.features.shape
+    if channels is not None and width != channels:
+        raise RejectedError("descriptors", f"its descriptors have {width} channels, the map's network makes {channels}")
+    if not 0 < count <= MAX_DESCRIPTORS or width > MAX_DESCRIPTORS:
+        raise RejectedError("descriptors", f"{count} descriptors of {width} channels; want 1 to {MAX_DESCRIPTORS}")
+    if d.axis is not None and d.axis.shape != (count, 2):
+        raise RejectedError("descriptors", f"its descriptors have axes of shape {d.axis.shape}; want ({count}, 2)")
+    parts = ((d.xyz, _REACH), (d.features, _LARGEST_FEATURE), (d.axes, 2.0))
+    if not all(np.abs(part).max() <= limit for part, limit in parts):  # NaN compares false
+        raise RejectedError("descriptors", "its descriptors are not finite, or too large")

@@ -1,0 +1,317 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Keyframes in, a globally consistent map out; with a store, a map file that is never more than a keyframe behind."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from dpm2_core.config import Settings
+from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.frame import Array, Frame, Keyframe, LoopClosure, Points
+from dpm2_core.geometry import se3
+from dpm2_core.slam.graph.pose_graph import PoseGraph
+from dpm2_core.slam.loops.closure import LoopCloser
+from dpm2_core.slam.loops.consistency import Loop, refused
+from dpm2_core.slam.mapping.admission import check_keyframe
+from dpm2_core.slam.mapping.moving import MovingSettings, MovingWindow
+from dpm2_core.slam.mapping.redundancy import RedundancySettings, lender
+from dpm2_core.slam.store.cloud_codec import pack_cloud
+from dpm2_core.slam.store.cloud_store import CloudStore
+from dpm2_core.slam.store.map_data import NO_POINTS, borrowing, load_map, map_cloud, restore
+from dpm2_core.slam.store.map_store import MapStore
+from dpm2_core.slam.store.rows import Edge
+from dpm2_core.slam.store.writer import MapWriter
+
+_MOST_MISSED = 1000  # keyframes between two, for which an edge is made less certain
+
+
+class MapSettings(Settings):
+    """The map that is shown and saved."""
+
+    voxel: float = 0.3
+    """Spacing of its points, m."""
+    thumbnail: int = Field(0, ge=0, le=1024)
+    """Width of the picture that a map file keeps of each keyframe, pixels; 0: none."""
+    moving: MovingSettings = MovingSettings()
+    redundancy: RedundancySettings = RedundancySettings()
+
+
+@dataclass(eq=False)
+class _Robot:
+    """One that has sent keyframes.
+
+    Attributes:
+        window: of its clouds. last: node of its last keyframe in this session, None before the first.
+        ids: so many are given. offset: of those of its present drive.
+    """
+
+    window: MovingWindow
+    last: int | None = None
+    ids: int = 0
+    offset: int = 0
+
+
+class Mapper:
+    """Holds keyframes and pose graph of one robot or several; their odometry runs on untouched.
+
+    Every robot has an odometry frame of its own. The map's frame is that of the first; where another one is in it is
+    not known before a loop ties the two.
+
+    Attributes:
+        keyframes: all, without their clouds; a node is a position among them. ids count on over a robot's sessions.
+        session_start: node of the first keyframe of this session: those before are of a map that was loaded.
+        closures: loops tried in this session.
+    """
+
+    def __init__(
+        self, settings: MapSettings, graph: PoseGraph, loops: LoopCloser, store: MapStore | None = None
+    ) -> None:
+        """`store`: the map file to go on with, its session begun; None keeps the map in memory, clouds on disk."""
+        self._settings = settings
+        self._graph = graph
+        self._loops = loops
+        self.keyframes: list[Keyframe] = []
+        self.closures: list[LoopClosure] = []
+        self._clouds = CloudStore()
+        self._writer: MapWriter | None = None
+        self._robots: dict[str, _Robot] = {}
+        self._placed = {0}  # nodes whose pose in the map is known from the start
+        self._T_start: Array = np.eye(4)  # T_map_odom of the first robot of the session
+        self._tie: Array | None = None  # covariance of the session's first keyframe relative to the last of the map
+        if store is not None:
+            self._load(store)
+        self.session_start = len(self.keyframes)
+
+    @property
+    def poses(self) -> Array:
+        """(N, 4, 4) optimised T_map_kf of all keyframes."""
+        return self._graph.poses
+
+    @property
+    def edges(self) -> list[tuple[int, int, Array, Array]]:
+        """Odometry edges and accepted loops: from, to, T_from_to, covariance."""
+        return self._graph.edges
+
+    @property
+    def T_map_odom(self) -> Array:
+        """(4, 4) of the robot whose keyframe came last, which carries every correction."""
+        if len(self.keyframes) == self.session_start:
+            return self._T_start
+        return se3.orthonormalised(self._graph.pose(-1) @ se3.inverse(self.keyframes[-1].T_odom_kf))
+
+    def T_map_odom_of(self, robot: str) -> Array | None:
+        """(4, 4) of a robot; None before it is known where in the map it is."""
+        last = self._robots[robot].last if robot in self._robots else None
+        if last is None or self._graph.part(last) not in {self._graph.part(node) for node in self._placed}:
+            return None
+        return se3.orthonormalised(self._graph.pose(last) @ se3.inverse(self.keyframes[last].T_odom_kf))
+
+    @property
+    def robots(self) -> list[str]:
+        """Names of those that have sent keyframes in this session."""
+        return [name for name, robot in self._robots.items() if robot.last is not None]
+
+    @property
+    def clouds(self) -> Sequence[Points]:
+        """(M, 4) of each keyframe in its own frame, read from disk; without what moves."""
+        return self._clouds
+
+    def borrows(self, node: int) -> bool:
+        """Whether a keyframe came back to an older one, and shows that one's cloud and descriptors as its own."""
+        return self._clouds.loan(node) is not None
+
+    @property
+    def store_problem(self) -> str:
+        """Why the map file is behind, in words; empty when it is not, or when there is none."""
+        return "" if self._writer is None else self._writer.problem
+
+    @property
+    def channels(self) -> int | None:
+        """Width of the features that its network makes; None without a network."""
+        return self._loops.channels
+
+    @property
+    def graph_problem(self) -> str:
+        """Why the poses are not optimised, in words; empty since they were."""
+        return self._graph.problem
+
+    def start_session(self, T_map_odom: Array, covariance: Array | None = None) -> None:
+        """Before the first keyframe of a session in a loaded map: where its odometry begins.
+
+        Args:
+            T_map_odom: (4, 4).
+            covariance: (6, 6) of the first keyframe's pose relative to the last one of the map, which are then joined
+                by an edge; None: the new session is not tied to the map before a loop is found.
+        """
+        self._T_start, self._tie = T_map_odom, covariance
+
+    def add(self, keyframe: Keyframe, thumbnail: bytes | None = None) -> list[LoopClosure]:
+        """Take a keyframe in, with a JPEG if wanted; returns the loops that were tried, accepted or not.
+
+        Raises:
+            RejectedError: it is not sound. Whatever is raised before the search for loops, the map is as it was before;
+                after that the keyframe is in, with what was found until then.
+        """
+        check_keyframe(keyframe, self._loops.channels)
+        node, cloud = len(self.keyframes), keyframe.cloud
+        robot = self._robot(keyframe.robot)
+        follows = robot.last is not None and keyframe.edge is not None
+        offset = robot.offset if follows else robot.ids
+        keyframe = self._loops.described(keyframe if follows else replace(keyframe, edge=None))
+        keyframe = replace(keyframe, id=keyframe.id + offset, cloud=NO_POINTS)
+        packed = pack_cloud(cloud)
+        edges = self._add_node(keyframe, robot.last if follows else None)
+        self._clouds.append(packed)
+        self.keyframes.append(keyframe)
+        robot.last, robot.ids, robot.offset = node, keyframe.id + 1, offset
+        closures: list[LoopClosure] = []
+        loops: list[Edge] = []
+        try:
+            closures, loops = self._close_loops(node)
+            self._lend(node, edges, loops)
+            self._mark_moving(robot.window.add(node, cloud, self.poses))
+        finally:
+            self._store(node, thumbnail, [*edges, *loops])
+        return closures
+
+    def _lend(self, node: int, edges: list[Edge], loops: list[Edge]) -> None:
+        """Give up the cloud of a keyframe that came back to an older one for that one's."""
+        again = edges if node == self.session_start else []  # the frame with which the session before ended
+        loan = lender(node, [*again, *self._kept(loops)], self._clouds.loan, self._settings.redundancy)
+        if loan is not None:
+            self._clouds.borrow(node, loan)
+            self.keyframes[node] = borrowing(self.keyframes[node], self.keyframes, loan)
+
+    def _store(self, node: int, thumbnail: bytes | None, edges: list[Edge]) -> None:
+        """Bring the map file, if there is one, up to date with a new keyframe."""
+        if self._writer is not None:
+            self._writer.add(node, self.keyframes[node], thumbnail)
+            for edge in edges:
+                self._writer.add_edge(edge)
+            self._writer.sync(self.poses)
+
+    def finish(self) -> None:
+        """At the end of a drive: wait for the solver, judge the last clouds, bring the map file up to date."""
+        self._optimise(changed=False, wait=True)
+        self._graph.close()
+        for robot in self._robots.values():
+            self._mark_moving(robot.window.finish(self.poses))
+        if self._writer is not None:
+            self._writer.sync(self.poses)
+
+    def cloud(self, voxel_size: float | None = None) -> Points:
+        """The map (M, 4) float32 in the map frame, one point in each voxel of that size (default: settings)."""
+        return map_cloud(self._clouds, self.poses, voxel_size or self._settings.voxel)
+
+    def write_g2o(self, path: Path) -> None:
+        """The pose graph as a g2o file."""
+        self._graph.write_g2o(path)
+
+    def _load(self, store: MapStore) -> None:
+        data, channels = load_map(store), self._loops.channels
+        for d in (keyframe.descriptors for keyframe in data.keyframes):
+            if d is not None and channels is not None and d.features.shape[1] != channels:
+                width = d.features.shape[1]
+                raise UsageError(f"{store.path}: descriptors of {width} channels, the network makes {channels}")
+        self.keyframes, self._clouds = data.keyframes, data.clouds
+        try:
+            restore(self._graph, data)
+        except (ValueError, Dpm2Error) as error:
+            raise Dpm2Error(f"{store.path}: {error}; see dpm2 map check") from None
+        for keyframe in data.keyframes:
+            robot = self._robot(keyframe.robot)
+            robot.ids = max(robot.ids, keyframe.id + 1)
+        if not store.read_only:
+            self._writer = MapWriter(store, self._clouds, data.poses)
+
+    def _robot(self, name: str) -> _Robot:
+        return self._robots.setdefault(name, _Robot(MovingWindow(self._settings.moving)))
+
+    def _add_node(self, keyframe: Keyframe, last: int | None) -> list[Edge]:
+        """A node with an edge to its robot's `last` one, also when some between them never arrived."""
+        node, found = len(self.keyframes), keyframe.edge
+        if node == self.session_start:
+            self._placed.add(node)
+        if found is not None and last is not None:
+            before, T_before = self.keyframes[last], self._graph.pose(last)
+            T_before_this = se3.inverse(before.T_odom_kf) @ keyframe.T_odom_kf
+            covariance = found.covariance * np.clip(keyframe.id - before.id, 1, _MOST_MISSED)
+            edge = Edge("odometry", last, node, T_before_this, covariance)
+            edge = replace(edge, confidence=found.confidence, rmse=found.rmse, method=found.method)
+        elif node == self.session_start and self._tie is not None:
+            last, T_before = node - 1, self._graph.pose(-1)
+            T_before_this = se3.inverse(T_before) @ self._T_start @ keyframe.T_odom_kf
+            edge = Edge("odometry", last, node, T_before_this, self._tie)
+        else:
+            T_map_odom = self._T_start if node == self.session_start else np.eye(4)
+            self._graph.add_node(T_map_odom @ keyframe.T_odom_kf, None, None)
+            return []
+        self._graph.add_node(T_before @ T_before_this, T_before_this, edge.covariance, last)
+        return [edge]
+
+    def _close_loops(self, node: int) -> tuple[list[LoopClosure], list[Edge]]:
+        """Loops of the last keyframe, as they are published and as they are stored."""
+        tried = [self._tied(loop) for loop in self._loops.close(self.keyframes, self._clouds, self.poses)]
+        closures = [
+            LoopClosure(a.id, b.id, loop.registration, a.robot, b.robot)
+            for loop in tried
+            for a, b in [(self.keyframes[loop.from_node], self.keyframes[loop.to_node])]
+        ]
+        self.closures += closures
+        self._optimise(any(loop.registration.ok for loop in tried))
+        return closures, [_loop_edge(loop) for loop in tried]
+
+    def _tied(self, loop: Loop) -> Loop:
+        """A loop that was tried, in the graph if it was accepted; rejected if the graph does not take it."""
+        found = loop.registration
+        if found.ok:
+            try:
+                self._graph.add_loop(loop.from_node, loop.to_node, found.T_target_source, found.covariance)
+            except Dpm2Error as error:
+                return refused(loop, str(error))
+        return loop
+
+    def _optimise(self, changed: bool, wait: bool = False) -> None:
+        """Solve the graph if it has `changed`, take in what another process has solved; `wait` for that."""
+        self._graph.collect(wait)
+        if changed:
+            try:
+                self._graph.optimise()
+            except Dpm2Error as error:  # the drive goes on, with the poses as they were
+                self._graph.problem = str(error)
+
+    def _kept(self, loops: Sequence[Edge]) -> list[Edge]:
+        """Those that the graph believes, too: on another's word no cloud is given up."""
+        doubted = {(told.from_node, told.to_node) for told in self._graph.verdicts if not told.kept}
+        return [edge for edge in loops if (edge.from_node, edge.to_node) not in doubted]
+
+    def _mark_moving(self, judged: Iterable[tuple[int, NDArray[np.bool_]]]) -> None:
+        for node, moving in judged:
+            if self._clouds.loan(node) is None and moving.any():
+                self._clouds.set_moving(node, moving)
+                if self._writer is not None:
+                    self._writer.set_moving(node)
+
+
+def _loop_edge(loop: Loop) -> Edge:
+    r = loop.registration
+    told = (r.ok, r.confidence, r.rmse, r.method, r.reason)
+    return Edge("loop", loop.from_node, loop.to_node, r.T_target_source, r.covariance, *told)
+
+
+def thumbnail(frame: Frame, width: int) -> bytes | None:
+    """JPEG of the frame's first picture, `width` pixels wide; None without a picture, or for a width of 0."""
+    if not frame.images or not width:
+        return None
+    import cv2
+
+    pixels = frame.images[0].pixels
+    height = max(1, round(width * pixels.shape[0] / pixels.shape[1]))
+    small = cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA)
+    return bytes(cv2.imencode(".jpg", cv2.cvtColor(small, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 80])[1])

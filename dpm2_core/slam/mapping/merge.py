@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Several maps into one: side by side where their frames are known, else tied by the loops between them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from dpm2_core.errors import Dpm2Error
+from dpm2_core.frame import Array, Points
+from dpm2_core.geometry import se3
+from dpm2_core.slam.graph.pose_graph import PoseGraph
+from dpm2_core.slam.loops.closure import LoopCloser
+from dpm2_core.slam.store.cloud_store import CloudStore, Loan
+from dpm2_core.slam.store.map_data import MapData, restore
+from dpm2_core.slam.store.rows import Edge
+
+FindLoops = Callable[[MapData, MapData], list[Edge]]
+"""Accepted loops from a node of one map to a node of another, each in its own numbers."""
+
+
+def merge_maps(a: MapData, b: MapData, T_a_b: Array, loops: Sequence[Edge] = ()) -> MapData:
+    """One map in the frame of `a`. Nodes and sessions of `b` count on after those of `a`.
+
+    Args:
+        T_a_b: (4, 4). loops: as `FindLoops` gives them.
+    """
+    n = len(a)
+    sessions = max((s.number for s in a.sessions), default=0)
+    moving = [*(a.clouds.moving(i) for i in range(n)), *(b.clouds.moving(i) for i in range(len(b)))]
+    loans = {i: loan for i in range(n) if (loan := a.clouds.loan(i))}
+    loans |= {n + i: Loan(n + loan.lender, loan.T_kf_lender) for i in range(len(b)) if (loan := b.clouds.loan(i))}
+    moved = [replace(edge, from_node=edge.from_node + n, to_node=edge.to_node + n) for edge in b.edges]
+    return MapData(
+        [*a.keyframes, *b.keyframes],
+        [*a.session, *(number + sessions for number in b.session)],
+        np.concatenate([a.poses, T_a_b @ b.poses]),
+        [*a.edges, *moved, *(replace(edge, to_node=edge.to_node + n) for edge in loops)],
+        [*a.trail, *(replace(p, node=p.node + n, session=p.session + sessions) for p in b.trail)],
+        [*a.sessions, *(replace(s, number=s.number + sessions) for s in b.sessions)],
+        CloudStore(lambda i: a.clouds.packed(i) if i < n else b.clouds.packed(i - n), moving, loans),
+        lambda i: a.thumbnail(i) if i < n else b.thumbnail(i - n),
+    )
+
+
+def align(a: MapData, b: MapData, find_loops: FindLoops) -> tuple[Array, list[Edge]]:
+    """T_a_b (4, 4) by the loops between two maps, and these.
+
+    Raises:
+        Dpm2Error: none was found.
+    """
+    loops = find_loops(a, b)
+    if not loops:
+        raise Dpm2Error("no place of one map was found in the other; give --transform if their frames are known")
+    guesses = [a.poses[e.from_node] @ e.T_from_to @ se3.inverse(b.poses[e.to_node]) for e in loops]
+    # The one that the others are nearest to: a start for the optimisation, which weighs them all.
+    apart = [np.median([np.linalg.norm((T - other)[:3, 3]) for other in guesses]) for T in guesses]
+    return guesses[int(np.argmin(apart))], loops
+
+
+def loops_by(closer: LoopCloser) -> FindLoops:
+    """Let a loop closer drive through the second map with the first one in its memory."""
+
+    def find(a: MapData, b: MapData) -> list[Edge]:
+        both = merge_maps(a, b, np.eye(4))
+        keyframes = list(a.keyframes)
+        out = []
+        for node, keyframe in enumerate(b.keyframes):
+            # Another name keeps the odometry of the two apart.
+            keyframes.append(replace(keyframe, robot=f"{keyframe.robot}/second", edge=keyframe.edge if node else None))
+            clouds: Sequence[Points] = both.clouds
+            for loop in closer.close(keyframes, clouds, both.poses[: len(keyframes)]):
+                r = loop.registration
+                if r.ok and loop.from_node < len(a) <= loop.to_node:
+                    told = (True, r.confidence, r.rmse, r.method)
+                    to = loop.to_node - len(a)
+                    out.append(Edge("loop", loop.from_node, to, r.T_target_source, r.covariance, *told))
+        return out
+
+    return find
+
+
+def optimised(data: MapData, graph: PoseGraph) -> MapData:
+    """The map with the poses that its constraints ask for; `graph` is empty."""
+    restore(graph, data)
+    graph.optimise()
+    return replace(data, poses=graph.poses)

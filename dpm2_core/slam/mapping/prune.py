@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Taking keyframes out of a map: the constraints through them are composed, and where they were is remembered."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from dpm2_core.geometry import se3
+from dpm2_core.slam.store.map_data import MapData, subset
+from dpm2_core.slam.store.rows import Edge, Pruned
+
+_LAP = 10  # keyframes: neighbours along the drive are no revisit
+
+
+def redundant_nodes(data: MapData, distance: float, angle: float) -> list[int]:
+    """Keyframes without a payload of their own, and those near an older one that stays; never the last.
+
+    Args:
+        distance: m, at most; 0: only those without a payload. angle: degrees between their headings, at most.
+    """
+    kept: list[int] = []
+    positions, last = data.poses[:, :3, 3], data.clouds.loan(len(data) - 1) if len(data) else None
+    given_up = []
+    for node in range(len(data)):
+        needed = node == len(data) - 1 or (last is not None and node == last.lender)
+        older = np.array([k for k in kept if node - k >= _LAP or data.session[k] != data.session[node]], np.intp)
+        near = older[np.linalg.norm(positions[older] - positions[node], axis=1) <= distance]
+        turned = se3.angle(se3.inverse(data.poses[near]) @ data.poses[node]) if distance and len(near) else np.inf
+        if not needed and (data.clouds.loan(node) is not None or np.min(turned) <= np.radians(angle)):
+            given_up.append(node)
+        else:
+            kept.append(node)
+    return given_up
+
+
+def prune(data: MapData, nodes: Collection[int]) -> MapData:
+    """The map without those nodes. Where they were is kept as `trail`, what tied them together as composed edges.
+
+    Raises:
+        ValueError: a node that stays borrows the cloud of one that goes.
+    """
+    gone = set(nodes)
+    kept = [node for node in range(len(data)) if node not in gone]
+    for node in kept:
+        if (loan := data.clouds.loan(node)) is not None and loan.lender in gone:
+            raise ValueError(f"keyframe {node} borrows the cloud of {loan.lender}")
+    new = {node: position for position, node in enumerate(kept)}
+    edges = [
+        replace(edge, from_node=new[edge.from_node], to_node=new[edge.to_node])
+        for edge in eliminate(data.edges, sorted(gone))
+    ]
+    anchors = {node: _anchor(data, node, kept) for node in gone}
+    trail = [
+        Pruned(
+            keyframe.id,
+            keyframe.robot,
+            data.session[node],
+            keyframe.stamp,
+            new[anchors[node]],
+            se3.inverse(data.poses[anchors[node]]) @ data.poses[node],
+        )
+        for node in sorted(gone)
+        for keyframe in [data.keyframes[node]]
+    ]
+    for old in data.trail:
+        anchor = anchors.get(old.node, old.node)
+        T_anchor_old = se3.inverse(data.poses[anchor]) @ data.poses[old.node]
+        trail.append(replace(old, node=new[anchor], T_node_kf=T_anchor_old @ old.T_node_kf))
+    return subset(data, kept, edges, trail)
+
+
+def _anchor(data: MapData, node: int, kept: Sequence[int]) -> int:
+    """The node that stays to which a pruned one is tied: its lender, or else the nearest along the drive."""
+    loan = data.clouds.loan(node)
+    at = np.array(kept)
+    if loan is not None and at[np.searchsorted(at, loan.lender) % len(at)] == loan.lender:
+        return loan.lender
+    return int(at[np.argmin(np.abs(at - node))])
+
+
+def eliminate(edges: Sequence[Edge], nodes: Sequence[int]) -> list[Edge]:
+    """Edges of a graph from which nodes are taken, one after the other.
+
+    A node's neighbours are joined to that one of them which the odometry ties to it best, each by the composition of
+    two edges: one edge less a node, as on a chain. (Exact marginalisation would join every one with every other.)
+    Refused loops of a node go with it.
+    """
+    left: dict[int, Edge] = dict(enumerate(edges))
+    at: dict[int, set[int]] = {}
+    for number, edge in left.items():
+        at.setdefault(edge.from_node, set()).add(number)
+        at.setdefault(edge.to_node, set()).add(number)
+    count = len(left)
+    for node in nodes:
+        numbers = sorted(at.pop(node, ()))
+        incident = [left.pop(number) for number in numbers]
+        for number, edge in zip(numbers, incident, strict=True):
+            at[edge.from_node if edge.to_node == node else edge.to_node].discard(number)
+        for edge in _joined(node, [edge for edge in incident if edge.ok]):
+            left[count] = edge
+            at[edge.from_node].add(count)
+            at[edge.to_node].add(count)
+            count += 1
+    return list(left.values())
+
+
+def _joined(node: int, incident: list[Edge]) -> list[Edge]:
+    """The edges between its neighbours that replace those of a node."""
+    spokes = [edge if edge.from_node == node else inverted(edge) for edge in incident]
+    if len(spokes) < 2:
+        return []
+    hub = min(spokes, key=lambda edge: (edge.kind != "odometry", np.trace(edge.covariance)))
+    out = [composed(inverted(hub), spoke) for spoke in spokes if spoke.to_node != hub.to_node]
+    return [edge if edge.from_node < edge.to_node else inverted(edge) for edge in out]
+
+
+def inverted(edge: Edge) -> Edge:
+    """The same constraint from its other end."""
+    A = se3.adjoint(edge.T_from_to)  # (T exp(xi))^-1 = T^-1 exp(-Ad_T xi)
+    T_to_from, covariance = se3.inverse(edge.T_from_to), A @ edge.covariance @ A.T
+    return replace(edge, from_node=edge.to_node, to_node=edge.from_node, T_from_to=T_to_from, covariance=covariance)
+
+
+def composed(first: Edge, second: Edge) -> Edge:
+    """One constraint after another, with errors that are independent."""
+    A = se3.adjoint(se3.inverse(second.T_from_to))
+    return replace(
+        second,
+        kind="odometry" if first.kind == second.kind == "odometry" else "loop",
+        from_node=first.from_node,
+        T_from_to=se3.orthonormalised(first.T_from_to @ second.T_from_to),
+        covariance=A @ first.covariance @ A.T + second.covariance,
+        confidence=min(first.confidence, second.confidence),
+        rmse=max(first.rmse, second.rmse),
+    )

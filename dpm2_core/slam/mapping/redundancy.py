@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Driving a block ten times does not make ten maps: a keyframe that came back to an old one uses its payload."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from pydantic import Field
+
+from dpm2_core.config import Settings
+from dpm2_core.geometry import se3
+from dpm2_core.slam.store.cloud_store import Loan
+from dpm2_core.slam.store.rows import Edge
+
+
+class RedundancySettings(Settings):
+    """Which keyframes of a revisit are given up: their pose stays in the graph, cloud and descriptors go."""
+
+    distance: float = Field(3.0, ge=0)
+    """Of a keyframe to the one that an accepted loop ties it to, m; 0 keeps all."""
+    angle: float = Field(30.0, ge=0, le=180)
+    """Turn between them, degrees: from another direction a place may look different."""
+
+
+def lender(
+    node: int, loops: Sequence[Edge], loan_of: Callable[[int], Loan | None], settings: RedundancySettings
+) -> Loan | None:
+    """Whose payload a new node can make do with; None: it keeps its own.
+
+    Args:
+        node: with `loops` those that were tried for it, to it.
+        loan_of: of older nodes: one that borrows itself hands on.
+    """
+    for edge in loops:
+        if not edge.ok or edge.to_node != node:
+            continue
+        T_kf_lender, other = se3.inverse(edge.T_from_to), edge.from_node
+        if (loan := loan_of(other)) is not None:
+            T_kf_lender, other = T_kf_lender @ loan.T_kf_lender, loan.lender
+        near = np.linalg.norm(T_kf_lender[:3, 3]) <= settings.distance
+        if near and se3.angle(T_kf_lender) <= np.radians(settings.angle):
+            return Loan(other, T_kf_lender)
+    return None

@@ -1,0 +1,263 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scan by scan: predict, register, gate, update. The state says how far the answer can be trusted."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import replace
+from time import perf_counter
+
+import numpy as np
+
+from dpm2_core.config import Settings
+from dpm2_core.frame import Array, Frame, Registration, State, Tracked
+from dpm2_core.geometry import se3
+from dpm2_core.slam.bridge import Bridge, Limits, covariance, predicted
+from dpm2_core.slam.odometry.keyframe_selection import KeyframeSelector
+from dpm2_core.slam.preprocess import Scan
+from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration
+
+
+class OdometrySettings(Settings):
+    """When to believe a registration, and what to do when there is none."""
+
+    max_acceleration: float = 40.0
+    """A registration that differs from the prediction by more than this allows is refused, m/s2 (0.5 m are free)."""
+    max_turn: float = 200.0
+    """The same for rotation, deg/s of difference from the predicted rate (3 deg are free)."""
+    steadiness: float = 10.0
+    """Standard deviation of the acceleration, m/s2 (and, in rad/s2, of the angular one): how far the prediction is
+    trusted where the points do not tell, as along a tunnel. Elsewhere they outweigh it."""
+    degraded_sigma: float = 0.08
+    """Standard deviation of the position in its worst direction above which the state is `degraded`, m."""
+    lost_after: int = 5
+    """Frames without a registration until the state is `lost`; `degraded` before."""
+    restart_after: int = 10
+    """Frames after a pause that are registered to the map before it, until the odometry counts as broken: a new stretch
+    then goes on from the predicted pose, with the uncertainty that the pause deserves."""
+    pause: float = 0.65
+    """Seconds without a registration after which one scan is no longer believed alone; in a stream of fewer frames
+    per second 1.5 of its periods."""
+
+
+_PERIOD = 0.1  # s, assumed between two stamps that do not advance
+# Motions [m along x, deg of yaw] tried while the velocity is unknown: up to 110 km/h and 100 deg/s at 10 Hz. In a curve
+# only if none of those straight ahead fits well: in a town a right one has a confidence of 0.74 and more.
+_AHEAD = ((0.0, 0), (1.0, 0), (2.0, 0), (3.0, 0), (-1.0, 0))
+_CURVES = tuple((x, yaw) for yaw in (4, -4, 8, -8) for x in (0.5, 1.5, 2.5))
+_FITS_WELL = 0.7
+_SLOWEST = 2.0  # s: no stream has a longer period
+_RHYTHM = 9  # periods: their median is that of the stream
+
+
+class Odometry:
+    """The pose of the LiDAR in the odometry frame, which is that of the first usable scan."""
+
+    def __init__(self, settings: OdometrySettings, registration: ScanRegistration, keyframes: KeyframeSelector) -> None:
+        self._settings = settings
+        self._registration = registration
+        self._keyframes = keyframes
+        self.reset()
+
+    @property
+    def uses_images(self) -> bool:
+        """Whether frames should come with their pictures."""
+        return self._registration.uses_images
+
+    def request_keyframe(self) -> None:
+        """Make a keyframe of the next registered scan, however short the way."""
+        self._keyframes.request()
+
+    def reset(self) -> None:
+        """Forget everything; the next scan is the first."""
+        self._T = np.eye(4)
+        self._twist: Array | None = None  # unknown until two scans are registered
+        self._covariance = np.zeros((6, 6))
+        self._stamp: int | None = None
+        self._registered = np.eye(4), 0.0  # the last registered pose, and the seconds since
+        self._failures = 0
+        self._first: Frame | None = None
+        self._periods: deque[float] = deque(maxlen=_RHYTHM)
+        self._clock = 0.0  # s since the first frame
+        self._bridge: Bridge | None = None
+        self._left = 0.0  # `_clock` at the last pose before the pause that is being bridged
+        self._breaks = 0
+        self._registration.clear()
+        self._keyframes.reset()
+
+    def process(self, frame: Frame) -> Tracked:
+        """Pose of one frame; never raises for what a sensor may deliver, and always gives a finite pose."""
+        clock = [perf_counter()]
+        dt = self._elapsed(frame.stamp)
+        twist = np.zeros(6) if self._twist is None else self._twist
+        scan = self._registration.prepare(frame, twist)
+        clock.append(perf_counter())
+        pauses = frame.problem is None and self._pauses(dt) and not self._registration.refusal(scan)
+        T_predicted = self._begin_stretch(dt) if pauses else predicted(self._T, twist, dt)
+        registration = self._register(scan, T_predicted, dt, frame.problem)
+        if self._first is not None and registration.ok:
+            scan, registration = self._begin_again(self._first, frame, registration, dt)
+        clock.append(perf_counter())
+        self._update(scan, registration, dt)
+        if registration.method == "first" and frame.time_offset is not None:
+            self._first = frame
+        T = self._T
+        if self._bridge is not None and registration.ok:
+            registration = self._cross(self._bridge, scan, registration)
+            T = registration.T_target_source
+        keyframe = self._keyframes.select(frame, scan, T, registration)
+        clock.append(perf_counter())
+        return Tracked(
+            stamp=frame.stamp,
+            index=frame.index,
+            T_odom_lidar=T,
+            covariance=self._covariance,
+            twist=np.zeros(6) if self._twist is None else self._twist,
+            state=self._state(registration),
+            registration=registration,
+            keyframe=keyframe,
+            breaks=self._breaks,
+            seconds=dict(zip(("preprocess", "register", "update"), np.diff(clock).tolist(), strict=True)),
+        )
+
+    def _elapsed(self, stamp: int) -> float:
+        """Seconds since the frame before; stamps that repeat or jump back count as one nominal period."""
+        dt = _PERIOD if self._stamp is None or stamp <= self._stamp else (stamp - self._stamp) * 1e-9
+        if self._stamp is not None:
+            self._periods.append(dt)
+        self._stamp = stamp
+        self._clock += dt
+        return dt
+
+    def _pauses(self, dt: float) -> bool:
+        """Whether so much time has passed since the last registered scan that another one is not believed alone."""
+        if not len(self._registration):
+            return False
+        if len(self._periods) > 1:
+            limit = max(self._settings.pause, 1.5 * sorted(self._periods)[(len(self._periods) - 1) // 2])
+        else:
+            limit = _SLOWEST  # whether that is a pause or the rhythm of the stream is not known yet
+        return self._registered[1] + dt > limit
+
+    def _begin_stretch(self, dt: float) -> Array:
+        """After a pause: the scan begins a map of its own, at the predicted pose (4, 4), which it returns."""
+        T_registered, seconds = self._registered
+        if self._bridge is None:
+            limits = Limits(self._settings.steadiness, self._settings.degraded_sigma)
+            self._bridge = Bridge(self._registration, T_registered, self._twist, limits)
+            self._left = self._clock - seconds - dt
+        self._registration, self._twist, self._first = self._registration.fresh(), None, None
+        self._T = self._bridge.begin(self._clock - self._left)
+        return self._T
+
+    def _cross(self, bridge: Bridge, scan: Scan, own: Registration) -> Registration:
+        """A scan of the stretch after a pause, in the map before it if that is certain; after long enough, a break."""
+        found, certain = bridge.register(scan, self._T, self._twist, own)
+        if certain:
+            self._bridge, self._registration = None, bridge.registration
+            self._failures = 0
+            self._follow(scan, found)
+            return found
+        self._covariance = bridge.covariance(self._T) + own.covariance
+        if bridge.tries >= self._settings.restart_after and self._twist is not None:
+            self._keyframes.doubt(self._covariance)
+            self._bridge, self._failures, self._breaks = None, 0, self._breaks + 1
+            return replace(own, reason=f"broken by a pause: {found.reason}")
+        self._failures += 1
+        T = found.T_target_source if found.ok else self._T
+        return replace(found, T_target_source=T, ok=False, reason=found.reason or "after a pause: not confirmed yet")
+
+    def _register(self, scan: Scan, T_predicted: Array, dt: float, problem: str | None) -> Registration:
+        if problem is not None:
+            return Registration(T_predicted, self._unknown(dt), 0.0, np.inf, "none", False, problem)
+        if not len(self._registration):
+            refusal = self._registration.refusal(scan)
+            return Registration(T_predicted, np.zeros((6, 6)), float(not refusal), 0.0, "first", not refusal, refusal)
+        if self._twist is None:
+            return self._registered_from_rest(scan, T_predicted, dt)
+        seconds = self._registered[1] + dt
+        widen = min(seconds / dt, 5.0)
+        information = np.eye(6) / (self._settings.steadiness * seconds * seconds) ** 2
+        answer = self._registration.register(scan, Prediction([T_predicted], widen, information))
+        return self._gated(answer, T_predicted, dt)
+
+    def _registered_from_rest(self, scan: Scan, T: Array, dt: float) -> Registration:
+        """While the velocity is unknown: the best of many starts; after a pause first as before it."""
+        if self._bridge is not None and self._bridge.twist is not None:
+            answer = self._registration.register(scan, self._bridge.expected(T, dt))
+            if answer.ok and answer.confidence >= _FITS_WELL:
+                return answer
+        for motions in (_AHEAD, _AHEAD + _CURVES):
+            starts = [T @ se3.exp([0, 0, np.radians(yaw), x, 0, 0]) for x, yaw in motions]
+            answer = self._registration.register(scan, Prediction(starts, widen=2.0))
+            if answer.ok and answer.confidence >= _FITS_WELL:
+                break
+        return answer
+
+    def _gated(self, answer: Registration, T_predicted: Array, dt: float) -> Registration:
+        """Refuse what no vehicle can do; the allowance grows while nothing has been registered."""
+        time = self._registered[1] + dt
+        off = se3.inverse(T_predicted) @ answer.T_target_source
+        metres, degrees = float(np.linalg.norm(off[:3, 3])), float(np.degrees(se3.angle(off)))
+        if answer.ok and metres > 0.5 + self._settings.max_acceleration * time * time:
+            return replace(answer, ok=False, reason=f"{metres:.1f} m from the prediction")
+        if answer.ok and degrees > 3 + self._settings.max_turn * time:
+            return replace(answer, ok=False, reason=f"{degrees:.0f} deg from the prediction")
+        return answer
+
+    def _begin_again(
+        self, first: Frame, frame: Frame, registration: Registration, dt: float
+    ) -> tuple[Scan, Registration]:
+        """The second scan has shown the velocity: undo the motion in the first one too, and register anew."""
+        self._first = None
+        twist = se3.log(se3.inverse(self._T) @ registration.T_target_source) / dt
+        self._registration.clear()
+        self._registration.update(self._registration.prepare(first, twist), self._T)
+        scan = self._registration.prepare(frame, twist)
+        return scan, self._registration.register(scan, Prediction([registration.T_target_source]))
+
+    def _update(self, scan: Scan, registration: Registration, dt: float) -> None:
+        """Move on: to the registered pose, or to the predicted one with the doubt that it deserves."""
+        T_registered, seconds = self._registered
+        if not registration.ok:
+            self._coast(dt)
+            return
+        if registration.method != "first":
+            # Not from the predicted pose of the frame before, of which an error would count as motion in one period.
+            self._twist = se3.log(se3.inverse(T_registered) @ registration.T_target_source) / (seconds + dt)
+        if self._bridge is None:
+            self._failures = 0
+        self._follow(scan, registration)
+
+    def _follow(self, scan: Scan, registration: Registration) -> None:
+        self._T = registration.T_target_source
+        self._registered = self._T, 0.0
+        self._covariance = registration.covariance
+        self._registration.update(scan, self._T)
+
+    def _coast(self, dt: float) -> None:
+        """Nothing registered: follow the prediction with growing uncertainty."""
+        if not len(self._registration):
+            return
+        self._failures += 1
+        self._covariance = self._unknown(dt)
+        T_registered, seconds = self._registered
+        self._registered = T_registered, seconds + dt
+        if self._twist is not None:
+            self._T = predicted(T_registered, self._twist, seconds + dt)
+        if self._bridge is not None:
+            self._covariance = self._covariance + self._bridge.covariance(self._T)
+
+    def _unknown(self, dt: float) -> Array:
+        """Covariance (6, 6) of what is only predicted."""
+        speed = 0.0 if self._twist is None else float(np.linalg.norm(self._twist[3:]))
+        return covariance(speed, self._registered[1] + dt, self._settings.steadiness)
+
+    def _state(self, registration: Registration) -> State:
+        if self._failures >= self._settings.lost_after:
+            return State.LOST
+        if self._twist is None and self._bridge is None:
+            return State.INITIALISING
+        if not registration.ok or registration.worst_sigma > self._settings.degraded_sigma or self._breaks:
+            return State.DEGRADED
+        return State.TRACKING

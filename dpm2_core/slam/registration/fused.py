@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The points, and the network where it knows more; the one vouches for the other, and what differs is said."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.linalg import eigh
+
+from dpm2_core.frame import Array, Frame, Registration
+from dpm2_core.geometry import se3
+from dpm2_core.slam.preprocess import Scan
+from dpm2_core.slam.registration.neural import NeuralScanRegistration
+from dpm2_core.slam.registration.protocol import MAP_NOISE, GeometricScanRegistration, Prediction, agree
+
+_LED = np.diag(np.repeat([np.radians(2), 0.5], 3) ** -2.0)
+"""How well the network's pose is known at least, rad and m: what the points need to be led by it, and no more."""
+
+
+class RefinedScanRegistration:
+    """The points as the geometric registration has them, and the network where it knows more.
+
+    Where both have an answer and agree (see `agree`), it is that of the points, and along directions that the network
+    knows better the mean by information: in town the points have it, along a tunnel the network. Where they contradict
+    each other, the points have it: they are many, and led there by the motion so far. While no motion is known the pose
+    of the network is one more start for them, and the likeliest wins. Where the points have no answer they try again
+    from the pose of the network; if they have none there, or another, the network answers alone, with its doubt.
+    `reason` says who did not agree, and why.
+    """
+
+    def __init__(self, neural: NeuralScanRegistration, geometric: GeometricScanRegistration) -> None:
+        self._neural = neural
+        self._geometric = geometric
+
+    @property
+    def uses_images(self) -> bool:
+        return self._neural.uses_images
+
+    def __len__(self) -> int:
+        return len(self._geometric)
+
+    def clear(self) -> None:
+        self._neural.clear()
+        self._geometric.clear()
+
+    def fresh(self) -> RefinedScanRegistration:
+        return RefinedScanRegistration(self._neural.fresh(), self._geometric.fresh())
+
+    def prepare(self, frame: Frame, twist: Array) -> Scan:
+        return self._neural.described(frame, self._geometric.prepare(frame, twist))
+
+    def refusal(self, scan: Scan) -> str:
+        return self._geometric.refusal(scan)
+
+    def register(self, scan: Scan, prediction: Prediction) -> Registration:
+        neural = self._neural.register(scan, prediction) if len(self._neural) else None
+        if neural is not None and neural.ok and prediction.information is None:
+            prediction = replace(prediction, starts=[neural.T_target_source, *prediction.starts])
+        points = self._geometric.register(scan, prediction)
+        if neural is None:
+            return _because(points, "neural: no descriptors yet")
+        if not neural.ok:
+            return _because(points, f"neural: {neural.reason}")
+        if not points.ok:
+            return self._led(scan, neural)
+        if not agree(points, neural):
+            return _because(points, f"neural and points {_apart(points, neural)} apart")
+        return _mean(points, neural, prediction.information)
+
+    def _led(self, scan: Scan, neural: Registration) -> Registration:
+        """The points from the pose of the network, when the motion so far did not lead them to an answer."""
+        points = self._geometric.register(scan, Prediction([neural.T_target_source], 1.0, _LED))
+        if not points.ok:
+            return replace(neural, reason=f"not refined: {points.reason}")
+        if agree(points, neural):
+            return _mean(points, neural, None)
+        xi = _difference(points, neural)
+        why = f"neural and points {_apart(points, neural)} apart"
+        return replace(neural, covariance=neural.covariance + np.outer(xi, xi), reason=why)
+
+    def update(self, scan: Scan, T_odom_lidar: Array) -> None:
+        self._geometric.update(scan, T_odom_lidar)
+        self._neural.update(scan, T_odom_lidar)
+
+
+def _mean(points: Registration, neural: Registration, prior: Array | None) -> Registration:
+    """Both by their information, along the directions that the network claims to know better than the points.
+
+    Elsewhere its errors would count for more than it adds: it judges itself too well and the points judge themselves
+    too badly. The information of the prediction, prior (6, 6), holds the points but is no part of the doubt.
+    """
+    of_points, of_network = np.linalg.inv(points.covariance), np.linalg.inv(neural.covariance + MAP_NOISE)
+    held = of_points if prior is None else of_points + prior
+    ratio, axes = eigh(of_network, of_points)
+    dual = of_points @ axes
+    of_network = (dual * np.where(ratio < 1, 0, ratio)) @ dual.T
+    step = np.linalg.solve(held + of_network, of_network @ _difference(points, neural))
+    T = se3.orthonormalised(points.T_target_source @ se3.exp(step))
+    return replace(points, T_target_source=T, covariance=np.linalg.inv(of_points + of_network), method="refined")
+
+
+def _difference(a: Registration, b: Registration) -> Array:
+    """xi (6,) [rad, m] that leads from one answer to the other."""
+    return se3.log(se3.inverse(a.T_target_source) @ b.T_target_source)
+
+
+def _apart(a: Registration, b: Registration) -> str:
+    xi = _difference(a, b)
+    return f"{np.linalg.norm(xi[3:]):.2f} m, {np.degrees(np.linalg.norm(xi[:3])):.1f} deg"
+
+
+def _because(answer: Registration, why: str) -> Registration:
+    return replace(answer, reason="; ".join(part for part in (answer.reason, why) if part))

@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scan to map by neural descriptors: those of a frame to the merged ones of keyframes around it; no start needed."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from pydantic import Field
+
+from dpm2_core.config import Settings
+from dpm2_core.descriptors import Descriptors, merge
+from dpm2_core.errors import Dpm2Error
+from dpm2_core.frame import Array, Frame, Registration
+from dpm2_core.geometry import se3
+from dpm2_core.slam.preprocess import Preprocessor, Scan
+from dpm2_core.slam.registration.protocol import Prediction, agree
+
+if TYPE_CHECKING:  # torch takes seconds to import, and the geometric SLAM does without
+    from dpm2_core.network.model import DeepPointMap2
+
+
+class NeuralSettings(Settings):
+    """Registration by the network; `registration` must be `neural` or `refined`."""
+
+    weights: str = "small"
+    """Name of weights that come with dpm2, or path of a .safetensors file."""
+    preset: str = ""
+    """Preset that the weights must have been trained for; empty takes any."""
+    spacing: float = Field(2.0, gt=0)
+    """A frame's descriptors enter the map after this much motion, m (or a turn of 15 degrees)."""
+    frames: int = Field(2, ge=1, le=16)
+    """So many of the map's frames, the nearest to the predicted pose, are merged and registered to."""
+    radius: float = Field(20.0, gt=0)
+    """Frames farther than this from the predicted pose are not registered to, unless all are, m."""
+    min_confidence: float = Field(0.1, ge=0, le=1)
+    """Mean probability of the best matches below which there is no answer."""
+    max_sigma: float = Field(0.6, gt=0)
+    """Largest standard deviation of the position in its worst direction, m."""
+
+
+_KEPT = 20  # frames: at least as many as can lie around the next one
+
+
+@dataclass(frozen=True, eq=False)
+class _Place:
+    """Where a frame was taken, T_odom_kf (4, 4), and what the network made of it."""
+
+    T_odom_kf: Array
+    descriptors: Descriptors
+
+
+class DescriptorMap:
+    """The descriptors of the last keyframes of the odometry."""
+
+    def __init__(self, spacing: float, frames: int, radius: float) -> None:
+        self._spacing, self._frames, self._radius = spacing, frames, radius
+        self._places: deque[_Place] = deque(maxlen=_KEPT)
+        self._merged: tuple[list[_Place], Descriptors] | None = None
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def clear(self) -> None:
+        self._places.clear()
+
+    def wants(self, T_odom_lidar: Array) -> bool:
+        """Whether a frame taken at that pose would show enough that is new."""
+        if not self._places:
+            return True
+        moved = se3.inverse(self._places[-1].T_odom_kf) @ T_odom_lidar
+        return bool(np.linalg.norm(moved[:3, 3]) >= self._spacing or se3.angle(moved) >= np.radians(15))
+
+    def insert(self, descriptors: Descriptors, T_odom_lidar: Array) -> None:
+        """Add those of a frame taken there."""
+        self._places.append(_Place(T_odom_lidar, descriptors))
+
+    def around(self, T_odom_lidar: Array) -> tuple[Array, Descriptors]:
+        """Pose T_odom_kf of the nearest frame, and the merged descriptors of it and its neighbours in its frame."""
+        distance = [float(np.linalg.norm(p.T_odom_kf[:3, 3] - T_odom_lidar[:3, 3])) for p in self._places]
+        order = np.argsort(distance, kind="stable")[: self._frames]
+        near = [self._places[i] for i in order if distance[i] <= self._radius or i == order[0]]
+        if self._merged is None or self._merged[0] != near:  # else the same object: the decoder keeps its part of it
+            T_kf_odom = se3.inverse(near[0].T_odom_kf)
+            others = [place.descriptors.moved(T_kf_odom @ place.T_odom_kf) for place in near[1:]]
+            self._merged = near, merge([near[0].descriptors, *others])
+        return near[0].T_odom_kf, self._merged[1]
+
+
+class NeuralScanRegistration:
+    """Descriptors to the descriptors of earlier frames. The prediction only chooses which those are."""
+
+    def __init__(self, settings: NeuralSettings, preprocessor: Preprocessor, model: DeepPointMap2) -> None:
+        self._settings = settings
+        self._preprocessor = preprocessor
+        self._model = model
+        self._map = DescriptorMap(settings.spacing, settings.frames, settings.radius)
+
+    @property
+    def uses_images(self) -> bool:
+        return self._model.encoder.image is not None
+
+    def __len__(self) -> int:
+        return len(self._map)
+
+    def clear(self) -> None:
+        self._map.clear()
+
+    def fresh(self) -> NeuralScanRegistration:
+        return NeuralScanRegistration(self._settings, self._preprocessor, self._model)
+
+    def prepare(self, frame: Frame, twist: Array) -> Scan:
+        return self.described(frame, Scan(self._preprocessor.measured(frame, twist)))
+
+    def described(self, frame: Frame, scan: Scan) -> Scan:
+        """The scan with its descriptors; without, if it has too few points."""
+        deskewed = replace(frame, points=scan.points, time_offset=None)
+        try:
+            return replace(scan, descriptors=self._model.describe(deskewed))
+        except Dpm2Error:
+            return scan
+
+    def refusal(self, scan: Scan) -> str:
+        return "" if scan.descriptors is not None else f"{len(scan.points)} points: too few for descriptors"
+
+    def register(self, scan: Scan, prediction: Prediction) -> Registration:
+        T_predicted = prediction.starts[0]
+        if scan.descriptors is None:
+            return _failed(T_predicted, self.refusal(scan))
+        T_odom_kf, target = self._map.around(T_predicted)
+        found = self._model.register(scan.descriptors, target)
+        if not found.ok:
+            return _failed(T_predicted, found.reason)
+        found = replace(found, T_target_source=se3.orthonormalised(T_odom_kf @ found.T_target_source))
+        if found.confidence < self._settings.min_confidence:
+            return replace(found, ok=False, reason=f"matches with a confidence of only {found.confidence:.2f}")
+        if (sigma := found.worst_sigma) > self._settings.max_sigma:
+            return replace(found, ok=False, reason=f"position uncertain by {sigma:.2f} m")
+        if prediction.information is not None:
+            covariance = np.linalg.inv(prediction.information).astype(np.float64)
+            if not agree(found, Registration(T_predicted, covariance, 0.0, np.inf, "predicted")):
+                return replace(found, ok=False, reason="contradicts the motion so far")
+        return found
+
+    def update(self, scan: Scan, T_odom_lidar: Array) -> None:
+        if scan.descriptors is not None and self._map.wants(T_odom_lidar):
+            self._map.insert(scan.descriptors, T_odom_lidar)
+
+
+def _failed(T_predicted: Array, reason: str) -> Registration:
+    covariance = np.diag([0.1, 0.1, 0.1, 1.0, 1.0, 1.0])
+    return Registration(T_predicted, covariance, 0.0, np.inf, "neural", False, reason)

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How a scan finds its pose: the part of the odometry that can be exchanged, and its geometric version."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol, Self
+
+import numpy as np
+
+from dpm2_core.frame import Array, Frame, Registration
+from dpm2_core.geometry import se3
+from dpm2_core.slam.preprocess import Preprocessor, Scan
+from dpm2_core.slam.registration.icp import GeometricRegistration
+from dpm2_core.slam.registration.local_map import LocalMap
+
+CHI2 = 22.46
+"""99.9 % quantile of chi2 with 6 degrees of freedom: two poses that are farther apart contradict each other."""
+
+# What the covariances of two registrations leave out, rad and m: the poses of the frames that make up the maps.
+MAP_NOISE = np.diag(np.repeat([np.radians(0.1), 0.03], 3) ** 2)
+
+_EQUAL = 0.02
+"""Mean log likelihoods of the points that differ by less say nothing, such as along a tunnel."""
+
+
+def agree(a: Registration, b: Registration) -> bool:
+    """Whether two answers may be one pose: xi^T (S_a + S_b + S_map)^-1 xi <= `CHI2`, xi (6,) being their difference."""
+    xi = se3.log(se3.inverse(a.T_target_source) @ b.T_target_source)
+    return bool(xi @ np.linalg.solve(a.covariance + b.covariance + MAP_NOISE, xi) <= CHI2)
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """What the motion so far says about the pose of a scan.
+
+    Attributes:
+        starts: (4, 4) T_odom_lidar, the likeliest first; several while the velocity is unknown.
+        widen: factor on how far from them the answer is looked for.
+        information: (6, 6) [rotation rad, translation m] of the first; None: nothing to go by.
+    """
+
+    starts: Sequence[Array]
+    widen: float = 1.0
+    information: Array | None = None
+
+
+class ScanRegistration(Protocol):
+    """Registers scans to what it remembers of earlier ones. T_target_source of its answers is T_odom_lidar.
+
+    Attributes:
+        uses_images: whether frames should come with their pictures.
+    """
+
+    @property
+    def uses_images(self) -> bool: ...
+
+    def __len__(self) -> int:
+        """0 while there is nothing to register to."""
+        ...
+
+    def clear(self) -> None:
+        """Forget everything."""
+        ...
+
+    def fresh(self) -> Self:
+        """Another one like it that remembers nothing yet."""
+        ...
+
+    def prepare(self, frame: Frame, twist: Array) -> Scan:
+        """What it needs of a frame that was taken while moving at `twist` (6,) [rad/s, m/s]; never raises."""
+        ...
+
+    def refusal(self, scan: Scan) -> str:
+        """Why no map can begin with this scan; empty if one can."""
+        ...
+
+    def register(self, scan: Scan, prediction: Prediction) -> Registration:
+        """Find the pose of a scan; needs a map."""
+        ...
+
+    def update(self, scan: Scan, T_odom_lidar: Array) -> None:
+        """Remember a scan that was taken there, if it shows enough that is new."""
+        ...
+
+
+class GeometricScanRegistration:
+    """Points to a local map of points."""
+
+    uses_images = False
+
+    def __init__(self, preprocessor: Preprocessor, registration: GeometricRegistration, local_map: LocalMap) -> None:
+        self._preprocessor = preprocessor
+        self._registration = registration
+        self._local_map = local_map
+
+    def __len__(self) -> int:
+        return len(self._local_map)
+
+    def clear(self) -> None:
+        self._local_map.clear()
+
+    def fresh(self) -> GeometricScanRegistration:
+        return GeometricScanRegistration(self._preprocessor, self._registration, self._local_map.fresh())
+
+    def prepare(self, frame: Frame, twist: Array) -> Scan:
+        return self._preprocessor.prepare(frame, twist)
+
+    def refusal(self, scan: Scan) -> str:
+        least = self._registration.min_points
+        return "" if len(scan.source) >= least else f"{len(scan.source)} points; a map needs {least}"
+
+    def register(self, scan: Scan, prediction: Prediction) -> Registration:
+        p = prediction
+        found = [self._registration.register(scan.source, self._local_map, T, p.widen, p.information) for T in p.starts]
+        if len(found) == 1:
+            return found[0]
+        fit = [self._registration.likelihood(scan.source, self._local_map, r.T_target_source) for r in found]
+        ok = max(r.ok for r in found)
+        best = max(value for r, value in zip(found, fit, strict=True) if r.ok == ok)
+        # The first of equals: least motion, where a tunnel fits anywhere.
+        return next(r for r, value in zip(found, fit, strict=True) if r.ok == ok and value >= best - _EQUAL)
+
+    def update(self, scan: Scan, T_odom_lidar: Array) -> None:
+        if self._local_map.wants(T_odom_lidar):
+            self._local_map.insert(scan.cloud, T_odom_lidar)

@@ -1,0 +1,247 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The picture where the geometry is silent: how far along a tunnel or a highway.
+
+Points and descriptors leave a direction open there: along it, every pose fits alike. The points of an earlier scan have
+a brightness in the picture that was taken with it, and the same points are looked for in the picture of this scan. One
+number is unknown, the way along the open direction; it is the one at which the two brightnesses correlate best. In town
+no direction is open, and no picture is ever touched.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from dpm2_core.config import Settings
+from dpm2_core.frame import Array, Frame, Image, Points, Registration
+from dpm2_core.geometry import se3
+from dpm2_core.slam.preprocess import Scan
+from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration
+
+
+class VisualSettings(Settings):
+    """How far along, by the picture."""
+
+    enabled: bool = True
+    """Ask the first camera where scans leave a direction open."""
+    sigma: float = Field(0.08, gt=0)
+    """Standard deviation of the position in its worst direction above which it counts as open, m."""
+    reach: float = Field(6.0, gt=0)
+    """Farthest that is looked to either side, m; less where the motion so far says more."""
+    baseline: float = Field(3.0, gt=0)
+    """Way after which another picture is the one to compare with, m."""
+    points: int = Field(1500, gt=0)
+    """So many points are compared."""
+    width: int = Field(640, gt=0)
+    """Pictures are reduced to this width, pixels."""
+    min_correlation: float = Field(0.3, ge=0, le=1)
+    """A poorer likeness is none."""
+    distinct: float = Field(0.1, ge=0, le=1)
+    """The best place must be liker than any other by this much: lane marks and lamps repeat."""
+
+
+_NEAR, _FAR = 2.0, 50.0  # m ahead of the camera: the compared points
+_STEPS = (0.1, 0.02)  # m, between the places tried: everywhere, then around the best
+_BLUR = (2.5, 1.0)  # pixels: so that nothing is missed between two of them
+_LOCAL = 12.0  # pixels: light that changes more slowly is no texture
+_LEAST = 100  # points that both pictures must show
+_CORRELATED = 100  # pixels next to each other, and the points between them, say the same
+_DOUBT = 0.3  # of the likeness at the coarse blur: the fine one chooses among those that are not farther behind
+_APART = 0.6  # m: other places, not the slope of the best one
+
+
+@dataclass(frozen=True, eq=False)
+class _Picture:
+    """Texture (h, w) float32 at each of `_BLUR`, K (3, 3) of the reduced picture, T_cam_lidar (4, 4)."""
+
+    texture: tuple[NDArray[np.float32], ...]
+    K: Array
+    T_cam_lidar: Array
+
+    def project(self, points: Array) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Pixels (..., N, 2) of points (..., N, 3) of the camera frame, m, and which of them the picture shows."""
+        ahead = points[..., 2] > _NEAR / 2
+        image = points @ self.K.T
+        uv = np.asarray(image[..., :2] / np.where(ahead, points[..., 2], 1.0)[..., None], np.float32)
+        height, width = self.texture[0].shape
+        shown: NDArray[np.bool_] = ahead & (uv >= 0).all(-1) & (uv[..., 0] <= width - 1) & (uv[..., 1] <= height - 1)
+        return uv, shown
+
+    def sample(self, points: Array, level: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Texture (S, N) at points (S, N, 3) of the camera frame, m, and which of them the picture shows."""
+        uv, shown = self.project(points)
+        found = cv2.remap(self.texture[level], uv[..., 0], uv[..., 1], cv2.INTER_LINEAR)
+        return np.asarray(found, np.float32), shown
+
+
+@dataclass(frozen=True, eq=False)
+class _Reference:
+    """A picture whose scan was taken at T_odom_lidar (4, 4), and points (N, 3) of that scan in its LiDAR frame."""
+
+    picture: _Picture
+    points: Array
+    T_odom_lidar: Array
+
+
+class VisualScanRegistration:
+    """Any registration, and the picture along the direction that it leaves open."""
+
+    def __init__(self, settings: VisualSettings, registration: ScanRegistration) -> None:
+        self._settings = settings
+        self._registration = registration
+        self._last: tuple[Scan, Array] | None = None  # a scan with a picture and where it was taken
+        self._reference: _Reference | None = None  # made of it when first needed
+
+    uses_images = True
+
+    def __len__(self) -> int:
+        return len(self._registration)
+
+    def clear(self) -> None:
+        self._registration.clear()
+        self._last = self._reference = None
+
+    def fresh(self) -> VisualScanRegistration:
+        return VisualScanRegistration(self._settings, self._registration.fresh())
+
+    def prepare(self, frame: Frame, twist: Array) -> Scan:
+        scan = self._registration.prepare(frame, twist)
+        return replace(scan, image=frame.images[0]) if frame.images else scan
+
+    def refusal(self, scan: Scan) -> str:
+        return self._registration.refusal(scan)
+
+    def register(self, scan: Scan, prediction: Prediction) -> Registration:
+        answer = self._registration.register(scan, prediction)
+        if not answer.ok or scan.image is None or self._last is None or answer.worst_sigma <= self._settings.sigma:
+            return answer
+        return self._along(answer, scan.image, prediction.information)
+
+    def update(self, scan: Scan, T_odom_lidar: Array) -> None:
+        self._registration.update(scan, T_odom_lidar)
+        if scan.image is None:
+            return
+        if self._last is not None:
+            moved = np.linalg.norm(self._last[1][:3, 3] - T_odom_lidar[:3, 3])
+            if self._reference is not None and moved < self._settings.baseline:
+                return
+        self._last, self._reference = (scan, T_odom_lidar), None
+
+    def _along(self, answer: Registration, image: Image, information: Array | None) -> Registration:
+        """The answer moved along its open direction to where the pictures agree; as it was, if they do not say."""
+        s = self._settings
+        axis = np.linalg.eigh(answer.covariance[3:, 3:])[1][:, -1]
+        b = np.concatenate([np.zeros(3), axis])
+        reach = s.reach
+        if information is not None:
+            reach = min(reach, max(_APART, 4 * float(np.sqrt(b @ np.linalg.solve(information, b)))))
+        if self._reference is None:
+            assert self._last is not None
+            self._reference = self._made(*self._last)
+        found = self._search(self._reference, _textured(image, s.width), answer.T_target_source, axis, reach)
+        if isinstance(found, str):
+            return replace(answer, reason="; ".join(part for part in (answer.reason, found) if part))
+        way, sigma = found
+        gain = answer.covariance @ b / (b @ answer.covariance @ b + sigma**2)
+        T = se3.orthonormalised(answer.T_target_source @ se3.exp(gain * way))
+        covariance = answer.covariance - np.outer(gain, b @ answer.covariance)
+        return replace(answer, T_target_source=T, covariance=(covariance + covariance.T) / 2, method="visual")
+
+    def _made(self, scan: Scan, T_odom_lidar: Array) -> _Reference:
+        assert scan.image is not None
+        picture = _textured(scan.image, self._settings.width)
+        points = _ahead(scan.points, picture, self._settings.points)
+        return _Reference(picture, points, T_odom_lidar)
+
+    def _search(
+        self, reference: _Reference, picture: _Picture, T_odom_lidar: Array, axis: Array, reach: float
+    ) -> tuple[float, float] | str:
+        """Way along `axis` of the LiDAR frame and its standard deviation, m; or why it is not known."""
+        s = self._settings
+        if len(reference.points) < _LEAST:
+            return f"picture: only {len(reference.points)} points in it"
+        here = _moved(reference.picture.T_cam_lidar, reference.points)[None]
+        values = [reference.picture.sample(here, level)[0][0] for level in (0, 1)]
+        there = _moved(picture.T_cam_lidar @ se3.inverse(T_odom_lidar) @ reference.T_odom_lidar, reference.points)
+        step = picture.T_cam_lidar[:3, :3] @ axis
+        ways = np.arange(-reach, reach + _STEPS[0] / 2, _STEPS[0])
+        likeness = _correlations(values[0], *picture.sample(there - ways[:, None, None] * step, 0))
+        candidates = _maxima(likeness, max(s.min_correlation / 2, float(likeness.max()) - _DOUBT))
+        if not len(candidates):
+            return f"picture: a likeness of only {max(float(likeness.max()), 0):.2f}"
+        around = np.arange(-_STEPS[0], _STEPS[0] + _STEPS[1] / 2, _STEPS[1])
+        peaks = []
+        for middle in ways[candidates]:
+            near = middle + around
+            fine = _correlations(values[1], *picture.sample(there - near[:, None, None] * step, 1))
+            peaks.append((float(fine.max()), near, fine))
+        peaks.sort(key=lambda peak: -peak[0])
+        best, near, fine = peaks[0]
+        if best < s.min_correlation:
+            return f"picture: a likeness of only {max(best, 0):.2f}"
+        others = [top for top, there, _ in peaks if abs(there[0] - near[0]) > _APART]
+        if others and others[0] > best - s.distinct:
+            return "picture: several places are alike"
+        return _peak(near, fine, len(reference.points))
+
+
+def _maxima(likeness: NDArray[np.float32], least: float) -> NDArray[np.intp]:
+    """Places inside the search that are liker than both neighbours and than `least`."""
+    inner = likeness[1:-1]
+    return 1 + np.flatnonzero((inner >= likeness[:-2]) & (inner > likeness[2:]) & (inner > least))
+
+
+def _textured(image: Image, width: int) -> _Picture:
+    """Brightness without its slow changes, over its local contrast, undistorted."""
+    camera, grey = image.camera, cv2.cvtColor(image.pixels, cv2.COLOR_RGB2GRAY)
+    if camera.distortion:
+        grey = cv2.undistort(grey, camera.K, np.array(camera.distortion))
+    scale = min(1.0, width / camera.size[0])
+    size = (round(camera.size[0] * scale), round(camera.size[1] * scale))
+    grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    detail = grey - cv2.GaussianBlur(grey, (0, 0), _LOCAL)
+    detail /= np.sqrt(cv2.GaussianBlur(detail * detail, (0, 0), 2 * _LOCAL)) + 2.0  # grey levels: less is noise
+    K = np.diag([size[0] / camera.size[0], size[1] / camera.size[1], 1.0]) @ camera.K
+    return _Picture(tuple(cv2.GaussianBlur(detail, (0, 0), blur) for blur in _BLUR), K, se3.inverse(camera.T_lidar_cam))
+
+
+def _ahead(points: Points, picture: _Picture, count: int) -> Array:
+    """At most `count` of the points (P, 4) that the picture shows, (N, 3) float64, spread evenly over the scan."""
+    in_camera = _moved(picture.T_cam_lidar, points[:, :3].astype(np.float64))
+    kept = np.flatnonzero(picture.project(in_camera)[1] & (in_camera[:, 2] > _NEAR) & (in_camera[:, 2] < _FAR))
+    return points[kept[:: max(1, len(kept) // count)], :3].astype(np.float64)
+
+
+def _moved(T: Array, points: Array) -> Array:
+    return points @ T[:3, :3].T + T[:3, 3]
+
+
+def _correlations(
+    values: NDArray[np.float32], found: NDArray[np.float32], shown: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    """Correlation (S,) of values (N,) with each row of found (S, N) over what is shown; 0 where that is too little."""
+    weight = shown.astype(np.float32)
+    count = weight.sum(1)
+    x = (values - (weight @ values / np.maximum(count, 1))[:, None]) * weight
+    y = (found - ((found * weight).sum(1) / np.maximum(count, 1))[:, None]) * weight
+    spread = np.sqrt((x * x).sum(1) * (y * y).sum(1))
+    return np.where(count >= _LEAST, (x * y).sum(1) / np.maximum(spread, 1e-6), 0.0)
+
+
+def _peak(ways: Array, likeness: NDArray[np.float32], points: int) -> tuple[float, float]:
+    """Maximum of a parabola through the top, and its standard deviation, m.
+
+    The information of a shift in y = x(shift) + noise is n (dx/dshift)^2 / var(noise); both follow from the correlation
+    r and its second derivative: -n r'' r / (1 - r^2).
+    """
+    i = int(np.clip(likeness.argmax(), 1, len(ways) - 2))
+    before, top, after = likeness[i - 1 : i + 2].astype(float)
+    step = ways[1] - ways[0]
+    bend = max((2 * top - before - after) / step**2, 1e-3)
+    way = ways[i] + float(np.clip((after - before) / (2 * bend * step), -step, step))
+    information = points / _CORRELATED * bend * top / max(1 - top * top, 1e-3)
+    return way, float(max(0.01, information**-0.5))

@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A drive and a map file: a new one, on from where an earlier run was cut off, or one only to find oneself in."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from dpm2_core.data.source import Source
+from dpm2_core.errors import UsageError
+from dpm2_core.network.pretrained import weights_path
+from dpm2_core.slam.mapping.mapper import Mapper
+from dpm2_core.slam.store.map_store import MapStore
+from dpm2_core.slam.store.rows import Session, weights_id
+from dpm2_core.slam.system import SlamSettings
+
+_SAME_FRAME = np.diag([1e-4] * 3 + [1e-3] * 3) ** 2  # rad, m: the rounding of what is the same frame
+
+
+def open_session(path: Path, settings: SlamSettings, config: str, resume: bool) -> MapStore:
+    """The map file to write to, with a new session begun.
+
+    Args:
+        config: YAML, kept with the session.
+        resume: go on with the file, if there is one; else it must not exist.
+
+    Raises:
+        UsageError: the file is there, or holds descriptors of other weights. Dpm2Error: it cannot be written.
+    """
+    described = settings.registration != "geometric" or (settings.loops.enabled and settings.loops.descriptors)
+    weights = weights_id(weights_path(settings.neural.weights)) if described else ""
+    if path.exists() and not resume:
+        raise UsageError(f"--map {path}: there is a file already; --resume goes on with it")
+    store = MapStore.open(path, read_only=False) if path.exists() else MapStore.create(path)
+    try:
+        _check_weights(store, weights)
+        store.begin_session(config, weights)
+    except BaseException:
+        store.close()
+        raise
+    return store
+
+
+def open_for_localisation(path: Path, settings: SlamSettings) -> MapStore:
+    """The map file to find oneself in, open for reading only.
+
+    Raises:
+        UsageError: no map, one without descriptors, or with those of other weights. Dpm2Error: it cannot be read.
+    """
+    store = MapStore.open(path)
+    try:
+        _check_weights(store, weights_id(weights_path(settings.neural.weights)))
+        if not any(store.payload(node, "descriptors") for node, *_ in store.rows("keyframes", "node")):
+            raise UsageError(f"{path}: no keyframe has descriptors (made with slam.loops.descriptors off?)")
+    except BaseException:
+        store.close()
+        raise
+    return store
+
+
+def _check_weights(store: MapStore, weights: str) -> None:
+    """Descriptors of different weights have nothing in common; `weights` "": none are made."""
+    for row in store.rows("sessions"):
+        if (before := Session(*row).weights) and weights and before != weights:
+            raise UsageError(f"{store.path}: made with weights {before}, not with {weights}")
+
+
+def resume_at(mapper: Mapper, source: Source, start: int) -> int:
+    """Position in the source of the map's last keyframe, from where the mapper goes on; `start` for an empty map.
+
+    Raises:
+        UsageError: the frame of that keyframe is not in the source.
+    """
+    if not mapper.keyframes:
+        return start
+    last = mapper.keyframes[-1]
+    first = next(iter(source.frames(0, 1)), None)
+    position = -1 if first is None else last.index - first.index
+    found = next(iter(source.frames(position, position + 1)), None) if 0 <= position < len(source) else None
+    if found is None or found.stamp != last.stamp:
+        raise UsageError(f"--resume: frame {last.index}, where the map ends, is not in {source.name}")
+    mapper.start_session(mapper.poses[-1], _SAME_FRAME)
+    return position

@@ -1,0 +1,296 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is wrong with a map file, and what of it is good: row by row, each judged for itself."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+import tempfile
+from collections.abc import Iterator
+from contextlib import closing, suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dpm2_core.database import connect
+from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.frame import Array, Keyframe
+from dpm2_core.geometry import se3
+from dpm2_core.slam.store import rows, schema
+from dpm2_core.slam.store.cloud_codec import pack_cloud, unpack_cloud, unpack_mask
+from dpm2_core.slam.store.cloud_store import CloudStore, Loan
+from dpm2_core.slam.store.map_data import NO_POINTS, MapData, save_as, subset
+from dpm2_core.slam.store.rows import Edge, Pruned, Session
+
+_SMALLEST = 20  # bytes of a row: a file has at most so many as fit, and nobody waits for the row 2^62 of a small one
+_DOUBT = np.diag([0.05] * 3 + [0.5] * 3) ** 2  # of an edge that bridges a lost keyframe, rad and m
+
+
+@dataclass
+class Findings:
+    """What a check found.
+
+    Attributes:
+        problems: one line each; empty: the map is sound.
+        keyframes: that can be used. lost: keyframes that cannot. lost_clouds: usable, but without their payload.
+    """
+
+    problems: list[str] = field(default_factory=list)
+    keyframes: int = 0
+    lost: int = 0
+    lost_clouds: int = 0
+
+
+def check_map(path: Path, recover: Path | None = None) -> Findings:
+    """Judge a map file without changing it; write the good part of it to a new file if wanted.
+
+    Raises:
+        UsageError: no map at all, or a later dpm2's. Dpm2Error: nothing can be read, or `recover` cannot be written.
+    """
+    if not path.is_file():
+        raise UsageError(f"{path}: no such map file")
+    findings = Findings()
+    with tempfile.TemporaryDirectory(prefix="dpm2_check_") as folder:
+        copy = Path(folder) / "map"  # SQLite replays FILE-wal when it opens a map: not on the patient
+        for suffix in ("", "-wal"):
+            with suppress(FileNotFoundError):
+                shutil.copyfile(f"{path}{suffix}", f"{copy}{suffix}")
+        with closing(_opened(copy, path, findings)) as sql:
+            data = _Salvage(sql, copy.stat().st_size // _SMALLEST, findings).run()
+            findings.keyframes = len(data)
+            if recover is not None:
+                if not len(data):
+                    raise Dpm2Error(f"{path}: nothing in it can be recovered")
+                save_as(data, recover)
+    return findings
+
+
+def _opened(copy: Path, path: Path, findings: Findings) -> sqlite3.Connection:
+    """The copy of the map as a database; with a new first page where the old one makes no sense."""
+    try:
+        sql: sqlite3.Connection = connect(copy, "rw")
+        version = schema.version_of(sql, path)
+        schema.check(sql, version)
+    except sqlite3.DatabaseError as error:
+        findings.problems.append(f"header: {error}")
+        sql = _with_new_header(copy)
+        version = schema.VERSION
+    with suppress(sqlite3.DatabaseError):
+        told = [row[0] for row in sql.execute("PRAGMA integrity_check(20)")]
+        findings.problems += [f"database: {' '.join(line.split())}" for line in told if line != "ok"]
+    try:
+        schema.migrate(sql, version)
+    except sqlite3.DatabaseError as error:
+        raise Dpm2Error(f"{path}: a damaged map of version {version}, which cannot be read: {error}") from None
+    return sql
+
+
+def _with_new_header(copy: Path) -> sqlite3.Connection:
+    """The first page holds the schema, which is the same in all maps: that of an empty one serves."""
+    empty = copy.with_name("empty")
+    with closing(connect(empty, "rwc")) as sql:
+        schema.create(sql)
+        size = sql.execute("PRAGMA page_size").fetchone()[0]
+    Path(f"{copy}-wal").unlink(missing_ok=True)
+    page = bytearray(empty.read_bytes()[:size])
+    page[28:32] = (copy.stat().st_size // size).to_bytes(4, "big")  # pages in the file
+    page[32:40] = bytes(8)  # no free pages
+    with copy.open("r+b") as file:
+        file.write(page)
+    return connect(copy, "rw")
+
+
+class _Salvage:
+    """Reads what can be read of a map."""
+
+    def __init__(self, sql: sqlite3.Connection, most: int, findings: Findings) -> None:
+        """`most`: rows that a table can have."""
+        self._sql, self._most, self._findings = sql, most, findings
+
+    def run(self) -> MapData:
+        """All that is good, without gaps."""
+        keyframes, session, loans = self._keyframes()
+        poses = self._poses(keyframes)
+        good = sorted(keyframes)
+        new = {node: position for position, node in enumerate(good)}
+        last = max(good, default=-1) + 1
+        moving: list[bytes | None] = [None] * last
+        for node, mask in self._rows("moving"):
+            try:
+                if node in keyframes and (cloud := self._payload(node)[0]) is not None:
+                    unpack_mask(mask, len(unpack_cloud(cloud)))
+                    moving[node] = mask
+            except (ValueError, TypeError) as error:
+                self._problem(f"keyframe {node}: which points move is lost: {error}")
+        edges = self._edges(new)
+        edges = self._bridged(edges, [keyframes[node] for node in good], [session[node] for node in good])
+        trail = self._trail(new)
+        # A map in the old numbers with holes, of which the good nodes are then taken.
+        nothing = pack_cloud(NO_POINTS)
+        filler = Keyframe(0, 0, 0, np.eye(4), NO_POINTS)
+        whole = MapData(
+            [keyframes.get(node, filler) for node in range(last)],
+            [session.get(node, 1) for node in range(last)],
+            np.array([poses.get(node, np.eye(4)) for node in range(last)]).reshape(-1, 4, 4),
+            [],
+            [],
+            self._sessions(session),
+            CloudStore(lambda node: self._payload(node)[0] or nothing, moving, loans),
+            lambda node: self._payload(node)[2],
+        )
+        return subset(whole, good, edges, trail)
+
+    def _keyframes(self) -> tuple[dict[int, Keyframe], dict[int, int], dict[int, Loan]]:
+        keyframes: dict[int, Keyframe] = {}
+        session: dict[int, int] = {}
+        loans: dict[int, Loan] = {}
+        for row in self._rows("keyframes"):
+            try:
+                node, keyframes[row[0]], session[row[0]], loan = rows.keyframe_of(row)
+            except ValueError as error:
+                self._problem(f"keyframe {row[0]}: {error}")
+                continue
+            if loan is not None:
+                loans[node] = loan
+        end = self._end()
+        if missing := sorted(set(range(end)) - keyframes.keys()):
+            self._problem(f"keyframes lost: {_listed(missing)}")
+            self._findings.lost = len(missing)
+        for node, loan in list(loans.items()):
+            if loan.lender not in keyframes or loan.lender in loans:
+                self._problem(f"keyframe {node}: borrows the cloud of {loan.lender}, which is lost or has none")
+                del loans[node]
+        without = [node for node in keyframes if node not in loans and self._payload(node, complain=True)[0] is None]
+        self._findings.lost_clouds = len(without)
+        for node in keyframes.keys() - set(without) - loans.keys():
+            packed = self._payload(node)[1]
+            descriptors = None if packed is None else rows.unpack_descriptors(packed)
+            keyframes[node] = replace(keyframes[node], descriptors=descriptors)
+        return keyframes, session, loans
+
+    def _payload(self, node: int, complain: bool = False) -> tuple[bytes | None, bytes | None, bytes | None]:
+        """Packed cloud, descriptors and thumbnail of a node, if they are good."""
+        try:
+            row = self._row("payloads", node)
+            if row is None:
+                raise ValueError("none there")
+            unpack_cloud(row[1])
+            if row[2] is not None:
+                rows.unpack_descriptors(row[2])
+            return row[1], row[2], row[3]
+        except (ValueError, TypeError) as error:
+            if complain:
+                self._problem(f"keyframe {node}: its payload is lost: {error}")
+            return None, None, None
+
+    def _poses(self, keyframes: dict[int, Keyframe]) -> dict[int, Array]:
+        """T_map_kf by node; one that is lost follows from the keyframe before, by odometry."""
+        stored = dict(self._rows("poses"))
+        poses: dict[int, Array] = {}
+        T_map_odom = np.eye(4)
+        for node in sorted(keyframes):
+            try:
+                if node not in stored:
+                    raise ValueError("lost")
+                T = rows.pose_of(stored[node])
+            except ValueError as error:
+                self._problem(f"keyframe {node}: its optimised pose is {error}")
+                T = T_map_odom @ keyframes[node].T_odom_kf
+            poses[node] = T
+            T_map_odom = T @ se3.inverse(keyframes[node].T_odom_kf)
+        return poses
+
+    def _edges(self, new: dict[int, int]) -> list[Edge]:
+        edges = []
+        for row in self._rows("edges"):
+            try:
+                edge = rows.edge_of(row)
+                rows.check_ends(edge, new)
+            except ValueError as error:
+                self._problem(f"edge {row[0]}: {error}")
+            else:
+                edges.append(replace(edge, from_node=new[edge.from_node], to_node=new[edge.to_node]))
+        return edges
+
+    def _trail(self, new: dict[int, int]) -> list[Pruned]:
+        trail = []
+        for row in self._rows("trail", "rowid"):
+            try:
+                pruned = rows.pruned_of(row)
+                trail.append(replace(pruned, node=new[pruned.node]))
+            except (ValueError, KeyError):
+                self._problem(f"trail {row[0]}: not a pose beside a keyframe that is there")
+        return trail
+
+    def _bridged(self, edges: list[Edge], keyframes: list[Keyframe], session: list[int]) -> list[Edge]:
+        """With odometry edges over the holes that lost keyframes and edges have left."""
+        tied = {edge.to_node for edge in edges if edge.kind == "odometry"}
+        out = list(edges)
+        for node in range(1, len(keyframes)):
+            a, b = keyframes[node - 1], keyframes[node]
+            if node not in tied and (session[node], b.robot) == (session[node - 1], a.robot) and b.id > 0:
+                T_a_b = se3.inverse(a.T_odom_kf) @ b.T_odom_kf
+                out.append(Edge("odometry", node - 1, node, T_a_b, _DOUBT, method="bridge"))
+        return out
+
+    def _sessions(self, session: dict[int, int]) -> list[Session]:
+        try:
+            return [rows.session_of(row) for row in self._sql.execute("SELECT * FROM sessions ORDER BY session")]
+        except (sqlite3.DatabaseError, ValueError) as error:
+            self._problem(f"sessions: {error}")
+            return [Session(number, "", "", "", "") for number in sorted(set(session.values()))]
+
+    def _rows(self, table: str, key: str = "") -> Iterator[tuple[Any, ...]]:
+        """The good rows of a table, each fetched by its key so that a damaged page costs only what is on it."""
+        key = key or schema.CONTENT[table][0]
+        for number in range(self._last(table, key) + 1):
+            try:
+                row = self._row(table, number, key)
+            except ValueError as error:
+                self._problem(f"{table} {number}: {error}")
+                continue
+            if row is not None:
+                yield row
+
+    def _row(self, table: str, number: int, key: str = "") -> tuple[Any, ...] | None:
+        names = schema.CONTENT[table]
+        query = f"SELECT {', '.join(names)}, crc FROM {table} WHERE {key or names[0]} = ?"
+        try:
+            row = self._sql.execute(query, (number,)).fetchone()
+        except (sqlite3.DatabaseError, OverflowError, UnicodeDecodeError) as error:
+            raise ValueError(str(error)) from None
+        if row is None:
+            return None
+        try:
+            intact = schema.row_crc(*row[:-1]) == row[-1]
+        except Exception:  # values of types that no row has
+            intact = False
+        if not intact:
+            raise ValueError("its checksum is wrong")
+        return tuple(row[:-1])
+
+    def _last(self, table: str, key: str) -> int:
+        try:
+            last = int(self._sql.execute(f"SELECT coalesce(max({key}), -1) FROM {table}").fetchone()[0])
+        except (sqlite3.DatabaseError, TypeError, ValueError):
+            return min(self._end() * 10, self._most)  # of edges there are several a keyframe
+        if last > self._most:
+            self._problem(f"{table}: a row {last} in a file of at most {self._most}")
+        return min(last, self._most)
+
+    def _end(self) -> int:
+        """One more than the last node that any table knows."""
+        last = -1
+        for table in ("keyframes", "payloads", "poses"):
+            with suppress(sqlite3.DatabaseError, TypeError, ValueError):
+                last = max(last, int(self._sql.execute(f"SELECT coalesce(max(node), -1) FROM {table}").fetchone()[0]))
+        return min(last, self._most) + 1
+
+    def _problem(self, text: str) -> None:
+        self._findings.problems.append(text)
+
+
+def _listed(numbers: list[int]) -> str:
+    return ", ".join(map(str, numbers[:10])) + (f" and {len(numbers) - 10} more" if len(numbers) > 10 else "")

@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Keyframe clouds on disk: the memory of a drive does not grow with its clouds."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from typing import BinaryIO, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dpm2_core.errors import Dpm2Error
+from dpm2_core.frame import Array, Points
+from dpm2_core.geometry import se3
+from dpm2_core.slam.store.cloud_codec import CodecError, pack_mask, unpack_cloud, unpack_mask
+
+Reader = Callable[[int], bytes | None]
+
+
+@dataclass(frozen=True, eq=False)
+class Loan:
+    """Whose cloud a redundant keyframe shows: that of `lender`, moved by T_kf_lender (4, 4)."""
+
+    lender: int
+    T_kf_lender: Array
+
+
+class SpillFile:
+    """Append-only pieces of bytes in an anonymous file, gone when the process is.
+
+    A disk that is full or not there is no reason to lose a map: the pieces then stay in memory.
+    """
+
+    def __init__(self) -> None:
+        self._where: list[tuple[int, int] | bytes] = []  # offset and length, or the bytes themselves
+        self._end = 0
+        self._file: BinaryIO | None = None
+        with suppress(OSError):
+            self._file = tempfile.TemporaryFile(prefix="dpm2_clouds_", buffering=0)  # noqa: SIM115
+
+    def append(self, data: bytes) -> int:
+        """Keep a piece; returns its number."""
+        try:
+            if self._file is None:
+                raise OSError("no temporary file")
+            self._file.seek(self._end)
+            if self._file.write(data) != len(data):
+                raise OSError("disk full")
+            self._where.append((self._end, len(data)))
+            self._end += len(data)
+        except OSError:
+            self._where.append(data)
+        return len(self._where) - 1
+
+    def read(self, number: int) -> bytes:
+        """A piece by its number."""
+        where = self._where[number]
+        if isinstance(where, bytes):
+            return where
+        assert self._file is not None
+        self._file.seek(where[0])
+        return self._file.read(where[1])
+
+
+class CloudStore(Sequence[Points]):
+    """The packed clouds of keyframes 0, 1, ...: in the map file where it holds them, else in a temporary one.
+
+    An item is the (M, 4) float32 cloud without the points that were found to move; `whole` has them too. A keyframe
+    that a revisit made redundant has none of its own: it borrows that of the keyframe it came back to.
+    """
+
+    def __init__(
+        self,
+        stored: Reader | None = None,
+        moving: Sequence[bytes | None] = (),
+        loans: Mapping[int, Loan] | None = None,
+        name: str = "map",
+    ) -> None:
+        """Empty, or with the clouds of a map file.
+
+        Args:
+            stored: reads a packed cloud from the file.
+            moving: packed mask, or None, of each that is in the file.
+            loans: those among them that have no cloud of their own.
+            name: of the map, for errors.
+        """
+        self._name = name
+        self._stored = stored
+        self._spill = SpillFile()
+        self._where: list[int | bytes | None] = [None] * len(moving)  # number in the temporary file; None: map file
+        self._moving = {index: mask for index, mask in enumerate(moving) if mask is not None}
+        self._loans = dict(loans or {})
+
+    def append(self, packed: bytes) -> None:
+        """The cloud of the next keyframe: in memory until the map file has it, or else the next one comes."""
+        if self._where and isinstance(last := self._where[-1], bytes):
+            self._where[-1] = self._spill.append(last)
+        self._where.append(packed)
+
+    def set_stored(self, index: int) -> None:
+        """The map file has it now."""
+        self._where[index] = None
+
+    def borrow(self, index: int, loan: Loan) -> None:
+        """Give a cloud up for that of another keyframe, which has its own."""
+        self._loans[index] = loan
+        self._where[index] = None
+        self._moving.pop(index, None)
+
+    def loan(self, index: int) -> Loan | None:
+        """Whose cloud it is, where it is not its own."""
+        return self._loans.get(index)
+
+    def set_moving(self, index: int, moving: NDArray[np.bool_]) -> None:
+        """Leave those points (M,) of a cloud out from now on."""
+        self._moving[index] = pack_mask(moving)
+
+    def moving(self, index: int) -> bytes | None:
+        """The packed mask of points that move; None: none is known."""
+        return self._moving.get(index)
+
+    def packed(self, index: int) -> bytes | None:
+        """The bytes of a cloud; None where it is borrowed."""
+        where = self._where[index]
+        if index in self._loans:
+            return None
+        if isinstance(where, int):
+            return self._spill.read(where)
+        return where if where is not None or self._stored is None else self._stored(index)
+
+    def whole(self, index: int) -> Points:
+        """(M, 4) with all its points; a borrowed one has none.
+
+        Raises:
+            Dpm2Error: it is damaged.
+        """
+        data = self.packed(range(len(self))[index])
+        with self._named(index):
+            return np.zeros((0, 4), np.float32) if data is None else unpack_cloud(data)
+
+    @contextmanager
+    def _named(self, index: int) -> Iterator[None]:
+        try:
+            yield
+        except CodecError as error:
+            raise Dpm2Error(f"{self._name}: keyframe {index}: {error}; see dpm2 map check") from None
+
+    def __len__(self) -> int:
+        return len(self._where)
+
+    @overload
+    def __getitem__(self, index: int) -> Points: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[Points]: ...
+
+    def __getitem__(self, index: int | slice) -> Points | list[Points]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(len(self))[index]]
+        index = range(len(self))[index]
+        if (loan := self._loans.get(index)) is not None:
+            return se3.transform(loan.T_kf_lender, self[loan.lender])
+        cloud = self.whole(index)
+        moving = self._moving.get(index)
+        with self._named(index):
+            return cloud if moving is None or not len(cloud) else cloud[~unpack_mask(moving, len(cloud))]

@@ -1,0 +1,264 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A whole map in memory, but for its clouds, which stay in the file: what mapper and tools begin with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from dpm2_core.errors import Dpm2Error
+from dpm2_core.frame import Array, Keyframe, Points, Registration
+from dpm2_core.geometry import se3
+from dpm2_core.geometry.voxel import voxel_first
+from dpm2_core.slam.graph.pose_graph import PoseGraph
+from dpm2_core.slam.store.cloud_store import CloudStore, Loan
+from dpm2_core.slam.store.map_store import Change, MapStore
+from dpm2_core.slam.store.rows import NO_POINTS as NO_POINTS
+from dpm2_core.slam.store.rows import (
+    Edge,
+    Pruned,
+    Session,
+    check_ends,
+    edge_of,
+    keyframe_of,
+    pose_of,
+    pruned_of,
+    session_of,
+    unpack_descriptors,
+)
+
+_T = TypeVar("_T")
+Thumbnail = Callable[[int], bytes | None]
+
+
+@dataclass(eq=False)
+class MapData:
+    """A map. A node is a position among the keyframes.
+
+    Attributes:
+        keyframes: without clouds. session: of each, from 1. poses: (N, 4, 4) optimised T_map_kf.
+        edges: odometry and loops, refused ones too. trail: keyframes that were pruned. sessions: who wrote it.
+        clouds: of each keyframe, read from the file when asked for.
+        thumbnail: JPEG of a node, or None.
+    """
+
+    keyframes: list[Keyframe]
+    session: list[int]
+    poses: Array
+    edges: list[Edge]
+    trail: list[Pruned]
+    sessions: list[Session]
+    clouds: CloudStore
+    thumbnail: Thumbnail = field(default=lambda node: None)
+
+    def __len__(self) -> int:
+        return len(self.keyframes)
+
+    @property
+    def constraints(self) -> list[Edge]:
+        """The edges that hold: odometry and accepted loops."""
+        return [edge for edge in self.edges if edge.ok]
+
+
+def load_map(store: MapStore, descriptors: bool = True) -> MapData:
+    """Read a map, which stays open for its clouds; `descriptors` False leaves those in the file, too.
+
+    Raises:
+        Dpm2Error: it is damaged; the message says where.
+    """
+    try:
+        with store.snapshot():
+            return _load(store, descriptors)
+    except ValueError as error:
+        raise Dpm2Error(f"{store.path}: {error}; see dpm2 map check") from None
+
+
+def _load(store: MapStore, descriptors: bool) -> MapData:
+    keyframes, session, loans = _load_keyframes(store, descriptors)
+    nodes = range(len(keyframes))
+    edges = []
+    for number, edge in _made(store, "edges", edge_of):
+        with _of("edge", number):
+            check_ends(edge, nodes)
+        edges.append(edge)
+    owner = [(keyframe.robot, number) for keyframe, number in zip(keyframes, session, strict=True)]
+    for node, edge in _chain(edges).items():
+        if owner[edge.from_node] == owner[node]:
+            known = (edge.T_from_to, edge.covariance, edge.confidence, edge.rmse, edge.method)
+            keyframes[node] = replace(keyframes[node], edge=Registration(*known))
+    poses = dict(_made(store, "poses", lambda row: pose_of(row[1])))
+    if missing := set(nodes) - poses.keys():
+        raise ValueError(f"keyframe {min(missing)} has no pose")
+    moving: dict[int, bytes] = dict(store.rows("moving"))
+    if not all(isinstance(mask, bytes) for mask in moving.values()):
+        raise ValueError("a mask of moving points that is none")
+    trail = [pruned for _, pruned in _made(store, "trail", pruned_of)]
+    if any(pruned.node not in nodes for pruned in trail):
+        raise ValueError("a pruned keyframe that belongs to none")
+    return MapData(
+        keyframes,
+        session,
+        np.array([poses[node] for node in nodes]).reshape(-1, 4, 4),
+        edges,
+        trail,
+        [made for _, made in _made(store, "sessions", session_of)],
+        CloudStore(store.cloud, [moving.get(node) for node in nodes], loans, str(store.path)),
+        lambda node: store.payload(node, "thumbnail"),
+    )
+
+
+def _load_keyframes(store: MapStore, descriptors: bool) -> tuple[list[Keyframe], list[int], dict[int, Loan]]:
+    """Keyframes with their odometry's pose, and descriptors if wanted; their sessions; those that borrow."""
+    keyframes, session, loans = [], [], {}
+    for position, (_, (node, keyframe, number, loan)) in enumerate(_made(store, "keyframes", keyframe_of)):
+        if node != position:
+            raise ValueError(f"keyframe {position} is missing")
+        keyframes.append(keyframe)
+        session.append(number)
+        if loan is not None:
+            loans[node] = loan
+    for node, loan in loans.items():  # a lender has a cloud of its own: there are no chains, and so no circles
+        if not 0 <= loan.lender < len(keyframes) or loan.lender in loans:
+            raise ValueError(f"keyframe {node} borrows the cloud of {loan.lender}, which has none")
+    if descriptors:
+        widths = set()
+        for node in range(len(keyframes)):
+            if (data := store.payload(node, "descriptors")) is not None:
+                with _of("keyframe", node):
+                    keyframes[node] = replace(keyframes[node], descriptors=(made := unpack_descriptors(data)))
+                    widths.add(made.features.shape[1])
+        if len(widths) > 1:
+            raise ValueError(f"descriptors of {', '.join(map(str, sorted(widths)))} channels, which cannot be compared")
+        for node, loan in loans.items():
+            keyframes[node] = borrowing(keyframes[node], keyframes, loan)
+    return keyframes, session, loans
+
+
+def _made(store: MapStore, table: str, make: Callable[[tuple[Any, ...]], _T]) -> Iterator[tuple[int, _T]]:
+    """Number and noun of each row of a table; which row an error is about is added to it."""
+    for row in store.rows(table):
+        with _of(table.removesuffix("s"), row[0]):
+            made = make(row)
+        yield row[0], made
+
+
+@contextmanager
+def _of(what: str, number: int) -> Iterator[None]:
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{what} {number}: {error}") from None
+
+
+def borrowing(keyframe: Keyframe, keyframes: Sequence[Keyframe], loan: Loan) -> Keyframe:
+    """The keyframe with the descriptors of another one, moved to its own frame; their features take no memory."""
+    lent = keyframes[loan.lender].descriptors
+    return replace(keyframe, descriptors=None if lent is None else lent.moved(loan.T_kf_lender))
+
+
+def save_as(data: MapData, path: Path) -> None:
+    """Write a map to a new file, which appears whole or not at all; clouds pass through one at a time.
+
+    Raises:
+        UsageError: there is a file already. Dpm2Error: it could not be written.
+    """
+    part = path.with_name(f".{path.name}.part")
+    _remove(part)
+    MapStore.create(path).close()  # refuses a file that is there, and a folder that cannot be written
+    try:
+        with MapStore.create(part) as store:
+            _fill(store, data)
+        part.replace(path)
+    except BaseException:
+        _remove(path)
+        raise
+    finally:
+        _remove(part)
+
+
+def _fill(store: MapStore, data: MapData) -> None:
+    store.add_sessions(data.sessions)
+    sessions = dict(enumerate(data.session))
+    for node, keyframe in enumerate(data.keyframes):
+        packed = data.clouds.loan(node) or data.clouds.packed(node)
+        mask = data.clouds.moving(node)
+        change = Change(
+            keyframes=[(node, keyframe, packed, data.thumbnail(node))],
+            poses={node: data.poses[node]},
+            moving={} if mask is None else {node: mask},
+        )
+        store.write(change, sessions)
+    store.write(Change(edges=data.edges, trail=data.trail))
+
+
+def _remove(path: Path) -> None:
+    for suffix in ("", "-wal", "-shm", "-journal"):
+        Path(f"{path}{suffix}").unlink(missing_ok=True)
+
+
+def subset(data: MapData, nodes: Sequence[int], edges: list[Edge], trail: list[Pruned]) -> MapData:
+    """The map of some of its nodes, lenders among them, renumbered; `edges` and `trail` are in the new numbers."""
+    where = list(nodes)
+    new = {node: i for i, node in enumerate(where)}
+    loans = {new[node]: Loan(new[loan.lender], loan.T_kf_lender) for node in where if (loan := data.clouds.loan(node))}
+    clouds = CloudStore(lambda i: data.clouds.packed(where[i]), [data.clouds.moving(node) for node in where], loans)
+    return MapData(
+        [data.keyframes[node] for node in where],
+        [data.session[node] for node in where],
+        data.poses[where],
+        edges,
+        trail,
+        data.sessions,
+        clouds,
+        lambda node: data.thumbnail(where[node]),
+    )
+
+
+def map_cloud(clouds: CloudStore, poses: Array, voxel: float) -> Points:
+    """The cloud (M, 4) float32 of a map in its frame, one point in each voxel of `voxel` m."""
+    cloud = NO_POINTS
+    own = [node for node in range(len(poses)) if clouds.loan(node) is None]
+    for start in range(0, len(own), 50):  # in parts: memory is that of the map, not of all the clouds
+        part = own[start : start + 50]
+        cloud = np.concatenate([cloud, *(se3.transform(poses[node], clouds[node]) for node in part)])
+        cloud = cloud[voxel_first(cloud, voxel)]
+    return cloud
+
+
+def trajectory(data: MapData) -> tuple[list[int], Array]:
+    """Stamps (ns) and (K, 4, 4) T_map_kf of all keyframes that ever were, pruned ones too, by robot and time."""
+    rows = [(k.robot, s, k.stamp, T) for k, s, T in zip(data.keyframes, data.session, data.poses, strict=True)]
+    rows += [(p.robot, p.session, p.stamp, data.poses[p.node] @ p.T_node_kf) for p in data.trail]
+    rows.sort(key=lambda row: row[:3])
+    return [row[2] for row in rows], np.array([row[3] for row in rows]).reshape(-1, 4, 4)
+
+
+def restore(graph: PoseGraph, data: MapData) -> None:
+    """Fill an empty pose graph with the nodes and constraints of a map."""
+    chain = _chain(data.constraints)
+    for node, T_map_kf in enumerate(data.poses):
+        if (edge := chain.get(node)) is not None:
+            graph.add_node(T_map_kf, edge.T_from_to, edge.covariance, edge.from_node)
+        else:
+            graph.add_node(T_map_kf, None, None)
+    for edge in data.constraints:
+        if chain.get(edge.to_node) is not edge:
+            graph.add_loop(edge.from_node, edge.to_node, edge.T_from_to, edge.covariance)
+
+
+def _chain(edges: Iterable[Edge]) -> dict[int, Edge]:
+    """The odometry by the node that it leads to: no node has two before it, or two after it."""
+    chain: dict[int, Edge] = {}
+    left: set[int] = set()
+    # Nearest nodes first: what pruning has left goes round about.
+    odometry = (edge for edge in edges if edge.ok and edge.kind == "odometry" and edge.from_node < edge.to_node)
+    for edge in sorted(odometry, key=lambda edge: edge.to_node - edge.from_node):
+        if edge.to_node not in chain and edge.from_node not in left:
+            chain[edge.to_node] = edge
+            left.add(edge.from_node)
+    return chain

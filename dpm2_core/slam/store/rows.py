@@ -1,0 +1,245 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Between the nouns and the rows of a map file; see schema.py.
+
+A row may come from anybody, its checksum right: what is made of it is of the right types, finite and within bounds.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+from collections.abc import Container
+from dataclasses import dataclass
+from itertools import accumulate
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from dpm2_core.descriptors import Descriptors
+from dpm2_core.errors import Dpm2Error
+from dpm2_core.frame import Array, Keyframe, Points
+from dpm2_core.geometry import se3
+from dpm2_core.slam.store.cloud_store import Loan
+from dpm2_core.slam.store.schema import row_crc
+
+NO_POINTS: Points = np.zeros((0, 4), np.float32)
+_FARTHEST = 1e7  # m: from there on float32 clouds are metres off
+_LONGEST_NAME = 255
+_DESCRIPTORS = struct.Struct("<IIB")  # number, channels, whether there are axes
+
+
+@dataclass(frozen=True, eq=False)
+class Edge:
+    """A constraint of the pose graph, or a loop that was tried and refused.
+
+    Attributes:
+        kind: "odometry" or "loop".
+        from_node, to_node: positions in the map.
+        T_from_to: (4, 4). covariance: (6, 6) [rotation rad, translation m] of xi in T_from_to @ Exp(xi).
+        ok: False for a refused loop; `reason` says why.
+        confidence, rmse, method: of the registration.
+    """
+
+    kind: Literal["odometry", "loop"]
+    from_node: int
+    to_node: int
+    T_from_to: Array
+    covariance: Array
+    ok: bool = True
+    confidence: float = 1.0
+    rmse: float = 0.0
+    method: str = ""
+    reason: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Pruned:
+    """A keyframe that is no longer there: `T_node_kf` (4, 4) from a node that is."""
+
+    id: int
+    robot: str
+    session: int
+    stamp: int
+    node: int
+    T_node_kf: Array
+
+
+@dataclass(frozen=True)
+class Session:
+    """One drive into a map: number from 1, version of the program, start (ISO 8601), YAML, weights (`weights_id`)."""
+
+    number: int
+    program: str
+    started: str
+    config: str
+    weights: str
+
+
+def weights_id(path: Path) -> str:
+    """What identifies weights: name and the first 16 digits of the file's SHA-256.
+
+    Raises:
+        Dpm2Error: the file cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            return f"{path.stem} {hashlib.file_digest(file, 'sha256').hexdigest()[:16]}"
+    except OSError as error:
+        raise Dpm2Error(f"{path}: {error.strerror}") from None
+
+
+def array_bytes(array: Array) -> bytes:
+    """Little-endian float64, row by row."""
+    return np.ascontiguousarray(array, "<f8").tobytes()
+
+
+def bytes_array(data: Any, side: int) -> Array:
+    """(side, side) float64.
+
+    Raises:
+        ValueError: not so many bytes, or none.
+    """
+    if not isinstance(data, bytes) or len(data) != 8 * side * side:
+        size = len(data) if isinstance(data, bytes) else "no"
+        raise ValueError(f"{size} bytes for a {side} by {side} matrix")
+    return np.frombuffer(data, "<f8").reshape(side, side).astype(np.float64)
+
+
+def pose_of(data: Any) -> Array:
+    """(4, 4) of its bytes.
+
+    Raises:
+        ValueError: not a finite rigid transform to a place on Earth.
+    """
+    T = bytes_array(data, 4)
+    if not se3.is_rigid(T) or np.abs(T[:3, 3]).max() > _FARTHEST:
+        raise ValueError("not a finite rigid transform")
+    return T
+
+
+def pack_descriptors(d: Descriptors) -> bytes:
+    """xyz float32, features float16, axes float32 if there are any."""
+    head = _DESCRIPTORS.pack(len(d), d.features.shape[1], d.axis is not None)
+    axis = b"" if d.axis is None else np.ascontiguousarray(d.axis, "<f4").tobytes()
+    xyz, features = np.ascontiguousarray(d.xyz, "<f4"), np.ascontiguousarray(d.features, "<f2")
+    return head + xyz.tobytes() + features.tobytes() + axis
+
+
+def unpack_descriptors(data: bytes) -> Descriptors:
+    """The inverse of `pack_descriptors`.
+
+    Raises:
+        ValueError: the bytes are no descriptors.
+    """
+    if len(data) < _DESCRIPTORS.size:
+        raise ValueError("no descriptors: too few bytes")
+    n, channels, axes = _DESCRIPTORS.unpack_from(data)
+    end = list(accumulate((_DESCRIPTORS.size, 12 * n, 2 * n * channels, 8 * n * bool(axes))))
+    if len(data) != end[-1] or not n or not channels:
+        raise ValueError(f"no descriptors: {len(data)} bytes for {n} of {channels}")
+    xyz = np.frombuffer(data, "<f4", 3 * n, end[0]).reshape(n, 3).copy()
+    features = np.frombuffer(data, "<f2", n * channels, end[1]).reshape(n, channels).copy()
+    axis = np.frombuffer(data, "<f4", 2 * n, end[2]).reshape(n, 2).copy() if axes else None
+    if not all(np.isfinite(part).all() for part in (xyz, features, axis) if part is not None):
+        raise ValueError("no descriptors: values that are not finite")
+    return Descriptors(xyz, features, axis)
+
+
+def with_crc(*values: Any) -> tuple[Any, ...]:
+    """A row and its checksum."""
+    return (*values, row_crc(*values))
+
+
+def keyframe_row(node: int, keyframe: Keyframe, session: int, loan: Loan | None) -> tuple[Any, ...]:
+    """Of table `keyframes`."""
+    k = keyframe
+    lent = (None, None) if loan is None else (int(loan.lender), array_bytes(loan.T_kf_lender))
+    return with_crc(node, k.id, k.robot, session, k.stamp, k.index, array_bytes(k.T_odom_kf), *lent)
+
+
+def keyframe_of(row: tuple[Any, ...]) -> tuple[int, Keyframe, int, Loan | None]:
+    """Node, keyframe without cloud and descriptors, session, and whose cloud it borrows, of a row of `keyframes`.
+
+    Raises:
+        ValueError: a value that no keyframe has.
+    """
+    node, id, robot, session, stamp, frame, T, lender, T_lent = row
+    _check_types((node, id, session, stamp, frame), robot)
+    keyframe = Keyframe(id, stamp, frame, pose_of(T), NO_POINTS, None, robot)
+    if lender is None:
+        return node, keyframe, session, None
+    _check_types((lender,))
+    return node, keyframe, session, Loan(lender, pose_of(T_lent))
+
+
+def edge_row(number: int, e: Edge) -> tuple[Any, ...]:
+    """Of table `edges`."""
+    T, covariance = array_bytes(e.T_from_to), array_bytes(e.covariance)
+    # SQLite has no NaN
+    numbers = (int(e.ok), *(float(x) if x == x else float("inf") for x in (e.confidence, e.rmse)))
+    return with_crc(number, e.kind, int(e.from_node), int(e.to_node), T, covariance, *numbers, e.method, e.reason)
+
+
+def edge_of(row: tuple[Any, ...]) -> Edge:
+    """Of a row of table `edges` without its checksum.
+
+    Raises:
+        ValueError: a value that no edge has; the nodes may be any.
+    """
+    _, kind, from_node, to_node, T, covariance, ok, confidence, rmse, method, reason = row
+    _check_types((from_node, to_node, ok), kind)
+    if kind not in ("odometry", "loop") or not all(isinstance(text, str) for text in (method, reason)):
+        raise ValueError(f"{kind!r} is not a kind of edge")
+    if not all(isinstance(x, float) and x == x for x in (confidence, rmse)):
+        raise ValueError("its confidence or rmse is no number")
+    try:
+        T, covariance = pose_of(T), bytes_array(covariance, 6)
+        if not np.isfinite(covariance).all() or (ok and not se3.is_covariance(covariance)):
+            raise ValueError
+    except ValueError:
+        raise ValueError("not a finite rigid transform with a positive covariance") from None
+    return Edge(kind, from_node, to_node, T, covariance, bool(ok), confidence, rmse, method, reason)
+
+
+def check_ends(edge: Edge, nodes: Container[int]) -> None:
+    """Raises ValueError unless both ends of an edge are among the nodes."""
+    if edge.from_node not in nodes or edge.to_node not in nodes or edge.from_node == edge.to_node:
+        raise ValueError(f"leads from {edge.from_node} to {edge.to_node}, which are not both there")
+
+
+def pruned_row(p: Pruned) -> tuple[Any, ...]:
+    """Of table `trail`."""
+    return with_crc(p.id, p.robot, p.session, p.stamp, p.node, array_bytes(p.T_node_kf))
+
+
+def pruned_of(row: tuple[Any, ...]) -> Pruned:
+    """Of a row of table `trail` without its checksum.
+
+    Raises:
+        ValueError: a value that none has; the node may be any.
+    """
+    id, robot, session, stamp, node, T_node_kf = row
+    _check_types((id, session, stamp, node), robot)
+    return Pruned(id, robot, session, stamp, node, pose_of(T_node_kf))
+
+
+def session_of(row: tuple[Any, ...]) -> Session:
+    """Of a row of table `sessions`.
+
+    Raises:
+        ValueError: a value that none has.
+    """
+    number, *texts = row
+    _check_types((number,))
+    if not all(isinstance(text, str) for text in texts):
+        raise ValueError("a session that is not in words")
+    return Session(number, *texts)
+
+
+def _check_types(numbers: tuple[Any, ...], name: Any = "") -> None:
+    """SQLite lets any column hold anything. Raises ValueError unless it is integers and a name of bearable length."""
+    if not all(isinstance(number, int) for number in numbers):
+        raise ValueError("something else where a whole number belongs")
+    if not isinstance(name, str) or len(name) > _LONGEST_NAME:
+        raise ValueError(f"no name, or one of more than {_LONGEST_NAME} characters")

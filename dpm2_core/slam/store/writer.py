@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Keeps a map file up to date with the mapper; when it cannot, the drive goes on in memory and the file catches up."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dpm2_core.errors import Dpm2Error
+from dpm2_core.frame import Array, Keyframe
+from dpm2_core.slam.store.cloud_store import CloudStore
+from dpm2_core.slam.store.map_store import Change, MapStore
+from dpm2_core.slam.store.rows import Edge
+
+_BATCH = 20  # keyframes a transaction while catching up: memory is that of so many clouds
+_STILL = 1e-4  # m and rad: poses that move by less are not worth writing
+
+
+class MapWriter:
+    """What the file does not have yet.
+
+    Attributes:
+        problem: why the last attempt to write failed, in words; empty when the file is up to date.
+    """
+
+    def __init__(self, store: MapStore, clouds: CloudStore, poses: Array) -> None:
+        """`poses` (N, 4, 4) are those that the file has."""
+        self.problem = ""
+        self._store, self._clouds = store, clouds
+        self._written = poses
+        self._keyframes: list[tuple[int, Keyframe, bytes | None]] = []
+        self._edges: list[Edge] = []
+        self._moving: set[int] = set()
+
+    def add(self, node: int, keyframe: Keyframe, thumbnail: bytes | None = None) -> None:
+        """A keyframe; its cloud is in the cloud store."""
+        self._keyframes.append((node, keyframe, thumbnail))
+
+    def add_edge(self, edge: Edge) -> None:
+        """An edge, after its keyframes."""
+        self._edges.append(edge)
+
+    def set_moving(self, node: int) -> None:
+        """The cloud store has a mask for that node."""
+        self._moving.add(node)
+
+    def sync(self, poses: Array) -> None:
+        """Write all that is new; (N, 4, 4) are the optimised poses. Never raises: see `problem`."""
+        try:
+            while len(self._keyframes) > _BATCH:
+                self._write(poses, self._keyframes[:_BATCH], last=False)
+            self._write(poses, self._keyframes, last=True)
+            self.problem = ""
+        except Dpm2Error as error:
+            self.problem = f"{error}; {len(self._keyframes)} keyframes are in memory only"
+
+    def _write(self, poses: Array, keyframes: list[tuple[int, Keyframe, bytes | None]], last: bool) -> None:
+        change, ends = Change(), keyframes[-1][0] + 1 if keyframes else len(self._written)
+        for node, keyframe, thumbnail in keyframes:
+            cloud = self._clouds.loan(node) or self._clouds.packed(node)
+            change.keyframes.append((node, keyframe, cloud, thumbnail))
+        change.edges = [edge for edge in self._edges if max(edge.from_node, edge.to_node) < ends]
+        change.poses = self._moved(poses[:ends] if not last else poses)
+        masks = {node: self._clouds.moving(node) for node in self._moving if node < ends}
+        change.moving = {node: mask for node, mask in masks.items() if mask is not None}
+        self._store.write(change)
+        for node, *_ in keyframes:
+            self._clouds.set_stored(node)
+        self._keyframes = self._keyframes[len(keyframes) :]
+        self._edges = [edge for edge in self._edges if max(edge.from_node, edge.to_node) >= ends]
+        self._moving -= masks.keys()
+        written = np.array(poses[:ends] if not last else poses)
+        still = [node for node in range(min(len(self._written), len(written))) if node not in change.poses]
+        written[still] = self._written[still]  # small moves add up until they are worth writing
+        self._written = written
+
+    def _moved(self, poses: Array) -> dict[int, Array]:
+        """Poses that the file does not have, by node."""
+        known = min(len(self._written), len(poses))
+        moved = np.abs(poses[:known] - self._written[:known]).max((1, 2), initial=0.0) > _STILL
+        return {int(node): poses[node] for node in (*np.flatnonzero(moved), *range(known, len(poses)))}

@@ -1,0 +1,212 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Keyframes become a consistent map: loops remove drift, wrong loops are refused, corrections reach every frame."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+
+from dpm2_core.evaluation.metrics import ape_rmse
+from dpm2_core.frame import Array, Keyframe, Registration, State, Tracked
+from dpm2_core.geometry import se3
+from dpm2_core.sim.lidar import Lidar
+from dpm2_core.sim.settings import LidarConfig
+from dpm2_core.sim.world import build_world
+from dpm2_core.slam.graph.pose_graph import PoseGraph, PoseGraphSettings
+from dpm2_core.slam.output import TrajectoryRecorder, save_map
+from dpm2_core.slam.system import SlamSettings, make_mapper
+
+# Loops by descriptors have tests of their own; here the pose leads to the candidates, which is faster.
+BY_POSE = SlamSettings.model_validate({"loops": {"descriptors": False}})
+SIGMA = np.diag([1e-3, 1e-3, 1e-3, 0.02, 0.02, 0.02]) ** 2
+
+
+def found(T: Array, ok: bool = True) -> Registration:
+    return Registration(T, SIGMA, 0.9, 0.05, "test", ok)
+
+
+def drifting(poses: Array, drift: Array, cloud: np.ndarray) -> list[Keyframe]:
+    """Keyframes whose odometry errs by the tangent `drift` (6,) at each step, all with the same cloud."""
+    T_odom, keyframes = np.eye(4), []
+    for i in range(len(poses)):
+        edge = None
+        if i:
+            T = se3.inverse(poses[i - 1]) @ poses[i] @ se3.exp(drift)
+            T_odom, edge = T_odom @ T, found(T)
+        keyframes.append(Keyframe(i, i * 10**8, i, T_odom, cloud, edge))
+    return keyframes
+
+
+def circle(count: int, radius: float = 20.0) -> Array:
+    """A lap of `count` poses that ends where it began."""
+    turn = np.linspace(0, 2 * np.pi, count)
+    return se3.exp(np.array([0, 0, 1.0, radius, 0, 0]) * turn[:, None])
+
+
+def test_a_loop_edge_spreads_the_drift() -> None:
+    poses = circle(40)
+    graph = PoseGraph(PoseGraphSettings())
+    for keyframe in drifting(poses, np.array([0, 0, 5e-4, 0.01, 0, 0.005]), np.zeros((0, 4), np.float32)):
+        edge = keyframe.edge
+        graph.add_node(keyframe.T_odom_kf, edge and edge.T_target_source, edge and edge.covariance)
+    before = np.linalg.norm(graph.poses[:, :3, 3] - poses[:, :3, 3], axis=1)
+    graph.add_loop(0, 39, se3.inverse(poses[0]) @ poses[39], SIGMA)
+    graph.optimise()
+    after = np.linalg.norm(graph.poses[:, :3, 3] - poses[:, :3, 3], axis=1)
+    assert after[-1] < 0.1 * before[-1]
+    assert np.sqrt((after**2).mean()) < 0.5 * np.sqrt((before**2).mean())
+    np.testing.assert_allclose(graph.poses[0], np.eye(4), atol=1e-6)  # the first stays
+
+
+def test_one_wrong_loop_among_right_ones_bends_little() -> None:
+    poses = circle(40)
+    graph = PoseGraph(PoseGraphSettings())
+    for keyframe in drifting(poses, np.zeros(6), np.zeros((0, 4), np.float32)):
+        edge = keyframe.edge
+        graph.add_node(keyframe.T_odom_kf, edge and edge.T_target_source, edge and edge.covariance)
+    graph.add_loop(0, 39, se3.inverse(poses[0]) @ poses[39], SIGMA)
+    graph.add_loop(3, 20, np.eye(4), SIGMA)  # 40 m wrong
+    graph.optimise()
+    assert np.linalg.norm(graph.poses[:, :3, 3] - poses[:, :3, 3], axis=1).max() < 0.5
+
+
+def test_g2o_reads_back_at_full_precision(tmp_path: Path) -> None:
+    graph = PoseGraph(PoseGraphSettings())
+    poses = circle(5)
+    for keyframe in drifting(poses, np.array([1e-3, 2e-3, 3e-3, 0.1, 0.2, 0.3]), np.zeros((0, 4), np.float32)):
+        edge = keyframe.edge
+        graph.add_node(keyframe.T_odom_kf, edge and edge.T_target_source, edge and edge.covariance)
+    graph.write_g2o(tmp_path / "graph.g2o")
+    factors, values = gtsam.readG2o(str(tmp_path / "graph.g2o"), True)
+    for node in range(5):
+        np.testing.assert_allclose(values.atPose3(node).matrix(), graph.poses[node], atol=1e-12)
+    # The error that gtsam finds in the file is the one that the graph has: information and its order are right.
+    moved = gtsam.Values()
+    for node in range(5):
+        off = se3.exp(np.array([1e-3, -2e-3, 1e-3, 0.01, 0.02, -0.01]) * node)
+        moved.insert(node, gtsam.Pose3(graph.poses[node] @ off))
+    expected = 0.0
+    for a, b, T, covariance in graph.edges:
+        pose_a, pose_b = moved.atPose3(a).matrix(), moved.atPose3(b).matrix()
+        off = se3.log(se3.inverse(T) @ se3.inverse(pose_a) @ pose_b)
+        expected += 0.5 * off @ np.linalg.solve(covariance, off)
+    assert factors.error(moved) == pytest.approx(expected, rel=1e-3)  # quaternion against tangent, to second order
+
+
+@pytest.fixture(scope="module")
+def lap() -> tuple[list[Keyframe], Array]:
+    """Keyframes of a lap through a suburb that ends 15 m beyond its start, with odometry that drifts by 2 m."""
+    world = build_world("loop", "suburb", seed=4, length=220.0)
+    lidar, rng = Lidar(LidarConfig(columns=1024)), np.random.default_rng(0)
+    at = np.arange(0.0, world.road.drive.length + 15, 5.0)
+    poses = np.array([world.pose_at(float(s)) for s in at])
+    scans = [lidar.scan(world, T, 0.0, rng).points for T in poses]
+    keyframes = drifting(poses, np.array([0, 0, 5e-4, 0.03, 0.01, 0.01]), scans[0])
+    keyframes = [replace(k, cloud=points) for k, points in zip(keyframes, scans, strict=True)]
+    return keyframes, se3.inverse(poses[0]) @ poses
+
+
+def test_a_lap_is_closed(lap: tuple[list[Keyframe], Array]) -> None:
+    keyframes, truth = lap
+    mapper = make_mapper(BY_POSE)
+    for keyframe in keyframes:
+        mapper.add(keyframe)
+    open_ended = make_mapper(SlamSettings.model_validate({"loops": {"enabled": False}}))
+    for keyframe in keyframes:
+        open_ended.add(keyframe)
+    assert open_ended.closures == []
+    accepted = [c for c in mapper.closures if c.registration.ok]
+    assert accepted
+    for closure in accepted:  # each tells the true relative pose
+        true = se3.inverse(truth[closure.from_id]) @ truth[closure.to_id]
+        assert np.linalg.norm((se3.inverse(true) @ closure.registration.T_target_source)[:3, 3]) < 0.1
+    end, open_end = (np.linalg.norm((m.poses[-1] - truth[-1])[:3, 3]) for m in (mapper, open_ended))
+    assert end < 0.1 * open_end
+    assert ape_rmse(truth, mapper.poses) < 0.8 * ape_rmse(truth, open_ended.poses)  # the drift bends each step alike
+    # the odometry was not touched: T_map_odom carries the correction
+    last = mapper.T_map_odom @ keyframes[-1].T_odom_kf
+    np.testing.assert_allclose(last, mapper.poses[-1], atol=1e-6)
+
+
+def test_look_alikes_are_refused_with_a_reason(lap: tuple[list[Keyframe], Array]) -> None:
+    """The odometry claims to be back at the start, but the points come from elsewhere."""
+    keyframes, _ = lap
+    mapper = make_mapper(BY_POSE)
+    for keyframe in keyframes[:-4]:
+        mapper.add(keyframe)
+    elsewhere = keyframes[len(keyframes) // 2].cloud
+    for keyframe in keyframes[-4:]:
+        for closure in mapper.add(replace(keyframe, cloud=elsewhere)):
+            assert not closure.registration.ok
+            assert closure.registration.reason
+
+
+def test_map_is_one_point_a_voxel_in_the_map_frame(lap: tuple[list[Keyframe], Array]) -> None:
+    mapper = make_mapper(BY_POSE)
+    assert mapper.cloud().shape == (0, 4)
+    for keyframe in lap[0][:3]:
+        mapper.add(keyframe)
+    cloud = mapper.cloud(1.0)
+    assert len(np.unique(np.floor(cloud[:, :3]).astype(int), axis=0)) == len(cloud)
+    assert len(mapper.cloud(2.0)) < len(cloud)
+    assert cloud[:, 0].max() > lap[0][0].cloud[:, 0].max() + 4  # the later keyframes reach farther
+
+
+def tracked(index: int, T: Array, keyframe: Keyframe | None) -> Tracked:
+    return Tracked(index * 10**8, index, T, np.zeros((6, 6)), np.zeros(6), State.TRACKING, found(T), keyframe)
+
+
+def test_corrections_reach_the_frames_between_keyframes() -> None:
+    recorder = TrajectoryRecorder()
+    poses = se3.exp(np.arange(11)[:, None] * np.array([0, 0, 0.01, 1.0, 0, 0]))
+    cloud = np.zeros((0, 4), np.float32)
+    for i, T in enumerate(poses):
+        recorder.add(tracked(i, T, Keyframe(i // 5, i, i, T, cloud) if i % 5 == 0 else None))
+    shift = se3.exp([0, 0, 0, 0, 1.0, 0])
+    corrected = np.array([poses[0], shift @ poses[5], shift @ poses[10]])
+    out = recorder.poses(corrected)
+    np.testing.assert_allclose(out[[0, 5, 10]], corrected, atol=1e-12)
+    np.testing.assert_allclose(out[:6, 1, 3] - poses[:6, 1, 3], np.linspace(0, 1, 6), atol=1e-9)  # evenly, no step
+    np.testing.assert_allclose(out[6:, 1, 3] - poses[6:, 1, 3], 1.0, atol=1e-9)
+
+
+def test_no_keyframe_no_correction() -> None:
+    recorder = TrajectoryRecorder()
+    recorder.add(tracked(0, np.eye(4), None))
+    np.testing.assert_array_equal(recorder.poses(np.zeros((0, 4, 4))), np.eye(4)[None])
+
+
+def test_saved_map_holds_all_of_it(tmp_path: Path, lap: tuple[list[Keyframe], Array]) -> None:
+    from dpm2_core.data.trajectory import read_trajectory
+
+    mapper = make_mapper(BY_POSE)
+    for keyframe in lap[0][:4]:
+        mapper.add(keyframe)
+    save_map(mapper, tmp_path / "map")
+    trajectory = read_trajectory(tmp_path / "map" / "trajectory.tum")
+    np.testing.assert_allclose(trajectory.poses, mapper.poses, atol=1e-9)
+    header = (tmp_path / "map" / "map.ply").read_bytes()[:200].decode("ascii", "replace")
+    assert f"element vertex {len(mapper.cloud())}" in header
+    assert (tmp_path / "map" / "pose_graph.g2o").read_text().count("EDGE_SE3:QUAT") == 3
+
+
+def test_each_robot_has_its_own_odometry_and_is_placed_when_tied() -> None:
+    """Interleaved keyframes of two robots and a restart of one: edges lead within a drive, ids count on."""
+    mapper = make_mapper(BY_POSE)
+    poses, cloud = circle(6), np.zeros((0, 4), np.float32)
+    for one in drifting(poses, np.zeros(6), cloud):
+        for robot in ("red", "blue"):
+            mapper.add(replace(one, robot=robot))
+    assert [(a, b) for a, b, *_ in mapper.edges] == [(n, n + 2) for n in range(10)]
+    np.testing.assert_allclose(mapper.T_map_odom_of("red"), np.eye(4), atol=1e-9)
+    assert mapper.T_map_odom_of("blue") is None  # nothing says where it is in red's map
+    assert mapper.T_map_odom_of("green") is None
+    for one in drifting(poses, np.zeros(6), cloud)[:2]:  # red again
+        mapper.add(replace(one, robot="red"))
+    assert [k.id for k in mapper.keyframes if k.robot == "red"] == list(range(8))
+    assert mapper.edges[-1][:2] == (12, 13)
+    assert mapper.T_map_odom_of("red") is None

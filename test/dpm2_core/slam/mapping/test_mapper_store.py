@@ -1,0 +1,233 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Mapper and file together: they agree, sessions follow each other, laps do not pile up, a full disk is survived."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dpm2_core.errors import UsageError
+from dpm2_core.frame import Array, Keyframe, Points, Registration
+from dpm2_core.geometry import se3
+from dpm2_core.slam.graph.pose_graph import PoseGraph, PoseGraphSettings
+from dpm2_core.slam.loops.closure import LoopCloser
+from dpm2_core.slam.loops.consistency import Loop
+from dpm2_core.slam.mapping.mapper import Mapper, MapSettings
+from dpm2_core.slam.store.map_data import load_map
+from dpm2_core.slam.store.map_store import MapStore
+
+SIGMA = np.diag([1e-3] * 3 + [0.02] * 3) ** 2
+LAP = 20
+
+
+class KnownLoops(LoopCloser):
+    """Finds each keyframe of the lap before: the search itself is tested elsewhere."""
+
+    channels = None
+
+    def __init__(self) -> None:
+        pass
+
+    def described(self, keyframe: Keyframe) -> Keyframe:
+        return keyframe
+
+    def close(self, keyframes: Sequence[Keyframe], clouds: Sequence[Points], poses: Array) -> list[Loop]:
+        node = len(keyframes) - 1
+        if node < LAP:
+            return []
+        T = se3.exp([0, 0, 1e-4, 2e-3, 1e-3, 0])
+        return [
+            Loop(node - LAP, node, Registration(T, SIGMA, 0.9, 0.05, "known", node % 7 != 0, "no" * (node % 7 == 0)))
+        ]
+
+
+def make(store: MapStore | None = None, **settings: object) -> Mapper:
+    return Mapper(MapSettings.model_validate(settings), PoseGraph(PoseGraphSettings()), KnownLoops(), store)
+
+
+def laps(count: int, seed: int = 0) -> list[Keyframe]:
+    rng = np.random.default_rng(seed)
+    out: list[Keyframe] = []
+    for i in range(count * LAP):
+        T = se3.exp(np.array([0, 0, 1.0, 20, 0, 0]) * (2 * np.pi * i / LAP))
+        edge = Registration(se3.inverse(out[-1].T_odom_kf) @ T, SIGMA, 0.9, 0.05, "test") if i else None
+        points = np.column_stack([rng.uniform(-30, 30, (500, 3)), rng.random(500)]).astype(np.float32)
+        out.append(Keyframe(i, i * 10**8, i, T, points, edge))
+    return out
+
+
+def test_the_file_holds_what_the_mapper_holds(tmp_path: Path) -> None:
+    path = tmp_path / "a.dpm2map"
+    with MapStore.create(path) as store:
+        store.begin_session()
+        mapper = make(store)
+        for keyframe in laps(2):
+            mapper.add(keyframe)
+            assert mapper.store_problem == ""
+        mapper.finish()
+        clouds = list(mapper.clouds)
+    with MapStore.open(path) as store:
+        data = load_map(store)
+        np.testing.assert_allclose(data.poses, mapper.poses, atol=1.1e-4)  # smaller moves are not written
+        assert len(data.constraints) == len(mapper.edges)
+        assert sum(not edge.ok for edge in data.edges) == sum(not c.registration.ok for c in mapper.closures) == 3
+        again = make(store)
+        assert len(again.keyframes) == again.session_start == 40
+        for before, after in zip(clouds, again.clouds, strict=True):
+            np.testing.assert_array_equal(after, before)
+
+
+def test_four_laps_have_the_clouds_of_one(tmp_path: Path) -> None:
+    """A keyframe whose loop was refused keeps its own: three in the second lap; later ones borrow from these, too."""
+    sizes = []
+    for count in (1, 4):
+        path = tmp_path / f"{count}.dpm2map"
+        with MapStore.create(path) as store:
+            store.begin_session()
+            mapper = make(store)
+            for keyframe in laps(count):
+                mapper.add(keyframe)
+            own = sum(mapper._clouds.loan(node) is None for node in range(len(mapper.keyframes)))
+        sizes.append((own, path.stat().st_size))
+    (own_1, _), (own_4, _) = sizes
+    assert own_1 == LAP
+    refused = sum(node % 7 == 0 for node in range(LAP, 4 * LAP))
+    assert own_4 <= LAP + refused
+    off = make(redundancy={"distance": 0})
+    for keyframe in laps(2):
+        off.add(keyframe)
+    assert all(off._clouds.loan(node) is None for node in range(40))
+
+
+def test_a_borrowed_cloud_lies_where_the_loop_says(tmp_path: Path) -> None:
+    mapper, keyframes = make(), laps(2)
+    for keyframe in keyframes:
+        mapper.add(keyframe)
+    T_old_new = se3.exp([0, 0, 1e-4, 2e-3, 1e-3, 0])
+    expected = se3.transform(se3.inverse(T_old_new), mapper.clouds[5])
+    np.testing.assert_allclose(mapper.clouds[25], expected, atol=1e-4)
+    far = make(redundancy={"distance": 1e-3})
+    for keyframe in keyframes:
+        far.add(keyframe)
+    assert far._clouds.loan(25) is None  # 2 mm apart
+
+
+def test_a_second_session_counts_on(tmp_path: Path) -> None:
+    path, drive = tmp_path / "a.dpm2map", laps(1)
+    for part in (drive[:8], drive[8:]):
+        store = MapStore.open(path, read_only=False) if path.exists() else MapStore.create(path)
+        with store:
+            store.begin_session()
+            mapper = make(store)
+            if mapper.keyframes:
+                T_map_odom = mapper.poses[-1] @ se3.inverse(drive[7].T_odom_kf)
+                mapper.start_session(T_map_odom, SIGMA)
+            for number, keyframe in enumerate(part):
+                edge = keyframe.edge if number else None
+                mapper.add(Keyframe(number, keyframe.stamp, keyframe.index, keyframe.T_odom_kf, keyframe.cloud, edge))
+    with MapStore.open(path) as store:
+        data = load_map(store)
+        assert [k.id for k in data.keyframes] == list(range(LAP))
+        assert data.session == [1] * 8 + [2] * 12
+        np.testing.assert_allclose(data.poses, [k.T_odom_kf for k in drive], atol=1e-6)
+        assert len([e for e in data.edges if e.kind == "odometry"]) == LAP - 1
+
+
+FULL_DISK = """
+import resource, signal, sys
+sys.path.insert(0, sys.argv[2])
+from pathlib import Path
+from test_mapper_store import laps, make
+from dpm2_core.slam.store.map_data import load_map
+from dpm2_core.slam.store.map_store import MapStore
+path = Path(sys.argv[1])
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+store = MapStore.create(path)
+store.begin_session()
+mapper = make(store)
+drive = laps(1)
+limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+problems = []
+for number, keyframe in enumerate(drive):
+    if number == 5:
+        room = Path(f"{path}-wal").stat().st_size + 10000
+        resource.setrlimit(resource.RLIMIT_FSIZE, (room, limit[1]))
+    if number == 15:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+    mapper.add(keyframe)
+    problems.append(mapper.store_problem)
+    assert len(mapper.clouds[number]) == 500
+assert not any(problems[:5]), problems
+assert all(problems[8:15]) and str(path) in problems[10] and "in memory only" in problems[10], problems
+assert not any(problems[15:]), problems
+assert len(mapper.cloud())
+store.close()
+with MapStore.open(path) as store:
+    data = load_map(store)
+    assert len(data) == 20 and len(data.edges) == 19
+print(problems[10])
+"""
+
+
+def test_a_full_disk_is_survived_and_the_file_catches_up(tmp_path: Path) -> None:
+    """In a process that for ten keyframes may write no more than it has."""
+    arguments = [str(tmp_path / "a.dpm2map"), str(Path(__file__).parent)]
+    done = subprocess.run([sys.executable, "-c", FULL_DISK, *arguments], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert len(done.stdout.splitlines()) == 1
+
+
+def test_memory_of_a_keyframe_is_that_of_its_descriptors(tmp_path: Path) -> None:
+    """Clouds of 8 kB a keyframe packed, 2 MB in all: what stays in memory without descriptors is far less."""
+    import tracemalloc
+
+    with MapStore.create(tmp_path / "a.dpm2map") as store:
+        store.begin_session()
+        mapper, drive = make(store, moving={"window": 0}), laps(3)
+        for keyframe in drive[:LAP]:
+            mapper.add(keyframe)
+        tracemalloc.start()
+        for keyframe in drive[LAP:]:
+            mapper.add(keyframe)
+        used, _ = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+    assert used / (2 * LAP) < 8000
+
+
+@pytest.mark.parametrize("width", [0, 64])
+def test_thumbnails(tmp_path: Path, width: int) -> None:
+    import cv2
+
+    from dpm2_core.frame import Camera, Frame, Image
+    from dpm2_core.slam.mapping.mapper import thumbnail
+
+    pixels = np.zeros((100, 200, 3), np.uint8)
+    pixels[..., 0] = 255  # red
+    frame = Frame(0, np.zeros((0, 4), np.float32), images=(Image(pixels, Camera(np.eye(3), np.eye(4), (200, 100))),))
+    jpeg = thumbnail(frame, width)
+    if not width:
+        assert jpeg is None
+        return
+    assert jpeg is not None
+    back = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+    assert back.shape == (32, 64, 3)
+    assert back[10, 10, 2] > 240  # BGR
+    assert back[10, 10, 0] < 20
+
+
+def test_descriptors_that_the_network_cannot_compare_are_told(map_file: Path) -> None:
+    """Of 16 channels, whatever weights the file names; every search for loops would fail with them."""
+
+    class Network(KnownLoops):
+        channels = 128
+
+    for read_only in (True, False):
+        with MapStore.open(map_file, read_only) as store:
+            with pytest.raises(UsageError, match="descriptors of 16 channels, the network makes 128") as caught:
+                Mapper(MapSettings(), PoseGraph(PoseGraphSettings()), Network(), store)
+            assert str(map_file) in str(caught.value)

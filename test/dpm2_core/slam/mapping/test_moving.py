@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What moved away leaves the map; what stands stays."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dpm2_core.frame import Array, Keyframe, Points
+from dpm2_core.geometry import se3
+from dpm2_core.geometry.ground import height_above_ground
+from dpm2_core.geometry.voxel import voxel_first
+from dpm2_core.sim.lidar import Lidar
+from dpm2_core.sim.settings import LidarConfig
+from dpm2_core.sim.world import build_world
+from dpm2_core.slam.mapping.moving import MovingSettings, MovingWindow, RangeImage, find_moving
+from dpm2_core.slam.system import SlamSettings, make_mapper
+
+SETTINGS = MovingSettings()
+GEOMETRIC = SlamSettings.model_validate({"loops": {"enabled": False}})
+
+
+def scene(box: tuple[float, float] | None = None) -> Points:
+    """Ground 1.7 m below, a round wall 25 m away, and a box of 2 m at x, y if wanted; all from the same place."""
+    angle, low = np.meshgrid(np.radians(np.arange(0, 360, 0.7)), np.radians(np.arange(-20, 8, 0.7)))
+    ray = np.stack([np.cos(low) * np.cos(angle), np.cos(low) * np.sin(angle), np.sin(low)], -1).reshape(-1, 3)
+    reach = np.minimum(25 / np.hypot(ray[:, 0], ray[:, 1]), np.where(ray[:, 2] < 0, 1.7 / np.abs(ray[:, 2]), np.inf))
+    if box is not None:
+        away = float(np.hypot(*box))
+        bearing = np.abs(np.angle(np.exp(1j * (np.arctan2(ray[:, 1], ray[:, 0]) - np.arctan2(box[1], box[0])))))
+        hit = (bearing < 1 / away) & (np.abs(ray[:, 2] * away + 0.7) < 1)
+        reach = np.where(hit, np.minimum(reach, away / np.hypot(ray[:, 0], ray[:, 1])), reach)
+    return np.column_stack([ray * reach[:, None], np.full(len(ray), 0.5)]).astype(np.float32)
+
+
+def test_a_box_that_drives_off_is_found_and_nothing_else() -> None:
+    here, away = scene((8, 0)), [scene((8, y)) for y in (6.0, -6.0, 14.0)]
+    moving = find_moving(here, np.eye(4), [(RangeImage(c), np.eye(4)) for c in away], SETTINGS)
+    box = (np.abs(np.hypot(here[:, 0], here[:, 1]) - 8) < 0.1) & (np.abs(here[:, 1]) < 1.1) & (here[:, 2] > -1.6)
+    above = box & (height_above_ground(here) > 0.25)
+    assert above.sum() > 100
+    assert moving[above].mean() > 0.95
+    assert not moving[~box].any()
+
+
+def test_a_box_that_stays_is_kept() -> None:
+    here = scene((8, 0))
+    others = [(RangeImage(here), np.eye(4))] * 4
+    assert not find_moving(here, np.eye(4), others, SETTINGS).any()
+
+
+def test_one_witness_is_not_enough_and_none_says_nothing() -> None:
+    here, empty = scene((8, 0)), RangeImage(scene())
+    assert not find_moving(here, np.eye(4), [(empty, np.eye(4))], SETTINGS).any()
+    assert not find_moving(here, np.eye(4), [], SETTINGS).any()
+    nothing = np.zeros((0, 4), np.float32)
+    assert find_moving(nothing, np.eye(4), [(empty, np.eye(4))], SETTINGS).shape == (0,)
+    assert not find_moving(here, np.eye(4), [(RangeImage(nothing), np.eye(4))] * 3, SETTINGS).any()
+
+
+def test_a_wrong_pose_by_noise_removes_nothing_that_stands() -> None:
+    """5 cm and 0.3 deg, more than neighbouring keyframes are off."""
+    here, noise = scene((8, 0)), np.random.default_rng(0)
+    sigma = [0.005, 0.005, 0.005, 0.05, 0.05, 0.05]
+    others = [(RangeImage(here), se3.exp(noise.normal(0, sigma))) for _ in range(8)]
+    assert find_moving(here, np.eye(4), others, SETTINGS).mean() < 1e-3
+
+
+def test_each_keyframe_is_judged_once() -> None:
+    window, judged = MovingWindow(MovingSettings(window=3)), []
+    poses = np.repeat(np.eye(4)[None], 10, 0)
+    for node in range(10):
+        judged += [n for n, _ in window.add(node, scene(), poses[: node + 1])]
+        assert judged == list(range(max(node - 2, 0)))
+    judged += [n for n, _ in window.finish(poses)]
+    assert judged == list(range(10))
+    assert list(window.finish(poses)) == []
+    off = MovingWindow(MovingSettings(window=0))
+    assert list(off.add(0, scene(), poses)) == []
+
+
+@pytest.fixture(scope="module")
+def street() -> list[tuple[Points, np.ndarray, Array]]:
+    """Keyframes of a city street with traffic: points, whether they move, true pose."""
+    world = build_world("straight", "city", seed=7, length=250.0)
+    lidar, rng = Lidar(LidarConfig(columns=1024)), np.random.default_rng(0)
+    out = []
+    for time in np.arange(0, 9, 0.5):
+        T = world.drive_pose(float(time))
+        scan = lidar.scan(world, T, float(time), rng)
+        near = np.flatnonzero(np.linalg.norm(scan.points[:, :3], axis=1) < 60)
+        near = near[voxel_first(scan.points[near], 0.3)]
+        out.append((scan.points[near], scan.moving[near], T))
+    return out
+
+
+def test_traffic_of_a_synthetic_street_is_left_out(street: list[tuple[Points, np.ndarray, Array]]) -> None:
+    """Here 55 % of the moving points go (80 % on longer drives), and next to none of the static ones."""
+    mapper = make_mapper(GEOMETRIC)
+    for node, (points, _, T) in enumerate(street):
+        mapper.add(Keyframe(node, node, node, T, points))
+    mapper.finish()
+    removed = static = movers = static_removed = 0
+    for node, (points, moves, _) in enumerate(street):
+        left = {tuple(xyz) for xyz in np.round(mapper.clouds[node][:, :3], 2)}
+        gone = np.array([tuple(xyz) not in left for xyz in np.round(mapper._clouds.whole(node)[:, :3], 2)])
+        assert len(gone) == len(points)
+        removed, movers = removed + (gone & moves).sum(), movers + moves.sum()
+        static_removed, static = static_removed + (gone & ~moves).sum(), static + (~moves).sum()
+    assert movers > 500
+    assert removed / movers > 0.45
+    assert static_removed / static < 1e-3
+    off = make_mapper(SlamSettings.model_validate({"loops": {"enabled": False}, "map": {"moving": {"window": 0}}}))
+    for node, (points, _, T) in enumerate(street[:8]):
+        off.add(Keyframe(node, node, node, T, points))
+    off.finish()
+    assert [len(cloud) for cloud in off.clouds] == [len(points) for points, _, _ in street[:8]]

@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The grid for Nav2: walls are occupied, what is seen before them is free, the rest is unknown."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from dpm2_core.errors import Dpm2Error
+from dpm2_core.frame import Points
+from dpm2_core.geometry import se3
+from dpm2_core.slam.mapping.occupancy import OccupancySettings, ground_below, occupancy_grid, write_grid
+
+SETTINGS = OccupancySettings(resolution=0.25, reach=20.0)
+
+
+def room(slope: float = 0.0) -> Points:
+    """Ground 1.7 m below with a slope (m/m along x), a wall at x = 8 of 3 m, a beam at 4 m height; seen from 0, 0."""
+    x, y = (v.ravel() for v in np.meshgrid(np.arange(-12, 7.9, 0.2), np.arange(-12, 12, 0.2)))
+    ground = np.column_stack([x, y, slope * x - 1.7])
+    y, z = (v.ravel() for v in np.meshgrid(np.arange(-6, 6, 0.1), np.arange(0.1, 3, 0.2)))
+    wall = np.column_stack([np.full(len(y), 8.01), y, 8 * slope - 1.7 + z])
+    beam = np.column_stack([np.full(200, 3.0), np.linspace(-5, 5, 200), np.full(200, 3 * slope + 2.3)])
+    points = np.concatenate([ground, wall, beam])
+    return np.column_stack([points, np.zeros(len(points))]).astype(np.float32)
+
+
+def read_back(path: Path) -> tuple[np.ndarray, dict[str, object]]:
+    """A map_server's view: what its trinary mode makes of YAML and PGM, by rows from the lowest y."""
+    about = yaml.safe_load(path.read_text())
+    magic, size, depth, pixels = (path.parent / about["image"]).read_bytes().split(b"\n", 3)
+    assert (magic, depth) == (b"P5", b"255")
+    columns, rows = map(int, size.split())
+    grey = np.frombuffer(pixels, np.uint8).reshape(rows, columns)[::-1]
+    occupancy = (255 - grey.astype(float)) / 255
+    cells = np.full(grey.shape, -1)
+    cells[occupancy > about["occupied_thresh"]] = 100
+    cells[occupancy < about["free_thresh"]] = 0
+    cells[grey == 205] = -1
+    return cells, about
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.08])
+def test_a_wall_before_the_unknown(tmp_path: Path, slope: float) -> None:
+    T = se3.make(np.eye(3), [100.0, -50.0, 3.0])
+    path = write_grid(tmp_path / "grid.yaml", occupancy_grid([room(slope)], T[None], SETTINGS))
+    cells, about = read_back(path)
+    assert about["resolution"] == 0.25
+    assert about["mode"] == "trinary"
+
+    def at(x: float, y: float) -> int:
+        """Of a place relative to the sensor."""
+        column = int((x + 100 - about["origin"][0]) // 0.25)
+        row = int((y - 50 - about["origin"][1]) // 0.25)
+        inside = 0 <= row < cells.shape[0] and 0 <= column < cells.shape[1]
+        return int(cells[row, column]) if inside else -1
+
+    assert [at(8.1, y) for y in (-5, 0, 5)] == [100, 100, 100]
+    assert [at(x, y) for x, y in ((2, 0), (6, 3), (-9, 0), (0, 9), (3, 1))] == [0] * 5  # also under the beam
+    assert [at(x, y) for x, y in ((9.5, 0), (12, 2), (0, 18))] == [-1] * 3  # behind the wall, beyond the ground
+    assert (cells == 100).sum() <= 49 * 2  # nothing but the wall
+
+
+def test_a_thing_that_most_keyframes_see_through_is_free() -> None:
+    empty, thing = room(), np.concatenate([room(), np.float32([[5, 0, z, 0] for z in (-1.0, -0.5, 0.0)])])
+    poses = np.repeat(np.eye(4)[None], 4, 0)
+    for clouds, expected in (([thing, empty, empty, empty], 254), ([thing] * 4, 0)):
+        grid = occupancy_grid(clouds, poses, SETTINGS)
+        row = grid.cells.shape[0] - 1 - int((0.1 - grid.origin[1]) // 0.25)
+        assert grid.cells[row, int((5.1 - grid.origin[0]) // 0.25)] == expected
+
+
+def test_ground_below_a_roof() -> None:
+    points = room().astype(float)[:, :3]
+    np.testing.assert_allclose(ground_below(points), -1.7, atol=1e-6)
+
+
+def test_nothing_and_too_much() -> None:
+    grid = occupancy_grid([np.zeros((0, 4), np.float32)], np.eye(4)[None], SETTINGS)
+    assert (grid.cells == 205).all()
+    far = np.stack([np.eye(4), se3.make(np.eye(3), [1e6, 1e6, 0])])
+    with pytest.raises(Dpm2Error, match="larger --resolution"):
+        occupancy_grid([room(), room()], far, SETTINGS)

@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Keyframes can be taken out and maps be joined: constraints, trajectory and clouds survive."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dpm2_core.errors import Dpm2Error
+from dpm2_core.frame import Array, Keyframe
+from dpm2_core.geometry import se3
+from dpm2_core.slam.graph.pose_graph import PoseGraph, PoseGraphSettings
+from dpm2_core.slam.mapping.merge import align, merge_maps, optimised
+from dpm2_core.slam.mapping.prune import composed, eliminate, inverted, prune, redundant_nodes
+from dpm2_core.slam.store.cloud_codec import pack_cloud
+from dpm2_core.slam.store.cloud_store import CloudStore, Loan
+from dpm2_core.slam.store.map_data import NO_POINTS, MapData, load_map, save_as, trajectory
+from dpm2_core.slam.store.map_store import MapStore
+from dpm2_core.slam.store.rows import Edge, Session
+
+SIGMA = np.diag([1e-3, 2e-3, 3e-3, 0.01, 0.02, 0.03]) ** 2
+
+
+def laps(count: int, steps: int = 40, session: bool = False) -> MapData:
+    """Rounds of one circle, each keyframe with an edge to the one before and to the one a round before."""
+    turn = 2 * np.pi / steps * np.arange(count * steps)[:, None]
+    poses = se3.exp(turn * np.array([0, 0, 1.0, 30.0, 0, 0]))
+    clouds = CloudStore()
+    keyframes, edges = [], []
+    for node, T in enumerate(poses):
+        clouds.append(pack_cloud(np.full((10, 4), node / 100, np.float32)))
+        keyframes.append(Keyframe(node, node * 10**8, node, T, NO_POINTS))
+        for other, kind in ((node - 1, "odometry"), (node - steps, "loop")):
+            if other >= 0:
+                T_other_node = se3.inverse(poses[other]) @ T
+                edges.append(Edge(kind, other, node, T_other_node, SIGMA))
+    numbers = [1 + session * (node // steps) for node in range(len(poses))]
+    return MapData(keyframes, numbers, poses, edges, [], [Session(1, "", "", "", "")], clouds)
+
+
+def error(edge: Edge, poses: Array) -> Array:
+    return se3.log(se3.inverse(edge.T_from_to) @ se3.inverse(poses[edge.from_node]) @ poses[edge.to_node])
+
+
+def test_composition_and_inversion_carry_the_covariance() -> None:
+    """Against samples: 20 thousand noisy pairs; 5 % is four standard errors of a variance."""
+    rng = np.random.default_rng(0)
+    Ta, Tb = se3.exp([0.1, -0.2, 0.5, 3, 1, 0.2]), se3.exp([-0.1, 0.3, 1.0, 2, -4, 0.5])
+    a, b = Edge("odometry", 0, 1, Ta, SIGMA), Edge("loop", 1, 2, Tb, 2 * SIGMA)
+    noisy_a = Ta @ se3.exp(rng.multivariate_normal(np.zeros(6), a.covariance, 20000))
+    noisy_b = Tb @ se3.exp(rng.multivariate_normal(np.zeros(6), b.covariance, 20000))
+    ab, back = composed(a, b), inverted(a)
+    assert (ab.kind, ab.from_node, ab.to_node) == ("loop", 0, 2)
+    for edge, samples in ((ab, noisy_a @ noisy_b), (back, se3.inverse(noisy_a))):
+        spread = np.cov(se3.log(se3.inverse(edge.T_from_to) @ samples).T)
+        scale = np.sqrt(np.outer(np.diag(edge.covariance), np.diag(edge.covariance)))
+        np.testing.assert_allclose(spread / scale, edge.covariance / scale, atol=0.05)
+
+
+def test_a_chain_keeps_its_ends() -> None:
+    """Taking out the middle of a chain is exact: one edge, whose covariance is the sum along the way."""
+    data = laps(1, 6)
+    (edge,) = eliminate(data.edges, [1, 2, 3, 4])
+    assert (edge.kind, edge.from_node, edge.to_node) == ("odometry", 0, 5)
+    np.testing.assert_allclose(error(edge, data.poses), 0, atol=1e-9)
+    whole = data.edges[0]
+    for other in data.edges[1:]:
+        whole = composed(whole, other)
+    np.testing.assert_allclose(edge.covariance, whole.covariance, rtol=1e-9)
+
+
+def test_pruning_laps_leaves_one_with_all_constraints() -> None:
+    data = laps(3)
+    nodes = redundant_nodes(data, 2.0, 20.0)
+    assert set(nodes) == set(range(40, 119))  # two laps, but for the last keyframe
+    less = prune(data, nodes)
+    assert len(less) == 41
+    assert len(less.constraints) < len(data.constraints)
+    ends = {(e.from_node, e.to_node) for e in less.constraints}
+    assert all((i, i + 1) in ends for i in range(40))  # connected, in a chain
+    for edge in less.constraints:
+        np.testing.assert_allclose(error(edge, less.poses), 0, atol=1e-6)
+        assert np.linalg.eigvalsh(edge.covariance)[0] > 0
+    stamps, poses = trajectory(less)  # nothing of the trajectory is lost
+    assert stamps == [k.stamp for k in data.keyframes]
+    np.testing.assert_allclose(poses, data.poses, atol=1e-9)
+    again = prune(less, [5, 6, 40])  # what a pruned one was tied to can go, too
+    np.testing.assert_allclose(trajectory(again)[1], data.poses, atol=1e-9)
+    np.testing.assert_array_equal(again.clouds[5], less.clouds[7])
+
+
+def test_the_optimum_stays_when_nodes_go() -> None:
+    """A lap with drift and a loop: solving before or after pruning gives about the same poses."""
+    data = laps(1)
+    drift = se3.exp([0, 0, 0.002, 0.01, 0.02, 0])
+    edges = [replace(edge, T_from_to=edge.T_from_to @ drift) for edge in data.edges]
+    edges.append(Edge("loop", 0, 39, se3.inverse(data.poses[0]) @ data.poses[39], SIGMA * 0.01))
+    data = replace(data, edges=edges)
+    before = optimised(data, PoseGraph(PoseGraphSettings())).poses
+    gone = [n for n in range(1, 39) if n % 3]
+    after = optimised(prune(data, gone), PoseGraph(PoseGraphSettings())).poses
+    kept = [n for n in range(40) if n not in gone]
+    moved = np.linalg.norm(before[kept][:, :3, 3] - data.poses[kept][:, :3, 3], axis=1).max()
+    assert moved > 0.1
+    assert np.linalg.norm(after[:, :3, 3] - before[kept][:, :3, 3], axis=1).max() < 0.02 * moved
+
+
+def test_borrowers_go_before_their_lenders() -> None:
+    data = laps(2)
+    for node in range(40, 80):
+        data.clouds.borrow(node, Loan(node - 40, np.eye(4)))
+    nodes = redundant_nodes(data, 0, 0)
+    assert nodes == list(range(40, 79))  # all that borrow, but the last, whose lender stays
+    assert len(prune(data, nodes)) == 41
+    with pytest.raises(ValueError, match="borrows the cloud of 39"):
+        prune(data, [39])
+
+
+def test_merged_side_by_side(tmp_path: Path, map_file: Path) -> None:
+    T = se3.exp([0, 0, 0.5, 100, 0, 0])
+    with MapStore.open(map_file) as a, MapStore.open(map_file) as b:
+        one, two = load_map(a), load_map(b)
+        save_as(merge_maps(one, two, T), tmp_path / "both.dpm2map")
+        with MapStore.open(tmp_path / "both.dpm2map") as store:
+            both = load_map(store)
+            assert len(both) == 24
+            assert both.session == [1] * 12 + [2] * 12
+            np.testing.assert_allclose(both.poses[12:], T @ one.poses)
+            np.testing.assert_array_equal(both.clouds[15], one.clouds[3])
+            assert [(e.from_node, e.to_node) for e in both.edges[13:14]] == [(12, 13)]
+            assert len(both.edges) == 26
+
+
+def test_maps_are_aligned_by_their_loops_though_one_of_them_is_off() -> None:
+    a, b = laps(1), laps(1)
+    T_a_b = se3.exp([0, 0, 1.0, 50, 20, 1])
+    b = replace(b, poses=se3.inverse(T_a_b) @ b.poses)  # the same places, in another frame
+    loops = [Edge("loop", n, n, np.eye(4), SIGMA) for n in (3, 13, 23)]
+    loops.append(Edge("loop", 5, 30, np.eye(4), SIGMA))
+    T, used = align(a, b, lambda one, two: loops)
+    np.testing.assert_allclose(T, T_a_b, atol=1e-6)
+    both = optimised(merge_maps(a, b, T, used[:3]), PoseGraph(PoseGraphSettings()))
+    np.testing.assert_allclose(both.poses[40:], both.poses[:40], atol=1e-3)
+    with pytest.raises(Dpm2Error, match="no place"):
+        align(a, b, lambda one, two: [])

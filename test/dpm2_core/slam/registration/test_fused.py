@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Who answers when network and points agree, when one is silent, and when they contradict each other.
+
+The points are real scans of the synthetic city; what the network says is chosen, so that it can be wrong on purpose.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dpm2_core.frame import Array, Frame, Registration
+from dpm2_core.geometry import se3
+from dpm2_core.slam.preprocess import Preprocessor, PreprocessSettings, Scan
+from dpm2_core.slam.registration.fused import RefinedScanRegistration
+from dpm2_core.slam.registration.icp import GeometricRegistration, GeometricSettings
+from dpm2_core.slam.registration.local_map import LocalMap, LocalMapSettings
+from dpm2_core.slam.registration.protocol import GeometricScanRegistration, Prediction
+
+from ..conftest import Drive
+
+SIGMA = np.repeat([0.001, 0.04], 3)  # rad, m, that the network claims
+
+
+class Oracle:
+    """A network that says what it is told."""
+
+    uses_images = False
+    T: Array = np.eye(4)
+    ok = True
+    size = 1
+    scale = 1.0
+
+    def __len__(self) -> int:
+        return self.size
+
+    def clear(self) -> None:
+        self.size = 0
+
+    def described(self, frame: Frame, scan: Scan) -> Scan:
+        return scan
+
+    def update(self, scan: Scan, T_odom_lidar: Array) -> None:
+        self.size += 1
+
+    def register(self, scan: Scan, prediction: Prediction) -> Registration:
+        reason = "" if self.ok else "no idea"
+        return Registration(self.T, np.diag((self.scale * SIGMA) ** 2), 0.9, 0.1, "neural", self.ok, reason)
+
+
+class Case:
+    """The sixth scan of a drive, to be registered to the five before."""
+
+    def __init__(self, drive: Drive) -> None:
+        frames, truth = drive
+        self.oracle = Oracle()
+        geometric = GeometricScanRegistration(
+            Preprocessor(PreprocessSettings()), GeometricRegistration(GeometricSettings()), LocalMap(LocalMapSettings())
+        )
+        self.registration = RefinedScanRegistration(self.oracle, geometric)  # type: ignore[arg-type]
+        for frame, T in zip(frames[:5], truth[:5], strict=True):
+            self.registration.update(self.registration.prepare(frame, np.zeros(6)), T)
+        self.scan = self.registration.prepare(frames[5], np.zeros(6))
+        self.truth = truth[5]
+        self.prediction = Prediction([self.truth @ se3.exp([0, 0, 0.005, 0.05, 0, 0])], information=100 * np.eye(6))
+
+    def register(self, off: list[float], **oracle: object) -> tuple[Registration, float]:
+        """Answer and its error, m, when the network is off by a tangent vector."""
+        self.oracle.T = self.truth @ se3.exp(off)
+        for name, value in oracle.items():
+            setattr(self.oracle, name, value)
+        answer = self.registration.register(self.scan, self.prediction)
+        return answer, float(np.linalg.norm(answer.T_target_source[:3, 3] - self.truth[:3, 3]))
+
+
+@pytest.fixture
+def case(suburb: Drive) -> Case:
+    return Case(suburb)
+
+
+def test_points_refine_the_network_where_both_agree(case: Case) -> None:
+    answer, error = case.register([0, 0, 0.001, 0.05, -0.03, 0])
+    assert (answer.ok, answer.method, answer.reason) == (True, "refined", "")
+    assert error < 0.02  # the network was off by 6 cm
+
+
+def test_a_network_that_knows_less_moves_nothing(case: Case) -> None:
+    answer, _ = case.register([0, 0, 0.005, 0.3, -0.2, 0], scale=3.0)
+    assert (answer.ok, answer.method) == (True, "refined")
+    alone, _ = case.register([0, 0, 0, 0, 0, 0], size=0)
+    np.testing.assert_allclose(answer.T_target_source, alone.T_target_source, atol=1e-9)
+
+
+@pytest.mark.parametrize("silent", [{"ok": False}, {"size": 0}])
+def test_points_alone_where_the_network_is_silent(case: Case, silent: dict[str, object]) -> None:
+    answer, error = case.register([0, 0, 0, 5, 0, 0], **silent)
+    assert (answer.ok, answer.method) == (True, "geometric")
+    assert answer.reason.startswith("neural: ")
+    assert error < 0.02
+
+
+def test_network_alone_where_the_points_fit_nothing(case: Case) -> None:
+    elsewhere = np.random.default_rng(3).uniform(-40, 40, (8000, 4)).astype(np.float32)
+    case.scan = case.registration.prepare(Frame(0, elsewhere), np.zeros(6))
+    answer, error = case.register([0, 0, 0, 0.03, 0, 0])
+    assert (answer.ok, answer.method) == (True, "neural")
+    assert answer.reason.startswith("not refined: ")
+    assert error == pytest.approx(0.03)
+
+
+def test_a_network_that_is_wrong_and_sure_of_it_is_outvoted(case: Case) -> None:
+    answer, error = case.register([0, 0, 0, 0.6, 0.2, 0])
+    assert (answer.ok, answer.method) == (True, "geometric")
+    assert "m, 0.0 deg apart" in answer.reason
+    assert error < 0.02
+
+
+def test_the_network_leads_the_points_where_the_motion_does_not(case: Case) -> None:
+    case.prediction = replace(case.prediction, starts=[case.truth @ se3.exp([0, 0, 1.5, 30, 0, 0])])
+    answer, error = case.register([0, 0, 0.001, 0.05, -0.03, 0])
+    assert (answer.ok, answer.method, answer.reason) == (True, "refined", "")
+    assert error < 0.02  # the network was off by 6 cm
+
+
+def test_a_contradiction_that_nothing_settles_is_answered_with_doubt(case: Case) -> None:
+    case.prediction = replace(case.prediction, starts=[case.truth @ se3.exp([0, 0, 1.5, 30, 0, 0])])
+    answer, _ = case.register([0, 0, 0, 0.6, 0.2, 0])
+    assert (answer.ok, answer.method) == (True, "neural")
+    assert "apart" in answer.reason
+    assert answer.worst_sigma > 0.5  # it covers its error of 0.63 m; beyond 0.08 m the state is `degraded`
+
+
+def test_while_no_motion_is_known_the_network_gives_one_more_start(case: Case) -> None:
+    """Points that start 12 m off settle elsewhere; from a network that is 0.6 m off, and sure of it, they do not."""
+    case.prediction = Prediction([case.truth @ se3.exp([0, 0, 0, 12, 0, 0])], widen=2.0)
+    _, lost = case.register([0, 0, 0, 0, 0, 0], size=0)
+    assert lost > 5
+    answer, error = case.register([0, 0, 0, 0.6, 0.2, 0], size=1)
+    assert (answer.ok, answer.method) == (True, "geometric")
+    assert error < 0.02
+
+
+def test_along_a_tunnel_the_network_has_it(tunnel: Drive) -> None:
+    """There the points know every direction but one."""
+    case = Case(tunnel)
+    answer, _ = case.register([0, 0, 0, 0.02, 0.03, 0])
+    assert (answer.ok, answer.method) == (True, "refined")
+    off = se3.log(se3.inverse(case.truth) @ answer.T_target_source)
+    assert abs(off[3] - 0.02) < 0.02  # the network's own error along; points alone: decimetres
+    assert abs(off[4]) < 0.02  # the network was off by 3 cm across

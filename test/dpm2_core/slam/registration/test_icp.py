@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Points to a map: what is accepted when only part of a scan has a counterpart, and which of several starts wins."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dpm2_core.frame import Array
+from dpm2_core.geometry import se3
+from dpm2_core.slam.odometry.odometry import OdometrySettings
+from dpm2_core.slam.preprocess import Preprocessor, PreprocessSettings, Scan
+from dpm2_core.slam.registration.icp import GeometricRegistration, GeometricSettings
+from dpm2_core.slam.registration.local_map import LocalMap, LocalMapSettings
+from dpm2_core.slam.registration.protocol import GeometricScanRegistration, Prediction, agree
+
+from ..conftest import Drive
+
+PRIOR = np.eye(6) / 0.1**2  # information of a velocity known to 1 m/s, 10 Hz
+Case = tuple[GeometricScanRegistration, Scan, Array]
+
+
+def make_case(drive: Drive, seen: float) -> Case:
+    """A map of one scan, of which something hides all but a share of the azimuth; the fourth scan after, its pose."""
+    frames, truth = drive
+    preprocessor = Preprocessor(PreprocessSettings())
+    registration = GeometricScanRegistration(
+        preprocessor, GeometricRegistration(GeometricSettings()), LocalMap(LocalMapSettings())
+    )
+    first, later = (preprocessor.prepare(frames[i], np.zeros(6)) for i in (0, 4))
+    azimuth = np.arctan2(first.cloud[:, 1], first.cloud[:, 0])
+    visible = np.cos(azimuth * 2) > np.cos(np.pi * seen)  # two sectors, ahead and behind
+    registration.update(Scan(first.points, first.cloud[visible], first.source), np.eye(4))
+    return registration, later, truth[4]
+
+
+@pytest.fixture
+def occluded(suburb: Drive) -> Case:
+    return make_case(suburb, 0.4)
+
+
+def error(T: Array, truth: Array) -> float:
+    return float(np.linalg.norm((se3.inverse(truth) @ T)[:3, 3]))
+
+
+def test_what_the_motion_led_to_expect_needs_fewer_counterparts(occluded: Case) -> None:
+    registration, scan, truth = occluded
+    start = truth @ se3.exp([0, 0, 0.005, 0.1, 0.03, 0])
+    answer = registration.register(scan, Prediction([start], information=PRIOR))
+    assert 0.3 < answer.confidence < 0.5, "else the case is none"
+    assert answer.ok
+    assert error(answer.T_target_source, truth) < 0.05  # a young map of 0.5 m cells: centimetres
+    guessed = registration.register(scan, Prediction([start]))
+    assert not guessed.ok
+    assert guessed.reason.endswith("points fit the map")
+
+
+@pytest.mark.parametrize("off", [[0, 0, 0, 2, 0, 0], [0, 0, 0, -2, 0, 0], [0, 0, 0, 0, 3, 0], [0, 0, 0.15, 2, 2, 0]])
+def test_a_wrong_prediction_in_a_map_of_one_scan_is_never_confirmed_without_doubt(
+    occluded: Case, off: list[float]
+) -> None:
+    """Along the road ground alone may fit anywhere: the covariance then says so, and the state is `degraded`."""
+    registration, scan, truth = occluded
+    answer = registration.register(scan, Prediction([truth @ se3.exp(off)], information=PRIOR))
+    wrong = error(answer.T_target_source, truth)
+    assert not answer.ok or answer.worst_sigma > max(OdometrySettings().degraded_sigma, wrong / 3)
+
+
+def test_a_scan_of_elsewhere_is_refused_where_it_was_expected(occluded: Case, tunnel: Drive) -> None:
+    registration, _, truth = occluded
+    elsewhere = Preprocessor(PreprocessSettings()).prepare(tunnel[0][0], np.zeros(6))
+    assert not registration.register(elsewhere, Prediction([truth], information=PRIOR)).ok
+
+
+def test_the_likeliest_start_wins_whatever_its_place(suburb: Drive) -> None:
+    registration, scan, truth = make_case(suburb, 1.0)
+    off = truth @ se3.exp([0, 0, 0, 6, 1, 0])  # too far to come back from
+    for starts in ([off, truth], [truth, off]):
+        answer = registration.register(scan, Prediction(starts))
+        assert answer.ok
+        assert error(answer.T_target_source, truth) < 0.05
+
+
+def test_likelihood_is_greatest_at_the_truth(suburb: Drive) -> None:
+    frames, truth = suburb
+    scan = Preprocessor(PreprocessSettings()).prepare(frames[4], np.zeros(6))
+    local_map = LocalMap(LocalMapSettings())
+    local_map.insert(Preprocessor(PreprocessSettings()).prepare(frames[0], np.zeros(6)).cloud, np.eye(4))
+    method = GeometricRegistration(GeometricSettings())
+    fit = [method.likelihood(scan.source, local_map, truth[4] @ se3.exp([0, 0, 0, x, 0, 0])) for x in (0, 0.3, 1, 3)]
+    assert fit == sorted(fit, reverse=True)
+    assert method.likelihood(scan.source + 1e3, local_map, truth[4]) == 0  # no counterpart at all
+
+
+def test_along_a_tunnel_answers_agree_and_the_least_motion_is_kept(tunnel: Drive) -> None:
+    """How far the car went cannot be seen there: starts that end metres apart do not contradict each other."""
+    registration, scan, _ = make_case(tunnel, 1.0)
+    starts = [se3.exp([0, 0, 0, x, 0, 0]) for x in (1.0, 2.0)]
+    alone = [registration.register(scan, Prediction([T])) for T in starts]
+    assert np.linalg.norm(alone[0].T_target_source[:3, 3] - alone[1].T_target_source[:3, 3]) > 0.3
+    assert agree(*alone)
+    kept = registration.register(scan, Prediction(starts))
+    np.testing.assert_allclose(kept.T_target_source, alone[0].T_target_source, atol=1e-9)

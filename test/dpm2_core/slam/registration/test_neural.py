@@ -1,0 +1,219 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Neural registration in the SLAM: which descriptors are registered to, what is refused, and what is loaded when."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from dpm2_core.descriptors import Descriptors
+from dpm2_core.errors import UsageError
+from dpm2_core.frame import Frame, Image, State
+from dpm2_core.geometry import se3
+from dpm2_core.network.model import DeepPointMap2
+from dpm2_core.network.pretrained import load_network
+from dpm2_core.network.settings import NetworkSettings, preset
+from dpm2_core.network.tokens import to_tokens
+from dpm2_core.network.weights import save_weights
+from dpm2_core.slam.preprocess import Preprocessor, PreprocessSettings
+from dpm2_core.slam.registration.neural import DescriptorMap, NeuralScanRegistration, NeuralSettings
+from dpm2_core.slam.registration.protocol import Prediction
+from dpm2_core.slam.system import SlamSettings, SlamSystem, make_registration
+
+Street = Callable[..., np.ndarray]
+
+
+@pytest.fixture
+def weights(tiny: Callable[..., NetworkSettings], street: Street, tmp_path: Path) -> Path:
+    """The tiny network as a file: random weights, but similarities centred, so that equal descriptors match best."""
+    torch.manual_seed(0)
+    model = DeepPointMap2(tiny(decoder={"temperature": 0.01})).eval().requires_grad_(False)
+    some = model.describe(Frame(0, cloud(street(np.random.default_rng(1)))))
+    tokens = to_tokens([some], model.settings.points.view_aligned)
+    last = model.decoder.similarity[-1]
+    assert isinstance(last.bias, torch.Tensor)
+    last.bias -= model.decoder.similarity(model.decoder(tokens, tokens).source).mean((0, 1))
+    path = tmp_path / "tiny.safetensors"
+    save_weights(model, path, {}, half=False)
+    return path
+
+
+def cloud(xyz: np.ndarray) -> np.ndarray:
+    """(N, 4) with intensity."""
+    return np.column_stack([xyz, np.full(len(xyz), 0.5)]).astype(np.float32)
+
+
+def descriptors(noise: np.random.Generator) -> Descriptors:
+    return Descriptors(noise.normal(size=(5, 3)).astype(np.float32), noise.normal(size=(5, 8)).astype(np.float16))
+
+
+def test_the_nearest_frames_are_merged_in_the_frame_of_the_nearest(noise: np.random.Generator) -> None:
+    places = DescriptorMap(spacing=3, frames=2, radius=20)
+    poses = [se3.exp([0, 0, 0.2 * i, 4.0 * i, 0, 0]) for i in range(4)]
+    sets = [descriptors(noise) for _ in poses]
+    for pose, s in zip(poses, sets, strict=True):
+        places.insert(s, pose)
+    T, merged = places.around(poses[2] @ se3.exp([0, 0, 0, 1.0, 0, 0]))
+    np.testing.assert_array_equal(T, poses[2])
+    world = se3.transform(T, merged.xyz.astype(np.float64))
+    for part, i in ((world[:5], 2), (world[5:], 3)):
+        np.testing.assert_allclose(part, se3.transform(poses[i], sets[i].xyz.astype(np.float64)), atol=1e-5)
+
+
+def test_frames_out_of_reach_are_left_out_unless_there_is_no_other(noise: np.random.Generator) -> None:
+    places = DescriptorMap(spacing=3, frames=3, radius=10)
+    for x in (0.0, 30.0):
+        places.insert(descriptors(noise), se3.make(np.eye(3), [x, 0, 0]))
+    assert len(places.around(se3.make(np.eye(3), [28, 0, 0]))[1]) == 5
+    assert len(places.around(se3.make(np.eye(3), [200, 0, 0]))[1]) == 5
+
+
+def test_a_frame_enters_after_motion_or_a_turn(noise: np.random.Generator) -> None:
+    places = DescriptorMap(spacing=3, frames=2, radius=20)
+    assert places.wants(np.eye(4))
+    places.insert(descriptors(noise), np.eye(4))
+    assert not places.wants(se3.exp([0, 0, 0.1, 2.9, 0, 0]))
+    assert places.wants(se3.exp([0, 0, 0, 3.1, 0, 0]))
+    assert places.wants(se3.exp([0, 0, 0.3, 0, 0, 0]))
+
+
+def test_memory_is_bounded(noise: np.random.Generator) -> None:
+    places = DescriptorMap(spacing=3, frames=2, radius=20)
+    for i in range(100):
+        places.insert(descriptors(noise), se3.make(np.eye(3), [3.0 * i, 0, 0]))
+    assert len(places) == 20
+
+
+def test_a_frame_seen_again_is_found_without_any_prior(
+    weights: Path, street: Street, noise: np.random.Generator
+) -> None:
+    """True of any weights: equal descriptors match, and untrained offsets are zero."""
+    s = SlamSettings(registration="neural", neural=NeuralSettings(weights=str(weights), min_confidence=0))
+    registration = make_registration(s)
+    frame = Frame(0, cloud(street(noise)))
+    scan = registration.prepare(frame, np.zeros(6))
+    place = se3.exp([0.02, 0.01, 1.3, 50.0, -20.0, 1.0])
+    registration.update(scan, place)
+    wrong = se3.exp([0, 0, -2.0, 900.0, 10.0, 0])
+    found = registration.register(scan, Prediction([wrong]))
+    assert (found.ok, found.method) == (True, "neural")
+    np.testing.assert_allclose(found.T_target_source, place, atol=1e-3)  # fp16 features, bf16 arithmetic
+    assert np.linalg.eigvalsh(found.covariance)[0] > 0
+    # but where the velocity is known, to 1 m/s, what contradicts it is refused
+    known = registration.register(scan, Prediction([wrong], information=np.eye(6) / 0.1**2))
+    assert (known.ok, known.reason) == (False, "contradicts the motion so far")
+    assert registration.register(scan, Prediction([place], information=np.eye(6) / 0.1**2)).ok
+
+
+def test_standing_still_from_the_first_frame_to_a_keyframe_with_descriptors(
+    weights: Path, street: Street, noise: np.random.Generator
+) -> None:
+    s = SlamSettings(registration="neural", neural=NeuralSettings(weights=str(weights), min_confidence=0))
+    system = SlamSystem(s)
+    points = cloud(street(noise))
+    tracked = [system.process(Frame(i * 10**8, points, index=i)) for i in range(4)]
+    assert all(t.registration.ok for t in tracked)
+    np.testing.assert_allclose(tracked[-1].T_odom_lidar, np.eye(4), atol=0.01)
+    keyframe = tracked[0].keyframe
+    assert keyframe is not None
+    assert keyframe.descriptors is not None
+    assert len(keyframe.descriptors) == 48
+
+
+def test_bad_frames_are_refused_in_words_and_survived(
+    weights: Path, street: Street, noise: np.random.Generator
+) -> None:
+    s = SlamSettings(registration="neural", neural=NeuralSettings(weights=str(weights), min_confidence=0))
+    system = SlamSystem(s)
+    points = cloud(street(noise))
+    good = [Frame(i * 10**8, points, index=i) for i in range(7)]
+    bad = [np.zeros((0, 4)), np.full((500, 4), np.nan), points[:10]]
+    frames = [Frame(0, bad[0].astype(np.float32)), *good[:3]]
+    frames += [Frame((3 + i) * 10**8, b.astype(np.float32)) for i, b in enumerate(bad)] + [good[6]]
+    tracked = [system.process(frame) for frame in frames]
+    for t in (tracked[0], *tracked[4:7]):
+        assert not t.registration.ok
+        assert "too few for descriptors" in t.registration.reason
+    assert tracked[6].state == State.DEGRADED
+    assert tracked[-1].registration.ok
+    assert all(np.isfinite(t.T_odom_lidar).all() and np.isfinite(t.covariance).all() for t in tracked)
+
+
+def test_unsure_matches_are_no_answer(weights: Path, street: Street, noise: np.random.Generator) -> None:
+    s = SlamSettings(registration="neural", neural=NeuralSettings(weights=str(weights), min_confidence=1))
+    registration = make_registration(s)
+    first, other = (registration.prepare(Frame(0, cloud(street(noise))), np.zeros(6)) for _ in range(2))
+    registration.update(first, np.eye(4))
+    found = registration.register(other, Prediction([np.eye(4)]))
+    assert not found.ok
+    assert "confidence of only" in found.reason
+
+
+def test_pictures_are_asked_for_and_used_where_the_network_has_a_camera(
+    tiny: Callable[..., NetworkSettings], street: Street, picture: Callable[..., Image], noise: np.random.Generator
+) -> None:
+    torch.manual_seed(0)
+    preprocessor = Preprocessor(PreprocessSettings())
+    frame = Frame(0, cloud(street(noise)), images=(picture(noise),))
+    for backbone, wanted in (("convnext", True), ("none", False)):
+        model = DeepPointMap2(tiny(image={"backbone": backbone})).eval().requires_grad_(False)
+        registration = NeuralScanRegistration(NeuralSettings(), preprocessor, model)
+        assert registration.uses_images is wanted
+        with_picture, without = (
+            registration.prepare(f, np.zeros(6)).descriptors for f in (frame, Frame(0, frame.points))
+        )
+        assert with_picture is not None
+        assert without is not None
+        assert np.array_equal(with_picture.features, without.features) is not wanted
+
+
+def test_descriptors_of_a_keyframe_take_70_kb(street: Street, noise: np.random.Generator) -> None:
+    torch.manual_seed(0)
+    model = DeepPointMap2(preset("small")).eval().requires_grad_(False)
+    found = model.describe(Frame(0, cloud(street(noise, 20_000))))
+    assert (len(found), found.features.dtype) == (256, np.float16)
+    assert found.nbytes <= 70_000
+
+
+def test_missing_weights_and_a_wrong_preset_are_errors_of_use(weights: Path) -> None:
+    with pytest.raises(UsageError, match="nowhere: no such file; weights that come with dpm2"):
+        load_network("nowhere", 1)
+    with pytest.raises(UsageError, match=r"weights of preset tiny, slam\.neural\.preset is base"):
+        load_network(str(weights), 1, "base")
+    with pytest.raises(UsageError, match="not a safetensors file"):
+        load_network(__file__, 1)
+
+
+@pytest.mark.parametrize(("about", "camera"), [({"images": "true"}, True), ({"images": "false"}, False), ({}, False)])
+def test_a_camera_branch_that_was_never_trained_is_left_out(
+    model: DeepPointMap2, tmp_path: Path, about: dict[str, str], camera: bool
+) -> None:
+    save_weights(model, tmp_path / "w.safetensors", about)
+    assert (load_network(str(tmp_path / "w.safetensors"), 1).encoder.image is not None) is camera
+
+
+def test_threads_are_those_of_the_settings(weights: Path) -> None:
+    before = torch.get_num_threads()
+    try:
+        load_network(str(weights), 1)
+        assert torch.get_num_threads() == 1
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_the_geometric_slam_does_not_import_torch() -> None:
+    """It takes seconds and 200 MB, for nothing where no loop asks for descriptors."""
+    program = (
+        "import sys, numpy as np; from dpm2_core.slam.system import SlamSettings, SlamSystem; "
+        "from dpm2_core.frame import Frame; import dpm2_core.commands.run; "
+        "points = np.random.default_rng(0).uniform(-20, 20, (3000, 4)).astype(np.float32); "
+        "system = SlamSystem(SlamSettings(loops={'descriptors': False})); "
+        "[system.process(Frame(i, points)) for i in range(2)]; sys.exit('torch' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", program], timeout=120).returncode == 0

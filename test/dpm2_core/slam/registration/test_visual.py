@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The picture along the direction that scans leave open: a corridor of constant section with painted walls."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.ndimage import map_coordinates
+
+from dpm2_core.data.open import open_source
+from dpm2_core.frame import Array, Camera, Frame, Image
+from dpm2_core.geometry import se3
+from dpm2_core.slam.registration.protocol import Prediction
+from dpm2_core.slam.registration.visual import VisualSettings
+from dpm2_core.slam.system import SlamSettings, make_odometry, make_registration
+
+HALF, HEIGHT = 4.0, 1.8  # m: from the sensor to the walls, and to floor and ceiling
+T_LIDAR_CAM = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
+CAMERA = Camera(np.array([[300, 0, 319.5], [0, 300, 119.5], [0, 0, 1.0]]), T_LIDAR_CAM, (640, 240))
+Paint = Callable[[Array], Array]
+
+
+def random_paint(seed: int = 0) -> Paint:
+    """Brightness (N,) of points (N, 3): smooth noise of 10 cm along the corridor and around it."""
+    noise = np.random.default_rng(seed).uniform(0, 255, (64, 2048)).astype(np.float32)
+    noise = cv2.GaussianBlur(noise, (0, 0), 1.5)
+
+    def paint(points: Array) -> Array:
+        around = 10 * np.where(np.abs(points[:, 1]) > HALF - 1e-6, points[:, 2] + 2, points[:, 1] + 2.5)
+        u, v = (10 * points[:, 0] + 200) % 2040, around % 60
+        return map_coordinates(noise, [v, u], order=1)
+
+    return paint
+
+
+def stripes(points: Array) -> Array:
+    """The same every 2 m."""
+    return 128 + 100 * np.sign(np.sin(np.pi * points[:, 0]))
+
+
+def hits(rays: Array, x: float) -> Array:
+    """Where rays (N, 3) from (x, 0, 0) meet walls, floor or ceiling, (N, 3) in the corridor."""
+    with np.errstate(divide="ignore"):
+        way = np.minimum(HALF / np.abs(rays[:, 1]), HEIGHT / np.abs(rays[:, 2]))
+    return np.clip(way, 0, 80)[:, None] * rays + [x, 0, 0]
+
+
+def frame(x: float, paint: Paint, index: int = 0, gain: float = 1.0) -> Frame:
+    """What is seen from `x` m along the corridor; `gain` is the exposure."""
+    noise = np.random.default_rng(index)
+    azimuth, elevation = noise.uniform(-np.pi, np.pi, 20_000), noise.uniform(-0.4, 0.4, 20_000)
+    rays = np.c_[np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
+    points = hits(rays, x) - [x, 0, 0] + noise.normal(0, 0.01, rays.shape)
+    u, v = np.meshgrid(np.arange(640), np.arange(240))
+    rays = np.c_[u.ravel(), v.ravel(), np.ones(u.size)] @ np.linalg.inv(CAMERA.K).T @ T_LIDAR_CAM[:3, :3].T
+    grey = np.clip(gain * paint(hits(rays, x)).reshape(u.shape), 0, 255).astype(np.uint8)
+    image = Image(np.repeat(grey[..., None], 3, 2), CAMERA)
+    return Frame(index * 10**8, np.c_[points, np.ones(len(points))].astype(np.float32), images=(image,), index=index)
+
+
+def registered(first: Frame, second: Frame, **visual: object) -> tuple[Array, Array, str, str]:
+    """Pose and covariance of the second in the frame of the first, who answered, and why."""
+    registration = make_registration(SlamSettings(visual=VisualSettings.model_validate(visual)))
+    registration.update(registration.prepare(first, np.zeros(6)), np.eye(4))
+    answer = registration.register(registration.prepare(second, np.zeros(6)), Prediction([np.eye(4)]))
+    assert answer.ok
+    return answer.T_target_source, answer.covariance, answer.method, answer.reason
+
+
+def test_the_way_along_a_corridor_is_read_from_its_walls() -> None:
+    """1.7 m that no point can tell, to 3 cm, a step of the fine search, whatever the exposure; its covariance knows."""
+    paint = random_paint()
+    first, second = frame(0.0, paint), frame(1.7, paint, 1, gain=0.6)
+    blind, covariance, method, _ = registered(first, second, enabled=False)
+    assert method == "geometric"
+    assert np.sqrt(covariance[3, 3]) > 0.3
+    assert abs(blind[0, 3] - 1.7) > 0.5
+    T, covariance, method, _ = registered(first, second)
+    assert method == "visual"
+    assert T[0, 3] == pytest.approx(1.7, abs=0.03)
+    np.testing.assert_allclose(T[1:3, 3], 0, atol=0.03)
+    assert np.sqrt(np.linalg.eigvalsh(covariance)[-1]) < 0.1
+    assert np.linalg.eigvalsh(covariance)[0] > 0
+
+
+@pytest.mark.parametrize(
+    ("paint", "why"), [(stripes, "several places are alike"), (lambda p: np.full(len(p), 99.0), "a likeness of only")]
+)
+def test_what_does_not_tell_is_not_believed(paint: Paint, why: str) -> None:
+    """Paint that repeats, or none: the answer stays the points', with their doubt, and says why."""
+    T, covariance, method, reason = registered(frame(0.0, paint), frame(0.7, paint, 1))
+    assert method == "geometric"
+    assert why in reason
+    assert np.sqrt(covariance[3, 3]) > 0.3
+    assert np.isfinite(T).all()
+
+
+def test_without_pictures_nothing_changes() -> None:
+    """Frames whose camera fails go the way they always went."""
+    paint = random_paint()
+    first, second = (Frame(f.stamp, f.points, index=f.index) for f in (frame(0.0, paint), frame(0.2, paint, 1)))
+    for one, other in zip(registered(first, second), registered(first, second, enabled=False), strict=True):
+        assert np.array_equal(one, other)
+
+
+def test_an_odometry_that_brakes_in_a_tunnel() -> None:
+    """Twelve scans at 1 m, then ever shorter: by its velocity alone it would overshoot, and it would say `degraded`."""
+    paint = random_paint(3)
+    steps = [1.0] * 8 + [0.8, 0.6, 0.4, 0.2, 0.1, 0.0, 0.0]
+    at = np.concatenate([[0.0], np.cumsum(steps)])
+    frames = [frame(x, paint, i) for i, x in enumerate(at)]
+    odometry = {on: make_odometry(SlamSettings(visual=VisualSettings(enabled=on))) for on in (True, False)}
+    tracks = {on: [odometry[on].process(f) for f in frames] for on in odometry}
+    errors = {
+        on: [abs((se3.inverse(t[0].T_odom_lidar) @ t[i].T_odom_lidar)[0, 3] - at[i]) for i in range(len(at))]
+        for on, t in tracks.items()
+    }
+    assert max(errors[True]) < 0.1
+    assert errors[False][-1] > 1.0
+    assert {str(t.state) for t in tracks[True][2:]} == {"tracking"}
+    assert "degraded" in {str(t.state) for t in tracks[False]}
+
+
+def test_points_and_pictures_of_a_real_drive_agree(kitti_root: Path) -> None:
+    """Asked where nothing is open, the picture moves the answer by centimetres: two measurements of one motion."""
+    frames = list(open_source(kitti_root / "sequences" / "04").frames(0, 12))
+    tracks = []
+    for sigma in (0.08, 1e-4):
+        odometry = make_odometry(SlamSettings(visual=VisualSettings(sigma=sigma)))
+        tracks.append([odometry.process(frame) for frame in frames])
+    methods = [tracked.registration.method for tracked in tracks[1][1:]]
+    assert methods.count("visual") >= 9  # of 11
+    assert "visual" not in [tracked.registration.method for tracked in tracks[0]]
+    steps = [[se3.inverse(a.T_odom_lidar) @ b.T_odom_lidar for a, b in pairwise(track)] for track in tracks]
+    apart = [np.linalg.norm((se3.inverse(a) @ b)[:3, 3]) for a, b in zip(*steps, strict=True)]
+    assert np.median(apart) < 0.03

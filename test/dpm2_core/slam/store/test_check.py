@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A damaged map is diagnosed without being touched, and what is good of it becomes a new, sound map."""
+
+from __future__ import annotations
+
+import sqlite3
+import subprocess
+import sys
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.frame import Keyframe
+from dpm2_core.slam.store.check import check_map
+from dpm2_core.slam.store.map_data import MapData, load_map
+from dpm2_core.slam.store.map_store import MapStore
+from dpm2_core.slam.store.rows import with_crc
+
+
+def execute(path: Path, *statements: tuple[str, tuple[object, ...]]) -> None:
+    with closing(sqlite3.connect(path)) as sql, sql:
+        for statement, values in statements:
+            sql.execute(statement, values)
+
+
+def recovered(path: Path) -> MapData:
+    """The good part, which must be sound; the damaged file is not touched."""
+    before, out = path.read_bytes(), path.with_name("recovered.dpm2map")
+    out.unlink(missing_ok=True)
+    check_map(path, out)
+    assert path.read_bytes() == before
+    assert check_map(out).problems == []
+    with MapStore.open(out) as store:
+        return load_map(store)
+
+
+def test_a_sound_map_has_no_problems(map_file: Path, drive: list[Keyframe]) -> None:
+    found = check_map(map_file)
+    assert (found.problems, found.keyframes, found.lost) == ([], 12, 0)
+    data = recovered(map_file)
+    assert len(data.edges) == 13
+    np.testing.assert_array_equal(data.poses[11], drive[11].T_odom_kf)
+
+
+def test_rounding_is_no_damage(map_file: Path) -> None:
+    """A loop that was rejected, as dpm2 0.1 wrote it: 1 + 2e-15 in its last corner."""
+    T = np.eye(4)
+    T[3, 3] = 1.0000000000000016
+    row = (90, "loop", 1, 5, T.tobytes(), np.eye(6).tobytes(), 0, 0.0, 1.9, "neural", "too unlike")
+    execute(map_file, ("INSERT INTO edges VALUES (?,?,?,?,?,?,?,?,?,?,?,?)", with_crc(*row)))
+    assert check_map(map_file).problems == []
+
+
+def test_each_kind_of_damage_is_named(map_file: Path, drive: list[Keyframe]) -> None:
+    nan, eye6 = np.full((4, 4), np.nan).tobytes(), np.eye(6).tobytes()
+    execute(
+        map_file,
+        ("UPDATE poses SET T_map_kf = ?, crc = ? WHERE node = 4", with_crc(4, nan)[1:]),
+        ("UPDATE payloads SET cloud = zeroblob(100) WHERE node = 6", ()),
+        ("UPDATE edges SET to_node = 77 WHERE id = 2", ()),
+        ("INSERT INTO edges VALUES (?,?,?,?,?,?,?,?,?,?,?,?)", with_crc(
+            90, "loop", 1, 55, np.eye(4).tobytes(), eye6, 1, 1.0, 0.1, "", "")),
+        ("DELETE FROM keyframes WHERE node = 8", ()),
+    )  # fmt: skip
+    found = check_map(map_file)
+    told = "\n".join(found.problems)
+    for words in (
+        "keyframe 4: its optimised pose is not a finite", "keyframe 6: its payload is lost", "edges 2: its checksum",
+        "edge 90: leads from 1 to 55", "keyframes lost: 8",
+    ):  # fmt: skip
+        assert words in told, told
+    assert (found.keyframes, found.lost, found.lost_clouds) == (11, 1, 1)
+    with MapStore.open(map_file) as store, pytest.raises(Dpm2Error, match="keyframe 8 is missing; see dpm2 map check"):
+        load_map(store)
+    data = recovered(map_file)
+    assert [k.id for k in data.keyframes] == [0, 1, 2, 3, 4, 5, 6, 7, 9, 10, 11]
+    # The lost pose follows from the odometry, and the holes in the chain are bridged by it.
+    np.testing.assert_allclose(data.poses[4], drive[4].T_odom_kf, atol=1e-9)
+    chain = {(e.from_node, e.to_node) for e in data.edges if e.kind == "odometry"}
+    assert chain == {(i, i + 1) for i in range(10)}
+    with MapStore.open(map_file.with_name("recovered.dpm2map")) as store:
+        assert [len(cloud) for cloud in load_map(store).clouds] == [300] * 6 + [0] + [300] * 4
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_damaged_pages_cost_only_what_is_on_them(map_file: Path, seed: int) -> None:
+    content = bytearray(map_file.read_bytes())
+    rng, pages = np.random.default_rng(seed), len(content) // 4096
+    for page in rng.choice(np.arange(8, pages), 2, replace=False):  # the roots of the tables come before
+        content[page * 4096 + 200 : (page + 1) * 4096] = rng.bytes(3896)
+    map_file.write_bytes(content)
+    assert check_map(map_file).problems
+    data = recovered(map_file)
+    assert len(data) >= 8  # each page holds a few keyframes or less
+
+
+def test_a_destroyed_header(map_file: Path, drive: list[Keyframe]) -> None:
+    content = bytearray(map_file.read_bytes())
+    content[:2000] = bytes(2000)
+    map_file.write_bytes(content)
+    with pytest.raises(UsageError, match="not a dpm2 map"):
+        MapStore.open(map_file)
+    data = recovered(map_file)
+    assert len(data) == 12
+    np.testing.assert_array_equal(data.poses[11], drive[11].T_odom_kf)
+
+
+def test_a_map_that_was_cut_off(map_file: Path) -> None:
+    content = map_file.read_bytes()
+    map_file.write_bytes(content[: len(content) * 3 // 5])
+    assert check_map(map_file).problems
+    assert len(recovered(map_file)) >= 1
+
+
+def test_nothing_left_to_recover(tmp_path: Path) -> None:
+    path = tmp_path / "a.dpm2map"
+    path.write_bytes(bytes(40960))
+    with pytest.raises(Dpm2Error, match="nothing in it"):
+        check_map(path, tmp_path / "out")
+    with pytest.raises(UsageError, match="no such"):
+        check_map(tmp_path / "none")
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_tail_of_a_killed_drive_is_recovered_too(map_file: Path) -> None:
+    """It lies in FILE-wal."""
+    program = f"""
+import os
+from pathlib import Path
+from dpm2_core.slam.store.map_store import MapStore
+MapStore.open(Path({str(map_file)!r}), read_only=False).begin_session("second")
+os._exit(0)
+"""
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
+    assert Path(f"{map_file}-wal").stat().st_size
+    assert check_map(map_file).problems == []
+    assert [s.config for s in recovered(map_file).sessions] == ["slam: {}", "second"]

@@ -1,0 +1,289 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A map file survives: kills, cut-off files, full disks, readers meanwhile, and programs of another time."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.frame import Keyframe
+from dpm2_core.slam.store import schema
+from dpm2_core.slam.store.check import check_map
+from dpm2_core.slam.store.cloud_codec import pack_cloud
+from dpm2_core.slam.store.cloud_store import Loan
+from dpm2_core.slam.store.map_data import load_map, save_as
+from dpm2_core.slam.store.map_store import Change, MapStore
+
+WRITER = """
+import sys
+from pathlib import Path
+import numpy as np
+from dpm2_core.descriptors import Descriptors
+from dpm2_core.frame import Keyframe
+from dpm2_core.slam.store.cloud_codec import pack_cloud
+from dpm2_core.slam.store.rows import Edge
+from dpm2_core.slam.store.map_store import Change, MapStore
+rng = np.random.default_rng(0)
+store = MapStore.create(Path(sys.argv[1]))
+store.begin_session()
+print("begun", flush=True)
+for node in range(int(sys.argv[2])):
+    cloud = rng.uniform(0, 1, (2000, 4)).astype(np.float32)
+    d = Descriptors(np.zeros((64, 3), np.float32), np.zeros((64, 128), np.float16))
+    k = Keyframe(node, node, node, np.eye(4), cloud, None, "", d)
+    edges = [Edge("odometry", node - 1, node, np.eye(4), np.eye(6))] if node else []
+    store.write(Change([(node, k, pack_cloud(cloud), None)], edges, {n: np.eye(4) for n in range(node + 1)}))
+    print(node, flush=True)
+"""
+
+
+def whole_prefix(path: Path) -> int:
+    """How many keyframes the map has; they must be the first ones, each with all that belongs to it."""
+    with MapStore.open(path) as store:
+        data = load_map(store)
+        assert [k.id for k in data.keyframes] == list(range(len(data)))
+        assert len(data.edges) == max(len(data) - 1, 0)
+        assert all(len(data.clouds[node]) == 2000 and k.descriptors for node, k in enumerate(data.keyframes))
+        return len(data)
+
+
+def test_everything_comes_back(tmp_path: Path, map_file: Path, drive: list[Keyframe]) -> None:
+    """Poses and covariances to the last bit, clouds to half a centimetre, descriptors as the float16 they are."""
+    for path in (map_file, tmp_path / "again.dpm2map"):
+        if path != map_file:
+            with MapStore.open(map_file) as store:
+                save_as(load_map(store), path)
+        with MapStore.open(path) as store:
+            data = load_map(store)
+            assert [(s.number, s.config, s.weights) for s in data.sessions] == [
+                (1, "slam: {}", "small 0123456789abcdef")
+            ]
+            for node, (k, back) in enumerate(zip(drive, data.keyframes, strict=True)):
+                assert (back.id, back.stamp, back.index, back.robot) == (k.id, k.stamp, k.index, k.robot)
+                np.testing.assert_array_equal(back.T_odom_kf, k.T_odom_kf)
+                np.testing.assert_array_equal(data.poses[node], k.T_odom_kf)
+                np.testing.assert_allclose(data.clouds[node], k.cloud, atol=0.0051)
+                assert back.descriptors is not None
+                assert k.descriptors is not None
+                np.testing.assert_array_equal(back.descriptors.xyz, k.descriptors.xyz)
+                np.testing.assert_array_equal(back.descriptors.features, k.descriptors.features)
+                if k.edge is not None:
+                    assert back.edge is not None
+                    np.testing.assert_array_equal(back.edge.covariance, k.edge.covariance)
+            assert [(e.kind, e.ok) for e in data.edges[-2:]] == [("loop", True), ("loop", False)]
+            assert data.edges[-1].reason == "too far"
+            assert data.edges[-1].rmse == np.inf
+
+
+def test_a_loan_and_a_thumbnail_come_back(map_file: Path, drive: list[Keyframe]) -> None:
+    T = np.eye(4)
+    T[0, 3] = 2.0
+    with MapStore.open(map_file, read_only=False) as store:
+        store.begin_session()
+        store.write(Change([(12, drive[0], Loan(3, T), None)], poses={12: np.eye(4)}))
+        store.write(Change([(13, drive[1], pack_cloud(drive[1].cloud), b"jpeg")], poses={13: np.eye(4)}))
+    with MapStore.open(map_file) as store:
+        data = load_map(store)
+        assert data.session[-2:] == [2, 2]
+        np.testing.assert_allclose(data.clouds[12][:, 0], data.clouds[3][:, 0] + 2, atol=1e-5)
+        borrowed, lent = data.keyframes[12].descriptors, data.keyframes[3].descriptors
+        assert borrowed is not None
+        assert lent is not None
+        assert borrowed.features is lent.features  # no memory
+        assert data.thumbnail(13) == b"jpeg"
+        assert data.thumbnail(0) is None
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_kill_at_any_instant_loses_no_keyframe_that_was_taken_in(tmp_path: Path, seed: int) -> None:
+    path = tmp_path / "a.dpm2map"
+    child = subprocess.Popen([sys.executable, "-c", WRITER, str(path), "1000000"], stdout=subprocess.PIPE)
+    assert child.stdout is not None
+    assert child.stdout.readline() == b"begun\n"
+    time.sleep(float(np.random.default_rng(seed).uniform(0, 0.5)))
+    child.send_signal(signal.SIGKILL)
+    acknowledged = len(child.stdout.read().splitlines())
+    child.wait()
+    child.stdout.close()
+    assert acknowledged - 1 <= whole_prefix(path) <= acknowledged + 1  # the last line itself may be cut off
+    assert check_map(path).problems == []
+    with MapStore.open(path, read_only=False) as store:  # and it can be written to again
+        store.begin_session()
+
+
+def test_a_file_cut_off_at_any_place_holds_the_first_keyframes(tmp_path: Path) -> None:
+    """What a machine that dies leaves of FILE-wal: any prefix, and garbage after it."""
+    path = tmp_path / "a.dpm2map"
+    program = WRITER + "\nimport os; os._exit(0)"  # without closing: FILE-wal stays
+    subprocess.run([sys.executable, "-c", program, str(path), "12"], check=True, capture_output=True, timeout=60)
+    main, wal = path.read_bytes(), Path(f"{path}-wal").read_bytes()
+    rng, counts = np.random.default_rng(0), set()
+    for trial in range(30):
+        cut = tmp_path / f"{trial}.dpm2map"
+        cut.write_bytes(main)
+        size = int(rng.integers(0, len(wal) + 1))
+        Path(f"{cut}-wal").write_bytes(wal[:size] + (rng.bytes(5000) if trial % 2 else b""))
+        try:
+            counts.add(whole_prefix(cut))
+        except UsageError:  # the very beginning: not even the schema had been written
+            assert size < 100_000
+    assert 12 in counts or max(counts) >= 10
+    assert len(counts) > 4
+
+
+def test_a_reader_sees_whole_keyframes_while_they_are_written(tmp_path: Path) -> None:
+    path = tmp_path / "a.dpm2map"
+    child = subprocess.Popen([sys.executable, "-c", WRITER, str(path), "60"], stdout=subprocess.PIPE)
+    assert child.stdout is not None
+    assert child.stdout.readline() == b"begun\n"
+    counts = []
+    while child.poll() is None:
+        counts.append(whole_prefix(path))
+    child.stdout.close()
+    assert child.returncode == 0  # and the writer was not disturbed
+    assert counts == sorted(counts)
+    assert len(set(counts)) > 2
+    assert whole_prefix(path) == 60
+
+
+def test_reading_leaves_no_trace(map_file: Path) -> None:
+    def state() -> tuple[str, list[str]]:
+        files = sorted(os.listdir(map_file.parent))
+        return hashlib.sha256(map_file.read_bytes()).hexdigest(), files
+
+    before = state()
+    with MapStore.open(map_file) as store:
+        data = load_map(store)
+        assert len(data.clouds[3])
+        with pytest.raises(Dpm2Error, match="readonly"):
+            store.begin_session()
+    assert state() == before
+
+
+def test_a_folder_that_cannot_be_written(map_file: Path) -> None:
+    """Reading works, also of a map whose writer was killed; writing is an error that says so."""
+    program = f"""
+import os, sys
+from pathlib import Path
+from dpm2_core.errors import Dpm2Error
+from dpm2_core.slam.store.map_data import load_map
+from dpm2_core.slam.store.map_store import Change, MapStore
+path = Path({str(map_file)!r})
+store = MapStore.open(path, read_only=False)
+store.begin_session()
+for folder in (path.parent, path.parent.parent, path.parent.parent.parent):
+    folder.chmod(0o755)
+path.parent.chmod(0o555)
+for file in path.parent.iterdir():
+    file.chmod(0o444)
+if os.getuid() == 0:
+    os.setuid(65534)  # root may write anywhere
+with MapStore.open(path) as reader:
+    data = load_map(reader)
+    print(len(data), len(data.sessions), len(data.clouds[0]))
+attempts = (lambda: MapStore.open(path, read_only=False).begin_session(), lambda: MapStore.create(path.parent / "b"))
+for attempt in attempts:
+    try:
+        attempt()
+    except Dpm2Error as error:
+        print(str(path.parent) in str(error), len(str(error).splitlines()))
+os._exit(0)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    map_file.parent.chmod(0o755)
+    assert done.stdout.splitlines() == ["12 2 300", "True 1", "True 1"], done.stderr
+
+
+VERSION_1 = """
+CREATE TABLE about (program TEXT, created TEXT, config TEXT, weights TEXT);
+CREATE TABLE keyframes (node INTEGER PRIMARY KEY, robot TEXT, stamp INTEGER, frame INTEGER, T_odom_kf BLOB,
+  T_map_kf BLOB, cloud BLOB, descriptors BLOB);
+CREATE TABLE edges (kind TEXT, from_node INTEGER, to_node INTEGER, T_from_to BLOB, covariance BLOB);
+"""
+
+
+def version_1(path: Path, drive: list[Keyframe]) -> None:
+    with sqlite3.connect(path) as sql:
+        sql.executescript(VERSION_1)
+        sql.execute(f"PRAGMA application_id = {schema.APPLICATION_ID}")
+        sql.execute("PRAGMA user_version = 1")
+        sql.execute("INSERT INTO about VALUES ('0.0.1', '2026-01-01T00:00:00', 'a: 1', '')")
+        for node, k in enumerate(drive):
+            T = k.T_odom_kf.tobytes()
+            row = (node, "", k.stamp, k.index, T, T, pack_cloud(k.cloud), None)
+            sql.execute("INSERT INTO keyframes VALUES (?,?,?,?,?,?,?,?)", row)
+            if k.edge is not None:
+                edge = ("odometry", node - 1, node, k.edge.T_target_source.tobytes(), k.edge.covariance.tobytes())
+                sql.execute("INSERT INTO edges VALUES (?,?,?,?,?)", edge)
+    sql.close()
+
+
+def test_an_older_map_is_read_and_brought_up_to_date(tmp_path: Path, drive: list[Keyframe]) -> None:
+    path = tmp_path / "old.dpm2map"
+    version_1(path, drive)
+    before = path.read_bytes()
+    for read_only in (True, False, True):
+        with MapStore.open(path, read_only=read_only) as store:
+            data = load_map(store)
+            assert len(data) == 12
+            assert [s.config for s in data.sessions] == ["a: 1"]
+            assert len(data.edges) == 11
+            np.testing.assert_array_equal(data.poses[7], drive[7].T_odom_kf)
+            np.testing.assert_allclose(data.clouds[7], drive[7].cloud, atol=0.0051)
+        assert (path.read_bytes() == before) == read_only or not read_only
+        if read_only is False:
+            before = path.read_bytes()
+            with sqlite3.connect(path) as sql:
+                assert sql.execute("PRAGMA user_version").fetchone() == (schema.VERSION,)
+            sql.close()
+
+
+def test_what_is_no_map_is_refused_in_one_line(tmp_path: Path, map_file: Path) -> None:
+    text, other, later = tmp_path / "a.txt", tmp_path / "other.db", map_file
+    text.write_text("no map at all, but long enough to look like something")
+    with sqlite3.connect(other) as sql:
+        sql.execute("CREATE TABLE t (x)")
+    sql.close()
+    with sqlite3.connect(later) as sql:
+        sql.execute("PRAGMA user_version = 99")
+    sql.close()
+    for path, words in ((text, "not a dpm2 map"), (other, "no dpm2 map"), (later, "later dpm2"), (tmp_path, "no such")):
+        for read_only in (True, False):
+            with pytest.raises(UsageError, match=words) as caught:
+                MapStore.open(path, read_only=read_only)
+            assert str(path) in str(caught.value)
+    with pytest.raises(UsageError, match="there is a file already"):
+        MapStore.create(text)
+
+
+def test_two_writers(map_file: Path, drive: list[Keyframe], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("dpm2_core.slam.store.map_store._BUSY_S", 0.1)
+    with MapStore.open(map_file, read_only=False) as one, MapStore.open(map_file, read_only=False) as two:
+        one._connection.execute("BEGIN IMMEDIATE")
+        with pytest.raises(Dpm2Error, match="locked"):
+            two.begin_session()
+        one._connection.execute("ROLLBACK")
+
+
+def test_an_unfinished_copy_leaves_nothing_behind(tmp_path: Path, map_file: Path) -> None:
+    with sqlite3.connect(map_file) as sql:
+        sql.execute("UPDATE payloads SET cloud = x'00' WHERE node = 5")
+    sql.close()
+    with MapStore.open(map_file) as store:
+        data = load_map(store, descriptors=False)
+        data.clouds._stored = lambda node: (_ for _ in ()).throw(Dpm2Error("disk gone"))
+        with pytest.raises(Dpm2Error, match="disk gone"):
+            save_as(data, tmp_path / "copy.dpm2map")
+        with pytest.raises(UsageError, match="already"):
+            save_as(data, map_file)
+    assert os.listdir(tmp_path) == [map_file.name]
