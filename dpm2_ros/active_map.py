@@ -12,12 +12,12 @@ from typing import Any
 from dpm2_core.config import dump_settings
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Array, Keyframe, LoopClosure, State
+from dpm2_core.slam.build import make_localiser, make_mapper
 from dpm2_core.slam.loops.localizer import Localiser, Located
 from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.output import save_map
 from dpm2_core.slam.session import open_for_localisation, open_session
 from dpm2_core.slam.store.map_store import MapStore
-from dpm2_core.slam.system import make_localiser, make_mapper
 from dpm2_ros.settings import NodeConfig
 
 AUTO = "auto"

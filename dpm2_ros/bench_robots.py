@@ -30,9 +30,10 @@ from dpm2_core.evaluation.metrics import align, ape_rmse
 from dpm2_core.evaluation.record import write_record
 from dpm2_core.frame import Array
 from dpm2_core.sim.simulated_drive import SimulatedDrive
+from dpm2_core.slam.settings import Config
 from dpm2_core.slam.store.map_data import MapData, load_map
 from dpm2_core.slam.store.map_store import MapStore
-from dpm2_core.slam.system import Config, SlamSystem
+from dpm2_core.slam.system import SlamSystem
 from dpm2_core.tables import FigureTable
 from dpm2_ros.bench_network import LOSS, Link, inside
 from dpm2_ros.conversions import cloud_to_msg, parse_keyframe_name

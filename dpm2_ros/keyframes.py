@@ -29,10 +29,10 @@ from dpm2_core.frame import Keyframe
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.network.pretrained import weights_path
 from dpm2_core.slam.mapping.admission import RejectedError
+from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.slam.store.cloud_codec import pack_cloud
 from dpm2_core.slam.store.cloud_store import SpillFile
 from dpm2_core.slam.store.rows import weights_id
-from dpm2_core.slam.system import SlamSettings
 from dpm2_ros.conversions import bytes_to_array, edge_to_msg, header, keyframe_name
 from dpm2_ros.subscriptions import STEADY
 

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from dpm2_core.config import Settings
-from dpm2_core.slam.system import Config
+from dpm2_core.slam.settings import Config
 
 FrameName = Annotated[str, Field(pattern=r"^[^/\s]\S*$")]
 Period = Annotated[float, Field(ge=0.1, le=3600)]

@@ -19,9 +19,9 @@ from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Keyframe, State, Tracked
 from dpm2_core.geometry import se3
+from dpm2_core.slam.build import make_loops, make_odometry
 from dpm2_core.slam.loops.localizer import LOST
 from dpm2_core.slam.mapping.admission import check_pose
-from dpm2_core.slam.system import make_loops, make_odometry
 from dpm2_ros.base_frame import BaseFrame
 from dpm2_ros.conversions import keyframe_to_base, odometry_to_msg, of_body, to_base
 from dpm2_ros.frames import FrameBuilder

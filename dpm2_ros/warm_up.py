@@ -9,7 +9,8 @@ import numpy as np
 
 from dpm2_core.frame import Camera, Frame, Image, Points
 from dpm2_core.geometry import se3
-from dpm2_core.slam.system import SlamSettings, SlamSystem
+from dpm2_core.slam.settings import SlamSettings
+from dpm2_core.slam.system import SlamSystem
 from dpm2_ros.runtime import STOP
 
 _FRAMES = 3  # the first begins the map, the second finds the speed, the third is like all others

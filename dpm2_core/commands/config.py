@@ -7,7 +7,7 @@ import typer
 
 from dpm2_core.commands.run import ConfigFile, Overrides
 from dpm2_core.config import dump_settings, load_settings
-from dpm2_core.slam.system import Config
+from dpm2_core.slam.settings import Config
 
 app = typer.Typer(help="Look at the configuration.")
 

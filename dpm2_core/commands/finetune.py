@@ -32,7 +32,7 @@ def finetune(
     from dpm2_core.learning import finetune as work
     from dpm2_core.learning import finetune_data, finetune_settings
     from dpm2_core.network.pretrained import load_network, weights_path  # torch is slow to import
-    from dpm2_core.slam.system import SlamSettings
+    from dpm2_core.slam.settings import SlamSettings
 
     refuse_overwriting(out, resume)
     chosen = load_settings(finetune_settings.FinetuneSettings, config, settings or [])

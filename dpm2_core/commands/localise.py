@@ -21,7 +21,8 @@ from dpm2_core.files import atomic_write
 from dpm2_core.frame import Array, Frame, State
 from dpm2_core.geometry import se3
 from dpm2_core.slam.session import open_for_localisation
-from dpm2_core.slam.system import Config, LocalisationSystem
+from dpm2_core.slam.settings import Config
+from dpm2_core.slam.system import LocalisationSystem
 
 
 def parse_hint(text: str) -> Array:

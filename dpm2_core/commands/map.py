@@ -21,7 +21,8 @@ from dpm2_core.data.trajectory import write_kitti, write_tum
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
-from dpm2_core.slam.store.map_data import MapData, load_map, map_cloud, restore, save_as, trajectory
+from dpm2_core.slam.mapping.restore import restore
+from dpm2_core.slam.store.map_data import MapData, load_map, map_cloud, save_as, trajectory
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.tables import FigureTable
 
@@ -102,10 +103,11 @@ def merge(
     settings: Overrides = None,
 ) -> None:
     """Join maps, by known transforms or by the places that they share."""
+    from dpm2_core.slam.build import make_loops
     from dpm2_core.slam.graph.pose_graph import PoseGraph
     from dpm2_core.slam.mapping.merge import align as aligned
     from dpm2_core.slam.mapping.merge import loops_by, merge_maps, optimised
-    from dpm2_core.slam.system import Config, make_loops
+    from dpm2_core.slam.settings import Config
 
     given = [parse_transform(text) for text in transform or ()]
     if len(paths) < 2 or align == bool(given) or (given and len(given) != len(paths) - 1):

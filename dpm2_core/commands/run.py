@@ -32,8 +32,9 @@ from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.slam.output import TrajectoryRecorder
 from dpm2_core.slam.session import open_session, resume_at
+from dpm2_core.slam.settings import Config
 from dpm2_core.slam.store.map_store import MapStore
-from dpm2_core.slam.system import Config, SlamSystem
+from dpm2_core.slam.system import SlamSystem
 
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="YAML file; `dpm2 config dump` shows every key.")]
 Overrides = Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, such as slam.map.voxel=0.3.")]

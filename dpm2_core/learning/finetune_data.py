@@ -16,7 +16,8 @@ from dpm2_core.learning.finetune_settings import DRIVES, HELD_OUT, REHEARSAL, Fi
 from dpm2_core.learning.generate import generate, pack
 from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.slam.output import TrajectoryRecorder
-from dpm2_core.slam.system import SlamSettings, SlamSystem
+from dpm2_core.slam.settings import SlamSettings
+from dpm2_core.slam.system import SlamSystem
 
 
 class Referenced:

@@ -11,9 +11,9 @@ from dpm2_core.data.source import Source
 from dpm2_core.errors import UsageError
 from dpm2_core.network.pretrained import weights_path
 from dpm2_core.slam.mapping.mapper import Mapper
+from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.slam.store.rows import Session, weights_id
-from dpm2_core.slam.system import SlamSettings
 
 _SAME_FRAME = np.diag([1e-4] * 3 + [1e-3] * 3) ** 2  # rad, m: the rounding of what is the same frame
 

@@ -12,7 +12,8 @@ from dpm2_core.data.open import open_source
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.metrics import evaluate
 from dpm2_core.frame import Array, Frame
-from dpm2_core.slam.system import SlamSettings, make_odometry
+from dpm2_core.slam.build import make_odometry
+from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.tasks.open import open_scans
 from dpm2_core.tasks.semantic_kitti import sequence_folders
 from dpm2_core.tasks.task import Task

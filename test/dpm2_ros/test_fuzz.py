@@ -34,10 +34,11 @@ from dpm2_core.data.open import open_source
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.frame import Frame, Tracked
+from dpm2_core.slam.build import make_odometry
+from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.slam.store.cloud_codec import pack_cloud, unpack_cloud
 from dpm2_core.slam.store.map_data import load_map
 from dpm2_core.slam.store.map_store import MapStore
-from dpm2_core.slam.system import SlamSettings, make_odometry
 from dpm2_ros.conversions import cloud_to_msg
 from dpm2_ros.replay import ros_environment, start
 

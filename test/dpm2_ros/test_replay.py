@@ -33,7 +33,8 @@ from dpm2_core.data.messages import stamp_ns
 from dpm2_core.data.trajectory import read_trajectory
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.slam.system import Config, SlamSystem
+from dpm2_core.slam.settings import Config
+from dpm2_core.slam.system import SlamSystem
 from dpm2_ros import lockstep
 from dpm2_ros.bag_player import BagPlayer, Options
 from dpm2_ros.conversions import pose_to_msg

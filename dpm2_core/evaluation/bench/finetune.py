@@ -29,7 +29,7 @@ from dpm2_core.network.pretrained import weights_path
 from dpm2_core.network.weights import load_model
 from dpm2_core.sim.drive import simulate
 from dpm2_core.sim.settings import LidarConfig, PresetName
-from dpm2_core.slam.system import SlamSettings
+from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.tables import FigureTable
 
 LIDAR = LidarConfig(beams=32, height=3.4, columns=1810)

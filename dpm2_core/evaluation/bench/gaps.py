@@ -15,7 +15,8 @@ from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.bench.harness import Options, Report, drives, processors, settings_of, unique_name
 from dpm2_core.frame import Array, Frame, State, Tracked
 from dpm2_core.geometry import se3
-from dpm2_core.slam.system import SlamSettings, make_odometry
+from dpm2_core.slam.build import make_odometry
+from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.tables import FigureTable
 
 _SECONDS = (1.0, 2.0, 3.0, 5.0, 7.0, 10.0)

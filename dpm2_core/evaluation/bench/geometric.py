@@ -20,7 +20,8 @@ from dpm2_core.evaluation.bench.harness import Options, Report, drives, processo
 from dpm2_core.evaluation.metrics import Metrics, evaluate
 from dpm2_core.frame import Array, Frame
 from dpm2_core.slam.output import TrajectoryRecorder
-from dpm2_core.slam.system import Config, SlamSystem
+from dpm2_core.slam.settings import Config
+from dpm2_core.slam.system import SlamSystem
 from dpm2_core.tables import FigureTable
 
 LENGTHS = (10.0, 20.0, 30.0, 40.0, 50.0)

@@ -22,7 +22,7 @@ from dpm2_core.data.open import open_source
 from dpm2_core.data.source import Source
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.evaluation.record import REPOSITORY, write_record
-from dpm2_core.slam.system import Config, SlamSettings
+from dpm2_core.slam.settings import Config, SlamSettings
 
 
 @dataclass(frozen=True)

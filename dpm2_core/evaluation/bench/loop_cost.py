@@ -18,8 +18,9 @@ from dpm2_core.frame import Array, Keyframe, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.world import build_world
+from dpm2_core.slam.build import make_loops
+from dpm2_core.slam.settings import Config
 from dpm2_core.slam.store.map_data import NO_POINTS
-from dpm2_core.slam.system import Config, make_loops
 
 SIZES = (100, 1000, 5000, 20000)
 _MEASURED = 15  # keyframes at each size

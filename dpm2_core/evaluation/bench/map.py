@@ -30,13 +30,14 @@ from dpm2_core.sim.drive import simulate
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import LidarConfig
 from dpm2_core.sim.world import World, build_world
+from dpm2_core.slam.build import make_mapper
 from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.mapping.prune import prune, redundant_nodes
+from dpm2_core.slam.settings import Config, SlamSettings
 from dpm2_core.slam.store.check import check_map
 from dpm2_core.slam.store.cloud_codec import unpack_mask
 from dpm2_core.slam.store.map_data import MapData, load_map, map_cloud, save_as
 from dpm2_core.slam.store.map_store import MapStore
-from dpm2_core.slam.system import Config, SlamSettings, make_mapper
 from dpm2_core.tables import FigureTable
 
 Mask = NDArray[np.bool_]

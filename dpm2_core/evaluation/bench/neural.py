@@ -44,7 +44,7 @@ from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pretrained import load_network, weights_path
 from dpm2_core.network.pyramid import build_pyramid, collate, crop
 from dpm2_core.network.weights import read_metadata
-from dpm2_core.slam.system import make_registration
+from dpm2_core.slam.build import make_registration
 
 Part = Callable[[DeepPointMap2, Options], dict[str, Any]]
 

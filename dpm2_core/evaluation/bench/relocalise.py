@@ -22,11 +22,12 @@ from dpm2_core.geometry import se3
 from dpm2_core.network.pretrained import load_network
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.simulated_drive import SimulatedDrive
+from dpm2_core.slam.build import make_mapper
 from dpm2_core.slam.loops.relocalization import Relocaliser, thinned
 from dpm2_core.slam.preprocess import Preprocessor
+from dpm2_core.slam.settings import Config, SlamSettings
 from dpm2_core.slam.store.map_data import load_map
 from dpm2_core.slam.store.map_store import MapStore
-from dpm2_core.slam.system import Config, SlamSettings, make_mapper
 
 RIGHT_M, RIGHT_DEG = 0.3, 1.0
 """An answer no farther off is right."""

@@ -20,7 +20,8 @@ from dpm2_core.evaluation.metrics import evaluate
 from dpm2_core.sim.settings import PresetName
 from dpm2_core.sim.simulated_drive import SimulatedDrive
 from dpm2_core.slam.output import TrajectoryRecorder
-from dpm2_core.slam.system import Config, SlamSettings, SlamSystem
+from dpm2_core.slam.settings import Config, SlamSettings
+from dpm2_core.slam.system import SlamSystem
 from dpm2_core.tables import FigureTable
 
 ROADS: dict[str, PresetName] = {

@@ -25,9 +25,10 @@ from dpm2_core.network.pretrained import PERCEPTION_WEIGHTS, PRETRAINED_DIR
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import LidarConfig, PresetName
 from dpm2_core.sim.world import World, build_world
+from dpm2_core.slam.build import make_odometry
 from dpm2_core.slam.filters import FilterKind, FilterSettings, make_filter
 from dpm2_core.slam.odometry.odometry import Odometry
-from dpm2_core.slam.system import Config, SlamSettings, make_odometry
+from dpm2_core.slam.settings import Config, SlamSettings
 from dpm2_core.tables import FigureTable
 
 PLACES: dict[PresetName, float] = {"city": 20.0, "suburb": 40.0, "rural": 40.0}

@@ -23,7 +23,7 @@ from dpm2_core.learning.generate import GenerateSettings, generate
 from dpm2_core.learning.train_overlap import FRAMES, OVERLAP, average_precision, draw_overlap
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.sim.settings import PresetName
-from dpm2_core.slam.system import make_registration
+from dpm2_core.slam.build import make_registration
 
 # Training begins at seed 1,000, validation at 900,000.
 _SEEDS = {"mixed": 910_000, "highway": 920_000, "tunnel": 930_000}

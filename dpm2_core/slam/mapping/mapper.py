@@ -13,7 +13,7 @@ from pydantic import Field
 
 from dpm2_core.config import Settings
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.frame import Array, Frame, Keyframe, LoopClosure, Points
+from dpm2_core.frame import Array, Keyframe, LoopClosure, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.loops.closure import LoopCloser
@@ -21,9 +21,10 @@ from dpm2_core.slam.loops.consistency import Loop, refused
 from dpm2_core.slam.mapping.admission import check_keyframe
 from dpm2_core.slam.mapping.moving import MovingSettings, MovingWindow
 from dpm2_core.slam.mapping.redundancy import RedundancySettings, lender
+from dpm2_core.slam.mapping.restore import restore
 from dpm2_core.slam.store.cloud_codec import pack_cloud
 from dpm2_core.slam.store.cloud_store import CloudStore
-from dpm2_core.slam.store.map_data import NO_POINTS, borrowing, load_map, map_cloud, restore
+from dpm2_core.slam.store.map_data import NO_POINTS, borrowing, load_map, map_cloud
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.slam.store.rows import Edge
 from dpm2_core.slam.store.writer import MapWriter
@@ -303,15 +304,3 @@ def _loop_edge(loop: Loop) -> Edge:
     r = loop.registration
     told = (r.ok, r.confidence, r.rmse, r.method, r.reason)
     return Edge("loop", loop.from_node, loop.to_node, r.T_target_source, r.covariance, *told)
-
-
-def thumbnail(frame: Frame, width: int) -> bytes | None:
-    """JPEG of the frame's first picture, `width` pixels wide; None without a picture, or for a width of 0."""
-    if not frame.images or not width:
-        return None
-    import cv2
-
-    pixels = frame.images[0].pixels
-    height = max(1, round(width * pixels.shape[0] / pixels.shape[1]))
-    small = cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA)
-    return bytes(cv2.imencode(".jpg", cv2.cvtColor(small, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 80])[1])

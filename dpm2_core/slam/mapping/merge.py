@@ -13,8 +13,9 @@ from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.loops.closure import LoopCloser
+from dpm2_core.slam.mapping.restore import restore
 from dpm2_core.slam.store.cloud_store import CloudStore, Loan
-from dpm2_core.slam.store.map_data import MapData, restore
+from dpm2_core.slam.store.map_data import MapData
 from dpm2_core.slam.store.rows import Edge
 
 FindLoops = Callable[[MapData, MapData], list[Edge]]

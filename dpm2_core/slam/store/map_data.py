@@ -15,7 +15,6 @@ from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Array, Keyframe, Points, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.voxel import voxel_first
-from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.store.cloud_store import CloudStore, Loan
 from dpm2_core.slam.store.map_store import Change, MapStore
 from dpm2_core.slam.store.rows import NO_POINTS as NO_POINTS
@@ -236,19 +235,6 @@ def trajectory(data: MapData) -> tuple[list[int], Array]:
     rows += [(p.robot, p.session, p.stamp, data.poses[p.node] @ p.T_node_kf) for p in data.trail]
     rows.sort(key=lambda row: row[:3])
     return [row[2] for row in rows], np.array([row[3] for row in rows]).reshape(-1, 4, 4)
-
-
-def restore(graph: PoseGraph, data: MapData) -> None:
-    """Fill an empty pose graph with the nodes and constraints of a map."""
-    chain = _chain(data.constraints)
-    for node, T_map_kf in enumerate(data.poses):
-        if (edge := chain.get(node)) is not None:
-            graph.add_node(T_map_kf, edge.T_from_to, edge.covariance, edge.from_node)
-        else:
-            graph.add_node(T_map_kf, None, None)
-    for edge in data.constraints:
-        if chain.get(edge.to_node) is not edge:
-            graph.add_loop(edge.from_node, edge.to_node, edge.T_from_to, edge.covariance)
 
 
 def _chain(edges: Iterable[Edge]) -> dict[int, Edge]:

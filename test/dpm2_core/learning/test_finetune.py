@@ -26,7 +26,7 @@ from dpm2_core.network.tokens import Tokens
 from dpm2_core.network.weights import load_model, read_metadata, save_weights
 from dpm2_core.sim.drive import simulate
 from dpm2_core.sim.settings import LidarConfig
-from dpm2_core.slam.system import SlamSettings
+from dpm2_core.slam.settings import SlamSettings
 
 
 def descriptors(poses: torch.Tensor, channels: int) -> Tokens:

@@ -16,7 +16,8 @@ from dpm2_core.network.perception.dynamic_objects import MoverNetSettings
 from dpm2_core.network.perception.gndnet import GroundNet, GroundSettings
 from dpm2_core.slam.filters import FilterSettings, GroundFilter, MoverFilter, StaticFilter, make_filter
 from dpm2_core.slam.preprocess import Preprocessor, PreprocessSettings
-from dpm2_core.slam.system import SlamSettings, SlamSystem
+from dpm2_core.slam.settings import SlamSettings
+from dpm2_core.slam.system import SlamSystem
 from dpm2_core.tasks.dynamic_objects_task import MoverTask, MoverTraining
 from dpm2_core.tasks.training import save_task
 

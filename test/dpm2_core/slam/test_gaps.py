@@ -15,8 +15,9 @@ from dpm2_core.geometry import se3
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import LidarConfig
 from dpm2_core.sim.world import World, build_world
+from dpm2_core.slam.build import make_odometry
 from dpm2_core.slam.output import TrajectoryRecorder
-from dpm2_core.slam.system import SlamSettings, make_odometry
+from dpm2_core.slam.settings import SlamSettings
 
 Pose = Callable[[float], Array]  # seconds to T_world_lidar (4, 4)
 

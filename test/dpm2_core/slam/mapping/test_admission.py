@@ -13,12 +13,13 @@ import pytest
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.frame import Array, Keyframe, Registration
 from dpm2_core.geometry import se3
+from dpm2_core.slam.build import make_mapper
 from dpm2_core.slam.loops.closure import LoopCloser
 from dpm2_core.slam.mapping.admission import RejectedError, check_keyframe
 from dpm2_core.slam.mapping.mapper import Mapper
+from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.slam.store.map_data import load_map
 from dpm2_core.slam.store.map_store import MapStore
-from dpm2_core.slam.system import SlamSettings, make_mapper
 
 STEP = se3.exp([0, 0, 0.05, 2.0, 0, 0])
 SIGMA = np.diag([1e-3, 1e-3, 1e-3, 0.02, 0.02, 0.02]) ** 2

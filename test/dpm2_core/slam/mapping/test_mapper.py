@@ -16,9 +16,10 @@ from dpm2_core.geometry import se3
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import LidarConfig
 from dpm2_core.sim.world import build_world
+from dpm2_core.slam.build import make_mapper
 from dpm2_core.slam.graph.pose_graph import PoseGraph, PoseGraphSettings
 from dpm2_core.slam.output import TrajectoryRecorder, save_map
-from dpm2_core.slam.system import SlamSettings, make_mapper
+from dpm2_core.slam.settings import SlamSettings
 
 # Loops by descriptors have tests of their own; here the pose leads to the candidates, which is faster.
 BY_POSE = SlamSettings.model_validate({"loops": {"descriptors": False}})

@@ -204,7 +204,7 @@ def test_thumbnails(tmp_path: Path, width: int) -> None:
     import cv2
 
     from dpm2_core.frame import Camera, Frame, Image
-    from dpm2_core.slam.mapping.mapper import thumbnail
+    from dpm2_core.slam.mapping.thumbnail import thumbnail
 
     pixels = np.zeros((100, 200, 3), np.uint8)
     pixels[..., 0] = 255  # red

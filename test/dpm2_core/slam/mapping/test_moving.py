@@ -13,8 +13,9 @@ from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import LidarConfig
 from dpm2_core.sim.world import build_world
+from dpm2_core.slam.build import make_mapper
 from dpm2_core.slam.mapping.moving import MovingSettings, MovingWindow, RangeImage, find_moving
-from dpm2_core.slam.system import SlamSettings, make_mapper
+from dpm2_core.slam.settings import SlamSettings
 
 SETTINGS = MovingSettings()
 GEOMETRIC = SlamSettings.model_validate({"loops": {"enabled": False}})

@@ -14,7 +14,8 @@ from dpm2_core.geometry import se3
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import LidarConfig
 from dpm2_core.sim.world import build_world
-from dpm2_core.slam.system import SlamSettings, make_odometry
+from dpm2_core.slam.build import make_odometry
+from dpm2_core.slam.settings import SlamSettings
 
 from ..conftest import Drive, make_drive
 

@@ -17,7 +17,8 @@ from dpm2_core.slam.preprocess import Preprocessor, PreprocessSettings, Scan
 from dpm2_core.slam.registration.fused import RefinedScanRegistration
 from dpm2_core.slam.registration.icp import GeometricRegistration, GeometricSettings
 from dpm2_core.slam.registration.local_map import LocalMap, LocalMapSettings
-from dpm2_core.slam.registration.protocol import GeometricScanRegistration, Prediction
+from dpm2_core.slam.registration.points import GeometricScanRegistration
+from dpm2_core.slam.registration.protocol import Prediction
 
 from ..conftest import Drive
 

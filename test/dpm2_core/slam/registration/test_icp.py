@@ -12,7 +12,8 @@ from dpm2_core.slam.odometry.odometry import OdometrySettings
 from dpm2_core.slam.preprocess import Preprocessor, PreprocessSettings, Scan
 from dpm2_core.slam.registration.icp import GeometricRegistration, GeometricSettings
 from dpm2_core.slam.registration.local_map import LocalMap, LocalMapSettings
-from dpm2_core.slam.registration.protocol import GeometricScanRegistration, Prediction, agree
+from dpm2_core.slam.registration.points import GeometricScanRegistration
+from dpm2_core.slam.registration.protocol import Prediction, agree
 
 from ..conftest import Drive
 

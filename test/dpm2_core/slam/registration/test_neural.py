@@ -21,10 +21,13 @@ from dpm2_core.network.pretrained import load_network
 from dpm2_core.network.settings import NetworkSettings, preset
 from dpm2_core.network.tokens import to_tokens
 from dpm2_core.network.weights import save_weights
+from dpm2_core.slam.build import make_registration
 from dpm2_core.slam.preprocess import Preprocessor, PreprocessSettings
-from dpm2_core.slam.registration.neural import DescriptorMap, NeuralScanRegistration, NeuralSettings
+from dpm2_core.slam.registration.descriptor_map import DescriptorMap
+from dpm2_core.slam.registration.neural import NeuralScanRegistration, NeuralSettings
 from dpm2_core.slam.registration.protocol import Prediction
-from dpm2_core.slam.system import SlamSettings, SlamSystem, make_registration
+from dpm2_core.slam.settings import SlamSettings
+from dpm2_core.slam.system import SlamSystem
 
 Street = Callable[..., np.ndarray]
 

@@ -15,9 +15,10 @@ from scipy.ndimage import map_coordinates
 from dpm2_core.data.open import open_source
 from dpm2_core.frame import Array, Camera, Frame, Image
 from dpm2_core.geometry import se3
+from dpm2_core.slam.build import make_odometry, make_registration
 from dpm2_core.slam.registration.protocol import Prediction
 from dpm2_core.slam.registration.visual import VisualSettings
-from dpm2_core.slam.system import SlamSettings, make_odometry, make_registration
+from dpm2_core.slam.settings import SlamSettings
 
 HALF, HEIGHT = 4.0, 1.8  # m: from the sensor to the walls, and to floor and ceiling
 T_LIDAR_CAM = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])

@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The descriptors of the last keyframes of the odometry, merged around a pose."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from dpm2_core.descriptors import Descriptors, merge
+from dpm2_core.frame import Array
+from dpm2_core.geometry import se3
+
+_KEPT = 20  # frames: at least as many as can lie around the next one
+
+
+@dataclass(frozen=True, eq=False)
+class _Place:
+    """Where a frame was taken, T_odom_kf (4, 4), and what the network made of it."""
+
+    T_odom_kf: Array
+    descriptors: Descriptors
+
+
+class DescriptorMap:
+    """The descriptors of the last keyframes of the odometry."""
+
+    def __init__(self, spacing: float, frames: int, radius: float) -> None:
+        self._spacing, self._frames, self._radius = spacing, frames, radius
+        self._places: deque[_Place] = deque(maxlen=_KEPT)
+        self._merged: tuple[list[_Place], Descriptors] | None = None
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def clear(self) -> None:
+        self._places.clear()
+
+    def wants(self, T_odom_lidar: Array) -> bool:
+        """Whether a frame taken at that pose would show enough that is new."""
+        if not self._places:
+            return True
+        moved = se3.inverse(self._places[-1].T_odom_kf) @ T_odom_lidar
+        return bool(np.linalg.norm(moved[:3, 3]) >= self._spacing or se3.angle(moved) >= np.radians(15))
+
+    def insert(self, descriptors: Descriptors, T_odom_lidar: Array) -> None:
+        """Add those of a frame taken there."""
+        self._places.append(_Place(T_odom_lidar, descriptors))
+
+    def around(self, T_odom_lidar: Array) -> tuple[Array, Descriptors]:
+        """Pose T_odom_kf of the nearest frame, and the merged descriptors of it and its neighbours in its frame."""
+        distance = [float(np.linalg.norm(p.T_odom_kf[:3, 3] - T_odom_lidar[:3, 3])) for p in self._places]
+        order = np.argsort(distance, kind="stable")[: self._frames]
+        near = [self._places[i] for i in order if distance[i] <= self._radius or i == order[0]]
+        if self._merged is None or self._merged[0] != near:  # else the same object: the decoder keeps its part of it
+            T_kf_odom = se3.inverse(near[0].T_odom_kf)
+            others = [place.descriptors.moved(T_kf_odom @ place.T_odom_kf) for place in near[1:]]
+            self._merged = near, merge([near[0].descriptors, *others])
+        return near[0].T_odom_kf, self._merged[1]

@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Settings of the SLAM, stage by stage, and of `dpm2 run`."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from dpm2_core.config import Settings
+from dpm2_core.data.settings import InputSettings
+from dpm2_core.slam.filters import FilterSettings
+from dpm2_core.slam.graph.pose_graph import PoseGraphSettings
+from dpm2_core.slam.loops.closure import LoopSettings
+from dpm2_core.slam.loops.relocalization import RelocaliseSettings
+from dpm2_core.slam.mapping.mapper import MapSettings
+from dpm2_core.slam.odometry.keyframe_selection import KeyframeSettings
+from dpm2_core.slam.odometry.odometry import OdometrySettings
+from dpm2_core.slam.preprocess import PreprocessSettings
+from dpm2_core.slam.registration.icp import GeometricSettings
+from dpm2_core.slam.registration.local_map import LocalMapSettings
+from dpm2_core.slam.registration.neural import NeuralSettings
+from dpm2_core.slam.registration.visual import VisualSettings
+
+
+class SlamSettings(Settings):
+    """The SLAM, stage by stage."""
+
+    registration: Literal["geometric", "neural", "refined"] = "geometric"
+    """How a scan finds its pose: by points, by neural descriptors, or by both."""
+    threads: int = Field(2, ge=1)
+    """Threads of the neighbour search and of the network."""
+    filter: FilterSettings = FilterSettings()
+    preprocess: PreprocessSettings = PreprocessSettings()
+    geometric: GeometricSettings = GeometricSettings()
+    neural: NeuralSettings = NeuralSettings()
+    visual: VisualSettings = VisualSettings()
+    local_map: LocalMapSettings = LocalMapSettings()
+    odometry: OdometrySettings = OdometrySettings()
+    keyframes: KeyframeSettings = KeyframeSettings()
+    loops: LoopSettings = LoopSettings()
+    relocalise: RelocaliseSettings = RelocaliseSettings()
+    pose_graph: PoseGraphSettings = PoseGraphSettings()
+    map: MapSettings = MapSettings()
+
+
+class Config(Settings):
+    """Everything that `dpm2 run` can be told."""
+
+    input: InputSettings = InputSettings()
+    slam: SlamSettings = SlamSettings()
