@@ -25,7 +25,7 @@ $(READY): setup.py pyproject.toml
 	@touch $@
 
 demo: setup ros  ## simulate a drive, replay it into slam_node, check and show what comes out; SRC=<KITTI sequence or bag> for your own
-	$(BIN)/python -m dpm2_ros.demo $(if $(SRC),"$(SRC)") --out out/demo
+	$(BIN)/python -m tools.demo $(if $(SRC),"$(SRC)") --out out/demo
 
 .PHONY: ros
 ros:  # of all targets the demo alone is nothing without it
@@ -48,10 +48,10 @@ bench: setup  ## the figures of benchmarks/, beside KISS-ICP
 	$(BIN)/python -m dpm2_core.cli bench $(ARGS)
 
 bench-ros: setup  ## the KITTI excerpt through bag, player and slam_node at 10 Hz
-	$(BIN)/python -m dpm2_ros.bench $(ARGS)
+	$(BIN)/python -m benchmarks.ros $(ARGS)
 
 bench-robots: setup  ## three robots and one mapper_node behind a link that loses packets and is cut for 30 s (root, nftables)
-	$(BIN)/python -m dpm2_ros.bench_robots $(ARGS)
+	$(BIN)/python -m benchmarks.robots $(ARGS)
 
 bench-memory: setup  ## resident memory over a synthetic drive of 2,000 frames (8 GB on disk)
 	$(BIN)/python -m dpm2_core.cli sim out/memory --frames 2000 --seed 3 --no-images

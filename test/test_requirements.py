@@ -19,7 +19,11 @@ from packaging.requirements import Requirement
 
 ROOT = Path(__file__).resolve().parents[1]
 WITH_ANOTHER_WAY = {"kiss_icp", "pypose"}  # a benchmark says that there is nothing to compare with
-FILES = sorted(path for folder in ("dpm2_core", "dpm2_ros", "launch") for path in (ROOT / folder).rglob("*.py"))
+FILES = sorted(
+    path
+    for folder in ("dpm2_core", "dpm2_ros", "benchmarks", "tools", "launch")
+    for path in (ROOT / folder).rglob("*.py")
+)
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +69,7 @@ def _imports(tree: ast.AST, extra: str | None = None, inside: bool = False) -> I
             names = [node.module]
         for name in names:
             top = name.partition(".")[0]
-            if top not in sys.stdlib_module_names and top not in ("dpm2_core", "dpm2_ros"):
+            if top not in sys.stdlib_module_names and top not in ("dpm2_core", "dpm2_ros", "benchmarks", "tools"):
                 yield top, extra, inside
         if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
             continue

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console, RenderableType
 
-from dpm2_core.evaluation.bench import geometric, neural_view
+from benchmarks import geometric, neural_view
 from dpm2_core.tables import FigureTable
 
 ROOT = Path(__file__).resolve().parents[2]

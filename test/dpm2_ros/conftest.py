@@ -29,8 +29,8 @@ from dpm2_core.geometry import se3
 from dpm2_core.sim.drive import simulate
 from dpm2_core.sim.settings import LidarConfig
 from dpm2_ros.conversions import cloud_to_msg
-from dpm2_ros.replay import ros_environment
 from dpm2_ros.runtime import ros_context
+from tools.replay import ros_environment
 
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = ros_environment()["ROS_AUTOMATIC_DISCOVERY_RANGE"]
 

@@ -24,9 +24,9 @@ from dpm2_core.data.image_messages import decode_image
 from dpm2_core.data.messages import decode_points, stamp_ns
 from dpm2_core.data.settings import InputSettings
 from dpm2_ros.bag_player import main
-from dpm2_ros.replay import ros_environment, start
 from dpm2_ros.runtime import exit_code
 from dpm2_ros.tf import TFMessage
+from tools.replay import ros_environment, start
 
 LATCHED_DEPTH = 10
 

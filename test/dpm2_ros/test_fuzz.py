@@ -40,7 +40,7 @@ from dpm2_core.slam.store.cloud_codec import pack_cloud, unpack_cloud
 from dpm2_core.slam.store.map_data import load_map
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_ros.conversions import cloud_to_msg
-from dpm2_ros.replay import ros_environment, start
+from tools.replay import ros_environment, start
 
 SECONDS = float(os.environ.get("DPM2_FUZZ_SECONDS", "6"))
 RATE = float(os.environ.get("DPM2_FUZZ_RATE", "400"))

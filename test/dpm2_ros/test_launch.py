@@ -24,10 +24,10 @@ import yaml
 
 from dpm2_core.config import flat_fields
 from dpm2_ros.parameters import CONFIG_FILE, load_parameters
-from dpm2_ros.replay import ros_environment, start
 from dpm2_ros.runtime import ros_context
 from dpm2_ros.settings import NodeConfig
 from dpm2_ros.share import share_directory
+from tools.replay import ros_environment, start
 
 ROOT = Path(__file__).resolve().parents[2]
 DEFAULTS = {name: info.get_default(call_default_factory=True) for name, info in flat_fields(NodeConfig)}

@@ -21,9 +21,9 @@ from dpm2_core.data.bags import BagSource
 from dpm2_core.data.messages import stamp_ns
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.evaluation.metrics import ape_rmse
-from dpm2_ros.demo import judge, map_poses
 from dpm2_ros.mapping import KEEP_ALL, LAST_ONE
-from dpm2_ros.replay import replay, ros_environment, start
+from tools.demo import judge, map_poses
+from tools.replay import replay, ros_environment, start
 
 SAVED = ["map.ply", "pose_graph.g2o", "trajectory.tum"]
 

@@ -26,8 +26,8 @@ from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_ros.conversions import cloud_to_msg, header, pose_to_msg
-from dpm2_ros.replay import ros_environment, start
 from dpm2_ros.tf import TFMessage
+from tools.replay import ros_environment, start
 
 
 @pytest.fixture(scope="module")

@@ -18,8 +18,8 @@ import yaml
 from rclpy.node import Node
 
 from dpm2_ros import build_tf2_msgs
-from dpm2_ros.replay import ros_environment
 from dpm2_ros.share import share_directory
+from tools.replay import ros_environment
 
 ROOT = Path(__file__).resolve().parents[2]
 EXECUTABLES = ("slam_node", "mapper_node", "bag_player")

@@ -38,8 +38,8 @@ from dpm2_core.slam.system import SlamSystem
 from dpm2_ros import lockstep
 from dpm2_ros.bag_player import BagPlayer, Options
 from dpm2_ros.conversions import pose_to_msg
-from dpm2_ros.replay import ros_environment, start, stop
 from dpm2_ros.slam_node import SlamNode
+from tools.replay import ros_environment, start, stop
 
 OPTIONS = Options(
     bag=Path(), rate=1.0, start=0.0, duration=None, loop=False, topics=(), wait=20.0, subscribers=1, clock=False,

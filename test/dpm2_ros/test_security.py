@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 
 from dpm2_ros.mapper_node import MapperNode
-from dpm2_ros.replay import ros_environment, start, stop
 from dpm2_ros.slam_node import SlamNode
+from tools.replay import ros_environment, start, stop
 
 POLICY = Path(__file__).parents[2] / "config" / "sros2_policy.xml"
 KINDS = {"publish": "publisher", "subscribe": "subscriber", "reply": "service", "request": "client"}

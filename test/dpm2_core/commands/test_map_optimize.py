@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.pose_graph import are_right, made_drive
 from dpm2_core.cli import main
-from dpm2_core.evaluation.bench.pose_graph import are_right, made_drive
 from dpm2_core.slam.graph.g2o import G2o, read_g2o, write_g2o
 
 

@@ -8,8 +8,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
+from benchmarks.gaps import gaps, judged, summary
 from dpm2_core.data.open import open_source
-from dpm2_core.evaluation.bench.gaps import gaps, judged, summary
 from dpm2_core.frame import Array, Frame, State, Tracked
 from dpm2_core.geometry import se3
 from dpm2_core.sim.lidar import Lidar

@@ -11,9 +11,9 @@ import numpy as np
 from rich.console import Group
 from rich.progress import track
 
+from benchmarks.harness import Options, Report, drives, unique_name
 from dpm2_core.config import load_settings
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.evaluation.bench.harness import Options, Report, drives, unique_name
 from dpm2_core.slam.settings import Config
 from dpm2_core.slam.system import SlamSystem
 from dpm2_core.tables import FigureTable

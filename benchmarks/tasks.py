@@ -15,9 +15,9 @@ from typing import Any, Literal
 import torch
 from rich.console import Group
 
+from benchmarks.harness import Options, Report, processors, write_report
 from dpm2_core.config import dump_settings, load_settings
 from dpm2_core.errors import UsageError
-from dpm2_core.evaluation.bench.harness import Options, Report, processors, write_report
 from dpm2_core.evaluation.record import git_commit
 from dpm2_core.files import atomic_write
 from dpm2_core.tables import FigureTable

@@ -12,17 +12,17 @@ import numpy as np
 import typer
 from rich.console import Group
 
+from benchmarks.harness import Options, Report, drives, write_report
 from dpm2_core.console import Console
 from dpm2_core.data import topics
 from dpm2_core.data.bags import BagSource
 from dpm2_core.data.convert import convert_kitti
 from dpm2_core.data.kitti import KittiSource
 from dpm2_core.data.settings import InputSettings
-from dpm2_core.evaluation.bench.harness import Options, Report, drives, write_report
 from dpm2_core.tables import FigureTable
-from dpm2_ros.demo import judge
-from dpm2_ros.replay import replay
 from dpm2_ros.runtime import exit_code
+from tools.demo import judge
+from tools.replay import replay
 
 FIGURES = ("frames_in", "frames_out", "dropped", "latency_p50_ms", "latency_p95_ms", "ape_rmse_m", "rpe_trans_m")
 
@@ -51,7 +51,7 @@ def bench(
     for name, row in results.items():
         table.add_row(name, *("-" if value is None else f"{value:.4g}" for value in row.values()))
     write_report(
-        out / "ros.json", "ros", Report({"drives": results}, Group(table)), options, "python -m dpm2_ros.bench"
+        out / "ros.json", "ros", Report({"drives": results}, Group(table)), options, "python -m benchmarks.ros"
     )
     Console().print(table)
     return 1 if any(row["failed_checks"] for row in results.values()) else 0
@@ -65,7 +65,7 @@ def _median(values: list[float | int | None], worst: bool) -> float | None:
 
 
 def main() -> int:
-    """Entry point of `python -m dpm2_ros.bench`."""
+    """Entry point of `python -m benchmarks.ros`."""
     app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
     app.command()(bench)
     return exit_code(lambda: app(standalone_mode=False))

@@ -13,10 +13,10 @@ import numpy as np
 from rich.console import Group
 from rich.progress import Progress
 
+from benchmarks.harness import Options, Report, drives, processors, unique_name
 from dpm2_core.config import load_settings
 from dpm2_core.data.source import Source
 from dpm2_core.errors import UsageError
-from dpm2_core.evaluation.bench.harness import Options, Report, drives, processors, unique_name
 from dpm2_core.evaluation.metrics import Metrics, evaluate
 from dpm2_core.frame import Array, Frame
 from dpm2_core.slam.output import TrajectoryRecorder

@@ -11,8 +11,8 @@ import numpy as np
 from rich.console import Group
 from rich.progress import Progress
 
+from benchmarks.harness import Options, Report, drives, processors, settings_of, unique_name
 from dpm2_core.errors import UsageError
-from dpm2_core.evaluation.bench.harness import Options, Report, drives, processors, settings_of, unique_name
 from dpm2_core.frame import Array, Frame, State, Tracked
 from dpm2_core.geometry import se3
 from dpm2_core.slam.build import make_odometry

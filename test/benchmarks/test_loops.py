@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.harness import Options
+from benchmarks.loops import judge_loops, revisits
+from benchmarks.relocalise import judged
+from benchmarks.roads import road_files
 from dpm2_core.errors import UsageError
-from dpm2_core.evaluation.bench.harness import Options
-from dpm2_core.evaluation.bench.loops import judge_loops, revisits
-from dpm2_core.evaluation.bench.relocalise import judged
-from dpm2_core.evaluation.bench.roads import road_files
 from dpm2_core.frame import Array, LoopClosure, Registration
 from dpm2_core.geometry import se3
 

@@ -14,11 +14,11 @@ import numpy as np
 import torch
 from rich.console import Group
 
+from benchmarks.harness import Options, Report, write_report
 from dpm2_core.config import load_settings
 from dpm2_core.data.open import open_source
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.errors import UsageError
-from dpm2_core.evaluation.bench.harness import Options, Report, write_report
 from dpm2_core.evaluation.pair_set import NEAR, SUCCESS, PairSet
 from dpm2_core.evaluation.record import git_commit
 from dpm2_core.learning.finetune import finetune

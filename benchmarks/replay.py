@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`python -m dpm2_ros.bench_replay BAG`: slam_node and bag_player started together; what becomes of each cloud."""
+"""`python -m benchmarks.replay BAG`: slam_node and bag_player started together; what becomes of each cloud."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from rich.console import Console
 
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.tables import FigureTable
-from dpm2_ros.replay import ros_environment, start, stop
 from dpm2_ros.runtime import exit_code
+from tools.replay import ros_environment, start, stop
 
 PLAYED = (("--rate", "1"), ("--rate", "2"), ("--lockstep",))
 _ACCOUNT = re.compile(r"(\d+) clouds sent: (\d+) processed, (\d+) dropped \(queue full\), (\d+) lost on the way(.*)")
@@ -74,7 +74,7 @@ def together(bag: Path, played: tuple[str, ...]) -> tuple[int, tuple[int, ...], 
 
 
 def main() -> int:
-    """Entry point of `python -m dpm2_ros.bench_replay`."""
+    """Entry point of `python -m benchmarks.replay`."""
     app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
     app.command()(bench)
     return exit_code(lambda: app(standalone_mode=False))

@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.geometric import BASELINE, kiss_config
+from benchmarks.harness import Options, settings_of
+from benchmarks.pairs import PairMethod, by_registration, kiss_from_identity, summarised
 from dpm2_core.data.corrupt import hidden_by, random_box
 from dpm2_core.data.packed import PackedDrive, Sample
 from dpm2_core.errors import UsageError
-from dpm2_core.evaluation.bench.geometric import BASELINE, kiss_config
-from dpm2_core.evaluation.bench.harness import Options, settings_of
-from dpm2_core.evaluation.bench.pairs import PairMethod, by_registration, kiss_from_identity, summarised
 from dpm2_core.evaluation.pair_set import NEAR, PairSet
 from dpm2_core.frame import Array, Frame, Image
 from dpm2_core.geometry import se3

@@ -21,11 +21,12 @@ from rich.progress import track
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from benchmarks.harness import Options
+from benchmarks.lossy_link import LOSS, Link, inside
+from benchmarks.roads import open_road, road_files
 from dpm2_core.config import load_settings
 from dpm2_core.console import Console
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.evaluation.bench.harness import Options
-from dpm2_core.evaluation.bench.roads import open_road, road_files
 from dpm2_core.evaluation.metrics import align, ape_rmse
 from dpm2_core.evaluation.record import write_record
 from dpm2_core.frame import Array
@@ -35,10 +36,9 @@ from dpm2_core.slam.store.map_data import MapData, load_map
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.slam.system import SlamSystem
 from dpm2_core.tables import FigureTable
-from dpm2_ros.bench_network import LOSS, Link, inside
 from dpm2_ros.conversions import cloud_to_msg, parse_keyframe_name
-from dpm2_ros.replay import ros_environment, start, stop
 from dpm2_ros.runtime import exit_code, ros_context
+from tools.replay import ros_environment, start, stop
 
 ROAD = "07"
 SPANS = {"red": (0, 420), "blue": (340, 760), "green": (680, 1100)}
@@ -124,7 +124,7 @@ def bench(
         "single_robot_ape_rmse_m": alone,
         "robots": robots,
     }
-    write_record(out / "robots.json", "robots", results, "python -m dpm2_ros.bench_robots")
+    write_record(out / "robots.json", "robots", results, "python -m benchmarks.robots")
     columns = list(next(iter(robots.values())))
     title = f"{maps} map, APE {_rms(errors):.3f} m; of one robot alone {alone:.3f} m"
     table = FigureTable(title, names=["robot"], figures=columns)
@@ -222,9 +222,9 @@ def _alone(source: SimulatedDrive) -> float:
 
 
 def main() -> int:
-    """Entry point of `python -m dpm2_ros.bench_robots`."""
+    """Entry point of `python -m benchmarks.robots`."""
     if not inside():
-        return Link.own_network("dpm2_ros.bench_robots")
+        return Link.own_network("benchmarks.robots")
     app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
     app.command()(bench)
     return exit_code(lambda: app(standalone_mode=False))

@@ -13,13 +13,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.harness import Options, drives, processors
+from benchmarks.memory import levelling
+from benchmarks.pairs import pairs_of, summarised
 from dpm2_core.commands.bench import bench
 from dpm2_core.data.packed import Sample, write_packed
 from dpm2_core.data.trajectory import write_kitti
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.evaluation.bench.harness import Options, drives, processors
-from dpm2_core.evaluation.bench.memory import levelling
-from dpm2_core.evaluation.bench.pairs import pairs_of, summarised
 from dpm2_core.frame import Image
 from dpm2_core.geometry import se3
 from dpm2_core.network.model import DeepPointMap2
@@ -99,7 +99,7 @@ def test_the_resident_set_follows_what_is_allocated() -> None:
     """In a process of its own: what other tests have left is freed at any time, by a collection or by a thread."""
     program = (
         "import numpy as np\n"
-        "from dpm2_core.evaluation.bench.memory import resident_mb\n"
+        "from benchmarks.memory import resident_mb\n"
         "before = resident_mb()\n"
         "block = np.ones(2**23)\n"
         "print(resident_mb() - before)\n"

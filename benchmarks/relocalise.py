@@ -14,9 +14,9 @@ import numpy as np
 from rich.console import Group
 from rich.progress import Progress
 
+from benchmarks.harness import Options, Report, processors
+from benchmarks.roads import open_road, road_files
 from dpm2_core.config import load_settings
-from dpm2_core.evaluation.bench.harness import Options, Report, processors
-from dpm2_core.evaluation.bench.roads import open_road, road_files
 from dpm2_core.frame import Array, Frame, Keyframe, Points, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.network.pretrained import load_network

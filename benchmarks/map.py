@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from rich.console import Console, Group
 from rich.progress import track
 
+from benchmarks.harness import Options, Report
 from dpm2_core.config import load_settings
 from dpm2_core.data.open import open_source
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.evaluation.bench.harness import Options, Report
 from dpm2_core.evaluation.metrics import ape_rmse
 from dpm2_core.frame import Array, Keyframe, Registration
 from dpm2_core.geometry import se3

@@ -29,9 +29,9 @@ from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.slam.output import corrected
 from dpm2_core.tables import FigureTable
-from dpm2_ros.replay import Replay, replay
 from dpm2_ros.runtime import exit_code
 from dpm2_ros.tf import TFMessage
+from tools.replay import Replay, replay
 
 QUEUE = 50
 """Clouds that slam_node may hold here: a machine that stalls for a moment shows latency, and loses nothing."""
@@ -216,7 +216,7 @@ def _value(value: float | int | None, unit: str, digits: int) -> str:
 
 
 def main() -> int:
-    """Entry point of `python -m dpm2_ros.demo`."""
+    """Entry point of `python -m tools.demo`."""
     app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
     app.command()(demo)
     try:

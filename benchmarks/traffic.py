@@ -15,9 +15,9 @@ import torch
 from numpy.typing import NDArray
 from rich.console import Group
 
+from benchmarks.harness import Options, Report, overrides_of, write_report
 from dpm2_core.config import load_settings
 from dpm2_core.errors import UsageError
-from dpm2_core.evaluation.bench.harness import Options, Report, overrides_of, write_report
 from dpm2_core.evaluation.metrics import evaluate
 from dpm2_core.evaluation.record import git_commit
 from dpm2_core.frame import Frame, Points

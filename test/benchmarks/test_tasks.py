@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks import tasks
+from benchmarks.harness import Options
 from dpm2_core.errors import UsageError
-from dpm2_core.evaluation.bench import tasks
-from dpm2_core.evaluation.bench.harness import Options
 from dpm2_core.tasks.drives import TaskDriveSettings
 
 

@@ -12,10 +12,10 @@ import numpy as np
 from rich.console import Group
 from rich.progress import Progress
 
+from benchmarks.harness import Options, Report
+from benchmarks.loops import judge_loops
 from dpm2_core.config import load_settings
 from dpm2_core.errors import UsageError
-from dpm2_core.evaluation.bench.harness import Options, Report
-from dpm2_core.evaluation.bench.loops import judge_loops
 from dpm2_core.evaluation.metrics import evaluate
 from dpm2_core.sim.settings import PresetName
 from dpm2_core.sim.simulated_drive import SimulatedDrive

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from dpm2_core.evaluation.bench import finetune
-from dpm2_core.evaluation.bench.harness import Options, write_report
+from benchmarks import finetune
+from benchmarks.harness import Options, write_report
 from dpm2_core.learning.finetune_settings import FinetuneSettings
 
 BEFORE = {"near_m": 0.1, "far_m": 0.2, "all_m": 0.15, "all_deg": 0.1, "success": 0.9, "pairs": 10}

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks import traffic
+from benchmarks.harness import Options
 from dpm2_core.errors import UsageError
-from dpm2_core.evaluation.bench import traffic
-from dpm2_core.evaluation.bench.harness import Options
 from dpm2_core.sim.settings import LidarConfig
 
 

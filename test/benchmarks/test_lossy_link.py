@@ -10,8 +10,8 @@ import sys
 
 import pytest
 
+from benchmarks.lossy_link import Link
 from dpm2_core.errors import UsageError
-from dpm2_ros.bench_network import Link
 
 LINK = """
 import socket, sys, time
@@ -53,7 +53,7 @@ def _can() -> bool:
 def test_it_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shutil, "which", lambda tool: None if tool == "nft" else tool)
     with pytest.raises(UsageError, match="nft"):
-        Link.own_network("dpm2_ros.bench_robots")
+        Link.own_network("benchmarks.robots")
 
 
 @pytest.mark.skipif(not all(map(shutil.which, ("unshare", "ip", "nft"))) or not _can(), reason="needs root, ip and nft")

@@ -13,10 +13,8 @@ from typing import Any
 import numpy as np
 from rich.progress import Progress
 
-from dpm2_core.data.source import Source
-from dpm2_core.errors import UsageError
-from dpm2_core.evaluation.bench.geometric import BASELINE, Method, dpm2, kiss_config, kiss_icp, quantiles_ms, summary
-from dpm2_core.evaluation.bench.harness import (
+from benchmarks.geometric import BASELINE, Method, dpm2, kiss_config, kiss_icp, quantiles_ms, summary
+from benchmarks.harness import (
     Options,
     Report,
     drives,
@@ -27,15 +25,17 @@ from dpm2_core.evaluation.bench.harness import (
     unique_name,
     write_report,
 )
-from dpm2_core.evaluation.bench.neural_view import view
-from dpm2_core.evaluation.bench.pairs import (
+from benchmarks.neural_view import view
+from benchmarks.pairs import (
     PairMethod,
     all_pairs,
     by_registration,
     gicp_from_identity,
     kiss_from_identity,
 )
-from dpm2_core.evaluation.bench.unseen import corruption, image_matters, overlap, synthetic
+from benchmarks.unseen import corruption, image_matters, overlap, synthetic
+from dpm2_core.data.source import Source
+from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.figures import success_png
 from dpm2_core.evaluation.record import git_commit
 from dpm2_core.frame import Frame

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from rich.console import Group
 from scipy.spatial import cKDTree
 
+from benchmarks.harness import Options, Report
 from dpm2_core.errors import UsageError
-from dpm2_core.evaluation.bench.harness import Options, Report
 from dpm2_core.evaluation.metrics import ape_rmse
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3

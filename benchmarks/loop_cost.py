@@ -10,10 +10,10 @@ import numpy as np
 from rich.console import Group
 from rich.progress import Progress
 
+from benchmarks.harness import Options, Report
+from benchmarks.memory import resident_mb
 from dpm2_core.config import load_settings
 from dpm2_core.descriptors import Descriptors
-from dpm2_core.evaluation.bench.harness import Options, Report
-from dpm2_core.evaluation.bench.memory import resident_mb
 from dpm2_core.frame import Array, Keyframe, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.sim.lidar import Lidar

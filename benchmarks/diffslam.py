@@ -11,13 +11,13 @@ import torch
 from rich.console import Group
 from torch import Tensor
 
+from benchmarks.diffslam_pypose import beside_pypose
+from benchmarks.harness import Options, Report, processors
 from dpm2_core.config import load_settings
 from dpm2_core.diffslam.clouds import window
 from dpm2_core.diffslam.icp import Cloud, problem
 from dpm2_core.diffslam.soft_lm import iterates
 from dpm2_core.diffslam.trajectory_loss import SlamLoss, SlamLossSettings, odometry, trajectory_loss
-from dpm2_core.evaluation.bench.diffslam_pypose import beside_pypose
-from dpm2_core.evaluation.bench.harness import Options, Report, processors
 from dpm2_core.geometry import se3, se3_torch
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.world import build_world

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Benchmarks that can be repeated: each is a function from `Options` to a `Report`, found by its name in `BENCHES`."""
+"""Benchmarks, not installed: each is a function from `Options` to a `Report`, found by its name in `BENCHES`."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from importlib import import_module
 
+from benchmarks.harness import Options, Report
 from dpm2_core.errors import UsageError
-from dpm2_core.evaluation.bench.harness import Options, Report
 
 
 @dataclass(frozen=True)
