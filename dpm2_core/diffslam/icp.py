@@ -16,7 +16,7 @@ from pydantic import Field
 from torch import Tensor
 
 from dpm2_core.config import Settings
-from dpm2_core.diffslam.neighbours import NeighbourSearch
+from dpm2_core.diffslam.neighbors import NeighbourSearch
 from dpm2_core.diffslam.soft_lm import SoftLmSettings, solve
 from dpm2_core.geometry import se3_torch
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dpm2_core.diffslam.neighbours import NeighbourSearch
+from dpm2_core.diffslam.neighbors import NeighbourSearch
 
 
 def clouds(offset: float = 0.0) -> tuple[Tensor, Tensor]:
