@@ -38,10 +38,11 @@ fuzz: setup  ## a minute of random messages, a thousand per second, on all that 
 	DPM2_FUZZ_SECONDS=60 DPM2_FUZZ_RATE=1000 $(BIN)/python -m pytest -s test/dpm2_ros/test_fuzz.py $(ARGS)
 
 lint: setup  ## style and types
-	@$(BIN)/python -c 'import ruff, mypy' 2>/dev/null || $(BIN)/python -m pip install -qq --disable-pip-version-check -e '.[lint]'
+	@$(BIN)/python -c 'import ruff, mypy, importlinter' 2>/dev/null || $(BIN)/python -m pip install -qq --disable-pip-version-check -e '.[lint]'
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports
 
 bench: setup  ## the figures of benchmarks/, beside KISS-ICP
 	@$(BIN)/python -c 'import kiss_icp' 2>/dev/null || $(BIN)/python -m pip install -qq -e '.[bench]'

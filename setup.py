@@ -42,7 +42,7 @@ EXTRAS = {
         "contourpy>=1.2,<2",  # lines along the kerbs
     ],
     "test": ["pytest>=8,<10", "pytest-timeout>=2.3,<3", "hypothesis>=6.100,<7"],
-    "lint": ["ruff>=0.9,<0.18", "mypy>=1.13,<3", "types-PyYAML"],
+    "lint": ["ruff>=0.9,<0.18", "mypy>=1.13,<3", "types-PyYAML", "import-linter>=2.1,<3"],
     "las": ["laspy>=2.5,<3"],  # dpm2 map export MAP OUT.las
     "timm": ["timm>=1,<2"],  # image backbones timm:NAME
     "train": ["tensorboard>=2.16,<3"],  # curves beside log.jsonl
