@@ -85,8 +85,8 @@ def known_motion(scan: Tensor, settings: SlamLossSettings) -> dict[str, Any]:
         icp = with_solver(settings, gate=gate).icp
         found = torch.cat([T[0] for T in iterates(problem(source, target, icp), begin, icp.solver)]).numpy()
         error = se3.inverse(MOTION) @ found
-        metres, radians = np.linalg.norm(error[:, :3, 3], axis=1), se3.angle(error)
-        out[gate] = {"mm": [_figure(1e3 * x) for x in metres], "deg": [_figure(x) for x in np.degrees(radians)]}
+        meters, radians = np.linalg.norm(error[:, :3, 3], axis=1), se3.angle(error)
+        out[gate] = {"mm": [_figure(1e3 * x) for x in meters], "deg": [_figure(x) for x in np.degrees(radians)]}
     return out
 
 

@@ -40,7 +40,7 @@ def beside_pypose(scan: Tensor, T_target_source: Tensor, settings: SlamLossSetti
         return pypose.module.ICP(stepper=stepper)(source, scan).matrix()
 
     def lm() -> Tensor:
-        return _by_optimiser(pypose, source, scan, iterations)
+        return _by_optimizer(pypose, source, scan, iterations)
 
     timed: dict[str, Callable[[], Tensor]] = {"dpm2": ours, "pypose_icp": icp, "pypose_lm": lm}
     rows = {name: _row(run, T_target_source.numpy()) for name, run in timed.items()}
@@ -62,7 +62,7 @@ def _row(run: Callable[[], Tensor], wanted: np.ndarray) -> dict[str, float]:
     return {name: float(f"{x:.4g}") for name, x in figures.items()}
 
 
-def _by_optimiser(pypose: Any, source: Tensor, target: Tensor, iterations: int) -> Tensor:
+def _by_optimizer(pypose: Any, source: Tensor, target: Tensor, iterations: int) -> Tensor:
     """Point-to-plane by `pypose.optim.LM`: its adaptive damping (up 2, down 0.5), each step matched anew."""
     cloud = Cloud(target[None])
 

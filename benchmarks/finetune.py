@@ -47,7 +47,7 @@ UNSEEN = {
     "old": GenerateSettings(worlds=8, first_seed=970_000, frames=16, mixture=_TOWNS),
 }
 """Worlds to be judged on, of the new LiDAR and of the old one."""
-ARMS: dict[str, tuple[str, ...]] = {
+VARIANTS: dict[str, tuple[str, ...]] = {
     "trajectory": (),
     "pairs": ("trajectory=0", "pairs=1"),
     "both": ("pairs=1",),
@@ -62,8 +62,8 @@ def bench_finetune(options: Options) -> Report:
 
     `--only` names one of the arms.
     """
-    if options.only is not None and options.only not in ARMS:
-        raise UsageError(f"--only {options.only}: no such training; choose from {', '.join(ARMS)}")
+    if options.only is not None and options.only not in VARIANTS:
+        raise UsageError(f"--only {options.only}: no such training; choose from {', '.join(VARIANTS)}")
     path, folder = options.out / "finetune.json", options.cache / "finetune"
     threads = torch.get_num_threads()
     torch.set_num_threads(options.threads)
@@ -75,14 +75,14 @@ def bench_finetune(options: Options) -> Report:
         judges = {name: PairSet(folder / name, 2 * options.pairs, network.settings, False) for name in UNSEEN}
         results = _read(path, chosen, digest)
         results.setdefault("before", {name: errors(judge, network) for name, judge in judges.items()})
-        for arm, seed in _wanted(options):
-            runs = results.setdefault("runs", {}).setdefault(arm, {})
+        for variant, seed in _wanted(options):
+            runs = results.setdefault("runs", {}).setdefault(variant, {})
             if str(seed) in runs:
                 continue
             out = (
-                folder / f"{arm}_{seed}_{digest[:8]}"
+                folder / f"{variant}_{seed}_{digest[:8]}"
             )  # a training that was stopped goes on from its own weights alone
-            runs[str(seed)] = _run(arm, seed, folder / "data", out, options, judges, results["before"])
+            runs[str(seed)] = _run(variant, seed, folder / "data", out, options, judges, results["before"])
             write_report(path, "finetune", _report(results, chosen, digest), options)
     finally:
         torch.set_num_threads(threads)
@@ -90,9 +90,9 @@ def bench_finetune(options: Options) -> Report:
 
 
 def _wanted(options: Options) -> list[tuple[str, int]]:
-    first = [(arm, 0) for arm in ARMS]
+    first = [(variant, 0) for variant in VARIANTS]
     rest = [("trajectory", seed) for seed in range(1, options.repetitions)]
-    return [(arm, seed) for arm, seed in first + rest if options.only in (None, arm)]
+    return [(variant, seed) for variant, seed in first + rest if options.only in (None, variant)]
 
 
 def _prepare(folder: Path, settings: FinetuneSettings, options: Options) -> None:
@@ -109,10 +109,10 @@ def _prepare(folder: Path, settings: FinetuneSettings, options: Options) -> None
 
 
 def _run(
-    arm: str, seed: int, data: Path, out: Path, options: Options, judges: dict[str, PairSet], before: dict[str, Any]
+    variant: str, seed: int, data: Path, out: Path, options: Options, judges: dict[str, PairSet], before: dict[str, Any]
 ) -> dict[str, Any]:
     """One training, what it cost, and the errors that are left."""
-    overrides = [STEPS, *options.overrides, *ARMS[arm], f"optimiser.seed={seed}"]
+    overrides = [STEPS, *options.overrides, *VARIANTS[variant], f"optimiser.seed={seed}"]
     settings = load_settings(FinetuneSettings, None, overrides)
     out.mkdir(parents=True, exist_ok=True)
     cpu = process_time()
@@ -156,8 +156,8 @@ def _read(path: Path, settings: FinetuneSettings, digest: str) -> dict[str, Any]
 def _report(results: dict[str, Any], settings: FinetuneSettings, digest: str) -> Report:
     before, runs = results["before"], results.get("runs", {})
     summary: dict[str, Any] = {}
-    for arm, seeds in runs.items():
-        summary[arm] = {
+    for variant, seeds in runs.items():
+        summary[variant] = {
             name: {
                 figure: {"mean": mean(values), "spread": pstdev(values), "seeds": len(values)}
                 for figure in ("near_m", "far_m", "all_m", "all_deg")
@@ -169,11 +169,11 @@ def _report(results: dict[str, Any], settings: FinetuneSettings, digest: str) ->
     title = "Median errors of pairs in unseen worlds, m"
     table = FigureTable(title, names=["losses", "seed", "LiDAR"], figures=figures)
     lines = [("before", "", before)]
-    lines += [(arm, seed, run["after"]) for arm, seeds in runs.items() for seed, run in seeds.items()]
-    for arm, seed, measured in lines:
+    lines += [(variant, seed, run["after"]) for variant, seeds in runs.items() for seed, run in seeds.items()]
+    for variant, seed, measured in lines:
         for name, row in measured.items():
             cells = [f"{row[figure]:.4f}" for figure in ("near_m", "far_m", "all_m", "all_deg")]
-            table.add_row(arm, seed, name, *cells, f"{row['success']:.1%}")
+            table.add_row(variant, seed, name, *cells, f"{row['success']:.1%}")
     record = {
         "lidar": LIDAR.model_dump(), "drives": {"presets": DRIVES, "frames": DRIVE_FRAMES},
         "settings": settings.model_dump(mode="json"), "weights_sha256": digest,

@@ -13,7 +13,7 @@ from rich.progress import Progress
 
 from benchmarks.harness import Options, Report, drives, processors, settings_of, unique_name
 from dpm2_core.errors import UsageError
-from dpm2_core.frame import Array, Frame, State, Tracked
+from dpm2_core.frame import Array, Frame, OdometryResult, State
 from dpm2_core.geometry import se3
 from dpm2_core.slam.build import make_odometry
 from dpm2_core.slam.settings import SlamSettings
@@ -101,7 +101,7 @@ def judged(frames: Sequence[Frame], truth: Array, gap: Gap, settings: SlamSettin
     }
 
 
-def _since(last: Tracked, base: Array, tracked: Tracked) -> Array:
+def _since(last: OdometryResult, base: Array, tracked: OdometryResult) -> Array:
     """Covariance (6, 6) of a pose, that of the last registered one before it being `base`; as the ROS node adds up."""
     A = se3.adjoint(se3.inverse(tracked.T_odom_lidar) @ last.T_odom_lidar)
     return np.asarray(A @ base @ A.T + tracked.covariance)

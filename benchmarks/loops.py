@@ -18,7 +18,7 @@ NEAR, GAP = 10.0, 50.0
 """A revisit: a keyframe so near to an earlier one, m, with at least so much path between them, m."""
 
 
-def judge_loops(closures: Sequence[LoopClosure], truth: Array) -> dict[str, Any]:
+def check_loops(closures: Sequence[LoopClosure], truth: Array) -> dict[str, Any]:
     """Counts of loops and revisits.
 
     Args:
@@ -31,18 +31,18 @@ def judge_loops(closures: Sequence[LoopClosure], truth: Array) -> dict[str, Any]
         A keyframe counts as a revisit in the same direction if any earlier one near it looks there, and so on.
     """
     found: set[int] = set()
-    errors, wrong, refusals = [], 0, Counter[str]()
+    errors, wrong, rejections = [], 0, Counter[str]()
     for closure in closures:
         r = closure.registration
         true = se3.inverse(truth[closure.from_id]) @ truth[closure.to_id]
         off = se3.inverse(true) @ r.T_target_source
-        metres, degrees = float(np.linalg.norm(off[:3, 3])), float(np.degrees(se3.angle(off)))
+        meters, degrees = float(np.linalg.norm(off[:3, 3])), float(np.degrees(se3.angle(off)))
         if not r.ok:
-            refusals[" ".join(word for word in r.reason.split() if not any(c.isdigit() for c in word))] += 1
-        elif metres > WRONG_M or degrees > WRONG_DEG:
+            rejections[" ".join(word for word in r.reason.split() if not any(c.isdigit() for c in word))] += 1
+        elif meters > WRONG_M or degrees > WRONG_DEG:
             wrong += 1
         else:
-            errors.append((metres, degrees))
+            errors.append((meters, degrees))
             found.add(closure.to_id)
     result: dict[str, Any] = {
         "tried": len(closures),
@@ -50,7 +50,7 @@ def judge_loops(closures: Sequence[LoopClosure], truth: Array) -> dict[str, Any]
         "wrong": wrong,
         "error_m": _quantiles([e[0] for e in errors]),
         "error_deg": _quantiles([e[1] for e in errors]),
-        "refusals": dict(refusals.most_common()),
+        "refusals": dict(rejections.most_common()),
     }
     for kind, nodes in revisits(truth).items():
         result[kind] = {"revisits": len(nodes), "found": len(nodes & found)}

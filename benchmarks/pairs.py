@@ -105,7 +105,7 @@ def pair_errors(method: PairMethod, frames: Sequence[Frame], poses: Array, pairs
     return errors
 
 
-def summarised(errors: Array) -> dict[str, float | int | None]:
+def summarized(errors: Array) -> dict[str, float | int | None]:
     """Median errors and success rate of (N, 2) errors, m and deg; None where there is nothing to say."""
     if not len(errors):
         return {"pairs": 0, "median_m": None, "median_deg": None, "success": None}
@@ -121,6 +121,6 @@ def all_pairs(
     """Each kind of pair, at most so many of it, by its methods."""
     pairs = pairs_of(poses, most)
     return {
-        kind: {name: summarised(pair_errors(method, frames, poses, pairs[kind])) for name, method in methods.items()}
+        kind: {name: summarized(pair_errors(method, frames, poses, pairs[kind])) for name, method in methods.items()}
         for kind, methods in kinds.items()
     }

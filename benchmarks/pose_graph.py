@@ -21,7 +21,7 @@ from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.g2o import read_g2o
 from dpm2_core.slam.graph.graph_data import GraphData, integrate
-from dpm2_core.slam.graph.robust import RobustSettings, least_squares, optimise
+from dpm2_core.slam.graph.robust import RobustSettings, least_squares, optimize
 from dpm2_core.slam.graph.worker import GraphWorker
 from dpm2_core.tables import FigureTable
 
@@ -133,7 +133,7 @@ def _row(truth: Array, graph: GraphData, right: _Mask, repetitions: int) -> dict
     seconds = []
     for _ in range(repetitions):
         began = time.perf_counter()
-        found = optimise(graph, RobustSettings())
+        found = optimize(graph, RobustSettings())
         poses = least_squares(replace(graph, poses=found.poses), found.kept)
         seconds.append(time.perf_counter() - began)
     return {

@@ -23,7 +23,7 @@ from dpm2_core.network.pretrained import load_network
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.simulated_drive import SimulatedDrive
 from dpm2_core.slam.build import make_mapper
-from dpm2_core.slam.loops.relocalization import Relocaliser, thinned
+from dpm2_core.slam.loops.relocalization import Relocalizer, downsampled
 from dpm2_core.slam.preprocess import Preprocessor
 from dpm2_core.slam.settings import Config, SlamSettings
 from dpm2_core.slam.store.map_data import load_map
@@ -59,7 +59,7 @@ def bench_relocalise(options: Options) -> Report:
         with MapStore.open(file) as store:
             data = load_map(store)
             network = load_network(settings.neural.weights, settings.threads, settings.neural.preset)
-            relocaliser = Relocaliser(
+            relocalizer = Relocalizer(
                 settings.relocalise, settings.geometric, network, data.keyframes, data.clouds, data.poses,
                 settings.threads,
             )  # fmt: skip
@@ -67,10 +67,10 @@ def bench_relocalise(options: Options) -> Report:
             rows = []
             for cloud, truth in visits(roads, settings, options.pairs):
                 started = perf_counter()
-                found = relocaliser.find(cloud)
+                found = relocalizer.find(cloud)
                 rows.append(_row(found, truth, perf_counter() - started))
                 progress.advance(task)
-            results = {"keyframes": len(data), "lateral_m": LATERAL, **judged(rows)}
+            results = {"keyframes": len(data), "lateral_m": LATERAL, **success_rates(rows)}
     return Report(results, Group(*(f"{name}: {value}" for name, value in results.items())))
 
 
@@ -88,7 +88,9 @@ def survey(options: Options, settings: SlamSettings, file: Path, progress: Progr
             frames = spaced(drive, 5.0)
             task = progress.add_task(f"map of {drive.name}", total=len(frames))
             for i in frames:
-                cloud = thinned(_measured(drive.frame(i), settings), settings.keyframes.voxel, settings.keyframes.range)
+                cloud = downsampled(
+                    _measured(drive.frame(i), settings), settings.keyframes.voxel, settings.keyframes.range
+                )
                 edge = Registration(np.eye(4), _EDGE, 1.0, 0.1, "survey") if mapper.keyframes else None
                 T = road.T_map_world @ drive.poses[i]
                 mapper.add(Keyframe(len(mapper.keyframes), i, i, T, cloud, edge))
@@ -108,20 +110,20 @@ def visits(roads: list[Road], settings: SlamSettings, count: int) -> Iterator[tu
         T = world.pose_at(s, rng.uniform(*LATERAL), rng.uniform(-np.pi, np.pi))
         scan = lidar.scan(world, T, rng.uniform(0, world.road.times[-1]), rng)
         points = _measured(Frame(0, scan.points), settings)
-        yield thinned(points, settings.keyframes.voxel, settings.keyframes.range), road.T_map_world @ T
+        yield downsampled(points, settings.keyframes.voxel, settings.keyframes.range), road.T_map_world @ T
 
 
-def spaced(drive: SimulatedDrive, metres: float) -> list[int]:
+def spaced(drive: SimulatedDrive, meters: float) -> list[int]:
     """Frames of a drive that are so far apart along it."""
     driven = drive.world.road.distance(drive.times)
-    return sorted({int(np.searchsorted(driven, s)) for s in np.arange(0, driven[-1], metres)})
+    return sorted({int(np.searchsorted(driven, s)) for s in np.arange(0, driven[-1], meters)})
 
 
-def judged(rows: list[tuple[bool, float, float, float]]) -> dict[str, Any]:
+def success_rates(rows: list[tuple[bool, float, float, float]]) -> dict[str, Any]:
     """Figures of answers: given or not, m and degrees off, seconds."""
-    ok, metres, degrees, seconds = (np.array(column) for column in zip(*rows, strict=True))
-    right = ok & (metres <= RIGHT_M) & (degrees <= RIGHT_DEG)
-    given = metres[ok.astype(bool)]
+    ok, meters, degrees, seconds = (np.array(column) for column in zip(*rows, strict=True))
+    right = ok & (meters <= RIGHT_M) & (degrees <= RIGHT_DEG)
+    given = meters[ok.astype(bool)]
     return {
         "visits": len(rows),
         "right": round(float(right.mean()), 4),

@@ -13,7 +13,7 @@ from rich.console import Group
 from rich.progress import Progress
 
 from benchmarks.harness import Options, Report
-from benchmarks.loops import judge_loops
+from benchmarks.loops import check_loops
 from dpm2_core.config import load_settings
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.metrics import evaluate
@@ -81,7 +81,7 @@ def drive(path: Path, settings: SlamSettings, progress: Progress) -> dict[str, A
         "keyframes": len(keyframes),
         "odometry": {name: getattr(alone, name) for name in _ERRORS},
         "slam": {name: getattr(slam, name) for name in _ERRORS},
-        "loops": judge_loops(mapper.closures, source.poses[keyframes]),
+        "loops": check_loops(mapper.closures, source.poses[keyframes]),
         "odometry_ms": _quantiles(odometry_s),
         "keyframe_ms": _quantiles(map_s),
         "wall_s": round(perf_counter() - started, 1),

@@ -21,7 +21,7 @@ from dpm2_core.data.kitti import KittiSource
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.tables import FigureTable
 from dpm2_ros.runtime import exit_code
-from tools.demo import judge
+from tools.demo import evaluate_replay
 from tools.replay import replay
 
 FIGURES = ("frames_in", "frames_out", "dropped", "latency_p50_ms", "latency_p95_ms", "ape_rmse_m", "rpe_trans_m")
@@ -42,7 +42,7 @@ def bench(
             work.mkdir()
             convert_kitti(drive.path, bag)
             played = BagSource(bag, InputSettings(images=False))
-            runs = [judge(played, replay(bag, topics.POINTS, work), work) for _ in range(repetitions)]
+            runs = [evaluate_replay(played, replay(bag, topics.POINTS, work), work) for _ in range(repetitions)]
             results[drive.name] = {
                 name: _median([run.summary[name] for run in runs], worst=name == "dropped") for name in FIGURES
             } | {"failed_checks": sum(not holds for run in runs for holds in run.checks.values())}

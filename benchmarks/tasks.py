@@ -147,18 +147,18 @@ def _compare(name: str, comparison: Comparison, options: Options) -> Any:
         "runs": {"without": {}, "with": {}},
     }
     for seed in range(options.repetitions):
-        for arm, gamma in (("without", 0.0), ("with", chosen.slam.gamma)):
+        for variant, gamma in (("without", 0.0), ("with", chosen.slam.gamma)):
             slam = chosen.slam.model_copy(update={"gamma": gamma})
             settings = chosen.model_copy(update={"seed": seed, "slam": slam})
-            out = folder / f"{arm}_{seed}"
+            out = folder / f"{variant}_{seed}"
             _train(name, settings, learn, out, shared)
-            figures = _judged(name, settings, judge, out)
+            figures = _measured(name, settings, judge, out)
             if comparison.slam:
                 slam_on = slam_figures(load_task(name, out / WEIGHTS), drives / "val")
                 figures |= {figure: _figure(value) for figure, value in slam_on.items()}
-            part["runs"][arm][str(seed)] = figures
+            part["runs"][variant][str(seed)] = figures
             part["summary"] = summary(part["runs"], comparison.figures)
-            part["complete"] = seed + 1 == options.repetitions and arm == "with"
+            part["complete"] = seed + 1 == options.repetitions and variant == "with"
             yield part
 
 
@@ -187,7 +187,7 @@ def _train(
         file.write(text)
 
 
-def _judged(name: str, settings: SlamTaskTraining, judge: TaskScans, out: Path) -> dict[str, Any]:
+def _measured(name: str, settings: SlamTaskTraining, judge: TaskScans, out: Path) -> dict[str, Any]:
     """Figures of one training on the scans of other worlds, and how the SLAM loss stood beside the task's."""
     figures = measure(load_task(name, out / WEIGHTS), judge)
     logged = (json.loads(line) for line in (out / "log.jsonl").read_text().splitlines())
@@ -214,19 +214,19 @@ def summary(runs: dict[str, dict[str, dict[str, Any]]], figures: dict[str, Bette
     """
     out = {}
     for figure, better in figures.items():
-        arms = {arm: [run[figure] for run in of.values()] for arm, of in runs.items()}
+        variants = {variant: [run[figure] for run in of.values()] for variant, of in runs.items()}
         row: dict[str, Any] = {
-            arm: {"mean": _figure(mean(values)), "std": _figure(stdev(values)) if len(values) > 1 else None}
-            for arm, values in arms.items()
+            variant: {"mean": _figure(mean(values)), "std": _figure(stdev(values)) if len(values) > 1 else None}
+            for variant, values in variants.items()
             if values
         }
-        if arms["with"] and arms["without"]:
-            gap = mean(arms["with"]) - mean(arms["without"])
+        if variants["with"] and variants["without"]:
+            gap = mean(variants["with"]) - mean(variants["without"])
             sign = -1 if better == "lower" else 1
-            size = abs(mean(arms["without"]))
+            size = abs(mean(variants["without"]))
             row["gain"] = _figure(sign * gap / size)
-            if min(map(len, arms.values())) > 1:
-                row["beyond_spread"] = abs(gap) > sum(stdev(values) for values in arms.values())
+            if min(map(len, variants.values())) > 1:
+                row["beyond_spread"] = abs(gap) > sum(stdev(values) for values in variants.values())
             seeds = sorted(runs["with"].keys() & runs["without"].keys())
             better_by = [sign * (runs["with"][s][figure] - runs["without"][s][figure]) for s in seeds]
             if len(seeds) > 1:
@@ -250,7 +250,7 @@ def _view(parts: dict[str, Any]) -> Group:
         columns = ["without", "with SLAM loss", "gain", "paired", "beyond the spread"]
         table = FigureTable(f"{name}, {len(part['runs']['with'])} seeds", names=["figure"], figures=columns)
         for figure, row in part["summary"].items():
-            cells = [_cell(row.get(arm)) for arm in ("without", "with")]
+            cells = [_cell(row.get(variant)) for variant in ("without", "with")]
             gain = f"{row['gain']:+.1%}" if "gain" in row else ""
             beyond = {True: "yes", False: "no"}.get(row.get("beyond_spread"), "")
             table.add_row(figure, *cells, gain, _paired(row.get("paired")), beyond)

@@ -12,7 +12,7 @@ import numpy as np
 
 from benchmarks.geometric import BASELINE, kiss_config
 from benchmarks.harness import Options, settings_of
-from benchmarks.pairs import PairMethod, by_registration, kiss_from_identity, summarised
+from benchmarks.pairs import PairMethod, by_registration, kiss_from_identity, summarized
 from dpm2_core.data.corrupt import hidden_by, random_box
 from dpm2_core.data.packed import PackedDrive, Sample
 from dpm2_core.errors import UsageError
@@ -63,7 +63,7 @@ def synthetic(network: DeepPointMap2, options: Options) -> dict[str, Any]:
     }
     good = rows[:, 2] < 0.6
     return {
-        "pairs": {kind: {"neural": summarised(rows[chosen, 2:4])} for kind, chosen in kinds.items()},
+        "pairs": {kind: {"neural": summarized(rows[chosen, 2:4])} for kind, chosen in kinds.items()},
         # Of 6 degrees of freedom: a median of 5.35 would say that the covariance is just right.
         "median_chi2": float(np.median(rows[good, 4])) if good.any() else None,
     }
@@ -102,7 +102,7 @@ def corruption(network: DeepPointMap2, options: Options) -> dict[str, Any]:
         pairs = _pairs(network, options, "mixed", options.pairs)
         pairs.drives = [_Changed(drive, change) for drive in pairs.drives]  # type: ignore[misc]
         rows[name] = pairs.errors(network)
-    out: dict[str, Any] = {"pairs": {name: {"neural": summarised(found[:, 2:4])} for name, found in rows.items()}}
+    out: dict[str, Any] = {"pairs": {name: {"neural": summarized(found[:, 2:4])} for name, found in rows.items()}}
     clean = np.median(rows["clean"][:, 2])
     out["error_ratio"] = {n: float(np.median(found[:, 2]) / clean) for n, found in rows.items() if n != "clean"}
     if not camera:
@@ -132,7 +132,7 @@ def image_matters(network: DeepPointMap2, options: Options) -> dict[str, Any]:
         if config is not None:
             methods[BASELINE] = _near_errors(pairs, kiss_from_identity(config))
         near = methods["descriptors without camera"][:, 0] <= NEAR
-        out["pairs"][f"{kind}, up to 5 m"] = {name: summarised(rows[near, 1:]) for name, rows in methods.items()}
+        out["pairs"][f"{kind}, up to 5 m"] = {name: summarized(rows[near, 1:]) for name, rows in methods.items()}
     if not camera:
         out["with the camera"] = _NO_CAMERA
     return out

@@ -114,17 +114,17 @@ class Registration:
 class State(StrEnum):
     """Health of the odometry and of the localisation in a map, as published in /diagnostics."""
 
-    INITIALISING = "initialising"
+    INITIALIZING = "initialising"
     TRACKING = "tracking"
     DEGRADED = "degraded"
     LOST = "lost"
-    RELOCALISING = "relocalising"
-    RELOCALISED = "relocalised"
+    RELOCALIZING = "relocalising"
+    RELOCALIZED = "relocalised"
 
     @property
     def located(self) -> bool:
         """Whether a place in a map goes with it."""
-        return self in (State.TRACKING, State.DEGRADED, State.RELOCALISED)
+        return self in (State.TRACKING, State.DEGRADED, State.RELOCALIZED)
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +161,7 @@ class LoopClosure:
 
 
 @dataclass(frozen=True, eq=False)
-class Tracked:
+class OdometryResult:
     """What the odometry knows after one frame.
 
     Attributes:

@@ -12,11 +12,11 @@ from typing import Any
 from dpm2_core.config import dump_settings
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Array, Keyframe, LoopClosure, State
-from dpm2_core.slam.build import make_localiser, make_mapper
-from dpm2_core.slam.loops.localizer import Localiser, Located
+from dpm2_core.slam.build import make_localizer, make_mapper
+from dpm2_core.slam.loops.localizer import LocalizationResult, Localizer
 from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.output import save_map
-from dpm2_core.slam.session import open_for_localisation, open_session
+from dpm2_core.slam.session import open_for_localization, open_session
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_ros.settings import NodeConfig
 
@@ -47,8 +47,8 @@ class ActiveMap:
         self._path = Path(ros.map_file) if ros.map_file not in ("", AUTO) else None  # written, or to be found in
         self._folder: Path | None = None  # of the clouds of this drive
         self._store: MapStore | None = None
-        self.localiser: Localiser | None = None
-        self.located: Located | None = None
+        self.localizer: Localizer | None = None
+        self.located: LocalizationResult | None = None
         self._T_map_odom: dict[str, Array] | None = None  # by robot, while the map grows; None before any keyframe
         if config.ros.localization_mode:
             self._load()
@@ -57,8 +57,8 @@ class ActiveMap:
 
     def T_map_odom(self, robot: str) -> Array | None:
         """(4, 4) of a robot; None while its place in the map is not known."""
-        if (localiser := self.localiser) is not None:
-            return localiser.T_map_odom if localiser.state.located else None
+        if (localizer := self.localizer) is not None:
+            return localizer.T_map_odom if localizer.state.located else None
         placed = self._T_map_odom
         if placed is None:
             return self.mapper.T_map_odom if robot == self._robot else None
@@ -66,8 +66,8 @@ class ActiveMap:
 
     def add(self, keyframe: Keyframe) -> list[LoopClosure]:
         """Take a keyframe in, or find it; returns the loops that were tried."""
-        if self.localiser is not None:
-            self._locate(self.localiser, keyframe)
+        if self.localizer is not None:
+            self._locate(self.localizer, keyframe)
             return []
         closures, before = self.mapper.add(keyframe), self._T_map_odom or {}
         found = {robot: self.mapper.T_map_odom_of(robot) for robot in self.mapper.robots}
@@ -82,7 +82,7 @@ class ActiveMap:
         Raises:
             UsageError, Dpm2Error: there is no file that would serve; what was before goes on.
         """
-        growing = self.localiser is None
+        growing = self.localizer is None
         if growing:
             if self._store is None:
                 raise UsageError("no map to find oneself in: ros.map_file is empty, or could not be written")
@@ -101,22 +101,22 @@ class ActiveMap:
         Raises:
             UsageError: the robot's place is not known. Dpm2Error: the file cannot be written.
         """
-        if (localiser := self.localiser) is None:
+        if (localizer := self.localizer) is None:
             return f"a map is being made already, {len(self.mapper.keyframes)} keyframes"
-        if not localiser.state.located:
-            raise UsageError(f"not extended: the robot is {localiser.state} in {self._path}")
+        if not localizer.state.located:
+            raise UsageError(f"not extended: the robot is {localizer.state} in {self._path}")
         self.close()
         self._resume()
-        self.mapper.start_session(localiser.T_map_odom)
-        self._T_map_odom, self.localiser, self.located = None, None, None
+        self.mapper.start_session(localizer.T_map_odom)
+        self._T_map_odom, self.localizer, self.located = None, None, None
         return f"{self._path} grows by a new session"
 
     def restart(self) -> None:
         """The robot's odometry has started again: where it is, a loop or a search has to tell."""
         placed = self._T_map_odom or {}
         self._T_map_odom = {robot: T for robot, T in placed.items() if robot != self._robot}
-        if self.localiser is not None:
-            self.localiser.restart()
+        if self.localizer is not None:
+            self.localizer.restart()
 
     def reset(self) -> str:
         """Save the map and begin an empty one; or, in a map that stays as it is, look for the robot anew.
@@ -125,7 +125,7 @@ class ActiveMap:
             Dpm2Error: it could not be saved, and goes on.
         """
         self.restart()
-        if self.localiser is not None:
+        if self.localizer is not None:
             return ""
         self.finish()
         if self.mapper.store_problem:
@@ -138,7 +138,7 @@ class ActiveMap:
     @property
     def saves(self) -> bool:
         """Whether `save` has a folder to write into."""
-        return self._directory is not None and self.localiser is None
+        return self._directory is not None and self.localizer is None
 
     def save(self) -> str:
         """Cloud, trajectory and pose graph into the drive's own folder; says so in words.
@@ -148,7 +148,7 @@ class ActiveMap:
         """
         if self._directory is None:
             raise UsageError("no map is saved: ros.map_directory is empty")
-        if self.localiser is not None:
+        if self.localizer is not None:
             raise UsageError("no map is saved: in localization_mode the map stays as it is, in its file")
         if not self.mapper.keyframes:
             raise UsageError("no map is saved: there is no keyframe yet")
@@ -173,7 +173,7 @@ class ActiveMap:
 
     def finish(self) -> None:
         """Do what still waits; the file stays open."""
-        if self.localiser is None:
+        if self.localizer is None:
             self.mapper.finish()
 
     def close(self) -> None:
@@ -218,16 +218,16 @@ class ActiveMap:
         """The file, to find oneself in; what was before stays if that fails."""
         if self._path is None:
             raise UsageError("no map to find oneself in: ros.map_file does not name one" + self._hint())
-        store = open_for_localisation(self._path, self._config.slam)
+        store = open_for_localization(self._path, self._config.slam)
         try:
             mapper = make_mapper(self._config.slam, store)
-            localiser = make_localiser(self._config.slam, mapper)
+            localizer = make_localizer(self._config.slam, mapper)
         except BaseException:
             store.close()
             raise
         if self._store is not None:
             self._store.close()
-        self._store, self.mapper, self.localiser, self.located = store, mapper, localiser, None
+        self._store, self.mapper, self.localizer, self.located = store, mapper, localizer, None
 
     def _hint(self) -> str:
         """The youngest map in the folder, where somebody may look for one."""
@@ -241,9 +241,9 @@ class ActiveMap:
         self._store = open_session(self._path, self._config.slam, dump_settings(self._config), resume=True)
         self.mapper = make_mapper(self._config.slam, self._store)
 
-    def _locate(self, localiser: Localiser, keyframe: Keyframe) -> None:
-        before = localiser.state
-        located = self.located = localiser.add(keyframe)
+    def _locate(self, localizer: Localizer, keyframe: Keyframe) -> None:
+        before = localizer.state
+        located = self.located = localizer.add(keyframe)
         if located.state is before:
             return
         if located.jumped:

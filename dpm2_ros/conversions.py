@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Header
 
-from dpm2_core.frame import Array, Keyframe, Points, Registration, Tracked
+from dpm2_core.frame import Array, Keyframe, OdometryResult, Points, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.slam.mapping.admission import MAX_ID, RejectedError
 
@@ -75,7 +75,9 @@ def covariance_from_ros(numbers: Array, R: Array) -> Array:
     return M @ np.asarray(numbers, np.float64).reshape(6, 6) @ M.T
 
 
-def odometry_to_msg(tracked: Tracked, covariance: Array, seconds: float, odom_frame: str, base_frame: str) -> Odometry:
+def odometry_to_msg(
+    tracked: OdometryResult, covariance: Array, seconds: float, odom_frame: str, base_frame: str
+) -> Odometry:
     """nav_msgs/Odometry at the cloud's stamp.
 
     Args:
@@ -151,7 +153,7 @@ def edge_to_msg(T: Array, covariance: Array, stamp: int, parent: str, child: str
     return message
 
 
-def to_base(tracked: Tracked, T_base_lidar: Array) -> Tracked:
+def to_base(tracked: OdometryResult, T_base_lidar: Array) -> OdometryResult:
     """The same motion seen from the base: odom then starts at the base's first pose, and the keyframe's cloud,
     pose and edge are those of the base. The LiDAR's own names (`T_odom_lidar`) then mean the base."""
     keyframe = None if tracked.keyframe is None else keyframe_to_base(tracked.keyframe, T_base_lidar)
@@ -159,7 +161,7 @@ def to_base(tracked: Tracked, T_base_lidar: Array) -> Tracked:
     return replace(moved, T_odom_lidar=T_base_lidar @ moved.T_odom_lidar, keyframe=keyframe)
 
 
-def of_body(tracked: Tracked, T_new_old: Array) -> Tracked:
+def of_body(tracked: OdometryResult, T_new_old: Array) -> OdometryResult:
     """The pose of another frame of the same rigid body in the same odom; the keyframe stays as it is."""
     A = se3.adjoint(T_new_old)
     return replace(

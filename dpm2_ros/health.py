@@ -12,14 +12,14 @@ from datetime import UTC, datetime
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 
-from dpm2_core.frame import State, Tracked
+from dpm2_core.frame import OdometryResult, State
 from dpm2_ros.diagnostics import ERROR, OK, STALE, WARN, DiagnosticsPublisher, mapper_status, message_status, status
 from dpm2_ros.frames import FrameBuilder
 from dpm2_ros.guard import GuardedNode
 from dpm2_ros.keyframes import BEHIND, KeyframeSender
 from dpm2_ros.mapping import MapperThread
 from dpm2_ros.subscriptions import Inputs
-from dpm2_ros.synchronizer import CameraState, Verdict
+from dpm2_ros.synchronizer import CameraState, StampCheck
 
 OTHER_CLOCK = 1.0
 """Seconds between a cloud's stamp and the node's clock beyond which they are not of the same clock."""
@@ -28,10 +28,10 @@ SILENT = 2.0
 
 _LEVEL = {
     State.TRACKING: OK,
-    State.INITIALISING: OK,
+    State.INITIALIZING: OK,
     State.DEGRADED: WARN,
-    State.RELOCALISING: WARN,
-    State.RELOCALISED: OK,
+    State.RELOCALIZING: WARN,
+    State.RELOCALIZED: OK,
     State.LOST: ERROR,
 }
 
@@ -45,10 +45,10 @@ class Health:
         self._done: deque[float] = deque(maxlen=50)
         self._seconds: dict[str, deque[float]] = {}
         self.processed = self.failed = self.errors = 0
-        self.last: Tracked | None = None
+        self.last: OdometryResult | None = None
         self._last_good: float | None = None
 
-    def add(self, tracked: Tracked, latency: float) -> None:
+    def add(self, tracked: OdometryResult, latency: float) -> None:
         """One frame is out, `latency` s after its cloud came in."""
         now = time.monotonic()
         with self._lock:
@@ -120,8 +120,8 @@ class Diagnostics:
             text = f"{delivered} of {made} keyframes have arrived at the mapper"
             level = WARN if made - delivered > BEHIND else OK
             out.append(self._status("mapper", level, text, {"keyframes": made, "delivered": delivered}))
-        elif self._mapper.localising:
-            out.append(self._localisation(self._mapper))
+        elif self._mapper.localizing:
+            out.append(self._localization(self._mapper))
         else:
             out.append(mapper_status(self._node, self._mapper))
         return [*out, message_status(self._node)]
@@ -130,7 +130,9 @@ class Diagnostics:
         """What became of all clouds that were sent since the first that arrived, in words; for when none is at work."""
         synchronizer, lost = self._inputs.synchronizer, self._inputs.losses.count
         received, waiting, processed = synchronizer.received, len(synchronizer), self._health.processed
-        rejected = sum(synchronizer.counts[why] for why in (Verdict.REPEATED, Verdict.OUT_OF_ORDER, Verdict.STRAY))
+        rejected = sum(
+            synchronizer.counts[why] for why in (StampCheck.REPEATED, StampCheck.OUT_OF_ORDER, StampCheck.STRAY)
+        )
         rare = {
             "rejected for their stamps": rejected,
             "still waiting": waiting,
@@ -148,10 +150,10 @@ class Diagnostics:
             "received": str(synchronizer.received),
             "lost on the way": str(losses.count),
             "dropped (queue full)": str(synchronizer.dropped),
-            "refused (stamp repeated)": str(counts[Verdict.REPEATED]),
-            "refused (stamp out of order)": str(counts[Verdict.OUT_OF_ORDER]),
-            "rejected (stray stamp)": str(counts[Verdict.STRAY]),
-            "restarts": str(counts[Verdict.RESTARTED]),
+            "refused (stamp repeated)": str(counts[StampCheck.REPEATED]),
+            "refused (stamp out of order)": str(counts[StampCheck.OUT_OF_ORDER]),
+            "rejected (stray stamp)": str(counts[StampCheck.STRAY]),
+            "restarts": str(counts[StampCheck.RESTARTED]),
             "waiting": str(len(synchronizer)),
         }
         if times := self._inputs.times:
@@ -199,10 +201,10 @@ class Diagnostics:
             return "use_sim_time is on, and nobody publishes /clock"
         return f"clouds are stamped {_date(stamp)}, /clock says {_date(now)}"
 
-    def _localisation(self, mapper: MapperThread) -> DiagnosticStatus:
+    def _localization(self, mapper: MapperThread) -> DiagnosticStatus:
         located, figures = mapper.located, {"keyframes of the map": str(mapper.keyframes)}
         if located is None:
-            return self._status("localisation", WARN, f"{State.RELOCALISING}: no keyframe yet", figures)
+            return self._status("localisation", WARN, f"{State.RELOCALIZING}: no keyframe yet", figures)
         found, text = located.registration, str(located.state)
         if found.ok:
             figures |= {"confidence": f"{found.confidence:.2f}", "worst sigma (m)": f"{found.worst_sigma:.3f}"}

@@ -22,7 +22,7 @@ from visualization_msgs.msg import MarkerArray
 
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Array, Keyframe, LoopClosure, State
-from dpm2_core.slam.loops.localizer import Located
+from dpm2_core.slam.loops.localizer import LocalizationResult
 from dpm2_core.slam.mapping.admission import RejectedError
 from dpm2_ros.active_map import ActiveMap
 from dpm2_ros.conversions import cloud_to_msg, edge_to_msg, keyframe_name
@@ -102,26 +102,26 @@ class MapperThread:
         return self._active.mapper.store_problem
 
     @property
-    def localising(self) -> bool:
+    def localizing(self) -> bool:
         """Whether the map stays as it is."""
-        return self._active.localiser is not None
+        return self._active.localizer is not None
 
     @property
-    def located(self) -> Located | None:
+    def located(self) -> LocalizationResult | None:
         """What became of the last keyframe in a map that stays as it is."""
         return self._active.located
 
     def state(self, odometry: State) -> State:
         """That of the robot: of its odometry, or, where that is well, of its place in a map that stays as it is."""
-        localiser = self._active.localiser
-        if localiser is None or odometry in (State.LOST, State.INITIALISING) or localiser.state is State.TRACKING:
+        localizer = self._active.localizer
+        if localizer is None or odometry in (State.LOST, State.INITIALIZING) or localizer.state is State.TRACKING:
             return odometry
-        return localiser.state
+        return localizer.state
 
     def wants_keyframe(self, stamp: int) -> bool:
         """Whether one is looked for that the odometry would not make of its own (ns)."""
-        idle, localiser = self._last is None or self._last.done(), self._active.localiser
-        return localiser is not None and idle and localiser.wants(stamp)
+        idle, localizer = self._last is None or self._last.done(), self._active.localizer
+        return localizer is not None and idle and localizer.wants(stamp)
 
     def broadcast(self, stamp: int, robot: str, odom_frame: str) -> None:
         """Send map -> odom of a robot, valid from that stamp (ns) on, if it is known."""
@@ -138,10 +138,10 @@ class MapperThread:
 
     def hint(self, T_map_base: Array) -> str:
         """The robot is about there (4, 4), somebody says; returns why that is of no use, if it is not."""
-        localiser = self._active.localiser
-        if localiser is None:
+        localizer = self._active.localizer
+        if localizer is None:
             return "a map is being made: a pose is of use only with localization_mode"
-        self._submit(lambda: localiser.hint(T_map_base))
+        self._submit(lambda: localizer.hint(T_map_base))
         return ""
 
     def localise(self) -> Future[str]:
@@ -205,7 +205,7 @@ class MapperThread:
 
     def _add(self, keyframe: Keyframe) -> None:
         closures = self._active.add(keyframe)
-        if self.localising:
+        if self.localizing:
             return
         self._stamp = keyframe.stamp
         for closure in closures:

@@ -17,7 +17,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.errors import UsageError
-from dpm2_core.frame import Array, Keyframe, State, Tracked
+from dpm2_core.frame import Array, Keyframe, OdometryResult, State
 from dpm2_core.geometry import se3
 from dpm2_core.slam.build import make_loops, make_odometry
 from dpm2_core.slam.loops.localizer import LOST
@@ -104,9 +104,9 @@ class SlamNode(GuardedNode):
         """The state of a drive at its start."""
         self._odometry.reset()
         self._base.restart()
-        self._held: list[Tracked] = []  # until the base frame is known
+        self._held: list[OdometryResult] = []  # until the base frame is known
         self._covariance = np.zeros((6, 6))
-        self._before: Tracked | None = None  # the last registered frame, of which `_covariance` is
+        self._before: OdometryResult | None = None  # the last registered frame, of which `_covariance` is
 
     def _work(self) -> None:
         while not self._stopping.is_set():
@@ -180,7 +180,7 @@ class SlamNode(GuardedNode):
             self.get_logger().error(base.problem, throttle_duration_sec=10)
         self._diagnostics.frame_problem = base.problem
 
-    def _hand_on(self, tracked: Tracked) -> Tracked:
+    def _hand_on(self, tracked: OdometryResult) -> OdometryResult:
         """The keyframe to the map, pose and transforms to everybody; returns what was published."""
         mapper, T_start_lidar = self._mapper, self._base.T_start_lidar
         if mapper is not None:
@@ -197,7 +197,7 @@ class SlamNode(GuardedNode):
         self._publish(tracked)
         return tracked
 
-    def _publish(self, tracked: Tracked) -> None:
+    def _publish(self, tracked: OdometryResult) -> None:
         ros, before, covariance, seconds = self._config.ros, self._before, self._covariance, 0.1
         if before is not None:  # the last one that was registered
             A = se3.adjoint(se3.inverse(tracked.T_odom_lidar) @ before.T_odom_lidar)
@@ -240,7 +240,7 @@ class SlamNode(GuardedNode):
         return response
 
     async def _on_load_map(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        if self._mapper is None or not self._mapper.localising:
+        if self._mapper is None or not self._mapper.localizing:
             response.success, response.message = False, "no map is loaded: localization_mode is off"
         else:
             await answer(self._mapper.localise(), response)

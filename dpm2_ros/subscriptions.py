@@ -28,7 +28,7 @@ from dpm2_core.slam.mapping.admission import RejectedError
 from dpm2_ros.checks import check_header, check_size, extended, unreadable
 from dpm2_ros.losses import Losses
 from dpm2_ros.settings import RosSettings
-from dpm2_ros.synchronizer import Bundle, Synchronizer, Verdict
+from dpm2_ros.synchronizer import Bundle, StampCheck, Synchronizer
 from dpm2_ros.tf import TFMessage
 
 _OTHER_FRAME = 2.0  # s without a cloud after which one in another frame begins another drive
@@ -217,15 +217,15 @@ class Inputs:
             for camera in self.synchronizer.cameras:
                 camera.present = bool(self._node.count_publishers(others[0].topic))
             lost = self.losses.add(stamp, number)
-            verdict = self.synchronizer.add_cloud(stamp, message, time.monotonic())
+            check = self.synchronizer.add_cloud(stamp, message, time.monotonic())
             self._arrived.notify()
         if lost:
             self._node.get_logger().warning(
                 f"{lost} clouds before that at {stamp / 1e9:.3f} s were lost on the way", throttle_duration_sec=5
             )
-        if verdict is not Verdict.ACCEPTED:
+        if check is not StampCheck.ACCEPTED:
             self._node.get_logger().warning(
-                f"cloud at {stamp_ns(message.header) / 1e9:.3f} s: {verdict}", throttle_duration_sec=5
+                f"cloud at {stamp_ns(message.header) / 1e9:.3f} s: {check}", throttle_duration_sec=5
             )
 
     def _on_image(self, message: Any) -> None:

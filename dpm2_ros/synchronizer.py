@@ -22,7 +22,7 @@ BUFFER = 16
 """Images kept for a camera."""
 
 
-class Verdict(StrEnum):
+class StampCheck(StrEnum):
     """What became of an incoming cloud."""
 
     ACCEPTED = "accepted"
@@ -82,7 +82,7 @@ class Synchronizer:
 
     def __init__(self, cameras: int, depth: int, timeout: float, tolerance: float) -> None:
         self.cameras = [CameraState() for _ in range(cameras)]
-        self.counts: dict[Verdict, int] = dict.fromkeys(Verdict, 0)
+        self.counts: dict[StampCheck, int] = dict.fromkeys(StampCheck, 0)
         self.dropped = 0
         self.last_arrival: float | None = None
         self._timeout, self._tolerance = timeout, round(tolerance * 1e9)
@@ -102,23 +102,23 @@ class Synchronizer:
         """Clouds that have come in."""
         return sum(self.counts.values()) + (self._jumped is not None)
 
-    def add_cloud(self, stamp: int, cloud: Any, now: float) -> Verdict:
+    def add_cloud(self, stamp: int, cloud: Any, now: float) -> StampCheck:
         """Take a cloud with its stamp (ns); `now` is when it arrived."""
         self.last_arrival = now
         if self._jumped is not None and self._newest is not None:
             self._settle(abs(stamp - self._jumped.stamp) <= abs(stamp - self._newest))
-        verdict = self._judge(stamp, now)
-        if verdict is Verdict.JUMPED:
+        check = self._check(stamp, now)
+        if check is StampCheck.JUMPED:
             self._jumped = Bundle(stamp, cloud, now, restarted=False)
-            return verdict
-        self.counts[verdict] += 1
-        if verdict is Verdict.ACCEPTED:
+            return check
+        self.counts[check] += 1
+        if check is StampCheck.ACCEPTED:
             self._accept(Bundle(stamp, cloud, now, restarted=False))
-        return verdict
+        return check
 
     def due(self, stamp: int, now: float) -> bool:
         """Whether a cloud of that stamp (ns) would be accepted as the next one of the drive."""
-        return self._newest is not None and self._judge(stamp, now) is Verdict.ACCEPTED
+        return self._newest is not None and self._check(stamp, now) is StampCheck.ACCEPTED
 
     def add_image(self, camera: int, stamp: int, image: Any, now: float) -> None:
         """Take an image of one camera with its stamp (ns)."""
@@ -168,15 +168,15 @@ class Synchronizer:
             return self._queue[0].arrival + self._timeout
         return self._jumped.arrival + HOLD if self._jumped is not None else None
 
-    def _judge(self, stamp: int, now: float) -> Verdict:
+    def _check(self, stamp: int, now: float) -> StampCheck:
         if self._newest is None:
-            return Verdict.ACCEPTED
+            return StampCheck.ACCEPTED
         step = (stamp - self._newest) * 1e-9
         if step < -JUMP or step > JUMP + now - self._arrival:
-            return Verdict.JUMPED
+            return StampCheck.JUMPED
         if step > 0:
-            return Verdict.ACCEPTED
-        return Verdict.OUT_OF_ORDER if step else Verdict.REPEATED
+            return StampCheck.ACCEPTED
+        return StampCheck.OUT_OF_ORDER if step else StampCheck.REPEATED
 
     def _settle(self, true: bool) -> None:
         """Accept or reject the cloud whose stamp jumped."""
@@ -184,7 +184,9 @@ class Synchronizer:
         if bundle is None or self._newest is None:
             return
         bundle.restarted = true and bundle.stamp < self._newest
-        self.counts[Verdict.RESTARTED if bundle.restarted else Verdict.ACCEPTED if true else Verdict.STRAY] += 1
+        self.counts[
+            StampCheck.RESTARTED if bundle.restarted else StampCheck.ACCEPTED if true else StampCheck.STRAY
+        ] += 1
         if true:
             self._accept(bundle)
 

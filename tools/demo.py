@@ -64,7 +64,7 @@ def demo(
         result = replay(
             bag, source.points_topic, out, rate, parameters, lambda done: progress.update(task, completed=done)
         )
-    outcome = judge(source, result, out)
+    outcome = evaluate_replay(source, result, out)
     with atomic_write(out / "summary.json") as file:
         file.write(json.dumps(outcome.summary, indent=2) + "\n")
     console.print(_table(source, result, outcome, out))
@@ -109,7 +109,7 @@ def _simulate(out: Path, frames: int, seed: int) -> None:
         raise Dpm2Error(f"dpm2 {' '.join(command)} failed")
 
 
-def judge(source: BagSource, result: Replay, out: Path) -> Outcome:
+def evaluate_replay(source: BagSource, result: Replay, out: Path) -> Outcome:
     """Compare what came out with what went in, and with the ground truth where there is some; draws the picture."""
     stamps = source.stamps
     found = [stamp for stamp in dict.fromkeys(stamps.tolist()) if stamp in result.poses]
@@ -140,11 +140,11 @@ def judge(source: BagSource, result: Replay, out: Path) -> Outcome:
         wanted = {f"odom -> {result.base_frame}", "map -> odom"}
         checks["/tf has odom -> base and map -> odom"] = wanted <= result.tf
     if len(found) > 1:
-        _judge_poses(source, result, out, found, summary, checks)
+        _check_poses(source, result, out, found, summary, checks)
     return Outcome(summary, checks)
 
 
-def _judge_poses(
+def _check_poses(
     source: BagSource,
     result: Replay,
     out: Path,

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from dpm2_core.commands.train import ConfigOption, OutOption, ResumeOption, SetOption, refuse_overwriting
+from dpm2_core.commands.train import ConfigOption, OutOption, ResumeOption, SetOption, reject_overwriting
 from dpm2_core.config import load_settings
 from dpm2_core.console import Console
 from dpm2_core.tables import FigureTable
@@ -34,7 +34,7 @@ def finetune(
     from dpm2_core.network.pretrained import load_network, weights_path  # torch is slow to import
     from dpm2_core.slam.settings import SlamSettings
 
-    refuse_overwriting(out, resume)
+    reject_overwriting(out, resume)
     chosen = load_settings(finetune_settings.FinetuneSettings, config, settings or [])
     start = weights_path(chosen.weights)
     network = load_network(chosen.weights, threads=2).settings

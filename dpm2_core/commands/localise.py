@@ -20,9 +20,9 @@ from dpm2_core.errors import UsageError
 from dpm2_core.files import atomic_write
 from dpm2_core.frame import Array, Frame, State
 from dpm2_core.geometry import se3
-from dpm2_core.slam.session import open_for_localisation
+from dpm2_core.slam.session import open_for_localization
 from dpm2_core.slam.settings import Config
-from dpm2_core.slam.system import LocalisationSystem
+from dpm2_core.slam.system import LocalizationSystem
 
 
 def parse_hint(text: str) -> Array:
@@ -40,7 +40,7 @@ def parse_hint(text: str) -> Array:
     return se3.make(se3.exp(np.array([0, 0, np.radians(yaw), 0, 0, 0]))[:3, :3], np.array([x, y, 0.0]))
 
 
-class LocalisationReport:
+class LocalizationReport:
     """What became of each frame.
 
     Attributes:
@@ -54,16 +54,16 @@ class LocalisationReport:
         self._first: int | None = None
         self._events: list[dict[str, Any]] = []
 
-    def add(self, system: LocalisationSystem, frame: Frame) -> str:
+    def add(self, system: LocalizationSystem, frame: Frame) -> str:
         """Take the next frame through the system; returns what is worth telling of it, or nothing."""
-        before = system.localiser.state
+        before = system.localizer.state
         tracked, located = system.process(frame)
-        state = State.LOST if tracked.state is State.LOST else system.localiser.state
+        state = State.LOST if tracked.state is State.LOST else system.localizer.state
         number = self._frames.total()
         self._frames[state] += 1
         if state.located:
             self.stamps.append(frame.stamp)
-            self.poses.append(system.localiser.T_map_odom @ tracked.T_odom_lidar)
+            self.poses.append(system.localizer.T_map_odom @ tracked.T_odom_lidar)
         if located is None or located.state is before or located.state is State.TRACKING:
             return ""
         kind = "kidnapped" if located.jumped and before.located else "found" if located.jumped else str(located.state)
@@ -87,7 +87,7 @@ class LocalisationReport:
         }
 
 
-def run_localised(
+def run_localized(
     source: Source, span: tuple[int, int], out: Path, map_file: Path, hint: Array | None, chosen: Config
 ) -> None:
     """The drive through a map: localisation.json, trajectory.tum of the frames whose place was known, config.yaml.
@@ -95,11 +95,11 @@ def run_localised(
     Raises:
         UsageError: no map to find oneself in.
     """
-    console, report = Console(stderr=True), LocalisationReport()
-    with open_for_localisation(map_file, chosen.slam) as store:
-        system = LocalisationSystem(chosen.slam, store)
+    console, report = Console(stderr=True), LocalizationReport()
+    with open_for_localization(map_file, chosen.slam) as store:
+        system = LocalizationSystem(chosen.slam, store)
         if hint is not None:
-            system.localiser.hint(hint)
+            system.localizer.hint(hint)
         out.mkdir(parents=True, exist_ok=True)
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
         with Progress(*columns, console=console) as progress:
@@ -108,7 +108,7 @@ def run_localised(
                 for frame in prefetch(source.frames(*span)):
                     if told := report.add(system, frame):
                         progress.console.print(told, soft_wrap=True)
-                    progress.update(task, advance=1, description=f"{source.name} {system.localiser.state}")
+                    progress.update(task, advance=1, description=f"{source.name} {system.localizer.state}")
             except KeyboardInterrupt:
                 console.print("interrupted; writing what there is", style="yellow")
     write_tum(out / "trajectory.tum", report.stamps, np.array(report.poses).reshape(-1, 4, 4))

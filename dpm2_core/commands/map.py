@@ -106,7 +106,7 @@ def merge(
     from dpm2_core.slam.build import make_loops
     from dpm2_core.slam.graph.pose_graph import PoseGraph
     from dpm2_core.slam.mapping.merge import align as aligned
-    from dpm2_core.slam.mapping.merge import loops_by, merge_maps, optimised
+    from dpm2_core.slam.mapping.merge import loops_by, merge_maps, optimized
     from dpm2_core.slam.settings import Config
 
     given = [parse_transform(text) for text in transform or ()]
@@ -120,7 +120,7 @@ def merge(
         for number, other in enumerate(others):
             if align:
                 T, loops = aligned(first, other, loops_by(make_loops(chosen)))
-                first = optimised(merge_maps(first, other, T, loops), PoseGraph(chosen.pose_graph))
+                first = optimized(merge_maps(first, other, T, loops), PoseGraph(chosen.pose_graph))
                 Console(stderr=True).print(f"{paths[number + 1]}: {len(loops)} loops to what came before")
             else:
                 first = merge_maps(first, other, given[number])

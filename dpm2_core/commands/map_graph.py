@@ -28,19 +28,19 @@ def optimize(
     """Optimise a pose graph and reject the loops that cannot be true."""
     from dpm2_core.slam.graph.g2o import read_g2o, require_connected, write_g2o
     from dpm2_core.slam.graph.graph_data import total_chi2
-    from dpm2_core.slam.graph.robust import RobustSettings, least_squares, optimise
+    from dpm2_core.slam.graph.robust import RobustSettings, least_squares, optimize
 
     file = read_g2o(graph)
     require_connected(graph, file)
     data = file.graph
     began = time.perf_counter()
     try:
-        solution = optimise(data, RobustSettings())
+        solution = optimize(data, RobustSettings())
         poses = least_squares(replace(data, poses=solution.poses), solution.kept)
     except RuntimeError as error:  # gtsam's: the system is singular
         raise Dpm2Error(f"{graph}: {' '.join(str(error).split())}") from None
     seconds = time.perf_counter() - began
-    optimised = replace(file, graph=replace(data, poses=poses))
+    optimized = replace(file, graph=replace(data, poses=poses))
     figures: dict[str, Any] = {
         "vertices": len(data),
         "edges": int(data.chained.sum()) + len(data.ends),
@@ -51,13 +51,13 @@ def optimize(
         "chi2_after": total_chi2(data, poses, solution.kept),
         "seconds": seconds,
     }
-    write_g2o(out, optimised, solution.kept)
+    write_g2o(out, optimized, solution.kept)
     if json_file is not None:
-        verdicts = [
+        loop_checks = [
             {"from": int(a), "to": int(b), "kept": bool(kept), "reason": solution.reason(loop)}
             for loop, ((a, b), kept) in enumerate(zip(file.ids[data.ends], solution.kept, strict=True))
         ]
-        record = {**figures, "settled": solution.settled, "ignored": file.ignored, "verdicts": verdicts}
+        record = {**figures, "settled": solution.settled, "ignored": file.ignored, "verdicts": loop_checks}
         with atomic_write(json_file) as text:
             text.write(json.dumps(record, indent=1) + "\n")
     _show(graph, figures, file.ignored, solution.settled)

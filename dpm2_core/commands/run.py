@@ -14,7 +14,7 @@ import numpy as np
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from dpm2_core.commands.localise import parse_hint, run_localised
+from dpm2_core.commands.localise import parse_hint, run_localized
 from dpm2_core.config import dump_settings, load_settings
 from dpm2_core.console import Console
 from dpm2_core.data.corrupt import CorruptedSource, CorruptionSettings, parse_corruption
@@ -81,7 +81,7 @@ def run(
             raise UsageError("--localise: the map stays as it is, and its frame is its own: without --map and --gt")
         T_hint = None if hint is None else parse_hint(hint)
         source, start, stop = _open(src, span, corruption, chosen, chosen.slam.registration != "geometric")
-        run_localised(source, (start, stop), out, localise, T_hint, chosen)
+        run_localized(source, (start, stop), out, localise, T_hint, chosen)
         return
     if hint is not None:
         raise UsageError("--hint: only with --localise")

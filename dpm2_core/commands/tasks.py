@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from dpm2_core.commands.train import ConfigOption, OutOption, ResumeOption, SetOption, refuse_overwriting, train
+from dpm2_core.commands.train import ConfigOption, OutOption, ResumeOption, SetOption, reject_overwriting, train
 from dpm2_core.config import load_settings
 from dpm2_core.console import Console
 from dpm2_core.tables import FigureTable
@@ -96,7 +96,7 @@ def _train(
     from dpm2_core.tasks.task import task_type
     from dpm2_core.tasks.training import WEIGHTS, train_task
 
-    refuse_overwriting(out, resume)
+    reject_overwriting(out, resume)
     kind = task_type(name)
     chosen = load_settings(kind.training_type, *settings)
     scans = open_scans(src, kind.needs)

@@ -81,10 +81,10 @@ def image(
     resume: ResumeOption = False,
 ) -> None:
     """The image branch alone, before phase one with pictures."""
-    from dpm2_core.learning.train_image import PhaseImageSettings, phase_image
+    from dpm2_core.learning.train_image import ImageTrainingSettings, train_image
 
-    refuse_overwriting(out, resume)
-    phase_image(load_settings(PhaseImageSettings, config, settings or []), out, resume)
+    reject_overwriting(out, resume)
+    train_image(load_settings(ImageTrainingSettings, config, settings or []), out, resume)
 
 
 @train.command()
@@ -95,10 +95,10 @@ def phase1(
     resume: ResumeOption = False,
 ) -> None:
     """Registration: encoder, decoder, similarity and offset heads."""
-    from dpm2_core.learning.train_registration import PhaseOneSettings, phase_one
+    from dpm2_core.learning.train_registration import RegistrationTrainingSettings, train_registration
 
-    refuse_overwriting(out, resume)
-    phase_one(load_settings(PhaseOneSettings, config, settings or []), out, resume)
+    reject_overwriting(out, resume)
+    train_registration(load_settings(RegistrationTrainingSettings, config, settings or []), out, resume)
 
 
 @train.command()
@@ -109,10 +109,10 @@ def phase2(
     resume: ResumeOption = False,
 ) -> None:
     """Overlap head alone, on the network of phase one."""
-    from dpm2_core.learning.train_overlap import PhaseTwoSettings, phase_two
+    from dpm2_core.learning.train_overlap import OverlapTrainingSettings, train_overlap
 
-    refuse_overwriting(out, resume)
-    phase_two(load_settings(PhaseTwoSettings, config, settings or []), out, resume)
+    reject_overwriting(out, resume)
+    train_overlap(load_settings(OverlapTrainingSettings, config, settings or []), out, resume)
 
 
 @train.command()
@@ -142,7 +142,7 @@ def ablation(
     Console().print(table, f"written to {report}")
 
 
-def refuse_overwriting(out: Path, resume: bool) -> None:
+def reject_overwriting(out: Path, resume: bool) -> None:
     """Raise UsageError where a new training would replace another, or there is none to resume."""
     if (out / "checkpoint.pt").exists() and not resume:
         raise UsageError(f"{out}: holds a training; --resume continues it, another --out keeps it")

@@ -20,7 +20,7 @@ from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Frame, Image, Points
 from dpm2_core.geometry import se3
 
-Share = Annotated[float, Field(ge=0, le=1)]
+Ratio = Annotated[float, Field(ge=0, le=1)]
 
 
 class CorruptionSettings(Settings):
@@ -28,19 +28,19 @@ class CorruptionSettings(Settings):
 
     seed: int = Field(0, ge=0)
     """Of everything random."""
-    camera: Share = 0.0
+    camera: Ratio = 0.0
     """Share of frames with black pictures."""
-    no_image: Share = 0.0
+    no_image: Ratio = 0.0
     """Share of frames without pictures."""
-    overexposed: Share = 0.0
+    overexposed: Ratio = 0.0
     """Share of frames whose pictures are too bright."""
-    underexposed: Share = 0.0
+    underexposed: Ratio = 0.0
     """Share of frames whose pictures are too dark."""
     stops: float = Field(3.0, ge=0, le=16)
     """By how much: each stop doubles or halves the light."""
-    obstruction: Share = 0.0
+    obstruction: Ratio = 0.0
     """Share of frames in which a random box near the LiDAR hides all that is behind it."""
-    beams: Share = 0.0
+    beams: Ratio = 0.0
     """Share of the LiDAR's beams that are dead all the time; a beam is a band of 0.4 deg of elevation."""
     extrinsic_deg: float = Field(0.0, ge=0, le=180)
     """The calibration of every camera is turned by that much about a random axis, degrees."""
@@ -100,7 +100,7 @@ class CorruptedSource:
         self._T_true_wrong = se3.make(Rotation.from_rotvec(turn).as_matrix(), shift)
         bands = int(np.pi / _BAND) + 1
         self._dead = self._rng(_BEAMS).permutation(bands) < round(settings.beams * bands)
-        self._hit = {kind: self._chosen(kind, share) for kind, share in self._shares().items()}
+        self._hit = {kind: self._chosen(kind, share) for kind, share in self._ratios().items()}
 
     @property
     def poses(self) -> Array | None:
@@ -132,7 +132,7 @@ class CorruptedSource:
         """With late pictures the frames before are read too, at 5 Hz or more as many as the delay is long."""
         return max(0, start - int(np.ceil(self._settings.time_offset * 20))) if self._settings.time_offset else start
 
-    def _shares(self) -> dict[int, float]:
+    def _ratios(self) -> dict[int, float]:
         s = self._settings
         kinds = (_CAMERA, _NO_IMAGE, _OVER, _UNDER, _OBSTRUCTION)
         return dict(zip(kinds, (s.camera, s.no_image, s.overexposed, s.underexposed, s.obstruction), strict=True))

@@ -131,7 +131,7 @@ class KittiSource:
             self.notes.append(f"{path}: {len(self) - known.sum()} of {len(self)} frames have no pose")
         T_world_cam = np.full((len(self), 4, 4), np.nan)
         # Rounded to 7 digits in the files, which a quaternion on the way through a bag would not keep.
-        T_world_cam[known] = se3.orthonormalised(se3.make(rows[known, :, :3], rows[known, :, 3]))
+        T_world_cam[known] = se3.orthonormalized(se3.make(rows[known, :, :3], rows[known, :, 3]))
         return se3.inverse(self.T_cam_lidar) @ T_world_cam @ self.T_cam_lidar
 
     def _of_each_scan(self, rows: Array) -> Array:
@@ -198,7 +198,7 @@ def read_calib(path: Path) -> dict[str, Array]:
             R = matrix[:, :3]
             if np.abs(R @ R.T - np.eye(3)).max() > 0.01 or np.linalg.det(R) < 0:
                 raise UsageError(f"{path}:{number}: Tr is no rigid transform")
-            calib[name] = se3.orthonormalised(se3.make(R, matrix[:, 3]))
+            calib[name] = se3.orthonormalized(se3.make(R, matrix[:, 3]))
         elif matrix[0, 0] <= 0 or matrix[1, 1] <= 0 or not np.allclose(matrix[2, :3], [0, 0, 1]):
             raise UsageError(f"{path}:{number}: {name} is no projection matrix of a rectified camera")
         else:

@@ -55,7 +55,7 @@ class Kitti360Source:
         R_rect = self._intrinsics.get("R_rect_00")
         if R_rect is None or len(R_rect) != 9:
             raise UsageError(f"{calibration / 'perspective.txt'}: no R_rect_00 of 9 numbers")
-        self._T_rect_cam = se3.orthonormalised(se3.make(R_rect.reshape(3, 3), np.zeros(3)))
+        self._T_rect_cam = se3.orthonormalized(se3.make(R_rect.reshape(3, 3), np.zeros(3)))
         self._T_cam_lidar = se3.inverse(T_lidar_cam)
         self.T_cam_lidar: Array | None = self._T_rect_cam @ self._T_cam_lidar
         self.stamps = self._stamps(velodyne / "timestamps.txt")
@@ -174,7 +174,7 @@ def _only_row(path: Path) -> Array:
 def _rigid(row: Array) -> Array:
     """(4, 4) of 12 numbers, row-major, their rounding removed."""
     matrix = row.reshape(3, 4)
-    return se3.orthonormalised(se3.make(matrix[:, :3], matrix[:, 3]))
+    return se3.orthonormalized(se3.make(matrix[:, :3], matrix[:, 3]))
 
 
 def _stamp(line: str, where: str) -> int:

@@ -85,7 +85,7 @@ class KittiCarlaSource:
         near = np.abs(times[at] - seconds) < 0.5 * _PERIOD
         poses = np.full((len(self), 4, 4), np.nan)
         matrices = rows[at[near], :12].reshape(-1, 3, 4)
-        poses[near] = se3.orthonormalised(se3.make(matrices[:, :, :3], matrices[:, :, 3]))
+        poses[near] = se3.orthonormalized(se3.make(matrices[:, :, :3], matrices[:, :, 3]))
         if not near.all():
             self.notes.append(f"{path}: {int((~near).sum())} of {len(self)} frames have no pose")
         return np.round(np.where(near, times[at], seconds) * 1e9).astype(np.int64), poses
@@ -96,7 +96,7 @@ class KittiCarlaSource:
         if not len(rows):
             return None
         T_body_lidar = rows[0].reshape(3, 4)
-        return se3.inverse(_T_BODY_OPTICAL) @ se3.orthonormalised(se3.make(T_body_lidar[:, :3], T_body_lidar[:, 3]))
+        return se3.inverse(_T_BODY_OPTICAL) @ se3.orthonormalized(se3.make(T_body_lidar[:, :3], T_body_lidar[:, 3]))
 
     def _camera(self) -> Camera | None:
         if not self._settings.images:

@@ -38,7 +38,7 @@ def window(
     for t, cloud in enumerate(clouds):
         weight = cloud.new_ones(cloud.shape[:1]) if weights is None else weights[t]
         _check(cloud, weight, f"{name}, scan {t}")
-        keep = _thinned(cloud.detach(), weight.detach(), count, voxel)
+        keep = _downsampled(cloud.detach(), weight.detach(), count, voxel)
         # A scan without any weight keeps one point, so that it keeps its place and its weights their (zero) gradient.
         kept = cloud[keep] if len(keep) else cloud[:1].nan_to_num(0.0, 0.0, 0.0)
         pairs.append((kept.double(), (weight[keep] if len(keep) else weight[:1]).double()))
@@ -64,7 +64,7 @@ def _check(cloud: Tensor, weight: Tensor, where: str) -> None:
         raise UsageError(f"{where}: {int(wrong.sum())} of its {len(cloud)} weights are not in 0..1")
 
 
-def _thinned(points: Tensor, weight: Tensor, count: int, voxel: float) -> Tensor:
+def _downsampled(points: Tensor, weight: Tensor, count: int, voxel: float) -> Tensor:
     """Indices of the points to keep, in their own order."""
     index = weight.nonzero()[:, 0]
     if len(index) <= count:

@@ -16,7 +16,7 @@ from pydantic import Field
 from torch import Tensor
 
 from dpm2_core.config import Settings
-from dpm2_core.diffslam.neighbors import NeighbourSearch
+from dpm2_core.diffslam.neighbors import NeighborSearch
 from dpm2_core.diffslam.soft_lm import SoftLmSettings, solve
 from dpm2_core.geometry import se3_torch
 
@@ -49,7 +49,7 @@ class Cloud:
         """Take points (B, N, 3) and weights (B, N), all one if None; a point of weight zero is not there."""
         self.points = points.double()
         self.weights = self.points.new_ones(points.shape[:2]) if weights is None else weights.double()
-        self.search = NeighbourSearch(self.points, self.weights.detach() > 0)
+        self.search = NeighborSearch(self.points, self.weights.detach() > 0)
         self.normals = _normals(self.points, self.weights, self.search, neighbours)
 
     def select(self, index: Sequence[int]) -> Cloud:
@@ -142,7 +142,7 @@ def _irls_weight(r: Tensor, settings: IcpSettings) -> Tensor:
     return s / r.abs().clamp(min=s)
 
 
-def _normals(points: Tensor, weights: Tensor, search: NeighbourSearch, k: int) -> Tensor:
+def _normals(points: Tensor, weights: Tensor, search: NeighborSearch, k: int) -> Tensor:
     """Unit normals (B, N, 3) by weighted PCA over the k nearest of each point; z where a point has no neighbours.
 
     With the gradient of the eigenvector to first order: without it the slope by one point is a third off. The gap to
@@ -154,8 +154,8 @@ def _normals(points: Tensor, weights: Tensor, search: NeighbourSearch, k: int) -
     near = _gather(points, flat).unflatten(1, index.shape[1:])
     w = weights.gather(1, flat).unflatten(1, index.shape[1:])[..., None]
     w = w / w.sum(-2, keepdim=True).clamp(min=1e-12)
-    centred = near - (w * near).sum(-2, keepdim=True)
-    C = (w * centred).mT @ centred
+    centered = near - (w * near).sum(-2, keepdim=True)
+    C = (w * centered).mT @ centered
     with torch.no_grad():
         values, vectors = torch.linalg.eigh(C)
         gap = values[..., :1] - values[..., 1:]

@@ -14,7 +14,7 @@ from torch import Tensor
 _CHUNK = 2**27  # distances at once, 1 GiB in float64
 
 
-class NeighbourSearch:
+class NeighborSearch:
     """Finds the points of clouds (B, N, 3) whose `valid` (B, N) is true; the first is used where there is none."""
 
     def __init__(self, points: Tensor, valid: Tensor) -> None:
@@ -26,7 +26,7 @@ class NeighbourSearch:
                 index = np.flatnonzero(mask) if mask.any() else np.zeros(1, np.int64)
                 self._trees.append((cKDTree(cloud[index], balanced_tree=False), index))
 
-    def select(self, index: Sequence[int]) -> NeighbourSearch:
+    def select(self, index: Sequence[int]) -> NeighborSearch:
         """Of the clouds of the batch at these places."""
         out = copy(self)
         out._points = self._points[torch.tensor(index, device=self._points.device)]

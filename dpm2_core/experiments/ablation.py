@@ -11,7 +11,7 @@ from pydantic import Field
 
 from dpm2_core.config import Settings, merged
 from dpm2_core.evaluation.pair_set import PairSet
-from dpm2_core.learning.train_registration import PhaseOneSettings, phase_one
+from dpm2_core.learning.train_registration import RegistrationTrainingSettings, train_registration
 from dpm2_core.network.weights import load_model
 
 TABLE_4: dict[str, dict[str, Any]] = {
@@ -29,7 +29,7 @@ TABLE_4: dict[str, dict[str, Any]] = {
 class AblationSettings(Settings):
     """A comparison of networks that differ in one thing."""
 
-    training: PhaseOneSettings = PhaseOneSettings()
+    training: RegistrationTrainingSettings = RegistrationTrainingSettings()
     """Of every variant; each changes its network."""
     variants: dict[str, dict[str, Any]] = TABLE_4
     """Name and change to the network of each."""
@@ -53,7 +53,7 @@ def ablation(
         folder = out / name.replace(" ", "_")
         weights = folder / "weights.safetensors"
         if not weights.exists():
-            phase_one(training, folder, resume=(folder / "checkpoint.pt").exists())
+            train_registration(training, folder, resume=(folder / "checkpoint.pt").exists())
         model = load_model(weights)
         images = training.data.images and model.encoder.image is not None
         table[name] = {

@@ -45,12 +45,12 @@ def vertical_edges(cloud: Points, tree: cKDTree, most: int) -> Points:
     return at[spaced(at, SPACING)[:most]]
 
 
-def verticality(centred: NDArray[np.floating]) -> NDArray[np.float64]:
+def verticality(centered: NDArray[np.floating]) -> NDArray[np.float64]:
     """(N,) 0..1 of (N, k, 3) neighbourhoods about their means: 1 is a vertical line, 0 a patch without a direction.
 
     (sqrt l1 - sqrt l2) / sqrt l1 with the largest eigenvalues of the covariance, times the vertical part of the axis.
     """
-    C = (centred.transpose(0, 2, 1) @ centred).astype(np.float64) / centred.shape[1]
+    C = (centered.transpose(0, 2, 1) @ centered).astype(np.float64) / centered.shape[1]
     xx, xy, xz, yy, yz, zz = C[:, 0, 0], C[:, 0, 1], C[:, 0, 2], C[:, 1, 1], C[:, 1, 2], C[:, 2, 2]
     mean = (xx + yy + zz) / 3
     a, d, f = xx - mean, yy - mean, zz - mean

@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
-def fit_planes(neighbourhoods: Array) -> tuple[Array, Array]:
+def fit_planes(neighborhoods: Array) -> tuple[Array, Array]:
     """Unit normals (N, 3) and variances along them (N,), m2, of (N, k, 3) neighbourhoods.
 
     The smallest eigenvector of each covariance in closed form (trigonometric solution of the characteristic cubic),
     six times faster than batched `eigh`. A neighbourhood without any extent gets the normal (0, 0, 1), variance 0.
     """
-    centred = neighbourhoods - neighbourhoods.mean(1, keepdims=True)
-    C = centred.transpose(0, 2, 1) @ centred / neighbourhoods.shape[1]
+    centered = neighborhoods - neighborhoods.mean(1, keepdims=True)
+    C = centered.transpose(0, 2, 1) @ centered / neighborhoods.shape[1]
     xx, xy, xz, yy, yz, zz = C[:, 0, 0], C[:, 0, 1], C[:, 0, 2], C[:, 1, 1], C[:, 1, 2], C[:, 2, 2]
     mean = (xx + yy + zz) / 3
     a, d, f = xx - mean, yy - mean, zz - mean

@@ -80,7 +80,7 @@ def angle(T: Array) -> Array:
     return np.linalg.norm(log(T)[..., :3], axis=-1)
 
 
-def orthonormalised(T: Array) -> Array:
+def orthonormalized(T: Array) -> Array:
     """The nearest rigid transform (projects the rotation, guards against a reflection)."""
     U, _, Vt = np.linalg.svd(T[..., :3, :3])
     U[..., -1] *= np.sign(np.linalg.det(U @ Vt))[..., None]

@@ -22,9 +22,9 @@ from dpm2_core.frame import Array
 from dpm2_core.learning.checkpoint import load_checkpoint
 from dpm2_core.learning.dataset import Batch, DataSettings, GroupDataset, draw_group
 from dpm2_core.learning.finetune_settings import DRIVES, HELD_OUT, REHEARSAL, FinetuneSettings
-from dpm2_core.learning.pair_sampling import Plan, plan_sets
+from dpm2_core.learning.pair_sampling import SetPairs, sample_set_pairs
 from dpm2_core.learning.pose_loss import differentiable_poses
-from dpm2_core.learning.train_registration import PhaseOne
+from dpm2_core.learning.train_registration import RegistrationTraining
 from dpm2_core.learning.trainer import process_group, train
 from dpm2_core.network.decoder import Decoder
 from dpm2_core.network.encoder import to_device
@@ -35,7 +35,7 @@ from dpm2_core.network.tokens import Tokens
 from dpm2_core.network.weights import load_model, read_metadata, save_weights
 
 
-class Finetuned(PhaseOne):
+class Finetuned(RegistrationTraining):
     """The network with the losses of phase one and of the trajectory."""
 
     def __init__(self, model: DeepPointMap2, settings: FinetuneSettings) -> None:
@@ -46,7 +46,7 @@ class Finetuned(PhaseOne):
         self.loss = settings.loss.model_copy(update={"backbone": 0.0})  # its head is not part of the weights
 
     def forward(  # type: ignore[override]
-        self, points: PointBatch, poses: Tensor, plans: tuple[Plan, ...]
+        self, points: PointBatch, poses: Tensor, plans: tuple[SetPairs, ...]
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Loss and figures of G places of F scans with their reference poses (G, F, 4, 4)."""
         by_trajectory, by_pairs = self.weights
@@ -57,10 +57,10 @@ class Finetuned(PhaseOne):
             loss, figures = self.pair_loss(tokens, plans)
             total = total + by_pairs * loss
         if by_trajectory:
-            found, astray = window_trajectories(self.model.decoder, tokens, poses)
+            found, diverged = window_trajectories(self.model.decoder, tokens, poses)
             reference = torch.linalg.inv(poses[:, :1]) @ poses
             loss = torch.stack([trajectory_loss(a, b) for a, b in zip(found, reference, strict=True)]).mean()
-            figures |= {"trajectory": loss, "astray": astray}
+            figures |= {"trajectory": loss, "astray": diverged}
             total = total + by_trajectory * loss
         figures["loss"] = total
         return total, {name: value.detach().float() for name, value in figures.items()}
@@ -87,7 +87,7 @@ def window_trajectories(decoder: Decoder, tokens: Tokens, poses: Tensor) -> tupl
     return torch.stack(chain, 1), (~usable).double().mean()
 
 
-def draw_stretch(poses: Array, frames: int, radius: float, noise: np.random.Generator) -> NDArray[np.intp]:
+def draw_road_segment(poses: Array, frames: int, radius: float, noise: np.random.Generator) -> NDArray[np.intp]:
     """`draw_group` in the order of the road, so that each scan follows the one before."""
     chosen = draw_group(poses, frames, radius, noise)
     at = poses[chosen, :3, 3] - poses[chosen, :3, 3].mean(0)
@@ -100,7 +100,7 @@ class StretchSettings(DataSettings):
 
     def draw(self, poses: Array, noise: np.random.Generator) -> NDArray[np.intp]:
         """See `draw_stretch`."""
-        return draw_stretch(poses, self.frames, self.radius, noise)
+        return draw_road_segment(poses, self.frames, self.radius, noise)
 
 
 def finetune(
@@ -124,7 +124,7 @@ def finetune(
 
         def loss(run: nn.Module, batch: Batch, step: int) -> tuple[Tensor, dict[str, Tensor]]:
             noise = torch.Generator().manual_seed(settings.optimiser.seed * 1_000_003 + step)
-            plans = (plan_sets(batch.poses, settings.frames, (1, 1), 20.0, noise),)
+            plans = (sample_set_pairs(batch.poses, settings.frames, (1, 1), 20.0, noise),)
             return run(*to_device((batch.points, batch.poses, plans), device))
 
         batches = iter(stretches.loader())

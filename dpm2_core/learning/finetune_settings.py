@@ -11,13 +11,13 @@ from dpm2_core.config import Settings
 from dpm2_core.learning.augment import AugmentSettings
 from dpm2_core.learning.generate import GenerateSettings
 from dpm2_core.learning.registration_loss import LossSettings
-from dpm2_core.learning.trainer import OptimiserSettings
+from dpm2_core.learning.trainer import OptimizerSettings
 
 DRIVES, HELD_OUT, REHEARSAL = "drives", "held_out", "rehearsal"
 """Folders of packed drives below the one of the training."""
 
 
-class FinetuneOptimiser(OptimiserSettings):
+class FinetuneOptimizer(OptimizerSettings):
     """Optimisation: a few small steps."""
 
     steps: int = Field(default=300, gt=0)
@@ -81,4 +81,4 @@ class FinetuneSettings(Settings):
     radius: float = Field(default=15.0, gt=0)
     """Farthest from the first one drawn, m."""
     augment: FinetuneAugment = FinetuneAugment()
-    optimiser: FinetuneOptimiser = FinetuneOptimiser()
+    optimiser: FinetuneOptimizer = FinetuneOptimizer()

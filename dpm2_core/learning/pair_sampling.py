@@ -12,7 +12,7 @@ from dpm2_core.geometry.kabsch import transform
 from dpm2_core.network.tokens import Tokens
 
 
-class Plan(NamedTuple):
+class SetPairs(NamedTuple):
     """Set pairs of a batch of encoded frames.
 
     Attributes:
@@ -28,7 +28,9 @@ class Plan(NamedTuple):
     T_target_source: Tensor
 
 
-def plan_sets(poses: Tensor, per_group: int, sides: tuple[int, int], radius: float, noise: torch.Generator) -> Plan:
+def sample_set_pairs(
+    poses: Tensor, per_group: int, sides: tuple[int, int], radius: float, noise: torch.Generator
+) -> SetPairs:
     """Draw `per_group` set pairs from every group.
 
     Args:
@@ -53,7 +55,7 @@ def plan_sets(poses: Tensor, per_group: int, sides: tuple[int, int], radius: flo
     index, T = torch.stack(rows), torch.stack(truth)
     inverse = torch.linalg.inv(T)
     first, second = 0, sides[0]
-    return Plan(
+    return SetPairs(
         index[:, :second],
         index[:, second:],
         (inverse[:, None, first] @ T[:, :second]).float(),

@@ -13,10 +13,10 @@ from torch import Tensor
 from dpm2_core.geometry import se3_torch
 from dpm2_core.network.decoder import Correlated, Decoder
 from dpm2_core.network.matching import correspond, guided_scores, match_scores
-from dpm2_core.network.pose_solver import precision_solve, solve_batch
+from dpm2_core.network.pose_solver import solve_batch, weighted_gauss_newton
 from dpm2_core.network.tokens import Tokens
 
-ASTRAY = 1.0
+DIVERGED = 1.0
 """A registration that is wrong by more than this has no gradient that leads back, m."""
 ROTATION = 25.0
 """What the square of an angle counts for beside that of a distance, m2 / rad2: as at a distance of 5 m."""
@@ -41,10 +41,10 @@ def differentiable_poses(
     if solved is None:
         return truth, torch.zeros(len(truth), dtype=torch.bool, device=truth.device)
     off = (solved.T[:, :3, 3] - truth[:, :3, 3]).norm(dim=-1)
-    usable = off < ASTRAY  # False for NaN
+    usable = off < DIVERGED  # False for NaN
     start = torch.where(usable[:, None, None], solved.T, truth)
     scores = guided_scores(match_scores(decoder, correlated), start, source, target)
-    T, _ = precision_solve(start, correspond(decoder, source, target, correlated, scores), rounds=2)
+    T, _ = weighted_gauss_newton(start, correspond(decoder, source, target, correlated, scores), rounds=2)
     usable = usable & T.detach().flatten(1).isfinite().all(1)
     return torch.where(usable[:, None, None], T, truth), usable
 

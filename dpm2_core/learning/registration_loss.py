@@ -43,7 +43,7 @@ class LossSettings(Settings):
     """Near-by points other than the nearest count as negatives in the pairing loss."""
 
 
-def phase_one_loss(
+def registration_loss(
     decoder: Decoder, source: Tokens, target: Tokens, T_target_source: Tensor, settings: LossSettings
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Loss of a batch of set pairs, and figures for the log.

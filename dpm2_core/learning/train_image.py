@@ -25,18 +25,18 @@ from dpm2_core.geometry import se3
 from dpm2_core.learning.augment import augment_image
 from dpm2_core.learning.checkpoint import load_checkpoint
 from dpm2_core.learning.dataset import Mixture, PackedSettings, draw_group
-from dpm2_core.learning.trainer import OptimiserSettings, process_group, train
+from dpm2_core.learning.trainer import OptimizerSettings, process_group, train
 from dpm2_core.network.encoder import collate_views, to_device
 from dpm2_core.network.losses import cosine, info_nce, label_distances
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.settings import NetworkSettings, preset
-from dpm2_core.network.spatial import Views, picture_features
+from dpm2_core.network.spatial import Views, image_features
 from dpm2_core.network.weights import load_weights, save_weights
 
 NEUTRAL = 1.5  # m, within which a point's neighbours are neither right nor wrong
 
 
-class PicturePairs(NamedTuple):
+class ImagePairs(NamedTuple):
     """Pictures two by two, first and second of each pair.
 
     Attributes:
@@ -54,7 +54,7 @@ class PictureSettings(PackedSettings):
     """Largest distance between two images, m."""
 
 
-class PhaseImageSettings(Settings):
+class ImageTrainingSettings(Settings):
     """A training of the image branch."""
 
     preset: str = "small"
@@ -67,12 +67,12 @@ class PhaseImageSettings(Settings):
     """Points drawn for each pair."""
     shift: float = Field(0.3, ge=0)
     """Deviation of the second picture's points from the true ones, m: descriptors never sit at the very same place."""
-    optimiser: OptimiserSettings = OptimiserSettings()
+    optimiser: OptimizerSettings = OptimizerSettings()
     start: str = ""
     """Weights (safetensors) of the network, whose other parts stay as they are; empty: random."""
 
 
-class PictureDataset:
+class ImageDataset:
     """Pairs of pictures of a place and the points that the first of them shows."""
 
     def __init__(
@@ -86,7 +86,7 @@ class PictureDataset:
         self._settings, self._network, self._seed, self._start, self._shard = settings, network, seed, start, shard
         self._drives = Mixture(settings)
 
-    def pairs(self, points: int) -> Iterator[PicturePairs]:
+    def pairs(self, points: int) -> Iterator[ImagePairs]:
         """An endless stream, as deterministic as the batches of phase one.
 
         Raises:
@@ -114,7 +114,7 @@ class PictureDataset:
             views = collate_views(images, self._network.image)
             if views is None or len(images) < 2 * settings.groups:
                 raise UsageError(f"data.packed: hardly any picture shows {points} points; lower `points`")
-            yield PicturePairs(views, torch.from_numpy(np.stack(drawn)))
+            yield ImagePairs(views, torch.from_numpy(np.stack(drawn)))
 
 
 def shown(points: NDArray[np.float32], camera: Camera) -> NDArray[np.bool_]:
@@ -125,7 +125,7 @@ def shown(points: NDArray[np.float32], camera: Camera) -> NDArray[np.bool_]:
     return ahead & (uv >= 0).all(1) & (uv < camera.size).all(1)
 
 
-class PhaseImage(nn.Module):
+class ImageTraining(nn.Module):
     """Image branch with its loss."""
 
     def __init__(self, network: NetworkSettings, shift: float) -> None:
@@ -140,12 +140,12 @@ class PhaseImage(nn.Module):
         for part in (self.image, self.head):
             part.requires_grad_(True)
 
-    def forward(self, batch: PicturePairs) -> tuple[Tensor, dict[str, Tensor]]:
+    def forward(self, batch: ImagePairs) -> tuple[Tensor, dict[str, Tensor]]:
         """Mean InfoNCE of the points that both pictures of a pair show."""
         maps = self.image(batch.views.pixels.flatten(0, 1))
         points = batch.points.clone()
         points[1::2] += torch.randn_like(points[1::2]) * self.shift
-        features, seen = picture_features(points, batch.views, maps)
+        features, seen = image_features(points, batch.views, maps)
         features = self.head(features)
         valid = seen[::2, :, None] & seen[1::2, None]
         distance = torch.cdist(batch.points[1::2], points[1::2], compute_mode="donot_use_mm_for_euclid_dist")
@@ -158,19 +158,19 @@ class PhaseImage(nn.Module):
         return loss, {"loss": loss.detach(), "right": right}
 
 
-def phase_image(settings: PhaseImageSettings, out: Path, resume: bool = False, until: int | None = None) -> Path:
+def train_image(settings: ImageTrainingSettings, out: Path, resume: bool = False, until: int | None = None) -> Path:
     """Train; checkpoint, log and the whole network's weights go to `out`. `until`: stop after this step."""
     with process_group() as (rank, world, device):
         torch.manual_seed(settings.optimiser.seed)
         network = preset(settings.preset, settings.network)
-        module = PhaseImage(network, settings.shift).to(device)
+        module = ImageTraining(network, settings.shift).to(device)
         if settings.start:
             load_weights(module.model, Path(settings.start))
         ema = copy.deepcopy(module).requires_grad_(False)
         start = load_checkpoint(out / "checkpoint.pt", module, ema, None) if resume else 0
-        data = PictureDataset(settings.data, network, settings.optimiser.seed, start, (rank, world))
+        data = ImageDataset(settings.data, network, settings.optimiser.seed, start, (rank, world))
 
-        def loss(run: nn.Module, batch: PicturePairs, step: int) -> tuple[Tensor, dict[str, Tensor]]:
+        def loss(run: nn.Module, batch: ImagePairs, step: int) -> tuple[Tensor, dict[str, Tensor]]:
             return run(to_device(batch, device))
 
         batches = data.pairs(settings.points)

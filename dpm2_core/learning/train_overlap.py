@@ -17,11 +17,11 @@ from dpm2_core.config import Settings
 from dpm2_core.frame import Array
 from dpm2_core.learning.checkpoint import load_checkpoint
 from dpm2_core.learning.dataset import Batch, GroupDataset, GroupSettings
-from dpm2_core.learning.trainer import OptimiserSettings, process_group, train
+from dpm2_core.learning.trainer import OptimizerSettings, process_group, train
 from dpm2_core.network.encoder import to_device
 from dpm2_core.network.losses import overlap_loss
 from dpm2_core.network.model import DeepPointMap2
-from dpm2_core.network.pose_solver import evidence, solve_batch
+from dpm2_core.network.pose_solver import overlap_features, solve_batch
 from dpm2_core.network.pyramid import PointBatch
 from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.network.spatial import Views
@@ -39,7 +39,7 @@ class OverlapSettings(GroupSettings):
         return draw_overlap(poses, noise)
 
 
-class OverlapOptimiserSettings(OptimiserSettings):
+class OverlapOptimiserSettings(OptimizerSettings):
     """Optimisation at a tenth of the rate and weight decay of phase one (section 5.1)."""
 
     steps: int = Field(600, gt=0)
@@ -48,7 +48,7 @@ class OverlapOptimiserSettings(OptimiserSettings):
     warmup: int = Field(20, ge=0)
 
 
-class PhaseTwoSettings(Settings):
+class OverlapTrainingSettings(Settings):
     """A training of phase two; the network is that of phase one, with all its settings."""
 
     start: str
@@ -81,7 +81,7 @@ def draw_overlap(poses: Array, noise: np.random.Generator) -> NDArray[np.intp]:
     return np.array([first, *noise.choice(near, 2), noise.choice(hard), noise.choice(far)])
 
 
-class PhaseTwo(nn.Module):
+class OverlapTraining(nn.Module):
     """The frozen network with a trained overlap head, and its loss."""
 
     def __init__(self, network: NetworkSettings) -> None:
@@ -100,7 +100,9 @@ class PhaseTwo(nn.Module):
             target = tokens._replace(**{name: getattr(tokens, name)[other] for name in tokens._fields})
             correlated = self.model.decoder(source, target)
             solved = solve_batch(self.model.decoder, source, target, correlated)
-            posed = torch.zeros(len(distance), 2, device=distance.device) if solved is None else evidence(solved)
+            posed = (
+                torch.zeros(len(distance), 2, device=distance.device) if solved is None else overlap_features(solved)
+            )
         logits = self.model.decoder.overlap(*correlated, source.mask, target.mask, posed)
         return overlap_loss(logits, distance, OVERLAP), logits
 
@@ -119,12 +121,12 @@ def average_precision(scores: np.ndarray, positive: np.ndarray) -> float:
     return float(precision[hits].mean()) if hits.any() else float("nan")
 
 
-def phase_two(settings: PhaseTwoSettings, out: Path, resume: bool = False) -> Path:
+def train_overlap(settings: OverlapTrainingSettings, out: Path, resume: bool = False) -> Path:
     """Train; writes checkpoint, log and `weights.safetensors`, phase one's with the new head, to `out`."""
     with process_group() as (rank, world, device):
         torch.manual_seed(settings.optimiser.seed)
         network = network_settings(Path(settings.start))
-        module = PhaseTwo(network).to(device)
+        module = OverlapTraining(network).to(device)
         about = load_weights(module.model, Path(settings.start))
         ema = copy.deepcopy(module).requires_grad_(False)
         start = load_checkpoint(out / "checkpoint.pt", module, ema, None) if resume else 0
@@ -144,7 +146,7 @@ def phase_two(settings: PhaseTwoSettings, out: Path, resume: bool = False) -> Pa
 
 
 def validator(
-    settings: PhaseTwoSettings, network: NetworkSettings, device: torch.device
+    settings: OverlapTrainingSettings, network: NetworkSettings, device: torch.device
 ) -> Callable[[nn.Module], dict[str, float]]:
     """A function that measures the average precision on fixed batches of unseen worlds."""
     options = settings.data.model_copy(update={"packed": {settings.validation: 1.0}})

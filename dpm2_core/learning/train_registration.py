@@ -16,21 +16,21 @@ from dpm2_core.config import Settings
 from dpm2_core.evaluation.pair_set import PairSet
 from dpm2_core.learning.checkpoint import load_checkpoint
 from dpm2_core.learning.dataset import Batch, DataSettings, GroupDataset
-from dpm2_core.learning.pair_sampling import Plan, merge_tokens, plan_sets
-from dpm2_core.learning.registration_loss import LossSettings, phase_one_loss
-from dpm2_core.learning.trainer import OptimiserSettings, process_group, train
+from dpm2_core.learning.pair_sampling import SetPairs, merge_tokens, sample_set_pairs
+from dpm2_core.learning.registration_loss import LossSettings, registration_loss
+from dpm2_core.learning.trainer import OptimizerSettings, process_group, train
 from dpm2_core.network.encoder import Encoded, to_device
 from dpm2_core.network.losses import cosine, info_nce, label_pairs
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pointnext import Scale
 from dpm2_core.network.pyramid import PointBatch
 from dpm2_core.network.settings import NetworkSettings, preset
-from dpm2_core.network.spatial import Views, picture_features
+from dpm2_core.network.spatial import Views, image_features
 from dpm2_core.network.tokens import Tokens
 from dpm2_core.network.weights import load_weights, save_weights
 
 
-class PhaseOne(nn.Module):
+class RegistrationTraining(nn.Module):
     """The network with its loss, as one module, so that it compiles and distributes whole."""
 
     def __init__(self, network: NetworkSettings, loss: LossSettings) -> None:
@@ -48,7 +48,7 @@ class PhaseOne(nn.Module):
             self.image_head = nn.Linear(network.image.pyramid, network.channels) if own is None else own
 
     def forward(
-        self, points: PointBatch, views: Views | None, plans: tuple[Plan, ...]
+        self, points: PointBatch, views: Views | None, plans: tuple[SetPairs, ...]
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Mean loss over the plans, and figures of the first."""
         encoded = self.model.encoder(points, views)
@@ -64,7 +64,7 @@ class PhaseOne(nn.Module):
         figures["loss"] = total
         return total, {name: value.detach().float() for name, value in figures.items()}
 
-    def pair_loss(self, tokens: Tokens, plans: tuple[Plan, ...]) -> tuple[Tensor, dict[str, Tensor]]:
+    def pair_loss(self, tokens: Tokens, plans: tuple[SetPairs, ...]) -> tuple[Tensor, dict[str, Tensor]]:
         """Mean over the plans of the losses on descriptors, and figures of the first."""
         total = tokens.features.new_zeros((), dtype=torch.float32)
         figures: dict[str, Tensor] = {}
@@ -72,30 +72,30 @@ class PhaseOne(nn.Module):
         for plan in plans:
             source = merge_tokens(tokens, plan.source, plan.T_source, view_aligned)
             target = merge_tokens(tokens, plan.target, plan.T_target, view_aligned)
-            loss, found = phase_one_loss(self.model.decoder, source, target, plan.T_target_source, self.loss)
+            loss, found = registration_loss(self.model.decoder, source, target, plan.T_target_source, self.loss)
             total = total + loss / len(plans)
             figures = figures or found
         return total, figures
 
-    def _backbone_loss(self, scale: Scale, plan: Plan) -> Tensor:
+    def _backbone_loss(self, scale: Scale, plan: SetPairs) -> Tensor:
         """InfoNCE of the backbone's key-points of single frames."""
         i, j = plan.source[:, 0], plan.target[:, 0]
         features = self.backbone_head(scale.features)
         labels = label_pairs(scale.xyz[i], scale.xyz[j], plan.T_target_source, (scale.mask[i], scale.mask[j]))
         return info_nce(cosine(features[i], features[j]) / self.model.decoder.settings.temperature, labels, False)
 
-    def _image_loss(self, head: nn.Module, encoded: Encoded, views: Views, plan: Plan) -> Tensor:
+    def _image_loss(self, head: nn.Module, encoded: Encoded, views: Views, plan: SetPairs) -> Tensor:
         """InfoNCE of the pictures' features where the descriptors project: the image branch learns long before the
         fusion makes use of it."""
         xyz = encoded.tokens.xyz
-        features, seen = picture_features(xyz, views, encoded.maps)
+        features, seen = image_features(xyz, views, encoded.maps)
         features, mask = head(features), encoded.tokens.mask & seen
         i, j = plan.source[:, 0], plan.target[:, 0]
         labels = label_pairs(xyz[i], xyz[j], plan.T_target_source, (mask[i], mask[j]))
         return info_nce(cosine(features[i], features[j]) / self.model.decoder.settings.temperature, labels, False)
 
 
-class PhaseOneSettings(Settings):
+class RegistrationTrainingSettings(Settings):
     """A training of phase one."""
 
     preset: str = "small"
@@ -108,7 +108,7 @@ class PhaseOneSettings(Settings):
     validation_pairs: int = Field(200, gt=0)
     """Frame pairs of a validation."""
     loss: LossSettings = LossSettings()
-    optimiser: OptimiserSettings = OptimiserSettings()
+    optimiser: OptimizerSettings = OptimizerSettings()
     pairs: int = Field(4, gt=0)
     """Frame pairs drawn from each place."""
     sets: float = Field(0.25, ge=0, le=1)
@@ -117,18 +117,20 @@ class PhaseOneSettings(Settings):
     """Weights (safetensors) to start from; empty: random."""
 
 
-def plans_of(poses: Tensor, settings: PhaseOneSettings, step: int) -> tuple[Plan, ...]:
+def set_pairs_of(poses: Tensor, settings: RegistrationTrainingSettings, step: int) -> tuple[SetPairs, ...]:
     """What a step registers: frame pairs, and at times one set pair a place."""
     noise = torch.Generator().manual_seed(settings.optimiser.seed * 1_000_003 + step)
     radius, frames = settings.data.radius, poses.shape[1]
-    plans = [plan_sets(poses, settings.pairs, (1, 1), radius, noise)]
+    plans = [sample_set_pairs(poses, settings.pairs, (1, 1), radius, noise)]
     if frames > 2 and torch.rand((), generator=noise) < settings.sets:
         sides = (1, frames - 1) if torch.rand((), generator=noise) < 0.5 else (frames // 2, frames - frames // 2)
-        plans.append(plan_sets(poses, 1, sides, radius, noise))
+        plans.append(sample_set_pairs(poses, 1, sides, radius, noise))
     return tuple(plans)
 
 
-def phase_one(settings: PhaseOneSettings, out: Path, resume: bool = False, until: int | None = None) -> Path:
+def train_registration(
+    settings: RegistrationTrainingSettings, out: Path, resume: bool = False, until: int | None = None
+) -> Path:
     """Train; checkpoints, log and at the end the averaged weights, `weights.safetensors`, go to `out`.
 
     until: stop after this step; `resume` continues from there.
@@ -136,7 +138,7 @@ def phase_one(settings: PhaseOneSettings, out: Path, resume: bool = False, until
     with process_group() as (rank, world, device):
         torch.manual_seed(settings.optimiser.seed)
         network = preset(settings.preset, settings.network)
-        module = PhaseOne(network, settings.loss).to(device)
+        module = RegistrationTraining(network, settings.loss).to(device)
         if settings.start:
             load_weights(module.model, Path(settings.start))
         ema = copy.deepcopy(module).requires_grad_(False)
@@ -144,7 +146,7 @@ def phase_one(settings: PhaseOneSettings, out: Path, resume: bool = False, until
         data = GroupDataset(settings.data, network, settings.optimiser.seed, start, (rank, world))
 
         def loss(run: nn.Module, batch: Batch, step: int) -> tuple[Tensor, dict[str, Tensor]]:
-            return run(*to_device((batch.points, batch.views, plans_of(batch.poses, settings, step)), device))
+            return run(*to_device((batch.points, batch.views, set_pairs_of(batch.poses, settings, step)), device))
 
         validate = validator(settings, network) if settings.validation and rank == 0 else None
         train(
@@ -167,12 +169,14 @@ def phase_one(settings: PhaseOneSettings, out: Path, resume: bool = False, until
     return out / "weights.safetensors"
 
 
-def validator(settings: PhaseOneSettings, network: NetworkSettings) -> Callable[[nn.Module], dict[str, float]]:
+def validator(
+    settings: RegistrationTrainingSettings, network: NetworkSettings
+) -> Callable[[nn.Module], dict[str, float]]:
     """A function that measures a module on frame pairs of unseen worlds."""
     pairs = PairSet(Path(settings.validation), settings.validation_pairs, network, settings.data.images)
 
     def validate(module: nn.Module) -> dict[str, float]:
-        assert isinstance(module, PhaseOne)
+        assert isinstance(module, RegistrationTraining)
         return pairs.measure(module.model)
 
     return validate

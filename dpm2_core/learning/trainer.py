@@ -22,7 +22,7 @@ from dpm2_core.config import Settings
 from dpm2_core.learning.checkpoint import Log, load_checkpoint, save_checkpoint
 
 
-class OptimiserSettings(Settings):
+class OptimizerSettings(Settings):
     """Optimisation."""
 
     steps: int = Field(3000, gt=0)
@@ -80,7 +80,7 @@ def process_group() -> Iterator[tuple[int, int, torch.device]]:
         torch.distributed.destroy_process_group()
 
 
-def learning_rate(settings: OptimiserSettings, step: int) -> float:
+def learning_rate(settings: OptimizerSettings, step: int) -> float:
     """Linear warm-up, then a cosine from `rate` to `final_rate`."""
     if step < settings.warmup:
         return settings.rate * (step + 1) / settings.warmup
@@ -114,7 +114,7 @@ def train(
     ema: nn.Module,
     batches: Iterator[Any],
     loss: Loss,
-    settings: OptimiserSettings,
+    settings: OptimizerSettings,
     out: Path,
     resume: bool,
     validate: Callable[[nn.Module], dict[str, float]] | None,

@@ -17,9 +17,9 @@ def zscore(values: Tensor, mask: Tensor | None = None) -> Tensor:
     weight = torch.ones_like(values) if mask is None else mask.to(values.dtype).expand_as(values)
     count = weight.sum(-1, keepdim=True).clamp(min=1)
     mean = (values * weight).sum(-1, keepdim=True) / count
-    centred = (values - mean) * weight
-    deviation = ((centred * centred).sum(-1, keepdim=True) / count).sqrt()
-    return centred / deviation.clamp(min=1e-4)
+    centered = (values - mean) * weight
+    deviation = ((centered * centered).sum(-1, keepdim=True) / count).sqrt()
+    return centered / deviation.clamp(min=1e-4)
 
 
 def sine_code(xyz: Tensor, width: int) -> Tensor:

@@ -10,7 +10,7 @@ from dpm2_core.network.attention import Attention, RelativeBias, sine_code
 from dpm2_core.network.convnext import FeatureMap
 from dpm2_core.network.pointnext import Scale, to_view, view_axes
 from dpm2_core.network.settings import NetworkSettings
-from dpm2_core.network.spatial import Views, picture_features, point_bias, ray_bias, sample_at_points, token_pixels
+from dpm2_core.network.spatial import Views, image_features, point_bias, ray_bias, sample_at_points, token_pixels
 from dpm2_core.network.tokens import Tokens
 
 SAMPLED = {"point_painting": 1, "roi_pooling": 3}  # side of the window that replaces the image attention
@@ -145,7 +145,7 @@ class Fusion(nn.Module):
             x = layer(x, (bias, self_mask), lidar, image)
         x = self.out(x)
         if self.pixel is not None and views is not None:
-            features, seen = picture_features(refs.xyz, views, maps)
+            features, seen = image_features(refs.xyz, views, maps)
             texture = nn.functional.normalize(self.pixel(features).float(), dim=-1).to(x.dtype)
             x = x + self.pixel_in(texture) * seen[..., None]
         return refs._replace(features=x)

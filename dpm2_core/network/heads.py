@@ -74,7 +74,7 @@ class OverlapHead(nn.Module):
         self.classify = nn.Sequential(nn.Linear(2 * width + 2 * pose, 2 * width), nn.ReLU(), nn.Linear(2 * width, 1))
 
     def forward(
-        self, source: Tensor, target: Tensor, source_mask: Tensor, target_mask: Tensor, evidence: Tensor
+        self, source: Tensor, target: Tensor, source_mask: Tensor, target_mask: Tensor, overlap_features: Tensor
     ) -> Tensor:
         """source (B, N, C), target (B, M, C) with masks (B, N), (B, M), `registration.evidence` (B, 2): logits (B,)."""
         pooled = []
@@ -82,7 +82,7 @@ class OverlapHead(nn.Module):
             weight = mask[..., None].to(features.dtype)
             pooled.append((self.points(features) * weight).sum(1) / weight.sum(1).clamp(min=1))
         if self.pose:
-            pooled.append(evidence.to(pooled[0].dtype))
+            pooled.append(overlap_features.to(pooled[0].dtype))
         return self.classify(torch.cat(pooled, -1))[..., 0].float()
 
 

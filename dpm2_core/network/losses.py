@@ -82,9 +82,9 @@ def mahalanobis_offset(residual: Tensor, weight: Tensor) -> Tensor:
     count = weight.sum()
     detached = residual.detach().float()
     mean = (detached * weight[:, None]).sum(0) / count.clamp(min=1)
-    centred = (detached - mean) * weight[:, None]
+    centered = (detached - mean) * weight[:, None]
     eye = torch.eye(3, device=residual.device)
-    covariance = centred.T @ centred / count.clamp(min=1) + 1e-6 * eye
+    covariance = centered.T @ centered / count.clamp(min=1) + 1e-6 * eye
     inverse = torch.linalg.inv(torch.where(count >= 4, covariance, eye))
     squared = ((residual @ inverse) * residual).sum(-1)
     distance = (squared + 1e-12).sqrt()  # the root has no gradient at 0
@@ -93,8 +93,8 @@ def mahalanobis_offset(residual: Tensor, weight: Tensor) -> Tensor:
 
 def student_offset(residual: Tensor, L: Tensor, weight: Tensor) -> Tensor:
     """Negative log likelihood of residuals (P, 3) under a Student distribution of precision L L^T (P, 3, 3)."""
-    whitened = (residual[..., None, :] @ L)[..., 0, :]
-    squared = (whitened * whitened).sum(-1)
+    whitened_residuals = (residual[..., None, :] @ L)[..., 0, :]
+    squared = (whitened_residuals * whitened_residuals).sum(-1)
     log_determinant = L.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     loss = (SOFT + 3) / 2 * torch.log1p(squared / SOFT) - log_determinant
     return (loss * weight).sum() / weight.sum().clamp(min=1)

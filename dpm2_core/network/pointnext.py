@@ -68,44 +68,44 @@ class Pooled(nn.Module):
     that reads the neighbour's own features is computed once a point before it is gathered.
     """
 
-    def __init__(self, channels_in: int, places: int, channels_out: int, pool_first: bool) -> None:
+    def __init__(self, channels_in: int, relative: int, channels_out: int, pool_first: bool) -> None:
         super().__init__()
-        self.split = (channels_in, places)
+        self.split = (channels_in, relative)
         self.pool_first = pool_first
-        self.linear = nn.Linear(channels_in + places, channels_out)
+        self.linear = nn.Linear(channels_in + relative, channels_out)
         self.norm = nn.LayerNorm(channels_out)
 
-    def forward(self, features: Tensor, index: Tensor, places: Tensor) -> Tensor:
+    def forward(self, features: Tensor, index: Tensor, relative: Tensor) -> Tensor:
         """features (B, m, C), index (B, n, k) into m, places (B, n, k, P): (B, n, channels_out)."""
         if not self.pool_first:
-            joined = torch.cat([gather(features, index), places.to(features.dtype)], -1)
+            joined = torch.cat([gather(features, index), relative.to(features.dtype)], -1)
             return torch.relu(self.norm(self.linear(joined))).amax(2)
         of_features, of_places = self.linear.weight.split(self.split, 1)
         own = nn.functional.linear(features, of_features, self.linear.bias)
-        return torch.relu(self.norm(pool_neighbours(own, index, places, of_places)))
+        return torch.relu(self.norm(pool_neighbors(own, index, relative, of_places)))
 
 
-def pool_neighbours(own: Tensor | None, index: Tensor | None, places: Tensor, weight: Tensor) -> Tensor:
+def pool_neighbors(own: Tensor | None, index: Tensor | None, relative: Tensor, weight: Tensor) -> Tensor:
     """Maximum over k of own[index] + weight @ places, without keeping the (n, k, C) sums for the gradient.
 
     own (B, m, C) and index (B, n, k), or None for places alone; places (B, n, k, P), weight (C, P): (B, n, C).
     """
     with torch.no_grad():
-        sums = nn.functional.linear(places, weight)
+        sums = nn.functional.linear(relative, weight)
         if own is not None and index is not None:
             sums = gather(own, index).add_(sums)
         if torch.is_inference_mode_enabled():
             return sums.amax(2)
-        best = argmax_neighbour(sums)
-    n_places = places.shape[-1]
-    chosen = places.gather(2, best[..., None].expand(*best.shape, n_places))
+        best = argmax_neighbor(sums)
+    n_places = relative.shape[-1]
+    chosen = relative.gather(2, best[..., None].expand(*best.shape, n_places))
     out = (chosen * weight).sum(-1)
     if own is not None and index is not None:
         out = out + own.gather(1, index.gather(2, best))
     return out
 
 
-def argmax_neighbour(sums: Tensor) -> Tensor:
+def argmax_neighbor(sums: Tensor) -> Tensor:
     """Index (B, n, C) of the largest of (B, n, k, C) over k < 256.
 
     `argmax` over an inner dimension is many times slower than `amax` on the CPU, so the index rides in the lowest bits.
@@ -124,12 +124,12 @@ class Aggregation(nn.Module):
         self.view_aligned = settings.view_aligned
         self.pooled = Pooled(channels_in, 5 if settings.view_aligned else 3, channels_out, settings.pool_first)
 
-    def forward(self, xyz: Tensor, centres: Tensor, features: Tensor, index: Tensor) -> Tensor:
+    def forward(self, xyz: Tensor, centers: Tensor, features: Tensor, index: Tensor) -> Tensor:
         """xyz (B, m, 3), centres (B, n, 3), features (B, m, C), index (B, n, k) into m: (B, n, channels_out)."""
-        delta = (gather(xyz, index) - centres[:, :, None]) / self.radius
+        delta = (gather(xyz, index) - centers[:, :, None]) / self.radius
         if not self.view_aligned:
             return self.pooled(features, index, delta)
-        axis = view_axes(centres)[:, :, None]
+        axis = view_axes(centers)[:, :, None]
         turn = gather(view_axes(xyz), index)  # the neighbour's own axis, seen in the centre's
         turned = to_view(torch.cat([turn, turn[..., :1]], -1), axis)[..., :2]
         return self.pooled(features, index, torch.cat([to_view(delta, axis), turned], -1))
@@ -151,30 +151,30 @@ class PatchAbstraction(nn.Module):
         self.norm = nn.LayerNorm(stage.channels)
         self.moments = ConvNormAct(stage.channels + MOMENTS, stage.channels) if settings.moments else None
 
-    def forward(self, centres: Tensor, patches: Tensor) -> Tensor:
+    def forward(self, centers: Tensor, patches: Tensor) -> Tensor:
         """centres (B, n, 3), patches (B, n, k, 3), both m: (B, n, channels)."""
         if self.view_aligned:
-            axis = view_axes(centres)
-            centres, patches = to_view(centres, axis), to_view(patches, axis[:, :, None])
+            axis = view_axes(centers)
+            centers, patches = to_view(centers, axis), to_view(patches, axis[:, :, None])
         local = patches / self.radius
         of_stem, of_place = self.linear.weight.split((self.stem.out_features, 3), 1)
         of_delta = of_place + of_stem @ self.stem.weight * (self.radius / self.far)
-        at_centre = self.linear(nn.functional.pad(self.stem(centres / self.far), (0, 3)))
+        at_center = self.linear(nn.functional.pad(self.stem(centers / self.far), (0, 3)))
         if self.pool_first:
-            out = torch.relu(self.norm(pool_neighbours(None, None, local, of_delta) + at_centre))
+            out = torch.relu(self.norm(pool_neighbors(None, None, local, of_delta) + at_center))
         else:
-            out = nn.functional.linear(local, of_delta) + at_centre[:, :, None]
+            out = nn.functional.linear(local, of_delta) + at_center[:, :, None]
             out = torch.relu(self.norm(out)).amax(2)
         if self.moments is None:
             return out
-        return self.moments(torch.cat([out, neighbourhood_moments(local).to(out.dtype)], -1))
+        return self.moments(torch.cat([out, neighborhood_moments(local).to(out.dtype)], -1))
 
 
-def neighbourhood_moments(local: Tensor) -> Tensor:
+def neighborhood_moments(local: Tensor) -> Tensor:
     """Mean and scatter of neighbourhoods (..., k, 3), the scatter divided by its trace: (..., 9)."""
     mean = local.mean(-2)
-    centred = local - mean[..., None, :]
-    x, y, z = centred.unbind(-1)
+    centered = local - mean[..., None, :]
+    x, y, z = centered.unbind(-1)
     scatter = torch.stack([(a * b).mean(-1) for a, b in ((x, x), (y, y), (z, z), (x, y), (x, z), (y, z))], -1)
     trace = scatter[..., :3].sum(-1, keepdim=True)
     return torch.cat([mean, scatter / (trace + 1e-4)], -1)

@@ -60,7 +60,7 @@ def robust_kabsch(pairs: Correspondences, T: Tensor, rounds: int = 3) -> tuple[T
     return T, inliers
 
 
-def whitened(T: Tensor, pairs: Correspondences) -> tuple[Tensor, Tensor]:
+def whitened_residuals(T: Tensor, pairs: Correspondences) -> tuple[Tensor, Tensor]:
     """Residuals in units of their deviation (B, 2K, 3) and their Jacobian (B, 2K, 3, 6) for T exp(xi)."""
     half = pairs.source.shape[1] // 2
     R, t = T[:, None, :3, :3], T[:, None, :3, 3]
@@ -68,9 +68,9 @@ def whitened(T: Tensor, pairs: Correspondences) -> tuple[Tensor, Tensor]:
     moved_back = ((target - t)[..., None, :] @ R)[..., 0, :]  # R^T (y - t)
     L = torch.cat([L[:, :half], R.transpose(-1, -2) @ L[:, half:]], 1)  # all in the source frame
     # In the source frame the step turns the target's point, in the target frame the source's.
-    arm = torch.cat([moved_back[:, :half], source[:, half:]], 1)
-    zero = torch.zeros_like(arm[..., 0])
-    x, y, z = arm.unbind(-1)
+    lever_arm = torch.cat([moved_back[:, :half], source[:, half:]], 1)
+    zero = torch.zeros_like(lever_arm[..., 0])
+    x, y, z = lever_arm.unbind(-1)
     minus_hat = torch.stack([zero, z, -y, -z, zero, x, y, -x, zero], -1).unflatten(-1, (3, 3))
     eye = torch.eye(3, dtype=source.dtype, device=source.device).expand_as(minus_hat)
     jacobian = L.transpose(-1, -2) @ torch.cat([minus_hat, eye], -1)
@@ -78,7 +78,7 @@ def whitened(T: Tensor, pairs: Correspondences) -> tuple[Tensor, Tensor]:
     return residual, jacobian
 
 
-def precision_solve(T: Tensor, pairs: Correspondences, rounds: int = 8) -> tuple[Tensor, Tensor]:
+def weighted_gauss_newton(T: Tensor, pairs: Correspondences, rounds: int = 8) -> tuple[Tensor, Tensor]:
     """Iteratively reweighted Gauss-Newton on the residuals weighed with their predicted precision.
 
     Args:
@@ -90,7 +90,7 @@ def precision_solve(T: Tensor, pairs: Correspondences, rounds: int = 8) -> tuple
     information = T.new_zeros(len(T), 6, 6)
     damping = torch.eye(6, dtype=T.dtype, device=T.device) * 1e-6
     for _ in range(rounds):
-        residual, jacobian = whitened(T, pairs)
+        residual, jacobian = whitened_residuals(T, pairs)
         squared = (residual * residual).sum(-1)
         weight = pairs.weight * (SOFT + 3) / (SOFT + squared)
         weighted = jacobian * weight[..., None, None]
@@ -141,7 +141,7 @@ def solve_batch(decoder: Decoder, source: Tokens, target: Tokens, correlated: Co
     return Solved(T, information, pairs, inliers, _confidence(unguided, T))
 
 
-def evidence(solved: Solved) -> Tensor:
+def overlap_features(solved: Solved) -> Tensor:
     """What the pose of a pair says about its overlap (B, 2): its confidence, and the distance in units of 20 m."""
     distance = (solved.T[:, :3, 3].norm(dim=-1) / 20).clamp(max=3).nan_to_num(3.0)
     return torch.stack([solved.confidence.nan_to_num(0.0), distance.to(solved.confidence.dtype)], -1).float()
@@ -153,7 +153,7 @@ def overlap_probability(
     """Probability (B,) that each pair was seen from within 20 m; NaN while the head is untrained."""
     if not decoder.overlap_trained:
         return torch.full(source.mask.shape[:1], torch.nan)
-    return decoder.overlap(*correlated, source.mask, target.mask, evidence(solved)).sigmoid()
+    return decoder.overlap(*correlated, source.mask, target.mask, overlap_features(solved)).sigmoid()
 
 
 def register_batch(decoder: Decoder, source: Tokens, target: Tokens, correlated: Correlated) -> list[Registration]:
@@ -168,13 +168,13 @@ def register_batch(decoder: Decoder, source: Tokens, target: Tokens, correlated:
     covariance = decoder.settings.covariance_scale * torch.linalg.inv(solved.information)
     overlap = overlap_probability(decoder, source, target, correlated, solved)
     figures = (field.tolist() for field in (solved.confidence, rmse, count, overlap))
-    return [_answer(*row) for row in zip(T.cpu(), covariance.cpu(), *figures, strict=True)]
+    return [_registration(*row) for row in zip(T.cpu(), covariance.cpu(), *figures, strict=True)]
 
 
 def _solve_precise(pairs: Correspondences, T: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Pose, information and inliers by the predicted precisions."""
-    T, information = precision_solve(T, pairs)
-    residual, _ = whitened(T, pairs)
+    T, information = weighted_gauss_newton(T, pairs)
+    residual, _ = whitened_residuals(T, pairs)
     return T, information, ((residual * residual).sum(-1) <= CHI2) & (pairs.weight > 0)
 
 
@@ -184,7 +184,7 @@ def _solve_svd(pairs: Correspondences, T: Tensor) -> tuple[Tensor, Tensor, Tenso
     error = (transform(T, pairs.source.double()) - pairs.target).norm(dim=-1)
     rmse = ((error**2 * inliers).sum(1) / inliers.sum(1).clamp(min=1)).sqrt()
     sigma = rmse.clamp(min=0.02)[:, None, None, None] / 3**0.5
-    _, jacobian = whitened(T, pairs._replace(L=torch.eye(3, device=T.device).expand_as(pairs.L)))
+    _, jacobian = whitened_residuals(T, pairs._replace(L=torch.eye(3, device=T.device).expand_as(pairs.L)))
     jacobian = (jacobian * inliers[..., None, None] / sigma).flatten(1, 2)
     return T, jacobian.transpose(1, 2) @ jacobian + 1e-6 * torch.eye(6, device=T.device), inliers
 
@@ -196,13 +196,15 @@ def _confidence(unguided: Correspondences, T: Tensor) -> Tensor:
     return weight.topk(min(CONFIDENT, weight.shape[1]))[0].mean(1)
 
 
-def _answer(T: Tensor, covariance: Tensor, confidence: float, rmse: float, count: int, overlap: float) -> Registration:
+def _registration(
+    T: Tensor, covariance: Tensor, confidence: float, rmse: float, count: int, overlap: float
+) -> Registration:
     if not bool(T.isfinite().all() and covariance.isfinite().all()):
         return _nothing("no finite pose")
     if count < 3:
         return _nothing(f"{count} matching descriptors, want 3")
     # Rigid to float64: the solver composes many steps, and an exponential of a large one leaves 1 + 2e-15 behind.
-    rigid = se3.orthonormalised(T.double().numpy())
+    rigid = se3.orthonormalized(T.double().numpy())
     return Registration(rigid, covariance.numpy(), confidence, rmse, "neural", overlap=overlap)
 
 

@@ -109,7 +109,7 @@ def sample_at_points(points: Tensor, views: Views, features: Tensor, window: int
     return samples.mean(-1).transpose(1, 2)
 
 
-def picture_features(points: Tensor, views: Views, maps: list[FeatureMap]) -> tuple[Tensor, Tensor]:
+def image_features(points: Tensor, views: Views, maps: list[FeatureMap]) -> tuple[Tensor, Tensor]:
     """Features of the finest maps where points project.
 
     Args:

@@ -10,11 +10,11 @@ from dpm2_core.sim.materials import Label, Material
 from dpm2_core.sim.mesh import Mesh, make, merge
 from dpm2_core.sim.shapes import box, relief, turned
 
-WALL_COLOURS = np.array([
+WALL_COLORS = np.array([
     (205, 196, 178), (222, 214, 200), (188, 170, 140), (196, 150, 110), (160, 92, 74), (146, 110, 92), (214, 202, 150),
     (176, 184, 178), (150, 154, 160), (228, 222, 214), (202, 168, 150), (132, 84, 70), (170, 178, 150), (190, 196, 206),
 ])  # fmt: skip
-ROOF_COLOURS = np.array([(150, 78, 58), (120, 66, 52), (92, 84, 82), (110, 104, 100), (136, 92, 70)])
+ROOF_COLORS = np.array([(150, 78, 58), (120, 66, 52), (92, 84, 82), (110, 104, 100), (136, 92, 70)])
 FLOOR = 2.9
 """Height of a storey, m."""
 FOUNDATION = 2.0
@@ -23,7 +23,7 @@ FOUNDATION = 2.0
 
 def building(width: float, depth: float, floors: int, rng: np.random.Generator) -> Mesh:
     """A house with its front on y = 0, x from -width/2 to width/2, and its back on y = depth; the ground is z = 0."""
-    wall = np.clip(WALL_COLOURS[rng.integers(len(WALL_COLOURS))] + rng.normal(0, 10, 3), 30, 240)
+    wall = np.clip(WALL_COLORS[rng.integers(len(WALL_COLORS))] + rng.normal(0, 10, 3), 30, 240)
     material = Material.BRICK if rng.random() < 0.3 else Material.PLASTER
     style = {"bay": rng.uniform(2.1, 3.6), "glass": rng.uniform(0.35, 0.6), "shop": rng.random() < 0.3 and floors > 2}
     sides = [
@@ -56,17 +56,17 @@ def _facade(
     )
     shape = (len(x) - 1, len(z) - 1)
     depth, materials = np.zeros(shape), np.full(shape, material)
-    colour = np.broadcast_to(wall, (*shape, 3)).copy()
+    color = np.broadcast_to(wall, (*shape, 3)).copy()
     window = np.zeros(shape, bool)
     window[1::2, 1::2] = rng.random((bays, floors)) > (0.06 if front else 0.5)
     if front:
-        _features(bays, floors, pitch, style, depth, window, colour, rng)
+        _features(bays, floors, pitch, style, depth, window, color, rng)
     shutters = rng.random(shape) < 0.12
     depth[window] += rng.uniform(0.1, 0.3)
     materials[window & ~shutters] = Material.GLASS
-    colour[window & ~shutters] = (70, 84, 98) * rng.uniform(0.6, 1.3, (int((window & ~shutters).sum()), 1))
-    colour[window & shutters] = wall * rng.uniform(0.4, 0.8)
-    return relief(x, z, depth, materials, colour.clip(0, 255))
+    color[window & ~shutters] = (70, 84, 98) * rng.uniform(0.6, 1.3, (int((window & ~shutters).sum()), 1))
+    color[window & shutters] = wall * rng.uniform(0.4, 0.8)
+    return relief(x, z, depth, materials, color.clip(0, 255))
 
 
 def _features(
@@ -76,18 +76,18 @@ def _features(
     style: dict[str, float],
     depth: NDArray,
     window: NDArray[np.bool_],
-    colour: NDArray,
+    color: NDArray,
     rng: np.random.Generator,
 ) -> None:
     """Doors, shops, bays, recesses and balconies, written into the cells of a front."""
     door = 1 + 2 * int(rng.integers(bays))
     depth[door, :2] += rng.uniform(0.3, 0.8)
     window[door, :2] = False
-    colour[door, :2] = rng.uniform(40, 140, 3)
+    color[door, :2] = rng.uniform(40, 140, 3)
     if style["shop"]:
         window[1:-1, 0:2] |= rng.random((2 * bays - 1, 1)) < 0.8
         window[door, :2] = False
-        colour[:, 2] = rng.uniform(40, 220, 3)  # the sign above the shop
+        color[:, 2] = rng.uniform(40, 220, 3)  # the sign above the shop
     for start in range(1, 2 * bays, 2):
         draw = rng.random()
         if draw < 0.08:
@@ -100,17 +100,17 @@ def _features(
             depth[start + 1, :] += rng.uniform(0.1, 0.4)  # a pilaster gap or drain pipe
     if rng.random() < 0.4:
         depth[:, 0] -= 0.08  # plinth
-        colour[:, 0] *= 0.7
+        color[:, 0] *= 0.7
     if rng.random() < 0.25 and bays > 3:
         depth[: 2 * int(rng.integers(1, bays - 1)) + 1] += rng.uniform(0.5, 2.0)  # a part that steps back
 
 
 def _roof(width: float, depth: float, top: float, rng: np.random.Generator) -> list[Mesh]:
-    colour = ROOF_COLOURS[rng.integers(len(ROOF_COLOURS))] + rng.normal(0, 8, 3)
+    color = ROOF_COLORS[rng.integers(len(ROOF_COLORS))] + rng.normal(0, 8, 3)
     w, over = width / 2 + 0.3, 0.4
     if rng.random() < 0.3 or depth > 18:
         parts = [
-            box((-w, -over / 2, top), (w, depth + over / 2, top + 0.3), Label.BUILDING, Material.ROOF, colour * 0.8)
+            box((-w, -over / 2, top), (w, depth + over / 2, top + 0.3), Label.BUILDING, Material.ROOF, color * 0.8)
         ]
         for _ in range(rng.integers(0, 4)):
             at = rng.uniform((-w + 1, 1), (w - 2, depth - 2))
@@ -131,6 +131,6 @@ def _roof(width: float, depth: float, top: float, rng: np.random.Generator) -> l
         (-w + hip, depth / 2, ridge), (w - hip, depth / 2, ridge),
     ])  # fmt: skip
     faces = [[0, 1, 5], [0, 5, 4], [2, 3, 4], [2, 4, 5], [1, 2, 5], [3, 0, 4], [0, 2, 1], [0, 3, 2]]
-    roof = make(corners, faces, Label.BUILDING, Material.ROOF, colour)
+    roof = make(corners, faces, Label.BUILDING, Material.ROOF, color)
     chimney = rng.uniform((-w + 1, depth * 0.3), (w - 1, depth * 0.7))
     return [roof, box((*chimney, top), (*(chimney + 0.6), ridge + 0.8), Label.BUILDING, Material.BRICK, (130, 80, 66))]

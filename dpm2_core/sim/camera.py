@@ -15,7 +15,7 @@ from dpm2_core.sim.materials import Material
 from dpm2_core.sim.mesh import Hits, Mesh, rotated
 from dpm2_core.sim.settings import CameraConfig
 from dpm2_core.sim.shading import Surface
-from dpm2_core.sim.traffic import Movers
+from dpm2_core.sim.traffic import DynamicObjects
 from dpm2_core.sim.world import World
 
 Array = NDArray[np.float64]
@@ -50,59 +50,59 @@ def render(
 ) -> NDArray[np.uint8]:
     """(H, W, 3) uint8 RGB of a world from a pose (4, 4) at a time, s; `rng` makes the pixel noise."""
     eye = T_world_cam[:3, 3].astype(np.float32)
-    movers = world.movers(time, eye)
+    dynamic_objects = world.dynamic_objects(time, eye)
     radiance = np.empty((config.height, config.width, 3), np.float32)
     for top in range(0, config.height, _BAND):  # bands fit the processor's cache: a sixth less work
         rows = slice(top, min(top + _BAND, config.height))
         view = rotated(_rays(config)[rows].reshape(-1, 3), T_world_cam[:3, :3])
-        radiance[rows] = _band(world, movers, eye, view, config).reshape(-1, config.width, 3)
+        radiance[rows] = _band(world, dynamic_objects, eye, view, config).reshape(-1, config.width, 3)
     return _develop(radiance, world.light.exposure, config.noise, rng)
 
 
-def _band(world: World, movers: Movers | None, eye: Float, view: Float, config: CameraConfig) -> Float:
+def _band(world: World, dynamic_objects: DynamicObjects | None, eye: Float, view: Float, config: CameraConfig) -> Float:
     """(R, 3) light that comes from the directions (R, 3), some rows of pixels."""
     light = world.light
-    surface, seen, distance = _visible(world, movers, eye, view, config)
+    surface, seen, distance = _visible(world, dynamic_objects, eye, view, config)
     lit = np.ones(len(distance), np.float32)
     if config.shadows and not light.tunnel and light.overcast < 0.85:
-        lit = _sunlit(world, movers, surface, seen, config.width)
-    colour = light.textures.albedo(surface, world.terrain)
-    colour *= light.shine(surface, lit)
-    colour[surface.material == Material.LAMP] = 1.3
-    colour -= _HAZE
-    colour *= np.exp(distance / np.float32(-300 if light.tunnel else -900))[:, None]
-    colour += _HAZE
+        lit = _sunlit(world, dynamic_objects, surface, seen, config.width)
+    color = light.textures.albedo(surface, world.terrain)
+    color *= light.shine(surface, lit)
+    color[surface.material == Material.LAMP] = 1.3
+    color -= _HAZE
+    color *= np.exp(distance / np.float32(-300 if light.tunnel else -900))[:, None]
+    color += _HAZE
     radiance = np.empty_like(view)
-    radiance[seen] = colour
+    radiance[seen] = color
     radiance[~seen] = light.sky(view[~seen])
     return radiance
 
 
 def _visible(
-    world: World, movers: Movers | None, eye: Float, view: Float, config: CameraConfig
+    world: World, dynamic_objects: DynamicObjects | None, eye: Float, view: Float, config: CameraConfig
 ) -> tuple[Surface, NDArray[np.bool_], Float]:
     """The nearest surface points of the rays that meet one, static or moving; which rays these are; their distances."""
     hits = world.scene.cast(np.broadcast_to(eye, view.shape).copy(), view, REACH)
-    if movers is not None:
-        moving, toward = movers.cast(eye, view, REACH)
+    if dynamic_objects is not None:
+        moving, toward = dynamic_objects.cast(eye, view, REACH)
         near = moving.distance < hits.distance[toward]
         chosen, moving = toward[near], moving.part(near)
         hits.distance[chosen], hits.normal[chosen] = moving.distance, moving.normal
     seen = np.isfinite(hits.distance)
     hits = hits.part(seen)
     columns = _attributes(world.static, hits)
-    if movers is not None:
+    if dynamic_objects is not None:
         place = np.cumsum(seen)[chosen] - 1
-        for column, own in zip(columns, _attributes(movers.scene.mesh, moving), strict=True):
+        for column, own in zip(columns, _attributes(dynamic_objects.scene.mesh, moving), strict=True):
             column[place] = own
-    uv, texture, material, colour = columns
+    uv, texture, material, color = columns
     direction, normal, distance = view[seen], hits.normal, hits.distance
     slope = np.einsum("ij,ij->i", normal, direction)
     scale = -np.sign(slope) / (np.sqrt(np.einsum("ij,ij->i", normal, normal)) + np.float32(1e-12))
     normal *= scale[:, None]
     footprint = distance / np.float32(config.focal) / np.sqrt(np.maximum(-slope * scale, np.float32(0.02)))
     position = direction * distance[:, None] + eye
-    return Surface(position, normal, direction, uv, texture, material, _LINEAR[colour], footprint), seen, distance
+    return Surface(position, normal, direction, uv, texture, material, _LINEAR[color], footprint), seen, distance
 
 
 def _attributes(mesh: Mesh, hits: Hits) -> tuple[NDArray, NDArray, NDArray, NDArray]:
@@ -112,10 +112,12 @@ def _attributes(mesh: Mesh, hits: Hits) -> tuple[NDArray, NDArray, NDArray, NDAr
     uv = (1 - hits.u - hits.v)[:, None] * corners[:, 0]
     uv += hits.u[:, None] * corners[:, 1]
     uv += hits.v[:, None] * corners[:, 2]
-    return uv, mesh.texture[face], mesh.material[face], mesh.colour[face]
+    return uv, mesh.texture[face], mesh.material[face], mesh.color[face]
 
 
-def _sunlit(world: World, movers: Movers | None, surface: Surface, seen: NDArray[np.bool_], width: int) -> Float:
+def _sunlit(
+    world: World, dynamic_objects: DynamicObjects | None, surface: Surface, seen: NDArray[np.bool_], width: int
+) -> Float:
     """(P,) 0..1, from rays to the sun through every other pixel of every other row."""
     grid = np.full(seen.shape, -1, np.int32)
     grid[seen] = np.arange(len(surface.material), dtype=np.int32)
@@ -124,8 +126,8 @@ def _sunlit(world: World, movers: Movers | None, surface: Surface, seen: NDArray
     origins = surface.position[point] + surface.normal[point] * np.float32(0.03)
     towards = np.broadcast_to(world.light.sun, origins.shape).copy()
     free = world.scene.cast(origins, towards, 150.0).face < 0
-    if movers is not None:
-        free &= movers.scene.cast(origins, towards, 150.0).face < 0
+    if dynamic_objects is not None:
+        free &= dynamic_objects.scene.cast(origins, towards, 150.0).face < 0
     half = np.ones(sparse.shape, np.float32)
     half[sparse >= 0] = free
     full = cv2.resize(half, (width, len(seen) // width), interpolation=cv2.INTER_LINEAR)

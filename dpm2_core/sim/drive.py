@@ -179,11 +179,11 @@ class _Drive:
         height = lidar.config.height
         self.T_world_lidar = np.stack([world.drive_pose(t, height) for t in self.times])
         self.view = camera or CameraConfig()
-        colour = calibration(self.view)
+        color = calibration(self.view)
         # The poses and Tr of the layout are of the left grey camera 0; the colour camera 2 sits beside it.
-        self.T_lidar_cam0 = colour.T_lidar_cam.copy()
+        self.T_lidar_cam0 = color.T_lidar_cam.copy()
         self.T_lidar_cam0[1, 3] = 0.0
-        self.T_lidar_cam2, self.K = colour.T_lidar_cam, colour.K
+        self.T_lidar_cam2, self.K = color.T_lidar_cam, color.K
 
     def write(self, root: Path, recipe: dict[str, Any], workers: int, progress: Callable[[int, int], None]) -> None:
         sequence = root / "sequences" / "00"

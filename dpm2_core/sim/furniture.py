@@ -9,15 +9,15 @@ from dpm2_core.sim.materials import Label, Material
 from dpm2_core.sim.mesh import Mesh, make, merge
 from dpm2_core.sim.shapes import box, rod
 
-GREY = (120, 122, 124)
+GRAY = (120, 122, 124)
 
 
 def lamp(rng: np.random.Generator) -> Mesh:
     """A street lamp of 4.5 to 9 m reaching over the road."""
     height, arm = rng.uniform(4.5, 9), rng.uniform(0.4, 2.0)
     return merge([
-        rod((0, 0, -0.3), (0, 0, height), (0.09, 0.05), 8, Label.POLE, Material.METAL, GREY),
-        rod((0, 0, height), (0, -arm, height + 0.3), (0.05, 0.04), 6, Label.POLE, Material.METAL, GREY),
+        rod((0, 0, -0.3), (0, 0, height), (0.09, 0.05), 8, Label.POLE, Material.METAL, GRAY),
+        rod((0, 0, height), (0, -arm, height + 0.3), (0.05, 0.04), 6, Label.POLE, Material.METAL, GRAY),
         box((-0.15, -arm - 0.5, height + 0.2), (0.15, -arm, height + 0.36), Label.POLE, Material.METAL, (150,) * 3),
     ])  # fmt: skip
 
@@ -26,15 +26,15 @@ def sign(rng: np.random.Generator) -> Mesh:
     """A traffic sign: disc, triangle, square or board, on a post."""
     height, radius = rng.uniform(1.9, 2.7), rng.uniform(0.28, 0.45)
     corners = int(rng.choice([3, 4, 8, 20]))
-    colour = np.array([(200, 30, 30), (30, 70, 170), (235, 235, 235), (230, 200, 40), (30, 120, 60)])[rng.integers(5)]
+    color = np.array([(200, 30, 30), (30, 70, 170), (235, 235, 235), (230, 200, 40), (30, 120, 60)])[rng.integers(5)]
     a = np.arange(corners) * 2 * np.pi / corners + np.pi / 2
     rim = np.stack([np.full(corners, -0.05), radius * np.cos(a), height + radius * np.sin(a)], -1)
     inner = rim * (1, 0.7, 1) * (1, 1, 0.7) + (-0.004, 0, 0.3 * height)
     fan = np.array([[0, k, k + 1] for k in range(1, corners - 1)])
     return merge([
-        rod((0, 0, -0.3), (0, 0, height + radius), (0.035, 0.035), 6, Label.POLE, Material.METAL, GREY),
-        make(rim, fan, Label.SIGN, Material.SIGN, colour),
-        make(inner, fan, Label.SIGN, Material.SIGN, (240, 240, 240) if colour.max() < 230 else (30, 30, 30)),
+        rod((0, 0, -0.3), (0, 0, height + radius), (0.035, 0.035), 6, Label.POLE, Material.METAL, GRAY),
+        make(rim, fan, Label.SIGN, Material.SIGN, color),
+        make(inner, fan, Label.SIGN, Material.SIGN, (240, 240, 240) if color.max() < 230 else (30, 30, 30)),
     ])  # fmt: skip
 
 
@@ -51,8 +51,8 @@ def post(rng: np.random.Generator) -> Mesh:
 def street_box(rng: np.random.Generator) -> Mesh:
     """An electric cabinet, bin, advertising board or post box."""
     size = rng.uniform((0.4, 0.3, 0.7), (1.3, 0.6, 1.5)) if rng.random() < 0.75 else np.array([1.4, 0.25, 2.5])
-    colour = rng.uniform(40, 210, 3)
-    return box((-size[0] / 2, -size[1] / 2, -0.2), (*(size[:2] / 2), size[2]), Label.OBJECT, Material.METAL, colour)
+    color = rng.uniform(40, 210, 3)
+    return box((-size[0] / 2, -size[1] / 2, -0.2), (*(size[:2] / 2), size[2]), Label.OBJECT, Material.METAL, color)
 
 
 def bench(rng: np.random.Generator) -> Mesh:
@@ -72,7 +72,7 @@ def shelter(rng: np.random.Generator) -> Mesh:
     """A bus stop: a roof on four posts with a glass back."""
     length = rng.uniform(2.5, 4.5)
     posts = [
-        rod((x, y, -0.2), (x, y, 2.3), (0.05, 0.05), 6, Label.POLE, Material.METAL, GREY)
+        rod((x, y, -0.2), (x, y, 2.3), (0.05, 0.05), 6, Label.POLE, Material.METAL, GRAY)
         for x in (-length / 2, length / 2)
         for y in (-0.6, 0.7)
     ]  # fmt: skip

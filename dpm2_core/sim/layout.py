@@ -207,7 +207,7 @@ class Layout:
 
     def _wall(self, line: Kerbline) -> Iterator[Mesh]:
         h, brick = self.rng.uniform(0.4, 2.2), self.rng.random() < 0.5
-        colour = (150, 92, 76) if brick else self.rng.uniform(130, 210) * np.array([1, 0.98, 0.93])
+        color = (150, 92, 76) if brick else self.rng.uniform(130, 210) * np.array([1, 0.98, 0.93])
         section = (
             (0.0, -0.5),
             (0.0, h),
@@ -219,7 +219,7 @@ class Layout:
             (0.25, -0.5),
         )
         material = Material.BRICK if brick else Material.CONCRETE
-        yield kerbside_ribbon(self.terrain, line, section, Label.FENCE, material, colour)
+        yield kerbside_ribbon(self.terrain, line, section, Label.FENCE, material, color)
 
     def _fence(self, line: Kerbline) -> Iterator[Mesh]:
         """Pickets and two rails, a metre at a time."""

@@ -97,16 +97,18 @@ class Lidar:
             self._paint(world, T_world_lidar, points, label, back)
         static = points[back]
         moving = np.zeros(len(directions), bool)
-        if movers := world.movers(time, T_world_lidar[:3, 3]):
-            hits, toward = movers.cast(origins if twist is not None else origins[0], directions, self.config.range)
+        if dynamic_objects := world.dynamic_objects(time, T_world_lidar[:3, 3]):
+            hits, toward = dynamic_objects.cast(
+                origins if twist is not None else origins[0], directions, self.config.range
+            )
             near = hits.distance < still.distance[toward]
             hits, which = hits.part(near), toward[near]
             moving[which] = True
             points[which], back[which] = self._returns(
-                movers.scene.mesh, hits, directions[which], chance[:, which], jitter[:, which], which
+                dynamic_objects.scene.mesh, hits, directions[which], chance[:, which], jitter[:, which], which
             )
-            kind = MOVING_LABEL[movers.scene.mesh.label[hits.face]]
-            label[which] = kind | movers.number[hits.face].astype(np.uint32) << 16
+            kind = MOVING_LABEL[dynamic_objects.scene.mesh.label[hits.face]]
+            label[which] = kind | dynamic_objects.number[hits.face].astype(np.uint32) << 16
         time_offset = self.column_time[self.column[back]]
         return Scan(points[back], label[back], moving[back], self.ring[back], time_offset, static)
 
@@ -145,7 +147,7 @@ class Lidar:
         material = mesh.material[face]
         cosine = np.abs(np.einsum("ij,ij->i", hits.normal, directions))
         cosine /= np.sqrt(np.einsum("ij,ij->i", hits.normal, hits.normal)) + np.float32(1e-12)
-        paint = mesh.colour[face].sum(1, dtype=np.float32) / np.float32(3 * 150)
+        paint = mesh.color[face].sum(1, dtype=np.float32) / np.float32(3 * 150)
         reflectance = REFLECTANCE[material] * (np.float32(0.55) + np.float32(0.45) * np.minimum(paint, np.float32(1.6)))
         distance = np.where(hits.face >= 0, hits.distance, 0).astype(np.float32)
         # What is left of the pulse against what the receiver needs.

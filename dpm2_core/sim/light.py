@@ -43,9 +43,9 @@ class Light:
         cloud = self.textures.noise(plane, 1.9) + 0.5 * self.textures.noise(plane + 1, 0.8)
         cloud += 0.25 * self.textures.noise(plane + 2, 0.3)
         cover = np.clip(0.5 * cloud - 0.5 + 1.6 * self.overcast, 0, 1)[:, None]
-        grey = np.array([0.86, 0.87, 0.9], np.float32) * np.clip(0.9 + 0.1 * cloud[:, None], 0.6, 1.2)
+        gray = np.array([0.86, 0.87, 0.9], np.float32) * np.clip(0.9 + 0.1 * cloud[:, None], 0.6, 1.2)
         glow = np.exp((view @ self.sun - 1) * 12)[:, None] * (1 - 0.7 * self.overcast)
-        return 1.5 * (blue * (1 - cover) + grey * cover) + glow
+        return 1.5 * (blue * (1 - cover) + gray * cover) + glow
 
     def shine(self, surface: Surface, lit: Float) -> Float:
         """(P, 3) light on each point, of which the sun's share reaches `lit` (P,)."""

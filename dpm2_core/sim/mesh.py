@@ -30,7 +30,7 @@ class Mesh:
     faces: Int
     label: NDArray[np.uint8]
     material: NDArray[np.uint8]
-    colour: NDArray[np.uint8]
+    color: NDArray[np.uint8]
     uv: Float
     texture: NDArray[np.uint16]
 
@@ -48,7 +48,7 @@ def make(
     faces: ArrayLike,
     label: Label | NDArray[np.integer],
     material: Material | NDArray[np.integer],
-    colour: ArrayLike = (128, 128, 128),
+    color: ArrayLike = (128, 128, 128),
     uv: Float | None = None,
 ) -> Mesh:
     """A mesh from (V, 3) vertices and (F, 3) faces; the other values are for all triangles or one each.
@@ -62,7 +62,7 @@ def make(
         faces,
         np.broadcast_to(np.asarray(label, np.uint8), n).copy(),
         np.broadcast_to(np.asarray(material, np.uint8), n).copy(),
-        np.broadcast_to(np.asarray(colour, np.uint8), (n, 3)).copy(),
+        np.broadcast_to(np.asarray(color, np.uint8), (n, 3)).copy(),
         _box_uv(vertices[faces]) if uv is None else np.asarray(uv, np.float32),
         np.zeros(n, np.uint16),
     )
@@ -94,16 +94,16 @@ def placed(template: Mesh, poses: ArrayLike, texture: ArrayLike = 0, tint: Array
     n, v = len(poses), len(template.vertices)
     points = np.einsum("nij,vj->nvi", poses[:, :3, :3], template.vertices) + poses[:, None, :3, 3]
     faces = template.faces[None] + (np.arange(n, dtype=np.int32) * v)[:, None, None]
-    colour = np.repeat(template.colour[None], n, 0)
+    color = np.repeat(template.color[None], n, 0)
     if tint is not None:
-        colour = (colour * np.asarray(tint, np.float32)[:, None]).clip(0, 255).astype(np.uint8)
+        color = (color * np.asarray(tint, np.float32)[:, None]).clip(0, 255).astype(np.uint8)
     f = len(template)
     return Mesh(
         points.reshape(-1, 3),
         faces.reshape(-1, 3),
         np.tile(template.label, n),
         np.tile(template.material, n),
-        colour.reshape(-1, 3),
+        color.reshape(-1, 3),
         np.tile(template.uv, (n, 1, 1)),
         np.repeat(np.broadcast_to(np.asarray(texture, np.uint16), n), f),
     )

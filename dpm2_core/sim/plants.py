@@ -65,9 +65,9 @@ def _conifer(rng: np.random.Generator, leafage: float) -> Mesh:
     share = rng.beta(1, 1.6, int(34 * leafage * height))
     angle = rng.uniform(0, 6.3, len(share))
     out = radius * (1 - share) * rng.uniform(0.5, 1.1, len(share))
-    centres = np.stack([out * np.cos(angle), out * np.sin(angle), foot + share * (height - foot)], -1)
+    centers = np.stack([out * np.cos(angle), out * np.sin(angle), foot + share * (height - foot)], -1)
     parts += [
-        leaves(centres, 0.5 / leafage**0.5, rng, green),
+        leaves(centers, 0.5 / leafage**0.5, rng, green),
         rod((0, 0, foot), (0, 0, height), (radius * 0.75, 0.02), 9, Label.VEGETATION, Material.LEAF, green * 0.7),
     ]
     return merge(parts)
@@ -89,5 +89,5 @@ def bush(rng: np.random.Generator) -> Mesh:
 def tuft(rng: np.random.Generator) -> Mesh:
     """A patch of tall grass and weeds about 1.5 m across, 0.1 to 0.6 m high."""
     n, height = int(rng.integers(10, 26)), rng.uniform(0.1, 0.6)
-    centres = np.concatenate([rng.normal(0, 0.5, (n, 2)), rng.uniform(0, height, (n, 1))], -1)
-    return leaves(centres, 0.5 * height, rng, _green(rng) * (1.25, 1.1, 1.0))
+    centers = np.concatenate([rng.normal(0, 0.5, (n, 2)), rng.uniform(0, height, (n, 1))], -1)
+    return leaves(centers, 0.5 * height, rng, _green(rng) * (1.25, 1.1, 1.0))

@@ -102,18 +102,18 @@ def make_road(kind: str, preset: Preset, rng: np.random.Generator, length: float
     """
     if kind not in ROAD_KINDS:
         return _road_of_poses(FilePath(kind), preset, rng)
-    centre = _centre(kind, preset, rng, length)
-    drive = centre.shifted(-preset.lane)
-    start = 0.0 if centre.closed else min(MARGIN, drive.length / 4)
+    center = _center(kind, preset, rng, length)
+    drive = center.shifted(-preset.lane)
+    start = 0.0 if center.closed else min(MARGIN, drive.length / 4)
     times, travelled = _progress(drive, preset.speed, start)
-    return Road([centre, *_side_streets([centre], preset, rng)], 1, drive, times, travelled)
+    return Road([center, *_side_streets([center], preset, rng)], 1, drive, times, travelled)
 
 
 MARGIN = 110.0
 """Road behind the start and beyond the end of an open drive, m: farther than the LiDAR sees."""
 
 
-def _centre(kind: str, preset: Preset, rng: np.random.Generator, length: float) -> Path:
+def _center(kind: str, preset: Preset, rng: np.random.Generator, length: float) -> Path:
     if kind == "random":
         if preset.degenerate:
             kind = "arc"
@@ -241,13 +241,13 @@ def _road_of_poses(file: FilePath, preset: Preset, rng: np.random.Generator) -> 
     at = _arc_lengths(position[:, :2])
     on_raw = np.interp(at, at[keep], _arc_lengths(position[keep, :2]))
     travelled: Array = np.interp(on_raw, raw.s, _arc_lengths(smooth))
-    centre = drive.shifted(preset.lane)
+    center = drive.shifted(preset.lane)
     z = gaussian_filter1d(np.interp(drive.s, travelled, position[:, 2]), 4)
-    z = np.interp(np.linspace(0, 1, len(centre.xy)), np.linspace(0, 1, len(z)), z)
+    z = np.interp(np.linspace(0, 1, len(center.xy)), np.linspace(0, 1, len(z)), z)
     n = int(MARGIN / STEP)
     beyond = np.arange(1, n + 1)[:, None] * STEP
-    heading = np.stack([np.cos(centre.yaw[[0, -1]]), np.sin(centre.yaw[[0, -1]])], -1)
-    xy = np.concatenate([centre.xy[0] - beyond[::-1] * heading[0], centre.xy, centre.xy[-1] + beyond * heading[1]])
+    heading = np.stack([np.cos(center.yaw[[0, -1]]), np.sin(center.yaw[[0, -1]])], -1)
+    xy = np.concatenate([center.xy[0] - beyond[::-1] * heading[0], center.xy, center.xy[-1] + beyond * heading[1]])
     z = np.pad(z, n, mode="edge")
     pieces = list(_first_visits(xy))
     streets = [Path(xy[a:b]) for a, b in pieces]

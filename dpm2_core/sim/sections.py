@@ -19,15 +19,13 @@ WALL = 5.5
 """Height of the noise barriers, m: a beam at +2 deg cannot see over them within 80 m, a camera can: trees."""
 
 
-def swept(
-    path: Path, terrain: Terrain, profile: ArrayLike, label: Label, material: Material, colour: ArrayLike
-) -> Mesh:
+def swept(path: Path, terrain: Terrain, profile: ArrayLike, label: Label, material: Material, color: ArrayLike) -> Mesh:
     """A profile (K, 2) of metres to the left and above the road, drawn along a path."""
     profile = np.asarray(profile, float)
     every = slice(None, None, 4)  # 2 m
     xy = np.stack([path.at(path.s, y)[0][every] for y in profile[:, 0]], 1)
     z = terrain.height_at(path.xy[every])[:, None] + profile[None, :, 1]
-    return sheet(np.concatenate([xy, z[..., None]], -1), label, material, colour)
+    return sheet(np.concatenate([xy, z[..., None]], -1), label, material, color)
 
 
 def clear(meshes: Iterable[Mesh], road: Road, terrain: Terrain) -> Iterator[Mesh]:
@@ -43,11 +41,11 @@ def clear(meshes: Iterable[Mesh], road: Road, terrain: Terrain) -> Iterator[Mesh
 def highway(road: Road, terrain: Terrain, rng: np.random.Generator) -> Iterator[Mesh]:
     """A concrete median, guard rails and noise barriers; trees behind the barriers."""
     half = terrain.preset.half_width
-    grey = (172, 170, 164)
+    gray = (172, 170, 164)
     flank = [(0.1, 0.85), (0.15, 0.33), (0.32, 0.08), (0.32, 0)]
     median = [*((-y, z) for y, z in reversed(flank)), *flank]
     for street in road.streets[: road.main]:
-        yield swept(street, terrain, median, Label.FENCE, Material.CONCRETE, grey)
+        yield swept(street, terrain, median, Label.FENCE, Material.CONCRETE, gray)
         for side in (-1, 1):
             y = side * (half + 0.6)
             rail = [(y, 0.45), (y - side * 0.08, 0.52), (y, 0.6), (y - side * 0.08, 0.68), (y, 0.75)]

@@ -37,7 +37,7 @@ class Surface:
     uv: Float
     texture: Int
     material: Int
-    colour: Float
+    color: Float
     footprint: Float
 
     def part(self, which: NDArray[np.intp]) -> Surface:
@@ -53,7 +53,7 @@ class Textures:
         tile = rng.standard_normal((_TILE, _TILE, 3)).astype(np.float32)
         self.tile = cv2.GaussianBlur(tile, (0, 0), 0.8, borderType=cv2.BORDER_REFLECT)
         self.tile /= self.tile.std()
-        self.grey = np.ascontiguousarray(self.tile[..., 0])
+        self.gray = np.ascontiguousarray(self.tile[..., 0])
         self.marking = rng.uniform(0.55, 0.95)
         self.gaudy = rng.uniform(0.04, 0.16)
 
@@ -64,7 +64,7 @@ class Textures:
         xy = np.zeros((max(-(-n // 1024), 1) * 1024, 2), np.float32)
         scaled = at * np.float32(3.0 / wavelength / _TILE)
         xy[:n] = (scaled - np.floor(scaled)) * np.float32(_TILE)
-        tile = self.grey if channels == 1 else self.tile
+        tile = self.gray if channels == 1 else self.tile
         out = cv2.remap(
             tile, xy[:, 0].reshape(-1, 1024), xy[:, 1].reshape(-1, 1024), cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP
         )
@@ -81,7 +81,7 @@ class Textures:
         shade += np.float32(0.10) * fade[1] * self.noise(uv + 11, 0.23)
         shade += np.float32(0.12) * fade[2] * self.noise(uv + 37, 1.13)
         shade += np.float32(0.12) * self.noise(uv + 71, 6.7)
-        out = surface.colour * (1 + strength * shade)[:, None]
+        out = surface.color * (1 + strength * shade)[:, None]
         out *= 1 + np.float32(0.05) * strength[:, None] * self.noise(uv + 101, 2.9, 3)
         for material, paint in _PAINTERS.items():
             which = np.flatnonzero(surface.material == material)
@@ -240,7 +240,7 @@ def _glass(t: Textures, s: Surface, out: Float, uv: Float, _: Terrain) -> Float:
     )
     out = out * (1 - mirror[:, None]) + scene * mirror[:, None]
     frame = np.maximum(_lines(uv[:, 0], 0.73, 0.06, s.footprint), _lines(uv[:, 1], 1.31, 0.06, s.footprint))
-    frame *= s.colour.sum(1) > 0.13  # not on cars
+    frame *= s.color.sum(1) > 0.13  # not on cars
     return out * (1 - frame[:, None]) + 0.6 * frame[:, None]
 
 

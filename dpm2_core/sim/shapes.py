@@ -16,11 +16,11 @@ BOX_FACES = np.array([
 ])  # fmt: skip
 
 
-def box(low: ArrayLike, high: ArrayLike, label: Label, material: Material, colour: ArrayLike) -> Mesh:
+def box(low: ArrayLike, high: ArrayLike, label: Label, material: Material, color: ArrayLike) -> Mesh:
     """An upright box between two corners (3,)."""
     (x, y, z), (X, Y, Z) = np.asarray(low, float), np.asarray(high, float)
     corners = [(x, y, z), (X, y, z), (X, Y, z), (x, Y, z), (x, y, Z), (X, y, Z), (X, Y, Z), (x, Y, Z)]
-    return make(corners, BOX_FACES, label, material, colour)
+    return make(corners, BOX_FACES, label, material, color)
 
 
 def rod(
@@ -30,7 +30,7 @@ def rod(
     sides: int,
     label: Label,
     material: Material,
-    colour: ArrayLike,
+    color: ArrayLike,
 ) -> Mesh:
     """A tapered tube from `start` to `end`, capped at the end."""
     start, end = np.asarray(start, float), np.asarray(end, float)
@@ -45,17 +45,17 @@ def rod(
         np.stack([i, j, j + sides], -1), np.stack([i, j + sides, i + sides], -1),
         np.stack([i + sides, j + sides, np.full(sides, 2 * sides)], -1),
     ])  # fmt: skip
-    return make(points, faces, label, material, colour)
+    return make(points, faces, label, material, color)
 
 
 def blob(
-    centre: ArrayLike,
+    center: ArrayLike,
     radii: ArrayLike,
     rough: float,
     rng: np.random.Generator,
     label: Label,
     material: Material,
-    colour: ArrayLike,
+    color: ArrayLike,
     detail: int = 1,
 ) -> Mesh:
     """An ellipsoid of 20 * 4**detail triangles with its vertices moved in and out by the share `rough`."""
@@ -64,42 +64,42 @@ def blob(
 
     sphere = trimesh.creation.icosphere(subdivisions=detail)
     points = sphere.vertices * (1 + rng.normal(0, rough, (len(sphere.vertices), 1))) * np.asarray(radii) + np.asarray(
-        centre
+        center
     )
-    return make(points, sphere.faces, label, material, colour)
+    return make(points, sphere.faces, label, material, color)
 
 
 def leaves(
-    centres: ArrayLike, size: float, rng: np.random.Generator, colour: ArrayLike, label: Label = Label.VEGETATION
+    centers: ArrayLike, size: float, rng: np.random.Generator, color: ArrayLike, label: Label = Label.VEGETATION
 ) -> Mesh:
     """One randomly turned triangle of about `size` m at each of the centres (N, 3), its brightness random."""
-    centres = np.asarray(centres, float)
-    n = len(centres)
-    corners = centres[:, None] + rng.normal(0, 0.6 * size, (n, 3, 3))
-    shade = rng.uniform(0.65, 1.3, (n, 1)) * np.asarray(colour)
+    centers = np.asarray(centers, float)
+    n = len(centers)
+    corners = centers[:, None] + rng.normal(0, 0.6 * size, (n, 3, 3))
+    shade = rng.uniform(0.65, 1.3, (n, 1)) * np.asarray(color)
     faces = np.arange(3 * n).reshape(n, 3)
     return make(corners.reshape(-1, 3), faces, label, Material.LEAF, shade.clip(0, 255))
 
 
-def extrusion(profile: ArrayLike, y: ArrayLike, label: Label, material: Material, colour: ArrayLike) -> Mesh:
+def extrusion(profile: ArrayLike, y: ArrayLike, label: Label, material: Material, color: ArrayLike) -> Mesh:
     """A closed convex-ish side profile (N, 2) of x, z, stretched across: half widths `y` (N,) at its corners."""
     profile = np.asarray(profile, float)
     n = len(profile)
     y = np.broadcast_to(np.asarray(y, float), n)
     left = np.stack([profile[:, 0], y, profile[:, 1]], -1)
     right = left * (1, -1, 1)
-    centre = np.stack([left.mean(0), right.mean(0)])
-    points = np.concatenate([left, right, centre])
+    center = np.stack([left.mean(0), right.mean(0)])
+    points = np.concatenate([left, right, center])
     i, j = np.arange(n), (np.arange(n) + 1) % n
     faces = np.concatenate([
         np.stack([i, j, j + n], -1), np.stack([i, j + n, i + n], -1),
         np.stack([i, j, np.full(n, 2 * n)], -1), np.stack([i + n, j + n, np.full(n, 2 * n + 1)], -1),
     ])  # fmt: skip
-    return make(points, faces, label, material, colour)
+    return make(points, faces, label, material, color)
 
 
 def relief(
-    x: ArrayLike, z: ArrayLike, depth: ArrayLike, material: ArrayLike, colour: ArrayLike, label: Label = Label.BUILDING
+    x: ArrayLike, z: ArrayLike, depth: ArrayLike, material: ArrayLike, color: ArrayLike, label: Label = Label.BUILDING
 ) -> Mesh:
     """A wall in the xz plane with recesses and bays: what a facade is.
 
@@ -110,11 +110,11 @@ def relief(
     The steps between cells of different depth are walls of the shallower cell's neighbour's colour.
     """
     x, z, depth = np.asarray(x, float), np.asarray(z, float), np.asarray(depth, float)
-    material, colour = np.asarray(material), np.asarray(colour)
+    material, color = np.asarray(material), np.asarray(color)
     i, j = np.indices(depth.shape).reshape(2, -1)
     d = depth.ravel()
     front = _quads(x[i], d, z[j], x[i + 1], d, z[j], x[i + 1], d, z[j + 1], x[i], d, z[j + 1])
-    quads, materials, colours = [front], [material.reshape(-1)], [colour.reshape(-1, 3)]
+    quads, materials, colors = [front], [material.reshape(-1)], [color.reshape(-1, 3)]
     ring = np.pad(depth, ((1, 1), (0, 0)))  # jambs; at the ends down to the plane
     i, j = np.nonzero(np.diff(ring, axis=0))
     quads.append(
@@ -135,7 +135,7 @@ def relief(
     )
     shallow = np.where(ring[i, j] < ring[i + 1, j], np.clip(i - 1, 0, None), np.clip(i, None, len(depth) - 1))
     materials.append(np.full(len(i), Material.PLASTER))
-    colours.append(colour[shallow, j])
+    colors.append(color[shallow, j])
     ring = np.pad(depth, ((0, 0), (1, 1)))  # sills and lintels
     i, j = np.nonzero(np.diff(ring, axis=1))
     quads.append(
@@ -156,11 +156,11 @@ def relief(
     )
     shallow = np.where(ring[i, j] < ring[i, j + 1], np.clip(j - 1, 0, None), np.clip(j, None, depth.shape[1] - 1))
     materials.append(np.full(len(i), Material.CONCRETE))
-    colours.append(colour[i, shallow])
+    colors.append(color[i, shallow])
     points = np.concatenate(quads).reshape(-1, 3)
     corner = np.arange(len(points)).reshape(-1, 4)
     faces = corner[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
-    return make(points, faces, label, np.repeat(np.concatenate(materials), 2), np.repeat(np.concatenate(colours), 2, 0))
+    return make(points, faces, label, np.repeat(np.concatenate(materials), 2), np.repeat(np.concatenate(colors), 2, 0))
 
 
 def _quads(*columns: np.ndarray) -> np.ndarray:
@@ -176,7 +176,7 @@ def turned(mesh: Mesh, yaw: float, to: ArrayLike = (0.0, 0.0, 0.0)) -> Mesh:
         mesh.faces,
         mesh.label,
         mesh.material,
-        mesh.colour,
+        mesh.color,
         mesh.uv,
         mesh.texture,
     )

@@ -59,7 +59,7 @@ class Terrain:
 
     def __init__(self, road: Road, preset: Preset, rng: np.random.Generator) -> None:
         self.preset, self.resolution = preset, RESOLUTION
-        self.centre = np.concatenate([p.xy for p in road.streets])
+        self.center = np.concatenate([p.xy for p in road.streets])
         self.yaw = np.concatenate([p.yaw for p in road.streets])
         offsets = np.cumsum([0.0] + [p.length + 1e3 for p in road.streets])
         self.along = np.concatenate([p.s + o for p, o in zip(road.streets, offsets[:-1], strict=True)])
@@ -67,7 +67,7 @@ class Terrain:
             [np.full(len(p.xy), preset.half_width * (1 if k < road.main else 0.8)) for k, p in enumerate(road.streets)]
         )
         self.junction = self._junctions(road)
-        low, high = self.centre.min(0) - MARGIN, self.centre.max(0) + MARGIN
+        low, high = self.center.min(0) - MARGIN, self.center.max(0) + MARGIN
         # whole 4 m cells
         self.origin = np.floor(low / 4) * 4
         shape = (np.ceil((high - self.origin) / 4) * 4 / RESOLUTION).astype(int) + 1
@@ -78,24 +78,24 @@ class Terrain:
 
     def _junctions(self, road: Road) -> NDArray[np.bool_]:
         reach = 2 * self.preset.half_width + 1
-        pairs = cKDTree(self.centre).query_pairs(reach, output_type="ndarray")
+        pairs = cKDTree(self.center).query_pairs(reach, output_type="ndarray")
         apart = np.abs(self.along[pairs[:, 0]] - self.along[pairs[:, 1]])
         laps = road.streets[0].length if road.drive.closed else np.inf
         pairs = pairs[(apart > 3 * reach) & (np.abs(apart - laps) > 3 * reach)]
-        out = np.zeros(len(self.centre), bool)
+        out = np.zeros(len(self.center), bool)
         out[pairs.ravel()] = True
         return out
 
     def _nearest(self, shape: NDArray[np.int_]) -> NDArray[np.int32]:
         mark = np.full((shape[1], shape[0]), -1, np.int32)
-        column, row = np.rint((self.centre - self.origin) / RESOLUTION).astype(int).T
-        mark[row, column] = np.arange(len(self.centre), dtype=np.int32)
+        column, row = np.rint((self.center - self.origin) / RESOLUTION).astype(int).T
+        mark[row, column] = np.arange(len(self.center), dtype=np.int32)
         at = distance_transform_edt(mark < 0, return_distances=False, return_indices=True)
         return mark[at[0], at[1]]
 
     def _distance(self) -> Array:
-        y = self.origin[1] + np.arange(self.nearest.shape[0])[:, None] * RESOLUTION - self.centre[self.nearest, 1]
-        x = self.origin[0] + np.arange(self.nearest.shape[1])[None] * RESOLUTION - self.centre[self.nearest, 0]
+        y = self.origin[1] + np.arange(self.nearest.shape[0])[:, None] * RESOLUTION - self.center[self.nearest, 1]
+        x = self.origin[0] + np.arange(self.nearest.shape[1])[None] * RESOLUTION - self.center[self.nearest, 0]
         return np.hypot(x, y)
 
     def _heights(self, road: Road, rng: np.random.Generator) -> NDArray[np.float32]:
@@ -103,12 +103,12 @@ class Terrain:
         # long waves are high, short ones low: grades stay such as streets have
         waves = zip(rng.normal(0, 0.001, 6), rng.uniform(60, 300, 6), rng.uniform(0, 6.3, (6, 2)), strict=True)
         z = preset.hills * sum(
-            steep * w * np.sin(2 * np.pi / w * (self.centre @ (np.cos(turn), np.sin(turn))) + phase)
+            steep * w * np.sin(2 * np.pi / w * (self.center @ (np.cos(turn), np.sin(turn))) + phase)
             for steep, w, (turn, phase) in waves
         )
         if road.heights is not None:
             known = np.concatenate(road.heights)
-            beside = cKDTree(self.centre[: len(known)]).query(self.centre[len(known) :])[1]
+            beside = cKDTree(self.center[: len(known)]).query(self.center[len(known) :])[1]
             z = np.concatenate([known, known[beside]])
         height = gaussian_filter(np.asarray(z, np.float32)[self.nearest], 5 / RESOLUTION)
         if preset.roughness > 0:
@@ -164,7 +164,7 @@ class Terrain:
         """Of points (N, 2): m to the left of the nearest street's centre, m along it, and whether at a crossing."""
         sample = self.nearest[self._cell(xy)]
         yaw = self.yaw[sample].astype(xy.dtype)
-        away = xy - self.centre[sample].astype(xy.dtype)
+        away = xy - self.center[sample].astype(xy.dtype)
         c, s = np.cos(yaw), np.sin(yaw)
         along = self.along[sample].astype(xy.dtype) + c * away[:, 0] + s * away[:, 1]
         return c * away[:, 1] - s * away[:, 0], along, self.junction[sample]
@@ -186,7 +186,7 @@ class Terrain:
             sample = self.nearest[self._cell(xy)]
             ahead = np.gradient(xy, axis=0)
             outward = np.stack([-ahead[:, 1], ahead[:, 0]], -1) / np.linalg.norm(ahead, axis=1, keepdims=True)
-            away = np.einsum("ij,ij->i", outward, xy - self.centre[sample])
+            away = np.einsum("ij,ij->i", outward, xy - self.center[sample])
             outward *= np.sign(away + 1e-9)[:, None]
             yield Kerbline(xy, outward, self.junction[sample])
 
@@ -220,8 +220,8 @@ class Terrain:
         paved = self.preset.degenerate | (middle < self.preset.sidewalk)
         label = np.where(road, Label.ROAD, np.where(paved, Label.SIDEWALK, Label.TERRAIN))
         material = np.where(road, Material.ASPHALT, np.where(paved, Material.PAVING, Material.GRASS))
-        colour = np.where(road[:, None], (112, 110, 110), np.where(paved[:, None], (150, 146, 138), (98, 118, 60)))
-        return make(xyz, faces, label, material, colour, xyz[:, :2].astype(np.float32)[faces])
+        color = np.where(road[:, None], (112, 110, 110), np.where(paved[:, None], (150, 146, 138), (98, 118, 60)))
+        return make(xyz, faces, label, material, color, xyz[:, :2].astype(np.float32)[faces])
 
     def _sidewalks(self) -> Iterator[Mesh]:
         if not (width := self.preset.sidewalk):
@@ -243,16 +243,16 @@ def kerbside_ribbon(
     profile: tuple[tuple[float, float], ...],
     label: Label,
     material: Material,
-    colour: ArrayLike,
+    color: ArrayLike,
 ) -> Mesh:
     """A section of (offset outward, height over the ground) points, m, drawn along a line on the terrain."""
     section = np.asarray(profile, float)
     xy = line.xy[:, None] + line.outward[:, None] * section[:, :1]
     z = terrain.height_at(xy.reshape(-1, 2)).reshape(xy.shape[:2]) + section[:, 1]
-    return sheet(np.concatenate([xy, z[..., None]], -1), label, material, colour)
+    return sheet(np.concatenate([xy, z[..., None]], -1), label, material, color)
 
 
-def sheet(points: ArrayLike, label: Label, material: Material, colour: ArrayLike) -> Mesh:
+def sheet(points: ArrayLike, label: Label, material: Material, color: ArrayLike) -> Mesh:
     """A surface through a grid (N, M, 3) of points; surface coordinates are metres along its columns and rows."""
     points = np.asarray(points, float)
     n, m = points.shape[:2]
@@ -263,7 +263,7 @@ def sheet(points: ArrayLike, label: Label, material: Material, colour: ArrayLike
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(middle, axis=0), axis=1))])
     across = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points[n // 2], axis=0), axis=1))])
     uv = np.stack(np.broadcast_arrays(along[:, None], across[None]), -1).reshape(-1, 2)
-    return make(points.reshape(-1, 3), faces, label, material, colour, uv[faces])
+    return make(points.reshape(-1, 3), faces, label, material, color, uv[faces])
 
 
 def _snapped(xy: Array, edge: NDArray[np.float32]) -> tuple[Array, NDArray[np.float32]]:

@@ -53,7 +53,7 @@ class Traffic:
         xy, yaw = drive.at(s, self.lateral)
         return xy, yaw + np.where((self.speed < 0) & ~self.follows, np.pi, 0.0)
 
-    def movers(self, time: float, around: ArrayLike) -> Movers | None:
+    def dynamic_objects(self, time: float, around: ArrayLike) -> DynamicObjects | None:
         """What is in sight of a place (2 or 3,) at a time, s; None if nothing is."""
         if not self.models:
             return None
@@ -64,11 +64,11 @@ class Traffic:
             return None
         poses = pose(xy[seen], self.terrain.surface_at(xy[seen]), yaw[seen])
         meshes = [placed(self.models[k], poses[i : i + 1], k * 101 % 65536) for i, k in enumerate(seen)]
-        return Movers(Scene(merge(meshes)), np.repeat((seen + 1).astype(np.uint16), [len(m) for m in meshes]))
+        return DynamicObjects(Scene(merge(meshes)), np.repeat((seen + 1).astype(np.uint16), [len(m) for m in meshes]))
 
 
 @dataclass(eq=False)
-class Movers:
+class DynamicObjects:
     """What moves, at one time: a scene, and the number (F,) of the mover that each of its triangles belongs to."""
 
     scene: Scene

@@ -23,7 +23,7 @@ from dpm2_core.sim.mesh import Mesh, Scene, merge
 from dpm2_core.sim.road import Road, make_road
 from dpm2_core.sim.settings import PRESET_NAMES, PRESETS, Preset, PresetName, varied, with_traffic
 from dpm2_core.sim.terrain import Terrain
-from dpm2_core.sim.traffic import Movers, Traffic, make_traffic
+from dpm2_core.sim.traffic import DynamicObjects, Traffic, make_traffic
 
 Array = NDArray[np.float64]
 
@@ -89,9 +89,9 @@ class World:
         )
         return T @ se3.make(tilt, np.zeros(3)), time
 
-    def movers(self, time: float, around: ArrayLike) -> Movers | None:
+    def dynamic_objects(self, time: float, around: ArrayLike) -> DynamicObjects | None:
         """What moves in sight of a place (2 or 3,) at a time, s; None if nothing does."""
-        return self.traffic.movers(time, around)
+        return self.traffic.dynamic_objects(time, around)
 
 
 def build_world(

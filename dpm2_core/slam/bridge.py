@@ -40,9 +40,9 @@ def predicted(T: Array, twist: Array, seconds: float) -> Array:
 
 def covariance(speed: float, seconds: float, acceleration: float) -> Array:
     """Covariance (6, 6) [rad, m] of the pose that `predicted` gives; no heading is worse than any heading."""
-    metres = 0.5 * seconds * _change(speed, seconds, acceleration)
+    meters = 0.5 * seconds * _change(speed, seconds, acceleration)
     heading = min(_TURN * seconds, np.pi / np.sqrt(3))
-    return np.diag([_TILT * heading, _TILT * heading, heading, metres, metres, metres]) ** 2
+    return np.diag([_TILT * heading, _TILT * heading, heading, meters, meters, meters]) ** 2
 
 
 def _change(speed: float, seconds: float, acceleration: float) -> float:

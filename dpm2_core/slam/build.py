@@ -7,8 +7,8 @@ from dpm2_core.network.pretrained import load_network
 from dpm2_core.slam.filters import make_filter
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.loops.closure import LoopCloser
-from dpm2_core.slam.loops.localizer import Localiser
-from dpm2_core.slam.loops.relocalization import Relocaliser
+from dpm2_core.slam.loops.localizer import Localizer
+from dpm2_core.slam.loops.relocalization import Relocalizer
 from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.odometry.keyframe_selection import KeyframeSelector
 from dpm2_core.slam.odometry.odometry import Odometry
@@ -52,17 +52,17 @@ def make_mapper(s: SlamSettings, store: MapStore | None = None) -> Mapper:
     return Mapper(s.map, PoseGraph(s.pose_graph), make_loops(s), store)
 
 
-def make_localiser(s: SlamSettings, mapper: Mapper) -> Localiser:
+def make_localizer(s: SlamSettings, mapper: Mapper) -> Localizer:
     """Finds keyframes in the map that a mapper has loaded.
 
     Raises:
         UsageError: the network has no weights to run with.
     """
     network = load_network(s.neural.weights, s.threads, s.neural.preset)
-    relocaliser = Relocaliser(
+    relocalizer = Relocalizer(
         s.relocalise, s.geometric, network, mapper.keyframes, mapper.clouds, mapper.poses, s.threads
     )
-    return Localiser(relocaliser, s.relocalise.max_failures)
+    return Localizer(relocalizer, s.relocalise.max_failures)
 
 
 def make_loops(s: SlamSettings) -> LoopCloser:

@@ -20,7 +20,7 @@ from dpm2_core.network.pretrained import PERCEPTION_WEIGHTS, PRETRAINED_DIR
 
 if TYPE_CHECKING:  # torch takes seconds to import, and the geometric SLAM does without
     from dpm2_core.network.perception.dslr import Dslr
-    from dpm2_core.network.perception.dynamic_objects import MoverNet
+    from dpm2_core.network.perception.dynamic_objects import DynamicObjectNet
     from dpm2_core.network.perception.gndnet import GroundNet
 
 
@@ -47,10 +47,10 @@ class PointFilter(Protocol):
     def __call__(self, points: Points) -> Points: ...
 
 
-class MoverFilter:
+class DynamicObjectFilter:
     """Leaves out what moves or could; see `network.movers`."""
 
-    def __init__(self, net: MoverNet, threshold: float, most: float) -> None:
+    def __init__(self, net: DynamicObjectNet, threshold: float, most: float) -> None:
         self._net, self._threshold, self._most = net, threshold, most
 
     def __call__(self, points: Points) -> Points:
@@ -111,7 +111,7 @@ def make_filter(settings: FilterSettings, threads: int) -> PointFilter | None:
     if settings.kind == "movers":
         from dpm2_core.network.perception import dynamic_objects
 
-        return MoverFilter(dynamic_objects.load(path), settings.threshold, settings.most)
+        return DynamicObjectFilter(dynamic_objects.load(path), settings.threshold, settings.most)
     if settings.kind == "ground":
         from dpm2_core.network.perception import gndnet
 

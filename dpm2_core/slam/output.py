@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from dpm2_core.data.ply import write_ply
 from dpm2_core.data.trajectory import write_tum
-from dpm2_core.frame import Array, Tracked
+from dpm2_core.frame import Array, OdometryResult
 from dpm2_core.geometry import se3
 from dpm2_core.slam.mapping.mapper import Mapper
 
@@ -28,7 +28,7 @@ class TrajectoryRecorder:
     def __len__(self) -> int:
         return len(self.stamps)
 
-    def add(self, tracked: Tracked) -> None:
+    def add(self, tracked: OdometryResult) -> None:
         """Take in the result of the next frame."""
         if tracked.keyframe is not None:
             self._keyframe.append(len(self.stamps))

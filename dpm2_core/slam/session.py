@@ -42,7 +42,7 @@ def open_session(path: Path, settings: SlamSettings, config: str, resume: bool) 
     return store
 
 
-def open_for_localisation(path: Path, settings: SlamSettings) -> MapStore:
+def open_for_localization(path: Path, settings: SlamSettings) -> MapStore:
     """The map file to find oneself in, open for reading only.
 
     Raises:

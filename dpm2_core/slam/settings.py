@@ -12,7 +12,7 @@ from dpm2_core.data.settings import InputSettings
 from dpm2_core.slam.filters import FilterSettings
 from dpm2_core.slam.graph.pose_graph import PoseGraphSettings
 from dpm2_core.slam.loops.closure import LoopSettings
-from dpm2_core.slam.loops.relocalization import RelocaliseSettings
+from dpm2_core.slam.loops.relocalization import RelocalizationSettings
 from dpm2_core.slam.mapping.mapper import MapSettings
 from dpm2_core.slam.odometry.keyframe_selection import KeyframeSettings
 from dpm2_core.slam.odometry.odometry import OdometrySettings
@@ -39,7 +39,7 @@ class SlamSettings(Settings):
     odometry: OdometrySettings = OdometrySettings()
     keyframes: KeyframeSettings = KeyframeSettings()
     loops: LoopSettings = LoopSettings()
-    relocalise: RelocaliseSettings = RelocaliseSettings()
+    relocalise: RelocalizationSettings = RelocalizationSettings()
     pose_graph: PoseGraphSettings = PoseGraphSettings()
     map: MapSettings = MapSettings()
 

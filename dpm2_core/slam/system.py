@@ -5,9 +5,9 @@ from __future__ import annotations
 
 from time import perf_counter
 
-from dpm2_core.frame import Frame, Tracked
-from dpm2_core.slam.build import make_localiser, make_mapper, make_odometry
-from dpm2_core.slam.loops.localizer import Located
+from dpm2_core.frame import Frame, OdometryResult
+from dpm2_core.slam.build import make_localizer, make_mapper, make_odometry
+from dpm2_core.slam.loops.localizer import LocalizationResult
 from dpm2_core.slam.mapping.thumbnail import thumbnail
 from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.slam.store.map_store import MapStore
@@ -22,7 +22,7 @@ class SlamSystem:
         self.odometry = make_odometry(self._settings, robot)
         self.mapper = make_mapper(self._settings, store)
 
-    def process(self, frame: Frame) -> Tracked:
+    def process(self, frame: Frame) -> OdometryResult:
         """Take one frame in: its pose in the odometry frame, and the map one keyframe richer when it shows enough."""
         tracked = self.odometry.process(frame)
         started = perf_counter()
@@ -37,24 +37,24 @@ class SlamSystem:
         self.mapper = make_mapper(self._settings)
 
 
-class LocalisationSystem:
+class LocalizationSystem:
     """One robot in a map that stays as it is: `odometry` runs on every frame, `localiser` on every keyframe."""
 
     def __init__(self, settings: SlamSettings, store: MapStore, robot: str = "") -> None:
         """`store`: the map file, open for reading only, see `open_for_localisation`."""
         self.odometry = make_odometry(settings, robot)
         self.mapper = make_mapper(settings, store)
-        self.localiser = make_localiser(settings, self.mapper)
+        self.localizer = make_localizer(settings, self.mapper)
 
-    def process(self, frame: Frame) -> tuple[Tracked, Located | None]:
+    def process(self, frame: Frame) -> tuple[OdometryResult, LocalizationResult | None]:
         """Take one frame in: its pose in the odometry frame, and, when it became a keyframe, its place in the map.
 
         While the localiser's `state.located`, `T_map_odom @ T_odom_lidar` is the frame's pose in the map.
         """
-        if self.localiser.wants(frame.stamp):
+        if self.localizer.wants(frame.stamp):
             self.odometry.request_keyframe()
         tracked = self.odometry.process(frame)
         started = perf_counter()
-        located = None if tracked.keyframe is None else self.localiser.add(tracked.keyframe)
+        located = None if tracked.keyframe is None else self.localizer.add(tracked.keyframe)
         tracked.seconds["localise"] = perf_counter() - started
         return tracked, located

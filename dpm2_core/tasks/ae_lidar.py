@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from dpm2_core.config import Settings
 from dpm2_core.errors import UsageError
-from dpm2_core.network.perception.dslr import down, initialise, up
+from dpm2_core.network.perception.dslr import down, initialize, up
 from dpm2_core.network.perception.range_image import CHANNELS, RangeImageSettings
 from dpm2_core.network.perception.task_weights import load_network
 
@@ -70,7 +70,7 @@ class LidarAutoencoder(nn.Module):
             nn.ConvTranspose2d(c, CHANNELS, 4, 2, 1, bias=False),
             nn.Tanh(),
         )
-        self.apply(initialise)
+        self.apply(initialize)
 
     def encode(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Codes (B, latent), drawn in training and the mean otherwise if variational, and their divergence (B,).

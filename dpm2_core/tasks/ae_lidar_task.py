@@ -56,12 +56,12 @@ class AeLidarTask(Task):
         super().__init__(settings)
         self.network = LidarAutoencoder(settings.network)
         self.slam_loss = SlamLoss(settings.slam_loss)
-        self._share = 0.0  # of the divergence that counts
+        self._ratio = 0.0  # of the divergence that counts
         self._reader = RangeReader(settings.network.image)
 
     def start_epoch(self, epoch: int) -> None:
         """The divergence counts for more with every epoch."""
-        self._share = min(1.0, (epoch + 1) / self.settings.divergence_warmup)
+        self._ratio = min(1.0, (epoch + 1) / self.settings.divergence_warmup)
 
     def losses(self, window: list[TaskScan]) -> tuple[Tensor, Callable[[], Tensor] | None]:
         """Sum of absolute errors, and divergence; SLAM on what was made against SLAM on the scans."""
@@ -69,7 +69,7 @@ class AeLidarTask(Task):
         made, divergence = self.network(scans.images)
         loss = image_error(made, scans.images)
         if self.settings.network.variational:
-            loss = loss + self._share * divergence.clamp(min=_LEAST_DIVERGENCE).mean()
+            loss = loss + self._ratio * divergence.clamp(min=_LEAST_DIVERGENCE).mean()
         scale = self.settings.network.image.scale
         return loss, lambda: slam_of(self.slam_loss, made, scans, scale, self.windows(len(made)))
 
@@ -94,7 +94,7 @@ class AeLidarTask(Task):
         scans, scale = self._reader.read([scan]), self.settings.network.image.scale
         return {"output": clouds(self._made(scans), scale)[0], "input": clouds(scans, scale)[0]}
 
-    def picture(self, scan: TaskScan, path: Path) -> None:
+    def figure(self, scan: TaskScan, path: Path) -> None:
         """The scan and its reconstruction: range images, and seen from above."""
         from dpm2_core.tasks.range_figure import range_png  # matplotlib is slow to import
 

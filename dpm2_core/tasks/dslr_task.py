@@ -95,8 +95,8 @@ class DslrTask(Task):
         if self.stage == 2:
             codes, moved = network.static_encoder(torch.cat([static.images, dynamic.images])).chunk(2)
             made = network.decoder(torch.cat([codes, moved]))
-            pairs = _verdict(network.discriminator(codes, codes[other]), 1.0)
-            pairs = pairs + _verdict(network.discriminator(codes[other], moved), 0.0)
+            pairs = _adversarial_loss(network.discriminator(codes, codes[other]), 1.0)
+            pairs = pairs + _adversarial_loss(network.discriminator(codes[other], moved), 0.0)
             return image_error(
                 made, torch.cat([static.images, dynamic.images])
             ) + self.settings.adversarial * pairs, None
@@ -104,7 +104,7 @@ class DslrTask(Task):
             codes = network.static_encoder(static.images)
         moved = network.dynamic_encoder(dynamic.images)
         made = network.decoder(moved)
-        passes = _verdict(network.discriminator(codes[other], moved), 1.0)
+        passes = _adversarial_loss(network.discriminator(codes[other], moved), 1.0)
 
         def slam() -> Tensor:
             return slam_of(self.slam_loss, made, static, self.settings.network.image.scale, self.windows(len(made)))
@@ -128,12 +128,12 @@ class DslrTask(Task):
             images["target_varies_m"].append(static.images)
             for i in range(len(part)):
                 of = static.part(i, i + 1)
-                row = self._judged(made.part(i, i + 1), dynamic.part(i, i + 1), of)
-                before = self._judged(dynamic.part(i, i + 1), dynamic.part(i, i + 1), of)
+                row = self._compared(made.part(i, i + 1), dynamic.part(i, i + 1), of)
+                before = self._compared(dynamic.part(i, i + 1), dynamic.part(i, i + 1), of)
                 rows.append(row | {f"input_{name}": value for name, value in before.items()})
         return mean_figures(rows) | {name: variety(of, scale) for name, of in images.items()}
 
-    def _judged(self, found: RangeScans, dynamic: RangeScans, static: RangeScans) -> dict[str, float]:
+    def _compared(self, found: RangeScans, dynamic: RangeScans, static: RangeScans) -> dict[str, float]:
         scale = self.settings.network.image.scale
         moved = dynamic.masks & static.masks & ((dynamic.images - static.images)[:, 0].abs() * scale > _MOVED)
         error = (found.images - static.images)[:, 0].abs()[moved] * scale
@@ -150,7 +150,7 @@ class DslrTask(Task):
         kinds = {"output": made, "kept": kept, "input": dynamic, "target": static}
         return {name: clouds(of, scale)[0] for name, of in kinds.items()}
 
-    def picture(self, scan: TaskScan, path: Path) -> None:
+    def figure(self, scan: TaskScan, path: Path) -> None:
         """The scan, its translation and its static twin: range images, and seen from above."""
         from dpm2_core.tasks.range_figure import range_png  # matplotlib is slow to import
 
@@ -163,5 +163,5 @@ class DslrTask(Task):
         range_png(path, rows, self.settings.network.image.scale, f"DSLR: {scan.sequence}, scan {scan.number}")
 
 
-def _verdict(logits: Tensor, wanted: float) -> Tensor:
+def _adversarial_loss(logits: Tensor, wanted: float) -> Tensor:
     return functional.binary_cross_entropy_with_logits(logits, torch.full_like(logits, wanted))

@@ -12,7 +12,9 @@ from dpm2_core.extras import needs
 from dpm2_core.files import atomic_write
 
 
-def movers_png(path: Path, points: NDArray[np.float32], found: NDArray[np.bool_], truth: NDArray[np.bool_]) -> None:
+def dynamic_objects_png(
+    path: Path, points: NDArray[np.float32], found: NDArray[np.bool_], truth: NDArray[np.bool_]
+) -> None:
     """Points (N, 3+) from above, x upwards, with what was found to be a mover (N,) and what is one (N,).
 
     Raises:

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dpm2_core.errors import UsageError
-from dpm2_core.network.perception.dynamic_objects import MoverNet, MoverNetSettings, occupancy, voxels
+from dpm2_core.network.perception.dynamic_objects import DynamicObjectNet, DynamicObjectNetSettings, occupancy, voxels
 from dpm2_core.tasks.ground_task import UNCOUNTED
 from dpm2_core.tasks.scan import TaskScan, TaskScans
 from dpm2_core.tasks.task import Task, TaskTraining
@@ -26,10 +26,10 @@ FIRST_MOVING = 252
 """The same while they move have this number and higher ones."""
 
 
-class MoverTraining(TaskTraining):
+class DynamicObjectTraining(TaskTraining):
     """A training of the movers."""
 
-    network: MoverNetSettings = MoverNetSettings()
+    network: DynamicObjectNetSettings = DynamicObjectNetSettings()
     """Grid and network."""
     epochs: int = Field(default=14, ge=1)
     window: int = Field(default=2, ge=2)
@@ -40,17 +40,17 @@ class MoverTraining(TaskTraining):
     """At most this share of a scan's points is left out, another one each time: sparser sensors."""
 
 
-class MoverTask(Task):
+class DynamicObjectTask(Task):
     """Points of movers, by the voxels that they are in."""
 
     name = "movers"
-    training_type = MoverTraining
+    training_type = DynamicObjectTraining
     needs = ("labels",)
-    settings: MoverTraining
+    settings: DynamicObjectTraining
 
-    def __init__(self, settings: MoverTraining) -> None:
+    def __init__(self, settings: DynamicObjectTraining) -> None:
         super().__init__(settings)
-        self.net = MoverNet(settings.network)
+        self.net = DynamicObjectNet(settings.network)
 
     def losses(self, window: list[TaskScan]) -> tuple[Tensor, Callable[[], Tensor] | None]:
         """Cross-entropy over the occupied voxels, each by the root of how many points it has; turned and mirrored."""
@@ -82,18 +82,18 @@ class MoverTask(Task):
                        (found & moving).sum(), moving.sum()]  # fmt: skip
         right, false, missed, right_moving, moving_all = counts
         return {
-            "iou": _share(right, right + false + missed),
-            "precision": _share(right, right + false),
-            "recall": _share(right, right + missed),
-            "recall_moving": _share(right_moving, moving_all),
+            "iou": _ratio(right, right + false + missed),
+            "precision": _ratio(right, right + false),
+            "recall": _ratio(right, right + missed),
+            "recall_moving": _ratio(right_moving, moving_all),
         }
 
-    def picture(self, scan: TaskScan, path: Path) -> None:
+    def figure(self, scan: TaskScan, path: Path) -> None:
         """The scan from above, what was found, missed and wrongly found in colours."""
-        from dpm2_core.tasks.dynamic_objects_figure import movers_png  # matplotlib is slow to import
+        from dpm2_core.tasks.dynamic_objects_figure import dynamic_objects_png  # matplotlib is slow to import
 
         points, movable, counted = _arrays(scan)
-        movers_png(path, points[counted], self.net.probability(points)[counted] > 0.5, movable[counted])
+        dynamic_objects_png(path, points[counted], self.net.probability(points)[counted] > 0.5, movable[counted])
 
 
 def _arrays(scan: TaskScan) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]:
@@ -117,5 +117,5 @@ def _turned(points: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.concatenate([points[:, :2] @ turn.T, points[:, 2:]], 1)
 
 
-def _share(part: float, whole: float) -> float:
+def _ratio(part: float, whole: float) -> float:
     return float(part / whole) if whole else math.nan

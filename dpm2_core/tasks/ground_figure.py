@@ -35,14 +35,14 @@ def ground_png(path: Path, found: Tensor, truth: Tensor, points: Tensor, setting
     views = (("elevation found, points above it", found, (low, high), "viridis"),
              ("elevation of the labels", truth, (low, high), "viridis"),
              ("found - labels", found - truth, (-0.3, 0.3), "RdBu"))  # fmt: skip
-    for axes, (title, grid, (lowest, highest), colours) in zip(figure.subplots(1, 3), views, strict=True):
+    for axes, (title, grid, (lowest, highest), colors) in zip(figure.subplots(1, 3), views, strict=True):
         image = axes.imshow(
             grid.cpu().numpy(),
             extent=(-half, half, -half, half),
             origin="lower",
             vmin=lowest,
             vmax=highest,
-            cmap=colours,
+            cmap=colors,
         )
         figure.colorbar(image, ax=axes, label="m", shrink=0.8)
         axes.set(title=title, xlabel="y, m", xlim=(half, -half), ylim=(-half, half))

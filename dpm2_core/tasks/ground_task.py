@@ -108,7 +108,7 @@ class GroundTask(Task):
             rows.append(ground_metrics(scan.points, ground, counted, elevation, self.settings.network))
         return mean_figures(rows)
 
-    def picture(self, scan: TaskScan, path: Path) -> None:
+    def figure(self, scan: TaskScan, path: Path) -> None:
         """Predicted elevation beside the true one, both with what stands on it, seen from above."""
         from dpm2_core.tasks.ground_figure import ground_png  # matplotlib is slow to import
 

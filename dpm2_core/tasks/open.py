@@ -8,11 +8,11 @@ from pathlib import Path
 
 from dpm2_core.errors import UsageError
 from dpm2_core.tasks.pairs import open_pairs
-from dpm2_core.tasks.scan import Need, ScanSequence, TaskScans
+from dpm2_core.tasks.scan import RequiredData, ScanSequence, TaskScans
 from dpm2_core.tasks.semantic_kitti import kitti_runs, sequence_folders
 
 
-def open_scans(path: Path | str, needs: Sequence[Need] = ()) -> TaskScans:
+def open_scans(path: Path | str, needs: Sequence[RequiredData] = ()) -> TaskScans:
     """The scans below a folder: a sequence, a data set of sequences/NN, or a folder of such; or pairs as DSLR has them.
 
     A gap in the numbers of the scans ends a sequence: what lies across it is no motion from one scan to the next.

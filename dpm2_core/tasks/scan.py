@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-Need = Literal["labels", "static"]
+RequiredData = Literal["labels", "static"]
 """What a task cannot do without."""
 
 

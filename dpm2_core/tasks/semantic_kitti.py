@@ -16,7 +16,7 @@ import torch
 from numpy.typing import DTypeLike
 
 from dpm2_core.errors import UsageError
-from dpm2_core.tasks.scan import Need, TaskScan
+from dpm2_core.tasks.scan import RequiredData, TaskScan
 
 _BYTES = {"velodyne": 16, "static": 16, "labels": 4}
 """Of a point in a file of that folder."""
@@ -32,7 +32,7 @@ def sequence_folders(path: Path) -> list[Path]:
     return sorted(found)
 
 
-def kitti_runs(folder: Path, root: Path, needs: Sequence[Need]) -> list[_KittiRun]:
+def kitti_runs(folder: Path, root: Path, needs: Sequence[RequiredData]) -> list[_KittiRun]:
     """Its scans, cut where numbers are missing; the files are there and have the right length."""
     numbers = sorted(int(p.stem) for p in (folder / "velodyne").glob("*.bin") if p.stem.isdecimal())
     if not numbers:

@@ -17,13 +17,13 @@ from dpm2_core.config import Settings
 from dpm2_core.diffslam.schedule import ScheduleSettings, is_due
 from dpm2_core.diffslam.trajectory_loss import SlamLossSettings
 from dpm2_core.errors import UsageError
-from dpm2_core.tasks.scan import Need, TaskScan, TaskScans
+from dpm2_core.tasks.scan import RequiredData, TaskScan, TaskScans
 
 TASKS = {
     "gndnet": "dpm2_core.tasks.ground_task:GroundTask",
     "dslr": "dpm2_core.tasks.dslr_task:DslrTask",
     "ae_lidar": "dpm2_core.tasks.ae_lidar_task:AeLidarTask",
-    "movers": "dpm2_core.tasks.dynamic_objects_task:MoverTask",
+    "movers": "dpm2_core.tasks.dynamic_objects_task:DynamicObjectTask",
 }
 """Where the task of each name is; imported when it is asked for."""
 
@@ -83,7 +83,7 @@ class Task(nn.Module, ABC):
     """As in `TASKS`."""
     training_type: ClassVar[type[TaskTraining]]
     """Its settings."""
-    needs: ClassVar[Sequence[Need]] = ()
+    needs: ClassVar[Sequence[RequiredData]] = ()
     """What its scans must have."""
 
     def __init__(self, settings: TaskTraining) -> None:
@@ -104,7 +104,7 @@ class Task(nn.Module, ABC):
         """Figures over all scans; called in eval mode without gradient, see `training.measure`."""
 
     @abstractmethod
-    def picture(self, scan: TaskScan, path: Path) -> None:
+    def figure(self, scan: TaskScan, path: Path) -> None:
         """Draw what the network makes of a scan beside what it should; called as `evaluate`."""
 
     def clouds(self, scan: TaskScan) -> dict[str, Tensor]:

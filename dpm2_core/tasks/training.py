@@ -16,7 +16,7 @@ from dpm2_core.diffslam.schedule import total_loss
 from dpm2_core.diffslam.windows import ContiguousWindows
 from dpm2_core.errors import UsageError
 from dpm2_core.learning.checkpoint import load_checkpoint
-from dpm2_core.learning.trainer import OptimiserSettings, train
+from dpm2_core.learning.trainer import OptimizerSettings, train
 from dpm2_core.network.perception.task_weights import load_strictly, read_weights, write_weights
 from dpm2_core.tasks.scan import TaskScan, TaskScans
 from dpm2_core.tasks.task import SlamTaskTraining, Task, TaskTraining, task_type
@@ -55,7 +55,7 @@ def train_task(
     def loss(module: nn.Module, batch: _Batch, step: int) -> tuple[Tensor, dict[str, Tensor]]:
         return eq1(task, batch.scans, batch.epoch, settings)
 
-    optimiser = OptimiserSettings(
+    optimiser = OptimizerSettings(
         steps=settings.epochs * epoch, rate=settings.rate, final_rate=settings.final_rate, warmup=settings.warmup,
         decay=settings.decay, clip=settings.clip, ema=0.0, seed=settings.seed, compile=False, bf16=False,
         save_every=epoch, validate_every=settings.validate_every * epoch,
@@ -110,7 +110,7 @@ def draw(task: Task, scans: TaskScans, index: int, path: Path) -> None:
     """
     if not 0 <= index < len(scans):
         raise UsageError(f"scan {index}: there are {len(scans)}, counted from 0")
-    task.eval().picture(scans[index].to(task.device), path)
+    task.eval().figure(scans[index].to(task.device), path)
 
 
 def save_task(task: Task, path: Path, about: dict[str, str], half: bool = False) -> None:

@@ -3,4 +3,4 @@
 
 from __future__ import annotations
 
-from ..dpm2_core.conftest import _picture, _street, model, noise  # noqa: F401
+from ..dpm2_core.conftest import _make_image, _street, model, noise  # noqa: F401

@@ -15,7 +15,7 @@ import pytest
 
 from benchmarks.harness import Options, drives, processors
 from benchmarks.memory import levelling
-from benchmarks.pairs import pairs_of, summarised
+from benchmarks.pairs import pairs_of, summarized
 from dpm2_core.commands.bench import bench
 from dpm2_core.data.packed import Sample, write_packed
 from dpm2_core.data.trajectory import write_kitti
@@ -159,12 +159,12 @@ def test_the_neural_benchmark_measures_pairs_odometry_and_stages(
     model: DeepPointMap2,
     street: Callable[..., np.ndarray],
     noise: np.random.Generator,
-    picture: Callable[..., Image],
+    make_image: Callable[..., Image],
 ) -> None:
     """With random weights: the classical methods beside it are right, and refined falls back on points."""
     save_weights(model, tmp_path / "tiny.safetensors", {"steps": "0", "images": "true", "phase": "2"})
     poses = se3.exp(np.outer(np.arange(4.0), [0, 0, 0.1, 3, 0, 0]))
-    samples = [Sample(street(noise), T, (picture(noise),)) for T in poses]
+    samples = [Sample(street(noise), T, (make_image(noise),)) for T in poses]
     write_packed(tmp_path / "unseen" / "world", samples, {})
     bench(
         ["neural"], source=[drive], out=tmp_path, repetitions=1, threads=1, pairs=3,
@@ -218,10 +218,10 @@ def test_pairs_are_of_their_kind_and_have_a_true_pose() -> None:
 
 def test_a_pair_without_an_answer_is_a_failure() -> None:
     rows = np.array([[0.1, 0.2], [0.1, 2.0], [np.inf, np.inf], [0.3, 0.4]])
-    assert summarised(rows) == {
+    assert summarized(rows) == {
         "pairs": 4,
         "median_m": pytest.approx(0.2),
         "median_deg": pytest.approx(1.2),
         "success": 0.5,
     }
-    assert summarised(rows[2:3])["median_m"] is None
+    assert summarized(rows[2:3])["median_m"] is None

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from benchmarks.harness import Options
-from benchmarks.loops import judge_loops, revisits
-from benchmarks.relocalise import judged
+from benchmarks.loops import check_loops, revisits
+from benchmarks.relocalise import success_rates
 from benchmarks.roads import road_files
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, LoopClosure, Registration
@@ -52,7 +52,7 @@ def test_wrong_loops_and_found_revisits_are_told_apart() -> None:
         closure(2, 39, T(2, 39)), closure(3, 38, T(3, 38) @ off), closure(4, 37, T(4, 37) @ turned),
         closure(5, 36, T(5, 36), ok=False), closure(6, 35, T(6, 35) @ off, ok=False),
     ]  # fmt: skip
-    result = judge_loops(closures, truth)
+    result = check_loops(closures, truth)
     assert (result["tried"], result["accepted"], result["wrong"]) == (5, 3, 2)
     assert result["reverse"] == {"revisits": 16, "found": 1}  # what was refused, or was wrong, found nothing
     assert result["refusals"] == {"only fit": 2}
@@ -60,7 +60,7 @@ def test_wrong_loops_and_found_revisits_are_told_apart() -> None:
 
 def test_an_answer_is_right_wrong_or_none() -> None:
     rows = [(True, 0.1, 0.2, 0.1), (True, 0.4, 0.2, 0.1), (True, 0.1, 1.2, 0.1), (False, 0.0, 0.0, 0.2)]
-    result = judged(rows)
+    result = success_rates(rows)
     assert (result["right"], result["wrong"], result["no_answer"]) == (0.25, 2, 1)
 
 

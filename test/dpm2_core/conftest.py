@@ -48,16 +48,16 @@ def street(noise: np.random.Generator, points: int = 4000) -> np.ndarray:
     parts = [ground]
     boxes = 25
     for _ in range(boxes):
-        centre = np.append(noise.uniform(-35, 35, 2), -1.7)
+        center = np.append(noise.uniform(-35, 35, 2), -1.7)
         half = noise.uniform([1, 1, 1], [5, 5, 8])
         side = noise.uniform(-1, 1, (points // 2 // boxes, 3))
         axis = noise.integers(0, 2, len(side))
         side[np.arange(len(side)), axis] = np.sign(side[np.arange(len(side)), axis])
-        parts.append(centre + side * half)
+        parts.append(center + side * half)
     return np.concatenate(parts).astype(np.float32)
 
 
-def picture(noise: np.random.Generator, size: tuple[int, int] = (128, 64)) -> Image:
+def make_image(noise: np.random.Generator, size: tuple[int, int] = (128, 64)) -> Image:
     """A forward-looking camera with a random picture, (width, height)."""
     K = np.array([[60.0, 0, size[0] / 2 - 0.5], [0, 60.0, size[1] / 2 - 0.5], [0, 0, 1]])
     T_lidar_cam = se3.make([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0.3, 0.05, -0.1])
@@ -77,10 +77,10 @@ def _street() -> Callable[..., np.ndarray]:
     return street
 
 
-@pytest.fixture(name="picture")
-def _picture() -> Callable[..., Image]:
+@pytest.fixture(name="make_image")
+def _make_image() -> Callable[..., Image]:
     """picture(noise, size=(128, 64)): a picture with its camera."""
-    return picture
+    return make_image
 
 
 @pytest.fixture
@@ -123,8 +123,8 @@ def map_file(tmp_path: Path, drive: list[Keyframe]) -> Path:
                 change.edges.append(Edge("odometry", node - 1, node, *told, True, 0.9, 0.05, "test"))
             store.write(change)
         T = se3.inverse(drive[2].T_odom_kf) @ drive[11].T_odom_kf
-        refused = Edge("loop", 0, 11, np.eye(4), np.eye(6), False, 0.1, np.inf, "test", "too far")
-        store.write(Change(edges=[Edge("loop", 2, 11, T, np.eye(6) * 1e-4, method="test"), refused]))
+        rejected = Edge("loop", 0, 11, np.eye(4), np.eye(6), False, 0.1, np.inf, "test", "too far")
+        store.write(Change(edges=[Edge("loop", 2, 11, T, np.eye(6) * 1e-4, method="test"), rejected]))
     return path
 
 

@@ -18,7 +18,7 @@ from dpm2_core.data.settings import InputSettings
 from dpm2_core.errors import UsageError
 
 
-class Colour(StrEnum):
+class Color(StrEnum):
     RED = "red"
     BLUE = "blue"
 
@@ -28,7 +28,7 @@ class Inner(Settings):
     """Edge of a voxel, m."""
 
     names: tuple[str, ...] = ()
-    colour: Colour = Colour.RED
+    colour: Color = Color.RED
 
 
 class Middle(Settings):
@@ -60,7 +60,7 @@ def _file(tmp_path: Path, text: str) -> Path:
 
 texts = st.text(st.characters(codec="utf-8", exclude_categories=["Cs"]), max_size=30)
 inners = st.builds(
-    Inner, voxel=st.floats(1e-12, 1e12), names=st.lists(texts, max_size=3).map(tuple), colour=st.sampled_from(Colour)
+    Inner, voxel=st.floats(1e-12, 1e12), names=st.lists(texts, max_size=3).map(tuple), colour=st.sampled_from(Color)
 )
 
 

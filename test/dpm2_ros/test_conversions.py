@@ -14,7 +14,7 @@ from hypothesis.extra import numpy as hnp
 from dpm2_core.data.messages import decode_points, stamp_ns
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.errors import UsageError
-from dpm2_core.frame import Array, Keyframe, Registration, State, Tracked
+from dpm2_core.frame import Array, Keyframe, OdometryResult, Registration, State
 from dpm2_core.geometry import se3
 from dpm2_ros import conversions
 
@@ -27,9 +27,9 @@ def spd(seed: int) -> Array:
     return A @ A.T
 
 
-def tracked(T: Array, keyframe: Keyframe | None = None) -> Tracked:
+def tracked(T: Array, keyframe: Keyframe | None = None) -> OdometryResult:
     registration = Registration(T, spd(1), 0.9, 0.1, "geometric")
-    return Tracked(5, 0, T, spd(2), np.arange(6.0), State.TRACKING, registration, keyframe)
+    return OdometryResult(5, 0, T, spd(2), np.arange(6.0), State.TRACKING, registration, keyframe)
 
 
 @given(hnp.arrays(np.float32, st.tuples(st.integers(0, 50), st.just(4)), elements=st.floats(0, 1, width=32)))

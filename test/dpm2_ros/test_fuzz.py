@@ -33,7 +33,7 @@ from dpm2_core.data.messages import stamp_ns
 from dpm2_core.data.open import open_source
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.transforms import transform_matrix
-from dpm2_core.frame import Frame, Tracked
+from dpm2_core.frame import Frame, OdometryResult
 from dpm2_core.slam.build import make_odometry
 from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.slam.store.cloud_codec import pack_cloud, unpack_cloud
@@ -216,7 +216,7 @@ def scans(street: Path) -> list[np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def alone(scans: list[np.ndarray]) -> list[Tracked]:
+def alone(scans: list[np.ndarray]) -> list[OdometryResult]:
     """What the odometry makes of the drive with nobody else about."""
     odometry = make_odometry(SlamSettings.model_validate(SETTINGS), "red")
     return [odometry.process(Frame(START + n * 10**8, points, index=n)) for n, points in enumerate(scans)]
@@ -292,7 +292,9 @@ def nodes(ros: Callable[..., Any], tmp_path: Path) -> Iterator[Nodes]:
     made.close()
 
 
-def test_a_drive_does_not_notice_what_else_is_sent(nodes: Nodes, scans: list[np.ndarray], alone: list[Tracked]) -> None:
+def test_a_drive_does_not_notice_what_else_is_sent(
+    nodes: Nodes, scans: list[np.ndarray], alone: list[OdometryResult]
+) -> None:
     wait, resident = nodes.harness.wait, []
 
     def drive(n: int) -> None:

@@ -22,7 +22,7 @@ from dpm2_core.data.messages import stamp_ns
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.evaluation.metrics import ape_rmse
 from dpm2_ros.mapping import KEEP_ALL, LAST_ONE
-from tools.demo import judge, map_poses
+from tools.demo import evaluate_replay, map_poses
 from tools.replay import replay, ros_environment, start
 
 SAVED = ["map.ply", "pose_graph.g2o", "trajectory.tum"]
@@ -152,7 +152,7 @@ def test_replay_is_judged_by_what_arrived(bag: Path, drive: Any, tmp_path: Path)
     """What `make demo` does: all checks hold; and without one pose, or in a wrong order of events, they do not."""
     result = replay(bag, topics.POINTS, tmp_path, parameters={"ros.map_period": 0.5, "slam.keyframes.distance": 2.0})
     source = BagSource(bag, InputSettings(images=False))
-    outcome = judge(source, result, tmp_path)
+    outcome = evaluate_replay(source, result, tmp_path)
     assert all(outcome.checks.values()), outcome.checks
     summary = outcome.summary
     assert list(summary) == [
@@ -166,8 +166,8 @@ def test_replay_is_judged_by_what_arrived(bag: Path, drive: Any, tmp_path: Path)
     poses = map_poses(source, result, source.stamps.tolist())
     assert ape_rmse(source.poses, poses) == pytest.approx(summary["ape_rmse_m"])
     lost = result.poses.pop(source.stamps.tolist()[3])
-    outcome = judge(source, result, tmp_path)
+    outcome = evaluate_replay(source, result, tmp_path)
     assert not outcome.checks["every cloud has its odometry, with the same stamp"]
     assert (outcome.summary["frames_out"], outcome.summary["dropped"]) == (drive.frames - 1, 1)
     result.poses[12345] = lost
-    assert not judge(source, result, tmp_path).checks["no odometry without its cloud"]
+    assert not evaluate_replay(source, result, tmp_path).checks["no odometry without its cloud"]

@@ -210,8 +210,8 @@ def test_from_mapping_to_localising_and_back(robot: Callable[..., Robot], tmp_pa
     assert growing.success
     assert "already" in growing.message
     r.send(*range(8))
-    localising = r.call(SetBool, "/slam_node/localization_mode", data=True)
-    assert localising.success, localising.message
+    localizing = r.call(SetBool, "/slam_node/localization_mode", data=True)
+    assert localizing.success, localizing.message
     before = digest(path)
     early = r.call(SetBool, "/slam_node/localization_mode", data=False)
     assert not early.success

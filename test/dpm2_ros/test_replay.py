@@ -127,8 +127,8 @@ def fast_camera(bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
             for shift in (-20_000_000, 12_000_000, 45_000_000):
                 stamp = log_time + shift
                 image.header.stamp.sec, image.header.stamp.nanosec = stamp // 10**9, stamp % 10**9
-                grey = cv2.GaussianBlur(rng.integers(0, 255, (40, 120), np.uint8), (0, 0), 2)
-                pixels = np.repeat(cv2.normalize(grey, None, 0, 255, cv2.NORM_MINMAX)[..., None], 3, 2)
+                gray = cv2.GaussianBlur(rng.integers(0, 255, (40, 120), np.uint8), (0, 0), 2)
+                pixels = np.repeat(cv2.normalize(gray, None, 0, 255, cv2.NORM_MINMAX)[..., None], 3, 2)
                 image = replace(image, data=pixels.reshape(-1))
                 out.append((stamp + 30_000_000, topic, kind, bytes(types.serialize_cdr(image, kind))))
         else:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dpm2_ros.synchronizer import HOLD, PATIENCE, Bundle, Synchronizer, Verdict
+from dpm2_ros.synchronizer import HOLD, PATIENCE, Bundle, StampCheck, Synchronizer
 
 MS = 1_000_000
 
@@ -147,25 +147,25 @@ def test_a_full_queue_drops_the_oldest_and_counts() -> None:
 
 
 @pytest.mark.parametrize(
-    ("stamp_ms", "verdict"),
+    ("stamp_ms", "check"),
     [
-        (10_000, Verdict.REPEATED),
-        (9_900, Verdict.OUT_OF_ORDER),
-        (9_000, Verdict.OUT_OF_ORDER),
-        (8_999, Verdict.JUMPED),
-        (10_001, Verdict.ACCEPTED),
-        (11_100, Verdict.ACCEPTED),  # a second beyond the 0.1 s that have passed
-        (11_101, Verdict.JUMPED),
+        (10_000, StampCheck.REPEATED),
+        (9_900, StampCheck.OUT_OF_ORDER),
+        (9_000, StampCheck.OUT_OF_ORDER),
+        (8_999, StampCheck.JUMPED),
+        (10_001, StampCheck.ACCEPTED),
+        (11_100, StampCheck.ACCEPTED),  # a second beyond the 0.1 s that have passed
+        (11_101, StampCheck.JUMPED),
     ],
 )
-def test_stamps_that_repeat_jump_back_or_forward(stamp_ms: int, verdict: Verdict) -> None:
+def test_stamps_that_repeat_jump_back_or_forward(stamp_ms: int, check: StampCheck) -> None:
     synchronizer = make(cameras=0)
     synchronizer.add_cloud(10_000 * MS, "before", now=0.0)
-    assert synchronizer.add_cloud(stamp_ms * MS, "after", now=0.1) is verdict
+    assert synchronizer.add_cloud(stamp_ms * MS, "after", now=0.1) is check
     left = drain(synchronizer, 0.1)
-    assert [bundle.cloud for bundle in left] == ["before"] + ["after"] * (verdict is Verdict.ACCEPTED)
-    if verdict is not Verdict.JUMPED:
-        assert synchronizer.counts[verdict] == 1 + (verdict is Verdict.ACCEPTED)
+    assert [bundle.cloud for bundle in left] == ["before"] + ["after"] * (check is StampCheck.ACCEPTED)
+    if check is not StampCheck.JUMPED:
+        assert synchronizer.counts[check] == 1 + (check is StampCheck.ACCEPTED)
 
 
 def feed(synchronizer: Synchronizer, *stamps_ms: int, period: float = 0.1) -> list[tuple[int, bool]]:
@@ -184,8 +184,8 @@ def test_one_stamp_far_off_costs_its_cloud_alone(stray: int) -> None:
     assert feed(synchronizer, 9_900, 10_000, stray, 10_200, 10_300) == [
         (stamp, False) for stamp in (9_900, 10_000, 10_200, 10_300)
     ]
-    assert synchronizer.counts[Verdict.STRAY] == 1
-    assert synchronizer.counts[Verdict.RESTARTED] == 0
+    assert synchronizer.counts[StampCheck.STRAY] == 1
+    assert synchronizer.counts[StampCheck.RESTARTED] == 0
 
 
 def test_a_jump_back_that_lasts_is_a_restart_and_loses_nothing() -> None:
@@ -194,7 +194,7 @@ def test_a_jump_back_that_lasts_is_a_restart_and_loses_nothing() -> None:
         synchronizer = make(cameras=0)
         stamps = (9_900, 10_000, first, first + 100, first + 200)
         assert feed(synchronizer, *stamps) == [(stamp, stamp == first) for stamp in stamps]
-        assert synchronizer.counts[Verdict.RESTARTED] == 1
+        assert synchronizer.counts[StampCheck.RESTARTED] == 1
         assert sum(synchronizer.counts.values()) == 5
 
 
@@ -207,7 +207,7 @@ def test_a_jump_ahead_that_lasts_loses_nothing() -> None:
 def test_a_pause_of_the_sensor_is_no_jump() -> None:
     synchronizer = make(cameras=0)
     synchronizer.add_cloud(10_000 * MS, "a", now=0.0)
-    assert synchronizer.add_cloud(20_000 * MS, "b", now=10.1) is Verdict.ACCEPTED
+    assert synchronizer.add_cloud(20_000 * MS, "b", now=10.1) is StampCheck.ACCEPTED
 
 
 def test_a_jump_that_nothing_follows_is_believed_after_a_while() -> None:
@@ -261,7 +261,7 @@ def test_every_cloud_leaves_once_or_is_counted(events: list[tuple[str, int, floa
     assert len(synchronizer) == 0
     counts = synchronizer.counts
     assert sum(counts.values()) == len(given_in)
-    assert len(out) + synchronizer.dropped == counts[Verdict.ACCEPTED] + counts[Verdict.RESTARTED]
+    assert len(out) + synchronizer.dropped == counts[StampCheck.ACCEPTED] + counts[StampCheck.RESTARTED]
     remaining = iter(given_in)
     assert all(bundle.cloud in remaining for bundle in out)  # a subsequence: same order, none twice
     assert all(abs(image - bundle.stamp) <= 50 * MS for bundle in out for image in bundle.images.values())

@@ -124,7 +124,7 @@ class Dslr(nn.Module):
             raise UsageError(f"DSLR: images of {settings.image.rows} rows; want at most {_TALLEST}")
         self.static_encoder, self.decoder = RangeEncoder(settings), RangeDecoder(settings)
         self.discriminator = PairDiscriminator(settings)
-        self.apply(initialise)
+        self.apply(initialize)
         self.dynamic_encoder = copy.deepcopy(self.static_encoder)
 
     def forward(self, images: Tensor) -> Tensor:
@@ -164,7 +164,7 @@ def load(path: Path) -> Dslr:
     return load_network(path, "dslr", "network", DslrSettings, Dslr)
 
 
-def initialise(module: nn.Module) -> None:
+def initialize(module: nn.Module) -> None:
     """Weights of the original: normal, 0.02 wide."""
     if isinstance(module, (nn.Conv2d, nn.ConvTranspose2d)):
         nn.init.normal_(module.weight, 0.0, 0.02)

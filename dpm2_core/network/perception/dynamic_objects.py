@@ -27,7 +27,7 @@ LAYERS = (0.25, 0.75, 1.25, 1.75, 2.5, 4.0)
 """Bounds of the layers of height above the ground, m; one more layer below, one above."""
 
 
-class MoverNetSettings(Settings):
+class DynamicObjectNetSettings(Settings):
     """Grid and network of the movers."""
 
     cells: int = Field(default=200, ge=16, multiple_of=8)
@@ -38,15 +38,15 @@ class MoverNetSettings(Settings):
     """Of the finest layers; the coarser ones have two and three times as many."""
 
 
-class MoverNet(nn.Module):
+class DynamicObjectNet(nn.Module):
     """Occupancy (B, 7, cells, cells), 0 or 1, to the logit of being a mover in each of its voxels, the same shape."""
 
     range: Tensor
 
-    def __init__(self, settings: MoverNetSettings | None = None) -> None:
+    def __init__(self, settings: DynamicObjectNetSettings | None = None) -> None:
         """Default settings if None: 152 thousand parameters."""
         super().__init__()
-        self.settings = settings = settings or MoverNetSettings()
+        self.settings = settings = settings or DynamicObjectNetSettings()
         c, planes = settings.channels, 4 * (len(LAYERS) + 1)  # 2 x 2 cells make one of the finest layers
         self.stem = _block(planes + 1, c, c)
         self.down = nn.ModuleList(_block(a * c, b * c, b * c, 2) for a, b in pairwise((1, 2, 3)))
@@ -81,7 +81,9 @@ class MoverNet(nn.Module):
         return out
 
 
-def voxels(points: NDArray[np.float32], settings: MoverNetSettings) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+def voxels(
+    points: NDArray[np.float32], settings: DynamicObjectNetSettings
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Number (N,) of the voxel of (N, 3+) finite points, by layer, x and y, and whether they are on the grid (N,)."""
     n = settings.cells
     x, y = (np.floor(points[:, axis] / settings.cell).astype(np.int64) + n // 2 for axis in (0, 1))
@@ -90,7 +92,7 @@ def voxels(points: NDArray[np.float32], settings: MoverNetSettings) -> tuple[NDA
     return (layer * n + x) * n + y, inside
 
 
-def occupancy(scans: Sequence[NDArray[np.int64]], settings: MoverNetSettings) -> Tensor:
+def occupancy(scans: Sequence[NDArray[np.int64]], settings: DynamicObjectNetSettings) -> Tensor:
     """(B, 7, cells, cells), 1 in the voxels (N_b,) of each scan, 0 elsewhere."""
     shape = (len(LAYERS) + 1, settings.cells, settings.cells)
     out = torch.zeros(len(scans), math.prod(shape))
@@ -109,6 +111,6 @@ def _block(inputs: int, middle: int, outputs: int, stride: int = 1) -> nn.Sequen
     return nn.Sequential(_layer(inputs, middle, stride), _layer(middle, outputs))
 
 
-def load(path: Path) -> MoverNet:
+def load(path: Path) -> DynamicObjectNet:
     """A trained network on the CPU, ready for inference; raises as `weights.load_network`."""
-    return load_network(path, "movers", "net", MoverNetSettings, MoverNet)
+    return load_network(path, "movers", "net", DynamicObjectNetSettings, DynamicObjectNet)

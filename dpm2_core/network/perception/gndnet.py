@@ -86,8 +86,8 @@ class GroundNet(nn.Module):
         count = xyz.new_zeros(s.cells**2).index_add_(0, cell, xyz.new_ones(len(cell))).clamp(min=1)
         mean = xyz.new_zeros(s.cells**2, 3).index_add_(0, cell, xyz) / count[:, None]
         grid = torch.stack([cell // s.cells, cell % s.cells], 1)
-        centre = (grid + 0.5 - s.cells / 2) * s.cell
-        own = torch.cat([xyz, scan[:, 3:], xyz - mean[cell], xyz[:, :2] - centre], 1)
+        center = (grid + 0.5 - s.cells / 2) * s.cell
+        own = torch.cat([xyz, scan[:, 3:], xyz - mean[cell], xyz[:, :2] - center], 1)
         features = functional.relu(self.pillar(own))
         out = features.new_zeros(s.cells**2, features.shape[1])
         out = out.scatter_reduce(0, cell[:, None].expand_as(features), features, "amax")  # ReLU: zero is the least

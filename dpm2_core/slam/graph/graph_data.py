@@ -74,7 +74,7 @@ def integrate(graph: GraphData) -> Array:
     return out
 
 
-class Stretches:
+class CondensedOdometry:
     """The odometry between chosen nodes, compounded: a graph that is small where loops are few, with the same optimum.
 
     Attributes:

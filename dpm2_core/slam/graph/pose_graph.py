@@ -32,7 +32,7 @@ class PoseGraphSettings(RobustSettings):
 
 
 @dataclass(frozen=True)
-class LoopVerdict:
+class LoopCheck:
     """What the graph thinks of a loop; a later one may differ.
 
     Attributes:
@@ -61,7 +61,7 @@ class PoseGraph:
         self._steps: list[Array] = []
         self._step_covariances: list[Array] = []
         self._loops: list[tuple[int, int, Array, Array]] = []
-        self._verdicts: list[LoopVerdict] = []
+        self._loop_checks: list[LoopCheck] = []
         self._worker = GraphWorker()
         self._moved = False  # a part, since a graph was sent: its solution is of no use
         self._sent = 0  # loops in the graph that is being solved
@@ -88,12 +88,12 @@ class PoseGraph:
             for node, before in enumerate(self._before)
             if before >= 0
         ]
-        return chain + [loop for loop, told in zip(self._loops, self._verdicts, strict=True) if told.kept]
+        return chain + [loop for loop, told in zip(self._loops, self._loop_checks, strict=True) if told.kept]
 
     @property
-    def verdicts(self) -> list[LoopVerdict]:
+    def loop_checks(self) -> list[LoopCheck]:
         """One for each loop, in the order in which they were added."""
-        return list(self._verdicts)
+        return list(self._loop_checks)
 
     @property
     def busy(self) -> bool:
@@ -150,13 +150,13 @@ class PoseGraph:
             T = T_to @ se3.inverse(self._poses[to_node])
             self._move(max(a, b), T if b > a else se3.inverse(T), parts)
         self._loops.append((from_node, to_node, T_from_to, covariance))
-        self._verdicts.append(LoopVerdict(from_node, to_node, True, ""))
+        self._loop_checks.append(LoopCheck(from_node, to_node, True, ""))
 
     def part(self, node: int) -> int:
         """Number of the part of the graph that a node is in: nodes of two parts have nothing to do with each other."""
         return self._parts()[self._trajectory[node]]
 
-    def optimise(self) -> None:
+    def optimize(self) -> None:
         """Move the poses to the optimum and judge the loops: here and now, or (`background`) in another process.
 
         Raises:
@@ -168,7 +168,7 @@ class PoseGraph:
                 self._submit()
             return
         try:
-            self._apply(robust.optimise(self._data(), self._settings), len(self._loops))
+            self._apply(robust.optimize(self._data(), self._settings), len(self._loops))
             self.problem = ""
         except (RuntimeError, np.linalg.LinAlgError) as error:  # gtsam's or numpy's: the system is singular
             raise Dpm2Error(f"pose graph: {' '.join(str(error).split())}") from None
@@ -228,11 +228,11 @@ class PoseGraph:
 
     def write_g2o(self, path: Path) -> None:
         """All vertices, the odometry and the loops that are kept, in g2o's SE3:QUAT format at full precision."""
-        kept = np.array([told.kept for told in self._verdicts], np.bool_)
+        kept = np.array([told.kept for told in self._loop_checks], np.bool_)
         write_g2o(path, G2o(self._data(), self._order(), planar=False), kept)
 
     def _joint(self, nodes: list[int]) -> Array:
-        kept, data = np.array([told.kept for told in self._verdicts], np.bool_), self._data()
+        kept, data = np.array([told.kept for told in self._loop_checks], np.bool_), self._data()
         return robust.joint_covariance(data, data.poses, kept, self._places()[nodes])
 
     def _order(self) -> NDArray[np.intp]:
@@ -259,7 +259,7 @@ class PoseGraph:
     def _parts(self) -> list[int]:
         """Of each trajectory, the oldest one that loops tie it to."""
         parts = list(range(len(self._ends)))
-        for (a, b, *_), told in zip(self._loops, self._verdicts, strict=True):
+        for (a, b, *_), told in zip(self._loops, self._loop_checks, strict=True):
             one, other = sorted((parts[self._trajectory[a]], parts[self._trajectory[b]]))
             if told.kept and one != other:
                 parts = [one if part == other else part for part in parts]
@@ -288,7 +288,7 @@ class PoseGraph:
                 self._poses[node] = self._poses[at] @ se3.inverse(old[at]) @ self._poses[node]
         for loop in range(loops):
             a, b = self._loops[loop][:2]
-            self._verdicts[loop] = LoopVerdict(a, b, bool(solution.kept[loop]), solution.reason(loop))
+            self._loop_checks[loop] = LoopCheck(a, b, bool(solution.kept[loop]), solution.reason(loop))
 
 
 def _check(what: str, node: int, T: Array, covariance: Array | None = None) -> None:

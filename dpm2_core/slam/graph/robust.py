@@ -24,9 +24,9 @@ from dpm2_core.config import Settings
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.graph_data import (
+    CondensedOdometry,
     GraphData,
     Index,
-    Stretches,
     chain_chi2,
     integrate,
     loop_errors,
@@ -81,7 +81,7 @@ class Solution:
         return told
 
 
-def optimise(graph: GraphData, settings: RobustSettings) -> Solution:
+def optimize(graph: GraphData, settings: RobustSettings) -> Solution:
     """Optimise and judge; deterministic.
 
     Raises:
@@ -91,26 +91,26 @@ def optimise(graph: GraphData, settings: RobustSettings) -> Solution:
     apart = np.sqrt(chain_chi2(graph, odometry))
     believed = ~(apart > settings.odometry_sigmas)
     start = _aligned(graph, graph.poses, believed, settings.loop_kernel)
-    stretches = Stretches(graph, odometry, np.concatenate([graph.ends.ravel(), graph.fixed]))
-    ends = np.searchsorted(stretches.nodes, graph.ends)
-    poses = start[stretches.nodes]
+    condensed = CondensedOdometry(graph, odometry, np.concatenate([graph.ends.ravel(), graph.fixed]))
+    ends = np.searchsorted(condensed.nodes, graph.ends)
+    poses = start[condensed.nodes]
     settled, count = False, 0
     while not settled and count < settings.rounds:
         count += 1
-        factors = _factors(graph, stretches, ends, poses, believed, settings.loop_kernel)
+        factors = _factors(graph, condensed, ends, poses, believed, settings.loop_kernel)
         poses = _solved(factors, poses, settings.iterations)
         sigmas = np.sqrt(mahalanobis(loop_errors(poses, ends, graph.T_from_to), graph.covariances))
         kept = sigmas <= settings.loop_sigmas
         settled = bool((kept == believed).all())
         if not settled and count < settings.rounds:
             believed = kept
-    return Solution(stretches.spread(poses), believed, sigmas, apart, count, settled)
+    return Solution(condensed.spread(poses), believed, sigmas, apart, count, settled)
 
 
 def least_squares(graph: GraphData, kept: NDArray[np.bool_], iterations: int = 50) -> Array:
     """(N, 4, 4) the plain least-squares optimum over the odometry and the loops kept, every node an unknown."""
-    stretches = Stretches(graph, integrate(graph), np.arange(len(graph)))
-    return _solved(_factors(graph, stretches, graph.ends, graph.poses, kept, None), graph.poses, iterations)
+    condensed = CondensedOdometry(graph, integrate(graph), np.arange(len(graph)))
+    return _solved(_factors(graph, condensed, graph.ends, graph.poses, kept, None), graph.poses, iterations)
 
 
 def joint_covariance(graph: GraphData, poses: Array, kept: NDArray[np.bool_], nodes: Index) -> Array:
@@ -120,11 +120,11 @@ def joint_covariance(graph: GraphData, poses: Array, kept: NDArray[np.bool_], no
         poses: (N, 4, 4) optimised. kept: (E,) loops to count.
     """
     ends = graph.ends[kept].ravel()
-    stretches = Stretches(graph, integrate(graph), np.concatenate([ends, graph.fixed, nodes]))
-    ends = np.searchsorted(stretches.nodes, graph.ends)  # of loops not kept too, which are then not read
-    at = poses[stretches.nodes]
-    marginals = gtsam.Marginals(_factors(graph, stretches, ends, at, kept, None), _values(at))
-    keys = np.searchsorted(stretches.nodes, nodes)
+    condensed = CondensedOdometry(graph, integrate(graph), np.concatenate([ends, graph.fixed, nodes]))
+    ends = np.searchsorted(condensed.nodes, graph.ends)  # of loops not kept too, which are then not read
+    at = poses[condensed.nodes]
+    marginals = gtsam.Marginals(_factors(graph, condensed, ends, at, kept, None), _values(at))
+    keys = np.searchsorted(condensed.nodes, nodes)
     if len(keys) == 1:
         return np.asarray(marginals.marginalCovariance(int(keys[0])))
     joint = marginals.jointMarginalCovariance([int(key) for key in keys])
@@ -132,14 +132,19 @@ def joint_covariance(graph: GraphData, poses: Array, kept: NDArray[np.bool_], no
 
 
 def _factors(
-    graph: GraphData, stretches: Stretches, ends: Index, poses: Array, believed: NDArray[np.bool_], kernel: float | None
+    graph: GraphData,
+    condensed: CondensedOdometry,
+    ends: Index,
+    poses: Array,
+    believed: NDArray[np.bool_],
+    kernel: float | None,
 ) -> Any:
     """The gtsam graph of the chosen nodes; `ends` count among them, no kernel: plain least squares."""
     factors, gaussian = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.Gaussian.Covariance
     noise: gtsam.noiseModel.Base
-    for k in np.flatnonzero(stretches.tied):
-        noise = gaussian(stretches.covariances[k])
-        factors.add(gtsam.BetweenFactorPose3(int(k) - 1, int(k), gtsam.Pose3(stretches.T[k]), noise))
+    for k in np.flatnonzero(condensed.tied):
+        noise = gaussian(condensed.covariances[k])
+        factors.add(gtsam.BetweenFactorPose3(int(k) - 1, int(k), gtsam.Pose3(condensed.T[k]), noise))
     for loop in np.flatnonzero(believed):
         noise = gaussian(graph.covariances[loop])
         if kernel is not None:
@@ -147,18 +152,18 @@ def _factors(
         a, b = ends[loop].tolist()
         factors.add(gtsam.BetweenFactorPose3(a, b, gtsam.Pose3(graph.T_from_to[loop]), noise))
     still = gtsam.noiseModel.Isotropic.Sigma(6, _FIXED)
-    for anchor in _anchors(graph, stretches, ends[believed]):
+    for anchor in _anchors(graph, condensed, ends[believed]):
         factors.add(gtsam.PriorFactorPose3(anchor, gtsam.Pose3(poses[anchor]), still))
     return factors
 
 
-def _anchors(graph: GraphData, stretches: Stretches, ends: Index) -> Iterator[int]:
+def _anchors(graph: GraphData, condensed: CondensedOdometry, ends: Index) -> Iterator[int]:
     """The fixed nodes, and one in each part of the graph that has none."""
-    count = len(stretches.nodes)
-    tied = np.flatnonzero(stretches.tied)
+    count = len(condensed.nodes)
+    tied = np.flatnonzero(condensed.tied)
     rows, columns = np.concatenate([tied, ends[:, 0]]), np.concatenate([tied - 1, ends[:, 1]])
     part = connected_components(coo_array((np.ones(len(rows)), (rows, columns)), (count, count)), directed=False)[1]
-    fixed = np.searchsorted(stretches.nodes, graph.fixed)
+    fixed = np.searchsorted(condensed.nodes, graph.fixed)
     yield from np.unique(fixed).tolist()
     first = np.unique(part, return_index=True)[1]
     yield from first[~np.isin(part[first], part[fixed])].tolist()

@@ -19,7 +19,7 @@ from typing import IO, Any
 
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.slam.graph.graph_data import GraphData
-from dpm2_core.slam.graph.robust import RobustSettings, Solution, optimise
+from dpm2_core.slam.graph.robust import RobustSettings, Solution, optimize
 
 _NICE = 10  # it yields to the odometry where processors are few
 
@@ -122,7 +122,7 @@ def _serve(requests: IO[bytes], answers: IO[bytes]) -> None:
             return
         answer: Any
         try:
-            answer = optimise(graph, RobustSettings(**settings))
+            answer = optimize(graph, RobustSettings(**settings))
         except RuntimeError as error:  # gtsam's: the system is singular
             answer = Dpm2Error(f"pose graph: {' '.join(str(error).split())}")
         pickle.dump(answer, answers, protocol=5)

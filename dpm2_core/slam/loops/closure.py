@@ -18,7 +18,7 @@ from pydantic import Field
 from dpm2_core.config import Settings
 from dpm2_core.frame import Array, Keyframe, Points, Registration
 from dpm2_core.geometry import se3
-from dpm2_core.slam.loops.consistency import Consistency, ConsistencySettings, Loop, Path, refused
+from dpm2_core.slam.loops.consistency import Consistency, ConsistencySettings, Loop, OdometryChain, rejected
 from dpm2_core.slam.loops.place_recognition import PlaceRecognition, merged
 from dpm2_core.slam.loops.verification import VerificationSettings, Verifier
 from dpm2_core.slam.registration.icp import GeometricSettings
@@ -70,7 +70,7 @@ class LoopCloser:
         self._settings = settings
         self._verifier = Verifier(settings.verification, registration, threads)
         self._places = PlaceRecognition(network) if network is not None else None
-        self._path = Path()
+        self._path = OdometryChain()
         self._consistency = Consistency(settings.consistency, self._path)
 
     @property
@@ -104,14 +104,14 @@ class LoopCloser:
         tried, proposals = self._proposals(node, since, keyframes, poses)
         for number, proposal in enumerate(proposals):
             if number >= self._settings.verified:
-                tried.append(refused(proposal, "others are more likely"))
+                tried.append(rejected(proposal, "others are more likely"))
                 continue
             loop = self._verified(proposal, keyframes, clouds, poses)
             if not loop.registration.ok:
                 tried.append(loop)
                 continue
             T_expected = se3.inverse(poses[loop.from_node]) @ poses[node]
-            tried += self._consistency.judge(loop, T_expected)
+            tried += self._consistency.check(loop, T_expected)
             break
         return tried
 
@@ -121,7 +121,7 @@ class LoopCloser:
         """Candidates that the network refused, and those for the points to judge, the most likely first."""
         s, descriptors = self._settings, keyframes[node].descriptors
         nearest = self._nearest(since, poses)
-        refusals: list[Loop] = []
+        rejections: list[Loop] = []
         proposals: list[Loop] = []
         if self._places is not None and descriptors is not None:
             similar = self._places.similar(descriptors, since > s.gap, s.candidates)
@@ -129,18 +129,18 @@ class LoopCloser:
             for loop in sorted(found, key=lambda loop: -loop.registration.confidence):
                 r = loop.registration
                 if not r.ok:
-                    refusals.append(loop)
+                    rejections.append(loop)
                 elif r.confidence < s.min_confidence:
-                    refusals.append(refused(loop, f"descriptors match with a confidence of only {r.confidence:.2f}"))
+                    rejections.append(rejected(loop, f"descriptors match with a confidence of only {r.confidence:.2f}"))
                 elif r.overlap < s.min_overlap:  # NaN of an untrained head refuses nothing
-                    refusals.append(refused(loop, f"the places overlap with a probability of only {r.overlap:.2f}"))
+                    rejections.append(rejected(loop, f"the places overlap with a probability of only {r.overlap:.2f}"))
                 else:
                     proposals.append(loop)
         if nearest is not None and all(abs(loop.from_node - nearest) > 1 for loop in proposals):
             T_guess = se3.inverse(poses[nearest]) @ poses[node]
             by_pose = Registration(T_guess, np.eye(6), 0.0, 0.0, "pose")
             proposals.insert(min(len(proposals), 1), Loop(nearest, node, by_pose))
-        return refusals, proposals
+        return rejections, proposals
 
     def _registered(self, node: int, candidates: Sequence[int], keyframes: Sequence[Keyframe]) -> list[Loop]:
         """The network's answer to each candidate."""

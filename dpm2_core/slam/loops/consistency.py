@@ -45,12 +45,12 @@ class Loop:
     registration: Registration
 
 
-class Path:
+class OdometryChain:
     """The odometry of all keyframes, in segments: one robot, one session, until the odometry was lost."""
 
     def __init__(self) -> None:
         self._segment = np.zeros(256, np.int64)
-        self._metres = np.zeros(256)  # since the segment began
+        self._meters = np.zeros(256)  # since the segment began
         self._T_odom_kf: list[Array] = []
         self._last: dict[str, int] = {}  # by robot
 
@@ -62,23 +62,23 @@ class Path:
         node, before = len(self), self._last.get(keyframe.robot)
         if node == len(self._segment):
             self._segment = np.concatenate([self._segment, np.zeros_like(self._segment)])
-            self._metres = np.concatenate([self._metres, np.zeros_like(self._metres)])
+            self._meters = np.concatenate([self._meters, np.zeros_like(self._meters)])
         self._last[keyframe.robot] = node
         self._T_odom_kf.append(keyframe.T_odom_kf)
         if before is None or keyframe.edge is None or keyframe.edge.worst_sigma > BROKEN:
-            self._segment[node], self._metres[node] = node, 0.0
+            self._segment[node], self._meters[node] = node, 0.0
             return
         step = np.linalg.norm(keyframe.T_odom_kf[:3, 3] - self._T_odom_kf[before][:3, 3])
-        self._segment[node], self._metres[node] = self._segment[before], self._metres[before] + step
+        self._segment[node], self._meters[node] = self._segment[before], self._meters[before] + step
 
     def since(self, node: int) -> Array:
         """(N,) metres of path between each node and this one; inf where there is no odometry between them."""
-        metres, same = self._metres[: len(self)], self._segment[: len(self)] == self._segment[node]
-        return np.where(same, np.abs(metres - metres[node]), np.inf)
+        meters, same = self._meters[: len(self)], self._segment[: len(self)] == self._segment[node]
+        return np.where(same, np.abs(meters - meters[node]), np.inf)
 
     def between(self, a: int, b: int) -> float:
         """The same for two nodes."""
-        return float(abs(self._metres[a] - self._metres[b])) if self._segment[a] == self._segment[b] else np.inf
+        return float(abs(self._meters[a] - self._meters[b])) if self._segment[a] == self._segment[b] else np.inf
 
     def T(self, a: int, b: int) -> Array:
         """T_a_b (4, 4) by odometry, of two nodes of one segment."""
@@ -88,13 +88,13 @@ class Path:
 class Consistency:
     """Lets a verified loop pass when the odometry or another loop agrees; until then it waits."""
 
-    def __init__(self, settings: ConsistencySettings, path: Path) -> None:
+    def __init__(self, settings: ConsistencySettings, path: OdometryChain) -> None:
         self._settings = settings
         self._path = path
         self._accepted: list[Loop] = []
         self._waiting: list[Loop] = []
 
-    def judge(self, loop: Loop, T_expected: Array) -> list[Loop]:
+    def check(self, loop: Loop, T_expected: Array) -> list[Loop]:
         """Judge a loop that the points have verified.
 
         Args:
@@ -105,17 +105,17 @@ class Consistency:
         """
         s, found = self._settings, loop.registration
         since = self._path.between(loop.from_node, loop.to_node)
-        metres, degrees = _apart(T_expected, found.T_target_source)
+        meters, degrees = _apart(T_expected, found.T_target_source)
         if np.isfinite(since):
-            if metres > 1 + s.drift * since or degrees > 3 + s.drift_turn * since:
-                return [refused(loop, f"{metres:.1f} m, {degrees:.1f} deg from the odometry")]
-            if metres <= s.certain and degrees <= s.certain:
+            if meters > 1 + s.drift * since or degrees > 3 + s.drift_turn * since:
+                return [rejected(loop, f"{meters:.1f} m, {degrees:.1f} deg from the odometry")]
+            if meters <= s.certain and degrees <= s.certain:
                 return self._accept([loop, *(w for w in self._waiting if self._agree(loop, w))])
         confirmed = [w for w in self._waiting if self._agree(loop, w)]
         if confirmed or any(self._agree(loop, a) for a in self._accepted[-200:]):
             return self._accept([loop, *confirmed])
         self._waiting.append(loop)
-        return [refused(loop, f"{metres:.1f} m from the odometry: waits for a second loop that agrees")]
+        return [rejected(loop, f"{meters:.1f} m from the odometry: waits for a second loop that agrees")]
 
     def _accept(self, loops: Sequence[Loop]) -> list[Loop]:
         self._accepted += loops
@@ -130,12 +130,12 @@ class Consistency:
         if one.to_node == other.to_node or max(there, back) > s.reach:
             return False
         around = path.T(one.from_node, other.from_node) @ other.registration.T_target_source
-        metres, degrees = _apart(one.registration.T_target_source, around @ path.T(other.to_node, one.to_node))
+        meters, degrees = _apart(one.registration.T_target_source, around @ path.T(other.to_node, one.to_node))
         allowed = s.circle + s.circle_drift * (there + back)
-        return metres <= allowed and degrees <= 3 * allowed
+        return meters <= allowed and degrees <= 3 * allowed
 
 
-def refused(loop: Loop, reason: str) -> Loop:
+def rejected(loop: Loop, reason: str) -> Loop:
     """The loop with the reason why it is not accepted."""
     return replace(loop, registration=replace(loop.registration, ok=False, reason=reason))
 

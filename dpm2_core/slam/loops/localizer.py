@@ -10,7 +10,7 @@ import numpy as np
 from dpm2_core.frame import Array, Keyframe, Registration, State
 from dpm2_core.geometry import se3
 from dpm2_core.slam.loops.consistency import BROKEN
-from dpm2_core.slam.loops.relocalization import Relocaliser, nowhere
+from dpm2_core.slam.loops.relocalization import Relocalizer, nowhere
 
 LOST = np.diag([1.0, 1.0, 1.0, 100.0, 100.0, 100.0]) ** 2
 """(6, 6) [rad, m] covariance of a pose that is as good as nothing."""
@@ -18,7 +18,7 @@ _PATIENCE = 1_000_000_000  # ns
 
 
 @dataclass(frozen=True, eq=False)
-class Located:
+class LocalizationResult:
     """A keyframe in the map.
 
     Attributes:
@@ -35,7 +35,7 @@ class Located:
     jumped: bool = False
 
 
-class Localiser:
+class Localizer:
     """Stands where the mapper does: keyframes in, `T_map_odom` out; but the map does not grow.
 
     Attributes:
@@ -44,8 +44,8 @@ class Localiser:
             the map does not confirm the odometry, LOST when that lasts or the odometry is broken.
     """
 
-    def __init__(self, relocaliser: Relocaliser, max_failures: int = 3) -> None:
-        self._relocaliser = relocaliser
+    def __init__(self, relocalizer: Relocalizer, max_failures: int = 3) -> None:
+        self._relocalizer = relocalizer
         self._max_failures = max_failures
         self._hint: Array | None = None
         self._failures = 0
@@ -53,7 +53,7 @@ class Localiser:
         self._T_last: Array | None = None
         self._stamp: int | None = None
         self.T_map_odom: Array = np.eye(4)
-        self.state = State.RELOCALISING
+        self.state = State.RELOCALIZING
 
     def wants(self, stamp: int) -> bool:
         """Whether to ask for a keyframe now (ns): while lost one looks once a second, also at a halt."""
@@ -61,14 +61,14 @@ class Localiser:
 
     def restart(self) -> None:
         """The odometry has begun anew: one may be anywhere."""
-        self.T_map_odom, self.state = np.eye(4), State.RELOCALISING
+        self.T_map_odom, self.state = np.eye(4), State.RELOCALIZING
         self._failures, self._distrust, self._T_last, self._stamp = 0, 0.0, None, None
 
     def hint(self, T_map_lidar: Array) -> None:
         """The next keyframe was taken about there (4, 4), somebody says."""
-        self._hint, self.state = T_map_lidar, State.RELOCALISING
+        self._hint, self.state = T_map_lidar, State.RELOCALIZING
 
-    def add(self, keyframe: Keyframe) -> Located:
+    def add(self, keyframe: Keyframe) -> LocalizationResult:
         """Find a keyframe, which has its cloud, in the map."""
         self._stamp = keyframe.stamp
         if keyframe.edge is not None and keyframe.edge.worst_sigma > BROKEN:
@@ -80,35 +80,35 @@ class Localiser:
             return self._track(keyframe)
         return self._find(keyframe, nowhere("lost"))
 
-    def _track(self, keyframe: Keyframe) -> Located:
+    def _track(self, keyframe: Keyframe) -> LocalizationResult:
         """Where the odometry says, if the points agree; else look everywhere."""
         T_predicted = self.T_map_odom @ keyframe.T_odom_kf
-        found = self._relocaliser.verify(keyframe.cloud, T_predicted)
+        found = self._relocalizer.verify(keyframe.cloud, T_predicted)
         if found.ok:
             return self._located(keyframe, found, jumped=False)
         self._failures += 1
         return self._find(keyframe, found)
 
-    def _find(self, keyframe: Keyframe, refused: Registration) -> Located:
+    def _find(self, keyframe: Keyframe, rejected: Registration) -> LocalizationResult:
         """Look in the whole map, or around the hint; while tracking, a far-off answer must insist."""
-        found = self._relocaliser.find(keyframe.cloud, self._hint, keyframe.descriptors)
+        found = self._relocalizer.find(keyframe.cloud, self._hint, keyframe.descriptors)
         self._hint = None
         tracking = self.state.located
         T_predicted = self.T_map_odom @ keyframe.T_odom_kf
         if found.ok:
-            metres = float(np.linalg.norm((se3.inverse(T_predicted) @ found.T_target_source)[:3, 3]))
-            near = metres <= 2.0 + 0.02 * self._distrust
+            meters = float(np.linalg.norm((se3.inverse(T_predicted) @ found.T_target_source)[:3, 3]))
+            near = meters <= 2.0 + 0.02 * self._distrust
             if not tracking or near or self._failures >= self._max_failures:
                 return self._located(keyframe, found, jumped=not (tracking and near))
         elif tracking:
-            found = refused
+            found = rejected
         if tracking:
             self.state = State.LOST if self._failures >= self._max_failures else State.DEGRADED
-        doubt = LOST if self.state is not State.DEGRADED else np.eye(6) * (0.1 + 0.01 * self._distrust) ** 2
-        return Located(T_predicted, doubt, self.state, found)
+        covariance = LOST if self.state is not State.DEGRADED else np.eye(6) * (0.1 + 0.01 * self._distrust) ** 2
+        return LocalizationResult(T_predicted, covariance, self.state, found)
 
-    def _located(self, keyframe: Keyframe, found: Registration, jumped: bool) -> Located:
-        self.T_map_odom = se3.orthonormalised(found.T_target_source @ se3.inverse(keyframe.T_odom_kf))
-        self.state = State.RELOCALISED if jumped else State.TRACKING
+    def _located(self, keyframe: Keyframe, found: Registration, jumped: bool) -> LocalizationResult:
+        self.T_map_odom = se3.orthonormalized(found.T_target_source @ se3.inverse(keyframe.T_odom_kf))
+        self.state = State.RELOCALIZED if jumped else State.TRACKING
         self._failures, self._distrust = 0, 0.0
-        return Located(found.T_target_source, found.covariance, self.state, found, jumped)
+        return LocalizationResult(found.T_target_source, found.covariance, self.state, found, jumped)

@@ -31,7 +31,7 @@ if TYPE_CHECKING:  # torch takes seconds to import
 _SAME_PLACE = 5.0  # m, candidates whose poses are nearer are one answer
 
 
-class RelocaliseSettings(Settings):
+class RelocalizationSettings(Settings):
     """Finding oneself in a map."""
 
     candidates: int = Field(6, ge=1)
@@ -51,12 +51,12 @@ class RelocaliseSettings(Settings):
     verification: VerificationSettings = VerificationSettings()
 
 
-class Relocaliser:
+class Relocalizer:
     """A map to find oneself in. Reads it, never changes it."""
 
     def __init__(
         self,
-        settings: RelocaliseSettings,
+        settings: RelocalizationSettings,
         registration: GeometricSettings,
         network: DeepPointMap2,
         keyframes: Sequence[Keyframe],
@@ -90,17 +90,17 @@ class Relocaliser:
             allowed = np.linalg.norm(self._poses[:, :2, 3] - hint[:2, 3], axis=1) <= s.hint_radius
         nodes = self._places.similar(descriptors, allowed, s.candidates)
         proposals = [p for p in self._proposals(descriptors, nodes) if p.confidence >= s.min_confidence]
-        refusals = [f"no keyframe of {int(allowed.sum())} matches the descriptors"] if not proposals else []
+        rejections = [f"no keyframe of {int(allowed.sum())} matches the descriptors"] if not proposals else []
         found: Registration | None = None
         for proposal in proposals[: s.verified]:
             answer = self.verify(cloud, proposal.T_target_source)
             if not answer.ok:
-                refusals.append(answer.reason)
+                rejections.append(answer.reason)
             elif found is None:
                 found = answer
-            elif _metres(found.T_target_source, answer.T_target_source) > _SAME_PLACE:
+            elif _meters(found.T_target_source, answer.T_target_source) > _SAME_PLACE:
                 return nowhere("two places of the map fit alike")
-        return nowhere("; ".join(refusals)) if found is None else found
+        return nowhere("; ".join(rejections)) if found is None else found
 
     def verify(self, cloud: Points, T_map_lidar: Array, widen: float = 1.0) -> Registration:
         """The points' answer to a pose in the map: T_map_lidar, believed or not; `widen` as in `Verifier.verify`."""
@@ -112,7 +112,7 @@ class Relocaliser:
         T_at_map = se3.inverse(self._poses[nodes[0]])
         around = self._around(nodes, T_at_map)
         found = self._verifier.verify(cloud, around, T_at_map @ T_map_lidar, widen).registration
-        T = se3.orthonormalised(self._poses[nodes[0]] @ found.T_target_source)
+        T = se3.orthonormalized(self._poses[nodes[0]] @ found.T_target_source)
         return replace(found, T_target_source=T, method="relocalisation")
 
     def _around(self, nodes: NDArray[np.intp], T_at_map: Array) -> LocalMap:
@@ -130,7 +130,7 @@ class Relocaliser:
         ]
         for proposal in sorted(in_map, key=lambda r: -r.confidence):
             T = proposal.T_target_source
-            if all(_metres(T, other.T_target_source) > _SAME_PLACE for other in proposals):
+            if all(_meters(T, other.T_target_source) > _SAME_PLACE for other in proposals):
                 proposals.append(proposal)
         return proposals
 
@@ -138,7 +138,7 @@ class Relocaliser:
         return np.linalg.norm(self._poses[:, :3, 3] - T_map_lidar[:3, 3], axis=1)
 
 
-def thinned(points: Points, voxel: float, reach: float) -> Points:
+def downsampled(points: Points, voxel: float, reach: float) -> Points:
     """The cloud (M, 4) that a keyframe would have of a scan (N, 4): a point in each voxel, none beyond `reach` m."""
     near = points[np.einsum("ij,ij->i", points[:, :3], points[:, :3]) < reach**2]
     return near[voxel_first(near, voxel)]
@@ -149,5 +149,5 @@ def nowhere(reason: str) -> Registration:
     return Registration(np.eye(4), np.eye(6) * 1e6, 0.0, np.inf, "relocalisation", False, reason)
 
 
-def _metres(a: Array, b: Array) -> float:
+def _meters(a: Array, b: Array) -> float:
     return float(np.linalg.norm(a[:3, 3] - b[:3, 3]))

@@ -43,7 +43,7 @@ class VerificationSettings(Settings):
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class VerificationResult:
     """What the points say.
 
     Attributes:
@@ -76,7 +76,7 @@ class Verifier:
         local_map.insert(np.concatenate(parts), np.eye(4))
         return local_map
 
-    def verify(self, cloud: Points, around: LocalMap, T_proposed: Array, widen: float = 1.0) -> Evidence:
+    def verify(self, cloud: Points, around: LocalMap, T_proposed: Array, widen: float = 1.0) -> VerificationResult:
         """Judge a pose of a cloud (M, 4) in a map.
 
         Args:
@@ -86,18 +86,20 @@ class Verifier:
         source = near[voxel_first(near, _SOURCE_VOXEL), :3].astype(np.float64)
         found = self._registration.register(source, around, T_proposed, widen)
         if not found.ok:
-            return Evidence(found)
+            return VerificationResult(found)
         fits = self._fits(source, around, found.T_target_source)
         standing = above_ground(source)
         points = int(standing.sum())
         structure = float(fits[standing].mean()) if points else 0.0
         moved = se3.inverse(T_proposed) @ found.T_target_source
-        metres, degrees = float(np.linalg.norm(moved[:3, 3])), float(np.degrees(se3.angle(moved)))
-        evidence = Evidence(
-            replace(found, confidence=min(found.confidence, structure)), structure, points, metres, degrees
+        meters, degrees = float(np.linalg.norm(moved[:3, 3])), float(np.degrees(se3.angle(moved)))
+        overlap_features = VerificationResult(
+            replace(found, confidence=min(found.confidence, structure)), structure, points, meters, degrees
         )
-        reason = self._objection(evidence, float(fits.mean()), widen)
-        return replace(evidence, registration=replace(evidence.registration, ok=not reason, reason=reason))
+        reason = self._objection(overlap_features, float(fits.mean()), widen)
+        return replace(
+            overlap_features, registration=replace(overlap_features.registration, ok=not reason, reason=reason)
+        )
 
     def _fits(self, source: Array, around: LocalMap, T: Array) -> NDArray[np.bool_]:
         """Which points (N,) lie on a surface of the map."""
@@ -107,7 +109,7 @@ class Verifier:
         residual = np.einsum("ij,ij->i", moved - around.points[index], normals)
         return (squared < self._gate**2) & (residual**2 < 9 * (self._noise**2 + spread))
 
-    def _objection(self, e: Evidence, share: float, widen: float) -> str:
+    def _objection(self, e: VerificationResult, share: float, widen: float) -> str:
         """Why it is not believed; empty if it is."""
         s, found = self._settings, e.registration
         if share < s.min_inliers:

@@ -17,7 +17,7 @@ from dpm2_core.frame import Array, Keyframe, LoopClosure, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.loops.closure import LoopCloser
-from dpm2_core.slam.loops.consistency import Loop, refused
+from dpm2_core.slam.loops.consistency import Loop, rejected
 from dpm2_core.slam.mapping.admission import check_keyframe
 from dpm2_core.slam.mapping.moving import MovingSettings, MovingWindow
 from dpm2_core.slam.mapping.redundancy import RedundancySettings, lender
@@ -104,14 +104,14 @@ class Mapper:
         """(4, 4) of the robot whose keyframe came last, which carries every correction."""
         if len(self.keyframes) == self.session_start:
             return self._T_start
-        return se3.orthonormalised(self._graph.pose(-1) @ se3.inverse(self.keyframes[-1].T_odom_kf))
+        return se3.orthonormalized(self._graph.pose(-1) @ se3.inverse(self.keyframes[-1].T_odom_kf))
 
     def T_map_odom_of(self, robot: str) -> Array | None:
         """(4, 4) of a robot; None before it is known where in the map it is."""
         last = self._robots[robot].last if robot in self._robots else None
         if last is None or self._graph.part(last) not in {self._graph.part(node) for node in self._placed}:
             return None
-        return se3.orthonormalised(self._graph.pose(last) @ se3.inverse(self.keyframes[last].T_odom_kf))
+        return se3.orthonormalized(self._graph.pose(last) @ se3.inverse(self.keyframes[last].T_odom_kf))
 
     @property
     def robots(self) -> list[str]:
@@ -199,7 +199,7 @@ class Mapper:
 
     def finish(self) -> None:
         """At the end of a drive: wait for the solver, judge the last clouds, bring the map file up to date."""
-        self._optimise(changed=False, wait=True)
+        self._optimize(changed=False, wait=True)
         self._graph.close()
         for robot in self._robots.values():
             self._mark_moving(robot.window.finish(self.poses))
@@ -265,7 +265,7 @@ class Mapper:
             for a, b in [(self.keyframes[loop.from_node], self.keyframes[loop.to_node])]
         ]
         self.closures += closures
-        self._optimise(any(loop.registration.ok for loop in tried))
+        self._optimize(any(loop.registration.ok for loop in tried))
         return closures, [_loop_edge(loop) for loop in tried]
 
     def _tied(self, loop: Loop) -> Loop:
@@ -275,22 +275,22 @@ class Mapper:
             try:
                 self._graph.add_loop(loop.from_node, loop.to_node, found.T_target_source, found.covariance)
             except Dpm2Error as error:
-                return refused(loop, str(error))
+                return rejected(loop, str(error))
         return loop
 
-    def _optimise(self, changed: bool, wait: bool = False) -> None:
+    def _optimize(self, changed: bool, wait: bool = False) -> None:
         """Solve the graph if it has `changed`, take in what another process has solved; `wait` for that."""
         self._graph.collect(wait)
         if changed:
             try:
-                self._graph.optimise()
+                self._graph.optimize()
             except Dpm2Error as error:  # the drive goes on, with the poses as they were
                 self._graph.problem = str(error)
 
     def _kept(self, loops: Sequence[Edge]) -> list[Edge]:
         """Those that the graph believes, too: on another's word no cloud is given up."""
-        doubted = {(told.from_node, told.to_node) for told in self._graph.verdicts if not told.kept}
-        return [edge for edge in loops if (edge.from_node, edge.to_node) not in doubted]
+        rejected_pairs = {(told.from_node, told.to_node) for told in self._graph.loop_checks if not told.kept}
+        return [edge for edge in loops if (edge.from_node, edge.to_node) not in rejected_pairs]
 
     def _mark_moving(self, judged: Iterable[tuple[int, NDArray[np.bool_]]]) -> None:
         for node, moving in judged:

@@ -83,8 +83,8 @@ def loops_by(closer: LoopCloser) -> FindLoops:
     return find
 
 
-def optimised(data: MapData, graph: PoseGraph) -> MapData:
+def optimized(data: MapData, graph: PoseGraph) -> MapData:
     """The map with the poses that its constraints ask for; `graph` is empty."""
     restore(graph, data)
-    graph.optimise()
+    graph.optimize()
     return replace(data, poses=graph.poses)

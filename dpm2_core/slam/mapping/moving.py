@@ -58,7 +58,7 @@ class RangeImage:
         standing = _nearest(r[above], row[above], column[above])
         self._near = [minimum_filter(standing, 2 * half + 1, mode=("nearest", "wrap")) for half in _HALVES]
 
-    def judge(self, points: Points, settings: MovingSettings) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    def compare(self, points: Points, settings: MovingSettings) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """For (M, 3+) points in the sensor's frame: whether they are looked through, and whether they are seen."""
         r, row, column = _spherical(points[:, :3])
         margin = settings.margin + 0.03 * r
@@ -91,7 +91,7 @@ def find_moving(
     candidates = np.flatnonzero(height_above_ground(cloud) > _CLEARANCE)
     part = cloud[candidates]
     for image, T_map_other in others:
-        looked, present = image.judge(se3.transform(se3.inverse(T_map_other) @ T_map_kf, part), settings)
+        looked, present = image.compare(se3.transform(se3.inverse(T_map_other) @ T_map_kf, part), settings)
         through[candidates] += looked
         seen[candidates] += present
     moving = (through >= settings.witnesses) & (through > seen)
@@ -126,14 +126,14 @@ class MovingWindow:
         if self._settings.window:
             self._seen.append((node, cloud, RangeImage(cloud)))
             if len(self._seen) > self._settings.window:
-                yield from self._judge(self._seen[-1 - self._settings.window][0], poses)
+                yield from self._compare(self._seen[-1 - self._settings.window][0], poses)
 
     def finish(self, poses: Array) -> Iterator[tuple[int, NDArray[np.bool_]]]:
         """Judge those at the end of the drive by what there is."""
         if self._seen:
-            yield from self._judge(self._seen[-1][0], poses)
+            yield from self._compare(self._seen[-1][0], poses)
 
-    def _judge(self, last: int, poses: Array) -> Iterator[tuple[int, NDArray[np.bool_]]]:
+    def _compare(self, last: int, poses: Array) -> Iterator[tuple[int, NDArray[np.bool_]]]:
         for node, cloud, _ in self._seen:
             if self._next <= node <= last:
                 others = [(image, poses[n]) for n, _, image in self._seen if n != node]

@@ -124,13 +124,13 @@ def write_grid(path: Path, grid: Grid) -> Path:
     Raises:
         Dpm2Error: a file could not be written.
     """
-    picture, about = path.with_suffix(".pgm"), path.with_suffix(".yaml")
+    image, about = path.with_suffix(".pgm"), path.with_suffix(".yaml")
     rows, columns = grid.cells.shape
-    with atomic_write(picture, "wb") as file:
+    with atomic_write(image, "wb") as file:
         file.write(f"P5\n{columns} {rows}\n255\n".encode("ascii"))
         file.write(grid.cells.tobytes())
     content = {
-        "image": picture.name,
+        "image": image.name,
         "mode": "trinary",
         "resolution": grid.resolution,
         "origin": [*grid.origin, 0.0],

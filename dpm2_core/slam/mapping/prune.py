@@ -10,7 +10,7 @@ import numpy as np
 
 from dpm2_core.geometry import se3
 from dpm2_core.slam.store.map_data import MapData, subset
-from dpm2_core.slam.store.rows import Edge, Pruned
+from dpm2_core.slam.store.rows import Edge, RemovedKeyframe
 
 _LAP = 10  # keyframes: neighbours along the drive are no revisit
 
@@ -54,7 +54,7 @@ def prune(data: MapData, nodes: Collection[int]) -> MapData:
     ]
     anchors = {node: _anchor(data, node, kept) for node in gone}
     trail = [
-        Pruned(
+        RemovedKeyframe(
             keyframe.id,
             keyframe.robot,
             data.session[node],
@@ -131,7 +131,7 @@ def composed(first: Edge, second: Edge) -> Edge:
         second,
         kind="odometry" if first.kind == second.kind == "odometry" else "loop",
         from_node=first.from_node,
-        T_from_to=se3.orthonormalised(first.T_from_to @ second.T_from_to),
+        T_from_to=se3.orthonormalized(first.T_from_to @ second.T_from_to),
         covariance=A @ first.covariance @ A.T + second.covariance,
         confidence=min(first.confidence, second.confidence),
         rmse=max(first.rmse, second.rmse),

@@ -41,16 +41,16 @@ class KeyframeSelector:
 
     def reset(self) -> None:
         self._last: Keyframe | None = None
-        self._doubt = np.zeros((6, 6))
+        self._uncertainty = np.zeros((6, 6))
         self._requested = False
 
     def request(self) -> None:
         """Make a keyframe of the next registered scan, however short the way: somebody is lost, and may be standing."""
         self._requested = True
 
-    def doubt(self, covariance: Array) -> None:
+    def add_uncertainty(self, covariance: Array) -> None:
         """The odometry was broken by that much (6, 6): the next edge is to be no firmer."""
-        self._doubt = self._doubt + covariance
+        self._uncertainty = self._uncertainty + covariance
 
     def select(self, frame: Frame, scan: Scan, T_odom_lidar: Array, registration: Registration) -> Keyframe | None:
         """The keyframe that this scan makes, or None. A scan that was not registered never makes one."""
@@ -59,11 +59,11 @@ class KeyframeSelector:
         s, last, edge = self._settings, self._last, None
         if last is not None:
             T_last_this = se3.inverse(last.T_odom_kf) @ T_odom_lidar
-            metres, radians = np.linalg.norm(T_last_this[:3, 3]), se3.angle(T_last_this)
-            if not self._requested and metres < s.distance and radians < np.radians(s.angle):
+            meters, radians = np.linalg.norm(T_last_this[:3, 3]), se3.angle(T_last_this)
+            if not self._requested and meters < s.distance and radians < np.radians(s.angle):
                 return None
-            sigma = np.repeat([np.radians(s.drift_rotation), s.drift_translation], 3) * max(metres, 1.0)
-            covariance = registration.covariance + np.diag(sigma**2) + self._doubt
+            sigma = np.repeat([np.radians(s.drift_rotation), s.drift_translation], 3) * max(meters, 1.0)
+            covariance = registration.covariance + np.diag(sigma**2) + self._uncertainty
             edge = replace(registration, T_target_source=T_last_this, covariance=covariance)
         near = scan.points[np.einsum("ij,ij->i", scan.points[:, :3], scan.points[:, :3]) < s.range**2]
         cloud = near[voxel_first(near, s.voxel)]
@@ -71,5 +71,5 @@ class KeyframeSelector:
         keyframe = Keyframe(
             keyframe_id, frame.stamp, frame.index, T_odom_lidar, cloud, edge, self._robot, scan.descriptors
         )
-        self._last, self._doubt, self._requested = keyframe, np.zeros((6, 6)), False
+        self._last, self._uncertainty, self._requested = keyframe, np.zeros((6, 6)), False
         return keyframe

@@ -10,7 +10,7 @@ from time import perf_counter
 import numpy as np
 
 from dpm2_core.config import Settings
-from dpm2_core.frame import Array, Frame, Registration, State, Tracked
+from dpm2_core.frame import Array, Frame, OdometryResult, Registration, State
 from dpm2_core.geometry import se3
 from dpm2_core.slam.bridge import Bridge, Limits, covariance, predicted
 from dpm2_core.slam.odometry.keyframe_selection import KeyframeSelector
@@ -85,14 +85,14 @@ class Odometry:
         self._registration.clear()
         self._keyframes.reset()
 
-    def process(self, frame: Frame) -> Tracked:
+    def process(self, frame: Frame) -> OdometryResult:
         """Pose of one frame; never raises for what a sensor may deliver, and always gives a finite pose."""
         clock = [perf_counter()]
         dt = self._elapsed(frame.stamp)
         twist = np.zeros(6) if self._twist is None else self._twist
         scan = self._registration.prepare(frame, twist)
         clock.append(perf_counter())
-        pauses = frame.problem is None and self._pauses(dt) and not self._registration.refusal(scan)
+        pauses = frame.problem is None and self._pauses(dt) and not self._registration.rejection(scan)
         T_predicted = self._begin_stretch(dt) if pauses else predicted(self._T, twist, dt)
         registration = self._register(scan, T_predicted, dt, frame.problem)
         if self._first is not None and registration.ok:
@@ -107,7 +107,7 @@ class Odometry:
             T = registration.T_target_source
         keyframe = self._keyframes.select(frame, scan, T, registration)
         clock.append(perf_counter())
-        return Tracked(
+        return OdometryResult(
             stamp=frame.stamp,
             index=frame.index,
             T_odom_lidar=T,
@@ -160,7 +160,7 @@ class Odometry:
             return found
         self._covariance = bridge.covariance(self._T) + own.covariance
         if bridge.tries >= self._settings.restart_after and self._twist is not None:
-            self._keyframes.doubt(self._covariance)
+            self._keyframes.add_uncertainty(self._covariance)
             self._bridge, self._failures, self._breaks = None, 0, self._breaks + 1
             return replace(own, reason=f"broken by a pause: {found.reason}")
         self._failures += 1
@@ -171,8 +171,10 @@ class Odometry:
         if problem is not None:
             return Registration(T_predicted, self._unknown(dt), 0.0, np.inf, "none", False, problem)
         if not len(self._registration):
-            refusal = self._registration.refusal(scan)
-            return Registration(T_predicted, np.zeros((6, 6)), float(not refusal), 0.0, "first", not refusal, refusal)
+            rejection = self._registration.rejection(scan)
+            return Registration(
+                T_predicted, np.zeros((6, 6)), float(not rejection), 0.0, "first", not rejection, rejection
+            )
         if self._twist is None:
             return self._registered_from_rest(scan, T_predicted, dt)
         seconds = self._registered[1] + dt
@@ -198,9 +200,9 @@ class Odometry:
         """Refuse what no vehicle can do; the allowance grows while nothing has been registered."""
         time = self._registered[1] + dt
         off = se3.inverse(T_predicted) @ answer.T_target_source
-        metres, degrees = float(np.linalg.norm(off[:3, 3])), float(np.degrees(se3.angle(off)))
-        if answer.ok and metres > 0.5 + self._settings.max_acceleration * time * time:
-            return replace(answer, ok=False, reason=f"{metres:.1f} m from the prediction")
+        meters, degrees = float(np.linalg.norm(off[:3, 3])), float(np.degrees(se3.angle(off)))
+        if answer.ok and meters > 0.5 + self._settings.max_acceleration * time * time:
+            return replace(answer, ok=False, reason=f"{meters:.1f} m from the prediction")
         if answer.ok and degrees > 3 + self._settings.max_turn * time:
             return replace(answer, ok=False, reason=f"{degrees:.0f} deg from the prediction")
         return answer
@@ -257,7 +259,7 @@ class Odometry:
         if self._failures >= self._settings.lost_after:
             return State.LOST
         if self._twist is None and self._bridge is None:
-            return State.INITIALISING
+            return State.INITIALIZING
         if not registration.ok or registration.worst_sigma > self._settings.degraded_sigma or self._breaks:
             return State.DEGRADED
         return State.TRACKING

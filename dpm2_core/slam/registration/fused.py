@@ -51,8 +51,8 @@ class RefinedScanRegistration:
     def prepare(self, frame: Frame, twist: Array) -> Scan:
         return self._neural.described(frame, self._geometric.prepare(frame, twist))
 
-    def refusal(self, scan: Scan) -> str:
-        return self._geometric.refusal(scan)
+    def rejection(self, scan: Scan) -> str:
+        return self._geometric.rejection(scan)
 
     def register(self, scan: Scan, prediction: Prediction) -> Registration:
         neural = self._neural.register(scan, prediction) if len(self._neural) else None
@@ -97,7 +97,7 @@ def _mean(points: Registration, neural: Registration, prior: Array | None) -> Re
     dual = of_points @ axes
     of_network = (dual * np.where(ratio < 1, 0, ratio)) @ dual.T
     step = np.linalg.solve(held + of_network, of_network @ _difference(points, neural))
-    T = se3.orthonormalised(points.T_target_source @ se3.exp(step))
+    T = se3.orthonormalized(points.T_target_source @ se3.exp(step))
     return replace(points, T_target_source=T, covariance=np.linalg.inv(of_points + of_network), method="refined")
 
 

@@ -70,15 +70,15 @@ class GeometricRegistration:
         prior = 1e-6 * np.eye(6) if prior is None else _CORRELATED * prior
         for _ in range(s.iterations):
             points = source[::4] if coarse else source
-            H, gradient, inliers, rmse = self._linearise(points, target, T, gate)
+            H, gradient, inliers, rmse = self._linearize(points, target, T, gate)
             if inliers < s.min_points / 4:
                 return _failed(T_guess, f"{inliers} of {len(points)} points near the map")
             pull = prior @ se3.log(se3.inverse(T_guess) @ T)
             step = np.linalg.solve(H + prior, -gradient - pull)
-            T = se3.orthonormalised(T @ se3.exp(step))
+            T = se3.orthonormalized(T @ se3.exp(step))
             gate = max(0.7 * gate, s.final_gate)
-            radians, metres = _COARSE if coarse else _FINE
-            if np.linalg.norm(step[:3]) < radians and np.linalg.norm(step[3:]) < metres:
+            radians, meters = _COARSE if coarse else _FINE
+            if np.linalg.norm(step[:3]) < radians and np.linalg.norm(step[3:]) < meters:
                 if not coarse:
                     break
                 coarse, gate = False, s.final_gate
@@ -98,15 +98,15 @@ class GeometricRegistration:
         log_density = -0.5 * np.log(variance) - np.log1p(residual * residual / variance)
         return float(np.maximum(log_density, 0).sum() / len(source))
 
-    def _linearise(self, source: Array, target: LocalMap, T: Array, gate: float) -> tuple[Array, Array, int, float]:
+    def _linearize(self, source: Array, target: LocalMap, T: Array, gate: float) -> tuple[Array, Array, int, float]:
         """Hessian (6, 6) and gradient (6,) for a step on the right of T, number of inliers, their rmse in m."""
         source, normals, residual, variance = self._matched(source, target, T, gate)
-        normalised = residual * residual / variance
-        weight = 1 / (variance * (1 + normalised))  # Cauchy kernel
+        normalized = residual * residual / variance
+        weight = 1 / (variance * (1 + normalized))  # Cauchy kernel
         normals_body = normals @ T[:3, :3]
         J = np.concatenate([np.cross(source, normals_body), normals_body], 1)
         H = J.T @ (J * weight[:, None])
-        fits = normalised < 9
+        fits = normalized < 9
         rmse = float(np.sqrt(np.mean(residual[fits] ** 2))) if fits.any() else np.inf
         return H, J.T @ (weight * residual), int(fits.sum()), rmse
 
@@ -123,8 +123,8 @@ class GeometricRegistration:
 
 def _close(T: Array, T_other: Array) -> bool:
     off = se3.inverse(T) @ T_other
-    radians, metres = _EXPECTED
-    return bool(np.linalg.norm(off[:3, 3]) <= metres and se3.angle(off) <= radians)
+    radians, meters = _EXPECTED
+    return bool(np.linalg.norm(off[:3, 3]) <= meters and se3.angle(off) <= radians)
 
 
 def _covariance(H: Array) -> Array:

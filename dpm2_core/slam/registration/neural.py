@@ -73,18 +73,18 @@ class NeuralScanRegistration:
         except Dpm2Error:
             return scan
 
-    def refusal(self, scan: Scan) -> str:
+    def rejection(self, scan: Scan) -> str:
         return "" if scan.descriptors is not None else f"{len(scan.points)} points: too few for descriptors"
 
     def register(self, scan: Scan, prediction: Prediction) -> Registration:
         T_predicted = prediction.starts[0]
         if scan.descriptors is None:
-            return _failed(T_predicted, self.refusal(scan))
+            return _failed(T_predicted, self.rejection(scan))
         T_odom_kf, target = self._map.around(T_predicted)
         found = self._model.register(scan.descriptors, target)
         if not found.ok:
             return _failed(T_predicted, found.reason)
-        found = replace(found, T_target_source=se3.orthonormalised(T_odom_kf @ found.T_target_source))
+        found = replace(found, T_target_source=se3.orthonormalized(T_odom_kf @ found.T_target_source))
         if found.confidence < self._settings.min_confidence:
             return replace(found, ok=False, reason=f"matches with a confidence of only {found.confidence:.2f}")
         if (sigma := found.worst_sigma) > self._settings.max_sigma:

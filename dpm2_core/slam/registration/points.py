@@ -35,7 +35,7 @@ class GeometricScanRegistration:
     def prepare(self, frame: Frame, twist: Array) -> Scan:
         return self._preprocessor.prepare(frame, twist)
 
-    def refusal(self, scan: Scan) -> str:
+    def rejection(self, scan: Scan) -> str:
         least = self._registration.min_points
         return "" if len(scan.source) >= least else f"{len(scan.source)} points; a map needs {least}"
 

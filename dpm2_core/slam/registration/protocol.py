@@ -67,7 +67,7 @@ class ScanRegistration(Protocol):
         """What it needs of a frame that was taken while moving at `twist` (6,) [rad/s, m/s]; never raises."""
         ...
 
-    def refusal(self, scan: Scan) -> str:
+    def rejection(self, scan: Scan) -> str:
         """Why no map can begin with this scan; empty if one can."""
         ...
 

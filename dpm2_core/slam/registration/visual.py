@@ -50,12 +50,12 @@ _BLUR = (2.5, 1.0)  # pixels: so that nothing is missed between two of them
 _LOCAL = 12.0  # pixels: light that changes more slowly is no texture
 _LEAST = 100  # points that both pictures must show
 _CORRELATED = 100  # pixels next to each other, and the points between them, say the same
-_DOUBT = 0.3  # of the likeness at the coarse blur: the fine one chooses among those that are not farther behind
+_COARSE_MARGIN = 0.3  # of the likeness at the coarse blur: the fine one chooses among those that are not farther behind
 _APART = 0.6  # m: other places, not the slope of the best one
 
 
 @dataclass(frozen=True, eq=False)
-class _Picture:
+class _GrayImage:
     """Texture (h, w) float32 at each of `_BLUR`, K (3, 3) of the reduced picture, T_cam_lidar (4, 4)."""
 
     texture: tuple[NDArray[np.float32], ...]
@@ -82,7 +82,7 @@ class _Picture:
 class _Reference:
     """A picture whose scan was taken at T_odom_lidar (4, 4), and points (N, 3) of that scan in its LiDAR frame."""
 
-    picture: _Picture
+    image: _GrayImage
     points: Array
     T_odom_lidar: Array
 
@@ -112,8 +112,8 @@ class VisualScanRegistration:
         scan = self._registration.prepare(frame, twist)
         return replace(scan, image=frame.images[0]) if frame.images else scan
 
-    def refusal(self, scan: Scan) -> str:
-        return self._registration.refusal(scan)
+    def rejection(self, scan: Scan) -> str:
+        return self._registration.rejection(scan)
 
     def register(self, scan: Scan, prediction: Prediction) -> Registration:
         answer = self._registration.register(scan, prediction)
@@ -145,39 +145,39 @@ class VisualScanRegistration:
         found = self._search(self._reference, _textured(image, s.width), answer.T_target_source, axis, reach)
         if isinstance(found, str):
             return replace(answer, reason="; ".join(part for part in (answer.reason, found) if part))
-        way, sigma = found
+        offset, sigma = found
         gain = answer.covariance @ b / (b @ answer.covariance @ b + sigma**2)
-        T = se3.orthonormalised(answer.T_target_source @ se3.exp(gain * way))
+        T = se3.orthonormalized(answer.T_target_source @ se3.exp(gain * offset))
         covariance = answer.covariance - np.outer(gain, b @ answer.covariance)
         return replace(answer, T_target_source=T, covariance=(covariance + covariance.T) / 2, method="visual")
 
     def _made(self, scan: Scan, T_odom_lidar: Array) -> _Reference:
         assert scan.image is not None
-        picture = _textured(scan.image, self._settings.width)
-        points = _ahead(scan.points, picture, self._settings.points)
-        return _Reference(picture, points, T_odom_lidar)
+        image = _textured(scan.image, self._settings.width)
+        points = _ahead(scan.points, image, self._settings.points)
+        return _Reference(image, points, T_odom_lidar)
 
     def _search(
-        self, reference: _Reference, picture: _Picture, T_odom_lidar: Array, axis: Array, reach: float
+        self, reference: _Reference, image: _GrayImage, T_odom_lidar: Array, axis: Array, reach: float
     ) -> tuple[float, float] | str:
         """Way along `axis` of the LiDAR frame and its standard deviation, m; or why it is not known."""
         s = self._settings
         if len(reference.points) < _LEAST:
             return f"picture: only {len(reference.points)} points in it"
-        here = _moved(reference.picture.T_cam_lidar, reference.points)[None]
-        values = [reference.picture.sample(here, level)[0][0] for level in (0, 1)]
-        there = _moved(picture.T_cam_lidar @ se3.inverse(T_odom_lidar) @ reference.T_odom_lidar, reference.points)
-        step = picture.T_cam_lidar[:3, :3] @ axis
-        ways = np.arange(-reach, reach + _STEPS[0] / 2, _STEPS[0])
-        likeness = _correlations(values[0], *picture.sample(there - ways[:, None, None] * step, 0))
-        candidates = _maxima(likeness, max(s.min_correlation / 2, float(likeness.max()) - _DOUBT))
+        here = _moved(reference.image.T_cam_lidar, reference.points)[None]
+        values = [reference.image.sample(here, level)[0][0] for level in (0, 1)]
+        there = _moved(image.T_cam_lidar @ se3.inverse(T_odom_lidar) @ reference.T_odom_lidar, reference.points)
+        step = image.T_cam_lidar[:3, :3] @ axis
+        offsets = np.arange(-reach, reach + _STEPS[0] / 2, _STEPS[0])
+        correlation = _correlations(values[0], *image.sample(there - offsets[:, None, None] * step, 0))
+        candidates = _maxima(correlation, max(s.min_correlation / 2, float(correlation.max()) - _COARSE_MARGIN))
         if not len(candidates):
-            return f"picture: a likeness of only {max(float(likeness.max()), 0):.2f}"
+            return f"picture: a likeness of only {max(float(correlation.max()), 0):.2f}"
         around = np.arange(-_STEPS[0], _STEPS[0] + _STEPS[1] / 2, _STEPS[1])
         peaks = []
-        for middle in ways[candidates]:
+        for middle in offsets[candidates]:
             near = middle + around
-            fine = _correlations(values[1], *picture.sample(there - near[:, None, None] * step, 1))
+            fine = _correlations(values[1], *image.sample(there - near[:, None, None] * step, 1))
             peaks.append((float(fine.max()), near, fine))
         peaks.sort(key=lambda peak: -peak[0])
         best, near, fine = peaks[0]
@@ -189,30 +189,32 @@ class VisualScanRegistration:
         return _peak(near, fine, len(reference.points))
 
 
-def _maxima(likeness: NDArray[np.float32], least: float) -> NDArray[np.intp]:
+def _maxima(correlation: NDArray[np.float32], least: float) -> NDArray[np.intp]:
     """Places inside the search that are liker than both neighbours and than `least`."""
-    inner = likeness[1:-1]
-    return 1 + np.flatnonzero((inner >= likeness[:-2]) & (inner > likeness[2:]) & (inner > least))
+    inner = correlation[1:-1]
+    return 1 + np.flatnonzero((inner >= correlation[:-2]) & (inner > correlation[2:]) & (inner > least))
 
 
-def _textured(image: Image, width: int) -> _Picture:
+def _textured(image: Image, width: int) -> _GrayImage:
     """Brightness without its slow changes, over its local contrast, undistorted."""
-    camera, grey = image.camera, cv2.cvtColor(image.pixels, cv2.COLOR_RGB2GRAY)
+    camera, gray = image.camera, cv2.cvtColor(image.pixels, cv2.COLOR_RGB2GRAY)
     if camera.distortion:
-        grey = cv2.undistort(grey, camera.K, np.array(camera.distortion))
+        gray = cv2.undistort(gray, camera.K, np.array(camera.distortion))
     scale = min(1.0, width / camera.size[0])
     size = (round(camera.size[0] * scale), round(camera.size[1] * scale))
-    grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA).astype(np.float32)
-    detail = grey - cv2.GaussianBlur(grey, (0, 0), _LOCAL)
+    gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    detail = gray - cv2.GaussianBlur(gray, (0, 0), _LOCAL)
     detail /= np.sqrt(cv2.GaussianBlur(detail * detail, (0, 0), 2 * _LOCAL)) + 2.0  # grey levels: less is noise
     K = np.diag([size[0] / camera.size[0], size[1] / camera.size[1], 1.0]) @ camera.K
-    return _Picture(tuple(cv2.GaussianBlur(detail, (0, 0), blur) for blur in _BLUR), K, se3.inverse(camera.T_lidar_cam))
+    return _GrayImage(
+        tuple(cv2.GaussianBlur(detail, (0, 0), blur) for blur in _BLUR), K, se3.inverse(camera.T_lidar_cam)
+    )
 
 
-def _ahead(points: Points, picture: _Picture, count: int) -> Array:
+def _ahead(points: Points, image: _GrayImage, count: int) -> Array:
     """At most `count` of the points (P, 4) that the picture shows, (N, 3) float64, spread evenly over the scan."""
-    in_camera = _moved(picture.T_cam_lidar, points[:, :3].astype(np.float64))
-    kept = np.flatnonzero(picture.project(in_camera)[1] & (in_camera[:, 2] > _NEAR) & (in_camera[:, 2] < _FAR))
+    in_camera = _moved(image.T_cam_lidar, points[:, :3].astype(np.float64))
+    kept = np.flatnonzero(image.project(in_camera)[1] & (in_camera[:, 2] > _NEAR) & (in_camera[:, 2] < _FAR))
     return points[kept[:: max(1, len(kept) // count)], :3].astype(np.float64)
 
 
@@ -232,16 +234,16 @@ def _correlations(
     return np.where(count >= _LEAST, (x * y).sum(1) / np.maximum(spread, 1e-6), 0.0)
 
 
-def _peak(ways: Array, likeness: NDArray[np.float32], points: int) -> tuple[float, float]:
+def _peak(offsets: Array, correlation: NDArray[np.float32], points: int) -> tuple[float, float]:
     """Maximum of a parabola through the top, and its standard deviation, m.
 
     The information of a shift in y = x(shift) + noise is n (dx/dshift)^2 / var(noise); both follow from the correlation
     r and its second derivative: -n r'' r / (1 - r^2).
     """
-    i = int(np.clip(likeness.argmax(), 1, len(ways) - 2))
-    before, top, after = likeness[i - 1 : i + 2].astype(float)
-    step = ways[1] - ways[0]
+    i = int(np.clip(correlation.argmax(), 1, len(offsets) - 2))
+    before, top, after = correlation[i - 1 : i + 2].astype(float)
+    step = offsets[1] - offsets[0]
     bend = max((2 * top - before - after) / step**2, 1e-3)
-    way = ways[i] + float(np.clip((after - before) / (2 * bend * step), -step, step))
+    offset = offsets[i] + float(np.clip((after - before) / (2 * bend * step), -step, step))
     information = points / _CORRELATED * bend * top / max(1 - top * top, 1e-3)
-    return way, float(max(0.01, information**-0.5))
+    return offset, float(max(0.01, information**-0.5))

@@ -22,10 +22,10 @@ from dpm2_core.slam.store import rows, schema
 from dpm2_core.slam.store.cloud_codec import pack_cloud, unpack_cloud, unpack_mask
 from dpm2_core.slam.store.cloud_store import CloudStore, Loan
 from dpm2_core.slam.store.map_data import NO_POINTS, MapData, save_as, subset
-from dpm2_core.slam.store.rows import Edge, Pruned, Session
+from dpm2_core.slam.store.rows import Edge, RemovedKeyframe, Session
 
 _SMALLEST = 20  # bytes of a row: a file has at most so many as fit, and nobody waits for the row 2^62 of a small one
-_DOUBT = np.diag([0.05] * 3 + [0.5] * 3) ** 2  # of an edge that bridges a lost keyframe, rad and m
+_BRIDGE_COVARIANCE = np.diag([0.05] * 3 + [0.5] * 3) ** 2  # of an edge that bridges a lost keyframe, rad and m
 
 
 @dataclass
@@ -214,11 +214,11 @@ class _Salvage:
                 edges.append(replace(edge, from_node=new[edge.from_node], to_node=new[edge.to_node]))
         return edges
 
-    def _trail(self, new: dict[int, int]) -> list[Pruned]:
+    def _trail(self, new: dict[int, int]) -> list[RemovedKeyframe]:
         trail = []
         for row in self._rows("trail", "rowid"):
             try:
-                pruned = rows.pruned_of(row)
+                pruned = rows.removed_of(row)
                 trail.append(replace(pruned, node=new[pruned.node]))
             except (ValueError, KeyError):
                 self._problem(f"trail {row[0]}: not a pose beside a keyframe that is there")
@@ -232,7 +232,7 @@ class _Salvage:
             a, b = keyframes[node - 1], keyframes[node]
             if node not in tied and (session[node], b.robot) == (session[node - 1], a.robot) and b.id > 0:
                 T_a_b = se3.inverse(a.T_odom_kf) @ b.T_odom_kf
-                out.append(Edge("odometry", node - 1, node, T_a_b, _DOUBT, method="bridge"))
+                out.append(Edge("odometry", node - 1, node, T_a_b, _BRIDGE_COVARIANCE, method="bridge"))
         return out
 
     def _sessions(self, session: dict[int, int]) -> list[Session]:

@@ -20,13 +20,13 @@ from dpm2_core.slam.store.map_store import Change, MapStore
 from dpm2_core.slam.store.rows import NO_POINTS as NO_POINTS
 from dpm2_core.slam.store.rows import (
     Edge,
-    Pruned,
+    RemovedKeyframe,
     Session,
     check_ends,
     edge_of,
     keyframe_of,
     pose_of,
-    pruned_of,
+    removed_of,
     session_of,
     unpack_descriptors,
 )
@@ -50,7 +50,7 @@ class MapData:
     session: list[int]
     poses: Array
     edges: list[Edge]
-    trail: list[Pruned]
+    trail: list[RemovedKeyframe]
     sessions: list[Session]
     clouds: CloudStore
     thumbnail: Thumbnail = field(default=lambda node: None)
@@ -96,7 +96,7 @@ def _load(store: MapStore, descriptors: bool) -> MapData:
     moving: dict[int, bytes] = dict(store.rows("moving"))
     if not all(isinstance(mask, bytes) for mask in moving.values()):
         raise ValueError("a mask of moving points that is none")
-    trail = [pruned for _, pruned in _made(store, "trail", pruned_of)]
+    trail = [pruned for _, pruned in _made(store, "trail", removed_of)]
     if any(pruned.node not in nodes for pruned in trail):
         raise ValueError("a pruned keyframe that belongs to none")
     return MapData(
@@ -200,7 +200,7 @@ def _remove(path: Path) -> None:
         Path(f"{path}{suffix}").unlink(missing_ok=True)
 
 
-def subset(data: MapData, nodes: Sequence[int], edges: list[Edge], trail: list[Pruned]) -> MapData:
+def subset(data: MapData, nodes: Sequence[int], edges: list[Edge], trail: list[RemovedKeyframe]) -> MapData:
     """The map of some of its nodes, lenders among them, renumbered; `edges` and `trail` are in the new numbers."""
     where = list(nodes)
     new = {node: i for i, node in enumerate(where)}

@@ -26,13 +26,13 @@ from dpm2_core.slam.store import schema
 from dpm2_core.slam.store.cloud_store import Loan
 from dpm2_core.slam.store.rows import (
     Edge,
-    Pruned,
+    RemovedKeyframe,
     Session,
     array_bytes,
     edge_row,
     keyframe_row,
     pack_descriptors,
-    pruned_row,
+    removed_row,
     with_crc,
 )
 
@@ -54,7 +54,7 @@ class Change:
     edges: list[Edge] = field(default_factory=list)
     poses: dict[int, Array] = field(default_factory=dict)
     moving: dict[int, bytes] = field(default_factory=dict)
-    trail: list[Pruned] = field(default_factory=list)
+    trail: list[RemovedKeyframe] = field(default_factory=list)
 
 
 class MapStore:
@@ -151,7 +151,7 @@ class MapStore:
             _insert(sql, "edges", [edge_row(first + i, edge) for i, edge in enumerate(change.edges)])
             _insert(sql, "poses", [with_crc(node, array_bytes(T)) for node, T in change.poses.items()])
             _insert(sql, "moving", [with_crc(node, mask) for node, mask in change.moving.items()])
-            _insert(sql, "trail", [pruned_row(p) for p in change.trail])
+            _insert(sql, "trail", [removed_row(p) for p in change.trail])
 
     def rows(self, table: str, columns: str = "", checked: bool = True) -> Iterator[tuple[Any, ...]]:
         """Rows of a table in their order, without checksums.

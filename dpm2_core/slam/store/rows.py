@@ -54,7 +54,7 @@ class Edge:
 
 
 @dataclass(frozen=True, eq=False)
-class Pruned:
+class RemovedKeyframe:
     """A keyframe that is no longer there: `T_node_kf` (4, 4) from a node that is."""
 
     id: int
@@ -208,12 +208,12 @@ def check_ends(edge: Edge, nodes: Container[int]) -> None:
         raise ValueError(f"leads from {edge.from_node} to {edge.to_node}, which are not both there")
 
 
-def pruned_row(p: Pruned) -> tuple[Any, ...]:
+def removed_row(p: RemovedKeyframe) -> tuple[Any, ...]:
     """Of table `trail`."""
     return with_crc(p.id, p.robot, p.session, p.stamp, p.node, array_bytes(p.T_node_kf))
 
 
-def pruned_of(row: tuple[Any, ...]) -> Pruned:
+def removed_of(row: tuple[Any, ...]) -> RemovedKeyframe:
     """Of a row of table `trail` without its checksum.
 
     Raises:
@@ -221,7 +221,7 @@ def pruned_of(row: tuple[Any, ...]) -> Pruned:
     """
     id, robot, session, stamp, node, T_node_kf = row
     _check_types((id, session, stamp, node), robot)
-    return Pruned(id, robot, session, stamp, node, pose_of(T_node_kf))
+    return RemovedKeyframe(id, robot, session, stamp, node, pose_of(T_node_kf))
 
 
 def session_of(row: tuple[Any, ...]) -> Session:

@@ -112,9 +112,9 @@ def test_kidnapping_is_noticed_and_answered(drive: Path, made: Path, tmp_path: P
 def test_another_drive_extends_the_map_as_a_session_tied_by_loops(drive: Path, made: Path, tmp_path: Path) -> None:
     path = tmp_path / "grown.dpm2map"
     path.write_bytes(made.read_bytes())
-    refused = dpm2("run", drive, "--out", tmp_path / "o", "--frames", "4:", "--map", path)
-    assert refused.returncode == 2
-    assert "--resume" in refused.stderr
+    rejected = dpm2("run", drive, "--out", tmp_path / "o", "--frames", "4:", "--map", path)
+    assert rejected.returncode == 2
+    assert "--resume" in rejected.stderr
     done = dpm2("run", drive, "--out", tmp_path / "o", "--frames", "4:", "--map", path, "--extend")
     assert done.returncode == 0, done.stderr
     with MapStore.open(path) as store:

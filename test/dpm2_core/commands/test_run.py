@@ -152,9 +152,9 @@ def test_given_ground_truth(drive: Path, sequence: Path, tmp_path: Path) -> None
     assert json.loads((tmp_path / "out" / "metrics.json").read_text())["ape_rmse_m"] < 0.03
     short = tmp_path / "short.txt"
     short.write_text("\n".join((drive / "poses" / "00.txt").read_text().splitlines()[:5]) + "\n")
-    refused = dpm2("run", sequence, "--out", tmp_path / "out2", "--gt", short)
-    assert refused.returncode == 2
-    assert "5 poses" in refused.stderr
+    rejected = dpm2("run", sequence, "--out", tmp_path / "out2", "--gt", short)
+    assert rejected.returncode == 2
+    assert "5 poses" in rejected.stderr
 
 
 def test_full_disk_keeps_the_old_map(drive: Path, tmp_path: Path) -> None:

@@ -323,18 +323,18 @@ def test_a_truncated_mcap_gives_what_is_whole(recording: Path, bare: bool) -> No
 def test_every_cut_is_survived(bags: Any, tmp_path: Path) -> None:
     """Wherever a small file is cut: some frames, all of them good, or one clear error."""
     bag = bags.write(tmp_path / "b", clouds(bags, [1, 2, 3]))
-    whole, refused = mcap(bag).read_bytes(), []
+    whole, rejected = mcap(bag).read_bytes(), []
     for size in range(0, len(whole), 97):
         mcap(bag).write_bytes(whole[:size])
         try:
             frames = list(BagSource(bag).frames())
         except UsageError as error:
-            refused.append(str(error))
+            rejected.append(str(error))
             continue
         assert len(frames) == 3
         assert all(frame.problem is None for frame in frames)
-    assert refused
-    assert all(re.search("file is empty|wrong magic|truncated before", reason) for reason in refused)
+    assert rejected
+    assert all(re.search("file is empty|wrong magic|truncated before", reason) for reason in rejected)
 
 
 @pytest.mark.parametrize("bare", [False, True])

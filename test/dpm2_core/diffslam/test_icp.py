@@ -30,8 +30,8 @@ def settings(iterations: int = 8, **solver: object) -> IcpSettings:
 def test_known_motion_is_recovered(scans: list[Tensor], motion: Tensor) -> None:
     """0.8 m and 1.2 deg from identity in the default 8 iterations, to 1 mm and 0.01 deg."""
     found = register(Cloud(scans[1][None]), Cloud(scans[0][None]), EYE, settings())
-    metres, radians = error(found[0], motion)
-    assert metres < 1e-3
+    meters, radians = error(found[0], motion)
+    assert meters < 1e-3
     assert radians < np.deg2rad(0.01)
 
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dpm2_core.diffslam.neighbors import NeighbourSearch
+from dpm2_core.diffslam.neighbors import NeighborSearch
 
 
 def clouds(offset: float = 0.0) -> tuple[Tensor, Tensor]:
@@ -16,9 +16,9 @@ def clouds(offset: float = 0.0) -> tuple[Tensor, Tensor]:
     return points, valid
 
 
-def by_distance(points: Tensor, valid: Tensor) -> NeighbourSearch:
+def by_distance(points: Tensor, valid: Tensor) -> NeighborSearch:
     """The way of the GPU, here."""
-    search = NeighbourSearch(points, valid)
+    search = NeighborSearch(points, valid)
     search._trees = []
     return search
 
@@ -30,7 +30,7 @@ def test_tree_and_distance_agree_with_brute_force() -> None:
         queries = points + 0.3
         distance = (queries[:, :, None] - points[:, None]).norm(dim=-1).masked_fill(~valid[:, None], torch.inf)
         wanted = distance.argsort(-1)[..., :5]
-        torch.testing.assert_close(NeighbourSearch(points, valid).nearest(queries, 5), wanted)
+        torch.testing.assert_close(NeighborSearch(points, valid).nearest(queries, 5), wanted)
         torch.testing.assert_close(by_distance(points, valid).nearest(queries, 5), wanted)
         torch.testing.assert_close(by_distance(points, valid).nearest(queries), wanted[..., :1])
 
@@ -41,7 +41,7 @@ def test_fewer_points_than_asked_repeat_the_nearest() -> None:
     valid[0] = False
     valid[1] = False
     valid[1, 7] = True
-    for search in (NeighbourSearch(points, valid), by_distance(points, valid)):
+    for search in (NeighborSearch(points, valid), by_distance(points, valid)):
         found = search.nearest(points, 4)
         assert bool((found[1] == 7).all())
         assert bool((found[0] == found[0, :, :1]).all())
@@ -53,6 +53,6 @@ def test_fewer_points_than_asked_repeat_the_nearest() -> None:
 def test_select_keeps_each_cloud_with_its_points() -> None:
     """In the order asked for, repeated too."""
     points, valid = clouds()
-    for search in (NeighbourSearch(points, valid), by_distance(points, valid)):
+    for search in (NeighborSearch(points, valid), by_distance(points, valid)):
         both = search.select([2, 0, 2]).nearest(points[[2, 0, 2]], 3)
         torch.testing.assert_close(both, search.nearest(points, 3)[[2, 0, 2]])

@@ -166,16 +166,16 @@ def test_windows_that_are_not_contiguous_are_refused(scans: list[Tensor]) -> Non
 def test_unusable_clouds_are_named(scans: list[Tensor], side: str) -> None:
     """Which of the two, which scan, what is wrong."""
 
-    def refused(clouds: list[Tensor], message: str) -> None:
+    def rejected(clouds: list[Tensor], message: str) -> None:
         with pytest.raises(UsageError, match=f"{side}.*{message}"):
             SlamLoss()(*((clouds, scans) if side == "predicted" else (scans, clouds)))
 
     broken = scans[2].clone()
     broken[3, 1] = torch.nan
-    refused([*scans[:2], broken, scans[3]], "scan 2: 1 of its 600 points are not finite")
-    refused([*scans[:3], scans[3][:49]], "scan 3: 49 points; want at least 50")
-    refused([*scans[:3], scans[3][:, :2]], r"scan 3: want floating-point points \(N, 3\)")
-    refused([*scans[:3], scans[3].long()], "scan 3: want floating-point")
+    rejected([*scans[:2], broken, scans[3]], "scan 2: 1 of its 600 points are not finite")
+    rejected([*scans[:3], scans[3][:49]], "scan 3: 49 points; want at least 50")
+    rejected([*scans[:3], scans[3][:, :2]], r"scan 3: want floating-point points \(N, 3\)")
+    rejected([*scans[:3], scans[3].long()], "scan 3: want floating-point")
 
 
 def test_unusable_weights_and_windows_are_refused(scans: list[Tensor]) -> None:

@@ -31,22 +31,22 @@ def _picture(path: Path) -> np.ndarray:
     return cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB).astype(int)
 
 
-def _orange(picture: np.ndarray) -> np.ndarray:
-    return np.argwhere(np.abs(picture - ORANGE).max(-1) < 12)
+def _orange(make_image: np.ndarray) -> np.ndarray:
+    return np.argwhere(np.abs(make_image - ORANGE).max(-1) < 12)
 
 
 def test_the_trajectory_is_drawn_to_scale_and_the_map_beneath_it(tmp_path: Path) -> None:
     """A quarter circle is as wide as it is high; the map lights up what is dark without it."""
     trajectory_png(tmp_path / "with.png", _arc(), cloud=_cloud(), title="")
     trajectory_png(tmp_path / "without.png", _arc(), title="")
-    picture, bare = _picture(tmp_path / "with.png"), _picture(tmp_path / "without.png")
+    make_image, bare = _picture(tmp_path / "with.png"), _picture(tmp_path / "without.png")
     # The legend, in the upper right, holds samples of the same colour.
-    points = _orange(picture)
-    points = points[(points[:, 0] > 0.25 * picture.shape[0]) | (points[:, 1] < 0.7 * picture.shape[1])]
+    points = _orange(make_image)
+    points = points[(points[:, 0] > 0.25 * make_image.shape[0]) | (points[:, 1] < 0.7 * make_image.shape[1])]
     height, width = np.ptp(points, axis=0)
     assert height > 200
     assert width == pytest.approx(height, rel=0.1)
-    assert (picture.max(-1) > 60).mean() > 5 * (bare.max(-1) > 60).mean()
+    assert (make_image.max(-1) > 60).mean() > 5 * (bare.max(-1) > 60).mean()
 
 
 def test_the_ground_truth_is_brought_into_the_map_frame(tmp_path: Path) -> None:

@@ -35,10 +35,10 @@ def test_weights_give_what_the_module_gives(learnable: bool) -> None:
 
 
 @pytest.fixture
-def frame(street: Callable, picture: Callable) -> Frame:
+def frame(street: Callable, make_image: Callable) -> Frame:
     noise = np.random.default_rng(0)
     points = np.c_[street(noise), np.full(4000, 0.5)].astype(np.float32)
-    return Frame(0, points, images=(picture(noise),))
+    return Frame(0, points, images=(make_image(noise),))
 
 
 def test_a_point_attends_around_where_it_is_seen(model: DeepPointMap2, frame: Frame) -> None:
@@ -66,7 +66,7 @@ def test_it_leaves_the_network_as_it_was(model: DeepPointMap2, frame: Frame) -> 
 
 
 def test_what_cannot_be_shown_is_said(
-    model: DeepPointMap2, tiny: Callable[..., NetworkSettings], frame: Frame, picture: Callable[..., Image]
+    model: DeepPointMap2, tiny: Callable[..., NetworkSettings], frame: Frame, make_image: Callable[..., Image]
 ) -> None:
     """No picture, no such point, no camera."""
     with pytest.raises(UsageError, match="has no picture"):

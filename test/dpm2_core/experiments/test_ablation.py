@@ -11,8 +11,8 @@ import pytest
 from dpm2_core.experiments.ablation import TABLE_4, AblationSettings, ablation
 from dpm2_core.learning.dataset import DataSettings
 from dpm2_core.learning.registration_loss import LossSettings
-from dpm2_core.learning.train_registration import PhaseOneSettings
-from dpm2_core.learning.trainer import OptimiserSettings
+from dpm2_core.learning.train_registration import RegistrationTrainingSettings
+from dpm2_core.learning.trainer import OptimizerSettings
 from dpm2_core.network.settings import PRESETS
 
 
@@ -21,13 +21,13 @@ def test_every_alternative_is_trained_and_measured_once(
 ) -> None:
     """All of Table 4; a second call trains nothing and finds the same figures."""
     monkeypatch.setitem(PRESETS, "tiny", tiny().model_dump())
-    training = PhaseOneSettings(
+    training = RegistrationTrainingSettings(
         preset="tiny",
         data=DataSettings(packed={str(packed): 1.0}, groups=1, frames=2, workers=0, images=True),
         loss=LossSettings(near=8, own=4),
         pairs=1,
         sets=0,
-        optimiser=OptimiserSettings(steps=1, compile=False, bf16=False, warmup=0),
+        optimiser=OptimizerSettings(steps=1, compile=False, bf16=False, warmup=0),
     )
     settings = AblationSettings(training=training, measure={"same": str(packed)}, pairs=2)
     seen: list[str] = []

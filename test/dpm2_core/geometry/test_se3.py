@@ -70,16 +70,16 @@ def test_hat_is_the_cross_product(a: np.ndarray, b: np.ndarray) -> None:
 def test_orthonormalised_gives_the_rotation_back_after_rounding(xi: np.ndarray, noise: np.ndarray) -> None:
     T = se3.exp(xi)
     noise[3] = 0
-    out = se3.orthonormalised(T + noise)
+    out = se3.orthonormalized(T + noise)
     np.testing.assert_allclose(out[:3, :3] @ out[:3, :3].T, np.eye(3), atol=1e-12)
     assert np.linalg.det(out[:3, :3]) == pytest.approx(1)
     assert np.abs(out - T).max() < 0.2  # three entries of 0.05 in each row, and some for the polar factor
-    np.testing.assert_allclose(se3.orthonormalised(T), T, atol=1e-12)
+    np.testing.assert_allclose(se3.orthonormalized(T), T, atol=1e-12)
 
 
 def test_orthonormalised_never_mirrors() -> None:
     mirror = np.diag([1.0, 1.0, -1.0, 1.0])
-    assert np.linalg.det(se3.orthonormalised(mirror)[:3, :3]) == pytest.approx(1)
+    assert np.linalg.det(se3.orthonormalized(mirror)[:3, :3]) == pytest.approx(1)
 
 
 @pytest.mark.parametrize("shape", [(), (1,), (5,), (2, 3), (0,)])
@@ -92,7 +92,7 @@ def test_every_function_takes_any_batch(shape: tuple[int, ...]) -> None:
         assert function(T).shape == (*shape, *tail)
         for i in np.ndindex(shape):
             np.testing.assert_allclose(function(T)[i], function(T[i]), atol=1e-14)
-    assert se3.orthonormalised(T).shape == T.shape
+    assert se3.orthonormalized(T).shape == T.shape
 
 
 def test_make_broadcasts_one_rotation_over_many_translations() -> None:

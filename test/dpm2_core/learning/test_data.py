@@ -18,7 +18,7 @@ from dpm2_core.errors import UsageError
 from dpm2_core.geometry import se3
 from dpm2_core.learning.augment import AugmentSettings, augment
 from dpm2_core.learning.dataset import DataSettings, GroupDataset, draw_group
-from dpm2_core.learning.pair_sampling import merge_tokens, plan_sets
+from dpm2_core.learning.pair_sampling import merge_tokens, sample_set_pairs
 from dpm2_core.learning.train_overlap import average_precision, draw_overlap
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.tokens import to_tokens
@@ -153,7 +153,7 @@ def test_plans_hold_the_truth(model: DeepPointMap2, packed: Path, sides: tuple[i
     """Members moved to the first of their side, and one side to the other, meet in the world."""
     data = GroupDataset(DataSettings(packed={str(packed): 1.0}, groups=2, frames=4, workers=0), model.settings, 0)
     batch = data.batch(0)
-    plan = plan_sets(batch.poses, 2, sides, 20.0, torch.Generator().manual_seed(0))
+    plan = sample_set_pairs(batch.poses, 2, sides, 20.0, torch.Generator().manual_seed(0))
     flat = batch.poses.flatten(0, 1).float()
     for row in range(4):
         members = torch.cat([plan.source[row], plan.target[row]])

@@ -17,9 +17,9 @@ from dpm2_core.diffslam.trajectory_loss import trajectory_loss
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
-from dpm2_core.learning.finetune import draw_stretch, finetune, window_trajectories
+from dpm2_core.learning.finetune import draw_road_segment, finetune, window_trajectories
 from dpm2_core.learning.finetune_data import prepare, refer
-from dpm2_core.learning.finetune_settings import FinetuneOptimiser, FinetuneSettings
+from dpm2_core.learning.finetune_settings import FinetuneOptimizer, FinetuneSettings
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.network.tokens import Tokens
@@ -58,8 +58,8 @@ def test_the_gradient_of_the_trajectory_is_that_of_differences(
     xyz = tokens.xyz.clone().requires_grad_(True)
 
     def loss(xyz: torch.Tensor) -> torch.Tensor:
-        found, astray = window_trajectories(model.decoder, tokens._replace(xyz=xyz), road)
-        assert float(astray) == 0.0
+        found, diverged = window_trajectories(model.decoder, tokens._replace(xyz=xyz), road)
+        assert float(diverged) == 0.0
         return trajectory_loss(found[0], reference[0])
 
     (slope,) = torch.autograd.grad(loss(xyz), xyz)
@@ -83,8 +83,8 @@ def test_a_scan_that_matches_nothing_goes_astray_without_a_gradient_or_nan(
     xyz = tokens.xyz.clone()
     xyz[1] = 30 * torch.randn_like(xyz[1])
     xyz.requires_grad_(True)
-    found, astray = window_trajectories(model.decoder, tokens._replace(xyz=xyz), road)
-    assert float(astray) > 0
+    found, diverged = window_trajectories(model.decoder, tokens._replace(xyz=xyz), road)
+    assert float(diverged) > 0
     torch.testing.assert_close(found[0, 1], (torch.linalg.inv(road[0, 0]) @ road[0, 1]), atol=1e-9, rtol=0)
     found.sum().backward()
     assert xyz.grad is not None
@@ -96,7 +96,7 @@ def test_a_stretch_is_in_the_order_of_the_road() -> None:
     order = np.random.default_rng(1).permutation(50)
     poses[:, 0, 3] = order
     for seed in range(10):
-        along = order[draw_stretch(poses, 4, 15.0, np.random.default_rng(seed))]
+        along = order[draw_road_segment(poses, 4, 15.0, np.random.default_rng(seed))]
         steps = np.diff(along)
         assert (steps > 0).all() or (steps < 0).all()
         assert abs(along[-1] - along[0]) <= 30
@@ -114,7 +114,7 @@ def settings(tmp_path: Path, packed: Path, tiny: Callable[..., NetworkSettings])
     torch.manual_seed(0)
     path = tmp_path / "start.safetensors"
     save_weights(DeepPointMap2(tiny()), path, {"images": "false", "phase": "2"}, half=False)
-    optimiser = FinetuneOptimiser(steps=4, warmup=1, bf16=False, save_every=2, rate=1e-3)
+    optimiser = FinetuneOptimizer(steps=4, warmup=1, bf16=False, save_every=2, rate=1e-3)
     chosen = {"rehearsal": str(packed), "pairs": 1.0, "groups": 1, "frames": 3, "optimiser": optimiser}
     return FinetuneSettings(weights=str(path), **chosen)  # type: ignore[arg-type]
 

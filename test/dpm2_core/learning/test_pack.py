@@ -24,9 +24,9 @@ class Sweeps:
 
     name, T_cam_lidar = "sweeps", None
 
-    def __init__(self, world: np.ndarray, picture: Callable, images: bool = True) -> None:
+    def __init__(self, world: np.ndarray, make_image: Callable, images: bool = True) -> None:
         self.notes: list[str] = []
-        self.world, self.picture, self.images = world, picture, images
+        self.world, self.make_image, self.images = world, make_image, images
         self.poses: Array | None = np.stack([self.at(0.1 * n) for n in range(6)])
         self.poses[2] = np.nan
 
@@ -42,18 +42,18 @@ class Sweeps:
             offsets = np.linspace(-0.05, 0.05, len(self.world)).astype(np.float32)
             T = np.stack([se3.inverse(self.at(0.1 * n + t)) for t in offsets])
             seen = np.einsum("nij,nj->ni", T[:, :3, :3], self.world) + T[:, :3, 3]
-            images = (self.picture(np.random.default_rng(n)),) if self.images or n == 3 else ()
+            images = (self.make_image(np.random.default_rng(n)),) if self.images or n == 3 else ()
             points = np.c_[seen, np.ones(len(seen))].astype(np.float32)
             yield Frame(n * 10**8, points, offsets, images, index=n)
 
 
 def test_packed_sweeps_are_rigid_and_fit_each_other(
-    street: Callable, picture: Callable, tiny: Callable, tmp_path: Path
+    street: Callable, make_image: Callable, tiny: Callable, tmp_path: Path
 ) -> None:
     """Undistorted by the true motion, the points of all frames are the same in the world; no pose, no sample."""
     world = street(np.random.default_rng(0), 1000)
     seen: list[int] = []
-    assert pack(Sweeps(world, picture), tmp_path / "d", tiny(), advance=lambda: seen.append(1)) == 5
+    assert pack(Sweeps(world, make_image), tmp_path / "d", tiny(), advance=lambda: seen.append(1)) == 5
     assert len(seen) == 6
     drive = PackedDrive(tmp_path / "d")
     height, width = tiny().image.size
@@ -66,9 +66,9 @@ def test_packed_sweeps_are_rigid_and_fit_each_other(
         assert np.quantile(gap, 0.99) < 0.02
 
 
-def test_what_cannot_be_packed(street: Callable, picture: Callable, tiny: Callable, tmp_path: Path) -> None:
+def test_what_cannot_be_packed(street: Callable, make_image: Callable, tiny: Callable, tmp_path: Path) -> None:
     """No poses; none in the range; pictures in some frames only."""
-    source = Sweeps(street(np.random.default_rng(0), 200), picture, images=False)
+    source = Sweeps(street(np.random.default_rng(0), 200), make_image, images=False)
     with pytest.raises(UsageError, match="some frames have a picture"):
         pack(source, tmp_path / "d", tiny())
     with pytest.raises(UsageError, match="no readable frame with a pose"):

@@ -14,7 +14,7 @@ from dpm2_core.learning.dataset import DataSettings, GroupDataset
 from dpm2_core.learning.pair_sampling import merge_tokens
 from dpm2_core.learning.pose_loss import FINE, differentiable_poses, pose_loss
 from dpm2_core.learning.registration_loss import LossSettings
-from dpm2_core.learning.train_registration import PhaseOne, PhaseOneSettings, plans_of
+from dpm2_core.learning.train_registration import RegistrationTraining, RegistrationTrainingSettings, set_pairs_of
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pose_solver import solve_batch
 from dpm2_core.network.settings import NetworkSettings
@@ -74,10 +74,10 @@ def test_phase_one_trains_by_it(packed: Path, tiny: Callable[..., NetworkSetting
     data = DataSettings(packed={str(packed): 1.0}, groups=1, frames=3, workers=0)
     loss = LossSettings(pairing=0, coarse=0, backbone=0, image=0, offset=0, pose=1, near=32, own=16)
     batch = GroupDataset(data, tiny(), seed=0).batch(0)
-    module = PhaseOne(tiny(), loss)
+    module = RegistrationTraining(tiny(), loss)
     with torch.no_grad():  # the last layer of the offsets is zero at first, and passes no gradient on
         module.model.decoder.offset.out.weight.normal_(std=0.1)
-    plan = plans_of(batch.poses, PhaseOneSettings(data=data, loss=loss, pairs=2, sets=0), 0)[0]
+    plan = set_pairs_of(batch.poses, RegistrationTrainingSettings(data=data, loss=loss, pairs=2, sets=0), 0)[0]
     tokens = module.model.encoder(batch.points, None).tokens
     source, target = (merge_tokens(tokens, side, plan.T_source, True) for side in (plan.source, plan.target))
     with torch.no_grad():

@@ -15,8 +15,8 @@ from safetensors.torch import load_file
 from dpm2_core.data.packed import Sample, write_packed
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Camera
-from dpm2_core.learning.train_image import PhaseImageSettings, PictureDataset, PictureSettings, phase_image, shown
-from dpm2_core.learning.trainer import OptimiserSettings
+from dpm2_core.learning.train_image import ImageDataset, ImageTrainingSettings, PictureSettings, shown, train_image
+from dpm2_core.learning.trainer import OptimizerSettings
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.settings import PRESETS, NetworkSettings
 from dpm2_core.network.weights import save_weights
@@ -30,29 +30,29 @@ def network(tiny: Callable, monkeypatch: pytest.MonkeyPatch) -> NetworkSettings:
 
 
 @pytest.fixture
-def settings(packed: Path, network: NetworkSettings, tmp_path: Path) -> PhaseImageSettings:
+def settings(packed: Path, network: NetworkSettings, tmp_path: Path) -> ImageTrainingSettings:
     """Four steps on the packed drive, from weights in `start.safetensors`."""
     torch.manual_seed(0)
     start = tmp_path / "start.safetensors"
     save_weights(DeepPointMap2(network), start, {})
-    return PhaseImageSettings(
+    return ImageTrainingSettings(
         preset="tiny",
         data=PictureSettings(packed={str(packed): 1.0}, groups=2, radius=3),
         points=32,
-        optimiser=OptimiserSettings(steps=4, compile=False, bf16=False, save_every=2, warmup=1),
+        optimiser=OptimizerSettings(steps=4, compile=False, bf16=False, save_every=2, warmup=1),
         start=str(start),
     )
 
 
-def test_it_changes_the_image_branch_alone(settings: PhaseImageSettings, tmp_path: Path) -> None:
+def test_it_changes_the_image_branch_alone(settings: ImageTrainingSettings, tmp_path: Path) -> None:
     """LiDAR, fusion and decoder stay bit for bit, and resuming gives the weights of one run."""
-    whole = load_file(phase_image(settings, tmp_path / "whole"))
+    whole = load_file(train_image(settings, tmp_path / "whole"))
     before = load_file(Path(settings.start))
     changed = {name for name in before if not torch.equal(before[name], whole[name])}
     assert changed
     assert all(name.startswith(("encoder.image.", "encoder.fusion.pixel.")) for name in changed)
-    phase_image(settings, tmp_path / "halves", until=2)
-    halves = load_file(phase_image(settings, tmp_path / "halves", resume=True))
+    train_image(settings, tmp_path / "halves", until=2)
+    halves = load_file(train_image(settings, tmp_path / "halves", resume=True))
     assert all(torch.equal(whole[name], halves[name]) for name in whole)
     rows = [json.loads(line) for line in (tmp_path / "whole" / "log.jsonl").read_text().splitlines()]
     assert all(np.isfinite(row["loss"]) and 0 <= row["right"] <= 1 for row in rows)
@@ -62,9 +62,9 @@ def _spread(points: torch.Tensor) -> torch.Tensor:
     return (points[:, :, None] - points[:, None]).norm(dim=-1)
 
 
-def test_points_of_a_pair_are_the_same_in_the_world(settings: PhaseImageSettings, network: NetworkSettings) -> None:
+def test_points_of_a_pair_are_the_same_in_the_world(settings: ImageTrainingSettings, network: NetworkSettings) -> None:
     """The second half of each pair is the first half seen from the other frame: an isometry, in front of the camera."""
-    batch = next(PictureDataset(settings.data, network, 0).pairs(settings.points))
+    batch = next(ImageDataset(settings.data, network, 0).pairs(settings.points))
     first, second = batch.points[::2], batch.points[1::2]
     torch.testing.assert_close(_spread(first), _spread(second), atol=1e-3, rtol=0)
     assert batch.views.pixels.shape[:2] == (4, 1)
@@ -78,13 +78,15 @@ def test_shown_is_what_projects_into_the_picture() -> None:
     assert shown(points, camera).tolist() == [True, False, True, False, False]
 
 
-def test_what_cannot_be_trained_is_refused(settings: PhaseImageSettings, samples: list[Sample], tmp_path: Path) -> None:
+def test_what_cannot_be_trained_is_refused(
+    settings: ImageTrainingSettings, samples: list[Sample], tmp_path: Path
+) -> None:
     """A network without features of its own pixels, a drive without pictures, and too few points."""
     with pytest.raises(UsageError, match=r"no picture features of its own"):
-        phase_image(settings.model_copy(update={"network": {"fusion": {"pixel": False}}, "start": ""}), tmp_path / "a")
+        train_image(settings.model_copy(update={"network": {"fusion": {"pixel": False}}, "start": ""}), tmp_path / "a")
     with pytest.raises(UsageError, match=r"hardly any picture shows 99999 points"):
-        phase_image(settings.model_copy(update={"points": 99_999}), tmp_path / "b")
+        train_image(settings.model_copy(update={"points": 99_999}), tmp_path / "b")
     write_packed(tmp_path / "blind" / "world", [s._replace(images=()) for s in samples], {})
     blind = settings.data.model_copy(update={"packed": {str(tmp_path / "blind"): 1.0}})
     with pytest.raises(UsageError, match=r"world: a drive without pictures"):
-        phase_image(settings.model_copy(update={"data": blind}), tmp_path / "c")
+        train_image(settings.model_copy(update={"data": blind}), tmp_path / "c")

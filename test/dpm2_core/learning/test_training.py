@@ -20,10 +20,15 @@ from dpm2_core.learning.augment import AugmentSettings
 from dpm2_core.learning.checkpoint import Log
 from dpm2_core.learning.dataset import DataSettings, GroupDataset
 from dpm2_core.learning.registration_loss import LossSettings
-from dpm2_core.learning.train_image import PhaseImageSettings
-from dpm2_core.learning.train_overlap import PhaseTwoSettings, phase_two
-from dpm2_core.learning.train_registration import PhaseOne, PhaseOneSettings, phase_one, plans_of
-from dpm2_core.learning.trainer import OptimiserSettings, learning_rate
+from dpm2_core.learning.train_image import ImageTrainingSettings
+from dpm2_core.learning.train_overlap import OverlapTrainingSettings, train_overlap
+from dpm2_core.learning.train_registration import (
+    RegistrationTraining,
+    RegistrationTrainingSettings,
+    set_pairs_of,
+    train_registration,
+)
+from dpm2_core.learning.trainer import OptimizerSettings, learning_rate
 from dpm2_core.network.settings import PRESETS
 from dpm2_core.network.weights import network_settings, read_metadata
 
@@ -31,10 +36,10 @@ STILL = AugmentSettings(drop=0, occlusion=0, beams=0, jitter=0, tilt=0, shift=(0
 
 
 @pytest.fixture
-def settings(packed: Path, tiny: Callable, monkeypatch: pytest.MonkeyPatch) -> PhaseOneSettings:
+def settings(packed: Path, tiny: Callable, monkeypatch: pytest.MonkeyPatch) -> RegistrationTrainingSettings:
     """Phase one of the tiny network on the packed drive, in float32, without compiling."""
     monkeypatch.setitem(PRESETS, "tiny", tiny().model_dump())
-    return PhaseOneSettings(
+    return RegistrationTrainingSettings(
         preset="tiny",
         data=DataSettings(packed={str(packed): 1.0}, groups=1, frames=3, workers=0, images=True),
         validation=str(packed),
@@ -42,7 +47,7 @@ def settings(packed: Path, tiny: Callable, monkeypatch: pytest.MonkeyPatch) -> P
         loss=LossSettings(near=32, own=16),
         pairs=2,
         sets=0.5,
-        optimiser=OptimiserSettings(steps=4, compile=False, bf16=False, save_every=2, validate_every=2, warmup=1),
+        optimiser=OptimizerSettings(steps=4, compile=False, bf16=False, save_every=2, validate_every=2, warmup=1),
     )
 
 
@@ -52,21 +57,21 @@ def losses(out: Path) -> dict[int, float]:
     return {row["step"]: row["loss"] for row in rows if "loss" in row}
 
 
-def test_resumed_equals_uninterrupted(settings: PhaseOneSettings, tmp_path: Path) -> None:
+def test_resumed_equals_uninterrupted(settings: RegistrationTrainingSettings, tmp_path: Path) -> None:
     """A run stopped after 2 of 4 steps and resumed logs the same losses and ends with the same weights, bit for bit."""
     whole, halves = tmp_path / "whole", tmp_path / "halves"
-    phase_one(settings, whole)
-    phase_one(settings, halves, until=2)
-    phase_one(settings, halves, resume=True)
+    train_registration(settings, whole)
+    train_registration(settings, halves, until=2)
+    train_registration(settings, halves, resume=True)
     assert losses(halves) == losses(whole)
     assert len(losses(whole)) == 4
     one, other = (load_file(out / "weights.safetensors") for out in (whole, halves))
     assert all(torch.equal(one[name], other[name]) for name in one)
 
 
-def test_log_has_figures_and_validation(settings: PhaseOneSettings, tmp_path: Path) -> None:
+def test_log_has_figures_and_validation(settings: RegistrationTrainingSettings, tmp_path: Path) -> None:
     """One JSON object a line; validation gives medians and success of near, far and turned pairs."""
-    phase_one(settings, tmp_path / "out")
+    train_registration(settings, tmp_path / "out")
     rows = [json.loads(line) for line in (tmp_path / "out" / "log.jsonl").read_text().splitlines()]
     assert {"pairing", "coarse", "backbone", "image", "offset", "offset_m", "right", "norm", "rate"} <= rows[0].keys()
     validations = [row for row in rows if "near_m" in row]
@@ -74,11 +79,11 @@ def test_log_has_figures_and_validation(settings: PhaseOneSettings, tmp_path: Pa
     assert {"near_deg", "near_success", "turned_m", "chi2"} <= validations[0].keys()
 
 
-def test_pictures_have_a_loss_of_their_own(settings: PhaseOneSettings, tiny: Callable) -> None:
+def test_pictures_have_a_loss_of_their_own(settings: RegistrationTrainingSettings, tiny: Callable) -> None:
     """It is a finite figure that trains the image branch; without pictures it is absent, not zero."""
-    module = PhaseOne(tiny(), settings.loss)
+    module = RegistrationTraining(tiny(), settings.loss)
     batch = GroupDataset(settings.data, tiny(), seed=0).batch(0)
-    plans = plans_of(batch.poses, settings, 0)
+    plans = set_pairs_of(batch.poses, settings, 0)
     total, figures = module(batch.points, batch.views, plans)
     assert figures["image"] > 0
     total.backward()
@@ -87,52 +92,54 @@ def test_pictures_have_a_loss_of_their_own(settings: PhaseOneSettings, tiny: Cal
     assert "image" not in module(batch.points, None, plans)[1]
 
 
-def test_a_checkpoint_of_another_network_is_refused(settings: PhaseOneSettings, tmp_path: Path) -> None:
+def test_a_checkpoint_of_another_network_is_refused(settings: RegistrationTrainingSettings, tmp_path: Path) -> None:
     """And so is a file that is none."""
-    phase_one(settings, tmp_path / "out")
+    train_registration(settings, tmp_path / "out")
     with pytest.raises(UsageError, match="checkpoint of another network"):
-        phase_one(settings.model_copy(update={"preset": "small"}), tmp_path / "out", resume=True)
+        train_registration(settings.model_copy(update={"preset": "small"}), tmp_path / "out", resume=True)
     (tmp_path / "out" / "checkpoint.pt").write_bytes(b"garbage")
     with pytest.raises(UsageError, match="not a checkpoint"):
-        phase_one(settings, tmp_path / "out", resume=True)
+        train_registration(settings, tmp_path / "out", resume=True)
 
 
-def test_phase_two_changes_the_overlap_head_alone(settings: PhaseOneSettings, tmp_path: Path) -> None:
+def test_phase_two_changes_the_overlap_head_alone(settings: RegistrationTrainingSettings, tmp_path: Path) -> None:
     """Every other tensor of the weights stays as phase one left it."""
-    start = phase_one(settings, tmp_path / "one")
+    start = train_registration(settings, tmp_path / "one")
     second = _overlap(settings, start, rate=1e-2, steps=4)
     second = second.model_copy(update={"validation": settings.validation, "validation_batches": 1})
-    before, after = load_file(start), load_file(phase_two(second, tmp_path / "two"))
+    before, after = load_file(start), load_file(train_overlap(second, tmp_path / "two"))
     changed = {name for name in before if not torch.equal(before[name], after[name])}
     assert changed
     assert all(name.startswith("decoder.overlap.") for name in changed)
 
 
-def _overlap(settings: PhaseOneSettings, start: Path, **optimiser: float) -> PhaseTwoSettings:
+def _overlap(settings: RegistrationTrainingSettings, start: Path, **optimiser: float) -> OverlapTrainingSettings:
     """Phase two on the drives of phase one, as if from a YAML file that sets these keys alone."""
     data = {"packed": settings.data.packed, "groups": 1, "workers": 0, "images": True}
     tree = {"start": str(start), "data": data, "optimiser": {"compile": False, "bf16": False, **optimiser}}
-    return settings_from(PhaseTwoSettings, tree)
+    return settings_from(OverlapTrainingSettings, tree)
 
 
 def test_phase_two_keeps_a_tenth_of_the_rate_whatever_else_is_set() -> None:
     """The paper's 1e-4 and 1e-5 hold beside other keys of the optimizer; one that is set itself counts."""
-    chosen = settings_from(PhaseTwoSettings, {"start": "w", "optimiser": {"steps": 2000, "decay": 3e-5}}).optimiser
+    chosen = settings_from(
+        OverlapTrainingSettings, {"start": "w", "optimiser": {"steps": 2000, "decay": 3e-5}}
+    ).optimiser
     assert (chosen.steps, chosen.rate, chosen.decay, chosen.warmup) == (2000, 1e-4, 3e-5, 20)
 
 
-def test_phase_two_keeps_the_network_of_phase_one(settings: PhaseOneSettings, tmp_path: Path) -> None:
+def test_phase_two_keeps_the_network_of_phase_one(settings: RegistrationTrainingSettings, tmp_path: Path) -> None:
     """Also settings that change no shape and differ from the preset: the weights that it writes tell them again."""
     changed = {"decoder": {"temperature": 0.5}, "fusion": {"image_mask": "front"}}
-    start = phase_one(settings.model_copy(update={"network": changed}), tmp_path / "one")
-    after = network_settings(phase_two(_overlap(settings, start, steps=1), tmp_path / "two"))
+    start = train_registration(settings.model_copy(update={"network": changed}), tmp_path / "one")
+    after = network_settings(train_overlap(_overlap(settings, start, steps=1), tmp_path / "two"))
     assert after == network_settings(start)
     assert (after.decoder.temperature, after.fusion.image_mask) == (0.5, "front")
 
 
 @pytest.mark.parametrize(("kind", "key"), [
-    (PhaseTwoSettings, "frames"), (PhaseTwoSettings, "radius"), (PhaseImageSettings, "frames"),
-    (PhaseImageSettings, "images"),
+    (OverlapTrainingSettings, "frames"), (OverlapTrainingSettings, "radius"), (ImageTrainingSettings, "frames"),
+    (ImageTrainingSettings, "images"),
 ])  # fmt: skip
 def test_a_setting_that_a_phase_does_not_use_is_refused(kind: type, key: str) -> None:
     """Frames of a place are fixed in phase two, two images of one in the image branch."""
@@ -153,13 +160,13 @@ def _overfitted(packed: Path, tiny: Callable, seed: int) -> list[float]:
     """Errors of the 4 pairs after 300 steps on them, m."""
     torch.manual_seed(seed)
     network = tiny(fusion={"points": 96})
-    module = PhaseOne(network, LossSettings(offset=1, near=64, own=32))
+    module = RegistrationTraining(network, LossSettings(offset=1, near=64, own=32))
     data = GroupDataset(
         DataSettings(packed={str(packed): 1.0}, groups=1, frames=3, workers=0, augment=STILL), network, seed=0
     )
     batch = data.batch(0)
-    settings = PhaseOneSettings(pairs=4, sets=0.0)
-    plans = plans_of(batch.poses, settings, 0)
+    settings = RegistrationTrainingSettings(pairs=4, sets=0.0)
+    plans = set_pairs_of(batch.poses, settings, 0)
     optimiser = torch.optim.AdamW(module.parameters(), 3e-3)
     for step in range(300):
         for group in optimiser.param_groups:
@@ -172,7 +179,7 @@ def _overfitted(packed: Path, tiny: Callable, seed: int) -> list[float]:
     return _errors(module, batch, plans)
 
 
-def _errors(module: PhaseOne, batch: object, plans: tuple) -> list[float]:
+def _errors(module: RegistrationTraining, batch: object, plans: tuple) -> list[float]:
     """Translation error of each pair, m."""
     from dpm2_core.learning.pair_sampling import merge_tokens
     from dpm2_core.network.pose_solver import register_batch
@@ -191,7 +198,7 @@ def _errors(module: PhaseOne, batch: object, plans: tuple) -> list[float]:
 
 def test_learning_rate() -> None:
     """Warm-up to the peak, cosine through the half, to the floor."""
-    settings = OptimiserSettings(steps=110, warmup=10, rate=1.0, final_rate=0.2)
+    settings = OptimizerSettings(steps=110, warmup=10, rate=1.0, final_rate=0.2)
     assert [round(learning_rate(settings, s), 6) for s in (0, 9, 10, 60, 110)] == [0.1, 1.0, 1.0, 0.6, 0.2]
 
 
@@ -201,24 +208,24 @@ from dpm2_core.config import settings_from
 from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.learning.dataset import DataSettings, GroupDataset
 from dpm2_core.learning.registration_loss import LossSettings
-from dpm2_core.learning.train_image import PhaseImageSettings
-from dpm2_core.learning.train_registration import PhaseOne, PhaseOneSettings, plans_of
+from dpm2_core.learning.train_image import ImageTrainingSettings
+from dpm2_core.learning.train_registration import RegistrationTraining, RegistrationTrainingSettings, set_pairs_of
 from dpm2_core.learning.trainer import process_group
 from torch.nn.parallel import DistributedDataParallel
 
 out, packed, network = sys.argv[1:]
 network = NetworkSettings.model_validate_json(network)
-settings = PhaseOneSettings(pairs=2, sets=0)
+settings = RegistrationTrainingSettings(pairs=2, sets=0)
 with process_group() as (rank, world, device):
     torch.manual_seed(0)
-    module = PhaseOne(network, LossSettings(near=16, own=8))
+    module = RegistrationTraining(network, LossSettings(near=16, own=8))
     run = DistributedDataParallel(module, find_unused_parameters=True) if world > 1 else module
     shares = [rank] if world > 1 else [0, 1]
     for share in shares:
         options = DataSettings(packed={packed: 1.0}, groups=1, frames=2, workers=0)
         batch = GroupDataset(options, network, 0, 0, (share, 2)).batch(0)
         torch.manual_seed(1)
-        loss, _ = run(batch.points, None, plans_of(batch.poses, settings, 0))
+        loss, _ = run(batch.points, None, set_pairs_of(batch.poses, settings, 0))
         (loss / len(shares)).backward()
     if rank == 0:
         torch.save({name: p.grad for name, p in module.named_parameters() if p.grad is not None}, out)
@@ -240,10 +247,10 @@ def test_two_processes_give_the_gradients_of_one(tmp_path: Path, packed: Path, t
         torch.testing.assert_close(two[name], gradient, atol=1e-6, rtol=1e-4, msg=name)
 
 
-def test_tensorboard_has_the_figures_of_the_log(settings: PhaseOneSettings, tmp_path: Path) -> None:
+def test_tensorboard_has_the_figures_of_the_log(settings: RegistrationTrainingSettings, tmp_path: Path) -> None:
     """Where its package is installed: the same losses at the same steps as log.jsonl, to float32."""
     accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
-    phase_one(settings, tmp_path / "out")
+    train_registration(settings, tmp_path / "out")
     events = accumulator.EventAccumulator(str(tmp_path / "out" / "tensorboard")).Reload()
     written = {event.step: event.value for event in events.Scalars("loss")}
     assert written == pytest.approx(losses(tmp_path / "out"), rel=1e-5)
@@ -260,11 +267,13 @@ def test_without_tensorboard_the_log_alone_is_written(tmp_path: Path, monkeypatc
     assert not (tmp_path / "tensorboard").exists()
 
 
-def test_phase_two_keeps_what_the_weights_say_of_phase_one(settings: PhaseOneSettings, tmp_path: Path) -> None:
+def test_phase_two_keeps_what_the_weights_say_of_phase_one(
+    settings: RegistrationTrainingSettings, tmp_path: Path
+) -> None:
     """Steps and pictures of phase one, by which the SLAM knows whether to use the camera, stay; the phase is two."""
-    start = phase_one(settings, tmp_path / "one")
+    start = train_registration(settings, tmp_path / "one")
     second = _overlap(settings, start, steps=1)
-    before, after = read_metadata(start), read_metadata(phase_two(second, tmp_path / "two"))
+    before, after = read_metadata(start), read_metadata(train_overlap(second, tmp_path / "two"))
     assert before["images"] == "true"
     assert before["phase"] == "1"
     assert {**before, "phase": "2"} == after
@@ -274,16 +283,18 @@ LOOP = """
 import sys
 from pathlib import Path
 from dpm2_core.network.settings import PRESETS
-from dpm2_core.learning.train_image import PhaseImageSettings
-from dpm2_core.learning.train_registration import PhaseOneSettings, phase_one
+from dpm2_core.learning.train_image import ImageTrainingSettings
+from dpm2_core.learning.train_registration import RegistrationTrainingSettings, train_registration
 import json
 out, settings, network = sys.argv[1:]
 PRESETS["tiny"] = json.loads(network)
-phase_one(PhaseOneSettings.model_validate_json(settings), Path(out))
+train_registration(RegistrationTrainingSettings.model_validate_json(settings), Path(out))
 """
 
 
-def test_the_whole_loop_runs_under_torchrun(settings: PhaseOneSettings, tiny: Callable, tmp_path: Path) -> None:
+def test_the_whole_loop_runs_under_torchrun(
+    settings: RegistrationTrainingSettings, tiny: Callable, tmp_path: Path
+) -> None:
     """Two gloo ranks train, log, validate and save once; their losses are not those of one process' smaller batch."""
     script = tmp_path / "loop.py"
     script.write_text(LOOP)
@@ -297,7 +308,7 @@ def test_the_whole_loop_runs_under_torchrun(settings: PhaseOneSettings, tiny: Ca
     assert sorted(losses(tmp_path / "two")) == [0, 1, 2, 3]
     rows = (tmp_path / "two" / "log.jsonl").read_text().splitlines()
     assert len([row for row in rows if '"loss"' in row]) == 4  # of one rank
-    phase_one(settings, tmp_path / "one")
+    train_registration(settings, tmp_path / "one")
     one, two = (load_file(tmp_path / name / "weights.safetensors") for name in ("one", "two"))
     assert one.keys() == two.keys()
     assert any(not torch.equal(one[name], two[name]) for name in one)  # the second rank's share counts

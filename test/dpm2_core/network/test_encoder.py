@@ -16,10 +16,10 @@ from dpm2_core.geometry import se3
 from dpm2_core.network.convnext import FeatureMap
 from dpm2_core.network.encoder import Encoder, collate_views, resize
 from dpm2_core.network.model import DeepPointMap2
-from dpm2_core.network.pointnext import argmax_neighbour
+from dpm2_core.network.pointnext import argmax_neighbor
 from dpm2_core.network.pyramid import build_pyramid, collate, crop
 from dpm2_core.network.settings import PRESETS, preset
-from dpm2_core.network.spatial import Views, picture_features
+from dpm2_core.network.spatial import Views, image_features
 
 
 def frame(cloud: np.ndarray, *images: Image) -> Frame:
@@ -118,32 +118,34 @@ def views_of(model: DeepPointMap2, *frames: list[Image]) -> Views:
 
 
 def test_missing_picture_equals_no_camera(
-    model: DeepPointMap2, noise: np.random.Generator, street: Callable, picture: Callable
+    model: DeepPointMap2, noise: np.random.Generator, street: Callable, make_image: Callable
 ) -> None:
     """Exactly: in a batch whose other frame has a picture, the one without gives what the LiDAR alone gives."""
     pyramid = build_pyramid(street(noise), model.settings)
     alone = model.encoder(collate([pyramid])).tokens.features
-    both = model.encoder(collate([pyramid, pyramid]), views_of(model, [], [picture(noise)])).tokens.features
+    both = model.encoder(collate([pyramid, pyramid]), views_of(model, [], [make_image(noise)])).tokens.features
     assert torch.equal(both[0], alone[0])
     assert (both[1] - alone[0]).abs().max() > 1e-3  # the picture is used
 
 
 def test_only_reference_points_in_view_read_the_picture(
-    model: DeepPointMap2, noise: np.random.Generator, street: Callable, picture: Callable
+    model: DeepPointMap2, noise: np.random.Generator, street: Callable, make_image: Callable
 ) -> None:
     """With one fusion layer, what lies behind the camera does not depend on the pixels."""
     pyramid = build_pyramid(street(noise), model.settings)
     points = collate([pyramid])
-    one, other = (model.encoder(points, views_of(model, [picture(noise)])).tokens for _ in range(2))
+    one, other = (model.encoder(points, views_of(model, [make_image(noise)])).tokens for _ in range(2))
     behind = one.xyz[0, :, 0] < 0
     assert torch.equal(one.features[0][behind], other.features[0][behind])
     assert not torch.equal(one.features[0][~behind], other.features[0][~behind])
 
 
-def test_several_cameras(model: DeepPointMap2, noise: np.random.Generator, street: Callable, picture: Callable) -> None:
+def test_several_cameras(
+    model: DeepPointMap2, noise: np.random.Generator, street: Callable, make_image: Callable
+) -> None:
     """Their order does not matter."""
     pyramid = build_pyramid(street(noise), model.settings)
-    a, b = picture(noise), picture(noise)
+    a, b = make_image(noise), make_image(noise)
     one = model.encoder(collate([pyramid]), views_of(model, [a, b])).tokens.features
     other = model.encoder(collate([pyramid]), views_of(model, [b, a])).tokens.features
     torch.testing.assert_close(one, other, atol=1e-5, rtol=0)
@@ -154,13 +156,13 @@ def test_several_cameras(model: DeepPointMap2, noise: np.random.Generator, stree
 )
 @pytest.mark.parametrize("reference", ["fps", "uniform", "normal"])
 def test_alternatives_of_the_ablations(
-    noise: np.random.Generator, kind: str, reference: str, tiny: Callable, street: Callable, picture: Callable
+    noise: np.random.Generator, kind: str, reference: str, tiny: Callable, street: Callable, make_image: Callable
 ) -> None:
     """Every choice of Tables 3 and 4 runs, uses the picture, and gives each parameter of its own a gradient."""
     torch.manual_seed(0)
     model = DeepPointMap2(tiny(fusion={"kind": kind, "reference": reference}))
     points = collate([build_pyramid(street(noise), model.settings)])
-    features = model.encoder(points, views_of(model, [picture(noise)])).tokens.features
+    features = model.encoder(points, views_of(model, [make_image(noise)])).tokens.features
     features.square().sum().backward()
     fusion = model.encoder.fusion
     assert fusion is not None
@@ -185,7 +187,7 @@ def test_argmax_neighbour() -> None:
     torch.manual_seed(0)
     for dtype in (torch.bfloat16, torch.float32):
         sums = (torch.randn(2, 9, 24, 8) - 1).to(dtype)
-        best = argmax_neighbour(sums)
+        best = argmax_neighbor(sums)
         found = sums.gather(2, best[:, :, None])[:, :, 0]
         torch.testing.assert_close(found, sums.amax(2), atol=1e-4, rtol=1e-4)  # float32 loses 8 bits to the index
 
@@ -199,9 +201,9 @@ def test_the_feature_of_the_own_pixel_begins_as_nothing(tiny: Callable, noise: n
     pixels = torch.zeros(1, 2, 3, 32, 48, dtype=torch.uint8)
     points = torch.tensor([[[10.0, 1, 0], [-10, 0, 0]]])
     both = Views(pixels, K, T, torch.tensor([[True, True]]))
-    found, seen = picture_features(points, both, features)
+    found, seen = image_features(points, both, features)
     one, other = (
-        picture_features(points, both._replace(present=torch.tensor([present])), features)[0]
+        image_features(points, both._replace(present=torch.tensor([present])), features)[0]
         for present in ([True, False], [False, True])
     )
     assert seen.tolist() == [[True, False]]

@@ -14,7 +14,7 @@ from dpm2_core.network.heads import OffsetHead, into_set_frame
 from dpm2_core.network.matching import Correspondences, best_pairs, guided_scores, softmax_both
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pointnext import from_view, to_view
-from dpm2_core.network.pose_solver import first_pose, precision_solve, robust_kabsch, whitened
+from dpm2_core.network.pose_solver import first_pose, robust_kabsch, weighted_gauss_newton, whitened_residuals
 from dpm2_core.network.tokens import Tokens, to_tokens
 
 
@@ -34,7 +34,7 @@ def test_perfect_matches_give_the_exact_pose(noise: np.random.Generator) -> None
     found, _ = robust_kabsch(pairs, first_pose(pairs))
     torch.testing.assert_close(found, T, atol=1e-6, rtol=0)
     off = T @ torch.from_numpy(se3.exp([0.1, -0.1, 0.3, 1, -2, 0.5]))
-    torch.testing.assert_close(precision_solve(off, pairs, rounds=30)[0], T, atol=1e-6, rtol=0)
+    torch.testing.assert_close(weighted_gauss_newton(off, pairs, rounds=30)[0], T, atol=1e-6, rtol=0)
 
 
 def test_outliers_are_left_out(noise: np.random.Generator) -> None:
@@ -45,7 +45,7 @@ def test_outliers_are_left_out(noise: np.random.Generator) -> None:
     pairs = pairs._replace(target=target, weight=torch.where(wrong, 0.05, pairs.weight))
     found, inliers = robust_kabsch(pairs, first_pose(pairs), rounds=10)
     assert not inliers[:, wrong].any()
-    torch.testing.assert_close(precision_solve(found, pairs)[0], T, atol=1e-3, rtol=0)
+    torch.testing.assert_close(weighted_gauss_newton(found, pairs)[0], T, atol=1e-3, rtol=0)
 
 
 @pytest.mark.parametrize("wrong", [0.5, 0.7])
@@ -92,7 +92,7 @@ def test_precision_tells_which_direction_to_trust(noise: np.random.Generator) ->
     across = torch.linalg.cholesky(1e4 * normal[:, :, None] * normal[:, None] + 1e-2 * torch.eye(3).double())
     pairs = Correspondences(source, target, torch.ones(1, n).double(), across[None])
     svd, _ = robust_kabsch(pairs, first_pose(pairs))
-    solved, information = precision_solve(svd, pairs)
+    solved, information = weighted_gauss_newton(svd, pairs)
     error = se3.log(se3.inverse(T[0].numpy()) @ solved[0].numpy())
     assert np.linalg.norm(error[3:]) < 0.01
     assert np.linalg.norm(svd[0, :3, 3] - T[0, :3, 3]) > 3 * np.linalg.norm(error[3:])
@@ -104,11 +104,11 @@ def test_jacobian_of_the_residuals(noise: np.random.Generator) -> None:
     """Against central differences of T exp(xi)."""
     pairs, T = perfect(noise, pairs=5)
     pairs = pairs._replace(target=pairs.target + 0.3)
-    _, jacobian = whitened(T, pairs)
+    _, jacobian = whitened_residuals(T, pairs)
     for k in range(6):
         step = torch.from_numpy(se3.exp(np.eye(6)[k] * 1e-6))
         back = torch.from_numpy(se3.exp(-np.eye(6)[k] * 1e-6))
-        numeric = (whitened(T @ step, pairs)[0] - whitened(T @ back, pairs)[0]) / 2e-6
+        numeric = (whitened_residuals(T @ step, pairs)[0] - whitened_residuals(T @ back, pairs)[0]) / 2e-6
         torch.testing.assert_close(jacobian[..., k], numeric, atol=1e-4, rtol=1e-4)
 
 
@@ -123,7 +123,7 @@ def test_moving_both_clouds_moves_the_answer(noise: np.random.Generator) -> None
     for solve in (
         first_pose,
         lambda p: robust_kabsch(p, first_pose(p))[0],
-        lambda p: precision_solve(first_pose(p), p, rounds=30)[0],
+        lambda p: weighted_gauss_newton(first_pose(p), p, rounds=30)[0],
     ):
         expected = A @ solve(pairs) @ torch.linalg.inv(B)
         torch.testing.assert_close(solve(moved), expected, atol=1e-4, rtol=0)

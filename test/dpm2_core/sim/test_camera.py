@@ -100,7 +100,7 @@ def test_textures_do_not_repeat(material: Material, highway: World) -> None:
         uv=np.column_stack([along, np.full(n, 0.7)]).astype(np.float32),
         texture=np.zeros(n, np.uint16),
         material=np.full(n, material, np.uint8),
-        colour=np.full((n, 3), 0.3, np.float32),
+        color=np.full((n, 3), 0.3, np.float32),
         footprint=np.full(n, 0.1, np.float32),
     )
     shade = Textures(3).albedo(strip, highway.terrain).sum(1)

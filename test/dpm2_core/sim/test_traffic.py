@@ -38,7 +38,7 @@ def test_dense_traffic_takes_a_third_of_the_points(dense: World) -> None:
     usual = build_world("straight", "city", seed=2, length=200)
     assert _share_moving(usual) < 0.1
     none = build_world("straight", "city", seed=2, length=200, traffic=0)
-    assert none.movers(3.0, none.drive_pose(3.0)[:3, 3]) is None
+    assert none.dynamic_objects(3.0, none.drive_pose(3.0)[:3, 3]) is None
 
 
 def test_columns_keep_clear_of_each_other_of_the_car_and_of_what_stands(dense: World) -> None:

@@ -12,13 +12,13 @@ import torch
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Frame
 from dpm2_core.network.perception.dslr import Dslr, DslrSettings
-from dpm2_core.network.perception.dynamic_objects import MoverNetSettings
+from dpm2_core.network.perception.dynamic_objects import DynamicObjectNetSettings
 from dpm2_core.network.perception.gndnet import GroundNet, GroundSettings
-from dpm2_core.slam.filters import FilterSettings, GroundFilter, MoverFilter, StaticFilter, make_filter
+from dpm2_core.slam.filters import DynamicObjectFilter, FilterSettings, GroundFilter, StaticFilter, make_filter
 from dpm2_core.slam.preprocess import Preprocessor, PreprocessSettings
 from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.slam.system import SlamSystem
-from dpm2_core.tasks.dynamic_objects_task import MoverTask, MoverTraining
+from dpm2_core.tasks.dynamic_objects_task import DynamicObjectTask, DynamicObjectTraining
 from dpm2_core.tasks.training import save_task
 
 
@@ -44,12 +44,12 @@ class _High:
 
 def test_movers_are_left_out_but_never_more_than_the_limit(points: np.ndarray) -> None:
     high = points[:, 2] > -1
-    left = MoverFilter(_High(-1.0), 0.5, 0.7)(points)  # type: ignore[arg-type]
+    left = DynamicObjectFilter(_High(-1.0), 0.5, 0.7)(points)  # type: ignore[arg-type]
     np.testing.assert_array_equal(left, points[~(high & (0.6 + 0.1 * points[:, 2] > 0.5))])
-    some = MoverFilter(_High(-9.0), 0.1, 0.3)(points)  # type: ignore[arg-type]
+    some = DynamicObjectFilter(_High(-9.0), 0.1, 0.3)(points)  # type: ignore[arg-type]
     assert len(some) >= 0.7 * len(points)
     assert some[:, 2].max() < points[:, 2].max()  # the likeliest went first
-    assert len(MoverFilter(_High(0), 0.5, 0.7)(points[:0])) == 0  # type: ignore[arg-type]
+    assert len(DynamicObjectFilter(_High(0), 0.5, 0.7)(points[:0])) == 0  # type: ignore[arg-type]
 
 
 def test_ground_is_left_out(points: np.ndarray) -> None:
@@ -80,7 +80,7 @@ def test_cloud_source_and_measured_are_what_the_filter_leaves(points: np.ndarray
 
 
 def test_a_slam_with_a_filter_runs_and_tells_what_is_missing(tmp_path: Path, points: np.ndarray) -> None:
-    task = MoverTask(MoverTraining(network=MoverNetSettings(cells=32, cell=1.0, channels=4)))
+    task = DynamicObjectTask(DynamicObjectTraining(network=DynamicObjectNetSettings(cells=32, cell=1.0, channels=4)))
     path = tmp_path / "movers.safetensors"
     save_task(task, path, {})
     system = SlamSystem(SlamSettings(filter=FilterSettings(kind="movers", weights=path), threads=1))

@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks.gaps import gaps, judged, summary
 from dpm2_core.data.open import open_source
-from dpm2_core.frame import Array, Frame, State, Tracked
+from dpm2_core.frame import Array, Frame, OdometryResult, State
 from dpm2_core.geometry import se3
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import LidarConfig
@@ -36,12 +36,12 @@ def scanned(world: World, pose: Pose, seconds: Sequence[float]) -> tuple[list[Fr
     return [Frame(round(s * 1e9), scan.points) for s, scan in zip(seconds, scans, strict=True)], poses
 
 
-def run(frames: Sequence[Frame]) -> list[Tracked]:
+def run(frames: Sequence[Frame]) -> list[OdometryResult]:
     odometry = make_odometry(SlamSettings(threads=1))
     return [odometry.process(frame) for frame in frames]
 
 
-def off(tracked: Sequence[Tracked], poses: Array) -> Array:
+def off(tracked: Sequence[OdometryResult], poses: Array) -> Array:
     """(N,) m from the true position relative to the first."""
     T_odom_lidar = np.array([t.T_odom_lidar for t in tracked])
     T = se3.inverse(se3.inverse(poses[0]) @ poses) @ se3.inverse(T_odom_lidar[0]) @ T_odom_lidar

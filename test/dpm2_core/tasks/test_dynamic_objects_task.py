@@ -10,14 +10,16 @@ import pytest
 import torch
 
 from dpm2_core.errors import UsageError
-from dpm2_core.network.perception.dynamic_objects import MoverNetSettings, load
+from dpm2_core.network.perception.dynamic_objects import DynamicObjectNetSettings, load
 from dpm2_core.network.perception.gndnet import GroundSettings
 from dpm2_core.network.perception.task_weights import write_weights
-from dpm2_core.tasks.dynamic_objects_task import MOVABLE, MoverTask, MoverTraining
+from dpm2_core.tasks.dynamic_objects_task import MOVABLE, DynamicObjectTask, DynamicObjectTraining
 from dpm2_core.tasks.scan import TaskScan, TaskScans
 from dpm2_core.tasks.training import save_task, train_task
 
-SMALL = MoverTraining(network=MoverNetSettings(cells=32, cell=1.0, channels=8), epochs=12, every=1, batch=1, drop=0.3)
+SMALL = DynamicObjectTraining(
+    network=DynamicObjectNetSettings(cells=32, cell=1.0, channels=8), epochs=12, every=1, batch=1, drop=0.3
+)
 
 
 class Drive:
@@ -50,7 +52,7 @@ class Drive:
 def test_it_learns_what_can_move_parked_or_not(tmp_path: Path) -> None:
     """From an IoU of chance to over 0.7, on scans that it has not seen; saved and loaded it says the same."""
     train, val = TaskScans([Drive(seed) for seed in range(4)]), TaskScans([Drive(99)])
-    untrained = MoverTask(SMALL).eval()
+    untrained = DynamicObjectTask(SMALL).eval()
     with torch.no_grad():
         before = untrained.evaluate(val)
     task = train_task("movers", SMALL, train, tmp_path / "run")
@@ -61,13 +63,13 @@ def test_it_learns_what_can_move_parked_or_not(tmp_path: Path) -> None:
     assert after["recall_moving"] > 0.7
     save_task(task, tmp_path / "w.safetensors", {}, half=False)
     points = val[0].points.numpy()
-    assert isinstance(task, MoverTask)
+    assert isinstance(task, DynamicObjectTask)
     np.testing.assert_array_equal(load(tmp_path / "w.safetensors").probability(points), task.net.probability(points))
 
 
 def test_figures_are_counts_of_points() -> None:
     """Everything found: precision is the share of what can move, unlabelled points apart; nothing can move: NaN."""
-    task, scan = MoverTask(SMALL).eval(), Drive(1)[0]
+    task, scan = DynamicObjectTask(SMALL).eval(), Drive(1)[0]
     assert scan.labels is not None
     with torch.no_grad():
         task.net.head.weight.zero_()
@@ -85,8 +87,8 @@ def test_figures_are_counts_of_points() -> None:
 def test_scans_without_classes_and_weights_of_others_are_errors_of_use(tmp_path: Path) -> None:
     scan = TaskScan(torch.zeros(10, 4), None, None, "drive", 3)
     with pytest.raises(UsageError, match="drive, scan 3: no labels"):
-        MoverTask(SMALL).losses([scan])
-    task = MoverTask(SMALL)
+        DynamicObjectTask(SMALL).losses([scan])
+    task = DynamicObjectTask(SMALL)
     write_weights(tmp_path / "g.safetensors", "gndnet", GroundSettings(), task.state_dict(), {})
     with pytest.raises(UsageError, match="weights of gndnet, not of movers"):
         load(tmp_path / "g.safetensors")
@@ -105,7 +107,7 @@ def test_points_that_are_not_finite_teach_nothing() -> None:
     assert scan.labels is not None
     points = torch.cat([scan.points, torch.full((5, 4), torch.nan)])
     broken = TaskScan(points, torch.cat([scan.labels, torch.full((5,), 252)]), None, "drive", 0)
-    loss, slam = MoverTask(SMALL).losses([broken, broken])
+    loss, slam = DynamicObjectTask(SMALL).losses([broken, broken])
     assert slam is None
     assert bool(loss.isfinite())
 

@@ -89,9 +89,9 @@ def test_damaged_files_are_named_at_once(
     path.unlink()
     if keep is not None:
         path.write_bytes(data[:keep])
-    with pytest.raises(UsageError, match=message) as refused:
+    with pytest.raises(UsageError, match=message) as rejected:
         open_scans(tmp_path)
-    assert f"00/{'labels' if 'labels for' in message else kind}/{name[:6]}" in str(refused.value)
+    assert f"00/{'labels' if 'labels for' in message else kind}/{name[:6]}" in str(rejected.value)
 
 
 def test_no_scans(tmp_path: Path) -> None:

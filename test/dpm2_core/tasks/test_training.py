@@ -193,20 +193,20 @@ def test_wrong_weights_are_refused(scans: TaskScans, tmp_path: Path) -> None:
     state = {name: value.contiguous() for name, value in task.state_dict().items()}
     about = {"task": "gndnet", "network": task.settings.network.model_dump_json()}
 
-    def refused(tensors: dict[str, Tensor], metadata: dict[str, str], message: str) -> None:
+    def rejected(tensors: dict[str, Tensor], metadata: dict[str, str], message: str) -> None:
         save_file(tensors, path, metadata)
         for load in (lambda: load_task("gndnet", path), lambda: gndnet.load(path)):
             with pytest.raises(UsageError, match=message):
                 load()
 
-    refused(state, {**about, "task": "dslr"}, "weights of dslr, not of gndnet")
-    refused(state, {"preset": "small"}, "weights of no task, not of gndnet")
-    refused(state, {"task": "gndnet"}, "without a network description")
-    refused(state, {**about, "network": '{"cell": 0}'}, "cell: input should be greater than 0")
-    refused(state, {**about, "network": '{"channels": 8, "cells": 32}'}, "tensors differ, such as net.down")
-    refused({name: v for name, v in state.items() if name != "net.pillar.bias"}, about, "such as net.pillar.bias")
+    rejected(state, {**about, "task": "dslr"}, "weights of dslr, not of gndnet")
+    rejected(state, {"preset": "small"}, "weights of no task, not of gndnet")
+    rejected(state, {"task": "gndnet"}, "without a network description")
+    rejected(state, {**about, "network": '{"cell": 0}'}, "cell: input should be greater than 0")
+    rejected(state, {**about, "network": '{"channels": 8, "cells": 32}'}, "tensors differ, such as net.down")
+    rejected({name: v for name, v in state.items() if name != "net.pillar.bias"}, about, "such as net.pillar.bias")
     broken = {**state, "net.head.bias": torch.tensor([math.nan])}
-    refused(broken, about, "net.head.bias holds values that are not finite")
+    rejected(broken, about, "net.head.bias holds values that are not finite")
 
 
 def test_windows_that_do_not_fit(scans: TaskScans, tmp_path: Path) -> None:

@@ -7,9 +7,15 @@ import numpy as np
 import pytest
 import torch
 
-from dpm2_core.network.perception.dynamic_objects import LAYERS, MoverNet, MoverNetSettings, occupancy, voxels
+from dpm2_core.network.perception.dynamic_objects import (
+    LAYERS,
+    DynamicObjectNet,
+    DynamicObjectNetSettings,
+    occupancy,
+    voxels,
+)
 
-SMALL = MoverNetSettings(cells=16, cell=1.0, channels=4)
+SMALL = DynamicObjectNetSettings(cells=16, cell=1.0, channels=4)
 
 
 def scene(rng: np.random.Generator, points: int = 3000) -> np.ndarray:
@@ -36,7 +42,7 @@ def test_voxels_are_those_of_counting_by_hand() -> None:
 
 def test_the_height_of_the_sensor_and_the_order_of_the_points_do_not_matter() -> None:
     torch.manual_seed(0)
-    net, points = MoverNet(SMALL).eval(), scene(np.random.default_rng(1))
+    net, points = DynamicObjectNet(SMALL).eval(), scene(np.random.default_rng(1))
     found = net.probability(points)
     higher = points - np.float32([0, 0, 0.5, 0])  # a float's last digit may still move a point over a bound
     assert np.mean(np.abs(net.probability(higher) - found) < 1e-5) > 0.99
@@ -45,7 +51,7 @@ def test_the_height_of_the_sensor_and_the_order_of_the_points_do_not_matter() ->
 
 def test_points_off_the_grid_stand_and_no_point_is_no_error() -> None:
     torch.manual_seed(0)
-    net, points = MoverNet(SMALL).eval(), scene(np.random.default_rng(2))
+    net, points = DynamicObjectNet(SMALL).eval(), scene(np.random.default_rng(2))
     found, off = net.probability(points), (np.abs(points[:, :2]) > 8).any(1)
     assert off.any()
     assert (found[off] == 0).all()
@@ -55,7 +61,7 @@ def test_points_off_the_grid_stand_and_no_point_is_no_error() -> None:
 
 @pytest.mark.parametrize("cells", [200, 104])
 def test_size_of_the_default(cells: int) -> None:
-    net = MoverNet(MoverNetSettings(cells=cells)).eval()
+    net = DynamicObjectNet(DynamicObjectNetSettings(cells=cells)).eval()
     assert sum(p.numel() for p in net.parameters()) == 152_332
     with torch.no_grad():
         assert net(torch.zeros(1, 7, cells, cells)).shape == (1, 7, cells, cells)

@@ -71,8 +71,8 @@ def test_labels_are_means_of_the_ground_of_a_cell() -> None:
 
 def test_height_above_a_slope_is_exact_between_the_cells() -> None:
     """Bilinear: a plane is a plane, with x and y in their places."""
-    centre = (torch.arange(16) + 0.5 - 8).double()
-    elevation = 0.1 * centre[:, None] - 0.2 * centre[None, :]
+    center = (torch.arange(16) + 0.5 - 8).double()
+    elevation = 0.1 * center[:, None] - 0.2 * center[None, :]
     points = torch.rand(50, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64) * 14 - 7
     wanted = points[:, 2] - (0.1 * points[:, 0] - 0.2 * points[:, 1])
     torch.testing.assert_close(height_above(points, elevation, SMALL), wanted)

@@ -53,8 +53,8 @@ def test_a_wrong_loop_is_rejected_with_a_reason_and_is_no_edge() -> None:
     drive(graph, 55)
     graph.add_loop(0, 50, np.eye(4), LOOP)
     graph.add_loop(5, 30, np.eye(4), LOOP)  # 40 m wrong
-    graph.optimise()
-    right, wrong = graph.verdicts
+    graph.optimize()
+    right, wrong = graph.loop_checks
     assert right.kept
     assert not wrong.kept
     assert "sigma from the optimised poses" in wrong.reason
@@ -66,45 +66,45 @@ def test_background_gives_what_inline_gives(background: PoseGraph) -> None:
     inline = PoseGraph(PoseGraphSettings())
     drive(inline, 55)
     inline.add_loop(0, 50, np.eye(4), LOOP)
-    inline.optimise()
-    background.optimise()
+    inline.optimize()
+    background.optimize()
     assert background.busy
     assert background.collect(wait=True)
     np.testing.assert_allclose(background.poses, inline.poses, atol=1e-9)
-    assert background.verdicts == inline.verdicts
+    assert background.loop_checks == inline.loop_checks
     assert not background.collect()
 
 
 def test_nodes_and_loops_added_meanwhile_are_not_lost(background: PoseGraph) -> None:
-    background.optimise()
+    background.optimize()
     drive(background, 10)
     before = background.poses
     background.add_loop(10, 60, np.eye(4), LOOP)
-    background.optimise()  # busy: it waits for its turn
+    background.optimize()  # busy: it waits for its turn
     while not background.collect():
         time.sleep(0.02)
     after = background.poses
     relative = [se3.inverse(p[54]) @ p[64] for p in (before, after)]
     np.testing.assert_allclose(relative[0], relative[1], atol=1e-9)  # the new nodes followed the old ones
     assert background.collect(wait=True)  # the second loop was sent off by itself
-    assert all(told.kept and told.reason for told in background.verdicts)
+    assert all(told.kept and told.reason for told in background.loop_checks)
     assert np.linalg.norm(background.poses[60, :3, 3] - background.poses[10, :3, 3]) < 0.1
 
 
 def test_a_killed_process_is_replaced(background: PoseGraph) -> None:
-    background.optimise()
+    background.optimize()
     background.collect(wait=True)
     pid = background._worker.pid
     assert pid is not None
     os.kill(pid, signal.SIGSTOP)  # so that it dies with the graph in hand
     background.add_loop(2, 52, np.eye(4), LOOP)
-    background.optimise()
+    background.optimize()
     os.kill(pid, signal.SIGKILL)
     assert background.collect(wait=True)
     assert background.problem == ""
     assert background._worker.pid != pid
-    assert background.verdicts[1].kept
-    assert background.verdicts[1].reason
+    assert background.loop_checks[1].kept
+    assert background.loop_checks[1].reason
 
 
 def test_no_process_outlives_a_killed_program() -> None:
@@ -116,7 +116,7 @@ def test_no_process_outlives_a_killed_program() -> None:
         "C = np.eye(6) * 1e-2\n"
         "g.add_node(np.eye(4), None, None)\n"
         "for _ in range(9): g.add_node(np.eye(4), np.eye(4), C)\n"
-        "g.add_loop(0, 9, np.eye(4), C); g.optimise(); g.collect(wait=True)\n"
+        "g.add_loop(0, 9, np.eye(4), C); g.optimize(); g.collect(wait=True)\n"
         "print(g._worker.pid, flush=True); time.sleep(60)\n"
     )
     with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as parent:
@@ -150,7 +150,7 @@ def test_a_loop_makes_the_far_end_certain() -> None:
     drive(graph, 55)
     before = np.trace(graph.covariance(50))
     graph.add_loop(0, 50, np.eye(4), LOOP)
-    graph.optimise()
+    graph.optimize()
     after = graph.covariance(50)
     assert np.trace(after) < before
     assert np.trace(after) < np.trace(LOOP)
@@ -174,7 +174,7 @@ def test_trajectories_that_grow_side_by_side_are_tied_by_loops() -> None:
         graph.add_node(np.eye(4), np.eye(4), sigma, 3)
     for k in (4, 9):
         graph.add_loop(2 * k, 2 * k + 1, np.eye(4), sigma)
-    graph.optimise()
+    graph.optimize()
     np.testing.assert_allclose(graph.poses[0:24:2], truth, atol=1e-6)
     np.testing.assert_allclose(graph.poses[1:24:2], truth, atol=1e-6)
     np.testing.assert_array_equal(graph.poses[24], own)
@@ -201,6 +201,6 @@ def test_an_unsound_edge_is_rejected_and_the_graph_stays_as_it_was(bad: float) -
     assert len(graph) == 55
     graph.add_node(T_last @ T_STEP, T_STEP, STEP)  # node 54 is still the last of its trajectory
     graph.add_loop(0, 50, np.eye(4), LOOP)
-    graph.optimise()
+    graph.optimize()
     assert np.isfinite(graph.poses).all()
-    assert [told.kept for told in graph.verdicts] == [True]
+    assert [told.kept for told in graph.loop_checks] == [True]

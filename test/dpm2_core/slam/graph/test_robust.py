@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
-from dpm2_core.slam.graph.graph_data import GraphData, Stretches, chain_chi2, integrate
-from dpm2_core.slam.graph.robust import RobustSettings, joint_covariance, least_squares, optimise
+from dpm2_core.slam.graph.graph_data import CondensedOdometry, GraphData, chain_chi2, integrate
+from dpm2_core.slam.graph.robust import RobustSettings, joint_covariance, least_squares, optimize
 
 STEP = np.diag([2e-3, 2e-3, 2e-3, 0.02, 0.02, 0.02]) ** 2
 LOOP = np.diag([5e-3, 5e-3, 5e-3, 0.05, 0.05, 0.05]) ** 2
@@ -54,13 +54,13 @@ ENDS = [(k, k + 50) for k in range(0, 70, 10)]
 def test_wrong_loops_are_rejected_and_leave_no_trace(seed: int, wrong: int) -> None:
     poses, graph = laps(seed=seed)
     rng = np.random.default_rng(seed)
-    clean = optimise(with_loops(graph, ENDS, right_loops(poses, ENDS)), RobustSettings())
+    clean = optimize(with_loops(graph, ENDS, right_loops(poses, ENDS)), RobustSettings())
     assert clean.kept.all()
     a = rng.integers(0, 50, wrong)
     false = [(int(n), int(n + k)) for n, k in zip(a, rng.integers(15, 36, wrong), strict=True)]  # over 18 m apart
     T = se3.exp(rng.normal(size=(wrong, 6)) * [0.02, 0.02, 1.0, 1, 1, 0.1])
     both = with_loops(graph, ENDS + false, np.concatenate([right_loops(poses, ENDS), T]))
-    found = optimise(both, RobustSettings())
+    found = optimize(both, RobustSettings())
     assert found.settled
     np.testing.assert_array_equal(found.kept, np.arange(len(both.ends)) < len(ENDS))
     # What is rejected takes no part: only where Levenberg-Marquardt stops may differ.
@@ -71,7 +71,7 @@ def test_a_right_loop_comes_back_when_the_graph_has_improved() -> None:
     poses, graph = laps()
     graph = with_loops(graph, ENDS, right_loops(poses, ENDS))
     apart = np.sqrt(chain_chi2(graph, integrate(graph)))
-    found = optimise(graph, RobustSettings(odometry_sigmas=float(apart.max()) - 1e-3))  # sets one aside
+    found = optimize(graph, RobustSettings(odometry_sigmas=float(apart.max()) - 1e-3))  # sets one aside
     assert found.kept.all()
     assert found.rounds == 2
 
@@ -79,14 +79,14 @@ def test_a_right_loop_comes_back_when_the_graph_has_improved() -> None:
 def test_few_unknowns_give_the_optimum_of_all() -> None:
     poses, graph = laps(seed=3)
     graph = with_loops(graph, ENDS, right_loops(poses, ENDS))
-    few = optimise(graph, RobustSettings(loop_kernel=1e6))  # a kernel so wide is plain least squares
+    few = optimize(graph, RobustSettings(loop_kernel=1e6))  # a kernel so wide is plain least squares
     every = least_squares(graph, np.ones(len(ENDS), np.bool_))
     assert rmse(few.poses, every) < 2e-3  # to first order in corrections of about 1 m a lap
 
 
 def test_spreading_what_is_not_off_changes_nothing() -> None:
     _, graph = laps(seed=5)
-    stretches = Stretches(graph, graph.poses, np.array([17, 3, 80]))
+    stretches = CondensedOdometry(graph, graph.poses, np.array([17, 3, 80]))
     np.testing.assert_array_equal(stretches.nodes, [0, 3, 17, 80, 119])
     np.testing.assert_allclose(stretches.spread(graph.poses[stretches.nodes]), graph.poses, atol=1e-9)
 
@@ -103,7 +103,7 @@ def test_a_trajectory_in_another_frame_is_joined_by_the_loops_that_agree() -> No
     T = right_loops(poses, ends)
     T[1] = se3.exp([0, 0, 1, 5, 5, 0])  # one of five is wrong
     graph = with_loops(GraphData(moved, chained, steps, covariances), ends, T)
-    found = optimise(graph, RobustSettings())
+    found = optimize(graph, RobustSettings())
     np.testing.assert_array_equal(found.kept, [True, False, True, True, True])
     assert rmse(found.poses, poses) < 0.6  # odometry noise: 0.02 m a step and 0.002 rad at a lever of 20 m
 
@@ -120,11 +120,11 @@ def test_covariance_grows_along_the_chain_as_its_steps_add_up() -> None:
 
 def test_an_empty_and_a_single_node_graph_are_solved() -> None:
     _, graph = laps(1)
-    np.testing.assert_allclose(optimise(graph, RobustSettings()).poses, graph.poses, atol=1e-12)
+    np.testing.assert_allclose(optimize(graph, RobustSettings()).poses, graph.poses, atol=1e-12)
 
 
 def test_a_covariance_that_is_none_is_refused() -> None:
     poses, graph = laps()
     graph = with_loops(graph, ENDS, right_loops(poses, ENDS))
     with pytest.raises((RuntimeError, np.linalg.LinAlgError)):
-        optimise(replace(graph, covariances=graph.covariances * 0), RobustSettings(odometry_sigmas=1e9))
+        optimize(replace(graph, covariances=graph.covariances * 0), RobustSettings(odometry_sigmas=1e9))

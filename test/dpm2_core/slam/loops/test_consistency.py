@@ -8,7 +8,7 @@ import pytest
 
 from dpm2_core.frame import Array, Keyframe, Registration
 from dpm2_core.geometry import se3
-from dpm2_core.slam.loops.consistency import Consistency, ConsistencySettings, Loop, Path
+from dpm2_core.slam.loops.consistency import Consistency, ConsistencySettings, Loop, OdometryChain
 
 FIRM, LOST = np.eye(6) * 1e-4, np.eye(6)
 
@@ -22,9 +22,9 @@ def keyframe(node: int, T: Array, covariance: Array | None = FIRM, robot: str = 
     return Keyframe(node, node, node, T, np.zeros((0, 4), np.float32), edge, robot)
 
 
-def straight(count: int = 101, step: float = 5.0) -> Path:
+def straight(count: int = 101, step: float = 5.0) -> OdometryChain:
     """A drive straight on, 500 m long."""
-    path = Path()
+    path = OdometryChain()
     for node in range(count):
         path.append(keyframe(node, pose(step * node), None if node == 0 else FIRM))
     return path
@@ -34,12 +34,12 @@ def loop(a: int, b: int, T: Array) -> Loop:
     return Loop(a, b, Registration(T, FIRM, 0.9, 0.1, "test"))
 
 
-def expected(path: Path, a: int, b: int) -> Array:
+def expected(path: OdometryChain, a: int, b: int) -> Array:
     return path.T(a, b)
 
 
 def test_path_lengths_are_known_within_a_segment_alone() -> None:
-    path = Path()
+    path = OdometryChain()
     nodes = [("a", None), ("a", FIRM), ("b", None), ("a", FIRM), ("b", FIRM), ("a", LOST), ("a", FIRM)]
     for node, (robot, covariance) in enumerate(nodes):
         path.append(keyframe(node, pose(3.0 * node), covariance, robot))
@@ -52,8 +52,8 @@ def test_path_lengths_are_known_within_a_segment_alone() -> None:
 def test_a_loop_that_agrees_with_the_odometry_needs_no_other() -> None:
     path = straight()
     T = expected(path, 0, 100)
-    (judged,) = Consistency(ConsistencySettings(), path).judge(loop(0, 100, T @ pose(1.5)), T)
-    assert judged.registration.ok
+    (checked,) = Consistency(ConsistencySettings(), path).check(loop(0, 100, T @ pose(1.5)), T)
+    assert checked.registration.ok
 
 
 def test_a_loop_beyond_all_drift_is_refused() -> None:
@@ -61,26 +61,26 @@ def test_a_loop_beyond_all_drift_is_refused() -> None:
     consistency = Consistency(ConsistencySettings(), path)
     T = expected(path, 0, 100)
     for off in (pose(12.0), pose(0, 0, np.radians(14))):  # 500 m of path allow 11 m and 13 degrees
-        (judged,) = consistency.judge(loop(0, 100, T @ off), T)
-        assert not judged.registration.ok
-        assert "from the odometry" in judged.registration.reason
+        (checked,) = consistency.check(loop(0, 100, T @ off), T)
+        assert not checked.registration.ok
+        assert "from the odometry" in checked.registration.reason
     # what was refused confirms nothing
-    (judged,) = consistency.judge(loop(1, 99, expected(path, 1, 99) @ pose(11.9)), expected(path, 1, 99))
-    assert not judged.registration.ok
+    (checked,) = consistency.check(loop(1, 99, expected(path, 1, 99) @ pose(11.9)), expected(path, 1, 99))
+    assert not checked.registration.ok
 
 
 def test_two_loops_that_agree_are_accepted_together() -> None:
     path, drift = straight(), pose(6.0)
     consistency = Consistency(ConsistencySettings(), path)
     first = loop(0, 99, drift @ expected(path, 0, 99))
-    (waiting,) = consistency.judge(first, expected(path, 0, 99))
+    (waiting,) = consistency.check(first, expected(path, 0, 99))
     assert not waiting.registration.ok
     assert "waits" in waiting.registration.reason
-    accepted = consistency.judge(loop(1, 100, drift @ expected(path, 1, 100)), expected(path, 1, 100))
+    accepted = consistency.check(loop(1, 100, drift @ expected(path, 1, 100)), expected(path, 1, 100))
     assert [(a.from_node, a.to_node) for a in accepted] == [(1, 100), (0, 99)]
     assert all(a.registration.ok for a in accepted)
     # a third one finds the two accepted, and nobody is accepted twice
-    third = consistency.judge(loop(2, 98, drift @ expected(path, 2, 98)), expected(path, 2, 98))
+    third = consistency.check(loop(2, 98, drift @ expected(path, 2, 98)), expected(path, 2, 98))
     assert [(a.from_node, a.to_node) for a in third] == [(2, 98)]
 
 
@@ -92,19 +92,19 @@ def test_two_loops_that_agree_are_accepted_together() -> None:
 def test_a_loop_is_not_confirmed_by(a: int, b: int, off: Array) -> None:
     path = straight()
     consistency = Consistency(ConsistencySettings(), path)
-    consistency.judge(loop(0, 99, pose(6.0) @ expected(path, 0, 99)), expected(path, 0, 99))
-    (judged,) = consistency.judge(loop(a, b, off @ expected(path, a, b)), expected(path, a, b))
-    assert not judged.registration.ok
+    consistency.check(loop(0, 99, pose(6.0) @ expected(path, 0, 99)), expected(path, 0, 99))
+    (checked,) = consistency.check(loop(a, b, off @ expected(path, a, b)), expected(path, a, b))
+    assert not checked.registration.ok
 
 
 def test_between_robots_it_always_takes_two() -> None:
     """Nothing is known of where they are to each other, however well a first loop happens to fit the map."""
-    path = Path()
+    path = OdometryChain()
     for node in range(40):
         robot = "a" if node < 20 else "b"
         path.append(keyframe(node, pose(5.0 * (node % 20)), None if node % 20 == 0 else FIRM, robot))
     consistency = Consistency(ConsistencySettings(), path)
     T = pose(0.5)
-    (first,) = consistency.judge(loop(3, 23, T), np.eye(4))
+    (first,) = consistency.check(loop(3, 23, T), np.eye(4))
     assert not first.registration.ok
-    assert len(consistency.judge(loop(4, 24, T), np.eye(4))) == 2
+    assert len(consistency.check(loop(4, 24, T), np.eye(4))) == 2

@@ -14,9 +14,9 @@ from dpm2_core.network.pretrained import load_network
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import LidarConfig
 from dpm2_core.sim.world import World, build_world
-from dpm2_core.slam.loops.localizer import Localiser
+from dpm2_core.slam.loops.localizer import Localizer
 from dpm2_core.slam.loops.place_recognition import PlaceRecognition
-from dpm2_core.slam.loops.relocalization import Relocaliser, RelocaliseSettings
+from dpm2_core.slam.loops.relocalization import RelocalizationSettings, Relocalizer
 from dpm2_core.slam.registration.icp import GeometricSettings
 
 FIRM, LOST = np.diag([1e-3] * 3 + [0.02] * 3) ** 2, np.eye(6)
@@ -34,7 +34,7 @@ def seen(s: float, lateral: float = 0.0, heading: float = 0.0, time: float = 0.0
 
 
 @pytest.fixture(scope="module")
-def relocaliser() -> Relocaliser:
+def relocalizer() -> Relocalizer:
     """A map of 60 m of a street."""
     network = load_network("small", 2)
     describe = PlaceRecognition(network).describe
@@ -42,7 +42,7 @@ def relocaliser() -> Relocaliser:
     poses = np.array([world().pose_at(s) for s in at])
     clouds = [seen(s) for s in at]
     keyframes = [Keyframe(i, i, i, poses[i], cloud[:0], None, "", describe(cloud)) for i, cloud in enumerate(clouds)]
-    return Relocaliser(RelocaliseSettings(), GeometricSettings(), network, keyframes, clouds, poses)
+    return Relocalizer(RelocalizationSettings(), GeometricSettings(), network, keyframes, clouds, poses)
 
 
 def off(found: Registration, truth: Array) -> tuple[float, float]:
@@ -54,26 +54,26 @@ def off(found: Registration, truth: Array) -> tuple[float, float]:
     ("s", "lateral", "heading"), [(63.0, 0.5, 0.0), (77.0, 2.5, 3.0), (92.0, 1.0, -1.6)], ids=["same", "back", "across"]
 )
 def test_found_from_one_cloud_with_other_traffic(
-    relocaliser: Relocaliser, s: float, lateral: float, heading: float
+    relocalizer: Relocalizer, s: float, lateral: float, heading: float
 ) -> None:
-    found = relocaliser.find(seen(s, lateral, heading, time=7.0))
+    found = relocalizer.find(seen(s, lateral, heading, time=7.0))
     assert found.ok, found.reason
-    metres, degrees = off(found, world().pose_at(s, lateral, heading))
-    assert metres < 0.1
+    meters, degrees = off(found, world().pose_at(s, lateral, heading))
+    assert meters < 0.1
     assert degrees < 0.2
 
 
-def test_another_street_is_not_found_and_a_wrong_hint_finds_nothing(relocaliser: Relocaliser) -> None:
+def test_another_street_is_not_found_and_a_wrong_hint_finds_nothing(relocalizer: Relocalizer) -> None:
     elsewhere = world("city", 5)
     for s in (60.0, 80.0):
-        assert not relocaliser.find(seen(s, of=elsewhere)).ok
+        assert not relocalizer.find(seen(s, of=elsewhere)).ok
     cloud = seen(63.0)
-    assert relocaliser.find(cloud, hint=world().pose_at(70.0)).ok
-    assert not relocaliser.find(cloud, hint=world().pose_at(70.0) @ se3.make(np.eye(3), np.array([500.0, 0, 0]))).ok
+    assert relocalizer.find(cloud, hint=world().pose_at(70.0)).ok
+    assert not relocalizer.find(cloud, hint=world().pose_at(70.0) @ se3.make(np.eye(3), np.array([500.0, 0, 0]))).ok
 
 
-def test_an_empty_cloud_is_no_place(relocaliser: Relocaliser) -> None:
-    found = relocaliser.find(np.zeros((0, 4), np.float32))
+def test_an_empty_cloud_is_no_place(relocalizer: Relocalizer) -> None:
+    found = relocalizer.find(np.zeros((0, 4), np.float32))
     assert not found.ok
     assert "too few" in found.reason
 
@@ -85,31 +85,31 @@ def keyframe(node: int, s: float, T_world_odom: Array, covariance: Array = FIRM,
     return Keyframe(node, node, node, T_odom_kf, seen(s, time=3.0, of=of), edge)
 
 
-def test_localisation_tracks_notices_kidnapping_and_admits_being_lost(relocaliser: Relocaliser) -> None:
-    localiser = Localiser(relocaliser)
+def test_localisation_tracks_notices_kidnapping_and_admits_being_lost(relocalizer: Relocalizer) -> None:
+    localizer = Localizer(relocalizer)
     origin = se3.exp(np.array([0, 0, 1.0, 30, -20, 0.5]))
-    first = localiser.add(keyframe(0, 55.0, origin))
-    assert first.state is State.RELOCALISED
-    np.testing.assert_allclose(localiser.T_map_odom[:3, 3], origin[:3, 3], atol=1.0)  # 0.1 deg at the lever's 60 m
+    first = localizer.add(keyframe(0, 55.0, origin))
+    assert first.state is State.RELOCALIZED
+    np.testing.assert_allclose(localizer.T_map_odom[:3, 3], origin[:3, 3], atol=1.0)  # 0.1 deg at the lever's 60 m
     # five metres on, the odometry errs by 0.3 m: taken up
-    tracked = localiser.add(keyframe(1, 60.0, origin @ se3.make(np.eye(3), np.array([0.3, 0, 0]))))
+    tracked = localizer.add(keyframe(1, 60.0, origin @ se3.make(np.eye(3), np.array([0.3, 0, 0]))))
     assert tracked.state is State.TRACKING
     assert not tracked.jumped
     assert np.linalg.norm(tracked.T_map_kf[:3, 3] - world().pose_at(60.0)[:3, 3]) < 0.1
     # the odometry was lost, and goes on somewhere: found at once
     broken = se3.exp(np.array([0, 0, -0.5, 5, 5, 0]))
-    again = localiser.add(keyframe(2, 95.0, broken, LOST))
-    assert again.state is State.RELOCALISED
+    again = localizer.add(keyframe(2, 95.0, broken, LOST))
+    assert again.state is State.RELOCALIZED
     assert again.jumped
     assert np.linalg.norm(again.T_map_kf[:3, 3] - world().pose_at(95.0)[:3, 3]) < 0.1
     # a place that the map does not show: doubted, then lost, and said so in the covariance
     states, sigmas = [], []
     for node in range(3, 7):
-        located = localiser.add(keyframe(node, 95.0 + node, broken, of=world("city", 5)))
+        located = localizer.add(keyframe(node, 95.0 + node, broken, of=world("city", 5)))
         states.append(located.state)
         sigmas.append(located.covariance[3, 3])
     assert states[0] is State.DEGRADED
     assert states[-1] is State.LOST
     assert sigmas[-1] >= 100.0**2 * 0.99
     # back again
-    assert localiser.add(keyframe(7, 70.0, broken)).state is State.RELOCALISED
+    assert localizer.add(keyframe(7, 70.0, broken)).state is State.RELOCALIZED

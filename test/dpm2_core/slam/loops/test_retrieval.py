@@ -41,8 +41,8 @@ def test_similarities_are_the_cosines_of_the_centred_vectors() -> None:
         index.append(place(seed))
     query = pooled(place(7, 0.1))
     mean = vectors.mean(0)
-    centred, wanted = vectors - mean, query - mean
-    cosine = centred @ wanted / np.linalg.norm(centred, axis=1) / np.linalg.norm(wanted)
+    centered, wanted = vectors - mean, query - mean
+    cosine = centered @ wanted / np.linalg.norm(centered, axis=1) / np.linalg.norm(wanted)
     np.testing.assert_allclose(index.similarities(query), cosine, atol=1e-3)  # float32, as a difference of squares
 
 

@@ -45,13 +45,13 @@ def test_a_right_pose_is_believed_and_improved(suburb: tuple[list[Points], Array
     assert 0.3 < e.moved < 0.8
 
 
-@pytest.mark.parametrize("metres", [-15.0, 12.0, 25.0])
-def test_a_wrong_place_in_the_same_street_is_not_believed(suburb: tuple[list[Points], Array], metres: float) -> None:
+@pytest.mark.parametrize("meters", [-15.0, 12.0, 25.0])
+def test_a_wrong_place_in_the_same_street_is_not_believed(suburb: tuple[list[Points], Array], meters: float) -> None:
     """The road fits wherever one is put on it; what stands beside it does not."""
     clouds, poses = suburb
     v = verifier()
     around = v.surroundings(clouds[:6], se3.inverse(poses[3]) @ poses[:6])
-    T = se3.inverse(poses[3]) @ poses[6] @ se3.exp(np.array([0, 0, 0, metres, 0, 0]))
+    T = se3.inverse(poses[3]) @ poses[6] @ se3.exp(np.array([0, 0, 0, meters, 0, 0]))
     e = v.verify(clouds[6], around, T)
     assert not e.registration.ok
     assert e.registration.reason
@@ -70,8 +70,8 @@ def test_along_a_tunnel_no_pose_is_believed() -> None:
     clouds, poses = street("tunnel")
     v = verifier()
     around = v.surroundings(clouds[:6], se3.inverse(poses[3]) @ poses[:6])
-    for metres in (0.0, 1.0, 8.0):
-        T = se3.inverse(poses[3]) @ poses[6] @ se3.exp(np.array([0, 0, 0, metres, 0, 0]))
+    for meters in (0.0, 1.0, 8.0):
+        T = se3.inverse(poses[3]) @ poses[6] @ se3.exp(np.array([0, 0, 0, meters, 0, 0]))
         assert not v.verify(clouds[6], around, T).registration.ok
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from dpm2_core.evaluation.metrics import ape_rmse
-from dpm2_core.frame import Array, Keyframe, Registration, State, Tracked
+from dpm2_core.frame import Array, Keyframe, OdometryResult, Registration, State
 from dpm2_core.geometry import se3
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import LidarConfig
@@ -56,7 +56,7 @@ def test_a_loop_edge_spreads_the_drift() -> None:
         graph.add_node(keyframe.T_odom_kf, edge and edge.T_target_source, edge and edge.covariance)
     before = np.linalg.norm(graph.poses[:, :3, 3] - poses[:, :3, 3], axis=1)
     graph.add_loop(0, 39, se3.inverse(poses[0]) @ poses[39], SIGMA)
-    graph.optimise()
+    graph.optimize()
     after = np.linalg.norm(graph.poses[:, :3, 3] - poses[:, :3, 3], axis=1)
     assert after[-1] < 0.1 * before[-1]
     assert np.sqrt((after**2).mean()) < 0.5 * np.sqrt((before**2).mean())
@@ -71,7 +71,7 @@ def test_one_wrong_loop_among_right_ones_bends_little() -> None:
         graph.add_node(keyframe.T_odom_kf, edge and edge.T_target_source, edge and edge.covariance)
     graph.add_loop(0, 39, se3.inverse(poses[0]) @ poses[39], SIGMA)
     graph.add_loop(3, 20, np.eye(4), SIGMA)  # 40 m wrong
-    graph.optimise()
+    graph.optimize()
     assert np.linalg.norm(graph.poses[:, :3, 3] - poses[:, :3, 3], axis=1).max() < 0.5
 
 
@@ -157,8 +157,8 @@ def test_map_is_one_point_a_voxel_in_the_map_frame(lap: tuple[list[Keyframe], Ar
     assert cloud[:, 0].max() > lap[0][0].cloud[:, 0].max() + 4  # the later keyframes reach farther
 
 
-def tracked(index: int, T: Array, keyframe: Keyframe | None) -> Tracked:
-    return Tracked(index * 10**8, index, T, np.zeros((6, 6)), np.zeros(6), State.TRACKING, found(T), keyframe)
+def tracked(index: int, T: Array, keyframe: Keyframe | None) -> OdometryResult:
+    return OdometryResult(index * 10**8, index, T, np.zeros((6, 6)), np.zeros(6), State.TRACKING, found(T), keyframe)
 
 
 def test_corrections_reach_the_frames_between_keyframes() -> None:

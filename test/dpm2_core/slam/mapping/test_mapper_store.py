@@ -96,8 +96,8 @@ def test_four_laps_have_the_clouds_of_one(tmp_path: Path) -> None:
         sizes.append((own, path.stat().st_size))
     (own_1, _), (own_4, _) = sizes
     assert own_1 == LAP
-    refused = sum(node % 7 == 0 for node in range(LAP, 4 * LAP))
-    assert own_4 <= LAP + refused
+    rejected = sum(node % 7 == 0 for node in range(LAP, 4 * LAP))
+    assert own_4 <= LAP + rejected
     off = make(redundancy={"distance": 0})
     for keyframe in laps(2):
         off.add(keyframe)

@@ -34,12 +34,12 @@ def read_back(path: Path) -> tuple[np.ndarray, dict[str, object]]:
     magic, size, depth, pixels = (path.parent / about["image"]).read_bytes().split(b"\n", 3)
     assert (magic, depth) == (b"P5", b"255")
     columns, rows = map(int, size.split())
-    grey = np.frombuffer(pixels, np.uint8).reshape(rows, columns)[::-1]
-    occupancy = (255 - grey.astype(float)) / 255
-    cells = np.full(grey.shape, -1)
+    gray = np.frombuffer(pixels, np.uint8).reshape(rows, columns)[::-1]
+    occupancy = (255 - gray.astype(float)) / 255
+    cells = np.full(gray.shape, -1)
     cells[occupancy > about["occupied_thresh"]] = 100
     cells[occupancy < about["free_thresh"]] = 0
-    cells[grey == 205] = -1
+    cells[gray == 205] = -1
     return cells, about
 
 

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from dpm2_core.frame import Frame, State, Tracked
+from dpm2_core.frame import Frame, OdometryResult, State
 from dpm2_core.geometry import se3
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import LidarConfig
@@ -20,12 +20,12 @@ from dpm2_core.slam.settings import SlamSettings
 from ..conftest import Drive, make_drive
 
 
-def run(frames: list[Frame]) -> list[Tracked]:
+def run(frames: list[Frame]) -> list[OdometryResult]:
     odometry = make_odometry(SlamSettings())
     return [odometry.process(frame) for frame in frames]
 
 
-def errors(tracked: list[Tracked], truth: np.ndarray) -> np.ndarray:
+def errors(tracked: list[OdometryResult], truth: np.ndarray) -> np.ndarray:
     """(N, 2) position error, m, and rotation error, deg, of each frame."""
     off = se3.inverse(truth) @ np.array([t.T_odom_lidar for t in tracked])
     return np.stack([np.linalg.norm(off[:, :3, 3], axis=1), np.degrees(se3.angle(off))], 1)
@@ -121,7 +121,7 @@ def test_bad_frames_before_the_first_good_one(suburb: Drive) -> None:
     frames, truth = suburb
     empty = Frame(-(10**8), np.zeros((0, 4), np.float32))
     tracked = run([empty, *frames[:6]])
-    assert tracked[0].state == State.INITIALISING
+    assert tracked[0].state == State.INITIALIZING
     assert not tracked[0].registration.ok
     assert errors(tracked[1:], truth[:6])[:, 0].max() < 0.05
 

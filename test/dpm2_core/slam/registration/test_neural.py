@@ -159,21 +159,21 @@ def test_unsure_matches_are_no_answer(weights: Path, street: Street, noise: np.r
 
 
 def test_pictures_are_asked_for_and_used_where_the_network_has_a_camera(
-    tiny: Callable[..., NetworkSettings], street: Street, picture: Callable[..., Image], noise: np.random.Generator
+    tiny: Callable[..., NetworkSettings], street: Street, make_image: Callable[..., Image], noise: np.random.Generator
 ) -> None:
     torch.manual_seed(0)
     preprocessor = Preprocessor(PreprocessSettings())
-    frame = Frame(0, cloud(street(noise)), images=(picture(noise),))
+    frame = Frame(0, cloud(street(noise)), images=(make_image(noise),))
     for backbone, wanted in (("convnext", True), ("none", False)):
         model = DeepPointMap2(tiny(image={"backbone": backbone})).eval().requires_grad_(False)
         registration = NeuralScanRegistration(NeuralSettings(), preprocessor, model)
         assert registration.uses_images is wanted
-        with_picture, without = (
+        with_image, without = (
             registration.prepare(f, np.zeros(6)).descriptors for f in (frame, Frame(0, frame.points))
         )
-        assert with_picture is not None
+        assert with_image is not None
         assert without is not None
-        assert np.array_equal(with_picture.features, without.features) is not wanted
+        assert np.array_equal(with_image.features, without.features) is not wanted
 
 
 def test_descriptors_of_a_keyframe_take_70_kb(street: Street, noise: np.random.Generator) -> None:

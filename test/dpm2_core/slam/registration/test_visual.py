@@ -59,8 +59,8 @@ def frame(x: float, paint: Paint, index: int = 0, gain: float = 1.0) -> Frame:
     points = hits(rays, x) - [x, 0, 0] + noise.normal(0, 0.01, rays.shape)
     u, v = np.meshgrid(np.arange(640), np.arange(240))
     rays = np.c_[u.ravel(), v.ravel(), np.ones(u.size)] @ np.linalg.inv(CAMERA.K).T @ T_LIDAR_CAM[:3, :3].T
-    grey = np.clip(gain * paint(hits(rays, x)).reshape(u.shape), 0, 255).astype(np.uint8)
-    image = Image(np.repeat(grey[..., None], 3, 2), CAMERA)
+    gray = np.clip(gain * paint(hits(rays, x)).reshape(u.shape), 0, 255).astype(np.uint8)
+    image = Image(np.repeat(gray[..., None], 3, 2), CAMERA)
     return Frame(index * 10**8, np.c_[points, np.ones(len(points))].astype(np.float32), images=(image,), index=index)
 
 

@@ -97,10 +97,10 @@ def test_round_trip_on_disk() -> None:
 
 
 def test_without_a_temporary_folder(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(**_: object) -> None:
+    def reject(**_: object) -> None:
         raise OSError("no space")
 
-    monkeypatch.setattr("tempfile.TemporaryFile", refuse)
+    monkeypatch.setattr("tempfile.TemporaryFile", reject)
     check(CloudStore())
 
 
