@@ -47,13 +47,13 @@ def beside_pypose(scan: Tensor, T_target_source: Tensor, settings: SlamLossSetti
     return {"version": pypose.__version__, "iterations": iterations, **rows}
 
 
-def _row(run: Callable[[], Tensor], wanted: np.ndarray) -> dict[str, float]:
+def _row(run: Callable[[], Tensor], requested: np.ndarray) -> dict[str, float]:
     seconds = []
     for _ in range(_REPETITIONS):
         begin = time.perf_counter()
-        found = run()
+        result = run()
         seconds.append(time.perf_counter() - begin)
-    error = se3.inverse(wanted) @ found.detach().double().numpy()
+    error = se3.inverse(requested) @ result.detach().double().numpy()
     figures = {
         "mm": 1e3 * float(np.linalg.norm(error[:3, 3])),
         "deg": float(np.degrees(se3.angle(error))),
@@ -75,10 +75,10 @@ def _by_optimizer(pypose: Any, source: Tensor, target: Tensor, iterations: int) 
             return (n * (self.T.Act(source) - q)).sum(-1, keepdim=True)
 
     model = Plane()
-    optimiser = pypose.optim.LM(model, strategy=pypose.optim.strategy.Adaptive(damping=1e-6))
+    optimizer = pypose.optim.LM(model, strategy=pypose.optim.strategy.Adaptive(damping=1e-6))
     for _ in range(iterations):
         with torch.no_grad():
             moved = model.T.Act(source)
         index = cloud.search.nearest(moved[None])[0, :, 0]
-        optimiser.step((target[index], cloud.normals[0, index]))
+        optimizer.step((target[index], cloud.normals[0, index]))
     return model.T.matrix()

@@ -150,12 +150,12 @@ def bench_geometric(options: Options) -> Report:
 def summary(source: Source, outcomes: Sequence[Outcome]) -> dict[str, Any]:
     """Medians over the repetitions of errors and speed, and the spread of the latter."""
     assert source.poses is not None
-    judged = [evaluate(source.poses, o.poses, LENGTHS, failed_frames=o.failed) for o in outcomes]
+    checked = [evaluate(source.poses, o.poses, LENGTHS, failed_frames=o.failed) for o in outcomes]
     fps = np.array([len(o.seconds) / o.seconds.sum() for o in outcomes])
     seconds = np.concatenate([o.seconds for o in outcomes])
     stages = {stage: np.concatenate([o.stages[stage] for o in outcomes]) for stage in outcomes[0].stages}
     return {
-        **_median(judged),
+        **_median(checked),
         "ape_rmse_m_of_thirds": _thirds(source.poses, outcomes[0].poses),
         "fps": float(np.median(fps)),
         "fps_of_repetitions": fps.round(2).tolist(),
@@ -171,11 +171,11 @@ def _thirds(truth: Array, poses: Array) -> list[float | None]:
     return [evaluate(truth[a:b], poses[a:b]).ape_rmse_m if b - a > 1 else None for a, b in pairwise(edges.tolist())]
 
 
-def _median(judged: Sequence[Metrics]) -> dict[str, Any]:
+def _median(checked: Sequence[Metrics]) -> dict[str, Any]:
     """Each figure's median; multi-threaded sums may differ in the last digits from run to run."""
-    medians: dict[str, Any] = {name: getattr(judged[0], name) for name in ("frames", "path_length_m", "segments")}
+    medians: dict[str, Any] = {name: getattr(checked[0], name) for name in ("frames", "path_length_m", "segments")}
     for name in ("failed_frames", *_ERRORS):
-        values = [getattr(metrics, name) for metrics in judged]
+        values = [getattr(metrics, name) for metrics in checked]
         medians[name] = None if None in values else float(np.median(values))
     return medians
 

@@ -107,9 +107,9 @@ def crashes(folder: Path, options: Options, drive: Path | None = None) -> dict[s
             finals.append(path)  # it came to its end before the kill: the next drive begins
             path = folder / f"killed{len(finals)}.dpm2map"
             before = 0
-        found = check_map(path) if path.exists() else None
+        result = check_map(path) if path.exists() else None
         after = _keyframes(path)
-        kills.append({"opens": found is None or not found.problems, "lost": before + added - after})
+        kills.append({"opens": result is None or not result.problems, "lost": before + added - after})
     _run([*command, "--map", str(path), "--resume"], None)
     finals.append(path)
     ape = [_ape(final, truth) for final in (alone, *finals)]

@@ -62,10 +62,10 @@ def bench_neural(options: Options) -> Report:
     weights = _weights(s.neural.weights)
     path = options.out / "neural.json"
     parts = read_parts(path, weights)
-    wanted = [options.only] if options.only else [name for name in PARTS if name not in parts]
+    requested = [options.only] if options.only else [name for name in PARTS if name not in parts]
     with processors(options.threads), Progress(transient=True) as progress:
-        task = progress.add_task("neural", total=len(wanted))
-        for name in wanted:
+        task = progress.add_task("neural", total=len(requested))
+        for name in requested:
             progress.update(task, description=name)
             started = perf_counter()
             found = PARTS[name](network, options)

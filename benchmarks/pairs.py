@@ -62,8 +62,8 @@ def by_registration(registration: ScanRegistration) -> PairMethod:
     def register(first: Frame, second: Frame) -> Array | None:
         registration.clear()
         registration.update(scan_of(first), np.eye(4))
-        answer = registration.register(scan_of(second), Prediction([np.eye(4)], widen=2.0))
-        return answer.T_target_source if answer.ok else None
+        result = registration.register(scan_of(second), Prediction([np.eye(4)], widen=2.0))
+        return result.T_target_source if result.ok else None
 
     return register
 

@@ -133,18 +133,18 @@ def _row(truth: Array, graph: GraphData, right: _Mask, repetitions: int) -> dict
     seconds = []
     for _ in range(repetitions):
         began = time.perf_counter()
-        found = optimize(graph, RobustSettings())
-        poses = least_squares(replace(graph, poses=found.poses), found.kept)
+        result = optimize(graph, RobustSettings())
+        poses = least_squares(replace(graph, poses=result.poses), result.kept)
         seconds.append(time.perf_counter() - began)
     return {
         "loops": len(right),
         "right": int(right.sum()),
-        "right_kept": int((found.kept & right).sum()),
-        "wrong_kept": int((found.kept & ~right).sum()),
+        "right_kept": int((result.kept & right).sum()),
+        "wrong_kept": int((result.kept & ~right).sum()),
         "odometry_ate_m": ape_rmse(truth, integrate(graph)),
         "ate_m": ape_rmse(truth, poses),
         "seconds": min(seconds),
-        "rounds": found.rounds,
+        "rounds": result.rounds,
     }
 
 

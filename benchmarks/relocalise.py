@@ -134,9 +134,9 @@ def success_rates(rows: list[tuple[bool, float, float, float]]) -> dict[str, Any
     }
 
 
-def _row(found: Registration, truth: Array, seconds: float) -> tuple[bool, float, float, float]:
-    off = se3.inverse(found.T_target_source) @ truth
-    return found.ok, float(np.linalg.norm(off[:3, 3])), float(np.degrees(se3.angle(off))), seconds
+def _row(result: Registration, truth: Array, seconds: float) -> tuple[bool, float, float, float]:
+    off = se3.inverse(result.T_target_source) @ truth
+    return result.ok, float(np.linalg.norm(off[:3, 3])), float(np.degrees(se3.angle(off))), seconds
 
 
 def _measured(frame: Frame, settings: SlamSettings) -> Points:

@@ -63,11 +63,11 @@ def together(bag: Path, played: tuple[str, ...]) -> tuple[int, tuple[int, ...], 
         finally:
             player.kill()
             ended = stop(node)
-        said = {name: (logs / name).read_text(errors="replace") for name in ("slam_node", "bag_player")}
-        account = _ACCOUNT.search(said["slam_node"])
-        sent = re.search(r"(\d+) of them clouds", said["bag_player"])
+        message = {name: (logs / name).read_text(errors="replace") for name in ("slam_node", "bag_player")}
+        account = _ACCOUNT.search(message["slam_node"])
+        sent = re.search(r"(\d+) of them clouds", message["bag_player"])
         if code or ended or account is None or sent is None:
-            raise Dpm2Error("a replay failed:\n" + "\n".join(said.values()))
+            raise Dpm2Error("a replay failed:\n" + "\n".join(message.values()))
         published = [int(line.rsplit(",", 1)[1]) for line in times.read_text().splitlines()[1:]]
         counts = tuple(int(number) for number in account.groups()[:4])
         return int(sent[1]), counts, account[5], (published[-1] - published[0]) * 1e-9

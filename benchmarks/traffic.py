@@ -58,21 +58,21 @@ def bench_traffic(options: Options) -> Report:
     """
     if options.only is not None and options.only not in REGISTRATIONS:
         raise UsageError(f"--only {options.only}: no such registration; choose from {', '.join(REGISTRATIONS)}")
-    wanted = REGISTRATIONS if options.only is None else (options.only,)
+    requested = REGISTRATIONS if options.only is None else (options.only,)
     path = options.out / "traffic.json"
     drives = _read(path, options)
     for preset, traffic in PLACES.items():
         for seed in range(FIRST_SEED, FIRST_SEED + options.repetitions):
             name = f"{preset} {seed}"
             runs = drives.get(name, {}).get("runs", {})
-            missing = {r: [m for m in _methods(r) if m not in runs.get(r, {})] for r in wanted}
+            missing = {r: [m for m in _methods(r) if m not in runs.get(r, {})] for r in requested}
             if not any(missing.values()):
                 continue
             world = build_world("straight", preset, seed, traffic=traffic)
             scans = list(_scans(world))
             truth = np.stack([world.drive_pose(0.1 * i) for i in range(FRAMES)])
-            share = mean(float(moving.mean()) for _, moving in scans)
-            drives[name] = {"traffic": traffic, "share_moving": share, "runs": runs}
+            ratio = mean(float(moving.mean()) for _, moving in scans)
+            drives[name] = {"traffic": traffic, "share_moving": ratio, "runs": runs}
             for registration, methods in missing.items():
                 found = {m: _run(scans, truth, _settings(options, registration), m) for m in methods}
                 runs[registration] = runs.get(registration, {}) | found
@@ -120,8 +120,8 @@ def _odometry(odometry: Odometry, clouds: list[Points], truth: NDArray[np.float6
         poses[i] = tracked.T_odom_lidar
         failed += not tracked.registration.ok
     seconds = (process_time() - cpu) / len(clouds)
-    judged = evaluate(truth, poses, failed_frames=failed)
-    return {**{name: getattr(judged, name) for name in _ERRORS}, "failed_frames": failed, "cpu_ms": 1e3 * seconds}
+    checked = evaluate(truth, poses, failed_frames=failed)
+    return {**{name: getattr(checked, name) for name in _ERRORS}, "failed_frames": failed, "cpu_ms": 1e3 * seconds}
 
 
 def _summary(drives: dict[str, Any]) -> dict[str, Any]:

@@ -189,8 +189,8 @@ def overlap(network: DeepPointMap2, options: Options) -> dict[str, Any]:
     scores: list[float] = []
     for at in range(0, len(chosen), 32):
         part = chosen[at : at + 32]
-        answers = network.register_many([descriptors[a] for a, _ in part], [descriptors[b] for _, b in part])
-        scores += [answer.overlap for answer in answers]
+        results = network.register_many([descriptors[a] for a, _ in part], [descriptors[b] for _, b in part])
+        scores += [result.overlap for result in results]
     near = np.array(distances) <= OVERLAP
     hard = (np.array(distances) > OVERLAP) & (np.array(distances) <= 40)
     return {

@@ -130,10 +130,10 @@ class ActiveMap:
         self.finish()
         if self.mapper.store_problem:
             raise Dpm2Error(f"no reset: {self.mapper.store_problem}")
-        told = self.save() if self.mapper.keyframes and self._directory is not None else ""
+        info = self.save() if self.mapper.keyframes and self._directory is not None else ""
         self.close()
         self._begin()
-        return told
+        return info
 
     @property
     def saves(self) -> bool:
@@ -190,20 +190,20 @@ class ActiveMap:
     def _begin(self) -> None:
         """An empty map, with a file if there is to be one. A file that cannot be made is no reason not to map."""
         ros, self._folder = self._config.ros, None
-        wanted = Path(ros.map_file)
+        requested = Path(ros.map_file)
         if ros.map_file == AUTO:
-            wanted = self._directory / f"{_NAME}{_SUFFIX}" if self._directory is not None else Path()
-        if wanted.name:
+            requested = self._directory / f"{_NAME}{_SUFFIX}" if self._directory is not None else Path()
+        if requested.name:
             try:
-                self._path, self._store = self._created(wanted)
+                self._path, self._store = self._created(requested)
                 self._log.info(f"map file: {self._path}")
             except Dpm2Error as error:
                 self._log.error(f"no map file: {error}")
         self.mapper, self._T_map_odom = make_mapper(self._config.slam, self._store), None
 
-    def _created(self, wanted: Path) -> tuple[Path, MapStore]:
+    def _created(self, requested: Path) -> tuple[Path, MapStore]:
         """A new map file whose name, and folder for its clouds, nobody has."""
-        for path in _numbered(wanted.with_name(_named(wanted.stem, self._robot) + wanted.suffix)):
+        for path in _numbered(requested.with_name(_named(requested.stem, self._robot) + requested.suffix)):
             if path.exists() or (self._directory is not None and (self._directory / path.stem).exists()):
                 continue
             try:

@@ -97,9 +97,9 @@ class BagPlayer:
 
     def _make_publishers(self) -> dict[str, Any]:
         """Latched topics first: whoever knows of a later one then knows of these."""
-        wanted = self._options.topics or tuple(self._bag.types)
+        requested = self._options.topics or tuple(self._bag.types)
         publishers = {}
-        for topic in sorted(wanted, key=lambda topic: topic not in LATCHED):
+        for topic in sorted(requested, key=lambda topic: topic not in LATCHED):
             if self._options.lockstep and topic == self._node.resolve_topic_name(ODOMETRY):
                 self._node.get_logger().warning(f"{topic} is left out: the odometry of now is to answer")
                 continue
@@ -123,15 +123,15 @@ class BagPlayer:
         """Until the clouds (or, without any, anything) have their subscribers; not for ever."""
         options, log = self._options, self._node.get_logger()
         clouds = [topic for topic in self._publishers if self._bag.types[topic] == CLOUD] or list(self._publishers)
-        began, told = time.monotonic(), False
+        began, info = time.monotonic(), False
         while sum(self._publishers[topic].get_subscription_count() for topic in clouds) < options.subscribers:
             waited = time.monotonic() - began
             if waited >= options.wait:
                 log.warning(f"playing, though nobody listens to {', '.join(clouds)} yet")
                 break
-            if waited > 1.0 and not told:
+            if waited > 1.0 and not info:
                 log.info(f"waiting {options.wait:g} s at most for somebody to listen to {', '.join(clouds)}")
-                told = True
+                info = True
             if STOP.wait(0.02):
                 return
         if self._lockstep is not None:

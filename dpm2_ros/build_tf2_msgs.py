@@ -93,8 +93,8 @@ def _generate(package: Path) -> None:
     (package / "msg" / "TFMessage.msg").write_text(DEFINITION)
     with contextlib.redirect_stdout(io.StringIO()):
         convert_msg_to_idl(package, "tf2_msgs", Path("msg/TFMessage.msg"), package / "msg")
-    share = [str(Path(sys.prefix) / "share")]
-    arguments = ("tf2_msgs", [f"{package}:msg/TFMessage.idl"], share, package)
+    ratio = [str(Path(sys.prefix) / "share")]
+    arguments = ("tf2_msgs", [f"{package}:msg/TFMessage.idl"], ratio, package)
     descriptions = HashTypeDescription("description").generate_type_hashes(*arguments)
     found = json.loads(Path(descriptions[0]).read_text())["type_hashes"][0]["hash_string"]
     if found != TYPE_HASH:

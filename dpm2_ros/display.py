@@ -43,12 +43,12 @@ def pose_graph_to_msg(mapper: Mapper, stamp: int, frame_id: str) -> MarkerArray:
         (Marker.LINE_LIST, RED, 0.1, _ends(positions, [(a, b) for a, b, ok in loops if not ok])),
     )
     markers = []
-    for id, (kind, colour, size, points) in enumerate(parts):
+    for id, (kind, color, size, points) in enumerate(parts):
         marker = Marker(header=header(stamp, frame_id), ns="pose_graph", id=id, type=kind)
         marker.action = Marker.ADD if len(points) else Marker.DELETE
         marker.pose = pose_to_msg(np.eye(4))
         marker.scale = Vector3(x=size, y=size, z=size)
-        marker.color = ColorRGBA(r=colour[0], g=colour[1], b=colour[2], a=1.0)
+        marker.color = ColorRGBA(r=color[0], g=color[1], b=color[2], a=1.0)
         marker.points = [Point(x=x, y=y, z=z) for x, y, z in points.tolist()]
         markers.append(marker)
     return MarkerArray(markers=markers)
@@ -56,14 +56,14 @@ def pose_graph_to_msg(mapper: Mapper, stamp: int, frame_id: str) -> MarkerArray:
 
 def loop_to_msg(closure: LoopClosure, stamp: int, from_name: str, to_name: str) -> DiagnosticArray:
     """What became of a loop candidate, and why: OK for an accepted one, WARN for one refused."""
-    found = closure.registration
-    numbers = {"confidence": found.confidence, "overlap": found.overlap, "rmse (m)": found.rmse}
-    values = [KeyValue(key="method", value=found.method)]
+    result = closure.registration
+    numbers = {"confidence": result.confidence, "overlap": result.overlap, "rmse (m)": result.rmse}
+    values = [KeyValue(key="method", value=result.method)]
     values += [KeyValue(key=key, value=f"{value:.3f}") for key, value in numbers.items()]
     status = DiagnosticStatus(
-        level=DiagnosticStatus.OK if found.ok else DiagnosticStatus.WARN,
+        level=DiagnosticStatus.OK if result.ok else DiagnosticStatus.WARN,
         name=f"loop: {from_name} - {to_name}",
-        message="accepted" if found.ok else found.reason,
+        message="accepted" if result.ok else result.reason,
         values=values,
     )
     return DiagnosticArray(header=header(stamp, from_name), status=[status])

@@ -76,9 +76,9 @@ class FrameBuilder:
             raise UsageError(f"{error}; publish it on /tf_static or set input.T_lidar_cam") from None
 
     def _correction(self) -> float:
-        wanted = self._settings.vertical_angle_correction_deg
-        if wanted != "auto":
-            return wanted
+        requested = self._settings.vertical_angle_correction_deg
+        if requested != "auto":
+            return requested
         if self._inputs.angle_correction_deg is not None:
             return self._inputs.angle_correction_deg
         return HDL64_CORRECTION_DEG if self._inputs.points_topic.startswith("/kitti/") else 0.0

@@ -205,11 +205,11 @@ class Diagnostics:
         located, figures = mapper.located, {"keyframes of the map": str(mapper.keyframes)}
         if located is None:
             return self._status("localisation", WARN, f"{State.RELOCALIZING}: no keyframe yet", figures)
-        found, text = located.registration, str(located.state)
-        if found.ok:
-            figures |= {"confidence": f"{found.confidence:.2f}", "worst sigma (m)": f"{found.worst_sigma:.3f}"}
+        result, text = located.registration, str(located.state)
+        if result.ok:
+            figures |= {"confidence": f"{result.confidence:.2f}", "worst sigma (m)": f"{result.worst_sigma:.3f}"}
         else:
-            text += f": {found.reason}"
+            text += f": {result.reason}"
         return self._status("localisation", _LEVEL[located.state], text, figures)
 
     def _camera(self, camera: CameraState) -> DiagnosticStatus:

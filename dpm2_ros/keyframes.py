@@ -120,8 +120,8 @@ class KeyframeSender:
         now = time.monotonic()
         with self._lock:
             below, above = self._answers.agreed
-            wanted = range(below, len(self._kept))
-            late = [id for id in wanted if id not in above and now - self._sent[id] > _PATIENCE][:_BURST]
+            requested = range(below, len(self._kept))
+            late = [id for id in requested if id not in above and now - self._sent[id] > _PATIENCE][:_BURST]
             for id in late:
                 self._sent[id] = now
             again = [[self._file.read(number) for number in self._kept[id]] for id in late]
@@ -147,8 +147,8 @@ class Answers:
     @property
     def agreed(self) -> tuple[int, frozenset[int]]:
         """All ids below the number, and some above."""
-        answers = [(slot.below, slot.above) for slot in self._slots]
-        return functools.reduce(_both, answers) if answers else (0, frozenset())
+        results = [(slot.below, slot.above) for slot in self._slots]
+        return functools.reduce(_both, results) if results else (0, frozenset())
 
     def add(self, below: int, above: Set[int], now: float) -> None:
         """An answer that came at that time, s."""
@@ -172,7 +172,7 @@ class _Slot:
 
 
 def _both(a: tuple[int, frozenset[int]], b: tuple[int, frozenset[int]]) -> tuple[int, frozenset[int]]:
-    less, more = sorted((a, b), key=lambda answer: answer[0])
+    less, more = sorted((a, b), key=lambda result: result[0])
     return less[0], frozenset(id for id in less[1] if id < more[0] or id in more[1])
 
 

@@ -192,9 +192,9 @@ class MapperThread:
 
     def _change(self, work: Callable[[], Any]) -> Any:
         """Work after which there is another map to show."""
-        answer = work()
+        result = work()
         self._changes += 1
-        return answer
+        return result
 
     def _take_in(self, make: Callable[[], Keyframe]) -> None:
         try:
@@ -213,16 +213,16 @@ class MapperThread:
         self._changes += 1
 
     def _publish_loop(self, closure: LoopClosure, stamp: int) -> None:
-        found = closure.registration
+        result = closure.registration
         ends = (closure.from_robot, closure.from_id), (closure.to_robot, closure.to_id)
         names = [keyframe_name(robot, id) for robot, id in ends]
         self._loop_candidates.publish(loop_to_msg(closure, stamp, *names))
-        if found.ok:
-            self._loop_closures.publish(edge_to_msg(found.T_target_source, found.covariance, stamp, *names))
+        if result.ok:
+            self._loop_closures.publish(edge_to_msg(result.T_target_source, result.covariance, stamp, *names))
 
     def _reset(self) -> None:
-        if told := self._change(self._active.reset):
-            self._node.get_logger().info(told)
+        if info := self._change(self._active.reset):
+            self._node.get_logger().info(info)
 
     async def _on_save(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         await answer(self._thread.submit(self._active.save), response)

@@ -254,9 +254,9 @@ class SlamNode(GuardedNode):
         return response
 
     def _on_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
-        frame, wanted = message.header.frame_id.lstrip("/"), self._config.ros.map_frame
-        if frame != wanted:
-            raise UsageError(f"initialpose not used: want it in frame {wanted}, not in {frame[:80]!r}")
+        frame, requested = message.header.frame_id.lstrip("/"), self._config.ros.map_frame
+        if frame != requested:
+            raise UsageError(f"initialpose not used: want it in frame {requested}, not in {frame[:80]!r}")
         T_map_base = transform_matrix(message.pose.pose)
         check_pose(T_map_base)
         T_map_start = T_map_base @ self._base.T_base_start

@@ -67,20 +67,20 @@ class MatchedSubscription:
 
     def refresh(self) -> None:
         """Follow the publishers of this moment."""
-        wanted = self.reliability
+        requested = self.reliability
         if self._setting != "auto":
-            wanted = ReliabilityPolicy[self._setting.upper()]
+            requested = ReliabilityPolicy[self._setting.upper()]
         elif offered := self._node.get_publishers_info_by_topic(self.topic):
             reliable = all(info.qos_profile.reliability != ReliabilityPolicy.BEST_EFFORT for info in offered)
-            wanted = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
-        if self._subscription is not None and wanted == self.reliability:
+            requested = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+        if self._subscription is not None and requested == self.reliability:
             return
-        before, self.reliability = self._subscription, wanted
-        qos = QoSProfile(depth=self._depth, history=HistoryPolicy.KEEP_LAST, reliability=wanted)
+        before, self.reliability = self._subscription, requested
+        qos = QoSProfile(depth=self._depth, history=HistoryPolicy.KEEP_LAST, reliability=requested)
         self._subscription = self._node.create_subscription(self._kind, self._given, self._callback, qos)
         if before is not None:
             self._node.destroy_subscription(before)
-            self._node.get_logger().info(f"{self.topic}: {wanted.name.lower()}, as its publisher")
+            self._node.get_logger().info(f"{self.topic}: {requested.name.lower()}, as its publisher")
 
 
 class StaticTransforms:

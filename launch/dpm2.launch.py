@@ -73,8 +73,8 @@ def rviz_remappings(value: dict[str, str], layout: str) -> dict[str, str]:
     here = "/" + "".join(f"{part}/" for part in value["namespace"].split("/") if part)
     rules = {topic: here + topic[1:] for topic in re.findall(r"/(?:dpm2/\w+|initialpose)", layout)}
     for argument, topic in SHOWN.items():
-        if wanted := value[argument]:
-            rules[topic] = wanted if wanted.startswith("/") else here + wanted
+        if requested := value[argument]:
+            rules[topic] = requested if requested.startswith("/") else here + requested
     return {topic: target for topic, target in rules.items() if topic != target}
 
 

@@ -76,15 +76,15 @@ def test_bold_is_what_is_best() -> None:
 
 def test_where_kiss_icp_is_ahead_is_said() -> None:
     names = {"t_err_percent": "KITTI's metric", "ape_rmse_m": "the ATE", "final_drift_percent": "the drift"}
-    (said,) = re.findall(r"KISS-ICP is slightly ahead in [^;]*;", text("README.md"))
+    (message,) = re.findall(r"KISS-ICP is slightly ahead in [^;]*;", text("README.md"))
     drives = record("geometric.json")["drives"]
     for key in ("rpe_trans_m", "rpe_rot_deg", *names):
         ahead = [drive for drive, row in drives.items() if row["kiss-icp"][key] < row["dpm2 without loops"][key]]
         if ahead:
             where = "both drives" if len(ahead) == len(drives) else ahead[0]
-            assert f"{names[key]} on {where}" in said, (key, ahead)
+            assert f"{names[key]} on {where}" in message, (key, ahead)
         else:
-            assert names.get(key, "RPE") not in said
+            assert names.get(key, "RPE") not in message
 
 
 def test_the_card_has_the_figures_of_the_odometry() -> None:
@@ -92,9 +92,9 @@ def test_the_card_has_the_figures_of_the_odometry() -> None:
     drives, seen = record("neural.json")["parts"]["odometry"]["drives"], 0
     for drive, registration, rpe, ate, drift, t_err, _ in rows(CARD, heading):
         true = drives[drive][METHODS[registration]]
-        said = (*rpe.split(", "), ate, drift, t_err)
+        message = (*rpe.split(", "), ate, drift, t_err)
         keys = ("rpe_trans_m", "rpe_rot_deg", "ape_rmse_m", "final_drift_percent", "t_err_percent")
-        for key, cell in zip(keys, said, strict=True):
+        for key, cell in zip(keys, message, strict=True):
             assert equals(cell, true[key]), (drive, registration, key)
         seen += 1
     assert seen == sum(map(len, drives.values()))
@@ -111,7 +111,7 @@ def test_what_refined_adds_on_these_drives_is_said() -> None:
 def test_what_the_camera_adds_to_the_descriptors_is_said() -> None:
     ratios = record("neural.json")["parts"]["corruption"]["error_ratio"]
     (ratio,) = (value for name, value in ratios.items() if "camera" in name)
-    (said,) = re.findall(r"every image black the shipped weights err ([\d.]+) times", text("README.md"))
-    assert equals(said, ratio)
-    (said,) = re.findall(r"\| every image black[^|]*\| ([\d.]+) \|", text(CARD))
-    assert equals(said, ratio)
+    (message,) = re.findall(r"every image black the shipped weights err ([\d.]+) times", text("README.md"))
+    assert equals(message, ratio)
+    (message,) = re.findall(r"\| every image black[^|]*\| ([\d.]+) \|", text(CARD))
+    assert equals(message, ratio)

@@ -121,14 +121,14 @@ def test_what_is_declared_for_the_base_install_is_imported(declared: dict[str, l
 def test_a_machine_is_asked_only_for_what_exists_for_it(declared: dict[str, list[Requirement]], machine: str) -> None:
     """Looked up in the package index: embreex, ros-rclpy and fpsample from 1.0 on have no wheels for aarch64."""
     environment = {"platform_machine": machine, "python_version": "3.12", "sys_platform": "linux"}
-    wanted = {
+    requested = {
         _normal(r.name): str(r.specifier)
         for rows in declared.values()
         for r in rows
         if r.marker is None or r.marker.evaluate(environment)
     }
-    assert ("embreex" in wanted) is ("ros-rclpy" in wanted) is (machine == "x86_64")
-    assert wanted["fpsample"] == ("==0.3.3" if machine == "aarch64" else "<2,>=1.0")
+    assert ("embreex" in requested) is ("ros-rclpy" in requested) is (machine == "x86_64")
+    assert requested["fpsample"] == ("==0.3.3" if machine == "aarch64" else "<2,>=1.0")
 
 
 def test_what_make_demo_and_make_test_install_has_their_extras() -> None:

@@ -137,8 +137,8 @@ def evaluate_replay(source: BagSource, result: Replay, out: Path) -> Outcome:
         "slam_node and bag_player ended cleanly": set(result.exit_codes.values()) == {0},
     }
     if TFMessage is not None:
-        wanted = {f"odom -> {result.base_frame}", "map -> odom"}
-        checks["/tf has odom -> base and map -> odom"] = wanted <= result.tf
+        requested = {f"odom -> {result.base_frame}", "map -> odom"}
+        checks["/tf has odom -> base and map -> odom"] = requested <= result.tf
     if len(found) > 1:
         _check_poses(source, result, out, found, summary, checks)
     return Outcome(summary, checks)

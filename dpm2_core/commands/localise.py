@@ -106,8 +106,8 @@ def run_localized(
             task = progress.add_task(source.name, total=span[1] - span[0])
             try:
                 for frame in prefetch(source.frames(*span)):
-                    if told := report.add(system, frame):
-                        progress.console.print(told, soft_wrap=True)
+                    if info := report.add(system, frame):
+                        progress.console.print(info, soft_wrap=True)
                     progress.update(task, advance=1, description=f"{source.name} {system.localizer.state}")
             except KeyboardInterrupt:
                 console.print("interrupted; writing what there is", style="yellow")

@@ -59,8 +59,8 @@ def info(path: MapFile) -> None:
         table.add_row(*row)
     for s in data.sessions:
         count = data.session.count(s.number)
-        told = f"{count} keyframes, {s.started}, dpm2 {s.program}, weights {s.weights or 'none'}"
-        table.add_row(f"session {s.number}", told)
+        info = f"{count} keyframes, {s.started}, dpm2 {s.program}, weights {s.weights or 'none'}"
+        table.add_row(f"session {s.number}", info)
     Console().print(table)
 
 
@@ -79,14 +79,14 @@ def export(
     if kind not in _EXPORTS:
         raise UsageError(f"{out}: choose --format from {', '.join(_EXPORTS)}")
     spacing = {"voxel": voxel, "resolution": resolution}
-    write, wanted = _EXPORTS[kind]
-    if ignored := [name for name, value in spacing.items() if value is not None and name != wanted]:
+    write, requested = _EXPORTS[kind]
+    if ignored := [name for name, value in spacing.items() if value is not None and name != requested]:
         raise UsageError(f"--{ignored[0]}: a map as {kind} has no use for it")
     with MapStore.open(path) as store:
         data = load_map(store, descriptors=False)
         if not len(data):
             raise UsageError(f"{path}: no keyframe in it yet")
-        write(data, out, spacing.get(wanted) or _SPACING[wanted])
+        write(data, out, spacing.get(requested) or _SPACING[requested])
     Console(stderr=True).print(f"{out} written", highlight=False, soft_wrap=True)
 
 
@@ -154,18 +154,20 @@ def check(
     """Look for damage: database, checksum of every row, edges that lead nowhere, poses that are none."""
     from dpm2_core.slam.store.check import check_map
 
-    found = check_map(path, recover)
+    result = check_map(path, recover)
     console = Console(soft_wrap=True, highlight=False)
-    for problem in found.problems:
+    for problem in result.problems:
         console.print(problem)
     if recover is not None:
-        console.print(f"{recover}: {found.keyframes} keyframes, {found.lost} lost, {found.lost_clouds} without cloud")
-    elif found.problems:
+        console.print(
+            f"{recover}: {result.keyframes} keyframes, {result.lost} lost, {result.lost_clouds} without cloud"
+        )
+    elif result.problems:
         raise Dpm2Error(
-            f"{path}: {len(found.problems)} problems, {found.keyframes} keyframes can be recovered with --recover OUT"
+            f"{path}: {len(result.problems)} problems, {result.keyframes} keyframes can be recovered with --recover OUT"
         )
     else:
-        console.print(f"{path}: {found.keyframes} keyframes, sound")
+        console.print(f"{path}: {result.keyframes} keyframes, sound")
 
 
 def parse_transform(text: str) -> Array:

@@ -116,7 +116,7 @@ def _run(
     out.mkdir(parents=True, exist_ok=True)
     with atomic_write(out / "config.yaml") as file:
         file.write(dump_settings(chosen))
-    seconds, answers, wall = _drive(source, start, stop, system, recorder, console)
+    seconds, results, wall = _drive(source, start, stop, system, recorder, console)
     for note in source.notes:
         console.print(note, style="yellow", soft_wrap=True)
     system.mapper.finish()
@@ -126,7 +126,7 @@ def _run(
     if problem := system.mapper.store_problem:
         console.print(f"map file incomplete: {problem}", style="red", soft_wrap=True)
     of_truth = truth, source.truth if gt is None else str(gt)
-    metrics = _write(out, source, system, recorder, of_truth, answers, seconds, wall)
+    metrics = _write(out, source, system, recorder, of_truth, results, seconds, wall)
     if metrics is not None:
         sensor = "LiDAR" if source.T_cam_lidar is None else "left camera"
         Console().print(metrics_table(metrics, title=f"{source.name}, {len(recorder)} frames", frame=sensor))
@@ -171,7 +171,7 @@ def _drive(
     Ctrl-C ends it early.
     """
     seconds: dict[str, list[float]] = {}
-    answers: Counter[str] = Counter()
+    results: Counter[str] = Counter()
     problem = ""  # of the map file
     began = perf_counter()
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
@@ -186,7 +186,7 @@ def _drive(
                 problem = now
                 for stage, time in tracked.seconds.items():
                     seconds.setdefault(stage, []).append(time)
-                answers[tracked.registration.method if tracked.registration.ok else "failed"] += 1
+                results[tracked.registration.method if tracked.registration.ok else "failed"] += 1
                 if not tracked.registration.ok:
                     progress.console.print(
                         f"frame {frame.index}: {tracked.registration.reason}", style="yellow", soft_wrap=True
@@ -194,7 +194,7 @@ def _drive(
                 progress.update(task, advance=1, description=f"{source.name} {tracked.state}")
         except KeyboardInterrupt:
             console.print(f"interrupted after {len(recorder)} frames; writing what there is", style="yellow")
-    return seconds, answers, perf_counter() - began
+    return seconds, results, perf_counter() - began
 
 
 def _ground_truth(source: Source, gt: Path | None, start: int, stop: int) -> Array | Trajectory | None:
@@ -204,7 +204,7 @@ def _ground_truth(source: Source, gt: Path | None, start: int, stop: int) -> Arr
     truth = read_trajectory(gt)
     if truth.kind == "tum" or truth.kind == "kitti-indexed":
         return truth
-    wanted = range(start, stop)
+    requested = range(start, stop)
     if len(truth) < len(source):
         raise UsageError(f"{gt}: {len(truth)} poses for {len(source)} frames of {source.name}")
     if len(truth) > len(source):  # a file of the whole sequence beside an excerpt: KITTI's frame numbers tell
@@ -213,7 +213,7 @@ def _ground_truth(source: Source, gt: Path | None, start: int, stop: int) -> Arr
             raise UsageError(f"{gt}: {len(truth)} poses, but {source.name} has frame {max(wanted_numbers)}")
         poses = truth.poses[wanted_numbers]
     else:
-        poses = truth.poses[list(wanted)]
+        poses = truth.poses[list(requested)]
     return poses if source.T_cam_lidar is None else _in_other_frame(poses, se3.inverse(source.T_cam_lidar))
 
 
@@ -228,7 +228,7 @@ def _write(
     system: SlamSystem,
     recorder: TrajectoryRecorder,
     of_truth: tuple[Array | Trajectory | None, str],
-    answers: Counter[str],
+    results: Counter[str],
     seconds: dict[str, list[float]],
     wall: float,
 ) -> Metrics | None:
@@ -245,9 +245,9 @@ def _write(
     total = np.sum(list(seconds.values()), axis=0)
     fps = len(total) / float(total.sum()) if len(total) else 0.0
     stages = {stage: _summary(times) for stage, times in [*seconds.items(), ("total", total.tolist())]}
-    timing = {"frames": len(recorder), "fps": fps, "wall_s": wall, "answers": dict(answers), "stages_ms": stages}
+    timing = {"frames": len(recorder), "fps": fps, "wall_s": wall, "answers": dict(results), "stages_ms": stages}
     _write_json(out / "timing.json", timing)
-    metrics, failed, (truth, truth_name) = None, answers["failed"], of_truth
+    metrics, failed, (truth, truth_name) = None, results["failed"], of_truth
     if isinstance(truth, Trajectory):
         own = Trajectory(poses, np.array(recorder.stamps), "tum")
         if truth.kind == "kitti-indexed":
@@ -257,8 +257,8 @@ def _write(
     elif truth is not None and np.isfinite(truth[: len(poses), 0, 0]).sum() >= 2:
         truth = truth[: len(poses)]
         T = source.T_cam_lidar
-        judged = truth if T is None else _in_other_frame(truth, T)
-        metrics = evaluate(judged, sensor, failed_frames=failed, breaks=recorder.breaks, fps=fps)
+        checked = truth if T is None else _in_other_frame(truth, T)
+        metrics = evaluate(checked, sensor, failed_frames=failed, breaks=recorder.breaks, fps=fps)
     if metrics is not None:
         metrics = metrics.model_copy(update={"truth": truth_name})
         _write_json(out / "metrics.json", metrics.model_dump())

@@ -38,8 +38,8 @@ def show(
     model = load_network(weights, threads=2)
     source = open_source(src, InputSettings(images=model.encoder.image is not None))
     target, moving = _frame(source, src, first), _frame(source, src, second)
-    wanted = point is not None or (model.encoder.image is not None and moving.images)
-    looked = image_attention(model, moving, point) if wanted else None
+    requested = point is not None or (model.encoder.image is not None and moving.images)
+    looked = image_attention(model, moving, point) if requested else None
     of_target, of_source = model.describe(target), model.describe(moving)
     found = model.register(of_source, of_target)
     matched = model.matches(of_source, of_target)

@@ -53,16 +53,18 @@ class Bag:
 
         Where the file turns out damaged the messages end, and `notes` says so.
         """
-        wanted = [topic for topic in topics if topic in self.types]
-        if not wanted:
+        requested = [topic for topic in topics if topic in self.types]
+        if not requested:
             return
         count = 0
         try:
-            for message in self._read(wanted):
+            for message in self._read(requested):
                 count += 1
                 yield message
         except Exception as error:  # a damaged chunk raises anything from ReaderError to struct.error
-            self.notes.append(f"{self.path}: damaged after {count} messages of {', '.join(wanted)} ({_reason(error)})")
+            self.notes.append(
+                f"{self.path}: damaged after {count} messages of {', '.join(requested)} ({_reason(error)})"
+            )
 
     def decode(self, topic: str, data: bytes) -> Any:
         """A message object of rosbags.
@@ -145,8 +147,8 @@ def _open_indexed(path: Path, paths: list[Path]) -> Bag:
 
 def _read_indexed(paths: list[Path], topics: Collection[str]) -> RawMessages:
     with _opened(paths) as readers:
-        wanted = [[c for c in reader.connections if c.topic in topics] for reader in readers]
-        streams = [reader.messages(connections=c) for reader, c in zip(readers, wanted, strict=True) if c]
+        requested = [[c for c in reader.connections if c.topic in topics] for reader in readers]
+        streams = [reader.messages(connections=c) for reader, c in zip(readers, requested, strict=True) if c]
         for connection, time, data in merge(*streams, key=lambda message: message[1]):
             yield connection.topic, time, data
 

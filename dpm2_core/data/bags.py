@@ -155,12 +155,12 @@ class BagSource:
         return decode_camera(info, T_lidar_cam, info.header.frame_id or self.image_topic)
 
     def _correction(self) -> float:
-        wanted = self._settings.vertical_angle_correction_deg
-        if wanted != "auto":
-            return wanted
-        said = self._bag.first(topics.VERTICAL_ANGLE_CORRECTION)
-        if said is not None:
-            return checked_correction(float(said.data), f"{self.path}: {topics.VERTICAL_ANGLE_CORRECTION}")
+        requested = self._settings.vertical_angle_correction_deg
+        if requested != "auto":
+            return requested
+        message = self._bag.first(topics.VERTICAL_ANGLE_CORRECTION)
+        if message is not None:
+            return checked_correction(float(message.data), f"{self.path}: {topics.VERTICAL_ANGLE_CORRECTION}")
         return HDL64_CORRECTION_DEG if self.points_topic.startswith("/kitti/") else 0.0
 
     def _pairs(self) -> Iterator[tuple[int, bytes, bytes | None]]:

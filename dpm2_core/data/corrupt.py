@@ -100,7 +100,7 @@ class CorruptedSource:
         self._T_true_wrong = se3.make(Rotation.from_rotvec(turn).as_matrix(), shift)
         bands = int(np.pi / _BAND) + 1
         self._dead = self._rng(_BEAMS).permutation(bands) < round(settings.beams * bands)
-        self._hit = {kind: self._chosen(kind, share) for kind, share in self._ratios().items()}
+        self._hit = {kind: self._chosen(kind, ratio) for kind, ratio in self._ratios().items()}
 
     @property
     def poses(self) -> Array | None:

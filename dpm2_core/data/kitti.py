@@ -84,17 +84,17 @@ class KittiSource:
             )
 
     def _correction(self) -> float:
-        wanted = self._settings.vertical_angle_correction_deg
-        if wanted != "auto":
-            return wanted
+        requested = self._settings.vertical_angle_correction_deg
+        if requested != "auto":
+            return requested
         note = self.path / "dpm2_sim.json"  # a simulated sensor has no such error, and says so
         try:
-            said = float(json.loads(note.read_text(encoding="utf-8"))["vertical_angle_correction_deg"])
+            message = float(json.loads(note.read_text(encoding="utf-8"))["vertical_angle_correction_deg"])
         except FileNotFoundError:
             return HDL64_CORRECTION_DEG
         except (OSError, ValueError, TypeError, KeyError) as error:
             raise UsageError(f"{note}: no number vertical_angle_correction_deg ({error})") from None
-        return checked_correction(said, str(note))
+        return checked_correction(message, str(note))
 
     def _stamps(self) -> NDArray[np.int64]:
         """(len,) ns, continued at a steady pace where times.txt ends early."""
@@ -115,11 +115,13 @@ class KittiSource:
     def _poses(self) -> Array | None:
         """(len, 4, 4) T_world_lidar from poses.txt here or poses/NN.txt of the root; None without."""
         beside, above = self.path / "poses.txt", self.path.resolve().parent.parent / "poses" / f"{self.name}.txt"
-        wanted = {"auto": (beside, above), "kitti": (above,), "semantic_kitti": (beside,)}[self._settings.kitti_poses]
-        path = next((file for file in wanted if file.is_file()), None)
+        requested = {"auto": (beside, above), "kitti": (above,), "semantic_kitti": (beside,)}[
+            self._settings.kitti_poses
+        ]
+        path = next((file for file in requested if file.is_file()), None)
         if path is None:
             if self._settings.kitti_poses != "auto":
-                raise UsageError(f"{wanted[0]}: no such file (input.kitti_poses is {self._settings.kitti_poses})")
+                raise UsageError(f"{requested[0]}: no such file (input.kitti_poses is {self._settings.kitti_poses})")
             return None
         if self.T_cam_lidar is None:
             self.notes.append(f"{path} is of the camera: without Tr it is no ground truth for the LiDAR")

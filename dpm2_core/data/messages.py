@@ -152,15 +152,15 @@ def _first(column: NDArray[Any]) -> NDArray[Any]:
 
 
 def _points(view: NDArray[np.void], intensity: str | None, intensity_max: float | None) -> Points:
-    wanted = ["x", "y", "z", *([intensity] if intensity else [])]
-    fields = [view.dtype.fields[name] for name in wanted] if view.dtype.fields else []
+    requested = ["x", "y", "z", *([intensity] if intensity else [])]
+    fields = [view.dtype.fields[name] for name in requested] if view.dtype.fields else []
     packed = [(np.dtype("<f4"), 4 * i) for i in range(4)]
     if [field[:2] for field in fields] == packed and view.dtype.itemsize == 16 and view.flags.c_contiguous:
         points = view.view("<f4").reshape(-1, 4)
     else:
         points = np.zeros((len(view), 4), np.float32)
         with np.errstate(over="ignore"):  # a double beyond float32 becomes inf, and an invalid point
-            for i, name in enumerate(wanted):
+            for i, name in enumerate(requested):
                 points[:, i] = _first(view[name])
     if not intensity:
         return points

@@ -162,9 +162,9 @@ def _period(keys: Keys) -> float:
     return float(np.median(np.diff(keys))) if len(keys) > 1 else 0.0
 
 
-def _nearest(keys: Keys, wanted: Keys, tolerance: int) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+def _nearest(keys: Keys, requested: Keys, tolerance: int) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
     """Row of the nearest of ascending `keys` for each wanted one, and whether it is within the tolerance."""
-    right = np.clip(np.searchsorted(keys, wanted), 0, len(keys) - 1)
+    right = np.clip(np.searchsorted(keys, requested), 0, len(keys) - 1)
     left = np.maximum(right - 1, 0)
-    rows = np.where(np.abs(keys[left] - wanted) <= np.abs(keys[right] - wanted), left, right)
-    return rows, np.abs(keys[rows] - wanted) <= tolerance
+    rows = np.where(np.abs(keys[left] - requested) <= np.abs(keys[right] - requested), left, right)
+    return rows, np.abs(keys[rows] - requested) <= tolerance

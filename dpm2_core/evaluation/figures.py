@@ -84,8 +84,8 @@ def success_png(path: Path | str, kinds: Mapping[str, Mapping[str, Mapping[str, 
     for y, (_, method, figures) in enumerate(rows):
         axes.barh(y, 100 * figures["success"], color=_ESTIMATE if "with camera" in method else _HEIGHTS[0])
         median = figures["median_m"]
-        said = "no answer for most" if median is None else f"{median:.2f} m"
-        axes.text(100 * figures["success"] + 1, y, said, color=_INK, va="center", fontsize=8)
+        message = "no answer for most" if median is None else f"{median:.2f} m"
+        axes.text(100 * figures["success"] + 1, y, message, color=_INK, va="center", fontsize=8)
     axes.set_yticks(range(len(rows)), [f"{kind}: {method}" for kind, method, _ in rows], color=_INK, fontsize=8)
     axes.set(xlim=(0, 115), ylim=(len(rows) - 0.4, -0.6))
     axes.set_xlabel("pairs registered, %; median error beside the bar", color=_INK)

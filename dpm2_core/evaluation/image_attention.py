@@ -122,10 +122,10 @@ def _projected(xyz: Tensor, views: Any) -> Array:
 def draw_attention(axes: Any, looked: ImageAttention) -> None:
     """The picture with its reference points, and over it the attention of the chosen one."""
     gray = looked.pixels.mean(2, keepdims=True) / 255 * 0.7
-    colour = cv2.cvtColor(
+    color = cv2.cvtColor(
         cv2.applyColorMap((255 * looked.heat).astype(np.uint8), cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB
     )
-    axes.imshow(gray + (colour / 255 - gray) * (0.75 * looked.heat[..., None]))
+    axes.imshow(gray + (color / 255 - gray) * (0.75 * looked.heat[..., None]))
     near = np.linalg.norm(looked.points, axis=1)
     axes.scatter(*looked.uv[looked.seen].T, c=near[looked.seen], cmap="viridis_r", s=14, linewidths=0)
     x, y = looked.uv[looked.chosen]

@@ -22,7 +22,7 @@ def matches_png(
     source: Points,
     target: Points,
     matched: tuple[Array, Array, Array],
-    found: Registration,
+    result: Registration,
     title: str = "",
     looked: ImageAttention | None = None,
 ) -> None:
@@ -54,14 +54,14 @@ def matches_png(
         draw_attention(figure.add_axes((0.02, 0.01, 0.96, low - 0.04), facecolor=_BACKGROUND), looked)
     at_source, at_target, confidence = matched
     right = np.array([2.1 * _REACH, 0.0])
-    for axes, points, shift, colour in (
+    for axes, points, shift, color in (
         (beside, target, np.zeros(2), _TARGET),
         (beside, source, right, _SOURCE),
         (above, target, np.zeros(2), _TARGET),
-        (above, se3.transform(found.T_target_source, source), np.zeros(2), _SOURCE),
+        (above, se3.transform(result.T_target_source, source), np.zeros(2), _SOURCE),
     ):
         near = points[np.abs(points[:, :2]).max(1) < _REACH]
-        axes.plot(*(near[:, :2] + shift).T, ",", color=colour, alpha=0.6)
+        axes.plot(*(near[:, :2] + shift).T, ",", color=color, alpha=0.6)
         axes.set_axis_off()
     order = np.argsort(confidence)  # the surest on top
     ends = np.stack([at_target[order, :2], at_source[order, :2] + right], 1)
@@ -76,12 +76,12 @@ def matches_png(
     bar = figure.colorbar(lines, ax=beside, fraction=0.02, pad=0.01)
     bar.set_label("confidence of a match", color=_INK)
     bar.ax.tick_params(colors=_INK)
-    moved = found.T_target_source
+    moved = result.T_target_source
     outcome = (
         f"{np.linalg.norm(moved[:3, 3]):.2f} m, {np.degrees(se3.angle(moved)):.2f} deg apart; "
-        f"confidence {found.confidence:.2f}, rmse {found.rmse:.2f} m"
-        if found.ok
-        else f"not registered: {found.reason}"
+        f"confidence {result.confidence:.2f}, rmse {result.rmse:.2f} m"
+        if result.ok
+        else f"not registered: {result.reason}"
     )
     figure.text(0.02, low + 0.945 * (1 - low), f"{title}: {outcome}", color=_INK, fontsize=13)
     with atomic_write(path, "wb") as file:

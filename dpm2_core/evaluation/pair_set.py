@@ -73,11 +73,11 @@ class PairSet:
         rows = []
         for begin in range(0, len(self.pairs), batch):
             chunk = self.pairs[begin : begin + batch]
-            answers = model.register_many([descriptors[p[0]] for p in chunk], [descriptors[p[1]] for p in chunk])
-            for i, ((_, _, T, distance), answer) in enumerate(zip(chunk, answers, strict=True), begin):
-                xi = se3.log(se3.inverse(answer.T_target_source) @ T)
-                error = np.linalg.norm(answer.T_target_source[:3, 3] - T[:3, 3])
-                squared = xi @ np.linalg.solve(answer.covariance, xi)
+            results = model.register_many([descriptors[p[0]] for p in chunk], [descriptors[p[1]] for p in chunk])
+            for i, ((_, _, T, distance), result) in enumerate(zip(chunk, results, strict=True), begin):
+                xi = se3.log(se3.inverse(result.T_target_source) @ T)
+                error = np.linalg.norm(result.T_target_source[:3, 3] - T[:3, 3])
+                squared = xi @ np.linalg.solve(result.covariance, xi)
                 rows.append((distance, i % 4 >= 2, error, np.degrees(np.linalg.norm(xi[:3])), squared))
         return np.array(rows)
 

@@ -89,8 +89,8 @@ def draw_group(poses: Array, frames: int, radius: float, noise: np.random.Genera
         return np.full(frames, first)
     distance = np.linalg.norm(poses[others, :3, 3] - poses[first, :3, 3], axis=1)
     chosen = [first]
-    for wanted in noise.uniform(0, radius, frames - 1):
-        gap = np.abs(distance - wanted)
+    for requested in noise.uniform(0, radius, frames - 1):
+        gap = np.abs(distance - requested)
         if len(others) >= frames - 1:
             gap[np.isin(others, chosen)] = np.inf
         chosen.append(others[gap.argmin()])

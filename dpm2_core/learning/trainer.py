@@ -132,10 +132,10 @@ def train(
         until: stop after this step, with a checkpoint; None for all of them.
     """
     keep_memory()
-    optimiser = torch.optim.AdamW(parameter_groups(module, settings.decay), settings.rate)
+    optimizer = torch.optim.AdamW(parameter_groups(module, settings.decay), settings.rate)
     checkpoint = out / "checkpoint.pt"
     if resume and start:
-        load_checkpoint(checkpoint, module, ema, optimiser)
+        load_checkpoint(checkpoint, module, ema, optimizer)
     wrapped: nn.Module = module
     if torch.distributed.is_initialized():
         wrapped = DistributedDataParallel(module, find_unused_parameters=True)
@@ -151,17 +151,17 @@ def train(
             batch = next(batches)
             waited = time.perf_counter() - begin
             rate = learning_rate(settings, step)
-            for group in optimiser.param_groups:
+            for group in optimizer.param_groups:
                 group["lr"] = rate
             torch.manual_seed(settings.seed * 1_000_003 + step)
             buffers = [value.clone() for value in module.buffers()]
             with torch.autocast(device.type, torch.bfloat16, enabled=settings.bf16):
                 value, figures = loss(wrapped, batch, step)
-            optimiser.zero_grad(set_to_none=True)
+            optimizer.zero_grad(set_to_none=True)
             value.backward()
             norm = nn.utils.clip_grad_norm_(module.parameters(), settings.clip)
             if norm.isfinite():
-                optimiser.step()
+                optimizer.step()
                 update_ema(ema, module, settings.ema, step)
             else:  # nothing of such a step stays, running means included
                 for value, before in zip(module.buffers(), buffers, strict=True):
@@ -174,7 +174,7 @@ def train(
             log.write(step, {**described, "norm": float(norm), "rate": rate, "seconds": seconds, "waited": waited})
             last = step + 1 == end
             if last or (step + 1) % settings.save_every == 0:
-                save_checkpoint(checkpoint, module, ema, optimiser, step + 1)
+                save_checkpoint(checkpoint, module, ema, optimizer, step + 1)
             if validate is not None and (last or (step + 1) % settings.validate_every == 0):
                 log.write(step, validate(ema))
     if log is not None:

@@ -63,7 +63,7 @@ class DeepPointMap2(nn.Module):
 
     def overlap(self, sources: Sequence[Descriptors], targets: Sequence[Descriptors]) -> list[float]:
         """Probability 0..1 that each pair was seen from within 20 m; NaN while the overlap head is untrained."""
-        return [found.overlap for found in self.register_many(list(sources), list(targets))]
+        return [result.overlap for result in self.register_many(list(sources), list(targets))]
 
     @torch.inference_mode()
     def matches(self, source: Descriptors, target: Descriptors) -> tuple[Array, Array, Array]:

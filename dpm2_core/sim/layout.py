@@ -40,8 +40,8 @@ class Layout:
         if preset.parked:
             yield from self._parked(preset.parked)
         if preset.buildings:
-            share, setback = preset.buildings, preset.setback
-            for level, chance in ((setback, share), (setback + 24, 0.5 * share), (setback + 50, 0.4 * share)):
+            ratio, setback = preset.buildings, preset.setback
+            for level, chance in ((setback, ratio), (setback + 24, 0.5 * ratio), (setback + 50, 0.4 * ratio)):
                 yield from self._buildings(level, chance)
         if preset.boundaries:
             yield from self._boundaries(preset.boundaries)

@@ -62,10 +62,10 @@ def _conifer(rng: np.random.Generator, leafage: float) -> Mesh:
     height, foot, green = rng.uniform(5, 14), rng.uniform(0.3, 1.5), _green(rng) * (0.7, 0.8, 0.8)
     radius = height * rng.uniform(0.14, 0.25)
     parts = [rod((0, 0, -0.5), (0, 0, height * 0.9), (0.18, 0.04), 6, Label.TRUNK, Material.BARK, (84, 70, 58))]
-    share = rng.beta(1, 1.6, int(34 * leafage * height))
-    angle = rng.uniform(0, 6.3, len(share))
-    out = radius * (1 - share) * rng.uniform(0.5, 1.1, len(share))
-    centers = np.stack([out * np.cos(angle), out * np.sin(angle), foot + share * (height - foot)], -1)
+    ratio = rng.beta(1, 1.6, int(34 * leafage * height))
+    angle = rng.uniform(0, 6.3, len(ratio))
+    out = radius * (1 - ratio) * rng.uniform(0.5, 1.1, len(ratio))
+    centers = np.stack([out * np.cos(angle), out * np.sin(angle), foot + ratio * (height - foot)], -1)
     parts += [
         leaves(centers, 0.5 / leafage**0.5, rng, green),
         rod((0, 0, foot), (0, 0, height), (radius * 0.75, 0.02), 9, Label.VEGETATION, Material.LEAF, green * 0.7),

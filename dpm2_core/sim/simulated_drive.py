@@ -69,10 +69,12 @@ class SimulatedDrive:
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
         """Frames start..stop-1, simulated some frames ahead in other threads."""
-        wanted = iter(range(start, len(self) if stop is None else min(stop, len(self))))
+        requested = iter(range(start, len(self) if stop is None else min(stop, len(self))))
         with ThreadPoolExecutor(self._workers, thread_name_prefix="sim") as pool:
-            ahead: deque[Future[Frame]] = deque(pool.submit(self.frame, i) for i in islice(wanted, 2 * self._workers))
+            ahead: deque[Future[Frame]] = deque(
+                pool.submit(self.frame, i) for i in islice(requested, 2 * self._workers)
+            )
             while ahead:
                 frame = ahead.popleft().result()
-                ahead.extend(pool.submit(self.frame, i) for i in islice(wanted, 1))
+                ahead.extend(pool.submit(self.frame, i) for i in islice(requested, 1))
                 yield frame

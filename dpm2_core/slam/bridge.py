@@ -119,12 +119,12 @@ class Bridge:
         if twist is not None:  # as if the motion had changed evenly
             motions.insert(1, (self._motion + twist) / 2)
         starts = [predicted(self._T, motion, self._seconds) @ T_begin_this for motion in motions]
-        found = self.registration.register(scan, Prediction(starts, widen=2.0))
-        problem = self._problem(found, twist)
+        result = self.registration.register(scan, Prediction(starts, widen=2.0))
+        problem = self._problem(result, twist)
         if problem:
-            return replace(found, ok=False, reason=problem), False
-        self._ties.append(_Tie(found, T_stretch))
-        return found, self._together(found.confidence >= _AS_WELL * own.confidence)
+            return replace(result, ok=False, reason=problem), False
+        self._ties.append(_Tie(result, T_stretch))
+        return result, self._together(result.confidence >= _AS_WELL * own.confidence)
 
     @property
     def _motion(self) -> Array:
@@ -134,17 +134,17 @@ class Bridge:
     def _speed(self) -> float:
         return float(np.linalg.norm(self._motion[3:]))
 
-    def _problem(self, found: Registration, twist: Array | None) -> str:
+    def _problem(self, result: Registration, twist: Array | None) -> str:
         """Why an answer cannot be right."""
-        if not found.ok:
-            return found.reason
-        if (sigma := found.worst_sigma) > self._limits.sigma:
+        if not result.ok:
+            return result.reason
+        if (sigma := result.worst_sigma) > self._limits.sigma:
             return f"after a pause: position uncertain by {sigma:.2f} m"
         if twist is None or self.twist is None:
             return ""
         # Between two known velocities, with a bounded acceleration, nothing is farther from their mean times the time.
-        way = self._T[:3, :3].T @ (found.T_target_source[:3, 3] - self._T[:3, 3])
-        turned = (se3.inverse(self._T) @ found.T_target_source)[:3, :3]
+        way = self._T[:3, :3].T @ (result.T_target_source[:3, 3] - self._T[:3, 3])
+        turned = (se3.inverse(self._T) @ result.T_target_source)[:3, :3]
         off = float(np.linalg.norm(way - self._seconds / 2 * (self.twist[3:] + turned @ twist[3:])))
         if off > _MOVED + self._limits.acceleration * self._seconds**2 / 4:
             return f"after a pause: {off:.0f} m from where the motion before and after leads"

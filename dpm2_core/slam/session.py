@@ -77,8 +77,8 @@ def resume_at(mapper: Mapper, source: Source, start: int) -> int:
     last = mapper.keyframes[-1]
     first = next(iter(source.frames(0, 1)), None)
     position = -1 if first is None else last.index - first.index
-    found = next(iter(source.frames(position, position + 1)), None) if 0 <= position < len(source) else None
-    if found is None or found.stamp != last.stamp:
+    result = next(iter(source.frames(position, position + 1)), None) if 0 <= position < len(source) else None
+    if result is None or result.stamp != last.stamp:
         raise UsageError(f"--resume: frame {last.index}, where the map ends, is not in {source.name}")
     mapper.start_session(mapper.poses[-1], _SAME_FRAME)
     return position

@@ -133,11 +133,11 @@ class DslrTask(Task):
                 rows.append(row | {f"input_{name}": value for name, value in before.items()})
         return mean_figures(rows) | {name: variety(of, scale) for name, of in images.items()}
 
-    def _compared(self, found: RangeScans, dynamic: RangeScans, static: RangeScans) -> dict[str, float]:
+    def _compared(self, result: RangeScans, dynamic: RangeScans, static: RangeScans) -> dict[str, float]:
         scale = self.settings.network.image.scale
         moved = dynamic.masks & static.masks & ((dynamic.images - static.images)[:, 0].abs() * scale > _MOVED)
-        error = (found.images - static.images)[:, 0].abs()[moved] * scale
-        return chamfer_figures(clouds(found, scale)[0], clouds(static, scale)[0]) | {"moved_m": float(error.mean())}
+        error = (result.images - static.images)[:, 0].abs()[moved] * scale
+        return chamfer_figures(clouds(result, scale)[0], clouds(static, scale)[0]) | {"moved_m": float(error.mean())}
 
     def clouds(self, scan: TaskScan) -> dict[str, Tensor]:
         """Points (N, 3), m, as range images show them: `output`, the translated scan, `kept`, those of the scan that
@@ -163,5 +163,5 @@ class DslrTask(Task):
         range_png(path, rows, self.settings.network.image.scale, f"DSLR: {scan.sequence}, scan {scan.number}")
 
 
-def _adversarial_loss(logits: Tensor, wanted: float) -> Tensor:
-    return functional.binary_cross_entropy_with_logits(logits, torch.full_like(logits, wanted))
+def _adversarial_loss(logits: Tensor, requested: float) -> Tensor:
+    return functional.binary_cross_entropy_with_logits(logits, torch.full_like(logits, requested))

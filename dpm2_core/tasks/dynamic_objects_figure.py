@@ -32,8 +32,8 @@ def dynamic_objects_png(
         (~found & truth, "mover, missed", "tab:red"),
         (found & ~truth, "standing, taken for one", "tab:blue"),
     )
-    for which, name, colour in kinds:
-        axes.plot(points[which, 1], points[which, 0], ".", ms=1, mew=0, color=colour, label=f"{name}: {which.sum()}")
+    for which, name, color in kinds:
+        axes.plot(points[which, 1], points[which, 0], ".", ms=1, mew=0, color=color, label=f"{name}: {which.sum()}")
     axes.set(xlim=(40, -40), ylim=(-40, 40), xlabel="y, m", ylabel="x (ahead), m", aspect="equal")
     axes.legend(markerscale=12, loc="upper right")
     with atomic_write(path, "wb") as file:

@@ -83,9 +83,9 @@ class GroundTask(Task):
         def slam() -> Tensor:
             xyz = [cloud[:, :3] for cloud in clouds]
             found = [obstacle_weight(c, e, network) for c, e in zip(xyz, elevation, strict=True)]
-            wanted = [obstacle_weight(c, e, network) for c, e in zip(xyz, labels, strict=True)]
+            requested = [obstacle_weight(c, e, network) for c, e in zip(xyz, labels, strict=True)]
             parts = self.windows(len(xyz))
-            return torch.stack([self.slam_loss(xyz[p], xyz[p], found[p], wanted[p]) for p in parts]).mean()
+            return torch.stack([self.slam_loss(xyz[p], xyz[p], found[p], requested[p]) for p in parts]).mean()
 
         counts = known + self.settings.gaps * (~known & known.flatten(1).any(1)[:, None, None])
         loss = ground_loss(elevation, labels, counts, network)

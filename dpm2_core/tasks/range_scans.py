@@ -112,11 +112,11 @@ def slam_of(slam_loss: SlamLoss, made: Tensor, true: RangeScans, scale: float, w
 
     Slots that are empty in the true scan do not count.
     """
-    found, wanted, weights = to_points(made, scale), to_points(true.images, scale), true.masks.flatten(1).to(made)
+    found, requested, weights = to_points(made, scale), to_points(true.images, scale), true.masks.flatten(1).to(made)
     values = []
     for part in windows:
         w = weights[part]
-        values.append(slam_loss(found[part], wanted[part], w, w, frames=true.frames[part]))
+        values.append(slam_loss(found[part], requested[part], w, w, frames=true.frames[part]))
     return torch.stack(values).mean()
 
 

@@ -55,14 +55,14 @@ def train_task(
     def loss(module: nn.Module, batch: _Batch, step: int) -> tuple[Tensor, dict[str, Tensor]]:
         return eq1(task, batch.scans, batch.epoch, settings)
 
-    optimiser = OptimizerSettings(
+    optimizer = OptimizerSettings(
         steps=settings.epochs * epoch, rate=settings.rate, final_rate=settings.final_rate, warmup=settings.warmup,
         decay=settings.decay, clip=settings.clip, ema=0.0, seed=settings.seed, compile=False, bf16=False,
         save_every=epoch, validate_every=settings.validate_every * epoch,
     )  # fmt: skip
     batches = _batches(task, scans, windows, settings.batch, start, device)
     measured = None if val is None else lambda module: measure(module, val)
-    train(task, twin, batches, loss, optimiser, out, resume, measured, start, 0, device,
+    train(task, twin, batches, loss, optimizer, out, resume, measured, start, 0, device,
           None if until is None else until * epoch)  # fmt: skip
     save_task(task, out / WEIGHTS, {"epochs": str(settings.epochs if until is None else until)})
     return task.eval()

@@ -128,7 +128,7 @@ def test_a_packed_excerpt_is_unpacked_for_as_long_as_the_run_lasts(drive: Path, 
         pass
 
 
-def test_what_cannot_be_measured_is_refused(drive: Path, tmp_path: Path) -> None:
+def test_what_cannot_be_measured_is_rejected(drive: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"speed: no such benchmark; choose from .*geometric, .*neural"):
         bench(["geometric", "speed"])
     for name, ignored in (("tasks", "source"), ("geometric", "weights"), ("pose-graph", "set"), ("map", "pairs")):

@@ -63,11 +63,11 @@ def test_the_link_goes_away_comes_back_and_loses_packets(tmp_path) -> None:
     node.parent.mkdir()
     node.write_text(ECHO)
     script = LINK.replace("from pathlib", f"import os; os.chdir({str(tmp_path)!r})\nfrom pathlib", 1)
-    found = subprocess.run(
+    result = subprocess.run(
         ["unshare", "--net", sys.executable, "-c", script, str(tmp_path / "log"), os.environ["PATH"]],
         capture_output=True, text=True, timeout=60, check=True,
     )  # fmt: skip
-    up, down, again = map(int, found.stdout.split())
+    up, down, again = map(int, result.stdout.split())
     assert 20 <= up <= 55, (tmp_path / "log").read_text()
     assert down == 0
     assert again > 4

@@ -70,7 +70,7 @@ def test_comparison_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         tasks.bench_tasks(Options(only="nonsense"))
 
 
-def test_arms_share_their_first_epochs_and_slam_is_judged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_arms_share_their_first_epochs_and_slam_is_checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What comes before the SLAM loss is trained once; odometry on the clouds of both arms is in the figures."""
     drives = TaskDriveSettings.model_validate(
         {

@@ -14,7 +14,7 @@ from dpm2_core.errors import UsageError
 from dpm2_core.sim.settings import LidarConfig
 
 
-def test_a_short_drive_is_judged_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_short_drive_is_checked_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(traffic, "PLACES", {"suburb": 20.0})
     monkeypatch.setattr(traffic, "FRAMES", 6)
     monkeypatch.setattr(traffic, "LIDAR", LidarConfig(columns=512))
@@ -43,8 +43,8 @@ def test_the_summary_is_of_means_and_medians_and_counts_drives_that_strayed() ->
         return {"rpe_trans_m": rpe, "rpe_rot_deg": 0.01, "ape_rmse_m": 0.0, "failed_frames": 0, "cpu_ms": 20.0}
 
     drives = {
-        str(i): {"runs": {"refined": {"none": run(none), "movers": run(movers)}}}
-        for i, (none, movers) in enumerate([(0.004, 0.002), (0.2, 0.003), (0.006, 0.004)])
+        str(i): {"runs": {"refined": {"none": run(none), "movers": run(dynamic)}}}
+        for i, (none, dynamic) in enumerate([(0.004, 0.002), (0.2, 0.003), (0.006, 0.004)])
     }
     found = traffic._summary(drives)["refined"]
     assert found["none"]["astray"] == 1

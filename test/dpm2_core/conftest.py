@@ -118,9 +118,9 @@ def map_file(tmp_path: Path, drive: list[Keyframe]) -> Path:
         store.begin_session("slam: {}", "small 0123456789abcdef")
         for node, keyframe in enumerate(drive):
             change = Change([(node, keyframe, pack_cloud(keyframe.cloud), None)], poses={node: keyframe.T_odom_kf})
-            if (found := keyframe.edge) is not None:
-                told = (found.T_target_source, found.covariance)
-                change.edges.append(Edge("odometry", node - 1, node, *told, True, 0.9, 0.05, "test"))
+            if (result := keyframe.edge) is not None:
+                info = (result.T_target_source, result.covariance)
+                change.edges.append(Edge("odometry", node - 1, node, *info, True, 0.9, 0.05, "test"))
             store.write(change)
         T = se3.inverse(drive[2].T_odom_kf) @ drive[11].T_odom_kf
         rejected = Edge("loop", 0, 11, np.eye(4), np.eye(6), False, 0.1, np.inf, "test", "too far")

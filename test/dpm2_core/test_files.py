@@ -55,9 +55,9 @@ try:
 except Dpm2Error as error:
     print(error)
 """
-    answer = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert str(path) in answer.stdout
-    assert "File too large" in answer.stdout
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert str(path) in result.stdout
+    assert "File too large" in result.stdout
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
 
@@ -82,6 +82,6 @@ def test_a_symbolic_link_stays_one(tmp_path: Path) -> None:
 
 def test_a_pipe_is_written_to_and_not_replaced() -> None:
     program = "from dpm2_core.files import atomic_write\nwith atomic_write('/dev/stdout') as f: f.write('through')"
-    answer = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert answer.stdout == "through"
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert result.stdout == "through"
     assert Path("/dev/stdout").is_symlink()

@@ -20,7 +20,7 @@ def test_an_image_fits_its_camera() -> None:
 
 
 @pytest.mark.parametrize("pixels", [_pixels(40, 30), _pixels(30, 40, 1), _pixels(30, 40)[..., 0]])
-def test_an_image_of_another_shape_is_refused(pixels: np.ndarray) -> None:
+def test_an_image_of_another_shape_is_rejected(pixels: np.ndarray) -> None:
     with pytest.raises(ValueError, match=r"left: image of .* calibration for \(30, 40\)"):
         Image(pixels, CAMERA)
 
@@ -38,7 +38,7 @@ def test_a_frame_may_be_empty_and_may_hold_nan() -> None:
 
 
 @pytest.mark.parametrize("shape", [(5,), (5, 3), (1, 5, 4)])
-def test_points_without_intensity_or_of_another_rank_are_refused(shape: tuple[int, ...]) -> None:
+def test_points_without_intensity_or_of_another_rank_are_rejected(shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match=r"frame 7: points are .* want \(N, 4\)"):
         Frame(stamp=0, points=np.zeros(shape, np.float32), index=7)
 

@@ -143,11 +143,11 @@ def rejected(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     seconds, memory = time.process_time() - began, tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert ended.value.code in (1, 2)
-    told = capsys.readouterr().err
-    assert told.count("\n") == 1, told
+    info = capsys.readouterr().err
+    assert info.count("\n") == 1, info
     assert seconds < 2 * 3  # tracemalloc takes two thirds of it
     assert memory < 64e6
-    return told
+    return info
 
 
 @pytest.mark.parametrize("attack", MAPS)
@@ -157,10 +157,10 @@ def test_a_hostile_map(tmp_path: Path, map_file: Path, attack: str, capsys: pyte
     # Of descriptors and of rows that nothing asks for only the check can know.
     only_checked = attack in ("descriptors of 1.8e19 values", "a row that is numbered 2^62")
     if not only_checked:
-        told = rejected(["map", "export", str(map_file), str(tmp_path / "out.ply")], capsys)
-        assert str(map_file) in told
-    told = rejected(["map", "check", str(map_file)], capsys)
-    assert str(map_file) in told
+        info = rejected(["map", "export", str(map_file), str(tmp_path / "out.ply")], capsys)
+        assert str(map_file) in info
+    info = rejected(["map", "check", str(map_file)], capsys)
+    assert str(map_file) in info
     assert sorted(path.name for path in tmp_path.iterdir()) == [map_file.name]
 
 
@@ -168,9 +168,9 @@ def test_a_hostile_map(tmp_path: Path, map_file: Path, attack: str, capsys: pyte
 def test_what_is_good_of_a_hostile_map_can_be_recovered(tmp_path: Path, map_file: Path, attack: str) -> None:
     """Eleven of its twelve keyframes at least, in a sound map; of one that was cut off what there is."""
     MAPS[attack](map_file)
-    found = check_map(map_file, tmp_path / "good.dpm2map")
-    assert found.problems
-    assert found.keyframes >= (1 if attack == "cut off" else 10)
+    result = check_map(map_file, tmp_path / "good.dpm2map")
+    assert result.problems
+    assert result.keyframes >= (1 if attack == "cut off" else 10)
     assert check_map(tmp_path / "good.dpm2map").problems == []
 
 
@@ -213,10 +213,10 @@ def test_hostile_weights(tmp_path: Path, model: DeepPointMap2, attack: str) -> N
         load_model(path)
     assert time.process_time() - began < 2
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 256e3  # kB; 65,536 x 65,536 numbers are 17 GB
-    told = str(caught.value)
-    assert words in told
-    assert str(path) in told or attack == "65,536 layers"
-    assert "\n" not in told
+    info = str(caught.value)
+    assert words in info
+    assert str(path) in info or attack == "65,536 layers"
+    assert "\n" not in info
 
 
 def test_weights_that_are_cut_off_or_not_finite(tmp_path: Path, model: DeepPointMap2) -> None:
@@ -244,8 +244,8 @@ def test_names_in_a_map_are_printed_and_not_interpreted(
     with pytest.raises(SystemExit) as ended:
         main(["map", "info", str(map_file)])
     assert ended.value.code == 0
-    told = capsys.readouterr().out
-    assert "[red]x[/nope] :boom: \\x1b]0;title\\x07\\x1b[2J\\u202e\\r" in told
-    assert not any(ord(c) < 32 and c != "\n" for c in told)
+    info = capsys.readouterr().out
+    assert "[red]x[/nope] :boom: \\x1b]0;title\\x07\\x1b[2J\\u202e\\r" in info
+    assert not any(ord(c) < 32 and c != "\n" for c in info)
     sql(map_file, f'CREATE TABLE "{evil}" (x)')
     assert "[red]x[/nope]" in rejected(["map", "info", str(map_file)], capsys)

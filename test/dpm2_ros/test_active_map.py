@@ -60,8 +60,8 @@ def test_nothing_is_overwritten(tmp_path: Path) -> None:
         files = {f"{name}.dpm2map", *(f"{name}/{kind}" for kind in ("map.ply", "pose_graph.g2o", "trajectory.tum"))}
         assert after.keys() - before.keys() == files
         assert {path: after[path] for path in before} == before
-        found = check_map(tmp_path / f"{name}.dpm2map")
-        assert (found.problems, found.keyframes) == ([], 3)
+        result = check_map(tmp_path / f"{name}.dpm2map")
+        assert (result.problems, result.keyframes) == ([], 3)
         before = after
 
 
@@ -78,8 +78,8 @@ def test_a_second_save_of_one_drive_replaces_the_first(tmp_path: Path) -> None:
     active = ActiveMap(config(map_directory=str(tmp_path)), "", LOG)
     for keyframe in keyframes(3):
         active.add(keyframe)
-        told = active.save()
-    assert told == f"map of 3 keyframes saved in {tmp_path / 'drive'}, and as {tmp_path / 'drive.dpm2map'}"
+        info = active.save()
+    assert info == f"map of 3 keyframes saved in {tmp_path / 'drive'}, and as {tmp_path / 'drive.dpm2map'}"
     active.close()
     assert {path.name for path in tmp_path.iterdir()} == {"drive", "drive.dpm2map"}
     assert len((tmp_path / "drive" / "trajectory.tum").read_text().splitlines()) == 1 + 3
@@ -124,8 +124,8 @@ def test_a_reset_that_cannot_save_keeps_the_map(tmp_path: Path) -> None:
         active.reset()
     active.add(keyframes(1)[0])  # the odometry has begun anew
     active.close()
-    found = check_map(tmp_path / "a.dpm2map")
-    assert (found.problems, found.keyframes) == ([], 3)
+    result = check_map(tmp_path / "a.dpm2map")
+    assert (result.problems, result.keyframes) == ([], 3)
 
 
 def test_an_odometry_that_starts_again_goes_on_in_the_same_map(tmp_path: Path) -> None:
@@ -134,8 +134,8 @@ def test_an_odometry_that_starts_again_goes_on_in_the_same_map(tmp_path: Path) -
     for keyframe in [*keyframes(3), *keyframes(2)]:
         active.add(keyframe)
     active.close()
-    found = check_map(tmp_path / "drive.dpm2map")
-    assert (found.problems, found.keyframes) == ([], 5)
+    result = check_map(tmp_path / "drive.dpm2map")
+    assert (result.problems, result.keyframes) == ([], 5)
 
 
 def test_what_was_saved_by_default_can_be_used(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

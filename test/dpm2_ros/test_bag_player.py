@@ -182,9 +182,9 @@ def test_a_type_is_imported_from_the_packages_of_ros_alone(
             connection = writer.add_connection(topic, kind, msgdef="string data\n", rihs01="RIHS01_" + 64 * "0")
             writer.write(connection, 1, b"\0\1\0\0\2\0\0\0a\0")
     assert play_here(str(tmp_path / "bag"), "--wait", "0") == 0
-    told = capfd.readouterr()
-    assert "/evil is left out: no message type evil/msg/Thing" in told.err
-    assert "/os is left out: no message type os/msg/path" in told.err
-    assert "1 messages played" in told.err
-    assert "imported" not in told.out
+    info = capfd.readouterr()
+    assert "/evil is left out: no message type evil/msg/Thing" in info.err
+    assert "/os is left out: no message type os/msg/path" in info.err
+    assert "1 messages played" in info.err
+    assert "imported" not in info.out
     assert "evil" not in sys.modules

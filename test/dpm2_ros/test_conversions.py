@@ -96,8 +96,8 @@ def test_covariance_describes_the_same_errors(xi: np.ndarray, seed: int) -> None
     translation = perturbed[:, :3, 3] - T[:3, 3]
     rotation = se3.log(perturbed @ se3.inverse(T))[:, :3]  # about fixed axes: on the left
     measured = np.cov(np.hstack([translation, rotation]).T)
-    told = conversions.covariance_to_ros(covariance, T[:3, :3]).reshape(6, 6)
-    np.testing.assert_allclose(measured, told, atol=0.15 * np.abs(told).max())  # 4000 samples: 5 %
+    info = conversions.covariance_to_ros(covariance, T[:3, :3]).reshape(6, 6)
+    np.testing.assert_allclose(measured, info, atol=0.15 * np.abs(info).max())  # 4000 samples: 5 %
 
 
 def test_odometry_message() -> None:

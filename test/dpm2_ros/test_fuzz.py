@@ -180,8 +180,8 @@ class Fuzzer:
 
     def _qos(self, topic: str) -> QoSProfile:
         """Reliable, and latched where that is asked for: so it reaches every subscriber."""
-        wanted = [info.qos_profile.durability for info in self._node.get_subscriptions_info_by_topic(topic)]
-        latched = DurabilityPolicy.TRANSIENT_LOCAL in wanted
+        requested = [info.qos_profile.durability for info in self._node.get_subscriptions_info_by_topic(topic)]
+        latched = DurabilityPolicy.TRANSIENT_LOCAL in requested
         durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
         return QoSProfile(depth=5, reliability=ReliabilityPolicy.RELIABLE, durability=durability)
 

@@ -158,8 +158,8 @@ def test_finds_itself_tracks_and_notices_being_carried_off(
     r.harness.wait(lambda: r.said("slam_node: localisation").startswith("tracking"), "the second answer")
     seen = len(r.diagnostics)
     r.send(19)  # the state that is told is that at the last cloud
-    told = lambda: [s.message for d in r.diagnostics[seen:] for s in d.status if s.name.endswith("odometry")]  # noqa: E731
-    r.harness.wait(lambda: any(text.startswith("track") for text in told()), "the state")
+    info = lambda: [s.message for d in r.diagnostics[seen:] for s in d.status if s.name.endswith("odometry")]  # noqa: E731
+    r.harness.wait(lambda: any(text.startswith("track") for text in info()), "the state")
     # carried off: scans from 15 m behind, which the odometry cannot follow
     r.stand(3, lambda: r.off(place(street, 3)) < 0.2, "the robot where it was put")
     assert r.close() == 0
@@ -183,9 +183,9 @@ def test_hints_and_services_answer_in_words(
     # the file goes: it cannot be loaded again, and the robot keeps what it has
     made_elsewhere = made.rename(made.with_name("gone.dpm2map"))
     try:
-        answer = r.call(Trigger, "/slam_node/load_map")
-        assert not answer.success
-        assert "no such map file" in answer.message
+        result = r.call(Trigger, "/slam_node/load_map")
+        assert not result.success
+        assert "no such map file" in result.message
     finally:
         made_elsewhere.rename(made)
     loaded = r.call(Trigger, "/slam_node/load_map")
@@ -201,7 +201,7 @@ def test_hints_and_services_answer_in_words(
     r.stand(3, lambda: again() and r.off(place(street, 3)) < 0.2, "the robot in the map after the jump")
 
 
-def test_from_mapping_to_localising_and_back(robot: Callable[..., Robot], tmp_path: Path) -> None:
+def test_from_mapping_to_localizing_and_back(robot: Callable[..., Robot], tmp_path: Path) -> None:
     """One node makes a map, finds itself in it, and lets it grow by a session; each answer is in words."""
     path = tmp_path / "own.dpm2map"
     r = robot(f"ros.map_file:={path}", "slam.keyframes.distance:=2.0")

@@ -90,9 +90,9 @@ def test_a_map_file_is_written_as_the_drive_goes_on(mapper: Any, tmp_path: Path)
     mapper.wait(lambda: stored("drive.dpm2map") == 3, "all of them in the file")
     client = mapper.node.create_client(Trigger, "/mapper_node/reset")
     assert client.wait_for_service(10)
-    answer = client.call_async(Trigger.Request())
-    mapper.wait(answer.done, "the reset")
-    assert answer.result().success
+    result = client.call_async(Trigger.Request())
+    mapper.wait(result.done, "the reset")
+    assert result.result().success
     mapper.wait(lambda: thread.keyframes == 0, "the empty map")  # which comes after the save
     assert read_trajectory(tmp_path / "map" / "drive" / "trajectory.tum").keys.tolist() == [1000, 1001, 1002]
     mapper.send(0, np.eye(4), points(0))
@@ -101,7 +101,7 @@ def test_a_map_file_is_written_as_the_drive_goes_on(mapper: Any, tmp_path: Path)
     assert thread.store_problem == ""
 
 
-def test_a_keyframe_of_another_name_is_refused_and_the_rest_goes_on(mapper: Any) -> None:
+def test_a_keyframe_of_another_name_is_rejected_and_the_rest_goes_on(mapper: Any) -> None:
     mapper.send(0, np.eye(4), points(0).astype(np.float32))
     mapper.send(1, np.eye(4), points(0).astype(np.float32), name="not a keyframe")
     mapper.send(1, se3.exp([0, 0, 0, 5, 0, 0]), points(1).astype(np.float32))

@@ -44,7 +44,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
 
 def test_the_wheel_has_what_ros2_looks_for(wheel: zipfile.ZipFile) -> None:
     names = [re.sub(r"^.*\.data/data/", "", name) for name in wheel.namelist()]
-    for wanted in (
+    for requested in (
         "share/ament_index/resource_index/packages/dpm2_ros",
         "share/dpm2_ros/package.xml",
         "share/dpm2_ros/config/fastdds.xml",
@@ -54,7 +54,7 @@ def test_the_wheel_has_what_ros2_looks_for(wheel: zipfile.ZipFile) -> None:
         "dpm2_core/slam/system.py",
         "dpm2_ros/slam_node.py",
     ):
-        assert wanted in names
+        assert requested in names
     assert not any(name.startswith(("test/", "build/")) for name in names)
 
 
@@ -99,12 +99,12 @@ def test_console_scripts_lead_to_functions(wheel: zipfile.ZipFile) -> None:
 
 def test_ros_wheels_are_required_unless_ros_is_there(tmp_path: Path) -> None:
     """With ROS sourced the wheels would shadow it; without, they are ROS."""
-    for distribution, wanted in (("", True), ("jazzy", False)):
+    for distribution, requested in (("", True), ("jazzy", False)):
         environment = os.environ | {"ROS_DISTRO": distribution}
         command = [sys.executable, "setup.py", "-q", "egg_info", "-e", str(tmp_path)]
         subprocess.run(command, cwd=ROOT, env=environment, check=True, capture_output=True)
         (requires,) = tmp_path.glob("*.egg-info/requires.txt")
-        assert ("ros-rclpy" in requires.read_text()) is wanted
+        assert ("ros-rclpy" in requires.read_text()) is requested
 
 
 @pytest.mark.parametrize("name", EXECUTABLES)

@@ -107,8 +107,8 @@ def test_losses_are_in_diagnostics(ros: Callable[..., Any], drive: Any) -> None:
     dropped, lost = int(values["dropped (queue full)"]), int(values["lost on the way"])
     assert int(values["processed"]) + dropped + lost == int(values["received"]) + lost == drive.frames
     assert lost >= 5
-    told = [one.message for message in diagnostics for one in message.status]
-    assert any(f"{lost} clouds lost on the way" in text for text in told)
+    info = [one.message for message in diagnostics for one in message.status]
+    assert any(f"{lost} clouds lost on the way" in text for text in info)
 
 
 @pytest.fixture(scope="module")

@@ -66,8 +66,8 @@ class Fleet:
         process = self._start(
             "slam_node", f"{name}.log", "-r", f"__ns:=/{name}", *(x for p in pairs for x in ("-p", p))
         )
-        said = self.folder / f"{name}.log"
-        new = lambda: "waiting for clouds" in said.read_text() and self._listeners(name) - before  # noqa: E731
+        message = self.folder / f"{name}.log"
+        new = lambda: "waiting for clouds" in message.read_text() and self._listeners(name) - before  # noqa: E731
         self.harness.wait(new, name, timeout=60)
         time.sleep(0.5)  # until the new one knows of this end, too
         return process

@@ -196,9 +196,9 @@ def test_nothing_is_published_before_the_base_is_reachable_and_nothing_is_lost(
     publish_static(r, "os_sensor", "lidar", T_SENSOR_LIDAR)
     for n in range(3):
         r.send(n)
-    told = "no transform from 'lidar' to 'base_link'; frames known: lidar, os_sensor"
-    r.wait(lambda: any(told in s.message for d in r.diagnostics for s in d.status), "what is missing")
-    status = next(s for d in r.diagnostics for s in d.status if told in s.message)
+    note = "no transform from 'lidar' to 'base_link'; frames known: lidar, os_sensor"
+    r.wait(lambda: any(note in s.message for d in r.diagnostics for s in d.status), "what is missing")
+    status = next(s for d in r.diagnostics for s in d.status if note in s.message)
     assert status.level == DiagnosticStatus.ERROR
     r.wait(lambda: r.values()["processed"] == "3", "three clouds to be processed")
     assert (r.odom, tf, keyframes) == ([], [], [])
@@ -332,7 +332,7 @@ def test_extrinsics_come_from_tf_static(rig: Callable[..., Rig]) -> None:
     np.testing.assert_allclose(frames[-1].images[0].camera.T_lidar_cam, T, atol=1e-9)
 
 
-def test_a_missing_extrinsic_refuses_the_images_and_says_so(rig: Callable[..., Rig]) -> None:
+def test_a_missing_extrinsic_rejects_the_images_and_says_so(rig: Callable[..., Rig]) -> None:
     r, camera = with_camera(rig, "ros.sync_timeout:=2.0")
     frames = record_frames(r)
     for n in range(3):
@@ -531,12 +531,12 @@ def call(r: Rig, service: str) -> Trigger.Response:
 
 def test_save_map_answers_in_words(rig: Callable[..., Rig], drive: Any, tmp_path: Path) -> None:
     r = rig(f"ros.map_directory:={tmp_path / 'map'}")
-    answer = call(r, "/slam_node/save_map")
-    assert (answer.success, answer.message) == (False, "no map is saved: there is no keyframe yet")
+    result = call(r, "/slam_node/save_map")
+    assert (result.success, result.message) == (False, "no map is saved: there is no keyframe yet")
     r.send_and_wait(0, 1)
-    answer = call(r, "/slam_node/save_map")
-    assert answer.success
-    assert answer.message == (
+    result = call(r, "/slam_node/save_map")
+    assert result.success
+    assert result.message == (
         f"map of 1 keyframes saved in {tmp_path / 'map' / 'drive'}, and as {tmp_path / 'map' / 'drive.dpm2map'}"
     )
     assert sorted(path.name for path in (tmp_path / "map" / "drive").iterdir()) == [
@@ -552,9 +552,9 @@ def test_a_map_that_cannot_be_saved_is_an_answer(rig: Callable[..., Rig], drive:
     r.send_and_wait(0)
     shutil.rmtree(tmp_path / "map")
     (tmp_path / "map").write_text("in the way")
-    answer = call(r, "/slam_node/save_map")
-    assert not answer.success
-    assert str(tmp_path / "map") in answer.message
+    result = call(r, "/slam_node/save_map")
+    assert not result.success
+    assert str(tmp_path / "map") in result.message
     (tmp_path / "map").unlink()  # so that the end of the node can save
 
 

@@ -63,23 +63,23 @@ def test_a_keyframe_that_is_never_sound_holds_up_the_others_for_seconds_only() -
 @pytest.mark.parametrize("claim", [(9, set()), (2, {5, 6, 7, 8})])
 def test_an_answer_that_claims_too_much_is_outweighed(claim: tuple[int, set[int]]) -> None:
     """The mapper has 0, 1, 2 and 5; somebody else says, hundreds of times a second, that it has more."""
-    answers = Answers()
+    results = Answers()
     for tick in range(40):
         now = 0.1 * tick
         if tick % 5 == 0:
-            answers.add(3, {5}, now)
-        answers.add(*claim, now)
-        below, above = answers.agreed
+            results.add(3, {5}, now)
+        results.add(*claim, now)
+        below, above = results.agreed
         assert below <= 3
         assert above <= {5}
 
 
 def test_answers_follow_the_mapper() -> None:
-    answers = Answers()
-    assert answers.agreed == (0, frozenset())
+    results = Answers()
+    assert results.agreed == (0, frozenset())
     for tick in range(10):
-        answers.add(tick, {tick + 2}, 0.5 * tick)
-    assert answers.agreed[0] >= 8  # the last two answers
+        results.add(tick, {tick + 2}, 0.5 * tick)
+    assert results.agreed[0] >= 8  # the last two answers
     for tick in range(10, 14):
-        answers.add(0, set(), 0.5 * tick)  # another mapper has nothing
-    assert answers.agreed == (0, frozenset())
+        results.add(0, set(), 0.5 * tick)  # another mapper has nothing
+    assert results.agreed == (0, frozenset())

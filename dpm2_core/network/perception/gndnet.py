@@ -135,8 +135,8 @@ def ground_loss(elevation: Tensor, labels: Tensor, known: Tensor, settings: Grou
         elevation, labels: (B, cells, cells) m. known: (B, cells, cells) bool, or how much a cell counts, 0..1; none
             known gives the curvature alone.
     """
-    wanted = torch.where(known > 0, labels, elevation.detach())
-    error = functional.smooth_l1_loss(elevation, wanted, reduction="none")
+    requested = torch.where(known > 0, labels, elevation.detach())
+    error = functional.smooth_l1_loss(elevation, requested, reduction="none")
     fit = (error * known).sum() / known.sum().clamp(min=1)
     bend = sum(elevation.diff(n=2, dim=axis).square().mean() for axis in (1, 2))
     return (1 - settings.smoothness) * fit + settings.smoothness * bend

@@ -112,9 +112,9 @@ class CondensedOdometry:
         errors = np.zeros((len(self.nodes), 6))
         errors[k] = se3.log(se3.inverse(self.T[k]) @ se3.inverse(poses[k - 1]) @ poses[k])
         pull = np.linalg.solve(self.covariances, errors[..., None])
-        share = (self._parts @ pull[self._owner])[..., 0]
-        moved = np.cumsum(share, axis=0)
-        moved -= (moved - share)[self._first][self._owner]
+        ratio = (self._parts @ pull[self._owner])[..., 0]
+        moved = np.cumsum(ratio, axis=0)
+        moved -= (moved - ratio)[self._first][self._owner]
         ends = poses.copy()
         ends[k] = poses[k - 1] @ self.T[k]  # where the odometry alone would put it
         out = ends[self._owner] @ se3.exp(moved) @ self._T_owner_node

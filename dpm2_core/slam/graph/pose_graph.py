@@ -88,7 +88,7 @@ class PoseGraph:
             for node, before in enumerate(self._before)
             if before >= 0
         ]
-        return chain + [loop for loop, told in zip(self._loops, self._loop_checks, strict=True) if told.kept]
+        return chain + [loop for loop, info in zip(self._loops, self._loop_checks, strict=True) if info.kept]
 
     @property
     def loop_checks(self) -> list[LoopCheck]:
@@ -228,11 +228,11 @@ class PoseGraph:
 
     def write_g2o(self, path: Path) -> None:
         """All vertices, the odometry and the loops that are kept, in g2o's SE3:QUAT format at full precision."""
-        kept = np.array([told.kept for told in self._loop_checks], np.bool_)
+        kept = np.array([info.kept for info in self._loop_checks], np.bool_)
         write_g2o(path, G2o(self._data(), self._order(), planar=False), kept)
 
     def _joint(self, nodes: list[int]) -> Array:
-        kept, data = np.array([told.kept for told in self._loop_checks], np.bool_), self._data()
+        kept, data = np.array([info.kept for info in self._loop_checks], np.bool_), self._data()
         return robust.joint_covariance(data, data.poses, kept, self._places()[nodes])
 
     def _order(self) -> NDArray[np.intp]:
@@ -259,9 +259,9 @@ class PoseGraph:
     def _parts(self) -> list[int]:
         """Of each trajectory, the oldest one that loops tie it to."""
         parts = list(range(len(self._ends)))
-        for (a, b, *_), told in zip(self._loops, self._loop_checks, strict=True):
+        for (a, b, *_), info in zip(self._loops, self._loop_checks, strict=True):
             one, other = sorted((parts[self._trajectory[a]], parts[self._trajectory[b]]))
-            if told.kept and one != other:
+            if info.kept and one != other:
                 parts = [one if part == other else part for part in parts]
         return parts
 

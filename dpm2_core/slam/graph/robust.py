@@ -75,10 +75,10 @@ class Solution:
 
     def reason(self, loop: int) -> str:
         """Why a loop was kept or rejected, in words."""
-        told = f"{self.sigmas[loop]:.1f} sigma from the optimised poses"
+        info = f"{self.sigmas[loop]:.1f} sigma from the optimised poses"
         if np.isfinite(self.odometry_sigmas[loop]):
-            told += f", {self.odometry_sigmas[loop]:.1f} from the odometry"
-        return told
+            info += f", {self.odometry_sigmas[loop]:.1f} from the odometry"
+        return info
 
 
 def optimize(graph: GraphData, settings: RobustSettings) -> Solution:

@@ -58,10 +58,10 @@ class GraphWorker:
         if self._waiter is None or (self._waiter.is_alive() and not wait):
             return None
         self._waiter.join()
-        self._waiter, answer, self._answer = None, self._answer, None
-        if isinstance(answer, Dpm2Error):
-            raise answer
-        return answer
+        self._waiter, result, self._answer = None, self._answer, None
+        if isinstance(result, Dpm2Error):
+            raise result
+        return result
 
     def close(self) -> None:
         """End the process."""
@@ -113,20 +113,20 @@ def _shut(process: subprocess.Popen[bytes]) -> None:
                 pipe.close()
 
 
-def _serve(requests: IO[bytes], answers: IO[bytes]) -> None:
+def _serve(requests: IO[bytes], results: IO[bytes]) -> None:
     """Answer until end of file."""
     while True:
         try:
             graph, settings = pickle.load(requests)
         except EOFError:
             return
-        answer: Any
+        result: Any
         try:
-            answer = optimize(graph, RobustSettings(**settings))
+            result = optimize(graph, RobustSettings(**settings))
         except RuntimeError as error:  # gtsam's: the system is singular
-            answer = Dpm2Error(f"pose graph: {' '.join(str(error).split())}")
-        pickle.dump(answer, answers, protocol=5)
-        answers.flush()
+            result = Dpm2Error(f"pose graph: {' '.join(str(error).split())}")
+        pickle.dump(result, results, protocol=5)
+        results.flush()
 
 
 if __name__ == "__main__":

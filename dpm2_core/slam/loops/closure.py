@@ -148,8 +148,8 @@ class LoopCloser:
         source = keyframes[node].descriptors
         targets = [keyframes[c].descriptors for c in candidates]
         assert source is not None
-        answers = self._places.register(source, [t for t in targets if t is not None])
-        return [Loop(c, node, answer) for c, answer in zip(candidates, answers, strict=True)]
+        results = self._places.register(source, [t for t in targets if t is not None])
+        return [Loop(c, node, result) for c, result in zip(candidates, results, strict=True)]
 
     def _nearest(self, since: Array, poses: Array) -> int | None:
         """The keyframe nearest by the pose, if it is near enough for the drift since then."""
@@ -166,13 +166,13 @@ class LoopCloser:
         proposed = proposal.registration
         by_pose = proposed.method == "pose"
         cloud = clouds[proposal.to_node]
-        found = self._verifier.verify(cloud, around, proposed.T_target_source, 2.0 if by_pose else 1.0).registration
-        if not found.ok and not by_pose:
+        result = self._verifier.verify(cloud, around, proposed.T_target_source, 2.0 if by_pose else 1.0).registration
+        if not result.ok and not by_pose:
             again = self._map_to_map(proposal, keyframes, poses)
             if again.ok:
                 second = self._verifier.verify(cloud, around, again.T_target_source).registration
-                found = second if second.ok else found
-        return replace(proposal, registration=found)
+                result = second if second.ok else result
+        return replace(proposal, registration=result)
 
     def _map_to_map(self, proposal: Loop, keyframes: Sequence[Keyframe], poses: Array) -> Registration:
         """T_from_to by the descriptors of the keyframes around both."""

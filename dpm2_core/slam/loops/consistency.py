@@ -103,9 +103,9 @@ class Consistency:
         Returns:
             The loop, accepted or refused with the reason; if accepted, with those that waited for one like it.
         """
-        s, found = self._settings, loop.registration
+        s, result = self._settings, loop.registration
         since = self._path.between(loop.from_node, loop.to_node)
-        meters, degrees = _apart(T_expected, found.T_target_source)
+        meters, degrees = _apart(T_expected, result.T_target_source)
         if np.isfinite(since):
             if meters > 1 + s.drift * since or degrees > 3 + s.drift_turn * since:
                 return [rejected(loop, f"{meters:.1f} m, {degrees:.1f} deg from the odometry")]

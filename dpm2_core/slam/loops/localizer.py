@@ -83,32 +83,32 @@ class Localizer:
     def _track(self, keyframe: Keyframe) -> LocalizationResult:
         """Where the odometry says, if the points agree; else look everywhere."""
         T_predicted = self.T_map_odom @ keyframe.T_odom_kf
-        found = self._relocalizer.verify(keyframe.cloud, T_predicted)
-        if found.ok:
-            return self._located(keyframe, found, jumped=False)
+        result = self._relocalizer.verify(keyframe.cloud, T_predicted)
+        if result.ok:
+            return self._located(keyframe, result, jumped=False)
         self._failures += 1
-        return self._find(keyframe, found)
+        return self._find(keyframe, result)
 
     def _find(self, keyframe: Keyframe, rejected: Registration) -> LocalizationResult:
         """Look in the whole map, or around the hint; while tracking, a far-off answer must insist."""
-        found = self._relocalizer.find(keyframe.cloud, self._hint, keyframe.descriptors)
+        result = self._relocalizer.find(keyframe.cloud, self._hint, keyframe.descriptors)
         self._hint = None
         tracking = self.state.located
         T_predicted = self.T_map_odom @ keyframe.T_odom_kf
-        if found.ok:
-            meters = float(np.linalg.norm((se3.inverse(T_predicted) @ found.T_target_source)[:3, 3]))
+        if result.ok:
+            meters = float(np.linalg.norm((se3.inverse(T_predicted) @ result.T_target_source)[:3, 3]))
             near = meters <= 2.0 + 0.02 * self._distrust
             if not tracking or near or self._failures >= self._max_failures:
-                return self._located(keyframe, found, jumped=not (tracking and near))
+                return self._located(keyframe, result, jumped=not (tracking and near))
         elif tracking:
-            found = rejected
+            result = rejected
         if tracking:
             self.state = State.LOST if self._failures >= self._max_failures else State.DEGRADED
         covariance = LOST if self.state is not State.DEGRADED else np.eye(6) * (0.1 + 0.01 * self._distrust) ** 2
-        return LocalizationResult(T_predicted, covariance, self.state, found)
+        return LocalizationResult(T_predicted, covariance, self.state, result)
 
-    def _located(self, keyframe: Keyframe, found: Registration, jumped: bool) -> LocalizationResult:
-        self.T_map_odom = se3.orthonormalized(found.T_target_source @ se3.inverse(keyframe.T_odom_kf))
+    def _located(self, keyframe: Keyframe, result: Registration, jumped: bool) -> LocalizationResult:
+        self.T_map_odom = se3.orthonormalized(result.T_target_source @ se3.inverse(keyframe.T_odom_kf))
         self.state = State.RELOCALIZED if jumped else State.TRACKING
         self._failures, self._distrust = 0, 0.0
-        return LocalizationResult(found.T_target_source, found.covariance, self.state, found, jumped)
+        return LocalizationResult(result.T_target_source, result.covariance, self.state, result, jumped)

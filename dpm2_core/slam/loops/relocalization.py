@@ -91,16 +91,16 @@ class Relocalizer:
         nodes = self._places.similar(descriptors, allowed, s.candidates)
         proposals = [p for p in self._proposals(descriptors, nodes) if p.confidence >= s.min_confidence]
         rejections = [f"no keyframe of {int(allowed.sum())} matches the descriptors"] if not proposals else []
-        found: Registration | None = None
+        result: Registration | None = None
         for proposal in proposals[: s.verified]:
-            answer = self.verify(cloud, proposal.T_target_source)
-            if not answer.ok:
-                rejections.append(answer.reason)
-            elif found is None:
-                found = answer
-            elif _meters(found.T_target_source, answer.T_target_source) > _SAME_PLACE:
+            outcome = self.verify(cloud, proposal.T_target_source)
+            if not outcome.ok:
+                rejections.append(outcome.reason)
+            elif result is None:
+                result = outcome
+            elif _meters(result.T_target_source, outcome.T_target_source) > _SAME_PLACE:
                 return nowhere("two places of the map fit alike")
-        return nowhere("; ".join(rejections)) if found is None else found
+        return nowhere("; ".join(rejections)) if result is None else result
 
     def verify(self, cloud: Points, T_map_lidar: Array, widen: float = 1.0) -> Registration:
         """The points' answer to a pose in the map: T_map_lidar, believed or not; `widen` as in `Verifier.verify`."""
@@ -111,9 +111,9 @@ class Relocalizer:
         nodes = near[np.argsort(distance[near])[: self._settings.keyframes]]
         T_at_map = se3.inverse(self._poses[nodes[0]])
         around = self._around(nodes, T_at_map)
-        found = self._verifier.verify(cloud, around, T_at_map @ T_map_lidar, widen).registration
-        T = se3.orthonormalized(self._poses[nodes[0]] @ found.T_target_source)
-        return replace(found, T_target_source=T, method="relocalisation")
+        result = self._verifier.verify(cloud, around, T_at_map @ T_map_lidar, widen).registration
+        T = se3.orthonormalized(self._poses[nodes[0]] @ result.T_target_source)
+        return replace(result, T_target_source=T, method="relocalisation")
 
     def _around(self, nodes: NDArray[np.intp], T_at_map: Array) -> LocalMap:
         return self._verifier.surroundings([self._clouds[n] for n in nodes.tolist()], T_at_map @ self._poses[nodes])
@@ -121,12 +121,12 @@ class Relocalizer:
     def _proposals(self, descriptors: Descriptors, nodes: Sequence[int]) -> list[Registration]:
         """T_map_lidar by each keyframe, the most confident first, one for each place."""
         known = [(node, d) for node in nodes if (d := self._keyframes[node].descriptors) is not None]
-        answers = self._places.register(descriptors, [d for _, d in known])
+        results = self._places.register(descriptors, [d for _, d in known])
         proposals: list[Registration] = []
         in_map = [
-            replace(answer, T_target_source=self._poses[node] @ answer.T_target_source)
-            for (node, _), answer in zip(known, answers, strict=True)
-            if answer.ok
+            replace(result, T_target_source=self._poses[node] @ result.T_target_source)
+            for (node, _), result in zip(known, results, strict=True)
+            if result.ok
         ]
         for proposal in sorted(in_map, key=lambda r: -r.confidence):
             T = proposal.T_target_source

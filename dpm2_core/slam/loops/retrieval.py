@@ -74,11 +74,11 @@ class PlaceIndex:
         What all places of a map have in common is no likeness, so the mean is taken off.
         """
         mean = (self._sum / max(self._used, 1)).astype(np.float32)
-        wanted = query - mean
+        requested = query - mean
         vectors, squared = self._vectors[: self._count], self._squared[: self._count]
-        dots = vectors @ np.stack([wanted, mean], 1)
+        dots = vectors @ np.stack([requested, mean], 1)
         length = np.sqrt(np.maximum(squared - 2 * dots[:, 1] + mean @ mean, 1e-12))
-        cosine = (dots[:, 0] - mean @ wanted) / (length * max(float(np.linalg.norm(wanted)), 1e-6))
+        cosine = (dots[:, 0] - mean @ requested) / (length * max(float(np.linalg.norm(requested)), 1e-6))
         return np.where(squared > 0, cosine, np.float32(-1))
 
     def nearest(self, query: Vector, allowed: NDArray[np.bool_], count: int, apart: int = 0) -> list[int]:
@@ -90,9 +90,9 @@ class PlaceIndex:
         """
         order = np.flatnonzero(allowed & (self._squared[: self._count] > 0))
         similar = self.similarities(query)[order]
-        wanted = min(len(order), count * (2 * apart + 1))
-        if wanted < len(order):
-            best = np.argpartition(-similar, wanted)[:wanted]
+        requested = min(len(order), count * (2 * apart + 1))
+        if requested < len(order):
+            best = np.argpartition(-similar, requested)[:requested]
             order, similar = order[best], similar[best]
         found: list[int] = []
         for node in order[np.argsort(-similar, kind="stable")].tolist():

@@ -84,17 +84,17 @@ class Verifier:
         """
         near = cloud[np.einsum("ij,ij->i", cloud[:, :3], cloud[:, :3]) < self._settings.range**2]
         source = near[voxel_first(near, _SOURCE_VOXEL), :3].astype(np.float64)
-        found = self._registration.register(source, around, T_proposed, widen)
-        if not found.ok:
-            return VerificationResult(found)
-        fits = self._fits(source, around, found.T_target_source)
+        result = self._registration.register(source, around, T_proposed, widen)
+        if not result.ok:
+            return VerificationResult(result)
+        fits = self._fits(source, around, result.T_target_source)
         standing = above_ground(source)
         points = int(standing.sum())
         structure = float(fits[standing].mean()) if points else 0.0
-        moved = se3.inverse(T_proposed) @ found.T_target_source
+        moved = se3.inverse(T_proposed) @ result.T_target_source
         meters, degrees = float(np.linalg.norm(moved[:3, 3])), float(np.degrees(se3.angle(moved)))
         overlap_features = VerificationResult(
-            replace(found, confidence=min(found.confidence, structure)), structure, points, meters, degrees
+            replace(result, confidence=min(result.confidence, structure)), structure, points, meters, degrees
         )
         reason = self._objection(overlap_features, float(fits.mean()), widen)
         return replace(
@@ -111,16 +111,16 @@ class Verifier:
 
     def _objection(self, e: VerificationResult, share: float, widen: float) -> str:
         """Why it is not believed; empty if it is."""
-        s, found = self._settings, e.registration
+        s, result = self._settings, e.registration
         if share < s.min_inliers:
             return f"only {share:.0%} of the points fit"
         if e.points < s.min_points:
             return f"only {e.points} points above the ground"
         if e.structure < s.min_structure:
             return f"only {e.structure:.0%} of what stands there fits"
-        if found.rmse > s.max_rmse:
-            return f"residual {found.rmse:.2f} m"
-        if (sigma := found.worst_sigma) > s.max_sigma:
+        if result.rmse > s.max_rmse:
+            return f"residual {result.rmse:.2f} m"
+        if (sigma := result.worst_sigma) > s.max_sigma:
             return f"position uncertain by {sigma:.2f} m"
         if e.moved > widen * s.max_moved or e.turned > widen * s.max_turned:
             return f"points and proposal {e.moved:.1f} m, {e.turned:.1f} deg apart"

@@ -236,15 +236,15 @@ class Mapper:
 
     def _add_node(self, keyframe: Keyframe, last: int | None) -> list[Edge]:
         """A node with an edge to its robot's `last` one, also when some between them never arrived."""
-        node, found = len(self.keyframes), keyframe.edge
+        node, result = len(self.keyframes), keyframe.edge
         if node == self.session_start:
             self._placed.add(node)
-        if found is not None and last is not None:
+        if result is not None and last is not None:
             before, T_before = self.keyframes[last], self._graph.pose(last)
             T_before_this = se3.inverse(before.T_odom_kf) @ keyframe.T_odom_kf
-            covariance = found.covariance * np.clip(keyframe.id - before.id, 1, _MOST_MISSED)
+            covariance = result.covariance * np.clip(keyframe.id - before.id, 1, _MOST_MISSED)
             edge = Edge("odometry", last, node, T_before_this, covariance)
-            edge = replace(edge, confidence=found.confidence, rmse=found.rmse, method=found.method)
+            edge = replace(edge, confidence=result.confidence, rmse=result.rmse, method=result.method)
         elif node == self.session_start and self._tie is not None:
             last, T_before = node - 1, self._graph.pose(-1)
             T_before_this = se3.inverse(T_before) @ self._T_start @ keyframe.T_odom_kf
@@ -270,10 +270,10 @@ class Mapper:
 
     def _tied(self, loop: Loop) -> Loop:
         """A loop that was tried, in the graph if it was accepted; rejected if the graph does not take it."""
-        found = loop.registration
-        if found.ok:
+        result = loop.registration
+        if result.ok:
             try:
-                self._graph.add_loop(loop.from_node, loop.to_node, found.T_target_source, found.covariance)
+                self._graph.add_loop(loop.from_node, loop.to_node, result.T_target_source, result.covariance)
             except Dpm2Error as error:
                 return rejected(loop, str(error))
         return loop
@@ -289,11 +289,11 @@ class Mapper:
 
     def _kept(self, loops: Sequence[Edge]) -> list[Edge]:
         """Those that the graph believes, too: on another's word no cloud is given up."""
-        rejected_pairs = {(told.from_node, told.to_node) for told in self._graph.loop_checks if not told.kept}
+        rejected_pairs = {(info.from_node, info.to_node) for info in self._graph.loop_checks if not info.kept}
         return [edge for edge in loops if (edge.from_node, edge.to_node) not in rejected_pairs]
 
-    def _mark_moving(self, judged: Iterable[tuple[int, NDArray[np.bool_]]]) -> None:
-        for node, moving in judged:
+    def _mark_moving(self, checked: Iterable[tuple[int, NDArray[np.bool_]]]) -> None:
+        for node, moving in checked:
             if self._clouds.loan(node) is None and moving.any():
                 self._clouds.set_moving(node, moving)
                 if self._writer is not None:
@@ -302,5 +302,5 @@ class Mapper:
 
 def _loop_edge(loop: Loop) -> Edge:
     r = loop.registration
-    told = (r.ok, r.confidence, r.rmse, r.method, r.reason)
-    return Edge("loop", loop.from_node, loop.to_node, r.T_target_source, r.covariance, *told)
+    info = (r.ok, r.confidence, r.rmse, r.method, r.reason)
+    return Edge("loop", loop.from_node, loop.to_node, r.T_target_source, r.covariance, *info)

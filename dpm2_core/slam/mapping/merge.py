@@ -75,9 +75,9 @@ def loops_by(closer: LoopCloser) -> FindLoops:
             for loop in closer.close(keyframes, clouds, both.poses[: len(keyframes)]):
                 r = loop.registration
                 if r.ok and loop.from_node < len(a) <= loop.to_node:
-                    told = (True, r.confidence, r.rmse, r.method)
+                    info = (True, r.confidence, r.rmse, r.method)
                     to = loop.to_node - len(a)
-                    out.append(Edge("loop", loop.from_node, to, r.T_target_source, r.covariance, *told))
+                    out.append(Edge("loop", loop.from_node, to, r.T_target_source, r.covariance, *info))
         return out
 
     return find

@@ -152,20 +152,20 @@ class Odometry:
 
     def _cross(self, bridge: Bridge, scan: Scan, own: Registration) -> Registration:
         """A scan of the stretch after a pause, in the map before it if that is certain; after long enough, a break."""
-        found, certain = bridge.register(scan, self._T, self._twist, own)
+        result, certain = bridge.register(scan, self._T, self._twist, own)
         if certain:
             self._bridge, self._registration = None, bridge.registration
             self._failures = 0
-            self._follow(scan, found)
-            return found
+            self._follow(scan, result)
+            return result
         self._covariance = bridge.covariance(self._T) + own.covariance
         if bridge.tries >= self._settings.restart_after and self._twist is not None:
             self._keyframes.add_uncertainty(self._covariance)
             self._bridge, self._failures, self._breaks = None, 0, self._breaks + 1
-            return replace(own, reason=f"broken by a pause: {found.reason}")
+            return replace(own, reason=f"broken by a pause: {result.reason}")
         self._failures += 1
-        T = found.T_target_source if found.ok else self._T
-        return replace(found, T_target_source=T, ok=False, reason=found.reason or "after a pause: not confirmed yet")
+        T = result.T_target_source if result.ok else self._T
+        return replace(result, T_target_source=T, ok=False, reason=result.reason or "after a pause: not confirmed yet")
 
     def _register(self, scan: Scan, T_predicted: Array, dt: float, problem: str | None) -> Registration:
         if problem is not None:
@@ -180,32 +180,32 @@ class Odometry:
         seconds = self._registered[1] + dt
         widen = min(seconds / dt, 5.0)
         information = np.eye(6) / (self._settings.steadiness * seconds * seconds) ** 2
-        answer = self._registration.register(scan, Prediction([T_predicted], widen, information))
-        return self._gated(answer, T_predicted, dt)
+        result = self._registration.register(scan, Prediction([T_predicted], widen, information))
+        return self._gated(result, T_predicted, dt)
 
     def _registered_from_rest(self, scan: Scan, T: Array, dt: float) -> Registration:
         """While the velocity is unknown: the best of many starts; after a pause first as before it."""
         if self._bridge is not None and self._bridge.twist is not None:
-            answer = self._registration.register(scan, self._bridge.expected(T, dt))
-            if answer.ok and answer.confidence >= _FITS_WELL:
-                return answer
+            result = self._registration.register(scan, self._bridge.expected(T, dt))
+            if result.ok and result.confidence >= _FITS_WELL:
+                return result
         for motions in (_AHEAD, _AHEAD + _CURVES):
             starts = [T @ se3.exp([0, 0, np.radians(yaw), x, 0, 0]) for x, yaw in motions]
-            answer = self._registration.register(scan, Prediction(starts, widen=2.0))
-            if answer.ok and answer.confidence >= _FITS_WELL:
+            result = self._registration.register(scan, Prediction(starts, widen=2.0))
+            if result.ok and result.confidence >= _FITS_WELL:
                 break
-        return answer
+        return result
 
-    def _gated(self, answer: Registration, T_predicted: Array, dt: float) -> Registration:
+    def _gated(self, result: Registration, T_predicted: Array, dt: float) -> Registration:
         """Refuse what no vehicle can do; the allowance grows while nothing has been registered."""
         time = self._registered[1] + dt
-        off = se3.inverse(T_predicted) @ answer.T_target_source
+        off = se3.inverse(T_predicted) @ result.T_target_source
         meters, degrees = float(np.linalg.norm(off[:3, 3])), float(np.degrees(se3.angle(off)))
-        if answer.ok and meters > 0.5 + self._settings.max_acceleration * time * time:
-            return replace(answer, ok=False, reason=f"{meters:.1f} m from the prediction")
-        if answer.ok and degrees > 3 + self._settings.max_turn * time:
-            return replace(answer, ok=False, reason=f"{degrees:.0f} deg from the prediction")
-        return answer
+        if result.ok and meters > 0.5 + self._settings.max_acceleration * time * time:
+            return replace(result, ok=False, reason=f"{meters:.1f} m from the prediction")
+        if result.ok and degrees > 3 + self._settings.max_turn * time:
+            return replace(result, ok=False, reason=f"{degrees:.0f} deg from the prediction")
+        return result
 
     def _begin_again(
         self, first: Frame, frame: Frame, registration: Registration, dt: float

@@ -111,5 +111,5 @@ def _apart(a: Registration, b: Registration) -> str:
     return f"{np.linalg.norm(xi[3:]):.2f} m, {np.degrees(np.linalg.norm(xi[:3])):.1f} deg"
 
 
-def _because(answer: Registration, why: str) -> Registration:
-    return replace(answer, reason="; ".join(part for part in (answer.reason, why) if part))
+def _because(result: Registration, why: str) -> Registration:
+    return replace(result, reason="; ".join(part for part in (result.reason, why) if part))

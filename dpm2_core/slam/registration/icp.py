@@ -82,12 +82,12 @@ class GeometricRegistration:
                 if not coarse:
                     break
                 coarse, gate = False, s.final_gate
-        share = inliers / len(points)
+        ratio = inliers / len(points)
         expected = predicted and target.is_young and _close(T_guess, T)
         least = s.min_inliers_expected if expected else s.min_inliers
-        ok = inliers >= s.min_points and share >= least
+        ok = inliers >= s.min_points and ratio >= least
         reason = "" if ok else f"{inliers} of {len(points)} points fit the map"
-        return Registration(T, _covariance(H), share, rmse, "geometric", ok, reason)
+        return Registration(T, _covariance(H), ratio, rmse, "geometric", ok, reason)
 
     def likelihood(self, source: Array, target: LocalMap, T: Array) -> float:
         """Mean log likelihood of the (N, 3) points at a pose T_target_source: tells which of two poses fits better.

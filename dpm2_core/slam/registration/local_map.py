@@ -88,10 +88,12 @@ class LocalMap:
 
     def planes(self, index: NDArray[np.int64]) -> tuple[Array, Array]:
         """Unit normal (Q, 3) and variance along it (Q,), m2, of the surface around each of those map points."""
-        wanted = index[np.isnan(self._variances[index])]
-        if len(wanted):
-            wanted = np.unique(wanted)
+        requested = index[np.isnan(self._variances[index])]
+        if len(requested):
+            requested = np.unique(requested)
             k = min(self._settings.plane_neighbours, len(self.points))
-            around, _ = self._tree.batch_knn_search(self.points[wanted], k, num_threads=self._threads)
-            self._normals[wanted], self._variances[wanted] = fit_planes(self.points[np.asarray(around).view(np.int64)])
+            around, _ = self._tree.batch_knn_search(self.points[requested], k, num_threads=self._threads)
+            self._normals[requested], self._variances[requested] = fit_planes(
+                self.points[np.asarray(around).view(np.int64)]
+            )
         return self._normals[index], self._variances[index]

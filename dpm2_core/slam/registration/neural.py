@@ -81,19 +81,19 @@ class NeuralScanRegistration:
         if scan.descriptors is None:
             return _failed(T_predicted, self.rejection(scan))
         T_odom_kf, target = self._map.around(T_predicted)
-        found = self._model.register(scan.descriptors, target)
-        if not found.ok:
-            return _failed(T_predicted, found.reason)
-        found = replace(found, T_target_source=se3.orthonormalized(T_odom_kf @ found.T_target_source))
-        if found.confidence < self._settings.min_confidence:
-            return replace(found, ok=False, reason=f"matches with a confidence of only {found.confidence:.2f}")
-        if (sigma := found.worst_sigma) > self._settings.max_sigma:
-            return replace(found, ok=False, reason=f"position uncertain by {sigma:.2f} m")
+        result = self._model.register(scan.descriptors, target)
+        if not result.ok:
+            return _failed(T_predicted, result.reason)
+        result = replace(result, T_target_source=se3.orthonormalized(T_odom_kf @ result.T_target_source))
+        if result.confidence < self._settings.min_confidence:
+            return replace(result, ok=False, reason=f"matches with a confidence of only {result.confidence:.2f}")
+        if (sigma := result.worst_sigma) > self._settings.max_sigma:
+            return replace(result, ok=False, reason=f"position uncertain by {sigma:.2f} m")
         if prediction.information is not None:
             covariance = np.linalg.inv(prediction.information).astype(np.float64)
-            if not agree(found, Registration(T_predicted, covariance, 0.0, np.inf, "predicted")):
-                return replace(found, ok=False, reason="contradicts the motion so far")
-        return found
+            if not agree(result, Registration(T_predicted, covariance, 0.0, np.inf, "predicted")):
+                return replace(result, ok=False, reason="contradicts the motion so far")
+        return result
 
     def update(self, scan: Scan, T_odom_lidar: Array) -> None:
         if scan.descriptors is not None and self._map.wants(T_odom_lidar):

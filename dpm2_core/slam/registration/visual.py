@@ -116,10 +116,10 @@ class VisualScanRegistration:
         return self._registration.rejection(scan)
 
     def register(self, scan: Scan, prediction: Prediction) -> Registration:
-        answer = self._registration.register(scan, prediction)
-        if not answer.ok or scan.image is None or self._last is None or answer.worst_sigma <= self._settings.sigma:
-            return answer
-        return self._along(answer, scan.image, prediction.information)
+        result = self._registration.register(scan, prediction)
+        if not result.ok or scan.image is None or self._last is None or result.worst_sigma <= self._settings.sigma:
+            return result
+        return self._along(result, scan.image, prediction.information)
 
     def update(self, scan: Scan, T_odom_lidar: Array) -> None:
         self._registration.update(scan, T_odom_lidar)
@@ -131,10 +131,10 @@ class VisualScanRegistration:
                 return
         self._last, self._reference = (scan, T_odom_lidar), None
 
-    def _along(self, answer: Registration, image: Image, information: Array | None) -> Registration:
+    def _along(self, result: Registration, image: Image, information: Array | None) -> Registration:
         """The answer moved along its open direction to where the pictures agree; as it was, if they do not say."""
         s = self._settings
-        axis = np.linalg.eigh(answer.covariance[3:, 3:])[1][:, -1]
+        axis = np.linalg.eigh(result.covariance[3:, 3:])[1][:, -1]
         b = np.concatenate([np.zeros(3), axis])
         reach = s.reach
         if information is not None:
@@ -142,14 +142,14 @@ class VisualScanRegistration:
         if self._reference is None:
             assert self._last is not None
             self._reference = self._made(*self._last)
-        found = self._search(self._reference, _textured(image, s.width), answer.T_target_source, axis, reach)
+        found = self._search(self._reference, _textured(image, s.width), result.T_target_source, axis, reach)
         if isinstance(found, str):
-            return replace(answer, reason="; ".join(part for part in (answer.reason, found) if part))
+            return replace(result, reason="; ".join(part for part in (result.reason, found) if part))
         offset, sigma = found
-        gain = answer.covariance @ b / (b @ answer.covariance @ b + sigma**2)
-        T = se3.orthonormalized(answer.T_target_source @ se3.exp(gain * offset))
-        covariance = answer.covariance - np.outer(gain, b @ answer.covariance)
-        return replace(answer, T_target_source=T, covariance=(covariance + covariance.T) / 2, method="visual")
+        gain = result.covariance @ b / (b @ result.covariance @ b + sigma**2)
+        T = se3.orthonormalized(result.T_target_source @ se3.exp(gain * offset))
+        covariance = result.covariance - np.outer(gain, b @ result.covariance)
+        return replace(result, T_target_source=T, covariance=(covariance + covariance.T) / 2, method="visual")
 
     def _made(self, scan: Scan, T_odom_lidar: Array) -> _Reference:
         assert scan.image is not None

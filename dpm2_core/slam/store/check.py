@@ -78,8 +78,8 @@ def _opened(copy: Path, path: Path, findings: Findings) -> sqlite3.Connection:
         sql = _with_new_header(copy)
         version = schema.VERSION
     with suppress(sqlite3.DatabaseError):
-        told = [row[0] for row in sql.execute("PRAGMA integrity_check(20)")]
-        findings.problems += [f"database: {' '.join(line.split())}" for line in told if line != "ok"]
+        info = [row[0] for row in sql.execute("PRAGMA integrity_check(20)")]
+        findings.problems += [f"database: {' '.join(line.split())}" for line in info if line != "ok"]
     try:
         schema.migrate(sql, version)
     except sqlite3.DatabaseError as error:

@@ -160,10 +160,10 @@ class MapStore:
             Dpm2Error: damage; `dpm2 map check` says how much.
         """
         names = () if columns else schema.CONTENT.get(table, ())
-        wanted = ", ".join((*names, "crc")) if names else columns or "*"
+        requested = ", ".join((*names, "crc")) if names else columns or "*"
         with _explained(self.path):
             before = None
-            for key, *row in self._connection.execute(f"SELECT rowid, {wanted} FROM {table} ORDER BY rowid"):
+            for key, *row in self._connection.execute(f"SELECT rowid, {requested} FROM {table} ORDER BY rowid"):
                 if before is not None and key <= before:  # a tree whose pages lead in a circle has no end
                     raise sqlite3.DatabaseError(f"malformed: {table} {key} comes after {before}")
                 before = key

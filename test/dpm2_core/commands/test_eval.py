@@ -66,7 +66,7 @@ def test_lidar_poses_meet_camera_ground_truth_through_the_calibration(tmp_path: 
         assert least <= ape <= most
 
 
-def test_different_lengths_are_refused_naming_both(tmp_path: Path) -> None:
+def test_different_lengths_are_rejected_naming_both(tmp_path: Path) -> None:
     write_kitti(tmp_path / "gt.txt", _drive(60))
     write_kitti(tmp_path / "est.txt", _drive(50))
     with pytest.raises(UsageError, match=r"60 poses .* 50 "):
@@ -74,12 +74,12 @@ def test_different_lengths_are_refused_naming_both(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "ten", "10,,20", "0", "-5", "inf", "nan"])
-def test_lengths_that_are_none_are_refused(text: str) -> None:
+def test_lengths_that_are_none_are_rejected(text: str) -> None:
     with pytest.raises(UsageError, match=f"--lengths {text}"):
         parse_lengths(text)
 
 
-def test_a_calibration_without_tr_or_that_is_not_there_is_refused(tmp_path: Path) -> None:
+def test_a_calibration_without_tr_or_that_is_not_there_is_rejected(tmp_path: Path) -> None:
     write_kitti(tmp_path / "gt.txt", _drive())
     (tmp_path / "calib.txt").write_text("P0: 1 0 0 0 0 1 0 0 0 0 1 0\n")
     for name, reason in (("calib.txt", "no Tr"), ("none.txt", "no such file")):

@@ -36,7 +36,7 @@ def loaded(path: Path) -> MapData:
 
 def test_info(map_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert dpm2("map", "info", map_file) == 0
-    told = " ".join(capsys.readouterr().out.split())
+    info = " ".join(capsys.readouterr().out.split())
     for words in (
         "12, 12 of them",
         "12 with descriptors",
@@ -44,7 +44,7 @@ def test_info(map_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
         "kB a keyframe",
         "small 0123456789",
     ):
-        assert words in told, told
+        assert words in info, info
 
 
 def test_trajectories_and_graph(tmp_path: Path, map_file: Path, drive: list[Keyframe]) -> None:

@@ -24,15 +24,15 @@ def test_wrong_loops_are_named_and_left_out(tmp_path: Path) -> None:
     truth, graph = made_drive(10, count=1500, right=20)
     right = are_right(truth, graph)
     assert right.sum() == 20  # the wrong ones are really wrong
-    path, out, told = tmp_path / "in.g2o", tmp_path / "out.g2o", tmp_path / "out.json"
+    path, out, info = tmp_path / "in.g2o", tmp_path / "out.g2o", tmp_path / "out.json"
     write_g2o(path, G2o(graph, np.arange(1500), planar=False))
-    assert status(str(path), "--out", str(out), "--json", str(told)) == 0
-    found = read_g2o(out)
-    assert found.has_poses
-    assert {tuple(e) for e in found.graph.ends.tolist()} == {tuple(e) for e in graph.ends[right].tolist()}
-    record = json.loads(told.read_text())
+    assert status(str(path), "--out", str(out), "--json", str(info)) == 0
+    result = read_g2o(out)
+    assert result.has_poses
+    assert {tuple(e) for e in result.graph.ends.tolist()} == {tuple(e) for e in graph.ends[right].tolist()}
+    record = json.loads(info.read_text())
     assert (record["kept"], record["rejected"]) == (20, 10)
-    assert [verdict["kept"] for verdict in record["verdicts"]] == right.tolist()
+    assert [check["kept"] for check in record["verdicts"]] == right.tolist()
     assert record["chi2_after"] < 1e-2 * record["chi2_before"]
 
 

@@ -33,7 +33,7 @@ def test_no_parameter_of_a_command_is_ignored(module: Path) -> None:
     (["map", "merge", "a", "b", "--out", "c", "--transform", "1 2 3 4", "--set", "slam.threads=1"],
      "--config and --set are for --align"),
 ])  # fmt: skip
-def test_an_option_without_effect_is_refused(
+def test_an_option_without_effect_is_rejected(
     command: list[str], words: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Before any file is opened, and none is made."""
@@ -45,8 +45,8 @@ def test_an_option_without_effect_is_refused(
 
 def test_a_task_without_slam_loss_takes_no_weight_for_it(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     """Neither as an option nor as a setting."""
-    movers = ["train", "movers", str(tmp_path), "--out", str(tmp_path / "out")]
-    assert _status([*movers, "--slam-weight", "1"]) == 2
+    dynamic = ["train", "movers", str(tmp_path), "--out", str(tmp_path / "out")]
+    assert _status([*dynamic, "--slam-weight", "1"]) == 2
     assert "--slam-weight" in capsys.readouterr().err
-    assert _status([*movers, "--set", "slam.gamma=1"]) == 2
+    assert _status([*dynamic, "--set", "slam.gamma=1"]) == 2
     assert "unknown key slam" in capsys.readouterr().err

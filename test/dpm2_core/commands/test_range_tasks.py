@@ -50,12 +50,12 @@ def test_train_and_measure(
     assert [row["step"] for row in log if "slam_loss" in row] == [4, 5]
 
     capsys.readouterr()
-    weights, picture = str(out / "weights.safetensors"), tmp_path / "scan.png"
-    assert _status(["eval-task", name, weights, str(pairs), "--json", "--picture", str(picture), "--frame", "2"]) == 0
+    weights, image = str(out / "weights.safetensors"), tmp_path / "scan.png"
+    assert _status(["eval-task", name, weights, str(pairs), "--json", "--picture", str(image), "--frame", "2"]) == 0
     printed = json.loads(capsys.readouterr().out)
     assert printed["scans"] == 6
     assert figures <= printed.keys()
-    assert picture.stat().st_size > 1000
+    assert image.stat().st_size > 1000
 
     assert _status(["eval-task", name, weights, str(pairs), "--slam"]) == 2
     assert "no sequences with poses" in capsys.readouterr().err

@@ -202,12 +202,12 @@ def test_config_dump_shows_every_key() -> None:
 
 
 def test_corrupted_sensors_on_request(drive: Path, tmp_path: Path) -> None:
-    for share in (0.0, 1.0):
-        out = tmp_path / str(share)
-        done = dpm2("run", drive, "--out", out, "--frames", "0:4", "--corrupt", f"beams={share},seed=1")
+    for ratio in (0.0, 1.0):
+        out = tmp_path / str(ratio)
+        done = dpm2("run", drive, "--out", out, "--frames", "0:4", "--corrupt", f"beams={ratio},seed=1")
         assert done.returncode == 0, done.stderr
-        answers = json.loads((out / "timing.json").read_text())["answers"]
-        assert answers == ({"first": 1, "geometric": 3} if share == 0 else {"failed": 4})
+        results = json.loads((out / "timing.json").read_text())["answers"]
+        assert results == ({"first": 1, "geometric": 3} if ratio == 0 else {"failed": 4})
     done = dpm2("run", drive, "--out", tmp_path / "no", "--corrupt", "camera=2")
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
     assert "--corrupt camera=2: camera" in done.stderr

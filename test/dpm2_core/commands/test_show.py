@@ -37,14 +37,14 @@ def show(sequence: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=120)
 
 
-def test_draws_a_picture(sequence: Path, tmp_path: Path) -> None:
+def test_draws_a_image(sequence: Path, tmp_path: Path) -> None:
     weights = str(sequence / "tiny.safetensors")
     done = show(sequence, "--frames", "0,1", "--out", str(tmp_path / "m.png"), "--weights", weights)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "m.png").read_bytes()[1:4] == b"PNG"
 
 
-def test_draws_the_picture_with_attention(sequence: Path, tmp_path: Path) -> None:
+def test_draws_the_image_with_attention(sequence: Path, tmp_path: Path) -> None:
     """With weights that have a camera and a drive with pictures, the drawing has a third part below."""
     folder = tmp_path / "drive"
     shutil.copytree(sequence, folder)

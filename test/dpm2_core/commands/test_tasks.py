@@ -51,12 +51,12 @@ def test_train_resume_and_measure(drive: Path, tmp_path: Path, capsys: pytest.Ca
     assert len((out / "log.jsonl").read_text().splitlines()) == len(log)
 
     capsys.readouterr()
-    weights, picture = str(out / "weights.safetensors"), tmp_path / "ground.png"
-    assert _status(["eval-task", "gndnet", weights, str(drive), "--json", "--picture", str(picture)]) == 0
+    weights, image = str(out / "weights.safetensors"), tmp_path / "ground.png"
+    assert _status(["eval-task", "gndnet", weights, str(drive), "--json", "--picture", str(image)]) == 0
     printed = json.loads(capsys.readouterr().out)
     assert printed["scans"] == 4
     assert {"mse", "miou", "precision", "recall"} <= printed.keys()
-    assert picture.stat().st_size > 1000
+    assert image.stat().st_size > 1000
     assert _status(["eval-task", "gndnet", weights, str(drive)]) == 0
     assert "precision" in capsys.readouterr().out
 

@@ -191,9 +191,9 @@ def test_images_that_cannot_be_used_cost_the_image_alone(
 
 def test_vertical_angle_correction_is_what_the_recording_says(bags: Any, tmp_path: Path) -> None:
     topic = "/kitti/velo/pointcloud"
-    said = (1, "/kitti/vertical_angle_correction_deg", bags.new("std_msgs/Float64", data=0.0))
+    texts = (1, "/kitti/vertical_angle_correction_deg", bags.new("std_msgs/Float64", data=0.0))
     kitti = bags.write(tmp_path / "kitti", clouds(bags, [1], topic))
-    simulated = bags.write(tmp_path / "sim", [*clouds(bags, [1], topic), said])
+    simulated = bags.write(tmp_path / "sim", [*clouds(bags, [1], topic), texts])
     other = bags.write(tmp_path / "other", clouds(bags, [1]))
     assert BagSource(kitti).vertical_angle_correction_deg == HDL64_CORRECTION_DEG
     assert BagSource(simulated).vertical_angle_correction_deg == 0

@@ -140,7 +140,7 @@ def test_a_scan_that_cannot_be_read_stays_a_frame(kitti_folder: MakeFolder, tmp_
     assert [len(frame.points) for frame in BagSource(tmp_path / "bag").frames()] == [60, 60, 0, 60, 60]
 
 
-def test_what_is_there_is_refused_or_replaced(kitti_folder: MakeFolder, tmp_path: Path) -> None:
+def test_what_is_there_is_rejected_or_replaced(kitti_folder: MakeFolder, tmp_path: Path) -> None:
     folder, out = kitti_folder(), tmp_path / "bag"
     convert_kitti(folder, out, end=2)
     with pytest.raises(UsageError, match="exists already; use --overwrite"):

@@ -45,9 +45,9 @@ class Drive:
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
         for i in range(N)[start:stop]:
-            picture = Image(np.full((4, 6, 3), 10 + i, np.uint8), self.camera)
+            image = Image(np.full((4, 6, 3), 10 + i, np.uint8), self.camera)
             offset = np.linspace(0, 0.1, 2000, dtype=np.float32)
-            yield Frame(i * 10**8, self.points[i], offset, (picture,), i)
+            yield Frame(i * 10**8, self.points[i], offset, (image,), i)
 
 
 def corrupted(**settings: float) -> list[Frame]:
@@ -123,9 +123,9 @@ def test_hidden_points_are_those_whose_ray_meets_the_box(seed: int) -> None:
     points = rng.normal(size=(40, 3)) * 10 + box.T_lidar_box[:3, 3] * rng.uniform(0, 3, (40, 1))
     hidden = hidden_by(box, points)
     bigger, smaller = (box._replace(half=box.half * scale) for scale in (1.01, 0.99))  # sampling misses thin corners
-    for point, answer in zip(points, hidden, strict=True):
-        assert answer or not segment_meets(smaller, point)
-        assert not answer or segment_meets(bigger, point)
+    for point, result in zip(points, hidden, strict=True):
+        assert result or not segment_meets(smaller, point)
+        assert not result or segment_meets(bigger, point)
 
 
 @given(seed=st.integers(0, 2**32))
@@ -179,14 +179,14 @@ def test_the_calibration_is_off_by_what_was_asked_for() -> None:
 
 
 @pytest.mark.parametrize(("late", "by"), [(0.1, 1), (0.25, 3), (0.0, 0)])
-def test_late_pictures_are_of_an_earlier_frame(late: float, by: int) -> None:
+def test_late_images_are_of_an_earlier_frame(late: float, by: int) -> None:
     numbers = [f.images[0].pixels[0, 0, 0] - 10 if f.images else None for f in corrupted(time_offset=late)]
     assert numbers == [None] * by + list(range(N - by))
 
 
 def test_settings_from_the_command_line() -> None:
-    found = parse_corruption("camera=0.3, obstruction=0.5,seed=1")
-    assert (found.camera, found.obstruction, found.seed) == (0.3, 0.5, 1)
+    result = parse_corruption("camera=0.3, obstruction=0.5,seed=1")
+    assert (result.camera, result.obstruction, result.seed) == (0.3, 0.5, 1)
 
 
 @pytest.mark.parametrize(

@@ -63,7 +63,7 @@ def test_the_size_is_in_the_header(ending: str, size: tuple[int, int]) -> None:
 
 @pytest.mark.parametrize("image", [png(30_000, 30_000), jpeg(65_000, 65_000), png(0, 0), b"BM" + bytes(100)])
 @pytest.mark.parametrize("size", [None, (8, 6)])
-def test_a_picture_that_is_a_bomb(image: bytes, size: tuple[int, int] | None) -> None:
+def test_a_image_that_is_a_bomb(image: bytes, size: tuple[int, int] | None) -> None:
     began = time.process_time()
     tracemalloc.start()
     try:
@@ -81,7 +81,7 @@ def rig(bags: Any) -> list[tuple[float, str, Any]]:
     return [(1, "/points", bags.cloud(1)), (1, "/tf_static", transform), (1, "/cam/camera_info", bags.info(1))]
 
 
-def test_a_bag_with_such_pictures_is_read_without_them(bags: Any, tmp_path: Path) -> None:
+def test_a_bag_with_such_images_is_read_without_them(bags: Any, tmp_path: Path) -> None:
     image = bags.new(
         "sensor_msgs/CompressedImage", bags.header(1, "cam"), "png", np.frombuffer(png(30_000, 30_000), np.uint8)
     )

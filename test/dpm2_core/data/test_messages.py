@@ -205,7 +205,7 @@ def broken(**changes: Any) -> SimpleNamespace:
         (broken(fields=[field("x", 0, 7), field("y", 4, 7), field("z", 8, 9)]), "field z: unknown datatype 9"),
     ],
 )
-def test_contradictory_clouds_are_refused(msg: SimpleNamespace, message: str) -> None:
+def test_contradictory_clouds_are_rejected(msg: SimpleNamespace, message: str) -> None:
     with pytest.raises(MessageError, match=message):
         messages.decode_points(msg)
 
@@ -264,15 +264,15 @@ def test_image_encodings(encoding: str, pixels: np.ndarray, want: np.ndarray, pa
 
 @pytest.mark.parametrize("bits", [8, 16])
 @pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
-def test_bayer_patterns_give_the_colour_they_were_made_from(pattern: str, bits: int) -> None:
+def test_bayer_patterns_give_the_color_they_were_made_from(pattern: str, bits: int) -> None:
     """A uniformly coloured scene survives the mosaic exactly, and only with the right pattern."""
-    colour = np.array([200, 120, 40], np.uint8)
+    color = np.array([200, 120, 40], np.uint8)
     mosaic = np.empty((8, 8), np.uint8)
     for i, letter in enumerate(pattern):
-        mosaic[i // 2 :: 2, i % 2 :: 2] = colour["rgb".index(letter)]
+        mosaic[i // 2 :: 2, i % 2 :: 2] = color["rgb".index(letter)]
     pixels = mosaic if bits == 8 else mosaic.astype(np.uint16) << 8
     decoded = image_messages.decode_image(image(pixels, f"bayer_{pattern}{bits}"))
-    np.testing.assert_array_equal(decoded[2:-2, 2:-2], np.broadcast_to(colour, (4, 4, 3)))
+    np.testing.assert_array_equal(decoded[2:-2, 2:-2], np.broadcast_to(color, (4, 4, 3)))
 
 
 def test_compressed_images() -> None:

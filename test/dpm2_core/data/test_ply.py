@@ -44,7 +44,7 @@ def test_an_independent_reader_agrees(tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.column_stack([vertices[n] for n in ("x", "y", "z", "intensity")]), points)
 
 
-def test_points_of_another_shape_are_refused(tmp_path: Path) -> None:
+def test_points_of_another_shape_are_rejected(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"want \(N, 4\)"):
         write_ply(tmp_path / "map.ply", np.zeros((5, 3), np.float32))
     assert not list(tmp_path.iterdir())

@@ -22,7 +22,7 @@ def _poses(count: int, scale: float = 1000.0) -> np.ndarray:
     return se3.make(Rotation.random(count, random_state=0).as_matrix(), rng.normal(scale=scale, size=(count, 3)))
 
 
-def test_kitti_keeps_poses_to_a_nanometre(tmp_path: Path) -> None:
+def test_kitti_keeps_poses_to_a_nanometer(tmp_path: Path) -> None:
     poses = _poses(20)
     write_kitti(tmp_path / "t.txt", poses)
     read = read_trajectory(tmp_path / "t.txt")
@@ -39,7 +39,7 @@ def test_kitti_keeps_frame_numbers(tmp_path: Path) -> None:
     np.testing.assert_allclose(read.poses, _poses(4), atol=1e-9)
 
 
-def test_tum_keeps_stamps_exactly_and_poses_to_a_micrometre(tmp_path: Path) -> None:
+def test_tum_keeps_stamps_exactly_and_poses_to_a_micrometer(tmp_path: Path) -> None:
     stamps = [-1, 0, 999_999_999, EPOCH, EPOCH + 1]
     write_tum(tmp_path / "t.tum", stamps, _poses(5))
     read = read_trajectory(tmp_path / "t.tum")
@@ -81,7 +81,7 @@ def test_a_damaged_file_is_an_error_that_names_file_and_line(tmp_path: Path, tex
         read_trajectory(path)
 
 
-def test_what_is_no_text_file_is_refused(tmp_path: Path) -> None:
+def test_what_is_no_text_file_is_rejected(tmp_path: Path) -> None:
     (tmp_path / "binary").write_bytes(bytes(range(256)))
     for path, reason in ((tmp_path / "none", "No such file"), (tmp_path, "directory"), (tmp_path / "binary", "text")):
         with pytest.raises(UsageError, match=f"{path}: .*{reason}"):

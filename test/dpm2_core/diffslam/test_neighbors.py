@@ -29,10 +29,10 @@ def test_tree_and_distance_agree_with_brute_force() -> None:
         points, valid = clouds(offset)
         queries = points + 0.3
         distance = (queries[:, :, None] - points[:, None]).norm(dim=-1).masked_fill(~valid[:, None], torch.inf)
-        wanted = distance.argsort(-1)[..., :5]
-        torch.testing.assert_close(NeighborSearch(points, valid).nearest(queries, 5), wanted)
-        torch.testing.assert_close(by_distance(points, valid).nearest(queries, 5), wanted)
-        torch.testing.assert_close(by_distance(points, valid).nearest(queries), wanted[..., :1])
+        requested = distance.argsort(-1)[..., :5]
+        torch.testing.assert_close(NeighborSearch(points, valid).nearest(queries, 5), requested)
+        torch.testing.assert_close(by_distance(points, valid).nearest(queries, 5), requested)
+        torch.testing.assert_close(by_distance(points, valid).nearest(queries), requested[..., :1])
 
 
 def test_fewer_points_than_asked_repeat_the_nearest() -> None:

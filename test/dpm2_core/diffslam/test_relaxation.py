@@ -86,7 +86,7 @@ def test_gradients_agree_with_finite_differences_and_each_other(ring: Tensor) ->
     assert float((slopes[0] - slopes[1]).norm() / slopes[0].norm()) < 0.01
 
 
-def test_unusable_graphs_are_refused(ring: Tensor) -> None:
+def test_unusable_graphs_are_rejected(ring: Tensor) -> None:
     """An edge to a pose that is not there, fewer measurements than edges."""
     with pytest.raises(UsageError, match="pose 9 of 8"):
         relax(ring, torch.tensor([[0, 9]]), relative(ring)[:1])

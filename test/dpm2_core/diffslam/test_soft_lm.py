@@ -67,7 +67,7 @@ def test_perfect_fit_is_no_division_by_zero() -> None:
 
 
 @pytest.mark.parametrize("bad", [{"iterations": 0}, {"lambda_min": 0.0}, {"gate": "hard"}, {"gradient": "none"}])
-def test_settings_that_cannot_be_are_refused(bad: dict[str, object]) -> None:
+def test_settings_that_cannot_be_are_rejected(bad: dict[str, object]) -> None:
     """By name."""
     with pytest.raises(UsageError, match=next(iter(bad))):
         settings_from(SoftLmSettings, bad)

@@ -24,11 +24,11 @@ def leaves(clouds: list[Tensor]) -> list[Tensor]:
 
 def test_odometry_follows_the_scans(scans: list[Tensor], motion: Tensor) -> None:
     """Each pose to 1 mm, from identity as from a guess, for a list as for a padded tensor with its mask."""
-    wanted = torch.stack([torch.linalg.matrix_power(motion, t) for t in range(4)])
+    requested = torch.stack([torch.linalg.matrix_power(motion, t) for t in range(4)])
     padded = torch.nn.functional.pad(torch.stack(scans), (0, 0, 0, 50), value=torch.nan)
     mask = torch.nn.functional.pad(torch.ones(4, 600), (0, 50))
     for found in (odometry(scans), odometry(scans, guess=motion), odometry(padded, mask)):
-        torch.testing.assert_close(found, wanted, atol=1e-3, rtol=0)
+        torch.testing.assert_close(found, requested, atol=1e-3, rtol=0)
 
 
 @pytest.mark.parametrize("gradient", ["unrolled", "implicit"])
@@ -80,11 +80,11 @@ def test_warm_start_measures_at_the_end_of_the_way(scans: list[Tensor], noisy: l
     the reference has ended, the loss comes near the converged one. Equal clouds have no loss; the reference is kept."""
     two = IcpSettings(solver=SoftLmSettings(iterations=2))
     with torch.no_grad():
-        wanted = float(SlamLoss(CONVERGED)(noisy, scans))
+        requested = float(SlamLoss(CONVERGED)(noisy, scans))
         cold = float(SlamLoss(SlamLossSettings(icp=two))(noisy, scans))
         loss = SlamLoss(SlamLossSettings(icp=two, warm_start=True))
         warm = float(loss(noisy, scans))
-        assert abs(warm - wanted) < 0.5 * abs(cold - wanted)
+        assert abs(warm - requested) < 0.5 * abs(cold - requested)
         assert float(loss(noisy, noisy)) < 1e-20
         frames = [("drive", t) for t in range(4)]
         assert float(loss(noisy, scans, frames=frames)) == warm
@@ -131,11 +131,11 @@ def test_truncation_stops_the_gradient_and_not_the_value(noisy: list[Tensor], sc
 
 def test_spans_make_a_graph_that_averages_noise(noisy: list[Tensor], motion: Tensor) -> None:
     """Scans two apart add measurements: the trajectory stays right, and differs from the chain alone."""
-    wanted = torch.stack([torch.linalg.matrix_power(motion, t) for t in range(4)])
+    requested = torch.stack([torch.linalg.matrix_power(motion, t) for t in range(4)])
     chain = odometry(noisy, settings=CONVERGED)
     graph = odometry(noisy, settings=CONVERGED.model_copy(update={"spans": (1, 2)}))
     assert float((graph - chain).abs().max()) > 1e-6
-    torch.testing.assert_close(graph, wanted, atol=0.02, rtol=0)  # noise of 1 cm on 600 points, three steps
+    torch.testing.assert_close(graph, requested, atol=0.02, rtol=0)  # noise of 1 cm on 600 points, three steps
 
 
 def test_reference_is_kept_by_frame(noisy: list[Tensor], scans: list[Tensor]) -> None:
@@ -147,7 +147,7 @@ def test_reference_is_kept_by_frame(noisy: list[Tensor], scans: list[Tensor]) ->
     assert float(loss(noisy, other)) != float(first)
 
 
-def test_windows_that_are_not_contiguous_are_refused(scans: list[Tensor]) -> None:
+def test_windows_that_are_not_contiguous_are_rejected(scans: list[Tensor]) -> None:
     """The border of two sequences, a gap, the wrong order, too few names."""
     loss = SlamLoss()
     for frames, message in (
@@ -178,7 +178,7 @@ def test_unusable_clouds_are_named(scans: list[Tensor], side: str) -> None:
     rejected([*scans[:3], scans[3].long()], "scan 3: want floating-point")
 
 
-def test_unusable_weights_and_windows_are_refused(scans: list[Tensor]) -> None:
+def test_unusable_weights_and_windows_are_rejected(scans: list[Tensor]) -> None:
     """Negative, above one, NaN, of another length; windows of different or too few scans; a guess of another shape."""
     for value in (-0.1, 1.1, float("nan")):
         with pytest.raises(UsageError, match=r"scan 0: 600 of its 600 weights are not in 0\.\.1"):
@@ -202,13 +202,13 @@ def test_zero_weights_give_a_finite_loss_and_no_gradient(noisy: list[Tensor], mo
     loss = SlamLoss()(pred, noisy, weights)
     steps = np.stack([se3.log(np.linalg.matrix_power(motion.numpy(), t)) for t in (1, 2, 3)])
     travelled = np.stack([np.linalg.matrix_power(motion.numpy(), t)[:3, 3] for t in (1, 2, 3)])
-    wanted = ((travelled**2).sum(1) + 25 * (steps[:, :3] ** 2).sum(1)).mean()
-    assert float(loss.detach()) == pytest.approx(wanted, rel=0.02)  # the reference is that of noisy scans
+    requested = ((travelled**2).sum(1) + 25 * (steps[:, :3] ** 2).sum(1)).mean()
+    assert float(loss.detach()) == pytest.approx(requested, rel=0.02)  # the reference is that of noisy scans
     loss.backward()
     assert all(float(x.grad.abs().max()) == 0.0 for x in (*pred, *weights))  # type: ignore[union-attr]
 
 
-def test_large_clouds_are_thinned_alike(noise: np.random.Generator, scans: list[Tensor]) -> None:
+def test_large_clouds_are_downsampled_alike(noise: np.random.Generator, scans: list[Tensor]) -> None:
     """More than `points` are thinned, the same in each call; gradients go to those that were kept."""
     big = [torch.cat([scan, scan + 0.01, scan - 0.01]) for scan in scans]
     pred = leaves(big)

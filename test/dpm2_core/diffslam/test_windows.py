@@ -54,7 +54,7 @@ def test_a_data_loader_takes_it() -> None:
 
 
 @pytest.mark.parametrize("bad", [(1, 1), (4, 0)])
-def test_windows_without_motion_are_refused(bad: tuple[int, int]) -> None:
+def test_windows_without_motion_are_rejected(bad: tuple[int, int]) -> None:
     """One scan, or the same scan again and again."""
     with pytest.raises(UsageError, match="want at least 2"):
         ContiguousWindows([100], *bad)
@@ -82,11 +82,11 @@ def test_every_kth_epoch_has_the_slam_loss() -> None:
 def test_a_lost_registration_is_not_the_whole_step() -> None:
     """gamma L_slam is bounded by a share of L_model, its slope along with it; below, it is as it is. That of the task
     stays as it is."""
-    for error, share in ((0.05, 0.05), (0.1, 0.1), (1.0, 0.1), (100.0, 0.1), (0.0, 0.0)):
+    for error, ratio in ((0.05, 0.05), (0.1, 0.1), (1.0, 0.1), (100.0, 0.1), (0.0, 0.0)):
         task, slam = (torch.tensor(value, requires_grad=True) for value in (4.0, 2 * error))
         settings = ScheduleSettings(gamma=2.0, every=1, most=0.1)
         total = total_loss(task, lambda x=slam: x, 0, settings)  # gamma L_slam is `error` times L_model
         total.backward()
-        assert float(total.detach()) == pytest.approx(4.0 * (1 + share))
+        assert float(total.detach()) == pytest.approx(4.0 * (1 + ratio))
         assert float(task.grad) == 1.0
-        assert float(slam.grad) == pytest.approx(2.0 * (share / error if error else 1.0))
+        assert float(slam.grad) == pytest.approx(2.0 * (ratio / error if error else 1.0))

@@ -68,7 +68,7 @@ def test_the_ground_truth_is_brought_into_the_map_frame(tmp_path: Path) -> None:
     ],
     ids=["one pose", "standing, empty map", "map out of sight"],
 )
-def test_a_drive_that_went_nowhere_still_gives_a_picture(
+def test_a_drive_that_went_nowhere_still_gives_a_image(
     tmp_path: Path, est: np.ndarray, cloud: np.ndarray | None
 ) -> None:
     trajectory_png(tmp_path / "p.png", est, np.full_like(est, np.nan), cloud)

@@ -117,7 +117,7 @@ def test_standing_still_has_no_drift_per_length() -> None:
     assert path_length(still) == 0
 
 
-def test_what_cannot_be_compared_is_refused() -> None:
+def test_what_cannot_be_compared_is_rejected() -> None:
     with pytest.raises(UsageError, match="101 poses, the estimate 100"):
         evaluate(_straight(), _straight(100))
     nothing = np.full((10, 4, 4), np.nan)

@@ -51,15 +51,15 @@ def horizontally(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def test_poles_are_found_first(noise: np.random.Generator) -> None:
     """Beside a wall and on ground: every pole, to 10 cm, before any place on the wall; none on the ground."""
     cloud = np.concatenate([ground(), wall(), poles(0.3, noise)])
-    found = edges_of(cloud)
-    assert found.dtype == np.float32
-    on_pole = horizontally(found, POLES) < 0.25  # the ground at its foot is among a pole's neighbours
-    assert horizontally(POLES, found).max() < 0.1
+    result = edges_of(cloud)
+    assert result.dtype == np.float32
+    on_pole = horizontally(result, POLES) < 0.25  # the ground at its foot is among a pole's neighbours
+    assert horizontally(POLES, result).max() < 0.1
     assert on_pole[: 2 * len(POLES)].all()  # each is long enough for two places
-    assert (np.abs(found[~on_pole, 1] - 18) < 0.1).all()
-    between = np.linalg.norm(found[:, None] - found, axis=2) + np.eye(len(found)) * 9
+    assert (np.abs(result[~on_pole, 1] - 18) < 0.1).all()
+    between = np.linalg.norm(result[:, None] - result, axis=2) + np.eye(len(result)) * 9
     assert between.min() >= SPACING
-    assert np.array_equal(edges_of(cloud, 3), found[:3])
+    assert np.array_equal(edges_of(cloud, 3), result[:3])
 
 
 def test_found_again_from_elsewhere(noise: np.random.Generator) -> None:

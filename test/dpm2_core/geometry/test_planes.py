@@ -26,7 +26,7 @@ def test_agrees_with_eigh(seed: int, log_scale: float, k: int) -> None:
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-9)
 
 
-def test_degenerate_neighbourhoods_are_finite() -> None:
+def test_degenerate_neighborhoods_are_finite() -> None:
     line = np.zeros((1, 5, 3))
     line[0, :, 0] = np.arange(5)
     point = np.ones((1, 5, 3))

@@ -56,5 +56,5 @@ def test_batches_have_any_shape() -> None:
     T = se3_torch.exp(xi)
     torch.testing.assert_close(se3_torch.log(T), xi)
     points = torch.randn(2, 7, 3, dtype=torch.float64)
-    wanted = torch.stack([torch.from_numpy(se3.transform(T[i, 0].numpy(), points[i].numpy())) for i in range(2)])
-    torch.testing.assert_close(se3_torch.transform(T[:, 0], points), wanted)
+    requested = torch.stack([torch.from_numpy(se3.transform(T[i, 0].numpy(), points[i].numpy())) for i in range(2)])
+    torch.testing.assert_close(se3_torch.transform(T[:, 0], points), requested)

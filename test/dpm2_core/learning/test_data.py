@@ -26,15 +26,15 @@ from dpm2_core.network.tokens import to_tokens
 NOTHING = {"drop": 0, "occlusion": 0, "beams": 0, "jitter": 0, "yaw": 0, "tilt": 0, "shift": (0, 0, 0), "image_drop": 0}
 
 
-def test_packing_keeps_clouds_to_a_millimetre(packed: Path, samples: list[Sample]) -> None:
+def test_packing_keeps_clouds_to_a_millimeter(packed: Path, samples: list[Sample]) -> None:
     """Points to half a quantum, poses and pictures exactly."""
     drive = PackedDrive(packed / "world")
     assert len(drive) == len(samples)
-    for found, true in zip((drive[i] for i in range(len(drive))), samples, strict=True):
-        assert np.abs(found.cloud - true.cloud).max() <= QUANTUM / 2 + 1e-5
-        assert np.array_equal(found.pose, true.pose)
-        assert np.array_equal(found.images[0].pixels, true.images[0].pixels)
-        assert np.array_equal(found.images[0].camera.T_lidar_cam, true.images[0].camera.T_lidar_cam)
+    for result, true in zip((drive[i] for i in range(len(drive))), samples, strict=True):
+        assert np.abs(result.cloud - true.cloud).max() <= QUANTUM / 2 + 1e-5
+        assert np.array_equal(result.pose, true.pose)
+        assert np.array_equal(result.images[0].pixels, true.images[0].pixels)
+        assert np.array_equal(result.images[0].camera.T_lidar_cam, true.images[0].camera.T_lidar_cam)
 
 
 def test_an_unfinished_drive_is_not_opened(packed: Path, samples: list[Sample], tmp_path: Path) -> None:
@@ -48,7 +48,7 @@ def test_an_unfinished_drive_is_not_opened(packed: Path, samples: list[Sample], 
     assert not (root / "new.part").exists()
 
 
-def test_foreign_folders_are_refused(tmp_path: Path) -> None:
+def test_foreign_folders_are_rejected(tmp_path: Path) -> None:
     """No poses, or another format."""
     (tmp_path / "about.json").write_text("{}")
     with pytest.raises(UsageError, match="no packed drive"):
@@ -84,7 +84,7 @@ def test_occlusion_removes_what_lies_behind(samples: list[Sample]) -> None:
     assert len(sizes) > 5
 
 
-def test_pictures_are_dropped_blacked_and_exposed(samples: list[Sample]) -> None:
+def test_images_are_dropped_blacked_and_exposed(samples: list[Sample]) -> None:
     """With certainty where the probability is 1; pixels stay bytes."""
     noise = np.random.default_rng(0)
     assert augment(samples[0], AugmentSettings(**{**NOTHING, "image_drop": 1}), noise).images == ()

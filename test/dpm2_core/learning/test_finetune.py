@@ -74,7 +74,7 @@ def test_the_gradient_of_the_trajectory_is_that_of_differences(
     assert float(slope[scan, place, axis]) == pytest.approx(float(difference), rel=0.02)
 
 
-def test_a_scan_that_matches_nothing_goes_astray_without_a_gradient_or_nan(
+def test_a_scan_that_matches_nothing_diverges_without_a_gradient_or_nan(
     tiny: Callable[..., NetworkSettings], road: torch.Tensor
 ) -> None:
     torch.manual_seed(0)
@@ -114,8 +114,8 @@ def settings(tmp_path: Path, packed: Path, tiny: Callable[..., NetworkSettings])
     torch.manual_seed(0)
     path = tmp_path / "start.safetensors"
     save_weights(DeepPointMap2(tiny()), path, {"images": "false", "phase": "2"}, half=False)
-    optimiser = FinetuneOptimizer(steps=4, warmup=1, bf16=False, save_every=2, rate=1e-3)
-    chosen = {"rehearsal": str(packed), "pairs": 1.0, "groups": 1, "frames": 3, "optimiser": optimiser}
+    optimizer = FinetuneOptimizer(steps=4, warmup=1, bf16=False, save_every=2, rate=1e-3)
+    chosen = {"rehearsal": str(packed), "pairs": 1.0, "groups": 1, "frames": 3, "optimiser": optimizer}
     return FinetuneSettings(weights=str(path), **chosen)  # type: ignore[arg-type]
 
 

@@ -24,7 +24,7 @@ TRUTH = torch.from_numpy(se3.exp([0.01, -0.02, 1.0, 3.0, 0.5, 0.1]))[None]
 
 
 @pytest.mark.parametrize("xi", [[0, 0, 0, 3, 4, 0], [0, 1, 0, 0, 0, 0]])
-def test_a_large_error_costs_what_it_is_and_five_metres_a_radian(xi: list[float]) -> None:
+def test_a_large_error_costs_what_it_is_and_five_meters_a_radian(xi: list[float]) -> None:
     """Both are 5 m; the smooth part takes at most `FINE` off."""
     loss = float(pose_loss(TRUTH @ torch.from_numpy(se3.exp(xi)), TRUTH))
     assert 5 - FINE <= loss <= 5
@@ -49,7 +49,7 @@ def places(count: int, channels: int) -> tuple[Tokens, Tokens]:
     return Tokens(xyz, features, axes[0], mask), Tokens(moved, features, axes[1], mask)
 
 
-def test_what_is_astray_takes_the_truth_and_has_no_gradient(tiny: Callable[..., NetworkSettings]) -> None:
+def test_what_has_diverged_takes_the_truth_and_has_no_gradient(tiny: Callable[..., NetworkSettings]) -> None:
     """The same pair is judged against a truth that it is near, and against one 3 m beside."""
     torch.manual_seed(0)
     model = DeepPointMap2(tiny()).eval()
@@ -68,7 +68,7 @@ def test_what_is_astray_takes_the_truth_and_has_no_gradient(tiny: Callable[..., 
     assert float(source.features.grad.abs().max()) == 0.0
 
 
-def test_phase_one_trains_by_it(packed: Path, tiny: Callable[..., NetworkSettings]) -> None:
+def test_registration_trains_by_it(packed: Path, tiny: Callable[..., NetworkSettings]) -> None:
     """With every other loss switched off the encoder still has a gradient, and both figures are in the log."""
     torch.manual_seed(0)
     data = DataSettings(packed={str(packed): 1.0}, groups=1, frames=3, workers=0)

@@ -70,7 +70,7 @@ def test_points_of_a_pair_are_the_same_in_the_world(settings: ImageTrainingSetti
     assert batch.views.pixels.shape[:2] == (4, 1)
 
 
-def test_shown_is_what_projects_into_the_picture() -> None:
+def test_shown_is_what_projects_into_the_image() -> None:
     """Ahead and inside, not behind, not beside. The camera looks along x of the LiDAR."""
     T_lidar_cam = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
     camera = Camera(np.array([[50, 0, 50], [0, 50, 25], [0, 0, 1.0]]), T_lidar_cam, (100, 50))
@@ -78,7 +78,7 @@ def test_shown_is_what_projects_into_the_picture() -> None:
     assert shown(points, camera).tolist() == [True, False, True, False, False]
 
 
-def test_what_cannot_be_trained_is_refused(
+def test_what_cannot_be_trained_is_rejected(
     settings: ImageTrainingSettings, samples: list[Sample], tmp_path: Path
 ) -> None:
     """A network without features of its own pixels, a drive without pictures, and too few points."""

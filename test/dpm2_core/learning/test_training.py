@@ -79,7 +79,7 @@ def test_log_has_figures_and_validation(settings: RegistrationTrainingSettings, 
     assert {"near_deg", "near_success", "turned_m", "chi2"} <= validations[0].keys()
 
 
-def test_pictures_have_a_loss_of_their_own(settings: RegistrationTrainingSettings, tiny: Callable) -> None:
+def test_images_have_a_loss_of_their_own(settings: RegistrationTrainingSettings, tiny: Callable) -> None:
     """It is a finite figure that trains the image branch; without pictures it is absent, not zero."""
     module = RegistrationTraining(tiny(), settings.loss)
     batch = GroupDataset(settings.data, tiny(), seed=0).batch(0)
@@ -92,7 +92,7 @@ def test_pictures_have_a_loss_of_their_own(settings: RegistrationTrainingSetting
     assert "image" not in module(batch.points, None, plans)[1]
 
 
-def test_a_checkpoint_of_another_network_is_refused(settings: RegistrationTrainingSettings, tmp_path: Path) -> None:
+def test_a_checkpoint_of_another_network_is_rejected(settings: RegistrationTrainingSettings, tmp_path: Path) -> None:
     """And so is a file that is none."""
     train_registration(settings, tmp_path / "out")
     with pytest.raises(UsageError, match="checkpoint of another network"):
@@ -102,7 +102,7 @@ def test_a_checkpoint_of_another_network_is_refused(settings: RegistrationTraini
         train_registration(settings, tmp_path / "out", resume=True)
 
 
-def test_phase_two_changes_the_overlap_head_alone(settings: RegistrationTrainingSettings, tmp_path: Path) -> None:
+def test_overlap_changes_the_overlap_head_alone(settings: RegistrationTrainingSettings, tmp_path: Path) -> None:
     """Every other tensor of the weights stays as phase one left it."""
     start = train_registration(settings, tmp_path / "one")
     second = _overlap(settings, start, rate=1e-2, steps=4)
@@ -120,7 +120,7 @@ def _overlap(settings: RegistrationTrainingSettings, start: Path, **optimiser: f
     return settings_from(OverlapTrainingSettings, tree)
 
 
-def test_phase_two_keeps_a_tenth_of_the_rate_whatever_else_is_set() -> None:
+def test_overlap_keeps_a_tenth_of_the_rate_whatever_else_is_set() -> None:
     """The paper's 1e-4 and 1e-5 hold beside other keys of the optimizer; one that is set itself counts."""
     chosen = settings_from(
         OverlapTrainingSettings, {"start": "w", "optimiser": {"steps": 2000, "decay": 3e-5}}
@@ -128,7 +128,7 @@ def test_phase_two_keeps_a_tenth_of_the_rate_whatever_else_is_set() -> None:
     assert (chosen.steps, chosen.rate, chosen.decay, chosen.warmup) == (2000, 1e-4, 3e-5, 20)
 
 
-def test_phase_two_keeps_the_network_of_phase_one(settings: RegistrationTrainingSettings, tmp_path: Path) -> None:
+def test_overlap_keeps_the_network_of_registration(settings: RegistrationTrainingSettings, tmp_path: Path) -> None:
     """Also settings that change no shape and differ from the preset: the weights that it writes tell them again."""
     changed = {"decoder": {"temperature": 0.5}, "fusion": {"image_mask": "front"}}
     start = train_registration(settings.model_copy(update={"network": changed}), tmp_path / "one")
@@ -141,13 +141,13 @@ def test_phase_two_keeps_the_network_of_phase_one(settings: RegistrationTraining
     (OverlapTrainingSettings, "frames"), (OverlapTrainingSettings, "radius"), (ImageTrainingSettings, "frames"),
     (ImageTrainingSettings, "images"),
 ])  # fmt: skip
-def test_a_setting_that_a_phase_does_not_use_is_refused(kind: type, key: str) -> None:
+def test_a_setting_that_a_phase_does_not_use_is_rejected(kind: type, key: str) -> None:
     """Frames of a place are fixed in phase two, two images of one in the image branch."""
     with pytest.raises(UsageError, match=f"unknown key data.{key}"):
         settings_from(kind, {"start": "w", "data": {key: 3}})
 
 
-def test_it_overfits_four_pairs_to_two_centimetres(packed: Path, tiny: Callable) -> None:
+def test_it_overfits_four_pairs_to_two_centimeters(packed: Path, tiny: Callable) -> None:
     """The same 4 pairs over and over are registered to 2 cm: nothing in the chain blocks the signal.
 
     Of so small a network an unlucky start may leave one pair unmatched, and which start that is changes with the order
@@ -167,15 +167,15 @@ def _overfitted(packed: Path, tiny: Callable, seed: int) -> list[float]:
     batch = data.batch(0)
     settings = RegistrationTrainingSettings(pairs=4, sets=0.0)
     plans = set_pairs_of(batch.poses, settings, 0)
-    optimiser = torch.optim.AdamW(module.parameters(), 3e-3)
+    optimizer = torch.optim.AdamW(module.parameters(), 3e-3)
     for step in range(300):
-        for group in optimiser.param_groups:
+        for group in optimizer.param_groups:
             group["lr"] = 3e-3 * min(1, (step + 1) / 20) * (1 - step / 300)
         loss, _ = module(batch.points, None, plans)
-        optimiser.zero_grad()
+        optimizer.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(module.parameters(), 1.0)
-        optimiser.step()
+        optimizer.step()
     return _errors(module, batch, plans)
 
 
@@ -189,10 +189,10 @@ def _errors(module: RegistrationTraining, batch: object, plans: tuple) -> list[f
         (plan,) = plans
         source = merge_tokens(tokens, plan.source, plan.T_source, True)
         target = merge_tokens(tokens, plan.target, plan.T_target, True)
-        answers = register_batch(module.model.decoder, source, target, module.model.decoder(source, target))
+        results = register_batch(module.model.decoder, source, target, module.model.decoder(source, target))
     return [
-        float((torch.from_numpy(answer.T_target_source[:3, 3]) - T[:3, 3]).norm())
-        for answer, T in zip(answers, plan.T_target_source, strict=True)
+        float((torch.from_numpy(result.T_target_source[:3, 3]) - T[:3, 3]).norm())
+        for result, T in zip(results, plan.T_target_source, strict=True)
     ]
 
 
@@ -267,7 +267,7 @@ def test_without_tensorboard_the_log_alone_is_written(tmp_path: Path, monkeypatc
     assert not (tmp_path / "tensorboard").exists()
 
 
-def test_phase_two_keeps_what_the_weights_say_of_phase_one(
+def test_overlap_keeps_what_the_weights_say_of_registration(
     settings: RegistrationTrainingSettings, tmp_path: Path
 ) -> None:
     """Steps and pictures of phase one, by which the SLAM knows whether to use the camera, stay; the phase is two."""

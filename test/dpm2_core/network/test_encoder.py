@@ -50,7 +50,7 @@ def test_presets_give_256_descriptors_of_128_channels(name: str, noise: np.rando
     assert np.isfinite(out.features).all()
 
 
-def test_unknown_preset_and_backbone_are_refused(tiny: Callable) -> None:
+def test_unknown_preset_and_backbone_are_rejected(tiny: Callable) -> None:
     """In one line that names the choices."""
     with pytest.raises(UsageError, match=r"network preset big: want one of small, base, paper, v1"):
         preset("big")
@@ -104,7 +104,7 @@ def test_sparse_sensors(model: DeepPointMap2, noise: np.random.Generator, beams:
 
 
 @pytest.mark.parametrize("cloud", [np.zeros((0, 3)), np.full((50, 3), np.nan), np.zeros((500, 3)), np.ones((5, 3)) * 9])
-def test_empty_scans_are_refused(model: DeepPointMap2, cloud: np.ndarray) -> None:
+def test_empty_scans_are_rejected(model: DeepPointMap2, cloud: np.ndarray) -> None:
     """Nothing in range: an error that says how much there was."""
     with pytest.raises(Dpm2Error, match=r"scan has \d+ points within"):
         model.describe(frame(cloud))
@@ -117,7 +117,7 @@ def views_of(model: DeepPointMap2, *frames: list[Image]) -> Views:
     return views
 
 
-def test_missing_picture_equals_no_camera(
+def test_missing_image_equals_no_camera(
     model: DeepPointMap2, noise: np.random.Generator, street: Callable, make_image: Callable
 ) -> None:
     """Exactly: in a batch whose other frame has a picture, the one without gives what the LiDAR alone gives."""
@@ -128,7 +128,7 @@ def test_missing_picture_equals_no_camera(
     assert (both[1] - alone[0]).abs().max() > 1e-3  # the picture is used
 
 
-def test_only_reference_points_in_view_read_the_picture(
+def test_only_reference_points_in_view_read_the_image(
     model: DeepPointMap2, noise: np.random.Generator, street: Callable, make_image: Callable
 ) -> None:
     """With one fusion layer, what lies behind the camera does not depend on the pixels."""
@@ -182,7 +182,7 @@ def test_resize_moves_the_intrinsics_with_the_pixels() -> None:
     np.testing.assert_allclose(np.linalg.solve(K_small, [u, v, 1]), before, atol=1e-9)
 
 
-def test_argmax_neighbour() -> None:
+def test_argmax_neighbor() -> None:
     """The index that `amax` would choose, in bf16 and float32, negative values included."""
     torch.manual_seed(0)
     for dtype in (torch.bfloat16, torch.float32):

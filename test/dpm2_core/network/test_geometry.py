@@ -17,7 +17,7 @@ from dpm2_core.geometry.rays import pixel_rays, point_ray_distance, project
 from dpm2_core.geometry.sampling import farthest_points, in_range, neighbours
 
 
-def test_range_refuses_what_is_not_finite() -> None:
+def test_range_rejects_what_is_not_finite() -> None:
     """NaN, inf and the origin of a lost return are outside."""
     points = np.array([[np.nan, 0, 0], [np.inf, 0, 0], [0, 0, 0], [3, 4, 0], [61, 0, 0]], np.float32)
     assert in_range(points, 1, 60).tolist() == [False, False, False, True, False]
@@ -36,7 +36,7 @@ def test_farthest_points_are_greedy(noise: np.random.Generator, n: int) -> None:
     assert (farthest_points(points, 20) == order[:20]).all()
 
 
-def test_neighbours_beyond_the_radius_repeat_the_nearest(noise: np.random.Generator) -> None:
+def test_neighbors_beyond_the_radius_repeat_the_nearest(noise: np.random.Generator) -> None:
     """Nothing farther than the radius is gathered, also where the cloud is smaller than k."""
     points = noise.uniform(-10, 10, (12, 3)).astype(np.float32)
     index = neighbours(cKDTree(points), points, 16, 5.0)

@@ -92,7 +92,7 @@ def test_loss_gradients() -> None:
     assert torch.autograd.gradcheck(lambda r, m: student_offset(r, m, torch.ones(6).double()), (residual, L))
 
 
-def test_overlap_label_is_twenty_metres() -> None:
+def test_overlap_label_is_twenty_meters() -> None:
     """A certain and right answer costs nothing, a certain and wrong one its logit."""
     distance = torch.tensor([20.0, 20.1])
     assert overlap_loss(torch.tensor([9.0, -9.0]), distance).item() < 1e-3

@@ -57,8 +57,8 @@ def test_consensus_survives_a_majority_of_wrong_matches(noise: np.random.Generat
     target = torch.where(
         bad[..., None], anywhere, pairs.target + torch.from_numpy(noise.normal(0, 0.1, (*bad.shape, 3)))
     )
-    found = first_pose(pairs._replace(target=target))
-    for estimate, truth in zip(found.numpy(), T.numpy(), strict=True):
+    result = first_pose(pairs._replace(target=target))
+    for estimate, truth in zip(result.numpy(), T.numpy(), strict=True):
         error = se3.log(se3.inverse(truth) @ estimate)
         assert np.linalg.norm(error[3:]) < 0.3  # 0.1 m of noise a point, some thirty right matches
         assert np.linalg.norm(error[:3]) < 0.03
@@ -187,14 +187,14 @@ def test_registration_of_sets_of_different_sizes(model: DeepPointMap2, noise: np
     sources = [described(model, noise, n) for n, _ in sizes]
     targets = [merge([described(model, noise, 48).moved(se3.exp(noise.normal(0, 1, 6)))] * (m // 48)) for _, m in sizes]
     together = model.register_many(sources, targets)
-    for source, target, answer in zip(sources, targets, together, strict=True):
-        assert answer.T_target_source.shape == (4, 4)
-        assert np.linalg.eigvalsh(answer.covariance).min() > 0
-        assert 0 <= answer.confidence <= 1
-        assert answer.method == "neural"
+    for source, target, result in zip(sources, targets, together, strict=True):
+        assert result.T_target_source.shape == (4, 4)
+        assert np.linalg.eigvalsh(result.covariance).min() > 0
+        assert 0 <= result.confidence <= 1
+        assert result.method == "neural"
         alone = model.register(source, target)
         # padding adds columns to bf16 products, and more pairs are kept in the larger batch
-        assert alone.confidence == pytest.approx(answer.confidence, abs=0.05)
+        assert alone.confidence == pytest.approx(result.confidence, abs=0.05)
 
 
 def test_every_pose_is_rigid_to_float64(model: DeepPointMap2, noise: np.random.Generator) -> None:
@@ -202,19 +202,19 @@ def test_every_pose_is_rigid_to_float64(model: DeepPointMap2, noise: np.random.G
     for scale in (1, 10, 100):
         sets = [described(model, noise, 90) for _ in range(12)]
         sets = [Descriptors(d.xyz * np.float32(scale), d.features) for d in sets]
-        for found in model.register_many(sets[:6], sets[6:]):
-            assert (found.T_target_source[3] == [0, 0, 0, 1]).all()
-            R = found.T_target_source[:3, :3]
+        for result in model.register_many(sets[:6], sets[6:]):
+            assert (result.T_target_source[3] == [0, 0, 0, 1]).all()
+            R = result.T_target_source[:3, :3]
             np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-14)
             assert np.linalg.det(R) > 0
 
 
 def test_too_few_descriptors_are_no_registration(model: DeepPointMap2, noise: np.random.Generator) -> None:
     """Not ok, with a reason, and no exception."""
-    answer = model.register(described(model, noise, 1), described(model, noise, 1))
-    assert not answer.ok
-    assert answer.confidence == 0
-    assert "matching descriptors" in answer.reason
+    result = model.register(described(model, noise, 1), described(model, noise, 1))
+    assert not result.ok
+    assert result.confidence == 0
+    assert "matching descriptors" in result.reason
 
 
 def test_swapping_the_heading_frame_of_a_set_changes_nothing(model: DeepPointMap2, noise: np.random.Generator) -> None:

@@ -34,7 +34,7 @@ def test_round_trip(model: DeepPointMap2, saved: Path) -> None:
     assert load_weights(model, saved)["steps"] == "3"
 
 
-def test_overlap_is_judged_after_phase_two_alone(model: DeepPointMap2, saved: Path, tmp_path: Path) -> None:
+def test_overlap_is_checked_after_overlap_alone(model: DeepPointMap2, saved: Path, tmp_path: Path) -> None:
     """An untrained head says NaN, never a figure that a gate would believe."""
     noise = np.random.default_rng(0)
     descriptors = Descriptors(
@@ -49,14 +49,14 @@ def test_overlap_is_judged_after_phase_two_alone(model: DeepPointMap2, saved: Pa
     assert 0 < trained < 1
 
 
-def test_wrong_preset_is_refused(saved: Path, tiny: Callable) -> None:
+def test_wrong_preset_is_rejected(saved: Path, tiny: Callable) -> None:
     """With both names."""
     other = DeepPointMap2(tiny().model_copy(update={"preset": "huge"}))
     with pytest.raises(UsageError, match="weights of preset tiny, the network is preset huge"):
         load_weights(other, saved)
 
 
-def test_wrong_shape_under_the_right_name_is_refused(saved: Path, tiny: Callable) -> None:
+def test_wrong_shape_under_the_right_name_is_rejected(saved: Path, tiny: Callable) -> None:
     """Also when a whole layer is missing; nothing is loaded then."""
     other = DeepPointMap2(tiny(decoder={"layers": 2}))
     before = {name: value.clone() for name, value in other.state_dict().items()}
@@ -70,7 +70,7 @@ class _Bomb:
         return (Path.touch, (Path("exploded"),))  # type: ignore[return-value]
 
 
-def test_a_pickle_is_refused_and_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_pickle_is_rejected_and_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Neither a bare pickle nor one in torch's format."""
     monkeypatch.chdir(tmp_path)
     Path("bare.safetensors").write_bytes(pickle.dumps(_Bomb()))

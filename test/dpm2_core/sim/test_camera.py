@@ -22,7 +22,7 @@ def _picture(world: World, T_world_lidar: np.ndarray, config: CameraConfig = SMA
     return render(world, config, T_world_cam, 1.0, np.random.default_rng(seed))
 
 
-def test_a_picture_is_exposed_varied_and_repeatable(city: World) -> None:
+def test_a_image_is_exposed_varied_and_repeatable(city: World) -> None:
     noisy = SMALL.model_copy(update={"noise": 2.0})
     one, same, other = (_picture(city, city.pose_at(40.0), noisy, seed) for seed in (1, 1, 2))
     assert one.shape == (96, 320, 3)
@@ -81,7 +81,7 @@ def test_white_paint_is_seen_where_the_road_has_it(highway: World) -> None:
     assert brightness(line) > brightness(line + 0.6) + 15
 
 
-def test_in_a_tunnel_only_the_picture_tells_the_motion(tunnel: World) -> None:
+def test_in_a_tunnel_only_the_image_tells_the_motion(tunnel: World) -> None:
     before, after = (_picture(tunnel, tunnel.pose_at(s)).astype(float) for s in (120.0, 120.8))
     assert np.abs(before - after).mean() > 4.0
 
@@ -109,7 +109,7 @@ def test_textures_do_not_repeat(material: Material, highway: World) -> None:
     assert np.abs(correlation).max() < 0.6
 
 
-def test_pictures_without_sky_and_without_anything_else(city: World) -> None:
+def test_images_without_sky_and_without_anything_else(city: World) -> None:
     """Looking at the ground and into the sky."""
     axes = np.array([[0, 1.0, 0], [1, 0, 0], [0, 0, -1]])
     x, y, z = city.pose_at(40.0)[:3, 3]

@@ -75,7 +75,7 @@ def test_the_number_of_workers_changes_nothing(drive: Path, tmp_path: Path) -> N
     assert _files(tmp_path / "one") == _files(drive)
 
 
-def test_a_complete_drive_is_reused_and_another_one_refused(drive: Path) -> None:
+def test_a_complete_drive_is_reused_and_another_one_rejected(drive: Path) -> None:
     before = _files(drive)
     assert not simulate(drive, frames=4, seed=3, road="loop", lidar=LIDAR, camera=CAMERA)
     assert _files(drive) == before
@@ -127,7 +127,7 @@ def test_a_killed_run_leaves_nothing_that_looks_whole_and_the_next_one_cleans_up
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
 
 
-def test_a_file_gives_its_own_frames_and_refuses_more(poses_file: Path, tmp_path: Path) -> None:
+def test_a_file_gives_its_own_frames_and_rejects_more(poses_file: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="has 235"):
         simulate(tmp_path / "out", frames=236, road=str(poses_file), images=False, lidar=LIDAR)
     simulate(tmp_path / "out", frames=60, road=str(poses_file), images=False, lidar=LIDAR)
@@ -148,7 +148,7 @@ def test_a_file_gives_its_own_frames_and_refuses_more(poses_file: Path, tmp_path
         ({"seed": -3}, "0 or more"),
     ],
 )
-def test_bad_arguments_are_refused_before_anything_is_written(tmp_path: Path, arguments: dict, message: str) -> None:
+def test_bad_arguments_are_rejected_before_anything_is_written(tmp_path: Path, arguments: dict, message: str) -> None:
     with pytest.raises(UsageError, match=message):
         simulate(tmp_path / "out", **{"frames": 2, **arguments})
     assert list(tmp_path.iterdir()) == []

@@ -91,7 +91,7 @@ def test_the_twin_is_the_scan_without_what_moves(city: World) -> None:
     assert scan.moving.sum() > 200
 
 
-def test_movers_are_labelled_as_in_semantic_kitti_and_numbered(city: World) -> None:
+def test_dynamic_objects_are_labelled_as_in_semantic_kitti_and_numbered(city: World) -> None:
     scan = _scan_at(city, *_busy(city))
     kind, number = scan.label & 0xFFFF, scan.label >> 16
     np.testing.assert_array_equal(kind >= 252, scan.moving)
@@ -103,7 +103,7 @@ def test_movers_are_labelled_as_in_semantic_kitti_and_numbered(city: World) -> N
         assert np.hypot(*extent) < 14
 
 
-def test_movers_move_and_what_stands_does_not(city: World) -> None:
+def test_dynamic_objects_move_and_what_stands_does_not(city: World) -> None:
     xy = [city.traffic.poses(t)[0] for t in (2.0, 2.1)]
     steps = np.linalg.norm(xy[1] - xy[0], axis=1)
     assert 0.03 < np.median(steps) < 3.0

@@ -97,13 +97,13 @@ def test_the_car_heads_where_the_file_says(poses_file: Path, tmp_path: Path) -> 
     ],
     ids=["short lines", "words", "empty", "nan", "standing"],
 )
-def test_bad_files_are_refused(tmp_path: Path, text: str, message: str) -> None:
+def test_bad_files_are_rejected(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "poses.txt"
     path.write_text(text)
     with pytest.raises(UsageError, match=message):
         make_road(str(path), PRESETS["city"], np.random.default_rng(0))
 
 
-def test_an_unknown_road_is_refused_with_what_there_is() -> None:
+def test_an_unknown_road_is_rejected_with_what_there_is() -> None:
     with pytest.raises(UsageError, match="straight, loop, figure8, random, or a file"):
         make_road("circle", PRESETS["city"], np.random.default_rng(0))

@@ -26,11 +26,11 @@ def dense() -> World:
 
 
 def _share_moving(world: World) -> float:
-    lidar, shares = Lidar(LIDAR), []
+    lidar, ratios = Lidar(LIDAR), []
     for time in np.linspace(1, 9, 5):
         scan = lidar.scan(world, world.drive_pose(time), time, np.random.default_rng(0))
-        shares.append(scan.moving.mean())
-    return float(np.mean(shares))
+        ratios.append(scan.moving.mean())
+    return float(np.mean(ratios))
 
 
 def test_dense_traffic_takes_a_third_of_the_points(dense: World) -> None:
@@ -66,7 +66,7 @@ def test_columns_keep_clear_of_each_other_of_the_car_and_of_what_stands(dense: W
         assert cKDTree(parked[:, :2]).query(lines)[0].min() > 1.3  # half a truck
 
 
-def test_the_note_of_a_drive_names_its_traffic_and_another_one_is_refused(tmp_path: Path) -> None:
+def test_the_note_of_a_drive_names_its_traffic_and_another_one_is_rejected(tmp_path: Path) -> None:
     out = tmp_path / "drive"
     assert simulate(out, 2, 3, "straight", images=False, lidar=LIDAR, traffic=5)
     assert json.loads((out / "sequences" / "00" / NOTE).read_text())["traffic"] == 5
@@ -76,6 +76,6 @@ def test_the_note_of_a_drive_names_its_traffic_and_another_one_is_refused(tmp_pa
 
 
 @pytest.mark.parametrize("traffic", [-1.0, 2000.0, float("nan")])
-def test_a_factor_that_cannot_be_is_refused(traffic: float) -> None:
+def test_a_factor_that_cannot_be_is_rejected(traffic: float) -> None:
     with pytest.raises(UsageError, match="--traffic"):
         build_world("straight", "city", traffic=traffic)

@@ -29,8 +29,8 @@ def test_equal_arguments_give_equal_worlds_and_other_seeds_others() -> None:
 def _low_vertices(world: World, labels: list[Label] | None = None) -> np.ndarray:
     """(N, 2) of what stands on the ground and reaches no higher than a car's sensor."""
     mesh = world.static
-    wanted = ~np.isin(mesh.label, GROUND) if labels is None else np.isin(mesh.label, labels)
-    vertices = mesh.vertices[np.unique(mesh.faces[wanted])]
+    requested = ~np.isin(mesh.label, GROUND) if labels is None else np.isin(mesh.label, labels)
+    vertices = mesh.vertices[np.unique(mesh.faces[requested])]
     return vertices[vertices[:, 2] < world.terrain.height_at(vertices[:, :2]) + 2.2, :2]
 
 
@@ -132,6 +132,6 @@ def test_poses_stand_on_the_ground_and_vary_as_asked(city: World) -> None:
         ({"seed": -1}, "0 or more"),
     ],
 )
-def test_bad_arguments_are_refused(arguments: dict, message: str) -> None:
+def test_bad_arguments_are_rejected(arguments: dict, message: str) -> None:
     with pytest.raises(UsageError, match=message):
         build_world(**arguments)

@@ -42,7 +42,7 @@ class _High:
         return (points[:, 2] > self.height).astype(np.float32) * (0.6 + 0.1 * points[:, 2])
 
 
-def test_movers_are_left_out_but_never_more_than_the_limit(points: np.ndarray) -> None:
+def test_dynamic_objects_are_left_out_but_never_more_than_the_limit(points: np.ndarray) -> None:
     high = points[:, 2] > -1
     left = DynamicObjectFilter(_High(-1.0), 0.5, 0.7)(points)  # type: ignore[arg-type]
     np.testing.assert_array_equal(left, points[~(high & (0.6 + 0.1 * points[:, 2] > 0.5))])

@@ -32,7 +32,7 @@ def test_an_empty_cloud_stays_empty() -> None:
     assert scan.source.shape == (0, 3)
 
 
-def test_impossible_settings_are_refused() -> None:
+def test_impossible_settings_are_rejected() -> None:
     with pytest.raises(UsageError, match="min_range < max_range"):
         load_settings(PreprocessSettings, overrides=["min_range=100"])
     with pytest.raises(UsageError, match="map_voxel <= source_voxel"):

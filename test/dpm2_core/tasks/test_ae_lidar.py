@@ -50,7 +50,7 @@ def test_other_sensors_fit(rows: int, columns: int) -> None:
 
 
 @pytest.mark.parametrize("rows", [8, 41])
-def test_rows_that_cannot_be_halved_are_refused(rows: int) -> None:
+def test_rows_that_cannot_be_halved_are_rejected(rows: int) -> None:
     """The message gives the number."""
     image = AeLidarImage(first=0, rows=rows)
     with pytest.raises(UsageError, match=f"images of {rows} rows; want a multiple of 8"):
@@ -64,8 +64,8 @@ def test_divergence_of_the_vae_is_that_of_its_distributions() -> None:
     images = torch.rand(3, 2, 16, 64)
     code, divergence = net.encode(images)
     mean, log_variance = net.encoder(images)[:, :, 0, 0].chunk(2, 1)
-    wanted = kl_divergence(Normal(mean, (log_variance / 2).exp()), Normal(0.0, 1.0)).sum(1)
-    torch.testing.assert_close(divergence, wanted)
+    requested = kl_divergence(Normal(mean, (log_variance / 2).exp()), Normal(0.0, 1.0)).sum(1)
+    torch.testing.assert_close(divergence, requested)
     torch.testing.assert_close(code, mean)
     net.train()
     assert not torch.equal(net.encode(images)[0], net.encode(images)[0])
@@ -107,7 +107,7 @@ def test_learns_and_can_be_loaded(pairs: Path, tmp_path: Path, variational: bool
     torch.testing.assert_close(loaded(image)[0], task.network(image)[0])
 
 
-def test_weights_of_another_task_are_refused(tmp_path: Path) -> None:
+def test_weights_of_another_task_are_rejected(tmp_path: Path) -> None:
     """The task's name is in the file."""
     shipped = Path(__file__).parents[3] / "dpm2_core" / "weights" / "small.safetensors"
     with pytest.raises(UsageError, match="not of ae_lidar"):

@@ -21,8 +21,8 @@ def test_is_what_all_distances_give(squared: bool, reduction: Literal["mean", "s
     """All pairs by cdist, in double: equal to rounding of the float32 input."""
     distance = torch.cdist(A.double(), B.double()) ** (2 if squared else 1)
     forth, back = distance.min(1)[0], distance.min(0)[0]
-    wanted = forth.sum() + back.sum() if reduction == "sum" else (forth.mean() + back.mean()) / 2
-    assert chamfer_distance(A, B, squared, reduction) == pytest.approx(float(wanted), rel=1e-9)
+    requested = forth.sum() + back.sum() if reduction == "sum" else (forth.mean() + back.mean()) / 2
+    assert chamfer_distance(A, B, squared, reduction) == pytest.approx(float(requested), rel=1e-9)
 
 
 def test_is_symmetric_and_zero_for_the_same() -> None:
@@ -38,7 +38,7 @@ def test_a_shift_of_well_separated_points_is_the_distance() -> None:
     assert chamfer_distance(grid, grid + torch.tensor([0.1, 0, 0]), squared=True) == pytest.approx(0.01, rel=1e-5)
 
 
-def test_clouds_that_cannot_be_are_refused() -> None:
+def test_clouds_that_cannot_be_are_rejected() -> None:
     """Empty, of the wrong shape, not finite: the message says which."""
     with pytest.raises(UsageError, match="first cloud has shape"):
         chamfer_distance(torch.empty(0, 3), B)

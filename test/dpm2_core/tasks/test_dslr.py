@@ -56,7 +56,7 @@ def test_other_sensors_fit(rows: int, columns: int) -> None:
     assert made.abs().max() <= 1
 
 
-def test_too_many_rows_are_refused() -> None:
+def test_too_many_rows_are_rejected() -> None:
     """The decoder makes 42."""
     with pytest.raises(UsageError, match="images of 64 rows; want at most 42"):
         Dslr(DslrSettings(image=RangeImageSettings(first=0, rows=64)))
@@ -194,7 +194,7 @@ def test_a_scan_without_points_in_the_image_is_none_and_spoils_nothing() -> None
     assert found["chamfer_m"] == pytest.approx(sum(row["chamfer_m"] for row in rows if row is not rows[1]) / 3)
 
 
-def test_what_is_no_dslr_is_refused(pairs: Path, tmp_path: Path) -> None:
+def test_what_is_no_dslr_is_rejected(pairs: Path, tmp_path: Path) -> None:
     """A pickle, another task's weights, a missing file, scans without twins."""
     torch.save({"weights": torch.ones(1)}, tmp_path / "pickle.pt")
     with pytest.raises(UsageError, match="pickled weights are never loaded"):

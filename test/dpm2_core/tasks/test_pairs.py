@@ -70,8 +70,8 @@ def test_ard16_as_points_in_slots(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read.masks[0].numpy(), near)
     assert 0 < float(read.images[0, 0].min()) <= float(read.images[0, 0].max()) < 1
     np.testing.assert_allclose(read.images[0, 0].numpy()[near] * 60.0, d[1][near], rtol=1e-5)
-    found = clouds(read, 60.0)[0]  # the columns' own azimuths: the points are where they were
-    np.testing.assert_allclose(found.numpy(), xyz[1][near][:, :3], atol=1e-3)
+    result = clouds(read, 60.0)[0]  # the columns' own azimuths: the points are where they were
+    np.testing.assert_allclose(result.numpy(), xyz[1][near][:, :3], atol=1e-3)
 
 
 def test_damage_is_named(tmp_path: Path) -> None:

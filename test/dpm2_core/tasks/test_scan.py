@@ -110,9 +110,9 @@ def test_synthetic_drives(tmp_path: Path) -> None:
     settings = TaskDriveSettings.model_validate(
         {"train": 2, "train_frames": 2, "val": 1, "val_frames": 2, "lidar": {"columns": 64, "beams": 16}}
     )
-    told: list[tuple[str, int, int]] = []
-    make_task_drives(tmp_path, settings, 1, lambda *step: told.append(step))
-    assert told[-1] == ("val/00", 2, 2)
+    info: list[tuple[str, int, int]] = []
+    make_task_drives(tmp_path, settings, 1, lambda *step: info.append(step))
+    assert info[-1] == ("val/00", 2, 2)
     train, val = (open_scans(tmp_path / which, ("labels", "static")) for which in ("train", "val"))
     assert (train.lengths, val.lengths) == ([2, 2], [2])
     clouds = [train[0].points, train[2].points, val[0].points]
@@ -120,9 +120,9 @@ def test_synthetic_drives(tmp_path: Path) -> None:
     ground, counted = ground_of(train[0])
     assert ground.float().mean() > 0.2
     assert bool(counted.all())
-    told.clear()
-    make_task_drives(tmp_path, settings, 1, lambda *step: told.append(step))
-    assert told == []
+    info.clear()
+    make_task_drives(tmp_path, settings, 1, lambda *step: info.append(step))
+    assert info == []
 
 
 def test_two_real_scans(tmp_path: Path) -> None:

@@ -54,7 +54,7 @@ def test_a_perfect_network_is_as_good_as_its_input(
     assert found["input_ate_m"] == pytest.approx(sum(alone) / 2)  # each drive is judged by its own scans
 
 
-def test_what_cannot_be_judged_is_refused(drives: Path, task: AeLidarTask, tmp_path: Path) -> None:
+def test_what_cannot_be_checked_is_rejected(drives: Path, task: AeLidarTask, tmp_path: Path) -> None:
     """No poses, a task that makes no clouds."""
     copied = tmp_path / "00"
     shutil.copytree(drives / "0" / "sequences" / "00", copied)

@@ -164,11 +164,11 @@ def test_measuring_changes_nothing(scans: TaskScans) -> None:
 def test_weights_come_back(scans: TaskScans, tmp_path: Path) -> None:
     """With the settings of the network, for the task and for the SLAM; in fp16 to its precision."""
     task = train_task("gndnet", settings(), scans, tmp_path / "out")
-    wanted = measure(task, scans)
-    assert measure(load_task("gndnet", tmp_path / "out" / WEIGHTS), scans) == wanted
+    requested = measure(task, scans)
+    assert measure(load_task("gndnet", tmp_path / "out" / WEIGHTS), scans) == requested
     save_task(task, tmp_path / "half.safetensors", {}, half=True)
     assert measure(load_task("gndnet", tmp_path / "half.safetensors"), scans)["mse"] == pytest.approx(
-        wanted["mse"], rel=0.05
+        requested["mse"], rel=0.05
     )
     net = gndnet.load(tmp_path / "out" / WEIGHTS)
     assert net.settings == task.settings.network
@@ -181,7 +181,7 @@ def test_weights_come_back(scans: TaskScans, tmp_path: Path) -> None:
         draw(task, scans, 6, tmp_path / "none.png")
 
 
-def test_wrong_weights_are_refused(scans: TaskScans, tmp_path: Path) -> None:
+def test_wrong_weights_are_rejected(scans: TaskScans, tmp_path: Path) -> None:
     """No file, a pickle, another task's, no settings, wrong ones, other shapes, NaN: each says so."""
     path = tmp_path / "w.safetensors"
     task = GroundTask(settings())

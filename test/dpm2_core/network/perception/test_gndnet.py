@@ -74,8 +74,8 @@ def test_height_above_a_slope_is_exact_between_the_cells() -> None:
     center = (torch.arange(16) + 0.5 - 8).double()
     elevation = 0.1 * center[:, None] - 0.2 * center[None, :]
     points = torch.rand(50, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64) * 14 - 7
-    wanted = points[:, 2] - (0.1 * points[:, 0] - 0.2 * points[:, 1])
-    torch.testing.assert_close(height_above(points, elevation, SMALL), wanted)
+    requested = points[:, 2] - (0.1 * points[:, 0] - 0.2 * points[:, 1])
+    torch.testing.assert_close(height_above(points, elevation, SMALL), requested)
 
 
 def test_loss_by_hand() -> None:
@@ -139,15 +139,15 @@ def test_it_learns_slopes() -> None:
     """Up to 20 %, in 200 steps; of others 95 % of the variance are explained, and what stands on them is found."""
     torch.manual_seed(0)
     net = GroundNet(SMALL)
-    optimiser = torch.optim.Adam(net.parameters(), 1e-2)
+    optimizer = torch.optim.Adam(net.parameters(), 1e-2)
     for step in range(200):
         scenes = [scene(8 * step + i, slope=0.4 * float(torch.rand(1) - 0.5)) for i in range(8)]
         pairs = [elevation_labels(points, ground, SMALL) for points, ground in scenes]
         labels, known = (torch.stack(parts) for parts in zip(*pairs, strict=True))
         loss = ground_loss(net([points for points, _ in scenes]), labels, known, SMALL)
-        optimiser.zero_grad()
+        optimizer.zero_grad()
         loss.backward()
-        optimiser.step()
+        optimizer.step()
     net.eval()
     for slope in (-0.15, 0.15):
         points, ground = scene(10_000, slope=slope)

@@ -93,7 +93,7 @@ def test_gradient_of_the_points_reaches_d_and_z() -> None:
     assert torch.autograd.gradcheck(lambda x: to_points(x, 120.0), image)
 
 
-def test_settings_that_cannot_be_are_refused() -> None:
+def test_settings_that_cannot_be_are_rejected() -> None:
     """More rows than beams, beams out of order, columns that the networks cannot halve."""
     with pytest.raises(UsageError, match=r"rows 40 to 79 of a sensor with 64 beams"):
         project(torch.zeros(1, 3), RangeImageSettings(first=40))

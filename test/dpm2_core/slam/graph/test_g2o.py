@@ -50,11 +50,11 @@ def test_round_trip_at_full_precision(tmp_path: Path, planar: bool) -> None:
 
 
 def test_an_edge_backwards_along_the_chain_is_odometry(tmp_path: Path) -> None:
-    found = read_g2o(file(tmp_path, f"EDGE_SE2 1 0 -2 0 0 {I3}", f"EDGE_SE2 1 2 2 0 0 {I3}")).graph
-    assert len(found.ends) == 0
-    np.testing.assert_allclose(found.poses[:, 0, 3], [0, 2, 4])
+    result = read_g2o(file(tmp_path, f"EDGE_SE2 1 0 -2 0 0 {I3}", f"EDGE_SE2 1 2 2 0 0 {I3}")).graph
+    assert len(result.ends) == 0
+    np.testing.assert_allclose(result.poses[:, 0, 3], [0, 2, 4])
     # 1 rad of error at the far end of 2 m shows as 2 m sideways, seen from this one.
-    np.testing.assert_allclose(found.step_covariances[1][4, 4], 1 + 2**2)
+    np.testing.assert_allclose(result.step_covariances[1][4, 4], 1 + 2**2)
 
 
 @pytest.mark.parametrize(

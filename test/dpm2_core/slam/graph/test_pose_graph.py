@@ -87,7 +87,7 @@ def test_nodes_and_loops_added_meanwhile_are_not_lost(background: PoseGraph) -> 
     relative = [se3.inverse(p[54]) @ p[64] for p in (before, after)]
     np.testing.assert_allclose(relative[0], relative[1], atol=1e-9)  # the new nodes followed the old ones
     assert background.collect(wait=True)  # the second loop was sent off by itself
-    assert all(told.kept and told.reason for told in background.loop_checks)
+    assert all(info.kept and info.reason for info in background.loop_checks)
     assert np.linalg.norm(background.poses[60, :3, 3] - background.poses[10, :3, 3]) < 0.1
 
 
@@ -136,7 +136,7 @@ def test_no_process_outlives_a_killed_program() -> None:
     pytest.fail("the optimiser's process lives on")
 
 
-def test_the_relative_covariance_of_neighbours_is_that_of_their_edge() -> None:
+def test_the_relative_covariance_of_neighbors_is_that_of_their_edge() -> None:
     graph = PoseGraph(PoseGraphSettings())
     drive(graph, 30)
     np.testing.assert_allclose(graph.relative_covariance(20, 21), STEP, rtol=1e-3, atol=1e-9)
@@ -203,4 +203,4 @@ def test_an_unsound_edge_is_rejected_and_the_graph_stays_as_it_was(bad: float) -
     graph.add_loop(0, 50, np.eye(4), LOOP)
     graph.optimize()
     assert np.isfinite(graph.poses).all()
-    assert [told.kept for told in graph.loop_checks] == [True]
+    assert [info.kept for info in graph.loop_checks] == [True]

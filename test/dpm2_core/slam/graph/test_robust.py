@@ -60,20 +60,20 @@ def test_wrong_loops_are_rejected_and_leave_no_trace(seed: int, wrong: int) -> N
     false = [(int(n), int(n + k)) for n, k in zip(a, rng.integers(15, 36, wrong), strict=True)]  # over 18 m apart
     T = se3.exp(rng.normal(size=(wrong, 6)) * [0.02, 0.02, 1.0, 1, 1, 0.1])
     both = with_loops(graph, ENDS + false, np.concatenate([right_loops(poses, ENDS), T]))
-    found = optimize(both, RobustSettings())
-    assert found.settled
-    np.testing.assert_array_equal(found.kept, np.arange(len(both.ends)) < len(ENDS))
+    result = optimize(both, RobustSettings())
+    assert result.settled
+    np.testing.assert_array_equal(result.kept, np.arange(len(both.ends)) < len(ENDS))
     # What is rejected takes no part: only where Levenberg-Marquardt stops may differ.
-    assert rmse(found.poses, clean.poses) < 0.01
+    assert rmse(result.poses, clean.poses) < 0.01
 
 
 def test_a_right_loop_comes_back_when_the_graph_has_improved() -> None:
     poses, graph = laps()
     graph = with_loops(graph, ENDS, right_loops(poses, ENDS))
     apart = np.sqrt(chain_chi2(graph, integrate(graph)))
-    found = optimize(graph, RobustSettings(odometry_sigmas=float(apart.max()) - 1e-3))  # sets one aside
-    assert found.kept.all()
-    assert found.rounds == 2
+    result = optimize(graph, RobustSettings(odometry_sigmas=float(apart.max()) - 1e-3))  # sets one aside
+    assert result.kept.all()
+    assert result.rounds == 2
 
 
 def test_few_unknowns_give_the_optimum_of_all() -> None:
@@ -103,9 +103,9 @@ def test_a_trajectory_in_another_frame_is_joined_by_the_loops_that_agree() -> No
     T = right_loops(poses, ends)
     T[1] = se3.exp([0, 0, 1, 5, 5, 0])  # one of five is wrong
     graph = with_loops(GraphData(moved, chained, steps, covariances), ends, T)
-    found = optimize(graph, RobustSettings())
-    np.testing.assert_array_equal(found.kept, [True, False, True, True, True])
-    assert rmse(found.poses, poses) < 0.6  # odometry noise: 0.02 m a step and 0.002 rad at a lever of 20 m
+    result = optimize(graph, RobustSettings())
+    np.testing.assert_array_equal(result.kept, [True, False, True, True, True])
+    assert rmse(result.poses, poses) < 0.6  # odometry noise: 0.02 m a step and 0.002 rad at a lever of 20 m
 
 
 def test_covariance_grows_along_the_chain_as_its_steps_add_up() -> None:
@@ -123,7 +123,7 @@ def test_an_empty_and_a_single_node_graph_are_solved() -> None:
     np.testing.assert_allclose(optimize(graph, RobustSettings()).poses, graph.poses, atol=1e-12)
 
 
-def test_a_covariance_that_is_none_is_refused() -> None:
+def test_a_covariance_that_is_none_is_rejected() -> None:
     poses, graph = laps()
     graph = with_loops(graph, ENDS, right_loops(poses, ENDS))
     with pytest.raises((RuntimeError, np.linalg.LinAlgError)):

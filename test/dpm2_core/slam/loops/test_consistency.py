@@ -56,7 +56,7 @@ def test_a_loop_that_agrees_with_the_odometry_needs_no_other() -> None:
     assert checked.registration.ok
 
 
-def test_a_loop_beyond_all_drift_is_refused() -> None:
+def test_a_loop_beyond_all_drift_is_rejected() -> None:
     path = straight()
     consistency = Consistency(ConsistencySettings(), path)
     T = expected(path, 0, 100)

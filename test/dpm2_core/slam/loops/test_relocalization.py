@@ -56,9 +56,9 @@ def off(found: Registration, truth: Array) -> tuple[float, float]:
 def test_found_from_one_cloud_with_other_traffic(
     relocalizer: Relocalizer, s: float, lateral: float, heading: float
 ) -> None:
-    found = relocalizer.find(seen(s, lateral, heading, time=7.0))
-    assert found.ok, found.reason
-    meters, degrees = off(found, world().pose_at(s, lateral, heading))
+    result = relocalizer.find(seen(s, lateral, heading, time=7.0))
+    assert result.ok, result.reason
+    meters, degrees = off(result, world().pose_at(s, lateral, heading))
     assert meters < 0.1
     assert degrees < 0.2
 
@@ -73,9 +73,9 @@ def test_another_street_is_not_found_and_a_wrong_hint_finds_nothing(relocalizer:
 
 
 def test_an_empty_cloud_is_no_place(relocalizer: Relocalizer) -> None:
-    found = relocalizer.find(np.zeros((0, 4), np.float32))
-    assert not found.ok
-    assert "too few" in found.reason
+    result = relocalizer.find(np.zeros((0, 4), np.float32))
+    assert not result.ok
+    assert "too few" in result.reason
 
 
 def keyframe(node: int, s: float, T_world_odom: Array, covariance: Array = FIRM, of: World | None = None) -> Keyframe:
@@ -85,7 +85,7 @@ def keyframe(node: int, s: float, T_world_odom: Array, covariance: Array = FIRM,
     return Keyframe(node, node, node, T_odom_kf, seen(s, time=3.0, of=of), edge)
 
 
-def test_localisation_tracks_notices_kidnapping_and_admits_being_lost(relocalizer: Relocalizer) -> None:
+def test_localization_tracks_notices_kidnapping_and_admits_being_lost(relocalizer: Relocalizer) -> None:
     localizer = Localizer(relocalizer)
     origin = se3.exp(np.array([0, 0, 1.0, 30, -20, 0.5]))
     first = localizer.add(keyframe(0, 55.0, origin))

@@ -34,15 +34,15 @@ def test_the_order_of_the_descriptors_does_not_matter() -> None:
     np.testing.assert_allclose(pooled(one), pooled(other), atol=1e-4)  # sums in float32
 
 
-def test_similarities_are_the_cosines_of_the_centred_vectors() -> None:
+def test_similarities_are_the_cosines_of_the_centered_vectors() -> None:
     index = PlaceIndex()
     vectors = np.array([pooled(place(seed)) for seed in range(40)], np.float64)
     for seed in range(40):
         index.append(place(seed))
     query = pooled(place(7, 0.1))
     mean = vectors.mean(0)
-    centered, wanted = vectors - mean, query - mean
-    cosine = centered @ wanted / np.linalg.norm(centered, axis=1) / np.linalg.norm(wanted)
+    centered, requested = vectors - mean, query - mean
+    cosine = centered @ requested / np.linalg.norm(centered, axis=1) / np.linalg.norm(requested)
     np.testing.assert_allclose(index.similarities(query), cosine, atol=1e-3)  # float32, as a difference of squares
 
 
@@ -58,7 +58,7 @@ def test_what_is_not_allowed_or_has_no_descriptors_is_never_found() -> None:
     assert index.nearest(pooled(place(6)), np.zeros(11, bool), 5) == []
 
 
-def test_neighbours_of_one_found_are_passed_over() -> None:
+def test_neighbors_of_one_found_are_passed_over() -> None:
     index = PlaceIndex()
     for seed in range(12):
         index.append(place(5, 0.01 * seed) if seed < 6 else place(seed))

@@ -133,7 +133,7 @@ def test_a_lap_is_closed(lap: tuple[list[Keyframe], Array]) -> None:
     np.testing.assert_allclose(last, mapper.poses[-1], atol=1e-6)
 
 
-def test_look_alikes_are_refused_with_a_reason(lap: tuple[list[Keyframe], Array]) -> None:
+def test_look_alikes_are_rejected_with_a_reason(lap: tuple[list[Keyframe], Array]) -> None:
     """The odometry claims to be back at the start, but the points come from elsewhere."""
     keyframes, _ = lap
     mapper = make_mapper(BY_POSE)

@@ -67,14 +67,14 @@ def test_a_wrong_pose_by_noise_removes_nothing_that_stands() -> None:
     assert find_moving(here, np.eye(4), others, SETTINGS).mean() < 1e-3
 
 
-def test_each_keyframe_is_judged_once() -> None:
-    window, judged = MovingWindow(MovingSettings(window=3)), []
+def test_each_keyframe_is_checked_once() -> None:
+    window, checked = MovingWindow(MovingSettings(window=3)), []
     poses = np.repeat(np.eye(4)[None], 10, 0)
     for node in range(10):
-        judged += [n for n, _ in window.add(node, scene(), poses[: node + 1])]
-        assert judged == list(range(max(node - 2, 0)))
-    judged += [n for n, _ in window.finish(poses)]
-    assert judged == list(range(10))
+        checked += [n for n, _ in window.add(node, scene(), poses[: node + 1])]
+        assert checked == list(range(max(node - 2, 0)))
+    checked += [n for n, _ in window.finish(poses)]
+    assert checked == list(range(10))
     assert list(window.finish(poses)) == []
     off = MovingWindow(MovingSettings(window=0))
     assert list(off.add(0, scene(), poses)) == []
@@ -101,15 +101,15 @@ def test_traffic_of_a_synthetic_street_is_left_out(street: list[tuple[Points, np
     for node, (points, _, T) in enumerate(street):
         mapper.add(Keyframe(node, node, node, T, points))
     mapper.finish()
-    removed = static = movers = static_removed = 0
+    removed = static = dynamic = static_removed = 0
     for node, (points, moves, _) in enumerate(street):
         left = {tuple(xyz) for xyz in np.round(mapper.clouds[node][:, :3], 2)}
         gone = np.array([tuple(xyz) not in left for xyz in np.round(mapper._clouds.whole(node)[:, :3], 2)])
         assert len(gone) == len(points)
-        removed, movers = removed + (gone & moves).sum(), movers + moves.sum()
+        removed, dynamic = removed + (gone & moves).sum(), dynamic + moves.sum()
         static_removed, static = static_removed + (gone & ~moves).sum(), static + (~moves).sum()
-    assert movers > 500
-    assert removed / movers > 0.45
+    assert dynamic > 500
+    assert removed / dynamic > 0.45
     assert static_removed / static < 1e-3
     off = make_mapper(SlamSettings.model_validate({"loops": {"enabled": False}, "map": {"moving": {"window": 0}}}))
     for node, (points, _, T) in enumerate(street[:8]):

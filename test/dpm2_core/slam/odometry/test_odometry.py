@@ -31,7 +31,7 @@ def errors(tracked: list[OdometryResult], truth: np.ndarray) -> np.ndarray:
     return np.stack([np.linalg.norm(off[:, :3, 3], axis=1), np.degrees(se3.angle(off))], 1)
 
 
-def test_follows_a_drive_to_centimetres(suburb: Drive) -> None:
+def test_follows_a_drive_to_centimeters(suburb: Drive) -> None:
     frames, truth = suburb
     tracked = run(frames)
     # 2 cm range noise on thousands of points averages out to millimetres a frame; 5 cm over 25 m leaves room for drift

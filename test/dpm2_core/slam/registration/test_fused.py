@@ -72,8 +72,8 @@ class Case:
         self.oracle.T = self.truth @ se3.exp(off)
         for name, value in oracle.items():
             setattr(self.oracle, name, value)
-        answer = self.registration.register(self.scan, self.prediction)
-        return answer, float(np.linalg.norm(answer.T_target_source[:3, 3] - self.truth[:3, 3]))
+        result = self.registration.register(self.scan, self.prediction)
+        return result, float(np.linalg.norm(result.T_target_source[:3, 3] - self.truth[:3, 3]))
 
 
 @pytest.fixture
@@ -82,55 +82,55 @@ def case(suburb: Drive) -> Case:
 
 
 def test_points_refine_the_network_where_both_agree(case: Case) -> None:
-    answer, error = case.register([0, 0, 0.001, 0.05, -0.03, 0])
-    assert (answer.ok, answer.method, answer.reason) == (True, "refined", "")
+    result, error = case.register([0, 0, 0.001, 0.05, -0.03, 0])
+    assert (result.ok, result.method, result.reason) == (True, "refined", "")
     assert error < 0.02  # the network was off by 6 cm
 
 
 def test_a_network_that_knows_less_moves_nothing(case: Case) -> None:
-    answer, _ = case.register([0, 0, 0.005, 0.3, -0.2, 0], scale=3.0)
-    assert (answer.ok, answer.method) == (True, "refined")
+    result, _ = case.register([0, 0, 0.005, 0.3, -0.2, 0], scale=3.0)
+    assert (result.ok, result.method) == (True, "refined")
     alone, _ = case.register([0, 0, 0, 0, 0, 0], size=0)
-    np.testing.assert_allclose(answer.T_target_source, alone.T_target_source, atol=1e-9)
+    np.testing.assert_allclose(result.T_target_source, alone.T_target_source, atol=1e-9)
 
 
 @pytest.mark.parametrize("silent", [{"ok": False}, {"size": 0}])
 def test_points_alone_where_the_network_is_silent(case: Case, silent: dict[str, object]) -> None:
-    answer, error = case.register([0, 0, 0, 5, 0, 0], **silent)
-    assert (answer.ok, answer.method) == (True, "geometric")
-    assert answer.reason.startswith("neural: ")
+    result, error = case.register([0, 0, 0, 5, 0, 0], **silent)
+    assert (result.ok, result.method) == (True, "geometric")
+    assert result.reason.startswith("neural: ")
     assert error < 0.02
 
 
 def test_network_alone_where_the_points_fit_nothing(case: Case) -> None:
     elsewhere = np.random.default_rng(3).uniform(-40, 40, (8000, 4)).astype(np.float32)
     case.scan = case.registration.prepare(Frame(0, elsewhere), np.zeros(6))
-    answer, error = case.register([0, 0, 0, 0.03, 0, 0])
-    assert (answer.ok, answer.method) == (True, "neural")
-    assert answer.reason.startswith("not refined: ")
+    result, error = case.register([0, 0, 0, 0.03, 0, 0])
+    assert (result.ok, result.method) == (True, "neural")
+    assert result.reason.startswith("not refined: ")
     assert error == pytest.approx(0.03)
 
 
 def test_a_network_that_is_wrong_and_sure_of_it_is_outvoted(case: Case) -> None:
-    answer, error = case.register([0, 0, 0, 0.6, 0.2, 0])
-    assert (answer.ok, answer.method) == (True, "geometric")
-    assert "m, 0.0 deg apart" in answer.reason
+    result, error = case.register([0, 0, 0, 0.6, 0.2, 0])
+    assert (result.ok, result.method) == (True, "geometric")
+    assert "m, 0.0 deg apart" in result.reason
     assert error < 0.02
 
 
 def test_the_network_leads_the_points_where_the_motion_does_not(case: Case) -> None:
     case.prediction = replace(case.prediction, starts=[case.truth @ se3.exp([0, 0, 1.5, 30, 0, 0])])
-    answer, error = case.register([0, 0, 0.001, 0.05, -0.03, 0])
-    assert (answer.ok, answer.method, answer.reason) == (True, "refined", "")
+    result, error = case.register([0, 0, 0.001, 0.05, -0.03, 0])
+    assert (result.ok, result.method, result.reason) == (True, "refined", "")
     assert error < 0.02  # the network was off by 6 cm
 
 
-def test_a_contradiction_that_nothing_settles_is_answered_with_doubt(case: Case) -> None:
+def test_a_contradiction_that_nothing_settles_is_answered_with_uncertainty(case: Case) -> None:
     case.prediction = replace(case.prediction, starts=[case.truth @ se3.exp([0, 0, 1.5, 30, 0, 0])])
-    answer, _ = case.register([0, 0, 0, 0.6, 0.2, 0])
-    assert (answer.ok, answer.method) == (True, "neural")
-    assert "apart" in answer.reason
-    assert answer.worst_sigma > 0.5  # it covers its error of 0.63 m; beyond 0.08 m the state is `degraded`
+    result, _ = case.register([0, 0, 0, 0.6, 0.2, 0])
+    assert (result.ok, result.method) == (True, "neural")
+    assert "apart" in result.reason
+    assert result.worst_sigma > 0.5  # it covers its error of 0.63 m; beyond 0.08 m the state is `degraded`
 
 
 def test_while_no_motion_is_known_the_network_gives_one_more_start(case: Case) -> None:
@@ -138,16 +138,16 @@ def test_while_no_motion_is_known_the_network_gives_one_more_start(case: Case) -
     case.prediction = Prediction([case.truth @ se3.exp([0, 0, 0, 12, 0, 0])], widen=2.0)
     _, lost = case.register([0, 0, 0, 0, 0, 0], size=0)
     assert lost > 5
-    answer, error = case.register([0, 0, 0, 0.6, 0.2, 0], size=1)
-    assert (answer.ok, answer.method) == (True, "geometric")
+    result, error = case.register([0, 0, 0, 0.6, 0.2, 0], size=1)
+    assert (result.ok, result.method) == (True, "geometric")
     assert error < 0.02
 
 
 def test_along_a_tunnel_the_network_has_it(tunnel: Drive) -> None:
     """There the points know every direction but one."""
     case = Case(tunnel)
-    answer, _ = case.register([0, 0, 0, 0.02, 0.03, 0])
-    assert (answer.ok, answer.method) == (True, "refined")
-    off = se3.log(se3.inverse(case.truth) @ answer.T_target_source)
+    result, _ = case.register([0, 0, 0, 0.02, 0.03, 0])
+    assert (result.ok, result.method) == (True, "refined")
+    off = se3.log(se3.inverse(case.truth) @ result.T_target_source)
     assert abs(off[3] - 0.02) < 0.02  # the network's own error along; points alone: decimetres
     assert abs(off[4]) < 0.02  # the network was off by 3 cm across

@@ -47,39 +47,39 @@ def error(T: Array, truth: Array) -> float:
 def test_what_the_motion_led_to_expect_needs_fewer_counterparts(occluded: Case) -> None:
     registration, scan, truth = occluded
     start = truth @ se3.exp([0, 0, 0.005, 0.1, 0.03, 0])
-    answer = registration.register(scan, Prediction([start], information=PRIOR))
-    assert 0.3 < answer.confidence < 0.5, "else the case is none"
-    assert answer.ok
-    assert error(answer.T_target_source, truth) < 0.05  # a young map of 0.5 m cells: centimetres
+    result = registration.register(scan, Prediction([start], information=PRIOR))
+    assert 0.3 < result.confidence < 0.5, "else the case is none"
+    assert result.ok
+    assert error(result.T_target_source, truth) < 0.05  # a young map of 0.5 m cells: centimetres
     guessed = registration.register(scan, Prediction([start]))
     assert not guessed.ok
     assert guessed.reason.endswith("points fit the map")
 
 
 @pytest.mark.parametrize("off", [[0, 0, 0, 2, 0, 0], [0, 0, 0, -2, 0, 0], [0, 0, 0, 0, 3, 0], [0, 0, 0.15, 2, 2, 0]])
-def test_a_wrong_prediction_in_a_map_of_one_scan_is_never_confirmed_without_doubt(
+def test_a_wrong_prediction_in_a_map_of_one_scan_is_never_confirmed_without_uncertainty(
     occluded: Case, off: list[float]
 ) -> None:
     """Along the road ground alone may fit anywhere: the covariance then says so, and the state is `degraded`."""
     registration, scan, truth = occluded
-    answer = registration.register(scan, Prediction([truth @ se3.exp(off)], information=PRIOR))
-    wrong = error(answer.T_target_source, truth)
-    assert not answer.ok or answer.worst_sigma > max(OdometrySettings().degraded_sigma, wrong / 3)
+    result = registration.register(scan, Prediction([truth @ se3.exp(off)], information=PRIOR))
+    wrong = error(result.T_target_source, truth)
+    assert not result.ok or result.worst_sigma > max(OdometrySettings().degraded_sigma, wrong / 3)
 
 
-def test_a_scan_of_elsewhere_is_refused_where_it_was_expected(occluded: Case, tunnel: Drive) -> None:
+def test_a_scan_of_elsewhere_is_rejected_where_it_was_expected(occluded: Case, tunnel: Drive) -> None:
     registration, _, truth = occluded
     elsewhere = Preprocessor(PreprocessSettings()).prepare(tunnel[0][0], np.zeros(6))
     assert not registration.register(elsewhere, Prediction([truth], information=PRIOR)).ok
 
 
-def test_the_likeliest_start_wins_whatever_its_place(suburb: Drive) -> None:
+def test_the_most_likely_start_wins_whatever_its_place(suburb: Drive) -> None:
     registration, scan, truth = make_case(suburb, 1.0)
     off = truth @ se3.exp([0, 0, 0, 6, 1, 0])  # too far to come back from
     for starts in ([off, truth], [truth, off]):
-        answer = registration.register(scan, Prediction(starts))
-        assert answer.ok
-        assert error(answer.T_target_source, truth) < 0.05
+        result = registration.register(scan, Prediction(starts))
+        assert result.ok
+        assert error(result.T_target_source, truth) < 0.05
 
 
 def test_likelihood_is_greatest_at_the_truth(suburb: Drive) -> None:

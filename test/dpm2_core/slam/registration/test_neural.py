@@ -104,10 +104,10 @@ def test_a_frame_seen_again_is_found_without_any_prior(
     place = se3.exp([0.02, 0.01, 1.3, 50.0, -20.0, 1.0])
     registration.update(scan, place)
     wrong = se3.exp([0, 0, -2.0, 900.0, 10.0, 0])
-    found = registration.register(scan, Prediction([wrong]))
-    assert (found.ok, found.method) == (True, "neural")
-    np.testing.assert_allclose(found.T_target_source, place, atol=1e-3)  # fp16 features, bf16 arithmetic
-    assert np.linalg.eigvalsh(found.covariance)[0] > 0
+    result = registration.register(scan, Prediction([wrong]))
+    assert (result.ok, result.method) == (True, "neural")
+    np.testing.assert_allclose(result.T_target_source, place, atol=1e-3)  # fp16 features, bf16 arithmetic
+    assert np.linalg.eigvalsh(result.covariance)[0] > 0
     # but where the velocity is known, to 1 m/s, what contradicts it is refused
     known = registration.register(scan, Prediction([wrong], information=np.eye(6) / 0.1**2))
     assert (known.ok, known.reason) == (False, "contradicts the motion so far")
@@ -129,7 +129,7 @@ def test_standing_still_from_the_first_frame_to_a_keyframe_with_descriptors(
     assert len(keyframe.descriptors) == 48
 
 
-def test_bad_frames_are_refused_in_words_and_survived(
+def test_bad_frames_are_rejected_in_words_and_survived(
     weights: Path, street: Street, noise: np.random.Generator
 ) -> None:
     s = SlamSettings(registration="neural", neural=NeuralSettings(weights=str(weights), min_confidence=0))
@@ -153,35 +153,35 @@ def test_unsure_matches_are_no_answer(weights: Path, street: Street, noise: np.r
     registration = make_registration(s)
     first, other = (registration.prepare(Frame(0, cloud(street(noise))), np.zeros(6)) for _ in range(2))
     registration.update(first, np.eye(4))
-    found = registration.register(other, Prediction([np.eye(4)]))
-    assert not found.ok
-    assert "confidence of only" in found.reason
+    result = registration.register(other, Prediction([np.eye(4)]))
+    assert not result.ok
+    assert "confidence of only" in result.reason
 
 
-def test_pictures_are_asked_for_and_used_where_the_network_has_a_camera(
+def test_images_are_asked_for_and_used_where_the_network_has_a_camera(
     tiny: Callable[..., NetworkSettings], street: Street, make_image: Callable[..., Image], noise: np.random.Generator
 ) -> None:
     torch.manual_seed(0)
     preprocessor = Preprocessor(PreprocessSettings())
     frame = Frame(0, cloud(street(noise)), images=(make_image(noise),))
-    for backbone, wanted in (("convnext", True), ("none", False)):
+    for backbone, requested in (("convnext", True), ("none", False)):
         model = DeepPointMap2(tiny(image={"backbone": backbone})).eval().requires_grad_(False)
         registration = NeuralScanRegistration(NeuralSettings(), preprocessor, model)
-        assert registration.uses_images is wanted
+        assert registration.uses_images is requested
         with_image, without = (
             registration.prepare(f, np.zeros(6)).descriptors for f in (frame, Frame(0, frame.points))
         )
         assert with_image is not None
         assert without is not None
-        assert np.array_equal(with_image.features, without.features) is not wanted
+        assert np.array_equal(with_image.features, without.features) is not requested
 
 
 def test_descriptors_of_a_keyframe_take_70_kb(street: Street, noise: np.random.Generator) -> None:
     torch.manual_seed(0)
     model = DeepPointMap2(preset("small")).eval().requires_grad_(False)
-    found = model.describe(Frame(0, cloud(street(noise, 20_000))))
-    assert (len(found), found.features.dtype) == (256, np.float16)
-    assert found.nbytes <= 70_000
+    result = model.describe(Frame(0, cloud(street(noise, 20_000))))
+    assert (len(result), result.features.dtype) == (256, np.float16)
+    assert result.nbytes <= 70_000
 
 
 def test_missing_weights_and_a_wrong_preset_are_errors_of_use(weights: Path) -> None:

@@ -68,9 +68,9 @@ def registered(first: Frame, second: Frame, **visual: object) -> tuple[Array, Ar
     """Pose and covariance of the second in the frame of the first, who answered, and why."""
     registration = make_registration(SlamSettings(visual=VisualSettings.model_validate(visual)))
     registration.update(registration.prepare(first, np.zeros(6)), np.eye(4))
-    answer = registration.register(registration.prepare(second, np.zeros(6)), Prediction([np.eye(4)]))
-    assert answer.ok
-    return answer.T_target_source, answer.covariance, answer.method, answer.reason
+    result = registration.register(registration.prepare(second, np.zeros(6)), Prediction([np.eye(4)]))
+    assert result.ok
+    return result.T_target_source, result.covariance, result.method, result.reason
 
 
 def test_the_way_along_a_corridor_is_read_from_its_walls() -> None:
@@ -101,7 +101,7 @@ def test_what_does_not_tell_is_not_believed(paint: Paint, why: str) -> None:
     assert np.isfinite(T).all()
 
 
-def test_without_pictures_nothing_changes() -> None:
+def test_without_images_nothing_changes() -> None:
     """Frames whose camera fails go the way they always went."""
     paint = random_paint()
     first, second = (Frame(f.stamp, f.points, index=f.index) for f in (frame(0.0, paint), frame(0.2, paint, 1)))
@@ -127,7 +127,7 @@ def test_an_odometry_that_brakes_in_a_tunnel() -> None:
     assert "degraded" in {str(t.state) for t in tracks[False]}
 
 
-def test_points_and_pictures_of_a_real_drive_agree(kitti_root: Path) -> None:
+def test_points_and_images_of_a_real_drive_agree(kitti_root: Path) -> None:
     """Asked where nothing is open, the picture moves the answer by centimetres: two measurements of one motion."""
     frames = list(open_source(kitti_root / "sequences" / "04").frames(0, 12))
     tracks = []

@@ -38,8 +38,8 @@ def recovered(path: Path) -> MapData:
 
 
 def test_a_sound_map_has_no_problems(map_file: Path, drive: list[Keyframe]) -> None:
-    found = check_map(map_file)
-    assert (found.problems, found.keyframes, found.lost) == ([], 12, 0)
+    result = check_map(map_file)
+    assert (result.problems, result.keyframes, result.lost) == ([], 12, 0)
     data = recovered(map_file)
     assert len(data.edges) == 13
     np.testing.assert_array_equal(data.poses[11], drive[11].T_odom_kf)
@@ -65,14 +65,14 @@ def test_each_kind_of_damage_is_named(map_file: Path, drive: list[Keyframe]) -> 
             90, "loop", 1, 55, np.eye(4).tobytes(), eye6, 1, 1.0, 0.1, "", "")),
         ("DELETE FROM keyframes WHERE node = 8", ()),
     )  # fmt: skip
-    found = check_map(map_file)
-    told = "\n".join(found.problems)
+    result = check_map(map_file)
+    info = "\n".join(result.problems)
     for words in (
         "keyframe 4: its optimised pose is not a finite", "keyframe 6: its payload is lost", "edges 2: its checksum",
         "edge 90: leads from 1 to 55", "keyframes lost: 8",
     ):  # fmt: skip
-        assert words in told, told
-    assert (found.keyframes, found.lost, found.lost_clouds) == (11, 1, 1)
+        assert words in info, info
+    assert (result.keyframes, result.lost, result.lost_clouds) == (11, 1, 1)
     with MapStore.open(map_file) as store, pytest.raises(Dpm2Error, match="keyframe 8 is missing; see dpm2 map check"):
         load_map(store)
     data = recovered(map_file)

@@ -248,7 +248,7 @@ def test_an_older_map_is_read_and_brought_up_to_date(tmp_path: Path, drive: list
             sql.close()
 
 
-def test_what_is_no_map_is_refused_in_one_line(tmp_path: Path, map_file: Path) -> None:
+def test_what_is_no_map_is_rejected_in_one_line(tmp_path: Path, map_file: Path) -> None:
     text, other, later = tmp_path / "a.txt", tmp_path / "other.db", map_file
     text.write_text("no map at all, but long enough to look like something")
     with sqlite3.connect(other) as sql:
