@@ -12,7 +12,7 @@ EXECUTABLES = ("slam_node", "mapper_node", "bag_player")
 
 REQUIREMENTS = [
     "numpy>=1.26,<3",  # every array
-    "scipy>=1.11,<2",  # rotations, nearest neighbours
+    "scipy>=1.11,<2",  # rotations, nearest neighbors
     "torch>=2.6,<2.14",  # the network; its CPU wheels serve, README.md
     "safetensors>=0.4,<1",  # weights: data that cannot execute code
     "small_gicp>=1.0,<2",  # scan registration, multi-threaded, without the GIL

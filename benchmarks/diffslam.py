@@ -33,7 +33,7 @@ _NOISE = 0.01  # m, that a predicted scan differs by from its target
 
 
 def bench_diffslam(options: Options) -> Report:
-    """Eight scans of a synthetic suburb, thinned to 2,048 points each; overrides are of `SlamLossSettings`."""
+    """Eight scans of a synthetic suburb, downsampled to 2,048 points each; overrides are of `SlamLossSettings`."""
     settings = load_settings(SlamLossSettings, None, options.overrides)
     settings = settings.model_copy(update={"points": POINTS})
     threads = torch.get_num_threads()

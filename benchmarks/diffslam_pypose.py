@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""pypose where it does the same as `diffslam`: registration of a known motion, by its ICP and by its LM optimiser."""
+"""pypose where it does the same as `diffslam`: registration of a known motion, by its ICP and by its LM optimizer."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def beside_pypose(scan: Tensor, T_target_source: Tensor, settings: SlamLossSetti
     """Error and time of each for a scan (N, 3) registered to itself, moved by T_target_source (4, 4), from identity.
 
     pypose's ICP is point-to-point with all distances at once, its LM is given our matches and residuals; neither has
-    weights of points, and the optimiser has no gradient and finds its Jacobian by autograd. All do `iterations` steps.
+    weights of points, and the optimizer has no gradient and finds its Jacobian by autograd. All do `iterations` steps.
     """
     try:
         import pypose

@@ -129,7 +129,7 @@ def _run(
 
 
 def errors(judge: PairSet, model: Any) -> dict[str, float]:
-    """Medians of the errors of translation, m, and rotation, deg, and the share that succeeds."""
+    """Medians of the errors of translation, m, and rotation, deg, and the fraction that succeeds."""
     rows = judge.errors(model)
     near = rows[:, 0] <= NEAR
     good = (rows[:, 2] < SUCCESS[0]) & (rows[:, 3] < SUCCESS[1])

@@ -37,7 +37,7 @@ class Outcome:
     """One method on one drive, once.
 
     Attributes:
-        poses: (N, 4, 4) of the LiDAR; ours as `dpm2 run` writes them, after optimisation of the pose graph.
+        poses: (N, 4, 4) of the LiDAR; ours as `dpm2 run` writes them, after optimization of the pose graph.
         seconds: (N,) wall time of each frame.
         cpu_seconds: of all frames and threads; other programs disturb it less.
         stages: (N,) wall time of each stage, s.
@@ -187,7 +187,7 @@ def quantiles_ms(seconds: Array) -> dict[str, float]:
 
 
 def _compare(methods: dict[str, Any]) -> None:
-    """Add our figures over the baseline's; frames a second pairwise, because neighbours in time share the machine."""
+    """Add our figures over the baseline's; frames a second pairwise, because neighbors in time share the machine."""
     if BASELINE not in methods:
         return
     baseline = methods[BASELINE]

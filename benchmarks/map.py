@@ -94,7 +94,7 @@ def crashes(folder: Path, options: Options, drive: Path | None = None) -> dict[s
     alone = folder / "alone.dpm2map"
     started = time.perf_counter()
     _run([*command, "--map", str(alone)], None)
-    duration = time.perf_counter() - started  # from the imports to the last picture
+    duration = time.perf_counter() - started  # from the imports to the last image
     rng, kills, finals = np.random.default_rng(0), [], []
     path = folder / "killed0.dpm2map"
     with_bar = track(range(kills_wanted), description="kills", transient=True, console=Console(stderr=True))
@@ -227,7 +227,7 @@ def _lap_row(mapper: Mapper, path: Path, lap: int) -> dict[str, Any]:
 
 
 def _moving(data: MapData, labels: list[Mask], settings: SlamSettings) -> dict[str, float]:
-    """Share of the points of moving things in the map before and after, of them removed, of static ones removed."""
+    """Fraction of the points of moving things in the map before and after, of them removed, of static ones removed."""
     own = [node for node in range(len(data)) if data.clouds.loan(node) is None]
     masks = {}
     for node in own:

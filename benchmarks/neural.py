@@ -181,7 +181,7 @@ def stage_times(network: DeepPointMap2, frames: Sequence[Frame]) -> dict[str, An
         clocks.append([b - a for a, b in pairwise(clock)])
         before, size = descriptors, descriptors.nbytes
     times = np.array(clocks)[1:]  # the first call allocates
-    names = ("crop and voxels", "sampling and neighbours", "pictures", "encoder", "decoder and pose")
+    names = ("crop and voxels", "sampling and neighbors", "pictures", "encoder", "decoder and pose")
     stages = {name: quantiles_ms(column) for name, column in zip(names, times.T, strict=True)}
     return {"stages_ms": {**stages, "total": quantiles_ms(times.sum(1))}, "descriptor_bytes": size}
 

@@ -71,7 +71,7 @@ def _odometry_table(drive: str, methods: Mapping[str, Any]) -> FigureTable:
 
 def _stage_table(drive: str, row: Mapping[str, Any]) -> FigureTable:
     ratio = f" Ratio of medians to KISS-ICP's: {row['ratio']:.2f}." if "ratio" in row else ""
-    title = f"{drive}: encode and register, ms a frame.{ratio}"
+    title = f"{drive}: encode and register, ms per frame.{ratio}"
     table = FigureTable(title, names=["stage"], figures=["median", "p95"])
     extra = {name: row[name] for name in ("without_camera_ms", "kiss-icp") if name in row}
     for stage, ms in {**row["stages_ms"], **extra}.items():

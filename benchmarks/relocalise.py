@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Relocalisation in a saved map: random places, headings and offsets, other traffic than when the map was made."""
+"""Relocalization in a saved map: random places, headings and offsets, other traffic than when the map was made."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def bench_relocalise(options: Options) -> Report:
 
 
 def survey(options: Options, settings: SlamSettings, file: Path, progress: Progress) -> list[Road]:
-    """Write the map of all roads, poses as they truly are: relocalisation alone is judged."""
+    """Write the map of all roads, poses as they truly are: relocalization alone is judged."""
     settings = settings.model_copy(update={"loops": settings.loops.model_copy(update={"gap": np.inf})})
     roads: list[Road] = []
     with MapStore.create(file) as store:

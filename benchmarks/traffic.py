@@ -39,10 +39,10 @@ FRAMES = 60
 LIDAR = LidarConfig(columns=1024)
 """64 beams, about 60 thousand points."""
 REGISTRATIONS = ("geometric", "neural", "refined")
-ORACLE = "true movers left out"
+ORACLE = "true dynamic objects left out"
 _ERRORS = ("rpe_trans_m", "rpe_rot_deg", "ape_rmse_m")
 LOST = 0.1
-"""A drive with a larger RPE is one that went astray, m: it held on to the traffic."""
+"""A drive with a larger RPE is one that diverged, m: it held on to the traffic."""
 
 Scans = list[tuple[Points, NDArray[np.bool_]]]
 """Points (N, 4) and which of them move (N,), frame by frame."""
@@ -125,7 +125,7 @@ def _odometry(odometry: Odometry, clouds: list[Points], truth: NDArray[np.float6
 
 
 def _summary(drives: dict[str, Any]) -> dict[str, Any]:
-    """Of each registration and method, over the drives that have it: mean, spread and median, drives astray, ratios.
+    """Of each registration and method, over the drives that have it: mean, spread and median, drives diverged, ratios.
 
     `ratio`: of means and medians to those of `none` on the same drives.
     """

@@ -83,18 +83,18 @@ class _Changed:
 
 
 def blackened(sample: Sample, index: int) -> Sample:
-    """Its pictures black: a camera that fails."""
+    """Its images black: a camera that fails."""
     return sample._replace(images=tuple(Image(np.zeros_like(i.pixels), i.camera) for i in sample.images))
 
 
 def obstructed(sample: Sample, index: int) -> Sample:
-    """Without the points behind a box near the sensor, one of a frame's own."""
+    """Without the points behind a box near the sensor, one of per frame's own."""
     hidden = hidden_by(random_box(np.random.default_rng([index, 5])), sample.cloud)
     return sample if (~hidden).sum() < _SMALLEST else sample._replace(cloud=sample.cloud[~hidden])
 
 
 def corruption(network: DeepPointMap2, options: Options) -> dict[str, Any]:
-    """Every frame with a black picture, or every frame with a box before the LiDAR, over the same pairs unharmed."""
+    """Every frame with a black image, or every frame with a box before the LiDAR, over the same pairs unharmed."""
     camera = network.encoder.image is not None
     rows = {"clean": _pairs(network, options, "mixed", options.pairs).errors(network)}
     changes = {"LiDAR obstruction 100 %": obstructed, **({"camera failure 100 %": blackened} if camera else {})}
@@ -113,7 +113,7 @@ def corruption(network: DeepPointMap2, options: Options) -> dict[str, Any]:
 def image_matters(network: DeepPointMap2, options: Options) -> dict[str, Any]:
     """Highway and tunnel, whose geometry does not tell the motion: with the camera, without, and KISS-ICP.
 
-    `descriptors` is the network alone; `neural` and `refined` are what the SLAM runs, the picture along the open
+    `descriptors` is the network alone; `neural` and `refined` are what the SLAM runs, the image along the open
     direction included.
     """
     camera = network.encoder.image is not None

@@ -89,7 +89,7 @@ def flat_fields(kind: type[Settings], prefix: str = "") -> Iterator[tuple[str, F
 def _read(path: Path) -> dict[str, Any]:
     try:
         tree = yaml.safe_load(path.read_text(encoding="utf-8"))
-        json.dumps(tree, default=str, skipkeys=True)  # refuses a mapping that holds itself through an alias
+        json.dumps(tree, default=str, skipkeys=True)  # rejects a mapping that holds itself through an alias
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror}") from None
     except _NOT_YAML as error:

@@ -42,7 +42,7 @@ class Camera:
 
 @dataclass(frozen=True, eq=False)
 class Image:
-    """One picture: pixels (H, W, 3) uint8 RGB, and the camera that took it."""
+    """One image: pixels (H, W, 3) uint8 RGB, and the camera that took it."""
 
     pixels: NDArray[np.uint8]
     camera: Camera
@@ -63,7 +63,7 @@ class Frame:
         stamp: ns since the epoch of the source.
         points: (N, 4) float32 [x, y, z in m, intensity 0..1] in the LiDAR frame; N may be 0, NaN is allowed.
         time_offset: (N,) float32 s, capture time of each point relative to `stamp`; None where the source has none.
-        images: zero, one or several pictures.
+        images: zero, one or several images.
         index: position in its source (KITTI frame number, message count of a bag).
         problem: why the scan could not be read; `points` is then empty and the frame counts as failed, not lost.
     """
@@ -112,7 +112,7 @@ class Registration:
 
 
 class State(StrEnum):
-    """Health of the odometry and of the localisation in a map, as published in /diagnostics."""
+    """Health of the odometry and of the localization in a map, as published in /diagnostics."""
 
     INITIALIZING = "initialising"
     TRACKING = "tracking"
@@ -133,7 +133,7 @@ class Keyframe:
 
     Attributes:
         id: count within its robot. robot: namespace, "" for the only one. stamp: ns. index: `Frame.index`.
-        T_odom_kf: (4, 4) pose when it was made, in the odometry frame; the pose graph holds the optimised one.
+        T_odom_kf: (4, 4) pose when it was made, in the odometry frame; the pose graph holds the optimized one.
         cloud: (M, 4) float32 sub-sampled points in its own LiDAR frame: the map and later refinement.
         edge: registration of this keyframe to the one before, T_before_this; None for the first.
         descriptors: neural ones, in its own LiDAR frame; None where the registration makes none.
@@ -151,7 +151,7 @@ class Keyframe:
 
 @dataclass(frozen=True, eq=False)
 class LoopClosure:
-    """A verified or refused loop: `registration.T_target_source` is T_from_to; `registration.ok` says accepted."""
+    """A verified or rejected loop: `registration.T_target_source` is T_from_to; `registration.ok` says accepted."""
 
     from_id: int
     to_id: int

@@ -26,11 +26,11 @@ _SUFFIX = ".dpm2map"
 
 
 class ActiveMap:
-    """It grows by keyframes, unless `localiser` is set. Methods are for one thread; any thread may read.
+    """It grows by keyframes, unless `localizer` is set. Methods are for one thread; any thread may read.
 
     Attributes:
         mapper: of the map, whether it grows or not.
-        localiser: finds the robot in a map that stays as it is; None while the map grows.
+        localizer: finds the robot in a map that stays as it is; None while the map grows.
         located: what became of the last keyframe in a map that stays as it is.
 
     Raises:
@@ -177,7 +177,7 @@ class ActiveMap:
             self.mapper.finish()
 
     def close(self) -> None:
-        """Everything that is known is in the file, which is closed; one without a keyframe is not kept."""
+        """Everything that is known is in the file, which is closed; one without per keyframe is not kept."""
         self.finish()
         if self._store is not None:
             self._store.close()

@@ -29,7 +29,7 @@ TYPE_HASH = "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020
 
 MODULE = f"tf2_msgs_s__rosidl_typesupport_c{sysconfig.get_config_var('EXT_SUFFIX')}"
 SUPPORTS = ("rosidl_typesupport_fastrtps_c", "rosidl_typesupport_introspection_c")
-"""Fast DDS wants both: the first to (de)serialise, the second to announce the type to other machines."""
+"""Fast DDS wants both: the first to (de)serialize, the second to announce the type to other machines."""
 
 
 def available() -> bool:

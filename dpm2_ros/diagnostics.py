@@ -47,7 +47,7 @@ def mapper_status(node: Node, mapper: MapperThread) -> DiagnosticStatus:
     if mapper.store_problem:
         problems.append(f"map file incomplete: {mapper.store_problem}")
     if mapper.graph_problem:
-        problems.append(f"poses not optimised: {mapper.graph_problem}")
+        problems.append(f"poses not optimized: {mapper.graph_problem}")
     text = "; ".join([f"{mapper.keyframes} keyframes, {accepted} loops", *problems])
     return status(node, "mapper", WARN if problems else OK, text, figures | {"waiting": mapper.waiting})
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What RViz and Foxglove show of the map: the optimised path, and the pose graph with its loops."""
+"""What RViz and Foxglove show of the map: the optimized path, and the pose graph with its loops."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ GRAY, GREEN, BLUE, RED = (0.7, 0.7, 0.7), (0.1, 0.8, 0.2), (0.2, 0.5, 1.0), (1.0
 
 
 def path_to_msg(poses: Array, stamps: Sequence[int], frame_id: str) -> Path:
-    """(N, 4, 4) optimised poses to nav_msgs/Path; stamps in ns."""
+    """(N, 4, 4) optimized poses to nav_msgs/Path; stamps in ns."""
     pairs = zip(stamps, poses, strict=True)
     stamped = [PoseStamped(header=header(stamp, frame_id), pose=pose_to_msg(T)) for stamp, T in pairs]
     return Path(header=header(stamps[-1] if stamps else 0, frame_id), poses=stamped)
 
 
 def pose_graph_to_msg(mapper: Mapper, stamp: int, frame_id: str) -> MarkerArray:
-    """Nodes gray, odometry edges green, accepted loops blue, refused ones red."""
+    """Nodes gray, odometry edges green, accepted loops blue, rejected ones red."""
     positions = mapper.poses[:, :3, 3]
     node = {(keyframe.robot, keyframe.id): n for n, keyframe in enumerate(mapper.keyframes)}
     ends = [((c.from_robot, c.from_id), (c.to_robot, c.to_id), c.registration.ok) for c in mapper.closures]
@@ -55,7 +55,7 @@ def pose_graph_to_msg(mapper: Mapper, stamp: int, frame_id: str) -> MarkerArray:
 
 
 def loop_to_msg(closure: LoopClosure, stamp: int, from_name: str, to_name: str) -> DiagnosticArray:
-    """What became of a loop candidate, and why: OK for an accepted one, WARN for one refused."""
+    """What became of a loop candidate, and why: OK for an accepted one, WARN for one rejected."""
     result = closure.registration
     numbers = {"confidence": result.confidence, "overlap": result.overlap, "rmse (m)": result.rmse}
     values = [KeyValue(key="method", value=result.method)]

@@ -24,7 +24,7 @@ class FrameBuilder:
     Args:
         settings: how to read the messages.
         inputs: calibration as it has come in so far.
-        complain: told of each different problem once.
+        complain: called once with each different problem.
 
     Attributes:
         image_problem: why the last image could not be used; empty if it could, or if there was none.

@@ -194,7 +194,7 @@ def received_to_msg(session: str, below: int, above: Sequence[int]) -> UInt32Mul
 
 
 def payload_to_msgs(keyframe: Keyframe, name: str, weights: str = "") -> tuple[PointCloud2, UInt8MultiArray]:
-    """Descriptors and packed cloud of a keyframe, the cloud thinned until both are within `BUDGET`."""
+    """Descriptors and packed cloud of a keyframe, the cloud downsampled until both are within `BUDGET`."""
     d = keyframe.descriptors
     descriptors = descriptors_to_msg(d, keyframe.stamp, name, weights)
     room = BUDGET - len(descriptors.data)

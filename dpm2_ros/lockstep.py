@@ -23,7 +23,7 @@ from dpm2_ros.runtime import STOP
 ODOMETRY = "dpm2/odom"
 """Topic, in the namespace of the player."""
 TIMEOUT = 10.0
-"""Seconds that a cloud waits for its odometry. A node refuses one whose stamp repeats; then the next goes out."""
+"""Seconds that a cloud waits for its odometry. A node rejects one whose stamp repeats; then the next goes out."""
 
 _Message = tuple[str, int, bytes]
 _UNSEEN, _SEEN = float("-inf"), float("inf")

@@ -34,11 +34,11 @@ from dpm2_ros.tf import TransformBroadcaster
 
 KEEP_ALL = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
 LAST_ONE = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-_NICER = 10  # steps of niceness: a tenth of the share of the odometry where both want a processor
+_NICER = 10  # steps of niceness: a tenth of the fraction of the odometry where both want a processor
 
 
 class MapperThread:
-    """Works on the map so that a loop search or an optimisation never delays the odometry.
+    """Works on the map so that a loop search or an optimization never delays the odometry.
 
     Every method may be called from any thread, and returns at once.
     """
@@ -93,7 +93,7 @@ class MapperThread:
 
     @property
     def graph_problem(self) -> str:
-        """Why the poses are not optimised, in words; empty since they were."""
+        """Why the poses are not optimized, in words; empty since they were."""
         return self._active.mapper.graph_problem
 
     @property

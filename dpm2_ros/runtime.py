@@ -19,7 +19,7 @@ from dpm2_core.errors import Dpm2Error, UsageError, printable
 from dpm2_ros.share import share_directory
 
 _SWITCH = 5e-4
-"""s until a thread must hand Python's lock on. The odometry asks for it tens of times a frame; with the usual 5 ms a
+"""s until a thread must hand Python's lock on. The odometry asks for it tens of times per frame; with the usual 5 ms a
 network in the thread of the map keeps it waiting each time."""
 _PROFILE, _NEW_NAME = "FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE"
 STOP = threading.Event()

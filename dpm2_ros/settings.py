@@ -27,7 +27,7 @@ class RosSettings(Settings):
     """How long a cloud waits for its image before it goes on without, s."""
 
     map_frame: FrameName = "map"
-    """Frame of the optimised map."""
+    """Frame of the optimized map."""
 
     odom_frame: FrameName = "odom"
     """Frame of the continuous odometry."""
@@ -56,7 +56,7 @@ class RosSettings(Settings):
     """Least time between two /dpm2/map, s; it is built only when somebody listens and it has changed."""
 
     map_max_points: int = Field(default=200_000, ge=1000, le=10_000_000)
-    """Largest /dpm2/map; a larger one is thinned evenly for publishing, not in memory and not on disk."""
+    """Largest /dpm2/map; a larger one is downsampled evenly for publishing, not in memory and not on disk."""
 
     path_period: Period = 1.0
     """Least time between two /dpm2/path and two /dpm2/pose_graph, s."""

@@ -107,7 +107,7 @@ class StaticTransforms:
 
 
 class Inputs:
-    """Clouds, images and calibration as they come in. The callbacks only put them into the synchroniser's queue.
+    """Clouds, images and calibration as they come in. The callbacks only put them into the synchronizer's queue.
 
     Attributes:
         points_topic, image_topic: full names, after remapping; no image_topic where images are not wanted.

@@ -15,7 +15,7 @@ from dpm2_ros.runtime import STOP
 
 _FRAMES = 3  # the first begins the map, the second finds the speed, the third is like all others
 _PERIOD = 100_000_000  # ns
-_SPEED = 1.0  # m a frame
+_SPEED = 1.0  # m per frame
 _SIZE = 640, 192  # pixels
 
 

@@ -49,7 +49,7 @@ def equals(said: str, true: float) -> bool:
 
 
 def test_the_figures_beside_kiss_icp_are_those_of_the_record() -> None:
-    heading = "| drive | method | RPE m | RPE deg | ATE m | t_err % | drift % | frames/s | CPU ms a frame |"
+    heading = "| drive | method | RPE m | RPE deg | ATE m | t_err % | drift % | frames/s | CPU ms per frame |"
     keys = ("rpe_trans_m", "rpe_rot_deg", "ape_rmse_m", "t_err_percent", "final_drift_percent", "fps", "cpu_ms")
     drives, seen, drive = record("geometric.json")["drives"], [], ""
     for cells in rows("README.md", heading):
@@ -63,7 +63,7 @@ def test_the_figures_beside_kiss_icp_are_those_of_the_record() -> None:
 
 def test_bold_is_what_is_best() -> None:
     """Of each drive and figure, and nothing else: the reader looks at what is bold."""
-    heading = "| drive | method | RPE m | RPE deg | ATE m | t_err % | drift % | frames/s | CPU ms a frame |"
+    heading = "| drive | method | RPE m | RPE deg | ATE m | t_err % | drift % | frames/s | CPU ms per frame |"
     drives: dict[str, list[list[str]]] = {}
     for cells in rows("README.md", heading):
         drives.setdefault(cells[0] or list(drives)[-1], []).append(cells[2:])
@@ -88,7 +88,7 @@ def test_where_kiss_icp_is_ahead_is_said() -> None:
 
 
 def test_the_card_has_the_figures_of_the_odometry() -> None:
-    heading = "| drive | registration | RPE m, deg | ATE m | drift % | t_err % | ms a frame |"
+    heading = "| drive | registration | RPE m, deg | ATE m | drift % | t_err % | ms per frame |"
     drives, seen = record("neural.json")["parts"]["odometry"]["drives"], 0
     for drive, registration, rpe, ate, drift, t_err, _ in rows(CARD, heading):
         true = drives[drive][METHODS[registration]]

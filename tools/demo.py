@@ -110,7 +110,7 @@ def _simulate(out: Path, frames: int, seed: int) -> None:
 
 
 def evaluate_replay(source: BagSource, result: Replay, out: Path) -> Outcome:
-    """Compare what came out with what went in, and with the ground truth where there is some; draws the picture."""
+    """Compare what came out with what went in, and with the ground truth where there is some; draws the image."""
     stamps = source.stamps
     found = [stamp for stamp in dict.fromkeys(stamps.tolist()) if stamp in result.poses]
     summary: dict[str, float | int | None] = {

@@ -100,7 +100,7 @@ def replay(
         points_topic: of the clouds in the bag.
         rate: speed of playing.
         parameters: of slam_node.
-        progress: told the number of frames that have come out, now and then.
+        progress: called with the number of frames that have come out, now and then.
 
     Raises:
         Dpm2Error: a process ended before its time; the message gives the end of its log.

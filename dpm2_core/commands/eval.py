@@ -74,11 +74,11 @@ def _of_drive(path: Path, settings: list[str]) -> Trajectory:
 
 
 def parse_lengths(text: str) -> tuple[float, ...]:
-    """`10,20,30` to metres."""
+    """`10,20,30` to meters."""
     try:
         lengths = tuple(float(part) for part in text.split(","))
     except ValueError:
-        raise UsageError(f"--lengths {text}: want metres separated by commas, such as 10,20,30,40,50") from None
+        raise UsageError(f"--lengths {text}: want meters separated by commas, such as 10,20,30,40,50") from None
     if not all(0 < length < float("inf") for length in lengths):
         raise UsageError(f"--lengths {text}: every length must be above 0 m")
     return lengths

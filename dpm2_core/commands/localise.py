@@ -34,7 +34,7 @@ def parse_hint(text: str) -> Array:
     try:
         x, y, yaw = (float(part) for part in text.split(","))
     except ValueError:
-        raise UsageError(f"--hint {text}: want x,y,yaw in metres and degrees, such as 12.5,-3,90") from None
+        raise UsageError(f"--hint {text}: want x,y,yaw in meters and degrees, such as 12.5,-3,90") from None
     if not np.isfinite([x, y, yaw]).all():
         raise UsageError(f"--hint {text}: not finite")
     return se3.make(se3.exp(np.array([0, 0, np.radians(yaw), 0, 0, 0]))[:3, :3], np.array([x, y, 0.0]))

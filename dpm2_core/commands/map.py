@@ -53,7 +53,7 @@ def info(path: MapFile) -> None:
         ("length", f"{_length(data):.1f} m"),
         ("extent", extent),
         ("loops", f"{sum(edge.ok for edge in loops)} accepted of {len(loops)} tried"),
-        ("size", f"{size / 1e6:.2f} MB, {size / max(len(data), 1) / 1e3:.1f} kB a keyframe"),
+        ("size", f"{size / 1e6:.2f} MB, {size / max(len(data), 1) / 1e3:.1f} kB per keyframe"),
     )
     for row in rows:
         table.add_row(*row)

@@ -20,12 +20,12 @@ from dpm2_core.tables import FigureTable
 
 def optimize(
     graph: Annotated[Path, typer.Argument(metavar="GRAPH.g2o", help="SE2 or SE3:QUAT; VERTEX lines may be absent.")],
-    out: Annotated[Path, typer.Option(help="New g2o file: optimised vertices, odometry, the loops that were kept.")],
+    out: Annotated[Path, typer.Option(help="New g2o file: optimized vertices, odometry, the loops that were kept.")],
     json_file: Annotated[
-        Path | None, typer.Option("--json", help="The figures, and for each loop the verdict and why.")
+        Path | None, typer.Option("--json", help="The figures, and for each loop the result and why.")
     ] = None,
 ) -> None:
-    """Optimise a pose graph and reject the loops that cannot be true."""
+    """Optimize a pose graph and reject the loops that cannot be true."""
     from dpm2_core.slam.graph.g2o import read_g2o, require_connected, write_g2o
     from dpm2_core.slam.graph.graph_data import total_chi2
     from dpm2_core.slam.graph.robust import RobustSettings, least_squares, optimize
@@ -72,5 +72,5 @@ def _show(graph: Path, figures: dict[str, Any], ignored: dict[str, int], settled
     for tag, count in ignored.items():
         table.add_row("ignored", f"{count} lines {tag}")
     if not settled:
-        table.add_row("note", "the verdicts had not come to rest; these are the last ones")
+        table.add_row("note", "the results had not come to rest; these are the last ones")
     Console().print(table)

@@ -49,8 +49,8 @@ def run(
     corrupt: Annotated[
         str | None,
         typer.Option(
-            help="Let sensors fail, NAME=VALUE,...: shares of frames camera (black), no_image, overexposed, "
-            "underexposed (by stops), obstruction; share of beams; extrinsic_deg, extrinsic_m, time_offset (s); seed."
+            help="Let sensors fail, NAME=VALUE,...: fractions of frames camera (black), no_image, overexposed, "
+            "underexposed (by stops), obstruction; fraction of beams; extrinsic_deg, extrinsic_m, time_offset (s); seed."
         ),
     ] = None,
     map_file: Annotated[
@@ -67,7 +67,7 @@ def run(
     config: ConfigFile = None,
     settings: Overrides = None,
 ) -> None:
-    """Run the SLAM on a recording and write trajectory, map, picture, timing and metrics."""
+    """Run the SLAM on a recording and write trajectory, map, image, timing and metrics."""
     overrides = [*(settings or []), *(["input.images=false"] if no_image else [])]
     chosen = load_settings(Config, config, overrides)
     corruption = None if corrupt is None else parse_corruption(corrupt)
@@ -166,7 +166,7 @@ def parse_range(text: str) -> tuple[int, int | None]:
 def _drive(
     source: Source, start: int, stop: int, system: SlamSystem, recorder: TrajectoryRecorder, console: Console
 ) -> tuple[dict[str, list[float]], Counter[str], float]:
-    """All frames through the system: seconds a stage and frame, who answered how often, wall time in s.
+    """All frames through the system: seconds per stage and frame, who answered how often, wall time in s.
 
     Ctrl-C ends it early.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`dpm2 show`: two scans with their matched descriptors and a picture with attention, as the network sees them."""
+"""`dpm2 show`: two scans with their matched descriptors and an image with attention, as the network sees them."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ def show(
     out: Annotated[Path, typer.Option(help="PNG to write.")] = Path("matches.png"),
     weights: Annotated[str, typer.Option(help="Name of shipped weights, or a .safetensors file.")] = "small",
     point: Annotated[
-        int | None, typer.Option(help="Reference point whose attention to the picture of b is shown.")
+        int | None, typer.Option(help="Reference point whose attention to the image of b is shown.")
     ] = None,
 ) -> None:
-    """Draw two scans from above with their matched descriptors, coloured by confidence, and how they fit.
+    """Draw two scans from above with their matched descriptors, colored by confidence, and how they fit.
 
-    With weights that have a camera, also what a reference point reads from the picture.
+    With weights that have a camera, also what a reference point reads from the image.
     """
     from dpm2_core.evaluation.image_attention import image_attention
     from dpm2_core.evaluation.matches import matches_png

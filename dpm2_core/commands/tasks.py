@@ -110,7 +110,7 @@ def eval_task(
     src: SourceArgument,
     as_json: Annotated[bool, typer.Option("--json", help="Figures as JSON on stdout.")] = False,
     picture: Annotated[Path | None, typer.Option(help="PNG of one scan to write.")] = None,
-    frame: Annotated[int, typer.Option(min=0, help="Scan of the picture, counted through all sequences.")] = 0,
+    frame: Annotated[int, typer.Option(min=0, help="Scan of the image, counted through all sequences.")] = 0,
     slam: Annotated[bool, typer.Option("--slam", help="Odometry on what the task makes, too; needs poses.")] = False,
 ) -> None:
     """Measure a trained task on scans that it has not learned from."""

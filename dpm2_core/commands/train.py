@@ -15,7 +15,7 @@ from dpm2_core.errors import UsageError
 train = typer.Typer(help="Make training data and train the network.", no_args_is_help=True)
 
 ConfigOption = Annotated[Path | None, typer.Option("--config", help="YAML; its defaults otherwise.")]
-SetOption = Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, such as optimiser.steps=2000.")]
+SetOption = Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, such as optimizer.steps=2000.")]
 OutOption = Annotated[Path, typer.Option("--out", help="Folder for checkpoint, log and weights.")]
 ResumeOption = Annotated[bool, typer.Option("--resume", help="Continue from the checkpoint in --out.")]
 
@@ -42,8 +42,8 @@ def pack(
     src: Annotated[Path, typer.Argument(help="KITTI, KITTI-360 or KITTI-CARLA folder, or a bag; with ground truth.")],
     out: Annotated[Path, typer.Argument(help="Folder of the packed drive; name it under data.packed to train on it.")],
     frames: Annotated[str, typer.Option(help="Positions a:b to pack, from 0.")] = ":",
-    preset: Annotated[str, typer.Option(help="Network preset: its crop and picture size are stored.")] = "small",
-    no_image: Annotated[bool, typer.Option("--no-image", help="Leave the pictures out.")] = False,
+    preset: Annotated[str, typer.Option(help="Network preset: its crop and image size are stored.")] = "small",
+    no_image: Annotated[bool, typer.Option("--no-image", help="Leave the images out.")] = False,
     settings: Annotated[
         list[str] | None, typer.Option("--set", help="KEY=VALUE of input, such as sequence=04.")
     ] = None,
@@ -80,7 +80,7 @@ def image(
     out: OutOption = Path("out/image"),
     resume: ResumeOption = False,
 ) -> None:
-    """The image branch alone, before phase one with pictures."""
+    """The image branch alone, before the registration training with images."""
     from dpm2_core.learning.train_image import ImageTrainingSettings, train_image
 
     reject_overwriting(out, resume)
@@ -108,7 +108,7 @@ def phase2(
     out: OutOption = Path("out/phase2"),
     resume: ResumeOption = False,
 ) -> None:
-    """Overlap head alone, on the network of phase one."""
+    """Overlap head alone, on the network of the registration training."""
     from dpm2_core.learning.train_overlap import OverlapTrainingSettings, train_overlap
 
     reject_overwriting(out, resume)

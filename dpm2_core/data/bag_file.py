@@ -39,7 +39,7 @@ class Bag:
         path: what was asked for.
         types: topic to message type, such as sensor_msgs/msg/PointCloud2.
         counts: topic to number of messages.
-        notes: what the user should be told (salvaged, damaged).
+        notes: messages for the user (salvaged, damaged).
     """
 
     path: Path

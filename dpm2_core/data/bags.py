@@ -230,7 +230,7 @@ class BagSource:
 
 def interpolate(stamps: Stamps, poses: Array, at: Stamps) -> Array:
     """Poses (M, 4, 4) known at `stamps` (M,) ns to `at` (N,): exact where known, else along the screw between the
-    neighbours; NaN outside and in gaps beyond 1 s. Returns (N, 4, 4)."""
+    neighbors; NaN outside and in gaps beyond 1 s. Returns (N, 4, 4)."""
     out = np.full((len(at), 4, 4), np.nan)
     stamps, order = np.unique(stamps, return_index=True)
     if not len(stamps):

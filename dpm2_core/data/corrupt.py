@@ -24,30 +24,30 @@ Ratio = Annotated[float, Field(ge=0, le=1)]
 
 
 class CorruptionSettings(Settings):
-    """What fails, and how often. The frames hit at a share of 0.3 are among those hit at 0.5 with the same seed."""
+    """What fails, and how often. The frames hit at a fraction of 0.3 are among those hit at 0.5 with the same seed."""
 
     seed: int = Field(0, ge=0)
     """Of everything random."""
     camera: Ratio = 0.0
-    """Share of frames with black pictures."""
+    """Fraction of frames with black images."""
     no_image: Ratio = 0.0
-    """Share of frames without pictures."""
+    """Fraction of frames without images."""
     overexposed: Ratio = 0.0
-    """Share of frames whose pictures are too bright."""
+    """Fraction of frames whose images are too bright."""
     underexposed: Ratio = 0.0
-    """Share of frames whose pictures are too dark."""
+    """Fraction of frames whose images are too dark."""
     stops: float = Field(3.0, ge=0, le=16)
     """By how much: each stop doubles or halves the light."""
     obstruction: Ratio = 0.0
-    """Share of frames in which a random box near the LiDAR hides all that is behind it."""
+    """Fraction of frames in which a random box near the LiDAR hides all that is behind it."""
     beams: Ratio = 0.0
-    """Share of the LiDAR's beams that are dead all the time; a beam is a band of 0.4 deg of elevation."""
+    """Fraction of the LiDAR's beams that are dead all the time; a beam is a band of 0.4 deg of elevation."""
     extrinsic_deg: float = Field(0.0, ge=0, le=180)
     """The calibration of every camera is turned by that much about a random axis, degrees."""
     extrinsic_m: float = Field(0.0, ge=0)
     """And shifted by that much in a random direction, m."""
     time_offset: float = Field(0.0, ge=0)
-    """Pictures come late: a frame has those of the last frame at least that old, s; none while there is none."""
+    """Images come late: a frame has those of the last frame at least that old, s; none while there is none."""
 
 
 _BAND = np.radians(0.4)  # the spacing of an HDL-64
@@ -56,14 +56,14 @@ _CAMERA, _NO_IMAGE, _OVER, _UNDER, _OBSTRUCTION, _BEAMS, _EXTRINSIC, _BOX = rang
 
 
 class Box(NamedTuple):
-    """A box: T_lidar_box (4, 4) of its centre, and half its edges (3,), m."""
+    """A box: T_lidar_box (4, 4) of its center, and half its edges (3,), m."""
 
     T_lidar_box: Array
     half: Array
 
 
 def random_box(rng: np.random.Generator) -> Box:
-    """A box of 0.5 to 3 m an edge at any angle, its surface at least 0.5 m and its centre at most 8.1 m away."""
+    """A box of 0.5 to 3 m an edge at any angle, its surface at least 0.5 m and its center at most 8.1 m away."""
     half = rng.uniform(0.25, 1.5, 3)
     distance = np.linalg.norm(half) + rng.uniform(0.5, 5.5)
     azimuth, elevation = rng.uniform(-np.pi, np.pi), rng.uniform(-0.3, 0.1)
@@ -129,7 +129,7 @@ class CorruptedSource:
                 yield self._corrupted(replace(frame, images=images), position)
 
     def _first_needed(self, start: int) -> int:
-        """With late pictures the frames before are read too, at 5 Hz or more as many as the delay is long."""
+        """With late images the frames before are read too, at 5 Hz or more as many as the delay is long."""
         return max(0, start - int(np.ceil(self._settings.time_offset * 20))) if self._settings.time_offset else start
 
     def _ratios(self) -> dict[int, float]:
@@ -138,7 +138,7 @@ class CorruptedSource:
         return dict(zip(kinds, (s.camera, s.no_image, s.overexposed, s.underexposed, s.obstruction), strict=True))
 
     def _chosen(self, kind: int, share: float) -> NDArray[np.bool_]:
-        """(len,) True for exactly that share of the frames."""
+        """(len,) True for exactly that fraction of the frames."""
         rank = self._rng(kind).permutation(len(self._source))
         return rank < round(share * len(rank))
 

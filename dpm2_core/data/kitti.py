@@ -147,7 +147,7 @@ class KittiSource:
         return out
 
     def _camera(self, calib: dict[str, Array]) -> Camera | None:
-        """The left colour camera, its size that of the first image that can be read; None without images."""
+        """The left color camera, its size that of the first image that can be read; None without images."""
         if not self._settings.images:
             return None
         paths = [path for path in map(self._image_path, self._scans) if path]
@@ -163,7 +163,7 @@ class KittiSource:
         if "P2" not in calib:
             raise UsageError(f"{self.path / 'calib.txt'}: no P2, which image_2 needs; without images it is not needed")
         K, offset = calib["P2"][:, :3], calib["P2"][:, 3]
-        # P2 = K [I | t] with t from the left grey camera 0, which the poses and Tr refer to.
+        # P2 = K [I | t] with t from the left gray camera 0, which the poses and Tr refer to.
         T_cam2_cam0 = se3.make(np.eye(3), np.linalg.solve(K, offset))
         return Camera(K, se3.inverse(T_cam2_cam0 @ self.T_cam_lidar), size, name="camera_color_left")
 
@@ -184,7 +184,7 @@ class KittiSource:
 
 
 def read_calib(path: Path) -> dict[str, Array]:
-    """P0..P3 (3, 4) and Tr (4, 4, LiDAR to left grey camera), those that a calib.txt has; nothing if there is none.
+    """P0..P3 (3, 4) and Tr (4, 4, LiDAR to left gray camera), those that a calib.txt has; nothing if there is none.
 
     Raises:
         UsageError: a line is damaged; the message names it.

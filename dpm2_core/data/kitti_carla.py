@@ -31,7 +31,7 @@ class KittiCarlaSource:
     """One town, by its folder, its `generated` folder, or the root and `input.sequence` (such as Town01).
 
     A sweep is as measured: each point is in the frame of the LiDAR at its own time. The stamp is that of the first
-    point, which is also when the picture was taken. There is no intensity: the points have the cosine of the angle of
+    point, which is also when the image was taken. There is no intensity: the points have the cosine of the angle of
     incidence in its place.
 
     Raises:
@@ -109,7 +109,7 @@ class KittiCarlaSource:
             self.notes.append(f"{self.folder}: images are left out: there is no lidar_to_cam0.txt")
             return None
         focal = size[0] / 2 / np.tan(np.radians(_FIELD_OF_VIEW / 2))
-        # The principal point is the middle of the picture; pixel centres are at integers here.
+        # The principal point is the middle of the image; pixel centers are at integers here.
         K = np.array([[focal, 0, size[0] / 2 - 0.5], [0, focal, size[1] / 2 - 0.5], [0, 0, 1]])
         return Camera(K, se3.inverse(self.T_cam_lidar), size, name="cam0")
 

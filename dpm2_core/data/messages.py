@@ -129,7 +129,7 @@ def decode_points(
 
     Raises:
         MessageError: x, y or z, or the time field asked for, is missing (the message lists the fields there are), or
-            `cloud_view` refused the layout.
+            `cloud_view` rejected the layout.
     """
     check_cloud(msg)
     available = [field.name for field in msg.fields]

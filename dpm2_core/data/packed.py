@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Drives packed for training: cropped clouds as 2 mm integers, poses and small pictures, memory-mapped."""
+"""Drives packed for training: cropped clouds as 2 mm integers, poses and small images, memory-mapped."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FORMAT = 1
 
 
 class Sample(NamedTuple):
-    """One frame: cloud (N, 3) float32 m, cropped; T_world_lidar (4, 4); pictures."""
+    """One frame: cloud (N, 3) float32 m, cropped; T_world_lidar (4, 4); images."""
 
     cloud: NDArray[np.float32]
     pose: Array
@@ -31,7 +31,7 @@ class Sample(NamedTuple):
 def write_packed(folder: Path, samples: Sequence[Sample], about: dict[str, object]) -> None:
     """Write the drive; a killed run leaves nothing that looks whole.
 
-    Every frame has the same number of pictures of the same size. `about` says where the drive is from.
+    Every frame has the same number of images of the same size. `about` says where the drive is from.
     """
     part = folder.with_name(folder.name + ".part")
     shutil.rmtree(part, ignore_errors=True)

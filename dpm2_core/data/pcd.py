@@ -37,7 +37,7 @@ def write_pcd(path: Path | str, points: Points) -> None:
 
 
 def write_las(path: Path | str, points: Points) -> None:
-    """Write (N, 4) as LAS 1.4, point format 6: millimetres, intensities scaled to 0..65535.
+    """Write (N, 4) as LAS 1.4, point format 6: millimeters, intensities scaled to 0..65535.
 
     Raises:
         MissingPackageError: laspy is not installed. Dpm2Error: the file could not be written.

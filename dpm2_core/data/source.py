@@ -14,7 +14,7 @@ class Source(Protocol):
 
     Attributes:
         name: what reports call it, such as "04" or the bag's file name.
-        notes: what the user should be told once (a missing Tr, topics chosen), in words. Reading frames may add to it.
+        notes: messages for the user, each once (a missing Tr, topics chosen), in words. Reading frames may add to it.
         truth: what `poses` are read from, a file below the data set's root or a topic; empty without any.
     """
 

@@ -158,7 +158,7 @@ def matched(gt: Trajectory, est: Trajectory, tolerance: float = 0.01) -> tuple[A
 
 
 def _period(keys: Keys) -> float:
-    """Median step between neighbours."""
+    """Median step between neighbors."""
     return float(np.median(np.diff(keys))) if len(keys) > 1 else 0.0
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A window of clouds as users have them, checked, thinned and padded to one tensor."""
+"""A window of clouds as users have them, checked, downsampled and padded to one tensor."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 from dpm2_core.errors import UsageError
 
 MIN_POINTS = 50
-"""A scan of fewer is refused: ten of them make one normal."""
+"""A scan of fewer is rejected: ten of them make one normal."""
 _CELLS = 2**20  # along each axis; a cell index of three axes fits into 63 bits
 
 

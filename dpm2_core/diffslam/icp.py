@@ -143,10 +143,10 @@ def _irls_weight(r: Tensor, settings: IcpSettings) -> Tensor:
 
 
 def _normals(points: Tensor, weights: Tensor, search: NeighborSearch, k: int) -> Tensor:
-    """Unit normals (B, N, 3) by weighted PCA over the k nearest of each point; z where a point has no neighbours.
+    """Unit normals (B, N, 3) by weighted PCA over the k nearest of each point; z where a point has no neighbors.
 
     With the gradient of the eigenvector to first order: without it the slope by one point is a third off. The gap to
-    the other eigenvalues is kept from zero, where a neighbourhood is a line and has no normal.
+    the other eigenvalues is kept from zero, where a neighborhood is a line and has no normal.
     """
     at = points.detach()
     index = search.nearest(torch.where(weights.detach()[..., None] > 0, at, torch.zeros_like(at)), k)

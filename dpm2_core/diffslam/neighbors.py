@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nearest neighbours in a batch of padded clouds, without gradient: a k-d tree on the CPU, all distances on a GPU."""
+"""Nearest neighbors in a batch of padded clouds, without gradient: a k-d tree on the CPU, all distances on a GPU."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class NeighborSearch:
         rows = max(1, _CHUNK // (B * N))
         found = []
         for part in queries.split(rows, 1):
-            # The fast form, |a|^2 + |b|^2 - 2ab, loses centimetres 100 m away.
+            # The fast form, |a|^2 + |b|^2 - 2ab, loses centimeters 100 m away.
             distance = torch.cdist(part, self._points, compute_mode="donot_use_mm_for_euclid_dist")
             distance, index = distance.topk(min(k, N), largest=False) if k > 1 else distance.min(-1, keepdim=True)
             found.append(torch.where(distance.isfinite(), index, index[..., :1]))

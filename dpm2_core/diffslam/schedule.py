@@ -14,7 +14,7 @@ _LEAST = 1e-12  # a SLAM loss of zero needs no bound
 
 
 class ScheduleSettings(Settings):
-    """L = L_model + gamma L_slam in every k-th epoch, the second term bounded by a share of the first."""
+    """L = L_model + gamma L_slam in every k-th epoch, the second term bounded by a fraction of the first."""
 
     gamma: float = Field(default=0.0, ge=0)
     """Weight of the SLAM loss; choose it so that the gradient of gamma L_slam is about half of that of L_model when it
@@ -24,8 +24,8 @@ class ScheduleSettings(Settings):
     begin: int = Field(default=0, ge=0)
     """Epochs before the first k: a network that knows nothing yet makes no clouds that a SLAM could run on."""
     most: float | None = Field(default=0.5, gt=0)
-    """Largest share of L_model that gamma L_slam may have in a step. Where a registration is lost, its error would be
-    the whole step, and it is heavy-tailed. None: no bound, eq. 1 as it is in the paper."""
+    """Largest fraction of L_model that gamma L_slam may have in a step. Where a registration is lost, its error would
+    be the whole step, and it is heavy-tailed. None: no bound, eq. 1 as it is in the paper."""
 
 
 def is_due(epoch: int, settings: ScheduleSettings) -> bool:

@@ -62,7 +62,7 @@ class Residuals(Protocol):
 
 
 class Problem(Protocol):
-    """What `solve` minimises."""
+    """What `solve` minimizes."""
 
     def associate(self, T: Tensor) -> Residuals:
         """The residuals around T (B, K, 4, 4); which points belong together is found without gradient."""

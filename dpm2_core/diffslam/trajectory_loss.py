@@ -32,13 +32,13 @@ class SlamLossSettings(Settings):
     points: int = Field(default=2048, ge=50)
     """Of a scan, at most."""
     voxel: float = Field(default=0.5, gt=0)
-    """A scan of more points is thinned to one in each voxel of this edge first, m."""
+    """A scan of more points is downsampled to one in each voxel of this edge first, m."""
     spans: tuple[int, ...] = Field(default=(1,), min_length=1)
     """Scans this far apart are registered. More than one span makes a pose graph, which is relaxed."""
     graph: SoftLmSettings = SoftLmSettings(iterations=5)
     """Of that relaxation."""
     rotation_weight: float = Field(default=25.0, ge=0)
-    """Squared metres that a squared radian counts for, m2 / rad2."""
+    """Squared meters that a squared radian counts for, m2 / rad2."""
     warm_start: bool = False
     """Both trajectories start where that of the target scans has ended, instead of at the guess: for scans so far apart
     that the iterations do not converge from there. What has not converged has a gradient that says little."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures: a run (map, estimated and true trajectory from above), and how often methods register pairs."""
+"""Images: a run (map, estimated and true trajectory from above), and how often methods register pairs."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def trajectory_png(
     Args:
         est: (N, 4, 4) poses in the map frame, z up.
         gt: (N, 4, 4) of the same frames, NaN where unknown, in any world frame: aligned by its positions.
-        cloud: (M, 3+) map points in the map frame, m; coloured by height.
+        cloud: (M, 3+) map points in the map frame, m; colored by height.
 
     Raises:
         Dpm2Error: the file could not be written.
@@ -66,7 +66,7 @@ def trajectory_png(
 
 
 def success_png(path: Path | str, kinds: Mapping[str, Mapping[str, Mapping[str, Any]]], title: str = "") -> None:
-    """Bars of the share of pairs that each method registers, one group a kind of pair, with the median errors.
+    """Bars of the fraction of pairs that each method registers, one group a kind of pair, with the median errors.
 
     Args:
         kinds: kind, method, and its figures `success` 0..1 and `median_m`, m (None where most have no answer).
@@ -115,7 +115,7 @@ def _bounds(positions: Array, cloud: Points | None) -> tuple[Array, Array]:
 
 
 def _raster(cloud: Points, positions: Array, low: Array, high: Array) -> NDArray[np.float64]:
-    """(H, W, 3) picture of the points: hue from the highest in each pixel, brightness from how many there are.
+    """(H, W, 3) image of the points: hue from the highest in each pixel, brightness from how many there are.
 
     Heights count from the nearest of the (N, 3) positions of the LiDAR: a street on a hill must not outshine houses
     in the valley. Pixels are no finer than the spacing of the points, so that surfaces look like surfaces.
@@ -143,7 +143,7 @@ def _raster(cloud: Points, positions: Array, low: Array, high: Array) -> NDArray
 
 
 def _scale_bar(axes: Axes, low: Array, high: Array) -> None:
-    """A bar of 1, 2 or 5 times a power of ten metres, about a sixth of the width."""
+    """A bar of 1, 2 or 5 times a power of ten meters, about a sixth of the width."""
     width = high[0] - low[0]
     decade = 10.0 ** np.floor(np.log10(width / 6))
     length = decade * max(step for step in (1, 2, 5) if step * decade <= width / 6)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the network looks: the attention of a reference point to the picture (the paper's Figure 7).
+"""Where the network looks: the attention of a reference point to the image (the paper's Figure 7).
 
 The network keeps no attention weights, since that would cost time and memory in every frame. They are computed again
 here from what the last fusion layer's image attention was given and its own projections.
@@ -31,11 +31,11 @@ _INK, _CHOSEN = "#c9d1d9", "#ff9f1c"
 
 @dataclass(frozen=True, eq=False)
 class ImageAttention:
-    """What a frame's descriptors read from its first picture.
+    """What a frame's descriptors read from its first image.
 
     Attributes:
         pixels: (H, W, 3) uint8, as the network sees it.
-        points: (N, 3) reference points, m. uv: (N, 2) where they are in the picture, pixels. seen: (N,) whether in it.
+        points: (N, 3) reference points, m. uv: (N, 2) where they are in the image, pixels. seen: (N,) whether in it.
         chosen: one of them. heat: (H, W) 0..1, its attention, the mean of all heads, per pixel; 1 is the most.
     """
 
@@ -49,11 +49,11 @@ class ImageAttention:
 
 @torch.inference_mode()
 def image_attention(model: DeepPointMap2, frame: Frame, point: int | None = None) -> ImageAttention:
-    """Attention of one reference point in the last layer; by default of the one nearest to the middle of the picture.
+    """Attention of one reference point in the last layer; by default of the one nearest to the middle of the image.
 
     Raises:
-        UsageError: weights without a camera or without attention to it, a frame without a picture, no such point, or
-            none in the picture.
+        UsageError: weights without a camera or without attention to it, a frame without an image, no such point, or
+            none in the image.
     """
     encoder = model.encoder
     attention = None if encoder.fusion is None else encoder.fusion.layers[-1].image
@@ -61,7 +61,7 @@ def image_attention(model: DeepPointMap2, frame: Frame, point: int | None = None
         raise UsageError("these weights have no camera branch with attention, so there is none to show")
     views = collate_views([frame.images[:1]], encoder.settings.image)
     if views is None:
-        raise UsageError(f"frame {frame.index} has no picture")
+        raise UsageError(f"frame {frame.index} has no image")
     points = collate([build_pyramid(crop(frame.points, encoder.settings.points), encoder.settings)])
     given: list[Any] = []
     hook = attention.register_forward_pre_hook(lambda module, arguments: given.append(arguments))
@@ -77,11 +77,11 @@ def image_attention(model: DeepPointMap2, frame: Frame, point: int | None = None
     height, width = encoder.settings.image.size
     if point is None:
         if not seen.any():
-            raise UsageError(f"no reference point of frame {frame.index} is in its picture")
+            raise UsageError(f"no reference point of frame {frame.index} is in its image")
         off = np.linalg.norm(uv - [width / 2, height / 2], axis=1)
         point = int(np.where(seen, off, np.inf).argmin())
     elif not 0 <= point < len(seen) or not seen[point]:
-        raise UsageError(f"point {point}: want one in the picture: {', '.join(map(str, np.flatnonzero(seen)))}")
+        raise UsageError(f"point {point}: want one in the image: {', '.join(map(str, np.flatnonzero(seen)))}")
     weights = attention_weights(attention, *given[-1])[0, :, point].mean(0)
     sizes = [m.features.shape[-2:] for m in encoded.maps]
     heat = np.zeros((height, width), np.float32)
@@ -114,13 +114,13 @@ def attention_weights(
 
 
 def _projected(xyz: Tensor, views: Any) -> Array:
-    """(N, 2) pixels of reference points (1, N, 3) in the first picture."""
+    """(N, 2) pixels of reference points (1, N, 3) in the first image."""
     uv, _ = project(xyz, views.K[:, 0].float(), views.T_lidar_cam[:, 0].float())
     return uv[0].cpu().numpy().astype(np.float64)
 
 
 def draw_attention(axes: Any, looked: ImageAttention) -> None:
-    """The picture with its reference points, and over it the attention of the chosen one."""
+    """The image with its reference points, and over it the attention of the chosen one."""
     gray = looked.pixels.mean(2, keepdims=True) / 255 * 0.7
     color = cv2.cvtColor(
         cv2.applyColorMap((255 * looked.heat).astype(np.uint8), cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB

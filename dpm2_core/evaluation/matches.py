@@ -32,7 +32,7 @@ def matches_png(
         source, target: (N, 3+) points of the two scans, each in its own frame, m.
         matched: positions (K, 3) in the source, (K, 3) in the target, and confidence (K,) 0..1 of each match.
         found: T_target_source.
-        looked: what to draw of the source's picture; None: nothing.
+        looked: what to draw of the source's image; None: nothing.
 
     Raises:
         Dpm2Error: the file could not be written.
@@ -42,7 +42,7 @@ def matches_png(
         from matplotlib.collections import LineCollection
         from matplotlib.figure import Figure
 
-    low = 0.0 if looked is None else 0.43  # the picture's share of the height, below the scans
+    low = 0.0 if looked is None else 0.43  # the image's fraction of the height, below the scans
     figure = Figure(figsize=(18, 7.2 / (1 - low)), dpi=110, facecolor=_BACKGROUND)
 
     def place(left: float, width: float) -> tuple[float, float, float, float]:

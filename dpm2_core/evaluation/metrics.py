@@ -136,7 +136,7 @@ def ape_rmse(gt: Array, est: Array) -> float:
 
 
 def rpe(gt: Array, est: Array) -> tuple[float | None, float | None]:
-    """Mean error from one frame to the next: translation m, rotation degrees; None without two known neighbours."""
+    """Mean error from one frame to the next: translation m, rotation degrees; None without two known neighbors."""
     both = known(gt) & known(est)
     first = np.flatnonzero(both[:-1] & both[1:])
     if not len(first):

@@ -12,7 +12,7 @@ from dpm2_core.geometry.voxel import voxel_first
 
 SPACING = 1.5  # m between two edges
 _NEIGHBOURS, _RADIUS = 16, 1.5  # m
-_LENGTH = 1.0  # m that the neighbourhood of an edge spans vertically, at least
+_LENGTH = 1.0  # m that the neighborhood of an edge spans vertically, at least
 _GAP = 0.5  # m between heights seen of an edge, at most: between sparser beams it is a guess where an edge is
 _SCORE = 0.2  # least of an edge: an upright patch five points high and four wide
 _CELL = 0.45  # m, of the columns that may hold an edge, and of the grid that thins them: an edge has many candidates
@@ -22,7 +22,7 @@ _KEPT = 16  # best candidates for each edge wanted: more than are within the spa
 def vertical_edges(cloud: Points, tree: cKDTree, most: int) -> Points:
     """Up to `most` (k, 3) places on vertical edges and poles, the clearest first, `SPACING` m apart.
 
-    A place is the mean of 16 neighbours whose extent is linear and vertical. Sparse beams, and places without vertical
+    A place is the mean of 16 neighbors whose extent is linear and vertical. Sparse beams, and places without vertical
     structure, give fewer or none: each must have been seen at heights no farther apart than 0.5 m, over 1 m.
 
     Args:
@@ -33,7 +33,7 @@ def vertical_edges(cloud: Points, tree: cKDTree, most: int) -> Points:
     if most <= 0 or not len(candidates):
         return np.zeros((0, 3), np.float32)
     distance, index = tree.query(candidates, _NEIGHBOURS)
-    index = np.where(distance <= _RADIUS, index, index[:, :1])  # a missing neighbour has distance inf
+    index = np.where(distance <= _RADIUS, index, index[:, :1])  # a missing neighbor has distance inf
     height = np.sort(cloud[index, 2], 1)
     known = (height[:, -1] - height[:, 0] >= _LENGTH) & (np.diff(height, axis=1).max(1) <= _GAP)
     around = cloud[index[known]] - candidates[known, None]
@@ -46,7 +46,7 @@ def vertical_edges(cloud: Points, tree: cKDTree, most: int) -> Points:
 
 
 def verticality(centered: NDArray[np.floating]) -> NDArray[np.float64]:
-    """(N,) 0..1 of (N, k, 3) neighbourhoods about their means: 1 is a vertical line, 0 a patch without a direction.
+    """(N,) 0..1 of (N, k, 3) neighborhoods about their means: 1 is a vertical line, 0 a patch without a direction.
 
     (sqrt l1 - sqrt l2) / sqrt l1 with the largest eigenvalues of the covariance, times the vertical part of the axis.
     """

@@ -8,7 +8,7 @@ from torch import Tensor
 
 
 def weighted_kabsch(source: Tensor, target: Tensor, weights: Tensor) -> Tensor:
-    """T_target_source that minimises sum w |target - T source|^2.
+    """T_target_source that minimizes sum w |target - T source|^2.
 
     A reflection is never returned. Where the weights sum to zero the transform is that of the plain centroids.
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Least-squares planes through many small neighbourhoods at once."""
+"""Least-squares planes through many small neighborhoods at once."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ Array = NDArray[np.float64]
 
 
 def fit_planes(neighborhoods: Array) -> tuple[Array, Array]:
-    """Unit normals (N, 3) and variances along them (N,), m2, of (N, k, 3) neighbourhoods.
+    """Unit normals (N, 3) and variances along them (N,), m2, of (N, k, 3) neighborhoods.
 
     The smallest eigenvector of each covariance in closed form (trigonometric solution of the characteristic cubic),
-    six times faster than batched `eigh`. A neighbourhood without any extent gets the normal (0, 0, 1), variance 0.
+    six times faster than batched `eigh`. A neighborhood without any extent gets the normal (0, 0, 1), variance 0.
     """
     centered = neighborhoods - neighborhoods.mean(1, keepdims=True)
     C = centered.transpose(0, 2, 1) @ centered / neighborhoods.shape[1]

@@ -13,7 +13,7 @@ def pixel_rays(uv: Tensor, K: Tensor, T_lidar_cam: Tensor) -> tuple[Tensor, Tens
     A direction is rotated only, it has no translation: the paper's equation 5 prints (u, u, 1, 1) and means (u, v, 1).
 
     Args:
-        uv: (T, 2) pixel coordinates, the centre of the first pixel being (0, 0).
+        uv: (T, 2) pixel coordinates, the center of the first pixel being (0, 0).
         K: (B, 3, 3) intrinsics, pixels.
         T_lidar_cam: (B, 4, 4) camera to LiDAR, m.
 

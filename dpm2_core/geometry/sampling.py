@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Point sampling in numpy: range crop, farthest points, hybrid neighbour query."""
+"""Point sampling in numpy: range crop, farthest points, hybrid neighbor query."""
 
 from __future__ import annotations
 
@@ -45,9 +45,9 @@ def interleaved(points: Points, special: Points, first: int) -> Points:
 
 
 def neighbours(tree: cKDTree, queries: Points, k: int, radius: float) -> Index:
-    """(M, k) indices of the neighbours of each query, nearest first; those beyond `radius` m repeat the nearest.
+    """(M, k) indices of the neighbors of each query, nearest first; those beyond `radius` m repeat the nearest.
 
-    The hybrid of a ball query and k nearest neighbours. The tree holds at least one point.
+    The hybrid of a ball query and k nearest neighbors. The tree holds at least one point.
     """
     distance, index = tree.query(queries, [*range(1, k + 1)])
-    return np.where(distance <= radius, index, index[:, :1])  # a missing neighbour has distance inf
+    return np.where(distance <= radius, index, index[:, :1])  # a missing neighbor has distance inf

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Augmentation of one sample: occlusion, drops, rigid motion with its pose and extrinsics, and the pictures."""
+"""Augmentation of one sample: occlusion, drops, rigid motion with its pose and extrinsics, and the images."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ class AugmentSettings(Settings):
     """Deviation of the origin's translation, m. Sideways shifts take the origin away from the sensor: they suit the
     networks that work in the sensor's axes only (3, 3, 1.5 there)."""
     image_drop: float = Field(0.15, ge=0, le=1)
-    """Probability that all pictures of a frame are missing."""
+    """Probability that all images of a frame are missing."""
     image_black: float = Field(0.05, ge=0, le=1)
-    """Probability that a picture is black."""
+    """Probability that an image is black."""
     exposure: float = Field(0.3, ge=0)
     """Deviation of the logarithm of exposure."""
     colour: float = Field(0.08, ge=0)
-    """Deviation of the logarithm of each colour's gain."""
+    """Deviation of the logarithm of each color's gain."""
     extrinsic_rotation: float = Field(0.002, ge=0)
     """Deviation of the error of the extrinsics, rad."""
     extrinsic_translation: float = Field(0.01, ge=0)
@@ -104,7 +104,7 @@ def _occlude(cloud: Cloud, settings: AugmentSettings, noise: np.random.Generator
 
 
 def augment_image(image: Image, T_new_old: Array, settings: AugmentSettings, noise: np.random.Generator) -> Image:
-    """Exposure, colour and black-out of the pixels; extrinsics moved with the LiDAR frame and slightly wrong."""
+    """Exposure, color and black-out of the pixels; extrinsics moved with the LiDAR frame and slightly wrong."""
     gain = np.exp(noise.normal(0, settings.exposure) + noise.normal(0, settings.colour, 3))
     if noise.random() < settings.image_black:
         gain = np.zeros(3)

@@ -18,7 +18,7 @@ FORMAT = 1
 
 
 def save_checkpoint(path: Path, module: nn.Module, ema: nn.Module, optimiser: torch.optim.Optimizer, step: int) -> None:
-    """Weights, averaged weights, optimiser and step. Everything random follows from seed and step."""
+    """Weights, averaged weights, optimizer and step. Everything random follows from seed and step."""
     state = {
         "format": FORMAT,
         "module": module.state_dict(),
@@ -41,7 +41,7 @@ def load_checkpoint(path: Path, module: nn.Module, ema: nn.Module, optimiser: to
         state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)  # executes nothing
     except (OSError, RuntimeError, ValueError, EOFError) as error:
         raise UsageError(f"{path}: no checkpoint: {error}") from None
-    except Exception as error:  # weights_only refuses pickled code with pickle.UnpicklingError
+    except Exception as error:  # weights_only rejects pickled code with pickle.UnpicklingError
         raise UsageError(f"{path}: not a checkpoint of this program: {str(error).splitlines()[0]}") from None
     try:
         module.load_state_dict(state["module"])

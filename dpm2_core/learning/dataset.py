@@ -67,7 +67,7 @@ class Batch(NamedTuple):
     """Frames of G places, F each, in the order place by place.
 
     Attributes:
-        points: G * F pyramids. views: their pictures, or None.
+        points: G * F pyramids. views: their images, or None.
         poses: (G, F, 4, 4) float64 T_world_lidar; worlds of different places are unrelated.
     """
 
@@ -79,7 +79,7 @@ class Batch(NamedTuple):
 def draw_group(poses: Array, frames: int, radius: float, noise: np.random.Generator) -> NDArray[np.intp]:
     """Indices (frames,) of one frame and others whose distance from it is about uniform in 0..radius m.
 
-    poses (n, 4, 4), NaN where unknown; frames repeat where the neighbourhood holds too few.
+    poses (n, 4, 4), NaN where unknown; frames repeat where the neighborhood holds too few.
     """
     known = np.flatnonzero(np.isfinite(poses[:, :3, 3]).all(1))
     first = noise.choice(known)

@@ -3,7 +3,8 @@
 
 The network registers the scans of a stretch of road one to the next; the trajectory that follows is held to that of the
 SLAM (eq. 3 of "Differentiable SLAM Helps Deep Learning-based LiDAR Perception Tasks"), and pairs of scans are matched
-as in phase one. In every batch there are scans of the LiDAR that the weights come from, so that it is not forgotten.
+as in the registration training. In every batch there are scans of the LiDAR that the weights come from, so that it is
+not forgotten.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from dpm2_core.network.weights import load_model, read_metadata, save_weights
 
 
 class Finetuned(RegistrationTraining):
-    """The network with the losses of phase one and of the trajectory."""
+    """The network with the losses of the registration training and of the trajectory."""
 
     def __init__(self, model: DeepPointMap2, settings: FinetuneSettings) -> None:
         super().__init__(model.settings, settings.loss)
@@ -67,11 +68,11 @@ class Finetuned(RegistrationTraining):
 
 
 def window_trajectories(decoder: Decoder, tokens: Tokens, poses: Tensor) -> tuple[Tensor, Tensor]:
-    """Trajectories (G, F, 4, 4) T_first_scan by registering each scan to the one before; the share that went astray.
+    """Trajectories (G, F, 4, 4) T_first_scan by registering each scan to the one before; the fraction that diverged.
 
     Args:
         tokens: descriptors of G * F scans, place by place. poses: (G, F, 4, 4) reference, float64; where the network is
-            astray, its motion is taken. See `differentiable_poses` for the gradient.
+            diverged, its motion is taken. See `differentiable_poses` for the gradient.
     """
     groups, frames = poses.shape[:2]
     number = torch.arange(groups * frames, device=poses.device).view(groups, frames)
@@ -99,7 +100,7 @@ class StretchSettings(DataSettings):
     """Packed drives, of which scans are drawn in the order of the road."""
 
     def draw(self, poses: Array, noise: np.random.Generator) -> NDArray[np.intp]:
-        """See `draw_stretch`."""
+        """See `draw_road_segment`."""
         return draw_road_segment(poses, self.frames, self.radius, noise)
 
 

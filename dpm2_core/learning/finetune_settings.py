@@ -18,7 +18,7 @@ DRIVES, HELD_OUT, REHEARSAL = "drives", "held_out", "rehearsal"
 
 
 class FinetuneOptimizer(OptimizerSettings):
-    """Optimisation: a few small steps."""
+    """Optimization: a few small steps."""
 
     steps: int = Field(default=300, gt=0)
     """Batches."""
@@ -64,7 +64,8 @@ class FinetuneSettings(Settings):
     trajectory: float = Field(default=2.0, ge=0)
     """Weight of the trajectory loss, 1/m2."""
     pairs: float = Field(default=0.0, ge=0)
-    """Weight of the losses of phase one, with the reference as truth. They gained nothing, and took from the other."""
+    """Weight of the losses of the registration training, with the reference as truth. They gained nothing, and took
+    from the other."""
     loss: LossSettings = LossSettings()
     rehearsal: str = ""
     """Folder of packed drives of the LiDAR that the weights come from; empty: synthetic worlds are made."""

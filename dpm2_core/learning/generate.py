@@ -41,7 +41,7 @@ class GenerateSettings(Settings):
     mixture: dict[PresetName, float] = Field(
         {"city": 0.3, "suburb": 0.3, "rural": 0.28, "highway": 0.06, "tunnel": 0.06}
     )
-    """Share of each kind of place."""
+    """Fraction of each kind of place."""
     beams: Literal[16, 32, 64, 128] = 64
     """Of the LiDAR."""
     height: float = Field(1.73, gt=0.5, le=10)
@@ -49,9 +49,9 @@ class GenerateSettings(Settings):
     traffic: float = Field(1.0, ge=0, le=1000)
     """Times that of the preset; of 20 on every lane is full."""
     images: bool = False
-    """Render a picture with each scan."""
+    """Render an image with each scan."""
     preset: str = "small"
-    """Network preset: its crop and picture size are stored."""
+    """Network preset: its crop and image size are stored."""
 
 
 def generate_world(folder: Path, seed: int, settings: GenerateSettings) -> None:
@@ -79,13 +79,13 @@ def generate_world(folder: Path, seed: int, settings: GenerateSettings) -> None:
 
 
 def _camera(network: NetworkSettings) -> CameraConfig:
-    """KITTI's field of view at twice the network's picture size: averaged down, it is free of aliasing."""
+    """KITTI's field of view at twice the network's image size: averaged down, it is free of aliasing."""
     height, width = network.image.size
     return CameraConfig(width=2 * width, height=2 * height, focal=720.0 * 2 * width / 1241)
 
 
 def small_image(image: Image, network: NetworkSettings) -> Image:
-    """The picture at the network's size."""
+    """The image at the network's size."""
     pixels, K = resize(image.pixels, image.camera.K, network.image.size)
     height, width = network.image.size
     camera = Camera(K, image.camera.T_lidar_cam, (width, height), image.camera.distortion, image.camera.name)
@@ -122,7 +122,7 @@ def pack(
     to look at; `advance` is called after each.
 
     Raises:
-        UsageError: the source has no poses, or its frames do not all have as many pictures.
+        UsageError: the source has no poses, or its frames do not all have as many images.
     """
     if source.poses is None:
         raise UsageError(f"{source.name}: no ground truth poses, training needs them")
@@ -151,7 +151,7 @@ def pack(
         raise UsageError(f"{source.name}: no readable frame with a pose")
     add(*before, twist)
     if len({len(sample.images) for sample in samples}) > 1:
-        raise UsageError(f"{source.name}: some frames have a picture and some have none; --no-image packs them without")
+        raise UsageError(f"{source.name}: some frames have an image and some have none; --no-image packs them without")
     write_packed(folder, samples, {"source": source.name})
     return len(samples)
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The error of the pose that the network finds, with a gradient: what losses on descriptors and offsets never see.
 
-Beyond the paper, whose phase one stops at the matches. It is eq. 3 of "Differentiable SLAM Helps Deep Learning-based
-LiDAR Perception Tasks" for single pairs.
+Beyond the paper, whose the registration training stops at the matches. It is eq. 3 of "Differentiable SLAM Helps Deep
+Learning-based LiDAR Perception Tasks" for single pairs.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ FINE = 0.05
 def differentiable_poses(
     decoder: Decoder, source: Tokens, target: Tokens, correlated: Correlated, truth: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Poses (B, 4, 4) T_target_source float64 with gradients, and which of them (B,) are not astray.
+    """Poses (B, 4, 4) T_target_source float64 with gradients, and which of them (B,) have not diverged.
 
     Matches, offsets and their precisions have a gradient; the pose has it through the last steps of its least squares,
     which start at the solution: as the implicit function theorem gives it, and without that of a decomposition, which
     is infinite where singular values meet.
 
     Args:
-        truth: (B, 4, 4) float64; where the network is `ASTRAY`, it is the pose.
+        truth: (B, 4, 4) float64; where the network is `DIVERGED`, it is the pose.
     """
     with torch.no_grad():
         solved = solve_batch(decoder, source, target, correlated)

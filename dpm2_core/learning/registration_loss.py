@@ -27,7 +27,7 @@ class LossSettings(Settings):
     backbone: float = 0.1
     """On the point backbone's key-points, through a head of its own."""
     image: float = 0.1
-    """On the features of the first picture where descriptors project into it, through a head of its own."""
+    """On the features of the first image where descriptors project into it, through a head of its own."""
     offset: float = 0.2
     """On predicted offsets. The likelihood's gradient is that of a distance divided by its deviation, some 0.1 m: with
     weight 1 it drowns the pairing."""
@@ -70,7 +70,7 @@ def registration_loss(
 
 
 def matches_right(scores: Tensor, labels: Labels, limit: float) -> Tensor:
-    """Share of the sources with a positive whose best match lies within `limit` m."""
+    """Fraction of the sources with a positive whose best match lies within `limit` m."""
     used = labels.forward >= 0
     best = scores.masked_fill(labels.distance.isinf(), -1e4).argmax(2, keepdim=True)
     right = (labels.distance.gather(2, best)[..., 0] <= limit) & used

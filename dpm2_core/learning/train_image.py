@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Before phase one with pictures: the image branch alone, on points that two pictures both show.
+"""Before the registration training with images: the image branch alone, on points that two images both show.
 
 Inside the whole network the image branch learns last: its way into the pose is long. Alone it learns in minutes,
 because every LiDAR point that both cameras see is an exact correspondence, and a step costs no point cloud network.
@@ -33,11 +33,11 @@ from dpm2_core.network.settings import NetworkSettings, preset
 from dpm2_core.network.spatial import Views, image_features
 from dpm2_core.network.weights import load_weights, save_weights
 
-NEUTRAL = 1.5  # m, within which a point's neighbours are neither right nor wrong
+NEUTRAL = 1.5  # m, within which a point's neighbors are neither right nor wrong
 
 
 class ImagePairs(NamedTuple):
-    """Pictures two by two, first and second of each pair.
+    """Images two by two, first and second of each pair.
 
     Attributes:
         views: of 2 P frames. points: (2 P, n, 3) m, the same points in both LiDAR frames of a pair.
@@ -66,14 +66,14 @@ class ImageTrainingSettings(Settings):
     points: int = Field(256, gt=0)
     """Points drawn for each pair."""
     shift: float = Field(0.3, ge=0)
-    """Deviation of the second picture's points from the true ones, m: descriptors never sit at the very same place."""
+    """Deviation of the second image's points from the true ones, m: descriptors never sit at the very same place."""
     optimiser: OptimizerSettings = OptimizerSettings()
     start: str = ""
     """Weights (safetensors) of the network, whose other parts stay as they are; empty: random."""
 
 
 class ImageDataset:
-    """Pairs of pictures of a place and the points that the first of them shows."""
+    """Pairs of images of a place and the points that the first of them shows."""
 
     def __init__(
         self,
@@ -87,10 +87,10 @@ class ImageDataset:
         self._drives = Mixture(settings)
 
     def pairs(self, points: int) -> Iterator[ImagePairs]:
-        """An endless stream, as deterministic as the batches of phase one.
+        """An endless stream, as deterministic as the batches of the registration training.
 
         Raises:
-            UsageError: a drive without pictures, or whose pictures show too few points.
+            UsageError: a drive without images, or whose images show too few points.
         """
         step, settings = self._start, self._settings
         while True:
@@ -104,7 +104,7 @@ class ImageDataset:
                 drive = self._drives.choose(noise)
                 a, b = (drive[i] for i in draw_group(drive.poses, 2, settings.radius, noise))
                 if not (a.images and b.images):
-                    raise UsageError(f"{drive.folder}: a drive without pictures; pack it with them or leave it out")
+                    raise UsageError(f"{drive.folder}: a drive without images; pack it with them or leave it out")
                 seen = a.cloud[shown(a.cloud, a.images[0].camera)]
                 if len(seen) < points:
                     continue
@@ -113,12 +113,12 @@ class ImageDataset:
                 images += [[augment_image(s.images[0], np.eye(4), settings.augment, noise)] for s in (a, b)]
             views = collate_views(images, self._network.image)
             if views is None or len(images) < 2 * settings.groups:
-                raise UsageError(f"data.packed: hardly any picture shows {points} points; lower `points`")
+                raise UsageError(f"data.packed: hardly any image shows {points} points; lower `points`")
             yield ImagePairs(views, torch.from_numpy(np.stack(drawn)))
 
 
 def shown(points: NDArray[np.float32], camera: Camera) -> NDArray[np.bool_]:
-    """Which points (N, 3), m, in the LiDAR frame project into the camera's picture."""
+    """Which points (N, 3), m, in the LiDAR frame project into the camera's image."""
     moved = se3.transform(se3.inverse(camera.T_lidar_cam), points)
     ahead = moved[:, 2] > 0.1
     uv = (moved @ camera.K.T)[:, :2] / np.where(ahead, moved[:, 2], 1.0)[:, None]
@@ -134,14 +134,14 @@ class ImageTraining(nn.Module):
         self.temperature, self.shift = network.decoder.temperature, shift
         encoder = self.model.encoder
         if encoder.image is None or encoder.fusion is None or encoder.fusion.pixel is None:
-            raise UsageError(f"preset {network.preset}: has no picture features of its own to train (fusion.pixel)")
+            raise UsageError(f"preset {network.preset}: has no image features of its own to train (fusion.pixel)")
         self.image, self.head = encoder.image, encoder.fusion.pixel
         self.requires_grad_(False)
         for part in (self.image, self.head):
             part.requires_grad_(True)
 
     def forward(self, batch: ImagePairs) -> tuple[Tensor, dict[str, Tensor]]:
-        """Mean InfoNCE of the points that both pictures of a pair show."""
+        """Mean InfoNCE of the points that both images of a pair show."""
         maps = self.image(batch.views.pixels.flatten(0, 1))
         points = batch.points.clone()
         points[1::2] += torch.randn_like(points[1::2]) * self.shift

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Phase two: the overlap head alone, on the frozen network of phase one, half of the pairs near, half hard or far."""
+"""The overlap training: the overlap head alone, on the frozen network of the registration training, half of the pairs
+near, half hard or far."""
 
 from __future__ import annotations
 
@@ -40,7 +41,7 @@ class OverlapSettings(GroupSettings):
 
 
 class OverlapOptimiserSettings(OptimizerSettings):
-    """Optimisation at a tenth of the rate and weight decay of phase one (section 5.1)."""
+    """Optimization at a tenth of the rate and weight decay of the registration training (section 5.1)."""
 
     steps: int = Field(600, gt=0)
     rate: float = Field(1e-4, gt=0)
@@ -49,10 +50,10 @@ class OverlapOptimiserSettings(OptimizerSettings):
 
 
 class OverlapTrainingSettings(Settings):
-    """A training of phase two; the network is that of phase one, with all its settings."""
+    """A training of the overlap training; the network is that of the registration training, with all its settings."""
 
     start: str
-    """Weights of phase one (safetensors)."""
+    """Weights of the registration training (safetensors)."""
     data: OverlapSettings = OverlapSettings()
     validation: str = ""
     """Folder of packed drives of other worlds; empty: none."""
@@ -122,7 +123,8 @@ def average_precision(scores: np.ndarray, positive: np.ndarray) -> float:
 
 
 def train_overlap(settings: OverlapTrainingSettings, out: Path, resume: bool = False) -> Path:
-    """Train; writes checkpoint, log and `weights.safetensors`, phase one's with the new head, to `out`."""
+    """Train; writes checkpoint, log and `weights.safetensors`, the registration training's with the new head, to
+    `out`."""
     with process_group() as (rank, world, device):
         torch.manual_seed(settings.optimiser.seed)
         network = network_settings(Path(settings.start))

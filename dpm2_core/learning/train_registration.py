@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Phase one: registration, of pairs of frames and of merged sets."""
+"""The registration training: registration, of pairs of frames and of merged sets."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class RegistrationTraining(nn.Module):
         return info_nce(cosine(features[i], features[j]) / self.model.decoder.settings.temperature, labels, False)
 
     def _image_loss(self, head: nn.Module, encoded: Encoded, views: Views, plan: SetPairs) -> Tensor:
-        """InfoNCE of the pictures' features where the descriptors project: the image branch learns long before the
+        """InfoNCE of the images' features where the descriptors project: the image branch learns long before the
         fusion makes use of it."""
         xyz = encoded.tokens.xyz
         features, seen = image_features(xyz, views, encoded.maps)
@@ -96,7 +96,7 @@ class RegistrationTraining(nn.Module):
 
 
 class RegistrationTrainingSettings(Settings):
-    """A training of phase one."""
+    """A training of the registration training."""
 
     preset: str = "small"
     """Network preset."""
@@ -112,7 +112,7 @@ class RegistrationTrainingSettings(Settings):
     pairs: int = Field(4, gt=0)
     """Frame pairs drawn from each place."""
     sets: float = Field(0.25, ge=0, le=1)
-    """Share of steps that also register merged sets: one frame to the others, or half to half."""
+    """Fraction of steps that also register merged sets: one frame to the others, or half to half."""
     start: str = ""
     """Weights (safetensors) to start from; empty: random."""
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ConvNeXt with a feature pyramid (FPN): a picture becomes feature pixels of several strides."""
+"""ConvNeXt with a feature pyramid (FPN): an image becomes feature pixels of several strides."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dpm2_core.network.settings import ImageSettings
 
 
 class FeatureMap(NamedTuple):
-    """One level: features (B, C, h, w), and the stride in pixels of the resized picture."""
+    """One level: features (B, C, h, w), and the stride in pixels of the resized image."""
 
     features: Tensor
     stride: int

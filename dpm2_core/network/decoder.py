@@ -67,7 +67,7 @@ class Decoder(nn.Module):
         self.similarity = PointMLP(width)
         self.offset = OffsetHead(width, decoder.precision)
         self.overlap = OverlapHead(width, decoder.overlap_pose)
-        self.overlap_trained = False  # until phase two has trained the head
+        self.overlap_trained = False  # until the overlap training has trained the head
         self.coarse = PointMLP(settings.channels)
 
     def forward(self, source: Tokens, target: Tokens) -> Correlated:

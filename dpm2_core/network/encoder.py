@@ -24,7 +24,7 @@ from dpm2_core.network.tokens import Tokens
 
 
 class Encoded(NamedTuple):
-    """Descriptors of a batch, and what the auxiliary losses read: key-points, and feature maps of the pictures."""
+    """Descriptors of a batch, and what the auxiliary losses read: key-points, and feature maps of the images."""
 
     tokens: Tokens
     scales: list[Scale]
@@ -46,7 +46,7 @@ class Encoder(nn.Module):
             raise ValueError(f"level {self.level} has {channels[self.level]} channels, descriptors {settings.channels}")
 
     def forward(self, points: PointBatch, views: Views | None = None) -> Encoded:
-        """Encode a batch; `views` None where no frame of it has a picture."""
+        """Encode a batch; `views` None where no frame of it has an image."""
         scales = self.points(points)
         if self.fusion is None:
             scale = scales[self.level]
@@ -63,7 +63,7 @@ class Encoder(nn.Module):
 
     @torch.inference_mode()
     def encode(self, frame: Frame) -> Descriptors:
-        """Descriptors of one frame, from its raw points and its pictures, if any.
+        """Descriptors of one frame, from its raw points and its images, if any.
 
         Raises:
             Dpm2Error: too few points in range.
@@ -83,7 +83,7 @@ class Encoder(nn.Module):
 
 
 def collate_views(images: Sequence[Sequence[Image]], settings: ImageSettings) -> Views | None:
-    """Resize and stack the pictures of each frame; absent ones are masked, None if no frame has any."""
+    """Resize and stack the images of each frame; absent ones are masked, None if no frame has any."""
     most = max((len(frame) for frame in images), default=0)
     if most == 0:
         return None
@@ -101,7 +101,7 @@ def collate_views(images: Sequence[Sequence[Image]], settings: ImageSettings) ->
 
 
 def resize(pixels: np.ndarray, K: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Resize (H, W, 3) to (3, *size) and scale the intrinsics, pixel centres being at integers."""
+    """Resize (H, W, 3) to (3, *size) and scale the intrinsics, pixel centers being at integers."""
     height, width = pixels.shape[:2]
     out = cv2.resize(pixels, size[::-1], interpolation=cv2.INTER_AREA)
     scale = np.diag([size[1] / width, size[0] / height, 1.0])

@@ -131,7 +131,7 @@ class Fusion(nn.Module):
         self.out = nn.Linear(width, settings.channels)
 
     def forward(self, scales: list[Scale], views: Views | None, maps: list[FeatureMap]) -> Tokens:
-        """scales of the point backbone; views with the feature maps (B * V, C, h, w) of their pictures, or None."""
+        """scales of the point backbone; views with the feature maps (B * V, C, h, w) of their images, or None."""
         refs = self.references(scales)
         chosen = [scales[i] for i in self.settings.levels]
         lidar = self._lidar(refs, chosen)

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from dpm2_core.network.pyramid import PointBatch
 from dpm2_core.network.settings import PointsSettings, StageSettings
 
-MOMENTS = 9  # mean (3) and scatter matrix (6) of a neighbourhood
+MOMENTS = 9  # mean (3) and scatter matrix (6) of a neighborhood
 
 
 class Scale(NamedTuple):
@@ -62,10 +62,10 @@ class ConvNormAct(nn.Sequential):
 
 
 class Pooled(nn.Module):
-    """Linear layer, LayerNorm, ReLU and maximum over neighbours.
+    """Linear layer, LayerNorm, ReLU and maximum over neighbors.
 
-    `pool_first` takes the maximum right after the linear layer: k times less to normalise, and the part of the layer
-    that reads the neighbour's own features is computed once a point before it is gathered.
+    `pool_first` takes the maximum right after the linear layer: k times less to normalize, and the part of the layer
+    that reads the neighbor's own features is computed once a point before it is gathered.
     """
 
     def __init__(self, channels_in: int, relative: int, channels_out: int, pool_first: bool) -> None:
@@ -116,7 +116,7 @@ def argmax_neighbor(sums: Tensor) -> Tensor:
 
 
 class Aggregation(nn.Module):
-    """Neighbour features with their relative places through one layer, then the maximum."""
+    """Neighbor features with their relative places through one layer, then the maximum."""
 
     def __init__(self, channels_in: int, channels_out: int, radius: float, settings: PointsSettings) -> None:
         super().__init__()
@@ -125,20 +125,20 @@ class Aggregation(nn.Module):
         self.pooled = Pooled(channels_in, 5 if settings.view_aligned else 3, channels_out, settings.pool_first)
 
     def forward(self, xyz: Tensor, centers: Tensor, features: Tensor, index: Tensor) -> Tensor:
-        """xyz (B, m, 3), centres (B, n, 3), features (B, m, C), index (B, n, k) into m: (B, n, channels_out)."""
+        """xyz (B, m, 3), centers (B, n, 3), features (B, m, C), index (B, n, k) into m: (B, n, channels_out)."""
         delta = (gather(xyz, index) - centers[:, :, None]) / self.radius
         if not self.view_aligned:
             return self.pooled(features, index, delta)
         axis = view_axes(centers)[:, :, None]
-        turn = gather(view_axes(xyz), index)  # the neighbour's own axis, seen in the centre's
+        turn = gather(view_axes(xyz), index)  # the neighbor's own axis, seen in the center's
         turned = to_view(torch.cat([turn, turn[..., :1]], -1), axis)[..., :2]
         return self.pooled(features, index, torch.cat([to_view(delta, axis), turned], -1))
 
 
 class PatchAbstraction(nn.Module):
-    """Stem and first set abstraction, on the neighbourhoods of raw points.
+    """Stem and first set abstraction, on the neighborhoods of raw points.
 
-    The stem is linear, so it is applied to centre and offset apart: the same result without a stem per neighbour.
+    The stem is linear, so it is applied to center and offset apart: the same result without a stem per neighbor.
     """
 
     def __init__(self, settings: PointsSettings) -> None:
@@ -152,7 +152,7 @@ class PatchAbstraction(nn.Module):
         self.moments = ConvNormAct(stage.channels + MOMENTS, stage.channels) if settings.moments else None
 
     def forward(self, centers: Tensor, patches: Tensor) -> Tensor:
-        """centres (B, n, 3), patches (B, n, k, 3), both m: (B, n, channels)."""
+        """centers (B, n, 3), patches (B, n, k, 3), both m: (B, n, channels)."""
         if self.view_aligned:
             axis = view_axes(centers)
             centers, patches = to_view(centers, axis), to_view(patches, axis[:, :, None])
@@ -171,7 +171,7 @@ class PatchAbstraction(nn.Module):
 
 
 def neighborhood_moments(local: Tensor) -> Tensor:
-    """Mean and scatter of neighbourhoods (..., k, 3), the scatter divided by its trace: (..., 9)."""
+    """Mean and scatter of neighborhoods (..., k, 3), the scatter divided by its trace: (..., 9)."""
     mean = local.mean(-2)
     centered = local - mean[..., None, :]
     x, y, z = centered.unbind(-1)

@@ -39,7 +39,7 @@ def weights_path(weights: str) -> Path:
 
 
 def load_network(weights: str, threads: int, preset: str = "") -> DeepPointMap2:
-    """The network with weights, ready to run on the CPU; without its camera if it was trained without pictures.
+    """The network with weights, ready to run on the CPU; without its camera if it was trained without images.
 
     Args:
         weights: name of shipped weights, or path of a .safetensors file.
@@ -57,7 +57,7 @@ def load_network(weights: str, threads: int, preset: str = "") -> DeepPointMap2:
     torch.set_num_threads(threads)
     model = load_model(path)
     if read_metadata(path).get("images") != "true":
-        model.encoder.image = None  # a branch that has never seen a picture would only disturb
+        model.encoder.image = None  # a branch that has never seen an image would only disturb
     if preset and model.settings.preset != preset:
         raise UsageError(f"{path}: weights of preset {model.settings.preset}, slam.neural.preset is {preset}")
     return model

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A raw scan becomes the point pyramid that the backbone reads: sampling and neighbour search, once, in numpy."""
+"""A raw scan becomes the point pyramid that the backbone reads: sampling and neighbor search, once, in numpy."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ class Pyramid:
         xyz: (n_0, 3) float32 m, farthest-first, the reference points as `fusion.reference` says; zeros after `count`.
         count: valid points of the first level; that of level i is min(count, n_i).
         patches: (n_0, k_0, 3) float16 m, input points around each first-level point, relative to it.
-        groups: per further level (n_i, k_i) int16, neighbours in the level before.
-        locals: per level, per residual block (n_i, k) int16, neighbours in the level itself.
+        groups: per further level (n_i, k_i) int16, neighbors in the level before.
+        locals: per level, per residual block (n_i, k) int16, neighbors in the level itself.
         ups: per feature propagation, coarse to fine, (n_fine, 3) int16, the nearest points of the coarser level.
     """
 

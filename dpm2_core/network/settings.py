@@ -24,13 +24,13 @@ class StageSettings(Settings):
     radius: float = Field(gt=0)
     """Radius of the set abstraction, m."""
     neighbours: int = Field(gt=0)
-    """Neighbours in the set abstraction."""
+    """Neighbors in the set abstraction."""
     channels: int = Field(gt=0)
     """Channels out."""
     residual_radii: tuple[float, ...] = Field((), max_length=64)
     """Radius of each inverted residual block, m."""
     residual_neighbours: int = Field(16, gt=0)
-    """Neighbours in the inverted residual blocks."""
+    """Neighbors in the inverted residual blocks."""
 
 
 class PointsSettings(Settings):
@@ -45,12 +45,12 @@ class PointsSettings(Settings):
     far: float = Field(60.0, gt=0)
     """Points farther than this are dropped, and the unit of the network's coordinates, m."""
     view_aligned: bool = True
-    """Express every neighbourhood in the frame whose x axis points horizontally away from the sensor. Features and
+    """Express every neighborhood in the frame whose x axis points horizontally away from the sensor. Features and
     offsets then do not change with the heading of the vehicle. False: the sensor's axes, as in the paper."""
     moments: bool = True
-    """Add mean and scatter matrix of each first-stage neighbourhood to its features: the local surface, explicitly."""
+    """Add mean and scatter matrix of each first-stage neighborhood to its features: the local surface, explicitly."""
     pool_first: bool = True
-    """Take the maximum over neighbours before normalising: several times faster. False: after, as PointNeXt does."""
+    """Take the maximum over neighbors before normalizing: several times faster. False: after, as PointNeXt does."""
     stem: int = Field(16, gt=0)
     """Channels of the point-wise stem."""
     stages: tuple[StageSettings, ...] = (
@@ -70,7 +70,7 @@ class ImageSettings(Settings):
     backbone: str = "convnext"
     """Name in the registry of image backbones, `timm:NAME` with the optional extra, or `none`: LiDAR only."""
     size: tuple[int, int] = (128, 416)
-    """Height and width that pictures are resized to, pixels."""
+    """Height and width that images are resized to, pixels."""
     depths: tuple[Annotated[int, Field(gt=0, le=64)], ...] = Field((1, 1, 2, 1), max_length=16)
     """ConvNeXt blocks of each stage."""
     channels: tuple[int, ...] = (24, 48, 96, 128)
@@ -111,7 +111,7 @@ class FusionSettings(Settings):
     relative: bool = True
     """Among reference points, add to the attention a learned bias from where one lies as seen from the other."""
     pixel: bool = True
-    """Add the picture's feature where a reference point projects to its descriptor: along a tunnel the texture right
+    """Add the image's feature where a reference point projects to its descriptor: along a tunnel the texture right
     there tells places apart, and the way through the attention is long to learn. False: the paper's."""
     image_mask: Literal["view", "front"] = "view"
     """Which reference points read an image: those that project into it, or, as in the paper, all, with the pixels
@@ -143,7 +143,7 @@ class DecoderSettings(Settings):
     overlap_pose: bool = True
     """Tell the overlap head how sure the registration is and how far apart it puts the pair. False: the paper's."""
     covariance_scale: float = Field(4.0, gt=0)
-    """Factor on the covariance of the pose: both directions of a pair and neighbouring pairs err alike."""
+    """Factor on the covariance of the pose: both directions of a pair and neighboring pairs err alike."""
 
 
 class NetworkSettings(Settings):

@@ -14,13 +14,13 @@ from dpm2_core.network.convnext import FeatureMap
 
 
 class Views(NamedTuple):
-    """The pictures of a batch, resized.
+    """The images of a batch, resized.
 
     Attributes:
         pixels: (B, V, 3, H, W) uint8.
-        K: (B, V, 3, 3) intrinsics of the resized picture, pixels.
+        K: (B, V, 3, 3) intrinsics of the resized image, pixels.
         T_lidar_cam: (B, V, 4, 4).
-        present: (B, V) False where a picture is missing.
+        present: (B, V) False where an image is missing.
     """
 
     pixels: Tensor
@@ -46,7 +46,7 @@ def _compact(bias: Tensor) -> Tensor:
 
 
 def token_pixels(maps: list[FeatureMap]) -> Tensor:
-    """Centres (T, 2) in the resized picture of the pixels of all maps, u then v."""
+    """Centers (T, 2) in the resized image of the pixels of all maps, u then v."""
     parts = []
     for features, stride in maps:
         h, w = features.shape[-2:]
@@ -63,7 +63,7 @@ def ray_bias(points: Tensor, views: Views, uv: Tensor, alphas: tuple[float, ...]
 
     Returns:
         The z-score over the V * T tokens of M exp(-alpha distance), (B, len(alphas), N, V * T), M being 0 for points
-        behind the camera; and `seen` (B, N, V), True where the point projects into a picture that is present.
+        behind the camera; and `seen` (B, N, V), True where the point projects into an image that is present.
     """
     distances, fronts, seen = [], [], []
     for view in range(views.pixels.shape[1]):
@@ -79,7 +79,7 @@ def ray_bias(points: Tensor, views: Views, uv: Tensor, alphas: tuple[float, ...]
 
 
 def seen_from(points: Tensor, views: Views, view: int) -> Tensor:
-    """Which points (B, N, 3) project into a view's picture, where there is one: (B, N)."""
+    """Which points (B, N, 3) project into a view's image, where there is one: (B, N)."""
     height, width = views.pixels.shape[-2:]
     at, depth = project(points, views.K[:, view].float(), views.T_lidar_cam[:, view].float())
     inside = (depth > 0.1) & (at[..., 0] >= 0) & (at[..., 0] < width) & (at[..., 1] >= 0) & (at[..., 1] < height)
@@ -93,7 +93,7 @@ def sample_at_points(points: Tensor, views: Views, features: Tensor, window: int
         points: (B, N, 3), m. features: (B, C, h, w). window: 1 or 3, side of the square of samples, a map pixel apart.
 
     Returns:
-        (B, N, C), the mean of the window; zero outside the picture.
+        (B, N, C), the mean of the window; zero outside the image.
     """
     height, width = views.pixels.shape[-2:]
     uv, depth = project(points, views.K[:, view].float(), views.T_lidar_cam[:, view].float())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A rectified colour camera by ray casting: shadows, exposure, vignetting, noise."""
+"""A rectified color camera by ray casting: shadows, exposure, vignetting, noise."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def _visible(
 
 
 def _attributes(mesh: Mesh, hits: Hits) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """uv (R, 2), texture, material and colour of the triangles hit; of any triangle where none was."""
+    """uv (R, 2), texture, material and color of the triangles hit; of any triangle where none was."""
     face = np.maximum(hits.face, 0)
     corners = mesh.uv[face]
     uv = (1 - hits.u - hits.v)[:, None] * corners[:, 0]

@@ -180,7 +180,7 @@ class _Drive:
         self.T_world_lidar = np.stack([world.drive_pose(t, height) for t in self.times])
         self.view = camera or CameraConfig()
         color = calibration(self.view)
-        # The poses and Tr of the layout are of the left grey camera 0; the colour camera 2 sits beside it.
+        # The poses and Tr of the layout are of the left gray camera 0; the color camera 2 sits beside it.
         self.T_lidar_cam0 = color.T_lidar_cam.copy()
         self.T_lidar_cam0[1, 3] = 0.0
         self.T_lidar_cam2, self.K = color.T_lidar_cam, color.K

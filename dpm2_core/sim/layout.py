@@ -222,7 +222,7 @@ class Layout:
         yield kerbside_ribbon(self.terrain, line, section, Label.FENCE, material, color)
 
     def _fence(self, line: Kerbline) -> Iterator[Mesh]:
-        """Pickets and two rails, a metre at a time."""
+        """Pickets and two rails, a meter at a time."""
         rng = self.rng
         h, gap = rng.uniform(0.8, 1.9), float(rng.choice([0.13, 0.2, 0.33]))
         wood = rng.random() < 0.7

@@ -40,7 +40,7 @@ class Scan:
     Attributes:
         points: (N, 4) float32 [x, y, z in m, intensity 0..1] in the LiDAR frame.
         label: (N,) uint32 as in SemanticKITTI: class in the low 16 bits (252 and more where moving), number of the
-            mover in the high ones.
+            dynamic object in the high ones.
         moving: (N,) bool. ring: (N,) uint8, 0 is the top beam.
         time_offset: (N,) float32 s, from the middle of the turn.
         static: (M, 4) float32, what the same pulses return without anything that moves.
@@ -83,7 +83,7 @@ class Lidar:
         """One turn at a pose (4, 4).
 
         Args:
-            time: s, where the movers are. They stand still during the turn.
+            time: s, where the dynamic objects are. They stand still during the turn.
             twist: (6,) [rad/s, m/s] of the sensor in its own frame during the turn: each point is then given in the
                 frame of its own moment, as a driver delivers it. None: already corrected for motion, as KITTI's are.
         """
@@ -152,7 +152,7 @@ class Lidar:
         distance = np.where(hits.face >= 0, hits.distance, 0).astype(np.float32)
         # What is left of the pulse against what the receiver needs.
         strength = reflectance * (cosine + np.float32(0.02)) * (np.float32(30) / np.maximum(distance, 5)) ** 2
-        # Whole panes and panels vanish rather than single pulses: half of the share is drawn once a quad.
+        # Whole panes and panels vanish rather than single pulses: half of the fraction is drawn once a quad.
         panel = ((face >> 1) * 40503 & 0xFFFF).astype(np.float32) / np.float32(0xFFFF)
         lost = config.dropout + MISS[material] * 2 * panel + np.exp(-strength / np.float32(0.006))
         back = (hits.face >= 0) & (chance[0] > lost)

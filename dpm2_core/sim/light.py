@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the light of a picture comes from."""
+"""Where the light of an image comes from."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Light:
         self.textures = Textures(seed)
 
     def sky(self, view: Float) -> Float:
-        """(P, 3) colour of the sky along directions (P, 3): a gradient, clouds, the glow round the sun."""
+        """(P, 3) color of the sky along directions (P, 3): a gradient, clouds, the glow round the sun."""
         if self.tunnel:
             return np.full((len(view), 3), 1.4, np.float32)
         up = np.clip(view[:, 2], 0.0, 1)[:, None]

@@ -68,8 +68,9 @@ class _Optics:
     """Of one material.
 
     Attributes:
-        reflectance: LiDAR intensity at normal incidence. miss: share of pulses that vanish. dark: share of returns too
-            weak to measure their intensity (0 then). roughness: extra range noise, m. retro: bright at any incidence.
+        reflectance: LiDAR intensity at normal incidence. miss: fraction of pulses that vanish. dark: fraction of
+            returns too weak to measure their intensity (0 then). roughness: extra range noise, m. retro: bright at any
+            incidence.
     """
 
     reflectance: float

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Triangle meshes with class, material, colour and surface coordinates on every triangle, and ray casting."""
+"""Triangle meshes with class, material, color and surface coordinates on every triangle, and ray casting."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Mesh:
 
     Attributes:
         vertices: (V, 3) float32 m. faces: (F, 3) int32.
-        label: (F,) uint8 `Label`. material: (F,) uint8 `Material`. colour: (F, 3) uint8 RGB.
+        label: (F,) uint8 `Label`. material: (F,) uint8 `Material`. color: (F, 3) uint8 RGB.
         uv: (F, 3, 2) float32, surface coordinates of the corners, m. texture: (F,) uint16, what sets patterns apart.
     """
 
@@ -88,7 +88,7 @@ def placed(template: Mesh, poses: ArrayLike, texture: ArrayLike = 0, tint: Array
     Args:
         poses: (N, 3, 4) or (N, 4, 4) affine maps template to world (scales and mirrors allowed).
         texture: (N,) pattern numbers.
-        tint: (N, 3) colour factors, 1 leaves the colour; None for all 1.
+        tint: (N, 3) color factors, 1 leaves the color; None for all 1.
     """
     poses = np.asarray(poses, np.float32)
     n, v = len(poses), len(template.vertices)
@@ -139,7 +139,7 @@ class Hits:
 
     Attributes:
         distance: (R,) float32 m, inf where nothing was hit. face: (R,) int32 triangle, -1 where nothing was hit.
-        normal: (R, 3) float32, not normalised, either side. u, v: (R,) float32 barycentric, weights of corners 1 and 2.
+        normal: (R, 3) float32, not normalized, either side. u, v: (R,) float32 barycentric, weights of corners 1 and 2.
     """
 
     distance: Float

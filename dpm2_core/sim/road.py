@@ -64,7 +64,7 @@ class Road:
     """Streets and a drive.
 
     Attributes:
-        streets: centre lines; the drive follows the first `main` of them, the others branch off.
+        streets: center lines; the drive follows the first `main` of them, the others branch off.
         drive: the path of the car. times: (K,) s and travelled: (K,) m, the drive's progress; a closed one goes on.
         heights: (M,) m of the samples of each main street, None where the terrain is free.
         slip: (K,) rad, heading of the car relative to the direction of the drive; None: it heads where it goes.

@@ -20,7 +20,7 @@ WALL = 5.5
 
 
 def swept(path: Path, terrain: Terrain, profile: ArrayLike, label: Label, material: Material, color: ArrayLike) -> Mesh:
-    """A profile (K, 2) of metres to the left and above the road, drawn along a path."""
+    """A profile (K, 2) of meters to the left and above the road, drawn along a path."""
     profile = np.asarray(profile, float)
     every = slice(None, None, 4)  # 2 m
     xy = np.stack([path.at(path.s, y)[0][every] for y in profile[:, 0]], 1)

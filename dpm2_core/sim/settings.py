@@ -31,7 +31,7 @@ class LidarConfig(Settings):
     noise: float = Field(default=0.02, ge=0)
     """Standard deviation of a range, m; rough surfaces add theirs."""
     dropout: float = Field(default=0.01, ge=0, lt=1)
-    """Share of returns lost at random; glass, dark paint, leaves and grazing far surfaces lose more."""
+    """Fraction of returns lost at random; glass, dark paint, leaves and grazing far surfaces lose more."""
     period: float = Field(default=0.1, gt=0)
     """Of one turn, s."""
     car_body: bool = True
@@ -39,7 +39,7 @@ class LidarConfig(Settings):
 
 
 class CameraConfig(Settings):
-    """A forward-looking rectified colour camera, 0.27 m ahead of and 0.08 m below the LiDAR."""
+    """A forward-looking rectified color camera, 0.27 m ahead of and 0.08 m below the LiDAR."""
 
     width: int = Field(default=1241, ge=16, le=8192)
     """Pixels."""
@@ -57,15 +57,15 @@ class Preset(Settings):
     """A kind of place. Densities are means: `varied` draws each world's own."""
 
     half_width: float
-    """Centre line to kerb, m."""
+    """Center line to kerb, m."""
     lane: float = 1.8
-    """Centre line to the middle of the driven lane, m."""
+    """Center line to the middle of the driven lane, m."""
     sidewalk: float = 0.0
     """Width, m; 0 for a grass verge."""
     setback: float = 6.0
     """Kerb to facade, m."""
     buildings: float = 0.0
-    """Share of the frontage that is built."""
+    """Fraction of the frontage that is built."""
     floors: tuple[int, int] = (1, 3)
     """Fewest and most."""
     side_streets: float = 0.0
@@ -77,9 +77,9 @@ class Preset(Settings):
     bushes: float = 0.0
     """Per 100 m and side."""
     boundaries: float = 0.0
-    """Share of the frontage with hedge, wall or fence."""
+    """Fraction of the frontage with hedge, wall or fence."""
     parked: float = 0.0
-    """Share of the kerb with parked cars."""
+    """Fraction of the kerb with parked cars."""
     poles: float = 0.0
     """Lamps, signs, bollards and boxes per 100 m and side."""
     clutter: float = 0.0

@@ -28,7 +28,7 @@ class Surface:
     Attributes:
         position: (P, 3) m in the world. normal: (P, 3) unit, towards the eye. view: (P, 3) unit, from the eye.
         uv: (P, 2) m on the surface. texture: (P,) number of the object's pattern. material: (P,).
-        colour: (P, 3) 0..1, its paint. footprint: (P,) m, what a pixel covers on the surface.
+        color: (P, 3) 0..1, its paint. footprint: (P,) m, what a pixel covers on the surface.
     """
 
     position: Float
@@ -71,7 +71,7 @@ class Textures:
         return out.reshape(-1)[:n] if channels == 1 else out.reshape(-1, channels)[:n]
 
     def albedo(self, surface: Surface, terrain: Terrain) -> Float:
-        """(P, 3) share of the light that each point reflects, by colour."""
+        """(P, 3) fraction of the light that each point reflects, by color."""
         uv = surface.uv + np.stack([surface.texture % 251, surface.texture // 251], -1).astype(np.float32) * np.float32(
             1.37
         )
@@ -113,7 +113,7 @@ def _unit(h: NDArray[np.uint32], k: int = 0) -> Float:
 
 
 def _vivid(h: NDArray[np.uint32]) -> Float:
-    """(P, 3) a saturated colour of a hash."""
+    """(P, 3) a saturated color of a hash."""
     hue = _unit(h, 0)[:, None] * 6
     rgb = np.clip(np.abs(np.remainder(hue + np.array([0, 4, 2], np.float32), 6) - 3) - 1, 0, 1)
     return (0.15 + 0.8 * _unit(h, 1)[:, None]) * (0.25 + 0.75 * rgb)

@@ -58,7 +58,7 @@ def blob(
     color: ArrayLike,
     detail: int = 1,
 ) -> Mesh:
-    """An ellipsoid of 20 * 4**detail triangles with its vertices moved in and out by the share `rough`."""
+    """An ellipsoid of 20 * 4**detail triangles with its vertices moved in and out by the fraction `rough`."""
     with needs("sim", "the synthetic city"):
         import trimesh
 
@@ -72,7 +72,7 @@ def blob(
 def leaves(
     centers: ArrayLike, size: float, rng: np.random.Generator, color: ArrayLike, label: Label = Label.VEGETATION
 ) -> Mesh:
-    """One randomly turned triangle of about `size` m at each of the centres (N, 3), its brightness random."""
+    """One randomly turned triangle of about `size` m at each of the centers (N, 3), its brightness random."""
     centers = np.asarray(centers, float)
     n = len(centers)
     corners = centers[:, None] + rng.normal(0, 0.6 * size, (n, 3, 3))
@@ -105,9 +105,9 @@ def relief(
 
     Args:
         x: (N+1,) and z: (M+1,) borders of its cells, m.
-        depth: (N, M) m, towards +y. material: (N, M). colour: (N, M, 3).
+        depth: (N, M) m, towards +y. material: (N, M). color: (N, M, 3).
 
-    The steps between cells of different depth are walls of the shallower cell's neighbour's colour.
+    The steps between cells of different depth are walls of the shallower cell's neighbor's color.
     """
     x, z, depth = np.asarray(x, float), np.asarray(z, float), np.asarray(depth, float)
     material, color = np.asarray(material), np.asarray(color)

@@ -51,10 +51,10 @@ class Terrain:
     """Rasters over the streets' bounding box.
 
     Attributes:
-        origin: (2,) m, centre of cell [0, 0]; cells are `RESOLUTION` apart, rows along y.
+        origin: (2,) m, center of cell [0, 0]; cells are `RESOLUTION` apart, rows along y.
         edge: (H, W) float32 m, distance to the nearest kerb, negative on a road.
         height: (H, W) float32 m, without kerbs. nearest: (H, W) int32, sample of the nearest street.
-        centre: (S, 2) m and yaw, along: (S,) of all street samples; junction: (S,) near another street.
+        center: (S, 2) m and yaw, along: (S,) of all street samples; junction: (S,) near another street.
     """
 
     def __init__(self, road: Road, preset: Preset, rng: np.random.Generator) -> None:
@@ -161,7 +161,7 @@ class Terrain:
         return out
 
     def lane_coordinates(self, xy: NDArray[np.floating]) -> tuple[NDArray, NDArray, NDArray[np.bool_]]:
-        """Of points (N, 2): m to the left of the nearest street's centre, m along it, and whether at a crossing."""
+        """Of points (N, 2): m to the left of the nearest street's center, m along it, and whether at a crossing."""
         sample = self.nearest[self._cell(xy)]
         yaw = self.yaw[sample].astype(xy.dtype)
         away = xy - self.center[sample].astype(xy.dtype)
@@ -253,7 +253,7 @@ def kerbside_ribbon(
 
 
 def sheet(points: ArrayLike, label: Label, material: Material, color: ArrayLike) -> Mesh:
-    """A surface through a grid (N, M, 3) of points; surface coordinates are metres along its columns and rows."""
+    """A surface through a grid (N, M, 3) of points; surface coordinates are meters along its columns and rows."""
     points = np.asarray(points, float)
     n, m = points.shape[:2]
     node = np.arange(n * m).reshape(n, m)

@@ -17,16 +17,17 @@ from dpm2_core.sim.vehicles import car, cyclist, person, truck
 Array = NDArray[np.float64]
 Float = NDArray[np.float32]
 SIGHT = 110.0
-"""Movers farther from the sensor are left out, m."""
+"""Dynamic objects farther from the sensor are left out, m."""
 GAP = 6.5
-"""Movers nearer to the sensor are left out, m: a drive that leaves its lane must not find itself inside a car."""
+"""Dynamic objects nearer to the sensor are left out, m: a drive that leaves its lane must not find itself inside a
+car."""
 ALONGSIDE = 2.4
 """The same for the columns of dense traffic, which keep to lanes 3.5 m apart, m."""
 
 
 @dataclass(eq=False)
 class Traffic:
-    """M movers along the drive.
+    """M dynamic objects along the drive.
 
     Attributes:
         models: one mesh each. start, speed, lateral: (M,) m, m/s and m to the left of the drive; a negative speed is
@@ -69,13 +70,14 @@ class Traffic:
 
 @dataclass(eq=False)
 class DynamicObjects:
-    """What moves, at one time: a scene, and the number (F,) of the mover that each of its triangles belongs to."""
+    """What moves, at one time: a scene, and the number (F,) of the dynamic object that each of its triangles belongs
+    to."""
 
     scene: Scene
     number: NDArray[np.uint16]
 
     def cast(self, origin: Float, directions: Float, reach: float) -> tuple[Hits, NDArray[np.intp]]:
-        """Hits of those K rays that can meet a mover, and which (K,) they are, of R from (3,) or (R, 3)."""
+        """Hits of those K rays that can meet a dynamic object, and which (K,) they are, of R from (3,) or (R, 3)."""
         all_rays = origin.ndim == 2
         toward = np.arange(len(directions)) if all_rays else _towards(self.scene.mesh, origin, directions)
         origins = np.ascontiguousarray(np.broadcast_to(origin, directions.shape)[toward])
@@ -101,7 +103,7 @@ def _towards(mesh: Mesh, origin: Float, directions: Float) -> NDArray[np.intp]:
 
 
 def make_traffic(road: Road, terrain: Terrain, preset: Preset, rng: np.random.Generator) -> Traffic:
-    """As many movers as the preset has on that length."""
+    """As many dynamic objects as the preset has on that length."""
     if preset.columns:
         walking = make_traffic(road, terrain, preset.model_copy(update={"traffic": 0.0, "columns": False}), rng)
         return _with_columns(walking, preset, rng)

@@ -15,7 +15,7 @@ PAINTS = np.array([
     (150, 24, 26), (30, 52, 110), (44, 76, 60), (190, 170, 60), (120, 88, 62),
 ])  # fmt: skip
 
-# length, width, height in m; side profiles of the body and the glazed part above, front to rear, as shares of them
+# length, width, height in m; side profiles of the body and the glazed part above, front to rear, as fractions of them
 _BODIES: dict[str, tuple[tuple[float, float, float], list[tuple[float, float]], list[tuple[float, float]]]] = {
     "hatchback": (
         (4.0, 1.72, 1.48),

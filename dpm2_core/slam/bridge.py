@@ -26,7 +26,8 @@ _MOVED = 1.0
 _AS_WELL = 0.9
 """...or when the scan fits the map before at least this much as well as its own stretch: one stands where one stood."""
 _SPEEDS = (1.0, 0.75, 0.5, 0.25, 0.0, 1.25)
-"""Shares of the motion so far from which the answer is looked for: a vehicle brakes and stops sooner than it gains."""
+"""Fractions of the motion so far from which the answer is looked for: a vehicle brakes and stops sooner than it
+gains."""
 _TURNS = (0.15, -0.15, 0.3, -0.3)  # rad/s: the same for the change of the yaw rate
 _HORIZON = 10.0  # s: farther ahead no motion is extrapolated
 _TURN = 0.3  # rad/s, standard deviation of the yaw rate in traffic

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a trained network leaves of a scan before the SLAM looks at it: no movers, no ground, or no traffic.
+"""What a trained network leaves of a scan before the SLAM looks at it: no dynamic objects, no ground, or no traffic.
 
 All that follows works on what is left: the choice of reference points and their descriptors, the registration of the
 points, and the map.
@@ -38,7 +38,7 @@ class FilterSettings(Settings):
     threshold: float = Field(0.5, gt=0, lt=1)
     """movers: probability from which a point is left out."""
     most: float = Field(0.7, ge=0, le=1)
-    """movers: at most this share of a scan is left out, the likeliest ones."""
+    """movers: at most this fraction of a scan is left out, the most likely ones."""
 
 
 class PointFilter(Protocol):

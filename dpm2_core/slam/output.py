@@ -21,7 +21,7 @@ class TrajectoryRecorder:
     def __init__(self) -> None:
         self.stamps: list[int] = []
         self.index: list[int] = []
-        self.breaks = 0  # of the odometry, see `Tracked`
+        self.breaks = 0  # of the odometry, see `OdometryResult`
         self._T_odom_lidar: list[Array] = []
         self._keyframe: list[int] = []  # position of each keyframe among the frames
 
@@ -38,7 +38,7 @@ class TrajectoryRecorder:
         self._T_odom_lidar.append(tracked.T_odom_lidar)
 
     def poses(self, T_map_kf: Array) -> Array:
-        """(N, 4, 4) T_map_lidar of all frames, given the (K, 4, 4) optimised poses of the keyframes."""
+        """(N, 4, 4) T_map_lidar of all frames, given the (K, 4, 4) optimized poses of the keyframes."""
         return corrected(np.array(self._T_odom_lidar).reshape(-1, 4, 4), np.array(self._keyframe, np.intp), T_map_kf)
 
 
@@ -51,7 +51,7 @@ def corrected(T_odom_lidar: Array, keyframes: NDArray[np.intp], T_map_kf: Array)
     Args:
         T_odom_lidar: (N, 4, 4).
         keyframes: (K,) ascending positions of the keyframes among them.
-        T_map_kf: (K, 4, 4) optimised poses of the keyframes.
+        T_map_kf: (K, 4, 4) optimized poses of the keyframes.
 
     Returns:
         (N, 4, 4) T_map_lidar; the odometry itself without any keyframe.
@@ -69,7 +69,7 @@ def corrected(T_odom_lidar: Array, keyframes: NDArray[np.intp], T_map_kf: Array)
 
 
 def save_map(mapper: Mapper, directory: Path) -> None:
-    """Write map.ply, trajectory.tum (one pose a keyframe) and pose_graph.g2o, each whole or not at all.
+    """Write map.ply, trajectory.tum (one pose per keyframe) and pose_graph.g2o, each whole or not at all.
 
     Raises:
         Dpm2Error: a file could not be written; the old one survives.

@@ -48,7 +48,7 @@ class Scan:
         cloud: (M, 4) float32, those for the local map. source: (N, 3) float64, those to register. Both are empty where
             the registration works on descriptors alone.
         descriptors: neural ones; None where there are none.
-        image: the picture that was taken with it, where the registration asks for one.
+        image: the image that was taken with it, where the registration asks for one.
     """
 
     points: Points
@@ -79,7 +79,7 @@ class Preprocessor:
         return points if self._filter is None else self._filter(points)
 
     def prepare(self, frame: Frame, twist: Array) -> Scan:
-        """`measured`, thinned out for local map and registration."""
+        """`measured`, downsampled for local map and registration."""
         points = self.measured(frame, twist)
         cloud = points[voxel_first(points, self._settings.map_voxel)]
         source = cloud[voxel_first(cloud, self._settings.source_voxel), :3].astype(np.float64)

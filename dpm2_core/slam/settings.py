@@ -29,7 +29,7 @@ class SlamSettings(Settings):
     registration: Literal["geometric", "neural", "refined"] = "geometric"
     """How a scan finds its pose: by points, by neural descriptors, or by both."""
     threads: int = Field(2, ge=1)
-    """Threads of the neighbour search and of the network."""
+    """Threads of the neighbor search and of the network."""
     filter: FilterSettings = FilterSettings()
     preprocess: PreprocessSettings = PreprocessSettings()
     geometric: GeometricSettings = GeometricSettings()

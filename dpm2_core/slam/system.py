@@ -38,10 +38,10 @@ class SlamSystem:
 
 
 class LocalizationSystem:
-    """One robot in a map that stays as it is: `odometry` runs on every frame, `localiser` on every keyframe."""
+    """One robot in a map that stays as it is: `odometry` runs on every frame, `localizer` on every keyframe."""
 
     def __init__(self, settings: SlamSettings, store: MapStore, robot: str = "") -> None:
-        """`store`: the map file, open for reading only, see `open_for_localisation`."""
+        """`store`: the map file, open for reading only, see `open_for_localization`."""
         self.odometry = make_odometry(settings, robot)
         self.mapper = make_mapper(settings, store)
         self.localizer = make_localizer(settings, self.mapper)
@@ -49,7 +49,7 @@ class LocalizationSystem:
     def process(self, frame: Frame) -> tuple[OdometryResult, LocalizationResult | None]:
         """Take one frame in: its pose in the odometry frame, and, when it became a keyframe, its place in the map.
 
-        While the localiser's `state.located`, `T_map_odom @ T_odom_lidar` is the frame's pose in the map.
+        While the localizer's `state.located`, `T_map_odom @ T_odom_lidar` is the frame's pose in the map.
         """
         if self.localizer.wants(frame.stamp):
             self.odometry.request_keyframe()

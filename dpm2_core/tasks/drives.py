@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Synthetic drives for the tasks: classes, twins without movers and poses are exact."""
+"""Synthetic drives for the tasks: classes, twins without dynamic objects and poses are exact."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Picture of the movers in a scan: what was found, what was missed, what was taken for one."""
+"""Image of the dynamic objects in a scan: what was found, what was missed, what was taken for one."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from dpm2_core.files import atomic_write
 def dynamic_objects_png(
     path: Path, points: NDArray[np.float32], found: NDArray[np.bool_], truth: NDArray[np.bool_]
 ) -> None:
-    """Points (N, 3+) from above, x upwards, with what was found to be a mover (N,) and what is one (N,).
+    """Points (N, 3+) from above, x upwards, with what was found to be a dynamic object (N,) and what is one (N,).
 
     Raises:
         Dpm2Error: the file could not be written.
@@ -28,8 +28,8 @@ def dynamic_objects_png(
     axes = figure.subplots()
     kinds = (
         (~found & ~truth, "standing", "0.7"),
-        (found & truth, "mover, found", "tab:green"),
-        (~found & truth, "mover, missed", "tab:red"),
+        (found & truth, "dynamic object, found", "tab:green"),
+        (~found & truth, "dynamic object, missed", "tab:red"),
         (found & ~truth, "standing, taken for one", "tab:blue"),
     )
     for which, name, color in kinds:

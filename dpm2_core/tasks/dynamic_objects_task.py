@@ -27,7 +27,7 @@ FIRST_MOVING = 252
 
 
 class DynamicObjectTraining(TaskTraining):
-    """A training of the movers."""
+    """A training of the dynamic objects."""
 
     network: DynamicObjectNetSettings = DynamicObjectNetSettings()
     """Grid and network."""
@@ -37,11 +37,11 @@ class DynamicObjectTraining(TaskTraining):
     every: int = Field(default=5, ge=1)
     rate: float = Field(default=3e-3, gt=0)
     drop: float = Field(default=0.7, ge=0, lt=1)
-    """At most this share of a scan's points is left out, another one each time: sparser sensors."""
+    """At most this fraction of a scan's points is left out, another one each time: sparser sensors."""
 
 
 class DynamicObjectTask(Task):
-    """Points of movers, by the voxels that they are in."""
+    """Points of dynamic objects, by the voxels that they are in."""
 
     name = "movers"
     training_type = DynamicObjectTraining
@@ -89,7 +89,7 @@ class DynamicObjectTask(Task):
         }
 
     def figure(self, scan: TaskScan, path: Path) -> None:
-        """The scan from above, what was found, missed and wrongly found in colours."""
+        """The scan from above, what was found, missed and wrongly found in colors."""
         from dpm2_core.tasks.dynamic_objects_figure import dynamic_objects_png  # matplotlib is slow to import
 
         points, movable, counted = _arrays(scan)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of what the tasks' networks make of a scan."""
+"""Images of what the tasks' networks make of a scan."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of range images: each as it is, and its points seen from above."""
+"""Images of range images: each as it is, and its points seen from above."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from dpm2_core.files import atomic_write
 from dpm2_core.network.perception.range_image import to_points
 
 _BACKGROUND, _INK = "#0d1117", "#c9d1d9"
-_FAR = 40.0  # m, the last colour, and the edge of the view from above
+_FAR = 40.0  # m, the last color, and the edge of the view from above
 
 
 def range_png(path: Path | str, rows: Mapping[str, tuple[Tensor, Tensor]], scale: float, title: str = "") -> None:
-    """Draw range images below each other, coloured by distance, black where a slot is empty.
+    """Draw range images below each other, colored by distance, black where a slot is empty.
 
     Args:
         rows: name, image (2, R, C) of d and z, and mask (R, C). scale: m that one stands for.

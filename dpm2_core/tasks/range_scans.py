@@ -122,7 +122,7 @@ def slam_of(slam_loss: SlamLoss, made: Tensor, true: RangeScans, scale: float, w
 
 def variety(images: Sequence[Tensor], scale: float) -> float:
     """How much the distances in images (B, 2, rows, columns) differ from scan to scan: their standard deviation in a
-    slot, m, the mean over the slots. Zero if a network makes one picture of everything."""
+    slot, m, the mean over the slots. Zero if a network makes one image of everything."""
     return float(torch.cat([image[:, 0] for image in images]).std(0, correction=0).mean()) * scale
 
 

@@ -153,7 +153,7 @@ def _batches(
         if settings.has_windows(epoch):
             windows.set_epoch(epoch)
             order = [i for window in windows for i in window]
-        else:  # neighbours in a step would be nearly one scan: batch statistics and gradients want many places
+        else:  # neighbors in a step would be nearly one scan: batch statistics and gradients want many places
             generator = torch.Generator().manual_seed(settings.seed * 1_000_003 + epoch)
             order = torch.randperm(len(scans), generator=generator).tolist()
         size = batch * settings.window

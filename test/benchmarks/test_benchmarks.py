@@ -30,7 +30,7 @@ FRAMES = 6
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A KITTI sequence of a street with houses, 1 m a frame, as points with 1 cm of noise."""
+    """A KITTI sequence of a street with houses, 1 m per frame, as points with 1 cm of noise."""
     folder = tmp_path_factory.mktemp("street")
     (folder / "velodyne").mkdir()
     (folder / "calib.txt").write_text("Tr: 0 -1 0 0 0 0 -1 0 1 0 0 0\n")

@@ -54,7 +54,7 @@ def test_wrong_loops_and_found_revisits_are_told_apart() -> None:
     ]  # fmt: skip
     result = check_loops(closures, truth)
     assert (result["tried"], result["accepted"], result["wrong"]) == (5, 3, 2)
-    assert result["reverse"] == {"revisits": 16, "found": 1}  # what was refused, or was wrong, found nothing
+    assert result["reverse"] == {"revisits": 16, "found": 1}  # what was rejected, or was wrong, found nothing
     assert result["refusals"] == {"only fit": 2}
 
 

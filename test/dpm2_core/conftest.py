@@ -58,7 +58,7 @@ def street(noise: np.random.Generator, points: int = 4000) -> np.ndarray:
 
 
 def make_image(noise: np.random.Generator, size: tuple[int, int] = (128, 64)) -> Image:
-    """A forward-looking camera with a random picture, (width, height)."""
+    """A forward-looking camera with a random image, (width, height)."""
     K = np.array([[60.0, 0, size[0] / 2 - 0.5], [0, 60.0, size[1] / 2 - 0.5], [0, 0, 1]])
     T_lidar_cam = se3.make([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0.3, 0.05, -0.1])
     pixels = noise.integers(0, 255, (size[1], size[0], 3), dtype=np.uint8)
@@ -79,7 +79,7 @@ def _street() -> Callable[..., np.ndarray]:
 
 @pytest.fixture(name="make_image")
 def _make_image() -> Callable[..., Image]:
-    """picture(noise, size=(128, 64)): a picture with its camera."""
+    """image(noise, size=(128, 64)): an image with its camera."""
     return make_image
 
 
@@ -112,7 +112,7 @@ def drive(noise: np.random.Generator) -> list[Keyframe]:
 
 @pytest.fixture
 def map_file(tmp_path: Path, drive: list[Keyframe]) -> Path:
-    """A closed map file of that drive, with a loop that was accepted and one that was refused."""
+    """A closed map file of that drive, with a loop that was accepted and one that was rejected."""
     path = tmp_path / "drive.dpm2map"
     with MapStore.create(path) as store:
         store.begin_session("slam: {}", "small 0123456789abcdef")

@@ -41,7 +41,7 @@ def test_an_interrupted_writer_leaves_the_old_file_and_nothing_else(
 
 
 def test_a_full_disk_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
-    """A file size limit makes the kernel refuse the write half-way, as a full disk does, without root or a mount."""
+    """A file size limit makes the kernel reject the write half-way, as a full disk does, without root or a mount."""
     path = tmp_path / "map.ply"
     path.write_text("old")
     program = f"""

@@ -193,7 +193,7 @@ WEIGHTS: dict[str, tuple[Callable[[DeepPointMap2], dict[str, str]], str]] = {
     "65,536 channels": (changed(decoder={"width": 65536}), "does not fit the network that it describes"),
     "a billion layers": (changed(decoder={"layers": 10**9}), "layers is 1000000000; at most"),
     "65,536 layers": (changed(fusion={"layers": 65536}), "less than or equal to 64"),
-    "a picture of a terapixel": (changed(image={"size": [10**6, 10**6]}), "image.size is 1000000"),
+    "an image of a terapixel": (changed(image={"size": [10**6, 10**6]}), "image.size is 1000000"),
     "a number without end": (changed(points={"far": float("inf")}), "points.far is inf"),
     "heads that do not divide": (changed(decoder={"heads": 7}), "cannot be"),
     "no JSON": (lambda model: {"preset": "tiny", "network": "{" * 100}, "not JSON"),

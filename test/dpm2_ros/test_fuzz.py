@@ -331,7 +331,7 @@ def test_a_drive_does_not_notice_what_else_is_sent(
     np.testing.assert_allclose(data.poses, [k.T_odom_kf for k in keyframes], atol=1e-6)
     with MapStore.open(nodes.file) as store:
         clouds = load_map(store, descriptors=False).clouds
-        for node, keyframe in enumerate(keyframes):  # thinned to what a message may have, else as they were
+        for node, keyframe in enumerate(keyframes):  # downsampled to what a message may have, else as they were
             measured = set(map(bytes, unpack_cloud(pack_cloud(keyframe.cloud))))
             kept = set(map(bytes, clouds.whole(node)))
             assert kept <= measured

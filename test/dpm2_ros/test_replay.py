@@ -144,7 +144,7 @@ def fast_camera(bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_lockstep_gives_the_trajectory_of_dpm2_run(
     ros: Callable[..., Any], processes: list[Any], fast_camera: Path, drive: Any, tmp_path: Path
 ) -> None:
-    """Bit for bit, pictures included: here every answer is moved by what the picture of its cloud says."""
+    """Bit for bit, images included: here every answer is moved by what the image of its cloud says."""
     settings = ["slam.visual.sigma=0.0001", "slam.visual.min_correlation=0.0", "slam.visual.distinct=0.0"]
     harness = ros()
     odometry = harness.hear(Odometry, "/dpm2/odom")
@@ -165,7 +165,7 @@ def test_lockstep_gives_the_trajectory_of_dpm2_run(
         return [pose_to_msg(one.T_odom_lidar) for one in tracked]
 
     assert [message.pose.pose for message in odometry] == expected()
-    assert [message.pose.pose for message in odometry] != expected("input.image_time_offset=-0.03")  # other pictures
+    assert [message.pose.pose for message in odometry] != expected("input.image_time_offset=-0.03")  # other images
     run(fast_camera, tmp_path / "out", settings=settings)
     written = read_trajectory(tmp_path / "out" / "trajectory.tum")
     assert written.keys.tolist() == [stamp_ns(message.header) for message in odometry]

@@ -186,7 +186,8 @@ def test_a_robot_that_is_killed_and_comes_back(fleet: Fleet) -> None:
 
 
 def test_a_keyframe_is_at_most_100_kB_on_the_wire(street: Path) -> None:
-    """Descriptors come out as they went in; a cloud too large is thinned until it fits, a small one is not touched."""
+    """Descriptors come out as they went in; a cloud too large is downsampled until it fits, a small one is not
+    touched."""
     from dpm2_core.network.pretrained import load_network
     from dpm2_core.slam.loops.place_recognition import PlaceRecognition
     from dpm2_core.slam.store.cloud_codec import unpack_cloud

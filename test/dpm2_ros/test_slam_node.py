@@ -101,7 +101,7 @@ def test_every_cloud_gives_its_pose(rig: Callable[..., Rig], drive: Any, reliabl
         assert (message.header.frame_id, message.child_frame_id) == ("odom", "lidar")
     covariance = np.array(r.odom[-1].pose.covariance).reshape(6, 6)
     assert (np.linalg.eigvalsh(covariance) > 0).all()
-    assert np.trace(covariance) > np.trace(np.array(r.odom[5].pose.covariance).reshape(6, 6))  # doubt accumulates
+    assert np.trace(covariance) > np.trace(np.array(r.odom[5].pose.covariance).reshape(6, 6))  # uncertainty accumulates
     assert r.odom[-1].twist.twist.linear.x == pytest.approx(8.0, abs=0.6)  # 0.8 m in 0.1 s
     values = r.values()
     assert (values["received"], values["processed"], values["dropped (queue full)"]) == ("16", "16", "0")
@@ -453,7 +453,7 @@ def test_stamps_that_repeat_or_go_back(rig: Callable[..., Rig], drive: Any) -> N
     r.send_and_wait(3)
     assert r.stamps() == [drive.stamp(n) for n in range(4)]
     values = r.values()
-    assert (values["refused (stamp repeated)"], values["refused (stamp out of order)"]) == ("1", "1")
+    assert (values["rejected (stamp repeated)"], values["rejected (stamp out of order)"]) == ("1", "1")
 
 
 @pytest.mark.parametrize("back", [1.5, 20.0], ids=["looped bag", "clock that was set"])

@@ -150,7 +150,7 @@ class Dslr(nn.Module):
 
     def in_front(self, d: Tensor, static: Tensor) -> Tensor:
         """Where distances (...), in units of the scale, are so much less than those of the static scan that something
-        which will not stay stands in between: by a fifth and a metre, which is more than the translation errs."""
+        which will not stay stands in between: by a fifth and a meter, which is more than the translation errs."""
         return d < 0.8 * static - 1.0 / self.settings.image.scale
 
     def static_points(self, points: Tensor) -> Tensor:

@@ -28,7 +28,7 @@ LAYERS = (0.25, 0.75, 1.25, 1.75, 2.5, 4.0)
 
 
 class DynamicObjectNetSettings(Settings):
-    """Grid and network of the movers."""
+    """Grid and network of the dynamic objects."""
 
     cells: int = Field(default=200, ge=16, multiple_of=8)
     """Of the grid along x and along y; the sensor is in its middle. What lies off it counts as standing."""
@@ -39,7 +39,8 @@ class DynamicObjectNetSettings(Settings):
 
 
 class DynamicObjectNet(nn.Module):
-    """Occupancy (B, 7, cells, cells), 0 or 1, to the logit of being a mover in each of its voxels, the same shape."""
+    """Occupancy (B, 7, cells, cells), 0 or 1, to the logit of being a dynamic object in each of its voxels, the same
+    shape."""
 
     range: Tensor
 

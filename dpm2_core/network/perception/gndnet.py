@@ -38,7 +38,7 @@ class GroundSettings(Settings):
     softness: float = Field(default=0.05, gt=0)
     """Width of the soft threshold, m."""
     smoothness: float = Field(default=0.1, ge=0, le=1)
-    """Share of the loss that is the curvature of the ground."""
+    """Fraction of the loss that is the curvature of the ground."""
 
 
 class GroundNet(nn.Module):

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Weights of a task as safetensors: they name the task and the settings of its network, and fit both or are refused."""
+"""Weights of a task as safetensors: they name the task and the settings of its network, and fit both or are
+rejected."""
 
 from __future__ import annotations
 

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pose graph: robust optimisation, a worker process, g2o."""
+"""The pose graph: robust optimization, a worker process, g2o."""

@@ -19,7 +19,7 @@ class GraphData:
     """Nodes are 0..N-1; the odometry is a chain of edges n-1 -> n, which may be broken; all other edges are loops.
 
     Attributes:
-        poses: (N, 4, 4) T_map_node, the start of an optimisation.
+        poses: (N, 4, 4) T_map_node, the start of an optimization.
         chained: (N,) whether node n is tied to n-1 by odometry. Where it is not, a trajectory begins.
         steps: (N, 4, 4) T_before_this of the odometry; identity where there is none.
         step_covariances: (N, 6, 6) [rotation rad, translation m] of `steps`; zero where there is none.

@@ -25,10 +25,10 @@ _ATTEMPTS = 2  # processes that may die over one graph
 
 
 class PoseGraphSettings(RobustSettings):
-    """Optimisation of the keyframe poses."""
+    """Optimization of the keyframe poses."""
 
     background: bool = False
-    """Optimise in another process while the drive goes on, for a live system; the result then depends on its timing."""
+    """Optimize in another process while the drive goes on, for a live system; the result then depends on its timing."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class PoseGraph:
     """Keyframe poses T_map_kf, odometry edges and loop edges; node n is the n-th one added.
 
     Attributes:
-        problem: why the last optimisation failed, in words; empty since one went well.
+        problem: why the last optimization failed, in words; empty since one went well.
     """
 
     def __init__(self, settings: PoseGraphSettings) -> None:
@@ -97,7 +97,7 @@ class PoseGraph:
 
     @property
     def busy(self) -> bool:
-        """Whether another process is optimising."""
+        """Whether another process is optimizing."""
         return self._worker.busy
 
     def add_node(
@@ -137,7 +137,7 @@ class PoseGraph:
         """Tie two keyframes that saw the same place.
 
         Where it is the first between two parts of the graph, the younger one is moved there as it is: from any other
-        start an optimisation would take the loop for a wrong one.
+        start an optimization would take the loop for a wrong one.
 
         Raises:
             Dpm2Error: the loop is not sound; nothing was added.
@@ -182,7 +182,7 @@ class PoseGraph:
             wait: until there is nothing more to wait for, as at the end of a drive.
 
         Returns:
-            Whether poses or verdicts changed.
+            Whether poses or results changed.
         """
         changed = False
         while self.busy:
@@ -215,7 +215,7 @@ class PoseGraph:
         return self._joint([node])
 
     def relative_covariance(self, a: int, b: int) -> Array:
-        """(6, 6) of xi in T_a_b @ Exp(xi) of two different nodes; small between neighbours, however far from the start.
+        """(6, 6) of xi in T_a_b @ Exp(xi) of two different nodes; small between neighbors, however far from the start.
 
         Raises:
             ValueError: it is one node.
@@ -292,7 +292,7 @@ class PoseGraph:
 
 
 def _check(what: str, node: int, T: Array, covariance: Array | None = None) -> None:
-    """One NaN would reach every pose with the next optimisation."""
+    """One NaN would reach every pose with the next optimization."""
     if not se3.is_rigid(T):
         raise Dpm2Error(f"pose graph: {what} {node}: not a finite rigid transform")
     if covariance is not None and not se3.is_covariance(covariance):

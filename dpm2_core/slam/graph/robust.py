@@ -3,7 +3,7 @@
 
 The odometry is trusted within its covariances, loops are not. A loop that the odometry between its ends flatly
 contradicts is set aside, the others are solved for under a Cauchy kernel (which hardly listens to what is far off), and
-every loop, also those set aside, is then judged by how far the optimised poses are from it; so on until the verdicts
+every loop, also those set aside, is then judged by how far the optimized poses are from it; so on until the results
 stay. Only the nodes at the ends of loops are unknowns: the odometry between them is compounded, its inner nodes follow.
 """
 
@@ -43,7 +43,7 @@ class RobustSettings(Settings):
     loop_kernel: float = Field(5.0, gt=0)
     """Width of the Cauchy kernel on loop edges, in standard deviations: what is many times farther off hardly pulls."""
     loop_sigmas: float = Field(10.0, gt=0)
-    """A loop is kept if the optimised poses are within so many standard deviations of it. Right ones are within 5,
+    """A loop is kept if the optimized poses are within so many standard deviations of it. Right ones are within 5,
     wrong ones hundreds off: the room between is for covariances that promise too much."""
     odometry_sigmas: float = Field(20.0, gt=0)
     """A loop starts out set aside if the odometry between its ends is more than so many standard deviations off."""
@@ -58,12 +58,12 @@ class Solution:
     """The outcome.
 
     Attributes:
-        poses: (N, 4, 4) optimised.
+        poses: (N, 4, 4) optimized.
         kept: (E,) whether each loop was used.
-        sigmas: (E,) how far the optimised poses are from each loop, in standard deviations.
+        sigmas: (E,) how far the optimized poses are from each loop, in standard deviations.
         odometry_sigmas: (E,) how far the odometry alone is; nan for loops between two trajectories.
         rounds: of solving and judging.
-        settled: whether the verdicts stayed; after `rounds` of the settings the last ones stand.
+        settled: whether the results stayed; after `rounds` of the settings the last ones stand.
     """
 
     poses: Array
@@ -75,14 +75,14 @@ class Solution:
 
     def reason(self, loop: int) -> str:
         """Why a loop was kept or rejected, in words."""
-        info = f"{self.sigmas[loop]:.1f} sigma from the optimised poses"
+        info = f"{self.sigmas[loop]:.1f} sigma from the optimized poses"
         if np.isfinite(self.odometry_sigmas[loop]):
             info += f", {self.odometry_sigmas[loop]:.1f} from the odometry"
         return info
 
 
 def optimize(graph: GraphData, settings: RobustSettings) -> Solution:
-    """Optimise and judge; deterministic.
+    """Optimize and judge; deterministic.
 
     Raises:
         RuntimeError: gtsam found the system to be singular, as with a covariance that is none.
@@ -117,7 +117,7 @@ def joint_covariance(graph: GraphData, poses: Array, kept: NDArray[np.bool_], no
     """(6 n, 6 n) covariance of distinct nodes' poses, [rotation, translation] of T_map_node @ Exp(xi) each in turn.
 
     Args:
-        poses: (N, 4, 4) optimised. kept: (E,) loops to count.
+        poses: (N, 4, 4) optimized. kept: (E,) loops to count.
     """
     ends = graph.ends[kept].ravel()
     condensed = CondensedOdometry(graph, integrate(graph), np.concatenate([ends, graph.fixed, nodes]))

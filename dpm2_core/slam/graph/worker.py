@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Optimises a pose graph in a process of its own: gtsam holds Python's lock while it works, and odometry must not wait.
+"""Optimizes a pose graph in a process of its own: gtsam holds Python's lock while it works, and odometry must not wait.
 
 The process is a fresh interpreter, never a fork (safe beside rclpy's threads and locks), in a session of its own (an
 interrupt from the terminal is for the program, not for it) and lives as long as its standard input: when the program
@@ -91,7 +91,7 @@ class GraphWorker:
             process.kill()
             status = process.wait()
             self._process = None
-            self._answer = Dpm2Error(f"the pose graph optimiser's process ended by itself (status {status})")
+            self._answer = Dpm2Error(f"the pose graph optimizer's process ended by itself (status {status})")
 
 
 def _start() -> subprocess.Popen[bytes]:

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Places found again: retrieval, registration, verification, consistency, relocalisation."""
+"""Places found again: retrieval, registration, verification, consistency, relocalization."""

@@ -50,7 +50,7 @@ class LoopSettings(Settings):
     radius: float = 8.0
     """The keyframe nearest by the pose is a candidate, too, if nearer than this, m; `drift` widens it."""
     drift: float = 0.01
-    """Widens the radius by so many metres a metre of path since that keyframe."""
+    """Widens the radius by so many meters per meter of path since that keyframe."""
     surroundings: float = 22.0
     """Keyframes so near to a candidate along the path make up the map to register to, m."""
     verification: VerificationSettings = VerificationSettings()
@@ -91,7 +91,8 @@ class LoopCloser:
             keyframes: all of them. clouds: theirs, each (M, 4) in its own frame. poses: (N, 4, 4) T_map_kf.
 
         Returns:
-            Every candidate, accepted or refused with its reason; and earlier ones of which it took a second to be sure.
+            Every candidate, accepted or rejected with its reason; and earlier ones of which it took a second to be
+            sure.
         """
         for node in range(len(self._path), len(keyframes)):
             self._path.append(keyframes[node])
@@ -118,7 +119,7 @@ class LoopCloser:
     def _proposals(
         self, node: int, since: Array, keyframes: Sequence[Keyframe], poses: Array
     ) -> tuple[list[Loop], list[Loop]]:
-        """Candidates that the network refused, and those for the points to judge, the most likely first."""
+        """Candidates that the network rejected, and those for the points to judge, the most likely first."""
         s, descriptors = self._settings, keyframes[node].descriptors
         nearest = self._nearest(since, poses)
         rejections: list[Loop] = []
@@ -132,7 +133,7 @@ class LoopCloser:
                     rejections.append(loop)
                 elif r.confidence < s.min_confidence:
                     rejections.append(rejected(loop, f"descriptors match with a confidence of only {r.confidence:.2f}"))
-                elif r.overlap < s.min_overlap:  # NaN of an untrained head refuses nothing
+                elif r.overlap < s.min_overlap:  # NaN of an untrained head rejects nothing
                     rejections.append(rejected(loop, f"the places overlap with a probability of only {r.overlap:.2f}"))
                 else:
                     proposals.append(loop)

@@ -23,9 +23,9 @@ class ConsistencySettings(Settings):
     """How far loops may differ from the odometry and from each other."""
 
     drift: float = 0.02
-    """Odometry error to reckon with a metre of path: a loop that corrects more (and 1 m) is refused."""
+    """Odometry error to reckon with per meter of path: a loop that corrects more (and 1 m) is rejected."""
     drift_turn: float = 0.02
-    """The same for rotation, degrees a metre (and 3 degrees)."""
+    """The same for rotation, degrees per meter (and 3 degrees)."""
     certain: float = 2.0
     """A loop that corrects the odometry by no more than this, m (and degrees), needs no other loop to confirm it."""
     reach: float = 100.0
@@ -33,7 +33,7 @@ class ConsistencySettings(Settings):
     circle: float = 0.4
     """...and the circle of the two misses its start by no more than this, m (and three times that, degrees)..."""
     circle_drift: float = 0.01
-    """...and this, a metre of the path in the circle (and three times that, degrees)."""
+    """...and this, a meter of the path in the circle (and three times that, degrees)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +72,7 @@ class OdometryChain:
         self._segment[node], self._meters[node] = self._segment[before], self._meters[before] + step
 
     def since(self, node: int) -> Array:
-        """(N,) metres of path between each node and this one; inf where there is no odometry between them."""
+        """(N,) meters of path between each node and this one; inf where there is no odometry between them."""
         meters, same = self._meters[: len(self)], self._segment[: len(self)] == self._segment[node]
         return np.where(same, np.abs(meters - meters[node]), np.inf)
 
@@ -101,7 +101,7 @@ class Consistency:
             T_expected: (4, 4) T_from_to as the map has it.
 
         Returns:
-            The loop, accepted or refused with the reason; if accepted, with those that waited for one like it.
+            The loop, accepted or rejected with the reason; if accepted, with those that waited for one like it.
         """
         s, result = self._settings, loop.registration
         since = self._path.between(loop.from_node, loop.to_node)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Localisation mode: keyframes are found in a map that stays as it is; kidnapping is noticed and answered."""
+"""Localization mode: keyframes are found in a map that stays as it is; kidnapping is noticed and answered."""
 
 from __future__ import annotations
 

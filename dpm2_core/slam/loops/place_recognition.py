@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The network's part in loops and relocalisation: which keyframes look like this one, and from where it was taken."""
+"""The network's part in loops and relocalization: which keyframes look like this one, and from where it was taken."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class PlaceRecognition:
     def describe(self, points: Points) -> Descriptors | None:
         """Descriptors of a cloud (M, 4); None if it has too few points.
 
-        A keyframe's cloud, thinned out as it is, gives descriptors that serve as well as those of the whole scan.
+        A keyframe's cloud, downsampled as it is, gives descriptors that serve as well as those of the whole scan.
         """
         try:
             return self._network.describe(Frame(0, points))
@@ -47,7 +47,7 @@ class PlaceRecognition:
             self._index.append(keyframes[node].descriptors)
 
     def similar(self, descriptors: Descriptors, allowed: NDArray[np.bool_], count: int) -> list[int]:
-        """At most `count` of the `allowed` (N,) nodes that look like it, the likest first, no two neighbours."""
+        """At most `count` of the `allowed` (N,) nodes that look like it, the most similar first, no two neighbors."""
         return self._index.nearest(pooled(descriptors), allowed, count, apart=1)
 
     def register(self, source: Descriptors, targets: Sequence[Descriptors]) -> list[Registration]:

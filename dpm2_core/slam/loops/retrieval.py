@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which places of the map look like this one: one vector a keyframe, compared with all others in one product.
+"""Which places of the map look like this one: one vector per keyframe, compared with all others in one product.
 
 The vector is the square root of the covariance of a keyframe's descriptors: P. Li, J. Xie, Q. Wang, Z. Gao, "Towards
 Faster Training of Global Covariance Pooling Networks by Iterative Matrix Square Root Normalization", CVPR 2018. It
@@ -71,7 +71,7 @@ class PlaceIndex:
     def similarities(self, query: Vector) -> NDArray[np.float32]:
         """Cosine (N,) of each keyframe's vector and the (528,) query, both less the mean of all; -1 without a vector.
 
-        What all places of a map have in common is no likeness, so the mean is taken off.
+        What all places of a map have in common is no correlation, so the mean is taken off.
         """
         mean = (self._sum / max(self._used, 1)).astype(np.float32)
         requested = query - mean
@@ -86,7 +86,7 @@ class PlaceIndex:
 
         Args:
             apart: a keyframe that is no farther than this in the order from one already taken is passed over: its
-                neighbours show the same place, and other places deserve a look.
+                neighbors show the same place, and other places deserve a look.
         """
         order = np.flatnonzero(allowed & (self._squared[: self._count] > 0))
         similar = self.similarities(query)[order]

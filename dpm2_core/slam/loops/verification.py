@@ -25,7 +25,7 @@ class VerificationSettings(Settings):
     """What a pose must show to be believed."""
 
     min_inliers: float = 0.6
-    """Share of the points that must fit the map."""
+    """Fraction of the points that must fit the map."""
     min_structure: float = 0.6
     """The same for what stands above the ground: the road fits anywhere."""
     min_points: int = 150
@@ -33,7 +33,7 @@ class VerificationSettings(Settings):
     max_rmse: float = 0.2
     """Largest residual of the points that fit, m."""
     max_sigma: float = 0.1
-    """Largest standard deviation of the position in its worst direction, m: refuses loops along a tunnel."""
+    """Largest standard deviation of the position in its worst direction, m: rejects loops along a tunnel."""
     max_moved: float = 2.0
     """The points may not move the proposed pose farther than this, m..."""
     max_turned: float = 5.0
@@ -48,7 +48,7 @@ class VerificationResult:
 
     Attributes:
         registration: the pose that they prefer; `ok` says whether it is believed, `reason` why not.
-        structure: share of the points above the ground that fit. points: number of those.
+        structure: fraction of the points above the ground that fit. points: number of those.
         moved: from the proposed pose, m. turned: the same, degrees.
     """
 

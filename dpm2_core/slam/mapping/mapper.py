@@ -38,7 +38,7 @@ class MapSettings(Settings):
     voxel: float = 0.3
     """Spacing of its points, m."""
     thumbnail: int = Field(0, ge=0, le=1024)
-    """Width of the picture that a map file keeps of each keyframe, pixels; 0: none."""
+    """Width of the image that a map file keeps of each keyframe, pixels; 0: none."""
     moving: MovingSettings = MovingSettings()
     redundancy: RedundancySettings = RedundancySettings()
 
@@ -91,7 +91,7 @@ class Mapper:
 
     @property
     def poses(self) -> Array:
-        """(N, 4, 4) optimised T_map_kf of all keyframes."""
+        """(N, 4, 4) optimized T_map_kf of all keyframes."""
         return self._graph.poses
 
     @property
@@ -139,7 +139,7 @@ class Mapper:
 
     @property
     def graph_problem(self) -> str:
-        """Why the poses are not optimised, in words; empty since they were."""
+        """Why the poses are not optimized, in words; empty since they were."""
         return self._graph.problem
 
     def start_session(self, T_map_odom: Array, covariance: Array | None = None) -> None:

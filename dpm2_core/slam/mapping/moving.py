@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which points of a cloud belong to things that moved away: other keyframes look through the place where they were.
 
-A cloud is compared with range images of its neighbours. Where a neighbour sees nothing at or before a point but
+A cloud is compared with range images of its neighbors. Where a neighbor sees nothing at or before a point but
 something well behind it, the point was not there then. One such witness may be chance (leaves, glass, the rim of a
-pole), so two are wanted, and more than there are neighbours that saw something at the point.
+pole), so two are wanted, and more than there are neighbors that saw something at the point.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class MovingSettings(Settings):
     margin: float = Field(0.5, gt=0)
     """What they see must lie so far behind it, m; 3 % of the range are added."""
     growth: float = Field(0.7, gt=0)
-    """Points this near to a moving one move with it, unless neighbours saw them, m."""
+    """Points this near to a moving one move with it, unless neighbors saw them, m."""
     footprint: float = Field(0.3, gt=0)
     """A return within this of the line of sight counts as seeing the point, m."""
 

@@ -27,7 +27,7 @@ Mask = NDArray[np.bool_]
 
 _DIRECTIONS = 720
 _GROUND_CELL = 1.0  # m
-_OCCUPIED, _FREE, _UNKNOWN = 0, 254, 205  # grey values of map_server
+_OCCUPIED, _FREE, _UNKNOWN = 0, 254, 205  # gray values of map_server
 _MOST = 400_000_000  # cells
 
 
@@ -119,7 +119,7 @@ def _seen_cells(
 
 
 def write_grid(path: Path, grid: Grid) -> Path:
-    """Write PATH.yaml and the picture PATH.pgm that it names; returns the former.
+    """Write PATH.yaml and the image PATH.pgm that it names; returns the former.
 
     Raises:
         Dpm2Error: a file could not be written.

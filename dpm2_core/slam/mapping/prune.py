@@ -12,7 +12,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.slam.store.map_data import MapData, subset
 from dpm2_core.slam.store.rows import Edge, RemovedKeyframe
 
-_LAP = 10  # keyframes: neighbours along the drive are no revisit
+_LAP = 10  # keyframes: neighbors along the drive are no revisit
 
 
 def redundant_nodes(data: MapData, distance: float, angle: float) -> list[int]:
@@ -84,9 +84,9 @@ def _anchor(data: MapData, node: int, kept: Sequence[int]) -> int:
 def eliminate(edges: Sequence[Edge], nodes: Sequence[int]) -> list[Edge]:
     """Edges of a graph from which nodes are taken, one after the other.
 
-    A node's neighbours are joined to that one of them which the odometry ties to it best, each by the composition of
+    A node's neighbors are joined to that one of them which the odometry ties to it best, each by the composition of
     two edges: one edge less a node, as on a chain. (Exact marginalisation would join every one with every other.)
-    Refused loops of a node go with it.
+    Rejected loops of a node go with it.
     """
     left: dict[int, Edge] = dict(enumerate(edges))
     at: dict[int, set[int]] = {}
@@ -108,7 +108,7 @@ def eliminate(edges: Sequence[Edge], nodes: Sequence[int]) -> list[Edge]:
 
 
 def _joined(node: int, incident: list[Edge]) -> list[Edge]:
-    """The edges between its neighbours that replace those of a node."""
+    """The edges between its neighbors that replace those of a node."""
     spokes = [edge if edge.from_node == node else inverted(edge) for edge in incident]
     if len(spokes) < 2:
         return []

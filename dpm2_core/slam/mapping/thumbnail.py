@@ -7,7 +7,7 @@ from dpm2_core.frame import Frame
 
 
 def thumbnail(frame: Frame, width: int) -> bytes | None:
-    """JPEG of the frame's first picture, `width` pixels wide; None without a picture, or for a width of 0."""
+    """JPEG of the frame's first image, `width` pixels wide; None without an image, or for a width of 0."""
     if not frame.images or not width:
         return None
     import cv2

@@ -26,9 +26,9 @@ class KeyframeSettings(Settings):
     range: float = 60.0
     """Points farther than this do not enter the map, m."""
     drift_translation: float = 0.01
-    """Standard deviation of the odometry a metre of motion, m: the stiffness of odometry edges in the pose graph."""
+    """Standard deviation of the odometry per meter of motion, m: the stiffness of odometry edges in the pose graph."""
     drift_rotation: float = 0.03
-    """The same for rotation, degrees a metre."""
+    """The same for rotation, degrees per meter."""
 
 
 class KeyframeSelector:

@@ -22,7 +22,7 @@ class OdometrySettings(Settings):
     """When to believe a registration, and what to do when there is none."""
 
     max_acceleration: float = 40.0
-    """A registration that differs from the prediction by more than this allows is refused, m/s2 (0.5 m are free)."""
+    """A registration that differs from the prediction by more than this allows is rejected, m/s2 (0.5 m are free)."""
     max_turn: float = 200.0
     """The same for rotation, deg/s of difference from the predicted rate (3 deg are free)."""
     steadiness: float = 10.0
@@ -61,7 +61,7 @@ class Odometry:
 
     @property
     def uses_images(self) -> bool:
-        """Whether frames should come with their pictures."""
+        """Whether frames should come with their images."""
         return self._registration.uses_images
 
     def request_keyframe(self) -> None:
@@ -219,7 +219,7 @@ class Odometry:
         return scan, self._registration.register(scan, Prediction([registration.T_target_source]))
 
     def _update(self, scan: Scan, registration: Registration, dt: float) -> None:
-        """Move on: to the registered pose, or to the predicted one with the doubt that it deserves."""
+        """Move on: to the registered pose, or to the predicted one with the uncertainty that it deserves."""
         T_registered, seconds = self._registered
         if not registration.ok:
             self._coast(dt)

@@ -49,7 +49,7 @@ class DescriptorMap:
         self._places.append(_Place(T_odom_lidar, descriptors))
 
     def around(self, T_odom_lidar: Array) -> tuple[Array, Descriptors]:
-        """Pose T_odom_kf of the nearest frame, and the merged descriptors of it and its neighbours in its frame."""
+        """Pose T_odom_kf of the nearest frame, and the merged descriptors of it and its neighbors in its frame."""
         distance = [float(np.linalg.norm(p.T_odom_kf[:3, 3] - T_odom_lidar[:3, 3])) for p in self._places]
         order = np.argsort(distance, kind="stable")[: self._frames]
         near = [self._places[i] for i in order if distance[i] <= self._radius or i == order[0]]

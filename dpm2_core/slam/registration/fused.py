@@ -25,8 +25,8 @@ class RefinedScanRegistration:
     Where both have an answer and agree (see `agree`), it is that of the points, and along directions that the network
     knows better the mean by information: in town the points have it, along a tunnel the network. Where they contradict
     each other, the points have it: they are many, and led there by the motion so far. While no motion is known the pose
-    of the network is one more start for them, and the likeliest wins. Where the points have no answer they try again
-    from the pose of the network; if they have none there, or another, the network answers alone, with its doubt.
+    of the network is one more start for them, and the most likely wins. Where the points have no answer they try again
+    from the pose of the network; if they have none there, or another, the network answers alone, with its uncertainty.
     `reason` says who did not agree, and why.
     """
 
@@ -89,7 +89,7 @@ def _mean(points: Registration, neural: Registration, prior: Array | None) -> Re
     """Both by their information, along the directions that the network claims to know better than the points.
 
     Elsewhere its errors would count for more than it adds: it judges itself too well and the points judge themselves
-    too badly. The information of the prediction, prior (6, 6), holds the points but is no part of the doubt.
+    too badly. The information of the prediction, prior (6, 6), holds the points but is no part of the uncertainty.
     """
     of_points, of_network = np.linalg.inv(points.covariance), np.linalg.inv(neural.covariance + MAP_NOISE)
     held = of_points if prior is None else of_points + prior

@@ -25,7 +25,7 @@ class GeometricSettings(Settings):
     min_points: int = 80
     """Fewer inliers than this are no answer."""
     min_inliers: float = 0.5
-    """A smaller share of inliers among the points is no answer."""
+    """A smaller fraction of inliers among the points is no answer."""
     min_inliers_expected: float = 0.3
     """The same in a map of at most 3 scans, where the answer is what the motion so far led to expect, to 0.3 m and
     2 degrees: two sources then say the same, and such a map, of which traffic hides ever other parts, has counterparts
@@ -92,7 +92,7 @@ class GeometricRegistration:
     def likelihood(self, source: Array, target: LocalMap, T: Array) -> float:
         """Mean log likelihood of the (N, 3) points at a pose T_target_source: tells which of two poses fits better.
 
-        Distances along the normals are Cauchy distributed; a point without a counterpart has a density of 1 per metre.
+        Distances along the normals are Cauchy distributed; a point without a counterpart has a density of 1 per meter.
         """
         _, _, residual, variance = self._matched(source, target, T, self._settings.final_gate)
         log_density = -0.5 * np.log(variance) - np.log1p(residual * residual / variance)

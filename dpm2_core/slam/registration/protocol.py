@@ -31,7 +31,7 @@ class Prediction:
     """What the motion so far says about the pose of a scan.
 
     Attributes:
-        starts: (4, 4) T_odom_lidar, the likeliest first; several while the velocity is unknown.
+        starts: (4, 4) T_odom_lidar, the most likely first; several while the velocity is unknown.
         widen: factor on how far from them the answer is looked for.
         information: (6, 6) [rotation rad, translation m] of the first; None: nothing to go by.
     """
@@ -45,7 +45,7 @@ class ScanRegistration(Protocol):
     """Registers scans to what it remembers of earlier ones. T_target_source of its answers is T_odom_lidar.
 
     Attributes:
-        uses_images: whether frames should come with their pictures.
+        uses_images: whether frames should come with their images.
     """
 
     @property

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The picture where the geometry is silent: how far along a tunnel or a highway.
+"""The image where the geometry is silent: how far along a tunnel or a highway.
 
 Points and descriptors leave a direction open there: along it, every pose fits alike. The points of an earlier scan have
-a brightness in the picture that was taken with it, and the same points are looked for in the picture of this scan. One
+a brightness in the image that was taken with it, and the same points are looked for in the image of this scan. One
 number is unknown, the way along the open direction; it is the one at which the two brightnesses correlate best. In town
-no direction is open, and no picture is ever touched.
+no direction is open, and no image is ever touched.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration
 
 
 class VisualSettings(Settings):
-    """How far along, by the picture."""
+    """How far along, by the image."""
 
     enabled: bool = True
     """Ask the first camera where scans leave a direction open."""
@@ -33,37 +33,39 @@ class VisualSettings(Settings):
     reach: float = Field(6.0, gt=0)
     """Farthest that is looked to either side, m; less where the motion so far says more."""
     baseline: float = Field(3.0, gt=0)
-    """Way after which another picture is the one to compare with, m."""
+    """Way after which another image is the one to compare with, m."""
     points: int = Field(1500, gt=0)
     """So many points are compared."""
     width: int = Field(640, gt=0)
-    """Pictures are reduced to this width, pixels."""
+    """Images are reduced to this width, pixels."""
     min_correlation: float = Field(0.3, ge=0, le=1)
-    """A poorer likeness is none."""
+    """A poorer correlation is none."""
     distinct: float = Field(0.1, ge=0, le=1)
-    """The best place must be liker than any other by this much: lane marks and lamps repeat."""
+    """The best place must be more similar than any other by this much: lane marks and lamps repeat."""
 
 
 _NEAR, _FAR = 2.0, 50.0  # m ahead of the camera: the compared points
 _STEPS = (0.1, 0.02)  # m, between the places tried: everywhere, then around the best
 _BLUR = (2.5, 1.0)  # pixels: so that nothing is missed between two of them
 _LOCAL = 12.0  # pixels: light that changes more slowly is no texture
-_LEAST = 100  # points that both pictures must show
+_LEAST = 100  # points that both images must show
 _CORRELATED = 100  # pixels next to each other, and the points between them, say the same
-_COARSE_MARGIN = 0.3  # of the likeness at the coarse blur: the fine one chooses among those that are not farther behind
+_COARSE_MARGIN = (
+    0.3  # of the correlation at the coarse blur: the fine one chooses among those that are not farther behind
+)
 _APART = 0.6  # m: other places, not the slope of the best one
 
 
 @dataclass(frozen=True, eq=False)
 class _GrayImage:
-    """Texture (h, w) float32 at each of `_BLUR`, K (3, 3) of the reduced picture, T_cam_lidar (4, 4)."""
+    """Texture (h, w) float32 at each of `_BLUR`, K (3, 3) of the reduced image, T_cam_lidar (4, 4)."""
 
     texture: tuple[NDArray[np.float32], ...]
     K: Array
     T_cam_lidar: Array
 
     def project(self, points: Array) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Pixels (..., N, 2) of points (..., N, 3) of the camera frame, m, and which of them the picture shows."""
+        """Pixels (..., N, 2) of points (..., N, 3) of the camera frame, m, and which of them the image shows."""
         ahead = points[..., 2] > _NEAR / 2
         image = points @ self.K.T
         uv = np.asarray(image[..., :2] / np.where(ahead, points[..., 2], 1.0)[..., None], np.float32)
@@ -72,7 +74,7 @@ class _GrayImage:
         return uv, shown
 
     def sample(self, points: Array, level: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Texture (S, N) at points (S, N, 3) of the camera frame, m, and which of them the picture shows."""
+        """Texture (S, N) at points (S, N, 3) of the camera frame, m, and which of them the image shows."""
         uv, shown = self.project(points)
         found = cv2.remap(self.texture[level], uv[..., 0], uv[..., 1], cv2.INTER_LINEAR)
         return np.asarray(found, np.float32), shown
@@ -80,7 +82,7 @@ class _GrayImage:
 
 @dataclass(frozen=True, eq=False)
 class _Reference:
-    """A picture whose scan was taken at T_odom_lidar (4, 4), and points (N, 3) of that scan in its LiDAR frame."""
+    """An image whose scan was taken at T_odom_lidar (4, 4), and points (N, 3) of that scan in its LiDAR frame."""
 
     image: _GrayImage
     points: Array
@@ -88,12 +90,12 @@ class _Reference:
 
 
 class VisualScanRegistration:
-    """Any registration, and the picture along the direction that it leaves open."""
+    """Any registration, and the image along the direction that it leaves open."""
 
     def __init__(self, settings: VisualSettings, registration: ScanRegistration) -> None:
         self._settings = settings
         self._registration = registration
-        self._last: tuple[Scan, Array] | None = None  # a scan with a picture and where it was taken
+        self._last: tuple[Scan, Array] | None = None  # a scan with an image and where it was taken
         self._reference: _Reference | None = None  # made of it when first needed
 
     uses_images = True
@@ -132,7 +134,7 @@ class VisualScanRegistration:
         self._last, self._reference = (scan, T_odom_lidar), None
 
     def _along(self, result: Registration, image: Image, information: Array | None) -> Registration:
-        """The answer moved along its open direction to where the pictures agree; as it was, if they do not say."""
+        """The answer moved along its open direction to where the images agree; as it was, if they do not say."""
         s = self._settings
         axis = np.linalg.eigh(result.covariance[3:, 3:])[1][:, -1]
         b = np.concatenate([np.zeros(3), axis])
@@ -163,7 +165,7 @@ class VisualScanRegistration:
         """Way along `axis` of the LiDAR frame and its standard deviation, m; or why it is not known."""
         s = self._settings
         if len(reference.points) < _LEAST:
-            return f"picture: only {len(reference.points)} points in it"
+            return f"image: only {len(reference.points)} points in it"
         here = _moved(reference.image.T_cam_lidar, reference.points)[None]
         values = [reference.image.sample(here, level)[0][0] for level in (0, 1)]
         there = _moved(image.T_cam_lidar @ se3.inverse(T_odom_lidar) @ reference.T_odom_lidar, reference.points)
@@ -172,7 +174,7 @@ class VisualScanRegistration:
         correlation = _correlations(values[0], *image.sample(there - offsets[:, None, None] * step, 0))
         candidates = _maxima(correlation, max(s.min_correlation / 2, float(correlation.max()) - _COARSE_MARGIN))
         if not len(candidates):
-            return f"picture: a likeness of only {max(float(correlation.max()), 0):.2f}"
+            return f"image: a correlation of only {max(float(correlation.max()), 0):.2f}"
         around = np.arange(-_STEPS[0], _STEPS[0] + _STEPS[1] / 2, _STEPS[1])
         peaks = []
         for middle in offsets[candidates]:
@@ -182,15 +184,15 @@ class VisualScanRegistration:
         peaks.sort(key=lambda peak: -peak[0])
         best, near, fine = peaks[0]
         if best < s.min_correlation:
-            return f"picture: a likeness of only {max(best, 0):.2f}"
+            return f"image: a correlation of only {max(best, 0):.2f}"
         others = [top for top, there, _ in peaks if abs(there[0] - near[0]) > _APART]
         if others and others[0] > best - s.distinct:
-            return "picture: several places are alike"
+            return "image: several places are alike"
         return _peak(near, fine, len(reference.points))
 
 
 def _maxima(correlation: NDArray[np.float32], least: float) -> NDArray[np.intp]:
-    """Places inside the search that are liker than both neighbours and than `least`."""
+    """Places inside the search that are more similar than both neighbors and than `least`."""
     inner = correlation[1:-1]
     return 1 + np.flatnonzero((inner >= correlation[:-2]) & (inner > correlation[2:]) & (inner > least))
 
@@ -204,7 +206,7 @@ def _textured(image: Image, width: int) -> _GrayImage:
     size = (round(camera.size[0] * scale), round(camera.size[1] * scale))
     gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA).astype(np.float32)
     detail = gray - cv2.GaussianBlur(gray, (0, 0), _LOCAL)
-    detail /= np.sqrt(cv2.GaussianBlur(detail * detail, (0, 0), 2 * _LOCAL)) + 2.0  # grey levels: less is noise
+    detail /= np.sqrt(cv2.GaussianBlur(detail * detail, (0, 0), 2 * _LOCAL)) + 2.0  # gray levels: less is noise
     K = np.diag([size[0] / camera.size[0], size[1] / camera.size[1], 1.0]) @ camera.K
     return _GrayImage(
         tuple(cv2.GaussianBlur(detail, (0, 0), blur) for blur in _BLUR), K, se3.inverse(camera.T_lidar_cam)
@@ -212,7 +214,7 @@ def _textured(image: Image, width: int) -> _GrayImage:
 
 
 def _ahead(points: Points, image: _GrayImage, count: int) -> Array:
-    """At most `count` of the points (P, 4) that the picture shows, (N, 3) float64, spread evenly over the scan."""
+    """At most `count` of the points (P, 4) that the image shows, (N, 3) float64, spread evenly over the scan."""
     in_camera = _moved(image.T_cam_lidar, points[:, :3].astype(np.float64))
     kept = np.flatnonzero(image.project(in_camera)[1] & (in_camera[:, 2] > _NEAR) & (in_camera[:, 2] < _FAR))
     return points[kept[:: max(1, len(kept) // count)], :3].astype(np.float64)

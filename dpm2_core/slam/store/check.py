@@ -196,7 +196,7 @@ class _Salvage:
                     raise ValueError("lost")
                 T = rows.pose_of(stored[node])
             except ValueError as error:
-                self._problem(f"keyframe {node}: its optimised pose is {error}")
+                self._problem(f"keyframe {node}: its optimized pose is {error}")
                 T = T_map_odom @ keyframes[node].T_odom_kf
             poses[node] = T
             T_map_odom = T @ se3.inverse(keyframes[node].T_odom_kf)

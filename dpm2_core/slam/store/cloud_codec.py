@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A cloud in few bytes: centimetres and 8-bit intensities, differences from point to point, deflated.
+"""A cloud in few bytes: centimeters and 8-bit intensities, differences from point to point, deflated.
 
-A keyframe cloud of 18 thousand points takes 64 kB instead of 280: 3.6 bytes a point. Points keep their order, in which
-neighbours of a LiDAR's beam follow each other; that is what makes the differences small.
+A keyframe cloud of 18 thousand points takes 64 kB instead of 280: 3.6 bytes per point. Points keep their order, in
+which neighbors of a LiDAR's beam follow each other; that is what makes the differences small.
 
 What is unpacked comes from a file or over a network: its size is bounded before it is inflated.
 """

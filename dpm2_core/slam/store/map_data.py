@@ -40,8 +40,8 @@ class MapData:
     """A map. A node is a position among the keyframes.
 
     Attributes:
-        keyframes: without clouds. session: of each, from 1. poses: (N, 4, 4) optimised T_map_kf.
-        edges: odometry and loops, refused ones too. trail: keyframes that were pruned. sessions: who wrote it.
+        keyframes: without clouds. session: of each, from 1. poses: (N, 4, 4) optimized T_map_kf.
+        edges: odometry and loops, rejected ones too. trail: keyframes that were pruned. sessions: who wrote it.
         clouds: of each keyframe, read from the file when asked for.
         thumbnail: JPEG of a node, or None.
     """
@@ -168,7 +168,7 @@ def save_as(data: MapData, path: Path) -> None:
     """
     part = path.with_name(f".{path.name}.part")
     _remove(part)
-    MapStore.create(path).close()  # refuses a file that is there, and a folder that cannot be written
+    MapStore.create(path).close()  # rejects a file that is there, and a folder that cannot be written
     try:
         with MapStore.create(part) as store:
             _fill(store, data)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The map as one file, written as the drive goes on: `kill -9` at any instant loses at most the keyframe in flight.
 
-SQLite in WAL mode: one transaction a keyframe; other processes read while one writes. A map that was closed is that
+SQLite in WAL mode: one transaction per keyframe; other processes read while one writes. A map that was closed is that
 one file; beside one whose writer was killed, or is alive, FILE-wal belongs to it. `synchronous=NORMAL`: a power cut may
 take the last seconds with it, but never the map.
 """

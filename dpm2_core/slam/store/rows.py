@@ -24,20 +24,20 @@ from dpm2_core.slam.store.cloud_store import Loan
 from dpm2_core.slam.store.schema import row_crc
 
 NO_POINTS: Points = np.zeros((0, 4), np.float32)
-_FARTHEST = 1e7  # m: from there on float32 clouds are metres off
+_FARTHEST = 1e7  # m: from there on float32 clouds are meters off
 _LONGEST_NAME = 255
 _DESCRIPTORS = struct.Struct("<IIB")  # number, channels, whether there are axes
 
 
 @dataclass(frozen=True, eq=False)
 class Edge:
-    """A constraint of the pose graph, or a loop that was tried and refused.
+    """A constraint of the pose graph, or a loop that was tried and rejected.
 
     Attributes:
         kind: "odometry" or "loop".
         from_node, to_node: positions in the map.
         T_from_to: (4, 4). covariance: (6, 6) [rotation rad, translation m] of xi in T_from_to @ Exp(xi).
-        ok: False for a refused loop; `reason` says why.
+        ok: False for a rejected loop; `reason` says why.
         confidence, rmse, method: of the registration.
     """
 

@@ -52,7 +52,7 @@ CREATE TABLE moving (            -- points of a cloud that belong to moving thin
   mask     BLOB NOT NULL,
   crc      INTEGER NOT NULL
 );
-CREATE TABLE poses (             -- optimised
+CREATE TABLE poses (             -- optimized
   node     INTEGER PRIMARY KEY,
   T_map_kf BLOB NOT NULL,
   crc      INTEGER NOT NULL
@@ -64,11 +64,11 @@ CREATE TABLE edges (
   to_node  INTEGER NOT NULL,
   T_from_to BLOB NOT NULL,
   covariance BLOB NOT NULL,      -- rotation (rad) first, then translation (m), in the frame of to_node
-  ok       INTEGER NOT NULL,     -- 0: a loop that was refused
+  ok       INTEGER NOT NULL,     -- 0: a loop that was rejected
   confidence REAL NOT NULL,
   rmse     REAL NOT NULL,        -- m
   method   TEXT NOT NULL,
-  reason   TEXT NOT NULL,        -- of a refusal
+  reason   TEXT NOT NULL,        -- of a rejection
   crc      INTEGER NOT NULL
 );
 CREATE TABLE trail (             -- keyframes that were pruned: where they were, relative to one that is still there
@@ -100,7 +100,7 @@ CREATE TABLE keyframes (node INTEGER PRIMARY KEY, robot TEXT, stamp INTEGER, fra
   T_map_kf BLOB, cloud BLOB, descriptors BLOB);
 CREATE TABLE edges (kind TEXT, from_node INTEGER, to_node INTEGER, T_from_to BLOB, covariance BLOB);
 """
-# Version 1 kept payloads beside the keyframes, without checksums, masks or refused loops.
+# Version 1 kept payloads beside the keyframes, without checksums, masks or rejected loops.
 _TO_2 = """
 ALTER TABLE keyframes RENAME TO keyframes_1;
 ALTER TABLE edges RENAME TO edges_1;

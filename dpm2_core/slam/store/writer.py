@@ -44,7 +44,7 @@ class MapWriter:
         self._moving.add(node)
 
     def sync(self, poses: Array) -> None:
-        """Write all that is new; (N, 4, 4) are the optimised poses. Never raises: see `problem`."""
+        """Write all that is new; (N, 4, 4) are the optimized poses. Never raises: see `problem`."""
         try:
             while len(self._keyframes) > _BATCH:
                 self._write(poses, self._keyframes[:_BATCH], last=False)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`dpm2 eval` prints the reference figures, says how it judged, and refuses what it cannot judge."""
+"""`dpm2 eval` prints the reference figures, says how it judged, and rejects what it cannot judge."""
 
 from __future__ import annotations
 

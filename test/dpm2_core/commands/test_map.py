@@ -41,7 +41,7 @@ def test_info(map_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
         "12, 12 of them",
         "12 with descriptors",
         "1 accepted of 2 tried",
-        "kB a keyframe",
+        "kB per keyframe",
         "small 0123456789",
     ):
         assert words in info, info

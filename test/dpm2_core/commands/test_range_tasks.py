@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`dpm2 train dslr|ae_lidar` and `dpm2 eval-task` on pairs in DSLR's layout: figures, picture, and what cannot be."""
+"""`dpm2 train dslr|ae_lidar` and `dpm2 eval-task` on pairs in DSLR's layout: figures, image, and what cannot be."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`dpm2 show` draws what the network matched, and refuses what it cannot draw in one line."""
+"""`dpm2 show` draws what the network matched, and rejects what it cannot draw in one line."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_draws_a_image(sequence: Path, tmp_path: Path) -> None:
 
 
 def test_draws_the_image_with_attention(sequence: Path, tmp_path: Path) -> None:
-    """With weights that have a camera and a drive with pictures, the drawing has a third part below."""
+    """With weights that have a camera and a drive with images, the drawing has a third part below."""
     folder = tmp_path / "drive"
     shutil.copytree(sequence, folder)
     (folder / "calib.txt").write_text("P2: 60 0 63.5 0 0 60 31.5 0 0 0 1 0\nTr: 0 -1 0 0 0 0 -1 -0.1 1 0 0 -0.3\n")

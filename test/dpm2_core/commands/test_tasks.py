@@ -38,7 +38,7 @@ def train(drive: Path, out: Path, *more: str) -> int:
 
 
 def test_train_resume_and_measure(drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """With the SLAM loss in the third epoch; a second training does not overwrite; figures, table and picture."""
+    """With the SLAM loss in the third epoch; a second training does not overwrite; figures, table and image."""
     out = tmp_path / "out"
     assert train(drive, out, "--slam-weight", "0.5", "--slam-every", "3", "--val", str(drive)) == 0
     log = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]

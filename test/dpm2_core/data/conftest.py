@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Small recordings made on the spot: a KITTI sequence of a few points a scan, and bags of any messages."""
+"""Small recordings made on the spot: a KITTI sequence of a few points per scan, and bags of any messages."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class BagMaker:
         return self.new("sensor_msgs/PointCloud2", header=self.header(stamp, frame), **fields)
 
     def image(self, stamp: float, value: int = 0, encoding: str = "mono8", size: tuple[int, int] = (8, 6)) -> Any:
-        """A grey image whose value says which one it is."""
+        """A gray image whose value says which one it is."""
         return self.new("sensor_msgs/Image", header=self.header(stamp, "cam"), height=size[1], width=size[0],
                         encoding=encoding, is_bigendian=0, step=size[0],
                         data=np.full(size[0] * size[1], value, np.uint8))  # fmt: skip

@@ -35,7 +35,7 @@ def by_time(messages: list[Message]) -> list[Message]:
 
 
 def seen(source: BagSource) -> list[int | None]:
-    """The grey value of each frame's image."""
+    """The gray value of each frame's image."""
     return [int(frame.images[0].pixels[0, 0, 0]) if frame.images else None for frame in source.frames()]
 
 

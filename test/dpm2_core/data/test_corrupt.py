@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Corruptions hit the share of frames that was asked for, the same ones for the same seed, and do what they say."""
+"""Corruptions hit the fraction of frames that was asked for, the same ones for the same seed, and do what they say."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ N = 20
 
 
 class Drive:
-    """Twenty frames of 2,000 points and one picture, whose brightness is its number."""
+    """Twenty frames of 2,000 points and one image, whose brightness is its number."""
 
     name = "drive"
     truth = "poses/drive.txt"

@@ -26,7 +26,7 @@ from dpm2_core.errors import UsageError
 
 
 def png(width: int, height: int) -> bytes:
-    """One colour, in a thousandth of the bytes that it is decoded to."""
+    """One color, in a thousandth of the bytes that it is decoded to."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))

@@ -273,7 +273,7 @@ def test_binary_instead_of_text_is_named(kitti_folder: MakeFolder) -> None:
 def test_images_that_cannot_be_used_cost_the_image_alone(kitti_folder: MakeFolder) -> None:
     folder = kitti_folder()
     cv2.imwrite(str(folder / "image_2" / "000001.png"), np.zeros((31, 40, 3), np.uint8))
-    (folder / "image_2" / "000002.png").write_bytes(b"no picture")
+    (folder / "image_2" / "000002.png").write_bytes(b"no image")
     (folder / "image_2" / "000003.png").unlink()
     source = KittiSource(folder)
     frames = list(source.frames())

@@ -81,7 +81,7 @@ def test_poses_are_of_the_lidar_and_unknown_between(root: Path, missing: str | N
 
 
 def test_frames(root: Path) -> None:
-    """Numbers, stamps to the nanosecond, the picture of the same number, and the rectified camera's calibration."""
+    """Numbers, stamps to the nanosecond, the image of the same number, and the rectified camera's calibration."""
     frames = list(open_source(root / "data_3d_raw" / DRIVE).frames(1, 3))
     assert [frame.index for frame in frames] == [1, 2]
     assert [frame.stamp % 10**9 for frame in frames] == [504300001, 604300001]

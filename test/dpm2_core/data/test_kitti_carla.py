@@ -70,7 +70,7 @@ def test_frames_poses_and_times(root: Path) -> None:
 
 
 def test_the_camera_looks_forward(root: Path) -> None:
-    """A point ahead, left and above projects to the upper left; 72 degrees fit across the picture."""
+    """A point ahead, left and above projects to the upper left; 72 degrees fit across the image."""
     camera = open_source(root).frames().__next__().images[0].camera
     x, y, z = se3.transform(se3.inverse(camera.T_lidar_cam), np.array([[10.3, 1.0, 0.9]]))[0]
     np.testing.assert_allclose([x, y, z], [-1, -1, 10], atol=1e-12)

@@ -265,7 +265,7 @@ def test_image_encodings(encoding: str, pixels: np.ndarray, want: np.ndarray, pa
 @pytest.mark.parametrize("bits", [8, 16])
 @pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
 def test_bayer_patterns_give_the_color_they_were_made_from(pattern: str, bits: int) -> None:
-    """A uniformly coloured scene survives the mosaic exactly, and only with the right pattern."""
+    """A uniformly colored scene survives the mosaic exactly, and only with the right pattern."""
     color = np.array([200, 120, 40], np.uint8)
     mosaic = np.empty((8, 8), np.uint8)
     for i, letter in enumerate(pattern):
@@ -277,7 +277,7 @@ def test_bayer_patterns_give_the_color_they_were_made_from(pattern: str, bits: i
 
 def test_compressed_images() -> None:
     smooth = cv2.resize(picture(4, 4), (64, 48), interpolation=cv2.INTER_CUBIC)
-    for form, tolerance in (("png", 0), ("jpeg", 30)):  # JPEG of a smooth picture, quality 95
+    for form, tolerance in (("png", 0), ("jpeg", 30)):  # JPEG of a smooth image, quality 95
         data = cv2.imencode(f".{form}", cv2.cvtColor(smooth, cv2.COLOR_RGB2BGR))[1].reshape(-1)
         decoded = image_messages.decode_image(SimpleNamespace(header=header(), format=form, data=data))
         assert np.abs(decoded.astype(int) - smooth).max() <= tolerance

@@ -33,7 +33,7 @@ def test_las(tmp_path: Path, count: int) -> None:
     las = laspy.read(tmp_path / "a.las")
     assert len(las.points) == count
     xyz = np.column_stack([las.x, las.y, las.z])
-    np.testing.assert_allclose(xyz.reshape(-1, 3), POINTS[:count, :3], atol=6e-4)  # millimetres
+    np.testing.assert_allclose(xyz.reshape(-1, 3), POINTS[:count, :3], atol=6e-4)  # millimeters
     np.testing.assert_allclose(np.asarray(las.intensity) / 65535, POINTS[:count, 3], atol=1e-5)
 
 

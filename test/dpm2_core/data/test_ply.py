@@ -51,7 +51,7 @@ def test_points_of_another_shape_are_rejected(tmp_path: Path) -> None:
 
 
 def test_what_is_written_is_read(tmp_path: Path) -> None:
-    """Properties by name, in the order asked for; a missing one, a text file and a short one are refused by name."""
+    """Properties by name, in the order asked for; a missing one, a text file and a short one are rejected by name."""
     points = np.random.default_rng(0).normal(size=(10, 4)).astype(np.float32)
     path = tmp_path / "map.ply"
     write_ply(path, points)

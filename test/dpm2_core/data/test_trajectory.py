@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trajectory files keep what they were given, and what does not belong together is refused."""
+"""Trajectory files keep what they were given, and what does not belong together is rejected."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_what_is_no_text_file_is_rejected(tmp_path: Path) -> None:
 
 
 def _trajectory(keys: list[int], kind: str) -> Trajectory:
-    """Poses whose x is their key, so that a match can be recognised."""
+    """Poses whose x is their key, so that a match can be recognized."""
     poses = np.tile(np.eye(4), (len(keys), 1, 1))
     poses[:, 0, 3] = keys
     return Trajectory(poses, np.array(keys, np.int64), kind)

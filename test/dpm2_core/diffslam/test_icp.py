@@ -151,7 +151,7 @@ def test_without_evidence_the_guess_stays(scans: list[Tensor], motion: Tensor, g
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
 def test_gpu_gives_the_poses_of_the_cpu(noisy: list[Tensor]) -> None:
-    """Both find the same neighbours; sums differ in their order."""
+    """Both find the same neighbors; sums differ in their order."""
     a, b = torch.stack(noisy[:2]), torch.stack(noisy[1:3])
     cpu = register(Cloud(b), Cloud(a), EYE.expand(2, 4, 4), settings())
     gpu = register(Cloud(b.cuda()), Cloud(a.cuda()), EYE.expand(2, 4, 4).cuda(), settings())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trees and distances find the same neighbours, never padding, also far from the origin."""
+"""Trees and distances find the same neighbors, never padding, also far from the origin."""
 
 from __future__ import annotations
 

@@ -209,7 +209,7 @@ def test_zero_weights_give_a_finite_loss_and_no_gradient(noisy: list[Tensor], mo
 
 
 def test_large_clouds_are_downsampled_alike(noise: np.random.Generator, scans: list[Tensor]) -> None:
-    """More than `points` are thinned, the same in each call; gradients go to those that were kept."""
+    """More than `points` are downsampled, the same in each call; gradients go to those that were kept."""
     big = [torch.cat([scan, scan + 0.01, scan - 0.01]) for scan in scans]
     pred = leaves(big)
     loss = SlamLoss(SlamLossSettings(points=500))(pred, big)

@@ -80,8 +80,8 @@ def test_every_kth_epoch_has_the_slam_loss() -> None:
 
 
 def test_a_lost_registration_is_not_the_whole_step() -> None:
-    """gamma L_slam is bounded by a share of L_model, its slope along with it; below, it is as it is. That of the task
-    stays as it is."""
+    """gamma L_slam is bounded by a fraction of L_model, its slope along with it; below, it is as it is. That of the
+    task stays as it is."""
     for error, ratio in ((0.05, 0.05), (0.1, 0.1), (1.0, 0.1), (100.0, 0.1), (0.0, 0.0)):
         task, slam = (torch.tensor(value, requires_grad=True) for value in (4.0, 2 * error))
         settings = ScheduleSettings(gamma=2.0, every=1, most=0.1)

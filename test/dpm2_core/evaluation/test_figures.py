@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The picture of a run shows what it is given, to scale, and is written whole."""
+"""The image of a run shows what it is given, to scale, and is written whole."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_the_trajectory_is_drawn_to_scale_and_the_map_beneath_it(tmp_path: Path)
     trajectory_png(tmp_path / "with.png", _arc(), cloud=_cloud(), title="")
     trajectory_png(tmp_path / "without.png", _arc(), title="")
     make_image, bare = _picture(tmp_path / "with.png"), _picture(tmp_path / "without.png")
-    # The legend, in the upper right, holds samples of the same colour.
+    # The legend, in the upper right, holds samples of the same color.
     points = _orange(make_image)
     points = points[(points[:, 0] > 0.25 * make_image.shape[0]) | (points[:, 1] < 0.7 * make_image.shape[1])]
     height, width = np.ptp(points, axis=0)
@@ -50,7 +50,7 @@ def test_the_trajectory_is_drawn_to_scale_and_the_map_beneath_it(tmp_path: Path)
 
 
 def test_the_ground_truth_is_brought_into_the_map_frame(tmp_path: Path) -> None:
-    """Ground truth of another world frame, with unknown frames, gives the picture of one in the map frame."""
+    """Ground truth of another world frame, with unknown frames, gives the image of one in the map frame."""
     gt = _arc()
     gt[10:20] = np.nan
     trajectory_png(tmp_path / "near.png", _arc(), gt, _cloud())

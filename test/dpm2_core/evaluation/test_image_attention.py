@@ -42,7 +42,7 @@ def frame(street: Callable, make_image: Callable) -> Frame:
 
 
 def test_a_point_attends_around_where_it_is_seen(model: DeepPointMap2, frame: Frame) -> None:
-    """Even untrained, by the distance from rays: the picture's brightest place is near the point's projection."""
+    """Even untrained, by the distance from rays: the image's brightest place is near the point's projection."""
     looked = image_attention(model, frame)
     height, width = model.settings.image.size
     assert looked.heat.shape == looked.pixels.shape[:2] == (height, width)
@@ -68,11 +68,11 @@ def test_it_leaves_the_network_as_it_was(model: DeepPointMap2, frame: Frame) -> 
 def test_what_cannot_be_shown_is_said(
     model: DeepPointMap2, tiny: Callable[..., NetworkSettings], frame: Frame, make_image: Callable[..., Image]
 ) -> None:
-    """No picture, no such point, no camera."""
-    with pytest.raises(UsageError, match="has no picture"):
+    """No image, no such point, no camera."""
+    with pytest.raises(UsageError, match="has no image"):
         image_attention(model, Frame(0, frame.points))
     behind = int(np.flatnonzero(~image_attention(model, frame).seen)[0])
-    with pytest.raises(UsageError, match=f"point {behind}: want one in the picture"):
+    with pytest.raises(UsageError, match=f"point {behind}: want one in the image"):
         image_attention(model, frame, behind)
     with pytest.raises(UsageError, match="no camera"):
         image_attention(DeepPointMap2(tiny(image={"backbone": "none"})), frame)

@@ -28,7 +28,7 @@ def test_the_development_kit_prints_the_same(kitti_excerpt: Path, name: str, t_e
 
 
 def _walk(count: int, noise: float, seed: int = 0) -> np.ndarray:
-    """A drive of about a metre a frame through gentle turns, every step disturbed by `noise` (rad and m)."""
+    """A drive of about a meter per frame through gentle turns, every step disturbed by `noise` (rad and m)."""
     turns = np.cumsum(np.random.default_rng(7).normal(scale=0.01, size=count))
     xi = np.column_stack([np.zeros((count, 2)), turns * 0.05, np.ones(count), np.zeros((count, 2))])
     steps = se3.exp(xi + np.random.default_rng(seed).normal(scale=noise, size=(count, 6)))

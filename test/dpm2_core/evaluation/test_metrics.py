@@ -69,7 +69,7 @@ def test_a_perfect_estimate_in_another_world_frame_has_no_error() -> None:
 
 def test_known_errors_come_out_as_defined() -> None:
     gt, est = _straight(), _straight()
-    est[:, 0, 3] *= 1.01  # 1 cm too far each metre
+    est[:, 0, 3] *= 1.01  # 1 cm too far each meter
     metrics = evaluate(gt, est, [10.0])
     assert metrics.rpe_trans_m == pytest.approx(0.01)
     assert metrics.final_drift_percent == pytest.approx(1.0)
@@ -82,7 +82,7 @@ def test_known_errors_come_out_as_defined() -> None:
 
 def test_rpe_is_the_mean_and_drift_is_aligned_at_the_first_pose() -> None:
     gt, est = _straight(11), _straight(11)
-    est[5:, 0, 3] += 1  # one step of ten is a metre too long
+    est[5:, 0, 3] += 1  # one step of ten is a meter too long
     assert rpe(gt, est)[0] == pytest.approx(0.1)
     assert final_drift_percent(gt, est) == pytest.approx(10.0)
     assert final_drift_percent(gt, ELSEWHERE @ est) == pytest.approx(10.0)

@@ -53,7 +53,7 @@ def test_poles_are_found_first(noise: np.random.Generator) -> None:
     cloud = np.concatenate([ground(), wall(), poles(0.3, noise)])
     result = edges_of(cloud)
     assert result.dtype == np.float32
-    on_pole = horizontally(result, POLES) < 0.25  # the ground at its foot is among a pole's neighbours
+    on_pole = horizontally(result, POLES) < 0.25  # the ground at its foot is among a pole's neighbors
     assert horizontally(POLES, result).max() < 0.1
     assert on_pole[: 2 * len(POLES)].all()  # each is long enough for two places
     assert (np.abs(result[~on_pole, 1] - 18) < 0.1).all()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Planes in closed form agree with an eigensolver, whatever the neighbourhood."""
+"""Planes in closed form agree with an eigensolver, whatever the neighborhood."""
 
 from __future__ import annotations
 

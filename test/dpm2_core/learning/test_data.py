@@ -27,7 +27,7 @@ NOTHING = {"drop": 0, "occlusion": 0, "beams": 0, "jitter": 0, "yaw": 0, "tilt":
 
 
 def test_packing_keeps_clouds_to_a_millimeter(packed: Path, samples: list[Sample]) -> None:
-    """Points to half a quantum, poses and pictures exactly."""
+    """Points to half a quantum, poses and images exactly."""
     drive = PackedDrive(packed / "world")
     assert len(drive) == len(samples)
     for result, true in zip((drive[i] for i in range(len(drive))), samples, strict=True):
@@ -112,7 +112,7 @@ def test_groups_are_near_and_spread() -> None:
 
 
 def test_a_lonely_frame_is_its_own_group() -> None:
-    """No neighbour within the radius: it repeats."""
+    """No neighbor within the radius: it repeats."""
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[1, 0, 3] = 100
     assert len(set(draw_group(poses, 3, 20, np.random.default_rng(0)))) == 1

@@ -62,14 +62,14 @@ def test_packed_sweeps_are_rigid_and_fit_each_other(
         assert sample.images[0].pixels.shape == (height, width, 3)
         there = se3.transform(sample.pose, sample.cloud.astype(np.float64))
         gap = np.linalg.norm(there[:, None] - world[None], axis=2).min(1)
-        # 2 mm of packing, and steps of a millisecond at 10 m/s; without undistorting it is half a metre.
+        # 2 mm of packing, and steps of a millisecond at 10 m/s; without undistorting it is half a meter.
         assert np.quantile(gap, 0.99) < 0.02
 
 
 def test_what_cannot_be_packed(street: Callable, make_image: Callable, tiny: Callable, tmp_path: Path) -> None:
-    """No poses; none in the range; pictures in some frames only."""
+    """No poses; none in the range; images in some frames only."""
     source = Sweeps(street(np.random.default_rng(0), 200), make_image, images=False)
-    with pytest.raises(UsageError, match="some frames have a picture"):
+    with pytest.raises(UsageError, match="some frames have an image"):
         pack(source, tmp_path / "d", tiny())
     with pytest.raises(UsageError, match="no readable frame with a pose"):
         pack(source, tmp_path / "d", tiny(), range(2, 3))

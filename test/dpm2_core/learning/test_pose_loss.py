@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The loss on the pose: what an error costs, that it trains the network, and that what is astray does not."""
+"""The loss on the pose: what an error costs, that it trains the network, and that what has diverged does not."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def test_registration_trains_by_it(packed: Path, tiny: Callable[..., NetworkSett
         solved = solve_batch(module.model.decoder, source, target, module.model.decoder(source, target))
     assert solved is not None
     beside = solved.T.float()
-    beside[:, 0, 3] += 0.3  # not astray, and not without an error
+    beside[:, 0, 3] += 0.3  # not diverged, and not without an error
     total, figures = module(batch.points, None, (plan._replace(T_target_source=beside),))
     total.backward()
     assert float(figures["pose"]) > 0.1

@@ -81,12 +81,12 @@ def test_shown_is_what_projects_into_the_image() -> None:
 def test_what_cannot_be_trained_is_rejected(
     settings: ImageTrainingSettings, samples: list[Sample], tmp_path: Path
 ) -> None:
-    """A network without features of its own pixels, a drive without pictures, and too few points."""
-    with pytest.raises(UsageError, match=r"no picture features of its own"):
+    """A network without features of its own pixels, a drive without images, and too few points."""
+    with pytest.raises(UsageError, match=r"no image features of its own"):
         train_image(settings.model_copy(update={"network": {"fusion": {"pixel": False}}, "start": ""}), tmp_path / "a")
-    with pytest.raises(UsageError, match=r"hardly any picture shows 99999 points"):
+    with pytest.raises(UsageError, match=r"hardly any image shows 99999 points"):
         train_image(settings.model_copy(update={"points": 99_999}), tmp_path / "b")
     write_packed(tmp_path / "blind" / "world", [s._replace(images=()) for s in samples], {})
     blind = settings.data.model_copy(update={"packed": {str(tmp_path / "blind"): 1.0}})
-    with pytest.raises(UsageError, match=r"world: a drive without pictures"):
+    with pytest.raises(UsageError, match=r"world: a drive without images"):
         train_image(settings.model_copy(update={"data": blind}), tmp_path / "c")

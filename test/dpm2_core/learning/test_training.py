@@ -37,7 +37,7 @@ STILL = AugmentSettings(drop=0, occlusion=0, beams=0, jitter=0, tilt=0, shift=(0
 
 @pytest.fixture
 def settings(packed: Path, tiny: Callable, monkeypatch: pytest.MonkeyPatch) -> RegistrationTrainingSettings:
-    """Phase one of the tiny network on the packed drive, in float32, without compiling."""
+    """The registration training of the tiny network on the packed drive, in float32, without compiling."""
     monkeypatch.setitem(PRESETS, "tiny", tiny().model_dump())
     return RegistrationTrainingSettings(
         preset="tiny",
@@ -80,7 +80,7 @@ def test_log_has_figures_and_validation(settings: RegistrationTrainingSettings, 
 
 
 def test_images_have_a_loss_of_their_own(settings: RegistrationTrainingSettings, tiny: Callable) -> None:
-    """It is a finite figure that trains the image branch; without pictures it is absent, not zero."""
+    """It is a finite figure that trains the image branch; without images it is absent, not zero."""
     module = RegistrationTraining(tiny(), settings.loss)
     batch = GroupDataset(settings.data, tiny(), seed=0).batch(0)
     plans = set_pairs_of(batch.poses, settings, 0)
@@ -103,7 +103,7 @@ def test_a_checkpoint_of_another_network_is_rejected(settings: RegistrationTrain
 
 
 def test_overlap_changes_the_overlap_head_alone(settings: RegistrationTrainingSettings, tmp_path: Path) -> None:
-    """Every other tensor of the weights stays as phase one left it."""
+    """Every other tensor of the weights stays as the registration training left it."""
     start = train_registration(settings, tmp_path / "one")
     second = _overlap(settings, start, rate=1e-2, steps=4)
     second = second.model_copy(update={"validation": settings.validation, "validation_batches": 1})
@@ -114,7 +114,8 @@ def test_overlap_changes_the_overlap_head_alone(settings: RegistrationTrainingSe
 
 
 def _overlap(settings: RegistrationTrainingSettings, start: Path, **optimiser: float) -> OverlapTrainingSettings:
-    """Phase two on the drives of phase one, as if from a YAML file that sets these keys alone."""
+    """The overlap training on the drives of the registration training, as if from a YAML file that sets these keys
+    alone."""
     data = {"packed": settings.data.packed, "groups": 1, "workers": 0, "images": True}
     tree = {"start": str(start), "data": data, "optimiser": {"compile": False, "bf16": False, **optimiser}}
     return settings_from(OverlapTrainingSettings, tree)
@@ -142,7 +143,7 @@ def test_overlap_keeps_the_network_of_registration(settings: RegistrationTrainin
     (ImageTrainingSettings, "images"),
 ])  # fmt: skip
 def test_a_setting_that_a_phase_does_not_use_is_rejected(kind: type, key: str) -> None:
-    """Frames of a place are fixed in phase two, two images of one in the image branch."""
+    """Frames of a place are fixed in the overlap training, two images of one in the image branch."""
     with pytest.raises(UsageError, match=f"unknown key data.{key}"):
         settings_from(kind, {"start": "w", "data": {key: 3}})
 
@@ -233,7 +234,7 @@ with process_group() as (rank, world, device):
 
 
 def test_two_processes_give_the_gradients_of_one(tmp_path: Path, packed: Path, tiny: Callable) -> None:
-    """gloo on the CPU, started by torchrun: each rank its share of the places, the mean of the losses."""
+    """gloo on the CPU, started by torchrun: each rank its fraction of the places, the mean of the losses."""
     script = tmp_path / "ranks.py"
     script.write_text(RANKS)
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[3]), "OMP_NUM_THREADS": "1"}
@@ -270,7 +271,8 @@ def test_without_tensorboard_the_log_alone_is_written(tmp_path: Path, monkeypatc
 def test_overlap_keeps_what_the_weights_say_of_registration(
     settings: RegistrationTrainingSettings, tmp_path: Path
 ) -> None:
-    """Steps and pictures of phase one, by which the SLAM knows whether to use the camera, stay; the phase is two."""
+    """Steps and images of the registration training, by which the SLAM knows whether to use the camera, stay; the phase
+    is two."""
     start = train_registration(settings, tmp_path / "one")
     second = _overlap(settings, start, steps=1)
     before, after = read_metadata(start), read_metadata(train_overlap(second, tmp_path / "two"))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Encoder: sizes, masks, invariances, and pictures that are missing."""
+"""Encoder: sizes, masks, invariances, and images that are missing."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_parameters_are_those_of_deep_point_map() -> None:
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_presets_give_256_descriptors_of_128_channels(name: str, noise: np.random.Generator, street: Callable) -> None:
-    """The contract of every preset, and 70 kB a frame."""
+    """The contract of every preset, and 70 kB per frame."""
     torch.manual_seed(0)
     out = Encoder(preset(name)).eval().encode(frame(street(noise, 6000)))
     assert out.xyz.shape == (256, 3)
@@ -111,7 +111,7 @@ def test_empty_scans_are_rejected(model: DeepPointMap2, cloud: np.ndarray) -> No
 
 
 def views_of(model: DeepPointMap2, *frames: list[Image]) -> Views:
-    """Batch of pictures."""
+    """Batch of images."""
     views = collate_views(frames, model.settings.image)
     assert views is not None
     return views
@@ -120,12 +120,12 @@ def views_of(model: DeepPointMap2, *frames: list[Image]) -> Views:
 def test_missing_image_equals_no_camera(
     model: DeepPointMap2, noise: np.random.Generator, street: Callable, make_image: Callable
 ) -> None:
-    """Exactly: in a batch whose other frame has a picture, the one without gives what the LiDAR alone gives."""
+    """Exactly: in a batch whose other frame has an image, the one without gives what the LiDAR alone gives."""
     pyramid = build_pyramid(street(noise), model.settings)
     alone = model.encoder(collate([pyramid])).tokens.features
     both = model.encoder(collate([pyramid, pyramid]), views_of(model, [], [make_image(noise)])).tokens.features
     assert torch.equal(both[0], alone[0])
-    assert (both[1] - alone[0]).abs().max() > 1e-3  # the picture is used
+    assert (both[1] - alone[0]).abs().max() > 1e-3  # the image is used
 
 
 def test_only_reference_points_in_view_read_the_image(
@@ -158,7 +158,7 @@ def test_several_cameras(
 def test_alternatives_of_the_ablations(
     noise: np.random.Generator, kind: str, reference: str, tiny: Callable, street: Callable, make_image: Callable
 ) -> None:
-    """Every choice of Tables 3 and 4 runs, uses the picture, and gives each parameter of its own a gradient."""
+    """Every choice of Tables 3 and 4 runs, uses the image, and gives each parameter of its own a gradient."""
     torch.manual_seed(0)
     model = DeepPointMap2(tiny(fusion={"kind": kind, "reference": reference}))
     points = collate([build_pyramid(street(noise), model.settings)])
@@ -172,9 +172,9 @@ def test_alternatives_of_the_ablations(
 
 
 def test_resize_moves_the_intrinsics_with_the_pixels() -> None:
-    """A bright pixel's ray is the same before and after halving: centres of pixels are at integers."""
+    """A bright pixel's ray is the same before and after halving: centers of pixels are at integers."""
     pixels = np.zeros((64, 128, 3), np.uint8)
-    pixels[20:22, 40:42] = 255  # centre (40.5, 20.5)
+    pixels[20:22, 40:42] = 255  # center (40.5, 20.5)
     K = np.array([[60.0, 0, 63.5], [0, 60.0, 31.5], [0, 0, 1]])
     small, K_small = resize(pixels, K, (32, 64))
     v, u = np.unravel_index(small[0].argmax(), small[0].shape)

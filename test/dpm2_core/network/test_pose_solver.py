@@ -38,7 +38,7 @@ def test_perfect_matches_give_the_exact_pose(noise: np.random.Generator) -> None
 
 
 def test_outliers_are_left_out(noise: np.random.Generator) -> None:
-    """A fifth of the matches off by tens of metres, with low confidence, moves neither solution by a millimetre."""
+    """A fifth of the matches off by tens of meters, with low confidence, moves neither solution by a millimeter."""
     pairs, T = perfect(noise)
     wrong = torch.arange(pairs.source.shape[1]) % 5 == 0
     target = torch.where(wrong[:, None], pairs.target + 30 * torch.randn(pairs.target.shape), pairs.target)
@@ -166,7 +166,7 @@ def test_view_frames_are_inverse() -> None:
 
 
 def test_offset_head_starts_without_offset() -> None:
-    """Zero offset and a deviation of half a metre, whatever the features; a valid triangle always."""
+    """Zero offset and a deviation of half a meter, whatever the features; a valid triangle always."""
     head = OffsetHead(32, precision=True)
     offset, L = head(torch.randn(5, 32), torch.randn(5, 32))
     assert (offset == 0).all()
@@ -198,7 +198,7 @@ def test_registration_of_sets_of_different_sizes(model: DeepPointMap2, noise: np
 
 
 def test_every_pose_is_rigid_to_float64(model: DeepPointMap2, noise: np.random.Generator) -> None:
-    """Also where nothing fits and the solver has gone far astray: a map keeps rejected loops, too."""
+    """Also where nothing fits and the solver has gone far diverged: a map keeps rejected loops, too."""
     for scale in (1, 10, 100):
         sets = [described(model, noise, 90) for _ in range(12)]
         sets = [Descriptors(d.xyz * np.float32(scale), d.features) for d in sets]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures: they fit the LiDAR, repeat exactly, and show in degenerate places what the LiDAR cannot."""
+"""Images: they fit the LiDAR, repeat exactly, and show in degenerate places what the LiDAR cannot."""
 
 from __future__ import annotations
 

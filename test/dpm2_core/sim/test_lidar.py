@@ -71,7 +71,7 @@ def test_ranges_have_the_noise_that_is_asked_for(city: World) -> None:
 
 
 def _busy(world: World) -> tuple[np.ndarray, float]:
-    """A pose and a time with a mover in view."""
+    """A pose and a time with a dynamic object in view."""
     for time in np.arange(0.0, 20.0, 0.5):
         T = world.drive_pose(float(time))
         if _scan_at(world, T, float(time)).moving.sum() > 200:
@@ -87,7 +87,7 @@ def test_the_twin_is_the_scan_without_what_moves(city: World) -> None:
     scan = _scan_at(city, *_busy(city))
     still = {row.tobytes() for row in scan.static}
     moving = np.array([row.tobytes() not in still for row in scan.points])
-    np.testing.assert_array_equal(moving, scan.moving)  # all others are there to the bit, no mover is
+    np.testing.assert_array_equal(moving, scan.moving)  # all others are there to the bit, no dynamic object is
     assert scan.moving.sum() > 200
 
 
@@ -98,7 +98,7 @@ def test_dynamic_objects_are_labelled_as_in_semantic_kitti_and_numbered(city: Wo
     assert set(np.unique(kind[scan.moving])) <= {252, 253, 254, 258}
     assert (number[scan.moving] > 0).all()
     assert (number[~scan.moving] == 0).all()
-    for k in np.unique(number[scan.moving]):  # one mover is one thing, in one place
+    for k in np.unique(number[scan.moving]):  # one dynamic object is one thing, in one place
         extent = np.ptp(scan.points[number == k, :2], axis=0)
         assert np.hypot(*extent) < 14
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Roads: closed ones close, drives are comfortable, files of poses are followed, bad ones refused."""
+"""Roads: closed ones close, drives are comfortable, files of poses are followed, bad ones rejected."""
 
 from __future__ import annotations
 

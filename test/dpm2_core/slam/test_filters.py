@@ -33,7 +33,7 @@ def points() -> np.ndarray:
 
 
 class _High:
-    """As a `MoverNet`: what is at least so high moves."""
+    """As a `DynamicObjectNet`: what is at least so high moves."""
 
     def __init__(self, height: float) -> None:
         self.height = height
@@ -48,7 +48,7 @@ def test_dynamic_objects_are_left_out_but_never_more_than_the_limit(points: np.n
     np.testing.assert_array_equal(left, points[~(high & (0.6 + 0.1 * points[:, 2] > 0.5))])
     some = DynamicObjectFilter(_High(-9.0), 0.1, 0.3)(points)  # type: ignore[arg-type]
     assert len(some) >= 0.7 * len(points)
-    assert some[:, 2].max() < points[:, 2].max()  # the likeliest went first
+    assert some[:, 2].max() < points[:, 2].max()  # the most likely went first
     assert len(DynamicObjectFilter(_High(0), 0.5, 0.7)(points[:0])) == 0  # type: ignore[arg-type]
 
 
@@ -86,7 +86,7 @@ def test_a_slam_with_a_filter_runs_and_tells_what_is_missing(tmp_path: Path, poi
     system = SlamSystem(SlamSettings(filter=FilterSettings(kind="movers", weights=path), threads=1))
     assert [system.process(Frame(i * 10**8, points)).registration.ok for i in range(3)] == [True] * 3
     assert make_filter(FilterSettings(), 1) is None
-    with pytest.raises(UsageError, match="weights of movers, not of gndnet"):
+    with pytest.raises(UsageError, match="weights of dynamic objects, not of gndnet"):
         make_filter(FilterSettings(kind="ground", weights=path), 1)
     with pytest.raises(UsageError, match=r"slam\.filter\.weights: no such file .*dpm2 train dslr"):
         make_filter(FilterSettings(kind="static", weights=tmp_path / "none.safetensors"), 1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What enters the SLAM: measurements only, at one instant, thinned out."""
+"""What enters the SLAM: measurements only, at one instant, downsampled."""
 
 from __future__ import annotations
 

@@ -88,7 +88,7 @@ def test_divergence_counts_for_more_with_every_epoch(pairs: Path) -> None:
 
 @pytest.mark.parametrize("variational", [False, True])
 def test_learns_and_can_be_loaded(pairs: Path, tmp_path: Path, variational: bool) -> None:
-    """The loss falls to less than half with the SLAM loss on; figures, clouds and a picture of what was written."""
+    """The loss falls to less than half with the SLAM loss on; figures, clouds and an image of what was written."""
     scans = open_scans(pairs)
     settings = training(network=network(variational=variational), slam=ScheduleSettings(gamma=1.0, every=5))
     task = train_task("ae_lidar", settings, scans, tmp_path)

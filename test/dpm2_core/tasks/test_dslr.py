@@ -92,7 +92,7 @@ def test_each_stage_trains_its_own_part(pairs: Path, epoch: int, reached: set[st
     assert gradients(task) == reached
     assert (slam is not None) == (epoch == 2)
     changed = {name for name, value in task.network.state_dict().items() if not torch.equal(value, before[name])}
-    assert {name.partition(".")[0] for name in changed} <= reached  # of batch normalisation
+    assert {name.partition(".")[0] for name in changed} <= reached  # of batch normalization
 
 
 def test_third_stage_begins_with_the_static_encoder(pairs: Path) -> None:

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The movers' task: it learns to tell a car from a wall, its figures are counts, and what does not fit is refused."""
+"""The dynamic objects' task: it learns to tell a car from a wall, its figures are counts, and what does not fit is
+rejected."""
 
 from __future__ import annotations
 
@@ -68,7 +69,7 @@ def test_it_learns_what_can_move_parked_or_not(tmp_path: Path) -> None:
 
 
 def test_figures_are_counts_of_points() -> None:
-    """Everything found: precision is the share of what can move, unlabelled points apart; nothing can move: NaN."""
+    """Everything found: precision is the fraction of what can move, unlabelled points apart; nothing can move: NaN."""
     task, scan = DynamicObjectTask(SMALL).eval(), Drive(1)[0]
     assert scan.labels is not None
     with torch.no_grad():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scans of the tasks: layouts, classes, twins, gaps, and what is refused before a training begins."""
+"""Scans of the tasks: layouts, classes, twins, gaps, and what is rejected before a training begins."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ def test_a_perfect_network_is_as_good_as_its_input(
 ) -> None:
     """Identity in place of the network: equal figures, and those of a drive of 3 m: under 0.1 m; untrained: worse.
 
-    128 columns put a point of a wall 20 m away up to 0.5 m from where it was, so centimetres are all there is.
+    128 columns put a point of a wall 20 m away up to 0.5 m from where it was, so centimeters are all there is.
     """
     untrained = slam_figures(task, drives / "0")
     monkeypatch.setattr(task.network, "forward", lambda images: (images, images.new_zeros(len(images))))

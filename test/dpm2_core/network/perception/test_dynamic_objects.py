@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The movers' network: its grid against counting by hand, its size, and what it does with what is off the grid."""
+"""The dynamic objects' network: its grid against counting by hand, its size, and what it does with what is off the
+grid."""
 
 from __future__ import annotations
 

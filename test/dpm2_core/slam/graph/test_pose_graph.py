@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The growing pose graph: verdicts, covariances, and the process that optimises it in the background."""
+"""The growing pose graph: results, covariances, and the process that optimizes it in the background."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_a_wrong_loop_is_rejected_with_a_reason_and_is_no_edge() -> None:
     right, wrong = graph.loop_checks
     assert right.kept
     assert not wrong.kept
-    assert "sigma from the optimised poses" in wrong.reason
+    assert "sigma from the optimized poses" in wrong.reason
     assert "from the odometry" in wrong.reason
     assert [edge[:2] for edge in graph.edges if edge[1] != edge[0] + 1] == [(0, 50)]
 
@@ -133,7 +133,7 @@ def test_no_process_outlives_a_killed_program() -> None:
             return
         time.sleep(0.1)
     os.kill(pid, signal.SIGKILL)
-    pytest.fail("the optimiser's process lives on")
+    pytest.fail("the optimizer's process lives on")
 
 
 def test_the_relative_covariance_of_neighbors_is_that_of_their_edge() -> None:

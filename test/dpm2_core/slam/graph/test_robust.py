@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Robust optimisation on graphs whose answer is known; covariances against the closed form."""
+"""Robust optimization on graphs whose answer is known; covariances against the closed form."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def test_a_trajectory_in_another_frame_is_joined_by_the_loops_that_agree() -> No
     graph = with_loops(GraphData(moved, chained, steps, covariances), ends, T)
     result = optimize(graph, RobustSettings())
     np.testing.assert_array_equal(result.kept, [True, False, True, True, True])
-    assert rmse(result.poses, poses) < 0.6  # odometry noise: 0.02 m a step and 0.002 rad at a lever of 20 m
+    assert rmse(result.poses, poses) < 0.6  # odometry noise: 0.02 m per step and 0.002 rad at a lever of 20 m
 
 
 def test_covariance_grows_along_the_chain_as_its_steps_add_up() -> None:

@@ -138,7 +138,8 @@ def test_disabled_it_closes_nothing_and_a_cloud_too_small_for_descriptors_is_no_
 
 
 def test_places_that_hardly_overlap_are_left_to_no_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What the overlap head doubts is refused in words, even where descriptors match; its silence refuses nothing."""
+    """What the overlap head considers unlikely is rejected in words, even where descriptors match; its silence rejects
+    nothing."""
     places = [(s, 2.5, 0.0) for s in (62.0, 67.0)]
     jump = se3.exp(np.array([0, 0, 0, 12.0, 0, 0]))  # the nearest by pose is no help
 

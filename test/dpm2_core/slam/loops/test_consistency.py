@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A loop passes when the odometry or a second loop agrees, waits while none does, and is refused beyond all drift."""
+"""A loop passes when the odometry or a second loop agrees, waits while none does, and is rejected beyond all drift."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_a_loop_beyond_all_drift_is_rejected() -> None:
         (checked,) = consistency.check(loop(0, 100, T @ off), T)
         assert not checked.registration.ok
         assert "from the odometry" in checked.registration.reason
-    # what was refused confirms nothing
+    # what was rejected confirms nothing
     (checked,) = consistency.check(loop(1, 99, expected(path, 1, 99) @ pose(11.9)), expected(path, 1, 99))
     assert not checked.registration.ok
 

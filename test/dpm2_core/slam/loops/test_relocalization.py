@@ -91,7 +91,7 @@ def test_localization_tracks_notices_kidnapping_and_admits_being_lost(relocalize
     first = localizer.add(keyframe(0, 55.0, origin))
     assert first.state is State.RELOCALIZED
     np.testing.assert_allclose(localizer.T_map_odom[:3, 3], origin[:3, 3], atol=1.0)  # 0.1 deg at the lever's 60 m
-    # five metres on, the odometry errs by 0.3 m: taken up
+    # five meters on, the odometry errs by 0.3 m: taken up
     tracked = localizer.add(keyframe(1, 60.0, origin @ se3.make(np.eye(3), np.array([0.3, 0, 0]))))
     assert tracked.state is State.TRACKING
     assert not tracked.jumped

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Keyframes become a consistent map: loops remove drift, wrong loops are refused, corrections reach every frame."""
+"""Keyframes become a consistent map: loops remove drift, wrong loops are rejected, corrections reach every frame."""
 
 from __future__ import annotations
 

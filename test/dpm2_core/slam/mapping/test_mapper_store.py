@@ -83,7 +83,7 @@ def test_the_file_holds_what_the_mapper_holds(tmp_path: Path) -> None:
 
 
 def test_four_laps_have_the_clouds_of_one(tmp_path: Path) -> None:
-    """A keyframe whose loop was refused keeps its own: three in the second lap; later ones borrow from these, too."""
+    """A keyframe whose loop was rejected keeps its own: three in the second lap; later ones borrow from these, too."""
     sizes = []
     for count in (1, 4):
         path = tmp_path / f"{count}.dpm2map"
@@ -183,7 +183,7 @@ def test_a_full_disk_is_survived_and_the_file_catches_up(tmp_path: Path) -> None
 
 
 def test_memory_of_a_keyframe_is_that_of_its_descriptors(tmp_path: Path) -> None:
-    """Clouds of 8 kB a keyframe packed, 2 MB in all: what stays in memory without descriptors is far less."""
+    """Clouds of 8 kB per keyframe packed, 2 MB in all: what stays in memory without descriptors is far less."""
     import tracemalloc
 
     with MapStore.create(tmp_path / "a.dpm2map") as store:

@@ -60,7 +60,7 @@ def test_one_witness_is_not_enough_and_none_says_nothing() -> None:
 
 
 def test_a_wrong_pose_by_noise_removes_nothing_that_stands() -> None:
-    """5 cm and 0.3 deg, more than neighbouring keyframes are off."""
+    """5 cm and 0.3 deg, more than neighboring keyframes are off."""
     here, noise = scene((8, 0)), np.random.default_rng(0)
     sigma = [0.005, 0.005, 0.005, 0.05, 0.05, 0.05]
     others = [(RangeImage(here), se3.exp(noise.normal(0, sigma))) for _ in range(8)]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The odometry follows a drive to centimetres, survives what sensors do, and says so when it cannot know."""
+"""The odometry follows a drive to centimeters, survives what sensors do, and says so when it cannot know."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def errors(tracked: list[OdometryResult], truth: np.ndarray) -> np.ndarray:
 def test_follows_a_drive_to_centimeters(suburb: Drive) -> None:
     frames, truth = suburb
     tracked = run(frames)
-    # 2 cm range noise on thousands of points averages out to millimetres a frame; 5 cm over 25 m leaves room for drift
+    # 2 cm range noise on thousands of points averages out to millimeters a frame; 5 cm over 25 m leaves room for drift
     assert errors(tracked, truth)[:, 0].max() < 0.05
     assert errors(tracked, truth)[:, 1].max() < 0.1
     assert [t.state for t in tracked[2:]] == [State.TRACKING] * (len(frames) - 2)
@@ -173,7 +173,7 @@ def test_stamps_that_repeat_jump_back_or_pause(suburb: Drive, stamps: list[int])
 
 
 def test_fast_start(suburb: Drive) -> None:
-    """Three metres between the first two scans: no velocity is known yet."""
+    """Three meters between the first two scans: no velocity is known yet."""
     frames = [replace(f, stamp=i * 10**8) for i, f in enumerate(suburb[0][::3])]
     assert errors(run(frames), suburb[1][::3])[:, 0].max() < 0.06
 
@@ -198,7 +198,8 @@ def test_a_drive_may_begin_in_a_column() -> None:
     assert np.mean([scan.moving.mean() for scan in scans]) > 0.45
     tracked = run([Frame(i * 10**8, scan.points) for i, scan in enumerate(scans)])
     assert all(t.registration.ok for t in tracked)
-    # The column moves by 1.6 m a frame against the road. What little of that stands holds the car to a few centimetres
+    # The column moves by 1.6 m per frame against the road. What little of that stands holds the car to a few
+    # centimeters
     assert errors(tracked, se3.inverse(truth[0]) @ truth)[:, 0].max() < 0.15
 
 

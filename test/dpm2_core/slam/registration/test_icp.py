@@ -22,7 +22,8 @@ Case = tuple[GeometricScanRegistration, Scan, Array]
 
 
 def make_case(drive: Drive, seen: float) -> Case:
-    """A map of one scan, of which something hides all but a share of the azimuth; the fourth scan after, its pose."""
+    """A map of one scan, of which something hides all but a fraction of the azimuth; the fourth scan after, its
+    pose."""
     frames, truth = drive
     preprocessor = Preprocessor(PreprocessSettings())
     registration = GeometricScanRegistration(
@@ -50,7 +51,7 @@ def test_what_the_motion_led_to_expect_needs_fewer_counterparts(occluded: Case) 
     result = registration.register(scan, Prediction([start], information=PRIOR))
     assert 0.3 < result.confidence < 0.5, "else the case is none"
     assert result.ok
-    assert error(result.T_target_source, truth) < 0.05  # a young map of 0.5 m cells: centimetres
+    assert error(result.T_target_source, truth) < 0.05  # a young map of 0.5 m cells: centimeters
     guessed = registration.register(scan, Prediction([start]))
     assert not guessed.ok
     assert guessed.reason.endswith("points fit the map")
@@ -94,7 +95,7 @@ def test_likelihood_is_greatest_at_the_truth(suburb: Drive) -> None:
 
 
 def test_along_a_tunnel_answers_agree_and_the_least_motion_is_kept(tunnel: Drive) -> None:
-    """How far the car went cannot be seen there: starts that end metres apart do not contradict each other."""
+    """How far the car went cannot be seen there: starts that end meters apart do not contradict each other."""
     registration, scan, _ = make_case(tunnel, 1.0)
     starts = [se3.exp([0, 0, 0, x, 0, 0]) for x in (1.0, 2.0)]
     alone = [registration.register(scan, Prediction([T])) for T in starts]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Neural registration in the SLAM: which descriptors are registered to, what is refused, and what is loaded when."""
+"""Neural registration in the SLAM: which descriptors are registered to, what is rejected, and what is loaded when."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ Street = Callable[..., np.ndarray]
 
 @pytest.fixture
 def weights(tiny: Callable[..., NetworkSettings], street: Street, tmp_path: Path) -> Path:
-    """The tiny network as a file: random weights, but similarities centred, so that equal descriptors match best."""
+    """The tiny network as a file: random weights, but similarities centered, so that equal descriptors match best."""
     torch.manual_seed(0)
     model = DeepPointMap2(tiny(decoder={"temperature": 0.01})).eval().requires_grad_(False)
     some = model.describe(Frame(0, cloud(street(np.random.default_rng(1)))))
@@ -108,7 +108,7 @@ def test_a_frame_seen_again_is_found_without_any_prior(
     assert (result.ok, result.method) == (True, "neural")
     np.testing.assert_allclose(result.T_target_source, place, atol=1e-3)  # fp16 features, bf16 arithmetic
     assert np.linalg.eigvalsh(result.covariance)[0] > 0
-    # but where the velocity is known, to 1 m/s, what contradicts it is refused
+    # but where the velocity is known, to 1 m/s, what contradicts it is rejected
     known = registration.register(scan, Prediction([wrong], information=np.eye(6) / 0.1**2))
     assert (known.ok, known.reason) == (False, "contradicts the motion so far")
     assert registration.register(scan, Prediction([place], information=np.eye(6) / 0.1**2)).ok

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The picture along the direction that scans leave open: a corridor of constant section with painted walls."""
+"""The image along the direction that scans leave open: a corridor of constant section with painted walls."""
 
 from __future__ import annotations
 
@@ -90,10 +90,11 @@ def test_the_way_along_a_corridor_is_read_from_its_walls() -> None:
 
 
 @pytest.mark.parametrize(
-    ("paint", "why"), [(stripes, "several places are alike"), (lambda p: np.full(len(p), 99.0), "a likeness of only")]
+    ("paint", "why"),
+    [(stripes, "several places are alike"), (lambda p: np.full(len(p), 99.0), "a correlation of only")],
 )
 def test_what_does_not_tell_is_not_believed(paint: Paint, why: str) -> None:
-    """Paint that repeats, or none: the answer stays the points', with their doubt, and says why."""
+    """Paint that repeats, or none: the answer stays the points', with their uncertainty, and says why."""
     T, covariance, method, reason = registered(frame(0.0, paint), frame(0.7, paint, 1))
     assert method == "geometric"
     assert why in reason
@@ -128,7 +129,7 @@ def test_an_odometry_that_brakes_in_a_tunnel() -> None:
 
 
 def test_points_and_images_of_a_real_drive_agree(kitti_root: Path) -> None:
-    """Asked where nothing is open, the picture moves the answer by centimetres: two measurements of one motion."""
+    """Asked where nothing is open, the image moves the answer by centimeters: two measurements of one motion."""
     frames = list(open_source(kitti_root / "sequences" / "04").frames(0, 12))
     tracks = []
     for sigma in (0.08, 1e-4):

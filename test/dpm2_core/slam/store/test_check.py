@@ -68,7 +68,7 @@ def test_each_kind_of_damage_is_named(map_file: Path, drive: list[Keyframe]) -> 
     result = check_map(map_file)
     info = "\n".join(result.problems)
     for words in (
-        "keyframe 4: its optimised pose is not a finite", "keyframe 6: its payload is lost", "edges 2: its checksum",
+        "keyframe 4: its optimized pose is not a finite", "keyframe 6: its payload is lost", "edges 2: its checksum",
         "edge 90: leads from 1 to 55", "keyframes lost: 8",
     ):  # fmt: skip
         assert words in info, info

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Clouds come back as they were to half a centimetre, from disk or, without one, from memory."""
+"""Clouds come back as they were to half a centimeter, from disk or, without one, from memory."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def clouds() -> list[np.ndarray]:
 
 @given(st.integers(0, 300), st.sampled_from([0.0, 1.0, 60.0, 327.0, 2000.0]), st.integers(0, 2**32 - 1))
 def test_rounding_is_half_a_step(count: int, reach: float, seed: int) -> None:
-    """Half a centimetre up to 327 m, in proportion beyond; order, number and dtype stay."""
+    """Half a centimeter up to 327 m, in proportion beyond; order, number and dtype stay."""
     rng = np.random.default_rng(seed)
     cloud = rng.uniform(-1, 1, (count, 4)).astype(np.float32) * np.float32([reach, reach, reach, 1])
     cloud[:, 3] = np.abs(cloud[:, 3])

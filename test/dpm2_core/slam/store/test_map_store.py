@@ -58,7 +58,7 @@ def whole_prefix(path: Path) -> int:
 
 
 def test_everything_comes_back(tmp_path: Path, map_file: Path, drive: list[Keyframe]) -> None:
-    """Poses and covariances to the last bit, clouds to half a centimetre, descriptors as the float16 they are."""
+    """Poses and covariances to the last bit, clouds to half a centimeter, descriptors as the float16 they are."""
     for path in (map_file, tmp_path / "again.dpm2map"):
         if path != map_file:
             with MapStore.open(map_file) as store:
