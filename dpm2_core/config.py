@@ -102,7 +102,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _value(text: str) -> Any:
-    """The value of a setting, YAML; text that is none is a string, and so is 04: no octal number, but a sequence."""
+    """The value of a setting, YAML; invalid YAML is taken as a string; so is 04, a KITTI sequence, not octal 4."""
     try:
         return text.strip() if re.fullmatch(r"\s*0\d+\s*", text) else yaml.safe_load(text)
     except _NOT_YAML:

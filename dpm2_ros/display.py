@@ -75,7 +75,7 @@ def _ends(positions: Array, pairs: Iterable[tuple[int, int]]) -> Array:
 
 
 class Display:
-    """Something large that is built only for those who look: when somebody listens, it has changed, and it is time."""
+    """A large message that is built only if it has a subscriber, has changed, and its period has passed."""
 
     def __init__(self, publisher: Any, period: float, make: Callable[[], Any]) -> None:
         self._publisher, self._period, self._make = publisher, period, make

@@ -137,7 +137,7 @@ class MapperThread:
         self._last = self._submit(lambda: self._take_in(make))
 
     def hint(self, T_map_base: Array) -> str:
-        """The robot is about there (4, 4), somebody says; returns why that is of no use, if it is not."""
+        """Prior for the robot's pose (4, 4), for example from RViz; returns why it cannot be used, or an empty text."""
         localizer = self._active.localizer
         if localizer is None:
             return "a map is being made: a pose is of use only with localization_mode"

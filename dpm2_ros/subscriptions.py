@@ -160,7 +160,7 @@ class Inputs:
                 self._arrived.wait(min(end, self.synchronizer.deadline() or end) - now)
 
     def calibrated(self, lidar_frame: str) -> bool:
-        """Whether everything latched that somebody publishes about the LiDAR has arrived."""
+        """Whether all latched messages about the LiDAR that have a publisher have arrived."""
         correction = self.angle_correction_deg is not None
         return self.static.complete(lidar_frame) and (
             correction or not self._node.count_publishers(self._correction_topic)

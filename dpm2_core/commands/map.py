@@ -151,7 +151,7 @@ def check(
     path: MapFile,
     recover: Annotated[Path | None, typer.Option(help="Write what is good to this new map file.")] = None,
 ) -> None:
-    """Look for damage: database, checksum of every row, edges that lead nowhere, poses that are none."""
+    """Look for damage: database, checksum of every row, dangling edges, invalid poses."""
     from dpm2_core.slam.store.check import check_map
 
     result = check_map(path, recover)

@@ -50,7 +50,8 @@ def run(
         str | None,
         typer.Option(
             help="Let sensors fail, NAME=VALUE,...: fractions of frames camera (black), no_image, overexposed, "
-            "underexposed (by stops), obstruction; fraction of beams; extrinsic_deg, extrinsic_m, time_offset (s); seed."
+            "underexposed (by stops), obstruction; fraction of beams; extrinsic_deg, extrinsic_m, time_offset (s); "
+            "seed."
         ),
     ] = None,
     map_file: Annotated[

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How good a trajectory is: file formats, error metrics, figures and the benchmark harness."""
+"""How good a trajectory or a registration is: error metrics, figures, and records of results."""

@@ -47,7 +47,7 @@ class GenerateSettings(Settings):
     height: float = Field(1.73, gt=0.5, le=10)
     """Of the LiDAR above the ground, m; each world's own is up to 0.2 m lower or 0.3 m higher."""
     traffic: float = Field(1.0, ge=0, le=1000)
-    """Times that of the preset; of 20 on every lane is full."""
+    """Factor on the preset's traffic; 20 fills every lane."""
     images: bool = False
     """Render an image with each scan."""
     preset: str = "small"

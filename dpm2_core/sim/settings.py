@@ -143,7 +143,7 @@ def varied(preset: Preset, rng: np.random.Generator) -> Preset:
 
 
 def with_traffic(own: Preset, nominal: Preset, factor: float) -> Preset:
-    """A world's own preset with `factor` times the traffic: 0 for none, of 20 on every lane is full.
+    """A world's own preset with `factor` times the traffic: 0 for none, 20 fills every lane.
 
     Above 1 the cars drive in columns, ahead, behind, alongside and oncoming, on a road that is wide enough for them,
     and as many of them in each world: then the world is not the one of factor 1.

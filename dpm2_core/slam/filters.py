@@ -48,7 +48,7 @@ class PointFilter(Protocol):
 
 
 class DynamicObjectFilter:
-    """Leaves out what moves or could; see `network.movers`."""
+    """Leaves out what moves or could; see `network.perception.dynamic_objects`."""
 
     def __init__(self, net: DynamicObjectNet, threshold: float, most: float) -> None:
         self._net, self._threshold, self._most = net, threshold, most

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A drive and a map file: a new one, on from where an earlier run was cut off, or one only to find oneself in."""
+"""Opens a map file for a drive: create, resume, extend, or localize only."""
 
 from __future__ import annotations
 

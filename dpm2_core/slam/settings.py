@@ -45,7 +45,7 @@ class SlamSettings(Settings):
 
 
 class Config(Settings):
-    """Everything that `dpm2 run` can be told."""
+    """All settings of `dpm2 run`."""
 
     input: InputSettings = InputSettings()
     slam: SlamSettings = SlamSettings()

@@ -85,7 +85,7 @@ def optimize(graph: GraphData, settings: RobustSettings) -> Solution:
     """Optimize and judge; deterministic.
 
     Raises:
-        RuntimeError: gtsam found the system to be singular, as with a covariance that is none.
+        RuntimeError: the system is singular, for example because a covariance is not positive definite.
     """
     odometry = integrate(graph)
     apart = np.sqrt(chain_chi2(graph, odometry))

@@ -23,7 +23,7 @@ class ConsistencySettings(Settings):
     """How far loops may differ from the odometry and from each other."""
 
     drift: float = 0.02
-    """Odometry error to reckon with per meter of path: a loop that corrects more (and 1 m) is rejected."""
+    """Expected odometry drift per meter; a loop that corrects more than this times the path, plus 1 m, is rejected."""
     drift_turn: float = 0.02
     """The same for rotation, degrees per meter (and 3 degrees)."""
     certain: float = 2.0

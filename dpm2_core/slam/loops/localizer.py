@@ -13,7 +13,7 @@ from dpm2_core.slam.loops.consistency import BROKEN
 from dpm2_core.slam.loops.relocalization import Relocalizer, nowhere
 
 LOST = np.diag([1.0, 1.0, 1.0, 100.0, 100.0, 100.0]) ** 2
-"""(6, 6) [rad, m] covariance of a pose that is as good as nothing."""
+"""(6, 6) [rad, m] covariance of an uninformative prior."""
 _PATIENCE = 1_000_000_000  # ns
 
 
@@ -65,7 +65,7 @@ class Localizer:
         self._failures, self._distrust, self._T_last, self._stamp = 0, 0.0, None, None
 
     def hint(self, T_map_lidar: Array) -> None:
-        """The next keyframe was taken about there (4, 4), somebody says."""
+        """Prior for the pose of the next keyframe (4, 4), for example from RViz."""
         self._hint, self.state = T_map_lidar, State.RELOCALIZING
 
     def add(self, keyframe: Keyframe) -> LocalizationResult:

@@ -47,7 +47,7 @@ class PlaceRecognition:
             self._index.append(keyframes[node].descriptors)
 
     def similar(self, descriptors: Descriptors, allowed: NDArray[np.bool_], count: int) -> list[int]:
-        """At most `count` of the `allowed` (N,) nodes that look like it, the most similar first, no two neighbors."""
+        """Up to `count` most similar nodes among `allowed` (N,), best first, no two of them next to each other."""
         return self._index.nearest(pooled(descriptors), allowed, count, apart=1)
 
     def register(self, source: Descriptors, targets: Sequence[Descriptors]) -> list[Registration]:

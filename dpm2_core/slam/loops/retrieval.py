@@ -71,7 +71,7 @@ class PlaceIndex:
     def similarities(self, query: Vector) -> NDArray[np.float32]:
         """Cosine (N,) of each keyframe's vector and the (528,) query, both less the mean of all; -1 without a vector.
 
-        What all places of a map have in common is no correlation, so the mean is taken off.
+        The mean descriptor is subtracted: components shared by all places do not discriminate.
         """
         mean = (self._sum / max(self._used, 1)).astype(np.float32)
         requested = query - mean

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The points' word on a pose that somebody else proposed: does what stands there fit, and how well is it known?"""
+"""Geometric verification of a proposed pose: inlier test and covariance."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ class RedundancySettings(Settings):
 def lender(
     node: int, loops: Sequence[Edge], loan_of: Callable[[int], Loan | None], settings: RedundancySettings
 ) -> Loan | None:
-    """Whose payload a new node can make do with; None: it keeps its own.
+    """The node whose payload a new node can share; None: it keeps its own.
 
     Args:
         node: with `loops` those that were tried for it, to it.

@@ -45,7 +45,7 @@ class KeyframeSelector:
         self._requested = False
 
     def request(self) -> None:
-        """Make a keyframe of the next registered scan, however short the way: somebody is lost, and may be standing."""
+        """Make a keyframe of the next registered scan at any distance: relocalization needs one even at standstill."""
         self._requested = True
 
     def add_uncertainty(self, covariance: Array) -> None:

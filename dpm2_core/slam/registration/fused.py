@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The points, and the network where it knows more; the one vouches for the other, and what differs is said."""
+"""Fuses ICP with the network's registration: each checks the other, and disagreement is reported in `reason`."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from dpm2_core.slam.registration.points import GeometricScanRegistration
 from dpm2_core.slam.registration.protocol import MAP_NOISE, Prediction, agree
 
 _LED = np.diag(np.repeat([np.radians(2), 0.5], 3) ** -2.0)
-"""How well the network's pose is known at least, rad and m: what the points need to be led by it, and no more."""
+"""Information of a network pose with a standard deviation of 2 degrees and 0.5 m: enough to initialize ICP."""
 
 
 class RefinedScanRegistration:
-    """The points as the geometric registration has them, and the network where it knows more.
+    """ICP and the network's registration, fused.
 
-    Where both have an answer and agree (see `agree`), it is that of the points, and along directions that the network
-    knows better the mean by information: in town the points have it, along a tunnel the network. Where they contradict
-    each other, the points have it: they are many, and led there by the motion so far. While no motion is known the pose
-    of the network is one more start for them, and the most likely wins. Where the points have no answer they try again
-    from the pose of the network; if they have none there, or another, the network answers alone, with its uncertainty.
-    `reason` says who did not agree, and why.
+    If both agree (see `agree`), they are fused by their information: ICP dominates in structured scenes, the network
+    along degenerate directions such as a tunnel. If they disagree, ICP's pose is kept: it has many points and starts
+    from the predicted motion. Without a motion prediction, the network's pose is an additional start of ICP and the
+    most likely result is kept. If ICP fails, it is tried again from the network's pose; if it fails there too, or
+    converges elsewhere, the network's pose is returned with its own covariance. `reason` says which of the two
+    disagreed, and why.
     """
 
     def __init__(self, neural: NeuralScanRegistration, geometric: GeometricScanRegistration) -> None:

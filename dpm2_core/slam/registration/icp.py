@@ -23,13 +23,13 @@ class GeometricSettings(Settings):
     iterations: int = 15
     """At most so many Gauss-Newton steps."""
     min_points: int = 80
-    """Fewer inliers than this are no answer."""
+    """A registration with fewer inliers is rejected."""
     min_inliers: float = 0.5
-    """A smaller fraction of inliers among the points is no answer."""
+    """A registration with a smaller ratio of inliers is rejected."""
     min_inliers_expected: float = 0.3
-    """The same in a map of at most 3 scans, where the answer is what the motion so far led to expect, to 0.3 m and
-    2 degrees: two sources then say the same, and such a map, of which traffic hides ever other parts, has counterparts
-    for no more. Of a map that has grown a scan without counterparts is another place."""
+    """Lower threshold while the map has at most 3 scans and the result agrees with the predicted motion (0.3 m, 2
+    degrees): while traffic occludes parts of so small a map, fewer points match. In a larger map few matches mean a
+    wrong place."""
 
 
 _COARSE, _FINE = (1e-3, 0.02), (1e-4, 1e-3)  # rad and m: a smaller step ends the pass
@@ -128,7 +128,7 @@ def _close(T: Array, T_other: Array) -> bool:
 
 
 def _covariance(H: Array) -> Array:
-    """Covariance (6, 6) from the Hessian, without the information that noise in the normals feigns.
+    """Covariance (6, 6) from the Hessian, minus the spurious information due to noise in the normals.
 
     Along a perfectly smooth tunnel every normal should be square to the axis; their noise makes it look as if some were
     not, and the motion along it as if it were known.

@@ -39,9 +39,9 @@ class VisualSettings(Settings):
     width: int = Field(640, gt=0)
     """Images are reduced to this width, pixels."""
     min_correlation: float = Field(0.3, ge=0, le=1)
-    """A poorer correlation is none."""
+    """Minimum correlation; lower values are discarded."""
     distinct: float = Field(0.1, ge=0, le=1)
-    """The best place must be more similar than any other by this much: lane marks and lamps repeat."""
+    """Minimum margin over the second-best correlation peak; rejects repetitive structure such as lane markings."""
 
 
 _NEAR, _FAR = 2.0, 50.0  # m ahead of the camera: the compared points
@@ -50,9 +50,7 @@ _BLUR = (2.5, 1.0)  # pixels: so that nothing is missed between two of them
 _LOCAL = 12.0  # pixels: light that changes more slowly is no texture
 _LEAST = 100  # points that both images must show
 _CORRELATED = 100  # pixels next to each other, and the points between them, say the same
-_COARSE_MARGIN = (
-    0.3  # of the correlation at the coarse blur: the fine one chooses among those that are not farther behind
-)
+_COARSE_MARGIN = 0.3  # candidates within it of the best coarse correlation are refined at the fine level
 _APART = 0.6  # m: other places, not the slope of the best one
 
 
@@ -192,7 +190,7 @@ class VisualScanRegistration:
 
 
 def _maxima(correlation: NDArray[np.float32], least: float) -> NDArray[np.intp]:
-    """Places inside the search that are more similar than both neighbors and than `least`."""
+    """Interior local maxima of the correlation above `least`."""
     inner = correlation[1:-1]
     return 1 + np.flatnonzero((inner >= correlation[:-2]) & (inner > correlation[2:]) & (inner > least))
 

@@ -53,7 +53,7 @@ def check_map(path: Path, recover: Path | None = None) -> Findings:
         raise UsageError(f"{path}: no such map file")
     findings = Findings()
     with tempfile.TemporaryDirectory(prefix="dpm2_check_") as folder:
-        copy = Path(folder) / "map"  # SQLite replays FILE-wal when it opens a map: not on the patient
+        copy = Path(folder) / "map"  # opening replays FILE-wal, which would change the damaged file
         for suffix in ("", "-wal"):
             with suppress(FileNotFoundError):
                 shutil.copyfile(f"{path}{suffix}", f"{copy}{suffix}")

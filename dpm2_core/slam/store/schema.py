@@ -36,14 +36,14 @@ CREATE TABLE keyframes (
   stamp    INTEGER NOT NULL,     -- ns
   frame    INTEGER NOT NULL,     -- number in the recording
   T_odom_kf BLOB NOT NULL,
-  lender   INTEGER,              -- a revisit: the keyframe with whose payload it makes do
+  lender   INTEGER,              -- a revisit: the keyframe whose payload it shares
   T_kf_lender BLOB,
   crc      INTEGER NOT NULL
 );
 CREATE TABLE payloads (
   node     INTEGER PRIMARY KEY,
-  cloud    BLOB NOT NULL,        -- see slam/cloud_codec.py
-  descriptors BLOB,              -- see slam/map/rows.py
+  cloud    BLOB NOT NULL,        -- see slam/store/cloud_codec.py
+  descriptors BLOB,              -- see slam/store/rows.py
   thumbnail BLOB,                -- JPEG
   crc      INTEGER NOT NULL
 );
