@@ -28,7 +28,7 @@ class Inner(Settings):
     """Edge of a voxel, m."""
 
     names: tuple[str, ...] = ()
-    colour: Color = Color.RED
+    color: Color = Color.RED
 
 
 class Middle(Settings):
@@ -60,7 +60,7 @@ def _file(tmp_path: Path, text: str) -> Path:
 
 texts = st.text(st.characters(codec="utf-8", exclude_categories=["Cs"]), max_size=30)
 inners = st.builds(
-    Inner, voxel=st.floats(1e-12, 1e12), names=st.lists(texts, max_size=3).map(tuple), colour=st.sampled_from(Color)
+    Inner, voxel=st.floats(1e-12, 1e12), names=st.lists(texts, max_size=3).map(tuple), color=st.sampled_from(Color)
 )
 
 
@@ -118,7 +118,7 @@ def test_an_override_of_one_of_two_keys_with_the_same_anchor_leaves_the_other(tm
         ("count: 10", "count: .*less than or equal to 9, got 10"),
         ("middle: {inner: {voxel: 0}}", "middle.inner.voxel: .*greater than 0, got 0"),
         ("middle: {inner: {voxel: .inf}}", "middle.inner.voxel: .*finite number"),
-        ("middle: {inner: {color: green}}", "middle.inner.colour: .*'red' or 'blue', got 'green'"),
+        ("middle: {inner: {color: green}}", "middle.inner.color: .*'red' or 'blue', got 'green'"),
         ("middle: {angle: six}", r"middle\.angle: .*number.*'auto'"),
         ("middle: 5", "middle: .*got 5"),
         ("several: [{voxel: -1}]", "several.0.voxel: .*greater than 0"),
@@ -175,7 +175,7 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
 
 def test_flat_fields_name_every_leaf_that_can_be_set() -> None:
     names = [name for name, _ in flat_fields(Outer)]
-    assert names[:4] == ["middle.inner.voxel", "middle.inner.names", "middle.inner.colour", "middle.angle"]
+    assert names[:4] == ["middle.inner.voxel", "middle.inner.names", "middle.inner.color", "middle.angle"]
     dumped = yaml.safe_load(dump_settings(Outer()))
     for name in names:
         value = dumped

@@ -148,14 +148,14 @@ def test_finds_itself_tracks_and_notices_being_carried_off(
     """From the middle of the map; carried back while it runs; and all through the file stays as it is."""
     before = digest(made)
     r = robot(f"ros.map_file:={made}", "ros.localization_mode:=true", "slam.keyframes.distance:=2.0")
-    assert "relocalising" in r.said("slam_node: localization")
+    assert "relocalising" in r.said("slam_node: localisation")
     r.send(*range(8, 17))
     r.harness.wait(
-        lambda: r.said("slam_node: localization").startswith(("relocalised", "tracking")), "an answer", timeout=30
+        lambda: r.said("slam_node: localisation").startswith(("relocalised", "tracking")), "an answer", timeout=30
     )
     r.send(17, 18)
     r.harness.wait(lambda: r.off(place(street, 18)) < 0.1, "its place in the map")
-    r.harness.wait(lambda: r.said("slam_node: localization").startswith("tracking"), "the second answer")
+    r.harness.wait(lambda: r.said("slam_node: localisation").startswith("tracking"), "the second answer")
     seen = len(r.diagnostics)
     r.send(19)  # the state that is told is that at the last cloud
     info = lambda: [s.message for d in r.diagnostics[seen:] for s in d.status if s.name.endswith("odometry")]  # noqa: E731
@@ -191,7 +191,7 @@ def test_hints_and_services_answer_in_words(
         made_elsewhere.rename(made)
     loaded = r.call(Trigger, "/slam_node/load_map")
     assert loaded.success, loaded.message
-    r.harness.wait(lambda: "relocalising" in r.said("slam_node: localization"), "the new search")
+    r.harness.wait(lambda: "relocalising" in r.said("slam_node: localisation"), "the new search")
     r.point(np.eye(4), "map")
     seen = len(r.tf)
     again = lambda: any(t.header.frame_id == "map" for m in r.tf[seen:] for t in m.transforms)  # noqa: E731

@@ -86,7 +86,7 @@ def test_a_slam_with_a_filter_runs_and_tells_what_is_missing(tmp_path: Path, poi
     system = SlamSystem(SlamSettings(filter=FilterSettings(kind="movers", weights=path), threads=1))
     assert [system.process(Frame(i * 10**8, points)).registration.ok for i in range(3)] == [True] * 3
     assert make_filter(FilterSettings(), 1) is None
-    with pytest.raises(UsageError, match="weights of dynamic objects, not of gndnet"):
+    with pytest.raises(UsageError, match="weights of movers, not of gndnet"):
         make_filter(FilterSettings(kind="ground", weights=path), 1)
     with pytest.raises(UsageError, match=r"slam\.filter\.weights: no such file .*dpm2 train dslr"):
         make_filter(FilterSettings(kind="static", weights=tmp_path / "none.safetensors"), 1)
