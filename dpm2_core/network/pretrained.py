@@ -3,20 +3,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import copy
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from threading import Lock
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from dpm2_core.errors import UsageError
 
 if TYPE_CHECKING:  # torch takes seconds to import, and the geometric SLAM does without
     from dpm2_core.network.model import DeepPointMap2
 
-
+M = TypeVar("M")
 PERCEPTION_WEIGHTS: dict[str, str] = {"movers": "movers", "ground": "gndnet", "static": "dslr"}
 """Names of the weights of each kind, and of the task that trains them."""
 PRETRAINED_DIR = Path(__file__).resolve().parents[1] / "weights"
 """Folder of the weights that come with dpm2."""
+_LOCK = Lock()
+_LOADED: dict[tuple[Path, Callable[[Path], Any]], tuple[tuple[int, int], Any]] = {}
+"""By file and loader: the file's (mtime ns, size) when it was loaded, and the network."""
 
 
 def pretrained_names() -> Sequence[str]:
@@ -38,8 +43,42 @@ def weights_path(weights: str) -> Path:
     return Path(weights)
 
 
+def load_once(path: Path, threads: int, load: Callable[[Path], M]) -> M:
+    """The network in a weights file: the first call in this process loads it, later calls get the same weights.
+
+    A file that has changed since is loaded again.
+
+    Args:
+        threads: of torch, which has one number for the whole process; the only place that sets it.
+        load: makes the network, ready for inference.
+
+    Returns:
+        An object of the caller's own, so that what one caller's network remembers is not mixed up with another's, in
+        this thread or in another one. Its layers are shared: do not train them.
+
+    Raises:
+        UsageError: as `load`, and for a file that is not there.
+    """
+    import torch
+
+    torch.set_num_threads(threads)
+    try:
+        file = path.resolve(strict=True)
+        stat = file.stat()
+    except OSError as error:
+        raise UsageError(f"{path}: {error.strerror}") from None
+    key, version = (file, load), (stat.st_mtime_ns, stat.st_size)
+    with _LOCK:
+        if key not in _LOADED or _LOADED[key][0] != version:
+            _LOADED[key] = (version, load(path))
+        network = copy.copy(_LOADED[key][1])  # of the object alone, not of the layers in it
+    return cast(M, network)
+
+
 def load_network(weights: str, threads: int, preset: str = "") -> DeepPointMap2:
     """The network with weights, ready to run on the CPU; without its camera if it was trained without images.
+
+    The weights are loaded once in a process, see `load_once`.
 
     Args:
         weights: name of shipped weights, or path of a .safetensors file.
@@ -50,14 +89,16 @@ def load_network(weights: str, threads: int, preset: str = "") -> DeepPointMap2:
         UsageError: no such weights, or of another preset.
     """
     path = weights_path(weights)
-    import torch
-
-    from dpm2_core.network.weights import load_model, read_metadata
-
-    torch.set_num_threads(threads)
-    model = load_model(path)
-    if read_metadata(path).get("images") != "true":
-        model.encoder.image = None  # a branch that has never seen an image would only disturb
+    model = load_once(path, threads, _load)
     if preset and model.settings.preset != preset:
         raise UsageError(f"{path}: weights of preset {model.settings.preset}, slam.neural.preset is {preset}")
+    return model
+
+
+def _load(path: Path) -> DeepPointMap2:
+    from dpm2_core.network.weights import load_model_and_metadata
+
+    model, metadata = load_model_and_metadata(path)
+    if metadata.get("images") != "true":
+        model.encoder.image = None  # a branch that has never seen an image would only disturb
     return model

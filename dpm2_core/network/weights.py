@@ -75,6 +75,11 @@ def load_weights(model: DeepPointMap2, path: Path) -> dict[str, str]:
         UsageError: missing file, another format, weights of another preset or shape.
     """
     state, metadata = read_tensors(path)
+    _fill(model, path, state, metadata)
+    return metadata
+
+
+def _fill(model: DeepPointMap2, path: Path, state: Mapping[str, torch.Tensor], metadata: Mapping[str, str]) -> None:
     stored = metadata.get("preset", "unknown")
     if stored != model.settings.preset:
         raise UsageError(f"{path}: weights of preset {stored}, the network is preset {model.settings.preset}")
@@ -82,7 +87,6 @@ def load_weights(model: DeepPointMap2, path: Path) -> dict[str, str]:
     if bad := [name for name, value in state.items() if not bool(value.isfinite().all())]:
         raise UsageError(f"{path}: {bad[0]} holds values that are not finite")
     model.load_state_dict(state)
-    return metadata
 
 
 def network_settings(path: Path) -> NetworkSettings:
@@ -95,17 +99,23 @@ def network_settings(path: Path) -> NetworkSettings:
 
 
 def load_model(path: Path) -> DeepPointMap2:
-    """The network that a weights file describes, with its weights, ready for inference.
+    """The network that a weights file describes, with its weights, ready for inference; a new one in every call.
 
     Raises:
         UsageError: as `load_weights`.
     """
+    return load_model_and_metadata(path)[0]
+
+
+def load_model_and_metadata(path: Path) -> tuple[DeepPointMap2, dict[str, str]]:
+    """`load_model`, and what was written about the weights beside them; the file is opened once."""
     state, metadata = read_tensors(path)
     settings = _network_settings(path, metadata)
     check_fit(path, state, lambda: DeepPointMap2(settings))
     model = DeepPointMap2(settings)
-    model.decoder.overlap_trained = load_weights(model, path).get("phase") == "2"
-    return model.eval().requires_grad_(False)
+    _fill(model, path, state, metadata)
+    model.decoder.overlap_trained = metadata.get("phase") == "2"
+    return model.eval().requires_grad_(False), metadata
 
 
 def _network_settings(path: Path, metadata: Mapping[str, str]) -> NetworkSettings:

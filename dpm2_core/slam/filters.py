@@ -16,7 +16,7 @@ from pydantic import Field
 from dpm2_core.config import Settings
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Points
-from dpm2_core.network.pretrained import PERCEPTION_WEIGHTS, PRETRAINED_DIR
+from dpm2_core.network.pretrained import PERCEPTION_WEIGHTS, PRETRAINED_DIR, load_once
 
 if TYPE_CHECKING:  # torch takes seconds to import, and the geometric SLAM does without
     from dpm2_core.network.perception.dslr import Dslr
@@ -105,17 +105,14 @@ def make_filter(settings: FilterSettings, threads: int) -> PointFilter | None:
         raise UsageError(
             f"slam.filter.weights: {why} ({path}); `dpm2 train {PERCEPTION_WEIGHTS[settings.kind]}` makes some"
         )
-    import torch
-
-    torch.set_num_threads(threads)
     if settings.kind == "movers":
         from dpm2_core.network.perception import dynamic_objects
 
-        return DynamicObjectFilter(dynamic_objects.load(path), settings.threshold, settings.most)
+        return DynamicObjectFilter(load_once(path, threads, dynamic_objects.load), settings.threshold, settings.most)
     if settings.kind == "ground":
         from dpm2_core.network.perception import gndnet
 
-        return GroundFilter(gndnet.load(path))
+        return GroundFilter(load_once(path, threads, gndnet.load))
     from dpm2_core.network.perception import dslr
 
-    return StaticFilter(dslr.load(path))
+    return StaticFilter(load_once(path, threads, dslr.load))

@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The weights of one file are in the memory of a process once, however many parts of the SLAM use them."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from dpm2_core.errors import UsageError
+from dpm2_core.frame import Frame
+from dpm2_core.network import weights as weights_module
+from dpm2_core.network.model import DeepPointMap2
+from dpm2_core.network.perception import dynamic_objects
+from dpm2_core.network.pretrained import PRETRAINED_DIR, load_network, load_once
+from dpm2_core.network.weights import save_weights
+from dpm2_core.slam.session import open_for_localization, open_session
+from dpm2_core.slam.settings import SlamSettings
+from dpm2_core.slam.system import LocalizationSystem, SlamSystem
+
+
+@pytest.fixture(autouse=True)
+def _threads() -> Iterator[None]:
+    """Those of torch are as before."""
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture
+def opened(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
+    """How often each safetensors file has been opened."""
+    count: Counter[str] = Counter()
+    really = weights_module.safe_open
+
+    def counted(path: Path, *arguments: Any) -> Any:
+        count[Path(path).name] += 1
+        return really(path, *arguments)
+
+    monkeypatch.setattr(weights_module, "safe_open", counted)
+    return count
+
+
+@pytest.fixture
+def network_file(model: DeepPointMap2, tmp_path: Path) -> Path:
+    """Weights of the tiny network."""
+    save_weights(model, tmp_path / "tiny.safetensors", {})
+    return tmp_path / "tiny.safetensors"
+
+
+def test_a_run_with_every_part_that_has_a_network_opens_each_file_once(
+    network_file: Path, tmp_path: Path, opened: Counter[str], street: Callable[..., np.ndarray],
+    noise: np.random.Generator,
+) -> None:  # fmt: skip
+    """Refined registration, loops by descriptors and a filter make a map; the same settings localize in it."""
+    filter_file = tmp_path / "filter.safetensors"
+    shutil.copy(PRETRAINED_DIR / "movers.safetensors", filter_file)
+    settings = SlamSettings.model_validate({
+        "registration": "refined", "threads": torch.get_num_threads(), "loops": {"descriptors": True},
+        "neural": {"weights": str(network_file), "preset": ""}, "filter": {"kind": "movers", "weights": filter_file},
+    })  # fmt: skip
+    points = np.column_stack([street(noise), np.full(4000, 0.5)]).astype(np.float32)
+    with open_session(tmp_path / "a.dpm2map", settings, "", resume=False) as store:
+        made = SlamSystem(settings, store=store)
+        for number in range(2):
+            made.process(Frame(number * 10**8, points))
+        made.mapper.finish()
+    with open_for_localization(tmp_path / "a.dpm2map", settings) as store:
+        LocalizationSystem(settings, store).process(Frame(0, points))
+    assert opened == {"tiny.safetensors": 1, "filter.safetensors": 1}
+
+
+def test_a_file_that_changed_is_loaded_again(network_file: Path, model: DeepPointMap2, opened: Counter[str]) -> None:
+    """And the networks that are in use stay as they are."""
+    one, same = load_network(str(network_file), 1), load_network(str(network_file), 1)
+    with torch.no_grad():
+        next(model.parameters()).add_(1)
+    save_weights(model, network_file, {})
+    os.utime(network_file, ns=(1, 1))
+    changed = load_network(str(network_file), 1)
+    values = [next(network.parameters()) for network in (one, same, changed)]
+    assert values[0] is values[1]
+    assert not torch.equal(values[0], values[2])
+    assert opened["tiny.safetensors"] == 2
+
+
+def test_a_link_to_the_file_and_a_relative_path_are_the_same_file(
+    network_file: Path, opened: Counter[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(network_file.parent)
+    Path("link.safetensors").symlink_to(network_file)
+    for name in (str(network_file), "tiny.safetensors", "link.safetensors"):
+        load_network(name, 1)
+    assert opened.total() == 1
+
+
+def test_what_one_user_registered_to_is_not_given_to_another(
+    network_file: Path, street: Callable[..., np.ndarray], noise: np.random.Generator
+) -> None:
+    """A network keeps its part of the work on the last target; the SLAM has one per thread."""
+    one, other = load_network(str(network_file), 1), load_network(str(network_file), 1)
+    assert one is not other
+    assert next(one.parameters()) is next(other.parameters())
+
+
+def test_weights_of_another_network_are_rejected_though_the_file_is_loaded(network_file: Path) -> None:
+    """The memory of one loader does not answer another one."""
+    load_network(str(network_file), 1)
+    with pytest.raises(UsageError, match="not of movers"):
+        load_once(network_file, 1, dynamic_objects.load)
+    with pytest.raises(UsageError, match=r"none\.safetensors: No such file"):
+        load_once(network_file.parent / "none.safetensors", 1, dynamic_objects.load)
