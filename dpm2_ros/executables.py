@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Sequence
 
+from dpm2_core.openmp import wait_passively
 from dpm2_ros.runtime import catch_signals, exit_code, spin_node
 
 
@@ -47,6 +48,7 @@ def bag_player(arguments: Sequence[str] | None = None) -> int:
 
 def _run(work: Callable[[Sequence[str]], int], arguments: Sequence[str] | None) -> int:
     catch_signals()
+    wait_passively()
     return exit_code(lambda: work(sys.argv[1:] if arguments is None else arguments))
 
 

@@ -11,6 +11,9 @@ from pathlib import Path
 import hypothesis
 import pytest
 
+from dpm2_core.openmp import wait_passively
+
+wait_passively()  # as the programs do, before a test imports numpy
 KITTI = Path(os.environ.get("DPM2_KITTI", Path(__file__).resolve().parents[2] / "shared" / "kitti"))
 
 # The same examples in every run, however slow the machine is.

@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What starts, starts light: imports change no environment, and a command loads what it needs alone."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from dpm2_core.cli import COMMANDS, load_command
+
+
+def python(program: str) -> str:
+    """Its output, in a process without the settings of OpenMP."""
+    program = f"import os; [os.environ.pop(n, 0) for n in ('OMP_WAIT_POLICY', 'GOMP_SPINCOUNT')]\n{program}"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_help_lists_every_command_with_its_own_first_paragraph(name: str) -> None:
+    """It is written in cli.py too, so that `dpm2 --help` need not import the command."""
+    assert COMMANDS[name][1] == (load_command(name).help or "").split("\n\n")[0]
+
+
+def test_the_help_imports_no_command_and_no_array() -> None:
+    heavy = "{'numpy', 'scipy', 'gtsam', 'torch', 'cv2', 'pydantic', 'dpm2_core.commands.run'}"
+    output = python(
+        "import sys; from dpm2_core.cli import main\n"
+        "try: main(['--help'])\n"
+        "except SystemExit as end: assert end.code == 0\n"
+        f"print('imported', {heavy} & set(sys.modules))"
+    )
+    assert "imported set()" in output
+    assert all(name in output for name in COMMANDS)
+
+
+def test_an_import_sets_no_environment_variable() -> None:
+    """Beyond those that cv2 sets for itself."""
+    python(
+        "import os, cv2; before = dict(os.environ)\n"
+        "import dpm2_core, dpm2_core.cli, dpm2_core.slam.system, dpm2_ros.executables\n"
+        "assert dict(os.environ) == before, set(os.environ.items()) ^ set(before.items())"
+    )
+
+
+@pytest.mark.parametrize("entry", [
+    "from dpm2_core.cli import main as entry; arguments = ['version']",
+    "from dpm2_ros.executables import bag_player as entry; arguments = ['nowhere']",
+])  # fmt: skip
+def test_the_entry_of_a_program_lets_idle_threads_sleep_before_numpy_is_there(entry: str) -> None:
+    """OpenMP reads the environment once; see `dpm2_core.openmp`."""
+    output = python(
+        f"import os, sys; {entry}\n"
+        "assert 'numpy' not in sys.modules\n"
+        "try: entry(arguments)\n"
+        "except SystemExit: pass\n"
+        "print(os.environ['OMP_WAIT_POLICY'], os.environ['GOMP_SPINCOUNT'])"
+    )
+    assert "passive 20000" in output
+
+
+def test_what_the_user_chose_stays() -> None:
+    output = python(
+        "import os; os.environ['OMP_WAIT_POLICY'] = 'active'\n"
+        "from dpm2_core.openmp import wait_passively; wait_passively(); print(os.environ['OMP_WAIT_POLICY'])"
+    )
+    assert output == "active\n"
