@@ -2,12 +2,14 @@
 """One description for `pip install .` and `colcon build`."""
 
 import os
+import re
 import sys
 from glob import glob
 from pathlib import Path
 
 from setuptools import find_packages, setup
 
+(VERSION,) = re.findall(r'__version__ = "(.+)"', Path("dpm2_core/_version.py").read_text(encoding="utf-8"))
 EXECUTABLES = ("slam_node", "mapper_node", "bag_player")
 
 REQUIREMENTS = [
@@ -42,7 +44,7 @@ EXTRAS = {
         "contourpy>=1.2,<2",  # lines along the kerbs
     ],
     "test": ["pytest>=8,<10", "pytest-timeout>=2.3,<3", "hypothesis>=6.100,<7"],
-    "lint": ["ruff>=0.9,<0.18", "mypy>=1.13,<3", "types-PyYAML", "import-linter>=2.1,<3"],
+    "lint": ["ruff>=0.9,<0.18", "mypy>=1.13,<3", "types-PyYAML", "import-linter>=2.1,<3", "grimp>=3.2,<4"],
     "las": ["laspy>=2.5,<3"],  # dpm2 map export MAP OUT.las
     "timm": ["timm>=1,<2"],  # image backbones timm:NAME
     "train": ["tensorboard>=2.16,<3"],  # curves beside log.jsonl
@@ -75,7 +77,7 @@ else:  # colcon puts a folder bin on PATH
 
 setup(
     name="dpm2_ros",
-    version="0.1.0",
+    version=VERSION,
     description="LiDAR-visual SLAM with neural descriptors for ROS 2",
     long_description=Path("README.md").read_text(encoding="utf-8") if Path("README.md").is_file() else "",
     long_description_content_type="text/markdown",
