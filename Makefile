@@ -12,7 +12,7 @@ EXTRAS ?= plot,sim,test
 # The environment is self-contained: a sourced ROS 2, another environment's bootstrap or its libraries must not leak in.
 unexport PYTHONPATH PYTHONHOME VIRTUAL_ENV AMENT_PREFIX_PATH ROS_DISTRO LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: help setup demo test fuzz lint bench bench-ros bench-robots bench-memory train-data train-small train-movers train-ground ablation sim parameters clean
+.PHONY: help setup demo test test-fast fuzz lint bench bench-ros bench-robots bench-memory train-data train-small train-movers train-ground ablation sim diagrams parameters clean
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:[^#]*##/\t/' | expand -t 16
 
@@ -31,8 +31,11 @@ demo: setup ros  ## simulate a drive, replay it into slam_node, check and show w
 ros:  # of all targets the demo alone is nothing without it
 	@$(BIN)/python -c 'import rclpy' 2>/dev/null || { echo "rclpy has no wheel for $$(uname -m): docs/ros2.md says how to run the demo with an installed ROS 2" >&2; exit 2; }
 
-test: setup  ## all tests
-	$(BIN)/python -m pytest $(ARGS)
+test: setup  ## all tests, and which of them took longest
+	$(BIN)/python -m pytest --durations=15 $(ARGS)
+
+test-fast: setup  ## all but the tests marked slow or ros (2 cores: about a minute)
+	$(BIN)/python -m pytest -m "not slow and not ros" $(ARGS)
 
 fuzz: setup  ## a minute of random messages, a thousand per second, on all that the nodes listen to, beside a drive
 	DPM2_FUZZ_SECONDS=60 DPM2_FUZZ_RATE=1000 $(BIN)/python -m pytest -s test/dpm2_ros/test_fuzz.py $(ARGS)
@@ -101,6 +104,10 @@ ablation: train-data  ## Table 4: every fusion trained alike at a small budget
 
 sim: setup  ## a synthetic drive in KITTI layout in out/sim
 	$(BIN)/dpm2 sim out/sim --frames $(or $(FRAMES),300) --seed $(or $(SEED),1) $(ARGS)
+
+diagrams: setup  ## redraw the imports in docs/architecture.md
+	@$(BIN)/python -c 'import grimp' 2>/dev/null || $(BIN)/python -m pip install -qq --disable-pip-version-check -e '.[lint]'
+	$(BIN)/python -m tools.draw_imports
 
 parameters: setup  ## regenerate docs/parameters.md
 	$(BIN)/python -m dpm2_ros.parameters > docs/parameters.md

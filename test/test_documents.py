@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What README and cards say is what the records in benchmarks/ say."""
+"""What README and cards say is what the records in benchmarks/ say; the modules that documents name exist."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 ROOT = Path(__file__).resolve().parents[1]
+DOCS = (ROOT / "docs").glob("*.md")
 CARD = "dpm2_core/weights/small.md"
 METHODS = {
     "dpm2, odometry": "dpm2 without loops",
@@ -115,3 +118,17 @@ def test_what_the_camera_adds_to_the_descriptors_is_said() -> None:
     assert equals(message, ratio)
     (message,) = re.findall(r"\| every image black[^|]*\| ([\d.]+) \|", text(CARD))
     assert equals(message, ratio)
+
+
+@pytest.mark.parametrize("path", ["README.md", "CONTRIBUTING.md", "Makefile", *sorted(p.name for p in DOCS)])
+def test_modules_that_are_named_exist(path: str) -> None:
+    """With a folder: there, from the root, the core or the nodes; without: somewhere. NAME stands for any."""
+    file = next(f for f in (ROOT / path, ROOT / "docs" / path) if f.is_file())
+    names = re.findall(r"(?<![\w/.])((?:\w+/)*\w+\.py)\b", file.read_text(encoding="utf-8"))
+    folders = (ROOT, ROOT / "dpm2_core", ROOT / "dpm2_ros")
+    known = {f.name for part in ("dpm2_core", "dpm2_ros", "test") for f in (ROOT / part).rglob("*.py")}
+    stale = [
+        n for n in names if "NAME" not in n and n not in known and not any((folder / n).is_file() for folder in folders)
+    ]
+    assert not stale
+    assert names or path != "architecture.md"
