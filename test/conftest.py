@@ -16,9 +16,18 @@ from dpm2_core.openmp import wait_passively
 wait_passively()  # as the programs do, before a test imports numpy
 KITTI = Path(os.environ.get("DPM2_KITTI", Path(__file__).resolve().parents[2] / "shared" / "kitti"))
 
+ROS = Path(__file__).resolve().parent / "dpm2_ros"
+
 # The same examples in every run, however slow the machine is.
 hypothesis.settings.register_profile("dpm2", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("dpm2")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Marker `ros` for all that lies in test/dpm2_ros, before -m selects."""
+    for item in items:
+        if ROS in item.path.parents:
+            item.add_marker("ros")
 
 
 @pytest.fixture(scope="session")

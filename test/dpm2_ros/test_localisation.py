@@ -29,6 +29,8 @@ from dpm2_ros.conversions import cloud_to_msg, header, pose_to_msg
 from dpm2_ros.tf import TFMessage
 from tools.replay import ros_environment, start
 
+pytestmark = pytest.mark.weights
+
 
 @pytest.fixture(scope="module")
 def made(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:

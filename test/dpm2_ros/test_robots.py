@@ -31,6 +31,8 @@ from dpm2_ros.keyframes import descriptors_from_msg, payload_to_msgs
 from dpm2_ros.tf import TFMessage
 from tools.replay import ros_environment, start
 
+pytestmark = pytest.mark.weights
+
 
 class Fleet:
     """Processes of robots and of their mapper; scans for each."""

@@ -82,6 +82,7 @@ def errors(loops: Sequence[Loop], truth: Array) -> list[float]:
     return [float(np.linalg.norm(T[:3, 3])) for T in off]
 
 
+@pytest.mark.weights
 @pytest.mark.parametrize("heading", [0.0, np.pi, np.pi / 2], ids=["same", "reverse", "across"])
 def test_a_revisit_is_found_whatever_the_drift_and_heading(heading: float) -> None:
     """The odometry is 3 m and 3 degrees off, and says nothing of where to look: the nearest by pose is off the mark."""
@@ -95,6 +96,7 @@ def test_a_revisit_is_found_whatever_the_drift_and_heading(heading: float) -> No
     assert len(waited) <= 1  # the first, for the second
 
 
+@pytest.mark.weights
 def test_a_place_never_seen_closes_no_loop_and_each_candidate_has_its_reason() -> None:
     world = build_world("straight", "city", seed=5, length=160.0)
     lidar, rng, search = Lidar(LidarConfig()), np.random.default_rng(0), closer(gap=30.0)
@@ -137,6 +139,7 @@ def test_disabled_it_closes_nothing_and_a_cloud_too_small_for_descriptors_is_no_
     assert search.close([tiny, tiny], [tiny.cloud] * 2, np.array([np.eye(4)] * 2)) == []
 
 
+@pytest.mark.weights
 def test_places_that_hardly_overlap_are_left_to_no_one(monkeypatch: pytest.MonkeyPatch) -> None:
     """What the overlap head considers unlikely is rejected in words, even where descriptors match; its silence rejects
     nothing."""

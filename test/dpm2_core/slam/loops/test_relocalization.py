@@ -19,6 +19,8 @@ from dpm2_core.slam.loops.place_recognition import PlaceRecognition
 from dpm2_core.slam.loops.relocalization import RelocalizationSettings, Relocalizer
 from dpm2_core.slam.registration.icp import GeometricSettings
 
+pytestmark = pytest.mark.weights
+
 FIRM, LOST = np.diag([1e-3] * 3 + [0.02] * 3) ** 2, np.eye(6)
 LIDAR = Lidar(LidarConfig(columns=1024))
 
