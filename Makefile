@@ -34,7 +34,7 @@ ros:  # of all targets the demo alone is nothing without it
 test: setup  ## all tests, and which of them took longest
 	$(BIN)/python -m pytest --durations=15 $(ARGS)
 
-test-fast: setup  ## all but the tests marked slow or ros (2 cores: about a minute)
+test-fast: setup  ## all but the tests marked slow or ros
 	$(BIN)/python -m pytest -m "not slow and not ros" $(ARGS)
 
 fuzz: setup  ## a minute of random messages, a thousand per second, on all that the nodes listen to, beside a drive

@@ -50,6 +50,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_the_geometric_benchmark_records_errors_speed_and_origin(drive: Path, tmp_path: Path) -> None:
     bench(["geometric"], source=[drive, drive], out=tmp_path, repetitions=2, threads=1, settings=["slam.map.voxel=1"])
     record = json.loads((tmp_path / "geometric.json").read_text())
@@ -153,6 +154,7 @@ def test_what_cannot_be_measured_is_rejected(drive: Path, tmp_path: Path) -> Non
     assert not list(tmp_path.glob("*.json"))
 
 
+@pytest.mark.slow
 def test_the_neural_benchmark_measures_pairs_odometry_and_stages(
     drive: Path,
     tmp_path: Path,

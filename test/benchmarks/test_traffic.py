@@ -14,6 +14,7 @@ from dpm2_core.errors import UsageError
 from dpm2_core.sim.settings import LidarConfig
 
 
+@pytest.mark.slow
 def test_a_short_drive_is_checked_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(traffic, "PLACES", {"suburb": 20.0})
     monkeypatch.setattr(traffic, "FRAMES", 6)

@@ -55,6 +55,7 @@ def test_every_command_starts_without_extras() -> None:
     assert all(command in done.stdout for command in COMMANDS)
 
 
+@pytest.mark.slow
 def test_a_run_needs_no_extra_and_says_which_file_is_not_there(sequence: Path, tmp_path: Path) -> None:
     done = dpm2("run", sequence, "--out", tmp_path)
     assert done.returncode == 0, done.stderr

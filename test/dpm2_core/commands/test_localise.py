@@ -21,7 +21,7 @@ from dpm2_core.sim.settings import LidarConfig
 from dpm2_core.slam.store.map_data import load_map
 from dpm2_core.slam.store.map_store import MapStore
 
-pytestmark = pytest.mark.weights
+pytestmark = [pytest.mark.slow, pytest.mark.weights]
 
 FRAMES, MAPPED = 30, 20
 

@@ -155,6 +155,7 @@ def test_run_writes_a_map_and_goes_on_with_it(
     assert len(read_trajectory(tmp_path / "b" / "trajectory.tum")) == 60 - two.keyframes[before].index
 
 
+@pytest.mark.slow
 def test_a_drive_that_is_killed_leaves_a_sound_map(
     tmp_path: Path, recording: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

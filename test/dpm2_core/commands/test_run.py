@@ -21,6 +21,8 @@ from dpm2_core.data.trajectory import read_trajectory
 from dpm2_core.sim.drive import simulate
 from dpm2_core.sim.settings import LidarConfig
 
+pytestmark = pytest.mark.slow
+
 FRAMES = 12
 RESULTS = {
     "trajectory_kitti.txt", "trajectory.tum", "map.ply", "trajectory.png", "timing.json", "config.yaml",

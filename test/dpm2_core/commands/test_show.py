@@ -44,6 +44,7 @@ def test_draws_a_image(sequence: Path, tmp_path: Path) -> None:
     assert (tmp_path / "m.png").read_bytes()[1:4] == b"PNG"
 
 
+@pytest.mark.slow
 def test_draws_the_image_with_attention(sequence: Path, tmp_path: Path) -> None:
     """With weights that have a camera and a drive with images, the drawing has a third part below."""
     folder = tmp_path / "drive"

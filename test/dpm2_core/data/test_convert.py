@@ -58,6 +58,7 @@ def test_round_trip(kitti_folder: MakeFolder, tmp_path: Path, zstd: bool) -> Non
     assert sorted(os.listdir(tmp_path)) == ["bag", "kitti"]
 
 
+@pytest.mark.slow
 def test_round_trip_of_the_real_excerpt(kitti_root: Path, tmp_path: Path) -> None:
     convert_kitti(kitti_root, tmp_path / "bag", "04", end=6)
     bag, folder = BagSource(tmp_path / "bag"), KittiSource(kitti_root, InputSettings(sequence="04"))

@@ -148,6 +148,7 @@ def test_a_setting_that_a_phase_does_not_use_is_rejected(kind: type, key: str) -
         settings_from(kind, {"start": "w", "data": {key: 3}})
 
 
+@pytest.mark.slow
 def test_it_overfits_four_pairs_to_two_centimeters(packed: Path, tiny: Callable) -> None:
     """The same 4 pairs over and over are registered to 2 cm: nothing in the chain blocks the signal.
 
@@ -233,6 +234,7 @@ with process_group() as (rank, world, device):
 """
 
 
+@pytest.mark.slow
 def test_two_processes_give_the_gradients_of_one(tmp_path: Path, packed: Path, tiny: Callable) -> None:
     """gloo on the CPU, started by torchrun: each rank its fraction of the places, the mean of the losses."""
     script = tmp_path / "ranks.py"
@@ -294,6 +296,7 @@ train_registration(RegistrationTrainingSettings.model_validate_json(settings), P
 """
 
 
+@pytest.mark.slow
 def test_the_whole_loop_runs_under_torchrun(
     settings: RegistrationTrainingSettings, tiny: Callable, tmp_path: Path
 ) -> None:

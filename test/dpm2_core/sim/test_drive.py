@@ -106,6 +106,7 @@ def test_a_failure_leaves_nothing(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_a_killed_run_leaves_nothing_that_looks_whole_and_the_next_one_cleans_up(tmp_path: Path) -> None:
     program = (
         "import sys, pathlib; from dpm2_core.sim.drive import simulate; from dpm2_core.sim.settings import LidarConfig;"

@@ -82,6 +82,7 @@ def errors(loops: Sequence[Loop], truth: Array) -> list[float]:
     return [float(np.linalg.norm(T[:3, 3])) for T in off]
 
 
+@pytest.mark.slow
 @pytest.mark.weights
 @pytest.mark.parametrize("heading", [0.0, np.pi, np.pi / 2], ids=["same", "reverse", "across"])
 def test_a_revisit_is_found_whatever_the_drift_and_heading(heading: float) -> None:
@@ -139,6 +140,7 @@ def test_disabled_it_closes_nothing_and_a_cloud_too_small_for_descriptors_is_no_
     assert search.close([tiny, tiny], [tiny.cloud] * 2, np.array([np.eye(4)] * 2)) == []
 
 
+@pytest.mark.slow
 @pytest.mark.weights
 def test_places_that_hardly_overlap_are_left_to_no_one(monkeypatch: pytest.MonkeyPatch) -> None:
     """What the overlap head considers unlikely is rejected in words, even where descriptors match; its silence rejects

@@ -52,6 +52,7 @@ def off(found: Registration, truth: Array) -> tuple[float, float]:
     return float(np.linalg.norm(difference[:3, 3])), float(np.degrees(se3.angle(difference)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("s", "lateral", "heading"), [(63.0, 0.5, 0.0), (77.0, 2.5, 3.0), (92.0, 1.0, -1.6)], ids=["same", "back", "across"]
 )

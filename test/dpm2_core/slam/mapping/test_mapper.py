@@ -111,6 +111,7 @@ def lap() -> tuple[list[Keyframe], Array]:
     return keyframes, se3.inverse(poses[0]) @ poses
 
 
+@pytest.mark.slow
 def test_a_lap_is_closed(lap: tuple[list[Keyframe], Array]) -> None:
     keyframes, truth = lap
     mapper = make_mapper(BY_POSE)

@@ -153,6 +153,7 @@ def test_velocity_after_a_gap_is_that_since_the_last_registered_scan(suburb: Dri
     np.testing.assert_allclose(last.twist[3:], true[3:], atol=0.1)  # two errors of 3 cm over 0.6 s
 
 
+@pytest.mark.slow
 def test_a_new_map_is_begun_when_nothing_fits_for_long(suburb: Drive) -> None:
     """Carried elsewhere: the odometry goes on, and the next edge of the pose graph says that it knows nothing."""
     elsewhere = np.random.default_rng(5).uniform(-40, 40, (8000, 4)).astype(np.float32)
