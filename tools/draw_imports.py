@@ -42,7 +42,7 @@ def diagrams() -> dict[str, str]:
 def packages(graph: ImportGraph) -> Arrows:
     """The packages; single files that import nothing but each other are drawn as one, `BASE`."""
     arrows = children(graph, "dpm2_core", "dpm2_ros")
-    files = {unit for unit in arrows if not graph.find_children(unit)}
+    files = {u for u in arrows if not graph.find_children(u) and graph.find_modules_that_directly_import(u)}
     base: set[str] = set()
     while more := {file for file in files - base if arrows[file] <= base}:
         base |= more
