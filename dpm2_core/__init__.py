@@ -1,4 +1,113 @@
 # SPDX-License-Identifier: Apache-2.0
-"""dpm2: LiDAR-visual SLAM with neural descriptors. No ROS import anywhere in this package."""
+"""dpm2: LiDAR-visual SLAM with neural descriptors. No ROS import anywhere in this package.
+
+The names below are the public API; `examples/` shows them at work. Each is imported when it is first used, so that
+`import dpm2_core` is quick, and geometric odometry imports neither torch nor matplotlib.
+
+* Data: `open_source(path)` gives a `Source` of `Frame`s, each with its `Image`s and their `Camera`s, from a recording
+  of any known format. `write_kitti` and `write_tum` write trajectories.
+* Settings: `Config` holds those of `dpm2 run`, `SlamSettings` those of the SLAM alone, `InputSettings` those of a
+  recording. `load_settings(Config, file, ["slam.threads=4"])` reads them from YAML, `dump_settings` writes them.
+* SLAM: `SlamSystem(settings).process(frame)` gives an `OdometryResult` with a `Registration` and a `State`, and makes
+  `Keyframe`s for the map; `make_odometry(settings)` does without the map. `open_session` makes or extends a map file.
+  `open_for_localization` opens one for `LocalizationSystem`, whose results are `LocalizationResult`s.
+* Network: `load_network(name, threads)` gives a network whose `describe` makes `Descriptors` of a frame, and whose
+  `register` finds the `Registration` of two.
+* Figures: `trajectory_png` draws a trajectory on its map, `matches_png` a registration; both need the extra `plot`.
+* Errors: `Dpm2Error` is what can go wrong, `UsageError` (one of them) what the caller can put right.
+
+A program that runs the SLAM beside others should call `dpm2_core.openmp.wait_passively()` before it imports numpy, as
+`dpm2` and the ROS nodes do: an import sets no environment variable.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
 
 from dpm2_core._version import __version__ as __version__
+
+if TYPE_CHECKING:
+    from dpm2_core.config import dump_settings, load_settings
+    from dpm2_core.data.open import open_source
+    from dpm2_core.data.settings import InputSettings
+    from dpm2_core.data.source import Source
+    from dpm2_core.data.trajectory import write_kitti, write_tum
+    from dpm2_core.descriptors import Descriptors
+    from dpm2_core.errors import Dpm2Error, UsageError
+    from dpm2_core.evaluation.figures import trajectory_png
+    from dpm2_core.evaluation.matches import matches_png
+    from dpm2_core.frame import Camera, Frame, Image, Keyframe, OdometryResult, Registration, State
+    from dpm2_core.network.pretrained import load_network
+    from dpm2_core.slam.build import make_odometry
+    from dpm2_core.slam.loops.localizer import LocalizationResult
+    from dpm2_core.slam.session import open_for_localization, open_session
+    from dpm2_core.slam.settings import Config, SlamSettings
+    from dpm2_core.slam.system import LocalizationSystem, SlamSystem
+
+__all__ = [
+    "Camera",
+    "Config",
+    "Descriptors",
+    "Dpm2Error",
+    "Frame",
+    "Image",
+    "InputSettings",
+    "Keyframe",
+    "LocalizationResult",
+    "LocalizationSystem",
+    "OdometryResult",
+    "Registration",
+    "SlamSettings",
+    "SlamSystem",
+    "Source",
+    "State",
+    "UsageError",
+    "__version__",
+    "dump_settings",
+    "load_network",
+    "load_settings",
+    "make_odometry",
+    "matches_png",
+    "open_for_localization",
+    "open_session",
+    "open_source",
+    "trajectory_png",
+    "write_kitti",
+    "write_tum",
+]
+
+_MODULES = {
+    "config": "dump_settings load_settings",
+    "data.open": "open_source",
+    "data.settings": "InputSettings",
+    "data.source": "Source",
+    "data.trajectory": "write_kitti write_tum",
+    "descriptors": "Descriptors",
+    "errors": "Dpm2Error UsageError",
+    "evaluation.figures": "trajectory_png",
+    "evaluation.matches": "matches_png",
+    "frame": "Camera Frame Image Keyframe OdometryResult Registration State",
+    "network.pretrained": "load_network",
+    "slam.build": "make_odometry",
+    "slam.loops.localizer": "LocalizationResult",
+    "slam.session": "open_for_localization open_session",
+    "slam.settings": "Config SlamSettings",
+    "slam.system": "LocalizationSystem SlamSystem",
+}
+"""The public names by the module that has them, as under TYPE_CHECKING above."""
+_PLACES = {name: module for module, names in _MODULES.items() for name in names.split()}
+
+
+if not TYPE_CHECKING:  # type checkers would take it for a module that has every name
+
+    def __getattr__(name: str) -> object:
+        if name not in _PLACES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        value = getattr(import_module(f"{__name__}.{_PLACES[name]}"), name)
+        globals()[name] = value  # found without this function from now on
+        return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

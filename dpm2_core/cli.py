@@ -14,7 +14,7 @@ from typing import Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from dpm2_core import __version__
+from dpm2_core._version import __version__
 from dpm2_core.errors import Dpm2Error, UsageError, printable
 from dpm2_core.openmp import wait_passively
 

@@ -18,7 +18,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from dpm2_core import __version__
+from dpm2_core._version import __version__
 from dpm2_core.database import Connection, connect
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Array, Keyframe

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The examples as a reader starts them, on a small simulated drive: what they print and write is right."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dpm2_core import open_source
+from dpm2_core.geometry import se3
+from dpm2_core.sim.drive import simulate
+from dpm2_core.sim.settings import LidarConfig
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+FRAMES = 14
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """13 m of a street."""
+    root = tmp_path_factory.mktemp("drive") / "sim"
+    simulate(root, FRAMES, seed=2, road="straight", preset="suburb", images=False, lidar=LidarConfig(columns=900))
+    return root
+
+
+@pytest.fixture(scope="module")
+def truth(drive: Path) -> np.ndarray:
+    """(N, 4, 4) T_first_lidar."""
+    poses = open_source(drive).poses
+    assert poses is not None
+    return np.asarray(se3.inverse(poses[0]) @ poses)
+
+
+def example(name: str, *arguments: object) -> subprocess.CompletedProcess[str]:
+    """An example in a process of its own."""
+    command = [sys.executable, str(EXAMPLES / f"{name}.py"), *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+
+
+def test_odometry_of_a_folder_in_ten_lines(drive: Path, truth: np.ndarray, tmp_path: Path) -> None:
+    done = example("odometry_of_a_folder", drive, tmp_path / "poses.txt")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == f"{FRAMES} frames, 0 of them not registered\n"
+    estimate = np.loadtxt(tmp_path / "poses.txt").reshape(-1, 3, 4)
+    assert np.linalg.norm(estimate[:, :, 3] - truth[:, :3, 3], axis=1).max() < 0.1  # as in test_run.py
+    lines = (EXAMPLES / "odometry_of_a_folder.py").read_text().splitlines()
+    assert len([line for line in lines if line and not line.startswith(("#", '"""'))]) <= 10
+
+
+def test_register_two_scans_and_draw_them(drive: Path, truth: np.ndarray, tmp_path: Path) -> None:
+    """Some 5 m apart; the network alone is right to a few decimeters."""
+    done = example("register_two_scans", drive, 0, 5, tmp_path / "matches.png")
+    assert done.returncode == 0, done.stderr
+    found = [float(word) for word in done.stdout.split(" m in ")[0].split()[-3:]]
+    assert np.linalg.norm(found - truth[5, :3, 3]) < 0.5
+    assert (tmp_path / "matches.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_map_then_localize(drive: Path, truth: np.ndarray, tmp_path: Path) -> None:
+    done = example("map_then_localize", drive, drive, tmp_path / "street.dpm2map")
+    assert done.returncode == 0, done.stderr
+    rows = np.array([line.split() for line in done.stdout.splitlines()], float)
+    assert len(rows) == FRAMES  # found at once
+    assert np.linalg.norm(rows[:, 1:] - truth[:, :3, 3], axis=1).max() < 0.1  # as in test_localise.py
+
+
+def test_a_recording_that_is_not_there_is_one_clear_error(tmp_path: Path) -> None:
+    done = example("odometry_of_a_folder", tmp_path / "nowhere", tmp_path / "poses.txt")
+    assert done.returncode != 0
+    assert (
+        done.stderr.splitlines()[-1] == f"dpm2_core.errors.UsageError: {tmp_path / 'nowhere'}: no such file or folder"
+    )
