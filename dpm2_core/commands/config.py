@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import typer
 
-from dpm2_core.commands.run import ConfigFile, Overrides
+from dpm2_core.commands.options import ConfigFile, Overrides
 from dpm2_core.config import dump_settings, load_settings
 from dpm2_core.slam.settings import Config
 

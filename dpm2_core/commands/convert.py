@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from dpm2_core.commands.options import progress_bar
 from dpm2_core.console import Console
 
 app = typer.Typer(no_args_is_help=True, help="Convert a recording to a rosbag2 (MCAP) folder.")
@@ -34,8 +34,7 @@ def kitti(
     from dpm2_core.data.convert import convert_kitti  # rosbags is slow to import for the other commands
 
     console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console) as bar:
+    with progress_bar(console) as bar:
         task = bar.add_task(f"{src} -> {out}", total=None)
         notes = convert_kitti(
             src, out, sequence, start, end, images, zstd, overwrite,

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from dpm2_core.commands.options import progress_bar
 from dpm2_core.config import dump_settings
 from dpm2_core.console import Console
 from dpm2_core.data.prefetch import prefetch
@@ -101,8 +101,7 @@ def run_localized(
         if hint is not None:
             system.localizer.hint(hint)
         out.mkdir(parents=True, exist_ok=True)
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-        with Progress(*columns, console=console) as progress:
+        with progress_bar(console) as progress:
             task = progress.add_task(source.name, total=span[1] - span[0])
             try:
                 for frame in prefetch(source.frames(*span)):

@@ -13,6 +13,7 @@ import typer
 from scipy.spatial.transform import Rotation
 
 from dpm2_core.commands.map_graph import optimize
+from dpm2_core.commands.options import ConfigFile, Overrides
 from dpm2_core.config import load_settings
 from dpm2_core.console import Console
 from dpm2_core.data.pcd import write_las, write_pcd
@@ -30,8 +31,6 @@ app = typer.Typer(help="Map files: info, export, merge, prune, check; pose graph
 app.command()(optimize)
 
 MapFile = Annotated[Path, typer.Argument(metavar="MAP", help="Map file, as `dpm2 run --map` writes it.")]
-ConfigFile = Annotated[Path | None, typer.Option("--config", help="YAML file; `dpm2 config dump` shows every key.")]
-Overrides = Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, such as slam.map.voxel=0.3.")]
 
 
 @app.command()

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from dpm2_core.commands.options import progress_bar
 from dpm2_core.config import settings_from
 from dpm2_core.console import Console
 from dpm2_core.sim.settings import LidarConfig, PresetName
@@ -36,8 +36,7 @@ def sim(
 
     lidar = settings_from(LidarConfig, {"beams": beams, "height": height, "range": reach}, default="dpm2 sim")
     console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console) as bar:
+    with progress_bar(console) as bar:
         task = bar.add_task(f"{preset} -> {out}", total=None)
         made = simulate(
             out, frames, seed, road, preset, images, lidar, workers=workers,

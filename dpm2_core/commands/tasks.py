@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from dpm2_core.commands.options import progress_bar
 from dpm2_core.commands.train import ConfigOption, OutOption, ResumeOption, SetOption, reject_overwriting, train
 from dpm2_core.config import load_settings
 from dpm2_core.console import Console
@@ -33,8 +33,7 @@ def tasks_data(
     from dpm2_core.tasks.drives import TaskDriveSettings, make_task_drives
 
     chosen = load_settings(TaskDriveSettings, config, settings or [])
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True)) as bar:
+    with progress_bar() as bar:
         task = bar.add_task(f"{out}")
         make_task_drives(out, chosen, workers, lambda name, done, total: bar.update(
             task, description=f"{out}/{name}", completed=done, total=total))  # fmt: skip

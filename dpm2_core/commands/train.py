@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from dpm2_core.commands.options import parse_range, progress_bar
 from dpm2_core.config import load_settings
 from dpm2_core.errors import UsageError
 
@@ -31,8 +31,7 @@ def data(
     from dpm2_core.learning.generate import GenerateSettings, generate  # torch and embree are slow to import
 
     chosen = load_settings(GenerateSettings, config, settings or [])
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns) as bar:
+    with progress_bar() as bar:
         task = bar.add_task(f"worlds -> {out}", total=chosen.worlds)
         generate(out, chosen, workers, lambda done, total: bar.update(task, completed=done, total=total))
 
@@ -49,7 +48,6 @@ def pack(
     ] = None,
 ) -> None:
     """A recorded drive with ground truth, packed for training."""
-    from dpm2_core.commands.run import parse_range
     from dpm2_core.data.open import open_source
     from dpm2_core.data.settings import InputSettings
     from dpm2_core.learning.generate import pack as write  # torch and embree are slow to import
@@ -64,8 +62,7 @@ def pack(
     chosen = range(len(source))[start:stop]
     if not chosen:
         raise UsageError(f"--frames {frames}: {src} has {len(source)} frames")
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns) as bar:
+    with progress_bar() as bar:
         task = bar.add_task(f"{source.name} -> {out}", total=len(chosen))
         packed = write(source, out, network, chosen, lambda: bar.advance(task))
     for note in source.notes:

@@ -43,8 +43,8 @@ def trajectory_png(
         from matplotlib.backends.backend_agg import FigureCanvasAgg  # half a second to import: not for every command
         from matplotlib.figure import Figure
 
-    est = est[known(est)]
     truth = None if gt is None else _aligned(gt, est)
+    est = est[known(est)]
     low, high = _bounds(est[:, :3, 3], cloud)
     width, height = high - low
     figure = Figure(figsize=(12, float(np.clip(12 * height / width, 3.5, 12)) + 0.8), dpi=150, facecolor=_BACKGROUND)
@@ -96,11 +96,11 @@ def success_png(path: Path | str, kinds: Mapping[str, Mapping[str, Mapping[str, 
 
 
 def _aligned(gt: Array, est: Array) -> Array | None:
-    """Known positions of the ground truth (K, 3) in the map frame; None with fewer than two."""
-    has_gt = known(gt)
-    if has_gt.sum() < 2:
+    """Known positions of the ground truth (K, 3) in the map frame; None with fewer than two in common."""
+    has_gt, common = known(gt), known(gt) & known(est)
+    if common.sum() < 2:
         return None
-    T_map_gt = align(gt[has_gt, :3, 3], est[has_gt, :3, 3])
+    T_map_gt = align(gt[common, :3, 3], est[common, :3, 3])
     return gt[has_gt, :3, 3] @ T_map_gt[:3, :3].T + T_map_gt[:3, 3]
 
 

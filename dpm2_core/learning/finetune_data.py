@@ -15,9 +15,8 @@ from dpm2_core.frame import Array, Frame
 from dpm2_core.learning.finetune_settings import DRIVES, HELD_OUT, REHEARSAL, FinetuneSettings
 from dpm2_core.learning.generate import generate, pack
 from dpm2_core.network.settings import NetworkSettings
-from dpm2_core.slam.output import TrajectoryRecorder
-from dpm2_core.slam.settings import SlamSettings
-from dpm2_core.slam.system import SlamSystem
+from dpm2_core.pipeline import OfflineRun
+from dpm2_core.slam.settings import Config, SlamSettings
 
 
 class Referenced:
@@ -37,15 +36,11 @@ class Referenced:
 
 def refer(source: Source, settings: SlamSettings, advance: Callable[[], None] = lambda: None) -> Referenced:
     """The source with the trajectory that the SLAM finds for it, loops closed."""
-    system, recorder, registered = SlamSystem(settings), TrajectoryRecorder(), []
-    for frame in source.frames():
-        tracked = system.process(frame)
-        recorder.add(tracked)
-        registered.append(tracked.registration.ok)
-        advance()
-    system.mapper.finish()
-    poses = recorder.poses(system.mapper.poses)
-    poses[~np.array(registered, bool)] = np.nan
+    result = OfflineRun(source, Config(slam=settings)).run(lambda tracked: advance())
+    if result.interrupted:  # half a reference is none
+        raise KeyboardInterrupt
+    poses = result.poses.copy()
+    poses[~np.array(result.registered, bool)] = np.nan
     return Referenced(source, poses)
 
 

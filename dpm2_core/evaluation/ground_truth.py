@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The true poses of a drive, from its source or from a file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from dpm2_core.data.source import Source
+from dpm2_core.data.trajectory import Trajectory, read_trajectory
+from dpm2_core.errors import UsageError
+from dpm2_core.frame import Array
+from dpm2_core.geometry import se3
+
+
+def read_ground_truth(source: Source, path: Path | None, start: int, stop: int) -> Array | Trajectory | None:
+    """Of frames start..stop-1: LiDAR poses (N, 4, 4), or a trajectory to be matched by stamp or number, or None.
+
+    Args:
+        path: file of poses (KITTI: left camera; TUM: LiDAR); those of the source otherwise.
+
+    Raises:
+        UsageError: no such file, or one of another drive.
+    """
+    if path is None:
+        return None if source.poses is None else source.poses[start:stop]
+    truth = read_trajectory(path)
+    if truth.kind == "tum" or truth.kind == "kitti-indexed":
+        return truth
+    if len(truth) < len(source):
+        raise UsageError(f"{path}: {len(truth)} poses for {len(source)} frames of {source.name}")
+    if len(truth) > len(source):  # a file of the whole sequence beside an excerpt: KITTI's frame numbers tell
+        numbers = [frame.index for frame in source.frames(start, stop)]
+        if max(numbers) >= len(truth):
+            raise UsageError(f"{path}: {len(truth)} poses, but {source.name} has frame {max(numbers)}")
+        poses = truth.poses[numbers]
+    else:
+        poses = truth.poses[start:stop]
+    return poses if source.T_cam_lidar is None else in_other_frame(poses, se3.inverse(source.T_cam_lidar))
+
+
+def in_other_frame(poses: Array, T_other_sensor: Array) -> Array:
+    """Poses of one sensor as those of another that is rigidly mounted to it."""
+    return T_other_sensor @ poses @ se3.inverse(T_other_sensor)

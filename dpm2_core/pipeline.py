@@ -1,0 +1,306 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A recording through the SLAM at full speed, without ROS: `OfflineRun`, and the files that its `Result` writes."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from time import perf_counter
+from typing import Any, Literal
+
+import numpy as np
+
+from dpm2_core.config import dump_settings
+from dpm2_core.data.open import open_source
+from dpm2_core.data.ply import write_ply
+from dpm2_core.data.prefetch import prefetch
+from dpm2_core.data.source import Source
+from dpm2_core.data.trajectory import Trajectory, matched, write_kitti, write_tum
+from dpm2_core.errors import UsageError
+from dpm2_core.evaluation.figures import trajectory_png
+from dpm2_core.evaluation.ground_truth import in_other_frame, read_ground_truth
+from dpm2_core.evaluation.metrics import Metrics, evaluate
+from dpm2_core.extras import MissingPackageError
+from dpm2_core.files import atomic_write
+from dpm2_core.frame import Array, OdometryResult
+from dpm2_core.slam.mapping.mapper import Mapper
+from dpm2_core.slam.output import TrajectoryRecorder
+from dpm2_core.slam.session import open_session, resume_at
+from dpm2_core.slam.settings import Config
+from dpm2_core.slam.system import SlamSystem
+
+MapMode = Literal["create", "resume", "extend"]
+"""What to do with a map file: make it, go on with the drive that was cut off, or add another drive."""
+Span = tuple[int, int | None]
+"""Positions of the first frame and of the one after the last; None: to the end."""
+
+
+class OfflineRun:
+    """One drive through the SLAM. A context manager: leaving it closes the map file, if there is one.
+
+    Attributes:
+        source: the recording. mapper: the map so far.
+    """
+
+    def __init__(
+        self,
+        source: Source | Path | str,
+        config: Config | None = None,
+        frames: Span = (0, None),
+        ground_truth: Path | None = None,
+        map_file: Path | None = None,
+        map_mode: MapMode = "create",
+    ) -> None:
+        """Open everything that the run needs; nothing is written yet but the beginning of the map file.
+
+        Args:
+            source: a recording, or the path of one, which is then opened with `config.input`.
+            ground_truth: file of poses (KITTI: left camera; TUM: LiDAR); those of the source otherwise.
+            map_file: written as the drive goes on.
+
+        Raises:
+            UsageError: no such recording, no frames in that span, ground truth of another drive, no such weights, or a
+                map file that is there already or does not fit. Dpm2Error: the map file cannot be written.
+        """
+        self._config = config or Config()
+        self._resources = ExitStack()
+        store = None
+        if map_file is not None:
+            store = open_session(map_file, self._config.slam, dump_settings(self._config), map_mode != "create")
+            self._resources.enter_context(store)
+        try:
+            self._system = SlamSystem(self._config.slam, store=store)
+            if isinstance(source, (Path, str)):
+                source = open_recording(source, self._config, self._uses_images)
+            self.source = source
+            self._start, self._stop = span_of(self.source, frames)
+            if map_mode == "resume":
+                self._start = resume_at(self._system.mapper, self.source, self._start)
+                _check_span(self.source, self._start, self._stop, frames)
+            self._truth = read_ground_truth(self.source, ground_truth, self._start, self._stop)
+        except BaseException:
+            self.close()
+            raise
+        self._truth_name = self.source.truth if ground_truth is None else str(ground_truth)
+
+    def __enter__(self) -> OfflineRun:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __len__(self) -> int:
+        """Number of frames to be processed."""
+        return self._stop - self._start
+
+    def close(self) -> None:
+        """Close the map file; a `Result` must be saved before."""
+        self._resources.close()
+
+    @property
+    def mapper(self) -> Mapper:
+        return self._system.mapper
+
+    @property
+    def _uses_images(self) -> bool:
+        return self._system.odometry.uses_images or self._config.slam.map.thumbnail > 0
+
+    def run(self, progress: Callable[[OdometryResult], None] = lambda tracked: None) -> Result:
+        """All frames through the SLAM, once; Ctrl-C ends it early, and the result is of the frames until then.
+
+        Args:
+            progress: called after each frame.
+        """
+        result = Result(self.source, self._config, self.mapper, self._truth, self._truth_name)
+        began = perf_counter()
+        try:
+            for frame in prefetch(self.source.frames(self._start, self._stop)):
+                tracked = self._system.process(frame)
+                result.add(tracked)
+                progress(tracked)
+        except KeyboardInterrupt:
+            result.interrupted = True
+        result.wall_s = perf_counter() - began
+        self.mapper.finish()
+        return result
+
+
+@dataclass(eq=False)
+class Result:
+    """What a run found. Clouds of the map stay in the map file, if there is one: save before the run is closed.
+
+    Attributes:
+        ground_truth: LiDAR poses (N, 4, 4) of the frames, or a trajectory to be matched by stamp or number, or None.
+        ground_truth_name: what it was read from.
+        recorder: the odometry's pose of every frame.
+        registered: of each frame, whether its registration succeeded.
+        methods: how many frames were registered how; "failed" for those that were not.
+        seconds: wall time of each frame by stage.
+        wall_s: of the whole run, reading included.
+    """
+
+    source: Source
+    config: Config
+    mapper: Mapper
+    ground_truth: Array | Trajectory | None
+    ground_truth_name: str
+    recorder: TrajectoryRecorder = field(default_factory=TrajectoryRecorder)
+    registered: list[bool] = field(default_factory=list)
+    methods: Counter[str] = field(default_factory=Counter)
+    seconds: dict[str, list[float]] = field(default_factory=dict)
+    wall_s: float = 0.0
+    interrupted: bool = False
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return len(self.recorder)
+
+    def add(self, tracked: OdometryResult) -> None:
+        """Take in the next frame."""
+        self.recorder.add(tracked)
+        self.registered.append(tracked.registration.ok)
+        self.methods[tracked.registration.method if tracked.registration.ok else "failed"] += 1
+        for stage, time in tracked.seconds.items():
+            self.seconds.setdefault(stage, []).append(time)
+
+    @cached_property
+    def poses(self) -> Array:
+        """(N, 4, 4) T_map_lidar of all frames after all corrections; read when the run has ended."""
+        return self.recorder.poses(self.mapper.poses[self.mapper.session_start :])
+
+    @property
+    def sensor_poses(self) -> Array:
+        """(N, 4, 4) of the left camera, as KITTI has them; of the LiDAR where the calibration is not known."""
+        return self.poses if self.source.T_cam_lidar is None else in_other_frame(self.poses, self.source.T_cam_lidar)
+
+    @property
+    def connected(self) -> bool:
+        """Whether a loop ties this drive to those that were in the map file before; True if there were none."""
+        first = self.mapper.session_start
+        return first == 0 or any(a < first <= b for a, b, _, _ in self.mapper.edges)
+
+    @property
+    def fps(self) -> float:
+        """Frames per second of processing alone; 0 without frames."""
+        total = self._frame_seconds
+        return len(total) / float(total.sum()) if len(total) else 0.0
+
+    @property
+    def _frame_seconds(self) -> Array:
+        return np.asarray(np.sum(list(self.seconds.values()), axis=0)) if self.seconds else np.zeros(0)
+
+    @property
+    def timing(self) -> dict[str, Any]:
+        """Content of timing.json."""
+        stages = {**self.seconds, "total": self._frame_seconds.tolist()}
+        return {
+            "frames": len(self),
+            "fps": self.fps,
+            "wall_s": self.wall_s,
+            "answers": dict(self.methods),
+            "stages_ms": {stage: _summary(times) for stage, times in stages.items()},
+        }
+
+    @cached_property
+    def metrics(self) -> Metrics | None:
+        """Against the ground truth; None without any.
+
+        Raises:
+            UsageError: nothing of the ground truth belongs to this drive.
+        """
+        truth, poses = self._compared()
+        if truth is None:
+            return None
+        if not isinstance(self.ground_truth, Trajectory):
+            if np.isfinite(truth[:, 0, 0]).sum() < 2:
+                return None
+            poses = self.sensor_poses
+            truth = truth if self.source.T_cam_lidar is None else in_other_frame(truth, self.source.T_cam_lidar)
+        failed = self.methods["failed"]
+        metrics = evaluate(truth, poses, failed_frames=failed, breaks=self.recorder.breaks, fps=self.fps)
+        return metrics.model_copy(update={"truth": self.ground_truth_name})
+
+    def save(self, out: Path) -> list[str]:
+        """Write all files, each whole or not at all; returns what could not be done, in words.
+
+        Raises:
+            Dpm2Error: a file could not be written; the old one survives. UsageError: see `metrics`.
+        """
+        out.mkdir(parents=True, exist_ok=True)
+        save_config(self.config, out)
+        write_kitti(out / "trajectory_kitti.txt", self.sensor_poses)
+        write_tum(out / "trajectory.tum", self.recorder.stamps, self.poses)
+        cloud = self.mapper.cloud()
+        write_ply(out / "map.ply", cloud)
+        self.mapper.write_g2o(out / "pose_graph.g2o")
+        _write_json(out / "timing.json", self.timing)
+        if self.metrics is not None:
+            _write_json(out / "metrics.json", self.metrics.model_dump())
+        truth, poses = self._compared()
+        try:
+            trajectory_png(out / "trajectory.png", poses, truth, cloud, title=f"{self.source.name}: {len(self)} frames")
+        except MissingPackageError as error:
+            return [f"no trajectory.png: {error}"]
+        return []
+
+    def _compared(self) -> tuple[Array | None, Array]:
+        """Ground truth and estimate (M, 4, 4) of the same frames."""
+        truth = self.ground_truth
+        if not isinstance(truth, Trajectory):
+            return None if truth is None else truth[: len(self)], self.poses
+        own = Trajectory(self.poses, np.array(self.recorder.stamps), "tum")
+        if truth.kind == "kitti-indexed":
+            own = Trajectory(self.sensor_poses, np.array(self.recorder.index), "kitti-indexed")
+        return matched(truth, own)
+
+
+def save_config(config: Config, out: Path) -> None:
+    """Write config.yaml, which `--config` reads back.
+
+    Raises:
+        Dpm2Error: it could not be written.
+    """
+    with atomic_write(out / "config.yaml") as file:
+        file.write(dump_settings(config))
+
+
+def open_recording(path: Path | str, config: Config, images: bool) -> Source:
+    """The recording, opened with `config.input`; `images` False leaves those out.
+
+    Raises:
+        UsageError: there is none that can be read.
+    """
+    # Decoding images that nobody looks at would only cost time.
+    return open_source(path, config.input.model_copy(update={"images": images and config.input.images}))
+
+
+def span_of(source: Source, frames: Span) -> tuple[int, int]:
+    """Positions of the first frame and of the one after the last, within the source.
+
+    Raises:
+        UsageError: it has no frames there.
+    """
+    start, stop = frames[0], len(source) if frames[1] is None else min(frames[1], len(source))
+    _check_span(source, start, stop, frames)
+    return start, stop
+
+
+def _check_span(source: Source, start: int, stop: int, frames: Span) -> None:
+    if start >= stop:
+        asked = f"{frames[0]}:{'' if frames[1] is None else frames[1]}"
+        raise UsageError(f"--frames {asked}: {source.name} has {len(source)} frames")
+
+
+def _summary(times: list[float]) -> dict[str, float]:
+    median, p95 = np.percentile(np.array(times) * 1e3, [50, 95]) if times else (0.0, 0.0)
+    return {"median": round(float(median), 3), "p95": round(float(p95), 3)}
+
+
+def _write_json(path: Path, content: object) -> None:
+    with atomic_write(path) as file:
+        file.write(json.dumps(content, indent=2) + "\n")
