@@ -241,6 +241,8 @@ class Result:
         _write_json(out / "timing.json", self.timing)
         if self.metrics is not None:
             _write_json(out / "metrics.json", self.metrics.model_dump())
+        if not len(self):
+            return ["no trajectory.png: no frame was processed"]
         truth, poses = self._compared()
         try:
             trajectory_png(out / "trajectory.png", poses, truth, cloud, title=f"{self.source.name}: {len(self)} frames")

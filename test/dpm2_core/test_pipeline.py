@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from dpm2_core.config import load_settings
 from dpm2_core.data.open import open_source
 from dpm2_core.data.trajectory import read_trajectory, write_kitti, write_tum
 from dpm2_core.errors import UsageError
-from dpm2_core.frame import OdometryResult
+from dpm2_core.frame import Frame, OdometryResult
 from dpm2_core.pipeline import OfflineRun, Result
 from dpm2_core.sim.drive import simulate
 from dpm2_core.sim.settings import LidarConfig
@@ -90,6 +91,19 @@ def test_an_interrupted_run_keeps_what_there_is(drive: Path, tmp_path: Path) -> 
     assert {path.name for path in tmp_path.iterdir()} == FILES
     assert len(read_trajectory(tmp_path / "trajectory_kitti.txt")) == 4
     assert json.loads((tmp_path / "metrics.json").read_text())["frames"] == 4
+
+
+def test_interrupted_before_the_first_frame(drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = open_source(drive)
+
+    def frames(start: int = 0, stop: int | None = None) -> Iterator[Frame]:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(source, "frames", frames)
+    result = OfflineRun(source, CONFIG).run()
+    assert result.interrupted
+    assert result.save(tmp_path) == ["no trajectory.png: no frame was processed"]
+    assert {path.name for path in tmp_path.iterdir()} == FILES - {"trajectory.png", "metrics.json"}
 
 
 def test_ground_truth_as_poses_and_as_a_tum_file(drive: Path, tmp_path: Path) -> None:
