@@ -13,10 +13,9 @@ from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Keyframe, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.store.cloud_codec import MAX_POINTS
+from dpm2_core.slam.store.rows import FARTHEST
 
 MAX_ID = 2**31 - 1
-FARTHEST = 1e7
-"""m from the origin: beyond that float64 poses and float32 clouds no longer agree on centimeters."""
 MAX_DESCRIPTORS = 4096
 _REACH = 32_000.0  # m: as far as a packed cloud reaches
 _LARGEST_VARIANCE = 1e12  # m^2: of a pose that is not known at all

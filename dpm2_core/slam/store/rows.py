@@ -24,7 +24,8 @@ from dpm2_core.slam.store.cloud_store import Loan
 from dpm2_core.slam.store.schema import row_crc
 
 NO_POINTS: Points = np.zeros((0, 4), np.float32)
-_FARTHEST = 1e7  # m: from there on float32 clouds are meters off
+FARTHEST = 1e7
+"""m from the origin: from there on float32 clouds are meters off. No pose of a map lies beyond."""
 _LONGEST_NAME = 255
 _DESCRIPTORS = struct.Struct("<IIB")  # number, channels, whether there are axes
 
@@ -113,7 +114,7 @@ def pose_of(data: Any) -> Array:
         ValueError: not a finite rigid transform to a place on Earth.
     """
     T = bytes_array(data, 4)
-    if not se3.is_rigid(T) or np.abs(T[:3, 3]).max() > _FARTHEST:
+    if not se3.is_rigid(T) or np.abs(T[:3, 3]).max() > FARTHEST:
         raise ValueError("not a finite rigid transform")
     return T
 
