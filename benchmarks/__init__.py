@@ -39,6 +39,7 @@ BENCHES: dict[str, Bench] = {
     "finetune": _bench("finetune:bench_finetune", "repetitions threads set pairs only"),
     "gaps": _bench("gaps:bench_gaps", "source kitti threads set weights only"),
     "geometric": _bench("geometric:bench_geometric", "source kitti repetitions threads set"),
+    "hard": _bench("hard:bench_hard", "source kitti threads set weights only"),
     "loop-cost": _bench("loop_cost:bench_loop_cost", "threads set"),
     "map": _bench("map:bench_map", "source set"),
     "memory": _bench("memory:bench_memory", "source threads set"),
@@ -53,7 +54,7 @@ BENCHES: dict[str, Bench] = {
 
 
 def check_options(names: Collection[str], given: Collection[str]) -> None:
-    """Refuse names of benchmarks that do not exist, and options that one of them would ignore.
+    """Reject names of benchmarks that do not exist, and options that one of them would ignore.
 
     Raises:
         UsageError: says which.

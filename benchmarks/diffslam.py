@@ -12,7 +12,7 @@ from rich.console import Group
 from torch import Tensor
 
 from benchmarks.diffslam_pypose import beside_pypose
-from benchmarks.harness import Options, Report, processors
+from benchmarks.harness import Options, Report, processors, rounded, torch_threads
 from dpm2_core.config import load_settings
 from dpm2_core.diffslam.clouds import window
 from dpm2_core.diffslam.icp import Cloud, problem
@@ -36,24 +36,19 @@ def bench_diffslam(options: Options) -> Report:
     """Eight scans of a synthetic suburb, downsampled to 2,048 points each; overrides are of `SlamLossSettings`."""
     settings = load_settings(SlamLossSettings, None, options.overrides)
     settings = settings.model_copy(update={"points": POINTS})
-    threads = torch.get_num_threads()
-    torch.set_num_threads(options.threads)
-    try:
-        with processors(options.threads):
-            scans, truth = street_scans()
-            points, _ = window(scans, None, POINTS, settings.voxel, "scans")
-            results: dict[str, Any] = {
-                "known_motion": known_motion(points[0], settings),
-                "gates": gates(points, truth, settings),
-                "gradients": gradients(points, settings),
-                "cost": {"cpu": cost(points, settings, max(options.repetitions, 5))},
-                "pypose": beside_pypose(points[0], torch.from_numpy(MOTION), settings),
-            }
-            if torch.cuda.is_available():
-                device = torch.cuda.get_device_name()
-                results["cost"][device] = cost(points.cuda(), settings, max(options.repetitions, 20))
-    finally:
-        torch.set_num_threads(threads)
+    with torch_threads(options.threads), processors(options.threads):
+        scans, truth = street_scans()
+        points, _ = window(scans, None, POINTS, settings.voxel, "scans")
+        results: dict[str, Any] = {
+            "known_motion": known_motion(points[0], settings),
+            "gates": gates(points, truth, settings),
+            "gradients": gradients(points, settings),
+            "cost": {"cpu": cost(points, settings, max(options.repetitions, 5))},
+            "pypose": beside_pypose(points[0], torch.from_numpy(MOTION), settings),
+        }
+        if torch.cuda.is_available():
+            device = torch.cuda.get_device_name()
+            results["cost"][device] = cost(points.cuda(), settings, max(options.repetitions, 20))
     return Report(results, _view(results))
 
 
@@ -86,7 +81,7 @@ def known_motion(scan: Tensor, settings: SlamLossSettings) -> dict[str, Any]:
         found = torch.cat([T[0] for T in iterates(problem(source, target, icp), begin, icp.solver)]).numpy()
         error = se3.inverse(MOTION) @ found
         meters, radians = np.linalg.norm(error[:, :3, 3], axis=1), se3.angle(error)
-        out[gate] = {"mm": [_figure(1e3 * x) for x in meters], "deg": [_figure(x) for x in np.degrees(radians)]}
+        out[gate] = {"mm": [rounded(1e3 * x) for x in meters], "deg": [rounded(x) for x in np.degrees(radians)]}
     return out
 
 
@@ -105,16 +100,16 @@ def gates(points: Tensor, truth: Tensor, settings: SlamLossSettings) -> dict[str
         for gradient in ("unrolled", "implicit"):
             poses, g = _by_points(points, truth, with_solver(settings, gradient=gradient, **changes))
             rows.setdefault(name, {})[gradient] = {
-                "to_converged_mm": _figure(1e3 * float((poses - end)[1:, :3, 3].norm(dim=1).mean())),
-                "gradient_cosine": _figure(float((g * slope).sum() / (g.norm() * slope.norm()).clamp(min=1e-300))),
+                "to_converged_mm": rounded(1e3 * float((poses - end)[1:, :3, 3].norm(dim=1).mean())),
+                "gradient_cosine": rounded(float((g * slope).sum() / (g.norm() * slope.norm()).clamp(min=1e-300))),
             }
     steps, true_steps = (se3.inverse(T[:-1].numpy()) @ T[1:].numpy() for T in (end, truth))
     error = se3.inverse(true_steps) @ steps
     return {
         "iterations": settings.icp.solver.iterations,
         "rpe_at_convergence": {
-            "mm": _figure(1e3 * float(np.linalg.norm(error[:, :3, 3], axis=1).mean())),
-            "deg": _figure(float(np.degrees(se3.angle(error)).mean())),
+            "mm": rounded(1e3 * float(np.linalg.norm(error[:, :3, 3], axis=1).mean())),
+            "deg": rounded(float(np.degrees(se3.angle(error)).mean())),
         },
         "rows": rows,
     }
@@ -150,10 +145,10 @@ def gradients(points: Tensor, settings: SlamLossSettings) -> dict[str, Any]:
                 moved[t, i] += step * slope[t, i] / length
                 with torch.no_grad():
                     values.append(float(loss(moved, points, frames=frames)))
-            errors.append(_figure(abs((values[0] - values[1]) / (2 * _STEP) / length - 1)))
-        out[gradient] = {"relative_errors": errors, "median": _figure(float(np.median(errors))), "worst": max(errors)}
+            errors.append(rounded(abs((values[0] - values[1]) / (2 * _STEP) / length - 1)))
+        out[gradient] = {"relative_errors": errors, "median": rounded(float(np.median(errors))), "worst": max(errors)}
     a, b = found["unrolled"], found["implicit"]
-    out["implicit_against_unrolled"] = _figure(float((a - b).norm() / a.norm()))
+    out["implicit_against_unrolled"] = rounded(float((a - b).norm() / a.norm()))
     return out
 
 
@@ -180,11 +175,11 @@ def cost(points: Tensor, settings: SlamLossSettings, repetitions: int) -> dict[s
                 forward.append(middle - begin)
                 backward.append(time.perf_counter() - middle)
             row[name] = {
-                "forward_ms": _figure(1e3 * float(np.median(forward))),
-                "backward_ms": _figure(1e3 * float(np.median(backward))),
-                "both_ms": _figure(1e3 * float(np.median(np.add(forward, backward)))),
+                "forward_ms": rounded(1e3 * float(np.median(forward))),
+                "backward_ms": rounded(1e3 * float(np.median(backward))),
+                "both_ms": rounded(1e3 * float(np.median(np.add(forward, backward)))),
             }
-        row["graph_mb"] = _figure(_held(loss, leaf, points) / 1e6)
+        row["graph_mb"] = rounded(_held(loss, leaf, points) / 1e6)
         rows[gradient] = row
     return {"scans": len(points), "points": points.shape[1], "repetitions": repetitions, **rows}
 
@@ -207,10 +202,6 @@ def _held(loss: SlamLoss, leaf: Tensor, points: Tensor) -> int:
 def _wait(points: Tensor) -> None:
     if points.is_cuda:
         torch.cuda.synchronize()
-
-
-def _figure(x: float) -> float:
-    return float(f"{x:.4g}")
 
 
 def _view(results: dict[str, Any]) -> Group:

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks.harness import rounded
 from dpm2_core.diffslam.icp import Cloud, register
 from dpm2_core.diffslam.trajectory_loss import SlamLossSettings
 from dpm2_core.geometry import se3, se3_torch
@@ -53,13 +54,8 @@ def _row(run: Callable[[], Tensor], requested: np.ndarray) -> dict[str, float]:
         begin = time.perf_counter()
         result = run()
         seconds.append(time.perf_counter() - begin)
-    error = se3.inverse(requested) @ result.detach().double().numpy()
-    figures = {
-        "mm": 1e3 * float(np.linalg.norm(error[:3, 3])),
-        "deg": float(np.degrees(se3.angle(error))),
-        "ms": 1e3 * float(np.median(seconds)),
-    }
-    return {name: float(f"{x:.4g}") for name, x in figures.items()}
+    meters, degrees = se3.magnitude(se3.inverse(requested) @ result.detach().double().numpy())
+    return {"mm": rounded(1e3 * meters), "deg": rounded(degrees), "ms": rounded(1e3 * float(np.median(seconds)))}
 
 
 def _by_optimizer(pypose: Any, source: Tensor, target: Tensor, iterations: int) -> Tensor:

@@ -11,8 +11,7 @@ import numpy as np
 from rich.console import Group
 from rich.progress import Progress
 
-from benchmarks.harness import Options, Report, drives, processors, settings_of, unique_name
-from dpm2_core.errors import UsageError
+from benchmarks.harness import Options, Report, drives, processors, requested, settings_of, truth_of, unique_name
 from dpm2_core.frame import Array, Frame, OdometryResult, State
 from dpm2_core.geometry import se3
 from dpm2_core.slam.build import make_odometry
@@ -51,26 +50,24 @@ def bench_gaps(options: Options) -> Report:
     Raises:
         UsageError: there is no drive, or one has no ground truth.
     """
-    methods = [options.only] if options.only else ["geometric", "refined", "neural"]
+    methods = requested(options, ("geometric", "adaptive", "refined", "neural"))
     results: dict[str, Any] = {}
     with drives(options) as sources, processors(options.threads), Progress(transient=True) as progress:
         for source in sources:
-            if source.poses is None:
-                raise UsageError(f"{source.name}: the drive has no ground truth to compare with")
-            frames = list(source.frames())
+            truth, frames = truth_of(source), list(source.frames())
             cases = list(gaps([frame.stamp for frame in frames]))
             name, task = unique_name(source, results), progress.add_task(source.name, total=len(cases) * len(methods))
             results[name] = {}
             for method in methods:
-                settings, rows = settings_of(options, method), []
+                settings, rows = settings_of(options, f"slam.registration={method}"), []
                 for gap in cases:
-                    rows.append(judged(frames, source.poses, gap, settings))
+                    rows.append(evaluated(frames, truth, gap, settings))
                     progress.advance(task)
                 results[name][method] = {"summary": summary(rows), "gaps": rows}
     return Report({"wrong_m": _WRONG, "drives": results}, Group(_table(results)))
 
 
-def judged(frames: Sequence[Frame], truth: Array, gap: Gap, settings: SlamSettings) -> dict[str, Any]:
+def evaluated(frames: Sequence[Frame], truth: Array, gap: Gap, settings: SlamSettings) -> dict[str, Any]:
     """What the odometry does after one gap; errors are those of the way from the last pose before it."""
     odometry = make_odometry(settings)
     before = [odometry.process(frame) for frame in frames[max(gap.first - _WARM, 0) : gap.first]][-1]
@@ -87,12 +84,12 @@ def judged(frames: Sequence[Frame], truth: Array, gap: Gap, settings: SlamSettin
             last, base = tracked, covariance
     tracking = [i for i, state in enumerate(states) if state is State.TRACKING]
     wrong = sum(errors[i] > _WRONG for i in tracking)
-    moved = se3.inverse(truth[gap.first - 1]) @ truth[gap.stop]
+    meters, degrees = se3.magnitude(se3.inverse(truth[gap.first - 1]) @ truth[gap.stop])
     return {
         "first": gap.first,
         "seconds": gap.seconds,
-        "moved_m": round(float(np.linalg.norm(moved[:3, 3])), 1),
-        "turned_deg": round(float(np.degrees(se3.angle(moved))), 1),
+        "moved_m": round(meters, 1),
+        "turned_deg": round(degrees, 1),
         "silently_wrong_frames": wrong,
         "uncovered_frames": uncovered,
         "tracking_after_frames": tracking[0] + 1 if tracking and not wrong else None,

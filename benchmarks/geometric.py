@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
 from time import perf_counter, process_time
 from typing import Any
@@ -13,15 +13,21 @@ import numpy as np
 from rich.console import Group
 from rich.progress import Progress
 
-from benchmarks.harness import Options, Report, drives, processors, unique_name
-from dpm2_core.config import load_settings
-from dpm2_core.data.source import Source
-from dpm2_core.errors import UsageError
+from benchmarks.harness import (
+    Options,
+    Report,
+    clean_cloud,
+    drives,
+    processors,
+    quantiles_ms,
+    settings_of,
+    truth_of,
+    unique_name,
+)
 from dpm2_core.evaluation.metrics import Metrics, evaluate
 from dpm2_core.frame import Array, Frame
+from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.output import TrajectoryRecorder
-from dpm2_core.slam.settings import Config
-from dpm2_core.slam.system import SlamSystem
 from dpm2_core.tables import FigureTable
 
 LENGTHS = (10.0, 20.0, 30.0, 40.0, 50.0)
@@ -54,25 +60,24 @@ class Outcome:
 Method = Callable[[Sequence[Frame]], Outcome]
 
 
-def dpm2(options: Options) -> Method:
-    """This project's SLAM, its mapper included."""
-    overrides = [f"slam.threads={options.threads}", *options.overrides]
-    settings = load_settings(Config, None, overrides).slam
+def dpm2(options: Options, *more: str) -> Method:
+    """This project's SLAM, its mapper included, with `more` settings."""
+    settings = settings_of(options, *more)
 
     def run(frames: Sequence[Frame]) -> Outcome:
-        system = SlamSystem(settings)
+        slam = make_slam(settings)
         tracked, recorder, seconds = [], TrajectoryRecorder(), np.zeros(len(frames))
         cpu = process_time()
         for i, frame in enumerate(frames):
             started = perf_counter()
-            tracked.append(system.process(frame))
+            tracked.append(slam.process(frame).odometry)
             seconds[i] = perf_counter() - started
         cpu = process_time() - cpu
         stages = {stage: np.array([t.seconds[stage] for t in tracked]) for stage in tracked[0].seconds}
         failed = sum(not t.registration.ok for t in tracked)
         for t in tracked:
             recorder.add(t)
-        return Outcome(recorder.poses(system.mapper.poses), seconds, cpu, stages, failed)
+        return Outcome(recorder.poses(slam.mapper.poses), seconds, cpu, stages, failed)
 
     return run
 
@@ -99,7 +104,7 @@ def kiss_icp(options: Options) -> Method | None:
     from kiss_icp.kiss_icp import KissICP
 
     def run(frames: Sequence[Frame]) -> Outcome:
-        clouds = [frame.points[np.isfinite(frame.points[:, :3]).all(1), :3].astype(np.float64) for frame in frames]
+        clouds = [clean_cloud(frame) for frame in frames]
         odometry = KissICP(config)
         poses, seconds = np.zeros((len(frames), 4, 4)), np.zeros(len(frames))
         cpu = process_time()
@@ -119,17 +124,15 @@ def bench_geometric(options: Options) -> Report:
     Raises:
         UsageError: there is no drive, or one has no ground truth.
     """
-    no_loops = replace(options, overrides=[*options.overrides, "slam.loops.enabled=false"])
-    runs = {OURS: dpm2(options), NO_LOOPS: dpm2(no_loops), BASELINE: kiss_icp(options)}
+    no_loops = dpm2(options, "slam.loops.enabled=false")
+    runs = {OURS: dpm2(options), NO_LOOPS: no_loops, BASELINE: kiss_icp(options)}
     methods = {name: run for name, run in runs.items() if run is not None}
     results: dict[str, Any] = {}
     truth: dict[str, str] = {}
     with drives(options) as sources, processors(options.threads), Progress(transient=True) as progress:
         task = progress.add_task("benchmark", total=len(sources) * options.repetitions * len(methods))
         for source in sources:
-            if source.poses is None:
-                raise UsageError(f"{source.name}: the drive has no ground truth to compare with")
-            frames = list(source.frames())
+            poses, frames = truth_of(source), list(source.frames())
             outcomes: dict[str, list[Outcome]] = {name: [] for name in methods}
             for _ in range(options.repetitions):
                 for name, run in methods.items():
@@ -137,7 +140,7 @@ def bench_geometric(options: Options) -> Report:
                     outcomes[name].append(run(frames))
                     progress.advance(task)
             name = unique_name(source, results)
-            results[name] = {method: summary(source, outcomes[method]) for method in methods}
+            results[name] = {method: summary(poses, outcomes[method]) for method in methods}
             truth[name] = source.truth
             del frames
     notes = [] if BASELINE in methods else ["kiss-icp is not installed (pip install 'dpm2_ros[bench]'): no comparison."]
@@ -147,16 +150,15 @@ def bench_geometric(options: Options) -> Report:
     return Report({"segment_lengths_m": LENGTHS, "truth": truth, "drives": results}, shown)
 
 
-def summary(source: Source, outcomes: Sequence[Outcome]) -> dict[str, Any]:
+def summary(truth: Array, outcomes: Sequence[Outcome]) -> dict[str, Any]:
     """Medians over the repetitions of errors and speed, and the spread of the latter."""
-    assert source.poses is not None
-    checked = [evaluate(source.poses, o.poses, LENGTHS, failed_frames=o.failed) for o in outcomes]
+    checked = [evaluate(truth, o.poses, LENGTHS, failed_frames=o.failed) for o in outcomes]
     fps = np.array([len(o.seconds) / o.seconds.sum() for o in outcomes])
     seconds = np.concatenate([o.seconds for o in outcomes])
     stages = {stage: np.concatenate([o.stages[stage] for o in outcomes]) for stage in outcomes[0].stages}
     return {
         **_median(checked),
-        "ape_rmse_m_of_thirds": _thirds(source.poses, outcomes[0].poses),
+        "ape_rmse_m_of_thirds": _thirds(truth, outcomes[0].poses),
         "fps": float(np.median(fps)),
         "fps_of_repetitions": fps.round(2).tolist(),
         "cpu_ms": 1e3 * float(np.median([o.cpu_seconds / len(o.seconds) for o in outcomes])),
@@ -166,7 +168,7 @@ def summary(source: Source, outcomes: Sequence[Outcome]) -> dict[str, Any]:
 
 
 def _thirds(truth: Array, poses: Array) -> list[float | None]:
-    """APE of each third of the drive alone: tells an error all along from a jump, of the estimate or of the truth."""
+    """APE of each third of the drive alone: an error all along, or a jump of estimate or truth?"""
     edges = np.linspace(0, len(truth), 4).astype(int)
     return [evaluate(truth[a:b], poses[a:b]).ape_rmse_m if b - a > 1 else None for a, b in pairwise(edges.tolist())]
 
@@ -178,12 +180,6 @@ def _median(checked: Sequence[Metrics]) -> dict[str, Any]:
         values = [getattr(metrics, name) for metrics in checked]
         medians[name] = None if None in values else float(np.median(values))
     return medians
-
-
-def quantiles_ms(seconds: Array) -> dict[str, float]:
-    """Median and 95th percentile of (N,) seconds, ms."""
-    median, p95 = np.percentile(1e3 * seconds, [50, 95])
-    return {"median": round(float(median), 2), "p95": round(float(p95), 2)}
 
 
 def _compare(methods: dict[str, Any]) -> None:

@@ -8,13 +8,14 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Container, Iterator, Sequence
+from collections.abc import Collection, Container, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Group
 
 from dpm2_core.config import load_settings
@@ -22,6 +23,7 @@ from dpm2_core.data.open import open_source
 from dpm2_core.data.source import Source
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.evaluation.record import REPOSITORY, write_record
+from dpm2_core.frame import Array, Frame
 from dpm2_core.slam.settings import Config, SlamSettings
 
 
@@ -60,15 +62,23 @@ class Options:
         return self.kitti or Path(os.environ.get("DPM2_KITTI", REPOSITORY.parent / "shared" / "kitti"))
 
 
-def overrides_of(options: Options, registration: str) -> list[str]:
-    """Settings of the SLAM with that registration and the weights that were asked for."""
+def settings_of(options: Options, *more: str) -> SlamSettings:
+    """Settings of the SLAM as asked for, with `more` of the kind `slam.registration=neural`."""
     weights = [] if options.weights is None else [f"slam.neural.weights={options.weights}"]
-    return [f"slam.threads={options.threads}", *weights, *options.overrides, f"slam.registration={registration}"]
+    return load_settings(Config, None, [f"slam.threads={options.threads}", *weights, *options.overrides, *more]).slam
 
 
-def settings_of(options: Options, registration: str) -> SlamSettings:
-    """Those settings, read."""
-    return load_settings(Config, None, overrides_of(options, registration)).slam
+def requested(options: Options, parts: Collection[str]) -> list[str]:
+    """The part of a benchmark that `--only` names, or all.
+
+    Raises:
+        UsageError: it has no such part.
+    """
+    if options.only is None:
+        return list(parts)
+    if options.only not in parts:
+        raise UsageError(f"--only {options.only}: no such part; choose from {', '.join(parts)}")
+    return [options.only]
 
 
 @dataclass(frozen=True)
@@ -105,6 +115,17 @@ def drives(options: Options) -> Iterator[list[Source]]:
         yield [open_source(path) for path in sequences]
 
 
+def truth_of(source: Source) -> Array:
+    """True poses (N, 4, 4) of a drive.
+
+    Raises:
+        UsageError: it has none.
+    """
+    if source.poses is None:
+        raise UsageError(f"{source.name}: the drive has no ground truth to compare with")
+    return source.poses
+
+
 def unique_name(source: Source, taken: Container[str]) -> str:
     """The drive's name, counted up where another one, such as a second folder `00`, already has it."""
     names = (source.name if n == 1 else f"{source.name} ({n})" for n in count(1))
@@ -125,16 +146,45 @@ def processors(number: int) -> Iterator[None]:
         os.sched_setaffinity(0, before)
 
 
+@contextmanager
+def torch_threads(number: int) -> Iterator[None]:
+    """So many threads for torch while the block lasts."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(number)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
 def write_report(path: Path, name: str, report: Report, options: Options, program: str = "dpm2") -> None:
     """The results of a benchmark; see `write_record`."""
     results = {"overrides": list(options.overrides), **report.results}
     write_record(path, name, results, program, options.threads)
 
 
-def read_parts(path: Path, weights: dict[str, Any]) -> dict[str, Any]:
-    """Parts of an earlier, unfinished run with the same weights; none if it is of others, damaged or not there."""
+def earlier(path: Path, key: str, **same: Any) -> dict[str, Any]:
+    """What an earlier run left under a key of its JSON; {} if it is not there, is damaged or differs in `same`."""
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
-        return dict(record["parts"]) if record["weights"] == weights else {}
+        return dict(record[key]) if all(record[name] == value for name, value in same.items()) else {}
     except (OSError, ValueError, KeyError, TypeError):
         return {}
+
+
+def rounded(x: float) -> float:
+    """To four digits."""
+    return float(f"{x:.4g}")
+
+
+def quantiles_ms(seconds: Sequence[float] | Array) -> dict[str, float]:
+    """Median and 95th percentile of (N,) seconds, ms."""
+    median, p95 = np.percentile(1e3 * np.asarray(seconds), [50, 95])
+    return {"median": round(float(median), 2), "p95": round(float(p95), 2)}
+
+
+def clean_cloud(frame: Frame) -> Array:
+    """(M, 3) float64 points of a frame without those that are not finite, as other programs want them."""
+    return frame.points[np.isfinite(frame.points[:, :3]).all(1), :3].astype(np.float64)

@@ -10,16 +10,14 @@ import numpy as np
 from rich.console import Group
 from rich.progress import Progress
 
-from benchmarks.harness import Options, Report
+from benchmarks.harness import Options, Report, settings_of
 from benchmarks.memory import resident_mb
-from dpm2_core.config import load_settings
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.frame import Array, Keyframe, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.world import build_world
 from dpm2_core.slam.build import make_loops
-from dpm2_core.slam.settings import Config
 from dpm2_core.slam.store.map_data import NO_POINTS
 
 SIZES = (100, 1000, 5000, 20000)
@@ -32,7 +30,7 @@ def bench_loop_cost(options: Options) -> Report:
 
     And the resident memory of the largest map, the clouds being on disk.
     """
-    settings = load_settings(Config, None, [f"slam.threads={options.threads}", *options.overrides]).slam
+    settings = settings_of(options)
     settings = settings.model_copy(update={"loops": settings.loops.model_copy(update={"min_confidence": 0.0})})
     world = build_world("straight", "suburb", seed=8, length=100.0)
     cloud = Lidar().scan(world, world.pose_at(60.0), 0.0, np.random.default_rng(0)).points

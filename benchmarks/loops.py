@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from dpm2_core.frame import Array, LoopClosure
+from dpm2_core.frame import Array, Edge
 from dpm2_core.geometry import se3
 
 WRONG_M, WRONG_DEG = 5.0, 5.0
@@ -18,12 +18,12 @@ NEAR, GAP = 10.0, 50.0
 """A revisit: a keyframe so near to an earlier one, m, with at least so much path between them, m."""
 
 
-def check_loops(closures: Sequence[LoopClosure], truth: Array) -> dict[str, Any]:
+def check_loops(loops: Sequence[Edge], truth: Array) -> dict[str, Any]:
     """Counts of loops and revisits.
 
     Args:
-        closures: all that were tried; ids are positions in `truth`.
-        truth: (N, 4, 4) true poses of the keyframes.
+        loops: all that were tried.
+        truth: (N, 4, 4) true poses of the keyframes, in the order of the map.
 
     Returns:
         accepted and wrong loops, the median error of the right ones, and for revisits in the same direction (within
@@ -32,20 +32,19 @@ def check_loops(closures: Sequence[LoopClosure], truth: Array) -> dict[str, Any]
     """
     found: set[int] = set()
     errors, wrong, rejections = [], 0, Counter[str]()
-    for closure in closures:
-        r = closure.registration
-        true = se3.inverse(truth[closure.from_id]) @ truth[closure.to_id]
-        off = se3.inverse(true) @ r.T_target_source
-        meters, degrees = float(np.linalg.norm(off[:3, 3])), float(np.degrees(se3.angle(off)))
-        if not r.ok:
-            rejections[" ".join(word for word in r.reason.split() if not any(c.isdigit() for c in word))] += 1
+    for loop in loops:
+        true = se3.inverse(truth[loop.from_node]) @ truth[loop.to_node]
+        meters, degrees = se3.magnitude(se3.inverse(true) @ loop.T_from_to)
+        if not loop.ok:
+            words = loop.registration.reason.split()
+            rejections[" ".join(word for word in words if not any(c.isdigit() for c in word))] += 1
         elif meters > WRONG_M or degrees > WRONG_DEG:
             wrong += 1
         else:
             errors.append((meters, degrees))
-            found.add(closure.to_id)
+            found.add(loop.to_node)
     result: dict[str, Any] = {
-        "tried": len(closures),
+        "tried": len(loops),
         "accepted": len(errors) + wrong,
         "wrong": wrong,
         "error_m": _quantiles([e[0] for e in errors]),

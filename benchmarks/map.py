@@ -18,17 +18,17 @@ from numpy.typing import NDArray
 from rich.console import Console, Group
 from rich.progress import track
 
-from benchmarks.harness import Options, Report
+from benchmarks.harness import Options, Report, truth_of
 from dpm2_core.config import load_settings
 from dpm2_core.data.open import open_source
-from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.errors import Dpm2Error
 from dpm2_core.evaluation.metrics import ape_rmse
 from dpm2_core.frame import Array, Keyframe, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.sim.drive import simulate
 from dpm2_core.sim.lidar import Lidar
-from dpm2_core.sim.settings import LidarConfig
+from dpm2_core.sim.settings import DriveConfig, LidarConfig
 from dpm2_core.sim.world import World, build_world
 from dpm2_core.slam.build import make_mapper
 from dpm2_core.slam.mapping.mapper import Mapper
@@ -55,11 +55,11 @@ from dpm2_core.cli import main
 from dpm2_core.slam.mapping.mapper import Mapper
 os.write(int(sys.argv[1]), b"s")
 add = Mapper.add
-def told(self, *arguments):
+def reported(self, *arguments):
     out = add(self, *arguments)
     os.write(int(sys.argv[1]), b"k")
     return out
-Mapper.add = told
+Mapper.add = reported
 main(sys.argv[2:])
 """
 
@@ -84,11 +84,15 @@ def crashes(folder: Path, options: Options, drive: Path | None = None) -> dict[s
     command, kills_wanted = ["run", "--out", str(folder / "out")], SOURCE_KILLS
     if drive is None:
         drive, kills_wanted = folder / "drive", KILLS
-        simulate(drive, _FRAMES, seed=5, road="loop", preset="suburb", images=False, lidar=LidarConfig(beams=16))
+        simulate(
+            drive,
+            DriveConfig(
+                frames=_FRAMES, seed=5, road="loop", preset="suburb", images=False, lidar=LidarConfig(beams=16)
+            ),
+        )
         command += ["--set", "slam.loops.descriptors=false"]
     source = open_source(drive)
-    if (truth := source.poses) is None:
-        raise UsageError(f"{drive}: no ground truth")
+    truth = truth_of(source)
     command += [str(drive)]
     command += [word for setting in options.overrides for word in ("--set", setting)]
     alone = folder / "alone.dpm2map"
@@ -222,7 +226,7 @@ def _lap(world: World, lap: int, previous: Keyframe | None) -> Iterator[tuple[Ke
 def _lap_row(mapper: Mapper, path: Path, lap: int) -> dict[str, Any]:
     own = sum(not mapper.borrows(node) for node in range(len(mapper.keyframes)))
     size = sum(file.stat().st_size for suffix in ("", "-wal") if (file := Path(f"{path}{suffix}")).exists())
-    accepted = sum(closure.registration.ok for closure in mapper.closures)
+    accepted = sum(loop.ok for loop in mapper.loops)
     return {"lap": lap + 1, "keyframes": len(mapper.keyframes), "with_own_cloud": own, "bytes": size, "loops": accepted}
 
 

@@ -11,11 +11,9 @@ import numpy as np
 from rich.console import Group
 from rich.progress import track
 
-from benchmarks.harness import Options, Report, drives, unique_name
-from dpm2_core.config import load_settings
+from benchmarks.harness import Options, Report, drives, settings_of, unique_name
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.slam.settings import Config
-from dpm2_core.slam.system import SlamSystem
+from dpm2_core.slam.build import make_slam
 from dpm2_core.tables import FigureTable
 
 _EVERY = 50  # frames between two samples
@@ -29,18 +27,18 @@ def bench_memory(options: Options) -> Report:
     """
     if not options.sources:
         raise UsageError("memory: give --source with a long drive; `dpm2 sim DIR --frames 2000 --no-images` makes one")
-    settings = load_settings(Config, None, [f"slam.threads={options.threads}", *options.overrides]).slam
+    settings = settings_of(options)
     results: dict[str, Any] = {}
     with drives(options) as sources:
         for source in sources:
-            system = SlamSystem(settings)
+            slam = make_slam(settings)
             samples = [(0, resident_mb())]
             frames = track(source.frames(), description=f"{source.name}: memory", total=len(source), transient=True)
             for count, frame in enumerate(frames, 1):
-                system.process(frame)
+                slam.process(frame)
                 if count % _EVERY == 0:
                     samples.append((count, resident_mb()))
-            results[unique_name(source, results)] = levelling(samples) | {"keyframes": len(system.mapper.keyframes)}
+            results[unique_name(source, results)] = levelling(samples) | {"keyframes": len(slam.mapper.keyframes)}
     return Report({"drives": results}, Group(_table(results)))
 
 

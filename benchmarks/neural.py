@@ -13,32 +13,26 @@ from typing import Any
 import numpy as np
 from rich.progress import Progress
 
-from benchmarks.geometric import BASELINE, Method, dpm2, kiss_config, kiss_icp, quantiles_ms, summary
+from benchmarks.geometric import BASELINE, Method, dpm2, kiss_config, kiss_icp, summary
 from benchmarks.harness import (
     Options,
     Report,
     drives,
-    overrides_of,
+    earlier,
     processors,
-    read_parts,
+    quantiles_ms,
+    requested,
     settings_of,
+    truth_of,
     unique_name,
     write_report,
 )
 from benchmarks.neural_view import view
-from benchmarks.pairs import (
-    PairMethod,
-    all_pairs,
-    by_registration,
-    gicp_from_identity,
-    kiss_from_identity,
-)
+from benchmarks.pairs import PairMethod, all_pairs, by_registration, gicp_from_identity, kiss_from_identity
 from benchmarks.unseen import corruption, image_matters, overlap, synthetic
-from dpm2_core.data.source import Source
-from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.figures import success_png
 from dpm2_core.evaluation.record import git_commit
-from dpm2_core.frame import Frame
+from dpm2_core.frame import Array, Frame
 from dpm2_core.network.encoder import collate_views
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pretrained import load_network, weights_path
@@ -55,17 +49,16 @@ def bench_neural(options: Options) -> Report:
     Raises:
         UsageError: no weights, no drive, one without ground truth, or no such part.
     """
-    if options.only and options.only not in PARTS:
-        raise UsageError(f"--only {options.only}: no such part; choose from {', '.join(PARTS)}")
-    s = settings_of(options, "neural")
+    chosen = requested(options, PARTS)
+    s = settings_of(options)
     network = load_network(s.neural.weights, options.threads, s.neural.preset)
     weights = _weights(s.neural.weights)
     path = options.out / "neural.json"
-    parts = read_parts(path, weights)
-    requested = [options.only] if options.only else [name for name in PARTS if name not in parts]
+    parts = earlier(path, "parts", weights=weights)
+    chosen = [name for name in chosen if options.only or name not in parts]
     with processors(options.threads), Progress(transient=True) as progress:
-        task = progress.add_task("neural", total=len(requested))
-        for name in requested:
+        task = progress.add_task("neural", total=len(chosen))
+        for name in chosen:
             progress.update(task, description=name)
             started = perf_counter()
             found = PARTS[name](network, options)
@@ -88,7 +81,7 @@ def _weights(name: str) -> dict[str, Any]:
     return {"name": name, "bytes": path.stat().st_size, "sha256": sha256(path.read_bytes()).hexdigest(), **about}
 
 
-def _of_drives(one: Callable[[Source, list[Frame], DeepPointMap2, Options], Any]) -> Part:
+def _of_drives(one: Callable[[Array, list[Frame], DeepPointMap2, Options], Any]) -> Part:
     """A part that asks the same of every drive."""
 
     def part(network: DeepPointMap2, options: Options) -> dict[str, Any]:
@@ -96,38 +89,34 @@ def _of_drives(one: Callable[[Source, list[Frame], DeepPointMap2, Options], Any]
         truth: dict[str, str] = {}
         with drives(options) as sources:
             for source in sources:
-                if source.poses is None:
-                    raise UsageError(f"{source.name}: the drive has no ground truth to compare with")
-                frames = list(source.frames())
+                poses, frames = truth_of(source), list(source.frames())
                 if network.encoder.image is None:
                     frames = [replace(frame, images=()) for frame in frames]
                 name = unique_name(source, found)
-                found[name], truth[name] = one(source, frames, network, options), source.truth
+                found[name], truth[name] = one(poses, frames, network, options), source.truth
         return {"drives": found, "truth": truth}
 
     return part
 
 
-def real_pairs(source: Source, frames: list[Frame], network: DeepPointMap2, options: Options) -> dict[str, Any]:
+def real_pairs(poses: Array, frames: list[Frame], network: DeepPointMap2, options: Options) -> dict[str, Any]:
     """Near pairs by the network alone; those 10-20 m apart by every method, none with a prior."""
-    neural = {"neural": by_registration(make_registration(settings_of(options, "neural")))}
     methods: dict[str, PairMethod] = {
-        **neural,
-        **{n: by_registration(make_registration(settings_of(options, n))) for n in ("refined", "geometric")},
-        "small_gicp": gicp_from_identity(options.threads),
+        name: by_registration(make_registration(settings_of(options, f"slam.registration={name}")))
+        for name in ("neural", "refined", "geometric")
     }
+    neural = {"neural": methods["neural"]}
+    methods["small_gicp"] = gicp_from_identity(options.threads)
     if (config := kiss_config(options)) is not None:
         methods[BASELINE] = kiss_from_identity(config)
-    assert source.poses is not None
     kinds = {"consecutive": neural, "8 apart": neural, "10-20 m": methods}
-    return all_pairs(kinds, frames, source.poses, options.pairs)
+    return all_pairs(kinds, frames, poses, options.pairs)
 
 
-def odometry(source: Source, frames: list[Frame], network: DeepPointMap2, options: Options) -> dict[str, Any]:
+def odometry(poses: Array, frames: list[Frame], network: DeepPointMap2, options: Options) -> dict[str, Any]:
     """As `dpm2 run` does it, by the network, refined and by the points alone, and KISS-ICP."""
     methods: dict[str, Method] = {
-        name: dpm2(replace(options, overrides=overrides_of(options, name)))
-        for name in ("neural", "refined", "geometric")
+        name: dpm2(options, f"slam.registration={name}") for name in ("neural", "refined", "geometric")
     }
     if (kiss := kiss_icp(options)) is not None:
         methods[BASELINE] = kiss
@@ -135,14 +124,14 @@ def odometry(source: Source, frames: list[Frame], network: DeepPointMap2, option
     for _ in range(options.repetitions):
         for name, run in methods.items():
             outcomes[name].append(run(frames))
-    rows = {name: summary(source, outcomes[name]) for name in methods}
+    rows = {name: summary(poses, outcomes[name]) for name in methods}
     if BASELINE in rows:
         for row in rows.values():
             row["frame_ms"]["ratio"] = round(row["frame_ms"]["median"] / rows[BASELINE]["frame_ms"]["median"], 3)
     return rows
 
 
-def speed(source: Source, frames: list[Frame], network: DeepPointMap2, options: Options) -> dict[str, Any]:
+def speed(poses: Array, frames: list[Frame], network: DeepPointMap2, options: Options) -> dict[str, Any]:
     """Encode and register, raw points to pose, by stages; KISS-ICP in turns with it, and what the camera adds."""
     frames = frames[:60]
     rounds: list[list[dict[str, Any]]] = []

@@ -12,7 +12,7 @@ from dpm2_core.tables import FigureTable
 
 
 def view(parts: Mapping[str, Any]) -> Group:
-    """Every part that was measured; what could not be is said below its table."""
+    """Every part that was measured; what could not be is noted below its table."""
     shown: list[RenderableType] = []
     for name, title in (
         ("synthetic", "Unseen synthetic worlds"),

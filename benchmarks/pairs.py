@@ -10,6 +10,7 @@ import numpy as np
 import small_gicp
 from numpy.typing import NDArray
 
+from benchmarks.harness import clean_cloud
 from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
 from dpm2_core.slam.preprocess import Scan
@@ -19,7 +20,7 @@ SUCCESS_M, SUCCESS_DEG = 0.6, 1.5
 """Errors below which a registration counts as a success."""
 
 PairMethod = Callable[[Frame, Frame], Array | None]
-"""T_first_second (4, 4) of two frames; None: no answer."""
+"""T_first_second (4, 4) of two frames; None: no result."""
 
 Pairs = Sequence[tuple[int, int]]
 
@@ -72,7 +73,7 @@ def gicp_from_identity(threads: int) -> PairMethod:
     """small_gicp's GICP of the two scans at 0.25 m, started at the identity with correspondences up to 2 m."""
 
     def register(first: Frame, second: Frame) -> Array:
-        target, source = (f.points[np.isfinite(f.points[:, :3]).all(1), :3].astype(np.float64) for f in (first, second))
+        target, source = clean_cloud(first), clean_cloud(second)
         options = {"max_correspondence_distance": 2.0, "max_iterations": 50, "num_threads": threads}
         return np.asarray(small_gicp.align(target, source, **options).T_target_source)
 
@@ -87,21 +88,19 @@ def kiss_from_identity(config: Any) -> PairMethod:
 
         odometry = KissICP(config)
         for frame in (first, second):
-            points = frame.points[np.isfinite(frame.points[:, :3]).all(1), :3].astype(np.float64)
-            odometry.register_frame(points, np.array([]))
+            odometry.register_frame(clean_cloud(frame), np.array([]))
         return np.asarray(odometry.last_pose)
 
     return register
 
 
 def pair_errors(method: PairMethod, frames: Sequence[Frame], poses: Array, pairs: Pairs) -> Array:
-    """(len(pairs), 2) translation error, m, and rotation error, deg; inf where there was no answer."""
+    """(len(pairs), 2) translation error, m, and rotation error, deg; inf where there was no result."""
     errors = np.full((len(pairs), 2), np.inf)
     for row, (a, b) in zip(errors, pairs, strict=True):
         T = method(frames[a], frames[b])
         if T is not None:
-            off = se3.inverse(se3.inverse(poses[a]) @ poses[b]) @ T
-            row[:] = np.linalg.norm(off[:3, 3]), np.degrees(se3.angle(off))
+            row[:] = se3.magnitude(se3.inverse(se3.inverse(poses[a]) @ poses[b]) @ T)
     return errors
 
 

@@ -14,9 +14,8 @@ import numpy as np
 from rich.console import Group
 from rich.progress import Progress
 
-from benchmarks.harness import Options, Report, processors
+from benchmarks.harness import Options, Report, processors, settings_of
 from benchmarks.roads import open_road, road_files
-from dpm2_core.config import load_settings
 from dpm2_core.frame import Array, Frame, Keyframe, Points, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.network.pretrained import load_network
@@ -24,13 +23,14 @@ from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.simulated_drive import SimulatedDrive
 from dpm2_core.slam.build import make_mapper
 from dpm2_core.slam.loops.relocalization import Relocalizer, downsampled
+from dpm2_core.slam.loops.verification import Verifier
 from dpm2_core.slam.preprocess import Preprocessor
-from dpm2_core.slam.settings import Config, SlamSettings
+from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.slam.store.map_data import load_map
 from dpm2_core.slam.store.map_store import MapStore
 
 RIGHT_M, RIGHT_DEG = 0.3, 1.0
-"""An answer no farther off is right."""
+"""A result no farther off is right."""
 LATERAL = (-1.2, 3.0)
 """m to the left of the drive: as far as cars at the kerb leave room, and into the other lane."""
 APART = 5000.0
@@ -52,17 +52,15 @@ def bench_relocalise(options: Options) -> Report:
     Raises:
         UsageError: there are no pose files.
     """
-    settings = load_settings(Config, None, [f"slam.threads={options.threads}", *options.overrides]).slam
+    settings = settings_of(options)
     with Progress(transient=True) as progress, tempfile.TemporaryDirectory() as folder, processors(options.threads):
         file = Path(folder) / "map.dpm2"
         roads = survey(options, settings, file, progress)
         with MapStore.open(file) as store:
             data = load_map(store)
             network = load_network(settings.neural.weights, settings.threads, settings.neural.preset)
-            relocalizer = Relocalizer(
-                settings.relocalise, settings.geometric, network, data.keyframes, data.clouds, data.poses,
-                settings.threads,
-            )  # fmt: skip
+            verifier = Verifier(settings.relocalise.verification, settings.geometric, settings.threads)
+            relocalizer = Relocalizer(settings.relocalise, verifier, network, data.keyframes, data.clouds, data.poses)
             task = progress.add_task("relocalise", total=options.pairs)
             rows = []
             for cloud, truth in visits(roads, settings, options.pairs):
@@ -75,7 +73,7 @@ def bench_relocalise(options: Options) -> Report:
 
 
 def survey(options: Options, settings: SlamSettings, file: Path, progress: Progress) -> list[Road]:
-    """Write the map of all roads, poses as they truly are: relocalization alone is judged."""
+    """Write the map of all roads, poses as they truly are: relocalization alone is measured."""
     settings = settings.model_copy(update={"loops": settings.loops.model_copy(update={"gap": np.inf})})
     roads: list[Road] = []
     with MapStore.create(file) as store:
@@ -120,7 +118,7 @@ def spaced(drive: SimulatedDrive, meters: float) -> list[int]:
 
 
 def success_rates(rows: list[tuple[bool, float, float, float]]) -> dict[str, Any]:
-    """Figures of answers: given or not, m and degrees off, seconds."""
+    """Figures of results: found or not, m and degrees off, seconds."""
     ok, meters, degrees, seconds = (np.array(column) for column in zip(*rows, strict=True))
     right = ok & (meters <= RIGHT_M) & (degrees <= RIGHT_DEG)
     given = meters[ok.astype(bool)]
@@ -135,8 +133,7 @@ def success_rates(rows: list[tuple[bool, float, float, float]]) -> dict[str, Any
 
 
 def _row(result: Registration, truth: Array, seconds: float) -> tuple[bool, float, float, float]:
-    off = se3.inverse(result.T_target_source) @ truth
-    return result.ok, float(np.linalg.norm(off[:3, 3])), float(np.degrees(se3.angle(off))), seconds
+    return result.ok, *se3.magnitude(se3.inverse(result.T_target_source) @ truth), seconds
 
 
 def _measured(frame: Frame, settings: SlamSettings) -> Points:

@@ -13,9 +13,9 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from dpm2_core.commands.options import run_command
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.tables import FigureTable
-from dpm2_ros.runtime import exit_code
 from tools.replay import ros_environment, start, stop
 
 PLAYED = (("--rate", "1"), ("--rate", "2"), ("--lockstep",))
@@ -73,12 +73,5 @@ def together(bag: Path, played: tuple[str, ...]) -> tuple[int, tuple[int, ...], 
         return int(sent[1]), counts, account[5], (published[-1] - published[0]) * 1e-9
 
 
-def main() -> int:
-    """Entry point of `python -m benchmarks.replay`."""
-    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-    app.command()(bench)
-    return exit_code(lambda: app(standalone_mode=False))
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_command(bench))

@@ -12,16 +12,15 @@ import numpy as np
 from rich.console import Group
 from rich.progress import Progress
 
-from benchmarks.harness import Options, Report
+from benchmarks.harness import Options, Report, quantiles_ms, settings_of
 from benchmarks.loops import check_loops
-from dpm2_core.config import load_settings
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.metrics import evaluate
 from dpm2_core.sim.settings import PresetName
 from dpm2_core.sim.simulated_drive import SimulatedDrive
+from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.output import TrajectoryRecorder
-from dpm2_core.slam.settings import Config, SlamSettings
-from dpm2_core.slam.system import SlamSystem
+from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.tables import FigureTable
 
 ROADS: dict[str, PresetName] = {
@@ -39,7 +38,7 @@ def bench_roads(options: Options) -> Report:
     Raises:
         UsageError: there are no pose files.
     """
-    settings = load_settings(Config, None, [f"slam.threads={options.threads}", *options.overrides]).slam
+    settings = settings_of(options)
     roads: dict[str, Any] = {}
     with Progress(transient=True) as progress:
         for path in road_files(options):
@@ -58,32 +57,32 @@ def open_road(path: Path) -> SimulatedDrive:
 def drive(path: Path, settings: SlamSettings, progress: Progress) -> dict[str, Any]:
     """One road: metrics of odometry alone and of the SLAM, and its loops."""
     source = open_road(path)
-    system, recorder = SlamSystem(settings), TrajectoryRecorder()
+    slam, recorder = make_slam(settings), TrajectoryRecorder()
     task = progress.add_task(path.stem, total=len(source))
     failed, odometry_s, map_s = 0, [], []
     started = perf_counter()
     for frame in source.frames():
-        tracked = system.process(frame)
+        tracked = slam.process(frame).odometry
         recorder.add(tracked)
         failed += not tracked.registration.ok
         odometry_s.append(sum(tracked.seconds.values()) - tracked.seconds["map"])
         if tracked.keyframe is not None:
             map_s.append(tracked.seconds["map"])
         progress.advance(task)
-    mapper = system.mapper
+    mapper = slam.mapper
     keyframes = np.array([k.index for k in mapper.keyframes])
     alone = evaluate(source.poses, recorder.poses(np.array([k.T_odom_kf for k in mapper.keyframes])))
-    slam = evaluate(source.poses, recorder.poses(mapper.poses), failed_frames=failed)
+    corrected = evaluate(source.poses, recorder.poses(mapper.poses), failed_frames=failed)
     return {
         "frames": len(source),
-        "path_length_m": slam.path_length_m,
+        "path_length_m": corrected.path_length_m,
         "failed_frames": failed,
         "keyframes": len(keyframes),
         "odometry": {name: getattr(alone, name) for name in _ERRORS},
-        "slam": {name: getattr(slam, name) for name in _ERRORS},
-        "loops": check_loops(mapper.closures, source.poses[keyframes]),
-        "odometry_ms": _quantiles(odometry_s),
-        "keyframe_ms": _quantiles(map_s),
+        "slam": {name: getattr(corrected, name) for name in _ERRORS},
+        "loops": check_loops(mapper.loops, source.poses[keyframes]),
+        "odometry_ms": quantiles_ms(odometry_s),
+        "keyframe_ms": quantiles_ms(map_s),
         "wall_s": round(perf_counter() - started, 1),
     }
 
@@ -112,11 +111,6 @@ def _summary(roads: dict[str, Any]) -> dict[str, Any]:
         found = sum(road["loops"][kind]["found"] for road in roads.values())
         total[kind] = {"revisits": there, "found": found, "recall": round(found / there, 3) if there else None}
     return total
-
-
-def _quantiles(seconds: Sequence[float]) -> dict[str, float]:
-    median, p95 = np.percentile(1e3 * np.array(seconds), [50, 95])
-    return {"median": round(float(median), 1), "p95": round(float(p95), 1)}
 
 
 def _table(roads: dict[str, Any]) -> FigureTable:

@@ -24,20 +24,21 @@ from scipy.sparse.csgraph import connected_components
 from benchmarks.harness import Options
 from benchmarks.lossy_link import LOSS, Link, inside
 from benchmarks.roads import open_road, road_files
+from dpm2_core.commands.options import run_command
 from dpm2_core.config import load_settings
 from dpm2_core.console import Console
-from dpm2_core.errors import Dpm2Error
+from dpm2_core.errors import Dpm2Error, exit_code
 from dpm2_core.evaluation.metrics import align, ape_rmse
 from dpm2_core.evaluation.record import write_record
 from dpm2_core.frame import Array
 from dpm2_core.sim.simulated_drive import SimulatedDrive
+from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.settings import Config
 from dpm2_core.slam.store.map_data import MapData, load_map
 from dpm2_core.slam.store.map_store import MapStore
-from dpm2_core.slam.system import SlamSystem
 from dpm2_core.tables import FigureTable
 from dpm2_ros.conversions import cloud_to_msg, parse_keyframe_name
-from dpm2_ros.runtime import exit_code, ros_context
+from dpm2_ros.runtime import ros_context
 from tools.replay import ros_environment, start, stop
 
 ROAD = "07"
@@ -113,7 +114,7 @@ def bench(
     edges = np.array([(edge.from_node, edge.to_node) for edge in data.constraints]).T
     maps, _ = connected_components(coo_array((np.ones(edges.shape[1]), edges), shape=(len(data), len(data))))
     errors, alone = _errors(source, data), _alone(source)
-    robots = {name: _judge(data, name, made[name], errors) for name in SPANS}
+    robots = {name: _evaluated(data, name, made[name], errors) for name in SPANS}
     results = {
         "road": ROAD,
         "packet_loss": LOSS,
@@ -205,7 +206,7 @@ def _rms(errors: Array) -> float:
     return float(np.sqrt((errors**2).sum(1).mean()))
 
 
-def _judge(data: MapData, name: str, made: set[int], errors: Array) -> dict[str, float]:
+def _evaluated(data: MapData, name: str, made: set[int], errors: Array) -> dict[str, float]:
     own = np.array([keyframe.robot == name for keyframe in data.keyframes])
     ids = {keyframe.id for keyframe in data.keyframes if keyframe.robot == name}
     return {"keyframes": len(made), "keyframes_missing": len(made - ids), "ape_rmse_m": _rms(errors[own])}
@@ -213,22 +214,13 @@ def _judge(data: MapData, name: str, made: set[int], errors: Array) -> dict[str,
 
 def _alone(source: SimulatedDrive) -> float:
     """APE of the keyframes of one robot that drives all of the road in one process, without ROS, m."""
-    system = SlamSystem(load_settings(Config).slam)
+    slam = make_slam(load_settings(Config).slam)
     for n in range(0, SPANS["green"][1], EVERY):
-        system.process(source.frame(n))
-    system.mapper.finish()
-    frames = [keyframe.index for keyframe in system.mapper.keyframes]
-    return ape_rmse(source.poses[frames], system.mapper.poses)
-
-
-def main() -> int:
-    """Entry point of `python -m benchmarks.robots`."""
-    if not inside():
-        return Link.own_network("benchmarks.robots")
-    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-    app.command()(bench)
-    return exit_code(lambda: app(standalone_mode=False))
+        slam.process(source.frame(n))
+    slam.mapper.finish()
+    frames = [keyframe.index for keyframe in slam.mapper.keyframes]
+    return ape_rmse(source.poses[frames], slam.mapper.poses)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_command(bench) if inside() else exit_code(lambda: Link.own_network("benchmarks.robots")))

@@ -13,6 +13,7 @@ import typer
 from rich.console import Group
 
 from benchmarks.harness import Options, Report, drives, write_report
+from dpm2_core.commands.options import run_command
 from dpm2_core.console import Console
 from dpm2_core.data import topics
 from dpm2_core.data.bags import BagSource
@@ -20,7 +21,6 @@ from dpm2_core.data.convert import convert_kitti
 from dpm2_core.data.kitti import KittiSource
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.tables import FigureTable
-from dpm2_ros.runtime import exit_code
 from tools.demo import evaluate_replay
 from tools.replay import replay
 
@@ -32,7 +32,7 @@ def bench(
     out: Annotated[Path, typer.Option(help="Folder for ros.json.")] = Path("benchmarks"),
     repetitions: Annotated[int, typer.Option(min=1, help="Replays of every drive.")] = 3,
 ) -> int:
-    """Replay every drive at its own speed and judge what comes out; medians, and the worst of what must not happen."""
+    """Replay every drive at its own speed and evaluate the poses; medians, and the worst of what must not happen."""
     options = Options(sources=source or (), repetitions=repetitions)
     results: dict[str, dict[str, float | int | None]] = {}
     with drives(options) as sources, tempfile.TemporaryDirectory(prefix="dpm2_bench_ros_") as folder:
@@ -40,7 +40,7 @@ def bench(
             assert isinstance(drive, KittiSource)
             bag, work = Path(folder) / f"bag_{drive.name}", Path(folder) / drive.name
             work.mkdir()
-            convert_kitti(drive.path, bag)
+            convert_kitti(KittiSource(drive.path), bag)
             played = BagSource(bag, InputSettings(images=False))
             runs = [evaluate_replay(played, replay(bag, topics.POINTS, work), work) for _ in range(repetitions)]
             results[drive.name] = {
@@ -64,12 +64,5 @@ def _median(values: list[float | int | None], worst: bool) -> float | None:
     return float(max(known) if worst else np.median(known))
 
 
-def main() -> int:
-    """Entry point of `python -m benchmarks.ros`."""
-    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-    app.command()(bench)
-    return exit_code(lambda: app(standalone_mode=False))
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_command(bench))

@@ -12,12 +12,10 @@ from pathlib import Path
 from statistics import mean, median, stdev
 from typing import Any, Literal
 
-import torch
 from rich.console import Group
 
-from benchmarks.harness import Options, Report, processors, write_report
+from benchmarks.harness import Options, Report, earlier, processors, requested, rounded, torch_threads, write_report
 from dpm2_core.config import dump_settings, load_settings
-from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.record import git_commit
 from dpm2_core.files import atomic_write
 from dpm2_core.tables import FigureTable
@@ -26,7 +24,7 @@ from dpm2_core.tasks.open import open_scans
 from dpm2_core.tasks.scan import TaskScans
 from dpm2_core.tasks.slam_figures import slam_figures
 from dpm2_core.tasks.task import SlamTaskTraining, task_type
-from dpm2_core.tasks.training import WEIGHTS, load_task, measure, train_task
+from dpm2_core.tasks.training import WEIGHTS, load_task, measure, new_task, train_task
 
 Better = Literal["lower", "higher"]
 _DONE = "settings.yaml"  # beside the weights of a training that ended
@@ -39,8 +37,8 @@ class Comparison:
     Attributes:
         settings: `key=value` of its training, the arm without the SLAM loss being the same with gamma 0.
         figures: of `Task.evaluate`, and which way is better.
-        drives: synthetic drives to learn from and to be judged on. drives_of: the task in whose folder they are.
-        slam: odometry on the clouds that the task makes is judged as well.
+        drives: synthetic drives for training and evaluation. drives_of: the task in whose folder they are.
+        slam: odometry on the clouds that the task makes is evaluated as well.
     """
 
     settings: tuple[str, ...]
@@ -93,35 +91,20 @@ def bench_tasks(options: Options) -> Report:
     A training that ended in an earlier run with the same settings is not repeated, one that was stopped goes on, and
     tasks.json is written after each.
     """
-    if options.only is not None and options.only not in COMPARISONS:
-        raise UsageError(f"--only {options.only}: no such task; choose from {', '.join(COMPARISONS)}")
-    path = options.out / "tasks.json"
-    parts = _read(path)
-    threads = torch.get_num_threads()
-    torch.set_num_threads(options.threads)
-    try:
-        with processors(options.threads):
-            for name in COMPARISONS if options.only is None else (options.only,):
-                if options.only is None and parts.get(name, {}).get("complete"):
-                    continue
-                for part in _compare(name, COMPARISONS[name], options):
-                    parts = {**_read(path), name: part}  # another process may have written its task
-                    write_report(path, "tasks", _report(parts), options)
-    finally:
-        torch.set_num_threads(threads)
+    chosen, path = requested(options, COMPARISONS), options.out / "tasks.json"
+    parts = earlier(path, "parts")
+    with torch_threads(options.threads), processors(options.threads):
+        for name in chosen:
+            if options.only is None and parts.get(name, {}).get("complete"):
+                continue
+            for part in _compare(name, COMPARISONS[name], options):
+                parts = {**earlier(path, "parts"), name: part}  # another process may have written its task
+                write_report(path, "tasks", _report(parts), options)
     return _report(parts)
 
 
 def _report(parts: dict[str, Any]) -> Report:
     return Report({"parts": parts}, _view(parts))
-
-
-def _read(path: Path) -> dict[str, Any]:
-    """Parts of an earlier run; none if the file is damaged or not there."""
-    try:
-        return dict(json.loads(path.read_text(encoding="utf-8"))["parts"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return {}
 
 
 def _compare(name: str, comparison: Comparison, options: Options) -> Any:
@@ -130,7 +113,7 @@ def _compare(name: str, comparison: Comparison, options: Options) -> Any:
     folder = options.cache / "tasks" / name
     drives = options.cache / "tasks" / (comparison.drives_of or name) / "drives"
     make_task_drives(drives, comparison.drives, options.threads)
-    learn, judge = (open_scans(drives / which, kind.needs) for which in ("train", "val"))
+    train, val = (open_scans(drives / which, kind.needs) for which in ("train", "val"))
     overrides = [*comparison.settings, *options.overrides]
     chosen = load_settings(kind.training_type, None, overrides)
     assert isinstance(chosen, SlamTaskTraining)
@@ -141,7 +124,7 @@ def _compare(name: str, comparison: Comparison, options: Options) -> Any:
         "threads": options.threads,
         "settings": overrides,
         "drives": comparison.drives.model_dump(mode="json"),
-        "scans": {"train": len(learn), "val": len(judge)},
+        "scans": {"train": len(train), "val": len(val)},
         "shared_epochs": shared,
         "complete": False,
         "runs": {"without": {}, "with": {}},
@@ -151,11 +134,11 @@ def _compare(name: str, comparison: Comparison, options: Options) -> Any:
             slam = chosen.slam.model_copy(update={"gamma": gamma})
             settings = chosen.model_copy(update={"seed": seed, "slam": slam})
             out = folder / f"{variant}_{seed}"
-            _train(name, settings, learn, out, shared)
-            figures = _measured(name, settings, judge, out)
+            _train(name, settings, train, out, shared)
+            figures = _measured(name, settings, val, out)
             if comparison.slam:
                 slam_on = slam_figures(load_task(name, out / WEIGHTS), drives / "val")
-                figures |= {figure: _figure(value) for figure, value in slam_on.items()}
+                figures |= {figure: rounded(value) for figure, value in slam_on.items()}
             part["runs"][variant][str(seed)] = figures
             part["summary"] = summary(part["runs"], comparison.figures)
             part["complete"] = seed + 1 == options.repetitions and variant == "with"
@@ -182,23 +165,23 @@ def _train(
         resume = True
     with atomic_write(begun) as file:
         file.write(text)
-    train_task(name, settings, learn, out, resume, until=until)
+    train_task(new_task(name, settings), learn, out, resume, until=until)
     with atomic_write(out / _DONE) as file:
         file.write(text)
 
 
-def _measured(name: str, settings: SlamTaskTraining, judge: TaskScans, out: Path) -> dict[str, Any]:
+def _measured(name: str, settings: SlamTaskTraining, val: TaskScans, out: Path) -> dict[str, Any]:
     """Figures of one training on the scans of other worlds, and how the SLAM loss stood beside the task's."""
-    figures = measure(load_task(name, out / WEIGHTS), judge)
+    figures = measure(load_task(name, out / WEIGHTS), val)
     logged = (json.loads(line) for line in (out / "log.jsonl").read_text().splitlines())
     # A training that was stopped may have logged steps twice, and goes on after the last checkpoint.
     rows = list({row["step"]: row for row in logged if "norm" in row}.values())
     epoch = len(rows) // settings.epochs
     first = [row for row in rows if row.get("slam_loss") is not None][:epoch]
     return {
-        **{figure: _figure(value) for figure, value in figures.items()},
-        "last_task_loss": _figure(median(row["task_loss"] for row in rows[-epoch:])),
-        "slam_share_at_first": _figure(
+        **{figure: rounded(value) for figure, value in figures.items()},
+        "last_task_loss": rounded(median(row["task_loss"] for row in rows[-epoch:])),
+        "slam_share_at_first": rounded(
             settings.slam.gamma * median(row["slam_loss"] / row["task_loss"] for row in first)) if first else None,
         "skipped_steps": sum(row["norm"] is None for row in rows),
     }  # fmt: skip
@@ -216,7 +199,7 @@ def summary(runs: dict[str, dict[str, dict[str, Any]]], figures: dict[str, Bette
     for figure, better in figures.items():
         variants = {variant: [run[figure] for run in of.values()] for variant, of in runs.items()}
         row: dict[str, Any] = {
-            variant: {"mean": _figure(mean(values)), "std": _figure(stdev(values)) if len(values) > 1 else None}
+            variant: {"mean": rounded(mean(values)), "std": rounded(stdev(values)) if len(values) > 1 else None}
             for variant, values in variants.items()
             if values
         }
@@ -224,24 +207,20 @@ def summary(runs: dict[str, dict[str, dict[str, Any]]], figures: dict[str, Bette
             gap = mean(variants["with"]) - mean(variants["without"])
             sign = -1 if better == "lower" else 1
             size = abs(mean(variants["without"]))
-            row["gain"] = _figure(sign * gap / size)
+            row["gain"] = rounded(sign * gap / size)
             if min(map(len, variants.values())) > 1:
                 row["beyond_spread"] = abs(gap) > sum(stdev(values) for values in variants.values())
             seeds = sorted(runs["with"].keys() & runs["without"].keys())
             better_by = [sign * (runs["with"][s][figure] - runs["without"][s][figure]) for s in seeds]
             if len(seeds) > 1:
                 row["paired"] = {
-                    "mean": _figure(mean(better_by) / size),
-                    "standard_error": _figure(stdev(better_by) / len(seeds) ** 0.5 / size),
+                    "mean": rounded(mean(better_by) / size),
+                    "standard_error": rounded(stdev(better_by) / len(seeds) ** 0.5 / size),
                     "better": sum(value > 0 for value in better_by),
                     "seeds": len(seeds),
                 }
         out[figure] = row
     return out
-
-
-def _figure(x: float) -> float:
-    return float(f"{x:.4g}")
 
 
 def _view(parts: dict[str, Any]) -> Group:

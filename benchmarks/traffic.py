@@ -3,9 +3,7 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
-from pathlib import Path
 from statistics import mean, median, pstdev
 from time import process_time
 from typing import Any
@@ -15,9 +13,7 @@ import torch
 from numpy.typing import NDArray
 from rich.console import Group
 
-from benchmarks.harness import Options, Report, overrides_of, write_report
-from dpm2_core.config import load_settings
-from dpm2_core.errors import UsageError
+from benchmarks.harness import Options, Report, earlier, requested, settings_of, write_report
 from dpm2_core.evaluation.metrics import evaluate
 from dpm2_core.evaluation.record import git_commit
 from dpm2_core.frame import Frame, Points
@@ -28,7 +24,7 @@ from dpm2_core.sim.world import World, build_world
 from dpm2_core.slam.build import make_odometry
 from dpm2_core.slam.filters import FilterKind, FilterSettings, make_filter
 from dpm2_core.slam.odometry.odometry import Odometry
-from dpm2_core.slam.settings import Config, SlamSettings
+from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.tables import FigureTable
 
 PLACES: dict[PresetName, float] = {"city": 20.0, "suburb": 40.0, "rural": 40.0}
@@ -56,16 +52,14 @@ def bench_traffic(options: Options) -> Report:
     Raises:
         UsageError: no such registration.
     """
-    if options.only is not None and options.only not in REGISTRATIONS:
-        raise UsageError(f"--only {options.only}: no such registration; choose from {', '.join(REGISTRATIONS)}")
-    requested = REGISTRATIONS if options.only is None else (options.only,)
+    chosen = requested(options, REGISTRATIONS)
     path = options.out / "traffic.json"
-    drives = _read(path, options)
+    drives = earlier(path, "drives", recipe=_recipe(options))
     for preset, traffic in PLACES.items():
         for seed in range(FIRST_SEED, FIRST_SEED + options.repetitions):
             name = f"{preset} {seed}"
             runs = drives.get(name, {}).get("runs", {})
-            missing = {r: [m for m in _methods(r) if m not in runs.get(r, {})] for r in requested}
+            missing = {r: [m for m in _methods(r) if m not in runs.get(r, {})] for r in chosen}
             if not any(missing.values()):
                 continue
             world = build_world("straight", preset, seed, traffic=traffic)
@@ -74,7 +68,8 @@ def bench_traffic(options: Options) -> Report:
             ratio = mean(float(moving.mean()) for _, moving in scans)
             drives[name] = {"traffic": traffic, "share_moving": ratio, "runs": runs}
             for registration, methods in missing.items():
-                found = {m: _run(scans, truth, _settings(options, registration), m) for m in methods}
+                settings = settings_of(options, f"slam.registration={registration}")
+                found = {m: _run(scans, truth, settings, m) for m in methods}
                 runs[registration] = runs.get(registration, {}) | found
                 write_report(path, "traffic", _report(drives, options), options)
     return _report(drives, options)
@@ -84,10 +79,6 @@ def _methods(registration: str) -> list[str]:
     """What is compared: `none`, the filters that have weights (with a network `movers` alone), the oracle."""
     shipped = [kind for kind, name in PERCEPTION_WEIGHTS.items() if (PRETRAINED_DIR / f"{name}.safetensors").is_file()]
     return ["none", *(kind for kind in shipped if registration == "geometric" or kind == "movers"), ORACLE]
-
-
-def _settings(options: Options, registration: str) -> SlamSettings:
-    return load_settings(Config, None, overrides_of(options, registration)).slam
 
 
 def _scans(world: World) -> Iterator[tuple[Points, NDArray[np.bool_]]]:
@@ -124,7 +115,7 @@ def _odometry(odometry: Odometry, clouds: list[Points], truth: NDArray[np.float6
     return {**{name: getattr(checked, name) for name in _ERRORS}, "failed_frames": failed, "cpu_ms": 1e3 * seconds}
 
 
-def _summary(drives: dict[str, Any]) -> dict[str, Any]:
+def summarized(drives: dict[str, Any]) -> dict[str, Any]:
     """Of each registration and method, over the drives that have it: mean, spread and median, drives diverged, ratios.
 
     `ratio`: of means and medians to those of `none` on the same drives.
@@ -159,17 +150,8 @@ def _recipe(options: Options) -> dict[str, Any]:
     }
 
 
-def _read(path: Path, options: Options) -> dict[str, Any]:
-    """Drives of an earlier run of the same settings; none if the file is of others, damaged or not there."""
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-        return dict(record["drives"]) if record["recipe"] == _recipe(options) else {}
-    except (OSError, ValueError, KeyError, TypeError):
-        return {}
-
-
 def _report(drives: dict[str, Any], options: Options) -> Report:
-    summary = _summary(drives)
+    summary = summarized(drives)
     results = {"recipe": _recipe(options), "summary": summary, "drives": drives, "torch": torch.__version__,
                "measured_at": git_commit()}  # fmt: skip
     title, figures = "RPE in dense traffic, mean over drives (median)", ["RPE m", "RPE deg", "astray", "CPU ms"]

@@ -111,7 +111,7 @@ def corruption(network: DeepPointMap2, options: Options) -> dict[str, Any]:
 
 
 def image_matters(network: DeepPointMap2, options: Options) -> dict[str, Any]:
-    """Highway and tunnel, whose geometry does not tell the motion: with the camera, without, and KISS-ICP.
+    """Highway and tunnel, whose geometry does not constrain the motion: with the camera, without, and KISS-ICP.
 
     `descriptors` is the network alone; `neural` and `refined` are what the SLAM runs, the image along the open
     direction included.
@@ -127,7 +127,7 @@ def image_matters(network: DeepPointMap2, options: Options) -> dict[str, Any]:
             word = "with camera" if images else "without camera"
             methods[f"descriptors {word}"] = pairs.errors(network)[:, [0, 2, 3]]
             for name in ("neural", "refined"):
-                registered = by_registration(make_registration(settings_of(options, name)))
+                registered = by_registration(make_registration(settings_of(options, f"slam.registration={name}")))
                 methods[f"{name} {word}"] = _near_errors(pairs, registered)
         if config is not None:
             methods[BASELINE] = _near_errors(pairs, kiss_from_identity(config))
@@ -139,17 +139,13 @@ def image_matters(network: DeepPointMap2, options: Options) -> dict[str, Any]:
 
 
 def _near_errors(pairs: PairSet, register: PairMethod) -> Array:
-    """(pairs, 3) distance m, translation error m, rotation error deg; infinite without an answer and for far pairs."""
+    """(pairs, 3) distance m, translation error m, rotation error deg; infinite without a result and for far pairs."""
     frames = {i: _turned(pairs, key, i) for key, i in pairs.frames.items()}
     rows = []
     for source, target, T, distance in pairs.pairs:
         found = register(frames[target], frames[source]) if distance <= NEAR else None
-        off = se3.inverse(T) @ found if found is not None else None
-        rows.append(
-            (distance, np.inf, np.inf)
-            if off is None
-            else (distance, np.linalg.norm(off[:3, 3]), np.degrees(se3.angle(off)))
-        )
+        error = (np.inf, np.inf) if found is None else se3.magnitude(se3.inverse(T) @ found)
+        rows.append((distance, *error))
     return np.array(rows)
 
 

@@ -8,9 +8,11 @@ The names below are the public API; `examples/` shows them at work. Each is impo
   of any known format. `write_kitti` and `write_tum` write trajectories.
 * Settings: `Config` holds those of `dpm2 run`, `SlamSettings` those of the SLAM alone, `InputSettings` those of a
   recording. `load_settings(Config, file, ["slam.threads=4"])` reads them from YAML, `dump_settings` writes them.
-* SLAM: `SlamSystem(settings).process(frame)` gives an `OdometryResult` with a `Registration` and a `State`, and makes
-  `Keyframe`s for the map; `make_odometry(settings)` does without the map. `open_session` makes or extends a map file.
-  `open_for_localization` opens one for `LocalizationSystem`, whose results are `LocalizationResult`s.
+* SLAM: `make_slam(settings)` puts a `Slam` together, whose `process(frame)` gives a `SlamResult`: the `OdometryResult`
+  with its `Registration` and `State`, and, of a frame that became a `Keyframe`, the loops (`Edge`s) that were tried.
+  `make_odometry` does without the map. `open_session` makes or extends a map file; with one from
+  `open_for_localization` the map stays as it is, and keyframes are found in it (`LocalizationResult`).
+  `OfflineRun(recording, config).run()` is `dpm2 run`.
 * Network: `load_network(name, threads)` gives a network whose `describe` makes `Descriptors` of a frame, and whose
   `register` finds the `Registration` of two.
 * Figures: `trajectory_png` draws a trajectory on its map, `matches_png` a registration; both need the extra `plot`.
@@ -37,29 +39,32 @@ if TYPE_CHECKING:
     from dpm2_core.errors import Dpm2Error, UsageError
     from dpm2_core.evaluation.figures import trajectory_png
     from dpm2_core.evaluation.matches import matches_png
-    from dpm2_core.frame import Camera, Frame, Image, Keyframe, OdometryResult, Registration, State
+    from dpm2_core.frame import Camera, Edge, Frame, Image, Keyframe, OdometryResult, Registration, State
     from dpm2_core.network.pretrained import load_network
-    from dpm2_core.slam.build import make_odometry
+    from dpm2_core.pipeline import OfflineRun
+    from dpm2_core.slam.build import make_odometry, make_slam
     from dpm2_core.slam.loops.localizer import LocalizationResult
     from dpm2_core.slam.session import open_for_localization, open_session
     from dpm2_core.slam.settings import Config, SlamSettings
-    from dpm2_core.slam.system import LocalizationSystem, SlamSystem
+    from dpm2_core.slam.system import Slam, SlamResult
 
 __all__ = [
     "Camera",
     "Config",
     "Descriptors",
     "Dpm2Error",
+    "Edge",
     "Frame",
     "Image",
     "InputSettings",
     "Keyframe",
     "LocalizationResult",
-    "LocalizationSystem",
     "OdometryResult",
+    "OfflineRun",
     "Registration",
+    "Slam",
+    "SlamResult",
     "SlamSettings",
-    "SlamSystem",
     "Source",
     "State",
     "UsageError",
@@ -68,6 +73,7 @@ __all__ = [
     "load_network",
     "load_settings",
     "make_odometry",
+    "make_slam",
     "matches_png",
     "open_for_localization",
     "open_session",
@@ -87,13 +93,14 @@ _MODULES = {
     "errors": "Dpm2Error UsageError",
     "evaluation.figures": "trajectory_png",
     "evaluation.matches": "matches_png",
-    "frame": "Camera Frame Image Keyframe OdometryResult Registration State",
+    "frame": "Camera Edge Frame Image Keyframe OdometryResult Registration State",
     "network.pretrained": "load_network",
-    "slam.build": "make_odometry",
+    "pipeline": "OfflineRun",
+    "slam.build": "make_odometry make_slam",
     "slam.loops.localizer": "LocalizationResult",
     "slam.session": "open_for_localization open_session",
     "slam.settings": "Config SlamSettings",
-    "slam.system": "LocalizationSystem SlamSystem",
+    "slam.system": "Slam SlamResult",
 }
 """The public names by the module that has them, as under TYPE_CHECKING above."""
 _PLACES = {name: module for module, names in _MODULES.items() for name in names.split()}

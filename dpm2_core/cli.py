@@ -15,12 +15,12 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from dpm2_core._version import __version__
-from dpm2_core.errors import Dpm2Error, UsageError, printable
+from dpm2_core.errors import exit_code
 from dpm2_core.openmp import wait_passively
 
 COMMANDS = {
     "run": ("run:run", "Run the SLAM on a recording and write trajectory, map, image, timing and metrics."),
-    "eval": ("eval:eval_", "Judge a trajectory: KITTI metric, APE, RPE and final drift."),
+    "eval": ("eval:eval_", "Evaluate a trajectory: KITTI metric, APE, RPE and final drift."),
     "show": (
         "show:show",
         "Draw two scans from above with their matched descriptors, colored by confidence, and how they fit.",
@@ -94,21 +94,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _status(arguments: Sequence[str] | None) -> int:
-    try:
-        return app(args=list(arguments) if arguments is not None else None, standalone_mode=False) or 0
-    except UsageError as error:
-        print(f"dpm2: {printable(str(error))}", file=sys.stderr)
-        return 2
-    except Dpm2Error as error:
-        print(f"dpm2: {printable(str(error))}", file=sys.stderr)
-        return 1
-    except Exception as error:
-        # click's own errors of use (an unknown option, a missing argument) know their exit code and their message.
-        message, code = getattr(error, "format_message", None), getattr(error, "exit_code", None)
-        if message is None or code is None:
-            raise
-        print(f"dpm2: {' '.join(message().split()) or 'see dpm2 --help'}", file=sys.stderr)
-        return int(code)
+    args = None if arguments is None else list(arguments)
+    return exit_code(lambda: app(args=args, standalone_mode=False), "dpm2")
 
 
 if __name__ == "__main__":

@@ -42,7 +42,7 @@ def load_settings(kind: type[T], path: Path | None = None, overrides: Sequence[s
     tree: dict[str, Any] = {}
     origin: dict[str, str] = {}
     if path is not None:
-        _merge(tree, _read(path))
+        _merge(tree, read_yaml(path))
     for setting in overrides:
         key, equals, text = setting.partition("=")
         key = key.strip()
@@ -77,16 +77,12 @@ def merged(tree: Mapping[str, Any], more: Mapping[str, Any]) -> dict[str, Any]:
     return out
 
 
-def flat_fields(kind: type[Settings], prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
-    """Dotted name and field of every leaf: the names that `--set` and the ROS parameters share."""
-    for name, info in kind.model_fields.items():
-        if isinstance(info.annotation, type) and issubclass(info.annotation, Settings):
-            yield from flat_fields(info.annotation, f"{prefix}{name}.")
-        else:
-            yield prefix + name, info
+def read_yaml(path: Path) -> dict[str, Any]:
+    """The mapping in a YAML file; {} for an empty one.
 
-
-def _read(path: Path) -> dict[str, Any]:
+    Raises:
+        UsageError: the file is missing, or holds something else.
+    """
     try:
         tree = yaml.safe_load(path.read_text(encoding="utf-8"))
         json.dumps(tree, default=str, skipkeys=True)  # rejects a mapping that holds itself through an alias
@@ -99,6 +95,15 @@ def _read(path: Path) -> dict[str, Any]:
     if not isinstance(tree, dict):
         raise UsageError(f"{path}: want a mapping of keys, found {type(tree).__name__}")
     return tree
+
+
+def flat_fields(kind: type[Settings], prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
+    """Dotted name and field of every leaf: the names that `--set` and the ROS parameters share."""
+    for name, info in kind.model_fields.items():
+        if isinstance(info.annotation, type) and issubclass(info.annotation, Settings):
+            yield from flat_fields(info.annotation, f"{prefix}{name}.")
+        else:
+            yield prefix + name, info
 
 
 def _value(text: str) -> Any:

@@ -50,7 +50,7 @@ class Connection(sqlite3.Connection):
 
 
 class _Steps:
-    """Counts calls; the one beyond `most` tells SQLite to stop."""
+    """Counts calls; the one beyond `most` makes SQLite stop."""
 
     def __init__(self, most: int) -> None:
         self.taken, self._most = 0, most
@@ -64,7 +64,7 @@ def connect(path: Path, mode: str, timeout: float = 5.0, size: int | None = None
     """Open a database file.
 
     Args:
-        mode: of SQLite's file URIs: ro, rw, rwc; `ro&immutable=1` for a file that nobody writes to.
+        mode: of SQLite's file URIs: ro, rw, rwc; `ro&immutable=1` for a file without a writer.
         size: of the file where it is to be another than that of `path` now, bytes.
     """
     if size is None:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,6 +53,26 @@ class Descriptors:
         axis = self.axes @ R[:2, :2].T
         axis /= np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), 1e-6)
         return Descriptors(self.xyz @ R.T + T[:3, 3].astype(np.float32), self.features, axis)
+
+
+class LazyDescriptors:
+    """Descriptors of a scan, made when they are first needed: that takes the network as long as all else together."""
+
+    def __init__(self, make: Callable[[], Descriptors | None]) -> None:
+        """`make`: gives None for a scan that has too few points."""
+        self._make: Callable[[], Descriptors | None] | None = make
+        self._value: Descriptors | None = None
+
+    @property
+    def made(self) -> bool:
+        """Whether they were needed."""
+        return self._make is None
+
+    def get(self) -> Descriptors | None:
+        """The descriptors; None of a scan that has too few points."""
+        if self._make is not None:
+            self._value, self._make = self._make(), None  # which held the scan's points
+        return self._value
 
 
 def merge(sets: Sequence[Descriptors]) -> Descriptors:

@@ -1,13 +1,38 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The two ways a call can fail that are not a bug; the command line turns them into exit codes 2 and 1."""
+"""The two ways a call can fail that are not a bug, and what a process makes of them."""
+
+import sys
+from collections.abc import Callable
 
 
 class Dpm2Error(Exception):
-    """The work failed: a full disk, a damaged file found half-way. One line, naming what and where. Exit code 1."""
+    """The work failed: a full disk, a damaged file found half-way. One line, naming what and where."""
+
+    exit_code = 1
 
 
 class UsageError(Dpm2Error):
-    """The request cannot be carried out as given: no such file, an unknown key, a missing extrinsic. Exit code 2."""
+    """The request cannot be carried out as given: no such file, an unknown key, a missing extrinsic."""
+
+    exit_code = 2
+
+
+def exit_code(work: Callable[[], int | None], name: str = "error") -> int:
+    """Run `work` and return its exit code; where it fails, that of the error, which is one line on stderr after `name`.
+
+    An error that is a bug is raised.
+    """
+    try:
+        return work() or 0
+    except Exception as error:
+        code = getattr(error, "exit_code", None)
+        if code is None:
+            raise
+        text = str(error)
+        if hasattr(error, "format_message"):  # click's own errors of use: an unknown option, a missing argument
+            text = " ".join(error.format_message().split()) or "see --help"
+        print(f"{name}: {printable(text)}", file=sys.stderr)
+        return int(code)
 
 
 def printable(text: str) -> str:

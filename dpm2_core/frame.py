@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,23 +85,23 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """The answer of every registration, geometric or neural.
+    """The result of every registration, geometric or neural.
 
     Attributes:
         T_target_source: (4, 4) float64.
         covariance: (6, 6) [rotation rad, translation m] of xi in T = T_target_source @ Exp(xi).
         confidence: 0..1, 0 for a guess.
         rmse: root mean square residual of the inliers, m.
-        method: who answered.
+        method: how it was found.
         ok: False: do not use it; `reason` says why in words.
-        overlap: probability that both saw the same place, 0..1; NaN where nobody judged it.
+        overlap: probability that both saw the same place, 0..1; NaN where it was not estimated.
     """
 
     T_target_source: Array
     covariance: Array
-    confidence: float
-    rmse: float
-    method: str
+    confidence: float = 1.0
+    rmse: float = 0.0
+    method: str = ""
     ok: bool = True
     reason: str = ""
     overlap: float = float("nan")
@@ -137,6 +138,7 @@ class Keyframe:
         cloud: (M, 4) float32 sub-sampled points in its own LiDAR frame: the map and later refinement.
         edge: registration of this keyframe to the one before, T_before_this; None for the first.
         descriptors: neural ones, in its own LiDAR frame; None where the registration makes none.
+        thumbnail: JPEG for the map file, or None.
     """
 
     id: int
@@ -147,22 +149,47 @@ class Keyframe:
     edge: Registration | None = None
     robot: str = ""
     descriptors: Descriptors | None = None
+    thumbnail: bytes | None = None
 
 
 @dataclass(frozen=True, eq=False)
-class LoopClosure:
-    """A verified or rejected loop: `registration.T_target_source` is T_from_to; `registration.ok` says accepted."""
+class Edge:
+    """A constraint between two keyframes: of the odometry, or a loop from its proposal to its row in the map file.
 
-    from_id: int
-    to_id: int
+    Attributes:
+        kind: "odometry" or "loop".
+        from_node, to_node: positions among the keyframes of the map.
+        registration: its `T_target_source` is T_from_to; `ok` False: rejected, `reason` says why.
+    """
+
+    kind: Literal["odometry", "loop"]
+    from_node: int
+    to_node: int
     registration: Registration
-    from_robot: str = ""
-    to_robot: str = ""
+
+    @property
+    def T_from_to(self) -> Array:
+        """(4, 4)."""
+        return self.registration.T_target_source
+
+    @property
+    def covariance(self) -> Array:
+        """(6, 6) [rotation rad, translation m] of xi in T_from_to @ Exp(xi)."""
+        return self.registration.covariance
+
+    @property
+    def ok(self) -> bool:
+        """Whether it constrains the poses."""
+        return self.registration.ok
+
+    def rejected(self, reason: str) -> Edge:
+        """The same edge, which does not constrain the poses."""
+        return replace(self, registration=replace(self.registration, ok=False, reason=reason))
 
 
 @dataclass(frozen=True, eq=False)
 class OdometryResult:
-    """What the odometry knows after one frame.
+    """The state of the odometry after one frame.
 
     Attributes:
         stamp: ns, that of the cloud. index: `Frame.index`.

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from time import perf_counter
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from dpm2_core.config import dump_settings
 from dpm2_core.data.open import open_source
 from dpm2_core.data.ply import write_ply
 from dpm2_core.data.prefetch import prefetch
-from dpm2_core.data.source import Source
+from dpm2_core.data.source import Source, Span
 from dpm2_core.data.trajectory import Trajectory, matched, write_kitti, write_tum
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.figures import trajectory_png
@@ -28,23 +28,19 @@ from dpm2_core.evaluation.metrics import Metrics, evaluate
 from dpm2_core.extras import MissingPackageError
 from dpm2_core.files import atomic_write
 from dpm2_core.frame import Array, OdometryResult
+from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.output import TrajectoryRecorder
-from dpm2_core.slam.session import open_session, resume_at
+from dpm2_core.slam.session import MapMode, open_map, resume_at
 from dpm2_core.slam.settings import Config
-from dpm2_core.slam.system import SlamSystem
-
-MapMode = Literal["create", "resume", "extend"]
-"""What to do with a map file: make it, go on with the drive that was cut off, or add another drive."""
-Span = tuple[int, int | None]
-"""Positions of the first frame and of the one after the last; None: to the end."""
+from dpm2_core.slam.system import SlamResult
 
 
 class OfflineRun:
     """One drive through the SLAM. A context manager: leaving it closes the map file, if there is one.
 
     Attributes:
-        source: the recording. mapper: the map so far.
+        source: the recording. slam: what it goes through.
     """
 
     def __init__(
@@ -61,28 +57,27 @@ class OfflineRun:
         Args:
             source: a recording, or the path of one, which is then opened with `config.input`.
             ground_truth: file of poses (KITTI: left camera; TUM: LiDAR); those of the source otherwise.
-            map_file: written as the drive goes on.
+            map_file: written as the drive goes on; with "localize" read, and left as it is.
 
         Raises:
             UsageError: no such recording, no frames in that span, ground truth of another drive, no such weights, or a
-                map file that is there already or does not fit. Dpm2Error: the map file cannot be written.
+                map file that is there already, is missing or does not fit. Dpm2Error: it cannot be read or written.
         """
         self._config = config or Config()
         self._resources = ExitStack()
-        store = None
-        if map_file is not None:
-            store = open_session(map_file, self._config.slam, dump_settings(self._config), map_mode != "create")
-            self._resources.enter_context(store)
+        self._truth: Array | Trajectory | None = None
+        store = None if map_file is None else self._resources.enter_context(open_map(map_file, self._config, map_mode))
         try:
-            self._system = SlamSystem(self._config.slam, store=store)
+            self.slam = make_slam(self._config.slam, store=store)
             if isinstance(source, (Path, str)):
-                source = open_recording(source, self._config, self._uses_images)
+                source = open_recording(source, self._config, self.slam.uses_images)
             self.source = source
             self._start, self._stop = span_of(self.source, frames)
             if map_mode == "resume":
-                self._start = resume_at(self._system.mapper, self.source, self._start)
+                self._start = resume_at(self.slam.mapper, self.source, self._start)
                 _check_span(self.source, self._start, self._stop, frames)
-            self._truth = read_ground_truth(self.source, ground_truth, self._start, self._stop)
+            if map_mode != "localize":  # the frame of the map is its own
+                self._truth = read_ground_truth(self.source, ground_truth, self._start, self._stop)
         except BaseException:
             self.close()
             raise
@@ -102,31 +97,23 @@ class OfflineRun:
         """Close the map file; a `Result` must be saved before."""
         self._resources.close()
 
-    @property
-    def mapper(self) -> Mapper:
-        return self._system.mapper
-
-    @property
-    def _uses_images(self) -> bool:
-        return self._system.odometry.uses_images or self._config.slam.map.thumbnail > 0
-
-    def run(self, progress: Callable[[OdometryResult], None] = lambda tracked: None) -> Result:
+    def run(self, progress: Callable[[SlamResult], None] = lambda result: None) -> Result:
         """All frames through the SLAM, once; Ctrl-C ends it early, and the result is of the frames until then.
 
         Args:
             progress: called after each frame.
         """
-        result = Result(self.source, self._config, self.mapper, self._truth, self._truth_name)
+        result = Result(self.source, self._config, self.slam.mapper, self._truth, self._truth_name)
         began = perf_counter()
         try:
             for frame in prefetch(self.source.frames(self._start, self._stop)):
-                tracked = self._system.process(frame)
-                result.add(tracked)
-                progress(tracked)
+                step = self.slam.process(frame)
+                result.add(step.odometry)
+                progress(step)
         except KeyboardInterrupt:
             result.interrupted = True
         result.wall_s = perf_counter() - began
-        self.mapper.finish()
+        self.slam.finish()
         return result
 
 
@@ -139,7 +126,7 @@ class Result:
         ground_truth_name: what it was read from.
         recorder: the odometry's pose of every frame.
         registered: of each frame, whether its registration succeeded.
-        methods: how many frames were registered how; "failed" for those that were not.
+        methods: how many frames were registered how; "failed" for those that were not. states: frames in each.
         seconds: wall time of each frame by stage.
         wall_s: of the whole run, reading included.
     """
@@ -152,6 +139,7 @@ class Result:
     recorder: TrajectoryRecorder = field(default_factory=TrajectoryRecorder)
     registered: list[bool] = field(default_factory=list)
     methods: Counter[str] = field(default_factory=Counter)
+    states: Counter[str] = field(default_factory=Counter)
     seconds: dict[str, list[float]] = field(default_factory=dict)
     wall_s: float = 0.0
     interrupted: bool = False
@@ -165,6 +153,7 @@ class Result:
         self.recorder.add(tracked)
         self.registered.append(tracked.registration.ok)
         self.methods[tracked.registration.method if tracked.registration.ok else "failed"] += 1
+        self.states[str(tracked.state)] += 1
         for stage, time in tracked.seconds.items():
             self.seconds.setdefault(stage, []).append(time)
 
@@ -182,7 +171,7 @@ class Result:
     def connected(self) -> bool:
         """Whether a loop ties this drive to those that were in the map file before; True if there were none."""
         first = self.mapper.session_start
-        return first == 0 or any(a < first <= b for a, b, _, _ in self.mapper.edges)
+        return first == 0 or any(edge.from_node < first <= edge.to_node for edge in self.mapper.edges)
 
     @property
     def fps(self) -> float:
@@ -203,6 +192,8 @@ class Result:
             "fps": self.fps,
             "wall_s": self.wall_s,
             "answers": dict(self.methods),
+            "states": dict(self.states),
+            "breaks": self.recorder.breaks,
             "stages_ms": {stage: _summary(times) for stage, times in stages.items()},
         }
 
@@ -277,7 +268,7 @@ def open_recording(path: Path | str, config: Config, images: bool) -> Source:
     Raises:
         UsageError: there is none that can be read.
     """
-    # Decoding images that nobody looks at would only cost time.
+    # Decoding images that are not used would only cost time.
     return open_source(path, config.input.model_copy(update={"images": images and config.input.images}))
 
 

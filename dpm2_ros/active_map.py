@@ -11,8 +11,8 @@ from typing import Any
 
 from dpm2_core.config import dump_settings
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.frame import Array, Keyframe, LoopClosure, State
-from dpm2_core.slam.build import make_localizer, make_mapper
+from dpm2_core.frame import Array, Edge, Keyframe, State
+from dpm2_core.slam.build import make_map, make_slam
 from dpm2_core.slam.loops.localizer import LocalizationResult, Localizer
 from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.output import save_map
@@ -26,18 +26,15 @@ _SUFFIX = ".dpm2map"
 
 
 class ActiveMap:
-    """It grows by keyframes, unless `localizer` is set. Methods are for one thread; any thread may read.
+    """It grows by keyframes, unless the SLAM has a localizer. Methods are for one thread; any thread may read.
 
     Attributes:
-        mapper: of the map, whether it grows or not.
-        localizer: finds the robot in a map that stays as it is; None while the map grows.
+        slam: what works on it; the map is exchanged there.
         located: what became of the last keyframe in a map that stays as it is.
 
     Raises:
         UsageError: `localization_mode` without a map that would serve.
     """
-
-    mapper: Mapper
 
     def __init__(self, config: NodeConfig, robot: str, log: Any) -> None:
         """`robot`: whose node it is; `log`: a ROS logger."""
@@ -46,14 +43,18 @@ class ActiveMap:
         self._directory = Path(ros.map_directory) if ros.map_directory else None
         self._path = Path(ros.map_file) if ros.map_file not in ("", AUTO) else None  # written, or to be found in
         self._folder: Path | None = None  # of the clouds of this drive
-        self._store: MapStore | None = None
-        self.localizer: Localizer | None = None
         self.located: LocalizationResult | None = None
         self._T_map_odom: dict[str, Array] | None = None  # by robot, while the map grows; None before any keyframe
-        if config.ros.localization_mode:
-            self._load()
-        else:
-            self._begin()
+        self._store = self._opened() if ros.localization_mode else self._new_file()
+        self.slam = make_slam(config.slam, robot, self._store)
+
+    @property
+    def mapper(self) -> Mapper:
+        return self.slam.mapper
+
+    @property
+    def localizer(self) -> Localizer | None:
+        return self.slam.localizer
 
     def T_map_odom(self, robot: str) -> Array | None:
         """(4, 4) of a robot; None while its place in the map is not known."""
@@ -64,17 +65,18 @@ class ActiveMap:
             return self.mapper.T_map_odom if robot == self._robot else None
         return placed.get(robot)
 
-    def add(self, keyframe: Keyframe) -> list[LoopClosure]:
+    def add(self, keyframe: Keyframe) -> list[Edge]:
         """Take a keyframe in, or find it; returns the loops that were tried."""
-        if self.localizer is not None:
-            self._locate(self.localizer, keyframe)
+        state = None if self.localizer is None else self.localizer.state
+        result, before = self.slam.map_step(keyframe), self._T_map_odom or {}
+        if state is not None and result.located is not None:
+            self._tell(state, result.located)
             return []
-        closures, before = self.mapper.add(keyframe), self._T_map_odom or {}
         found = {robot: self.mapper.T_map_odom_of(robot) for robot in self.mapper.robots}
         placed = self._T_map_odom = {robot: T for robot, T in found.items() if T is not None}
         for robot in placed.keys() - before.keys():
             self._log.info(f"robot {robot or '/'}: its place in the map is known")
-        return closures
+        return result.loops
 
     def localise(self) -> str:
         """End the map that grows, if it does, and look for the robot in the file; says so in words.
@@ -108,11 +110,11 @@ class ActiveMap:
         self.close()
         self._resume()
         self.mapper.start_session(localizer.T_map_odom)
-        self._T_map_odom, self.localizer, self.located = None, None, None
+        self._T_map_odom, self.located = None, None
         return f"{self._path} grows by a new session"
 
     def restart(self) -> None:
-        """The robot's odometry has started again: where it is, a loop or a search has to tell."""
+        """The robot's odometry has started again: a loop or a search has to find where it is."""
         placed = self._T_map_odom or {}
         self._T_map_odom = {robot: T for robot, T in placed.items() if robot != self._robot}
         if self.localizer is not None:
@@ -173,8 +175,7 @@ class ActiveMap:
 
     def finish(self) -> None:
         """Do what still waits; the file stays open."""
-        if self.localizer is None:
-            self.mapper.finish()
+        self.slam.finish()
 
     def close(self) -> None:
         """Everything that is known is in the file, which is closed; one without per keyframe is not kept."""
@@ -188,21 +189,29 @@ class ActiveMap:
             self._store = None
 
     def _begin(self) -> None:
-        """An empty map, with a file if there is to be one. A file that cannot be made is no reason not to map."""
+        """An empty map."""
+        self._store = self._new_file()
+        self.slam.use(*make_map(self._config.slam, self._store))
+        self._T_map_odom = None
+
+    def _new_file(self) -> MapStore | None:
+        """A map file, if there is to be one. A file that cannot be made is no reason not to map."""
         ros, self._folder = self._config.ros, None
         requested = Path(ros.map_file)
         if ros.map_file == AUTO:
             requested = self._directory / f"{_NAME}{_SUFFIX}" if self._directory is not None else Path()
         if requested.name:
             try:
-                self._path, self._store = self._created(requested)
-                self._log.info(f"map file: {self._path}")
+                self._path, store = self._created(requested)
             except Dpm2Error as error:
                 self._log.error(f"no map file: {error}")
-        self.mapper, self._T_map_odom = make_mapper(self._config.slam, self._store), None
+            else:
+                self._log.info(f"map file: {self._path}")
+                return store
+        return None
 
     def _created(self, requested: Path) -> tuple[Path, MapStore]:
-        """A new map file whose name, and folder for its clouds, nobody has."""
+        """A new map file with a name, and a folder for its clouds, that do not exist yet."""
         for path in _numbered(requested.with_name(_named(requested.stem, self._robot) + requested.suffix)):
             if path.exists() or (self._directory is not None and (self._directory / path.stem).exists()):
                 continue
@@ -216,21 +225,25 @@ class ActiveMap:
 
     def _load(self) -> None:
         """The file, to find oneself in; what was before stays if that fails."""
-        if self._path is None:
-            raise UsageError("no map to find oneself in: ros.map_file does not name one" + self._hint())
-        store = open_for_localization(self._path, self._config.slam)
+        store = self._opened()
         try:
-            mapper = make_mapper(self._config.slam, store)
-            localizer = make_localizer(self._config.slam, mapper)
+            made = make_map(self._config.slam, store)
         except BaseException:
             store.close()
             raise
         if self._store is not None:
             self._store.close()
-        self._store, self.mapper, self.localizer, self.located = store, mapper, localizer, None
+        self._store, self.located = store, None
+        self.slam.use(*made)
+
+    def _opened(self) -> MapStore:
+        """The file, open for reading only."""
+        if self._path is None:
+            raise UsageError("no map to find oneself in: ros.map_file does not name one" + self._hint())
+        return open_for_localization(self._path, self._config.slam)
 
     def _hint(self) -> str:
-        """The youngest map in the folder, where somebody may look for one."""
+        """The youngest map in the folder."""
         found = sorted(self._directory.glob(f"*{_SUFFIX}"), key=_age) if self._directory is not None else []
         return f"; the youngest in {self._directory} is {found[-1]}" if found else ""
 
@@ -239,11 +252,10 @@ class ActiveMap:
         assert self._path is not None
         self._folder = None
         self._store = open_session(self._path, self._config.slam, dump_settings(self._config), resume=True)
-        self.mapper = make_mapper(self._config.slam, self._store)
+        self.slam.use(*make_map(self._config.slam, self._store))
 
-    def _locate(self, localizer: Localizer, keyframe: Keyframe) -> None:
-        before = localizer.state
-        located = self.located = localizer.add(keyframe)
+    def _tell(self, before: State, located: LocalizationResult) -> None:
+        self.located = located
         if located.state is before:
             return
         if located.jumped:

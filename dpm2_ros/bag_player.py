@@ -75,10 +75,12 @@ class BagPlayer:
         """Play to the end, or until a signal, and say how much it was.
 
         Raises:
-            Dpm2Error: the log cannot be written; in lockstep, no odometry answers, or not every cloud was answered.
+            Dpm2Error: the log cannot be written; in lockstep, there is no odometry, or not of every cloud.
         """
         self._publish_latched()
         self._await_subscribers()
+        if self._lockstep is not None:
+            self._lockstep.begin()
         count = 0
         while True:
             count += self._play_once()
@@ -96,12 +98,12 @@ class BagPlayer:
         self._node.get_logger().info(f"{self._options.bag}: {count} messages played, {self._clouds} of them clouds")
 
     def _make_publishers(self) -> dict[str, Any]:
-        """Latched topics first: whoever knows of a later one then knows of these."""
+        """Latched topics first: a subscriber that has discovered a later one then has these."""
         requested = self._options.topics or tuple(self._bag.types)
         publishers = {}
         for topic in sorted(requested, key=lambda topic: topic not in LATCHED):
             if self._options.lockstep and topic == self._node.resolve_topic_name(ODOMETRY):
-                self._node.get_logger().warning(f"{topic} is left out: the odometry of now is to answer")
+                self._node.get_logger().warning(f"{topic} is left out: it comes from the node now")
                 continue
             kind = self._bag.types[topic]
             if (known := message_type(kind)) is None:
@@ -127,10 +129,10 @@ class BagPlayer:
         while sum(self._publishers[topic].get_subscription_count() for topic in clouds) < options.subscribers:
             waited = time.monotonic() - began
             if waited >= options.wait:
-                log.warning(f"playing, though nobody listens to {', '.join(clouds)} yet")
+                log.warning(f"playing without a subscriber to {', '.join(clouds)} yet")
                 break
             if waited > 1.0 and not info:
-                log.info(f"waiting {options.wait:g} s at most for somebody to listen to {', '.join(clouds)}")
+                log.info(f"waiting {options.wait:g} s at most for a subscriber to {', '.join(clouds)}")
                 info = True
             if STOP.wait(0.02):
                 return
@@ -139,7 +141,7 @@ class BagPlayer:
         STOP.wait(0.2)  # other topics of the same subscriber are matched within moments of each other
 
     def _await_delivery(self) -> None:
-        """What is on its way must not end with the process: clouds above all, which are told when they do not arrive.
+        """What is on its way must not end with the process: clouds above all; those that do not arrive are reported.
 
         A receipt for the last message, if it is small, may come only seconds after the message.
         """
@@ -218,17 +220,17 @@ def _play(
     duration: Annotated[float | None, typer.Option(help="seconds to play, of the recording's time", min=0)] = None,
     loop: Annotated[bool, typer.Option("--loop", help="start again at the end, until stopped")] = False,
     topics: Annotated[list[str] | None, typer.Option(help="only these topics; may be repeated")] = None,
-    wait: Annotated[float, typer.Option(help="longest wait for somebody to listen to the clouds, s", min=0)] = 30.0,
+    wait: Annotated[float, typer.Option(help="longest wait for a subscriber to the clouds, s", min=0)] = 30.0,
     subscribers: Annotated[int, typer.Option(help="how many listeners to wait for", min=1)] = 1,
     clock: Annotated[bool, typer.Option(help="publish /clock, for nodes with use_sim_time")] = True,
     log: Annotated[Path | None, typer.Option(help="CSV file for the moment at which each message went out")] = None,
     lockstep: Annotated[
-        bool, typer.Option("--lockstep", help="no timing: each cloud when dpm2/odom has answered the one before")
+        bool, typer.Option("--lockstep", help="no timing: each cloud after the dpm2/odom of the one before")
     ] = False,
 ) -> int:
     """Publish a recording. Exit code 2 for one that cannot be read."""
     if lockstep and rate != 1.0:
-        raise UsageError("--lockstep goes as fast as it is answered: without --rate")
+        raise UsageError("--lockstep goes as fast as the node: without --rate")
     node = rclpy.create_node("bag_player")
     try:
         options = Options(

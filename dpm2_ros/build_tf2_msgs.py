@@ -21,7 +21,7 @@ import sysconfig
 import tempfile
 from pathlib import Path
 
-from dpm2_core.errors import Dpm2Error
+from dpm2_core.errors import Dpm2Error, exit_code
 
 DEFINITION = "geometry_msgs/TransformStamped[] transforms\n"
 TYPE_HASH = "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
@@ -151,12 +151,7 @@ def main() -> int:
     if available():
         print("tf2_msgs: already installed")
         return 0
-    try:
-        print(f"tf2_msgs: built into {build()}")
-    except Dpm2Error as error:
-        print(error, file=sys.stderr)
-        return 1
-    return 0
+    return exit_code(lambda: print(f"tf2_msgs: built into {build()}"))
 
 
 if __name__ == "__main__":

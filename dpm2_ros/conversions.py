@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import array
 import re
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Header
 
-from dpm2_core.frame import Array, Keyframe, OdometryResult, Points, Registration
+from dpm2_core.frame import Array, Keyframe, OdometryResult, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.mapping.admission import MAX_ID, RejectedError
 
@@ -75,21 +75,50 @@ def covariance_from_ros(numbers: Array, R: Array) -> Array:
     return M @ np.asarray(numbers, np.float64).reshape(6, 6) @ M.T
 
 
+@dataclass(frozen=True, eq=False)
+class BodyMotion:
+    """Pose and motion of one frame of the vehicle: the LiDAR's, or one that is rigidly tied to it.
+
+    Attributes:
+        stamp: ns. T_odom_body: (4, 4).
+        covariance: (6, 6) of the last step, as in `OdometryResult`. twist: (6,) [rad/s, m/s] in that frame.
+    """
+
+    stamp: int
+    T_odom_body: Array
+    covariance: Array
+    twist: Array
+
+    @classmethod
+    def of_lidar(cls, result: OdometryResult) -> BodyMotion:
+        return cls(result.stamp, result.T_odom_lidar, result.covariance, result.twist)
+
+    def of_other(self, T_other_body: Array) -> BodyMotion:
+        """That of another frame of the same rigid body, in the same odom."""
+        A = se3.adjoint(T_other_body)
+        T_odom_other = self.T_odom_body @ se3.inverse(T_other_body)
+        return BodyMotion(self.stamp, T_odom_other, A @ self.covariance @ A.T, A @ self.twist)
+
+    def of_base(self, T_base_body: Array) -> BodyMotion:
+        """That of the base, in an odom that begins at the base's first pose."""
+        moved = self.of_other(T_base_body)
+        return replace(moved, T_odom_body=T_base_body @ moved.T_odom_body)
+
+
 def odometry_to_msg(
-    tracked: OdometryResult, covariance: Array, seconds: float, odom_frame: str, base_frame: str
+    motion: BodyMotion, covariance: Array, seconds: float, odom_frame: str, body_frame: str
 ) -> Odometry:
     """nav_msgs/Odometry at the cloud's stamp.
 
     Args:
-        tracked: pose, twist, and the covariance of the last step.
         covariance: (6, 6) of the pose since the start, as in `Registration`.
         seconds: length of the last step, which turns its covariance into that of the twist.
     """
-    message = Odometry(header=header(tracked.stamp, odom_frame), child_frame_id=base_frame)
-    message.pose.pose = pose_to_msg(tracked.T_odom_lidar)
-    message.pose.covariance = covariance_to_ros(covariance, tracked.T_odom_lidar[:3, :3])
-    message.twist.twist = Twist(linear=vector(tracked.twist[3:]), angular=vector(tracked.twist[:3]))
-    message.twist.covariance = covariance_to_ros(tracked.covariance, np.eye(3)) / seconds**2
+    message = Odometry(header=header(motion.stamp, odom_frame), child_frame_id=body_frame)
+    message.pose.pose = pose_to_msg(motion.T_odom_body)
+    message.pose.covariance = covariance_to_ros(covariance, motion.T_odom_body[:3, :3])
+    message.twist.twist = Twist(linear=vector(motion.twist[3:]), angular=vector(motion.twist[:3]))
+    message.twist.covariance = covariance_to_ros(motion.covariance, np.eye(3)) / seconds**2
     return message
 
 
@@ -153,41 +182,16 @@ def edge_to_msg(T: Array, covariance: Array, stamp: int, parent: str, child: str
     return message
 
 
-def to_base(tracked: OdometryResult, T_base_lidar: Array) -> OdometryResult:
-    """The same motion seen from the base: odom then starts at the base's first pose, and the keyframe's cloud,
-    pose and edge are those of the base. The LiDAR's own names (`T_odom_lidar`) then mean the base."""
-    keyframe = None if tracked.keyframe is None else keyframe_to_base(tracked.keyframe, T_base_lidar)
-    moved = of_body(tracked, T_base_lidar)
-    return replace(moved, T_odom_lidar=T_base_lidar @ moved.T_odom_lidar, keyframe=keyframe)
-
-
-def of_body(tracked: OdometryResult, T_new_old: Array) -> OdometryResult:
-    """The pose of another frame of the same rigid body in the same odom; the keyframe stays as it is."""
-    A = se3.adjoint(T_new_old)
-    return replace(
-        tracked,
-        T_odom_lidar=tracked.T_odom_lidar @ se3.inverse(T_new_old),
-        covariance=A @ tracked.covariance @ A.T,
-        twist=A @ tracked.twist,
-        registration=_registration_to_base(tracked.registration, T_new_old),
-    )
-
-
 def keyframe_to_base(keyframe: Keyframe, T_base_lidar: Array) -> Keyframe:
     """The same place seen from the base: its pose, cloud, descriptors and edge."""
+    edge, A = keyframe.edge, se3.adjoint(T_base_lidar)
+    if edge is not None:
+        T_before_this = T_base_lidar @ edge.T_target_source @ se3.inverse(T_base_lidar)
+        edge = replace(edge, T_target_source=T_before_this, covariance=A @ edge.covariance @ A.T)
     return replace(
         keyframe,
         T_odom_kf=T_base_lidar @ keyframe.T_odom_kf @ se3.inverse(T_base_lidar),
         cloud=se3.transform(T_base_lidar, keyframe.cloud).astype(np.float32),
-        edge=None if keyframe.edge is None else _registration_to_base(keyframe.edge, T_base_lidar),
+        edge=edge,
         descriptors=None if keyframe.descriptors is None else keyframe.descriptors.moved(T_base_lidar),
-    )
-
-
-def _registration_to_base(registration: Registration, T_base_lidar: Array) -> Registration:
-    A = se3.adjoint(T_base_lidar)
-    return replace(
-        registration,
-        T_target_source=T_base_lidar @ registration.T_target_source @ se3.inverse(T_base_lidar),
-        covariance=A @ registration.covariance @ A.T,
     )

@@ -13,17 +13,19 @@ from dpm2_ros.mapping import MapperThread
 from dpm2_ros.subscriptions import STEADY
 
 OK, WARN, ERROR, STALE = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR, DiagnosticStatus.STALE
+PERIOD = 1.0
+"""s between two messages."""
 _RECENT = 10.0  # s
 _LONGEST = 1000  # characters of a text, some of which quote messages
 
 
 class DiagnosticsPublisher:
-    """Asks for the statuses once a second, and sends them."""
+    """Asks for the statuses every `PERIOD`, and sends them."""
 
     def __init__(self, node: Node, statuses: Callable[[], list[DiagnosticStatus]]) -> None:
         self._node, self._statuses = node, statuses
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        node.create_timer(1.0, self.publish, clock=STEADY)
+        node.create_timer(PERIOD, self.publish, clock=STEADY)
 
     def publish(self) -> None:
         """Send them now."""

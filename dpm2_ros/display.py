@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from nav_msgs.msg import Path
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
-from dpm2_core.frame import Array, LoopClosure
+from dpm2_core.frame import Array, Edge
 from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_ros.conversions import header, pose_to_msg
 
@@ -31,16 +31,16 @@ def path_to_msg(poses: Array, stamps: Sequence[int], frame_id: str) -> Path:
 def pose_graph_to_msg(mapper: Mapper, stamp: int, frame_id: str) -> MarkerArray:
     """Nodes gray, odometry edges green, accepted loops blue, rejected ones red."""
     positions = mapper.poses[:, :3, 3]
-    node = {(keyframe.robot, keyframe.id): n for n, keyframe in enumerate(mapper.keyframes)}
-    ends = [((c.from_robot, c.from_id), (c.to_robot, c.to_id), c.registration.ok) for c in mapper.closures]
-    loops = [(node[a], node[b], ok) for a, b, ok in ends]
-    closed = {(a, b) for a, b, _ in loops}
-    steps = [(a, b) for a, b, _, _ in mapper.edges if (a, b) not in closed]
+    odometry = [edge for edge in mapper.edges if edge.kind == "odometry"]
+    kept = [edge for edge in mapper.edges if edge.kind == "loop"]
+    rejected = {(loop.from_node, loop.to_node): loop for loop in mapper.loops}
+    for loop in kept:
+        rejected.pop((loop.from_node, loop.to_node), None)
     parts = (
         (Marker.SPHERE_LIST, GRAY, 0.6, positions),
-        (Marker.LINE_LIST, GREEN, 0.15, _ends(positions, steps)),
-        (Marker.LINE_LIST, BLUE, 0.3, _ends(positions, [(a, b) for a, b, ok in loops if ok])),
-        (Marker.LINE_LIST, RED, 0.1, _ends(positions, [(a, b) for a, b, ok in loops if not ok])),
+        (Marker.LINE_LIST, GREEN, 0.15, _ends(positions, odometry)),
+        (Marker.LINE_LIST, BLUE, 0.3, _ends(positions, kept)),
+        (Marker.LINE_LIST, RED, 0.1, _ends(positions, list(rejected.values()))),
     )
     markers = []
     for id, (kind, color, size, points) in enumerate(parts):
@@ -54,9 +54,9 @@ def pose_graph_to_msg(mapper: Mapper, stamp: int, frame_id: str) -> MarkerArray:
     return MarkerArray(markers=markers)
 
 
-def loop_to_msg(closure: LoopClosure, stamp: int, from_name: str, to_name: str) -> DiagnosticArray:
+def loop_to_msg(loop: Edge, stamp: int, from_name: str, to_name: str) -> DiagnosticArray:
     """What became of a loop candidate, and why: OK for an accepted one, WARN for one rejected."""
-    result = closure.registration
+    result = loop.registration
     numbers = {"confidence": result.confidence, "overlap": result.overlap, "rmse (m)": result.rmse}
     values = [KeyValue(key="method", value=result.method)]
     values += [KeyValue(key=key, value=f"{value:.3f}") for key, value in numbers.items()]
@@ -69,9 +69,9 @@ def loop_to_msg(closure: LoopClosure, stamp: int, from_name: str, to_name: str) 
     return DiagnosticArray(header=header(stamp, from_name), status=[status])
 
 
-def _ends(positions: Array, pairs: Iterable[tuple[int, int]]) -> Array:
-    """(2 E, 3) end points of E edges between nodes."""
-    return positions[np.array(list(pairs), np.intp).reshape(-1)]
+def _ends(positions: Array, edges: Sequence[Edge]) -> Array:
+    """(2 E, 3) end points of E edges."""
+    return positions[np.array([(edge.from_node, edge.to_node) for edge in edges], np.intp).reshape(-1)]
 
 
 class Display:

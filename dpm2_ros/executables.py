@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
+from importlib.util import find_spec
 
+from dpm2_core.errors import UsageError, exit_code
 from dpm2_core.openmp import wait_passively
-from dpm2_ros.runtime import catch_signals, exit_code, spin_node
+from dpm2_ros.runtime import catch_signals, spin_node
 
 
 def slam_node(arguments: Sequence[str] | None = None) -> int:
@@ -49,7 +51,16 @@ def bag_player(arguments: Sequence[str] | None = None) -> int:
 def _run(work: Callable[[Sequence[str]], int], arguments: Sequence[str] | None) -> int:
     catch_signals()
     wait_passively()
-    return exit_code(lambda: work(sys.argv[1:] if arguments is None else arguments))
+
+    def with_ros() -> int:
+        try:
+            return work(sys.argv[1:] if arguments is None else arguments)
+        except ModuleNotFoundError:
+            if find_spec("rclpy") is not None:
+                raise
+            raise UsageError("no ROS 2 here: install it and source its setup.bash, see docs/ros2.md") from None
+
+    return exit_code(with_ros)
 
 
 if __name__ == "__main__":

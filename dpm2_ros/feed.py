@@ -32,16 +32,17 @@ ODOM = "/dpm2/keyframe_odom"
 """Topic by which robots are found."""
 SILENT = 5.0
 """s without a message after which a drive counts as over; a robot announces its last keyframe every 2 s."""
-_BESIDE = 2.5  # s for which both of two drives must be heard to be two robots
+BESIDE = 2.5
+"""s for which both of two drives must be heard to be two robots."""
 _STREAMS = 256  # drives that are known, most of them over
 _APART = 8  # robots beside the one whose namespace it is
 _HELD = 16_000_000  # bytes that may wait
-_ANSWERS = 50  # between two ticks, to drives that are not known yet
+_ACKS = 50  # between two ticks, to drives that are not known yet
 _BACKLOG = 32  # keyframes that may wait for the mapper
 
 
 class Feed:
-    """One namespace: joins messages to keyframes, hands them to the mapper, and tells the robot which have arrived.
+    """One namespace: joins messages to keyframes, hands them to the mapper, and acknowledges those that have arrived.
 
     A new session is that of the robot that was started again, once the old one has been silent for `SILENT` s. If both
     are heard they are two robots, and the second gets a name of its own, `robot.session`. So no session ends another.
@@ -53,7 +54,7 @@ class Feed:
         self.made = time.monotonic()
         self._streams: dict[str, Stream] = {}  # by session, the one that was heard last at the end
         self._main: Stream | None = None
-        self._answers = 0
+        self._acks = 0
         self._cloud_topic, self._seen_topic = f"{namespace}/dpm2/keyframe_cloud", f"{namespace}/dpm2/keyframe"
         self._pose_topic = namespace + ODOM
         self._subscriptions = [
@@ -81,15 +82,15 @@ class Feed:
         return [name for name, s in self.robots.items() if name != self._robot and s.heard > recent]
 
     def tick(self) -> None:
-        """Twice a second: decide what waits, and tell the robots what has arrived."""
+        """Twice a second: decide what waits, and acknowledge what has arrived."""
         now = time.monotonic()
-        self._answers = 0
-        for stream in list(self._streams.values())[-_ANSWERS:]:
+        self._acks = 0
+        for stream in list(self._streams.values())[-_ACKS:]:
             if (id := stream.give_up(now)) is not None:
                 self._node.reject(self._pose_topic, "keyframe given up", f"keyframe {id} of {self._robot or '/'}")
             self._hand_on(stream, now)
             if now - stream.heard < 2 * SILENT and (stream.robot is not None or stream.holds):
-                self._answer(stream, now)
+                self._acknowledge(stream, now)
 
     def forget(self) -> None:
         """The map is empty: the next keyframe of each drive is its first."""
@@ -173,9 +174,9 @@ class Feed:
             unknown = (s for s in self._streams.values() if not s.taken)
             oldest = next(unknown, None) or next(s for s in self._streams.values() if s is not self._main)
             del self._streams[oldest.session]
-        if session and stream.robot is None and now - stream.answered > 0.4 and self._answers < _ANSWERS:
-            self._answers += 1
-            self._answer(stream, now)
+        if session and stream.robot is None and now - stream.acknowledged > 0.4 and self._acks < _ACKS:
+            self._acks += 1
+            self._acknowledge(stream, now)
         return stream, id
 
     def _put(self, stream: Stream, id: int, part: str, value: Any, descriptors: Descriptors | None = None) -> None:
@@ -185,7 +186,7 @@ class Feed:
             self._bound()
 
     def _bound(self) -> None:
-        """Drives that nobody knows may not fill the memory: what was heard of longest ago is dropped."""
+        """Unknown drives may not fill the memory: those whose last message is oldest are dropped."""
         held = {session: s.holds for session, s in self._streams.items() if s is not self._main}
         total = sum(held.values())
         for session, size in held.items():
@@ -203,7 +204,7 @@ class Feed:
             self._add(stream, *taken)
 
     def _place(self, stream: Stream, now: float) -> bool:
-        """Whose drive it is, if that can be told: the robot's, or that of another one in the same namespace."""
+        """Whose drive it is, if that is certain: the robot's, or that of another one in the same namespace."""
         main, name = self._main, self._robot or "/"
         if not stream.ready:
             return False
@@ -213,7 +214,7 @@ class Feed:
                 main.replaced()
             self._main, stream.robot = stream, self._robot
             return True
-        if main.heard < stream.since + _BESIDE:
+        if main.heard < stream.since + BESIDE:
             return False
         if len(self.beside) >= _APART:
             raise RejectedError("too many robots", f"more than {_APART} robots beside {name} in its namespace")
@@ -230,9 +231,9 @@ class Feed:
         assert packed is not None
         self._mapper.add(lambda: replace(keyframe, cloud=unpack_cloud(packed)))
 
-    def _answer(self, stream: Stream, now: float) -> None:
+    def _acknowledge(self, stream: Stream, now: float) -> None:
         if stream.session:
-            stream.answered = now
+            stream.acknowledged = now
             self._received.publish(received_to_msg(stream.session, stream.next, stream.above))
 
 
@@ -249,7 +250,7 @@ def _noted(stream: Stream, id: int) -> Iterator[None]:
 def keyframe_from(
     pose: Odometry, points: Points, robot: str, id: int, before: Keyframe | None, descriptors: Descriptors | None = None
 ) -> Keyframe:
-    """A keyframe from its messages; its edge leads to the last one that arrived (the mapper reckons with those missed).
+    """A keyframe from its messages; its edge leads to the last one that arrived (the mapper expects gaps).
 
     A covariance of zeros says that the odometry began anew: there is no edge.
 

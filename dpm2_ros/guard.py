@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A node that no message ends: what it cannot use is rejected, counted by its reason, and said now and then."""
+"""A node that no message ends: what it cannot use is rejected, counted by its reason, and logged now and then."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 
 from rclpy.node import Node
 
-from dpm2_core.errors import Dpm2Error
+from dpm2_core.errors import Dpm2Error, printable
 from dpm2_core.slam.mapping.admission import RejectedError
 
 _QUIET = 5.0  # s between two lines about the same reason
@@ -21,10 +21,10 @@ _LENGTH = 300  # characters of a line, whatever is in the message
 
 
 class GuardedNode(Node):
-    """Every callback of a subscription or a timer is guarded; services answer, so they say themselves what is wrong.
+    """Every callback of a subscription or a timer is guarded; a service reports in its response what is wrong.
 
     Attributes:
-        errors: exceptions that were nobody's intention: bugs, but the node goes on.
+        errors: unexpected exceptions: bugs, but the node goes on.
     """
 
     def __init__(self, name: str, **options: Any) -> None:
@@ -106,5 +106,4 @@ class GuardedNode(Node):
 
 def one_line(text: str, length: int = _LENGTH) -> str:
     """A text of unknown origin for a terminal: what does not print is escaped, what is too long is cut."""
-    text = text if len(text) <= length else f"{text[:length]}..."
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+    return printable(text if len(text) <= length else f"{text[:length]}...")

@@ -12,9 +12,9 @@ from datetime import UTC, datetime
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 
+from dpm2_core.data.frames import FrameBuilder
 from dpm2_core.frame import OdometryResult, State
 from dpm2_ros.diagnostics import ERROR, OK, STALE, WARN, DiagnosticsPublisher, mapper_status, message_status, status
-from dpm2_ros.frames import FrameBuilder
 from dpm2_ros.guard import GuardedNode
 from dpm2_ros.keyframes import BEHIND, KeyframeSender
 from dpm2_ros.mapping import MapperThread
@@ -114,7 +114,8 @@ class Diagnostics:
 
     def _statuses(self) -> list[DiagnosticStatus]:
         out = [self._odometry()]
-        out += [self._camera(camera) for camera in self._inputs.synchronizer.cameras]
+        if camera := self._inputs.synchronizer.camera:
+            out.append(self._camera(camera))
         if self._mapper is None:
             delivered, made = self._sender.delivered
             text = f"{delivered} of {made} keyframes have arrived at the mapper"
@@ -160,16 +161,14 @@ class Diagnostics:
             figures |= {
                 name: f"{ns * 1e-9:.3f}" for name, ns in zip(("cloud stamp (s)", "clock (s)"), times, strict=True)
             }
-        silence = _silence(synchronizer.last_arrival)
+        silence, topic = _silence(synchronizer.last_arrival), self._inputs.calibration.points_topic
         last = health.last
         if silence is None:
             found = self._inputs.candidates()
             hint = f"; point clouds are published on {', '.join(found)}" if found else ""
-            return self._status("odometry", STALE, f"no cloud on {self._inputs.points_topic} yet{hint}", figures)
+            return self._status("odometry", STALE, f"no cloud on {topic} yet{hint}", figures)
         if silence > SILENT:
-            return self._status(
-                "odometry", STALE, f"no cloud on {self._inputs.points_topic} for {silence:.0f} s", figures
-            )
+            return self._status("odometry", STALE, f"no cloud on {topic} for {silence:.0f} s", figures)
         if last is None:
             return self._status("odometry", OK, "the first cloud is being processed", figures)
         level, text = _LEVEL[last.state], str(last.state)
@@ -198,7 +197,7 @@ class Diagnostics:
             text = f"clouds are stamped {_date(stamp)}, the clock of this machine says {_date(now)}"
             return f"{text}: a sensor's clock has to be set, a recording wants use_sim_time and /clock"
         if not now:
-            return "use_sim_time is on, and nobody publishes /clock"
+            return "use_sim_time is on, and /clock has no publisher"
         return f"clouds are stamped {_date(stamp)}, /clock says {_date(now)}"
 
     def _localization(self, mapper: MapperThread) -> DiagnosticStatus:
@@ -214,11 +213,11 @@ class Diagnostics:
 
     def _camera(self, camera: CameraState) -> DiagnosticStatus:
         figures = {"received": camera.received, "used": camera.matched, "late": camera.late}
-        silence = _silence(camera.last_arrival)
+        silence, topic = _silence(camera.last_arrival), self._inputs.calibration.image_topic
         if silence is None:
-            level, text = WARN, f"no image on {self._inputs.image_topic} yet; LiDAR only"
+            level, text = WARN, f"no image on {topic} yet; LiDAR only"
         elif silence > SILENT:
-            level, text = WARN, f"no image on {self._inputs.image_topic} for {silence:.0f} s; LiDAR only"
+            level, text = WARN, f"no image on {topic} for {silence:.0f} s; LiDAR only"
         elif self._frames.image_problem:
             level, text = ERROR, f"{self._frames.image_problem}; LiDAR only"
         elif not camera.awaited:

@@ -2,7 +2,7 @@
 """Keyframes on the wire: three messages each, at most 100 kB together, sent again until the mapper has them.
 
 A robot keeps all keyframes of its drive, in a temporary file, and announces its last one every two seconds. The mapper
-answers with what it has: all below a number, and some above. So it costs nothing to be out of reach for a while, to
+acknowledges what it has: all below a number, and some above. So it costs nothing to be out of reach for a while, to
 join late, or to start the mapper again; DDS' own reliability ends with either process, and forgets what is too old.
 """
 
@@ -45,8 +45,8 @@ BEHIND = 10
 
 _FEATURE = "feature"
 _MOST_CHANNELS = 4096
-_MOST_ANSWERED = 1001  # numbers in an answer
-_SLOT, _MEMORY = 0.3, 0.8  # s; the mapper answers twice a second
+_MOST_ACKED = 1001  # numbers in an acknowledgment
+_SLOT, _MEMORY = 0.3, 0.8  # s; the mapper acknowledges twice a second
 _TICK, _PATIENCE, _ANNOUNCE, _BURST = 0.25, 1.5, 2.0, 8  # s; s until sent again; s; keyframes a tick
 _FAREWELL = 4.0  # s; DDS asks after 3 s for a receipt that has not come
 
@@ -68,9 +68,9 @@ class KeyframeSender:
 
     @property
     def delivered(self) -> tuple[int, int]:
-        """Keyframes that the mapper has said it has, and all."""
+        """Keyframes that the mapper has acknowledged, and all."""
         with self._lock:
-            below, above = self._answers.agreed
+            below, above = self._acks.agreed
             return below + len(above), len(self._kept)
 
     def restart(self) -> None:
@@ -80,7 +80,7 @@ class KeyframeSender:
             self._kept: list[list[int]] = []  # numbers in the file of the three messages, by id
             self._file = SpillFile()
             self._sent: list[float] = []  # when each was sent last
-            self._answers = Answers()
+            self._acks = Acks()
             self._announced = 0.0
 
     def send(self, keyframe: Keyframe) -> None:
@@ -107,19 +107,21 @@ class KeyframeSender:
             publisher.publish(message)
 
     def _on_received(self, message: UInt32MultiArray) -> None:
-        if not message.layout.dim or not 0 < len(message.data) <= _MOST_ANSWERED:
-            raise RejectedError("answer", f"an answer of {len(message.data)} numbers; want 1 to {_MOST_ANSWERED}")
+        if not message.layout.dim or not 0 < len(message.data) <= _MOST_ACKED:
+            raise RejectedError(
+                "acknowledgment", f"an acknowledgment of {len(message.data)} numbers; want 1 to {_MOST_ACKED}"
+            )
         with self._lock:
             if message.layout.dim[0].label == self.session:
                 below, *above = message.data.tolist()
                 made = len(self._kept)
-                self._answers.add(min(below, made), {id for id in above if below <= id < made}, time.monotonic())
+                self._acks.add(min(below, made), {id for id in above if below <= id < made}, time.monotonic())
 
     def _repeat(self) -> None:
         """Send a few of those again that have been missed for long; announce the last one."""
         now = time.monotonic()
         with self._lock:
-            below, above = self._answers.agreed
+            below, above = self._acks.agreed
             requested = range(below, len(self._kept))
             late = [id for id in requested if id not in above and now - self._sent[id] > _PATIENCE][:_BURST]
             for id in late:
@@ -134,11 +136,11 @@ class KeyframeSender:
             self._pose.publish(last)
 
 
-class Answers:
-    """What the mapper has: that on which all its answers of the last second agree.
+class Acks:
+    """What the mapper has: that on which all its acknowledgments of the last second agree.
 
-    Anybody can send an answer. One that claims too little costs a keyframe sent twice; one that claims too much would
-    cost the keyframe, so no single one is believed.
+    Anyone can send one. One that claims too little costs a keyframe sent twice; one that claims too much would
+    cost the keyframe, so no single one is trusted.
     """
 
     def __init__(self) -> None:
@@ -151,7 +153,7 @@ class Answers:
         return functools.reduce(_both, results) if results else (0, frozenset())
 
     def add(self, below: int, above: Set[int], now: float) -> None:
-        """An answer that came at that time, s."""
+        """One that came at that time, s."""
         if not self._slots or now - self._slots[-1].begin > _SLOT:
             self._slots.append(_Slot(now, now, below, frozenset(above)))
         else:
@@ -163,7 +165,7 @@ class Answers:
 
 @dataclass(eq=False)
 class _Slot:
-    """Answers that came between two times, s, and on what they agree."""
+    """Those that came between two times, s, and on what they agree."""
 
     begin: float
     end: float
@@ -177,12 +179,12 @@ def _both(a: tuple[int, frozenset[int]], b: tuple[int, frozenset[int]]) -> tuple
 
 
 def weights_identity(settings: SlamSettings) -> str:
-    """What descriptors are told apart by: the first 16 digits of the SHA-256 of the network's file; "" without one.
+    """The identity of what made descriptors: the first 16 digits of the SHA-256 of the network's file; "" without one.
 
     Raises:
         UsageError: there is no such file.
     """
-    if settings.registration == "geometric" and not (settings.loops.enabled and settings.loops.descriptors):
+    if not settings.uses_descriptors:
         return ""
     return weights_id(weights_path(settings.neural.weights)).split()[-1]
 

@@ -6,8 +6,8 @@ images. So nothing depends on how long anything takes, and slam_node sees what `
 from __future__ import annotations
 
 import time
-from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
+from itertools import islice
 from typing import Any
 
 from nav_msgs.msg import Odometry
@@ -15,8 +15,9 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from dpm2_core.data.bag_file import Bag
-from dpm2_core.data.bags import CAMERA_INFO, CLOUD, IMAGES, LATE, serialized_stamp
-from dpm2_core.data.messages import stamp_ns
+from dpm2_core.data.bags import CAMERA_INFO, CLOUD, IMAGES
+from dpm2_core.data.messages import serialized_stamp, stamp_ns
+from dpm2_core.data.pairing import RawMessage, clouds_after_images, passed
 from dpm2_core.errors import Dpm2Error
 from dpm2_ros.runtime import STOP
 
@@ -25,12 +26,9 @@ ODOMETRY = "dpm2/odom"
 TIMEOUT = 10.0
 """Seconds that a cloud waits for its odometry. A node rejects one whose stamp repeats; then the next goes out."""
 
-_Message = tuple[str, int, bytes]
-_UNSEEN, _SEEN = float("-inf"), float("inf")
-
 
 class Lockstep:
-    """The order and the pace of a player that waits for the node that answers.
+    """The order and the pace of a player that waits for the node.
 
     Args:
         node: of the player.
@@ -44,9 +42,10 @@ class Lockstep:
         self._odometry = node.create_subscription(Odometry, ODOMETRY, self._on_odometry, qos)
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(node)
-        self._clouds: list[str] = []  # topics that are answered
-        self._asked: int | None = None  # stamp of the cloud that is not answered yet, ns; 0: it has none
-        self._sent = self._unanswered = 0
+        self._clouds: list[str] = []  # topics that get an odometry
+        self._awaited: int | None = None  # stamp of the cloud whose odometry is awaited, ns; 0: it has no stamp
+        self._images: dict[str, int] = {}  # stamp of the last one, by topic
+        self._sent = self._missing = 0
 
     def find(self, end: float) -> None:
         """Wait, until `end` of the monotonic clock, for the node that turns clouds into odometry.
@@ -56,11 +55,11 @@ class Lockstep:
         """
         topic, clouds = self._odometry.topic_name, [t for t in self._publishers if self._bag.types[t] == CLOUD]
         while not STOP.wait(0.02):
-            answering = {_node(info) for info in self._node.get_publishers_info_by_topic(topic)}
+            nodes = {_node(info) for info in self._node.get_publishers_info_by_topic(topic)}
             self._clouds = [
                 cloud
                 for cloud in clouds
-                if any(_node(info) in answering for info in self._node.get_subscriptions_info_by_topic(cloud))
+                if any(_node(info) in nodes for info in self._node.get_subscriptions_info_by_topic(cloud))
                 and self._publishers[cloud].get_subscription_count()
             ]
             if self._clouds and self._odometry.get_publisher_count():
@@ -68,39 +67,35 @@ class Lockstep:
             if time.monotonic() >= end:
                 raise Dpm2Error(f"lockstep: no node turns {' or '.join(clouds) or 'clouds'} into {topic}")
 
-    def order(self, messages: Iterable[_Message]) -> Iterator[_Message]:
-        """The same messages, each cloud after the images, of topics that somebody listens to, that may be its own.
+    def begin(self) -> None:
+        """Before the first message: the calibration of each camera, which `dpm2 run` has from the start."""
+        for topic, publisher in self._publishers.items():
+            if self._bag.types[topic] == CAMERA_INFO:
+                for _, _, data in islice(self._bag.messages([topic]), 1):
+                    publisher.publish(bytes(data))
 
-        As `dpm2 run` does, it waits until no later image can be nearer, or for half a second of the recording.
-        """
+    def order(self, messages: Iterable[RawMessage]) -> Iterator[RawMessage]:
+        """The same messages as `dpm2 run` takes them: a cloud after the images, if they have a subscriber."""
         listened = [topic for topic, publisher in self._publishers.items() if publisher.get_subscription_count()]
-        latest = {topic: _UNSEEN for topic in listened if self._bag.types[topic] in (*IMAGES, CAMERA_INFO)}
-        waiting: deque[_Message] = deque()
-        for topic, log_time, data in messages:
-            while waiting and log_time - waiting[0][1] > LATE:
-                yield waiting.popleft()
-            if topic in self._clouds:
-                waiting.append((topic, log_time, data))
-            else:
-                yield topic, log_time, data
-            if topic in latest:
-                calibration = self._bag.types[topic] == CAMERA_INFO  # any will do
-                latest[topic] = _SEEN if calibration else serialized_stamp(data, log_time)
-            while waiting and all(stamp >= serialized_stamp(waiting[0][2], waiting[0][1]) for stamp in latest.values()):
-                yield waiting.popleft()
-        yield from waiting
+        return clouds_after_images(messages, self._clouds, [t for t in listened if self._bag.types[t] in IMAGES])
 
     def turn(self, topic: str, data: bytes) -> None:
         """Before a message is published: wait, if it is a cloud, for the odometry of the one before.
 
-        Its images went out before the wait, and so have arrived when it ends.
+        Its images went out before the wait, and so have arrived when it ends. An image that may be nearer to the cloud
+        before than those that went out ahead of it came too late for it, and waits as well.
 
         Raises:
             Dpm2Error: the node is gone.
         """
+        if self._bag.types[topic] in IMAGES:
+            before, stamp = self._images.get(topic, 0), serialized_stamp(data, 0)
+            if self._awaited is not None and not (passed(before, self._awaited) and before <= stamp):
+                self._await_odometry()
+            self._images[topic] = stamp
         if topic in self._clouds:
-            self._await_answer()
-            self._asked = serialized_stamp(data, 0)
+            self._await_odometry()
+            self._awaited = serialized_stamp(data, 0)
             self._sent += 1
 
     def conclude(self) -> None:
@@ -109,29 +104,30 @@ class Lockstep:
         Raises:
             Dpm2Error: not every cloud had its odometry.
         """
-        self._await_answer()
+        self._await_odometry()
         if STOP.is_set():
             return
-        if self._unanswered:
-            raise Dpm2Error(f"lockstep: {self._unanswered} of {self._sent} clouds had no odometry")
+        if self._missing:
+            raise Dpm2Error(f"lockstep: {self._missing} of {self._sent} clouds had no odometry")
         self._node.get_logger().info(f"lockstep: each of {self._sent} clouds had its odometry")
 
-    def _await_answer(self) -> None:
+    def _await_odometry(self) -> None:
         end = time.monotonic() + TIMEOUT
-        while self._asked is not None and not STOP.is_set():
+        while self._awaited is not None and not STOP.is_set():
             if not self._odometry.get_publisher_count():
-                raise Dpm2Error(f"lockstep: nobody publishes {self._odometry.topic_name} any more")
+                raise Dpm2Error(f"lockstep: {self._odometry.topic_name} has no publisher any more")
             if time.monotonic() >= end:
                 self._node.get_logger().warning(
-                    f"lockstep: no odometry within {TIMEOUT:g} s for the cloud at {self._asked * 1e-9:.3f} s; going on"
+                    f"lockstep: no odometry within {TIMEOUT:g} s for the cloud at {self._awaited * 1e-9:.3f} s; "
+                    "the next one goes out"
                 )
-                self._unanswered, self._asked = self._unanswered + 1, None
+                self._missing, self._awaited = self._missing + 1, None
                 return
             self._executor.spin_once(timeout_sec=0.1)
 
     def _on_odometry(self, message: Odometry) -> None:
-        if self._asked in (0, stamp_ns(message.header)):  # a cloud without a stamp gets the time of its arrival
-            self._asked = None
+        if self._awaited in (0, stamp_ns(message.header)):  # a cloud without a stamp gets the time of its arrival
+            self._awaited = None
 
 
 def _node(info: Any) -> tuple[str, str]:

@@ -9,6 +9,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from std_srvs.srv import Trigger
 
 from dpm2_core.errors import UsageError
+from dpm2_core.slam.system import Slam
 from dpm2_ros.diagnostics import OK, WARN, DiagnosticsPublisher, mapper_status, message_status, status
 from dpm2_ros.feed import ODOM, Feed
 from dpm2_ros.guard import GuardedNode
@@ -19,7 +20,8 @@ from dpm2_ros.settings import NodeConfig
 from dpm2_ros.subscriptions import STEADY
 
 _MOST_ROBOTS = 64
-_PATIENCE = 10.0  # s that a topic has to bring a keyframe before another may take its place
+PATIENCE = 10.0
+"""s that a topic has to bring a keyframe before another may take its place."""
 
 
 class MapperNode(GuardedNode):
@@ -42,6 +44,11 @@ class MapperNode(GuardedNode):
         self.create_timer(0.5, self._tick, clock=STEADY)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self._diagnostics = DiagnosticsPublisher(self, self._statuses)
+
+    @property
+    def slam(self) -> Slam:
+        """What works on the map."""
+        return self._mapper.slam
 
     def close(self) -> None:
         """Save the map.
@@ -67,7 +74,7 @@ class MapperNode(GuardedNode):
 
     def _idle(self, namespace: str, feed: Feed) -> bool:
         """Whether nothing is lost without that feed."""
-        return namespace != self._own and not feed.proven and time.monotonic() - feed.made > _PATIENCE
+        return namespace != self._own and not feed.proven and time.monotonic() - feed.made > PATIENCE
 
     def _make_room(self) -> bool:
         oldest = next((namespace for namespace, feed in self._feeds.items() if self._idle(namespace, feed)), None)

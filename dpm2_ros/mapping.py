@@ -21,9 +21,10 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.frame import Array, Keyframe, LoopClosure, State
+from dpm2_core.frame import Array, Edge, Keyframe
 from dpm2_core.slam.loops.localizer import LocalizationResult
 from dpm2_core.slam.mapping.admission import RejectedError
+from dpm2_core.slam.system import Slam
 from dpm2_ros.active_map import ActiveMap
 from dpm2_ros.conversions import cloud_to_msg, edge_to_msg, keyframe_name
 from dpm2_ros.display import Display, loop_to_msg, path_to_msg, pose_graph_to_msg
@@ -50,7 +51,6 @@ class MapperThread:
         self._active = ActiveMap(config, robot, node.get_logger())
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="mapper", initializer=yield_to_odometry)
         self._stamp = 0  # of the last keyframe, ns
-        self._last: Future[None] | None = None  # of the keyframes taken in
         self._restarted: Future[None] | None = None  # since when the odometry's start is known here
         self._lock, self._waiting = threading.Lock(), 0
         self._changes = self.keyframes
@@ -71,6 +71,11 @@ class MapperThread:
         node.create_service(Trigger, "~/save_map", self._on_save)
 
     @property
+    def slam(self) -> Slam:
+        """What works on the map; its odometry is for another thread."""
+        return self._active.slam
+
+    @property
     def keyframes(self) -> int:
         """How many there are."""
         return len(self._active.mapper.keyframes)
@@ -78,8 +83,8 @@ class MapperThread:
     @property
     def loops(self) -> tuple[int, int]:
         """Loops accepted, and loops tried."""
-        closures = list(self._active.mapper.closures)
-        return sum(closure.registration.ok for closure in closures), len(closures)
+        loops = list(self._active.mapper.loops)
+        return sum(loop.ok for loop in loops), len(loops)
 
     @property
     def waiting(self) -> int:
@@ -111,18 +116,6 @@ class MapperThread:
         """What became of the last keyframe in a map that stays as it is."""
         return self._active.located
 
-    def state(self, odometry: State) -> State:
-        """That of the robot: of its odometry, or, where that is well, of its place in a map that stays as it is."""
-        localizer = self._active.localizer
-        if localizer is None or odometry in (State.LOST, State.INITIALIZING) or localizer.state is State.TRACKING:
-            return odometry
-        return localizer.state
-
-    def wants_keyframe(self, stamp: int) -> bool:
-        """Whether one is looked for that the odometry would not make of its own (ns)."""
-        idle, localizer = self._last is None or self._last.done(), self._active.localizer
-        return localizer is not None and idle and localizer.wants(stamp)
-
     def broadcast(self, stamp: int, robot: str, odom_frame: str) -> None:
         """Send map -> odom of a robot, valid from that stamp (ns) on, if it is known."""
         restarting = robot == self._robot and self._restarted is not None and not self._restarted.done()
@@ -134,7 +127,7 @@ class MapperThread:
         """Take in the keyframe that `make`, called in this thread, returns."""
         with self._lock:
             self._waiting += 1
-        self._last = self._submit(lambda: self._take_in(make))
+        self._submit(lambda: self._take_in(make))
 
     def hint(self, T_map_base: Array) -> str:
         """Prior for the robot's pose (4, 4), for example from RViz; returns why it cannot be used, or an empty text."""
@@ -145,7 +138,7 @@ class MapperThread:
         return ""
 
     def localise(self) -> Future[str]:
-        """End the map that is being made, if one is, and look for the robot in the map file; the answer in words."""
+        """End the map that is being made, if one is, and look for the robot in the map file; returns a message."""
         return self._thread.submit(self._change, self._active.localise)
 
     def extend(self) -> Future[str]:
@@ -204,28 +197,27 @@ class MapperThread:
                 self._waiting -= 1
 
     def _add(self, keyframe: Keyframe) -> None:
-        closures = self._active.add(keyframe)
+        loops = self._active.add(keyframe)
         if self.localizing:
             return
         self._stamp = keyframe.stamp
-        for closure in closures:
-            self._publish_loop(closure, keyframe.stamp)
+        for loop in loops:
+            self._publish_loop(loop, keyframe.stamp)
         self._changes += 1
 
-    def _publish_loop(self, closure: LoopClosure, stamp: int) -> None:
-        result = closure.registration
-        ends = (closure.from_robot, closure.from_id), (closure.to_robot, closure.to_id)
-        names = [keyframe_name(robot, id) for robot, id in ends]
-        self._loop_candidates.publish(loop_to_msg(closure, stamp, *names))
-        if result.ok:
-            self._loop_closures.publish(edge_to_msg(result.T_target_source, result.covariance, stamp, *names))
+    def _publish_loop(self, loop: Edge, stamp: int) -> None:
+        ends = [self._active.mapper.keyframes[node] for node in (loop.from_node, loop.to_node)]
+        names = [keyframe_name(keyframe.robot, keyframe.id) for keyframe in ends]
+        self._loop_candidates.publish(loop_to_msg(loop, stamp, *names))
+        if loop.ok:
+            self._loop_closures.publish(edge_to_msg(loop.T_from_to, loop.covariance, stamp, *names))
 
     def _reset(self) -> None:
         if info := self._change(self._active.reset):
             self._node.get_logger().info(info)
 
     async def _on_save(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        await answer(self._thread.submit(self._active.save), response)
+        await respond(self._thread.submit(self._active.save), response)
         return response
 
     def _show(self) -> None:
@@ -255,8 +247,8 @@ def yield_to_odometry() -> None:
         os.setpriority(os.PRIO_PROCESS, thread, os.getpriority(os.PRIO_PROCESS, thread) + _NICER)
 
 
-async def answer(work: Future[str], response: Any) -> None:
-    """Fill the response of a service with what comes of work in another thread: success, or why not, in words."""
+async def respond(work: Future[str], response: Any) -> None:
+    """Fill the response of a service with the result of work in another thread: success, or why not."""
     while not work.done():
         await _OtherCallbacks()
     try:

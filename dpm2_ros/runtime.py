@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The life of a process: signals, spinning, exit codes. One or several SIGINT or SIGTERM end it cleanly.
+"""The life of a process: signals, spinning. One or several SIGINT or SIGTERM end it cleanly.
 
 rclpy's own handlers give up at the second SIGINT, which `ros2 launch` sends, and with them a map that is being saved.
 """
@@ -11,11 +11,10 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from dpm2_core.errors import Dpm2Error, UsageError, printable
+from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_ros.share import share_directory
 
 _SWITCH = 5e-4
@@ -32,34 +31,10 @@ def catch_signals() -> None:
         signal.signal(name, lambda *_: STOP.set())
 
 
-def exit_code(work: Callable[[], int | None]) -> int:
-    """Run `work`; an error of use or a failed work ends in one line on stderr and the code that the CLI uses too."""
-    try:
-        return work() or 0
-    except UsageError as error:
-        print(f"error: {printable(str(error))}", file=sys.stderr)
-        return 2
-    except Dpm2Error as error:
-        print(f"error: {printable(str(error))}", file=sys.stderr)
-        return 1
-    except ModuleNotFoundError:
-        if find_spec("rclpy") is not None:
-            raise
-        print("error: no ROS 2 here: install it and source its setup.bash, see docs/ros2.md", file=sys.stderr)
-        return 2
-    except Exception as error:
-        # click's own errors of use (an unknown option, a missing argument); typer may carry a click of its own
-        message = getattr(error, "format_message", None)
-        if message is None:
-            raise
-        print(f"error: {' '.join(message().split()) or 'see --help'}", file=sys.stderr)
-        return 2
-
-
 def use_dds_profile() -> None:
     """From here on Fast DDS has the shared memory that clouds need, unless the user has configured it.
 
-    It reads the variable when the process makes its first participant; that of Jazzy knows only the older name.
+    It reads the variable when the process makes its first participant; that of Jazzy has only the older name.
     """
     configured = os.environ.get("FASTDDS_BUILTIN_TRANSPORTS") or Path("DEFAULT_FASTRTPS_PROFILES.xml").is_file()
     if os.environ.get(_PROFILE) or (configured and not os.environ.get(_NEW_NAME)):

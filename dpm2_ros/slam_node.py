@@ -15,20 +15,21 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from std_srvs.srv import SetBool, Trigger
 
+from dpm2_core.data.frames import Calibration, FrameBuilder
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Keyframe, OdometryResult, State
 from dpm2_core.geometry import se3
-from dpm2_core.slam.build import make_loops, make_odometry
+from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.loops.localizer import LOST
 from dpm2_core.slam.mapping.admission import check_pose
+from dpm2_core.slam.system import Slam
 from dpm2_ros.base_frame import BaseFrame
-from dpm2_ros.conversions import keyframe_to_base, odometry_to_msg, of_body, to_base
-from dpm2_ros.frames import FrameBuilder
+from dpm2_ros.conversions import BodyMotion, keyframe_to_base, odometry_to_msg
 from dpm2_ros.guard import GuardedNode
 from dpm2_ros.health import Diagnostics, Health
 from dpm2_ros.keyframes import KeyframeSender, weights_identity
-from dpm2_ros.mapping import MapperThread, answer, robot_name, yield_to_odometry
+from dpm2_ros.mapping import MapperThread, respond, robot_name, yield_to_odometry
 from dpm2_ros.parameters import load_parameters
 from dpm2_ros.settings import NodeConfig
 from dpm2_ros.subscriptions import Inputs
@@ -53,13 +54,12 @@ class SlamNode(GuardedNode):
         ros, self._robot = self._config.ros, robot_name(self)
         if ros.localization_mode and not ros.embed_mapper:
             raise UsageError("ros.localization_mode: needs ros.embed_mapper")
-        self._odometry = make_odometry(self._config.slam, self._robot)
         self._mapper = MapperThread(self, self._config, self._robot) if ros.embed_mapper else None
+        self._slam = make_slam(self._config.slam, self._robot) if self._mapper is None else self._mapper.slam
         self._health = Health()
         weights = weights_identity(self._config.slam)
         self._sender = KeyframeSender(self, self._robot, ros.odom_frame, not ros.embed_mapper, weights)
         self._odom = self.create_publisher(Odometry, "dpm2/odom", 10)
-        self._described = make_loops(self._config.slam).described
         # Idle with the mapper, which has its own.
         self._line = ThreadPoolExecutor(1, thread_name_prefix="keyframes", initializer=yield_to_odometry)
         self._tf = TransformBroadcaster(self, ros.odom_frame, ros.publish_tf_odom)
@@ -73,17 +73,25 @@ class SlamNode(GuardedNode):
         self._waited = False  # for the base frame
         warm_up(self._config.slam)
         # Last of all: who is subscribed is ready, and whoever waits for subscribers loses nothing.
-        reading = self._config.input.model_copy(
-            update={"images": self._config.input.images and self._odometry.uses_images}
-        )
+        reading = self._config.input.model_copy(update={"images": self._config.input.images and self._slam.uses_images})
         self._inputs = Inputs(self, reading, ros)
-        self._frames = FrameBuilder(reading, self._inputs, self.get_logger().error)
+        self._frames = FrameBuilder(reading, self._inputs.calibration, self.get_logger().error)
         self._diagnostics = Diagnostics(self, self._inputs, self._frames, self._health, self._mapper, self._sender)
         self._begin()
         self._index = 0
         self._worker = threading.Thread(target=self._work, name="worker")
         self._worker.start()
         self.get_logger().info(f"waiting for clouds on {self._inputs.subscriptions[0].topic}")
+
+    @property
+    def slam(self) -> Slam:
+        """What runs in this node."""
+        return self._slam
+
+    @property
+    def calibration(self) -> Calibration:
+        """What is known of the sensors so far."""
+        return self._inputs.calibration
 
     def close(self) -> None:
         """End the worker after the frame it is at, then the mapper, which saves the map.
@@ -102,11 +110,11 @@ class SlamNode(GuardedNode):
 
     def _begin(self) -> None:
         """The state of a drive at its start."""
-        self._odometry.reset()
+        self._slam.odometry.reset()
         self._base.restart()
         self._held: list[OdometryResult] = []  # until the base frame is known
         self._covariance = np.zeros((6, 6))
-        self._before: OdometryResult | None = None  # the last registered frame, of which `_covariance` is
+        self._before: BodyMotion | None = None  # the last registered frame, of which `_covariance` is
 
     def _work(self) -> None:
         while not self._stopping.is_set():
@@ -140,10 +148,8 @@ class SlamNode(GuardedNode):
             if self._mapper is not None:
                 self._mapper.restart()
         self._look_for_base(bundle.cloud.header.frame_id or "lidar")
-        mapper = self._mapper
-        if mapper is not None and self._base.name and mapper.wants_keyframe(bundle.stamp):
-            self._odometry.request_keyframe()
-        tracked = self._odometry.process(self._frames.frame(bundle, self._index))
+        frame = self._frames.frame(bundle.stamp, bundle.cloud, bundle.image, self._index)
+        tracked = self._slam.odometry_step(frame)
         self._index += 1
         self._held.append(tracked)
         if self._base.name:
@@ -162,16 +168,16 @@ class SlamNode(GuardedNode):
 
     def _look_for_base(self, lidar_frame: str) -> None:
         """Before the first pose wait for what is latched, while clouds may still queue; then follow what comes."""
-        base, inputs, ros = self._base, self._inputs, self._config.ros
+        base, inputs, known, ros = self._base, self._inputs, self._inputs.calibration, self._config.ros
         end, room = time.monotonic() + ros.tf_timeout, max(ros.queue_depth - 1, 1)
         while not self._waited:
-            found = inputs.calibrated(lidar_frame) and (base.optional or base.look(inputs.static.tree, lidar_frame))
+            found = inputs.calibrated(lidar_frame) and (base.optional or base.look(known.transforms, lidar_frame))
             full = len(inputs.synchronizer) >= room
             self._waited = found or full or self._stopping.is_set() or time.monotonic() >= end
             if not self._waited:
                 time.sleep(0.01)
         before = base.name
-        if base.look(inputs.static.tree, lidar_frame) and before:
+        if base.look(known.transforms, lidar_frame) and before:
             self.get_logger().warning(
                 f"/tf_static has put {base.name} above {before}: the pose is that of {base.name} from now on, in the "
                 f"same odom; set ros.base_frame to wait for it"
@@ -181,44 +187,38 @@ class SlamNode(GuardedNode):
         self._diagnostics.frame_problem = base.problem
 
     def _hand_on(self, tracked: OdometryResult) -> OdometryResult:
-        """The keyframe to the map, pose and transforms to everybody; returns what was published."""
+        """The keyframe to the map, pose and transforms published; returns what was published."""
         mapper, T_start_lidar = self._mapper, self._base.T_start_lidar
-        if mapper is not None:
-            tracked = replace(tracked, state=mapper.state(tracked.state))
         if tracked.keyframe is not None:
             make = partial(self._finished, tracked.keyframe, T_start_lidar)
             if mapper is not None:
                 mapper.add(make)
             else:
                 self._line.submit(make).add_done_callback(self._report)
-        tracked = replace(tracked, keyframe=None)
-        if not np.array_equal(T_start_lidar, np.eye(4)):
-            tracked = to_base(tracked, T_start_lidar)
-        self._publish(tracked)
+        tracked = replace(tracked, keyframe=None, state=self._slam.state(tracked.state))
+        self._publish(tracked, BodyMotion.of_lidar(tracked).of_base(T_start_lidar))
         return tracked
 
-    def _publish(self, tracked: OdometryResult) -> None:
+    def _publish(self, tracked: OdometryResult, motion: BodyMotion) -> None:
         ros, before, covariance, seconds = self._config.ros, self._before, self._covariance, 0.1
         if before is not None:  # the last one that was registered
-            A = se3.adjoint(se3.inverse(tracked.T_odom_lidar) @ before.T_odom_lidar)
-            covariance = A @ covariance @ A.T + tracked.covariance
-            seconds = max((tracked.stamp - before.stamp) * 1e-9, 1e-3)
+            A = se3.adjoint(se3.inverse(motion.T_odom_body) @ before.T_odom_body)
+            covariance = A @ covariance @ A.T + motion.covariance
+            seconds = max((motion.stamp - before.stamp) * 1e-9, 1e-3)
         if before is None or tracked.registration.ok:
-            self._before, self._covariance = tracked, covariance
+            self._before, self._covariance = motion, covariance
         if tracked.state is State.LOST:
             covariance = covariance + LOST
-        base, T_base_start = self._base.name, self._base.T_base_start
-        if not np.array_equal(T_base_start, np.eye(4)):
-            A = se3.adjoint(T_base_start)
-            tracked, covariance = of_body(tracked, T_base_start), A @ covariance @ A.T
-        self._odom.publish(odometry_to_msg(tracked, covariance, seconds, ros.odom_frame, base))
-        self._tf.send(tracked.T_odom_lidar, tracked.stamp, base)
+        A = se3.adjoint(self._base.T_base_start)
+        motion, covariance = motion.of_other(self._base.T_base_start), A @ covariance @ A.T
+        self._odom.publish(odometry_to_msg(motion, covariance, seconds, ros.odom_frame, self._base.name))
+        self._tf.send(motion.T_odom_body, motion.stamp, self._base.name)
         if self._mapper is not None:
-            self._mapper.broadcast(tracked.stamp, self._robot, ros.odom_frame)
+            self._mapper.broadcast(motion.stamp, self._robot, ros.odom_frame)
 
     def _finished(self, keyframe: Keyframe, T_base_lidar: Array) -> Keyframe:
         """Not in the worker's thread: the keyframe in the base's frame, sent; with descriptors as the LiDAR sees it."""
-        keyframe = self._described(keyframe)
+        keyframe = self._slam.mapper.described(keyframe)
         if not np.array_equal(T_base_lidar, np.eye(4)):
             keyframe = keyframe_to_base(keyframe, T_base_lidar)
         self._sender.send(keyframe)
@@ -243,14 +243,14 @@ class SlamNode(GuardedNode):
         if self._mapper is None or not self._mapper.localizing:
             response.success, response.message = False, "no map is loaded: localization_mode is off"
         else:
-            await answer(self._mapper.localise(), response)
+            await respond(self._mapper.localise(), response)
         return response
 
     async def _on_localization_mode(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         if self._mapper is None:
             response.success, response.message = False, "the mapper is another node's: ros.embed_mapper is off"
         else:
-            await answer(self._mapper.localise() if request.data else self._mapper.extend(), response)
+            await respond(self._mapper.localise() if request.data else self._mapper.extend(), response)
         return response
 
     def _on_initial_pose(self, message: PoseWithCovarianceStamped) -> None:

@@ -38,7 +38,7 @@ class Parts:
 
 
 class Stream:
-    """One drive, told from others by its session; without a session nothing is sent again, and order is arrival.
+    """One drive, known by its session; without a session nothing is sent again, and order is arrival.
 
     Attributes:
         next: all ids below have gone on to the map, or were given up.
@@ -52,7 +52,7 @@ class Stream:
     def __init__(self, session: str, now: float) -> None:
         self.session, self.next, self.taken = session, 0, 0
         self.heard = self.since = now
-        self.answered = -float("inf")
+        self.acknowledged = -float("inf")
         self.robot: str | None = None
         self.last: Keyframe | None = None
         self.odom_frame = ""

@@ -18,11 +18,11 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 from std_msgs.msg import Float64
 
 from dpm2_core.data import topics
+from dpm2_core.data.frames import Calibration
 from dpm2_core.data.image_messages import decode_camera
 from dpm2_core.data.kitti import checked_correction
 from dpm2_core.data.messages import stamp_ns
 from dpm2_core.data.settings import InputSettings
-from dpm2_core.data.transforms import TransformTree
 from dpm2_core.errors import UsageError
 from dpm2_core.slam.mapping.admission import RejectedError
 from dpm2_ros.checks import check_header, check_size, extended, unreadable
@@ -83,65 +83,42 @@ class MatchedSubscription:
             self._node.get_logger().info(f"{self.topic}: {requested.name.lower()}, as its publisher")
 
 
-class StaticTransforms:
-    """What /tf_static says. Without tf2_msgs there is none, and extrinsics come from parameters alone."""
-
-    def __init__(self, node: Node) -> None:
-        self._node = node
-        self._topic = node.resolve_topic_name(topics.TF_STATIC)
-        self.tree = TransformTree()
-        self._messages = 0
-        if TFMessage is not None:
-            node.create_subscription(TFMessage, topics.TF_STATIC, self._on_message, LATCHED)
-
-    def complete(self, frame: str) -> bool:
-        """Whether all who publish it have been heard, and the frame is in the tree if anybody does."""
-        publishers = self._node.count_publishers(self._topic)
-        return not publishers or (frame.lstrip("/") in self.tree.frames and self._messages >= publishers)
-
-    def _on_message(self, message: Any) -> None:
-        self._messages += 1
-        self.tree, problem = extended(self.tree, message)  # another tree: the worker may be reading the present one
-        if problem:
-            raise RejectedError("transform", problem)
-
-
 class Inputs:
     """Clouds, images and calibration as they come in. The callbacks only put them into the synchronizer's queue.
 
     Attributes:
-        points_topic, image_topic: full names, after remapping; no image_topic where images are not wanted.
+        calibration: what is known by now; its topics are full names, after remapping.
     """
 
     def __init__(self, node: Node, settings: InputSettings, ros: RosSettings) -> None:
         self._node = node
         points_topic, image_topic = settings.points_topic or topics.POINTS, settings.image_topic or topics.IMAGE
-        self.points_topic = node.resolve_topic_name(points_topic)
-        self.image_topic = node.resolve_topic_name(image_topic) if settings.images else ""
+        image_name = node.resolve_topic_name(image_topic) if settings.images else ""
+        self.calibration = Calibration(node.resolve_topic_name(points_topic), image_name)
         self._image_shift = round(settings.image_time_offset * 1e9)
         self._arrived = threading.Condition()
         self.synchronizer = Synchronizer(
-            cameras=1 if self.image_topic else 0,
+            camera=settings.images,
             depth=ros.queue_depth,
             timeout=ros.sync_timeout,
             tolerance=settings.image_tolerance,
         )
         self.losses = Losses()
         """Clouds that were sent, and never arrived."""
-        self.camera_info: CameraInfo | None = None
-        self._calibrated = False  # by it
+        self._calibrated = False  # by a CameraInfo
         self._frame: str | None = None  # of the clouds
-        self.angle_correction_deg: float | None = None
-        self.static = StaticTransforms(node)
         self._times: deque[tuple[int, int]] = deque(maxlen=5)
         beside: list[MatchedSubscription] = []
-        if self.image_topic:
-            image_type = CompressedImage if self.image_topic.endswith("/compressed") else Image
+        if settings.images:
+            image_type = CompressedImage if image_name.endswith("/compressed") else Image
             info_topic = settings.camera_info_topic or _camera_info_beside(node, image_topic)
             beside = [
                 MatchedSubscription(node, image_type, image_topic, self._on_image, ros),
                 MatchedSubscription(node, CameraInfo, info_topic, self._on_camera_info, ros),
             ]
+        self._static_topic, self._static_messages = node.resolve_topic_name(topics.TF_STATIC), 0
+        if TFMessage is not None:  # else extrinsics come from parameters alone
+            node.create_subscription(TFMessage, topics.TF_STATIC, self._on_static, LATCHED)
         self._correction_topic = node.resolve_topic_name(topics.VERTICAL_ANGLE_CORRECTION)
         node.create_subscription(Float64, topics.VERTICAL_ANGLE_CORRECTION, self._on_correction, LATCHED)
         # The last to be announced: who waits for it has found the others.
@@ -161,10 +138,11 @@ class Inputs:
 
     def calibrated(self, lidar_frame: str) -> bool:
         """Whether all latched messages about the LiDAR that have a publisher have arrived."""
-        correction = self.angle_correction_deg is not None
-        return self.static.complete(lidar_frame) and (
-            correction or not self._node.count_publishers(self._correction_topic)
-        )
+        known, count = self.calibration, self._node.count_publishers
+        publishers, frames = count(self._static_topic), known.transforms.frames
+        if publishers and (self._static_messages < publishers or lidar_frame.lstrip("/") not in frames):
+            return False
+        return known.angle_correction_deg is not None or not count(self._correction_topic)
 
     @property
     def times(self) -> tuple[int, int] | None:
@@ -176,7 +154,7 @@ class Inputs:
         return times[len(times) // 2] if len(times) >= 3 else None
 
     def candidates(self) -> list[str]:
-        """Topics on which somebody else publishes point clouds."""
+        """Other topics with point clouds."""
         own = {topic for topic, _ in self._node.get_publisher_names_and_types_by_node(
             self._node.get_name(), self._node.get_namespace())}  # fmt: skip
         kind = "sensor_msgs/msg/PointCloud2"
@@ -214,7 +192,7 @@ class Inputs:
             self._times.append((stamped, self._node.get_clock().now().nanoseconds))
         stamp = self._stamp(message)
         with self._arrived:
-            for camera in self.synchronizer.cameras:
+            if camera := self.synchronizer.camera:
                 camera.present = bool(self._node.count_publishers(others[0].topic))
             lost = self.losses.add(stamp, number)
             check = self.synchronizer.add_cloud(stamp, message, time.monotonic())
@@ -233,7 +211,7 @@ class Inputs:
         check_size(message)
         with self._arrived:
             stamp = self._stamp(message) + self._image_shift
-            self.synchronizer.add_image(0, stamp, message, time.monotonic())
+            self.synchronizer.add_image(stamp, message, time.monotonic())
             self._arrived.notify()
 
     def _stamp(self, message: Any) -> int:
@@ -249,10 +227,17 @@ class Inputs:
                 raise  # what is known stays
         else:
             self._calibrated = True
-        self.camera_info = message
+        self.calibration.camera_info = message
+
+    def _on_static(self, message: Any) -> None:
+        self._static_messages += 1
+        tree, problem = extended(self.calibration.transforms, message)
+        self.calibration.transforms = tree  # another one: the worker may be reading that of before
+        if problem:
+            raise RejectedError("transform", problem)
 
     def _on_correction(self, message: Float64) -> None:
-        self.angle_correction_deg = checked_correction(message.data, self._correction_topic)
+        self.calibration.angle_correction_deg = checked_correction(message.data, self._correction_topic)
 
     def _refresh(self) -> None:
         for subscription in self.subscriptions:

@@ -1,25 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which images go with which cloud, and when a cloud has waited long enough. Pure logic: no ROS, no clock, no thread.
+"""Which clouds are accepted, and when one has waited long enough for its image. Pure: no ROS, no clock, no thread.
 
-The cloud leads: every accepted cloud leaves exactly once, in order, with the images that were there in time.
+Every accepted cloud leaves exactly once, in order, with its image by the rules of `dpm2_core.data.pairing`. It leaves
+as soon as there is one within the tolerance: a nearer one that may be on its way is not worth the wait.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-JUMP = 1.0
-"""A stamp that goes back by more than this (s), or ahead by more than this beyond the time that has passed, jumps. It
-may be wrong, or time itself has jumped: a looped bag, a clock that was set, a recording with a gap."""
+from dpm2_core.data.pairing import JUMP, Images, passed
+
 HOLD = 0.5
-"""Longest wait (s) for the next stamp, which tells."""
+"""Longest wait (s) for the next stamp, which confirms a jump."""
 PATIENCE = 5
-"""Clouds in a row that a camera may miss before nobody waits for it any more (until it delivers again)."""
-BUFFER = 16
-"""Images kept for a camera."""
+"""Clouds in a row that a camera may miss before clouds no longer wait for it (until it delivers again)."""
 
 
 class StampCheck(StrEnum):
@@ -32,7 +30,7 @@ class StampCheck(StrEnum):
     """Rejected: its stamp is that of the cloud before."""
     OUT_OF_ORDER = "out of order"
     """Rejected: a later cloud has been accepted already."""
-    JUMPED = "the stamp jumps; the next one tells whether it is true"
+    JUMPED = "the stamp jumps; the next one shows whether it is right"
     """Neither accepted nor rejected yet; counted as what becomes of it."""
     STRAY = "stray"
     """Rejected: its stamp jumped, and the next one did not."""
@@ -40,29 +38,28 @@ class StampCheck(StrEnum):
 
 @dataclass(eq=False)
 class Bundle:
-    """A cloud and its images (by camera number), ready to be processed; arrival and `now` are seconds of one clock."""
+    """A cloud and its image, ready to be processed; arrival and `now` are seconds of one clock."""
 
     stamp: int
     cloud: Any
     arrival: float
     restarted: bool
-    images: dict[int, Any] = field(default_factory=dict)
+    image: Any = None
 
 
 @dataclass(eq=False)
 class CameraState:
-    """What one camera has delivered."""
+    """What the camera has delivered."""
 
     received: int = 0
     matched: int = 0
     late: int = 0
-    """Images whose cloud had left without them."""
+    """Images for which a cloud had not waited."""
     missed: int = 0
     """Clouds in a row that left without its image."""
     last_arrival: float | None = None
     present: bool = True
-    """Whether anybody is there who could deliver; nobody waits for a camera that is not."""
-    images: deque[tuple[int, Any]] = field(default_factory=lambda: deque(maxlen=BUFFER))
+    """Whether there is a publisher; clouds do not wait for a camera without one."""
 
     @property
     def awaited(self) -> bool:
@@ -71,27 +68,27 @@ class CameraState:
 
 
 class Synchronizer:
-    """A bounded queue of clouds, each waiting for its images.
+    """A bounded queue of clouds, each waiting for its image.
 
     Args:
-        cameras: how many there are; 0 never waits.
+        camera: whether images are wanted; without, nothing waits.
         depth: clouds that may wait; when full, the oldest is dropped.
-        timeout: longest wait of a cloud for its images, s.
+        timeout: longest wait of a cloud for its image, s.
         tolerance: greatest difference of stamps that belong together, s.
     """
 
-    def __init__(self, cameras: int, depth: int, timeout: float, tolerance: float) -> None:
-        self.cameras = [CameraState() for _ in range(cameras)]
+    def __init__(self, camera: bool, depth: int, timeout: float, tolerance: float) -> None:
+        self.camera = CameraState() if camera else None
         self.counts: dict[StampCheck, int] = dict.fromkeys(StampCheck, 0)
         self.dropped = 0
         self.last_arrival: float | None = None
-        self._timeout, self._tolerance = timeout, round(tolerance * 1e9)
+        self._timeout, self._images = timeout, Images(tolerance)
         self._queue: deque[Bundle] = deque()
         self._depth = depth
         self._newest: int | None = None  # stamp of the last cloud accepted
         self._arrival = 0.0  # of that cloud
         self._jumped: Bundle | None = None
-        self._left: Bundle | None = None  # the last cloud that went
+        self._left = -float("inf"), 0.0  # stamp and arrival of the last cloud that went
 
     def __len__(self) -> int:
         """Clouds that are waiting."""
@@ -120,46 +117,35 @@ class Synchronizer:
         """Whether a cloud of that stamp (ns) would be accepted as the next one of the drive."""
         return self._newest is not None and self._check(stamp, now) is StampCheck.ACCEPTED
 
-    def add_image(self, camera: int, stamp: int, image: Any, now: float) -> None:
-        """Take an image of one camera with its stamp (ns)."""
-        state = self.cameras[camera]
-        state.received += 1
-        state.last_arrival = now
-        if state.images and stamp < state.images[-1][0] - JUMP * 1e9:
-            state.images.clear()
-        left = self._left
-        gone = left is not None and -JUMP * 1e9 < stamp - left.stamp <= self._tolerance
-        if left is not None and gone and (state.missed or stamp < left.stamp - self._tolerance):
-            state.late += 1
-            if now <= left.arrival + self._timeout:
-                state.missed = 0  # it would have come in time, had that cloud waited
-            return
-        state.missed = 0
-        state.images.append((stamp, image))
+    def add_image(self, stamp: int, image: Any, now: float) -> None:
+        """Take an image with its stamp (ns); there must be a camera."""
+        camera, tolerance, (left, arrival) = self.camera, self._images.tolerance, self._left
+        assert camera is not None
+        camera.received += 1
+        camera.last_arrival = now
+        late = -JUMP < stamp - left <= (tolerance if camera.missed else -tolerance)
+        camera.late += late
+        if not late or now <= arrival + self._timeout:
+            camera.missed = 0  # a late one would have come in time, had that cloud waited
+        self._images.add(stamp, image)
 
     def pop(self, now: float) -> Bundle | None:
-        """The next cloud that has its images or has waited long enough; None if there is none yet."""
+        """The next cloud that has its image or has waited long enough; None if there is none yet."""
         if self._jumped is not None and now >= self._jumped.arrival + HOLD:
             self._settle(true=True)
         if not self._queue:
             return None
-        head = self._queue[0]
-        found = [self._match(state, head.stamp) for state in self.cameras]
-        pending = any(
-            match is None and state.present and state.awaited and not self._passed(state, head.stamp)
-            for match, state in zip(found, self.cameras, strict=True)
-        )
-        if pending and now < head.arrival + self._timeout:
-            return None
+        head, camera = self._queue[0], self.camera
+        head.image = self._images.nearest(head.stamp)
+        if camera is not None:
+            waits = camera.present and camera.awaited and not passed(self._images.last, head.stamp)
+            if head.image is None and waits and now < head.arrival + self._timeout:
+                return None
+            camera.matched += head.image is not None
+            camera.missed += head.image is None
         self._queue.popleft()
-        for camera, (match, state) in enumerate(zip(found, self.cameras, strict=True)):
-            if match is None:
-                state.missed += 1
-            else:
-                state.matched += 1
-                head.images[camera] = match[1]
-            self._forget(state, head.stamp)
-        self._left = Bundle(head.stamp, None, head.arrival, head.restarted)
+        self._images.forget(head.stamp)
+        self._left = head.stamp, head.arrival
         return head
 
     def deadline(self) -> float | None:
@@ -171,8 +157,8 @@ class Synchronizer:
     def _check(self, stamp: int, now: float) -> StampCheck:
         if self._newest is None:
             return StampCheck.ACCEPTED
-        step = (stamp - self._newest) * 1e-9
-        if step < -JUMP or step > JUMP + now - self._arrival:
+        step = stamp - self._newest
+        if step < -JUMP or step > JUMP + (now - self._arrival) * 1e9:
             return StampCheck.JUMPED
         if step > 0:
             return StampCheck.ACCEPTED
@@ -197,16 +183,3 @@ class Synchronizer:
             oldest = self._queue.popleft()
             self._queue[0].restarted |= oldest.restarted  # not lost with the cloud that announced it
             self.dropped += 1
-
-    def _match(self, state: CameraState, stamp: int) -> tuple[int, Any] | None:
-        nearest = min(state.images, key=lambda image: abs(image[0] - stamp), default=None)
-        return nearest if nearest is not None and abs(nearest[0] - stamp) <= self._tolerance else None
-
-    def _passed(self, state: CameraState, stamp: int) -> bool:
-        """Whether the camera is already beyond this cloud, so that waiting is useless."""
-        return bool(state.images) and stamp + self._tolerance < state.images[-1][0] < stamp + JUMP * 1e9
-
-    def _forget(self, state: CameraState, stamp: int) -> None:
-        """Images too old for the next cloud, or left over from before a restart."""
-        while state.images and not 0 <= state.images[0][0] - stamp + self._tolerance < JUMP * 1e9:
-            state.images.popleft()

@@ -9,8 +9,8 @@ import numpy as np
 
 from dpm2_core.frame import Camera, Frame, Image, Points
 from dpm2_core.geometry import se3
+from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.settings import SlamSettings
-from dpm2_core.slam.system import SlamSystem
 from dpm2_ros.runtime import STOP
 
 _FRAMES = 3  # the first begins the map, the second finds the speed, the third is like all others
@@ -26,14 +26,14 @@ def warm_up(settings: SlamSettings) -> None:
     Raises:
         UsageError: a network has no weights to run with.
     """
-    system = SlamSystem(settings)
+    slam = make_slam(settings)
     for n in range(_FRAMES):
         if STOP.is_set():
             return
-        system.odometry.request_keyframe()  # so that the network and the map work on each
-        frame = Frame(n * _PERIOD, _street(n * _SPEED), images=_image() if system.odometry.uses_images else (), index=n)
-        system.process(frame)
-    system.mapper.finish()
+        slam.odometry.request_keyframe()  # so that the network and the map work on each
+        frame = Frame(n * _PERIOD, _street(n * _SPEED), images=_image() if slam.uses_images else (), index=n)
+        slam.process(frame)
+    slam.mapper.finish()
 
 
 def _street(x: float) -> Points:

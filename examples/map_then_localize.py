@@ -12,9 +12,8 @@ from pathlib import Path
 
 from dpm2_core import (
     Config,
-    LocalizationSystem,
-    SlamSystem,
     dump_settings,
+    make_slam,
     open_for_localization,
     open_session,
     open_source,
@@ -24,16 +23,15 @@ recording, other, map_file = sys.argv[1], sys.argv[2], Path(sys.argv[3])
 config = Config()
 
 with open_session(map_file, config.slam, dump_settings(config), resume=False) as store:
-    slam = SlamSystem(config.slam, store=store)
+    slam = make_slam(config.slam, store=store)
     for frame in open_source(recording).frames():
         slam.process(frame)
-    slam.mapper.finish()
+    slam.finish()
     print(f"{map_file}: {len(slam.mapper.keyframes)} keyframes", file=sys.stderr)
 
 with open_for_localization(map_file, config.slam) as store:
-    system = LocalizationSystem(config.slam, store)
+    slam = make_slam(config.slam, store=store)
     for frame in open_source(other).frames():
-        odometry, _ = system.process(frame)
-        if system.localizer.state.located:
-            T_map_lidar = system.localizer.T_map_odom @ odometry.T_odom_lidar
+        T_map_lidar = slam.process(frame).T_map_lidar
+        if T_map_lidar is not None:
             print(frame.stamp, *T_map_lidar[:3, 3].round(3))

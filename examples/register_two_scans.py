@@ -25,4 +25,4 @@ if not registration.ok:
 x, y, z = registration.T_target_source[:3, 3]
 print(f"the source is at {x:.2f} {y:.2f} {z:.2f} m in the frame of the target")
 print(f"confidence {registration.confidence:.2f}, position to {registration.worst_sigma:.2f} m (1 sigma)")
-matches_png(out, source.points, target.points, network.matches(of_source, of_target), registration)
+matches_png(out, network, source, target)

@@ -7,13 +7,21 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import hypothesis
 import pytest
 
 from dpm2_core.openmp import wait_passively
 
+if TYPE_CHECKING:
+    import numpy as np
+
+    from dpm2_core.network.model import DeepPointMap2
+
 wait_passively()  # as the programs do, before a test imports numpy
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # where a test does not ask for more: its arrays are small
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # some hundred processes are started: compile their modules once
 KITTI = Path(os.environ.get("DPM2_KITTI", Path(__file__).resolve().parents[2] / "shared" / "kitti"))
 
 ROS = Path(__file__).resolve().parent / "dpm2_ros"
@@ -44,3 +52,37 @@ def kitti_root(kitti_excerpt: Path, tmp_path_factory: pytest.TempPathFactory) ->
     root = tmp_path_factory.mktemp("kitti")
     subprocess.run([sys.executable, str(kitti_excerpt / "unpack.py"), str(root)], check=True, capture_output=True)
     return root
+
+
+@pytest.fixture(scope="session")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """28 m of a simulated street in KITTI layout, 30 scans without images. Not to be written to."""
+    from dpm2_core.sim.drive import simulate
+    from dpm2_core.sim.settings import DriveConfig, LidarConfig
+
+    root = tmp_path_factory.mktemp("recording") / "sim"
+    lidar = LidarConfig(columns=900)
+    drive = DriveConfig(frames=30, seed=2, road="straight", preset="suburb", images=False, lidar=lidar)
+    simulate(root, drive)
+    return root
+
+
+@pytest.fixture
+def noise() -> np.random.Generator:
+    """Seeded."""
+    import numpy as np
+
+    return np.random.default_rng(7)
+
+
+@pytest.fixture
+def model() -> DeepPointMap2:
+    """A tiny network with seeded random weights."""
+    import torch
+
+    from dpm2_core.network.model import DeepPointMap2
+
+    from .helpers.networks import tiny
+
+    torch.manual_seed(0)
+    return DeepPointMap2(tiny()).eval()

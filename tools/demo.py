@@ -15,9 +15,11 @@ import numpy as np
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from dpm2_core.commands.options import run_command
 from dpm2_core.console import Console
 from dpm2_core.data.bags import BagSource
 from dpm2_core.data.convert import convert_kitti
+from dpm2_core.data.kitti import KittiSource
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.trajectory import read_trajectory
 from dpm2_core.errors import Dpm2Error, UsageError
@@ -29,7 +31,6 @@ from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.slam.output import corrected
 from dpm2_core.tables import FigureTable
-from dpm2_ros.runtime import exit_code
 from dpm2_ros.tf import TFMessage
 from tools.replay import Replay, replay
 
@@ -97,7 +98,7 @@ def prepare(src: Path | None, out: Path, frames: int, seed: int, console: Consol
     made_from = bag.with_suffix(".source")  # the same name elsewhere is another drive
     if not (bag / "metadata.yaml").is_file() or made_from.read_text() != str(src.resolve()):
         with console.status(f"converting {src} to {bag}"):
-            for note in convert_kitti(src, bag, overwrite=True):
+            for note in convert_kitti(KittiSource(src), bag, overwrite=True):
                 console.print(note, style="yellow")
         made_from.write_text(str(src.resolve()))
     return bag
@@ -215,15 +216,5 @@ def _value(value: float | int | None, unit: str, digits: int) -> str:
     return "-" if value is None else f"{value:.{digits}f} {unit}"
 
 
-def main() -> int:
-    """Entry point of `python -m tools.demo`."""
-    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-    app.command()(demo)
-    try:
-        return exit_code(lambda: app(standalone_mode=False))
-    except KeyboardInterrupt:
-        return 130
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_command(demo))

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.errors import Dpm2Error, UsageError, exit_code
 from dpm2_core.extras import needs
 from dpm2_core.files import atomic_write
 
@@ -133,13 +133,10 @@ def _label(unit: str, arrows: Arrows) -> str:
 
 def main() -> None:
     """Write the document with its diagrams as the imports are now."""
-    try:
-        text = DOCUMENT.read_text(encoding="utf-8")
-        with atomic_write(DOCUMENT) as file:
-            file.write(replaced(text, diagrams()))
-    except Dpm2Error as error:
-        sys.exit(f"draw_imports: {error}")
+    text = DOCUMENT.read_text(encoding="utf-8")
+    with atomic_write(DOCUMENT) as file:
+        file.write(replaced(text, diagrams()))
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(exit_code(main, "draw_imports"))

@@ -117,7 +117,7 @@ def replay(
     try:
         with _Listener(result) as listener:
             alive = _watch(slam, "slam_node", out)
-            while not listener.connected():  # or the first poses would go out before anybody hears them
+            while not listener.connected():  # or the first poses would be sent before there is a subscriber
                 alive()
                 listener.spin(0.1)
             playing = [str(bag), "--rate", str(rate), "--wait", "60", "--log", str(times)]
@@ -248,7 +248,7 @@ def _published(times: Path, points_topic: str) -> Nanoseconds:
 
 def _tail(log: Path) -> str:
     lines = [line for line in log.read_text(errors="replace").splitlines() if line.strip()]
-    return lines[-1] if lines else "it said nothing"
+    return lines[-1] if lines else "no output"
 
 
 def _yaml(value: object) -> str:

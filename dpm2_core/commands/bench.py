@@ -17,8 +17,8 @@ def bench(
     names: Annotated[
         list[str] | None,
         typer.Argument(
-            help="diffslam, finetune, geometric (default), loop-cost, map, memory, neural, pose-graph, relocalise, "
-            "roads, tasks, traffic."
+            help="diffslam, finetune, gaps, geometric (default), hard, loop-cost, map, memory, neural, pose-graph, "
+            "relocalise, roads, tasks, traffic."
         ),
     ] = None,
     source: Annotated[

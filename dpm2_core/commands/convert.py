@@ -32,13 +32,16 @@ def kitti(
 ) -> None:
     """KITTI odometry to a bag with the topic names of kitti2bag, ground truth included where there is some."""
     from dpm2_core.data.convert import convert_kitti  # rosbags is slow to import for the other commands
+    from dpm2_core.data.kitti import KittiSource
+    from dpm2_core.data.settings import InputSettings
 
     console = Console(stderr=True)
     with progress_bar(console) as bar:
         task = bar.add_task(f"{src} -> {out}", total=None)
+        source = KittiSource(src, InputSettings(sequence=sequence, images=images))
         notes = convert_kitti(
-            src, out, sequence, start, end, images, zstd, overwrite,
-            progress=lambda done, total: bar.update(task, completed=done, total=total),
+            source, out, (start, end), zstd, overwrite,
+            lambda done, total: bar.update(task, completed=done, total=total),
         )  # fmt: skip
     for note in notes:
         console.print(f"note: {note}", highlight=False)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`dpm2 eval`: judge a trajectory file against ground truth, and say how it was judged."""
+"""`dpm2 eval`: evaluate a trajectory file against ground truth, and print how it was evaluated."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def eval_(
         list[str] | None, typer.Option("--set", help="KEY=VALUE of input where --gt is a drive, such as sequence=04.")
     ] = None,
 ) -> None:
-    """Judge a trajectory: KITTI metric, APE, RPE and final drift."""
+    """Evaluate a trajectory: KITTI metric, APE, RPE and final drift."""
     if settings and not gt.is_dir():
         raise UsageError(f"--set {settings[0]}: says how a drive is read, and {gt} is a file")
     chosen = parse_lengths(lengths) if lengths else OFFICIAL_LENGTHS

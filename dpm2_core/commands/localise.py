@@ -11,18 +11,16 @@ from typing import Any
 import numpy as np
 
 from dpm2_core.commands.options import progress_bar
-from dpm2_core.config import dump_settings
 from dpm2_core.console import Console
-from dpm2_core.data.prefetch import prefetch
-from dpm2_core.data.source import Source
 from dpm2_core.data.trajectory import write_tum
 from dpm2_core.errors import UsageError
 from dpm2_core.files import atomic_write
-from dpm2_core.frame import Array, Frame, State
+from dpm2_core.frame import Array, State
 from dpm2_core.geometry import se3
-from dpm2_core.slam.session import open_for_localization
+from dpm2_core.pipeline import OfflineRun, save_config
+from dpm2_core.slam.loops.localizer import Localizer
 from dpm2_core.slam.settings import Config
-from dpm2_core.slam.system import LocalizationSystem
+from dpm2_core.slam.system import SlamResult
 
 
 def parse_hint(text: str) -> Array:
@@ -47,36 +45,43 @@ class LocalizationReport:
         stamps: ns, of the frames whose place in the map was known. poses: T_map_lidar (4, 4) of each of them.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, localizer: Localizer) -> None:
+        self._localizer = localizer
+        self._before = localizer.state
         self.stamps: list[int] = []
         self.poses: list[Array] = []
         self._frames: Counter[State] = Counter()
         self._first: int | None = None
         self._events: list[dict[str, Any]] = []
 
-    def add(self, system: LocalizationSystem, frame: Frame) -> str:
-        """Take the next frame through the system; returns what is worth telling of it, or nothing."""
-        before = system.localizer.state
-        tracked, located = system.process(frame)
-        state = State.LOST if tracked.state is State.LOST else system.localizer.state
+    def add(self, result: SlamResult) -> str:
+        """Take in the result of the next frame; returns the event that it is, or an empty text."""
+        before, self._before = self._before, self._localizer.state
+        tracked, located = result.odometry, None if result.map is None else result.map.located
+        state = State.LOST if tracked.state is State.LOST else self._localizer.state
         number = self._frames.total()
         self._frames[state] += 1
-        if state.located:
-            self.stamps.append(frame.stamp)
-            self.poses.append(system.localizer.T_map_odom @ tracked.T_odom_lidar)
+        if state.located and result.T_map_lidar is not None:
+            self.stamps.append(tracked.stamp)
+            self.poses.append(result.T_map_lidar)
         if located is None or located.state is before or located.state is State.TRACKING:
             return ""
         kind = "kidnapped" if located.jumped and before.located else "found" if located.jumped else str(located.state)
         if located.jumped and self._first is None:
             self._first = number
-        event = {"frame": frame.index, "stamp_ns": frame.stamp, "event": kind, "reason": located.registration.reason}
+        event: dict[str, Any] = {
+            "frame": tracked.index,
+            "stamp_ns": tracked.stamp,
+            "event": kind,
+            "reason": located.registration.reason,
+        }
         if located.jumped:
             event["position_m"] = located.T_map_kf[:3, 3].round(3).tolist()
         self._events.append(event)
-        return f"frame {frame.index}: {kind} {event.get('position_m', '')}{located.registration.reason}"
+        return f"frame {tracked.index}: {kind} {event.get('position_m', '')}{located.registration.reason}"
 
     def summary(self) -> dict[str, Any]:
-        """Counts of frames by state, how many passed until the first answer (None: there was none), and events."""
+        """Counts of frames by state, how many passed until the first result (None: there was none), and events."""
         return {
             "frames": self._frames.total(),
             "frames_until_found": self._first,
@@ -87,41 +92,33 @@ class LocalizationReport:
         }
 
 
-def run_localized(
-    source: Source, span: tuple[int, int], out: Path, map_file: Path, hint: Array | None, chosen: Config
-) -> None:
-    """The drive through a map: localisation.json, trajectory.tum of the frames whose place was known, config.yaml.
+def run_localized(drive: OfflineRun, out: Path, hint: Array | None, config: Config) -> None:
+    """The drive through a map: localisation.json, trajectory.tum of the frames whose place was known, config.yaml."""
+    localizer, name = drive.slam.localizer, drive.source.name
+    assert localizer is not None
+    report = LocalizationReport(localizer)
+    if hint is not None:
+        localizer.hint(hint)
+    out.mkdir(parents=True, exist_ok=True)
+    with progress_bar() as bar:
+        task = bar.add_task(name, total=len(drive))
 
-    Raises:
-        UsageError: no map to find oneself in.
-    """
-    console, report = Console(stderr=True), LocalizationReport()
-    with open_for_localization(map_file, chosen.slam) as store:
-        system = LocalizationSystem(chosen.slam, store)
-        if hint is not None:
-            system.localizer.hint(hint)
-        out.mkdir(parents=True, exist_ok=True)
-        with progress_bar(console) as progress:
-            task = progress.add_task(source.name, total=span[1] - span[0])
-            try:
-                for frame in prefetch(source.frames(*span)):
-                    if info := report.add(system, frame):
-                        progress.console.print(info, soft_wrap=True)
-                    progress.update(task, advance=1, description=f"{source.name} {system.localizer.state}")
-            except KeyboardInterrupt:
-                console.print("interrupted; writing what there is", style="yellow")
+        def progress(result: SlamResult) -> None:
+            if info := report.add(result):
+                bar.console.print(info, soft_wrap=True)
+            bar.update(task, advance=1, description=f"{name} {localizer.state}")
+
+        interrupted = drive.run(progress).interrupted
+    if interrupted:
+        Console(stderr=True).print("interrupted; writing what there is", style="yellow")
+    save_config(config, out)
     write_tum(out / "trajectory.tum", report.stamps, np.array(report.poses).reshape(-1, 4, 4))
     summary = report.summary()
-    for name, text in (
-        ("config.yaml", dump_settings(chosen)),
-        ("localisation.json", json.dumps(summary, indent=2) + "\n"),
-    ):
-        with atomic_write(out / name) as file:
-            file.write(text)
+    with atomic_write(out / "localisation.json") as file:
+        file.write(json.dumps(summary, indent=2) + "\n")
     until = summary["frames_until_found"]
     found = "not found" if until is None else f"found after {until} frames"
     Console().print(
-        f"{source.name} in {map_file.name}: {found}, place known in {len(report.stamps)} of {summary['frames']} frames"
-        f"; results in {out}",
+        f"{name}: {found}, place known in {len(report.stamps)} of {summary['frames']} frames; results in {out}",
         soft_wrap=True,
     )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`dpm2 map optimize`: anybody's pose graph, robustly."""
+"""`dpm2 map optimize`: a pose graph of any program, robustly."""
 
 from __future__ import annotations
 
@@ -53,11 +53,11 @@ def optimize(
     }
     write_g2o(out, optimized, solution.kept)
     if json_file is not None:
-        loop_checks = [
+        verdicts = [
             {"from": int(a), "to": int(b), "kept": bool(kept), "reason": solution.reason(loop)}
             for loop, ((a, b), kept) in enumerate(zip(file.ids[data.ends], solution.kept, strict=True))
         ]
-        record = {**figures, "settled": solution.settled, "ignored": file.ignored, "verdicts": loop_checks}
+        record = {**figures, "settled": solution.settled, "ignored": file.ignored, "verdicts": verdicts}
         with atomic_write(json_file) as text:
             text.write(json.dumps(record, indent=1) + "\n")
     _show(graph, figures, file.ignored, solution.settled)

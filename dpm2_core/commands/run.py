@@ -16,9 +16,10 @@ from dpm2_core.data.corrupt import CorruptedSource, parse_corruption
 from dpm2_core.data.source import Source
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.report import metrics_table
-from dpm2_core.frame import OdometryResult
-from dpm2_core.pipeline import MapMode, OfflineRun, Result, open_recording, save_config, span_of
+from dpm2_core.pipeline import OfflineRun, Result, open_recording, save_config
+from dpm2_core.slam.session import MapMode
 from dpm2_core.slam.settings import Config
+from dpm2_core.slam.system import SlamResult
 
 
 def run(
@@ -64,13 +65,13 @@ def run(
         raise UsageError("--hint: only with --localise")
     T_hint = None if hint is None else parse_hint(hint)
     source: Source | Path = src
-    if localise is not None or corruption is not None:
-        wanted = chosen.slam.registration != "geometric" or chosen.slam.visual.enabled
-        source = open_recording(src, chosen, wanted or (localise is None and chosen.slam.map.thumbnail > 0))
-        source = source if corruption is None else CorruptedSource(source, corruption)
-        if localise is not None:
-            run_localized(source, span_of(source, span), out, localise, T_hint, chosen)
-            return
+    if corruption is not None:
+        wanted = chosen.slam.registration != "geometric" or chosen.slam.visual.enabled or chosen.slam.map.thumbnail > 0
+        source = CorruptedSource(open_recording(src, chosen, wanted), corruption)
+    if localise is not None:
+        with OfflineRun(source, chosen, span, map_file=localise, map_mode="localize") as drive:
+            run_localized(drive, out, T_hint, chosen)
+        return
     mode: MapMode = "resume" if resume else "extend" if extend else "create"
     with OfflineRun(source, chosen, span, gt, map_file, mode) as drive:
         out.mkdir(parents=True, exist_ok=True)
@@ -84,9 +85,10 @@ def _drive(drive: OfflineRun) -> Result:
     with progress_bar() as bar:
         task = bar.add_task(name, total=len(drive))
 
-        def progress(tracked: OdometryResult) -> None:
+        def progress(result: SlamResult) -> None:
             nonlocal problem
-            if (now := drive.mapper.store_problem) and not problem:
+            tracked = result.odometry
+            if (now := drive.slam.mapper.store_problem) and not problem:
                 bar.console.print(f"map file: {now}", style="red", soft_wrap=True)
             problem = now
             if not tracked.registration.ok:

@@ -40,11 +40,8 @@ def show(
     target, moving = _frame(source, src, first), _frame(source, src, second)
     requested = point is not None or (model.encoder.image is not None and moving.images)
     looked = image_attention(model, moving, point) if requested else None
-    of_target, of_source = model.describe(target), model.describe(moving)
-    found = model.register(of_source, of_target)
-    matched = model.matches(of_source, of_target)
     title = f"{source.name}, frame {moving.index} to frame {target.index}"
-    matches_png(out, moving.points, target.points, matched, found, title, looked)
+    matches_png(out, model, moving, target, title, looked)
     Console(stderr=True).print(f"{out}: {title}", soft_wrap=True)
 
 

@@ -11,7 +11,7 @@ import typer
 from dpm2_core.commands.options import progress_bar
 from dpm2_core.config import settings_from
 from dpm2_core.console import Console
-from dpm2_core.sim.settings import LidarConfig, PresetName
+from dpm2_core.sim.settings import DriveConfig, PresetName
 
 
 def sim(
@@ -34,12 +34,11 @@ def sim(
     """Simulate a drive: scans, images, poses, point labels, scans without moving objects, and a map of the ground."""
     from dpm2_core.sim.drive import simulate  # embree and the rest are slow to import for the other commands
 
-    lidar = settings_from(LidarConfig, {"beams": beams, "height": height, "range": reach}, default="dpm2 sim")
+    lidar = {"beams": beams, "height": height, "range": reach}
+    tree = {"frames": frames, "seed": seed, "road": road, "preset": preset, "images": images, "traffic": traffic}
+    drive = settings_from(DriveConfig, {**tree, "lidar": lidar}, default="dpm2 sim")
     console = Console(stderr=True)
     with progress_bar(console) as bar:
         task = bar.add_task(f"{preset} -> {out}", total=None)
-        made = simulate(
-            out, frames, seed, road, preset, images, lidar, workers=workers,
-            progress=lambda done, total: bar.update(task, completed=done, total=total), traffic=traffic,
-        )  # fmt: skip
+        made = simulate(out, drive, workers, lambda done, total: bar.update(task, completed=done, total=total))
     console.print(f"{out}: {'written' if made else 'is there already'}", highlight=False)

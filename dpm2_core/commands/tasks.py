@@ -93,13 +93,13 @@ def _train(
     """Train a task with the settings of a YAML file and of overrides."""
     from dpm2_core.tasks.open import open_scans  # torch is slow to import
     from dpm2_core.tasks.task import task_type
-    from dpm2_core.tasks.training import WEIGHTS, train_task
+    from dpm2_core.tasks.training import WEIGHTS, new_task, train_task
 
     reject_overwriting(out, resume)
     kind = task_type(name)
     chosen = load_settings(kind.training_type, *settings)
     scans = open_scans(src, kind.needs)
-    train_task(name, chosen, scans, out, resume, None if val is None else open_scans(val, kind.needs))
+    train_task(new_task(name, chosen), scans, out, resume, None if val is None else open_scans(val, kind.needs))
     typer.echo(f"{out / WEIGHTS}: written", err=True)
 
 

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import struct
-from collections import deque
 from collections.abc import Iterator
 from functools import cached_property
 from itertools import islice
@@ -16,14 +14,14 @@ from numpy.typing import NDArray
 
 from dpm2_core.data import topics
 from dpm2_core.data.bag_file import open_bag
-from dpm2_core.data.image_messages import decode_camera, decode_image
+from dpm2_core.data.frames import Calibration, FrameBuilder
 from dpm2_core.data.kitti import checked_correction
-from dpm2_core.data.messages import MessageError, decode_points, stamp_ns
+from dpm2_core.data.messages import serialized_stamp, stamp_ns
+from dpm2_core.data.pairing import Images, clouds_after_images
 from dpm2_core.data.settings import InputSettings
-from dpm2_core.data.transforms import TransformTree, transform_matrix
-from dpm2_core.data.vertical_angle import HDL64_CORRECTION_DEG, correct_vertical_angle
+from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.errors import UsageError
-from dpm2_core.frame import Array, Camera, Frame, Image
+from dpm2_core.frame import Array, Camera, Frame
 from dpm2_core.geometry import se3
 
 Stamps = NDArray[np.int64]
@@ -32,9 +30,6 @@ CLOUD = "sensor_msgs/msg/PointCloud2"
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 _TRUTH = ("nav_msgs/msg/Odometry", "nav_msgs/msg/Path")
-LATE = 500_000_000
-"""ns of log time that a cloud waits for its image."""
-_BUFFERED_IMAGES = 32  # bounds memory where their stamps are of no use
 _TRUTH_GAP = 1_000_000_000  # ns between two true poses beyond which nothing is known in between
 
 
@@ -55,14 +50,16 @@ class BagSource:
         self.points_topic = self._choose_points()
         first = self._bag.first(self.points_topic)
         self.lidar_frame: str = first.header.frame_id if first else ""
-        self.transforms = TransformTree()
+        self._calibration = Calibration(self.points_topic, angle_correction_deg=self._recorded_correction())
+        self.transforms = self._calibration.transforms
         for _, _, data in self._bag.messages([topics.TF_STATIC]):
             self.transforms.add(self._bag.decode(topics.TF_STATIC, data))
         self.T_cam_lidar: Array | None = None
         if topics.GRAY_CAMERA in self.transforms.frames:
             self.T_cam_lidar = self.transforms.lookup(topics.GRAY_CAMERA, self.lidar_frame)
-        self.vertical_angle_correction_deg = self._correction()
-        self.image_topic = self._choose_image()
+        self._frames = FrameBuilder(self._settings, self._calibration, self.notes.append, self._bag.decode)
+        self.vertical_angle_correction_deg = self._frames.angle_correction_deg
+        self.image_topic = self._calibration.image_topic = self._choose_image()
         self.camera = self._camera() if self.image_topic else None
 
     def __len__(self) -> int:
@@ -76,7 +73,7 @@ class BagSource:
                 continue
             if before is not None and stamp <= before:
                 self._note_once("time stamps do not increase", f"at frame {index}: {(stamp - before) * 1e-9:+.3f} s")
-            frame = self._frame(index, stamp, cloud, image)
+            frame = self._frames.frame(stamp, cloud, image, index)
             before, without, count = stamp, without + (not frame.images), count + 1
             yield frame
         if self.camera and without:
@@ -145,67 +142,30 @@ class BagSource:
                 )
             self.notes.append(f"images of {self.image_topic} are left out: no CameraInfo on {info_topic}")
             return None
-        T_lidar_cam = self._settings.extrinsic()
-        if T_lidar_cam is None:
-            try:
-                T_lidar_cam = self.transforms.lookup(self.lidar_frame, info.header.frame_id)
-            except UsageError as error:
-                raise UsageError(f"{self.path}: camera {self.image_topic}: {error}; "
-                                 "set input.T_lidar_cam, or input.images=false") from None  # fmt: skip
-        return decode_camera(info, T_lidar_cam, info.header.frame_id or self.image_topic)
+        self._calibration.camera_info = info
+        image = None if info.header.frame_id else self._bag.first(self.image_topic)
+        try:
+            return self._frames.camera(self.lidar_frame, image.header.frame_id if image else "")
+        except UsageError as error:
+            raise UsageError(f"{self.path}: camera {self.image_topic}: {error}") from None
 
-    def _correction(self) -> float:
-        requested = self._settings.vertical_angle_correction_deg
-        if requested != "auto":
-            return requested
-        message = self._bag.first(topics.VERTICAL_ANGLE_CORRECTION)
-        if message is not None:
-            return checked_correction(float(message.data), f"{self.path}: {topics.VERTICAL_ANGLE_CORRECTION}")
-        return HDL64_CORRECTION_DEG if self.points_topic.startswith("/kitti/") else 0.0
+    def _recorded_correction(self) -> float | None:
+        topic, wanted = topics.VERTICAL_ANGLE_CORRECTION, self._settings.vertical_angle_correction_deg == "auto"
+        message = self._bag.first(topic) if wanted else None
+        return None if message is None else checked_correction(float(message.data), f"{self.path}: {topic}")
 
     def _pairs(self) -> Iterator[tuple[int, bytes, bytes | None]]:
-        """(stamp, cloud, image or None), serialized. A cloud waits until no later image can be nearer, or too long."""
-        clouds: deque[tuple[int, int, bytes]] = deque()
-        images: deque[tuple[int, bytes]] = deque(maxlen=_BUFFERED_IMAGES)
-        shift = round(self._settings.image_time_offset * 1e9)
-        for topic, time, data in self._bag.messages([self.points_topic, self.image_topic][: 2 if self.camera else 1]):
+        """(stamp, cloud, image or None), serialized."""
+        offset, images = round(self._settings.image_time_offset * 1e9), Images(self._settings.image_tolerance)
+        cameras = [self.image_topic] if self.camera else []
+        messages = self._bag.messages([self.points_topic, *cameras])
+        for topic, time, data in clouds_after_images(messages, [self.points_topic], cameras, offset):
+            stamp = serialized_stamp(data, time)
             if topic == self.points_topic:
-                clouds.append((serialized_stamp(data, time), time, data))
+                yield stamp, data, images.nearest(stamp)
+                images.forget(stamp)
             else:
-                images.append((serialized_stamp(data, time) + shift, data))
-            while clouds and (
-                not self.camera or (images and images[-1][0] >= clouds[0][0]) or time - clouds[0][1] > LATE
-            ):
-                stamp, _, cloud = clouds.popleft()
-                yield stamp, cloud, self._nearest(stamp, images)
-        for stamp, _, cloud in clouds:
-            yield stamp, cloud, self._nearest(stamp, images)
-
-    def _nearest(self, stamp: int, images: deque[tuple[int, bytes]]) -> bytes | None:
-        tolerance = round(self._settings.image_tolerance * 1e9)
-        while images and images[0][0] < stamp - tolerance:
-            images.popleft()
-        taken, data = min(images, key=lambda image: abs(image[0] - stamp), default=(0, None))
-        return data if data is not None and abs(taken - stamp) <= tolerance else None
-
-    def _frame(self, index: int, stamp: int, cloud: bytes, image: bytes | None) -> Frame:
-        settings = self._settings
-        try:
-            msg = self._bag.decode(self.points_topic, cloud)
-            points, time = decode_points(msg, settings.time_field, settings.time_unit, settings.intensity_max)
-        except MessageError as error:
-            return Frame(stamp, np.empty((0, 4), np.float32), index=index, problem=str(error))
-        points = correct_vertical_angle(points, self.vertical_angle_correction_deg)
-        return Frame(stamp, points, time, self._images(image), index)
-
-    def _images(self, data: bytes | None) -> tuple[Image, ...]:
-        if data is None or self.camera is None:
-            return ()
-        try:
-            return (Image(decode_image(self._bag.decode(self.image_topic, data), self.camera.size), self.camera),)
-        except (MessageError, ValueError) as error:
-            self._note_once(f"images of {self.image_topic} that cannot be used are left out", f"the first: {error}")
-            return ()
+                images.add(stamp + offset, data)
 
     def _truth(self, topic: str) -> tuple[Stamps, Array]:
         """Stamps (M,) ns and T_world_lidar (M, 4, 4); of several Path messages the last, the most complete, counts."""
@@ -246,11 +206,3 @@ def interpolate(stamps: Stamps, poses: Array, at: Stamps) -> Array:
     fraction = ((at - stamps[left])[between] / gap[between])[:, None]
     out[between] = T0 @ se3.exp(fraction * se3.log(se3.inverse(T0) @ T1))
     return out
-
-
-def serialized_stamp(data: bytes, time: int) -> int:
-    """Stamp in ns of a serialized message that begins with a header, without decoding the rest; `time` if it is 0."""
-    if len(data) < 12:
-        return time
-    sec, nanosec = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)  # after the 4 bytes that name the order
-    return sec * 1_000_000_000 + nanosec or time

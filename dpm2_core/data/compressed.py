@@ -18,7 +18,7 @@ _BARE = {0x01, *range(0xD0, 0xD8)}  # and those without a length
 
 
 def compressed_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height of a JPEG or PNG; None for anything else, and where it is cut off before they are told."""
+    """Width and height of a JPEG or PNG; None for anything else, and where it is cut off before them."""
     if data.startswith(_PNG) and data[12:16] == b"IHDR" and len(data) >= 24:
         width, height = struct.unpack_from(">II", data, 16)
         return int(width), int(height)

@@ -7,6 +7,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from copy import copy
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from dpm2_core.data import topics
 from dpm2_core.data.kitti import KittiSource
 from dpm2_core.data.messages import cloud_fields, point_columns
 from dpm2_core.data.prefetch import prefetch
-from dpm2_core.data.settings import InputSettings
+from dpm2_core.data.source import Span
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Array, Camera, Frame
 from dpm2_core.geometry import se3
@@ -35,23 +36,20 @@ _TYPES = get_typestore(Stores.ROS2_JAZZY).types
 
 
 def convert_kitti(
-    src: Path,
+    source: KittiSource,
     out: Path,
-    sequence: str = "",
-    start: int = 0,
-    end: int | None = None,
-    images: bool = True,
+    frames: Span = (0, None),
     zstd: bool = False,
     overwrite: bool = False,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[str]:
-    """Write frames start..end-1 (positions) of a sequence to the new folder `out`; it appears whole or not at all.
+    """Write frames of a sequence to the new folder `out`; it appears whole or not at all.
 
     Points are written as they are; the vertical angle correction that they need is recorded beside them.
 
     Args:
-        src, sequence: as for `KittiSource`.
-        images: with image_2, as rgb8.
+        source: with its images, as rgb8.
+        frames: positions of the first and of the one to stop before.
         zstd: compress the chunks of the file.
         overwrite: replace a bag at `out`.
         progress: called with frames written and frames in all.
@@ -60,10 +58,10 @@ def convert_kitti(
         What the user should know, in words.
 
     Raises:
-        UsageError: no such sequence or frames, or `out` is taken.
+        UsageError: no such frames, or `out` is taken.
         Dpm2Error: it could not be written (disk full); nothing is left behind.
     """
-    source = KittiSource(src, InputSettings(sequence=sequence, images=images))
+    start, end = frames
     positions = range(len(source))[start:end]
     if not positions:
         raise UsageError(f"{source.path}: no frames {start}:{'' if end is None else end}; it has {len(source)}")
@@ -73,7 +71,7 @@ def convert_kitti(
             writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
         with writer:
             bag = _KittiBag(writer, source, positions)
-            for done, frame in enumerate(prefetch(source.frames(positions.start, positions.stop)), 1):
+            for done, frame in enumerate(prefetch(bag.source.frames(positions.start, positions.stop)), 1):
                 bag.write(frame)
                 progress(done, len(positions))
     return source.notes
@@ -83,12 +81,13 @@ class _KittiBag:
     """The topics of one recording; the constructor writes those that come once."""
 
     def __init__(self, writer: Writer, source: KittiSource, positions: range) -> None:
-        self._writer, self._source = writer, source
+        self._writer = writer
+        self.source = copy(source)
+        self.source.vertical_angle_correction_deg = 0.0  # recorded here, applied by who reads
         self._connections: dict[str, Any] = {}
         self._typestore = get_typestore(Stores.ROS2_JAZZY)
         first = EPOCH_NS + int(source.stamps[positions.start])
         correction = _TYPES["std_msgs/msg/Float64"](data=source.vertical_angle_correction_deg)
-        source.vertical_angle_correction_deg = 0.0  # recorded here, applied by who reads
         self._put(topics.VERTICAL_ANGLE_CORRECTION, first, correction, latched=True)
         transforms = [_transform(first, parent, child, T) for parent, child, T in _static_frames(source)]
         self._put(topics.TF_STATIC, first, _TYPES["tf2_msgs/msg/TFMessage"](transforms=transforms), latched=True)
@@ -104,7 +103,7 @@ class _KittiBag:
         """Image first: who waits for the cloud then has it already."""
         stamp = EPOCH_NS + frame.stamp
         if frame.problem:
-            self._source.notes.append(f"{frame.problem}: written as an empty cloud")
+            self.source.notes.append(f"{frame.problem}: written as an empty cloud")
         for image in frame.images:
             self._put(topics.CAMERA_INFO, stamp, _camera_info(stamp, image.camera))
             self._put(topics.IMAGE, stamp, _image(stamp, image.pixels))

@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpm2_core.data.messages import scale_intensity
-from dpm2_core.data.scan_file import read_image, read_scan
+from dpm2_core.data.scan_file import chosen, image_size, images_of, read_scan
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.text import parse_row, read_lines, read_numbers
 from dpm2_core.data.vertical_angle import HDL64_CORRECTION_DEG, correct_vertical_angle
 from dpm2_core.errors import UsageError
-from dpm2_core.frame import Array, Camera, Frame, Image
+from dpm2_core.frame import Array, Camera, Frame
 from dpm2_core.geometry import se3
 
 _MAX_CORRECTION_DEG = 5.0
@@ -78,7 +78,7 @@ class KittiSource:
             yield Frame(
                 stamp=int(stamp),
                 points=correct_vertical_angle(points, self.vertical_angle_correction_deg),
-                images=self._images(scan.stem),
+                images=images_of(self._image_path(scan), self.camera, self.notes),
                 index=int(scan.stem),
                 problem=problem,
             )
@@ -127,13 +127,13 @@ class KittiSource:
             self.notes.append(f"{path} is of the camera: without Tr it is no ground truth for the LiDAR")
             return None
         self.truth = "/".join(path.parts[-2:])  # poses/04.txt, or SemanticKITTI's 04/poses.txt
-        rows = self._of_each_scan(read_numbers(path, 12)).reshape(-1, 3, 4)
-        known = np.isfinite(rows).all((1, 2))
+        rows = self._of_each_scan(read_numbers(path, 12))
+        known = np.isfinite(rows).all(1)
         if not known.all():
             self.notes.append(f"{path}: {len(self) - known.sum()} of {len(self)} frames have no pose")
         T_world_cam = np.full((len(self), 4, 4), np.nan)
         # Rounded to 7 digits in the files, which a quaternion on the way through a bag would not keep.
-        T_world_cam[known] = se3.orthonormalized(se3.make(rows[known, :, :3], rows[known, :, 3]))
+        T_world_cam[known] = se3.from_rows(rows[known])
         return se3.inverse(self.T_cam_lidar) @ T_world_cam @ self.T_cam_lidar
 
     def _of_each_scan(self, rows: Array) -> Array:
@@ -153,7 +153,7 @@ class KittiSource:
         paths = [path for path in map(self._image_path, self._scans) if path]
         if not paths:
             return None
-        size = next((pixels.shape[1::-1] for pixels in map(read_image, paths) if pixels is not None), None)
+        size = image_size(paths)
         if size is None:
             self.notes.append(f"{paths[0].parent}: none of its images can be read")
             return None
@@ -171,17 +171,6 @@ class KittiSource:
         paths = (self.path / "image_2" / f"{scan.stem}{suffix}" for suffix in (".png", ".jpg"))
         return next((path for path in paths if path.is_file()), None)
 
-    def _images(self, stem: str) -> tuple[Image, ...]:
-        path = self._image_path(Path(stem)) if self.camera else None
-        if path is None or self.camera is None:
-            return ()
-        pixels = read_image(path)
-        if pixels is not None and pixels.shape[1::-1] == self.camera.size:
-            return (Image(pixels, self.camera),)
-        found = "cannot be read" if pixels is None else f"is {pixels.shape[1]}x{pixels.shape[0]}"
-        self.notes.append(f"{path} {found} (others are {'x'.join(map(str, self.camera.size))}): frame used without it")
-        return ()
-
 
 def read_calib(path: Path) -> dict[str, Array]:
     """P0..P3 (3, 4) and Tr (4, 4, LiDAR to left gray camera), those that a calib.txt has; nothing if there is none.
@@ -194,13 +183,13 @@ def read_calib(path: Path) -> dict[str, Array]:
         key, colon, text = line.partition(":")
         if not colon or key.strip() not in ("P0", "P1", "P2", "P3", "Tr"):
             continue  # raw and object calibrations have many more
-        matrix = parse_row(text, 12, f"{path}:{number}: {key}").reshape(3, 4)
-        name = key.strip()
+        row, name = parse_row(text, 12, f"{path}:{number}: {key}"), key.strip()
+        matrix = row.reshape(3, 4)
         if name == "Tr":
             R = matrix[:, :3]
             if np.abs(R @ R.T - np.eye(3)).max() > 0.01 or np.linalg.det(R) < 0:
                 raise UsageError(f"{path}:{number}: Tr is no rigid transform")
-            calib[name] = se3.orthonormalized(se3.make(R, matrix[:, 3]))
+            calib[name] = se3.from_rows(row)
         elif matrix[0, 0] <= 0 or matrix[1, 1] <= 0 or not np.allclose(matrix[2, :3], [0, 0, 1]):
             raise UsageError(f"{path}:{number}: {name} is no projection matrix of a rectified camera")
         else:
@@ -215,9 +204,6 @@ def _sequence_folder(path: Path, sequence: str) -> Path:
         raise UsageError(f"{path}: no such folder")
     root = path / "sequences" if (path / "sequences").is_dir() else path
     found = sorted(folder.name for folder in root.iterdir() if (folder / "velodyne").is_dir())
-    if sequence in found or (not sequence and len(found) == 1):
-        return root / (sequence or found[0])
-    if found:
-        asked = f"no sequence {sequence}" if sequence else "several sequences"
-        raise UsageError(f"{path}: {asked}; choose one with input.sequence: {', '.join(found)}")
-    raise UsageError(f"{path}: no KITTI sequence (no velodyne folder in it or below sequences/) and no bag")
+    if not found:
+        raise UsageError(f"{path}: no KITTI sequence (no velodyne folder in it or below sequences/) and no bag")
+    return root / chosen(path, sequence, found)

@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpm2_core.data.messages import scale_intensity
-from dpm2_core.data.scan_file import read_image, read_scan
+from dpm2_core.data.scan_file import chosen, image_size, images_of, read_scan
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.text import parse_row, read_lines, read_numbers
 from dpm2_core.data.vertical_angle import correct_vertical_angle
 from dpm2_core.errors import UsageError
-from dpm2_core.frame import Array, Camera, Frame, Image, Points
+from dpm2_core.frame import Array, Camera, Frame, Points
 from dpm2_core.geometry import se3
 
 _PERIOD = 0.1  # s, a turn of the LiDAR
@@ -50,7 +50,7 @@ class Kitti360Source:
             raise UsageError(f"{velodyne}: no scans (data/NNNNNNNNNN.bin) in this folder")
         self.numbers = np.array([int(scan.stem) for scan in self._scans])
         calibration = self.root / "calibration"
-        T_lidar_cam = _rigid(_only_row(calibration / "calib_cam_to_velo.txt"))
+        T_lidar_cam = se3.from_rows(_only_row(calibration / "calib_cam_to_velo.txt"))
         self._intrinsics = read_keyed(calibration / "perspective.txt")
         R_rect = self._intrinsics.get("R_rect_00")
         if R_rect is None or len(R_rect) != 9:
@@ -72,9 +72,8 @@ class Kitti360Source:
         for scan, stamp in list(zip(self._scans, self.stamps, strict=True))[start:stop]:
             points, problem = read_scan(scan)
             points = correct_vertical_angle(scale_intensity(points, self._settings.intensity_max), degrees)
-            yield Frame(
-                int(stamp), points, azimuth_time(points), self._images(scan.stem), index=int(scan.stem), problem=problem
-            )
+            images = images_of(self._image_path(scan.stem), self.camera, self.notes)
+            yield Frame(int(stamp), points, azimuth_time(points), images, index=int(scan.stem), problem=problem)
 
     def _stamps(self, path: Path) -> NDArray[np.int64]:
         """(len,) ns; line k of timestamps.txt is of scan k."""
@@ -94,7 +93,7 @@ class Kitti360Source:
             row = read_keyed(mounting).get("image_00")
             if row is None:
                 raise UsageError(f"{mounting}: no image_00, which {of_imu} needs")
-            T_sensor_lidar = _rigid(row) @ self._T_cam_lidar
+            T_sensor_lidar = se3.from_rows(row) @ self._T_cam_lidar
         elif of_camera.is_file():
             file, rows = of_camera, read_numbers(of_camera, 17)
             T_sensor_lidar = self._T_rect_cam @ self._T_cam_lidar
@@ -105,7 +104,7 @@ class Kitti360Source:
         at = {int(number): k for k, number in enumerate(self.numbers)}
         for row in rows:
             if (k := at.get(int(row[0]))) is not None:
-                poses[k] = _rigid(row[1:13]) @ T_sensor_lidar
+                poses[k] = se3.from_rows(row[1:13]) @ T_sensor_lidar
         known = int(np.isfinite(poses[:, 0, 0]).sum())
         if known < len(self):
             self.notes.append(f"{file}: {len(self) - known} of {len(self)} frames have no pose")
@@ -115,7 +114,7 @@ class Kitti360Source:
         if not self._settings.images:
             return None
         paths = (path for scan in self._scans if (path := self._image_path(scan.stem)).is_file())
-        size = next((pixels.shape[1::-1] for pixels in map(read_image, paths) if pixels is not None), None)
+        size = image_size(paths)
         if size is None:
             return None
         P = self._intrinsics.get("P_rect_00")
@@ -126,16 +125,6 @@ class Kitti360Source:
 
     def _image_path(self, stem: str) -> Path:
         return self.root / "data_2d_raw" / self.drive / "image_00" / "data_rect" / f"{stem}.png"
-
-    def _images(self, stem: str) -> tuple[Image, ...]:
-        path = self._image_path(stem)
-        if self.camera is None or not path.is_file():
-            return ()
-        pixels = read_image(path)
-        if pixels is None or pixels.shape[1::-1] != self.camera.size:
-            self.notes.append(f"{path}: unreadable or of another size: frame used without it")
-            return ()
-        return (Image(pixels, self.camera),)
 
 
 def azimuth_time(points: Points) -> Points:
@@ -171,12 +160,6 @@ def _only_row(path: Path) -> Array:
     return rows[0]
 
 
-def _rigid(row: Array) -> Array:
-    """(4, 4) of 12 numbers, row-major, their rounding removed."""
-    matrix = row.reshape(3, 4)
-    return se3.orthonormalized(se3.make(matrix[:, :3], matrix[:, 3]))
-
-
 def _stamp(line: str, where: str) -> int:
     """`2013-05-28 08:46:02.904300000` in ns since 1970; a float would lose the last digits."""
     date, dot, fraction = line.strip().partition(".")
@@ -192,10 +175,7 @@ def _find(path: Path, sequence: str) -> tuple[Path, str]:
     if (path / "velodyne_points").is_dir():
         return path.resolve().parents[1], path.resolve().name
     found = sorted(p.name for p in (path / "data_3d_raw").glob("*") if (p / "velodyne_points").is_dir())
-    chosen = [name for name in found if sequence in (name, name.removesuffix("_sync")[-4:])] if sequence else found
-    if len(chosen) == 1:
-        return path, chosen[0]
     if not found:
         raise UsageError(f"{path}: no drive (data_3d_raw/*/velodyne_points) below it")
-    asked = f"no sequence {sequence}" if sequence else "several sequences"
-    raise UsageError(f"{path}: {asked}; choose one with input.sequence: {', '.join(found)}")
+    matching = [name for name in found if sequence in ("", name, name.removesuffix("_sync")[-4:])]
+    return path, chosen(path, sequence, found, matching)

@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpm2_core.data.ply import read_ply
-from dpm2_core.data.scan_file import read_image
+from dpm2_core.data.scan_file import chosen, image_size, images_of
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.text import read_lines, read_numbers
 from dpm2_core.data.vertical_angle import correct_vertical_angle
 from dpm2_core.errors import UsageError
-from dpm2_core.frame import Array, Camera, Frame, Image
+from dpm2_core.frame import Array, Camera, Frame
 from dpm2_core.geometry import se3
 
 _FIELD_OF_VIEW = 72.0  # deg, across the width, of its cameras
@@ -69,7 +69,8 @@ class KittiCarlaSource:
             if len(points):
                 offset = (columns[:, 4] - stamp * 1e-9).astype(np.float32)
             points = correct_vertical_angle(points, 0.0 if requested == "auto" else requested)
-            yield Frame(int(stamp), points, offset, self._images(number), index=number, problem=problem)
+            images = images_of(self._image_path(number), self.camera, self.notes)
+            yield Frame(int(stamp), points, offset, images, index=number, problem=problem)
 
     def _trajectory(self) -> tuple[NDArray[np.int64], Array | None]:
         """Stamps (len,) ns and poses (len, 4, 4) T_world_lidar at them, of the file with one pose a millisecond."""
@@ -84,8 +85,7 @@ class KittiCarlaSource:
         at = np.clip(np.searchsorted(times, seconds - 1e-6), 0, len(times) - 1)
         near = np.abs(times[at] - seconds) < 0.5 * _PERIOD
         poses = np.full((len(self), 4, 4), np.nan)
-        matrices = rows[at[near], :12].reshape(-1, 3, 4)
-        poses[near] = se3.orthonormalized(se3.make(matrices[:, :, :3], matrices[:, :, 3]))
+        poses[near] = se3.from_rows(rows[at[near], :12])
         if not near.all():
             self.notes.append(f"{path}: {int((~near).sum())} of {len(self)} frames have no pose")
         return np.round(np.where(near, times[at], seconds) * 1e9).astype(np.int64), poses
@@ -93,16 +93,13 @@ class KittiCarlaSource:
     def _extrinsic(self) -> Array | None:
         """LiDAR to the optical frame of camera 0; None where lidar_to_cam0.txt is missing."""
         rows = _rows(self.folder / "lidar_to_cam0.txt", 12)
-        if not len(rows):
-            return None
-        T_body_lidar = rows[0].reshape(3, 4)
-        return se3.inverse(_T_BODY_OPTICAL) @ se3.orthonormalized(se3.make(T_body_lidar[:, :3], T_body_lidar[:, 3]))
+        return se3.inverse(_T_BODY_OPTICAL) @ se3.from_rows(rows[0]) if len(rows) else None
 
     def _camera(self) -> Camera | None:
         if not self._settings.images:
             return None
         paths = (path for number in self.numbers if (path := self._image_path(number)).is_file())
-        size = next((pixels.shape[1::-1] for pixels in map(read_image, paths) if pixels is not None), None)
+        size = image_size(paths)
         if size is None:
             return None
         if self.T_cam_lidar is None:
@@ -115,16 +112,6 @@ class KittiCarlaSource:
 
     def _image_path(self, number: int) -> Path:
         return self.folder / "images_rgb" / f"{number:04d}_0.png"
-
-    def _images(self, number: int) -> tuple[Image, ...]:
-        path = self._image_path(number)
-        if self.camera is None or not path.is_file():
-            return ()
-        pixels = read_image(path)
-        if pixels is None or pixels.shape[1::-1] != self.camera.size:
-            self.notes.append(f"{path}: unreadable or of another size: frame used without it")
-            return ()
-        return (Image(pixels, self.camera),)
 
 
 def _rows(path: Path, columns: int) -> Array:
@@ -139,9 +126,6 @@ def _find(path: Path, sequence: str) -> Path:
         if (folder / "frames").is_dir():
             return folder
     found = sorted(p.parent.parent.name for p in path.glob("*/generated/frames"))
-    if sequence in found or (not sequence and len(found) == 1):
-        return path / (sequence or found[0]) / "generated"
     if not found:
         raise UsageError(f"{path}: no town (generated/frames) in or below it")
-    asked = f"no sequence {sequence}" if sequence else "several sequences"
-    raise UsageError(f"{path}: {asked}; choose one with input.sequence: {', '.join(found)}")
+    return path / chosen(path, sequence, found) / "generated"

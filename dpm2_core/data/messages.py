@@ -6,6 +6,7 @@ Nothing here imports ROS. Message fields are those of sensor_msgs; `transforms.T
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Collection, Mapping
 from typing import Any, Literal
 
@@ -38,7 +39,7 @@ _LONGEST_SCAN = 2.0
 
 
 _LARGEST_POINT = 1 << 16
-_DISTORTIONS = (0, 4, 5, 8, 12, 14)  # numbers of coefficients that OpenCV knows
+_DISTORTIONS = (0, 4, 5, 8, 12, 14)  # numbers of coefficients that OpenCV supports
 _WIDEST_IMAGE = 1 << 15
 
 
@@ -49,6 +50,14 @@ class MessageError(UsageError):
 def stamp_ns(header: Any) -> int:
     """std_msgs/Header to ns since the epoch."""
     return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
+
+
+def serialized_stamp(data: bytes, time: int) -> int:
+    """Stamp in ns of a serialized message that begins with a header, without decoding the rest; `time` if it is 0."""
+    if len(data) < 12:
+        return time
+    sec, nanosec = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)  # after the 4 bytes that name the order
+    return sec * 1_000_000_000 + nanosec or time
 
 
 def cloud_view(msg: Any, names: Collection[str] | None = None) -> NDArray[np.void]:
@@ -221,7 +230,7 @@ def cloud_fields(columns: Mapping[str, NDArray[Any]], point_field: Callable[...,
     """Everything but the header of a sensor_msgs/PointCloud2, as keyword arguments for its constructor.
 
     Args:
-        columns: field name to (N,) or (N, count) array, in order, of a type that PointField knows.
+        columns: field name to (N,) or (N, count) array, in order, of a type that PointField has.
         point_field: the PointField class, called with name, offset, datatype and count.
 
     Returns:

@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scans and images of one file each."""
+"""Scans and images of one file each, and which of several sequences is meant."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dpm2_core.data.compressed import decode_compressed
-from dpm2_core.frame import Points
+from dpm2_core.errors import UsageError
+from dpm2_core.frame import Camera, Image, Points
 
 
 def read_scan(path: Path) -> tuple[Points, str | None]:
@@ -30,3 +32,36 @@ def read_image(path: Path) -> NDArray[np.uint8] | None:
         return decode_compressed(path.read_bytes())
     except (OSError, ValueError):
         return None
+
+
+def image_size(paths: Iterable[Path]) -> tuple[int, int] | None:
+    """Width and height of the first image that can be read; None if there is none."""
+    return next((pixels.shape[1::-1] for pixels in map(read_image, paths) if pixels is not None), None)
+
+
+def images_of(path: Path | None, camera: Camera | None, notes: list[str]) -> tuple[Image, ...]:
+    """The image of a frame, if it has one and there is a camera; a note says why one is left out."""
+    if camera is None or path is None or not path.is_file():
+        return ()
+    pixels = read_image(path)
+    if pixels is not None and pixels.shape[1::-1] == camera.size:
+        return (Image(pixels, camera),)
+    found = "cannot be read" if pixels is None else f"is {pixels.shape[1]}x{pixels.shape[0]}"
+    notes.append(f"{path} {found} (others are {'x'.join(map(str, camera.size))}): frame used without it")
+    return ()
+
+
+def chosen(path: Path, sequence: str, found: Sequence[str], matching: Sequence[str] | None = None) -> str:
+    """The sequence that is meant: the one asked for, or the only one.
+
+    Args:
+        found: those below `path`. matching: those of them that `sequence` may mean; None: those of that very name.
+
+    Raises:
+        UsageError: none or several.
+    """
+    matching = [name for name in found if sequence in ("", name)] if matching is None else matching
+    if len(matching) == 1:
+        return matching[0]
+    asked = f"no sequence {sequence}" if sequence else "several sequences"
+    raise UsageError(f"{path}: {asked}; choose one with input.sequence: {', '.join(found)}")

@@ -55,7 +55,7 @@ class InputSettings(Settings):
     """Added to the stamps of images before they are compared with those of clouds, s."""
 
     time_field: str | None = None
-    """PointCloud2 field with the time of each point; null looks for a usual name (t, time, stamp...), "" is none."""
+    """PointCloud2 field with the time of each point; null looks for a usual name (t, time, stamp...), "": none."""
 
     time_unit: Literal["auto", "s", "ms", "us", "ns"] = "auto"
     """Unit of that field; auto takes the one in which a scan lasts 2 ms to 2 s."""

@@ -8,6 +8,9 @@ from typing import Protocol
 
 from dpm2_core.frame import Array, Frame
 
+Span = tuple[int, int | None]
+"""Positions of the first frame and of the one after the last; None: to the end."""
+
 
 class Source(Protocol):
     """A drive.

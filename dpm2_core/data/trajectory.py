@@ -24,7 +24,7 @@ _TUM, _KITTI, _KITTI_INDEXED, _KITTI_360 = 8, 12, 13, 17  # numbers a line
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Poses and what tells them apart.
+    """Poses and their keys.
 
     Attributes:
         poses: (N, 4, 4) float64 T_world_sensor, m.

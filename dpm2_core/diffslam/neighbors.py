@@ -36,7 +36,7 @@ class NeighborSearch:
     def nearest(self, queries: Tensor, k: int = 1) -> Tensor:
         """(B, M, k) indices of the k points nearest to queries (B, M, 3); a cloud of fewer repeats its nearest."""
         queries = queries.detach()
-        return self._by_tree(queries, k) if self._trees else self._by_distance(queries, k)
+        return self._by_tree(queries, k) if self._trees else nearest_by_distance(queries, self._points, k)
 
     def _by_tree(self, queries: Tensor, k: int) -> Tensor:
         out = torch.empty(*queries.shape[:2], k, dtype=torch.int64)
@@ -45,14 +45,19 @@ class NeighborSearch:
             out[b] = torch.from_numpy(index[np.where(found < tree.n, found, found[:, :1])])
         return out
 
-    def _by_distance(self, queries: Tensor, k: int) -> Tensor:
-        B, N = self._points.shape[:2]
-        rows = max(1, _CHUNK // (B * N))
-        found = []
-        for part in queries.split(rows, 1):
-            # The fast form, |a|^2 + |b|^2 - 2ab, loses centimeters 100 m away.
-            distance = torch.cdist(part, self._points, compute_mode="donot_use_mm_for_euclid_dist")
-            distance, index = distance.topk(min(k, N), largest=False) if k > 1 else distance.min(-1, keepdim=True)
-            found.append(torch.where(distance.isfinite(), index, index[..., :1]))
-        index = torch.cat(found, 1)
-        return torch.cat([index, index[..., :1].expand(-1, -1, k - index.shape[-1])], -1)
+
+def nearest_by_distance(queries: Tensor, points: Tensor, k: int) -> Tensor:
+    """(B, M, k) indices of the k nearest of points (B, N, 3), those that count finite; for a GPU, where a tree is slow.
+
+    As `NeighborSearch.nearest`.
+    """
+    B, N = points.shape[:2]
+    rows = max(1, _CHUNK // (B * N))
+    found = []
+    for part in queries.split(rows, 1):
+        # The fast form, |a|^2 + |b|^2 - 2ab, loses centimeters 100 m away.
+        distance = torch.cdist(part, points, compute_mode="donot_use_mm_for_euclid_dist")
+        distance, index = distance.topk(min(k, N), largest=False) if k > 1 else distance.min(-1, keepdim=True)
+        found.append(torch.where(distance.isfinite(), index, index[..., :1]))
+    index = torch.cat(found, 1)
+    return torch.cat([index, index[..., :1].expand(-1, -1, k - index.shape[-1])], -1)

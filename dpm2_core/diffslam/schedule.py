@@ -22,7 +22,7 @@ class ScheduleSettings(Settings):
     every: int = Field(default=5, ge=1)
     """k: the last of every k epochs has the SLAM loss (the paper: 27 of 150 epochs for GndNet)."""
     begin: int = Field(default=0, ge=0)
-    """Epochs before the first k: a network that knows nothing yet makes no clouds that a SLAM could run on."""
+    """Epochs before the first k: an untrained network makes no clouds that a SLAM could run on."""
     most: float | None = Field(default=0.5, gt=0)
     """Largest fraction of L_model that gamma L_slam may have in a step. Where a registration is lost, its error would
     be the whole step, and it is heavy-tailed. None: no bound, eq. 1 as it is in the paper."""

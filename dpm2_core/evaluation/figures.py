@@ -69,7 +69,7 @@ def success_png(path: Path | str, kinds: Mapping[str, Mapping[str, Mapping[str, 
     """Bars of the fraction of pairs that each method registers, one group a kind of pair, with the median errors.
 
     Args:
-        kinds: kind, method, and its figures `success` 0..1 and `median_m`, m (None where most have no answer).
+        kinds: kind, method, and its figures `success` 0..1 and `median_m`, m (None where most have no result).
 
     Raises:
         Dpm2Error: the file could not be written.
@@ -84,7 +84,7 @@ def success_png(path: Path | str, kinds: Mapping[str, Mapping[str, Mapping[str, 
     for y, (_, method, figures) in enumerate(rows):
         axes.barh(y, 100 * figures["success"], color=_ESTIMATE if "with camera" in method else _HEIGHTS[0])
         median = figures["median_m"]
-        message = "no answer for most" if median is None else f"{median:.2f} m"
+        message = "no result for most" if median is None else f"{median:.2f} m"
         axes.text(100 * figures["success"] + 1, y, message, color=_INK, va="center", fontsize=8)
     axes.set_yticks(range(len(rows)), [f"{kind}: {method}" for kind, method, _ in rows], color=_INK, fontsize=8)
     axes.set(xlim=(0, 115), ylim=(len(rows) - 0.4, -0.6))

@@ -28,7 +28,7 @@ def read_ground_truth(source: Source, path: Path | None, start: int, stop: int) 
         return truth
     if len(truth) < len(source):
         raise UsageError(f"{path}: {len(truth)} poses for {len(source)} frames of {source.name}")
-    if len(truth) > len(source):  # a file of the whole sequence beside an excerpt: KITTI's frame numbers tell
+    if len(truth) > len(source):  # a file of the whole sequence beside an excerpt: KITTI's frame numbers say which
         numbers = [frame.index for frame in source.frames(start, stop)]
         if max(numbers) >= len(truth):
             raise UsageError(f"{path}: {len(truth)} poses, but {source.name} has frame {max(numbers)}")

@@ -47,17 +47,14 @@ class SegmentErrors:
         return (float(self.t_err.mean()), float(self.r_err.mean())) if len(self) else None
 
 
-def segment_errors(
-    gt: Array, est: Array, lengths: Sequence[float] = OFFICIAL_LENGTHS, step: int | None = None
-) -> SegmentErrors:
+def segment_errors(gt: Array, est: Array, lengths: Sequence[float] = OFFICIAL_LENGTHS) -> SegmentErrors:
     """Compare (N, 4, 4) poses with (N, 4, 4) ground truth of the same frames and the same sensor frame.
 
     Args:
         est: rows of NaN where a frame has no estimate; segments that begin or end there are left out.
-        lengths: m.
-        step: a segment starts every `step` frames; as the benchmark does every 10, with other lengths every frame.
+        lengths: m. With those of the benchmark a segment starts every 10 frames, as there, with others at each frame.
     """
-    step = step or (10 if tuple(lengths) == OFFICIAL_LENGTHS else 1)
+    step = 10 if tuple(lengths) == OFFICIAL_LENGTHS else 1
     travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(gt[:, :3, 3], axis=0), axis=1))])
     first, length = (grid.ravel() for grid in np.meshgrid(np.arange(0, len(gt), step), lengths, indexing="ij"))
     last = np.searchsorted(travelled, travelled[first] + length, side="right")  # the first frame beyond the length

@@ -10,8 +10,9 @@ import numpy as np
 from dpm2_core.evaluation.image_attention import ImageAttention, draw_attention
 from dpm2_core.extras import needs
 from dpm2_core.files import atomic_write
-from dpm2_core.frame import Array, Points, Registration
+from dpm2_core.frame import Frame
 from dpm2_core.geometry import se3
+from dpm2_core.network.model import DeepPointMap2
 
 _BACKGROUND, _INK, _TARGET, _SOURCE = "#0d1117", "#c9d1d9", "#3f7fbf", "#ff9f1c"
 _REACH = 50.0  # m of each scan that is drawn around its sensor
@@ -19,24 +20,24 @@ _REACH = 50.0  # m of each scan that is drawn around its sensor
 
 def matches_png(
     path: Path | str,
-    source: Points,
-    target: Points,
-    matched: tuple[Array, Array, Array],
-    result: Registration,
+    network: DeepPointMap2,
+    source: Frame,
+    target: Frame,
     title: str = "",
     looked: ImageAttention | None = None,
 ) -> None:
-    """Two views from above: the scans beside each other with their matches, and one on top of the other as registered.
+    """Two views from above of how a network registers a scan to another: the scans beside each other with their
+    matches, and one on top of the other.
 
     Args:
-        source, target: (N, 3+) points of the two scans, each in its own frame, m.
-        matched: positions (K, 3) in the source, (K, 3) in the target, and confidence (K,) 0..1 of each match.
-        found: T_target_source.
         looked: what to draw of the source's image; None: nothing.
 
     Raises:
-        Dpm2Error: the file could not be written.
+        Dpm2Error: too few points, or the file could not be written.
     """
+    of_source, of_target = network.describe(source), network.describe(target)
+    result = network.register(of_source, of_target)
+    at_source, at_target, confidence = network.matches(of_source, of_target)
     with needs("plot", "drawing"):
         from matplotlib.backends.backend_agg import FigureCanvasAgg  # half a second to import: not for every command
         from matplotlib.collections import LineCollection
@@ -52,13 +53,12 @@ def matches_png(
     above = figure.add_axes(place(0.66, 0.33), facecolor=_BACKGROUND, aspect="equal")
     if looked is not None:
         draw_attention(figure.add_axes((0.02, 0.01, 0.96, low - 0.04), facecolor=_BACKGROUND), looked)
-    at_source, at_target, confidence = matched
     right = np.array([2.1 * _REACH, 0.0])
     for axes, points, shift, color in (
-        (beside, target, np.zeros(2), _TARGET),
-        (beside, source, right, _SOURCE),
-        (above, target, np.zeros(2), _TARGET),
-        (above, se3.transform(result.T_target_source, source), np.zeros(2), _SOURCE),
+        (beside, target.points, np.zeros(2), _TARGET),
+        (beside, source.points, right, _SOURCE),
+        (above, target.points, np.zeros(2), _TARGET),
+        (above, se3.transform(result.T_target_source, source.points), np.zeros(2), _SOURCE),
     ):
         near = points[np.abs(points[:, :2]).max(1) < _REACH]
         axes.plot(*(near[:, :2] + shift).T, ",", color=color, alpha=0.6)
@@ -76,10 +76,9 @@ def matches_png(
     bar = figure.colorbar(lines, ax=beside, fraction=0.02, pad=0.01)
     bar.set_label("confidence of a match", color=_INK)
     bar.ax.tick_params(colors=_INK)
-    moved = result.T_target_source
+    meters, degrees = se3.magnitude(result.T_target_source)
     outcome = (
-        f"{np.linalg.norm(moved[:3, 3]):.2f} m, {np.degrees(se3.angle(moved)):.2f} deg apart; "
-        f"confidence {result.confidence:.2f}, rmse {result.rmse:.2f} m"
+        f"{meters:.2f} m, {degrees:.2f} deg apart; confidence {result.confidence:.2f}, rmse {result.rmse:.2f} m"
         if result.ok
         else f"not registered: {result.reason}"
     )

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One set of error figures for every trajectory that this project judges, with one definition each.
+"""One set of error figures for every trajectory that this project evaluates, with one definition each.
 
-All compare the poses of the same sensor frame; the alignment of the two world frames is said with each figure.
+All compare the poses of the same sensor frame; the alignment of the two world frames is stated with each figure.
 `evo` computes the same APE and RPE and is the oracle of the tests, but is under the GPL and so not a dependency.
 """
 
@@ -75,10 +75,10 @@ def evaluate(
     breaks: int = 0,
     fps: float | None = None,
 ) -> Metrics:
-    """Judge (N, 4, 4) poses against (N, 4, 4) ground truth of the same frames.
+    """Evaluate (N, 4, 4) poses against (N, 4, 4) ground truth of the same frames.
 
     Args:
-        gt: rows of NaN where the ground truth is unknown; these frames are not judged.
+        gt: rows of NaN where the ground truth is unknown; these frames are left out.
         est: in the sensor frame of `gt` (the world frames may differ); rows of NaN where there is no estimate.
         lengths: of the KITTI metric's segments, m.
         failed_frames: as the SLAM system counted them; by default the frames without an estimate.

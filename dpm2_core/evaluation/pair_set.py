@@ -23,8 +23,8 @@ SUCCESS = (0.6, 1.5)  # m, deg
 class PairSet:
     """Pairs drawn once: half up to 5 m apart, half 5 to 20 m; every second one with the source turned at random."""
 
-    def __init__(self, root: Path, pairs: int, network: NetworkSettings, images: bool, seed: int = 0) -> None:
-        noise = np.random.default_rng(seed)
+    def __init__(self, root: Path, pairs: int, network: NetworkSettings, images: bool) -> None:
+        noise = np.random.default_rng(0)
         self.drives = open_packed(root)
         self.network, self.images = network, images
         self.frames: dict[tuple[int, int, float], int] = {}
@@ -48,14 +48,14 @@ class PairSet:
         return self.frames.setdefault((drive, index, yaw), len(self.frames))
 
     @torch.inference_mode()
-    def encode(self, model: DeepPointMap2, batch: int = 8) -> list[Descriptors]:
+    def encode(self, model: DeepPointMap2) -> list[Descriptors]:
         """Descriptors of every frame of the set."""
         keys = list(self.frames)
         out: list[Descriptors] = []
         device = next(model.parameters()).device
-        for begin in range(0, len(keys), batch):
+        for begin in range(0, len(keys), 8):
             pyramids, images = [], []
-            for drive, index, yaw in keys[begin : begin + batch]:
+            for drive, index, yaw in keys[begin : begin + 8]:
                 sample = self.drives[drive][index]
                 turn = se3.exp([0, 0, yaw, 0, 0, 0])
                 pyramids.append(build_pyramid(se3.transform(turn, sample.cloud), self.network))
@@ -67,12 +67,12 @@ class PairSet:
             out += model.encoder.encode_batch(collate(pyramids), collate_views(images, self.network.image), device)
         return out
 
-    def errors(self, model: DeepPointMap2, batch: int = 16) -> np.ndarray:
+    def errors(self, model: DeepPointMap2) -> np.ndarray:
         """Per pair: distance m, turned (0 or 1), translation error m, rotation error deg, squared Mahalanobis error."""
         descriptors = self.encode(model)
         rows = []
-        for begin in range(0, len(self.pairs), batch):
-            chunk = self.pairs[begin : begin + batch]
+        for begin in range(0, len(self.pairs), 16):
+            chunk = self.pairs[begin : begin + 16]
             results = model.register_many([descriptors[p[0]] for p in chunk], [descriptors[p[1]] for p in chunk])
             for i, ((_, _, T, distance), result) in enumerate(zip(chunk, results, strict=True), begin):
                 xi = se3.log(se3.inverse(result.T_target_source) @ T)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Results as JSON, with what is needed to judge and repeat them: command, commit, machine, versions."""
+"""Results as JSON, with what is needed to assess and repeat them: command, commit, machine, versions."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _PACKAGES = ("numpy", "scipy", "small_gicp", "gtsam", "torch", "kiss-icp")
 
 
 def write_record(path: Path, name: str, results: dict[str, Any], program: str = "dpm2", threads: int = 2) -> None:
-    """Results with everything that is needed to judge and repeat them, as JSON.
+    """Results with everything that is needed to assess and repeat them, as JSON.
 
     Raises:
         Dpm2Error: the file could not be written.

@@ -5,20 +5,32 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import minimum_filter
+from scipy.ndimage import grey_opening, minimum_filter
 
-Points = NDArray[np.float32]
+_OPENING = 7  # cells
 
 
-def height_above_ground(points: Points, cell: float = 1.0, reach: int = 2) -> Points:
+def height_above_ground(points: NDArray[np.floating], cell: float = 1.0, reach: int = 2) -> NDArray[np.floating]:
     """(M,) m of (M, 3+) points above the lowest one within `reach` cells of `cell` m around them."""
     if not len(points):
-        return np.zeros(0, np.float32)
+        return np.zeros(0, points.dtype)
     x, y = (np.floor(points[:, axis] / cell).astype(np.int64) for axis in (0, 1))
     x, y, z = x - x.min(), y - y.min(), np.ascontiguousarray(points[:, 2])
     shape = int(x.max()) + 1, int(y.max()) + 1
     at = x * shape[1] + y  # one index is twice as fast as two
-    lowest = np.full(shape, np.inf, np.float32)
+    lowest = np.full(shape, np.inf, points.dtype)
     np.minimum.at(lowest.reshape(-1), at, z)
     around = minimum_filter(lowest, 2 * reach + 1, mode="constant", cval=np.inf)
     return z - around.reshape(-1)[at]
+
+
+def ground_below(points: NDArray[np.float64], cell: float = 1.0) -> NDArray[np.float64]:
+    """(M,) height of the ground under (M, 3) points, m: the lowest around, which a roof alone cannot raise."""
+    at = np.floor(points[:, :2] / cell).astype(np.int64)
+    at -= at.min(0)
+    lowest = np.full(at.max(0) + 1, np.inf)
+    np.minimum.at(lowest, (at[:, 0], at[:, 1]), points[:, 2])
+    # Where there is no point an opening takes no notice: a hole is as high as it gets.
+    hole = ~np.isfinite(lowest)
+    lowest[hole] = points[:, 2].max()
+    return grey_opening(lowest, (_OPENING, _OPENING))[at[:, 0], at[:, 1]]

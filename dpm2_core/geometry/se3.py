@@ -80,11 +80,23 @@ def angle(T: Array) -> Array:
     return np.linalg.norm(log(T)[..., :3], axis=-1)
 
 
+def magnitude(T: Array) -> tuple[float, float]:
+    """How far (4, 4) moves, m, and how far it turns, degrees: of `inverse(a) @ b` the distance of two poses."""
+    return float(np.linalg.norm(T[:3, 3])), float(np.degrees(angle(T)))
+
+
 def orthonormalized(T: Array) -> Array:
     """The nearest rigid transform (projects the rotation, guards against a reflection)."""
     U, _, Vt = np.linalg.svd(T[..., :3, :3])
     U[..., -1] *= np.sign(np.linalg.det(U @ Vt))[..., None]
     return make(U @ Vt, T[..., :3, 3])
+
+
+def from_rows(rows: ArrayLike) -> Array:
+    """(..., 12) numbers of files, row-major, to (..., 4, 4), their rounding removed."""
+    rows = np.asarray(rows, np.float64)
+    matrices = rows.reshape(*rows.shape[:-1], 3, 4)
+    return orthonormalized(make(matrices[..., :3], matrices[..., 3]))
 
 
 def is_rigid(T: Array, tolerance: float = 1e-3) -> bool:
@@ -110,7 +122,7 @@ def is_covariance(covariance: Array, smallest: float = 1e-18, largest: float = 1
     if variances.min() < smallest or variances.max() > largest:
         return False
     sigma = np.sqrt(variances)
-    correlation = covariance / np.outer(sigma, sigma)  # so that rad and m, however different, are judged alike
+    correlation = covariance / np.outer(sigma, sigma)  # so that rad and m, however different, are treated alike
     if np.abs(correlation - correlation.T).max() > 1e-6:
         return False
     try:

@@ -31,7 +31,7 @@ def save_checkpoint(path: Path, module: nn.Module, ema: nn.Module, optimiser: to
     os.replace(part, path)
 
 
-def load_checkpoint(path: Path, module: nn.Module, ema: nn.Module, optimiser: torch.optim.Optimizer | None) -> int:
+def load_checkpoint(path: Path, module: nn.Module, ema: nn.Module, optimiser: torch.optim.Optimizer) -> int:
     """Restore a run; returns the step it had finished.
 
     Raises:
@@ -49,8 +49,7 @@ def load_checkpoint(path: Path, module: nn.Module, ema: nn.Module, optimiser: to
     except (KeyError, RuntimeError) as error:
         first = str(error).splitlines()[-1].strip()
         raise UsageError(f"{path}: checkpoint of another network: {first}") from None
-    if optimiser is not None:
-        optimiser.load_state_dict(state["optimiser"])
+    optimiser.load_state_dict(state["optimiser"])
     return int(state["step"])
 
 

@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from itertools import count
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from pydantic import Field
 from torch import Tensor
-from torch.utils.data import DataLoader, IterableDataset, get_worker_info
+from torch.utils.data import DataLoader, Dataset
 
 from dpm2_core.config import Settings
 from dpm2_core.data.packed import PackedDrive, Sample, open_packed
@@ -39,15 +39,11 @@ class PackedSettings(Settings):
     augment: AugmentSettings = AugmentSettings()
 
 
-class GroupSettings(PackedSettings, ABC):
-    """Packed drives, and how the frames of a place are drawn from one."""
+class GroupSettings(PackedSettings):
+    """Packed drives, with images or without."""
 
     images: bool = False
     """Read the images."""
-
-    @abstractmethod
-    def draw(self, poses: Array, noise: np.random.Generator) -> NDArray[np.intp]:
-        """Indices (F,) of the frames of a place in a drive with these poses (n, 4, 4), NaN where unknown."""
 
 
 class DataSettings(GroupSettings):
@@ -60,7 +56,11 @@ class DataSettings(GroupSettings):
 
     def draw(self, poses: Array, noise: np.random.Generator) -> NDArray[np.intp]:
         """See `draw_group`."""
-        return draw_group(poses, self.frames, self.radius, noise)
+        return draw_group(poses, noise, self.frames, self.radius)
+
+
+Draw = Callable[[Array, np.random.Generator], NDArray[np.intp]]
+"""Of the poses (n, 4, 4) of a drive, NaN where unknown: indices (F,) of the frames of a place."""
 
 
 class Batch(NamedTuple):
@@ -76,7 +76,7 @@ class Batch(NamedTuple):
     poses: Tensor
 
 
-def draw_group(poses: Array, frames: int, radius: float, noise: np.random.Generator) -> NDArray[np.intp]:
+def draw_group(poses: Array, noise: np.random.Generator, frames: int, radius: float) -> NDArray[np.intp]:
     """Indices (frames,) of one frame and others whose distance from it is about uniform in 0..radius m.
 
     poses (n, 4, 4), NaN where unknown; frames repeat where the neighborhood holds too few.
@@ -121,39 +121,24 @@ class Mixture:
         return self.drives[noise.choice(len(self.drives), p=self.chances)]
 
 
-class GroupDataset(IterableDataset):
-    """An endless stream of batches; batch `n` depends on seed and `n` alone, so a resumed run sees the same."""
+class GroupDataset(Dataset[Batch]):
+    """Batches without an end; batch `n` of a process depends on seed, rank and `n` alone, so a resumed run sees the
+    same."""
 
-    def __init__(
-        self,
-        settings: GroupSettings,
-        network: NetworkSettings,
-        seed: int,
-        start: int = 0,
-        shard: tuple[int, int] = (0, 1),
-    ) -> None:
-        self.settings, self.network, self.seed, self.start, self.shard = settings, network, seed, start, shard
+    def __init__(self, settings: GroupSettings, network: NetworkSettings, draw: Draw, seed: int) -> None:
+        self.settings, self.network, self.draw, self.seed = settings, network, draw, seed
         self.drives = Mixture(settings)
 
-    def __iter__(self) -> Iterator[Batch]:
-        info = get_worker_info()
-        step, stride = self.start, 1
-        if info is not None:
-            step, stride = self.start + info.id, info.num_workers
-        while True:
-            yield self.batch(step)
-            step += stride
-
-    def batch(self, step: int) -> Batch:
-        """Batch number `step` of this process."""
-        noise = np.random.default_rng([self.seed, step, self.shard[0]])
+    def __getitem__(self, place: tuple[int, int]) -> Batch:
+        """Batch of (step, rank of the process)."""
+        noise = np.random.default_rng([self.seed, *place])
         settings = self.settings
         pyramids: list[Pyramid] = []
         images = []
         poses = []
         for _ in range(settings.groups):
             drive = self.drives.choose(noise)
-            for index in settings.draw(drive.poses, noise):
+            for index in self.draw(drive.poses, noise):
                 sample: Sample = augment(drive[index], settings.augment, noise)
                 pyramids.append(build_pyramid(sample.cloud, self.network))
                 images.append(sample.images if settings.images else ())
@@ -162,16 +147,18 @@ class GroupDataset(IterableDataset):
         shaped = torch.from_numpy(np.stack(poses)).view(settings.groups, -1, 4, 4)
         return Batch(collate(pyramids), views, shaped)
 
-    def loader(self) -> DataLoader:
-        """Batches in order, prepared ahead by worker processes."""
+    def batches(self, start: int, rank: int) -> Iterator[Batch]:
+        """Batches from step `start` on, in order, prepared ahead by worker processes."""
         workers = self.settings.workers
-        return DataLoader(
-            self,
-            batch_size=None,
-            num_workers=workers,
-            prefetch_factor=4 if workers else None,
-            persistent_workers=False,
-            worker_init_fn=_one_thread,
+        return iter(
+            DataLoader(
+                self,
+                batch_size=None,
+                sampler=((step, rank) for step in count(start)),
+                num_workers=workers,
+                prefetch_factor=4 if workers else None,
+                worker_init_fn=_one_thread,
+            )
         )
 
 

@@ -9,7 +9,8 @@ not forgotten.
 
 from __future__ import annotations
 
-import copy
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,15 +21,13 @@ from torch import Tensor, nn
 from dpm2_core.diffslam.trajectory_loss import trajectory_loss
 from dpm2_core.evaluation.pair_set import PairSet
 from dpm2_core.frame import Array
-from dpm2_core.learning.checkpoint import load_checkpoint
-from dpm2_core.learning.dataset import Batch, DataSettings, GroupDataset, draw_group
+from dpm2_core.learning.dataset import GroupDataset, GroupSettings, draw_group
 from dpm2_core.learning.finetune_settings import DRIVES, HELD_OUT, REHEARSAL, FinetuneSettings
 from dpm2_core.learning.pair_sampling import SetPairs, sample_set_pairs
 from dpm2_core.learning.pose_loss import differentiable_poses
 from dpm2_core.learning.train_registration import RegistrationTraining
-from dpm2_core.learning.trainer import process_group, train
+from dpm2_core.learning.trainer import Trainer
 from dpm2_core.network.decoder import Decoder
-from dpm2_core.network.encoder import to_device
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pretrained import weights_path
 from dpm2_core.network.pyramid import PointBatch
@@ -88,20 +87,12 @@ def window_trajectories(decoder: Decoder, tokens: Tokens, poses: Tensor) -> tupl
     return torch.stack(chain, 1), (~usable).double().mean()
 
 
-def draw_road_segment(poses: Array, frames: int, radius: float, noise: np.random.Generator) -> NDArray[np.intp]:
+def draw_road_segment(poses: Array, noise: np.random.Generator, frames: int, radius: float) -> NDArray[np.intp]:
     """`draw_group` in the order of the road, so that each scan follows the one before."""
-    chosen = draw_group(poses, frames, radius, noise)
+    chosen = draw_group(poses, noise, frames, radius)
     at = poses[chosen, :3, 3] - poses[chosen, :3, 3].mean(0)
     along = np.linalg.svd(at, full_matrices=False)[2][0]
     return chosen[np.argsort(at @ along, kind="stable")]
-
-
-class StretchSettings(DataSettings):
-    """Packed drives, of which scans are drawn in the order of the road."""
-
-    def draw(self, poses: Array, noise: np.random.Generator) -> NDArray[np.intp]:
-        """See `draw_road_segment`."""
-        return draw_road_segment(poses, self.frames, self.radius, noise)
 
 
 def finetune(
@@ -114,27 +105,25 @@ def finetune(
     Raises:
         UsageError: no such weights, no drives, or nothing to resume.
     """
-    path = weights_path(settings.weights)
-    with process_group() as (rank, world, device):
-        torch.manual_seed(settings.optimiser.seed)
-        module = Finetuned(load_model(path), settings).to(device)
-        ema = copy.deepcopy(module).requires_grad_(False)
-        start = load_checkpoint(out / "checkpoint.pt", module, ema, None) if resume else 0
-        places = _places(settings, data or out)
-        stretches = GroupDataset(places, module.model.settings, settings.optimiser.seed, start, (rank, world))
+    start_from, optimizer, weights = weights_path(settings.weights), settings.optimiser, out / "weights.safetensors"
+    torch.manual_seed(optimizer.seed)
+    module = Finetuned(load_model(start_from), settings)
+    segments = partial(draw_road_segment, frames=settings.frames, radius=settings.radius)
+    places = GroupDataset(_packed(settings, data or out), module.model.settings, segments, optimizer.seed)
 
-        def loss(run: nn.Module, batch: Batch, step: int) -> tuple[Tensor, dict[str, Tensor]]:
-            noise = torch.Generator().manual_seed(settings.optimiser.seed * 1_000_003 + step)
-            plans = (sample_set_pairs(batch.poses, settings.frames, (1, 1), 20.0, noise),)
-            return run(*to_device((batch.points, batch.poses, plans), device))
+    def batches(start: int, rank: int) -> Iterator[tuple[PointBatch, Tensor, tuple[SetPairs]]]:
+        for step, (points, _, poses) in enumerate(places.batches(start, rank), start):
+            noise = torch.Generator().manual_seed(optimizer.seed * 1_000_003 + step)
+            yield points, poses, (sample_set_pairs(poses, settings.frames, (1, 1), 20.0, noise),)
 
-        batches = iter(stretches.loader())
-        train(module, ema, batches, loss, settings.optimiser, out, resume, None, start, rank, device, until)
-        if rank == 0:
-            about = {k: v for k, v in read_metadata(path).items() if k not in ("preset", "network")}
-            about |= {"finetuned_from": path.stem, "finetuned_steps": str(settings.optimiser.steps)}
-            save_weights(ema.model, out / "weights.safetensors", about)
-    return out / "weights.safetensors"
+    def save(averaged: nn.Module) -> None:
+        assert isinstance(averaged, Finetuned)
+        about = {k: v for k, v in read_metadata(start_from).items() if k not in ("preset", "network")}
+        about |= {"finetuned_from": start_from.stem, "finetuned_steps": str(optimizer.steps)}
+        save_weights(averaged.model, weights, about)
+
+    Trainer(module, batches, optimizer, out, save).run(resume, until)
+    return weights
 
 
 def measure(weights: Path, settings: FinetuneSettings, out: Path, pairs: int = 100) -> dict[str, dict[str, float]]:
@@ -148,11 +137,8 @@ def measure(weights: Path, settings: FinetuneSettings, out: Path, pairs: int = 1
     }
 
 
-def _places(settings: FinetuneSettings, out: Path) -> StretchSettings:
+def _packed(settings: FinetuneSettings, out: Path) -> GroupSettings:
     packed = {str(out / DRIVES): 1 - settings.rehearsal_share}
     if settings.rehearsal_share:
         packed[settings.rehearsal or str(out / REHEARSAL)] = settings.rehearsal_share
-    return StretchSettings(
-        packed=packed, groups=settings.groups, frames=settings.frames, radius=settings.radius,
-        workers=1, augment=settings.augment,
-    )  # fmt: skip
+    return GroupSettings(packed=packed, groups=settings.groups, workers=1, augment=settings.augment)

@@ -58,7 +58,11 @@ def registration_loss(
     pairing = info_nce(scores, labels, settings.neutral_is_negative)
     coarse_scores = cosine(decoder.coarse(source.features), decoder.coarse(target.features)) / temperature
     coarse = info_nce(coarse_scores, labels, False)
-    offset, error = offset_loss(decoder, source, target, T_target_source, correlated, scores.detach(), labels, settings)
+    limit, masks = decoder.settings.offset_limit, (source.mask, target.mask)
+    pairs = offset_pairs(scores.detach(), labels, masks, limit, settings)
+    offset, errors = offset_loss(decoder, source, target, T_target_source, correlated, pairs)
+    near = pairs[1][:, : settings.near].repeat(2, 1)
+    error = (errors[:, : settings.near] * near).sum() / near.sum().clamp(min=1)
     total = settings.pairing * pairing + settings.coarse * coarse + settings.offset * offset
     figures = {"pairing": pairing, "coarse": coarse, "offset": offset, "offset_m": error}
     if settings.pose:
@@ -66,7 +70,7 @@ def registration_loss(
         T, usable = differentiable_poses(decoder, source, target, correlated, truth)
         figures |= {"pose": pose_loss(T, truth), "astray": 1 - usable.double().mean()}
         total = total + settings.pose * figures["pose"]
-    return total, {**figures, "right": matches_right(scores.detach(), labels, decoder.settings.offset_limit)}
+    return total, {**figures, "right": matches_right(scores.detach(), labels, limit)}
 
 
 def matches_right(scores: Tensor, labels: Labels, limit: float) -> Tensor:
@@ -77,34 +81,38 @@ def matches_right(scores: Tensor, labels: Labels, limit: float) -> Tensor:
     return right.sum() / used.sum().clamp(min=1)
 
 
-def offset_loss(
-    decoder: Decoder,
-    source: Tokens,
-    target: Tokens,
-    T_target_source: Tensor,
-    correlated: Correlated,
-    scores: Tensor,
-    labels: Labels,
-    settings: LossSettings,
+def offset_pairs(
+    scores: Tensor, labels: Labels, masks: tuple[Tensor, Tensor], limit: float, settings: LossSettings
 ) -> tuple[Tensor, Tensor]:
-    """Loss of the offsets of near pairs and of the network's own best matches; mean error of the near ones, m."""
-    m = labels.distance.shape[2]
-    limit = decoder.settings.offset_limit
+    """Pairs whose offsets are compared: near ones, and the network's own best matches.
+
+    Returns:
+        (B, near + own) index into the flattened (N, M) pairs of each set pair, and 1 or 0, whether it counts.
+    """
     chance = torch.rand_like(labels.distance).masked_fill(labels.distance > limit, -1).flatten(1)
     drawn, flat = chance.topk(settings.near)
-    near_weight = (drawn >= 0).float()
-    weight = near_weight
-    if settings.own:
-        probability = softmax_both(scores, source.mask, target.mask)
-        own = probability.flatten(1).topk(settings.own)[1]
-        good = (labels.distance.flatten(1).gather(1, own) <= settings.own_limit).float()
-        flat, weight = torch.cat([flat, own], 1), torch.cat([near_weight, good], 1)
+    weight = (drawn >= 0).float()
+    if not settings.own:
+        return flat, weight
+    own = softmax_both(scores, *masks).flatten(1).topk(settings.own)[1]
+    good = (labels.distance.flatten(1).gather(1, own) <= settings.own_limit).float()
+    return torch.cat([flat, own], 1), torch.cat([weight, good], 1)
+
+
+def offset_loss(
+    decoder: Decoder, source: Tokens, target: Tokens, T: Tensor, correlated: Correlated, pairs: tuple[Tensor, Tensor]
+) -> tuple[Tensor, Tensor]:
+    """Loss of the offsets of pairs as `offset_pairs` gives them, and error (2 B, pairs) of each, m, there and back.
+
+    T: (B, 4, 4) T_target_source.
+    """
+    flat, weight = pairs
+    m = target.xyz.shape[1]
     i, j = flat // m, flat % m
     x, y = take(source.xyz, i), take(target.xyz, j)
     a, b = take(correlated.source, i), take(correlated.target, j)
     there, L_there = decoder.offset(a, b)
     back, L_back = decoder.offset(b, a)
-    T = T_target_source
     inverse = torch.linalg.inv(T.double()).to(T.dtype)
     residual = torch.cat(
         [
@@ -117,6 +125,4 @@ def offset_loss(
         loss = student_offset(residual, torch.cat([L_there, L_back]), weights)
     else:
         loss = mahalanobis_offset(residual.flatten(0, 1), weights.flatten())
-    n = settings.near
-    error = (residual.detach()[:, :n].norm(dim=-1) * weights[:, :n]).sum() / weights[:, :n].sum().clamp(min=1)
-    return loss, error
+    return loss, residual.detach().norm(dim=-1)

@@ -7,8 +7,8 @@ because every LiDAR point that both cameras see is an exact correspondence, and 
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Iterator
+from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,10 +23,9 @@ from dpm2_core.errors import UsageError
 from dpm2_core.frame import Camera, Image
 from dpm2_core.geometry import se3
 from dpm2_core.learning.augment import augment_image
-from dpm2_core.learning.checkpoint import load_checkpoint
 from dpm2_core.learning.dataset import Mixture, PackedSettings, draw_group
-from dpm2_core.learning.trainer import OptimizerSettings, process_group, train
-from dpm2_core.network.encoder import collate_views, to_device
+from dpm2_core.learning.trainer import OptimizerSettings, Trainer
+from dpm2_core.network.encoder import collate_views
 from dpm2_core.network.losses import cosine, info_nce, label_distances
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.settings import NetworkSettings, preset
@@ -47,7 +46,7 @@ class ImagePairs(NamedTuple):
     points: Tensor
 
 
-class PictureSettings(PackedSettings):
+class ImageDataSettings(PackedSettings):
     """Packed drives, and how far apart the images of a pair are."""
 
     radius: float = Field(20.0, gt=0)
@@ -61,7 +60,7 @@ class ImageTrainingSettings(Settings):
     """Network preset."""
     network: dict[str, Any] = Field({})
     """Changes to the preset."""
-    data: PictureSettings = PictureSettings()
+    data: ImageDataSettings = ImageDataSettings()
     """Drives with images."""
     points: int = Field(256, gt=0)
     """Points drawn for each pair."""
@@ -75,34 +74,26 @@ class ImageTrainingSettings(Settings):
 class ImageDataset:
     """Pairs of images of a place and the points that the first of them shows."""
 
-    def __init__(
-        self,
-        settings: PictureSettings,
-        network: NetworkSettings,
-        seed: int,
-        start: int = 0,
-        shard: tuple[int, int] = (0, 1),
-    ) -> None:
-        self._settings, self._network, self._seed, self._start, self._shard = settings, network, seed, start, shard
+    def __init__(self, settings: ImageDataSettings, network: NetworkSettings, seed: int) -> None:
+        self._settings, self._network, self._seed = settings, network, seed
         self._drives = Mixture(settings)
 
-    def pairs(self, points: int) -> Iterator[ImagePairs]:
-        """An endless stream, as deterministic as the batches of the registration training.
+    def pairs(self, points: int, start: int = 0, rank: int = 0) -> Iterator[ImagePairs]:
+        """Pairs of each step from `start` on, without an end, as deterministic as the batches of `GroupDataset`.
 
         Raises:
             UsageError: a drive without images, or whose images show too few points.
         """
-        step, settings = self._start, self._settings
-        while True:
-            noise = np.random.default_rng([self._seed, step, self._shard[0]])
-            step += 1
+        settings = self._settings
+        for step in count(start):
+            noise = np.random.default_rng([self._seed, step, rank])
             images: list[list[Image]] = []
             drawn: list[NDArray[np.float32]] = []
             for _ in range(100 * settings.groups):
                 if len(images) == 2 * settings.groups:
                     break
                 drive = self._drives.choose(noise)
-                a, b = (drive[i] for i in draw_group(drive.poses, 2, settings.radius, noise))
+                a, b = (drive[i] for i in draw_group(drive.poses, noise, 2, settings.radius))
                 if not (a.images and b.images):
                     raise UsageError(f"{drive.folder}: a drive without images; pack it with them or leave it out")
                 seen = a.cloud[shown(a.cloud, a.images[0].camera)]
@@ -160,22 +151,20 @@ class ImageTraining(nn.Module):
 
 def train_image(settings: ImageTrainingSettings, out: Path, resume: bool = False, until: int | None = None) -> Path:
     """Train; checkpoint, log and the whole network's weights go to `out`. `until`: stop after this step."""
-    with process_group() as (rank, world, device):
-        torch.manual_seed(settings.optimiser.seed)
-        network = preset(settings.preset, settings.network)
-        module = ImageTraining(network, settings.shift).to(device)
-        if settings.start:
-            load_weights(module.model, Path(settings.start))
-        ema = copy.deepcopy(module).requires_grad_(False)
-        start = load_checkpoint(out / "checkpoint.pt", module, ema, None) if resume else 0
-        data = ImageDataset(settings.data, network, settings.optimiser.seed, start, (rank, world))
+    optimizer, weights = settings.optimiser, out / "weights.safetensors"
+    torch.manual_seed(optimizer.seed)
+    network = preset(settings.preset, settings.network)
+    module = ImageTraining(network, settings.shift)
+    if settings.start:
+        load_weights(module.model, Path(settings.start))
+    data = ImageDataset(settings.data, network, optimizer.seed)
 
-        def loss(run: nn.Module, batch: ImagePairs, step: int) -> tuple[Tensor, dict[str, Tensor]]:
-            return run(to_device(batch, device))
+    def batches(start: int, rank: int) -> Iterator[tuple[ImagePairs]]:
+        return ((pairs,) for pairs in data.pairs(settings.points, start, rank))
 
-        batches = data.pairs(settings.points)
-        train(module, ema, batches, loss, settings.optimiser, out, resume, None, start, rank, device, until)
-        if rank == 0:
-            about = {"phase": "image", "steps": str(settings.optimiser.steps)}
-            save_weights(ema.model, out / "weights.safetensors", about)
-    return out / "weights.safetensors"
+    def save(averaged: nn.Module) -> None:
+        assert isinstance(averaged, ImageTraining)
+        save_weights(averaged.model, weights, {"phase": "image", "steps": str(optimizer.steps)})
+
+    Trainer(module, batches, optimizer, out, save).run(resume, until)
+    return weights

@@ -4,8 +4,8 @@ near, half hard or far."""
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +16,8 @@ from torch import Tensor, nn
 
 from dpm2_core.config import Settings
 from dpm2_core.frame import Array
-from dpm2_core.learning.checkpoint import load_checkpoint
-from dpm2_core.learning.dataset import Batch, GroupDataset, GroupSettings
-from dpm2_core.learning.trainer import OptimizerSettings, process_group, train
+from dpm2_core.learning.dataset import GroupDataset, GroupSettings
+from dpm2_core.learning.trainer import OptimizerSettings, Trainer
 from dpm2_core.network.encoder import to_device
 from dpm2_core.network.losses import overlap_loss
 from dpm2_core.network.model import DeepPointMap2
@@ -26,18 +25,12 @@ from dpm2_core.network.pose_solver import overlap_features, solve_batch
 from dpm2_core.network.pyramid import PointBatch
 from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.network.spatial import Views
+from dpm2_core.network.tokens import Tokens
 from dpm2_core.network.weights import load_weights, network_settings, save_weights
 
 OVERLAP = 20.0  # m: nearer pairs are positive
 HARD = 40.0  # m: half of the negatives lie between OVERLAP and this
 FRAMES = 5  # a reference, two near it, one hard negative, one far
-
-
-class OverlapSettings(GroupSettings):
-    """Packed drives, of which frames are drawn that overlap and that do not, see `draw_overlap`."""
-
-    def draw(self, poses: Array, noise: np.random.Generator) -> NDArray[np.intp]:
-        return draw_overlap(poses, noise)
 
 
 class OverlapOptimiserSettings(OptimizerSettings):
@@ -54,7 +47,8 @@ class OverlapTrainingSettings(Settings):
 
     start: str
     """Weights of the registration training (safetensors)."""
-    data: OverlapSettings = OverlapSettings()
+    data: GroupSettings = GroupSettings()
+    """Packed drives, of which frames are drawn that overlap and that do not, see `draw_overlap`."""
     validation: str = ""
     """Folder of packed drives of other worlds; empty: none."""
     validation_batches: int = Field(25, gt=0)
@@ -91,26 +85,27 @@ class OverlapTraining(nn.Module):
         self.model.requires_grad_(False)
         self.model.decoder.overlap.requires_grad_(True)
 
-    def forward(self, points: PointBatch, views: Views | None, distance: Tensor) -> tuple[Tensor, Tensor]:
-        """Loss and logits (G * 4,) of each place's first frame with its others, `distance` (G * 4,) m away."""
+    def forward(self, points: PointBatch, views: Views | None, distance: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """Loss of places whose frames are `distance` (G * 4,) m from the first."""
+        loss = overlap_loss(self.logits(points, views), distance, OVERLAP)
+        return loss, {"loss": loss.detach()}
+
+    def logits(self, points: PointBatch, views: Views | None) -> Tensor:
+        """(G * 4,) of each place's first frame with its others."""
         with torch.no_grad():
             tokens = self.model.encoder(points, views).tokens
-            first = torch.arange(0, len(tokens.xyz), FRAMES, device=distance.device).repeat_interleave(FRAMES - 1)
-            other = torch.arange(len(tokens.xyz), device=distance.device).view(-1, FRAMES)[:, 1:].flatten()
-            source = tokens._replace(**{name: getattr(tokens, name)[first] for name in tokens._fields})
-            target = tokens._replace(**{name: getattr(tokens, name)[other] for name in tokens._fields})
+            number = torch.arange(len(tokens.xyz), device=tokens.xyz.device).view(-1, FRAMES)
+            source = Tokens(*(field[number[:, :1].expand(-1, FRAMES - 1).flatten()] for field in tokens))
+            target = Tokens(*(field[number[:, 1:].flatten()] for field in tokens))
             correlated = self.model.decoder(source, target)
             solved = solve_batch(self.model.decoder, source, target, correlated)
-            posed = (
-                torch.zeros(len(distance), 2, device=distance.device) if solved is None else overlap_features(solved)
-            )
-        logits = self.model.decoder.overlap(*correlated, source.mask, target.mask, posed)
-        return overlap_loss(logits, distance, OVERLAP), logits
+            posed = overlap_features(solved) if solved is not None else source.xyz.new_zeros(len(source.xyz), 2)
+        return self.model.decoder.overlap(*correlated, source.mask, target.mask, posed)
 
 
-def pair_distances(batch: Batch) -> Tensor:
-    """(G * 4,) m between the first frame of each place and the others."""
-    t = batch.poses[:, :, :3, 3]
+def pair_distances(poses: Tensor) -> Tensor:
+    """(G * 4,) m between the first frame of each place and the others, of poses (G, FRAMES, 4, 4)."""
+    t = poses[:, :, :3, 3]
     return (t[:, 1:] - t[:, :1]).norm(dim=-1).flatten().float()
 
 
@@ -125,45 +120,42 @@ def average_precision(scores: np.ndarray, positive: np.ndarray) -> float:
 def train_overlap(settings: OverlapTrainingSettings, out: Path, resume: bool = False) -> Path:
     """Train; writes checkpoint, log and `weights.safetensors`, the registration training's with the new head, to
     `out`."""
-    with process_group() as (rank, world, device):
-        torch.manual_seed(settings.optimiser.seed)
-        network = network_settings(Path(settings.start))
-        module = OverlapTraining(network).to(device)
-        about = load_weights(module.model, Path(settings.start))
-        ema = copy.deepcopy(module).requires_grad_(False)
-        start = load_checkpoint(out / "checkpoint.pt", module, ema, None) if resume else 0
-        seed = settings.optimiser.seed
-        data = GroupDataset(settings.data, network, seed, start, (rank, world))
+    optimizer, weights = settings.optimiser, out / "weights.safetensors"
+    torch.manual_seed(optimizer.seed)
+    network = network_settings(Path(settings.start))
+    module = OverlapTraining(network)
+    about = load_weights(module.model, Path(settings.start))
+    data = GroupDataset(settings.data, network, draw_overlap, optimizer.seed)
 
-        def loss(run: nn.Module, batch: Batch, step: int) -> tuple[Tensor, dict[str, Tensor]]:
-            value, _ = run(*to_device((batch.points, batch.views, pair_distances(batch)), device))
-            return value, {"loss": value.detach()}
+    def batches(start: int, rank: int) -> Iterator[tuple[PointBatch, Views | None, Tensor]]:
+        return ((batch.points, batch.views, pair_distances(batch.poses)) for batch in data.batches(start, rank))
 
-        validate = validator(settings, network, device) if settings.validation and rank == 0 else None
-        train(module, ema, iter(data.loader()), loss, settings.optimiser, out, resume, validate, start, rank, device)
-        if rank == 0:
-            kept = {key: value for key, value in about.items() if key not in ("preset", "network")}
-            save_weights(ema.model, out / "weights.safetensors", {**kept, "phase": "2"})
-    return out / "weights.safetensors"
+    def save(averaged: nn.Module) -> None:
+        assert isinstance(averaged, OverlapTraining)
+        kept = {key: value for key, value in about.items() if key not in ("preset", "network")}
+        save_weights(averaged.model, weights, {**kept, "phase": "2"})
+
+    validate = validator(settings, network) if settings.validation else None
+    Trainer(module, batches, optimizer, out, save, validate).run(resume)
+    return weights
 
 
-def validator(
-    settings: OverlapTrainingSettings, network: NetworkSettings, device: torch.device
-) -> Callable[[nn.Module], dict[str, float]]:
+def validator(settings: OverlapTrainingSettings, network: NetworkSettings) -> Callable[[nn.Module], dict[str, float]]:
     """A function that measures the average precision on fixed batches of unseen worlds."""
     options = settings.data.model_copy(update={"packed": {settings.validation: 1.0}})
-    data = GroupDataset(options, network, seed=1)
-    batches = [data.batch(i) for i in range(settings.validation_batches)]
+    data = GroupDataset(options, network, draw_overlap, seed=1)
+    batch = cache(lambda number: data[number, 0])
 
     @torch.inference_mode()
     def validate(module: nn.Module) -> dict[str, float]:
+        assert isinstance(module, OverlapTraining)
+        device = next(module.parameters()).device
         scores, distances = [], []
-        for batch in batches:
-            distance = pair_distances(batch)
+        for points, views, poses in map(batch, range(settings.validation_batches)):
             with torch.autocast(device.type, torch.bfloat16):
-                _, logits = module(*to_device((batch.points, batch.views, distance), device))
+                logits = module.logits(*to_device((points, views), device))
             scores.append(logits.cpu().numpy())
-            distances.append(distance.numpy())
+            distances.append(pair_distances(poses).numpy())
         positive = np.concatenate(distances) <= OVERLAP
         return {"average_precision": average_precision(np.concatenate(scores), positive)}
 

@@ -3,8 +3,7 @@
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +13,11 @@ from torch import Tensor, nn
 
 from dpm2_core.config import Settings
 from dpm2_core.evaluation.pair_set import PairSet
-from dpm2_core.learning.checkpoint import load_checkpoint
-from dpm2_core.learning.dataset import Batch, DataSettings, GroupDataset
+from dpm2_core.learning.dataset import DataSettings, GroupDataset
 from dpm2_core.learning.pair_sampling import SetPairs, merge_tokens, sample_set_pairs
 from dpm2_core.learning.registration_loss import LossSettings, registration_loss
-from dpm2_core.learning.trainer import OptimizerSettings, process_group, train
-from dpm2_core.network.encoder import Encoded, to_device
+from dpm2_core.learning.trainer import OptimizerSettings, Trainer
+from dpm2_core.network.encoder import Encoded
 from dpm2_core.network.losses import cosine, info_nce, label_pairs
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pointnext import Scale
@@ -135,38 +133,26 @@ def train_registration(
 
     until: stop after this step; `resume` continues from there.
     """
-    with process_group() as (rank, world, device):
-        torch.manual_seed(settings.optimiser.seed)
-        network = preset(settings.preset, settings.network)
-        module = RegistrationTraining(network, settings.loss).to(device)
-        if settings.start:
-            load_weights(module.model, Path(settings.start))
-        ema = copy.deepcopy(module).requires_grad_(False)
-        start = load_checkpoint(out / "checkpoint.pt", module, ema, None) if resume else 0
-        data = GroupDataset(settings.data, network, settings.optimiser.seed, start, (rank, world))
+    optimizer, weights = settings.optimiser, out / "weights.safetensors"
+    torch.manual_seed(optimizer.seed)
+    network = preset(settings.preset, settings.network)
+    module = RegistrationTraining(network, settings.loss)
+    if settings.start:
+        load_weights(module.model, Path(settings.start))
+    data = GroupDataset(settings.data, network, settings.data.draw, optimizer.seed)
 
-        def loss(run: nn.Module, batch: Batch, step: int) -> tuple[Tensor, dict[str, Tensor]]:
-            return run(*to_device((batch.points, batch.views, set_pairs_of(batch.poses, settings, step)), device))
+    def batches(start: int, rank: int) -> Iterator[tuple[PointBatch, Views | None, tuple[SetPairs, ...]]]:
+        for step, (points, views, poses) in enumerate(data.batches(start, rank), start):
+            yield points, views, set_pairs_of(poses, settings, step)
 
-        validate = validator(settings, network) if settings.validation and rank == 0 else None
-        train(
-            module,
-            ema,
-            iter(data.loader()),
-            loss,
-            settings.optimiser,
-            out,
-            resume,
-            validate,
-            start,
-            rank,
-            device,
-            until,
-        )
-        if rank == 0:
-            about = {"phase": "1", "steps": str(settings.optimiser.steps), "images": str(settings.data.images).lower()}
-            save_weights(ema.model, out / "weights.safetensors", about)
-    return out / "weights.safetensors"
+    def save(averaged: nn.Module) -> None:
+        assert isinstance(averaged, RegistrationTraining)
+        about = {"phase": "1", "steps": str(optimizer.steps), "images": str(settings.data.images).lower()}
+        save_weights(averaged.model, weights, about)
+
+    validate = validator(settings, network) if settings.validation else None
+    Trainer(module, batches, optimizer, out, save, validate).run(resume, until)
+    return weights
 
 
 def validator(

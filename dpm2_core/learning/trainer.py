@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The training loop of both phases: AdamW, warm-up and cosine, clipping, EMA, checkpoints, several processes."""
+"""The loop that all trainings share: AdamW, warm-up and cosine, clipping, EMA, checkpoints, several processes."""
 
 from __future__ import annotations
 
+import copy
 import ctypes.util
 import math
 import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,7 @@ from torch.nn.parallel import DistributedDataParallel
 
 from dpm2_core.config import Settings
 from dpm2_core.learning.checkpoint import Log, load_checkpoint, save_checkpoint
+from dpm2_core.network.encoder import to_device
 
 
 class OptimizerSettings(Settings):
@@ -57,9 +60,6 @@ def keep_memory() -> None:
     if libc is not None and hasattr(handle := ctypes.CDLL(libc), "mallopt"):
         handle.mallopt(-3, 1 << 30)  # M_MMAP_THRESHOLD
         handle.mallopt(-1, (1 << 31) - 1)  # M_TRIM_THRESHOLD
-
-
-Loss = Callable[[nn.Module, Any, int], tuple[Tensor, dict[str, Tensor]]]
 
 
 @contextmanager
@@ -109,73 +109,89 @@ def update_ema(ema: nn.Module, module: nn.Module, decay: float, step: int) -> No
     torch._foreach_add_(averaged, now, alpha=1 - decay)
 
 
-def train(
-    module: nn.Module,
-    ema: nn.Module,
-    batches: Iterator[Any],
-    loss: Loss,
-    settings: OptimizerSettings,
-    out: Path,
-    resume: bool,
-    validate: Callable[[nn.Module], dict[str, float]] | None,
-    start: int,
-    rank: int,
-    device: torch.device,
-    until: int | None = None,
-) -> None:
-    """Run steps `start`.. of a training.
+@dataclass(frozen=True)
+class Trainer:
+    """A training, from its batches to the averaged weights; under torchrun in several processes.
 
-    Args:
-        module: what is trained, on its device; `ema` its averaged twin.
-        loss: of (module, batch, step), the mean over this process's share.
-        validate: figures of a module for the log, called on the averaged weights.
-        until: stop after this step, with a checkpoint; None for all of them.
+    Attributes:
+        module: what is trained. Called with a batch it gives the loss, the mean over the batch, and figures for the
+            log, `loss` among them.
+        batches: of (first step, rank of the process): what the module is called with in each step, without an end.
+        settings: optimization.
+        out: folder of `checkpoint.pt` and `log.jsonl`.
+        save: writes the averaged module at the end.
+        validate: figures of the averaged module for the log.
     """
-    keep_memory()
-    optimizer = torch.optim.AdamW(parameter_groups(module, settings.decay), settings.rate)
-    checkpoint = out / "checkpoint.pt"
-    if resume and start:
-        load_checkpoint(checkpoint, module, ema, optimizer)
-    wrapped: nn.Module = module
-    if torch.distributed.is_initialized():
-        wrapped = DistributedDataParallel(module, find_unused_parameters=True)
-    if settings.compile:
-        wrapped.compile(dynamic=False)
-    log = Log(out, append=resume) if rank == 0 else None
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, disable=rank != 0) as progress:
-        task = progress.add_task("training", total=settings.steps, completed=start)
-        end = settings.steps if until is None else min(until, settings.steps)
-        for step in range(start, end):
-            begin = time.perf_counter()
-            batch = next(batches)
-            waited = time.perf_counter() - begin
-            rate = learning_rate(settings, step)
-            for group in optimizer.param_groups:
-                group["lr"] = rate
-            torch.manual_seed(settings.seed * 1_000_003 + step)
-            buffers = [value.clone() for value in module.buffers()]
-            with torch.autocast(device.type, torch.bfloat16, enabled=settings.bf16):
-                value, figures = loss(wrapped, batch, step)
-            optimizer.zero_grad(set_to_none=True)
-            value.backward()
-            norm = nn.utils.clip_grad_norm_(module.parameters(), settings.clip)
-            if norm.isfinite():
-                optimizer.step()
-                update_ema(ema, module, settings.ema, step)
-            else:  # nothing of such a step stays, running means included
-                for value, before in zip(module.buffers(), buffers, strict=True):
-                    value.data.copy_(before)
-            seconds = time.perf_counter() - begin
-            described = {name: float(v) for name, v in figures.items()}
-            progress.update(task, advance=1, description=f"loss {described['loss']:.3f}")
-            if log is None:
-                continue
-            log.write(step, {**described, "norm": float(norm), "rate": rate, "seconds": seconds, "waited": waited})
-            last = step + 1 == end
-            if last or (step + 1) % settings.save_every == 0:
-                save_checkpoint(checkpoint, module, ema, optimizer, step + 1)
-            if validate is not None and (last or (step + 1) % settings.validate_every == 0):
-                log.write(step, validate(ema))
-    if log is not None:
-        log.close()
+
+    module: nn.Module
+    batches: Callable[[int, int], Iterator[tuple[Any, ...]]]
+    settings: OptimizerSettings
+    out: Path
+    save: Callable[[nn.Module], None]
+    validate: Callable[[nn.Module], dict[str, float]] | None = None
+
+    def run(self, resume: bool = False, until: int | None = None) -> None:
+        """Train, with `resume` on from the checkpoint; `until`: stop after this step, with a checkpoint.
+
+        Raises:
+            UsageError: nothing to resume.
+        """
+        keep_memory()
+        with process_group() as (rank, world, device):
+            module = self.module.to(device)
+            ema = copy.deepcopy(module).requires_grad_(False)
+            optimizer = torch.optim.AdamW(parameter_groups(module, self.settings.decay), self.settings.rate)
+            start = load_checkpoint(self.out / "checkpoint.pt", module, ema, optimizer) if resume else 0
+            steps = range(start, self.settings.steps if until is None else min(until, self.settings.steps))
+            batches = self.batches(start, rank)
+            wrapped = DistributedDataParallel(module, find_unused_parameters=True) if world > 1 else module
+            if self.settings.compile:
+                wrapped.compile(dynamic=False)
+            log = Log(self.out, append=resume) if rank == 0 else None
+            columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+            with Progress(*columns, disable=rank != 0) as progress:
+                task = progress.add_task("training", total=self.settings.steps, completed=start)
+                for step in steps:
+                    begin = time.perf_counter()
+                    batch = next(batches)
+                    waited = time.perf_counter() - begin
+                    figures = self._step(wrapped, ema, optimizer, to_device(batch, device), step)
+                    figures |= {"seconds": time.perf_counter() - begin, "waited": waited}
+                    progress.update(task, advance=1, description=f"loss {figures['loss']:.3f}")
+                    if log is not None:
+                        log.write(step, figures)
+                        self._keep(ema, optimizer, log, step + 1, last=step == steps[-1])
+            if log is not None:
+                log.close()
+                self.save(ema)
+
+    def _step(
+        self, wrapped: nn.Module, ema: nn.Module, optimizer: torch.optim.Optimizer, batch: tuple[Any, ...], step: int
+    ) -> dict[str, float]:
+        """One step of the optimizer; figures for the log."""
+        module, settings = self.module, self.settings
+        rate = learning_rate(settings, step)
+        for group in optimizer.param_groups:
+            group["lr"] = rate
+        torch.manual_seed(settings.seed * 1_000_003 + step)
+        buffers = [value.clone() for value in module.buffers()]
+        device = next(module.parameters()).device
+        with torch.autocast(device.type, torch.bfloat16, enabled=settings.bf16):
+            loss, figures = wrapped(*batch)
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        norm = nn.utils.clip_grad_norm_(module.parameters(), settings.clip)
+        if norm.isfinite():
+            optimizer.step()
+            update_ema(ema, module, settings.ema, step)
+        else:  # nothing of such a step stays, running means included
+            for value, before in zip(module.buffers(), buffers, strict=True):
+                value.data.copy_(before)
+        return {name: float(value) for name, value in figures.items()} | {"norm": float(norm), "rate": rate}
+
+    def _keep(self, ema: nn.Module, optimizer: torch.optim.Optimizer, log: Log, done: int, last: bool) -> None:
+        """Checkpoint and validation, where they are due after so many steps."""
+        if last or done % self.settings.save_every == 0:
+            save_checkpoint(self.out / "checkpoint.pt", self.module, ema, optimizer, done)
+        if self.validate is not None and (last or done % self.settings.validate_every == 0):
+            log.write(done - 1, self.validate(ema))

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -85,8 +86,10 @@ class ImagePyramid(nn.Module):
         width = settings.pyramid
         self.lateral = nn.ModuleList(nn.Conv2d(c, width, 1) for c in channels[self.first :])
         self.smooth = nn.ModuleList(nn.Conv2d(width, width, 3, padding=1) for _ in settings.strides)
-        self.register_buffer("mean", torch.tensor([0.485, 0.456, 0.406]).view(1, 3, 1, 1) * 255, persistent=False)
-        self.register_buffer("std", torch.tensor([0.229, 0.224, 0.225]).view(1, 3, 1, 1) * 255, persistent=False)
+        # By numpy: the first product of tensors on the meta device imports torch._dynamo, which takes 2 s.
+        for name, value in (("mean", [0.485, 0.456, 0.406]), ("std", [0.229, 0.224, 0.225])):
+            scaled = np.array(value, np.float32)[:, None, None] * np.float32(255)
+            self.register_buffer(name, torch.tensor(scaled[None]), persistent=False)
 
     def forward(self, pixels: Tensor) -> list[FeatureMap]:
         """pixels (B, 3, H, W) uint8 RGB: one map per configured stride, fine to coarse."""

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.frame import Frame, Image
@@ -111,8 +111,8 @@ def resize(pixels: np.ndarray, K: np.ndarray, size: tuple[int, int]) -> tuple[np
 
 
 def to_device(batch: Any, device: torch.device | str) -> Any:
-    """Move a NamedTuple or tuple of tensors, nested at will."""
-    if batch is None or isinstance(batch, Tensor):
-        return batch if batch is None else batch.to(device, non_blocking=True)
-    moved = [to_device(item, device) for item in batch]
-    return type(batch)(*moved) if hasattr(batch, "_fields") else tuple(moved)
+    """Move all in tuples and lists, nested at will, that can be moved."""
+    if isinstance(batch, tuple | list):
+        moved = [to_device(item, device) for item in batch]
+        return type(batch)(*moved) if hasattr(batch, "_fields") else type(batch)(moved)
+    return batch.to(device) if hasattr(batch, "to") else batch

@@ -19,7 +19,7 @@ class PointMLP(nn.Sequential):
 class OffsetHead(nn.Module):
     """Where the point that corresponds to descriptor b lies as seen from descriptor a, and how sure that is.
 
-    The answer is given in a's view frame: its covariance then turns with the sensor, as the surfaces do.
+    The offset is in a's view frame: its covariance then turns with the sensor, as the surfaces do.
     """
 
     def __init__(self, width: int, precision: bool) -> None:
@@ -63,7 +63,7 @@ class OffsetHead(nn.Module):
 class OverlapHead(nn.Module):
     """Probability that two frames are within 20 m: point-wise layers, mean over the valid points, classifier.
 
-    `pose`: the classifier is also told how confident the registration of the pair is and how far apart it puts them.
+    `pose`: the classifier also takes how confident the registration of the pair is and how far apart it puts them.
     Means over the points alone know little of either, and the paper's head, trained alike, hardly got off the ground.
     """
 

@@ -29,14 +29,12 @@ class Labels(NamedTuple):
     near: Tensor
 
 
-def label_pairs(
-    source: Tensor, target: Tensor, T_target_source: Tensor, masks: tuple[Tensor, Tensor], limit: float = 1.0
-) -> Labels:
-    """source (B, N, 3), target (B, M, 3), m, their true relation (B, 4, 4), masks (B, N), (B, M), limit in m."""
+def label_pairs(source: Tensor, target: Tensor, T_target_source: Tensor, masks: tuple[Tensor, Tensor]) -> Labels:
+    """source (B, N, 3), target (B, M, 3), m, their true relation (B, 4, 4), masks (B, N), (B, M); the limit is 1 m."""
     moved = transform(T_target_source, source)
     distance = torch.cdist(moved, target, compute_mode="donot_use_mm_for_euclid_dist")
     valid = masks[0][:, :, None] & masks[1][:, None]
-    return label_distances(distance.masked_fill(~valid, torch.inf), limit)
+    return label_distances(distance.masked_fill(~valid, torch.inf), 1.0)
 
 
 def label_distances(distance: Tensor, limit: float) -> Labels:

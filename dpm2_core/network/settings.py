@@ -4,11 +4,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from dpm2_core.config import Settings, merged, settings_from
+from dpm2_core.config import Settings, merged, read_yaml, settings_from
 from dpm2_core.errors import UsageError
 
 FusionKind = Literal[
@@ -141,7 +142,7 @@ class DecoderSettings(Settings):
     guided: int = Field(2, ge=0, le=64)
     """Times that descriptors are matched anew with the pose at hand. 0: the paper's single matching."""
     overlap_pose: bool = True
-    """Tell the overlap head how sure the registration is and how far apart it puts the pair. False: the paper's."""
+    """Give the overlap head how certain the registration is and how far apart it puts the pair. False: the paper's."""
     covariance_scale: float = Field(4.0, gt=0)
     """Factor on the covariance of the pose: both directions of a pair and neighboring pairs err alike."""
 
@@ -159,91 +160,8 @@ class NetworkSettings(Settings):
     decoder: DecoderSettings = DecoderSettings()
 
 
-_V1_STAGES = [
-    {"points": 4096, "radius": 3, "neighbours": 32, "channels": 32, "residual_radii": [6], "residual_neighbours": 32},
-    {"points": 1024, "radius": 6, "neighbours": 32, "channels": 64, "residual_radii": [12], "residual_neighbours": 32},
-    {
-        "points": 256,
-        "radius": 12,
-        "neighbours": 32,
-        "channels": 128,
-        "residual_radii": [24, 24],
-        "residual_neighbours": 32,
-    },
-    {"points": 64, "radius": 24, "neighbours": 32, "channels": 256, "residual_radii": [48], "residual_neighbours": 32},
-    {"points": 16, "radius": 48, "neighbours": 16, "channels": 512, "residual_radii": [96], "residual_neighbours": 16},
-]
-_V1: dict[str, Any] = {
-    "preset": "v1",
-    "points": {"view_aligned": False, "moments": False, "pool_first": False, "stages": _V1_STAGES, "upsample": 2},
-    "image": {"backbone": "none"},
-    "fusion": {"kind": "none", "reference": "fps"},
-    "decoder": {"width": 256, "heads": 8, "position": "sine", "precision": False, "guided": 0, "overlap_pose": False},
-}
-_PAPER: dict[str, Any] = {
-    **_V1,
-    "preset": "paper",
-    "image": {
-        "backbone": "convnext",
-        "size": [192, 624],
-        "depths": [3, 3, 9, 3],
-        "channels": [96, 192, 384, 768],
-        "pyramid": 128,
-        "strides": [16, 32],
-    },
-    "fusion": {
-        "reference_features": False,
-        "heads": 8,
-        "alpha_lidar": 0.07,
-        "alpha_image": [0.5],
-        "learned_gain": False,
-        "levels": [2, 3, 4],
-        "relative": False,
-        "pixel": False,
-        "image_mask": "front",
-    },
-}
-_BASE: dict[str, Any] = {
-    "preset": "base",
-    "points": {
-        "stages": [
-            {
-                "points": 4096,
-                "radius": 1.5,
-                "neighbours": 24,
-                "channels": 48,
-                "residual_radii": [3],
-                "residual_neighbours": 16,
-            },
-            {
-                "points": 1024,
-                "radius": 3,
-                "neighbours": 32,
-                "channels": 96,
-                "residual_radii": [6],
-                "residual_neighbours": 24,
-            },
-            {
-                "points": 256,
-                "radius": 8,
-                "neighbours": 32,
-                "channels": 192,
-                "residual_radii": [12, 12],
-                "residual_neighbours": 24,
-            },
-            {"points": 64, "radius": 24, "neighbours": 32, "channels": 256, "residual_radii": [36]},
-        ]
-    },
-    "image": {
-        "size": [192, 624],
-        "depths": [2, 2, 4, 2],
-        "channels": [48, 96, 192, 256],
-        "pyramid": 96,
-    },
-    "fusion": {"layers": 4, "heads": 8, "alpha_image": [0.3, 0.3, 1.0, 1.0, 2.5, 2.5, 6.0, 6.0]},
-    "decoder": {"width": 256, "layers": 4, "heads": 8},
-}
-PRESETS: dict[str, dict[str, Any]] = {"small": {}, "base": _BASE, "paper": _PAPER, "v1": _V1}
+PRESETS = ("small", "base", "paper", "v1")
+"""Files of changes to these defaults, in the folder `presets`."""
 
 
 def preset(name: str, changes: Mapping[str, Any] | None = None) -> NetworkSettings:
@@ -254,4 +172,5 @@ def preset(name: str, changes: Mapping[str, Any] | None = None) -> NetworkSettin
     """
     if name not in PRESETS:
         raise UsageError(f"network preset {name}: want one of {', '.join(PRESETS)}")
-    return settings_from(NetworkSettings, merged(PRESETS[name], changes or {}), default=f"preset {name}")
+    path = Path(__file__).with_name("presets") / f"{name}.yaml"
+    return settings_from(NetworkSettings, merged(read_yaml(path), changes or {}), default=f"preset {name}")

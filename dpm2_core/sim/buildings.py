@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
-from dpm2_core.sim.materials import Label, Material
+from dpm2_core.sim.materials import Label, Material, Surface
 from dpm2_core.sim.mesh import Mesh, make, merge
 from dpm2_core.sim.shapes import box, relief, turned
 
@@ -21,33 +23,46 @@ FOUNDATION = 2.0
 """How far walls go below the ground at their origin, m, for slopes."""
 
 
+class Style(NamedTuple):
+    """What the sides of a house have in common.
+
+    Attributes:
+        floors: how many. wall: color (3,). material: of the walls.
+        bay: width from window to window, m. glass: fraction of it that a window takes. shop: on the ground floor.
+    """
+
+    floors: int
+    wall: NDArray
+    material: Material
+    bay: float
+    glass: float
+    shop: bool
+
+
 def building(width: float, depth: float, floors: int, rng: np.random.Generator) -> Mesh:
     """A house with its front on y = 0, x from -width/2 to width/2, and its back on y = depth; the ground is z = 0."""
-    wall = np.clip(WALL_COLORS[rng.integers(len(WALL_COLORS))] + rng.normal(0, 10, 3), 30, 240)
-    material = Material.BRICK if rng.random() < 0.3 else Material.PLASTER
-    style = {"bay": rng.uniform(2.1, 3.6), "glass": rng.uniform(0.35, 0.6), "shop": rng.random() < 0.3 and floors > 2}
+    style = Style(
+        floors,
+        wall=np.clip(WALL_COLORS[rng.integers(len(WALL_COLORS))] + rng.normal(0, 10, 3), 30, 240),
+        material=Material.BRICK if rng.random() < 0.3 else Material.PLASTER,
+        bay=rng.uniform(2.1, 3.6),
+        glass=rng.uniform(0.35, 0.6),
+        shop=rng.random() < 0.3 and floors > 2,
+    )
     sides = [
-        turned(_facade(width, floors, wall, material, style, rng, True), 0.0, (0, 0, 0)),
-        turned(_facade(depth, floors, wall, material, style, rng, False), np.pi / 2, (width / 2, depth / 2, 0)),
-        turned(_facade(width, floors, wall, material, style, rng, False), np.pi, (0, depth, 0)),
-        turned(_facade(depth, floors, wall, material, style, rng, False), -np.pi / 2, (-width / 2, depth / 2, 0)),
+        turned(_facade(width, style, rng, front=True), 0.0, (0, 0, 0)),
+        turned(_facade(depth, style, rng), np.pi / 2, (width / 2, depth / 2, 0)),
+        turned(_facade(width, style, rng), np.pi, (0, depth, 0)),
+        turned(_facade(depth, style, rng), -np.pi / 2, (-width / 2, depth / 2, 0)),
     ]
     return merge([*sides, *_roof(width, depth, floors * FLOOR + 0.5, rng)])
 
 
-def _facade(
-    width: float,
-    floors: int,
-    wall: NDArray,
-    material: Material,
-    style: dict[str, float],
-    rng: np.random.Generator,
-    front: bool,
-) -> Mesh:
+def _facade(width: float, style: Style, rng: np.random.Generator, front: bool = False) -> Mesh:
     """One wall from -width/2 to width/2 along x, facing -y, with a grid of windows."""
-    bays = max(1, round(width / style["bay"])) if front else max(1, round(width / 4.5))
-    pitch = width / bays
-    glass = style["glass"] if front else 0.3
+    bays = max(1, round(width / (style.bay if front else 4.5)))
+    pitch, floors = width / bays, style.floors
+    glass = style.glass if front else 0.3
     left = -width / 2 + pitch * (np.arange(bays) + 0.5 - glass / 2)
     x = np.concatenate([[-width / 2], np.stack([left, left + pitch * glass], -1).ravel(), [width / 2]])
     sills = np.arange(floors) * FLOOR + rng.uniform(0.7, 1.1)
@@ -55,36 +70,30 @@ def _facade(
         [[-FOUNDATION], np.stack([sills, sills + rng.uniform(1.2, 1.6)], -1).ravel(), [floors * FLOOR + 0.5]]
     )
     shape = (len(x) - 1, len(z) - 1)
-    depth, materials = np.zeros(shape), np.full(shape, material)
-    color = np.broadcast_to(wall, (*shape, 3)).copy()
+    depth, materials = np.zeros(shape), np.full(shape, style.material)
+    color = np.broadcast_to(style.wall, (*shape, 3)).copy()
     window = np.zeros(shape, bool)
     window[1::2, 1::2] = rng.random((bays, floors)) > (0.06 if front else 0.5)
     if front:
-        _features(bays, floors, pitch, style, depth, window, color, rng)
+        _features(style, depth, window, color, rng)
     shutters = rng.random(shape) < 0.12
     depth[window] += rng.uniform(0.1, 0.3)
     materials[window & ~shutters] = Material.GLASS
     color[window & ~shutters] = (70, 84, 98) * rng.uniform(0.6, 1.3, (int((window & ~shutters).sum()), 1))
-    color[window & shutters] = wall * rng.uniform(0.4, 0.8)
+    color[window & shutters] = style.wall * rng.uniform(0.4, 0.8)
     return relief(x, z, depth, materials, color.clip(0, 255))
 
 
 def _features(
-    bays: int,
-    floors: int,
-    pitch: float,
-    style: dict[str, float],
-    depth: NDArray,
-    window: NDArray[np.bool_],
-    color: NDArray,
-    rng: np.random.Generator,
+    style: Style, depth: NDArray, window: NDArray[np.bool_], color: NDArray, rng: np.random.Generator
 ) -> None:
     """Doors, shops, bays, recesses and balconies, written into the cells of a front."""
+    bays = len(depth) // 2
     door = 1 + 2 * int(rng.integers(bays))
     depth[door, :2] += rng.uniform(0.3, 0.8)
     window[door, :2] = False
     color[door, :2] = rng.uniform(40, 140, 3)
-    if style["shop"]:
+    if style.shop:
         window[1:-1, 0:2] |= rng.random((2 * bays - 1, 1)) < 0.8
         window[door, :2] = False
         color[:, 2] = rng.uniform(40, 220, 3)  # the sign above the shop
@@ -94,7 +103,7 @@ def _features(
             depth[start, 2:] -= rng.uniform(0.4, 0.9)  # an oriel from the first floor up
         elif draw < 0.16:
             depth[start, 1:] += rng.uniform(0.6, 1.5)  # a loggia
-        elif draw < 0.3 and floors > 1:
+        elif draw < 0.3 and style.floors > 1:
             depth[max(start - 1, 0) : start + 2, 2:-1:2] -= rng.uniform(0.6, 1.3)  # balconies: slab and parapet
         elif draw < 0.4:
             depth[start + 1, :] += rng.uniform(0.1, 0.4)  # a pilaster gap or drain pipe
@@ -109,20 +118,12 @@ def _roof(width: float, depth: float, top: float, rng: np.random.Generator) -> l
     color = ROOF_COLORS[rng.integers(len(ROOF_COLORS))] + rng.normal(0, 8, 3)
     w, over = width / 2 + 0.3, 0.4
     if rng.random() < 0.3 or depth > 18:
-        parts = [
-            box((-w, -over / 2, top), (w, depth + over / 2, top + 0.3), Label.BUILDING, Material.ROOF, color * 0.8)
-        ]
+        flat = Surface(Label.BUILDING, Material.ROOF, color * 0.8)
+        metal = Surface(Label.BUILDING, Material.METAL, (130,) * 3)
+        parts = [box((-w, -over / 2, top), (w, depth + over / 2, top + 0.3), flat)]
         for _ in range(rng.integers(0, 4)):
             at = rng.uniform((-w + 1, 1), (w - 2, depth - 2))
-            parts.append(
-                box(
-                    (*at, top),
-                    (*(at + rng.uniform(0.6, 2, 2)), top + rng.uniform(0.6, 2)),
-                    Label.BUILDING,
-                    Material.METAL,
-                    (130,) * 3,
-                )
-            )
+            parts.append(box((*at, top), (*(at + rng.uniform(0.6, 2, 2)), top + rng.uniform(0.6, 2)), metal))
         return parts
     ridge = top + depth / 2 * rng.uniform(0.5, 1.0)
     hip = rng.choice([0.0, 0.0, width / 4])
@@ -133,4 +134,5 @@ def _roof(width: float, depth: float, top: float, rng: np.random.Generator) -> l
     faces = [[0, 1, 5], [0, 5, 4], [2, 3, 4], [2, 4, 5], [1, 2, 5], [3, 0, 4], [0, 2, 1], [0, 3, 2]]
     roof = make(corners, faces, Label.BUILDING, Material.ROOF, color)
     chimney = rng.uniform((-w + 1, depth * 0.3), (w - 1, depth * 0.7))
-    return [roof, box((*chimney, top), (*(chimney + 0.6), ridge + 0.8), Label.BUILDING, Material.BRICK, (130, 80, 66))]
+    brick = Surface(Label.BUILDING, Material.BRICK, (130, 80, 66))
+    return [roof, box((*chimney, top), (*(chimney + 0.6), ridge + 0.8), brick)]

@@ -29,11 +29,11 @@ REACH = 600.0
 """How far one sees, m."""
 
 
-def calibration(config: CameraConfig, name: str = "image_2") -> Camera:
+def calibration(config: CameraConfig) -> Camera:
     """The camera on the car: looking ahead, 0.27 m ahead of and 0.08 m below the LiDAR, 0.06 m left of its middle."""
     K = np.array([[config.focal, 0, config.width / 2 - 0.5], [0, config.focal, config.height / 2 - 0.5], [0, 0, 1]])
     axes = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # x right, y down, z ahead
-    return Camera(K, se3.make(axes, (0.27, 0.06, -0.08)), (config.width, config.height), name=name)
+    return Camera(K, se3.make(axes, (0.27, 0.06, -0.08)), (config.width, config.height), name="image_2")
 
 
 @lru_cache(maxsize=8)

@@ -23,7 +23,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.sim.camera import calibration, render
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.road import FRAME_PERIOD, ROAD_KINDS, make_road, read_drive
-from dpm2_core.sim.settings import CameraConfig, LidarConfig, PresetName
+from dpm2_core.sim.settings import DriveConfig
 from dpm2_core.sim.world import World, build_world, own_preset, random_stream
 
 Array = NDArray[np.float64]
@@ -37,65 +37,52 @@ _LIDAR_STREAM, _CAMERA_STREAM = 10, 11
 
 def simulate(
     out: Path,
-    frames: int | None = None,
-    seed: int = 0,
-    road: str = "loop",
-    preset: PresetName = "city",
-    images: bool = True,
-    lidar: LidarConfig | None = None,
-    camera: CameraConfig | None = None,
+    drive: DriveConfig,
     workers: int = 2,
     progress: Callable[[int, int], None] = lambda done, total: None,
-    traffic: float = 1.0,
 ) -> bool:
     """Write a drive to `out`, which appears when it is complete and not before.
 
     Args:
         out: root of the KITTI layout: sequences/00/{velodyne,image_2,labels,static,...}, poses/00.txt.
-        frames: at 10 Hz; None for 150, or all of a file of poses. The result does not depend on `workers`.
-        road, preset, seed, traffic: see `build_world`. The lap of a closed road is chosen so that the drive ends where
-            it began.
+        workers: threads; the result does not depend on them.
         progress: called with frames done and frames in all.
 
     Returns:
         False if the same drive was there already, and is left as it is.
 
     Raises:
-        UsageError: an argument cannot be, or `out` holds something else. Dpm2Error: it could not be written.
+        UsageError: a setting cannot be, or `out` holds something else. Dpm2Error: it could not be written.
     """
-    lidar, camera = lidar or LidarConfig(), camera or CameraConfig()
-    frames = _frames(road, frames)
-    recipe = _recipe(frames, seed, road, preset, images, lidar, camera)
-    if traffic != 1:
-        recipe["traffic"] = traffic
+    drive = drive.model_copy(update={"frames": _frames(drive)})
+    recipe = _recipe(drive)
     if _is_there(out, recipe):
         return False
-    length = fitting_length(road, preset, seed, frames, traffic) if road in ROAD_KINDS else 400.0
-    world = build_world(road, preset, seed, length, traffic)
-    drive = _Drive(world, Lidar(lidar), camera if images else None, frames)
+    length = fitting_length(drive) if drive.road in ROAD_KINDS else 400.0
+    world = build_world(drive.road, drive.preset, drive.seed, length, drive.traffic)
     with _whole(out) as part:
-        drive.write(part, recipe, workers, progress)
+        _Drive(world, drive).write(part, recipe, workers, progress)
     return True
 
 
-def _frames(road: str, frames: int | None) -> int:
-    if frames is not None and frames < 1:
-        raise UsageError(f"--frames {frames}: want at least 1")
-    if road in ROAD_KINDS:
-        return 150 if frames is None else frames
-    known = len(read_drive(Path(road)))
-    if frames is not None and frames > known:
-        raise UsageError(f"--frames {frames}: {road} has {known}")
-    return known if frames is None else frames
+def _frames(drive: DriveConfig) -> int:
+    if drive.frames is not None and drive.frames < 1:
+        raise UsageError(f"--frames {drive.frames}: want at least 1")
+    if drive.road in ROAD_KINDS:
+        return 150 if drive.frames is None else drive.frames
+    known = len(read_drive(Path(drive.road)))
+    if drive.frames is not None and drive.frames > known:
+        raise UsageError(f"--frames {drive.frames}: {drive.road} has {known}")
+    return known if drive.frames is None else drive.frames
 
 
-def fitting_length(road: str, preset: PresetName, seed: int, frames: int, traffic: float = 1.0) -> float:
-    """Of the road, m, that a drive of so many frames just fills."""
-    kind = own_preset(preset, seed, traffic)
-    end = (frames - 1) * FRAME_PERIOD
+def fitting_length(drive: DriveConfig) -> float:
+    """Of the road, m, that the frames of a drive just fill."""
+    kind = own_preset(drive.preset, drive.seed, drive.traffic)
+    end = (_frames(drive) - 1) * FRAME_PERIOD
     length = float(np.clip(end * kind.speed, 60, 20000))
     for _ in range(12):  # how far it goes depends on the curves, and these on the length
-        streets = make_road(road, kind, random_stream(seed, preset, 0), length)
+        streets = make_road(drive.road, kind, random_stream(drive.seed, drive.preset, 0), length)
         driven = float(streets.distance(end) - streets.distance(0.0))
         if streets.drive.closed:
             length = min(length + 0.8 * (driven - OVERLAP - streets.drive.length), LONGEST_LAP)
@@ -105,22 +92,15 @@ def fitting_length(road: str, preset: PresetName, seed: int, frames: int, traffi
     return length
 
 
-def _recipe(
-    frames: int, seed: int, road: str, preset: PresetName, images: bool, lidar: LidarConfig, camera: CameraConfig
-) -> dict[str, Any]:
-    if road not in ROAD_KINDS:
-        road = f"{Path(road).name} sha256:{hashlib.sha256(Path(road).read_bytes()).hexdigest()}"
-    return {
-        "generator": "dpm2 sim 1",
-        "frames": frames,
-        "seed": seed,
-        "road": road,
-        "preset": preset,
-        "images": images,
-        "vertical_angle_correction_deg": 0,
-        "lidar": lidar.model_dump(),
-        "camera": camera.model_dump(),
-    }
+def _recipe(drive: DriveConfig) -> dict[str, Any]:
+    """What the drive is made from, of a file its name and checksum; usual traffic goes without saying."""
+    recipe = {"generator": "dpm2 sim 1", "vertical_angle_correction_deg": 0, **drive.model_dump()}
+    if drive.road not in ROAD_KINDS:
+        path = Path(drive.road)
+        recipe["road"] = f"{path.name} sha256:{hashlib.sha256(path.read_bytes()).hexdigest()}"
+    if drive.traffic == 1:
+        del recipe["traffic"]
+    return recipe
 
 
 def _is_there(out: Path, recipe: dict[str, Any]) -> bool:
@@ -173,13 +153,11 @@ def _alive(pid: str) -> bool:
 class _Drive:
     """One world, sensors and the poses of the drive; writes frames in any order."""
 
-    def __init__(self, world: World, lidar: Lidar, camera: CameraConfig | None, frames: int) -> None:
-        self.world, self.lidar, self.camera = world, lidar, camera
-        self.times = np.arange(frames) * FRAME_PERIOD
-        height = lidar.config.height
-        self.T_world_lidar = np.stack([world.drive_pose(t, height) for t in self.times])
-        self.view = camera or CameraConfig()
-        color = calibration(self.view)
+    def __init__(self, world: World, drive: DriveConfig) -> None:
+        self.world, self.lidar, self.camera = world, Lidar(drive.lidar), drive.camera if drive.images else None
+        self.times = np.arange(_frames(drive)) * FRAME_PERIOD
+        self.T_world_lidar = np.stack([world.drive_pose(t, drive.lidar.height) for t in self.times])
+        color = calibration(drive.camera)
         # The poses and Tr of the layout are of the left gray camera 0; the color camera 2 sits beside it.
         self.T_lidar_cam0 = color.T_lidar_cam.copy()
         self.T_lidar_cam0[1, 3] = 0.0

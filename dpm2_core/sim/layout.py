@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from dpm2_core.sim import plants
 from dpm2_core.sim.buildings import building
 from dpm2_core.sim.furniture import FURNITURE, street_box
-from dpm2_core.sim.materials import Label, Material
+from dpm2_core.sim.materials import Label, Material, Surface
 from dpm2_core.sim.mesh import Mesh, merge, placed, pose
 from dpm2_core.sim.road import Road
 from dpm2_core.sim.settings import Preset
@@ -47,7 +47,7 @@ class Layout:
             yield from self._boundaries(preset.boundaries)
         kerb = preset.sidewalk or 1.2
         furniture = self._furniture()
-        yield from self._scattered(furniture, preset.poles, (0.45, 0.9), 0.3, aligned=True)
+        yield from self._scattered(furniture, preset.poles, (0.45, 0.9), 0.3, scale=None)
         trees = [plants.tree(self.rng) for _ in range(10)]
         distant = [plants.tree(self.rng, 0.4) for _ in range(10)]
         bushes = [plants.bush(self.rng) for _ in range(8)]
@@ -79,11 +79,13 @@ class Layout:
         per_100m: float,
         band: tuple[float, float],
         radius: float,
-        aligned: bool = False,
         patchy: bool = False,
-        scale: tuple[float, float] = (0.8, 1.25),
+        scale: tuple[float, float] | None = (0.8, 1.25),
     ) -> Iterator[Mesh]:
-        """Copies at random places of a band beside the kerb, that keep `radius` m from what is there already."""
+        """Copies at random places of a band beside the kerb, that keep `radius` m from what is there already.
+
+        `scale`: least and largest; None for copies as they are, in line with the kerb.
+        """
         if per_100m <= 0:
             return
         terrain, rng = self.terrain, self.rng
@@ -98,7 +100,7 @@ class Layout:
                 continue
             xy = line.xy[at] + line.outward[at] * rng.uniform(-0.5, 0.5, (n, 1)) * (band[1] - band[0])
             which = rng.integers(0, len(templates), n)
-            size = np.ones(n) if aligned else rng.uniform(*scale, n)
+            size = np.ones(n) if scale is None else rng.uniform(*scale, n)
             keep = terrain.edge_at(xy) > band[0] - 0.25
             keep &= self.drive.query(xy)[0] > CLEAR_OF_DRIVE + reach[which] * size
             row, column = terrain._cell(xy)
@@ -109,7 +111,7 @@ class Layout:
                 self.taken[row[keep], column[keep]] = 1
             xy, at, which, size = xy[keep], at[keep], which[keep], size[keep]
             yaw = rng.uniform(0, 2 * np.pi, len(xy))
-            if aligned:
+            if scale is None:
                 yaw = np.arctan2(line.outward[at, 1], line.outward[at, 0]) - np.pi / 2 + rng.normal(0, 0.05, len(xy))
             tint = rng.uniform(0.8, 1.2, (len(xy), 1)) * rng.uniform(0.93, 1.07, (len(xy), 3))
             z = terrain.surface_at(xy)
@@ -222,18 +224,15 @@ class Layout:
         yield kerbside_ribbon(self.terrain, line, section, Label.FENCE, material, color)
 
     def _fence(self, line: Kerbline) -> Iterator[Mesh]:
-        """Pickets and two rails, a meter at a time."""
+        """Pickets and two rails, per meter."""
         rng = self.rng
         h, gap = rng.uniform(0.8, 1.9), float(rng.choice([0.13, 0.2, 0.33]))
         wood = rng.random() < 0.7
-        kind = (
-            Label.FENCE,
-            Material.WOOD if wood else Material.METAL,
-            rng.uniform(0.4, 1) * np.array((190, 150, 110) if wood else (150, 155, 155)),
-        )
+        color = rng.uniform(0.4, 1) * np.array((190, 150, 110) if wood else (150, 155, 155))
+        kind = Surface(Label.FENCE, Material.WOOD if wood else Material.METAL, color)
         width = gap * rng.uniform(0.3, 0.75)
-        pickets = [box((x, 0, -0.1), (x + width, 0.02, h), *kind) for x in np.arange(0, 1, gap)]
-        rails = [box((0, 0.02, z), (1.02, 0.06, z + 0.08), *kind) for z in (0.25 * h, 0.8 * h)]
+        pickets = [box((x, 0, -0.1), (x + width, 0.02, h), kind) for x in np.arange(0, 1, gap)]
+        rails = [box((0, 0.02, z), (1.02, 0.06, z + 0.08), kind) for z in (0.25 * h, 0.8 * h)]
         ahead = np.diff(line.xy, axis=0)
         yaw = np.arctan2(ahead[:, 1], ahead[:, 0])
         stretch = np.stack([np.linalg.norm(ahead, axis=1), np.ones(len(yaw)), np.ones(len(yaw))], -1)

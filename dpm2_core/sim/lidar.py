@@ -93,7 +93,7 @@ class Lidar:
         still = world.scene.cast(origins, directions, self.config.range)
         points, back = self._returns(world.static, still, directions, chance, jitter)
         label = world.static.label[np.maximum(still.face, 0)].astype(np.uint32)
-        if not world.terrain.preset.degenerate:  # there, intensity would tell the motion
+        if not world.terrain.preset.degenerate:  # there, intensity would reveal the motion
             self._paint(world, T_world_lidar, points, label, back)
         static = points[back]
         moving = np.zeros(len(directions), bool)

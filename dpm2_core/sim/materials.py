@@ -5,8 +5,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 
 class Label(IntEnum):
@@ -61,6 +63,14 @@ class Material(IntEnum):
     CLOTH = 16
     TILE = 17
     LAMP = 18
+
+
+class Surface(NamedTuple):
+    """What a solid is, what it is made of, and its color (3,) 0..255."""
+
+    label: Label
+    material: Material
+    color: ArrayLike
 
 
 @dataclass(frozen=True)

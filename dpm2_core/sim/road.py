@@ -265,10 +265,10 @@ def _arc_lengths(xy: Array) -> Array:
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))])
 
 
-def _first_visits(xy: Array, radius: float = 5.0, lag: float = 30.0) -> Iterator[tuple[int, int]]:
-    """Runs [a, b) of samples that are no return to within `radius` m of a place left more than `lag` m ago."""
-    pairs = cKDTree(xy).query_pairs(radius, output_type="ndarray")
-    pairs = pairs[np.abs(pairs[:, 0] - pairs[:, 1]) > lag / STEP]
+def _first_visits(xy: Array) -> Iterator[tuple[int, int]]:
+    """Runs [a, b) of samples that are no return to within 5 m of a place left more than 30 m ago."""
+    pairs = cKDTree(xy).query_pairs(5.0, output_type="ndarray")
+    pairs = pairs[np.abs(pairs[:, 0] - pairs[:, 1]) > 30.0 / STEP]
     new = np.ones(len(xy), bool)
     new[pairs.max(1)] = False
     edges = np.flatnonzero(np.diff(np.concatenate([[0], new.astype(np.int8), [0]])))

@@ -53,6 +53,26 @@ class CameraConfig(Settings):
     """Standard deviation of a pixel value, of 255."""
 
 
+class DriveConfig(Settings):
+    """A drive through a world: with the version of this program, all that its files depend on."""
+
+    frames: int | None = None
+    """At 10 Hz; None for 150, or all of a file of poses."""
+    seed: int = 0
+    """Of the world and the noise."""
+    road: str = "loop"
+    """straight, loop, figure8, random, or a file of KITTI poses. The lap of a closed road is chosen so that the drive
+    ends where it began."""
+    preset: PresetName = "city"
+    """Kind of place."""
+    images: bool = True
+    """Render the images of the camera."""
+    traffic: float = 1.0
+    """Times that of the preset; see `with_traffic`."""
+    lidar: LidarConfig = LidarConfig()
+    camera: CameraConfig = CameraConfig()
+
+
 class Preset(Settings):
     """A kind of place. Densities are means: `varied` draws each world's own."""
 
@@ -99,7 +119,7 @@ class Preset(Settings):
     roughness: float = 0.05
     """Amplitude of unevenness beside the road, m."""
     degenerate: bool = False
-    """Constant section: nothing in the geometry tells the motion along the road."""
+    """Constant section: nothing in the geometry constrains the motion along the road."""
 
 
 PRESETS: dict[PresetName, Preset] = {

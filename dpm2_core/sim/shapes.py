@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import ArrayLike
 
 from dpm2_core.extras import needs
-from dpm2_core.sim.materials import Label, Material
+from dpm2_core.sim.materials import Label, Material, Surface
 from dpm2_core.sim.mesh import Mesh, make
 
 BOX_FACES = np.array([
@@ -16,22 +18,14 @@ BOX_FACES = np.array([
 ])  # fmt: skip
 
 
-def box(low: ArrayLike, high: ArrayLike, label: Label, material: Material, color: ArrayLike) -> Mesh:
+def box(low: ArrayLike, high: ArrayLike, surface: Surface) -> Mesh:
     """An upright box between two corners (3,)."""
     (x, y, z), (X, Y, Z) = np.asarray(low, float), np.asarray(high, float)
     corners = [(x, y, z), (X, y, z), (X, Y, z), (x, Y, z), (x, y, Z), (X, y, Z), (X, Y, Z), (x, Y, Z)]
-    return make(corners, BOX_FACES, label, material, color)
+    return make(corners, BOX_FACES, *surface)
 
 
-def rod(
-    start: ArrayLike,
-    end: ArrayLike,
-    radii: tuple[float, float],
-    sides: int,
-    label: Label,
-    material: Material,
-    color: ArrayLike,
-) -> Mesh:
+def rod(start: ArrayLike, end: ArrayLike, radii: tuple[float, float], sides: int, surface: Surface) -> Mesh:
     """A tapered tube from `start` to `end`, capped at the end."""
     start, end = np.asarray(start, float), np.asarray(end, float)
     axis = (end - start) / np.linalg.norm(end - start)
@@ -45,43 +39,30 @@ def rod(
         np.stack([i, j, j + sides], -1), np.stack([i, j + sides, i + sides], -1),
         np.stack([i + sides, j + sides, np.full(sides, 2 * sides)], -1),
     ])  # fmt: skip
-    return make(points, faces, label, material, color)
+    return make(points, faces, *surface)
 
 
-def blob(
-    center: ArrayLike,
-    radii: ArrayLike,
-    rough: float,
-    rng: np.random.Generator,
-    label: Label,
-    material: Material,
-    color: ArrayLike,
-    detail: int = 1,
-) -> Mesh:
-    """An ellipsoid of 20 * 4**detail triangles with its vertices moved in and out by the fraction `rough`."""
+def blob(center: ArrayLike, radii: ArrayLike, rough: float, rng: np.random.Generator, surface: Surface) -> Mesh:
+    """An ellipsoid of 80 triangles with its vertices moved in and out by the fraction `rough`."""
     with needs("sim", "the synthetic city"):
         import trimesh
 
-    sphere = trimesh.creation.icosphere(subdivisions=detail)
-    points = sphere.vertices * (1 + rng.normal(0, rough, (len(sphere.vertices), 1))) * np.asarray(radii) + np.asarray(
-        center
-    )
-    return make(points, sphere.faces, label, material, color)
+    sphere = trimesh.creation.icosphere(subdivisions=1)
+    points = sphere.vertices * (1 + rng.normal(0, rough, (len(sphere.vertices), 1))) * np.asarray(radii)
+    return make(points + np.asarray(center), sphere.faces, *surface)
 
 
-def leaves(
-    centers: ArrayLike, size: float, rng: np.random.Generator, color: ArrayLike, label: Label = Label.VEGETATION
-) -> Mesh:
+def leaves(centers: ArrayLike, size: float, rng: np.random.Generator, color: ArrayLike) -> Mesh:
     """One randomly turned triangle of about `size` m at each of the centers (N, 3), its brightness random."""
     centers = np.asarray(centers, float)
     n = len(centers)
     corners = centers[:, None] + rng.normal(0, 0.6 * size, (n, 3, 3))
     shade = rng.uniform(0.65, 1.3, (n, 1)) * np.asarray(color)
     faces = np.arange(3 * n).reshape(n, 3)
-    return make(corners.reshape(-1, 3), faces, label, Material.LEAF, shade.clip(0, 255))
+    return make(corners.reshape(-1, 3), faces, Label.VEGETATION, Material.LEAF, shade.clip(0, 255))
 
 
-def extrusion(profile: ArrayLike, y: ArrayLike, label: Label, material: Material, color: ArrayLike) -> Mesh:
+def extrusion(profile: ArrayLike, y: ArrayLike, surface: Surface) -> Mesh:
     """A closed convex-ish side profile (N, 2) of x, z, stretched across: half widths `y` (N,) at its corners."""
     profile = np.asarray(profile, float)
     n = len(profile)
@@ -95,12 +76,10 @@ def extrusion(profile: ArrayLike, y: ArrayLike, label: Label, material: Material
         np.stack([i, j, j + n], -1), np.stack([i, j + n, i + n], -1),
         np.stack([i, j, np.full(n, 2 * n)], -1), np.stack([i + n, j + n, np.full(n, 2 * n + 1)], -1),
     ])  # fmt: skip
-    return make(points, faces, label, material, color)
+    return make(points, faces, *surface)
 
 
-def relief(
-    x: ArrayLike, z: ArrayLike, depth: ArrayLike, material: ArrayLike, color: ArrayLike, label: Label = Label.BUILDING
-) -> Mesh:
+def relief(x: ArrayLike, z: ArrayLike, depth: ArrayLike, material: ArrayLike, color: ArrayLike) -> Mesh:
     """A wall in the xz plane with recesses and bays: what a facade is.
 
     Args:
@@ -117,50 +96,23 @@ def relief(
     quads, materials, colors = [front], [material.reshape(-1)], [color.reshape(-1, 3)]
     ring = np.pad(depth, ((1, 1), (0, 0)))  # jambs; at the ends down to the plane
     i, j = np.nonzero(np.diff(ring, axis=0))
-    quads.append(
-        _quads(
-            x[i],
-            ring[i, j],
-            z[j],
-            x[i],
-            ring[i + 1, j],
-            z[j],
-            x[i],
-            ring[i + 1, j],
-            z[j + 1],
-            x[i],
-            ring[i, j],
-            z[j + 1],
-        )
-    )
+    near, far = ring[i, j], ring[i + 1, j]
+    quads.append(_quads(x[i], near, z[j], x[i], far, z[j], x[i], far, z[j + 1], x[i], near, z[j + 1]))
     shallow = np.where(ring[i, j] < ring[i + 1, j], np.clip(i - 1, 0, None), np.clip(i, None, len(depth) - 1))
     materials.append(np.full(len(i), Material.PLASTER))
     colors.append(color[shallow, j])
     ring = np.pad(depth, ((0, 0), (1, 1)))  # sills and lintels
     i, j = np.nonzero(np.diff(ring, axis=1))
-    quads.append(
-        _quads(
-            x[i],
-            ring[i, j],
-            z[j],
-            x[i + 1],
-            ring[i, j],
-            z[j],
-            x[i + 1],
-            ring[i, j + 1],
-            z[j],
-            x[i],
-            ring[i, j + 1],
-            z[j],
-        )
-    )
+    near, far = ring[i, j], ring[i, j + 1]
+    quads.append(_quads(x[i], near, z[j], x[i + 1], near, z[j], x[i + 1], far, z[j], x[i], far, z[j]))
     shallow = np.where(ring[i, j] < ring[i, j + 1], np.clip(j - 1, 0, None), np.clip(j, None, depth.shape[1] - 1))
     materials.append(np.full(len(i), Material.CONCRETE))
     colors.append(color[i, shallow])
     points = np.concatenate(quads).reshape(-1, 3)
     corner = np.arange(len(points)).reshape(-1, 4)
     faces = corner[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
-    return make(points, faces, label, np.repeat(np.concatenate(materials), 2), np.repeat(np.concatenate(colors), 2, 0))
+    of_quads = np.concatenate(materials), np.concatenate(colors)
+    return make(points, faces, Label.BUILDING, *(np.repeat(values, 2, 0) for values in of_quads))
 
 
 def _quads(*columns: np.ndarray) -> np.ndarray:
@@ -171,12 +123,4 @@ def turned(mesh: Mesh, yaw: float, to: ArrayLike = (0.0, 0.0, 0.0)) -> Mesh:
     """The mesh turned about z by `yaw` rad and moved; its surface coordinates stay."""
     c, s = np.cos(yaw), np.sin(yaw)
     R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]], np.float32)
-    return Mesh(
-        mesh.vertices @ R.T + np.asarray(to, np.float32),
-        mesh.faces,
-        mesh.label,
-        mesh.material,
-        mesh.color,
-        mesh.uv,
-        mesh.texture,
-    )
+    return replace(mesh, vertices=mesh.vertices @ R.T + np.asarray(to, np.float32))

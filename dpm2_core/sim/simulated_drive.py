@@ -3,13 +3,11 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
-from itertools import islice
 
 import numpy as np
 
+from dpm2_core.data.prefetch import prefetch
 from dpm2_core.frame import Array, Frame
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import LidarConfig, PresetName
@@ -28,27 +26,17 @@ class SimulatedDrive:
     T_cam_lidar = None
     truth = "simulation"
 
-    def __init__(
-        self,
-        road: str,
-        preset: PresetName = "suburb",
-        seed: int = 0,
-        lidar: LidarConfig | None = None,
-        workers: int = 1,
-        name: str = "",
-        traffic: float = 1.0,
-    ) -> None:
-        """`road`, `preset`, `seed` and `traffic` as in `build_world`, `name` what reports call it.
+    def __init__(self, road: str, preset: PresetName = "suburb", seed: int = 0, name: str = "") -> None:
+        """`road`, `preset` and `seed` as in `build_world`, `name` what reports call it.
 
         Raises:
             UsageError: no such road or preset.
         """
         self.name = name or f"{road} {preset} {seed}"
         self.notes: list[str] = []
-        self.world = build_world(road, preset, seed, traffic=traffic)
+        self.world = build_world(road, preset, seed)
         self.times = self.world.road.times
-        self._lidar = Lidar(lidar or LidarConfig())
-        self._workers = workers
+        self._lidar = Lidar(LidarConfig())
         height = self._lidar.config.height
         self.T_world_lidar: Array = np.stack([self.world.drive_pose(float(t), height) for t in self.times])
 
@@ -68,13 +56,5 @@ class SimulatedDrive:
         return Frame(round(time * 1e9), scan.points, index=i)
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
-        """Frames start..stop-1, simulated some frames ahead in other threads."""
-        requested = iter(range(start, len(self) if stop is None else min(stop, len(self))))
-        with ThreadPoolExecutor(self._workers, thread_name_prefix="sim") as pool:
-            ahead: deque[Future[Frame]] = deque(
-                pool.submit(self.frame, i) for i in islice(requested, 2 * self._workers)
-            )
-            while ahead:
-                frame = ahead.popleft().result()
-                ahead.extend(pool.submit(self.frame, i) for i in islice(requested, 1))
-                yield frame
+        """Frames start..stop-1, simulated ahead in another thread."""
+        return prefetch(map(self.frame, range(len(self))[start:stop]))

@@ -4,9 +4,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from dpm2_core.sim.materials import Label, Material
+from dpm2_core.sim.materials import Label, Material, Surface
 from dpm2_core.sim.mesh import Mesh, merge
 from dpm2_core.sim.shapes import blob, box, extrusion, rod
 
@@ -50,38 +49,23 @@ def car(rng: np.random.Generator) -> Mesh:
     kind = str(rng.choice(list(_BODIES), p=[0.32, 0.24, 0.18, 0.16, 0.1]))
     size, body, cabin = _BODIES[kind]
     length, width, height = np.asarray(size) * rng.uniform(0.93, 1.07, 3)
-    paint = PAINTS[rng.integers(len(PAINTS))] * rng.uniform(0.85, 1.1)
+    paint = Surface(Label.CAR, Material.PAINT, PAINTS[rng.integers(len(PAINTS))] * rng.uniform(0.85, 1.1))
     scale = np.array([length, height])
     half = np.where(np.asarray(body)[:, 1] < 0.2, 0.94, 1.0) * width / 2
     roof = np.where(np.asarray(cabin)[:, 1] > 0.8, 0.78 if kind != "van" else 0.92, 0.97) * width / 2
     parts = [
-        extrusion(np.asarray(body) * scale, half, Label.CAR, Material.PAINT, paint),
-        extrusion(np.asarray(cabin) * scale, roof, Label.CAR, Material.GLASS, (38, 44, 52)),
+        extrusion(np.asarray(body) * scale, half, paint),
+        extrusion(np.asarray(cabin) * scale, roof, Surface(Label.CAR, Material.GLASS, (38, 44, 52))),
     ]
     front, back = np.asarray(cabin)[1] * scale, np.asarray(cabin)[2] * scale
-    parts.append(
-        box(
-            (back[0], -roof[1] * 1.01, front[1] - 0.03),
-            (front[0], roof[1] * 1.01, height + 0.02),
-            Label.CAR,
-            Material.PAINT,
-            paint,
-        )
-    )
+    parts.append(box((back[0], -roof[1] * 1.01, front[1] - 0.03), (front[0], roof[1] * 1.01, height + 0.02), paint))
     return merge([*parts, *_wheels(length, width, 0.31), *_lights(length, width, height)])
 
 
 def _wheels(length: float, width: float, radius: float) -> list[Mesh]:
+    tire, inner, outer = Surface(Label.CAR, Material.RUBBER, (26,) * 3), width / 2 - 0.2, width / 2 + 0.02
     return [
-        rod(
-            (x * length, y * (width / 2 - 0.2), radius),
-            (x * length, y * (width / 2 + 0.02), radius),
-            (radius, radius),
-            12,
-            Label.CAR,
-            Material.RUBBER,
-            (26, 26, 26),
-        )
+        rod((x * length, y * inner, radius), (x * length, y * outer, radius), (radius, radius), 12, tire)
         for x in (0.31, -0.29)
         for y in (1, -1)
     ]
@@ -89,67 +73,48 @@ def _wheels(length: float, width: float, radius: float) -> list[Mesh]:
 
 def _lights(length: float, width: float, height: float) -> list[Mesh]:
     x, y, z = length / 2, width / 2, height
+    white, red, plate = (Surface(Label.CAR, Material.SIGN, c) for c in ((235, 235, 225), (190, 30, 25), (240,) * 3))
     parts = []
     for side in (-1, 1):
         low, high = sorted((side * y * 0.95, side * y * 0.6))
-        parts.append(box((x - 0.1, low, 0.4 * z), (x + 0.03, high, 0.5 * z), Label.CAR, Material.SIGN, (235, 235, 225)))
-        parts.append(
-            box((-x - 0.03, low, 0.45 * z), (-x + 0.1, high, 0.55 * z), Label.CAR, Material.SIGN, (190, 30, 25))
-        )
-    parts.append(box((-x - 0.03, -0.26, 0.3 * z), (-x + 0.1, 0.26, 0.38 * z), Label.CAR, Material.SIGN, (240,) * 3))
+        parts.append(box((x - 0.1, low, 0.4 * z), (x + 0.03, high, 0.5 * z), white))
+        parts.append(box((-x - 0.03, low, 0.45 * z), (-x + 0.1, high, 0.55 * z), red))
+    parts.append(box((-x - 0.03, -0.26, 0.3 * z), (-x + 0.1, 0.26, 0.38 * z), plate))
     return parts
 
 
 def truck(rng: np.random.Generator) -> Mesh:
     """A lorry or a bus of 7 to 12 m."""
-    length, height, paint = rng.uniform(7, 12), rng.uniform(2.9, 3.8), PAINTS[rng.integers(len(PAINTS))] * 1.0
+    length, height = rng.uniform(7, 12), rng.uniform(2.9, 3.8)
+    paint, load = (Surface(Label.TRUCK, Material.PAINT, PAINTS[rng.integers(len(PAINTS))]) for _ in range(2))
+    tire = Surface(Label.TRUCK, Material.RUBBER, (26,) * 3)
     x = length / 2
     cab = [(x, 0.4), (x, 1.4), (x - 0.25, 2.7), (x - 2.0, 2.7), (x - 2.0, 0.4)]
     parts = [
-        extrusion(cab, 1.2, Label.TRUCK, Material.PAINT, paint),
-        box((x - 0.3, -1.1, 1.45), (x - 0.02, 1.1, 2.4), Label.TRUCK, Material.GLASS, (40, 46, 54)),
-        box(
-            (-x, -1.25, 0.9),
-            (x - 2.2, 1.25, height),
-            Label.TRUCK,
-            Material.PAINT,
-            PAINTS[rng.integers(len(PAINTS))] * 1.0,
-        ),
-        box((-x, -1.0, 0.5), (x - 1, 1.0, 0.9), Label.TRUCK, Material.METAL, (50,) * 3),
+        extrusion(cab, 1.2, paint),
+        box((x - 0.3, -1.1, 1.45), (x - 0.02, 1.1, 2.4), Surface(Label.TRUCK, Material.GLASS, (40, 46, 54))),
+        box((-x, -1.25, 0.9), (x - 2.2, 1.25, height), load),
+        box((-x, -1.0, 0.5), (x - 1, 1.0, 0.9), Surface(Label.TRUCK, Material.METAL, (50,) * 3)),
     ]
     for along in (x - 1.2, -x + 1.2, -x + 2.4):
         for side in (-1, 1):
-            parts.append(
-                rod(
-                    (along, side * 0.9, 0.5),
-                    (along, side * 1.24, 0.5),
-                    (0.5, 0.5),
-                    12,
-                    Label.TRUCK,
-                    Material.RUBBER,
-                    (26,) * 3,
-                )
-            )
+            parts.append(rod((along, side * 0.9, 0.5), (along, side * 1.24, 0.5), (0.5, 0.5), 12, tire))
     return merge(parts)
 
 
 def person(rng: np.random.Generator, label: Label = Label.PERSON, saddle: float = 0.0) -> Mesh:
-    """Somebody of 1.5 to 1.95 m in mid-stride, or sitting `saddle` m higher."""
+    """A person of 1.5 to 1.95 m in mid-stride, or sitting `saddle` m higher."""
     size, step = rng.uniform(1.5, 1.95) / 1.75, rng.uniform(0.1, 0.32)
-    shirt, trousers, skin = (
-        rng.uniform(30, 220, 3),
-        rng.uniform(20, 120, 3),
-        np.array((205, 165, 140)) * rng.uniform(0.5, 1.1),
-    )
-    limb: tuple[Label, Material] = (label, Material.CLOTH)
+    colors = rng.uniform(30, 220, 3), rng.uniform(20, 120, 3), np.array((205, 165, 140)) * rng.uniform(0.5, 1.1)
+    shirt, trousers, skin = (Surface(label, Material.CLOTH, color) for color in colors)
     hip, top = 0.88 * size, 1.45 * size
     parts = [
-        rod((step, 0.1, 0.02), (0, 0.09, hip), (0.07, 0.09), 6, *limb, trousers),
-        rod((-step, -0.1, 0.02), (0, -0.09, hip), (0.07, 0.09), 6, *limb, trousers),
-        rod((-step * 0.7, 0.24, hip), (0, 0.2, top), (0.04, 0.06), 5, *limb, shirt),
-        rod((step * 0.7, -0.24, hip), (0, -0.2, top), (0.04, 0.06), 5, *limb, shirt),
-        blob((0, 0, (hip + top) / 2), (0.15, 0.22, (top - hip) / 2 + 0.1), 0.02, rng, *limb, shirt),
-        blob((0, 0, top + 0.2 * size), (0.11, 0.1, 0.14), 0.02, rng, *limb, skin),
+        rod((step, 0.1, 0.02), (0, 0.09, hip), (0.07, 0.09), 6, trousers),
+        rod((-step, -0.1, 0.02), (0, -0.09, hip), (0.07, 0.09), 6, trousers),
+        rod((-step * 0.7, 0.24, hip), (0, 0.2, top), (0.04, 0.06), 5, shirt),
+        rod((step * 0.7, -0.24, hip), (0, -0.2, top), (0.04, 0.06), 5, shirt),
+        blob((0, 0, (hip + top) / 2), (0.15, 0.22, (top - hip) / 2 + 0.1), 0.02, rng, shirt),
+        blob((0, 0, top + 0.2 * size), (0.11, 0.1, 0.14), 0.02, rng, skin),
     ]
     mesh = merge(parts)
     mesh.vertices[:, 2] += saddle
@@ -157,18 +122,16 @@ def person(rng: np.random.Generator, label: Label = Label.PERSON, saddle: float 
 
 
 def cyclist(rng: np.random.Generator) -> Mesh:
-    """Somebody on a bicycle."""
-    frame: tuple[Label, Material, ArrayLike] = (Label.BICYCLIST, Material.METAL, rng.uniform(20, 200, 3))
+    """A person on a bicycle."""
+    frame = Surface(Label.BICYCLIST, Material.METAL, rng.uniform(20, 200, 3))
+    tire = Surface(Label.BICYCLIST, Material.RUBBER, (30,) * 3)
     bars = [
         ((-0.5, 0, 0.35), (0, 0, 0.3)),
         ((0, 0, 0.3), (0.4, 0, 0.85)),
         ((0.52, 0, 0.35), (0.4, 0, 0.95)),
         ((0, 0, 0.3), (-0.2, 0, 0.9)),
     ]
-    parts = [rod(a, b, (0.025, 0.025), 4, *frame) for a, b in bars]
-    parts += [
-        rod((x, -0.02, 0.34), (x, 0.02, 0.34), (0.34, 0.34), 12, Label.BICYCLIST, Material.RUBBER, (30,) * 3)
-        for x in (-0.5, 0.52)
-    ]
-    parts += [person(rng, Label.BICYCLIST, 0.25), rod((0.4, -0.28, 0.98), (0.4, 0.28, 0.98), (0.02, 0.02), 4, *frame)]
+    parts = [rod(a, b, (0.025, 0.025), 4, frame) for a, b in bars]
+    parts += [rod((x, -0.02, 0.34), (x, 0.02, 0.34), (0.34, 0.34), 12, tire) for x in (-0.5, 0.52)]
+    parts += [person(rng, Label.BICYCLIST, 0.25), rod((0.4, -0.28, 0.98), (0.4, 0.28, 0.98), (0.02, 0.02), 4, frame)]
     return merge(parts)

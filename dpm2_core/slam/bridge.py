@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Across a pause: where the scans after it lie in the map before it, and when that may be believed.
+"""Across a pause: where the scans after it lie in the map before it, and when that is accepted.
 
 After a pause the motion so far says little, and one scan can fit a map at many places: road to road, wall to wall. So
 the scans after a pause make a map of their own, a new stretch, whose motion is known whatever happened in the pause.
-Each of them is registered to the map before, too. The answers are believed when several of them, found independently
+Each of them is registered to the map before, too. The results are accepted when several of them, found independently
 of each other, move as the stretch does, when no direction is left open, and when a vehicle can have come there.
 """
 
@@ -16,45 +16,25 @@ import numpy as np
 
 from dpm2_core.frame import Array, Registration
 from dpm2_core.geometry import se3
+from dpm2_core.geometry.motion import covariance, predicted, velocity_change
 from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration, agree
 
 _TIES = 3
-"""So many answers must agree: two meet by chance."""
+"""So many results must agree: two meet by chance."""
 _MOVED = 1.0
-"""They tell something only when one has moved in between, m..."""
+"""They are evidence only when the robot has moved in between, m..."""
 _AS_WELL = 0.9
 """...or when the scan fits the map before at least this much as well as its own stretch: one stands where one stood."""
 _SPEEDS = (1.0, 0.75, 0.5, 0.25, 0.0, 1.25)
-"""Fractions of the motion so far from which the answer is looked for: a vehicle brakes and stops sooner than it
+"""Fractions of the motion so far from which the pose is searched: a vehicle brakes and stops sooner than it
 gains."""
 _TURNS = (0.15, -0.15, 0.3, -0.3)  # rad/s: the same for the change of the yaw rate
-_HORIZON = 10.0  # s: farther ahead no motion is extrapolated
-_TURN = 0.3  # rad/s, standard deviation of the yaw rate in traffic
-_TILT = 0.1  # of the heading's: slopes
-
-
-def predicted(T: Array, twist: Array, seconds: float) -> Array:
-    """The pose (4, 4) after that time at a constant `twist` (6,) [rad/s, m/s]."""
-    return T @ se3.exp(twist * min(seconds, _HORIZON))
-
-
-def covariance(speed: float, seconds: float, acceleration: float) -> Array:
-    """Covariance (6, 6) [rad, m] of the pose that `predicted` gives; no heading is worse than any heading."""
-    meters = 0.5 * seconds * _change(speed, seconds, acceleration)
-    heading = min(_TURN * seconds, np.pi / np.sqrt(3))
-    return np.diag([_TILT * heading, _TILT * heading, heading, meters, meters, meters]) ** 2
-
-
-def _change(speed: float, seconds: float, acceleration: float) -> float:
-    """Standard deviation of the velocity after that time, m/s: by that acceleration (m/s2) in every direction, but not
-    more than a vehicle as fast as this one can change it."""
-    return min(acceleration * seconds, speed + acceleration)
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What a vehicle does and an answer must reach: `acceleration`, m/s2; `sigma` of its position at most, m."""
+    """What a vehicle can do and a result must reach: `acceleration`, m/s2; `sigma` of its position at most, m."""
 
     acceleration: float
     sigma: float
@@ -95,7 +75,7 @@ class Bridge:
 
     def expected(self, T: Array, dt: float) -> Prediction:
         """Of the second scan of the stretch, `dt` s after the first at T (4, 4): the motion before, less certain."""
-        sigma = dt * _change(self._speed, self._seconds, self._limits.acceleration)
+        sigma = dt * velocity_change(self._speed, self._seconds, self._limits.acceleration)
         return Prediction([predicted(T, self._motion, dt)], 2.0, np.eye(6) / sigma**2)
 
     def covariance(self, T_stretch: Array) -> Array:
@@ -136,7 +116,7 @@ class Bridge:
         return float(np.linalg.norm(self._motion[3:]))
 
     def _problem(self, result: Registration, twist: Array | None) -> str:
-        """Why an answer cannot be right."""
+        """Why a result cannot be right."""
         if not result.ok:
             return result.reason
         if (sigma := result.worst_sigma) > self._limits.sigma:
@@ -152,7 +132,7 @@ class Bridge:
         return ""
 
     def _together(self, fits: bool) -> bool:
-        """Whether the last answers move as the stretch does; at a halt that says little, unless the scan `fits`."""
+        """Whether the last results move as the stretch does; at a halt that says little, unless the scan `fits`."""
         last = self._ties[-1]
         moved = [se3.inverse(tie.T_stretch) @ last.T_stretch for tie in self._ties]
         if len(moved) < _TIES or not (fits or np.linalg.norm(moved[0][:3, 3]) >= _MOVED):

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Builds the parts of the SLAM from its settings."""
+"""The only factory: settings in, the SLAM or one of its parts out."""
 
 from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 from dpm2_core.network.pretrained import load_network
 from dpm2_core.slam.filters import make_filter
@@ -9,11 +11,12 @@ from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.loops.closure import LoopCloser
 from dpm2_core.slam.loops.localizer import Localizer
 from dpm2_core.slam.loops.relocalization import Relocalizer
+from dpm2_core.slam.loops.verification import Verifier
 from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.odometry.keyframe_selection import KeyframeSelector
 from dpm2_core.slam.odometry.odometry import Odometry
 from dpm2_core.slam.preprocess import Preprocessor
-from dpm2_core.slam.registration.fused import RefinedScanRegistration
+from dpm2_core.slam.registration.fused import FusedScanRegistration
 from dpm2_core.slam.registration.icp import GeometricRegistration
 from dpm2_core.slam.registration.local_map import LocalMap
 from dpm2_core.slam.registration.neural import NeuralScanRegistration
@@ -22,6 +25,31 @@ from dpm2_core.slam.registration.protocol import ScanRegistration
 from dpm2_core.slam.registration.visual import VisualScanRegistration
 from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.slam.store.map_store import MapStore
+from dpm2_core.slam.system import Slam
+
+if TYPE_CHECKING:  # torch takes seconds to import
+    from dpm2_core.network.model import DeepPointMap2
+
+
+def make_slam(settings: SlamSettings | None = None, robot: str = "", store: MapStore | None = None) -> Slam:
+    """The SLAM with all its parts.
+
+    Args:
+        robot: namespace of its keyframes, "" for the only one.
+        store: the map file: to write, or to go on with, its session begun (`open_session`); or, open for reading only
+            (`open_for_localization`), to find oneself in. None: the map is in memory, its clouds in a temporary file.
+
+    Raises:
+        UsageError: a network has no weights to run with.
+    """
+    s = settings or SlamSettings()
+    return Slam(make_odometry(s, robot), *make_map(s, store), s.map.thumbnail)
+
+
+def make_map(s: SlamSettings, store: MapStore | None = None) -> tuple[Mapper, Localizer | None]:
+    """The mapper, and in a map that stays as it is what finds keyframes there; `store` as for `make_slam`."""
+    mapper = make_mapper(s, store)
+    return mapper, make_localizer(s, mapper) if store is not None and store.read_only else None
 
 
 def make_odometry(s: SlamSettings, robot: str = "") -> Odometry:
@@ -41,9 +69,12 @@ def make_registration(s: SlamSettings) -> ScanRegistration:
     )
     chosen: ScanRegistration = geometric
     if s.registration != "geometric":
-        network = load_network(s.neural.weights, s.threads, s.neural.preset)
-        neural = NeuralScanRegistration(s.neural, preprocessor, network)
-        chosen = neural if s.registration == "neural" else RefinedScanRegistration(neural, geometric)
+        neural = NeuralScanRegistration(s.neural, preprocessor, _network(s))
+        chosen = (
+            neural
+            if s.registration == "neural"
+            else FusedScanRegistration(neural, geometric, s.registration == "refined")
+        )
     return VisualScanRegistration(s.visual, chosen) if s.visual.enabled else chosen
 
 
@@ -58,10 +89,8 @@ def make_localizer(s: SlamSettings, mapper: Mapper) -> Localizer:
     Raises:
         UsageError: the network has no weights to run with.
     """
-    network = load_network(s.neural.weights, s.threads, s.neural.preset)
-    relocalizer = Relocalizer(
-        s.relocalise, s.geometric, network, mapper.keyframes, mapper.clouds, mapper.poses, s.threads
-    )
+    verifier = Verifier(s.relocalise.verification, s.geometric, s.threads)
+    relocalizer = Relocalizer(s.relocalise, verifier, _network(s), mapper.keyframes, mapper.clouds, mapper.poses)
     return Localizer(relocalizer, s.relocalise.max_failures)
 
 
@@ -71,7 +100,10 @@ def make_loops(s: SlamSettings) -> LoopCloser:
     Raises:
         UsageError: the network has no weights to run with.
     """
-    network = None
-    if s.loops.enabled and s.loops.descriptors:
-        network = load_network(s.neural.weights, s.threads, s.neural.preset)
-    return LoopCloser(s.loops, s.geometric, s.threads, network)
+    described = s.loops.enabled and s.loops.descriptors
+    return LoopCloser(s.loops, s.geometric, s.threads, _network(s) if described else None)
+
+
+def _network(s: SlamSettings) -> DeepPointMap2:
+    """The same one for registration, loops and relocalization."""
+    return load_network(s.neural.weights, s.threads, s.neural.preset)

@@ -7,8 +7,10 @@ points, and the map.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, Protocol
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from pydantic import Field
@@ -22,7 +24,6 @@ if TYPE_CHECKING:  # torch takes seconds to import, and the geometric SLAM does 
     from dpm2_core.network.perception.dslr import Dslr
     from dpm2_core.network.perception.dynamic_objects import DynamicObjectNet
     from dpm2_core.network.perception.gndnet import GroundNet
-
 
 FilterKind = Literal["none", "movers", "ground", "static"]
 
@@ -41,54 +42,37 @@ class FilterSettings(Settings):
     """movers: at most this fraction of a scan is left out, the most likely ones."""
 
 
-class PointFilter(Protocol):
-    """Points (N, 4) float32 [x, y, z m, intensity 0..1] in the frame of the LiDAR to those that stay; may be none."""
-
-    def __call__(self, points: Points) -> Points: ...
+PointFilter = Callable[[Points], Points]
+"""Of the points (N, 4) float32 [x, y, z m, intensity 0..1] in the frame of the LiDAR, those that stay; may be none."""
 
 
-class DynamicObjectFilter:
-    """Leaves out what moves or could; see `network.perception.dynamic_objects`."""
-
-    def __init__(self, net: DynamicObjectNet, threshold: float, most: float) -> None:
-        self._net, self._threshold, self._most = net, threshold, most
-
-    def __call__(self, points: Points) -> Points:
-        if not len(points):
-            return points
-        probability = self._net.probability(points)
-        # A network that finds hardly anything else is wrong, or has nothing to go by: half a scan is still a scan.
-        bound = max(self._threshold, float(np.quantile(probability, 1 - self._most)))
-        return points[probability <= bound]
+def without_dynamic_objects(net: DynamicObjectNet, threshold: float, most: float, points: Points) -> Points:
+    """Without what moves or could; see `network.perception.dynamic_objects`."""
+    if not len(points):
+        return points
+    probability = net.probability(points)
+    # A network that finds hardly anything else is wrong, or has nothing to go by: half a scan is still a scan.
+    bound = max(threshold, float(np.quantile(probability, 1 - most)))
+    return points[probability <= bound]
 
 
-class GroundFilter:
-    """Leaves out the ground, and what lies off the grid of GndNet."""
+def without_ground(net: GroundNet, points: Points) -> Points:
+    """Without the ground, and what lies off the grid of GndNet."""
+    import torch
 
-    def __init__(self, net: GroundNet) -> None:
-        self._net = net
+    from dpm2_core.network.perception.gndnet import obstacle_weight
 
-    def __call__(self, points: Points) -> Points:
-        import torch
-
-        from dpm2_core.network.perception.gndnet import obstacle_weight
-
-        with torch.inference_mode():
-            scan = torch.from_numpy(points)
-            above = obstacle_weight(scan, self._net([scan])[0], self._net.settings) > 0.5
-        return points[above.numpy()]
+    with torch.inference_mode():
+        scan = torch.from_numpy(points)
+        above = obstacle_weight(scan, net([scan])[0], net.settings) > 0.5
+    return points[above.numpy()]
 
 
-class StaticFilter:
-    """Leaves out what stands in front of the scan as DSLR thinks that it would be without traffic."""
+def without_traffic(net: Dslr, points: Points) -> Points:
+    """Without what stands in front of the scan as DSLR thinks that it would be without traffic."""
+    import torch
 
-    def __init__(self, net: Dslr) -> None:
-        self._net = net
-
-    def __call__(self, points: Points) -> Points:
-        import torch
-
-        return points[self._net.still(torch.from_numpy(points)).numpy()]
+    return points[net.still(torch.from_numpy(points)).numpy()]
 
 
 def make_filter(settings: FilterSettings, threads: int) -> PointFilter | None:
@@ -108,11 +92,12 @@ def make_filter(settings: FilterSettings, threads: int) -> PointFilter | None:
     if settings.kind == "movers":
         from dpm2_core.network.perception import dynamic_objects
 
-        return DynamicObjectFilter(load_once(path, threads, dynamic_objects.load), settings.threshold, settings.most)
+        movers = load_once(path, threads, dynamic_objects.load)
+        return partial(without_dynamic_objects, movers, settings.threshold, settings.most)
     if settings.kind == "ground":
         from dpm2_core.network.perception import gndnet
 
-        return GroundFilter(load_once(path, threads, gndnet.load))
+        return partial(without_ground, load_once(path, threads, gndnet.load))
     from dpm2_core.network.perception import dslr
 
-    return StaticFilter(load_once(path, threads, dslr.load))
+    return partial(without_traffic, load_once(path, threads, dslr.load))

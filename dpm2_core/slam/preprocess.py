@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import model_validator
 
 from dpm2_core.config import Settings
-from dpm2_core.descriptors import Descriptors
+from dpm2_core.descriptors import Descriptors, LazyDescriptors
 from dpm2_core.frame import Array, Frame, Image, Points
 from dpm2_core.geometry.deskew import deskew
 from dpm2_core.geometry.voxel import voxel_first
@@ -47,15 +47,20 @@ class Scan:
         points: (P, 4) float32, all that were measured within range and that the filter, if any, left.
         cloud: (M, 4) float32, those for the local map. source: (N, 3) float64, those to register. Both are empty where
             the registration works on descriptors alone.
-        descriptors: neural ones; None where there are none.
+        description: neural descriptors, made when they are needed; None where the registration uses none.
         image: the image that was taken with it, where the registration asks for one.
     """
 
     points: Points
     cloud: Points = field(default_factory=lambda: np.zeros((0, 4), np.float32))
     source: Array = field(default_factory=lambda: np.zeros((0, 3)))
-    descriptors: Descriptors | None = None
+    description: LazyDescriptors | None = None
     image: Image | None = None
+
+    @property
+    def descriptors(self) -> Descriptors | None:
+        """Made now, if they were not before; None where there are none."""
+        return None if self.description is None else self.description.get()
 
 
 class Preprocessor:

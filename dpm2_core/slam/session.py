@@ -4,18 +4,29 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
+from dpm2_core.config import dump_settings
 from dpm2_core.data.source import Source
 from dpm2_core.errors import UsageError
 from dpm2_core.network.pretrained import weights_path
 from dpm2_core.slam.mapping.mapper import Mapper
-from dpm2_core.slam.settings import SlamSettings
+from dpm2_core.slam.settings import Config, SlamSettings
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.slam.store.rows import Session, weights_id
 
+MapMode = Literal["create", "resume", "extend", "localize"]
+"""What to do with a map file: make it, go on with the drive that was cut off, add another drive, or only read it."""
 _SAME_FRAME = np.diag([1e-4] * 3 + [1e-3] * 3) ** 2  # rad, m: the rounding of what is the same frame
+
+
+def open_map(path: Path, config: Config, mode: MapMode) -> MapStore:
+    """The map file, for what `mode` says; see `open_session` and `open_for_localization`."""
+    if mode == "localize":
+        return open_for_localization(path, config.slam)
+    return open_session(path, config.slam, dump_settings(config), mode != "create")
 
 
 def open_session(path: Path, settings: SlamSettings, config: str, resume: bool) -> MapStore:
@@ -28,11 +39,11 @@ def open_session(path: Path, settings: SlamSettings, config: str, resume: bool) 
     Raises:
         UsageError: the file is there, or holds descriptors of other weights. Dpm2Error: it cannot be written.
     """
-    described = settings.registration != "geometric" or (settings.loops.enabled and settings.loops.descriptors)
-    weights = weights_id(weights_path(settings.neural.weights)) if described else ""
+    weights = weights_id(weights_path(settings.neural.weights)) if settings.uses_descriptors else ""
     if path.exists() and not resume:
         raise UsageError(f"--map {path}: there is a file already; --resume goes on with it")
-    store = MapStore.open(path, read_only=False) if path.exists() else MapStore.create(path)
+    # Not whether it exists now: another node may have made one of that name since.
+    store = MapStore.open(path, read_only=False) if resume and path.exists() else MapStore.create(path)
     try:
         _check_weights(store, weights)
         store.begin_session(config, weights)

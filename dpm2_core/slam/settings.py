@@ -26,8 +26,9 @@ from dpm2_core.slam.registration.visual import VisualSettings
 class SlamSettings(Settings):
     """The SLAM, stage by stage."""
 
-    registration: Literal["geometric", "neural", "refined"] = "geometric"
-    """How a scan finds its pose: by points, by neural descriptors, or by both."""
+    registration: Literal["geometric", "neural", "refined", "adaptive"] = "geometric"
+    """How a scan finds its pose: by points, by neural descriptors, by both (refined), or by points that ask the network
+    where they do not know (adaptive): at the start, after a pause, at few frames per second, along a tunnel."""
     threads: int = Field(2, ge=1)
     """Threads of the neighbor search and of the network."""
     filter: FilterSettings = FilterSettings()
@@ -42,6 +43,11 @@ class SlamSettings(Settings):
     relocalise: RelocalizationSettings = RelocalizationSettings()
     pose_graph: PoseGraphSettings = PoseGraphSettings()
     map: MapSettings = MapSettings()
+
+    @property
+    def uses_descriptors(self) -> bool:
+        """Whether keyframes may have descriptors, which only those of the same weights can be compared with."""
+        return self.registration != "geometric" or (self.loops.enabled and self.loops.descriptors)
 
 
 class Config(Settings):

@@ -1,60 +1,143 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The whole SLAM: odometry makes keyframes, the mapper makes them consistent. Synchronous and deterministic."""
+"""The whole SLAM: a frame in, its pose and what became of the map out. Synchronous and deterministic.
+
+`Slam.process` is the algorithm: every frame through the odometry, every keyframe into the map, which closes loops, or,
+where the map is to stay as it is, to its place there. The ROS node runs the same object, its two steps in two threads.
+`slam/build.py` puts the parts together.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from time import perf_counter
 
-from dpm2_core.frame import Frame, OdometryResult
-from dpm2_core.slam.build import make_localizer, make_mapper, make_odometry
-from dpm2_core.slam.loops.localizer import LocalizationResult
+from dpm2_core.frame import Array, Edge, Frame, Keyframe, OdometryResult, State
+from dpm2_core.slam.loops.localizer import LocalizationResult, Localizer
+from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.mapping.thumbnail import thumbnail
-from dpm2_core.slam.settings import SlamSettings
-from dpm2_core.slam.store.map_store import MapStore
+from dpm2_core.slam.odometry.odometry import Odometry
+
+_LOST_ON_THE_WAY = 10_000_000_000  # ns after which a keyframe that has not come to the map will not come any more
 
 
-class SlamSystem:
-    """One robot: `odometry` runs on every frame, `mapper` on every keyframe; the ROS node runs them in two threads."""
+@dataclass(frozen=True, eq=False)
+class MapResult:
+    """What became of a keyframe.
 
-    def __init__(self, settings: SlamSettings | None = None, robot: str = "", store: MapStore | None = None) -> None:
-        """`store`: the map file to write, or to go on with; its session has begun."""
-        self._settings = settings or SlamSettings()
-        self.odometry = make_odometry(self._settings, robot)
-        self.mapper = make_mapper(self._settings, store)
+    Attributes:
+        loops: those that were tried, accepted or rejected, in a map that grows.
+        located: its place in a map that stays as it is; None in one that grows.
+    """
 
-    def process(self, frame: Frame) -> OdometryResult:
-        """Take one frame in: its pose in the odometry frame, and the map one keyframe richer when it shows enough."""
-        tracked = self.odometry.process(frame)
-        started = perf_counter()
-        if tracked.keyframe is not None:
-            self.mapper.add(tracked.keyframe, thumbnail(frame, self._settings.map.thumbnail))
-        tracked.seconds["map"] = perf_counter() - started
-        return tracked
-
-    def reset(self) -> None:
-        """Begin anew, with an empty map; one in a file stays as it is."""
-        self.odometry.reset()
-        self.mapper = make_mapper(self._settings)
+    loops: list[Edge]
+    located: LocalizationResult | None = None
 
 
-class LocalizationSystem:
-    """One robot in a map that stays as it is: `odometry` runs on every frame, `localizer` on every keyframe."""
+@dataclass(frozen=True, eq=False)
+class SlamResult:
+    """The state of the SLAM after one frame.
 
-    def __init__(self, settings: SlamSettings, store: MapStore, robot: str = "") -> None:
-        """`store`: the map file, open for reading only, see `open_for_localization`."""
-        self.odometry = make_odometry(settings, robot)
-        self.mapper = make_mapper(settings, store)
-        self.localizer = make_localizer(settings, self.mapper)
+    Attributes:
+        odometry: of every frame.
+        map: of a frame that became a keyframe; else None.
+        T_map_odom: (4, 4), which carries every correction; None while the place in the map is not known.
+        state: of the odometry, or, where that is well, of the place in a map that stays as it is.
+    """
 
-    def process(self, frame: Frame) -> tuple[OdometryResult, LocalizationResult | None]:
-        """Take one frame in: its pose in the odometry frame, and, when it became a keyframe, its place in the map.
+    odometry: OdometryResult
+    map: MapResult | None
+    T_map_odom: Array | None
+    state: State
 
-        While the localizer's `state.located`, `T_map_odom @ T_odom_lidar` is the frame's pose in the map.
+    @property
+    def T_map_lidar(self) -> Array | None:
+        """(4, 4); None while the place in the map is not known."""
+        return None if self.T_map_odom is None else self.T_map_odom @ self.odometry.T_odom_lidar
+
+
+class Slam:
+    """One robot in one map.
+
+    Attributes:
+        odometry: takes every frame.
+        mapper: the map. It takes every keyframe, unless there is a localizer.
+        localizer: finds every keyframe in the map, which then stays as it is; None: the map grows.
+    """
+
+    def __init__(
+        self, odometry: Odometry, mapper: Mapper, localizer: Localizer | None = None, thumbnail_width: int = 0
+    ) -> None:
+        """`thumbnail_width`: of the image that a keyframe carries into a map file, pixels; 0: none."""
+        self.odometry, self.mapper, self.localizer = odometry, mapper, localizer
+        self._thumbnail_width = thumbnail_width
+        self._T_map_odom: Array | None = None  # of the map that grows, until the next keyframe
+        self._underway: int | None = None  # stamp of the keyframe that has not come to the map yet
+
+    @property
+    def uses_images(self) -> bool:
+        """Whether frames should come with their images."""
+        return self.odometry.uses_images or self._thumbnail_width > 0
+
+    def process(self, frame: Frame) -> SlamResult:
+        """Take one frame in. Never raises for what a sensor may deliver."""
+        odometry = self.odometry_step(frame)
+        began = perf_counter()
+        result = None
+        if odometry.keyframe is not None:
+            result = self.map_step(odometry.keyframe)
+        odometry.seconds["map"] = perf_counter() - began
+        return SlamResult(odometry, result, self.T_map_odom, self.state(odometry.state))
+
+    def odometry_step(self, frame: Frame) -> OdometryResult:
+        """The frame's pose in the odometry frame, and a keyframe when it shows enough that is new, or if one is lost.
+
+        May run in another thread than the other steps.
         """
-        if self.localizer.wants(frame.stamp):
+        localizer, underway = self.localizer, self._underway
+        arriving = underway is not None and abs(frame.stamp - underway) < _LOST_ON_THE_WAY
+        if localizer is not None and not arriving and localizer.wants(frame.stamp):
             self.odometry.request_keyframe()
-        tracked = self.odometry.process(frame)
-        started = perf_counter()
-        located = None if tracked.keyframe is None else self.localizer.add(tracked.keyframe)
-        tracked.seconds["localise"] = perf_counter() - started
-        return tracked, located
+        result = self.odometry.process(frame)
+        if result.keyframe is None:
+            return result
+        self._underway = frame.stamp
+        image = thumbnail(frame, self._thumbnail_width)
+        return result if image is None else replace(result, keyframe=replace(result.keyframe, thumbnail=image))
+
+    def map_step(self, keyframe: Keyframe) -> MapResult:
+        """Take a keyframe into the map, or find it there.
+
+        Raises:
+            RejectedError: it is not sound; see `Mapper.add`.
+        """
+        self._T_map_odom = None
+        if keyframe.stamp == self._underway:
+            self._underway = None
+        if self.localizer is not None:
+            return MapResult([], self.localizer.add(keyframe))
+        return MapResult(self.mapper.add(keyframe))
+
+    def use(self, mapper: Mapper, localizer: Localizer | None) -> None:
+        """Go on in another map."""
+        self.mapper, self.localizer, self._T_map_odom = mapper, localizer, None
+
+    def finish(self) -> None:
+        """At the end of a drive: complete the map and its file."""
+        if self.localizer is None:
+            self.mapper.finish()
+
+    @property
+    def T_map_odom(self) -> Array | None:
+        """(4, 4); None while the place in the map is not known."""
+        if self.localizer is not None:
+            return self.localizer.T_map_odom if self.localizer.state.located else None
+        if self._T_map_odom is None:
+            self._T_map_odom = self.mapper.T_map_odom
+        return self._T_map_odom
+
+    def state(self, odometry: State) -> State:
+        """That of the robot, given that of its odometry."""
+        localizer = self.localizer
+        if localizer is None or odometry in (State.LOST, State.INITIALIZING) or localizer.state is State.TRACKING:
+            return odometry
+        return localizer.state

@@ -11,10 +11,10 @@ from torch import Tensor
 
 from dpm2_core.diffslam.trajectory_loss import SlamLoss
 from dpm2_core.tasks.ae_lidar import AeLidarSettings, LidarAutoencoder
+from dpm2_core.tasks.chamfer import chamfer_figures
 from dpm2_core.tasks.range_scans import (
     RangeReader,
     RangeScans,
-    chamfer_figures,
     clouds,
     image_error,
     slam_of,

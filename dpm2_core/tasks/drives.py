@@ -10,7 +10,7 @@ from pathlib import Path
 from pydantic import Field
 
 from dpm2_core.config import Settings
-from dpm2_core.sim.settings import LidarConfig, PresetName
+from dpm2_core.sim.settings import DriveConfig, LidarConfig, PresetName
 
 
 class TaskDriveSettings(Settings):
@@ -21,7 +21,7 @@ class TaskDriveSettings(Settings):
     train_frames: int = Field(default=60, ge=2)
     """Scans of each."""
     val: int = Field(default=3, ge=1)
-    """Drives to be judged on."""
+    """Drives for evaluation."""
     val_frames: int = Field(default=40, ge=2)
     """Scans of each."""
     first_seed: int = Field(default=7000, ge=0)
@@ -54,7 +54,8 @@ def make_task_drives(
     for kind, drives, frames, offset in kinds:
         for i in range(drives):
             name, preset = f"{kind}/{i:02d}", settings.presets[i % len(settings.presets)]
-            simulate(
-                out / name, frames, settings.first_seed + offset + i, "random", preset, images=False,
-                lidar=settings.lidar, workers=workers, traffic=settings.traffic, progress=partial(progress, name),
+            drive = DriveConfig(
+                frames=frames, seed=settings.first_seed + offset + i, road="random", preset=preset, images=False,
+                traffic=settings.traffic, lidar=settings.lidar,
             )  # fmt: skip
+            simulate(out / name, drive, workers, partial(progress, name))

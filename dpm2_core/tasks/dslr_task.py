@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""DSLR as a task: its three stages, the SLAM loss in the third, and what it is judged by."""
+"""DSLR as a task: its three stages, the SLAM loss in the third, and its figures."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from torch.nn import functional
 
 from dpm2_core.diffslam.trajectory_loss import SlamLoss
 from dpm2_core.network.perception.dslr import Dslr, DslrSettings
+from dpm2_core.tasks.chamfer import chamfer_figures
 from dpm2_core.tasks.range_scans import (
     RangeReader,
     RangeScans,
-    chamfer_figures,
     clouds,
     image_error,
     slam_of,

@@ -94,7 +94,7 @@ class GroundTask(Task):
     def _moved(self) -> tuple[Tensor, Tensor]:
         """A random roll, pitch and lift: (4, 4) and (4,) that points (N, 4) are turned and moved by."""
         turn = torch.eye(4)
-        turn[:3, :3] = _tilt(math.radians(self.settings.tilt))
+        turn[:3, :3] = random_tilt(math.radians(self.settings.tilt))
         up = torch.tensor([0.0, 0.0, (2 * float(torch.rand(1)) - 1) * self.settings.lift, 0.0])
         return turn.to(self.device), up.to(self.device)
 
@@ -138,7 +138,7 @@ def filled(elevation: Tensor, known: Tensor) -> Tensor:
     return elevation[x, y]
 
 
-def _tilt(largest: float) -> Tensor:
+def random_tilt(largest: float) -> Tensor:
     """Rotation (3, 3) by a random roll and pitch of up to `largest`, rad."""
     roll, pitch = ((2 * torch.rand(2) - 1) * largest).tolist()
     a, b, c, d = math.cos(roll), math.sin(roll), math.cos(pitch), math.sin(pitch)

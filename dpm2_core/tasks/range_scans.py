@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scans as range images, for the tasks that learn on them, and how clouds made from images are judged."""
+"""Scans as range images, for the tasks that learn on them, and how clouds made from images are evaluated."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -13,7 +12,6 @@ from torch import Tensor
 from dpm2_core.diffslam.trajectory_loss import SlamLoss
 from dpm2_core.errors import UsageError
 from dpm2_core.network.perception.range_image import RangeImageSettings, fill, project, to_points
-from dpm2_core.tasks.chamfer import nearest_distances
 from dpm2_core.tasks.pairs import SCALE, ImageScan
 from dpm2_core.tasks.scan import TaskScan
 
@@ -40,7 +38,7 @@ class RangeScans:
 
 
 class RangeReader:
-    """Makes range images of scans, and keeps the latest of those that it is told to."""
+    """Makes range images of scans, and keeps the latest of those that it is asked to keep."""
 
     def __init__(self, settings: RangeImageSettings) -> None:
         """Images of that geometry."""
@@ -51,7 +49,7 @@ class RangeReader:
         """The scans, or their twins without what moves.
 
         Args:
-            keep: the images, for the next time. Scans are told apart by sequence and number, so only those of one data
+            keep: the images, for the next time. Scans are identified by sequence and number, so only those of one data
                 set may be kept.
 
         Raises:
@@ -124,13 +122,3 @@ def variety(images: Sequence[Tensor], scale: float) -> float:
     """How much the distances in images (B, 2, rows, columns) differ from scan to scan: their standard deviation in a
     slot, m, the mean over the slots. Zero if a network makes one image of everything."""
     return float(torch.cat([image[:, 0] for image in images]).std(0, correction=0).mean()) * scale
-
-
-def chamfer_figures(found: Tensor, true: Tensor) -> dict[str, float]:
-    """Of two clouds (N, 3), (M, 3), m: `chamfer_m`, the mean distance, and `chamfer`, as DSLR gives it; NaN if one is
-    empty."""
-    if not len(found) or not len(true):
-        return {"chamfer_m": math.nan, "chamfer": math.nan}
-    forth, back = nearest_distances(found, true)
-    squares = float((forth**2).sum() + (back**2).sum())
-    return {"chamfer_m": float(forth.mean() + back.mean()) / 2, "chamfer": squares / SCALE**2}

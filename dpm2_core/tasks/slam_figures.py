@@ -23,7 +23,7 @@ _PERIOD = 100_000_000  # ns between scans
 
 
 @torch.no_grad()
-def slam_figures(task: Task, path: Path, settings: SlamSettings | None = None) -> dict[str, float]:
+def slam_figures(task: Task, path: Path) -> dict[str, float]:
     """Of each kind of cloud that the task has: `KIND_ate_m`, `KIND_rpe_m` and `KIND_rpe_deg`, means over the sequences.
 
     ATE is the root mean square position error after alignment (Umeyama, without scale), RPE the mean error from one
@@ -40,13 +40,13 @@ def slam_figures(task: Task, path: Path, settings: SlamSettings | None = None) -
         truth = open_source(folder).poses
         scans = open_scans(folder, task.needs)
         if truth is None or len(truth) != len(scans):
-            raise UsageError(f"{folder}: no true poses of its {len(scans)} scans; SLAM cannot be judged")
+            raise UsageError(f"{folder}: no true poses of its {len(scans)} scans; the SLAM cannot be evaluated")
         made = [task.clouds(scans[i].to(task.device)) for i in range(len(scans))]
         if not made[0]:
             raise UsageError(f"{task.name}: makes no clouds that SLAM could run on")
         row: dict[str, float] = {}
         for kind in made[0]:
-            figures = evaluate(truth, _odometry([of[kind].cpu().numpy() for of in made], settings or SlamSettings()))
+            figures = evaluate(truth, _odometry([of[kind].cpu().numpy() for of in made]))
             row[f"{kind}_ate_m"] = _number(figures.ape_rmse_m)
             row[f"{kind}_rpe_m"] = _number(figures.rpe_trans_m)
             row[f"{kind}_rpe_deg"] = _number(figures.rpe_rot_deg)
@@ -56,9 +56,9 @@ def slam_figures(task: Task, path: Path, settings: SlamSettings | None = None) -
     return mean_figures(rows)
 
 
-def _odometry(clouds: list[np.ndarray], settings: SlamSettings) -> Array:
+def _odometry(clouds: list[np.ndarray]) -> Array:
     """Poses (N, 4, 4) of clouds (M, 3), m."""
-    odometry = make_odometry(settings)
+    odometry = make_odometry(SlamSettings())
     poses = []
     for i, cloud in enumerate(clouds):
         points = np.concatenate([cloud, np.zeros((len(cloud), 1))], 1).astype(np.float32)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a task is: a network, its losses on a window of scans, and how it is judged."""
+"""What a task is: a network, its losses on a window of scans, and how it is evaluated."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from dpm2_core.config import Settings
-from dpm2_core.diffslam.schedule import ScheduleSettings, is_due
+from dpm2_core.diffslam.schedule import ScheduleSettings, is_due, total_loss
 from dpm2_core.diffslam.trajectory_loss import SlamLossSettings
 from dpm2_core.errors import UsageError
 from dpm2_core.tasks.scan import RequiredData, TaskScan, TaskScans
@@ -95,9 +95,25 @@ class Task(nn.Module, ABC):
         """Loss of the task, a scalar, and a function that gives the SLAM loss, m2; None where it has no meaning.
 
         `window` holds the scans of `settings.batch` windows one after the other, see `windows`; they are contiguous in
-        the epochs that `TaskTraining.has_windows` tells, and the SLAM loss has a meaning only there. What is random
+        the epochs that `TaskTraining.has_windows` gives, and the SLAM loss has a meaning only there. What is random
         here is drawn from torch's generator, so that a resumed training draws the same.
         """
+
+    def forward(self, window: list[TaskScan], epoch: int) -> tuple[Tensor, dict[str, Tensor]]:
+        """Eq. 1 and its parts, `task_loss` and, in the epochs where it counts, `slam_loss` (without gamma)."""
+        model_loss, slam_loss = self.losses(window)
+        parts = {"task_loss": model_loss}
+
+        def slam() -> Tensor:
+            assert slam_loss is not None
+            parts["slam_loss"] = slam_loss()
+            return parts["slam_loss"].to(model_loss)
+
+        # A prediction that is not finite has no trajectory; its step is skipped, and the log shows it.
+        total, settings = model_loss, self.settings
+        if isinstance(settings, SlamTaskTraining) and slam_loss is not None and bool(model_loss.isfinite()):
+            total = total_loss(model_loss, slam, epoch, settings.slam)
+        return total, {"loss": total.detach()} | {name: value.detach() for name, value in parts.items()}
 
     @abstractmethod
     def evaluate(self, scans: TaskScans) -> dict[str, float]:

@@ -3,86 +3,67 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
-from dpm2_core.diffslam.schedule import total_loss
 from dpm2_core.diffslam.windows import ContiguousWindows
 from dpm2_core.errors import UsageError
-from dpm2_core.learning.checkpoint import load_checkpoint
-from dpm2_core.learning.trainer import OptimizerSettings, train
+from dpm2_core.learning.trainer import OptimizerSettings, Trainer
 from dpm2_core.network.perception.task_weights import load_strictly, read_weights, write_weights
 from dpm2_core.tasks.scan import TaskScan, TaskScans
-from dpm2_core.tasks.task import SlamTaskTraining, Task, TaskTraining, task_type
+from dpm2_core.tasks.task import Task, TaskTraining, task_type
 
 WEIGHTS = "weights.safetensors"
 """What a training leaves in its folder, beside checkpoint.pt and log.jsonl."""
 
 
+def new_task(name: str, settings: TaskTraining) -> Task:
+    """An untrained task; `settings` of the type that `task_type(name)` names."""
+    torch.manual_seed(settings.seed)
+    return task_type(name)(settings)
+
+
 def train_task(
-    name: str,
-    settings: TaskTraining,
+    task: Task,
     scans: TaskScans,
     out: Path,
     resume: bool = False,
     val: TaskScans | None = None,
     until: int | None = None,
 ) -> Task:
-    """Train; checkpoint, log and at the end `WEIGHTS` go to `out`. The same seed gives the same weights,
+    """Train a new task; checkpoint, log and at the end `WEIGHTS` go to `out`. The same seed gives the same weights,
     on one thread to the last bit.
 
     Args:
-        settings: of the type that `task_type(name)` names. val: scans to measure on as the training goes on.
+        val: scans to measure on as the training goes on.
         until: stop after this epoch, with a checkpoint; `resume` goes on from there as if nothing had been.
 
     Raises:
         UsageError: no window fits into the scans, or there is nothing to resume.
     """
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    torch.manual_seed(settings.seed)
-    task = task_type(name)(settings).to(device)
-    twin = copy.deepcopy(task).requires_grad_(False)
-    start = load_checkpoint(out / "checkpoint.pt", task, twin, None) if resume else 0
+    settings = task.settings
     windows = ContiguousWindows(scans.lengths, settings.window, settings.every, settings.seed)
     epoch = max(1, len(windows) // settings.batch)
-
-    def loss(module: nn.Module, batch: _Batch, step: int) -> tuple[Tensor, dict[str, Tensor]]:
-        return eq1(task, batch.scans, batch.epoch, settings)
-
     optimizer = OptimizerSettings(
         steps=settings.epochs * epoch, rate=settings.rate, final_rate=settings.final_rate, warmup=settings.warmup,
         decay=settings.decay, clip=settings.clip, ema=0.0, seed=settings.seed, compile=False, bf16=False,
         save_every=epoch, validate_every=settings.validate_every * epoch,
     )  # fmt: skip
-    batches = _batches(task, scans, windows, settings.batch, start, device)
-    measured = None if val is None else lambda module: measure(module, val)
-    train(task, twin, batches, loss, optimizer, out, resume, measured, start, 0, device,
-          None if until is None else until * epoch)  # fmt: skip
-    save_task(task, out / WEIGHTS, {"epochs": str(settings.epochs if until is None else until)})
+
+    def batches(start: int, rank: int) -> Iterator[tuple[list[TaskScan], int]]:
+        return _batches(task, scans, windows, start)
+
+    def save(averaged: nn.Module) -> None:
+        save_task(task, out / WEIGHTS, {"epochs": str(settings.epochs if until is None else until)})
+
+    validate = None if val is None else partial(measure, scans=val)
+    Trainer(task, batches, optimizer, out, save, validate).run(resume, None if until is None else until * epoch)
     return task.eval()
-
-
-def eq1(task: Task, window: list[TaskScan], epoch: int, settings: TaskTraining) -> tuple[Tensor, dict[str, Tensor]]:
-    """Eq. 1 and its parts, `task_loss` and, in the epochs where it counts, `slam_loss` (without gamma)."""
-    model_loss, slam_loss = task.losses(window)
-    parts = {"task_loss": model_loss}
-
-    def slam() -> Tensor:
-        assert slam_loss is not None
-        parts["slam_loss"] = slam_loss()
-        return parts["slam_loss"].to(model_loss)
-
-    # A prediction that is not finite has no trajectory; its step is skipped, and the log shows it.
-    total = model_loss
-    if isinstance(settings, SlamTaskTraining) and slam_loss is not None and bool(model_loss.isfinite()):
-        total = total_loss(model_loss, slam, epoch, settings.slam)
-    return total, {"loss": total.detach()} | {name: value.detach() for name, value in parts.items()}
 
 
 @torch.no_grad()
@@ -132,33 +113,26 @@ def load_task(name: str, path: Path) -> Task:
     return task.eval().requires_grad_(False)
 
 
-@dataclass(frozen=True)
-class _Batch:
-    """The scans of a step, if contiguous one window after the other, and its epoch."""
-
-    epoch: int
-    scans: list[TaskScan]
-
-
 def _batches(
-    task: Task, scans: TaskScans, windows: ContiguousWindows, batch: int, start: int, device: torch.device
-) -> Iterator[_Batch]:
-    """The scans of so many windows a step, from step `start` on, for ever; what is left of an epoch is not used."""
-    steps = max(1, len(windows) // batch)
+    task: Task, scans: TaskScans, windows: ContiguousWindows, start: int
+) -> Iterator[tuple[list[TaskScan], int]]:
+    """The scans of `settings.batch` windows a step, if contiguous one window after the other, and the epoch; from step
+    `start` on, for ever; what is left of an epoch is not used."""
+    settings = task.settings
+    steps = max(1, len(windows) // settings.batch)
     epoch, skip = divmod(start, steps)
     while True:
         task.train()
         task.start_epoch(epoch)
-        settings = task.settings
         if settings.has_windows(epoch):
             windows.set_epoch(epoch)
             order = [i for window in windows for i in window]
         else:  # neighbors in a step would be nearly one scan: batch statistics and gradients want many places
             generator = torch.Generator().manual_seed(settings.seed * 1_000_003 + epoch)
             order = torch.randperm(len(scans), generator=generator).tolist()
-        size = batch * settings.window
+        size = settings.batch * settings.window
         for step in range(skip, steps):
-            yield _Batch(epoch, [scans[i].to(device) for i in order[step * size : (step + 1) * size]])
+            yield [scans[i] for i in order[step * size : (step + 1) * size]], epoch
         epoch, skip = epoch + 1, 0
 
 

@@ -7,7 +7,6 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -20,16 +19,17 @@ from dpm2_core.commands.bench import bench
 from dpm2_core.data.packed import Sample, write_packed
 from dpm2_core.data.trajectory import write_kitti
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.frame import Image
 from dpm2_core.geometry import se3
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.weights import save_weights
+
+from ..helpers.scenes import boxes, make_image
 
 FRAMES = 6
 
 
 @pytest.fixture(scope="module")
-def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A KITTI sequence of a street with houses, 1 m per frame, as points with 1 cm of noise."""
     folder = tmp_path_factory.mktemp("street")
     (folder / "velodyne").mkdir()
@@ -51,14 +51,21 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_the_geometric_benchmark_records_errors_speed_and_origin(drive: Path, tmp_path: Path) -> None:
-    bench(["geometric"], source=[drive, drive], out=tmp_path, repetitions=2, threads=1, settings=["slam.map.voxel=1"])
+def test_the_geometric_benchmark_records_errors_speed_and_origin(sequence: Path, tmp_path: Path) -> None:
+    bench(
+        ["geometric"],
+        source=[sequence, sequence],
+        out=tmp_path,
+        repetitions=2,
+        threads=1,
+        settings=["slam.map.voxel=1"],
+    )
     record = json.loads((tmp_path / "geometric.json").read_text())
     assert (record["benchmark"], record["overrides"]) == ("geometric", ["slam.map.voxel=1"])
     assert record["machine"]["threads"] == 1
     assert record["versions"]["numpy"] == np.__version__
-    assert set(record["drives"]) == {drive.name, f"{drive.name} (2)"}
-    ours = record["drives"][drive.name]["dpm2"]
+    assert set(record["drives"]) == {sequence.name, f"{sequence.name} (2)"}
+    ours = record["drives"][sequence.name]["dpm2"]
     assert (ours["frames"], ours["failed_frames"]) == (FRAMES, 0)
     assert ours["rpe_trans_m"] < 0.02  # noise of 1 cm a point, thousands of points
     assert len(ours["fps_of_repetitions"]) == 2
@@ -66,21 +73,29 @@ def test_the_geometric_benchmark_records_errors_speed_and_origin(drive: Path, tm
     assert set(ours["stages_ms"]) == {"preprocess", "register", "update", "map"}
 
 
-def test_kiss_icp_runs_beside_it_on_the_same_scans(drive: Path, tmp_path: Path) -> None:
+def test_kiss_icp_runs_beside_it_on_the_same_scans(sequence: Path, tmp_path: Path) -> None:
     pytest.importorskip("kiss_icp")
-    bench(None, source=[drive], out=tmp_path, repetitions=1, threads=2)
+    bench(None, source=[sequence], out=tmp_path, repetitions=1, threads=2)
     record = json.loads((tmp_path / "geometric.json").read_text())
-    assert record["truth"] == {drive.name: f"{drive.name}/poses.txt"}
-    methods = record["drives"][drive.name]
+    assert record["truth"] == {sequence.name: f"{sequence.name}/poses.txt"}
+    methods = record["drives"][sequence.name]
     assert methods["kiss-icp"]["rpe_trans_m"] < 0.02
     ratio = methods["ratio"]
     assert ratio["fps"] == pytest.approx(methods["dpm2"]["fps"] / methods["kiss-icp"]["fps"], rel=0.01)
     assert ratio["ape_rmse_m"] == pytest.approx(methods["dpm2"]["ape_rmse_m"] / methods["kiss-icp"]["ape_rmse_m"])
 
 
-def test_the_memory_benchmark_samples_the_resident_set(drive: Path, tmp_path: Path) -> None:
-    bench(["memory"], source=[drive], out=tmp_path)
-    result = json.loads((tmp_path / "memory.json").read_text())["drives"][drive.name]
+def test_frames_farther_apart_are_measured_as_far_as_a_drive_has_them(sequence: Path, tmp_path: Path) -> None:
+    bench(["hard"], source=[sequence], out=tmp_path, threads=1, only="geometric")
+    rates = json.loads((tmp_path / "hard.json").read_text())["drives"][sequence.name]
+    assert [(rate, row["geometric"]["frames"]) for rate, row in rates.items()] == [("every 1", 6), ("every 3", 2)]
+    assert rates["every 1"]["geometric"]["rpe_trans_m"] < 0.02
+    assert rates["every 1"]["geometric"]["failed_frames"] == 0
+
+
+def test_the_memory_benchmark_samples_the_resident_set(sequence: Path, tmp_path: Path) -> None:
+    bench(["memory"], source=[sequence], out=tmp_path)
+    result = json.loads((tmp_path / "memory.json").read_text())["drives"][sequence.name]
     assert result["samples"][0][0] == 0
     assert result["rss_mb"]["start"] > 20, "an interpreter with numpy alone takes more"
     assert result["keyframes"] >= 1
@@ -117,9 +132,9 @@ def test_processors_are_limited_inside_the_block_alone() -> None:
     assert os.sched_getaffinity(0) == before
 
 
-def test_a_packed_excerpt_is_unpacked_for_as_long_as_the_run_lasts(drive: Path, tmp_path: Path) -> None:
+def test_a_packed_excerpt_is_unpacked_for_as_long_as_the_run_lasts(sequence: Path, tmp_path: Path) -> None:
     unpack = tmp_path / "unpack.py"
-    unpack.write_text(f"import shutil, sys\nshutil.copytree({str(drive)!r}, sys.argv[1] + '/sequences/07')")
+    unpack.write_text(f"import shutil, sys\nshutil.copytree({str(sequence)!r}, sys.argv[1] + '/sequences/07')")
     with drives(Options(kitti=tmp_path)) as sources:
         assert [(source.name, len(source)) for source in sources] == [("07", FRAMES)]
         frame = next(iter(sources[0].frames(0, 1)))
@@ -129,14 +144,14 @@ def test_a_packed_excerpt_is_unpacked_for_as_long_as_the_run_lasts(drive: Path, 
         pass
 
 
-def test_what_cannot_be_measured_is_rejected(drive: Path, tmp_path: Path) -> None:
+def test_what_cannot_be_measured_is_rejected(sequence: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"speed: no such benchmark; choose from .*geometric, .*neural"):
         bench(["geometric", "speed"])
     for name, ignored in (("tasks", "source"), ("geometric", "weights"), ("pose-graph", "set"), ("map", "pairs")):
-        argument = {"settings" if ignored == "set" else ignored: [drive]}
+        argument = {"settings" if ignored == "set" else ignored: [sequence]}
         with pytest.raises(UsageError, match=f"--{ignored}: benchmark {name} has no use for it; it takes --"):
             bench([name], out=tmp_path, **argument)
-    with pytest.raises(UsageError, match="--only tasks: no such training"):
+    with pytest.raises(UsageError, match="--only tasks: no such part"):
         bench(["finetune"], out=tmp_path, only="tasks")
     with pytest.raises(UsageError, match="none: no KITTI excerpt"):
         bench(kitti=tmp_path / "none")
@@ -145,7 +160,7 @@ def test_what_cannot_be_measured_is_rejected(drive: Path, tmp_path: Path) -> Non
     with pytest.raises(UsageError, match="memory: give --source"):
         bench(["memory"])
     with pytest.raises(UsageError, match="nonsense"):
-        bench(source=[drive], settings=["slam.nonsense=1"], out=tmp_path)
+        bench(source=[sequence], settings=["slam.nonsense=1"], out=tmp_path)
     blind = tmp_path / "blind"
     (blind / "velodyne").mkdir(parents=True)
     (blind / "velodyne" / "000000.bin").write_bytes(b"\0" * 16)
@@ -156,20 +171,18 @@ def test_what_cannot_be_measured_is_rejected(drive: Path, tmp_path: Path) -> Non
 
 @pytest.mark.slow
 def test_the_neural_benchmark_measures_pairs_odometry_and_stages(
-    drive: Path,
+    sequence: Path,
     tmp_path: Path,
     model: DeepPointMap2,
-    street: Callable[..., np.ndarray],
     noise: np.random.Generator,
-    make_image: Callable[..., Image],
 ) -> None:
     """With random weights: the classical methods beside it are right, and refined falls back on points."""
     save_weights(model, tmp_path / "tiny.safetensors", {"steps": "0", "images": "true", "phase": "2"})
     poses = se3.exp(np.outer(np.arange(4.0), [0, 0, 0.1, 3, 0, 0]))
-    samples = [Sample(street(noise), T, (make_image(noise),)) for T in poses]
+    samples = [Sample(boxes(noise), T, (make_image(noise),)) for T in poses]
     write_packed(tmp_path / "unseen" / "world", samples, {})
     bench(
-        ["neural"], source=[drive], out=tmp_path, repetitions=1, threads=1, pairs=3,
+        ["neural"], source=[sequence], out=tmp_path, repetitions=1, threads=1, pairs=3,
         weights=str(tmp_path / "tiny.safetensors"), unseen=tmp_path / "unseen",
     )  # fmt: skip
     path = tmp_path / "neural.json"
@@ -178,23 +191,23 @@ def test_the_neural_benchmark_measures_pairs_odometry_and_stages(
     parts = record["parts"]
     assert list(parts) == ["synthetic", "real", "odometry", "corruption", "image", "overlap", "speed"]
     assert parts["synthetic"]["pairs"]["up to 20 m, any yaw"]["neural"]["pairs"] > 0
-    ours = parts["real"]["drives"][drive.name]
+    ours = parts["real"]["drives"][sequence.name]
     assert list(ours["consecutive"]) == ["neural"]
     assert set(ours["10-20 m"]) >= {"neural", "refined", "geometric", "small_gicp"}
     assert ours["8 apart"]["neural"]["pairs"] == 0  # six frames
-    assert parts["odometry"]["drives"][drive.name]["geometric"]["ape_rmse_m"] < 0.02
+    assert parts["odometry"]["drives"][sequence.name]["geometric"]["ape_rmse_m"] < 0.02
     assert set(parts["corruption"]["error_ratio"]) == {"LiDAR obstruction 100 %", "camera failure 100 %"}
     assert {"neural with camera", "neural without camera"} <= set(parts["image"]["pairs"]["tunnel, up to 5 m"])
     assert (tmp_path / "neural_image.png").read_bytes().startswith(b"\x89PNG")
     assert 0 <= parts["overlap"]["average_precision"] <= 1
-    speed = parts["speed"]["drives"][drive.name]
+    speed = parts["speed"]["drives"][sequence.name]
     assert speed["stages_ms"]["total"]["median"] > 0
     assert 0 < speed["descriptor_bytes"] < 70_000
     # What is there stays, what is missing is measured, and a part that is asked for is measured again.
     del record["parts"]["overlap"]
     record["parts"]["real"]["seconds"] = record["parts"]["speed"]["seconds"] = -1
     path.write_text(json.dumps(record))
-    again = {"source": [drive], "out": tmp_path, "repetitions": 1, "threads": 1, "pairs": 3,
+    again = {"source": [sequence], "out": tmp_path, "repetitions": 1, "threads": 1, "pairs": 3,
              "weights": str(tmp_path / "tiny.safetensors"), "unseen": tmp_path / "unseen"}  # fmt: skip
     bench(["neural"], **again)
     parts = json.loads(path.read_text())["parts"]

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks import finetune
-from benchmarks.harness import Options, write_report
+from benchmarks.harness import Options, earlier, write_report
 from dpm2_core.learning.finetune_settings import FinetuneSettings
 
 BEFORE = {"near_m": 0.1, "far_m": 0.2, "all_m": 0.15, "all_deg": 0.1, "success": 0.9, "pairs": 10}
@@ -21,22 +21,24 @@ def _run(factor: float) -> dict:
 
 
 def test_each_loss_alone_is_trained_once_and_both_for_every_seed() -> None:
-    assert finetune._wanted(Options(repetitions=3)) == [
+    assert finetune.trainings(Options(repetitions=3)) == [
         ("trajectory", 0), ("pairs", 0), ("both", 0), ("poses", 0), ("trajectory", 1), ("trajectory", 2)
     ]  # fmt: skip
-    assert finetune._wanted(Options(repetitions=3, only="pairs")) == [("pairs", 0)]
+    assert finetune.trainings(Options(repetitions=3, only="pairs")) == [("pairs", 0)]
 
 
 def test_results_are_found_again_by_a_run_of_the_same_settings_and_weights(tmp_path: Path) -> None:
     settings, options = FinetuneSettings(), Options(out=tmp_path)
     results = {"before": dict.fromkeys(finetune.UNSEEN, BEFORE), "runs": {"both": {"0": _run(0.6), "1": _run(0.8)}}}
-    report = finetune._report(results, settings, "digest")
+    report = finetune.report(results, settings, "digest")
     found = report.results["ratios"]["both"]["new"]["all_m"]
     assert found == {"mean": pytest.approx(0.7), "spread": pytest.approx(0.1), "seeds": 2}
     path = tmp_path / "finetune.json"
     write_report(path, "finetune", report, options)
-    assert finetune._read(path, settings, "digest") == results
-    assert finetune._read(path, FinetuneSettings(radius=3.0), "digest") == {}
-    assert finetune._read(path, settings, "of other weights") == {}
+    same = {"settings": settings.model_dump(mode="json"), "weights_sha256": "digest"}
+    assert {key: earlier(path, key, **same) for key in results} == results
+    other = {**same, "settings": FinetuneSettings(radius=3.0).model_dump(mode="json")}
+    assert earlier(path, "runs", **other) == {}
+    assert earlier(path, "runs", **{**same, "weights_sha256": "of other weights"}) == {}
     path.write_text("{")
-    assert finetune._read(path, settings, "digest") == {}
+    assert earlier(path, "runs", **same) == {}

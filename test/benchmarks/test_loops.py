@@ -13,7 +13,7 @@ from benchmarks.loops import check_loops, revisits
 from benchmarks.relocalise import success_rates
 from benchmarks.roads import road_files
 from dpm2_core.errors import UsageError
-from dpm2_core.frame import Array, LoopClosure, Registration
+from dpm2_core.frame import Array, Edge, Registration
 from dpm2_core.geometry import se3
 
 
@@ -25,8 +25,8 @@ def there_and_back(lateral: float = 4.0) -> Array:
     return np.array(there + back)
 
 
-def closure(a: int, b: int, T: Array, ok: bool = True) -> LoopClosure:
-    return LoopClosure(a, b, Registration(T, np.eye(6), 0.9, 0.1, "test", ok, "" if ok else "only 31% fit"))
+def closure(a: int, b: int, T: Array, ok: bool = True) -> Edge:
+    return Edge("loop", a, b, Registration(T, np.eye(6), 0.9, 0.1, "test", ok, "" if ok else "only 31% fit"))
 
 
 def test_revisits_by_heading() -> None:
@@ -48,11 +48,11 @@ def test_wrong_loops_and_found_revisits_are_told_apart() -> None:
 
     off = se3.make(np.eye(3), np.array([5.5, 0, 0]))
     turned = se3.exp(np.array([0, 0, np.radians(6), 0, 0, 0]))
-    closures = [
+    loops = [
         closure(2, 39, T(2, 39)), closure(3, 38, T(3, 38) @ off), closure(4, 37, T(4, 37) @ turned),
         closure(5, 36, T(5, 36), ok=False), closure(6, 35, T(6, 35) @ off, ok=False),
     ]  # fmt: skip
-    result = check_loops(closures, truth)
+    result = check_loops(loops, truth)
     assert (result["tried"], result["accepted"], result["wrong"]) == (5, 3, 2)
     assert result["reverse"] == {"revisits": 16, "found": 1}  # what was rejected, or was wrong, found nothing
     assert result["refusals"] == {"only fit": 2}

@@ -23,7 +23,7 @@ echo = link.start_mapper([], {"PATH": sys.argv[2]}, Path(sys.argv[1]))
 s = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 s.bind(("10.73.0.1", 7400)); s.settimeout(0.2)
 
-def answers(count):
+def replies(count):
     got = 0
     for _ in range(count):
         try:
@@ -33,9 +33,9 @@ def answers(count):
     return got
 
 end = time.monotonic() + 20
-while not answers(1) and time.monotonic() < end:
+while not replies(1) and time.monotonic() < end:
     time.sleep(0.1)
-up = answers(60); link.set(up=False); down = answers(5); link.set(up=True); again = answers(20)
+up = replies(60); link.set(up=False); down = replies(5); link.set(up=True); again = replies(20)
 echo.kill()
 print(up, down, again)
 """
@@ -58,7 +58,7 @@ def test_it_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.skipif(not all(map(shutil.which, ("unshare", "ip", "nft"))) or not _can(), reason="needs root, ip and nft")
 def test_the_link_goes_away_comes_back_and_loses_packets(tmp_path) -> None:
-    """A fifth is lost each way: 38 of 60 answers are expected; 20 and 55 are beyond four sigma."""
+    """A fifth is lost each way: 38 of 60 replies are expected; 20 and 55 are beyond four sigma."""
     node = tmp_path / "dpm2_ros" / "executables.py"  # what starts at the far end: an echo in place of mapper_node
     node.parent.mkdir()
     node.write_text(ECHO)

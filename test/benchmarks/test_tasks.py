@@ -48,7 +48,9 @@ def test_comparison_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(tasks, "COMPARISONS", {"gndnet": tasks.Comparison(small, figures, drives)})
     trained = []
     original = tasks.train_task
-    monkeypatch.setattr(tasks, "train_task", lambda *a, **k: trained.append(a[1].slam.gamma) or original(*a, **k))
+    monkeypatch.setattr(
+        tasks, "train_task", lambda *a, **k: trained.append(a[0].settings.slam.gamma) or original(*a, **k)
+    )
     options = Options(threads=1, repetitions=1, only="gndnet", out=tmp_path / "out", cache=tmp_path / "cache")
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "tasks.json").write_text('{"parts": {"dslr": {"summary": {}, "runs": {"with": {}}}}}')
@@ -66,7 +68,7 @@ def test_comparison_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert trained == [0.0, 0.0, 0.1]
     tasks.bench_tasks(Options(**{**vars(options), "overrides": ("slam.gamma=0.2",)}))
     assert trained == [0.0, 0.0, 0.1, 0.2]
-    with pytest.raises(UsageError, match="--only nonsense: no such task"):
+    with pytest.raises(UsageError, match="--only nonsense: no such part"):
         tasks.bench_tasks(Options(only="nonsense"))
 
 
@@ -92,7 +94,9 @@ def test_arms_share_their_first_epochs_and_slam_is_checked(tmp_path: Path, monke
     trained = []
     original = tasks.train_task
     monkeypatch.setattr(
-        tasks, "train_task", lambda *a, **k: trained.append((a[1].slam.gamma, a[4], k["until"])) or original(*a, **k)
+        tasks,
+        "train_task",
+        lambda *a, **k: trained.append((a[0].settings.slam.gamma, a[3], k["until"])) or original(*a, **k),
     )
     options = Options(threads=1, repetitions=1, only="dslr", out=tmp_path, cache=tmp_path / "cache")
     runs = tasks.bench_tasks(options).results["parts"]["dslr"]["runs"]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The traffic benchmark on a few scans: every method is judged, a second run goes on, strays are counted."""
+"""The traffic benchmark on a few scans: all methods are evaluated, a second run continues, diverged drives count."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from dpm2_core.sim.settings import LidarConfig
 
 
 @pytest.mark.slow
-def test_a_short_drive_is_checked_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_short_drive_is_evaluated_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(traffic, "PLACES", {"suburb": 20.0})
     monkeypatch.setattr(traffic, "FRAMES", 6)
     monkeypatch.setattr(traffic, "LIDAR", LidarConfig(columns=512))
@@ -47,7 +47,7 @@ def test_the_summary_is_of_means_and_medians_and_counts_drives_that_strayed() ->
         str(i): {"runs": {"refined": {"none": run(none), "movers": run(dynamic)}}}
         for i, (none, dynamic) in enumerate([(0.004, 0.002), (0.2, 0.003), (0.006, 0.004)])
     }
-    found = traffic._summary(drives)["refined"]
+    found = traffic.summarized(drives)["refined"]
     assert found["none"]["astray"] == 1
     assert found["movers"]["astray"] == 0
     assert found["none"]["rpe_m"] == pytest.approx(0.07)

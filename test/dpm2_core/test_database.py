@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A database of unknown origin keeps nobody waiting, and an honest large one is read whole."""
+"""A database of unknown origin is left after a bounded time, and an honest large one is read whole."""
 
 from __future__ import annotations
 

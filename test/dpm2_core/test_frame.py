@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dpm2_core.frame import Camera, Frame, Image
+from dpm2_core.frame import Camera, Edge, Frame, Image, Registration
 
 CAMERA = Camera(K=np.eye(3), T_lidar_cam=np.eye(4), size=(40, 30), name="left")
 
@@ -48,6 +48,15 @@ def test_every_point_wants_its_time_offset() -> None:
     assert Frame(stamp=0, points=points, time_offset=np.zeros(5, np.float32)).time_offset is not None
     with pytest.raises(ValueError, match="4 time offsets for 5 points"):
         Frame(stamp=0, points=points, time_offset=np.zeros(4, np.float32))
+
+
+def test_a_rejected_edge_keeps_what_was_measured() -> None:
+    loop = Edge("loop", 3, 90, Registration(2 * np.eye(4), np.eye(6), 0.9, 0.05, "points"))
+    rejected = loop.rejected("too far")
+    assert loop.ok
+    assert not rejected.ok
+    assert (rejected.from_node, rejected.to_node, rejected.registration.reason) == (3, 90, "too far")
+    np.testing.assert_array_equal(rejected.T_from_to, loop.T_from_to)
 
 
 def test_nouns_cannot_be_changed() -> None:

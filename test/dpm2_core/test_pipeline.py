@@ -14,13 +14,14 @@ from dpm2_core.config import load_settings
 from dpm2_core.data.open import open_source
 from dpm2_core.data.trajectory import read_trajectory, write_kitti, write_tum
 from dpm2_core.errors import UsageError
-from dpm2_core.frame import Frame, OdometryResult
+from dpm2_core.frame import Frame
 from dpm2_core.pipeline import OfflineRun, Result
-from dpm2_core.sim.drive import simulate
-from dpm2_core.sim.settings import LidarConfig
+from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.output import TrajectoryRecorder
 from dpm2_core.slam.settings import Config
-from dpm2_core.slam.system import SlamSystem
+from dpm2_core.slam.system import SlamResult
+
+from ..helpers.drives import first_scans
 
 FRAMES = 8
 CONFIG = load_settings(Config, None, ["slam.loops.enabled=false", "slam.threads=1"])
@@ -32,28 +33,26 @@ FILES = {
 
 
 @pytest.fixture(scope="module")
-def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A short simulated drive without images."""
-    root = tmp_path_factory.mktemp("drive") / "sim"
-    simulate(root, FRAMES, seed=2, road="straight", preset="suburb", images=False, lidar=LidarConfig(columns=900))
-    return root
+def recording(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The first of its scans."""
+    return first_scans(recording, FRAMES, tmp_path_factory.mktemp("first"))
 
 
 @pytest.fixture(scope="module")
-def result(drive: Path) -> Result:
+def result(recording: Path) -> Result:
     """Of the whole drive."""
-    return OfflineRun(drive, CONFIG).run()
+    return OfflineRun(recording, CONFIG).run()
 
 
-def test_it_is_the_slam_frame_by_frame(drive: Path, result: Result) -> None:
+def test_it_is_the_slam_frame_by_frame(recording: Path, result: Result) -> None:
     """Reading ahead and recording change no bit of a pose."""
-    system = SlamSystem(CONFIG.slam)
+    slam = make_slam(CONFIG.slam)
     recorder = TrajectoryRecorder()
-    for frame in open_source(drive).frames():
-        recorder.add(system.process(frame))
+    for frame in open_source(recording).frames():
+        recorder.add(slam.process(frame).odometry)
     assert len(result) == FRAMES
     assert result.recorder.stamps == recorder.stamps
-    np.testing.assert_array_equal(result.poses, recorder.poses(system.mapper.poses))
+    np.testing.assert_array_equal(result.poses, recorder.poses(slam.mapper.poses))
     assert result.registered == [True] * FRAMES
     assert dict(result.methods) == {"first": 1, "geometric": FRAMES - 1}
     assert result.metrics is not None
@@ -71,20 +70,22 @@ def test_a_saved_result_is_every_file_and_reads_back(result: Result, tmp_path: P
     assert result.metrics is not None
     assert json.loads((out / "metrics.json").read_text()) == json.loads(result.metrics.model_dump_json())
     timing = json.loads((out / "timing.json").read_text())
-    assert list(timing) == ["frames", "fps", "wall_s", "answers", "stages_ms"]
+    assert list(timing) == ["frames", "fps", "wall_s", "answers", "states", "breaks", "stages_ms"]
     assert timing["frames"] == FRAMES
+    assert timing["states"] == {"initialising": 1, "tracking": FRAMES - 1}
+    assert timing["breaks"] == 0
     assert list(timing["stages_ms"])[-2:] == ["map", "total"]
 
 
-def test_an_interrupted_run_keeps_what_there_is(drive: Path, tmp_path: Path) -> None:
+def test_an_interrupted_run_keeps_what_there_is(recording: Path, tmp_path: Path) -> None:
     seen: list[int] = []
 
-    def progress(tracked: OdometryResult) -> None:
-        seen.append(tracked.index)
+    def progress(result: SlamResult) -> None:
+        seen.append(result.odometry.index)
         if len(seen) == 4:
             raise KeyboardInterrupt  # as Ctrl-C does, here at a known frame
 
-    result = OfflineRun(drive, CONFIG).run(progress)
+    result = OfflineRun(recording, CONFIG).run(progress)
     assert result.interrupted
     assert seen == [0, 1, 2, 3]
     result.save(tmp_path)
@@ -93,8 +94,8 @@ def test_an_interrupted_run_keeps_what_there_is(drive: Path, tmp_path: Path) -> 
     assert json.loads((tmp_path / "metrics.json").read_text())["frames"] == 4
 
 
-def test_interrupted_before_the_first_frame(drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    source = open_source(drive)
+def test_interrupted_before_the_first_frame(recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = open_source(recording)
 
     def frames(start: int = 0, stop: int | None = None) -> Iterator[Frame]:
         raise KeyboardInterrupt
@@ -106,16 +107,16 @@ def test_interrupted_before_the_first_frame(drive: Path, tmp_path: Path, monkeyp
     assert {path.name for path in tmp_path.iterdir()} == FILES - {"trajectory.png", "metrics.json"}
 
 
-def test_ground_truth_as_poses_and_as_a_tum_file(drive: Path, tmp_path: Path) -> None:
+def test_ground_truth_as_poses_and_as_a_tum_file(recording: Path, tmp_path: Path) -> None:
     """The same truth in either form gives nearly the same error: of the LiDAR by a TUM file, else of the camera."""
-    source = open_source(drive)
+    source = open_source(recording)
     assert source.poses is not None
     write_tum(tmp_path / "truth.tum", [frame.stamp for frame in source.frames()], source.poses)
     source.poses = None  # type: ignore[misc]  # a recording without any of its own
     alone = OfflineRun(source, CONFIG, (2, 7)).run()
     assert alone.metrics is None
     stamped = OfflineRun(source, CONFIG, (2, 7), tmp_path / "truth.tum").run()
-    given = OfflineRun(source, CONFIG, (2, 7), drive / "poses" / "00.txt").run()
+    given = OfflineRun(source, CONFIG, (2, 7), recording / "poses" / "00.txt").run()
     assert stamped.metrics is not None
     assert given.metrics is not None
     assert stamped.metrics.truth == str(tmp_path / "truth.tum")
@@ -126,26 +127,26 @@ def test_ground_truth_as_poses_and_as_a_tum_file(drive: Path, tmp_path: Path) ->
     assert {path.name for path in (tmp_path / "out").iterdir()} == FILES
 
 
-def test_a_run_goes_on_in_its_map_file(drive: Path, tmp_path: Path) -> None:
+def test_a_run_goes_on_in_its_map_file(recording: Path, tmp_path: Path) -> None:
     path = tmp_path / "drive.dpm2map"
-    with OfflineRun(drive, CONFIG, (0, 4), map_file=path) as begun:
+    with OfflineRun(recording, CONFIG, (0, 4), map_file=path) as begun:
         nodes = len(begun.run().mapper.keyframes)
     assert nodes >= 1
-    with OfflineRun(drive, CONFIG, map_file=path, map_mode="resume") as again:
+    with OfflineRun(recording, CONFIG, map_file=path, map_mode="resume") as again:
         result = again.run()
         assert result.mapper.session_start == nodes
         assert result.connected
         assert result.recorder.index[-1] == FRAMES - 1
         result.save(tmp_path / "out")
     with pytest.raises(UsageError, match="there is a file already"):
-        OfflineRun(drive, CONFIG, map_file=path)
+        OfflineRun(recording, CONFIG, map_file=path)
 
 
-def test_errors_of_use_come_before_anything_runs(drive: Path, tmp_path: Path) -> None:
+def test_errors_of_use_come_before_anything_runs(recording: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no such file"):
         OfflineRun(tmp_path / "nowhere", CONFIG)
     with pytest.raises(UsageError, match=f"--frames 50:60: 00 has {FRAMES} frames"):
-        OfflineRun(drive, CONFIG, (50, 60))
+        OfflineRun(recording, CONFIG, (50, 60))
     write_kitti(tmp_path / "short.txt", np.tile(np.eye(4), (3, 1, 1)))
     with pytest.raises(UsageError, match=f"3 poses for {FRAMES} frames of 00"):
-        OfflineRun(drive, CONFIG, ground_truth=tmp_path / "short.txt")
+        OfflineRun(recording, CONFIG, ground_truth=tmp_path / "short.txt")

@@ -24,10 +24,9 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 
 from dpm2_core.data.convert import convert_kitti
+from dpm2_core.data.kitti import KittiSource
 from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
-from dpm2_core.sim.drive import simulate
-from dpm2_core.sim.settings import LidarConfig
 from dpm2_ros.conversions import cloud_to_msg
 from dpm2_ros.runtime import ros_context
 from tools.replay import ros_environment
@@ -130,18 +129,10 @@ def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """28 m of a simulated street, 30 scans: more to see than in `sequence`, as places to be found again need it."""
-    root = tmp_path_factory.mktemp("street") / "sim"
-    simulate(root, 30, seed=2, road="straight", preset="suburb", images=False, lidar=LidarConfig(columns=900))
-    return root
-
-
-@pytest.fixture(scope="session")
 def bag(sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The drive as a bag."""
     out = tmp_path_factory.mktemp("bags") / "drive"
-    convert_kitti(sequence, out)
+    convert_kitti(KittiSource(sequence), out)
     return out
 
 
@@ -171,6 +162,13 @@ class Harness:
         self._executor.wake()
         self._closing.append(node)
         return node
+
+    def remove(self, node: Node) -> None:
+        """Close a node under test before the end."""
+        self._closing.remove(node)
+        self._executor.remove_node(node)
+        node.close()  # type: ignore[attr-defined]
+        node.destroy_node()
 
     def hear(self, kind: type, topic: str, qos: Any = 100) -> list[Any]:
         """The messages of a topic, as they come."""

@@ -23,15 +23,15 @@ from dpm2_core.data.bags import BagSource
 from dpm2_core.data.image_messages import decode_image
 from dpm2_core.data.messages import decode_points, stamp_ns
 from dpm2_core.data.settings import InputSettings
+from dpm2_core.errors import exit_code
 from dpm2_ros.bag_player import main
-from dpm2_ros.runtime import exit_code
 from dpm2_ros.tf import TFMessage
 from tools.replay import ros_environment, start
 
 LATCHED_DEPTH = 10
 
 
-class Ears:
+class Listener:
     """Subscribers to the KITTI topics, and the player as a process."""
 
     def __init__(self, harness: Any, domain: int, log: Path) -> None:
@@ -56,27 +56,27 @@ class Ears:
 
 
 @pytest.fixture
-def ears(ros: Callable[..., Any], tmp_path: Path) -> Iterator[Ears]:
+def listener(ros: Callable[..., Any], tmp_path: Path) -> Iterator[Listener]:
     harness = ros()
     domain = harness.node.context.get_domain_id()
-    heard = Ears(harness, domain, tmp_path / "player.log")
-    yield heard
-    if heard.process is not None and heard.process.poll() is None:
-        heard.process.kill()
-        heard.process.wait()
+    made = Listener(harness, domain, tmp_path / "player.log")
+    yield made
+    if made.process is not None and made.process.poll() is None:
+        made.process.kill()
+        made.process.wait()
 
 
-def test_everything_arrives_as_recorded_and_in_time(ears: Ears, bag: Path, drive: Any, tmp_path: Path) -> None:
-    player = ears.play(str(bag), "--wait", "20", "--rate", "2", "--log", str(tmp_path / "times.csv"))
-    assert player.wait(30) == 0, ears.output()
-    ears.harness.wait(lambda: len(ears.clouds) == len(ears.images) == drive.frames, "every cloud and image")
+def test_everything_arrives_as_recorded_and_in_time(listener: Listener, bag: Path, drive: Any, tmp_path: Path) -> None:
+    player = listener.play(str(bag), "--wait", "20", "--rate", "2", "--log", str(tmp_path / "times.csv"))
+    assert player.wait(30) == 0, listener.output()
+    listener.harness.wait(lambda: len(listener.clouds) == len(listener.images) == drive.frames, "every cloud and image")
     source = BagSource(bag, InputSettings(vertical_angle_correction_deg=0.0))
-    for message, image, frame in zip(ears.clouds, ears.images, source.frames(), strict=True):
+    for message, image, frame in zip(listener.clouds, listener.images, source.frames(), strict=True):
         assert stamp_ns(message.header) == frame.stamp
         np.testing.assert_array_equal(decode_points(message)[0], frame.points)
         np.testing.assert_array_equal(decode_image(image), frame.images[0].pixels)
-    assert len(ears.infos) == drive.frames
-    assert {t.child_frame_id for t in ears.static[0].transforms} >= {"velo_link", "camera_color_left"}
+    assert len(listener.infos) == drive.frames
+    assert {t.child_frame_id for t in listener.static[0].transforms} >= {"velo_link", "camera_color_left"}
     with (tmp_path / "times.csv").open() as file:
         rows = [row for row in csv.DictReader(file) if row["topic"] == topics.POINTS]
     published = np.array([int(row["published_ns"]) for row in rows])
@@ -85,31 +85,31 @@ def test_everything_arrives_as_recorded_and_in_time(ears: Ears, bag: Path, drive
     seconds = (published - published[0]) * 1e-9
     assert (seconds > 0.05 * np.arange(drive.frames) - 0.02).all()
     assert np.median(seconds - 0.05 * np.arange(drive.frames)) < 0.3
-    now = np.array([message.clock.sec * 10**9 + message.clock.nanosec for message in ears.clock])
+    now = np.array([message.clock.sec * 10**9 + message.clock.nanosec for message in listener.clock])
     assert len(now) > 50
     assert (np.diff(now) >= -20_000_000).all()  # while it waits the clock is measured, and may be ahead by a moment
     assert now[0] >= source.stamps[0] - 20_000_000
     assert now[-1] == source.stamps[-1]
 
 
-def test_start_duration_and_topics(ears: Ears, bag: Path, drive: Any) -> None:
+def test_start_duration_and_topics(listener: Listener, bag: Path, drive: Any) -> None:
     arguments = ["--start", "0.45", "--duration", "0.4", "--topics", topics.POINTS, "--topics", topics.TF_STATIC]
-    assert ears.play(str(bag), "--wait", "20", *arguments).wait(30) == 0, ears.output()
-    ears.harness.wait(lambda: len(ears.clouds) >= 4, "four clouds")
+    assert listener.play(str(bag), "--wait", "20", *arguments).wait(30) == 0, listener.output()
+    listener.harness.wait(lambda: len(listener.clouds) >= 4, "four clouds")
     stamps = BagSource(bag, InputSettings(images=False)).stamps.tolist()
-    assert [stamp_ns(message.header) for message in ears.clouds] == stamps[5:9]
-    assert ears.images == []
-    assert ears.static  # calibration comes from wherever one starts
+    assert [stamp_ns(message.header) for message in listener.clouds] == stamps[5:9]
+    assert listener.images == []
+    assert listener.static  # calibration comes from wherever one starts
 
 
-def test_it_loops_until_it_is_stopped(ears: Ears, bag: Path, drive: Any) -> None:
-    player = ears.play(str(bag), "--wait", "20", "--loop", "--rate", "8")
-    ears.harness.wait(lambda: len(ears.clouds) > 2 * drive.frames, "a third round")
+def test_it_loops_until_it_is_stopped(listener: Listener, bag: Path, drive: Any) -> None:
+    player = listener.play(str(bag), "--wait", "20", "--loop", "--rate", "8")
+    listener.harness.wait(lambda: len(listener.clouds) > 2 * drive.frames, "a third round")
     player.send_signal(signal.SIGINT)
     player.send_signal(signal.SIGINT)
     assert player.wait(10) == 0
-    assert "Traceback" not in ears.output()
-    stamps = [stamp_ns(message.header) for message in ears.clouds]
+    assert "Traceback" not in listener.output()
+    stamps = [stamp_ns(message.header) for message in listener.clouds]
     assert stamps[drive.frames : 2 * drive.frames] == stamps[: drive.frames]
 
 
@@ -133,9 +133,9 @@ def play_here(*arguments: str) -> int:
     return exit_code(lambda: main(arguments))
 
 
-def test_without_anybody_listening_it_says_so_and_plays(bag: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_without_a_subscriber_it_says_so_and_plays(bag: Path, capfd: pytest.CaptureFixture[str]) -> None:
     assert play_here(str(bag), "--wait", "0.3", "--duration", "0.1") == 0
-    assert f"nobody listens to {topics.POINTS} yet" in capfd.readouterr().err
+    assert f"playing without a subscriber to {topics.POINTS} yet" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -157,20 +157,20 @@ def test_mistakes_end_with_2_and_one_line(
     assert says in line.replace("'", "")
 
 
-def test_a_truncated_bag_plays_what_is_left(ears: Ears, bag: Path, tmp_path: Path, drive: Any) -> None:
+def test_a_truncated_bag_plays_what_is_left(listener: Listener, bag: Path, tmp_path: Path, drive: Any) -> None:
     (whole,) = bag.glob("*.mcap")
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(whole.read_bytes()[: whole.stat().st_size * 6 // 10])
-    assert ears.play(str(cut), "--wait", "20", "--rate", "4").wait(30) == 0, ears.output()
+    assert listener.play(str(cut), "--wait", "20", "--rate", "4").wait(30) == 0, listener.output()
     time.sleep(0.5)
-    assert 0 < len(ears.clouds) < drive.frames
-    assert "truncated" in ears.output()
+    assert 0 < len(listener.clouds) < drive.frames
+    assert "truncated" in listener.output()
 
 
 def test_a_type_is_imported_from_the_packages_of_ros_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """A bag that names a module which lies in the working directory: it is left out, and said so."""
+    """A bag that names a module which lies in the working directory: it is left out, and reported."""
     package = tmp_path / "evil" / "msg"
     package.mkdir(parents=True)
     (package.parent / "__init__.py").write_text("")

@@ -59,7 +59,7 @@ def test_without_one_it_never_has_a_parent_and_its_pose_is_consistent(order: tup
 
 
 def test_a_frame_that_this_node_moves_is_no_base() -> None:
-    """Somebody publishes map -> odom -> base as static: odom -> map would be a circle."""
+    """map -> odom -> base is published as static: odom -> map would be a circle."""
     tree = TransformTree()
     for parent, child in (("map", "odom"), ("odom", "base"), ("base", "lidar")):
         tree.set(parent, child, np.eye(4))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages carry what the core said: exactly for points, to rounding for poses, in ROS' convention for covariances."""
+"""Messages carry what the core has: exactly for points, to rounding for poses, in ROS' convention for covariances."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hypothesis.extra import numpy as hnp
 from dpm2_core.data.messages import decode_points, stamp_ns
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.errors import UsageError
-from dpm2_core.frame import Array, Keyframe, OdometryResult, Registration, State
+from dpm2_core.frame import Array, Keyframe, Registration
 from dpm2_core.geometry import se3
 from dpm2_ros import conversions
 
@@ -27,9 +27,8 @@ def spd(seed: int) -> Array:
     return A @ A.T
 
 
-def tracked(T: Array, keyframe: Keyframe | None = None) -> OdometryResult:
-    registration = Registration(T, spd(1), 0.9, 0.1, "geometric")
-    return OdometryResult(5, 0, T, spd(2), np.arange(6.0), State.TRACKING, registration, keyframe)
+def motion(T: Array) -> conversions.BodyMotion:
+    return conversions.BodyMotion(5, T, spd(2), np.arange(6.0))
 
 
 @given(hnp.arrays(np.float32, st.tuples(st.integers(0, 50), st.just(4)), elements=st.floats(0, 1, width=32)))
@@ -89,7 +88,7 @@ def test_covariance_is_translation_first_along_the_axes_of_the_header() -> None:
 
 @given(tangents, st.integers(0, 20))
 def test_covariance_describes_the_same_errors(xi: np.ndarray, seed: int) -> None:
-    """Errors drawn in the core's convention have, seen along the header's axes, the covariance that ROS is told."""
+    """Errors drawn in the core's convention have, seen along the header's axes, the covariance of the message."""
     T, covariance = se3.exp(xi), spd(seed) * 1e-8
     errors = np.random.default_rng(seed).multivariate_normal(np.zeros(6), covariance, 4000)
     perturbed = T @ se3.exp(errors)
@@ -102,7 +101,7 @@ def test_covariance_describes_the_same_errors(xi: np.ndarray, seed: int) -> None
 
 def test_odometry_message() -> None:
     T = se3.exp([0.1, 0.2, 0.3, 1, 2, 3])
-    message = conversions.odometry_to_msg(tracked(T), spd(3), 0.1, "odom", "base")
+    message = conversions.odometry_to_msg(motion(T), spd(3), 0.1, "odom", "base")
     assert (message.header.frame_id, message.child_frame_id, stamp_ns(message.header)) == ("odom", "base", 5)
     np.testing.assert_allclose(conversions.covariance_from_ros(message.pose.covariance, T[:3, :3]), spd(3), atol=EXACT)
     twist = message.twist.twist
@@ -134,17 +133,17 @@ def test_motion_of_the_base(xi: np.ndarray, mount: np.ndarray) -> None:
     cloud = np.array([[1, 2, 3, 0.5]], np.float32)
     edge = Registration(T_odom_lidar, spd(4), 1.0, 0.0, "geometric")
     keyframe = Keyframe(1, 5, 0, T_odom_lidar, cloud, edge)
-    seen = conversions.to_base(tracked(T_odom_lidar, keyframe), T_base_lidar)
-    start = conversions.to_base(tracked(np.eye(4)), T_base_lidar)
-    np.testing.assert_allclose(start.T_odom_lidar, np.eye(4), atol=EXACT)
+    base = motion(T_odom_lidar).of_base(T_base_lidar)
+    start = motion(np.eye(4)).of_base(T_base_lidar)
+    np.testing.assert_allclose(start.T_odom_body, np.eye(4), atol=EXACT)
     # odom of the base is the base at the start: T_odombase_odomlidar = T_base_lidar
-    np.testing.assert_allclose(seen.T_odom_lidar @ T_base_lidar, T_base_lidar @ T_odom_lidar, atol=EXACT)
-    assert seen.keyframe is not None
-    assert seen.keyframe.edge is not None
-    in_odom = seen.keyframe.T_odom_kf @ np.append(seen.keyframe.cloud[0, :3].astype(float), 1)
+    np.testing.assert_allclose(base.T_odom_body @ T_base_lidar, T_base_lidar @ T_odom_lidar, atol=EXACT)
+    seen = conversions.keyframe_to_base(keyframe, T_base_lidar)
+    assert seen.edge is not None
+    in_odom = seen.T_odom_kf @ np.append(seen.cloud[0, :3].astype(float), 1)
     expected = T_base_lidar @ T_odom_lidar @ np.append(cloud[0, :3].astype(float), 1)
     np.testing.assert_allclose(in_odom, expected, atol=1e-5)  # the cloud is float32
-    np.testing.assert_allclose(seen.keyframe.edge.T_target_source, seen.keyframe.T_odom_kf, atol=EXACT)
+    np.testing.assert_allclose(seen.edge.T_target_source, seen.T_odom_kf, atol=EXACT)
     # exp(twist dt) of the base is the conjugated one of the LiDAR
-    step = T_base_lidar @ se3.exp(0.1 * tracked(T_odom_lidar).twist) @ se3.inverse(T_base_lidar)
-    np.testing.assert_allclose(se3.exp(0.1 * seen.twist), step, atol=1e-8)
+    step = T_base_lidar @ se3.exp(0.1 * motion(T_odom_lidar).twist) @ se3.inverse(T_base_lidar)
+    np.testing.assert_allclose(se3.exp(0.1 * base.twist), step, atol=1e-8)

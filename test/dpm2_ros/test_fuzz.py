@@ -209,17 +209,17 @@ class Fuzzer:
 
 
 @pytest.fixture(scope="module")
-def scans(street: Path) -> list[np.ndarray]:
+def street_scans(recording: Path) -> list[np.ndarray]:
     """Of a street; in the long run the robot then stands, so that no more is to be kept."""
-    drive = [frame.points[::2] for frame in open_source(street, InputSettings(images=False)).frames(0, 24)]
+    drive = [frame.points[::2] for frame in open_source(recording, InputSettings(images=False)).frames(0, 24)]
     return drive + 3 * len(drive) * drive[-1:] if LONG else drive
 
 
 @pytest.fixture(scope="module")
-def alone(scans: list[np.ndarray]) -> list[OdometryResult]:
-    """What the odometry makes of the drive with nobody else about."""
+def alone(street_scans: list[np.ndarray]) -> list[OdometryResult]:
+    """The odometry of the drive alone."""
     odometry = make_odometry(SlamSettings.model_validate(SETTINGS), "red")
-    return [odometry.process(Frame(START + n * 10**8, points, index=n)) for n, points in enumerate(scans)]
+    return [odometry.process(Frame(START + n * 10**8, points, index=n)) for n, points in enumerate(street_scans)]
 
 
 class Nodes:
@@ -262,7 +262,7 @@ class Nodes:
         return [*sorted(real), *sorted(sessions), *future, "red/odom", "base_link", "red"]
 
     def pose(self, n: int) -> np.ndarray | None:
-        """The node's answer to scan n: what others send on that topic has other stamps."""
+        """The node's pose of scan n: what others send on that topic has other stamps."""
         found = [m for m in list(self.odom) if stamp_ns(m.header) == START + n * 10**8]
         return transform_matrix(found[0].pose.pose) if found else None
 
@@ -293,12 +293,12 @@ def nodes(ros: Callable[..., Any], tmp_path: Path) -> Iterator[Nodes]:
 
 
 def test_a_drive_does_not_notice_what_else_is_sent(
-    nodes: Nodes, scans: list[np.ndarray], alone: list[OdometryResult]
+    nodes: Nodes, street_scans: list[np.ndarray], alone: list[OdometryResult]
 ) -> None:
     wait, resident = nodes.harness.wait, []
 
     def drive(n: int) -> None:
-        nodes.lidar.publish(cloud_to_msg(scans[n], START + n * 10**8, "red/lidar"))
+        nodes.lidar.publish(cloud_to_msg(street_scans[n], START + n * 10**8, "red/lidar"))
         wait(lambda: nodes.pose(n) is not None, f"scan {n}", 60)
 
     drive(0)
@@ -309,16 +309,18 @@ def test_a_drive_does_not_notice_what_else_is_sent(
             fuzzer.topics
         )
         began = time.monotonic()
-        for n in range(1, len(scans)):
+        for n in range(1, len(street_scans)):
             drive(n)
-            time.sleep(max(0.0, began + n * SECONDS / len(scans) - time.monotonic()))
+            time.sleep(max(0.0, began + n * SECONDS / len(street_scans) - time.monotonic()))
             resident.append(nodes.resident())
         sent = sum(fuzzer.sent.values())
     print(f"{sent} messages in {time.monotonic() - began:.1f} s on {len(fuzzer.topics)} topics")
     logs = {name: log.read_text(errors="replace")[-3000:] for name, log in nodes.logs.items()}
     assert all(process.poll() is None for process in nodes.processes.values()), logs
 
-    np.testing.assert_allclose([nodes.pose(n) for n in range(len(scans))], [t.T_odom_lidar for t in alone], atol=1e-6)
+    np.testing.assert_allclose(
+        [nodes.pose(n) for n in range(len(street_scans))], [t.T_odom_lidar for t in alone], atol=1e-6
+    )
     keyframes = [tracked.keyframe for tracked in alone if tracked.keyframe is not None]
 
     def stored() -> Any:

@@ -5,8 +5,6 @@ from __future__ import annotations
 
 import hashlib
 import signal
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -29,16 +27,16 @@ from dpm2_ros.conversions import cloud_to_msg, header, pose_to_msg
 from dpm2_ros.tf import TFMessage
 from tools.replay import ros_environment, start
 
+from ..helpers.command import dpm2
+
 pytestmark = pytest.mark.weights
 
 
 @pytest.fixture(scope="module")
-def made(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Its map, as the command makes it."""
     folder = tmp_path_factory.mktemp("map")
-    arguments = ["run", street, "--out", folder / "out", "--map", folder / "drive.dpm2map"]
-    command = [sys.executable, "-m", "dpm2_core.cli", *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    done = dpm2("run", recording, "--out", folder / "out", "--map", folder / "drive.dpm2map")
     assert done.returncode == 0, done.stderr
     return folder / "drive.dpm2map"
 
@@ -48,11 +46,11 @@ def digest(path: Path) -> str:
 
 
 class Robot:
-    """A slam_node process, its LiDAR, and ears."""
+    """A slam_node process, its LiDAR, and subscriptions."""
 
-    def __init__(self, harness: Any, street: Path, log: Path, *parameters: str) -> None:
+    def __init__(self, harness: Any, recording: Path, log: Path, *parameters: str) -> None:
         self.harness, self.log, self._stamp = harness, log, 100_000_000_000
-        self._source = open_source(street, InputSettings(images=False))
+        self._source = open_source(recording, InputSettings(images=False))
         self.lidar = harness.publisher(PointCloud2, topics.POINTS)
         self.odom = harness.hear(Odometry, "/dpm2/odom")
         self.diagnostics = harness.hear(DiagnosticArray, "/diagnostics")
@@ -64,7 +62,7 @@ class Robot:
 
     def _ready(self) -> bool:
         assert self.process.poll() is None, self.log.read_text()
-        return bool(self.lidar.get_subscription_count() and self.said(""))
+        return bool(self.lidar.get_subscription_count() and self.message(""))
 
     def send(self, *frames: int) -> None:
         """Scans, 0.1 s apart whatever their place in the drive, each when the one before has come out."""
@@ -88,7 +86,7 @@ class Robot:
 
         self.harness.wait(again, what, timeout=40)
 
-    def said(self, part: str) -> str:
+    def message(self, part: str) -> str:
         """The last status of a part."""
         statuses = [s for m in self.diagnostics for s in m.status if s.name.endswith(part)]
         return f"{statuses[-1].message} " if statuses else ""
@@ -112,7 +110,7 @@ class Robot:
         message = PoseWithCovarianceStamped(header=header(0, frame))
         message.pose.pose = pose_to_msg(T_map_lidar)
         publisher = self.harness.publisher(PoseWithCovarianceStamped, "/initialpose")
-        self.harness.wait(publisher.get_subscription_count, "slam_node's ears")
+        self.harness.wait(publisher.get_subscription_count, "slam_node's subscription")
         publisher.publish(message)
 
     def close(self) -> int:
@@ -124,11 +122,11 @@ class Robot:
 
 
 @pytest.fixture
-def robot(ros: Callable[..., Any], street: Path, tmp_path: Path) -> Iterator[Callable[..., Robot]]:
+def robot(ros: Callable[..., Any], recording: Path, tmp_path: Path) -> Iterator[Callable[..., Robot]]:
     robots: list[Robot] = []
 
     def make(*parameters: str) -> Robot:
-        robots.append(Robot(ros(), street, tmp_path / "log", *parameters))
+        robots.append(Robot(ros(), recording, tmp_path / "log", *parameters))
         return robots[-1]
 
     yield make
@@ -137,33 +135,33 @@ def robot(ros: Callable[..., Any], street: Path, tmp_path: Path) -> Iterator[Cal
         r.process.wait()
 
 
-def place(street: Path, n: int) -> Array:
+def place(recording: Path, n: int) -> Array:
     """T_map_lidar of a scan, (4, 4): the map's frame is that of the first one."""
-    poses = open_source(street, InputSettings(images=False)).poses
+    poses = open_source(recording, InputSettings(images=False)).poses
     assert poses is not None
     return np.asarray(se3.inverse(poses[0]) @ poses[n])
 
 
 def test_finds_itself_tracks_and_notices_being_carried_off(
-    robot: Callable[..., Robot], street: Path, made: Path, tmp_path: Path
+    robot: Callable[..., Robot], recording: Path, made: Path, tmp_path: Path
 ) -> None:
     """From the middle of the map; carried back while it runs; and all through the file stays as it is."""
     before = digest(made)
     r = robot(f"ros.map_file:={made}", "ros.localization_mode:=true", "slam.keyframes.distance:=2.0")
-    assert "relocalising" in r.said("slam_node: localisation")
+    assert "relocalising" in r.message("slam_node: localisation")
     r.send(*range(8, 17))
     r.harness.wait(
-        lambda: r.said("slam_node: localisation").startswith(("relocalised", "tracking")), "an answer", timeout=30
+        lambda: r.message("slam_node: localisation").startswith(("relocalised", "tracking")), "a result", timeout=30
     )
     r.send(17, 18)
-    r.harness.wait(lambda: r.off(place(street, 18)) < 0.1, "its place in the map")
-    r.harness.wait(lambda: r.said("slam_node: localisation").startswith("tracking"), "the second answer")
+    r.harness.wait(lambda: r.off(place(recording, 18)) < 0.1, "its place in the map")
+    r.harness.wait(lambda: r.message("slam_node: localisation").startswith("tracking"), "the second result")
     seen = len(r.diagnostics)
-    r.send(19)  # the state that is told is that at the last cloud
+    r.send(19)  # the state that is published is that at the last cloud
     info = lambda: [s.message for d in r.diagnostics[seen:] for s in d.status if s.name.endswith("odometry")]  # noqa: E731
     r.harness.wait(lambda: any(text.startswith("track") for text in info()), "the state")
     # carried off: scans from 15 m behind, which the odometry cannot follow
-    r.stand(3, lambda: r.off(place(street, 3)) < 0.2, "the robot where it was put")
+    r.stand(3, lambda: r.off(place(recording, 3)) < 0.2, "the robot where it was put")
     assert r.close() == 0
     log = r.log.read_text()
     assert "found at" in log
@@ -172,8 +170,8 @@ def test_finds_itself_tracks_and_notices_being_carried_off(
     assert sorted(path.name for path in made.parent.iterdir()) == ["drive.dpm2map", "out"]
 
 
-def test_hints_and_services_answer_in_words(
-    robot: Callable[..., Robot], street: Path, made: Path, tmp_path: Path
+def test_hints_and_services_give_reasons(
+    robot: Callable[..., Robot], recording: Path, made: Path, tmp_path: Path
 ) -> None:
     """A hint in another frame, a map saved that stays as it is, a file that is gone: rejected, and the drive goes
     on."""
@@ -193,7 +191,7 @@ def test_hints_and_services_answer_in_words(
         made_elsewhere.rename(made)
     loaded = r.call(Trigger, "/slam_node/load_map")
     assert loaded.success, loaded.message
-    r.harness.wait(lambda: "relocalising" in r.said("slam_node: localisation"), "the new search")
+    r.harness.wait(lambda: "relocalising" in r.message("slam_node: localisation"), "the new search")
     r.point(np.eye(4), "map")
     seen = len(r.tf)
     again = lambda: any(t.header.frame_id == "map" for m in r.tf[seen:] for t in m.transforms)  # noqa: E731
@@ -201,11 +199,11 @@ def test_hints_and_services_answer_in_words(
     r.go_back(20.0)  # its clock is set: odom begins anew, so that the place in the map has to be found anew
     r.stand(3, lambda: "time went back" in r.log.read_text(), "the restart")
     seen = len(r.tf)
-    r.stand(3, lambda: again() and r.off(place(street, 3)) < 0.2, "the robot in the map after the jump")
+    r.stand(3, lambda: again() and r.off(place(recording, 3)) < 0.2, "the robot in the map after the jump")
 
 
 def test_from_mapping_to_localizing_and_back(robot: Callable[..., Robot], tmp_path: Path) -> None:
-    """One node makes a map, finds itself in it, and lets it grow by a session; each answer is in words."""
+    """One node makes a map, finds itself in it, and lets it grow by a session; each response has a message."""
     path = tmp_path / "own.dpm2map"
     r = robot(f"ros.map_file:={path}", "slam.keyframes.distance:=2.0")
     assert not r.call(Trigger, "/slam_node/load_map").success
@@ -237,7 +235,7 @@ def test_from_mapping_to_localizing_and_back(robot: Callable[..., Robot], tmp_pa
     assert len({(k.robot, k.id) for k in data.keyframes}) == len(data)
 
 
-def test_a_map_that_is_not_there_ends_the_node_in_words(run: Callable[..., Any], tmp_path: Path) -> None:
+def test_a_map_that_is_not_there_ends_the_node_with_one_line(run: Callable[..., Any], tmp_path: Path) -> None:
     pairs = [f"ros.map_file:={tmp_path / 'none'}", "ros.localization_mode:=true"]
     done = run("slam_node", "--ros-args", *(part for pair in pairs for part in ("-p", pair)))
     assert done.returncode == 2

@@ -34,7 +34,7 @@ def test_another_publisher_begins_anew() -> None:
 
 
 def test_several_publishers_have_no_common_numbers() -> None:
-    """Without a number in between nothing can be said of the numbers around it."""
+    """Without a number in between nothing is known of the numbers around it."""
     losses = Losses()
     for n, number in enumerate([1, 2, None, 40, 41]):
         losses.add(n * PERIOD, number)

@@ -25,9 +25,10 @@ from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.frame import Keyframe
 from dpm2_core.geometry import se3
+from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.store.map_data import load_map
 from dpm2_core.slam.store.map_store import MapStore
-from dpm2_ros import feed
+from dpm2_ros import feed, mapper_node
 from dpm2_ros.conversions import edge_to_msg, keyframe_name
 from dpm2_ros.feed import keyframe_from
 from dpm2_ros.keyframes import descriptors_to_msg, payload_to_msgs
@@ -37,13 +38,14 @@ from dpm2_ros.tf import TFMessage
 
 
 @pytest.fixture
-def mapper(ros: Callable[..., Any], tmp_path: Path) -> Any:
+def mapper(ros: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     """Harness with a mapper_node that saves to tmp_path/map, and `send(name, T, cloud)` for keyframes."""
+    monkeypatch.setattr("dpm2_ros.diagnostics.PERIOD", 0.1)
     harness = ros(f"ros.map_directory:={tmp_path / 'map'}")
     harness.mapper = harness.add(MapperNode())
     kinds = ((Odometry, "odom"), (PointCloud2, ""), (UInt8MultiArray, "cloud"))
     wires = [harness.node.create_publisher(kind, f"/dpm2/keyframe_{end}".rstrip("_"), KEEP_ALL) for kind, end in kinds]
-    harness.wait(lambda: all(wire.get_subscription_count() for wire in wires), "the mapper's ears")
+    harness.wait(lambda: all(wire.get_subscription_count() for wire in wires), "the mapper's subscriptions")
 
     def send(id: int, T: np.ndarray, points: np.ndarray, cloud_first: bool = False, name: str = "") -> None:
         name = name or keyframe_name("", id)
@@ -57,6 +59,16 @@ def mapper(ros: Callable[..., Any], tmp_path: Path) -> Any:
     return harness
 
 
+def core(mapper: Any) -> Mapper:
+    """What makes the map in the node."""
+    return mapper.mapper.slam.mapper
+
+
+def keyframes(mapper: Any) -> int:
+    """In the map so far."""
+    return len(core(mapper).keyframes)
+
+
 def points(seed: int) -> np.ndarray:
     return np.random.default_rng(seed).uniform(0, 1, (500, 4)).astype(np.float32) * [20, 20, 5, 1]
 
@@ -66,9 +78,8 @@ def test_keyframes_become_a_map_in_either_order_of_messages(mapper: Any, tmp_pat
     T = [se3.exp([0, 0, 0.1 * n, 5.0 * n, 0, 0]) for n in range(4)]
     for n in range(4):
         mapper.send(n, T[n], points(n).astype(np.float32), cloud_first)
-    mapper.wait(lambda: mapper.mapper._mapper.keyframes == 4, "four keyframes")
-    mapper.mapper.close()
-    mapper._closing.remove(mapper.mapper)
+    mapper.wait(lambda: keyframes(mapper) == 4, "four keyframes")
+    mapper.remove(mapper.mapper)
     saved = read_trajectory(tmp_path / "map" / "drive" / "trajectory.tum")
     assert saved.keys.tolist() == [1000, 1001, 1002, 1003]
     np.testing.assert_allclose(saved.poses, T, atol=1e-6)
@@ -78,7 +89,6 @@ def test_keyframes_become_a_map_in_either_order_of_messages(mapper: Any, tmp_pat
 
 def test_a_map_file_is_written_as_the_drive_goes_on(mapper: Any, tmp_path: Path) -> None:
     """By default; all keyframes are in it before the node ends. A reset saves it, and a new map gets its own files."""
-    thread = mapper.mapper._mapper
 
     def stored(name: str) -> int:
         with MapStore.open(tmp_path / "map" / name) as store:
@@ -86,37 +96,36 @@ def test_a_map_file_is_written_as_the_drive_goes_on(mapper: Any, tmp_path: Path)
 
     for id in (0, 1, 2):
         mapper.send(id, se3.exp([0, 0, 0, 5.0 * id, 0, 0]), points(id))
-        mapper.wait(lambda expected=id + 1: thread.keyframes == expected, "the keyframe")
+        mapper.wait(lambda expected=id + 1: keyframes(mapper) == expected, "the keyframe")
     mapper.wait(lambda: stored("drive.dpm2map") == 3, "all of them in the file")
     client = mapper.node.create_client(Trigger, "/mapper_node/reset")
     assert client.wait_for_service(10)
     result = client.call_async(Trigger.Request())
     mapper.wait(result.done, "the reset")
     assert result.result().success
-    mapper.wait(lambda: thread.keyframes == 0, "the empty map")  # which comes after the save
+    mapper.wait(lambda: keyframes(mapper) == 0, "the empty map")  # which comes after the save
     assert read_trajectory(tmp_path / "map" / "drive" / "trajectory.tum").keys.tolist() == [1000, 1001, 1002]
     mapper.send(0, np.eye(4), points(0))
-    mapper.wait(lambda: thread.keyframes == 1 and stored("drive-2.dpm2map") == 1, "the keyframe in the new file")
+    mapper.wait(lambda: keyframes(mapper) == 1 and stored("drive-2.dpm2map") == 1, "the keyframe in the new file")
     assert stored("drive.dpm2map") == 3
-    assert thread.store_problem == ""
+    assert core(mapper).store_problem == ""
 
 
 def test_a_keyframe_of_another_name_is_rejected_and_the_rest_goes_on(mapper: Any) -> None:
     mapper.send(0, np.eye(4), points(0).astype(np.float32))
     mapper.send(1, np.eye(4), points(0).astype(np.float32), name="not a keyframe")
     mapper.send(1, se3.exp([0, 0, 0, 5, 0, 0]), points(1).astype(np.float32))
-    mapper.wait(lambda: mapper.mapper._mapper.keyframes == 2, "two keyframes")
+    mapper.wait(lambda: keyframes(mapper) == 2, "two keyframes")
 
 
 def test_a_restarted_odometry_goes_on_in_the_same_map(mapper: Any) -> None:
     """As a trajectory of its own, which nothing ties to the first; ids count on."""
     for id in (0, 1, 2, 0):
         mapper.send(id, se3.exp([0, 0, 0, 5.0 * id, 0, 0]), points(id))
-    mapper.wait(lambda: mapper.mapper._mapper.keyframes == 4, "all four")
-    core = mapper.mapper._mapper._active.mapper
-    assert [keyframe.id for keyframe in core.keyframes] == [0, 1, 2, 3]
-    assert [(a, b) for a, b, _, _ in core.edges] == [(0, 1), (1, 2)]
-    assert core.T_map_odom_of("") is None
+    mapper.wait(lambda: keyframes(mapper) == 4, "all four")
+    assert [keyframe.id for keyframe in core(mapper).keyframes] == [0, 1, 2, 3]
+    assert [(e.from_node, e.to_node) for e in core(mapper).edges] == [(0, 1), (1, 2)]
+    assert core(mapper).T_map_odom_of("") is None
 
 
 def test_map_to_odom_goes_out_with_every_odometry(mapper: Any) -> None:
@@ -155,10 +164,6 @@ def send_all(mapper: Any, *ids: int, session: str = S, shift: float = 0.0) -> No
     for id in ids:
         T = se3.exp([0, 0, 0, 5.0 * id + shift, 0, 0])
         mapper.send(id, T, points(id), name=keyframe_name("", id, session))
-
-
-def core(mapper: Any) -> Any:
-    return mapper.mapper._mapper._active.mapper
 
 
 def rejections(mapper: Any) -> dict[str, int]:
@@ -210,7 +215,7 @@ def test_nothing_under_the_name_of_a_keyframe_displaces_it(mapper: Any) -> None:
     kinds = {kind.partition(": ")[2] for kind in rejections(mapper)}
     assert kinds == {"covariance", "pose", "frame", "cloud", "size", "descriptors"}
     send_all(mapper, 0, 1, 2)
-    mapper.wait(lambda: mapper.mapper._mapper.keyframes == 3, "the map")
+    mapper.wait(lambda: keyframes(mapper) == 3, "the map")
     np.testing.assert_allclose(core(mapper).poses[:, 0, 3], [0, 5, 10], atol=1e-6)
 
 
@@ -222,7 +227,7 @@ def test_no_name_ends_the_mapper(mapper: Any, name: str) -> None:
     mapper.send(1, np.eye(4), points(1), name=name)
     mapper.wait(lambda: sum(mapper.mapper.rejections.values()) == 3, "three messages rejected")
     send_all(mapper, 0)
-    mapper.wait(lambda: mapper.mapper._mapper.keyframes == 1, "the keyframe after it")
+    mapper.wait(lambda: keyframes(mapper) == 1, "the keyframe after it")
 
 
 def test_descriptors_of_other_weights_are_made_anew(mapper: Any) -> None:
@@ -233,7 +238,7 @@ def test_descriptors_of_other_weights_are_made_anew(mapper: Any) -> None:
     seen, packed = payload_to_msgs(Keyframe(0, 9, 0, np.eye(4), cloud, descriptors=foreign), name, "0123456789abcdef")
     for publisher, message in zip(wire, (pose, seen, packed), strict=True):
         publisher.publish(message)
-    mapper.wait(lambda: mapper.mapper._mapper.keyframes == 1, "the keyframe", timeout=60)
+    mapper.wait(lambda: keyframes(mapper) == 1, "the keyframe", timeout=60)
     assert mapper.mapper.rejections == {"/dpm2/keyframe: descriptors of other weights": 1}
     own = core(mapper).keyframes[0].descriptors
     assert own is None or not np.array_equal(own.features, foreign.features)
@@ -243,59 +248,64 @@ def test_descriptors_of_other_weights_are_made_anew(mapper: Any) -> None:
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Drives count as over after a second."""
     monkeypatch.setattr(feed, "SILENT", 1.0)
-    monkeypatch.setattr(feed, "_BESIDE", 0.3)
+    monkeypatch.setattr(feed, "BESIDE", 0.3)
 
 
 @pytest.mark.usefixtures("quick")
 def test_two_drives_in_one_namespace_are_kept_apart(mapper: Any) -> None:
-    """A forged session, or a second robot by accident: it is said, and each gets on as if alone."""
+    """A forged session, or a second robot by accident: it is reported, and each gets on as if alone."""
     mapper.hear(DiagnosticArray, "/diagnostics")
     send_all(mapper, 0, 1)
-    mapper.wait(lambda: mapper.mapper._mapper.keyframes == 2, "the drive")
+    mapper.wait(lambda: keyframes(mapper) == 2, "the drive")
     send_all(mapper, 0, 1, session=OTHER, shift=100.0)
 
     def apart() -> bool:
         send_all(mapper, 2)  # again and again, as a robot does
         time.sleep(0.1)
-        return mapper.mapper._mapper.keyframes == 5
+        return keyframes(mapper) == 5
 
     mapper.wait(apart, "both drives")
     send_all(mapper, 2, session=OTHER, shift=100.0)
     send_all(mapper, 3)
-    mapper.wait(lambda: mapper.mapper._mapper.keyframes == 7, "both go on")
+    mapper.wait(lambda: keyframes(mapper) == 7, "both go on")
     drives = {name: [k.id for k in core(mapper).keyframes if k.robot == name] for name in core(mapper).robots}
     assert drives == {"": [0, 1, 2, 3], f".{OTHER}": [0, 1, 2]}
     assert len(core(mapper).edges) == 5  # none between the two
 
-    def told() -> bool:
+    def reported() -> bool:
         send_all(mapper, 2, session=OTHER)
         time.sleep(0.1)
         heard = [status for m in mapper.received["/diagnostics"] for status in m.status]
         return any(f"two in one namespace: .{OTHER} kept apart" in status.message for status in heard)
 
-    mapper.wait(told, "the diagnostics")
+    mapper.wait(reported, "the diagnostics")
 
 
 @pytest.mark.usefixtures("quick")
 def test_a_drive_that_another_one_has_replaced_comes_back(mapper: Any) -> None:
-    """The robot was out of reach, somebody began a session in its name meanwhile: nothing that it sends is lost."""
+    """The robot was out of reach, a session in its name began meanwhile: nothing that it sends is lost."""
     for session, ids in ((S, (0, 1)), (OTHER, (0,)), (S, (2, 3))):
         time.sleep(1.2)
-        expected = mapper.mapper._mapper.keyframes + len(ids)
+        expected = keyframes(mapper) + len(ids)
         send_all(mapper, *ids, session=session)
-        mapper.wait(lambda n=expected: mapper.mapper._mapper.keyframes == n, f"{ids} of {session}")
+        mapper.wait(lambda n=expected: keyframes(mapper) == n, f"{ids} of {session}")
     assert [k.robot for k in core(mapper).keyframes] == [""] * 5
-    assert [(a, b) for a, b, *_ in core(mapper).edges] == [(0, 1), (3, 4)]
+    assert [(e.from_node, e.to_node) for e in core(mapper).edges] == [(0, 1), (3, 4)]
 
 
-def test_topics_that_bring_nothing_are_forgotten(mapper: Any) -> None:
+def test_topics_that_bring_nothing_are_forgotten(mapper: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """A thousand namespaces cannot make a thousand subscriptions; a robot that comes after them is heard."""
-    node = mapper.mapper
+    monkeypatch.setattr(mapper_node, "PATIENCE", 1.0)
+    topics = [f"/x{n}/dpm2/keyframe_odom" for n in range(80)]
     many = rclpy.create_node("many", use_global_arguments=False)
-    for n in range(80):
-        many.create_publisher(Odometry, f"/x{n}/dpm2/keyframe_odom", 1)
-    mapper.wait(lambda: len(node._feeds) == 64, "as many as there may be")
-    for topic in list(node._feeds.values()):
-        topic.made -= 60.0  # a minute ago
+    for topic in topics:
+        many.create_publisher(Odometry, topic, 1)
+
+    def heard() -> int:
+        return sum(mapper.node.count_subscribers(topic) for topic in topics)
+
+    mapper.wait(lambda: heard() == 63, "as many as there may be, with its own")
     many.destroy_node()
-    mapper.wait(lambda: list(node._feeds) == [""], "those without a publisher to go")
+    mapper.wait(lambda: heard() == 0, "those without a publisher to go")
+    send_all(mapper, 0)
+    mapper.wait(lambda: keyframes(mapper) == 1, "a robot that is still heard")

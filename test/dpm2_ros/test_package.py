@@ -52,6 +52,8 @@ def test_the_wheel_has_what_ros2_looks_for(wheel: zipfile.ZipFile) -> None:
         "share/dpm2_ros/launch/dpm2.launch.py",
         *(f"lib/dpm2_ros/{name}" for name in EXECUTABLES),
         "dpm2_core/slam/system.py",
+        "dpm2_core/network/presets/small.yaml",
+        "dpm2_core/weights/small.safetensors",
         "dpm2_ros/slam_node.py",
     ):
         assert requested in names
@@ -180,5 +182,5 @@ def test_tf2_msgs_without_a_compiler_is_one_line(tmp_path: Path) -> None:
         command, env=ros_environment(99) | {"PATH": str(tmp_path)}, capture_output=True, text=True, check=False
     )
     assert done.returncode == 1
-    assert done.stderr.startswith("tf2_msgs cannot be built: no gcc on PATH")
+    assert done.stderr.startswith("error: tf2_msgs cannot be built: no gcc on PATH")
     assert len(done.stderr.splitlines()) == 1

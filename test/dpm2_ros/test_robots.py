@@ -37,9 +37,9 @@ pytestmark = pytest.mark.weights
 class Fleet:
     """Processes of robots and of their mapper; scans for each."""
 
-    def __init__(self, harness: Any, street: Path, folder: Path) -> None:
+    def __init__(self, harness: Any, recording: Path, folder: Path) -> None:
         self.harness, self.folder = harness, folder
-        self.source = open_source(street, InputSettings(images=False))
+        self.source = open_source(recording, InputSettings(images=False))
         self.environment = ros_environment(harness.node.context.get_domain_id())
         self.tf = harness.hear(TFMessage, "/tf")
         self.processes: list[subprocess.Popen[bytes]] = []
@@ -115,14 +115,14 @@ class Fleet:
 
 
 @pytest.fixture
-def fleet(ros: Callable[..., Any], street: Path, tmp_path: Path) -> Iterator[Fleet]:
-    made = Fleet(ros(), street, tmp_path)
+def fleet(ros: Callable[..., Any], recording: Path, tmp_path: Path) -> Iterator[Fleet]:
+    made = Fleet(ros(), recording, tmp_path)
     yield made
     made.close()
 
 
 def test_two_robots_one_map_each_with_its_own_correction(fleet: Fleet) -> None:
-    """The second joins late, in the middle of what the first has seen, and is told where it is in the map."""
+    """The second joins late, in the middle of what the first has seen, and learns where it is in the map."""
     fleet.mapper()
     fleet.robot("red")
     fleet.drive("red", *range(19))
@@ -187,14 +187,14 @@ def test_a_robot_that_is_killed_and_comes_back(fleet: Fleet) -> None:
     assert odometry == [(0, 1), (1, 2), (3, 4), (4, 5)]
 
 
-def test_a_keyframe_is_at_most_100_kB_on_the_wire(street: Path) -> None:
+def test_a_keyframe_is_at_most_100_kB_on_the_wire(recording: Path) -> None:
     """Descriptors come out as they went in; a cloud too large is downsampled until it fits, a small one is not
     touched."""
     from dpm2_core.network.pretrained import load_network
     from dpm2_core.slam.loops.place_recognition import PlaceRecognition
     from dpm2_core.slam.store.cloud_codec import unpack_cloud
 
-    points = next(iter(open_source(street, InputSettings(images=False)).frames(0, 1))).points
+    points = next(iter(open_source(recording, InputSettings(images=False)).frames(0, 1))).points
     descriptors = PlaceRecognition(load_network("small", 1)).describe(points)
     assert descriptors is not None
     for cloud in (points, points[::50]):

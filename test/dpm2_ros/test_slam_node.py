@@ -36,7 +36,7 @@ ACCURATE = 0.05  # m: the scans are exact, sampled at 0.35 m, and averaged into 
 
 
 class Rig:
-    """A slam_node, a LiDAR, and ears."""
+    """A slam_node, a LiDAR, and subscriptions."""
 
     def __init__(self, ros: Callable[..., Any], drive: Any, *parameters: str, reliable: bool = True, **options: Any):
         quiet = () if any(p.startswith("input.images") for p in parameters) else ("input.images:=false",)
@@ -76,12 +76,19 @@ class Rig:
     def values(self, part: str = "odometry") -> dict[str, str]:
         return {value.key: value.value for value in self.status(part).values}
 
+    @property
+    def keyframes(self) -> int:
+        """In the map of the node."""
+        return len(self.node.slam.mapper.keyframes)
+
     def stamps(self) -> list[int]:
         return [stamp_ns(message.header) for message in self.odom]
 
 
 @pytest.fixture
-def rig(ros: Callable[..., Any], drive: Any) -> Callable[..., Rig]:
+def rig(ros: Callable[..., Any], drive: Any, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Rig]:
+    """Makes a Rig whose node sends diagnostics ten times a second."""
+    monkeypatch.setattr("dpm2_ros.diagnostics.PERIOD", 0.1)
     return lambda *parameters, **options: Rig(ros, drive, *parameters, **options)
 
 
@@ -90,7 +97,7 @@ def test_every_cloud_gives_its_pose(rig: Callable[..., Rig], drive: Any, reliabl
     """Also from a best-effort publisher, which a reliable subscription would never hear."""
     r = rig("use_sim_time:=true", reliable=reliable)
     clock = r.harness.publisher(Clock, "/clock")
-    r.wait(clock.get_subscription_count, "the ear for /clock")
+    r.wait(clock.get_subscription_count, "the subscription to /clock")
     for n in range(drive.frames):
         clock.publish(Clock(clock=stamp_to_msg(drive.stamp(n))))
         r.send_and_wait(n)
@@ -138,13 +145,15 @@ def test_keyframes_map_path_and_tf(rig: Callable[..., Rig], drive: Any) -> None:
 def test_the_map_is_bounded_and_built_only_for_listeners(rig: Callable[..., Rig], drive: Any) -> None:
     r = rig("ros.map_max_points:=1000", "ros.map_period:=0.1")
     r.send_and_wait(0, 1, 2)
-    display = r.node._mapper._displays[2]
-    time.sleep(0.5)
-    assert display._shown == 0  # nobody listens: nothing was built
+    built, make = [], r.node.slam.mapper.cloud
+    r.node.slam.mapper.cloud = lambda *sizes: (built.append(1), make(*sizes))[1]  # type: ignore[method-assign]
+    time.sleep(0.3)
+    assert not built  # there is no subscriber
     maps = r.harness.hear(PointCloud2, "/dpm2/map", LATCHED)
-    r.wait(lambda: maps, "the map, once somebody listens")
-    time.sleep(0.5)
+    r.wait(lambda: maps, "the map, once there is a subscriber")
+    time.sleep(0.3)
     assert [m.width for m in maps] == [1000]  # and not again while nothing changes
+    assert len(built) == 1
 
 
 def test_tf_can_be_switched_off(rig: Callable[..., Rig]) -> None:
@@ -168,7 +177,7 @@ def test_the_base_is_the_root_of_tf_static(rig: Callable[..., Rig], drive: Any) 
     r = rig()
     static = r.harness.publisher(TFMessage, "/tf_static", latched=True)
     static.publish(TFMessage(transforms=[transform_to_msg(T_base_lidar, 0, "base_link", "lidar")]))
-    r.wait(lambda: "lidar" in r.node._inputs.static.tree.frames, "/tf_static")
+    r.wait(lambda: "lidar" in r.node.calibration.transforms.frames, "/tf_static")
     r.send_and_wait(*range(8))
     for n, message in enumerate(r.odom):
         assert message.child_frame_id == "base_link"
@@ -183,7 +192,7 @@ def publish_static(r: Rig, parent: str, child: str, T: Any) -> None:
     """By a publisher of its own, as drivers and robot_state_publisher are."""
     publisher = r.harness.publisher(TFMessage, "/tf_static", latched=True)
     publisher.publish(TFMessage(transforms=[transform_to_msg(T, 0, parent, child)]))
-    r.wait(lambda: child in r.node._inputs.static.tree.frames, "/tf_static")
+    r.wait(lambda: child in r.node.calibration.transforms.frames, "/tf_static")
 
 
 def test_nothing_is_published_before_the_base_is_reachable_and_nothing_is_lost(
@@ -192,7 +201,7 @@ def test_nothing_is_published_before_the_base_is_reachable_and_nothing_is_lost(
     """The driver's part of /tf_static comes first, that of the robot with the base three clouds later."""
     r = rig("ros.base_frame:=base_link", "ros.tf_timeout:=0.1")
     keyframes, tf = r.harness.hear(Odometry, "/dpm2/keyframe_odom"), r.harness.hear(TFMessage, "/tf")
-    r.wait(lambda: r.node.count_subscribers("/tf") and r.node.count_subscribers("/dpm2/keyframe_odom"), "ears")
+    r.wait(lambda: r.node.count_subscribers("/tf") and r.node.count_subscribers("/dpm2/keyframe_odom"), "subscriptions")
     publish_static(r, "os_sensor", "lidar", T_SENSOR_LIDAR)
     for n in range(3):
         r.send(n)
@@ -257,8 +266,8 @@ def test_the_lidars_own_frame_is_the_base_where_tf_static_does_not_name_it(rig: 
     assert [message.child_frame_id for message in r.odom] == ["lidar", "lidar"]
 
 
-def test_stamps_of_another_clock_are_told(rig: Callable[..., Rig]) -> None:
-    """A recording without /clock, or a sensor whose clock nobody has set: a warning with both values."""
+def test_stamps_of_another_clock_are_reported(rig: Callable[..., Rig]) -> None:
+    """A recording without /clock, or a sensor whose clock is not set: a warning with both values."""
     r = rig()
     r.send_and_wait(0, 1, 2)
     status = r.status()
@@ -271,11 +280,12 @@ def test_stamps_of_another_clock_are_told(rig: Callable[..., Rig]) -> None:
     assert abs(float(values["clock (s)"]) - time.time()) < 60
 
 
-def test_sim_time_without_a_clock_is_told(rig: Callable[..., Rig]) -> None:
+def test_sim_time_without_a_clock_is_reported(rig: Callable[..., Rig]) -> None:
     r = rig("use_sim_time:=true")
     r.send_and_wait(0, 1, 2)
-    assert r.status().message.endswith("use_sim_time is on, and nobody publishes /clock")
-    assert r.status().level == DiagnosticStatus.WARN
+    status = r.status()
+    assert status.message.endswith("use_sim_time is on, and /clock has no publisher")
+    assert status.level == DiagnosticStatus.WARN
 
 
 class Camera:
@@ -285,7 +295,8 @@ class Camera:
         self._rig = r
         self._image, self._info = r.harness.publisher(Image, IMAGE), r.harness.publisher(CameraInfo, CAMERA_INFO)
         r.wait(
-            lambda: self._image.get_subscription_count() and self._info.get_subscription_count(), "the camera's ears"
+            lambda: self._image.get_subscription_count() and self._info.get_subscription_count(),
+            "subscribers",
         )
 
     def send(self, n: int, offset: float = 0.0) -> None:
@@ -346,7 +357,7 @@ def test_a_missing_extrinsic_rejects_the_images_and_says_so(rig: Callable[..., R
 
 
 def test_a_camera_that_never_comes_comes_late_and_stops(rig: Callable[..., Rig], drive: Any) -> None:
-    """Every cloud gets its pose all the while, and /diagnostics tells."""
+    """Every cloud gets its pose all the while, and /diagnostics shows it."""
     r, camera = with_camera(rig, PLACE, "ros.sync_timeout:=0.05")
     frames = record_frames(r)
     r.send_and_wait(0, 1, 2)
@@ -358,14 +369,14 @@ def test_a_camera_that_never_comes_comes_late_and_stops(rig: Callable[..., Rig],
     assert r.status("camera").level == DiagnosticStatus.OK
     r.send_and_wait(*range(10, drive.frames))
     assert [bool(frame.images) for frame in frames] == [3 <= n < 10 for n in range(drive.frames)]
-    r.wait(lambda: r.status("camera").level == DiagnosticStatus.WARN, "the silence of the camera to be noticed")
-    assert "no image" in r.status("camera").message
+    r.wait(lambda: "no image" in r.status("camera").message, "the silence of the camera to be noticed")
+    assert r.status("camera").level == DiagnosticStatus.WARN
 
 
 def test_without_a_camera_no_cloud_waits_for_one(rig: Callable[..., Rig], drive: Any) -> None:
     """Images are wanted by default; a drive without any is as fast from its first cloud on as one that wants none."""
     r = rig("input.images:=true", "ros.sync_timeout:=5.0")
-    assert r.node._odometry.uses_images
+    assert r.node.slam.odometry.uses_images
     began = time.monotonic()
     r.send_and_wait(*range(drive.frames))
     assert time.monotonic() - began < 5.0  # a single wait would last that long; without any it is under a second
@@ -378,27 +389,29 @@ def test_images_that_nothing_looks_at_are_not_received(rig: Callable[..., Rig]) 
 
 
 def test_keyframes_that_no_mapper_has_received_are_counted(rig: Callable[..., Rig], drive: Any) -> None:
-    """Without a mapper that answers all are missing, a warning; once one says it has some, they are not."""
+    """Without a mapper all are missing, a warning; once one acknowledges some, they are not."""
     r = rig("ros.embed_mapper:=false", "slam.keyframes.distance:=0.5")
     received = r.harness.publisher(UInt32MultiArray, "/dpm2/keyframes_received")
+    poses = r.harness.hear(Odometry, "/dpm2/keyframe_odom")
+    r.wait(lambda: r.node.count_subscribers("/dpm2/keyframe_odom"), "the subscription")
     r.send_and_wait(*range(drive.frames))
     r.wait(lambda: r.status("mapper").message.startswith(f"0 of {drive.frames} keyframes"), "the count")
     assert r.status("mapper").level == DiagnosticStatus.WARN
-    received.publish(received_to_msg(r.node._sender.session, 5, [7]))
-    r.wait(lambda: r.status("mapper").message.startswith(f"6 of {drive.frames} keyframes"), "the answer to count")
+    received.publish(received_to_msg(poses[0].child_frame_id.rpartition(".")[2], 5, [7]))
+    r.wait(lambda: r.status("mapper").message.startswith(f"6 of {drive.frames} keyframes"), "the acknowledgment")
     assert r.status("mapper").level == DiagnosticStatus.OK
 
 
 def record_frames(r: Rig) -> list[Any]:
     """What the odometry is given."""
     frames: list[Any] = []
-    process = r.node._odometry.process
+    process = r.node.slam.odometry.process
 
     def recording(frame: Any) -> Any:
         frames.append(frame)
         return process(frame)
 
-    r.node._odometry.process = recording  # type: ignore[method-assign]
+    r.node.slam.odometry.process = recording  # type: ignore[method-assign]
     return frames
 
 
@@ -460,21 +473,25 @@ def test_stamps_that_repeat_or_go_back(rig: Callable[..., Rig], drive: Any) -> N
 def test_time_that_goes_back_restarts_the_odometry_and_keeps_the_map(
     rig: Callable[..., Rig], drive: Any, back: float
 ) -> None:
-    """Where the robot is in the map is not known then before a loop is found, and not told."""
+    """Where the robot is in the map is not known then before a loop is found, and not published."""
     r = rig("slam.loops.enabled:=false")
     tf = r.harness.hear(TFMessage, "/tf")
     r.send_and_wait(*range(drive.frames))
-    before = r.node._mapper.keyframes
-    assert before >= 3
-    seen = len(tf)
-    for n in range(2):  # together: the second tells that the first is true
+    r.wait(lambda: r.keyframes == 3, "the keyframes at 0, 5.6 and 11.2 m")
+    before = 3
+
+    def map_to_odom() -> int:
+        return sum(t.header.frame_id == "map" for message in tf for t in message.transforms)
+
+    r.wait(lambda: map_to_odom() == drive.frames, "map -> odom of each cloud")
+    for n in range(2):  # together: the second confirms the first
         r.send(n, stamp=drive.stamp(n + drive.frames) - round(back * 1e9) - drive.period)
     r.wait(lambda: len(r.odom) == drive.frames + 2, "the clouds after the jump")
     assert transform_matrix(r.odom[-2].pose.pose)[:3, 3] == pytest.approx([0, 0, 0], abs=1e-9)
-    r.wait(lambda: r.node._mapper.keyframes == before + 1, "the keyframe after the jump")
+    r.wait(lambda: r.keyframes == before + 1, "the keyframe after the jump")
     r.send_and_wait(2, stamp=drive.stamp(2 + drive.frames) - round(back * 1e9) - drive.period)
     assert r.values()["restarts"] == "1"
-    assert "map" not in {t.header.frame_id for m in tf[seen:] for t in m.transforms}
+    assert map_to_odom() == drive.frames  # none since
 
 
 def test_one_cloud_stamped_far_ahead_costs_that_cloud_alone(rig: Callable[..., Rig], drive: Any) -> None:
@@ -499,7 +516,7 @@ def test_clouds_that_stop_are_noticed(rig: Callable[..., Rig]) -> None:
     assert r.status().level == DiagnosticStatus.STALE
 
 
-def test_a_wrong_topic_is_told_with_the_right_one(ros: Callable[..., Any], drive: Any) -> None:
+def test_a_wrong_topic_is_reported_with_the_right_one(ros: Callable[..., Any], drive: Any) -> None:
     r = Rig.__new__(Rig)
     r.harness = ros("input.points_topic:=/points", "input.images:=false")
     r.wait, r.diagnostics = r.harness.wait, r.harness.hear(DiagnosticArray, "/diagnostics")
@@ -510,8 +527,8 @@ def test_a_wrong_topic_is_told_with_the_right_one(ros: Callable[..., Any], drive
 
 def test_an_overloaded_node_drops_the_oldest_and_counts(rig: Callable[..., Rig], drive: Any) -> None:
     r = rig("ros.queue_depth:=2")
-    process = r.node._odometry.process
-    r.node._odometry.process = lambda frame: (time.sleep(0.4), process(frame))[1]  # type: ignore[method-assign]
+    process = r.node.slam.odometry.process
+    r.node.slam.odometry.process = lambda frame: (time.sleep(0.4), process(frame))[1]  # type: ignore[method-assign]
     for n in range(8):
         r.send(n)
         time.sleep(0.05)
@@ -529,7 +546,7 @@ def call(r: Rig, service: str) -> Trigger.Response:
     return future.result()
 
 
-def test_save_map_answers_in_words(rig: Callable[..., Rig], drive: Any, tmp_path: Path) -> None:
+def test_save_map_says_what_it_did(rig: Callable[..., Rig], drive: Any, tmp_path: Path) -> None:
     r = rig(f"ros.map_directory:={tmp_path / 'map'}")
     result = call(r, "/slam_node/save_map")
     assert (result.success, result.message) == (False, "no map is saved: there is no keyframe yet")
@@ -546,7 +563,7 @@ def test_save_map_answers_in_words(rig: Callable[..., Rig], drive: Any, tmp_path
     ]
 
 
-def test_a_map_that_cannot_be_saved_is_an_answer(rig: Callable[..., Rig], drive: Any, tmp_path: Path) -> None:
+def test_a_map_that_cannot_be_saved_is_a_response(rig: Callable[..., Rig], drive: Any, tmp_path: Path) -> None:
     """The disk is full as far as the file system goes: the map's folder is a file."""
     r = rig(f"ros.map_directory:={tmp_path / 'map'}")
     r.send_and_wait(0)
@@ -562,6 +579,6 @@ def test_reset_starts_again(rig: Callable[..., Rig], drive: Any) -> None:
     r = rig()
     r.send_and_wait(*range(6))
     assert call(r, "/slam_node/reset").success
-    r.wait(lambda: r.node._mapper.keyframes == 0, "the empty map")
+    r.wait(lambda: r.keyframes == 0, "the empty map")
     r.send_and_wait(6)
     assert transform_matrix(r.odom[-1].pose.pose)[:3, 3] == pytest.approx([0, 0, 0], abs=1e-9)

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a mapper holds of a drive is bounded, nothing is lost for it, and no single answer makes a robot give up."""
+"""What a mapper holds of a drive is bounded, nothing is lost for it, and no single reply makes a robot give up."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from dpm2_ros.keyframes import Answers
+from dpm2_ros.keyframes import Acks
 from dpm2_ros.streams import AHEAD, Stream
 
 CLOUD = bytes(100_000)
@@ -43,13 +43,13 @@ def test_ids_far_ahead_cost_no_memory() -> None:
         put(stream, id)
         stream.put(id % AHEAD, "cloud", CLOUD)
     assert stream.holds < 3 * AHEAD * len(CLOUD)
-    assert len(stream.above) < AHEAD  # what is told to the robot: it sends the rest again
+    assert len(stream.above) < AHEAD  # what the robot learns: it sends the rest again
     put(stream, 0)
     assert taken(stream) == list(range(AHEAD))
 
 
 def test_a_keyframe_that_is_never_sound_holds_up_the_others_for_seconds_only() -> None:
-    """One that is merely late is waited for, however often somebody sends something else under its name at first."""
+    """One that is merely late is waited for, however often something else is sent under its name at first."""
     stream = Stream("5f3a9c01", 0.0)
     put(stream, 1)
     assert stream.give_up(1000.0) is None
@@ -62,8 +62,8 @@ def test_a_keyframe_that_is_never_sound_holds_up_the_others_for_seconds_only() -
 
 @pytest.mark.parametrize("claim", [(9, set()), (2, {5, 6, 7, 8})])
 def test_an_answer_that_claims_too_much_is_outweighed(claim: tuple[int, set[int]]) -> None:
-    """The mapper has 0, 1, 2 and 5; somebody else says, hundreds of times per second, that it has more."""
-    results = Answers()
+    """The mapper has 0, 1, 2 and 5; another sender says, hundreds of times per second, that it has more."""
+    results = Acks()
     for tick in range(40):
         now = 0.1 * tick
         if tick % 5 == 0:
@@ -74,12 +74,12 @@ def test_an_answer_that_claims_too_much_is_outweighed(claim: tuple[int, set[int]
         assert above <= {5}
 
 
-def test_answers_follow_the_mapper() -> None:
-    results = Answers()
+def test_acknowledgments_follow_the_mapper() -> None:
+    results = Acks()
     assert results.agreed == (0, frozenset())
     for tick in range(10):
         results.add(tick, {tick + 2}, 0.5 * tick)
-    assert results.agreed[0] >= 8  # the last two answers
+    assert results.agreed[0] >= 8  # the last two
     for tick in range(10, 14):
         results.add(0, set(), 0.5 * tick)  # another mapper has nothing
     assert results.agreed == (0, frozenset())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What comes in is judged by the topics that are really listened to, after remapping; what is absurd is ignored."""
+"""What comes in is checked by the topics that are really subscribed to, after remapping; what is absurd is ignored."""
 
 from __future__ import annotations
 
@@ -15,14 +15,13 @@ from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import Float64
 
+from dpm2_core.data.frames import FrameBuilder
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.frame import Points
 from dpm2_ros.conversions import cloud_to_msg
-from dpm2_ros.frames import FrameBuilder
 from dpm2_ros.guard import GuardedNode
 from dpm2_ros.settings import RosSettings
 from dpm2_ros.subscriptions import LATCHED, Inputs
-from dpm2_ros.synchronizer import Bundle
 
 CLOUD: Points = np.array([[50, 0, 0, 0.5], [0, 30, 1, 0.5]], np.float32)
 
@@ -46,15 +45,15 @@ def inputs(node: Node, **settings: Any) -> Inputs:
 
 def raised(inputs: Inputs) -> float:
     """Degrees by which the points of a cloud have been raised."""
-    frame = FrameBuilder(InputSettings(), inputs, print).frame(Bundle(0, cloud_to_msg(CLOUD, 1, "lidar"), 0, False), 0)
+    frame = FrameBuilder(InputSettings(), inputs.calibration, print).frame(0, cloud_to_msg(CLOUD, 1, "lidar"), None, 0)
     return math.degrees(math.atan2(frame.points[0, 2], frame.points[0, 0]))
 
 
 def test_a_remapped_lidar_has_not_the_error_of_kittis(node: Callable[..., Node]) -> None:
     """The setting still names KITTI's topic, and the clouds come from elsewhere."""
-    ears = inputs(node("/kitti/velo/pointcloud:=/ouster/points"))
-    assert ears.points_topic == "/ouster/points"
-    assert raised(ears) == 0
+    made = inputs(node("/kitti/velo/pointcloud:=/ouster/points"))
+    assert made.calibration.points_topic == "/ouster/points"
+    assert raised(made) == 0
 
 
 def test_kittis_own_topic_has_it(node: Callable[..., Node]) -> None:
@@ -66,18 +65,17 @@ def test_kittis_own_topic_has_it(node: Callable[..., Node]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("remappings", "namespace", "settings", "kind", "image", "info"),
+    ("remappings", "namespace", "settings", "image", "info"),
     [
-        ((), "", {}, Image, "/kitti/camera_color_left/image_raw", "/kitti/camera_color_left/camera_info"),
-        ((), "", {"image_topic": "/a/b/compressed"}, CompressedImage, "/a/b/compressed", "/a/camera_info"),
-        ((), "/red", {"image_topic": "cam/image"}, Image, "/red/cam/image", "/red/cam/camera_info"),
-        ((), "/red", {"image_topic": "/image"}, Image, "/image", "/camera_info"),
-        ((), "/red", {"image_topic": "image"}, Image, "/red/image", "/red/camera_info"),
+        ((), "", {}, "/kitti/camera_color_left/image_raw", "/kitti/camera_color_left/camera_info"),
+        ((), "", {"image_topic": "/a/b/compressed"}, "/a/b/compressed", "/a/camera_info"),
+        ((), "/red", {"image_topic": "cam/image"}, "/red/cam/image", "/red/cam/camera_info"),
+        ((), "/red", {"image_topic": "/image"}, "/image", "/camera_info"),
+        ((), "/red", {"image_topic": "image"}, "/red/image", "/red/camera_info"),
         (
             ("/kitti/camera_color_left/image_raw:=/cam/image/compressed",),
             "",
             {},
-            CompressedImage,
             "/cam/image/compressed",
             "/cam/camera_info",
         ),
@@ -85,11 +83,10 @@ def test_kittis_own_topic_has_it(node: Callable[..., Node]) -> None:
             ("/kitti/camera_color_left/image_raw:=/cam/image", "/kitti/camera_color_left/camera_info:=/calibration"),
             "",
             {},
-            Image,
             "/cam/image",
             "/calibration",
         ),
-        (("/c/image:=/a/image",), "", {"image_topic": "/c/image", "camera_info_topic": "/b"}, Image, "/a/image", "/b"),
+        (("/c/image:=/a/image",), "", {"image_topic": "/c/image", "camera_info_topic": "/b"}, "/a/image", "/b"),
     ],
 )  # fmt: skip
 def test_image_type_and_calibration_follow_the_remapped_topic(
@@ -97,13 +94,13 @@ def test_image_type_and_calibration_follow_the_remapped_topic(
     remappings: tuple[str, ...],
     namespace: str,
     settings: dict[str, str],
-    kind: type,
     image: str,
     info: str,
 ) -> None:
+    kind = CompressedImage if image.endswith("/compressed") else Image
     n = node(*remappings, namespace=namespace)
-    ears = inputs(n, **settings)
-    assert ears.image_topic == image
+    made = inputs(n, **settings)
+    assert made.calibration.image_topic == image
     listening = {(s.topic_name, s.msg_type) for s in n.subscriptions}
     assert {(image, kind), (info, CameraInfo)} <= listening
 
@@ -111,7 +108,7 @@ def test_image_type_and_calibration_follow_the_remapped_topic(
 def test_a_remapping_is_applied_once(node: Callable[..., Node]) -> None:
     """Two topics that change places: what a second application would undo."""
     n = node("/a:=/b", "/b:=/a")
-    assert inputs(n, points_topic="/a", images=False).points_topic == "/b"
+    assert inputs(n, points_topic="/a", images=False).calibration.points_topic == "/b"
     assert "/b" in {s.topic_name for s in n.subscriptions}
     assert "/a" not in {s.topic_name for s in n.subscriptions}
 
@@ -120,12 +117,12 @@ def test_a_remapping_is_applied_once(node: Callable[..., Node]) -> None:
 def test_an_absurd_correction_from_the_wire_is_ignored(node: Callable[..., Node], value: float) -> None:
     """Whoever publishes it, and whatever came before it."""
     n = node()
-    ears = inputs(n)
+    made = inputs(n)
     publisher = n.create_publisher(Float64, "/kitti/vertical_angle_correction_deg", LATCHED)
     for data in (1.5, value, 2.5):
         publisher.publish(Float64(data=data))
     seen = set()
     while 2.5 not in seen:
         rclpy.spin_once(n, timeout_sec=5)
-        seen.add(ears.angle_correction_deg)
+        seen.add(made.calibration.angle_correction_deg)
     assert seen <= {None, 1.5, 2.5}

@@ -12,25 +12,23 @@ import pytest
 
 from dpm2_core import open_source
 from dpm2_core.geometry import se3
-from dpm2_core.sim.drive import simulate
-from dpm2_core.sim.settings import LidarConfig
+
+from ..helpers.drives import first_scans
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 FRAMES = 14
 
 
 @pytest.fixture(scope="module")
-def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """13 m of a street."""
-    root = tmp_path_factory.mktemp("drive") / "sim"
-    simulate(root, FRAMES, seed=2, road="straight", preset="suburb", images=False, lidar=LidarConfig(columns=900))
-    return root
+def recording(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """13 m of it."""
+    return first_scans(recording, FRAMES, tmp_path_factory.mktemp("first"))
 
 
 @pytest.fixture(scope="module")
-def truth(drive: Path) -> np.ndarray:
+def truth(recording: Path) -> np.ndarray:
     """(N, 4, 4) T_first_lidar."""
-    poses = open_source(drive).poses
+    poses = open_source(recording).poses
     assert poses is not None
     return np.asarray(se3.inverse(poses[0]) @ poses)
 
@@ -41,8 +39,8 @@ def example(name: str, *arguments: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
 
 
-def test_odometry_of_a_folder_in_ten_lines(drive: Path, truth: np.ndarray, tmp_path: Path) -> None:
-    done = example("odometry_of_a_folder", drive, tmp_path / "poses.txt")
+def test_odometry_of_a_folder_in_ten_lines(recording: Path, truth: np.ndarray, tmp_path: Path) -> None:
+    done = example("odometry_of_a_folder", recording, tmp_path / "poses.txt")
     assert done.returncode == 0, done.stderr
     assert done.stdout == f"{FRAMES} frames, 0 of them not registered\n"
     estimate = np.loadtxt(tmp_path / "poses.txt").reshape(-1, 3, 4)
@@ -51,17 +49,17 @@ def test_odometry_of_a_folder_in_ten_lines(drive: Path, truth: np.ndarray, tmp_p
     assert len([line for line in lines if line and not line.startswith(("#", '"""'))]) <= 10
 
 
-def test_register_two_scans_and_draw_them(drive: Path, truth: np.ndarray, tmp_path: Path) -> None:
+def test_register_two_scans_and_draw_them(recording: Path, truth: np.ndarray, tmp_path: Path) -> None:
     """Some 5 m apart; the network alone is right to a few decimeters."""
-    done = example("register_two_scans", drive, 0, 5, tmp_path / "matches.png")
+    done = example("register_two_scans", recording, 0, 5, tmp_path / "matches.png")
     assert done.returncode == 0, done.stderr
     found = [float(word) for word in done.stdout.split(" m in ")[0].split()[-3:]]
     assert np.linalg.norm(found - truth[5, :3, 3]) < 0.5
     assert (tmp_path / "matches.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_map_then_localize(drive: Path, truth: np.ndarray, tmp_path: Path) -> None:
-    done = example("map_then_localize", drive, drive, tmp_path / "street.dpm2map")
+def test_map_then_localize(recording: Path, truth: np.ndarray, tmp_path: Path) -> None:
+    done = example("map_then_localize", recording, recording, tmp_path / "street.dpm2map")
     assert done.returncode == 0, done.stderr
     rows = np.array([line.split() for line in done.stdout.splitlines()], float)
     assert len(rows) == FRAMES  # found at once

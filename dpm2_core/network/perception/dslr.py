@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """DSLR (Kumar et al., AAAI 2021): a scan without what moves, from one with it, by an adversarially trained autoencoder.
 
-An autoencoder learns static scans; a discriminator learns to tell a pair of static codes from a static and a dynamic
-one; then a copy of the encoder learns to give dynamic scans codes that pass for static and decode to the static twin.
+An autoencoder learns static scans; a discriminator learns to distinguish a pair of static codes from a static and a
+dynamic one; then a copy of the encoder learns to give dynamic scans codes that pass for static and decode to the
+static twin.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which points of one scan are of things that move, or could: a small encoder-decoder over a grid seen from above.
 
-A column of the grid says in which layers of height above the ground it has points; the answer has the same shape. Only
+A column of the grid says in which layers of height above the ground it has points; the output has the same shape. Only
 occupancy goes in, no counts, no intensity and no height of the sensor: so that another LiDAR looks much the same.
 """
 

@@ -218,7 +218,7 @@ def _covariances(path: Path, lines: _Lines, upper: Array, planar: bool) -> Array
 
 
 def _graph(poses: Array, ends: NDArray[np.intp], T: Array, covariances: Array, fixed: NDArray[np.intp]) -> GraphData:
-    """Tell the odometry from the loops: the first edge between two neighboring nodes is odometry."""
+    """Separate the odometry from the loops: the first edge between two neighboring nodes is odometry."""
     count = len(poses)
     backward = ends[:, 0] - ends[:, 1] == 1
     flipped = se3.adjoint(T)  # T_b_a's covariance is that of T_a_b, seen from the other end

@@ -4,14 +4,14 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.frame import Array
+from dpm2_core.frame import Array, Edge
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph import robust
 from dpm2_core.slam.graph.g2o import G2o, write_g2o
@@ -20,7 +20,8 @@ from dpm2_core.slam.graph.robust import RobustSettings, Solution
 from dpm2_core.slam.graph.worker import GraphWorker
 
 _log = logging.getLogger(__name__)
-_SHORT = 50  # loops: fewer are solved in about 20 ms, sooner than they are sent anywhere
+SHORT = 50
+"""Loops; fewer are solved in about 20 ms, sooner than they are sent to another process."""
 _ATTEMPTS = 2  # processes that may die over one graph
 
 
@@ -29,20 +30,6 @@ class PoseGraphSettings(RobustSettings):
 
     background: bool = False
     """Optimize in another process while the drive goes on, for a live system; the result then depends on its timing."""
-
-
-@dataclass(frozen=True)
-class LoopCheck:
-    """What the graph thinks of a loop; a later one may differ.
-
-    Attributes:
-        kept: False: the poses do without it. reason: in words, empty until it has been judged.
-    """
-
-    from_node: int
-    to_node: int
-    kept: bool
-    reason: str
 
 
 class PoseGraph:
@@ -55,13 +42,10 @@ class PoseGraph:
     def __init__(self, settings: PoseGraphSettings) -> None:
         self._settings = settings
         self._poses: list[Array] = []
-        self._before: list[int] = []  # by odometry; -1 where a trajectory begins
+        self._steps: list[Edge | None] = []  # the odometry to each node; None where a trajectory begins
         self._trajectory: list[int] = []  # number of each node's
         self._ends: list[int] = []  # last node of each trajectory
-        self._steps: list[Array] = []
-        self._step_covariances: list[Array] = []
-        self._loops: list[tuple[int, int, Array, Array]] = []
-        self._loop_checks: list[LoopCheck] = []
+        self._loops: list[Edge] = []
         self._worker = GraphWorker()
         self._moved = False  # a part, since a graph was sent: its solution is of no use
         self._sent = 0  # loops in the graph that is being solved
@@ -81,59 +65,47 @@ class PoseGraph:
         return self._poses[node]
 
     @property
-    def edges(self) -> list[tuple[int, int, Array, Array]]:
-        """Odometry edges, then the loops that are kept or not judged yet: from, to, T_from_to, covariance."""
-        chain = [
-            (before, node, self._steps[node], self._step_covariances[node])
-            for node, before in enumerate(self._before)
-            if before >= 0
-        ]
-        return chain + [loop for loop, info in zip(self._loops, self._loop_checks, strict=True) if info.kept]
+    def edges(self) -> list[Edge]:
+        """Odometry edges, then the loops that are kept or not checked yet."""
+        return [step for step in self._steps if step is not None] + [loop for loop in self._loops if loop.ok]
 
     @property
-    def loop_checks(self) -> list[LoopCheck]:
-        """One for each loop, in the order in which they were added."""
-        return list(self._loop_checks)
+    def loops(self) -> list[Edge]:
+        """All in the order in which they were added; `ok` and `reason` by the last optimization."""
+        return list(self._loops)
 
     @property
     def busy(self) -> bool:
         """Whether another process is optimizing."""
         return self._worker.busy
 
-    def add_node(
-        self, T_map_kf: Array, T_before_this: Array | None, covariance: Array | None, before: int | None = None
-    ) -> None:
-        """Append a keyframe: with an edge to the one before, or as the start of a trajectory of its own.
+    def add_node(self, T_map_kf: Array, odometry: Edge | None = None) -> None:
+        """Append a keyframe: with an edge from the last node of its trajectory, or as the start of another one.
 
         A part of the graph that nothing ties to another keeps the pose of its first node.
 
-        Args:
-            before: the last node of its trajectory, where several grow at a time; None: the last node of all.
-
         Raises:
-            ValueError: odometry goes on from there already.
+            ValueError: the edge does not lead to the new node, or odometry goes on from its other end already.
             Dpm2Error: the pose or the edge is not sound; nothing was appended.
         """
-        _check("node", len(self), T_map_kf)
         node = len(self)
-        if T_before_this is None or covariance is None:
-            before, T_before_this, covariance = -1, np.eye(4), np.zeros((6, 6))
+        _check("node", node, T_map_kf)
+        if odometry is None:
             self._trajectory.append(len(self._ends))
             self._ends.append(node)
         else:
-            _check("edge to node", node, T_before_this, covariance)
-            before = node - 1 if before is None else before
-            number = self._trajectory[before]
-            if self._ends[number] != before:
-                raise ValueError(f"node {before} is not the last of its trajectory")
+            _check("edge to node", node, odometry.T_from_to, odometry.covariance)
+            if odometry.to_node != node:
+                raise ValueError(f"the edge leads to node {odometry.to_node}, not to {node}")
+            number = self._trajectory[odometry.from_node]
+            if self._ends[number] != odometry.from_node:
+                raise ValueError(f"node {odometry.from_node} is not the last of its trajectory")
             self._trajectory.append(number)
             self._ends[number] = node
-        self._before.append(before)
         self._poses.append(T_map_kf)
-        self._steps.append(T_before_this)
-        self._step_covariances.append(covariance)
+        self._steps.append(odometry)
 
-    def add_loop(self, from_node: int, to_node: int, T_from_to: Array, covariance: Array) -> None:
+    def add_loop(self, loop: Edge) -> None:
         """Tie two keyframes that saw the same place.
 
         Where it is the first between two parts of the graph, the younger one is moved there as it is: from any other
@@ -142,27 +114,26 @@ class PoseGraph:
         Raises:
             Dpm2Error: the loop is not sound; nothing was added.
         """
-        _check("loop to node", to_node, T_from_to, covariance)
+        _check("loop to node", loop.to_node, loop.T_from_to, loop.covariance)
         parts = self._parts()
-        a, b = parts[self._trajectory[from_node]], parts[self._trajectory[to_node]]
+        a, b = parts[self._trajectory[loop.from_node]], parts[self._trajectory[loop.to_node]]
         if a != b:
-            T_to = self._poses[from_node] @ T_from_to  # where the loop has that node
-            T = T_to @ se3.inverse(self._poses[to_node])
+            T_to = self._poses[loop.from_node] @ loop.T_from_to  # where the loop has that node
+            T = T_to @ se3.inverse(self._poses[loop.to_node])
             self._move(max(a, b), T if b > a else se3.inverse(T), parts)
-        self._loops.append((from_node, to_node, T_from_to, covariance))
-        self._loop_checks.append(LoopCheck(from_node, to_node, True, ""))
+        self._loops.append(loop)
 
     def part(self, node: int) -> int:
         """Number of the part of the graph that a node is in: nodes of two parts have nothing to do with each other."""
         return self._parts()[self._trajectory[node]]
 
     def optimize(self) -> None:
-        """Move the poses to the optimum and judge the loops: here and now, or (`background`) in another process.
+        """Move the poses to the optimum and check the loops: here and now, or (`background`) in another process.
 
         Raises:
             Dpm2Error: the graph cannot be solved.
         """
-        if self._settings.background and len(self._loops) >= _SHORT:
+        if self._settings.background and len(self._loops) >= SHORT:
             self.collect()
             if not self.busy:
                 self._submit()
@@ -228,12 +199,15 @@ class PoseGraph:
 
     def write_g2o(self, path: Path) -> None:
         """All vertices, the odometry and the loops that are kept, in g2o's SE3:QUAT format at full precision."""
-        kept = np.array([info.kept for info in self._loop_checks], np.bool_)
-        write_g2o(path, G2o(self._data(), self._order(), planar=False), kept)
+        write_g2o(path, G2o(self._data(), self._order(), planar=False), self._kept())
 
     def _joint(self, nodes: list[int]) -> Array:
-        kept, data = np.array([info.kept for info in self._loop_checks], np.bool_), self._data()
-        return robust.joint_covariance(data, data.poses, kept, self._places()[nodes])
+        data = self._data()
+        return robust.joint_covariance(data, data.poses, self._kept(), self._places()[nodes])
+
+    def _kept(self) -> NDArray[np.bool_]:
+        """(E,) which loops constrain the poses."""
+        return np.array([loop.ok for loop in self._loops], np.bool_)
 
     def _order(self) -> NDArray[np.intp]:
         """(N,) nodes as the solver has them: one trajectory after the other, so that each is a chain."""
@@ -244,24 +218,26 @@ class PoseGraph:
         return np.argsort(self._order())
 
     def _data(self) -> GraphData:
-        order = self._order()
-        ends = np.array([loop[:2] for loop in self._loops], np.intp).reshape(-1, 2)
+        order, steps = self._order(), self._steps
+        ends = np.array([(loop.from_node, loop.to_node) for loop in self._loops], np.intp).reshape(-1, 2)
         return GraphData(
             self.poses[order],
-            np.array(self._before, np.intp)[order] >= 0,
-            np.array(self._steps).reshape(-1, 4, 4)[order],
-            np.array(self._step_covariances).reshape(-1, 6, 6)[order],
+            np.array([step is not None for step in steps], np.bool_)[order],
+            np.array([np.eye(4) if step is None else step.T_from_to for step in steps]).reshape(-1, 4, 4)[order],
+            np.array([np.zeros((6, 6)) if step is None else step.covariance for step in steps]).reshape(-1, 6, 6)[
+                order
+            ],
             self._places()[ends],
-            np.array([loop[2] for loop in self._loops]).reshape(-1, 4, 4),
-            np.array([loop[3] for loop in self._loops]).reshape(-1, 6, 6),
+            np.array([loop.T_from_to for loop in self._loops]).reshape(-1, 4, 4),
+            np.array([loop.covariance for loop in self._loops]).reshape(-1, 6, 6),
         )
 
     def _parts(self) -> list[int]:
         """Of each trajectory, the oldest one that loops tie it to."""
         parts = list(range(len(self._ends)))
-        for (a, b, *_), info in zip(self._loops, self._loop_checks, strict=True):
-            one, other = sorted((parts[self._trajectory[a]], parts[self._trajectory[b]]))
-            if info.kept and one != other:
+        for loop in self._loops:
+            one, other = sorted(parts[self._trajectory[node]] for node in (loop.from_node, loop.to_node))
+            if loop.ok and one != other:
                 parts = [one if part == other else part for part in parts]
         return parts
 
@@ -286,9 +262,9 @@ class PoseGraph:
             at = last.get(self._trajectory[node])
             if at is not None:  # else another trajectory: nothing ties it to what moved
                 self._poses[node] = self._poses[at] @ se3.inverse(old[at]) @ self._poses[node]
-        for loop in range(loops):
-            a, b = self._loops[loop][:2]
-            self._loop_checks[loop] = LoopCheck(a, b, bool(solution.kept[loop]), solution.reason(loop))
+        for number, loop in enumerate(self._loops[:loops]):
+            checked = replace(loop.registration, ok=bool(solution.kept[number]), reason=solution.reason(number))
+            self._loops[number] = replace(loop, registration=checked)
 
 
 def _check(what: str, node: int, T: Array, covariance: Array | None = None) -> None:

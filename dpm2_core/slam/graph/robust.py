@@ -3,7 +3,7 @@
 
 The odometry is trusted within its covariances, loops are not. A loop that the odometry between its ends flatly
 contradicts is set aside, the others are solved for under a Cauchy kernel (which hardly listens to what is far off), and
-every loop, also those set aside, is then judged by how far the optimized poses are from it; so on until the results
+every loop, also those set aside, is then checked by how far the optimized poses are from it; so on until the results
 stay. Only the nodes at the ends of loops are unknowns: the odometry between them is compounded, its inner nodes follow.
 """
 
@@ -38,7 +38,7 @@ _FIXED = 1e-6  # rad and m, standard deviation of a pose that stays
 
 
 class RobustSettings(Settings):
-    """How loops are weighed and judged."""
+    """How loops are weighted and checked."""
 
     loop_kernel: float = Field(5.0, gt=0)
     """Width of the Cauchy kernel on loop edges, in standard deviations: what is many times farther off hardly pulls."""
@@ -82,29 +82,29 @@ class Solution:
 
 
 def optimize(graph: GraphData, settings: RobustSettings) -> Solution:
-    """Optimize and judge; deterministic.
+    """Optimize and check the loops; deterministic.
 
     Raises:
         RuntimeError: the system is singular, for example because a covariance is not positive definite.
     """
     odometry = integrate(graph)
     apart = np.sqrt(chain_chi2(graph, odometry))
-    believed = ~(apart > settings.odometry_sigmas)
-    start = _aligned(graph, graph.poses, believed, settings.loop_kernel)
+    used = ~(apart > settings.odometry_sigmas)
+    start = _aligned(graph, graph.poses, used, settings.loop_kernel)
     condensed = CondensedOdometry(graph, odometry, np.concatenate([graph.ends.ravel(), graph.fixed]))
     ends = np.searchsorted(condensed.nodes, graph.ends)
     poses = start[condensed.nodes]
     settled, count = False, 0
     while not settled and count < settings.rounds:
         count += 1
-        factors = _factors(graph, condensed, ends, poses, believed, settings.loop_kernel)
+        factors = _factors(graph, condensed, ends, poses, used, settings.loop_kernel)
         poses = _solved(factors, poses, settings.iterations)
         sigmas = np.sqrt(mahalanobis(loop_errors(poses, ends, graph.T_from_to), graph.covariances))
         kept = sigmas <= settings.loop_sigmas
-        settled = bool((kept == believed).all())
+        settled = bool((kept == used).all())
         if not settled and count < settings.rounds:
-            believed = kept
-    return Solution(condensed.spread(poses), believed, sigmas, apart, count, settled)
+            used = kept
+    return Solution(condensed.spread(poses), used, sigmas, apart, count, settled)
 
 
 def least_squares(graph: GraphData, kept: NDArray[np.bool_], iterations: int = 50) -> Array:
@@ -136,7 +136,7 @@ def _factors(
     condensed: CondensedOdometry,
     ends: Index,
     poses: Array,
-    believed: NDArray[np.bool_],
+    used: NDArray[np.bool_],
     kernel: float | None,
 ) -> Any:
     """The gtsam graph of the chosen nodes; `ends` count among them, no kernel: plain least squares."""
@@ -145,14 +145,14 @@ def _factors(
     for k in np.flatnonzero(condensed.tied):
         noise = gaussian(condensed.covariances[k])
         factors.add(gtsam.BetweenFactorPose3(int(k) - 1, int(k), gtsam.Pose3(condensed.T[k]), noise))
-    for loop in np.flatnonzero(believed):
+    for loop in np.flatnonzero(used):
         noise = gaussian(graph.covariances[loop])
         if kernel is not None:
             noise = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(kernel), noise)
         a, b = ends[loop].tolist()
         factors.add(gtsam.BetweenFactorPose3(a, b, gtsam.Pose3(graph.T_from_to[loop]), noise))
     still = gtsam.noiseModel.Isotropic.Sigma(6, _FIXED)
-    for anchor in _anchors(graph, condensed, ends[believed]):
+    for anchor in _anchors(graph, condensed, ends[used]):
         factors.add(gtsam.PriorFactorPose3(anchor, gtsam.Pose3(poses[anchor]), still))
     return factors
 
@@ -183,7 +183,7 @@ def _solved(factors: Any, poses: Array, iterations: int) -> Array:
     return np.array([solved.atPose3(node).matrix() for node in range(len(poses))])
 
 
-def _aligned(graph: GraphData, poses: Array, believed: NDArray[np.bool_], kernel: float) -> Array:
+def _aligned(graph: GraphData, poses: Array, used: NDArray[np.bool_], kernel: float) -> Array:
     """Poses with each trajectory placed rigidly where most of its loops to those before agree that it is.
 
     Without it a trajectory whose own frame is far away or turned would have to find its place by many small steps.
@@ -195,7 +195,7 @@ def _aligned(graph: GraphData, poses: Array, believed: NDArray[np.bool_], kernel
     ends_number = number[graph.ends]
     for this in range(1, number[-1] + 1):
         own = number == this
-        ties = np.flatnonzero(believed & (ends_number.max(1) == this) & (ends_number.min(1) < this))
+        ties = np.flatnonzero(used & (ends_number.max(1) == this) & (ends_number.min(1) < this))
         if not len(ties) or own[graph.fixed].any():
             continue
         ends, T = graph.ends[ties], graph.T_from_to[ties]

@@ -30,17 +30,12 @@ class GraphWorker:
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
         self._waiter: threading.Thread | None = None
-        self._answer: Solution | Dpm2Error | None = None
+        self._solution: Solution | Dpm2Error | None = None
 
     @property
     def busy(self) -> bool:
-        """Whether a graph was submitted whose answer has not been taken."""
+        """Whether a graph was submitted whose solution has not been taken."""
         return self._waiter is not None
-
-    @property
-    def pid(self) -> int | None:
-        """Of the process, None while there is none."""
-        return None if self._process is None else self._process.pid
 
     def submit(self, graph: GraphData, settings: RobustSettings) -> None:
         """Begin; returns at once. `busy` must be False."""
@@ -50,7 +45,7 @@ class GraphWorker:
         self._waiter.start()
 
     def take(self, wait: bool = False) -> Solution | None:
-        """The answer, once; None while there is none.
+        """The solution, once; None while there is none.
 
         Raises:
             Dpm2Error: the process died, or the graph cannot be solved. The worker can be used again.
@@ -58,7 +53,7 @@ class GraphWorker:
         if self._waiter is None or (self._waiter.is_alive() and not wait):
             return None
         self._waiter.join()
-        self._waiter, result, self._answer = None, self._answer, None
+        self._waiter, result, self._solution = None, self._solution, None
         if isinstance(result, Dpm2Error):
             raise result
         return result
@@ -71,7 +66,7 @@ class GraphWorker:
             process.wait()
         if self._waiter is not None:
             self._waiter.join()
-            self._waiter, self._answer = None, None
+            self._waiter, self._solution = None, None
         if process is not None:
             _shut(process)
 
@@ -86,12 +81,12 @@ class GraphWorker:
                 (graph, settings.model_dump(include=set(RobustSettings.model_fields))), process.stdin, protocol=5
             )
             process.stdin.flush()
-            self._answer = pickle.load(process.stdout)
+            self._solution = pickle.load(process.stdout)
         except (OSError, ValueError, EOFError, pickle.UnpicklingError):
             process.kill()
             status = process.wait()
             self._process = None
-            self._answer = Dpm2Error(f"the pose graph optimizer's process ended by itself (status {status})")
+            self._solution = Dpm2Error(f"the pose graph optimizer's process ended by itself (status {status})")
 
 
 def _start() -> subprocess.Popen[bytes]:
@@ -114,7 +109,7 @@ def _shut(process: subprocess.Popen[bytes]) -> None:
 
 
 def _serve(requests: IO[bytes], results: IO[bytes]) -> None:
-    """Answer until end of file."""
+    """Solve until end of file."""
     while True:
         try:
             graph, settings = pickle.load(requests)
@@ -131,9 +126,9 @@ def _serve(requests: IO[bytes], results: IO[bytes]) -> None:
 
 if __name__ == "__main__":
     os.nice(_NICE)
-    answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # whatever a library prints must not get between the answers
+    solutions = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # whatever a library prints must not get between the solutions
     try:
-        _serve(sys.stdin.buffer, answers)
+        _serve(sys.stdin.buffer, solutions)
     except BrokenPipeError:  # the program has gone
         os._exit(0)

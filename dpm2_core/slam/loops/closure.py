@@ -16,9 +16,9 @@ import numpy as np
 from pydantic import Field
 
 from dpm2_core.config import Settings
-from dpm2_core.frame import Array, Keyframe, Points, Registration
+from dpm2_core.frame import Array, Edge, Keyframe, Points, Registration
 from dpm2_core.geometry import se3
-from dpm2_core.slam.loops.consistency import Consistency, ConsistencySettings, Loop, OdometryChain, rejected
+from dpm2_core.slam.loops.consistency import Consistency, ConsistencySettings, OdometryChain
 from dpm2_core.slam.loops.place_recognition import PlaceRecognition, merged
 from dpm2_core.slam.loops.verification import VerificationSettings, Verifier
 from dpm2_core.slam.registration.icp import GeometricSettings
@@ -58,7 +58,7 @@ class LoopSettings(Settings):
 
 
 class LoopCloser:
-    """Finds and judges the loops of each new keyframe. A node is a keyframe's position in the map."""
+    """Finds and verifies the loops of each new keyframe. A node is a keyframe's position in the map."""
 
     def __init__(
         self,
@@ -84,7 +84,7 @@ class LoopCloser:
             return keyframe
         return replace(keyframe, descriptors=self._places.describe(keyframe.cloud))
 
-    def close(self, keyframes: Sequence[Keyframe], clouds: Sequence[Points], poses: Array) -> list[Loop]:
+    def close(self, keyframes: Sequence[Keyframe], clouds: Sequence[Points], poses: Array) -> list[Edge]:
         """Try to close loops with the last keyframe.
 
         Args:
@@ -105,10 +105,10 @@ class LoopCloser:
         tried, proposals = self._proposals(node, since, keyframes, poses)
         for number, proposal in enumerate(proposals):
             if number >= self._settings.verified:
-                tried.append(rejected(proposal, "others are more likely"))
+                tried.append(proposal.rejected("others are more likely"))
                 continue
             loop = self._verified(proposal, keyframes, clouds, poses)
-            if not loop.registration.ok:
+            if not loop.ok:
                 tried.append(loop)
                 continue
             T_expected = se3.inverse(poses[loop.from_node]) @ poses[node]
@@ -118,12 +118,12 @@ class LoopCloser:
 
     def _proposals(
         self, node: int, since: Array, keyframes: Sequence[Keyframe], poses: Array
-    ) -> tuple[list[Loop], list[Loop]]:
-        """Candidates that the network rejected, and those for the points to judge, the most likely first."""
+    ) -> tuple[list[Edge], list[Edge]]:
+        """Candidates that the network rejected, and those for the points to verify, the most likely first."""
         s, descriptors = self._settings, keyframes[node].descriptors
         nearest = self._nearest(since, poses)
-        rejections: list[Loop] = []
-        proposals: list[Loop] = []
+        rejections: list[Edge] = []
+        proposals: list[Edge] = []
         if self._places is not None and descriptors is not None:
             similar = self._places.similar(descriptors, since > s.gap, s.candidates)
             found = self._registered(node, similar, keyframes)
@@ -132,25 +132,25 @@ class LoopCloser:
                 if not r.ok:
                     rejections.append(loop)
                 elif r.confidence < s.min_confidence:
-                    rejections.append(rejected(loop, f"descriptors match with a confidence of only {r.confidence:.2f}"))
+                    rejections.append(loop.rejected(f"descriptors match with a confidence of only {r.confidence:.2f}"))
                 elif r.overlap < s.min_overlap:  # NaN of an untrained head rejects nothing
-                    rejections.append(rejected(loop, f"the places overlap with a probability of only {r.overlap:.2f}"))
+                    rejections.append(loop.rejected(f"the places overlap with a probability of only {r.overlap:.2f}"))
                 else:
                     proposals.append(loop)
         if nearest is not None and all(abs(loop.from_node - nearest) > 1 for loop in proposals):
             T_guess = se3.inverse(poses[nearest]) @ poses[node]
             by_pose = Registration(T_guess, np.eye(6), 0.0, 0.0, "pose")
-            proposals.insert(min(len(proposals), 1), Loop(nearest, node, by_pose))
+            proposals.insert(min(len(proposals), 1), Edge("loop", nearest, node, by_pose))
         return rejections, proposals
 
-    def _registered(self, node: int, candidates: Sequence[int], keyframes: Sequence[Keyframe]) -> list[Loop]:
-        """The network's answer to each candidate."""
+    def _registered(self, node: int, candidates: Sequence[int], keyframes: Sequence[Keyframe]) -> list[Edge]:
+        """The network's registration of each candidate."""
         assert self._places is not None
         source = keyframes[node].descriptors
         targets = [keyframes[c].descriptors for c in candidates]
         assert source is not None
         results = self._places.register(source, [t for t in targets if t is not None])
-        return [Loop(c, node, result) for c, result in zip(candidates, results, strict=True)]
+        return [Edge("loop", c, node, result) for c, result in zip(candidates, results, strict=True)]
 
     def _nearest(self, since: Array, poses: Array) -> int | None:
         """The keyframe nearest by the pose, if it is near enough for the drift since then."""
@@ -159,8 +159,8 @@ class LoopCloser:
         near = np.flatnonzero((since > s.gap) & np.isfinite(since) & (distance < s.radius + s.drift * since))
         return int(near[np.argmin(distance[near])]) if len(near) else None
 
-    def _verified(self, proposal: Loop, keyframes: Sequence[Keyframe], clouds: Sequence[Points], poses: Array) -> Loop:
-        """The points' answer; if they disagree, once more from the pose that the descriptors around both suggest."""
+    def _verified(self, proposal: Edge, keyframes: Sequence[Keyframe], clouds: Sequence[Points], poses: Array) -> Edge:
+        """Verification by the points; if it fails, once more from the pose that the descriptors around both suggest."""
         nodes = self._around(proposal.from_node, proposal.to_node, self._settings.surroundings)
         T_candidate_kf = se3.inverse(poses[proposal.from_node]) @ poses[nodes]
         around = self._verifier.surroundings([clouds[n] for n in nodes], T_candidate_kf)
@@ -175,7 +175,7 @@ class LoopCloser:
                 result = second if second.ok else result
         return replace(proposal, registration=result)
 
-    def _map_to_map(self, proposal: Loop, keyframes: Sequence[Keyframe], poses: Array) -> Registration:
+    def _map_to_map(self, proposal: Edge, keyframes: Sequence[Keyframe], poses: Array) -> Registration:
         """T_from_to by the descriptors of the keyframes around both."""
         assert self._places is not None
         a, b = proposal.from_node, proposal.to_node

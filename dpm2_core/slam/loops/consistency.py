@@ -8,12 +8,11 @@ Two loops and the odometry between their ends make a circle, after which one mus
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 
 import numpy as np
 
 from dpm2_core.config import Settings
-from dpm2_core.frame import Array, Keyframe, Registration
+from dpm2_core.frame import Array, Edge, Keyframe
 from dpm2_core.geometry import se3
 
 BROKEN = 0.5  # m, standard deviation of an odometry edge that says that the odometry was lost
@@ -33,16 +32,7 @@ class ConsistencySettings(Settings):
     circle: float = 0.4
     """...and the circle of the two misses its start by no more than this, m (and three times that, degrees)..."""
     circle_drift: float = 0.01
-    """...and this, a meter of the path in the circle (and three times that, degrees)."""
-
-
-@dataclass(frozen=True, eq=False)
-class Loop:
-    """A loop between two nodes: `registration.T_target_source` is T_from_to; `registration.ok` says accepted."""
-
-    from_node: int
-    to_node: int
-    registration: Registration
+    """...and this per meter of the path in the circle (and three times that in degrees)."""
 
 
 class OdometryChain:
@@ -91,11 +81,11 @@ class Consistency:
     def __init__(self, settings: ConsistencySettings, path: OdometryChain) -> None:
         self._settings = settings
         self._path = path
-        self._accepted: list[Loop] = []
-        self._waiting: list[Loop] = []
+        self._accepted: list[Edge] = []
+        self._waiting: list[Edge] = []
 
-    def check(self, loop: Loop, T_expected: Array) -> list[Loop]:
-        """Judge a loop that the points have verified.
+    def check(self, loop: Edge, T_expected: Array) -> list[Edge]:
+        """Check a loop that the points have verified.
 
         Args:
             T_expected: (4, 4) T_from_to as the map has it.
@@ -103,44 +93,33 @@ class Consistency:
         Returns:
             The loop, accepted or rejected with the reason; if accepted, with those that waited for one like it.
         """
-        s, result = self._settings, loop.registration
+        s = self._settings
         since = self._path.between(loop.from_node, loop.to_node)
-        meters, degrees = _apart(T_expected, result.T_target_source)
+        meters, degrees = se3.magnitude(se3.inverse(T_expected) @ loop.T_from_to)
         if np.isfinite(since):
             if meters > 1 + s.drift * since or degrees > 3 + s.drift_turn * since:
-                return [rejected(loop, f"{meters:.1f} m, {degrees:.1f} deg from the odometry")]
+                return [loop.rejected(f"{meters:.1f} m, {degrees:.1f} deg from the odometry")]
             if meters <= s.certain and degrees <= s.certain:
                 return self._accept([loop, *(w for w in self._waiting if self._agree(loop, w))])
         confirmed = [w for w in self._waiting if self._agree(loop, w)]
         if confirmed or any(self._agree(loop, a) for a in self._accepted[-200:]):
             return self._accept([loop, *confirmed])
         self._waiting.append(loop)
-        return [rejected(loop, f"{meters:.1f} m from the odometry: waits for a second loop that agrees")]
+        return [loop.rejected(f"{meters:.1f} m from the odometry: waits for a second loop that agrees")]
 
-    def _accept(self, loops: Sequence[Loop]) -> list[Loop]:
+    def _accept(self, loops: Sequence[Edge]) -> list[Edge]:
         self._accepted += loops
         self._waiting = [w for w in self._waiting if all(w is not loop for loop in loops)]
         return list(loops)
 
-    def _agree(self, one: Loop, other: Loop) -> bool:
+    def _agree(self, one: Edge, other: Edge) -> bool:
         """Whether the circle through both closes."""
         s, path = self._settings, self._path
         there = path.between(one.from_node, other.from_node)
         back = path.between(one.to_node, other.to_node)
         if one.to_node == other.to_node or max(there, back) > s.reach:
             return False
-        around = path.T(one.from_node, other.from_node) @ other.registration.T_target_source
-        meters, degrees = _apart(one.registration.T_target_source, around @ path.T(other.to_node, one.to_node))
+        around = path.T(one.from_node, other.from_node) @ other.T_from_to @ path.T(other.to_node, one.to_node)
+        meters, degrees = se3.magnitude(se3.inverse(one.T_from_to) @ around)
         allowed = s.circle + s.circle_drift * (there + back)
         return meters <= allowed and degrees <= 3 * allowed
-
-
-def rejected(loop: Loop, reason: str) -> Loop:
-    """The loop with the reason why it is not accepted."""
-    return replace(loop, registration=replace(loop.registration, ok=False, reason=reason))
-
-
-def _apart(a: Array, b: Array) -> tuple[float, float]:
-    """Distance of two transforms, m and degrees."""
-    difference = se3.inverse(a) @ b
-    return float(np.linalg.norm(difference[:3, 3])), float(np.degrees(se3.angle(difference)))

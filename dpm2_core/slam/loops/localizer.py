@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Localization mode: keyframes are found in a map that stays as it is; kidnapping is noticed and answered."""
+"""Localization mode: keyframes are found in a map that stays as it is; kidnapping is noticed and recovered from."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Localizer:
 
     Attributes:
         T_map_odom: (4, 4), the last that was verified; it means nothing before `state.located`.
-        state: RELOCALISING before the first answer, which makes it RELOCALISED; the next one TRACKING; DEGRADED where
+        state: RELOCALISING before the first result, which makes it RELOCALISED; the next one TRACKING; DEGRADED where
             the map does not confirm the odometry, LOST when that lasts or the odometry is broken.
     """
 
@@ -90,13 +90,13 @@ class Localizer:
         return self._find(keyframe, result)
 
     def _find(self, keyframe: Keyframe, rejected: Registration) -> LocalizationResult:
-        """Look in the whole map, or around the hint; while tracking, a far-off answer must insist."""
+        """Look in the whole map, or around the hint; while tracking, a far-off result must be repeated."""
         result = self._relocalizer.find(keyframe.cloud, self._hint, keyframe.descriptors)
         self._hint = None
         tracking = self.state.located
         T_predicted = self.T_map_odom @ keyframe.T_odom_kf
         if result.ok:
-            meters = float(np.linalg.norm((se3.inverse(T_predicted) @ result.T_target_source)[:3, 3]))
+            meters, _ = se3.magnitude(se3.inverse(T_predicted) @ result.T_target_source)
             near = meters <= 2.0 + 0.02 * self._distrust
             if not tracking or near or self._failures >= self._max_failures:
                 return self._located(keyframe, result, jumped=not (tracking and near))

@@ -20,7 +20,7 @@ if TYPE_CHECKING:  # torch takes seconds to import
 
 
 class PlaceRecognition:
-    """Knows the descriptors of all keyframes by their node: their position in the map."""
+    """The descriptors of all keyframes by their node: their position in the map."""
 
     def __init__(self, network: DeepPointMap2) -> None:
         self._network = network

@@ -22,13 +22,12 @@ from dpm2_core.geometry import se3
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.slam.loops.place_recognition import PlaceRecognition
 from dpm2_core.slam.loops.verification import VerificationSettings, Verifier
-from dpm2_core.slam.registration.icp import GeometricSettings
 from dpm2_core.slam.registration.local_map import LocalMap
 
 if TYPE_CHECKING:  # torch takes seconds to import
     from dpm2_core.network.model import DeepPointMap2
 
-_SAME_PLACE = 5.0  # m, candidates whose poses are nearer are one answer
+_SAME_PLACE = 5.0  # m, candidates whose poses are nearer are one place
 
 
 class RelocalizationSettings(Settings):
@@ -37,7 +36,7 @@ class RelocalizationSettings(Settings):
     candidates: int = Field(6, ge=1)
     """So many keyframes that look like the scan are registered by the network..."""
     verified: int = Field(3, ge=1)
-    """...and so many of the places that come out are judged by the points, the most confident first."""
+    """...and so many of the resulting places are verified by the points, the most confident first."""
     min_confidence: float = Field(0.15, ge=0, le=1)
     """Of the network's registration, below which the points are not asked."""
     surroundings: float = Field(22.0, gt=0)
@@ -57,19 +56,18 @@ class Relocalizer:
     def __init__(
         self,
         settings: RelocalizationSettings,
-        registration: GeometricSettings,
+        verifier: Verifier,
         network: DeepPointMap2,
         keyframes: Sequence[Keyframe],
         clouds: Sequence[Points],
         poses: Array,
-        threads: int = 2,
     ) -> None:
         """`keyframes` with descriptors, their `clouds` (M, 4), and `poses` (N, 4, 4) T_map_kf."""
         self._settings = settings
         self._keyframes, self._clouds, self._poses = keyframes, clouds, poses
         self._places = PlaceRecognition(network)
         self._places.update(keyframes)
-        self._verifier = Verifier(settings.verification, registration, threads)
+        self._verifier = verifier
 
     def __len__(self) -> int:
         return len(self._keyframes)
@@ -103,7 +101,7 @@ class Relocalizer:
         return nowhere("; ".join(rejections)) if result is None else result
 
     def verify(self, cloud: Points, T_map_lidar: Array, widen: float = 1.0) -> Registration:
-        """The points' answer to a pose in the map: T_map_lidar, believed or not; `widen` as in `Verifier.verify`."""
+        """Verifies a pose in the map by the points: T_map_lidar, `ok` or not; `widen` as in `Verifier.verify`."""
         distance = self._distance(T_map_lidar)
         near = np.flatnonzero(distance <= self._settings.surroundings)
         if not len(near):

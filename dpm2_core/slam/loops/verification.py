@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from dpm2_core.config import Settings
 from dpm2_core.frame import Array, Points, Registration
 from dpm2_core.geometry import se3
+from dpm2_core.geometry.ground import height_above_ground
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.slam.registration.icp import GeometricRegistration, GeometricSettings
 from dpm2_core.slam.registration.local_map import LocalMap, LocalMapSettings
@@ -22,14 +23,14 @@ _ABOVE = 0.5  # m over it: what stands there
 
 
 class VerificationSettings(Settings):
-    """What a pose must show to be believed."""
+    """What a pose needs to be accepted."""
 
     min_inliers: float = 0.6
     """Fraction of the points that must fit the map."""
     min_structure: float = 0.6
     """The same for what stands above the ground: the road fits anywhere."""
     min_points: int = 150
-    """So many points above the ground at least; where nothing stands, nothing can be told apart."""
+    """So many points above the ground at least; with fewer, places cannot be distinguished."""
     max_rmse: float = 0.2
     """Largest residual of the points that fit, m."""
     max_sigma: float = 0.1
@@ -47,7 +48,7 @@ class VerificationResult:
     """What the points say.
 
     Attributes:
-        registration: the pose that they prefer; `ok` says whether it is believed, `reason` why not.
+        registration: the refined pose; `ok` says whether it is accepted, `reason` why not.
         structure: fraction of the points above the ground that fit. points: number of those.
         moved: from the proposed pose, m. turned: the same, degrees.
     """
@@ -60,7 +61,7 @@ class VerificationResult:
 
 
 class Verifier:
-    """Registers a cloud to the keyframes around a place, from a proposed pose, and judges the result."""
+    """Registers a cloud to the keyframes around a place, from a proposed pose, and checks the result."""
 
     def __init__(self, settings: VerificationSettings, registration: GeometricSettings, threads: int) -> None:
         self._settings = settings
@@ -77,7 +78,7 @@ class Verifier:
         return local_map
 
     def verify(self, cloud: Points, around: LocalMap, T_proposed: Array, widen: float = 1.0) -> VerificationResult:
-        """Judge a pose of a cloud (M, 4) in a map.
+        """Verify a pose of a cloud (M, 4) in a map.
 
         Args:
             widen: factor on how far from the proposed pose the points may look for theirs.
@@ -88,11 +89,10 @@ class Verifier:
         if not result.ok:
             return VerificationResult(result)
         fits = self._fits(source, around, result.T_target_source)
-        standing = above_ground(source)
+        standing = height_above_ground(source, _CELL, reach=0) > _ABOVE
         points = int(standing.sum())
         structure = float(fits[standing].mean()) if points else 0.0
-        moved = se3.inverse(T_proposed) @ result.T_target_source
-        meters, degrees = float(np.linalg.norm(moved[:3, 3])), float(np.degrees(se3.angle(moved)))
+        meters, degrees = se3.magnitude(se3.inverse(T_proposed) @ result.T_target_source)
         overlap_features = VerificationResult(
             replace(result, confidence=min(result.confidence, structure)), structure, points, meters, degrees
         )
@@ -110,7 +110,7 @@ class Verifier:
         return (squared < self._gate**2) & (residual**2 < 9 * (self._noise**2 + spread))
 
     def _objection(self, e: VerificationResult, share: float, widen: float) -> str:
-        """Why it is not believed; empty if it is."""
+        """Why it is not accepted; empty if it is."""
         s, result = self._settings, e.registration
         if share < s.min_inliers:
             return f"only {share:.0%} of the points fit"
@@ -125,11 +125,3 @@ class Verifier:
         if e.moved > widen * s.max_moved or e.turned > widen * s.max_turned:
             return f"points and proposal {e.moved:.1f} m, {e.turned:.1f} deg apart"
         return ""
-
-
-def above_ground(points: Array) -> NDArray[np.bool_]:
-    """Which points (N, 3) of a level scan stand above the lowest around them."""
-    cells, cell = np.unique(np.floor(points[:, :2] / _CELL).astype(np.int64), axis=0, return_inverse=True)
-    lowest = np.full(len(cells), np.inf)
-    np.minimum.at(lowest, cell.ravel(), points[:, 2])
-    return points[:, 2] > lowest[cell.ravel()] + _ABOVE

@@ -13,11 +13,10 @@ from pydantic import Field
 
 from dpm2_core.config import Settings
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.frame import Array, Keyframe, LoopClosure, Points
+from dpm2_core.frame import Array, Edge, Keyframe, Points, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.loops.closure import LoopCloser
-from dpm2_core.slam.loops.consistency import Loop, rejected
 from dpm2_core.slam.mapping.admission import check_keyframe
 from dpm2_core.slam.mapping.moving import MovingSettings, MovingWindow
 from dpm2_core.slam.mapping.redundancy import RedundancySettings, lender
@@ -26,7 +25,6 @@ from dpm2_core.slam.store.cloud_codec import pack_cloud
 from dpm2_core.slam.store.cloud_store import CloudStore
 from dpm2_core.slam.store.map_data import NO_POINTS, borrowing, load_map, map_cloud
 from dpm2_core.slam.store.map_store import MapStore
-from dpm2_core.slam.store.rows import Edge
 from dpm2_core.slam.store.writer import MapWriter
 
 _MOST_MISSED = 1000  # keyframes between two, for which an edge is made less certain
@@ -67,7 +65,7 @@ class Mapper:
     Attributes:
         keyframes: all, without their clouds; a node is a position among them. ids count on over a robot's sessions.
         session_start: node of the first keyframe of this session: those before are of a map that was loaded.
-        closures: loops tried in this session.
+        loops: tried in this session, accepted or rejected.
     """
 
     def __init__(
@@ -76,9 +74,9 @@ class Mapper:
         """`store`: the map file to go on with, its session begun; None keeps the map in memory, clouds on disk."""
         self._settings = settings
         self._graph = graph
-        self._loops = loops
+        self._closer = loops
         self.keyframes: list[Keyframe] = []
-        self.closures: list[LoopClosure] = []
+        self.loops: list[Edge] = []
         self._clouds = CloudStore()
         self._writer: MapWriter | None = None
         self._robots: dict[str, _Robot] = {}
@@ -95,8 +93,8 @@ class Mapper:
         return self._graph.poses
 
     @property
-    def edges(self) -> list[tuple[int, int, Array, Array]]:
-        """Odometry edges and accepted loops: from, to, T_from_to, covariance."""
+    def edges(self) -> list[Edge]:
+        """Odometry edges and accepted loops."""
         return self._graph.edges
 
     @property
@@ -119,7 +117,7 @@ class Mapper:
         return [name for name, robot in self._robots.items() if robot.last is not None]
 
     @property
-    def clouds(self) -> Sequence[Points]:
+    def clouds(self) -> CloudStore:
         """(M, 4) of each keyframe in its own frame, read from disk; without what moves."""
         return self._clouds
 
@@ -135,7 +133,7 @@ class Mapper:
     @property
     def channels(self) -> int | None:
         """Width of the features that its network makes; None without a network."""
-        return self._loops.channels
+        return self._closer.channels
 
     @property
     def graph_problem(self) -> str:
@@ -152,38 +150,41 @@ class Mapper:
         """
         self._T_start, self._tie = T_map_odom, covariance
 
-    def add(self, keyframe: Keyframe, thumbnail: bytes | None = None) -> list[LoopClosure]:
-        """Take a keyframe in, with a JPEG if wanted; returns the loops that were tried, accepted or not.
+    def described(self, keyframe: Keyframe) -> Keyframe:
+        """The keyframe with descriptors, if loops are searched with them and its registration made none."""
+        return self._closer.described(keyframe)
+
+    def add(self, keyframe: Keyframe) -> list[Edge]:
+        """Take a keyframe in; returns the loops that were tried, accepted or not.
 
         Raises:
             RejectedError: it is not sound. Whatever is raised before the search for loops, the map is as it was before;
                 after that the keyframe is in, with what was found until then.
         """
-        check_keyframe(keyframe, self._loops.channels)
-        node, cloud = len(self.keyframes), keyframe.cloud
+        check_keyframe(keyframe, self._closer.channels)
+        node, cloud, thumbnail = len(self.keyframes), keyframe.cloud, keyframe.thumbnail
         robot = self._robot(keyframe.robot)
         follows = robot.last is not None and keyframe.edge is not None
         offset = robot.offset if follows else robot.ids
-        keyframe = self._loops.described(keyframe if follows else replace(keyframe, edge=None))
-        keyframe = replace(keyframe, id=keyframe.id + offset, cloud=NO_POINTS)
+        keyframe = self.described(keyframe if follows else replace(keyframe, edge=None))
+        keyframe = replace(keyframe, id=keyframe.id + offset, cloud=NO_POINTS, thumbnail=None)
         packed = pack_cloud(cloud)
-        edges = self._add_node(keyframe, robot.last if follows else None)
+        odometry = self._add_node(keyframe, robot.last if follows else None)
         self._clouds.append(packed)
         self.keyframes.append(keyframe)
         robot.last, robot.ids, robot.offset = node, keyframe.id + 1, offset
-        closures: list[LoopClosure] = []
-        loops: list[Edge] = []
+        before = len(self.loops)
         try:
-            closures, loops = self._close_loops(node)
-            self._lend(node, edges, loops)
+            self._close_loops()
+            self._lend(node, odometry, self.loops[before:])
             self._mark_moving(robot.window.add(node, cloud, self.poses))
         finally:
-            self._store(node, thumbnail, [*edges, *loops])
-        return closures
+            self._store(node, thumbnail, [*odometry, *self.loops[before:]])
+        return self.loops[before:]
 
-    def _lend(self, node: int, edges: list[Edge], loops: list[Edge]) -> None:
+    def _lend(self, node: int, odometry: list[Edge], loops: list[Edge]) -> None:
         """Give up the cloud of a keyframe that came back to an older one for that one's."""
-        again = edges if node == self.session_start else []  # the frame with which the session before ended
+        again = odometry if node == self.session_start else []  # the frame with which the session before ended
         loan = lender(node, [*again, *self._kept(loops)], self._clouds.loan, self._settings.redundancy)
         if loan is not None:
             self._clouds.borrow(node, loan)
@@ -198,7 +199,7 @@ class Mapper:
             self._writer.sync(self.poses)
 
     def finish(self) -> None:
-        """At the end of a drive: wait for the solver, judge the last clouds, bring the map file up to date."""
+        """At the end of a drive: wait for the solver, find moving points in the last clouds, write the map file."""
         self._optimize(changed=False, wait=True)
         self._graph.close()
         for robot in self._robots.values():
@@ -215,7 +216,7 @@ class Mapper:
         self._graph.write_g2o(path)
 
     def _load(self, store: MapStore) -> None:
-        data, channels = load_map(store), self._loops.channels
+        data, channels = load_map(store), self._closer.channels
         for d in (keyframe.descriptors for keyframe in data.keyframes):
             if d is not None and channels is not None and d.features.shape[1] != channels:
                 width = d.features.shape[1]
@@ -240,42 +241,35 @@ class Mapper:
         if node == self.session_start:
             self._placed.add(node)
         if result is not None and last is not None:
-            before, T_before = self.keyframes[last], self._graph.pose(last)
+            before = self.keyframes[last]
             T_before_this = se3.inverse(before.T_odom_kf) @ keyframe.T_odom_kf
             covariance = result.covariance * np.clip(keyframe.id - before.id, 1, _MOST_MISSED)
-            edge = Edge("odometry", last, node, T_before_this, covariance)
-            edge = replace(edge, confidence=result.confidence, rmse=result.rmse, method=result.method)
+            result = replace(result, T_target_source=T_before_this, covariance=covariance)
         elif node == self.session_start and self._tie is not None:
-            last, T_before = node - 1, self._graph.pose(-1)
-            T_before_this = se3.inverse(T_before) @ self._T_start @ keyframe.T_odom_kf
-            edge = Edge("odometry", last, node, T_before_this, self._tie)
+            last = node - 1
+            T_before_this = se3.inverse(self._graph.pose(last)) @ self._T_start @ keyframe.T_odom_kf
+            result = Registration(T_before_this, self._tie)
         else:
             T_map_odom = self._T_start if node == self.session_start else np.eye(4)
-            self._graph.add_node(T_map_odom @ keyframe.T_odom_kf, None, None)
+            self._graph.add_node(T_map_odom @ keyframe.T_odom_kf)
             return []
-        self._graph.add_node(T_before @ T_before_this, T_before_this, edge.covariance, last)
+        edge = Edge("odometry", last, node, result)
+        self._graph.add_node(self._graph.pose(last) @ edge.T_from_to, edge)
         return [edge]
 
-    def _close_loops(self, node: int) -> tuple[list[LoopClosure], list[Edge]]:
-        """Loops of the last keyframe, as they are published and as they are stored."""
-        tried = [self._tied(loop) for loop in self._loops.close(self.keyframes, self._clouds, self.poses)]
-        closures = [
-            LoopClosure(a.id, b.id, loop.registration, a.robot, b.robot)
-            for loop in tried
-            for a, b in [(self.keyframes[loop.from_node], self.keyframes[loop.to_node])]
-        ]
-        self.closures += closures
-        self._optimize(any(loop.registration.ok for loop in tried))
-        return closures, [_loop_edge(loop) for loop in tried]
+    def _close_loops(self) -> None:
+        """Loops of the last keyframe: into the graph, unless they were rejected there or before."""
+        tried = [self._tied(loop) for loop in self._closer.close(self.keyframes, self._clouds, self.poses)]
+        self.loops += tried
+        self._optimize(any(loop.ok for loop in tried))
 
-    def _tied(self, loop: Loop) -> Loop:
+    def _tied(self, loop: Edge) -> Edge:
         """A loop that was tried, in the graph if it was accepted; rejected if the graph does not take it."""
-        result = loop.registration
-        if result.ok:
+        if loop.ok:
             try:
-                self._graph.add_loop(loop.from_node, loop.to_node, result.T_target_source, result.covariance)
+                self._graph.add_loop(loop)
             except Dpm2Error as error:
-                return rejected(loop, str(error))
+                return loop.rejected(str(error))
         return loop
 
     def _optimize(self, changed: bool, wait: bool = False) -> None:
@@ -288,9 +282,9 @@ class Mapper:
                 self._graph.problem = str(error)
 
     def _kept(self, loops: Sequence[Edge]) -> list[Edge]:
-        """Those that the graph believes, too: on another's word no cloud is given up."""
-        rejected_pairs = {(info.from_node, info.to_node) for info in self._graph.loop_checks if not info.kept}
-        return [edge for edge in loops if (edge.from_node, edge.to_node) not in rejected_pairs]
+        """Those that the optimization has not rejected either: for no other is a cloud given up."""
+        rejected = {(loop.from_node, loop.to_node) for loop in self._graph.loops if not loop.ok}
+        return [loop for loop in loops if (loop.from_node, loop.to_node) not in rejected]
 
     def _mark_moving(self, checked: Iterable[tuple[int, NDArray[np.bool_]]]) -> None:
         for node, moving in checked:
@@ -298,9 +292,3 @@ class Mapper:
                 self._clouds.set_moving(node, moving)
                 if self._writer is not None:
                     self._writer.set_moving(node)
-
-
-def _loop_edge(loop: Loop) -> Edge:
-    r = loop.registration
-    info = (r.ok, r.confidence, r.rmse, r.method, r.reason)
-    return Edge("loop", loop.from_node, loop.to_node, r.T_target_source, r.covariance, *info)

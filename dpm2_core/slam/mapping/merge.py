@@ -9,14 +9,13 @@ from dataclasses import replace
 import numpy as np
 
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.frame import Array, Points
+from dpm2_core.frame import Array, Edge, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.loops.closure import LoopCloser
 from dpm2_core.slam.mapping.restore import restore
 from dpm2_core.slam.store.cloud_store import CloudStore, Loan
 from dpm2_core.slam.store.map_data import MapData
-from dpm2_core.slam.store.rows import Edge
 
 FindLoops = Callable[[MapData, MapData], list[Edge]]
 """Accepted loops from a node of one map to a node of another, each in its own numbers."""
@@ -73,11 +72,8 @@ def loops_by(closer: LoopCloser) -> FindLoops:
             keyframes.append(replace(keyframe, robot=f"{keyframe.robot}/second", edge=keyframe.edge if node else None))
             clouds: Sequence[Points] = both.clouds
             for loop in closer.close(keyframes, clouds, both.poses[: len(keyframes)]):
-                r = loop.registration
-                if r.ok and loop.from_node < len(a) <= loop.to_node:
-                    info = (True, r.confidence, r.rmse, r.method)
-                    to = loop.to_node - len(a)
-                    out.append(Edge("loop", loop.from_node, to, r.T_target_source, r.covariance, *info))
+                if loop.ok and loop.from_node < len(a) <= loop.to_node:
+                    out.append(replace(loop, to_node=loop.to_node - len(a)))
         return out
 
     return find

@@ -47,7 +47,7 @@ class MovingSettings(Settings):
 
 
 class RangeImage:
-    """The nearest return in each direction from a sensor, one degree a pixel; inf where there is none."""
+    """The nearest return in each direction from a sensor, one degree per pixel; inf where there is none."""
 
     def __init__(self, points: Points) -> None:
         """(M, 4) in the sensor's frame."""
@@ -111,15 +111,15 @@ def _grown(moving: Mask, cloud: Points, candidates: NDArray[np.intp], reach: flo
 
 
 class MovingWindow:
-    """The last keyframes of a drive: each is judged once there are as many after it as before it."""
+    """The last keyframes of a drive: each is checked once there are as many after it as before it."""
 
     def __init__(self, settings: MovingSettings) -> None:
         self._settings = settings
         self._seen: deque[tuple[int, Points, RangeImage]] = deque(maxlen=2 * settings.window + 1)
-        self._next = 0  # the first node that has not been judged
+        self._next = 0  # the first node that has not been checked
 
     def add(self, node: int, cloud: Points, poses: Array) -> Iterator[tuple[int, NDArray[np.bool_]]]:
-        """Take in the whole cloud (M, 4) of the next node; yields the node that can be judged now, and its mask.
+        """Take in the whole cloud (M, 4) of the next node; yields the node that can be checked now, and its mask.
 
         `poses` (N, 4, 4) are T_map_kf of all nodes so far.
         """
@@ -129,7 +129,7 @@ class MovingWindow:
                 yield from self._compare(self._seen[-1 - self._settings.window][0], poses)
 
     def finish(self, poses: Array) -> Iterator[tuple[int, NDArray[np.bool_]]]:
-        """Judge those at the end of the drive by what there is."""
+        """Check those at the end of the drive by the keyframes that there are."""
         if self._seen:
             yield from self._compare(self._seen[-1][0], poses)
 

@@ -15,18 +15,17 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy.ndimage import grey_opening
 
 from dpm2_core.config import Settings
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.files import atomic_write
 from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
+from dpm2_core.geometry.ground import ground_below
 
 Mask = NDArray[np.bool_]
 
 _DIRECTIONS = 720
-_GROUND_CELL = 1.0  # m
 _OCCUPIED, _FREE, _UNKNOWN = 0, 254, 205  # gray values of map_server
 _MOST = 400_000_000  # cells
 
@@ -85,18 +84,6 @@ def occupancy_grid(clouds: Sequence[Points], poses: Array, settings: OccupancySe
     grid = grid[first[0] : last[0], first[1] : last[1]]
     x, y = np.round((low + first) * size, 6)
     return Grid(np.ascontiguousarray(grid.T[::-1]), (float(x), float(y)), size)
-
-
-def ground_below(points: Array) -> Array:
-    """(M,) height of the ground under (M, 3) points, m: the lowest around, which a roof alone cannot raise."""
-    at = np.floor(points[:, :2] / _GROUND_CELL).astype(np.int64)
-    at -= at.min(0)
-    lowest = np.full(at.max(0) + 1, np.inf)
-    np.minimum.at(lowest, (at[:, 0], at[:, 1]), points[:, 2])
-    # Where there is no point an opening takes no notice: a hole is as high as it gets.
-    hole = ~np.isfinite(lowest)
-    lowest[hole] = points[:, 2].max()
-    return grey_opening(lowest, (7, 7))[at[:, 0], at[:, 1]]
 
 
 def _seen_cells(

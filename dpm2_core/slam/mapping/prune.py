@@ -5,12 +5,14 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 
+from dpm2_core.frame import Edge
 from dpm2_core.geometry import se3
 from dpm2_core.slam.store.map_data import MapData, subset
-from dpm2_core.slam.store.rows import Edge, RemovedKeyframe
+from dpm2_core.slam.store.rows import RemovedKeyframe
 
 _LAP = 10  # keyframes: neighbors along the drive are no revisit
 
@@ -121,18 +123,19 @@ def inverted(edge: Edge) -> Edge:
     """The same constraint from its other end."""
     A = se3.adjoint(edge.T_from_to)  # (T exp(xi))^-1 = T^-1 exp(-Ad_T xi)
     T_to_from, covariance = se3.inverse(edge.T_from_to), A @ edge.covariance @ A.T
-    return replace(edge, from_node=edge.to_node, to_node=edge.from_node, T_from_to=T_to_from, covariance=covariance)
+    inverse = replace(edge.registration, T_target_source=T_to_from, covariance=covariance)
+    return Edge(edge.kind, edge.to_node, edge.from_node, inverse)
 
 
 def composed(first: Edge, second: Edge) -> Edge:
     """One constraint after another, with errors that are independent."""
     A = se3.adjoint(se3.inverse(second.T_from_to))
-    return replace(
-        second,
-        kind="odometry" if first.kind == second.kind == "odometry" else "loop",
-        from_node=first.from_node,
-        T_from_to=se3.orthonormalized(first.T_from_to @ second.T_from_to),
+    both = replace(
+        second.registration,
+        T_target_source=se3.orthonormalized(first.T_from_to @ second.T_from_to),
         covariance=A @ first.covariance @ A.T + second.covariance,
-        confidence=min(first.confidence, second.confidence),
-        rmse=max(first.rmse, second.rmse),
+        confidence=min(first.registration.confidence, second.registration.confidence),
+        rmse=max(first.registration.rmse, second.registration.rmse),
     )
+    kind: Literal["odometry", "loop"] = "odometry" if first.kind == second.kind == "odometry" else "loop"
+    return Edge(kind, first.from_node, second.to_node, both)

@@ -5,13 +5,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-import numpy as np
 from pydantic import Field
 
 from dpm2_core.config import Settings
+from dpm2_core.frame import Edge
 from dpm2_core.geometry import se3
 from dpm2_core.slam.store.cloud_store import Loan
-from dpm2_core.slam.store.rows import Edge
 
 
 class RedundancySettings(Settings):
@@ -38,7 +37,7 @@ def lender(
         T_kf_lender, other = se3.inverse(edge.T_from_to), edge.from_node
         if (loan := loan_of(other)) is not None:
             T_kf_lender, other = T_kf_lender @ loan.T_kf_lender, loan.lender
-        near = np.linalg.norm(T_kf_lender[:3, 3]) <= settings.distance
-        if near and se3.angle(T_kf_lender) <= np.radians(settings.angle):
+        meters, degrees = se3.magnitude(T_kf_lender)
+        if meters <= settings.distance and degrees <= settings.angle:
             return Loan(other, T_kf_lender)
     return None

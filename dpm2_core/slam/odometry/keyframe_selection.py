@@ -59,8 +59,8 @@ class KeyframeSelector:
         s, last, edge = self._settings, self._last, None
         if last is not None:
             T_last_this = se3.inverse(last.T_odom_kf) @ T_odom_lidar
-            meters, radians = np.linalg.norm(T_last_this[:3, 3]), se3.angle(T_last_this)
-            if not self._requested and meters < s.distance and radians < np.radians(s.angle):
+            meters, degrees = se3.magnitude(T_last_this)
+            if not self._requested and meters < s.distance and degrees < s.angle:
                 return None
             sigma = np.repeat([np.radians(s.drift_rotation), s.drift_translation], 3) * max(meters, 1.0)
             covariance = registration.covariance + np.diag(sigma**2) + self._uncertainty
@@ -68,8 +68,7 @@ class KeyframeSelector:
         near = scan.points[np.einsum("ij,ij->i", scan.points[:, :3], scan.points[:, :3]) < s.range**2]
         cloud = near[voxel_first(near, s.voxel)]
         keyframe_id = 0 if last is None else last.id + 1
-        keyframe = Keyframe(
-            keyframe_id, frame.stamp, frame.index, T_odom_lidar, cloud, edge, self._robot, scan.descriptors
-        )
+        known = scan.descriptors if scan.description is not None and scan.description.made else None
+        keyframe = Keyframe(keyframe_id, frame.stamp, frame.index, T_odom_lidar, cloud, edge, self._robot, known)
         self._last, self._uncertainty, self._requested = keyframe, np.zeros((6, 6)), False
         return keyframe

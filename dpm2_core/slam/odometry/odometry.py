@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scan by scan: predict, register, gate, update. The state says how far the answer can be trusted."""
+"""Scan by scan: predict, register, gate, update. The state says how far the result can be trusted."""
 
 from __future__ import annotations
 
@@ -12,14 +12,15 @@ import numpy as np
 from dpm2_core.config import Settings
 from dpm2_core.frame import Array, Frame, OdometryResult, Registration, State
 from dpm2_core.geometry import se3
-from dpm2_core.slam.bridge import Bridge, Limits, covariance, predicted
+from dpm2_core.geometry.motion import covariance, predicted
+from dpm2_core.slam.bridge import Bridge, Limits
 from dpm2_core.slam.odometry.keyframe_selection import KeyframeSelector
 from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration
 
 
 class OdometrySettings(Settings):
-    """When to believe a registration, and what to do when there is none."""
+    """When to accept a registration, and what to do when there is none."""
 
     max_acceleration: float = 40.0
     """A registration that differs from the prediction by more than this allows is rejected, m/s2 (0.5 m are free)."""
@@ -27,7 +28,7 @@ class OdometrySettings(Settings):
     """The same for rotation, deg/s of difference from the predicted rate (3 deg are free)."""
     steadiness: float = 10.0
     """Standard deviation of the acceleration, m/s2 (and, in rad/s2, of the angular one): how far the prediction is
-    trusted where the points do not tell, as along a tunnel. Elsewhere they outweigh it."""
+    trusted where the points do not constrain the pose, as along a tunnel. Elsewhere they outweigh it."""
     degraded_sigma: float = 0.08
     """Standard deviation of the position in its worst direction above which the state is `degraded`, m."""
     lost_after: int = 5
@@ -36,7 +37,7 @@ class OdometrySettings(Settings):
     """Frames after a pause that are registered to the map before it, until the odometry counts as broken: a new stretch
     then goes on from the predicted pose, with the uncertainty that the pause deserves."""
     pause: float = 0.65
-    """Seconds without a registration after which one scan is no longer believed alone; in a stream of fewer frames
+    """Seconds without a registration after which one scan alone is no longer accepted; in a stream of fewer frames
     per second 1.5 of its periods."""
 
 
@@ -130,7 +131,7 @@ class Odometry:
         return dt
 
     def _pauses(self, dt: float) -> bool:
-        """Whether so much time has passed since the last registered scan that another one is not believed alone."""
+        """Whether so much time has passed since the last registered scan that another one alone is not accepted."""
         if not len(self._registration):
             return False
         if len(self._periods) > 1:
@@ -197,10 +198,9 @@ class Odometry:
         return result
 
     def _gated(self, result: Registration, T_predicted: Array, dt: float) -> Registration:
-        """Refuse what no vehicle can do; the allowance grows while nothing has been registered."""
+        """Reject what no vehicle can do; the allowance grows while nothing has been registered."""
         time = self._registered[1] + dt
-        off = se3.inverse(T_predicted) @ result.T_target_source
-        meters, degrees = float(np.linalg.norm(off[:3, 3])), float(np.degrees(se3.angle(off)))
+        meters, degrees = se3.magnitude(se3.inverse(T_predicted) @ result.T_target_source)
         if result.ok and meters > 0.5 + self._settings.max_acceleration * time * time:
             return replace(result, ok=False, reason=f"{meters:.1f} m from the prediction")
         if result.ok and degrees > 3 + self._settings.max_turn * time:

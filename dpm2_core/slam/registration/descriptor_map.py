@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dpm2_core.descriptors import Descriptors, merge
+from dpm2_core.descriptors import Descriptors, LazyDescriptors, merge
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 
@@ -17,10 +17,10 @@ _KEPT = 20  # frames: at least as many as can lie around the next one
 
 @dataclass(frozen=True, eq=False)
 class _Place:
-    """Where a frame was taken, T_odom_kf (4, 4), and what the network made of it."""
+    """Where a frame was taken, T_odom_kf (4, 4), and what the network makes of it."""
 
     T_odom_kf: Array
-    descriptors: Descriptors
+    description: LazyDescriptors
 
 
 class DescriptorMap:
@@ -41,20 +41,29 @@ class DescriptorMap:
         """Whether a frame taken at that pose would show enough that is new."""
         if not self._places:
             return True
-        moved = se3.inverse(self._places[-1].T_odom_kf) @ T_odom_lidar
-        return bool(np.linalg.norm(moved[:3, 3]) >= self._spacing or se3.angle(moved) >= np.radians(15))
+        meters, degrees = se3.magnitude(se3.inverse(self._places[-1].T_odom_kf) @ T_odom_lidar)
+        return meters >= self._spacing or degrees >= 15
 
-    def insert(self, descriptors: Descriptors, T_odom_lidar: Array) -> None:
+    def insert(self, description: LazyDescriptors, T_odom_lidar: Array) -> None:
         """Add those of a frame taken there."""
-        self._places.append(_Place(T_odom_lidar, descriptors))
+        self._places.append(_Place(T_odom_lidar, description))
 
-    def around(self, T_odom_lidar: Array) -> tuple[Array, Descriptors]:
-        """Pose T_odom_kf of the nearest frame, and the merged descriptors of it and its neighbors in its frame."""
+    def around(self, T_odom_lidar: Array) -> tuple[Array, Descriptors] | None:
+        """Pose T_odom_kf of the nearest frame, and the merged descriptors of it and its neighbors in its frame.
+
+        None where the frames nearby have no descriptors.
+        """
         distance = [float(np.linalg.norm(p.T_odom_kf[:3, 3] - T_odom_lidar[:3, 3])) for p in self._places]
         order = np.argsort(distance, kind="stable")[: self._frames]
         near = [self._places[i] for i in order if distance[i] <= self._radius or i == order[0]]
-        if self._merged is None or self._merged[0] != near:  # else the same object: the decoder keeps its part of it
-            T_kf_odom = se3.inverse(near[0].T_odom_kf)
-            others = [place.descriptors.moved(T_kf_odom @ place.T_odom_kf) for place in near[1:]]
-            self._merged = near, merge([near[0].descriptors, *others])
-        return near[0].T_odom_kf, self._merged[1]
+        if self._merged is not None and self._merged[0] == near:  # the same object: the decoder keeps its part of it
+            return near[0].T_odom_kf, self._merged[1]
+        found = [(place, d) for place in near if (d := place.description.get()) is not None]
+        if not found:
+            return None
+        T_kf_odom = se3.inverse(found[0][0].T_odom_kf)
+        sets = [found[0][1], *(d.moved(T_kf_odom @ place.T_odom_kf) for place, d in found[1:])]
+        merged = merge(sets)
+        if len(found) == len(near):
+            self._merged = near, merged
+        return found[0][0].T_odom_kf, merged

@@ -19,20 +19,29 @@ _LED = np.diag(np.repeat([np.radians(2), 0.5], 3) ** -2.0)
 """Information of a network pose with a standard deviation of 2 degrees and 0.5 m: enough to initialize ICP."""
 
 
-class RefinedScanRegistration:
+_SURE_MOTION = 1.0  # m, standard deviation of a prediction from which the points alone find their pose
+_SURE_FIT = 0.5  # fraction of the points that fit
+_SURE_SIGMA = 0.08  # m, standard deviation of a position with no direction left open
+
+
+class FusedScanRegistration:
     """ICP and the network's registration, fused.
 
     If both agree (see `agree`), they are fused by their information: ICP dominates in structured scenes, the network
-    along degenerate directions such as a tunnel. If they disagree, ICP's pose is kept: it has many points and starts
-    from the predicted motion. Without a motion prediction, the network's pose is an additional start of ICP and the
-    most likely result is kept. If ICP fails, it is tried again from the network's pose; if it fails there too, or
-    converges elsewhere, the network's pose is returned with its own covariance. `reason` says which of the two
-    disagreed, and why.
+    along degenerate directions such as a tunnel. If they disagree, ICP starts from the network's pose as well, and the
+    more likely of its results is kept. Without a motion prediction, the network's pose is an additional start of ICP
+    at once. If ICP fails, it is tried again from the network's pose; if it fails there too, or converges elsewhere,
+    the network's pose is returned with its own covariance. `reason` says which of the two disagreed, and why.
     """
 
-    def __init__(self, neural: NeuralScanRegistration, geometric: GeometricScanRegistration) -> None:
+    def __init__(
+        self, neural: NeuralScanRegistration, geometric: GeometricScanRegistration, always: bool = True
+    ) -> None:
+        """`always` False: the network is asked only when the points do not know: those
+        that fit well, with no direction open, from a motion that is known."""
         self._neural = neural
         self._geometric = geometric
+        self._always = always
 
     @property
     def uses_images(self) -> bool:
@@ -45,8 +54,8 @@ class RefinedScanRegistration:
         self._neural.clear()
         self._geometric.clear()
 
-    def fresh(self) -> RefinedScanRegistration:
-        return RefinedScanRegistration(self._neural.fresh(), self._geometric.fresh())
+    def fresh(self) -> FusedScanRegistration:
+        return FusedScanRegistration(self._neural.fresh(), self._geometric.fresh(), self._always)
 
     def prepare(self, frame: Frame, twist: Array) -> Scan:
         return self._neural.described(frame, self._geometric.prepare(frame, twist))
@@ -55,6 +64,10 @@ class RefinedScanRegistration:
         return self._geometric.rejection(scan)
 
     def register(self, scan: Scan, prediction: Prediction) -> Registration:
+        if not self._always and prediction.sigma <= _SURE_MOTION:
+            points = self._geometric.register(scan, prediction)
+            if points.ok and points.confidence >= _SURE_FIT and points.worst_sigma <= _SURE_SIGMA:
+                return points
         neural = self._neural.register(scan, prediction) if len(self._neural) else None
         if neural is not None and neural.ok and prediction.information is None:
             prediction = replace(prediction, starts=[neural.T_target_source, *prediction.starts])
@@ -66,11 +79,15 @@ class RefinedScanRegistration:
         if not points.ok:
             return self._led(scan, neural)
         if not agree(points, neural):
+            starts = [points.T_target_source, neural.T_target_source]
+            likelier = self._geometric.register(scan, replace(prediction, starts=starts))
+            if likelier.ok and agree(likelier, neural):
+                return _mean(likelier, neural, None)
             return _because(points, f"neural and points {_apart(points, neural)} apart")
         return _mean(points, neural, prediction.information)
 
     def _led(self, scan: Scan, neural: Registration) -> Registration:
-        """The points from the pose of the network, when the motion so far did not lead them to an answer."""
+        """The points from the pose of the network, when the motion so far did not lead them to a result."""
         points = self._geometric.register(scan, Prediction([neural.T_target_source], 1.0, _LED))
         if not points.ok:
             return replace(neural, reason=f"not refined: {points.reason}")
@@ -88,8 +105,8 @@ class RefinedScanRegistration:
 def _mean(points: Registration, neural: Registration, prior: Array | None) -> Registration:
     """Both by their information, along the directions that the network claims to know better than the points.
 
-    Elsewhere its errors would count for more than it adds: it judges itself too well and the points judge themselves
-    too badly. The information of the prediction, prior (6, 6), holds the points but is no part of the uncertainty.
+    Elsewhere its errors would count for more than it adds: its covariance is too small and that of the points too
+    large. The information of the prediction, prior (6, 6), holds the points but is no part of the uncertainty.
     """
     of_points, of_network = np.linalg.inv(points.covariance), np.linalg.inv(neural.covariance + MAP_NOISE)
     held = of_points if prior is None else of_points + prior
@@ -102,7 +119,7 @@ def _mean(points: Registration, neural: Registration, prior: Array | None) -> Re
 
 
 def _difference(a: Registration, b: Registration) -> Array:
-    """xi (6,) [rad, m] that leads from one answer to the other."""
+    """xi (6,) [rad, m] that leads from one result to the other."""
     return se3.log(se3.inverse(a.T_target_source) @ b.T_target_source)
 
 

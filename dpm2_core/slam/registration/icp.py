@@ -33,7 +33,7 @@ class GeometricSettings(Settings):
 
 
 _COARSE, _FINE = (1e-3, 0.02), (1e-4, 1e-3)  # rad and m: a smaller step ends the pass
-_EXPECTED = (np.radians(2), 0.3)  # rad and m from the prediction; hard braking makes 0.1 m in 0.1 s
+_EXPECTED = (0.3, 2.0)  # m and degrees from the prediction; hard braking makes 0.1 m in 0.1 s
 _CORRELATED = 10
 _NORMAL_NOISE = 0.09  # rad, of fitted normals; measured rms along smooth tunnels: 0.02 to 0.12, in towns over 0.25
 
@@ -56,7 +56,7 @@ class GeometricRegistration:
             T_guess: (4, 4) prediction.
             widen: factor on the first gate, for a prediction that is known to be poor.
             prior: (6, 6) information [rad, m] of the prediction. Along a tunnel nothing else says how far the car went;
-                anywhere else the points outweigh it. The covariance of the answer is that of the points alone.
+                anywhere else the points outweigh it. The covariance of the result is that of the points alone.
         """
         s = self._settings
         if len(source) < s.min_points or len(target) < s.min_points:
@@ -90,7 +90,7 @@ class GeometricRegistration:
         return Registration(T, _covariance(H), ratio, rmse, "geometric", ok, reason)
 
     def likelihood(self, source: Array, target: LocalMap, T: Array) -> float:
-        """Mean log likelihood of the (N, 3) points at a pose T_target_source: tells which of two poses fits better.
+        """Mean log likelihood of the (N, 3) points at a pose T_target_source: the greater, the better a pose fits.
 
         Distances along the normals are Cauchy distributed; a point without a counterpart has a density of 1 per meter.
         """
@@ -122,9 +122,8 @@ class GeometricRegistration:
 
 
 def _close(T: Array, T_other: Array) -> bool:
-    off = se3.inverse(T) @ T_other
-    radians, meters = _EXPECTED
-    return bool(np.linalg.norm(off[:3, 3]) <= meters and se3.angle(off) <= radians)
+    meters, degrees = se3.magnitude(se3.inverse(T) @ T_other)
+    return meters <= _EXPECTED[0] and degrees <= _EXPECTED[1]
 
 
 def _covariance(H: Array) -> Array:

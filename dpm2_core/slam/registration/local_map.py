@@ -61,8 +61,8 @@ class LocalMap:
         """Whether a scan taken at that pose would show enough that is new."""
         if self._T_last is None:
             return True
-        moved = se3.inverse(self._T_last) @ T_odom_lidar
-        return bool(np.linalg.norm(moved[:3, 3]) > self._settings.spacing or se3.angle(moved) > np.radians(10))
+        meters, degrees = se3.magnitude(se3.inverse(self._T_last) @ T_odom_lidar)
+        return meters > self._settings.spacing or degrees > 10
 
     def insert(self, points: NDArray[np.floating], T_odom_lidar: Array) -> None:
         """Add the (N, 3+) points of a scan where the map has none yet; drop what is far or old."""

@@ -4,14 +4,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 from pydantic import Field
 
 from dpm2_core.config import Settings
+from dpm2_core.descriptors import Descriptors, LazyDescriptors
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.frame import Array, Frame, Registration
+from dpm2_core.frame import Array, Frame, Points, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.slam.preprocess import Preprocessor, Scan
 from dpm2_core.slam.registration.descriptor_map import DescriptorMap
@@ -22,7 +24,7 @@ if TYPE_CHECKING:  # torch takes seconds to import, and the geometric SLAM does 
 
 
 class NeuralSettings(Settings):
-    """Registration by the network; `registration` must be `neural` or `refined`."""
+    """Registration by the network; `registration` must be another than `geometric`."""
 
     weights: str = "small"
     """Name of weights that come with dpm2, or path of a .safetensors file."""
@@ -35,7 +37,7 @@ class NeuralSettings(Settings):
     radius: float = Field(20.0, gt=0)
     """Frames farther than this from the predicted pose are not registered to, unless all are, m."""
     min_confidence: float = Field(0.1, ge=0, le=1)
-    """Mean probability of the best matches below which there is no answer."""
+    """Mean probability of the best matches below which there is no result."""
     max_sigma: float = Field(0.6, gt=0)
     """Largest standard deviation of the position in its worst direction, m."""
 
@@ -66,12 +68,15 @@ class NeuralScanRegistration:
         return self.described(frame, Scan(self._preprocessor.measured(frame, twist)))
 
     def described(self, frame: Frame, scan: Scan) -> Scan:
-        """The scan with its descriptors; without, if it has too few points."""
-        deskewed = replace(frame, points=scan.points, time_offset=None)
+        """The scan with a description, which is made when it is needed."""
+        return replace(scan, description=LazyDescriptors(partial(self._describe, frame, scan.points)))
+
+    def _describe(self, frame: Frame, points: Points) -> Descriptors | None:
+        """None of too few points."""
         try:
-            return replace(scan, descriptors=self._model.describe(deskewed))
+            return self._model.describe(replace(frame, points=points, time_offset=None))
         except Dpm2Error:
-            return scan
+            return None
 
     def rejection(self, scan: Scan) -> str:
         return "" if scan.descriptors is not None else f"{len(scan.points)} points: too few for descriptors"
@@ -80,7 +85,9 @@ class NeuralScanRegistration:
         T_predicted = prediction.starts[0]
         if scan.descriptors is None:
             return _failed(T_predicted, self.rejection(scan))
-        T_odom_kf, target = self._map.around(T_predicted)
+        if (around := self._map.around(T_predicted)) is None:
+            return _failed(T_predicted, "no descriptors around")
+        T_odom_kf, target = around
         result = self._model.register(scan.descriptors, target)
         if not result.ok:
             return _failed(T_predicted, result.reason)
@@ -96,8 +103,8 @@ class NeuralScanRegistration:
         return result
 
     def update(self, scan: Scan, T_odom_lidar: Array) -> None:
-        if scan.descriptors is not None and self._map.wants(T_odom_lidar):
-            self._map.insert(scan.descriptors, T_odom_lidar)
+        if scan.description is not None and self._map.wants(T_odom_lidar):
+            self._map.insert(scan.description, T_odom_lidar)
 
 
 def _failed(T_predicted: Array, reason: str) -> Registration:

@@ -21,7 +21,7 @@ MAP_NOISE = np.diag(np.repeat([np.radians(0.1), 0.03], 3) ** 2)
 
 
 def agree(a: Registration, b: Registration) -> bool:
-    """Whether two answers may be one pose: xi^T (S_a + S_b + S_map)^-1 xi <= `CHI2`, xi (6,) being their difference."""
+    """Whether two results may be one pose: xi^T (S_a + S_b + S_map)^-1 xi <= `CHI2`, xi (6,) being their difference."""
     xi = se3.log(se3.inverse(a.T_target_source) @ b.T_target_source)
     return bool(xi @ np.linalg.solve(a.covariance + b.covariance + MAP_NOISE, xi) <= CHI2)
 
@@ -32,7 +32,7 @@ class Prediction:
 
     Attributes:
         starts: (4, 4) T_odom_lidar, the most likely first; several while the velocity is unknown.
-        widen: factor on how far from them the answer is looked for.
+        widen: factor on how far from them the pose is searched.
         information: (6, 6) [rotation rad, translation m] of the first; None: nothing to go by.
     """
 
@@ -40,9 +40,16 @@ class Prediction:
     widen: float = 1.0
     information: Array | None = None
 
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of the first position in its least certain direction, m; infinite if nothing is known."""
+        if self.information is None:
+            return float("inf")
+        return float(np.linalg.eigvalsh(self.information[3:, 3:])[0] ** -0.5)
+
 
 class ScanRegistration(Protocol):
-    """Registers scans to what it remembers of earlier ones. T_target_source of its answers is T_odom_lidar.
+    """Registers scans to what it remembers of earlier ones. T_target_source of its results is T_odom_lidar.
 
     Attributes:
         uses_images: whether frames should come with their images.

@@ -132,7 +132,7 @@ class VisualScanRegistration:
         self._last, self._reference = (scan, T_odom_lidar), None
 
     def _along(self, result: Registration, image: Image, information: Array | None) -> Registration:
-        """The answer moved along its open direction to where the images agree; as it was, if they do not say."""
+        """The result moved along its open direction to where the images agree; unchanged if they do not."""
         s = self._settings
         axis = np.linalg.eigh(result.covariance[3:, 3:])[1][:, -1]
         b = np.concatenate([np.zeros(3), axis])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is wrong with a map file, and what of it is good: row by row, each judged for itself."""
+"""What is wrong with a map file, and what of it is good: row by row, each checked by itself."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ import numpy as np
 
 from dpm2_core.database import connect
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.frame import Array, Keyframe
+from dpm2_core.frame import Array, Edge, Keyframe, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.slam.store import rows, schema
 from dpm2_core.slam.store.cloud_codec import pack_cloud, unpack_cloud, unpack_mask
 from dpm2_core.slam.store.cloud_store import CloudStore, Loan
 from dpm2_core.slam.store.map_data import NO_POINTS, MapData, save_as, subset
-from dpm2_core.slam.store.rows import Edge, RemovedKeyframe, Session
+from dpm2_core.slam.store.rows import RemovedKeyframe, Session
 
-_SMALLEST = 20  # bytes of a row: a file has at most so many as fit, and nobody waits for the row 2^62 of a small one
+_SMALLEST = 20  # bytes of a row: a file has at most so many as fit, and a small one no row 2^62
 _BRIDGE_COVARIANCE = np.diag([0.05] * 3 + [0.5] * 3) ** 2  # of an edge that bridges a lost keyframe, rad and m
 
 
@@ -44,7 +44,7 @@ class Findings:
 
 
 def check_map(path: Path, recover: Path | None = None) -> Findings:
-    """Judge a map file without changing it; write the good part of it to a new file if wanted.
+    """Check a map file without changing it; write the good part of it to a new file if wanted.
 
     Raises:
         UsageError: no map at all, or a later dpm2's. Dpm2Error: nothing can be read, or `recover` cannot be written.
@@ -232,7 +232,8 @@ class _Salvage:
             a, b = keyframes[node - 1], keyframes[node]
             if node not in tied and (session[node], b.robot) == (session[node - 1], a.robot) and b.id > 0:
                 T_a_b = se3.inverse(a.T_odom_kf) @ b.T_odom_kf
-                out.append(Edge("odometry", node - 1, node, T_a_b, _BRIDGE_COVARIANCE, method="bridge"))
+                bridge = Registration(T_a_b, _BRIDGE_COVARIANCE, method="bridge")
+                out.append(Edge("odometry", node - 1, node, bridge))
         return out
 
     def _sessions(self, session: dict[int, int]) -> list[Session]:
@@ -281,7 +282,7 @@ class _Salvage:
         return min(last, self._most)
 
     def _end(self) -> int:
-        """One more than the last node that any table knows."""
+        """One more than the last node that any table has."""
         last = -1
         for table in ("keyframes", "payloads", "poses"):
             with suppress(sqlite3.DatabaseError, TypeError, ValueError):

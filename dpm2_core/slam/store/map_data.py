@@ -12,14 +12,13 @@ from typing import Any, TypeVar
 import numpy as np
 
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.frame import Array, Keyframe, Points, Registration
+from dpm2_core.frame import Array, Edge, Keyframe, Points
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.slam.store.cloud_store import CloudStore, Loan
 from dpm2_core.slam.store.map_store import Change, MapStore
 from dpm2_core.slam.store.rows import NO_POINTS as NO_POINTS
 from dpm2_core.slam.store.rows import (
-    Edge,
     RemovedKeyframe,
     Session,
     check_ends,
@@ -86,16 +85,15 @@ def _load(store: MapStore, descriptors: bool) -> MapData:
             check_ends(edge, nodes)
         edges.append(edge)
     owner = [(keyframe.robot, number) for keyframe, number in zip(keyframes, session, strict=True)]
-    for node, edge in _chain(edges).items():
+    for node, edge in odometry_by_node(edges).items():
         if owner[edge.from_node] == owner[node]:
-            known = (edge.T_from_to, edge.covariance, edge.confidence, edge.rmse, edge.method)
-            keyframes[node] = replace(keyframes[node], edge=Registration(*known))
+            keyframes[node] = replace(keyframes[node], edge=edge.registration)
     poses = dict(_made(store, "poses", lambda row: pose_of(row[1])))
     if missing := set(nodes) - poses.keys():
         raise ValueError(f"keyframe {min(missing)} has no pose")
     moving: dict[int, bytes] = dict(store.rows("moving"))
     if not all(isinstance(mask, bytes) for mask in moving.values()):
-        raise ValueError("a mask of moving points that is none")
+        raise ValueError("invalid mask of moving points")
     trail = [pruned for _, pruned in _made(store, "trail", removed_of)]
     if any(pruned.node not in nodes for pruned in trail):
         raise ValueError("a pruned keyframe that belongs to none")
@@ -237,7 +235,7 @@ def trajectory(data: MapData) -> tuple[list[int], Array]:
     return [row[2] for row in rows], np.array([row[3] for row in rows]).reshape(-1, 4, 4)
 
 
-def _chain(edges: Iterable[Edge]) -> dict[int, Edge]:
+def odometry_by_node(edges: Iterable[Edge]) -> dict[int, Edge]:
     """The odometry by the node that it leads to: no node has two before it, or two after it."""
     chain: dict[int, Edge] = {}
     left: set[int] = set()

@@ -21,11 +21,10 @@ from typing import Any
 from dpm2_core._version import __version__
 from dpm2_core.database import Connection, connect
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.frame import Array, Keyframe
+from dpm2_core.frame import Array, Edge, Keyframe
 from dpm2_core.slam.store import schema
 from dpm2_core.slam.store.cloud_store import Loan
 from dpm2_core.slam.store.rows import (
-    Edge,
     RemovedKeyframe,
     Session,
     array_bytes,
@@ -36,7 +35,8 @@ from dpm2_core.slam.store.rows import (
     with_crc,
 )
 
-_BUSY_S = 5.0  # a reader never blocks the writer for long, another writer is an error
+BUSY = 5.0
+"""s to wait for another program: a reader never blocks the writer for long, another writer is an error."""
 _HEAD = b"SQLite format 3"
 
 
@@ -188,7 +188,7 @@ class MapStore:
     def close(self) -> None:
         """End it. The last one to write leaves a single file behind, without FILE-wal."""
         if not self.read_only:
-            with suppress(sqlite3.Error):  # somebody reads, or the disk is full: FILE-wal stays, and nothing is lost
+            with suppress(sqlite3.Error):  # there is a reader, or the disk is full: FILE-wal stays, and nothing is lost
                 self._connection.execute("PRAGMA busy_timeout = 200")
                 self._connection.execute("PRAGMA journal_mode = DELETE")
         self._connection.close()
@@ -234,7 +234,7 @@ def _insert(sql: sqlite3.Connection, table: str, rows: Sequence[tuple[Any, ...]]
 
 
 def _connect(path: Path, mode: str) -> Connection:
-    return connect(path, mode, _BUSY_S)
+    return connect(path, mode, BUSY)
 
 
 def _durable(connection: sqlite3.Connection) -> None:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Between the nouns and the rows of a map file; see schema.py.
 
-A row may come from anybody, its checksum right: what is made of it is of the right types, finite and within bounds.
+A row may come from anyone, with a correct checksum: what is made of it is of the right types, finite and within bounds.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ from collections.abc import Container
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.frame import Array, Keyframe, Points
+from dpm2_core.frame import Array, Edge, Keyframe, Points, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.slam.store.cloud_store import Loan
 from dpm2_core.slam.store.schema import row_crc
@@ -28,30 +28,6 @@ FARTHEST = 1e7
 """m from the origin: from there on float32 clouds are meters off. No pose of a map lies beyond."""
 _LONGEST_NAME = 255
 _DESCRIPTORS = struct.Struct("<IIB")  # number, channels, whether there are axes
-
-
-@dataclass(frozen=True, eq=False)
-class Edge:
-    """A constraint of the pose graph, or a loop that was tried and rejected.
-
-    Attributes:
-        kind: "odometry" or "loop".
-        from_node, to_node: positions in the map.
-        T_from_to: (4, 4). covariance: (6, 6) [rotation rad, translation m] of xi in T_from_to @ Exp(xi).
-        ok: False for a rejected loop; `reason` says why.
-        confidence, rmse, method: of the registration.
-    """
-
-    kind: Literal["odometry", "loop"]
-    from_node: int
-    to_node: int
-    T_from_to: Array
-    covariance: Array
-    ok: bool = True
-    confidence: float = 1.0
-    rmse: float = 0.0
-    method: str = ""
-    reason: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,12 +150,14 @@ def keyframe_of(row: tuple[Any, ...]) -> tuple[int, Keyframe, int, Loan | None]:
     return node, keyframe, session, Loan(lender, pose_of(T_lent))
 
 
-def edge_row(number: int, e: Edge) -> tuple[Any, ...]:
+def edge_row(number: int, edge: Edge) -> tuple[Any, ...]:
     """Of table `edges`."""
-    T, covariance = array_bytes(e.T_from_to), array_bytes(e.covariance)
+    r = edge.registration
+    T, covariance = array_bytes(r.T_target_source), array_bytes(r.covariance)
     # SQLite has no NaN
-    numbers = (int(e.ok), *(float(x) if x == x else float("inf") for x in (e.confidence, e.rmse)))
-    return with_crc(number, e.kind, int(e.from_node), int(e.to_node), T, covariance, *numbers, e.method, e.reason)
+    numbers = (int(r.ok), *(float(x) if x == x else float("inf") for x in (r.confidence, r.rmse)))
+    ends = int(edge.from_node), int(edge.to_node)
+    return with_crc(number, edge.kind, *ends, T, covariance, *numbers, r.method, r.reason)
 
 
 def edge_of(row: tuple[Any, ...]) -> Edge:
@@ -200,7 +178,7 @@ def edge_of(row: tuple[Any, ...]) -> Edge:
             raise ValueError
     except ValueError:
         raise ValueError("not a finite rigid transform with a positive covariance") from None
-    return Edge(kind, from_node, to_node, T, covariance, bool(ok), confidence, rmse, method, reason)
+    return Edge(kind, from_node, to_node, Registration(T, covariance, confidence, rmse, method, bool(ok), reason))
 
 
 def check_ends(edge: Edge, nodes: Container[int]) -> None:

@@ -6,10 +6,9 @@ from __future__ import annotations
 import numpy as np
 
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.frame import Array, Keyframe
+from dpm2_core.frame import Array, Edge, Keyframe
 from dpm2_core.slam.store.cloud_store import CloudStore
 from dpm2_core.slam.store.map_store import Change, MapStore
-from dpm2_core.slam.store.rows import Edge
 
 _BATCH = 20  # keyframes a transaction while catching up: memory is that of so many clouds
 _STILL = 1e-4  # m and rad: poses that move by less are not worth writing

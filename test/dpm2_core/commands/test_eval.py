@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`dpm2 eval` prints the reference figures, says how it judged, and rejects what it cannot judge."""
+"""`dpm2 eval` prints the reference figures, says how it evaluated, and rejects what it cannot evaluate."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def test_a_calibration_without_tr_or_that_is_not_there_is_rejected(tmp_path: Pat
 
 
 def test_a_drive_is_its_own_ground_truth(tmp_path: Path) -> None:
-    """--gt may be a drive of any layout: it judges an estimate of the left camera that has frame numbers."""
+    """--gt may be a drive of any layout: it evaluates an estimate of the left camera that has frame numbers."""
     folder = tmp_path / "sequences" / "07"
     (folder / "velodyne").mkdir(parents=True)
     poses = np.stack([se3.exp([0, 0.02 * n, 0, 0, 0, n]) for n in range(6)])

@@ -5,8 +5,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -16,58 +14,44 @@ from dpm2_core.data.open import open_source
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.trajectory import read_trajectory
 from dpm2_core.geometry import se3
-from dpm2_core.sim.drive import simulate
-from dpm2_core.sim.settings import LidarConfig
 from dpm2_core.slam.store.map_data import load_map
 from dpm2_core.slam.store.map_store import MapStore
 
+from ...helpers.command import dpm2
+
 pytestmark = [pytest.mark.slow, pytest.mark.weights]
 
-FRAMES, MAPPED = 30, 20
-
-
-def dpm2(*arguments: object) -> subprocess.CompletedProcess[str]:
-    """The command in a process of its own."""
-    command = [sys.executable, "-m", "dpm2_core.cli", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+MAPPED = 20
 
 
 @pytest.fixture(scope="module")
-def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """28 m of a street."""
-    root = tmp_path_factory.mktemp("drive") / "sim"
-    simulate(root, FRAMES, seed=2, road="straight", preset="suburb", images=False, lidar=LidarConfig(columns=900))
-    return root
-
-
-@pytest.fixture(scope="module")
-def made(drive: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The map of its first 20 scans, with the session's weights noted."""
     folder = tmp_path_factory.mktemp("map")
     path = folder / "drive.dpm2map"
-    done = dpm2("run", drive, "--out", folder / "out", "--frames", f":{MAPPED}", "--map", path)
+    done = dpm2("run", recording, "--out", folder / "out", "--frames", f":{MAPPED}", "--map", path)
     assert done.returncode == 0, done.stderr
     with MapStore.open(path) as store:
         assert load_map(store).sessions[0].weights.startswith("small ")
     return path
 
 
-def truth(drive: Path) -> np.ndarray:
+def truth(recording: Path) -> np.ndarray:
     """(N, 4, 4) T_map_lidar: the map's frame is that of the first scan."""
-    poses = open_source(drive, InputSettings(images=False)).poses
+    poses = open_source(recording, InputSettings(images=False)).poses
     assert poses is not None
     return np.asarray(se3.inverse(poses[0]) @ poses)
 
 
 @pytest.mark.parametrize("hint", [None, "8,3,170"])
 def test_the_drive_is_found_in_the_map_which_stays_as_it_is(
-    drive: Path, made: Path, tmp_path: Path, hint: str | None
+    recording: Path, made: Path, tmp_path: Path, hint: str | None
 ) -> None:
     """From scan 8 on, out to 4 m beyond the map; whatever heading is hinted."""
     before = hashlib.sha256(made.read_bytes()).hexdigest()
     hints = [] if hint is None else ["--hint", hint]
     out = tmp_path / "out"
-    done = dpm2("run", drive, "--out", out, "--frames", "8:24", "--localise", made, *hints)
+    done = dpm2("run", recording, "--out", out, "--frames", "8:24", "--localise", made, *hints)
     assert done.returncode == 0, done.stderr
     assert hashlib.sha256(made.read_bytes()).hexdigest() == before
     assert sorted(path.name for path in made.parent.iterdir()) == ["drive.dpm2map", "out"]
@@ -75,14 +59,14 @@ def test_the_drive_is_found_in_the_map_which_stays_as_it_is(
     assert (report["frames"], report["frames_until_found"], report["kidnappings"]) == (16, 0, 0)
     estimate = read_trajectory(out / "trajectory.tum")
     assert len(estimate) == report["frames_located"] == 16
-    off = np.linalg.norm(estimate.poses[:, :3, 3] - truth(drive)[8:24, :3, 3], axis=1)
+    off = np.linalg.norm(estimate.poses[:, :3, 3] - truth(recording)[8:24, :3, 3], axis=1)
     assert off.max() < 0.1
     assert "found after 0 frames" in done.stdout
 
 
-def test_a_wrong_hint_only_costs_time(drive: Path, made: Path, tmp_path: Path) -> None:
+def test_a_wrong_hint_only_costs_time(recording: Path, made: Path, tmp_path: Path) -> None:
     """Nothing is there; then it looks everywhere, after a second although it has hardly moved."""
-    done = dpm2("run", drive, "--out", tmp_path / "o", "--frames", ":13", "--localise", made, "--hint", "500,0,0")
+    done = dpm2("run", recording, "--out", tmp_path / "o", "--frames", ":13", "--localise", made, "--hint", "500,0,0")
     assert done.returncode == 0, done.stderr
     report = json.loads((tmp_path / "o" / "localisation.json").read_text())
     assert report["frames_until_found"] == 6  # the next keyframe, 5 m on
@@ -90,13 +74,13 @@ def test_a_wrong_hint_only_costs_time(drive: Path, made: Path, tmp_path: Path) -
     assert len(read_trajectory(tmp_path / "o" / "trajectory.tum")) == 7
 
 
-def test_kidnapping_is_noticed_and_answered(drive: Path, made: Path, tmp_path: Path) -> None:
+def test_kidnapping_is_noticed_and_answered(recording: Path, made: Path, tmp_path: Path) -> None:
     """The scans jump from the end of the map back to its beginning: lost for a while, never sure of a wrong place."""
     sequence = tmp_path / "sequence"
     (sequence / "velodyne").mkdir(parents=True)
     order = [*range(8, 19), *[1] * 30]
     for n, frame in enumerate(order):
-        target = drive / "sequences" / "00" / "velodyne" / f"{frame:06d}.bin"
+        target = recording / "sequences" / "00" / "velodyne" / f"{frame:06d}.bin"
         (sequence / "velodyne" / f"{n:06d}.bin").symlink_to(target)
     (sequence / "times.txt").write_text("".join(f"{0.1 * n:.1f}\n" for n in range(len(order))))
     done = dpm2("run", sequence, "--out", tmp_path / "o", "--localise", made)
@@ -105,19 +89,19 @@ def test_kidnapping_is_noticed_and_answered(drive: Path, made: Path, tmp_path: P
     assert [event["event"] for event in report["events"]].count("found") + report["kidnappings"] == 2
     estimate = read_trajectory(tmp_path / "o" / "trajectory.tum")
     where = np.round(estimate.keys * 1e-8).astype(int)
-    T = truth(drive)[np.array(order)[where]]
+    T = truth(recording)[np.array(order)[where]]
     off = np.linalg.norm(estimate.poses[:, :3, 3] - T[:, :3, 3], axis=1)
     assert off[-1] < 0.3
     assert report["frames_by_state"]["lost"] > 0
 
 
-def test_another_drive_extends_the_map_as_a_session_tied_by_loops(drive: Path, made: Path, tmp_path: Path) -> None:
+def test_another_drive_extends_the_map_as_a_session_tied_by_loops(recording: Path, made: Path, tmp_path: Path) -> None:
     path = tmp_path / "grown.dpm2map"
     path.write_bytes(made.read_bytes())
-    rejected = dpm2("run", drive, "--out", tmp_path / "o", "--frames", "4:", "--map", path)
+    rejected = dpm2("run", recording, "--out", tmp_path / "o", "--frames", "4:", "--map", path)
     assert rejected.returncode == 2
     assert "--resume" in rejected.stderr
-    done = dpm2("run", drive, "--out", tmp_path / "o", "--frames", "4:", "--map", path, "--extend")
+    done = dpm2("run", recording, "--out", tmp_path / "o", "--frames", "4:", "--map", path, "--extend")
     assert done.returncode == 0, done.stderr
     with MapStore.open(path) as store:
         data = load_map(store)
@@ -126,7 +110,7 @@ def test_another_drive_extends_the_map_as_a_session_tied_by_loops(drive: Path, m
     assert any(edge.from_node < first <= edge.to_node for edge in data.constraints), done.stderr
     at = {k.stamp: T for k, T in zip(data.keyframes[first:], data.poses[first:], strict=True)}
     last = max(at)
-    expected = truth(drive)[round(last * 1e-8)]
+    expected = truth(recording)[round(last * 1e-8)]
     assert np.linalg.norm(at[last][:3, 3] - expected[:3, 3]) < 0.2
 
 
@@ -143,12 +127,12 @@ def test_another_drive_extends_the_map_as_a_session_tied_by_loops(drive: Path, m
         (["--localise", "OTHER"], "made with weights other 0123"),
     ],
 )
-def test_errors_of_use(drive: Path, made: Path, tmp_path: Path, arguments: list[str], words: str) -> None:
+def test_errors_of_use(recording: Path, made: Path, tmp_path: Path, arguments: list[str], words: str) -> None:
     files = {"MAP": made, "NONE": tmp_path / "none.dpm2map", "OTHER": tmp_path / "other.dpm2map"}
     for name, weights in (("NONE", ""), ("OTHER", "other 0123")):
         with MapStore.create(files[name]) as store:
             store.begin_session("", weights)
-    done = dpm2("run", drive, "--out", tmp_path / "o", *[files.get(a, a) for a in arguments])
+    done = dpm2("run", recording, "--out", tmp_path / "o", *[files.get(a, a) for a in arguments])
     assert done.returncode == 2, done.stderr
     assert words in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1

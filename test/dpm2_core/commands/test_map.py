@@ -12,21 +12,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dpm2_core.cli import main
 from dpm2_core.data.trajectory import read_trajectory
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Array, Keyframe
 from dpm2_core.geometry import se3
 from dpm2_core.sim.drive import simulate
-from dpm2_core.sim.settings import LidarConfig
+from dpm2_core.sim.settings import DriveConfig, LidarConfig
 from dpm2_core.slam.store.map_data import MapData, load_map
 from dpm2_core.slam.store.map_store import MapStore
 
-
-def dpm2(*words: object) -> int:
-    with pytest.raises(SystemExit) as end:
-        main([str(word) for word in words])
-    return int(end.value.code or 0)
+from ...helpers.command import dpm2
 
 
 def loaded(path: Path) -> MapData:
@@ -34,9 +29,10 @@ def loaded(path: Path) -> MapData:
         return load_map(store)
 
 
-def test_info(map_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert dpm2("map", "info", map_file) == 0
-    info = " ".join(capsys.readouterr().out.split())
+def test_info(map_file: Path) -> None:
+    done = dpm2("map", "info", map_file)
+    assert done.returncode == 0
+    info = " ".join(done.stdout.split())
     for words in (
         "12, 12 of them",
         "12 with descriptors",
@@ -47,15 +43,15 @@ def test_info(map_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert words in info, info
 
 
-def test_trajectories_and_graph(tmp_path: Path, map_file: Path, drive: list[Keyframe]) -> None:
+def test_trajectories_and_graph(tmp_path: Path, map_file: Path, keyframes: list[Keyframe]) -> None:
     import gtsam
 
-    poses = np.array([k.T_odom_kf for k in drive])
+    poses = np.array([k.T_odom_kf for k in keyframes])
     for name in ("a.tum", "a.g2o"):
-        assert dpm2("map", "export", map_file, tmp_path / name) == 0
-    assert dpm2("map", "export", map_file, tmp_path / "kitti.txt", "--format", "kitti") == 0
+        assert dpm2("map", "export", map_file, tmp_path / name).returncode == 0
+    assert dpm2("map", "export", map_file, tmp_path / "kitti.txt", "--format", "kitti").returncode == 0
     tum, kitti = read_trajectory(tmp_path / "a.tum"), read_trajectory(tmp_path / "kitti.txt")
-    assert list(tum.keys) == [k.stamp for k in drive]
+    assert list(tum.keys) == [k.stamp for k in keyframes]
     np.testing.assert_allclose(tum.poses, poses, atol=1e-9)
     np.testing.assert_allclose(kitti.poses, poses, atol=1e-9)
     factors, values = gtsam.readG2o(str(tmp_path / "a.g2o"), True)
@@ -65,7 +61,7 @@ def test_trajectories_and_graph(tmp_path: Path, map_file: Path, drive: list[Keyf
 
 def test_clouds_agree_in_every_format(tmp_path: Path, map_file: Path) -> None:
     for ending in ("ply", "pcd"):
-        assert dpm2("map", "export", map_file, tmp_path / f"a.{ending}", "--voxel", 1.0) == 0
+        assert dpm2("map", "export", map_file, tmp_path / f"a.{ending}", "--voxel", 1.0).returncode == 0
     ply = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")[2]
     pcd = (tmp_path / "a.pcd").read_bytes().partition(b"DATA binary\n")[2]
     assert ply == pcd
@@ -75,51 +71,61 @@ def test_clouds_agree_in_every_format(tmp_path: Path, map_file: Path) -> None:
 
 
 def test_occupancy(tmp_path: Path, map_file: Path) -> None:
-    assert dpm2("map", "export", map_file, tmp_path / "grid.yaml", "--resolution", 0.5) == 0
+    assert dpm2("map", "export", map_file, tmp_path / "grid.yaml", "--resolution", 0.5).returncode == 0
     assert {p.name for p in tmp_path.glob("grid.*")} == {"grid.yaml", "grid.pgm"}
 
 
-def test_what_cannot_be_exported(tmp_path: Path, map_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert dpm2("map", "export", map_file, tmp_path / "a.jpg") == 2
-    assert "choose --format from ply, pcd" in capsys.readouterr().err
+def test_what_cannot_be_exported(tmp_path: Path, map_file: Path) -> None:
+    done = dpm2("map", "export", map_file, tmp_path / "a.jpg")
+    assert done.returncode == 2
+    assert "choose --format from ply, pcd" in done.stderr
     with MapStore.create(tmp_path / "empty.dpm2map") as store:
         store.begin_session()
-    assert dpm2("map", "export", tmp_path / "empty.dpm2map", tmp_path / "a.ply") == 2
-    assert "no keyframe" in capsys.readouterr().err
-    assert dpm2("map", "info", tmp_path / "empty.dpm2map") == 0
+    done = dpm2("map", "export", tmp_path / "empty.dpm2map", tmp_path / "a.ply")
+    assert done.returncode == 2
+    assert "no keyframe" in done.stderr
+    assert dpm2("map", "info", tmp_path / "empty.dpm2map").returncode == 0
 
 
-def test_merge_by_transform(tmp_path: Path, map_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_merge_by_transform(tmp_path: Path, map_file: Path) -> None:
     out = tmp_path / "both.dpm2map"
-    assert dpm2("map", "merge", map_file, map_file, "--out", out, "--transform", "10 0 0 90") == 0
+    assert dpm2("map", "merge", map_file, map_file, "--out", out, "--transform", "10 0 0 90").returncode == 0
     both = loaded(out)
     T = se3.make([[0, -1, 0], [1, 0, 0], [0, 0, 1]], [10, 0, 0])
     np.testing.assert_allclose(both.poses[12:], T @ both.poses[:12], atol=1e-9)
-    capsys.readouterr()
     for words in (["--transform", "1 2 3"], [], ["--align", "--transform", "0 0 0 0"], ["--transform", "a b c d"]):
-        assert dpm2("map", "merge", map_file, map_file, "--out", tmp_path / "no", *words) == 2
-        assert len(capsys.readouterr().err.splitlines()) == 1
-    assert dpm2("map", "merge", map_file, map_file, "--out", out, "--transform", "0 0 0 0") == 2
-    assert "a file already" in capsys.readouterr().err
+        done = dpm2("map", "merge", map_file, map_file, "--out", tmp_path / "no", *words)
+        assert done.returncode == 2
+        assert len(done.stderr.splitlines()) == 1
+    done = dpm2("map", "merge", map_file, map_file, "--out", out, "--transform", "0 0 0 0")
+    assert done.returncode == 2
+    assert "a file already" in done.stderr
 
 
-def test_check_and_recover(tmp_path: Path, map_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert dpm2("map", "check", map_file) == 0
-    assert "sound" in capsys.readouterr().out
+def test_check_and_recover(tmp_path: Path, map_file: Path) -> None:
+    done = dpm2("map", "check", map_file)
+    assert done.returncode == 0
+    assert "sound" in done.stdout
     content = bytearray(map_file.read_bytes())
     content[-3000:-100] = bytes(2900)
     map_file.write_bytes(content)
-    assert dpm2("map", "check", map_file) == 1
-    assert "--recover" in capsys.readouterr().err
-    assert dpm2("map", "check", map_file, "--recover", tmp_path / "good.dpm2map") == 0
-    assert dpm2("map", "check", tmp_path / "good.dpm2map") == 0
+    done = dpm2("map", "check", map_file)
+    assert done.returncode == 1
+    assert "--recover" in done.stderr
+    assert dpm2("map", "check", map_file, "--recover", tmp_path / "good.dpm2map").returncode == 0
+    assert dpm2("map", "check", tmp_path / "good.dpm2map").returncode == 0
 
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A lap of 60 frames."""
     folder = tmp_path_factory.mktemp("drive") / "drive"
-    simulate(folder, 60, 3, "loop", "suburb", False, LidarConfig(beams=32, columns=512))
+    simulate(
+        folder,
+        DriveConfig(
+            frames=60, seed=3, road="loop", preset="suburb", images=False, lidar=LidarConfig(beams=32, columns=512)
+        ),
+    )
     return folder
 
 
@@ -130,16 +136,15 @@ def aligned(data: MapData) -> dict[int, Array]:
 RUN = ("--set", "slam.loops.descriptors=false")
 
 
-def test_run_writes_a_map_and_goes_on_with_it(
-    tmp_path: Path, recording: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_run_writes_a_map_and_goes_on_with_it(tmp_path: Path, recording: Path) -> None:
     whole, parts = tmp_path / "whole.dpm2map", tmp_path / "parts.dpm2map"
-    assert dpm2("run", recording, "--out", tmp_path / "a", "--map", whole, *RUN) == 0
-    assert dpm2("run", recording, "--out", tmp_path / "b", "--map", parts, "--frames", "0:35", *RUN) == 0
+    assert dpm2("run", recording, "--out", tmp_path / "a", "--map", whole, *RUN).returncode == 0
+    assert dpm2("run", recording, "--out", tmp_path / "b", "--map", parts, "--frames", "0:35", *RUN).returncode == 0
     before = len(loaded(parts))
-    assert dpm2("run", recording, "--out", tmp_path / "b", "--map", parts, *RUN) == 2
-    assert "--resume goes on with it" in capsys.readouterr().err
-    assert dpm2("run", recording, "--out", tmp_path / "b", "--map", parts, "--resume", *RUN) == 0
+    rejected = dpm2("run", recording, "--out", tmp_path / "b", "--map", parts, *RUN)
+    assert rejected.returncode == 2
+    assert "--resume goes on with it" in rejected.stderr
+    assert dpm2("run", recording, "--out", tmp_path / "b", "--map", parts, "--resume", *RUN).returncode == 0
     one, two = loaded(whole), loaded(parts)
     assert set(two.session) == {1, 2}
     assert two.keyframes[before].index == two.keyframes[before - 1].index  # it begins where the first part ended
@@ -156,13 +161,11 @@ def test_run_writes_a_map_and_goes_on_with_it(
 
 
 @pytest.mark.slow
-def test_a_drive_that_is_killed_leaves_a_sound_map(
-    tmp_path: Path, recording: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_drive_that_is_killed_leaves_a_sound_map(tmp_path: Path, recording: Path) -> None:
     """kill -9 of a real drive, after the network has tried loops and had them rejected."""
     path = tmp_path / "a.dpm2map"
-    doubting = ("--set", "slam.loops.gap=3", "--set", "slam.loops.min_confidence=2", "--set", "slam.loops.radius=0")
-    command = ["run", str(recording), "--out", str(tmp_path / "out"), "--map", str(path), *doubting]
+    rejecting = ("--set", "slam.loops.gap=3", "--set", "slam.loops.min_confidence=2", "--set", "slam.loops.radius=0")
+    command = ["run", str(recording), "--out", str(tmp_path / "out"), "--map", str(path), *rejecting]
     child = subprocess.Popen([sys.executable, "-m", "dpm2_core.cli", *command], stderr=subprocess.DEVNULL)
     try:
         while child.poll() is None and not _rejected(path):
@@ -171,8 +174,9 @@ def test_a_drive_that_is_killed_leaves_a_sound_map(
     finally:
         child.kill()
         child.wait()
-    assert dpm2("map", "check", path) == 0
-    assert "keyframes, sound" in capsys.readouterr().out
+    done = dpm2("map", "check", path)
+    assert done.returncode == 0
+    assert "keyframes, sound" in done.stdout
     assert _rejected(path)
 
 
@@ -185,11 +189,10 @@ def _rejected(path: Path) -> int:
         return 0
 
 
-def test_a_map_of_another_drive_is_not_gone_on_with(
-    tmp_path: Path, recording: Path, map_file: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert dpm2("run", recording, "--out", tmp_path / "a", "--map", map_file, "--resume", *RUN) == 2
-    assert "is not in" in capsys.readouterr().err
+def test_a_map_of_another_drive_is_not_gone_on_with(tmp_path: Path, recording: Path, map_file: Path) -> None:
+    done = dpm2("run", recording, "--out", tmp_path / "a", "--map", map_file, "--resume", *RUN)
+    assert done.returncode == 2
+    assert "is not in" in done.stderr
 
 
 def test_reading_commands_leave_the_file_as_it_is(tmp_path: Path, map_file: Path) -> None:

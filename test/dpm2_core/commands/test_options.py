@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 import dpm2_core.commands
-from dpm2_core.cli import _status
+
+from ...helpers.command import dpm2
 
 COMMANDS = sorted(Path(dpm2_core.commands.__path__[0]).glob("*.py"))
 
@@ -34,19 +35,20 @@ def test_no_parameter_of_a_command_is_ignored(module: Path) -> None:
      "--config and --set are for --align"),
 ])  # fmt: skip
 def test_an_option_without_effect_is_rejected(
-    command: list[str], words: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    command: list[str], words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Before any file is opened, and none is made."""
     monkeypatch.chdir(tmp_path)
-    assert _status(command) == 2
-    assert words in capsys.readouterr().err
+    done = dpm2(*command)
+    assert done.returncode == 2
+    assert words in done.stderr
     assert not list(tmp_path.iterdir())
 
 
-def test_a_task_without_slam_loss_takes_no_weight_for_it(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_a_task_without_slam_loss_takes_no_weight_for_it(tmp_path: Path) -> None:
     """Neither as an option nor as a setting."""
-    dynamic = ["train", "movers", str(tmp_path), "--out", str(tmp_path / "out")]
-    assert _status([*dynamic, "--slam-weight", "1"]) == 2
-    assert "--slam-weight" in capsys.readouterr().err
-    assert _status([*dynamic, "--set", "slam.gamma=1"]) == 2
-    assert "unknown key slam" in capsys.readouterr().err
+    movers = ["train", "movers", tmp_path, "--out", tmp_path / "out"]
+    for more, words in ((["--slam-weight", "1"], "--slam-weight"), (["--set", "slam.gamma=1"], "unknown key slam")):
+        done = dpm2(*movers, *more)
+        assert done.returncode == 2
+        assert words in done.stderr

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dpm2_core.cli import _status
+from ...helpers.command import dpm2
 
 SENSOR = "network.image={beams: [[2, -14, 16]], first: 0, rows: 16, columns: 64, scale: 120}"
 SMALL = [SENSOR, "network.channels=4", "network.latent=8", "window=3", "every=1", "batch=1", "slam_loss.points=200"]
@@ -38,27 +38,27 @@ def pairs(tmp_path: Path) -> Path:
         ("ae_lidar", ["network.variational=true"], {"chamfer_m", "chamfer", "d_error_m"}),
     ],
 )
-def test_train_and_measure(
-    pairs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, stages: list[str], figures: set[str]
-) -> None:
-    """The SLAM loss in the last of three epochs; weights of one task are none of the other; SLAM needs poses."""
+def test_train_and_measure(pairs: Path, tmp_path: Path, name: str, stages: list[str], figures: set[str]) -> None:
+    """The SLAM loss in the last of three epochs; weights of one task are rejected by the other; SLAM needs poses."""
     out = tmp_path / "out"
     settings = [word for setting in [*SMALL, *stages, "epochs=3"] for word in ("--set", setting)]
     slam = ["--slam-weight", "0.5", "--slam-every", "3"]
-    assert _status(["train", name, str(pairs), "--out", str(out), *settings, *slam]) == 0
+    assert dpm2("train", name, pairs, "--out", out, *settings, *slam).returncode == 0
     log = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
     assert [row["step"] for row in log if "slam_loss" in row] == [4, 5]
 
-    capsys.readouterr()
-    weights, image = str(out / "weights.safetensors"), tmp_path / "scan.png"
-    assert _status(["eval-task", name, weights, str(pairs), "--json", "--picture", str(image), "--frame", "2"]) == 0
-    printed = json.loads(capsys.readouterr().out)
+    weights, image = out / "weights.safetensors", tmp_path / "scan.png"
+    done = dpm2("eval-task", name, weights, pairs, "--json", "--picture", image, "--frame", "2")
+    assert done.returncode == 0, done.stderr
+    printed = json.loads(done.stdout)
     assert printed["scans"] == 6
     assert figures <= printed.keys()
     assert image.stat().st_size > 1000
 
-    assert _status(["eval-task", name, weights, str(pairs), "--slam"]) == 2
-    assert "no sequences with poses" in capsys.readouterr().err
+    rejected = dpm2("eval-task", name, weights, pairs, "--slam")
+    assert rejected.returncode == 2
+    assert "no sequences with poses" in rejected.stderr
     other = "ae_lidar" if name == "dslr" else "dslr"
-    assert _status(["eval-task", other, weights, str(pairs)]) == 2
-    assert f"weights of {name}, not of {other}" in capsys.readouterr().err
+    rejected = dpm2("eval-task", other, weights, pairs)
+    assert rejected.returncode == 2
+    assert f"weights of {name}, not of {other}" in rejected.stderr

@@ -17,9 +17,14 @@ import numpy as np
 import pytest
 
 from dpm2_core.data.convert import convert_kitti
+from dpm2_core.data.kitti import KittiSource
 from dpm2_core.data.trajectory import read_trajectory
-from dpm2_core.sim.drive import simulate
-from dpm2_core.sim.settings import LidarConfig
+from dpm2_core.errors import Dpm2Error
+from dpm2_core.slam.store.map_data import load_map
+from dpm2_core.slam.store.map_store import MapStore
+
+from ...helpers.command import dpm2, dpm2_process
+from ...helpers.drives import first_scans
 
 pytestmark = pytest.mark.slow
 
@@ -30,31 +35,23 @@ RESULTS = {
 }  # fmt: skip
 
 
-def dpm2(*arguments: object, **options: object) -> subprocess.CompletedProcess[str]:
-    """The command in a process of its own."""
-    command = [sys.executable, "-m", "dpm2_core.cli", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, **options)  # type: ignore[call-overload]
-
-
 @pytest.fixture(scope="module")
-def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A short simulated drive without images."""
-    root = tmp_path_factory.mktemp("drive") / "sim"
-    simulate(root, FRAMES, seed=2, road="straight", preset="suburb", images=False, lidar=LidarConfig(columns=900))
-    return root
+def recording(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The first of its scans."""
+    return first_scans(recording, FRAMES, tmp_path_factory.mktemp("first"))
 
 
 @pytest.fixture
-def sequence(drive: Path, tmp_path: Path) -> Path:
+def sequence(recording: Path, tmp_path: Path) -> Path:
     """A copy of its sequence folder, to be damaged."""
     copy = tmp_path / "sequence"
-    shutil.copytree(drive / "sequences" / "00", copy)
+    shutil.copytree(recording / "sequences" / "00", copy)
     return copy
 
 
-def test_writes_everything_and_is_right(drive: Path, tmp_path: Path) -> None:
+def test_writes_everything_and_is_right(recording: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    done = dpm2("run", drive, "--out", out)
+    done = dpm2_process("run", recording, "--out", out)
     assert done.returncode == 0, done.stderr
     assert {path.name for path in out.iterdir()} == RESULTS
     metrics = json.loads((out / "metrics.json").read_text())
@@ -67,33 +64,35 @@ def test_writes_everything_and_is_right(drive: Path, tmp_path: Path) -> None:
     assert metrics["rpe_trans_m"] < 0.02
     assert metrics["fps"] > 0
     estimate = read_trajectory(out / "trajectory_kitti.txt")
-    truth = read_trajectory(drive / "poses" / "00.txt")
+    truth = read_trajectory(recording / "poses" / "00.txt")
     assert len(estimate) == FRAMES
     np.testing.assert_allclose(estimate.poses[:, :3, 3], truth.poses[:, :3, 3], atol=0.05)  # camera frame, as KITTI's
     assert (out / "trajectory.png").read_bytes()[1:4] == b"PNG"
-    again = dpm2("eval", "--gt", drive / "poses" / "00.txt", "--est", out / "trajectory_kitti.txt", "--json", out / "e")
+    again = dpm2(
+        "eval", "--gt", recording / "poses" / "00.txt", "--est", out / "trajectory_kitti.txt", "--json", out / "e"
+    )
     assert again.returncode == 0, again.stderr
     assert json.loads((out / "e").read_text())["ape_rmse_m"] == pytest.approx(metrics["ape_rmse_m"], rel=1e-6)
 
 
-def test_a_bag_gives_the_same(drive: Path, tmp_path: Path) -> None:
-    convert_kitti(drive, tmp_path / "bag")
-    for source, out in ((drive, "folder"), (tmp_path / "bag", "bag_out")):
+def test_a_bag_gives_the_same(recording: Path, tmp_path: Path) -> None:
+    convert_kitti(KittiSource(recording), tmp_path / "bag")
+    for source, out in ((recording, "folder"), (tmp_path / "bag", "bag_out")):
         done = dpm2("run", source, "--out", tmp_path / out, "--frames", "2:9")
         assert done.returncode == 0, done.stderr
-    # The bag's stamps are absolute, so intervals differ in the last digits of a float: not one answer to the bit.
+    # The bag's stamps are absolute, so intervals differ in the last digits of a float: not equal to the bit.
     folder, bag = (read_trajectory(tmp_path / out / "trajectory_kitti.txt").poses for out in ("folder", "bag_out"))
     assert len(folder) == 7
     np.testing.assert_allclose(folder, bag, atol=1e-6)
     assert json.loads((tmp_path / "bag_out" / "metrics.json").read_text())["ape_rmse_m"] < 0.03
 
 
-def test_resolved_configuration_is_written_and_reads_back(drive: Path, tmp_path: Path) -> None:
+def test_resolved_configuration_is_written_and_reads_back(recording: Path, tmp_path: Path) -> None:
     first = tmp_path / "first"
-    assert dpm2("run", drive, "--out", first, "--frames", ":3", "--set", "slam.map.voxel=0.7").returncode == 0
+    assert dpm2("run", recording, "--out", first, "--frames", ":3", "--set", "slam.map.voxel=0.7").returncode == 0
     assert "voxel: 0.7" in (first / "config.yaml").read_text()
     second = tmp_path / "second"
-    done = dpm2("run", drive, "--out", second, "--frames", ":3", "--config", first / "config.yaml")
+    done = dpm2("run", recording, "--out", second, "--frames", ":3", "--config", first / "config.yaml")
     assert done.returncode == 0, done.stderr
     assert (second / "config.yaml").read_text() == (first / "config.yaml").read_text()
 
@@ -112,8 +111,8 @@ def test_resolved_configuration_is_written_and_reads_back(drive: Path, tmp_path:
         (["SRC", "--colour", "red"], "--colour"),
     ],
 )
-def test_errors_of_use(drive: Path, tmp_path: Path, arguments: list[str], words: str) -> None:
-    done = dpm2("run", *[drive if a == "SRC" else a for a in arguments], "--out", tmp_path / "out")
+def test_errors_of_use(recording: Path, tmp_path: Path, arguments: list[str], words: str) -> None:
+    done = dpm2("run", *[recording if a == "SRC" else a for a in arguments], "--out", tmp_path / "out")
     assert done.returncode == 2
     assert words in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
@@ -147,28 +146,28 @@ def test_without_calibration_poses_stay_in_the_lidar_frame(sequence: Path, tmp_p
     assert poses[-1, 0, 3] > 5  # x is ahead: the LiDAR's axes, not the camera's
 
 
-def test_given_ground_truth(drive: Path, sequence: Path, tmp_path: Path) -> None:
+def test_given_ground_truth(recording: Path, sequence: Path, tmp_path: Path) -> None:
     (sequence / "poses.txt").unlink(missing_ok=True)
-    done = dpm2("run", sequence, "--out", tmp_path / "out", "--gt", drive / "poses" / "00.txt", "--frames", "1:10")
+    done = dpm2("run", sequence, "--out", tmp_path / "out", "--gt", recording / "poses" / "00.txt", "--frames", "1:10")
     assert done.returncode == 0, done.stderr
     assert json.loads((tmp_path / "out" / "metrics.json").read_text())["ape_rmse_m"] < 0.03
     short = tmp_path / "short.txt"
-    short.write_text("\n".join((drive / "poses" / "00.txt").read_text().splitlines()[:5]) + "\n")
+    short.write_text("\n".join((recording / "poses" / "00.txt").read_text().splitlines()[:5]) + "\n")
     rejected = dpm2("run", sequence, "--out", tmp_path / "out2", "--gt", short)
     assert rejected.returncode == 2
     assert "5 poses" in rejected.stderr
 
 
-def test_full_disk_keeps_the_old_map(drive: Path, tmp_path: Path) -> None:
+def test_full_disk_keeps_the_old_map(recording: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    assert dpm2("run", drive, "--out", out, "--frames", ":4").returncode == 0
+    assert dpm2("run", recording, "--out", out, "--frames", ":4").returncode == 0
     before = (out / "map.ply").read_bytes()
 
     def limit() -> None:  # no file may grow beyond 50 kB: writing the map fails as on a full disk
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000))
 
-    done = dpm2("run", drive, "--out", out, preexec_fn=limit)
+    done = dpm2_process("run", recording, "--out", out, preexec_fn=limit)
     assert done.returncode == 1
     assert "map.ply" in done.stderr
     assert (out / "map.ply").read_bytes() == before
@@ -180,19 +179,27 @@ def test_interrupted_run_writes_what_there_is(sequence: Path, tmp_path: Path) ->
         (sequence / "velodyne" / f"{i:06d}.bin").symlink_to(sequence / "velodyne" / f"{FRAMES - 1:06d}.bin")
     (sequence / "times.txt").write_text("".join(f"{0.1 * i:.1f}\n" for i in range(2000)))
     (sequence / "poses.txt").unlink(missing_ok=True)
-    out = tmp_path / "out"
-    command = [sys.executable, "-m", "dpm2_core.cli", "run", str(sequence), "--out", str(out)]
+    out, path = tmp_path / "out", tmp_path / "drive.dpm2map"
+    command = [sys.executable, "-m", "dpm2_core.cli", "run", str(sequence), "--out", str(out), "--map", str(path)]
     listen = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # a test in the background may have it ignored
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, preexec_fn=listen)
-    while not (out / "config.yaml").exists():
+    while not _keyframes(path):
         assert process.poll() is None
-        time.sleep(0.01)
-    time.sleep(1.0)
+        time.sleep(0.05)
     process.send_signal(signal.SIGINT)
     _, stderr = process.communicate(timeout=60)
     assert process.returncode == 0, stderr
     assert "interrupted after" in stderr
     assert 1 <= len(read_trajectory(out / "trajectory_kitti.txt")) < 2000
+
+
+def _keyframes(path: Path) -> int:
+    """In the map file so far."""
+    try:
+        with MapStore.open(path) as store:
+            return len(load_map(store))
+    except Dpm2Error:  # not there yet, or just being made
+        return 0
 
 
 def test_config_dump_shows_every_key() -> None:
@@ -203,22 +210,22 @@ def test_config_dump_shows_every_key() -> None:
     assert dpm2("config", "dump", "--set", "nonsense=1").returncode == 2
 
 
-def test_corrupted_sensors_on_request(drive: Path, tmp_path: Path) -> None:
+def test_corrupted_sensors_on_request(recording: Path, tmp_path: Path) -> None:
     for ratio in (0.0, 1.0):
         out = tmp_path / str(ratio)
-        done = dpm2("run", drive, "--out", out, "--frames", "0:4", "--corrupt", f"beams={ratio},seed=1")
+        done = dpm2("run", recording, "--out", out, "--frames", "0:4", "--corrupt", f"beams={ratio},seed=1")
         assert done.returncode == 0, done.stderr
         results = json.loads((out / "timing.json").read_text())["answers"]
         assert results == ({"first": 1, "geometric": 3} if ratio == 0 else {"failed": 4})
-    done = dpm2("run", drive, "--out", tmp_path / "no", "--corrupt", "camera=2")
+    done = dpm2("run", recording, "--out", tmp_path / "no", "--corrupt", "camera=2")
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
     assert "--corrupt camera=2: camera" in done.stderr
     assert not (tmp_path / "no").exists()
 
 
-def test_a_network_without_weights_is_an_error_of_use(drive: Path, tmp_path: Path) -> None:
+def test_a_network_without_weights_is_an_error_of_use(recording: Path, tmp_path: Path) -> None:
     settings = ("--set", "slam.registration=neural", "--set", f"slam.neural.weights={tmp_path}/none.safetensors")
-    done = dpm2("run", drive, "--out", tmp_path / "no", *settings)
+    done = dpm2("run", recording, "--out", tmp_path / "no", *settings)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
     assert "none.safetensors: no such file; weights that come with dpm2:" in done.stderr
     assert not (tmp_path / "no").exists()

@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import cv2
@@ -16,7 +14,9 @@ import torch
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.weights import save_weights
 
-from ..conftest import street, tiny
+from ...helpers.command import dpm2
+from ...helpers.networks import tiny
+from ...helpers.scenes import boxes
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +24,7 @@ def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two scans of a street, 1 m apart, and weights of a tiny untrained network beside them."""
     folder = tmp_path_factory.mktemp("show")
     (folder / "velodyne").mkdir()
-    points = np.c_[street(np.random.default_rng(0)), np.full(4000, 0.5)].astype(np.float32)
+    points = np.c_[boxes(np.random.default_rng(0)), np.full(4000, 0.5)].astype(np.float32)
     for number in (0, 1):
         (points - np.array([number, 0, 0, 0], np.float32)).tofile(folder / "velodyne" / f"{number:06d}.bin")
     torch.manual_seed(0)
@@ -32,14 +32,9 @@ def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def show(sequence: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "dpm2_core.cli", "show", str(sequence), *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120)
-
-
-def test_draws_a_image(sequence: Path, tmp_path: Path) -> None:
+def test_draws_an_image(sequence: Path, tmp_path: Path) -> None:
     weights = str(sequence / "tiny.safetensors")
-    done = show(sequence, "--frames", "0,1", "--out", str(tmp_path / "m.png"), "--weights", weights)
+    done = dpm2("show", sequence, "--frames", "0,1", "--out", str(tmp_path / "m.png"), "--weights", weights)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "m.png").read_bytes()[1:4] == b"PNG"
 
@@ -58,7 +53,7 @@ def test_draws_the_image_with_attention(sequence: Path, tmp_path: Path) -> None:
     sizes = []
     for name in ("tiny", "camera"):
         out, weights = tmp_path / f"{name}.png", str(folder / f"{name}.safetensors")
-        done = show(folder, "--frames", "0,1", "--out", str(out), "--weights", weights)
+        done = dpm2("show", folder, "--frames", "0,1", "--out", str(out), "--weights", weights)
         assert done.returncode == 0, done.stderr
         sizes.append(cv2.imread(str(out)).shape)
     assert sizes[1][0] > 1.5 * sizes[0][0]
@@ -74,7 +69,7 @@ def test_draws_the_image_with_attention(sequence: Path, tmp_path: Path) -> None:
     ],
 )
 def test_errors_of_use(sequence: Path, arguments: list[str], words: str) -> None:
-    done = show(sequence, *arguments)
+    done = dpm2("show", sequence, *arguments)
     assert done.returncode == 2
     assert words in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dpm2_core.cli import _status
+from ...helpers.command import Done, dpm2
 
 SMALL = ["network.cells=32", "network.cell=2", "network.channels=4", "window=3", "every=1", "slam_loss.points=300"]
 
 
 @pytest.fixture
-def drive(tmp_path: Path) -> Path:
+def recording(tmp_path: Path) -> Path:
     """Four labelled scans of a field with a wall on either side, 0.5 m apart."""
     noise = np.random.default_rng(0)
     ground = np.column_stack([noise.uniform(-25, 25, (600, 2)), np.full(600, -1.7)])
@@ -31,67 +31,66 @@ def drive(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def train(drive: Path, out: Path, *more: str) -> int:
-    """Exit code of a training of three epochs of one step."""
+def train(recording: Path, out: Path, *more: object) -> Done:
+    """A training of three epochs of one step."""
     settings = [word for setting in [*SMALL, "epochs=3", "warmup=1"] for word in ("--set", setting)]
-    return _status(["train", "gndnet", str(drive), "--out", str(out), *settings, *more])
+    return dpm2("train", "gndnet", recording, "--out", out, *settings, *more)
 
 
-def test_train_resume_and_measure(drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_train_resume_and_measure(recording: Path, tmp_path: Path) -> None:
     """With the SLAM loss in the third epoch; a second training does not overwrite; figures, table and image."""
     out = tmp_path / "out"
-    assert train(drive, out, "--slam-weight", "0.5", "--slam-every", "3", "--val", str(drive)) == 0
+    assert train(recording, out, "--slam-weight", "0.5", "--slam-every", "3", "--val", recording).returncode == 0
     log = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
     assert [row["step"] for row in log if "slam_loss" in row] == [2]
     assert "miou" in log[-1]
-    capsys.readouterr()
-    assert train(drive, out) == 2
-    assert "--resume continues it" in capsys.readouterr().err
-    assert train(drive, out, "--resume") == 0  # nothing is left to do
+    again = train(recording, out)
+    assert again.returncode == 2
+    assert "--resume continues it" in again.stderr
+    assert train(recording, out, "--resume").returncode == 0  # nothing is left to do
     assert len((out / "log.jsonl").read_text().splitlines()) == len(log)
 
-    capsys.readouterr()
-    weights, image = str(out / "weights.safetensors"), tmp_path / "ground.png"
-    assert _status(["eval-task", "gndnet", weights, str(drive), "--json", "--picture", str(image)]) == 0
-    printed = json.loads(capsys.readouterr().out)
+    weights, image = out / "weights.safetensors", tmp_path / "ground.png"
+    done = dpm2("eval-task", "gndnet", weights, recording, "--json", "--picture", image)
+    assert done.returncode == 0, done.stderr
+    printed = json.loads(done.stdout)
     assert printed["scans"] == 4
     assert {"mse", "miou", "precision", "recall"} <= printed.keys()
     assert image.stat().st_size > 1000
-    assert _status(["eval-task", "gndnet", weights, str(drive)]) == 0
-    assert "precision" in capsys.readouterr().out
+    assert "precision" in dpm2("eval-task", "gndnet", weights, recording).stdout
 
 
-def test_errors_of_use(drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_errors_of_use(recording: Path, tmp_path: Path) -> None:
     """Exit code 2 and one line that names what is wrong."""
     out = tmp_path / "out"
 
-    def said(*arguments: object) -> str:
-        assert _status([str(a) for a in arguments]) == 2
-        error = capsys.readouterr().err
-        assert error.startswith("dpm2: ")
-        assert error.count("\n") == 1
-        return error
+    def error(*arguments: object) -> str:
+        done = dpm2(*arguments)
+        assert done.returncode == 2
+        assert done.stderr.startswith("dpm2: ")
+        assert done.stderr.count("\n") == 1
+        return done.stderr
 
-    assert "nowhere: no such folder" in said("train", "gndnet", tmp_path / "nowhere", "--out", out)
-    assert "unknown key network.cellz" in said("train", "gndnet", drive, "--out", out, "--set", "network.cellz=3")
-    assert "no checkpoint.pt to resume" in said("train", "gndnet", drive, "--out", out, "--resume")
-    assert "no sequence has the 9 scans" in said("train", "gndnet", drive, "--out", out)  # 5 of every second
-    assert "--slam-weight" in said("train", "gndnet", drive, "--out", out, "--slam-weight", "-1")
+    assert "nowhere: no such folder" in error("train", "gndnet", tmp_path / "nowhere", "--out", out)
+    assert "unknown key network.cellz" in error("train", "gndnet", recording, "--out", out, "--set", "network.cellz=3")
+    assert "no checkpoint.pt to resume" in error("train", "gndnet", recording, "--out", out, "--resume")
+    assert "no sequence has the 9 scans" in error("train", "gndnet", recording, "--out", out)  # 5 of every second
+    assert "--slam-weight" in error("train", "gndnet", recording, "--out", out, "--slam-weight", "-1")
     assert not (out / "checkpoint.pt").exists()
-    assert "no such weights" in said("eval-task", "gndnet", tmp_path / "none.safetensors", drive)
-    assert "nonsense: no such task" in said("eval-task", "nonsense", tmp_path / "none.safetensors", drive)
-    label = drive / "sequences" / "00" / "labels" / "000001.label"
+    assert "no such weights" in error("eval-task", "gndnet", tmp_path / "none.safetensors", recording)
+    assert "nonsense: no such task" in error("eval-task", "nonsense", tmp_path / "none.safetensors", recording)
+    label = recording / "sequences" / "00" / "labels" / "000001.label"
     label.write_bytes(label.read_bytes()[:-4])
-    assert "000001.label: 899 labels for 900 points" in said("train", "gndnet", drive, "--out", out)
+    assert "000001.label: 899 labels for 900 points" in error("train", "gndnet", recording, "--out", out)
     label.unlink()
-    assert "000001.label: No such file" in said("train", "gndnet", drive, "--out", out)
+    assert "000001.label: No such file" in error("train", "gndnet", recording, "--out", out)
 
 
 def test_data_of_the_tasks(tmp_path: Path) -> None:
     """`dpm2 train tasks-data` fills train/ and val/, and takes the settings of the sensor."""
     settings = ["train=1", "val=1", "train_frames=2", "val_frames=2", "lidar.columns=48", "lidar.beams=16"]
     words = [word for setting in settings for word in ("--set", setting)]
-    assert _status(["train", "tasks-data", str(tmp_path / "data"), *words, "--workers", "1"]) == 0
+    assert dpm2("train", "tasks-data", tmp_path / "data", *words, "--workers", "1").returncode == 0
     for which in ("train", "val"):
         folder = tmp_path / "data" / which / "00" / "sequences" / "00"
         for kind in ("velodyne", "labels", "static"):

@@ -22,6 +22,7 @@ from dpm2_core.data.bags import BagSource
 from dpm2_core.data.convert import EPOCH_NS, convert_kitti
 from dpm2_core.data.kitti import KittiSource
 from dpm2_core.data.settings import InputSettings
+from dpm2_core.data.source import Span
 from dpm2_core.errors import UsageError
 from dpm2_core.geometry import se3
 
@@ -29,16 +30,20 @@ MakeFolder = Callable[..., Path]
 ROOT = Path(dpm2_core.__file__).resolve().parents[1]
 
 
-def assert_same_drive(bag: BagSource, folder: KittiSource) -> None:
-    assert len(bag) == len(folder)
+def assert_same_drive(bag: BagSource, folder: KittiSource, count: int | None = None) -> None:
+    """Of the first `count` frames of the folder, or of all."""
+    assert len(bag) == (len(folder) if count is None else count)
     assert bag.vertical_angle_correction_deg == folder.vertical_angle_correction_deg
-    for ours, theirs in zip(bag.frames(), folder.frames(), strict=True):
+    for ours, theirs in zip(bag.frames(), folder.frames(0, count), strict=True):
         assert ours.stamp == EPOCH_NS + theirs.stamp
         np.testing.assert_array_equal(ours.points, theirs.points)
         assert len(ours.images) == len(theirs.images)
         for a, b in zip(ours.images, theirs.images, strict=True):
             np.testing.assert_array_equal(a.pixels, b.pixels)
-    for ours_T, theirs_T in ((bag.poses, folder.poses), (bag.T_cam_lidar, folder.T_cam_lidar)):
+    for ours_T, theirs_T in (
+        (bag.poses, None if folder.poses is None else folder.poses[:count]),
+        (bag.T_cam_lidar, folder.T_cam_lidar),
+    ):
         assert ours_T is not None
         np.testing.assert_allclose(ours_T, theirs_T, rtol=0, atol=1e-9)
     if folder.camera:
@@ -51,7 +56,7 @@ def assert_same_drive(bag: BagSource, folder: KittiSource) -> None:
 def test_round_trip(kitti_folder: MakeFolder, tmp_path: Path, zstd: bool) -> None:
     folder = kitti_folder(numbers=[3, 4, 6])
     steps: list[tuple[int, int]] = []
-    notes = convert_kitti(folder, tmp_path / "bag", zstd=zstd, progress=lambda *step: steps.append(step))
+    notes = convert_kitti(KittiSource(folder), tmp_path / "bag", zstd=zstd, progress=lambda *step: steps.append(step))
     assert notes == []
     assert steps == [(1, 3), (2, 3), (3, 3)]
     assert_same_drive(BagSource(tmp_path / "bag"), KittiSource(folder))
@@ -60,23 +65,22 @@ def test_round_trip(kitti_folder: MakeFolder, tmp_path: Path, zstd: bool) -> Non
 
 @pytest.mark.slow
 def test_round_trip_of_the_real_excerpt(kitti_root: Path, tmp_path: Path) -> None:
-    convert_kitti(kitti_root, tmp_path / "bag", "04", end=6)
-    bag, folder = BagSource(tmp_path / "bag"), KittiSource(kitti_root, InputSettings(sequence="04"))
-    folder._scans, folder.stamps, folder.poses = folder._scans[:6], folder.stamps[:6], folder.poses[:6]  # type: ignore[index]
-    assert_same_drive(bag, folder)
+    folder = KittiSource(kitti_root, InputSettings(sequence="04"))
+    convert_kitti(folder, tmp_path / "bag", (0, 6))
+    assert_same_drive(BagSource(tmp_path / "bag"), folder, 6)
 
 
 def test_a_simulated_drive_stays_without_correction(kitti_folder: MakeFolder, tmp_path: Path) -> None:
     folder = kitti_folder()
     (folder / "dpm2_sim.json").write_text('{"vertical_angle_correction_deg": 0}')
-    convert_kitti(folder, tmp_path / "bag")
+    convert_kitti(KittiSource(folder), tmp_path / "bag")
     assert BagSource(tmp_path / "bag").vertical_angle_correction_deg == 0
     assert_same_drive(BagSource(tmp_path / "bag"), KittiSource(folder))
 
 
 def test_topics_frames_and_qos_are_those_of_kitti2bag(kitti_folder: MakeFolder, tmp_path: Path) -> None:
     folder = kitti_folder()
-    convert_kitti(folder, tmp_path / "bag")
+    convert_kitti(KittiSource(folder), tmp_path / "bag")
     bag = open_bag(tmp_path / "bag")
     assert bag.types == {
         "/kitti/velo/pointcloud": "sensor_msgs/msg/PointCloud2",
@@ -111,7 +115,8 @@ def test_topics_frames_and_qos_are_those_of_kitti2bag(kitti_folder: MakeFolder, 
 
 def test_part_of_a_drive_without_images(kitti_folder: MakeFolder, tmp_path: Path) -> None:
     folder = kitti_folder()
-    convert_kitti(folder.parents[1], tmp_path / "bag", "07", start=1, end=3, images=False)
+    drive = KittiSource(folder.parents[1], InputSettings(sequence="07", images=False))
+    convert_kitti(drive, tmp_path / "bag", (1, 3))
     source = BagSource(tmp_path / "bag")
     assert [frame.stamp - EPOCH_NS for frame in source.frames()] == [100_000_000, 200_000_000]
     assert topics.IMAGE not in open_bag(tmp_path / "bag").types
@@ -124,7 +129,7 @@ def test_a_bare_sequence_becomes_a_lidar_bag(kitti_folder: MakeFolder, tmp_path:
     folder = kitti_folder(images=False)
     for path in (folder / "calib.txt", folder / "times.txt", folder.parents[1] / "poses" / "07.txt"):
         path.unlink()
-    notes = convert_kitti(folder, tmp_path / "bag")
+    notes = convert_kitti(KittiSource(folder), tmp_path / "bag")
     assert len(notes) == 2
     source = BagSource(tmp_path / "bag")
     assert len(list(source.frames())) == 5
@@ -136,42 +141,40 @@ def test_a_bare_sequence_becomes_a_lidar_bag(kitti_folder: MakeFolder, tmp_path:
 def test_a_scan_that_cannot_be_read_stays_a_frame(kitti_folder: MakeFolder, tmp_path: Path) -> None:
     folder = kitti_folder()
     (folder / "velodyne" / "000002.bin").write_bytes(b"123")
-    notes = convert_kitti(folder, tmp_path / "bag")
+    notes = convert_kitti(KittiSource(folder), tmp_path / "bag")
     assert "000002.bin: 3 bytes are no whole number of points (16 bytes each): written as an empty cloud" in notes[0]
     assert [len(frame.points) for frame in BagSource(tmp_path / "bag").frames()] == [60, 60, 0, 60, 60]
 
 
 def test_what_is_there_is_rejected_or_replaced(kitti_folder: MakeFolder, tmp_path: Path) -> None:
     folder, out = kitti_folder(), tmp_path / "bag"
-    convert_kitti(folder, out, end=2)
+    convert_kitti(KittiSource(folder), out, (0, 2))
     with pytest.raises(UsageError, match="exists already; use --overwrite"):
-        convert_kitti(folder, out)
+        convert_kitti(KittiSource(folder), out)
     assert len(BagSource(out)) == 2
-    convert_kitti(folder, out, overwrite=True)
+    convert_kitti(KittiSource(folder), out, overwrite=True)
     assert len(BagSource(out)) == 5
     other = tmp_path / "photos"
     other.mkdir()
     (other / "holiday.jpg").touch()
     with pytest.raises(UsageError, match="not a rosbag2 folder, so it is not overwritten"):
-        convert_kitti(folder, other, overwrite=True)
+        convert_kitti(KittiSource(folder), other, overwrite=True)
     assert (other / "holiday.jpg").exists()
 
 
 @pytest.mark.parametrize(
-    ("out", "arguments", "message"),
+    ("out", "frames", "message"),
     [
-        ("bag", {"start": 5}, "no frames 5:; it has 5"),
-        ("bag", {"start": 3, "end": 3}, "no frames 3:3; it has 5"),
-        ("bag", {"sequence": "99"}, None),
-        ("bag.mcap", {}, "a rosbag2 recording is a folder; leave out the .mcap"),
+        ("bag", (5, None), "no frames 5:; it has 5"),
+        ("bag", (3, 3), "no frames 3:3; it has 5"),
+        ("bag.mcap", (0, None), "a rosbag2 recording is a folder; leave out the .mcap"),
     ],
 )
 def test_requests_that_cannot_be_met(
-    kitti_folder: MakeFolder, tmp_path: Path, out: str, arguments: dict[str, object], message: str | None
+    kitti_folder: MakeFolder, tmp_path: Path, out: str, frames: Span, message: str
 ) -> None:
-    root = kitti_folder().parents[1]
-    with pytest.raises(UsageError, match=message or "no sequence 99; choose one"):
-        convert_kitti(root, tmp_path / out, **arguments)  # type: ignore[arg-type]
+    with pytest.raises(UsageError, match=message):
+        convert_kitti(KittiSource(kitti_folder()), tmp_path / out, frames)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["kitti"]
 
 
@@ -187,10 +190,11 @@ def test_a_killed_conversion_leaves_nothing_that_looks_whole(kitti_folder: MakeF
 import sys, time
 from pathlib import Path
 from dpm2_core.data.convert import convert_kitti
+from dpm2_core.data.kitti import KittiSource
 def progress(done, total):
     print(done, flush=True)
     time.sleep(60 if done == 3 else 0)
-convert_kitti(Path(sys.argv[1]), Path(sys.argv[2]), progress=progress)
+convert_kitti(KittiSource(sys.argv[1]), Path(sys.argv[2]), progress=progress)
 """
     process = run(code, folder, out)
     assert process.stdout is not None
@@ -199,7 +203,7 @@ convert_kitti(Path(sys.argv[1]), Path(sys.argv[2]), progress=progress)
     process.send_signal(signal.SIGKILL)
     process.communicate()
     assert not out.exists()
-    convert_kitti(folder, out)  # and the next try clears up
+    convert_kitti(KittiSource(folder), out)  # and the next try clears up
     assert sorted(path.name for path in tmp_path.iterdir()) == ["bag", "kitti"]
     assert len(BagSource(out)) == 5
 
@@ -207,16 +211,17 @@ convert_kitti(Path(sys.argv[1]), Path(sys.argv[2]), progress=progress)
 def test_a_full_disk_is_an_error_without_leftovers(kitti_folder: MakeFolder, tmp_path: Path) -> None:
     """A limit on the size of files raises the OSError that a full disk does; the bag that was there survives."""
     folder, out = kitti_folder(), tmp_path / "bag"
-    convert_kitti(folder, out, end=1)
+    convert_kitti(KittiSource(folder), out, (0, 1))
     np.zeros((200_000, 4), "<f4").tofile(folder / "velodyne" / "000004.bin")
     code = """
 import resource, sys
 from pathlib import Path
 from dpm2_core.data.convert import convert_kitti
+from dpm2_core.data.kitti import KittiSource
 from dpm2_core.errors import Dpm2Error, UsageError
 resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, 1_000_000))
 try:
-    convert_kitti(Path(sys.argv[1]), Path(sys.argv[2]), overwrite=True)
+    convert_kitti(KittiSource(sys.argv[1]), Path(sys.argv[2]), overwrite=True)
 except Dpm2Error as error:
     print(type(error).__name__, error)
 """
@@ -231,7 +236,7 @@ def test_a_place_that_cannot_be_written_is_named(kitti_folder: MakeFolder, tmp_p
     from dpm2_core.errors import Dpm2Error
 
     with pytest.raises(Dpm2Error, match=r"file/bag: not written: Not a directory"):
-        convert_kitti(kitti_folder(), tmp_path / "file" / "bag")
+        convert_kitti(KittiSource(kitti_folder()), tmp_path / "file" / "bag")
 
 
 def test_command_line(kitti_folder: MakeFolder, tmp_path: Path) -> None:
@@ -250,7 +255,7 @@ def test_ground_truth_starts_where_the_drive_does(kitti_folder: MakeFolder, tmp_
     """Frames without a pose have none in the bag either: no zero pose, no repeated one."""
     folder = kitti_folder()
     (folder / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3)
-    convert_kitti(folder, tmp_path / "bag")
+    convert_kitti(KittiSource(folder), tmp_path / "bag")
     poses = BagSource(tmp_path / "bag").poses
     assert poses is not None
     np.testing.assert_allclose(poses[:3], se3.exp(np.zeros((3, 6))), atol=1e-12)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dpm2_core.diffslam.neighbors import NeighborSearch
+from dpm2_core.diffslam.neighbors import NeighborSearch, nearest_by_distance
 
 
 def clouds(offset: float = 0.0) -> tuple[Tensor, Tensor]:
@@ -16,11 +16,14 @@ def clouds(offset: float = 0.0) -> tuple[Tensor, Tensor]:
     return points, valid
 
 
-def by_distance(points: Tensor, valid: Tensor) -> NeighborSearch:
-    """The way of the GPU, here."""
-    search = NeighborSearch(points, valid)
-    search._trees = []
-    return search
+def by_tree(points: Tensor, valid: Tensor, queries: Tensor, k: int = 1) -> Tensor:
+    """As on the CPU."""
+    return NeighborSearch(points, valid).nearest(queries, k)
+
+
+def by_distance(points: Tensor, valid: Tensor, queries: Tensor, k: int = 1) -> Tensor:
+    """As on a GPU."""
+    return nearest_by_distance(queries, points.masked_fill(~valid[..., None], torch.inf), k)
 
 
 def test_tree_and_distance_agree_with_brute_force() -> None:
@@ -30,9 +33,9 @@ def test_tree_and_distance_agree_with_brute_force() -> None:
         queries = points + 0.3
         distance = (queries[:, :, None] - points[:, None]).norm(dim=-1).masked_fill(~valid[:, None], torch.inf)
         requested = distance.argsort(-1)[..., :5]
-        torch.testing.assert_close(NeighborSearch(points, valid).nearest(queries, 5), requested)
-        torch.testing.assert_close(by_distance(points, valid).nearest(queries, 5), requested)
-        torch.testing.assert_close(by_distance(points, valid).nearest(queries), requested[..., :1])
+        for nearest in (by_tree, by_distance):
+            torch.testing.assert_close(nearest(points, valid, queries, 5), requested)
+            torch.testing.assert_close(nearest(points, valid, queries), requested[..., :1])
 
 
 def test_fewer_points_than_asked_repeat_the_nearest() -> None:
@@ -41,18 +44,18 @@ def test_fewer_points_than_asked_repeat_the_nearest() -> None:
     valid[0] = False
     valid[1] = False
     valid[1, 7] = True
-    for search in (NeighborSearch(points, valid), by_distance(points, valid)):
-        found = search.nearest(points, 4)
+    for nearest in (by_tree, by_distance):
+        found = nearest(points, valid, points, 4)
         assert bool((found[1] == 7).all())
         assert bool((found[0] == found[0, :, :1]).all())
-    short = by_distance(points[:, :3], torch.ones(3, 3, dtype=torch.bool)).nearest(points, 5)
-    assert short.shape == (3, 80, 5)
-    assert int(short.max()) <= 2
+        short = nearest(points[:, :3], torch.ones(3, 3, dtype=torch.bool), points, 5)
+        assert short.shape == (3, 80, 5)
+        assert int(short.max()) <= 2
 
 
 def test_select_keeps_each_cloud_with_its_points() -> None:
     """In the order asked for, repeated too."""
     points, valid = clouds()
-    for search in (NeighborSearch(points, valid), by_distance(points, valid)):
-        both = search.select([2, 0, 2]).nearest(points[[2, 0, 2]], 3)
-        torch.testing.assert_close(both, search.nearest(points, 3)[[2, 0, 2]])
+    search = NeighborSearch(points, valid)
+    both = search.select([2, 0, 2]).nearest(points[[2, 0, 2]], 3)
+    torch.testing.assert_close(both, search.nearest(points, 3)[[2, 0, 2]])

@@ -69,7 +69,7 @@ def test_weights_decide_between_loops(ring: Tensor) -> None:
 
 
 def test_gradients_agree_with_finite_differences_and_each_other(ring: Tensor) -> None:
-    """Of the poses by measurements (as tangents) and weights; inconsistent ones, so that residuals are not zero."""
+    """Of every third pose by measurements (as tangents) and weights; inconsistent ones: residuals are not zero."""
     measured = moved(relative(ring), 0.05)
     xi = torch.zeros(len(EDGES), 6, dtype=torch.float64, requires_grad=True)
     weights = torch.full((len(EDGES),), 0.7, dtype=torch.float64, requires_grad=True)
@@ -78,7 +78,7 @@ def test_gradients_agree_with_finite_differences_and_each_other(ring: Tensor) ->
         settings = SoftLmSettings(iterations=iterations, gradient=gradient)
         return relax(ring, EDGES, measured @ se3_torch.exp(xi), weights, 25.0, settings)[1:, :3]
 
-    assert torch.autograd.gradcheck(solved, (xi, weights), atol=1e-6)
+    assert torch.autograd.gradcheck(lambda *by: solved(*by)[::3], (xi, weights), atol=1e-6)
     slopes = []
     for gradient in ("unrolled", "implicit"):
         value = solved(xi, weights, gradient, 25).pow(2).sum()

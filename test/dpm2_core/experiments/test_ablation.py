@@ -3,26 +3,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-
-import pytest
 
 from dpm2_core.experiments.ablation import TABLE_4, AblationSettings, ablation
 from dpm2_core.learning.dataset import DataSettings
 from dpm2_core.learning.registration_loss import LossSettings
 from dpm2_core.learning.train_registration import RegistrationTrainingSettings
 from dpm2_core.learning.trainer import OptimizerSettings
-from dpm2_core.network.settings import PRESETS
+
+from ...helpers.networks import tiny
 
 
-def test_every_alternative_is_trained_and_measured_once(
-    packed: Path, tiny: Callable, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_every_alternative_is_trained_and_measured_once(packed: Path, tmp_path: Path) -> None:
     """All of Table 4; a second call trains nothing and finds the same figures."""
-    monkeypatch.setitem(PRESETS, "tiny", tiny().model_dump())
     training = RegistrationTrainingSettings(
-        preset="tiny",
+        network=tiny().model_dump(),
         data=DataSettings(packed={str(packed): 1.0}, groups=1, frames=2, workers=0, images=True),
         loss=LossSettings(near=8, own=4),
         pairs=1,

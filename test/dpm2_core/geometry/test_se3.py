@@ -61,6 +61,15 @@ def test_angle_is_exact_down_to_nothing(xi: np.ndarray) -> None:
     assert se3.angle(se3.exp(xi)) == pytest.approx(np.linalg.norm(xi[:3]), abs=1e-14, rel=1e-9)
 
 
+@given(tangents())
+def test_magnitude_is_the_same_from_either_end(xi: np.ndarray) -> None:
+    """From its other end a motion is as long and as large a turn; the tolerance is rounding at 100 m."""
+    T = se3.exp(xi)
+    meters, degrees = se3.magnitude(T)
+    assert degrees == pytest.approx(np.degrees(np.linalg.norm(xi[:3])), abs=1e-6)
+    np.testing.assert_allclose(se3.magnitude(se3.inverse(T)), (meters, degrees), rtol=1e-9, atol=1e-9)
+
+
 @given(arrays(np.float64, 3, elements=st.floats(-10, 10)), arrays(np.float64, 3, elements=st.floats(-10, 10)))
 def test_hat_is_the_cross_product(a: np.ndarray, b: np.ndarray) -> None:
     np.testing.assert_allclose(se3.hat(a) @ b, np.cross(a, b), atol=1e-13)

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +21,8 @@ from dpm2_core.learning.pair_sampling import merge_tokens, sample_set_pairs
 from dpm2_core.learning.train_overlap import average_precision, draw_overlap
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.tokens import to_tokens
+
+from ...helpers.networks import tiny
 
 NOTHING = {"drop": 0, "occlusion": 0, "beams": 0, "jitter": 0, "yaw": 0, "tilt": 0, "shift": (0, 0, 0), "image_drop": 0}
 
@@ -103,7 +104,7 @@ def test_groups_are_near_and_spread() -> None:
     noise = np.random.default_rng(0)
     distances = []
     for _ in range(200):
-        chosen = draw_group(poses, 4, 20, noise)
+        chosen = draw_group(poses, noise, 4, 20)
         assert len(set(chosen)) == 4
         assert np.isfinite(poses[chosen]).all()
         distances += list(np.abs(poses[chosen[1:], 0, 3] - poses[chosen[0], 0, 3]))
@@ -115,7 +116,7 @@ def test_a_lonely_frame_is_its_own_group() -> None:
     """No neighbor within the radius: it repeats."""
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[1, 0, 3] = 100
-    assert len(set(draw_group(poses, 3, 20, np.random.default_rng(0)))) == 1
+    assert len(set(draw_group(poses, np.random.default_rng(0), 3, 20))) == 1
 
 
 def test_overlap_groups_have_half_positives_and_hard_negatives() -> None:
@@ -136,23 +137,23 @@ def test_average_precision_of_known_rankings() -> None:
     assert average_precision(np.array([0.9, 0.8, 0.1]), np.array([False, True, False])) == 0.5
 
 
-def test_batches_depend_on_their_number_alone(packed: Path, tiny: Callable) -> None:
+def test_batches_depend_on_their_number_alone(packed: Path) -> None:
     """So that a resumed run, with any number of workers, sees the same."""
     settings = DataSettings(packed={str(packed): 1.0}, groups=1, frames=2, images=True, workers=0)
-    data = GroupDataset(settings, tiny(), seed=3)
-    later = GroupDataset(settings.model_copy(update={"workers": 2}), tiny(), seed=3, start=2)
-    for step, batch in zip(range(2, 5), later.loader(), strict=False):
-        again = data.batch(step)
+    data = GroupDataset(settings, tiny(), settings.draw, seed=3)
+    later = GroupDataset(settings.model_copy(update={"workers": 2}), tiny(), settings.draw, seed=3)
+    for step, batch in zip(range(2, 5), later.batches(2, 0), strict=False):
+        again = data[step, 0]
         assert torch.equal(again.points.xyz, batch.points.xyz)
         assert torch.equal(again.poses, batch.poses)
-    assert not torch.equal(data.batch(0).points.xyz, data.batch(1).points.xyz)
+    assert not torch.equal(data[0, 0].points.xyz, data[1, 0].points.xyz)
 
 
 @pytest.mark.parametrize("sides", [(1, 1), (1, 3), (2, 2)])
 def test_plans_hold_the_truth(model: DeepPointMap2, packed: Path, sides: tuple[int, int]) -> None:
     """Members moved to the first of their side, and one side to the other, meet in the world."""
-    data = GroupDataset(DataSettings(packed={str(packed): 1.0}, groups=2, frames=4, workers=0), model.settings, 0)
-    batch = data.batch(0)
+    settings = DataSettings(packed={str(packed): 1.0}, groups=2, frames=4, workers=0)
+    batch = GroupDataset(settings, model.settings, settings.draw, 0)[0, 0]
     plan = sample_set_pairs(batch.poses, 2, sides, 20.0, torch.Generator().manual_seed(0))
     flat = batch.poses.flatten(0, 1).float()
     for row in range(4):

@@ -3,14 +3,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from dpm2_core.cli import main
 from dpm2_core.data.open import open_source
 from dpm2_core.data.packed import open_packed
 from dpm2_core.diffslam.trajectory_loss import trajectory_loss
@@ -21,12 +19,14 @@ from dpm2_core.learning.finetune import draw_road_segment, finetune, window_traj
 from dpm2_core.learning.finetune_data import prepare, refer
 from dpm2_core.learning.finetune_settings import FinetuneOptimizer, FinetuneSettings
 from dpm2_core.network.model import DeepPointMap2
-from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.network.tokens import Tokens
 from dpm2_core.network.weights import load_model, read_metadata, save_weights
 from dpm2_core.sim.drive import simulate
-from dpm2_core.sim.settings import LidarConfig
+from dpm2_core.sim.settings import DriveConfig, LidarConfig
 from dpm2_core.slam.settings import SlamSettings
+
+from ...helpers.command import dpm2
+from ...helpers.networks import tiny
 
 
 def descriptors(poses: torch.Tensor, channels: int) -> Tokens:
@@ -47,9 +47,7 @@ def road() -> torch.Tensor:
     return torch.from_numpy(np.stack([se3.exp([0, 0, 0.05 * i, 2.0 * i, 0.1 * i, 0]) for i in range(3)])[None])
 
 
-def test_the_gradient_of_the_trajectory_is_that_of_differences(
-    tiny: Callable[..., NetworkSettings], road: torch.Tensor
-) -> None:
+def test_the_gradient_of_the_trajectory_is_that_of_differences(road: torch.Tensor) -> None:
     """With respect to one coordinate of one descriptor, to 2 %: the last least-squares steps carry it."""
     torch.manual_seed(0)
     model = DeepPointMap2(tiny()).eval()
@@ -74,9 +72,7 @@ def test_the_gradient_of_the_trajectory_is_that_of_differences(
     assert float(slope[scan, place, axis]) == pytest.approx(float(difference), rel=0.02)
 
 
-def test_a_scan_that_matches_nothing_diverges_without_a_gradient_or_nan(
-    tiny: Callable[..., NetworkSettings], road: torch.Tensor
-) -> None:
+def test_a_scan_that_matches_nothing_diverges_without_a_gradient_or_nan(road: torch.Tensor) -> None:
     torch.manual_seed(0)
     model = DeepPointMap2(tiny()).eval()
     tokens = descriptors(road, model.settings.channels)
@@ -96,21 +92,31 @@ def test_a_stretch_is_in_the_order_of_the_road() -> None:
     order = np.random.default_rng(1).permutation(50)
     poses[:, 0, 3] = order
     for seed in range(10):
-        along = order[draw_road_segment(poses, 4, 15.0, np.random.default_rng(seed))]
+        along = order[draw_road_segment(poses, np.random.default_rng(seed), 4, 15.0)]
         steps = np.diff(along)
         assert (steps > 0).all() or (steps < 0).all()
         assert abs(along[-1] - along[0]) <= 30
 
 
 @pytest.fixture(scope="module")
-def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("finetune") / "drive"
-    simulate(out, 24, 5, "straight", "suburb", images=False, lidar=LidarConfig(beams=32, columns=600, height=2.2))
+    simulate(
+        out,
+        DriveConfig(
+            frames=24,
+            seed=5,
+            road="straight",
+            preset="suburb",
+            images=False,
+            lidar=LidarConfig(beams=32, columns=600, height=2.2),
+        ),
+    )
     return out
 
 
 @pytest.fixture
-def settings(tmp_path: Path, packed: Path, tiny: Callable[..., NetworkSettings]) -> FinetuneSettings:
+def settings(tmp_path: Path, packed: Path) -> FinetuneSettings:
     torch.manual_seed(0)
     path = tmp_path / "start.safetensors"
     save_weights(DeepPointMap2(tiny()), path, {"images": "false", "phase": "2"}, half=False)
@@ -119,27 +125,27 @@ def settings(tmp_path: Path, packed: Path, tiny: Callable[..., NetworkSettings])
     return FinetuneSettings(weights=str(path), **chosen)  # type: ignore[arg-type]
 
 
-def _truth(drive: Path) -> Array:
-    poses = open_source(drive).poses
+def _truth(recording: Path) -> Array:
+    poses = open_source(recording).poses
     assert poses is not None
     return poses
 
 
-def test_the_reference_is_the_trajectory_of_the_slam_and_frames_without_one_have_none(drive: Path) -> None:
+def test_the_reference_is_the_trajectory_of_the_slam_and_frames_without_one_have_none(recording: Path) -> None:
     """No ground truth goes in: from scan to scan it is within 2 cm of it."""
-    referenced = refer(open_source(drive), SlamSettings(threads=1))
-    truth = _truth(drive)
+    referenced = refer(open_source(recording), SlamSettings(threads=1))
+    truth = _truth(recording)
     steps = [se3.inverse(poses[:-1]) @ poses[1:] for poses in (referenced.poses, truth)]
     assert np.linalg.norm(steps[0][:, :3, 3] - steps[1][:, :3, 3], axis=1).max() < 0.02
 
 
 def test_a_stopped_training_goes_on_to_the_same_weights(
-    drive: Path, tmp_path: Path, settings: FinetuneSettings
+    recording: Path, tmp_path: Path, settings: FinetuneSettings
 ) -> None:
-    """And the weights carry what those that they started from said of themselves."""
+    """And the weights carry the metadata of those that they started from."""
     data = tmp_path / "data"
     network = load_model(Path(settings.weights)).settings
-    prepare([open_source(drive)], settings, network, SlamSettings(threads=1), data)
+    prepare([open_source(recording)], settings, network, SlamSettings(threads=1), data)
     assert sum(len(packed) for packed in open_packed(data / "drives")) == 20
     whole = finetune(settings, tmp_path / "whole", data=data)
     finetune(settings, tmp_path / "parts", until=2, data=data)
@@ -153,31 +159,23 @@ def test_a_stopped_training_goes_on_to_the_same_weights(
 
 
 def test_a_drive_that_cannot_be_followed_is_an_error_of_use(
-    drive: Path, tmp_path: Path, settings: FinetuneSettings
+    recording: Path, tmp_path: Path, settings: FinetuneSettings
 ) -> None:
     network = load_model(Path(settings.weights)).settings
-    source = open_source(drive)
+    source = open_source(recording)
     blind = SlamSettings(threads=1, preprocess={"min_range": 79.0, "max_range": 80.0})  # type: ignore[arg-type]
     with pytest.raises(UsageError, match="nothing to learn"):
         prepare([source], settings, network, blind, tmp_path / "data")
 
 
-def test_errors_of_use_are_one_line(
-    drive: Path, tmp_path: Path, settings: FinetuneSettings, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_errors_of_use_are_one_line(recording: Path, tmp_path: Path, settings: FinetuneSettings) -> None:
     for arguments, message in (
         ([str(tmp_path / "none")], "none"),
-        ([str(drive), "--set", "weights=nowhere"], "nowhere: no such file"),
-        ([str(drive), "--set", "trajectry=1"], "unknown key trajectry"),
-        ([str(drive), "--resume"], "no checkpoint.pt to resume"),
+        ([str(recording), "--set", "weights=nowhere"], "nowhere: no such file"),
+        ([str(recording), "--set", "trajectry=1"], "unknown key trajectry"),
+        ([str(recording), "--resume"], "no checkpoint.pt to resume"),
     ):
-        assert main_status([*arguments, "--out", str(tmp_path / "o")]) == 2
-        error = capsys.readouterr().err
-        assert message in error
-        assert error.count("\n") == 1
-
-
-def main_status(arguments: list[str]) -> int:
-    with pytest.raises(SystemExit) as exit_:
-        main(["finetune", *arguments])
-    return int(exit_.value.code or 0)
+        done = dpm2("finetune", *arguments, "--out", tmp_path / "o")
+        assert done.returncode == 2
+        assert message in done.stderr
+        assert done.stderr.count("\n") == 1

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -18,15 +18,18 @@ from dpm2_core.geometry import se3
 from dpm2_core.learning.dataset import DataSettings, GroupDataset, Mixture
 from dpm2_core.learning.generate import pack
 
+from ...helpers.networks import tiny
+from ...helpers.scenes import boxes, make_image
+
 
 class Sweeps:
     """Six sweeps of a street at 10 m/s in a bend, each point seen from where the LiDAR was at its time."""
 
     name, T_cam_lidar = "sweeps", None
 
-    def __init__(self, world: np.ndarray, make_image: Callable, images: bool = True) -> None:
+    def __init__(self, world: np.ndarray, images: bool = True) -> None:
         self.notes: list[str] = []
-        self.world, self.make_image, self.images = world, make_image, images
+        self.world, self.images = world, images
         self.poses: Array | None = np.stack([self.at(0.1 * n) for n in range(6)])
         self.poses[2] = np.nan
 
@@ -42,18 +45,16 @@ class Sweeps:
             offsets = np.linspace(-0.05, 0.05, len(self.world)).astype(np.float32)
             T = np.stack([se3.inverse(self.at(0.1 * n + t)) for t in offsets])
             seen = np.einsum("nij,nj->ni", T[:, :3, :3], self.world) + T[:, :3, 3]
-            images = (self.make_image(np.random.default_rng(n)),) if self.images or n == 3 else ()
+            images = (make_image(np.random.default_rng(n)),) if self.images or n == 3 else ()
             points = np.c_[seen, np.ones(len(seen))].astype(np.float32)
             yield Frame(n * 10**8, points, offsets, images, index=n)
 
 
-def test_packed_sweeps_are_rigid_and_fit_each_other(
-    street: Callable, make_image: Callable, tiny: Callable, tmp_path: Path
-) -> None:
+def test_packed_sweeps_are_rigid_and_fit_each_other(tmp_path: Path) -> None:
     """Undistorted by the true motion, the points of all frames are the same in the world; no pose, no sample."""
-    world = street(np.random.default_rng(0), 1000)
+    world = boxes(np.random.default_rng(0), 1000)
     seen: list[int] = []
-    assert pack(Sweeps(world, make_image), tmp_path / "d", tiny(), advance=lambda: seen.append(1)) == 5
+    assert pack(Sweeps(world), tmp_path / "d", tiny(), advance=lambda: seen.append(1)) == 5
     assert len(seen) == 6
     drive = PackedDrive(tmp_path / "d")
     height, width = tiny().image.size
@@ -66,9 +67,9 @@ def test_packed_sweeps_are_rigid_and_fit_each_other(
         assert np.quantile(gap, 0.99) < 0.02
 
 
-def test_what_cannot_be_packed(street: Callable, make_image: Callable, tiny: Callable, tmp_path: Path) -> None:
+def test_what_cannot_be_packed(tmp_path: Path) -> None:
     """No poses; none in the range; images in some frames only."""
-    source = Sweeps(street(np.random.default_rng(0), 200), make_image, images=False)
+    source = Sweeps(boxes(np.random.default_rng(0), 200), images=False)
     with pytest.raises(UsageError, match="some frames have an image"):
         pack(source, tmp_path / "d", tiny())
     with pytest.raises(UsageError, match="no readable frame with a pose"):
@@ -80,11 +81,11 @@ def test_what_cannot_be_packed(street: Callable, make_image: Callable, tiny: Cal
 
 
 @pytest.fixture
-def kitti(street: Callable, tmp_path: Path) -> Path:
+def kitti(tmp_path: Path) -> Path:
     """sequences/03 with four scans, 1 m apart."""
     folder = tmp_path / "kitti" / "sequences" / "03"
     (folder / "velodyne").mkdir(parents=True)
-    points = np.c_[street(np.random.default_rng(0)), np.full(4000, 0.5)].astype(np.float32)
+    points = np.c_[boxes(np.random.default_rng(0)), np.full(4000, 0.5)].astype(np.float32)
     for n in range(4):
         (points - np.array([n, 0, 0, 0], np.float32)).tofile(folder / "velodyne" / f"{n:06d}.bin")
     (folder / "calib.txt").write_text("Tr: 0 -1 0 0 0 0 -1 0 1 0 0 0\n")
@@ -92,7 +93,7 @@ def kitti(street: Callable, tmp_path: Path) -> Path:
     return tmp_path / "kitti"
 
 
-def test_command_and_mixture(kitti: Path, packed: Path, tiny: Callable, tmp_path: Path) -> None:
+def test_command_and_mixture(kitti: Path, packed: Path, tmp_path: Path) -> None:
     """`dpm2 train pack`, then training data by weight: 0.9 of the groups from a folder whatever its size."""
     out = tmp_path / "real" / "03"
     arguments = ["train", "pack", str(kitti), str(out), "--frames", "1:", "--set", "sequence=03"]
@@ -104,7 +105,7 @@ def test_command_and_mixture(kitti: Path, packed: Path, tiny: Callable, tmp_path
     mixture = Mixture(settings)
     chances = dict(zip((drive.name for drive in mixture.drives), mixture.chances, strict=True))
     assert chances == pytest.approx({"03": 0.9, "world": 0.1})
-    assert np.isfinite(GroupDataset(settings, tiny(), seed=0).batch(0).poses.numpy()).all()
+    assert np.isfinite(GroupDataset(settings, tiny(), settings.draw, seed=0)[0, 0].poses.numpy()).all()
     again = CliRunner().invoke(app, arguments)
     assert isinstance(again.exception, UsageError)
     assert "is there already" in str(again.exception)

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -17,8 +16,9 @@ from dpm2_core.learning.registration_loss import LossSettings
 from dpm2_core.learning.train_registration import RegistrationTraining, RegistrationTrainingSettings, set_pairs_of
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pose_solver import solve_batch
-from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.network.tokens import Tokens
+
+from ...helpers.networks import tiny
 
 TRUTH = torch.from_numpy(se3.exp([0.01, -0.02, 1.0, 3.0, 0.5, 0.1]))[None]
 
@@ -49,8 +49,8 @@ def places(count: int, channels: int) -> tuple[Tokens, Tokens]:
     return Tokens(xyz, features, axes[0], mask), Tokens(moved, features, axes[1], mask)
 
 
-def test_what_has_diverged_takes_the_truth_and_has_no_gradient(tiny: Callable[..., NetworkSettings]) -> None:
-    """The same pair is judged against a truth that it is near, and against one 3 m beside."""
+def test_what_has_diverged_takes_the_truth_and_has_no_gradient() -> None:
+    """The same pair is compared with a truth that it is near, and with one 3 m beside."""
     torch.manual_seed(0)
     model = DeepPointMap2(tiny()).eval()
     source, target = places(60, model.settings.channels)
@@ -68,12 +68,12 @@ def test_what_has_diverged_takes_the_truth_and_has_no_gradient(tiny: Callable[..
     assert float(source.features.grad.abs().max()) == 0.0
 
 
-def test_registration_trains_by_it(packed: Path, tiny: Callable[..., NetworkSettings]) -> None:
+def test_registration_trains_by_it(packed: Path) -> None:
     """With every other loss switched off the encoder still has a gradient, and both figures are in the log."""
     torch.manual_seed(0)
     data = DataSettings(packed={str(packed): 1.0}, groups=1, frames=3, workers=0)
     loss = LossSettings(pairing=0, coarse=0, backbone=0, image=0, offset=0, pose=1, near=32, own=16)
-    batch = GroupDataset(data, tiny(), seed=0).batch(0)
+    batch = GroupDataset(data, tiny(), data.draw, seed=0)[0, 0]
     module = RegistrationTraining(tiny(), loss)
     with torch.no_grad():  # the last layer of the offsets is zero at first, and passes no gradient on
         module.model.decoder.offset.out.weight.normal_(std=0.1)

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,17 +14,18 @@ from safetensors.torch import load_file
 from dpm2_core.data.packed import Sample, write_packed
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Camera
-from dpm2_core.learning.train_image import ImageDataset, ImageTrainingSettings, PictureSettings, shown, train_image
+from dpm2_core.learning.train_image import ImageDataset, ImageDataSettings, ImageTrainingSettings, shown, train_image
 from dpm2_core.learning.trainer import OptimizerSettings
 from dpm2_core.network.model import DeepPointMap2
-from dpm2_core.network.settings import PRESETS, NetworkSettings
+from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.network.weights import save_weights
+
+from ...helpers.networks import tiny
 
 
 @pytest.fixture
-def network(tiny: Callable, monkeypatch: pytest.MonkeyPatch) -> NetworkSettings:
-    """The tiny preset."""
-    monkeypatch.setitem(PRESETS, "tiny", tiny().model_dump())
+def network() -> NetworkSettings:
+    """The tiny network."""
     return tiny()
 
 
@@ -36,8 +36,8 @@ def settings(packed: Path, network: NetworkSettings, tmp_path: Path) -> ImageTra
     start = tmp_path / "start.safetensors"
     save_weights(DeepPointMap2(network), start, {})
     return ImageTrainingSettings(
-        preset="tiny",
-        data=PictureSettings(packed={str(packed): 1.0}, groups=2, radius=3),
+        network=network.model_dump(),
+        data=ImageDataSettings(packed={str(packed): 1.0}, groups=2, radius=3),
         points=32,
         optimiser=OptimizerSettings(steps=4, compile=False, bf16=False, save_every=2, warmup=1),
         start=str(start),

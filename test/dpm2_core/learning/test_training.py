@@ -7,14 +7,13 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
 from safetensors.torch import load_file
 
-from dpm2_core.config import settings_from
+from dpm2_core.config import merged, settings_from
 from dpm2_core.errors import UsageError
 from dpm2_core.learning.augment import AugmentSettings
 from dpm2_core.learning.checkpoint import Log
@@ -29,18 +28,19 @@ from dpm2_core.learning.train_registration import (
     train_registration,
 )
 from dpm2_core.learning.trainer import OptimizerSettings, learning_rate
-from dpm2_core.network.settings import PRESETS
 from dpm2_core.network.weights import network_settings, read_metadata
+
+from ...helpers import ranks
+from ...helpers.networks import tiny
 
 STILL = AugmentSettings(drop=0, occlusion=0, beams=0, jitter=0, tilt=0, shift=(0, 0, 0), image_drop=0)
 
 
 @pytest.fixture
-def settings(packed: Path, tiny: Callable, monkeypatch: pytest.MonkeyPatch) -> RegistrationTrainingSettings:
+def settings(packed: Path) -> RegistrationTrainingSettings:
     """The registration training of the tiny network on the packed drive, in float32, without compiling."""
-    monkeypatch.setitem(PRESETS, "tiny", tiny().model_dump())
     return RegistrationTrainingSettings(
-        preset="tiny",
+        network=tiny().model_dump(),
         data=DataSettings(packed={str(packed): 1.0}, groups=1, frames=3, workers=0, images=True),
         validation=str(packed),
         validation_pairs=4,
@@ -79,10 +79,10 @@ def test_log_has_figures_and_validation(settings: RegistrationTrainingSettings, 
     assert {"near_deg", "near_success", "turned_m", "chi2"} <= validations[0].keys()
 
 
-def test_images_have_a_loss_of_their_own(settings: RegistrationTrainingSettings, tiny: Callable) -> None:
+def test_images_have_a_loss_of_their_own(settings: RegistrationTrainingSettings) -> None:
     """It is a finite figure that trains the image branch; without images it is absent, not zero."""
     module = RegistrationTraining(tiny(), settings.loss)
-    batch = GroupDataset(settings.data, tiny(), seed=0).batch(0)
+    batch = GroupDataset(settings.data, tiny(), settings.data.draw, seed=0)[0, 0]
     plans = set_pairs_of(batch.poses, settings, 0)
     total, figures = module(batch.points, batch.views, plans)
     assert figures["image"] > 0
@@ -93,10 +93,10 @@ def test_images_have_a_loss_of_their_own(settings: RegistrationTrainingSettings,
 
 
 def test_a_checkpoint_of_another_network_is_rejected(settings: RegistrationTrainingSettings, tmp_path: Path) -> None:
-    """And so is a file that is none."""
+    """And so is a file of another kind."""
     train_registration(settings, tmp_path / "out")
     with pytest.raises(UsageError, match="checkpoint of another network"):
-        train_registration(settings.model_copy(update={"preset": "small"}), tmp_path / "out", resume=True)
+        train_registration(settings.model_copy(update={"network": {}}), tmp_path / "out", resume=True)
     (tmp_path / "out" / "checkpoint.pt").write_bytes(b"garbage")
     with pytest.raises(UsageError, match="not a checkpoint"):
         train_registration(settings, tmp_path / "out", resume=True)
@@ -130,9 +130,11 @@ def test_overlap_keeps_a_tenth_of_the_rate_whatever_else_is_set() -> None:
 
 
 def test_overlap_keeps_the_network_of_registration(settings: RegistrationTrainingSettings, tmp_path: Path) -> None:
-    """Also settings that change no shape and differ from the preset: the weights that it writes tell them again."""
+    """Also settings that change no shape and differ from the preset: the weights that it writes have them again."""
     changed = {"decoder": {"temperature": 0.5}, "fusion": {"image_mask": "front"}}
-    start = train_registration(settings.model_copy(update={"network": changed}), tmp_path / "one")
+    start = train_registration(
+        settings.model_copy(update={"network": merged(settings.network, changed)}), tmp_path / "one"
+    )
     after = network_settings(train_overlap(_overlap(settings, start, steps=1), tmp_path / "two"))
     assert after == network_settings(start)
     assert (after.decoder.temperature, after.fusion.image_mask) == (0.5, "front")
@@ -149,24 +151,22 @@ def test_a_setting_that_a_phase_does_not_use_is_rejected(kind: type, key: str) -
 
 
 @pytest.mark.slow
-def test_it_overfits_four_pairs_to_two_centimeters(packed: Path, tiny: Callable) -> None:
-    """The same 4 pairs over and over are registered to 2 cm: nothing in the chain blocks the signal.
+def test_it_overfits_four_pairs_to_two_centimeters(packed: Path) -> None:
+    """The same 4 pairs over and over are registered to 2 cm within 300 steps: nothing in the chain blocks the signal.
 
-    Of so small a network an unlucky start may leave one pair unmatched, and which start that is changes with the order
-    of sums (threads, processor): one of three starts has to do it.
+    With so small a network an unlucky start may leave one pair unmatched, and which start that is changes with the
+    order of sums (threads, processor): one of three starts has to do it.
     """
-    assert any(max(_overfitted(packed, tiny, seed)) < 0.02 for seed in range(3))
+    assert any(_overfits(packed, seed) for seed in (1, 2, 0))
 
 
-def _overfitted(packed: Path, tiny: Callable, seed: int) -> list[float]:
-    """Errors of the 4 pairs after 300 steps on them, m."""
+def _overfits(packed: Path, seed: int) -> bool:
+    """Whether all 4 pairs are at some time registered to 2 cm, looked at every 25 steps."""
     torch.manual_seed(seed)
     network = tiny(fusion={"points": 96})
     module = RegistrationTraining(network, LossSettings(offset=1, near=64, own=32))
-    data = GroupDataset(
-        DataSettings(packed={str(packed): 1.0}, groups=1, frames=3, workers=0, augment=STILL), network, seed=0
-    )
-    batch = data.batch(0)
+    data = DataSettings(packed={str(packed): 1.0}, groups=1, frames=3, workers=0, augment=STILL)
+    batch = GroupDataset(data, network, data.draw, seed=0)[0, 0]
     settings = RegistrationTrainingSettings(pairs=4, sets=0.0)
     plans = set_pairs_of(batch.poses, settings, 0)
     optimizer = torch.optim.AdamW(module.parameters(), 3e-3)
@@ -178,7 +178,9 @@ def _overfitted(packed: Path, tiny: Callable, seed: int) -> list[float]:
         loss.backward()
         torch.nn.utils.clip_grad_norm_(module.parameters(), 1.0)
         optimizer.step()
-    return _errors(module, batch, plans)
+        if step % 25 == 24 and max(_errors(module, batch, plans)) < 0.02:
+            return True
+    return False
 
 
 def _errors(module: RegistrationTraining, batch: object, plans: tuple) -> list[float]:
@@ -202,52 +204,6 @@ def test_learning_rate() -> None:
     """Warm-up to the peak, cosine through the half, to the floor."""
     settings = OptimizerSettings(steps=110, warmup=10, rate=1.0, final_rate=0.2)
     assert [round(learning_rate(settings, s), 6) for s in (0, 9, 10, 60, 110)] == [0.1, 1.0, 1.0, 0.6, 0.2]
-
-
-RANKS = """
-import sys, torch
-from dpm2_core.config import settings_from
-from dpm2_core.network.settings import NetworkSettings
-from dpm2_core.learning.dataset import DataSettings, GroupDataset
-from dpm2_core.learning.registration_loss import LossSettings
-from dpm2_core.learning.train_image import ImageTrainingSettings
-from dpm2_core.learning.train_registration import RegistrationTraining, RegistrationTrainingSettings, set_pairs_of
-from dpm2_core.learning.trainer import process_group
-from torch.nn.parallel import DistributedDataParallel
-
-out, packed, network = sys.argv[1:]
-network = NetworkSettings.model_validate_json(network)
-settings = RegistrationTrainingSettings(pairs=2, sets=0)
-with process_group() as (rank, world, device):
-    torch.manual_seed(0)
-    module = RegistrationTraining(network, LossSettings(near=16, own=8))
-    run = DistributedDataParallel(module, find_unused_parameters=True) if world > 1 else module
-    shares = [rank] if world > 1 else [0, 1]
-    for share in shares:
-        options = DataSettings(packed={packed: 1.0}, groups=1, frames=2, workers=0)
-        batch = GroupDataset(options, network, 0, 0, (share, 2)).batch(0)
-        torch.manual_seed(1)
-        loss, _ = run(batch.points, None, set_pairs_of(batch.poses, settings, 0))
-        (loss / len(shares)).backward()
-    if rank == 0:
-        torch.save({name: p.grad for name, p in module.named_parameters() if p.grad is not None}, out)
-"""
-
-
-@pytest.mark.slow
-def test_two_processes_give_the_gradients_of_one(tmp_path: Path, packed: Path, tiny: Callable) -> None:
-    """gloo on the CPU, started by torchrun: each rank its fraction of the places, the mean of the losses."""
-    script = tmp_path / "ranks.py"
-    script.write_text(RANKS)
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[3]), "OMP_NUM_THREADS": "1"}
-    arguments = [str(packed), tiny().model_dump_json()]
-    subprocess.run([sys.executable, script, tmp_path / "one", *arguments], check=True, env=environment)
-    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
-    subprocess.run([*torchrun, script, tmp_path / "two", *arguments], check=True, env=environment, capture_output=True)
-    one, two = (torch.load(tmp_path / name, weights_only=True) for name in ("one", "two"))
-    assert len(one) > 50
-    for name, gradient in one.items():
-        torch.testing.assert_close(two[name], gradient, atol=1e-6, rtol=1e-4, msg=name)
 
 
 def test_tensorboard_has_the_figures_of_the_log(settings: RegistrationTrainingSettings, tmp_path: Path) -> None:
@@ -283,32 +239,38 @@ def test_overlap_keeps_what_the_weights_say_of_registration(
     assert {**before, "phase": "2"} == after
 
 
+TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[3]), "OMP_NUM_THREADS": "1"}
+
+
+@pytest.mark.slow
+def test_two_processes_give_the_gradients_of_one(tmp_path: Path, packed: Path) -> None:
+    """gloo on the CPU, started by torchrun: each rank its part of the places, the mean of the losses."""
+    command = [*TORCHRUN, ranks.__file__, tmp_path / "two", packed, tiny().model_dump_json()]
+    done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+    one, two = ranks.gradients(str(packed), tiny()), torch.load(tmp_path / "two", weights_only=True)
+    assert len(one) > 50
+    for name, gradient in one.items():
+        torch.testing.assert_close(two[name], gradient, atol=1e-6, rtol=1e-4, msg=name)
+
+
 LOOP = """
 import sys
 from pathlib import Path
-from dpm2_core.network.settings import PRESETS
-from dpm2_core.learning.train_image import ImageTrainingSettings
 from dpm2_core.learning.train_registration import RegistrationTrainingSettings, train_registration
-import json
-out, settings, network = sys.argv[1:]
-PRESETS["tiny"] = json.loads(network)
+out, settings = sys.argv[1:]
 train_registration(RegistrationTrainingSettings.model_validate_json(settings), Path(out))
 """
 
 
 @pytest.mark.slow
-def test_the_whole_loop_runs_under_torchrun(
-    settings: RegistrationTrainingSettings, tiny: Callable, tmp_path: Path
-) -> None:
+def test_the_whole_loop_runs_under_torchrun(settings: RegistrationTrainingSettings, tmp_path: Path) -> None:
     """Two gloo ranks train, log, validate and save once; their losses are not those of one process' smaller batch."""
     script = tmp_path / "loop.py"
     script.write_text(LOOP)
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[3]), "OMP_NUM_THREADS": "1"}
-    arguments = [settings.model_dump_json(), tiny().model_dump_json()]
-    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
-    done = subprocess.run(
-        [*torchrun, script, tmp_path / "two", *arguments], env=environment, capture_output=True, text=True, timeout=120
-    )
+    command = [*TORCHRUN, script, tmp_path / "two", settings.model_dump_json()]
+    done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stderr[-3000:]
     assert sorted(losses(tmp_path / "two")) == [0, 1, 2, 3]
     rows = (tmp_path / "two" / "log.jsonl").read_text().splitlines()
@@ -316,5 +278,5 @@ def test_the_whole_loop_runs_under_torchrun(
     train_registration(settings, tmp_path / "one")
     one, two = (load_file(tmp_path / name / "weights.safetensors") for name in ("one", "two"))
     assert one.keys() == two.keys()
-    assert any(not torch.equal(one[name], two[name]) for name in one)  # the second rank's share counts
+    assert any(not torch.equal(one[name], two[name]) for name in one)  # the second rank's part counts
     assert all(torch.isfinite(tensor).all() for tensor in two.values())

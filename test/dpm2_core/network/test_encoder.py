@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -17,9 +16,14 @@ from dpm2_core.network.convnext import FeatureMap
 from dpm2_core.network.encoder import Encoder, collate_views, resize
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pointnext import argmax_neighbor
+from dpm2_core.network.pretrained import weights_path
 from dpm2_core.network.pyramid import build_pyramid, collate, crop
 from dpm2_core.network.settings import PRESETS, preset
 from dpm2_core.network.spatial import Views, image_features
+from dpm2_core.network.weights import network_settings
+
+from ...helpers.networks import tiny
+from ...helpers.scenes import boxes, make_image
 
 
 def frame(cloud: np.ndarray, *images: Image) -> Frame:
@@ -40,17 +44,23 @@ def test_parameters_are_those_of_deep_point_map() -> None:
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_presets_give_256_descriptors_of_128_channels(name: str, noise: np.random.Generator, street: Callable) -> None:
+def test_presets_give_256_descriptors_of_128_channels(name: str, noise: np.random.Generator) -> None:
     """The contract of every preset, and 70 kB per frame."""
     torch.manual_seed(0)
-    out = Encoder(preset(name)).eval().encode(frame(street(noise, 6000)))
+    out = Encoder(preset(name)).eval().encode(frame(boxes(noise, 6000)))
     assert out.xyz.shape == (256, 3)
     assert out.features.shape == (256, 128)
     assert out.xyz.nbytes + out.features.nbytes <= 70_000
     assert np.isfinite(out.features).all()
 
 
-def test_unknown_preset_and_backbone_are_rejected(tiny: Callable) -> None:
+@pytest.mark.weights
+def test_the_shipped_weights_are_of_the_preset_small() -> None:
+    """With all its settings, so that a training that starts from them needs no change to the preset."""
+    assert network_settings(weights_path("small")) == preset("small")
+
+
+def test_unknown_preset_and_backbone_are_rejected() -> None:
     """In one line that names the choices."""
     with pytest.raises(UsageError, match=r"network preset big: want one of small, base, paper, v1"):
         preset("big")
@@ -60,27 +70,27 @@ def test_unknown_preset_and_backbone_are_rejected(tiny: Callable) -> None:
         Encoder(tiny(image={"backbone": "vgg"}))
 
 
-def test_order_of_points_changes_nothing(model: DeepPointMap2, noise: np.random.Generator, street: Callable) -> None:
+def test_order_of_points_changes_nothing(model: DeepPointMap2, noise: np.random.Generator) -> None:
     """A scan of one point a voxel gives the same descriptors in any order of its points."""
-    cloud = crop(street(noise, 1500), model.settings.points)
+    cloud = crop(boxes(noise, 1500), model.settings.points)
     one, other = (model.describe(frame(c)) for c in (cloud, noise.permutation(cloud)))
     assert np.array_equal(one.xyz, other.xyz)
     assert np.array_equal(one.features, other.features)
 
 
-def test_heading_changes_nothing(model: DeepPointMap2, noise: np.random.Generator, street: Callable) -> None:
+def test_heading_changes_nothing(model: DeepPointMap2, noise: np.random.Generator) -> None:
     """Turned about the vertical, the same samples get the same features: what `view_aligned` promises."""
-    pyramid = build_pyramid(street(noise, 1500), model.settings)
+    pyramid = build_pyramid(boxes(noise, 1500), model.settings)
     R = se3.exp([0, 0, 2.1, 0, 0, 0])[:3, :3].astype(np.float32)
     turned = replace(pyramid, xyz=pyramid.xyz @ R.T, patches=(pyramid.patches @ R.T).astype(np.float16))
     one, other = (model.encoder(collate([p])).tokens for p in (pyramid, turned))
     torch.testing.assert_close(one.features, other.features, atol=2e-3, rtol=0)  # patches are float16
 
 
-def test_padding_changes_nothing(model: DeepPointMap2, noise: np.random.Generator, street: Callable) -> None:
+def test_padding_changes_nothing(model: DeepPointMap2, noise: np.random.Generator) -> None:
     """A sparse scan encodes alike alone and in a batch with a full one; its padding is masked."""
     settings = model.settings
-    sparse, full = build_pyramid(street(noise, 100)[:40], settings), build_pyramid(street(noise), settings)
+    sparse, full = build_pyramid(boxes(noise, 100)[:40], settings), build_pyramid(boxes(noise), settings)
     alone = model.encoder(collate([sparse])).tokens
     together = model.encoder(collate([full, sparse])).tokens
     assert together.mask.sum(1).tolist() == [48, 40]
@@ -117,22 +127,18 @@ def views_of(model: DeepPointMap2, *frames: list[Image]) -> Views:
     return views
 
 
-def test_missing_image_equals_no_camera(
-    model: DeepPointMap2, noise: np.random.Generator, street: Callable, make_image: Callable
-) -> None:
+def test_missing_image_equals_no_camera(model: DeepPointMap2, noise: np.random.Generator) -> None:
     """Exactly: in a batch whose other frame has an image, the one without gives what the LiDAR alone gives."""
-    pyramid = build_pyramid(street(noise), model.settings)
+    pyramid = build_pyramid(boxes(noise), model.settings)
     alone = model.encoder(collate([pyramid])).tokens.features
     both = model.encoder(collate([pyramid, pyramid]), views_of(model, [], [make_image(noise)])).tokens.features
     assert torch.equal(both[0], alone[0])
     assert (both[1] - alone[0]).abs().max() > 1e-3  # the image is used
 
 
-def test_only_reference_points_in_view_read_the_image(
-    model: DeepPointMap2, noise: np.random.Generator, street: Callable, make_image: Callable
-) -> None:
+def test_only_reference_points_in_view_read_the_image(model: DeepPointMap2, noise: np.random.Generator) -> None:
     """With one fusion layer, what lies behind the camera does not depend on the pixels."""
-    pyramid = build_pyramid(street(noise), model.settings)
+    pyramid = build_pyramid(boxes(noise), model.settings)
     points = collate([pyramid])
     one, other = (model.encoder(points, views_of(model, [make_image(noise)])).tokens for _ in range(2))
     behind = one.xyz[0, :, 0] < 0
@@ -140,11 +146,9 @@ def test_only_reference_points_in_view_read_the_image(
     assert not torch.equal(one.features[0][~behind], other.features[0][~behind])
 
 
-def test_several_cameras(
-    model: DeepPointMap2, noise: np.random.Generator, street: Callable, make_image: Callable
-) -> None:
+def test_several_cameras(model: DeepPointMap2, noise: np.random.Generator) -> None:
     """Their order does not matter."""
-    pyramid = build_pyramid(street(noise), model.settings)
+    pyramid = build_pyramid(boxes(noise), model.settings)
     a, b = make_image(noise), make_image(noise)
     one = model.encoder(collate([pyramid]), views_of(model, [a, b])).tokens.features
     other = model.encoder(collate([pyramid]), views_of(model, [b, a])).tokens.features
@@ -155,13 +159,11 @@ def test_several_cameras(
     "kind", ["biased", "point_painting", "roi_pooling", "scale_dot", "without_learnable", "without_spatial"]
 )
 @pytest.mark.parametrize("reference", ["fps", "uniform", "normal"])
-def test_alternatives_of_the_ablations(
-    noise: np.random.Generator, kind: str, reference: str, tiny: Callable, street: Callable, make_image: Callable
-) -> None:
+def test_alternatives_of_the_ablations(noise: np.random.Generator, kind: str, reference: str) -> None:
     """Every choice of Tables 3 and 4 runs, uses the image, and gives each parameter of its own a gradient."""
     torch.manual_seed(0)
     model = DeepPointMap2(tiny(fusion={"kind": kind, "reference": reference}))
-    points = collate([build_pyramid(street(noise), model.settings)])
+    points = collate([build_pyramid(boxes(noise), model.settings)])
     features = model.encoder(points, views_of(model, [make_image(noise)])).tokens.features
     features.square().sum().backward()
     fusion = model.encoder.fusion
@@ -192,7 +194,7 @@ def test_argmax_neighbor() -> None:
         torch.testing.assert_close(found, sums.amax(2), atol=1e-4, rtol=1e-4)  # float32 loses 8 bits to the index
 
 
-def test_the_feature_of_the_own_pixel_begins_as_nothing(tiny: Callable, noise: np.random.Generator) -> None:
+def test_the_feature_of_the_own_pixel_begins_as_nothing(noise: np.random.Generator) -> None:
     """At first a network with it is the network without, and stays so where no view sees; several are averaged."""
     torch.manual_seed(0)
     features = [FeatureMap(torch.randn(2, 8, 4, 6), 8)]

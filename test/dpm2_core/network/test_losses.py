@@ -93,7 +93,7 @@ def test_loss_gradients() -> None:
 
 
 def test_overlap_label_is_twenty_meters() -> None:
-    """A certain and right answer costs nothing, a certain and wrong one its logit."""
+    """A certain and right prediction costs nothing, a certain and wrong one its logit."""
     distance = torch.tensor([20.0, 20.1])
     assert overlap_loss(torch.tensor([9.0, -9.0]), distance).item() < 1e-3
     assert overlap_loss(torch.tensor([-9.0, 9.0]), distance).item() == pytest.approx(9, abs=1e-3)

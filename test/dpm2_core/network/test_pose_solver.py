@@ -182,7 +182,7 @@ def described(model: DeepPointMap2, noise: np.random.Generator, n: int) -> Descr
 
 
 def test_registration_of_sets_of_different_sizes(model: DeepPointMap2, noise: np.random.Generator) -> None:
-    """A batch answers as its members alone do: frames, merged maps and sparse scans together."""
+    """A batch gives what its members alone give: frames, merged maps and sparse scans together."""
     sizes = [(48, 48), (48, 144), (30, 48)]
     sources = [described(model, noise, n) for n, _ in sizes]
     targets = [merge([described(model, noise, 48).moved(se3.exp(noise.normal(0, 1, 6)))] * (m // 48)) for _, m in sizes]

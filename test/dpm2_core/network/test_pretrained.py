@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import os
 import shutil
+import subprocess
+import sys
 from collections import Counter
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,17 +22,11 @@ from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.perception import dynamic_objects
 from dpm2_core.network.pretrained import PRETRAINED_DIR, load_network, load_once
 from dpm2_core.network.weights import save_weights
+from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.session import open_for_localization, open_session
 from dpm2_core.slam.settings import SlamSettings
-from dpm2_core.slam.system import LocalizationSystem, SlamSystem
 
-
-@pytest.fixture(autouse=True)
-def _threads() -> Iterator[None]:
-    """Those of torch are as before."""
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
+from ...helpers.scenes import boxes
 
 
 @pytest.fixture
@@ -56,7 +51,7 @@ def network_file(model: DeepPointMap2, tmp_path: Path) -> Path:
 
 
 def test_a_run_with_every_part_that_has_a_network_opens_each_file_once(
-    network_file: Path, tmp_path: Path, opened: Counter[str], street: Callable[..., np.ndarray],
+    network_file: Path, tmp_path: Path, opened: Counter[str],
     noise: np.random.Generator,
 ) -> None:  # fmt: skip
     """Refined registration, loops by descriptors and a filter make a map; the same settings localize in it."""
@@ -66,14 +61,14 @@ def test_a_run_with_every_part_that_has_a_network_opens_each_file_once(
         "registration": "refined", "threads": torch.get_num_threads(), "loops": {"descriptors": True},
         "neural": {"weights": str(network_file), "preset": ""}, "filter": {"kind": "movers", "weights": filter_file},
     })  # fmt: skip
-    points = np.column_stack([street(noise), np.full(4000, 0.5)]).astype(np.float32)
+    points = np.column_stack([boxes(noise), np.full(4000, 0.5)]).astype(np.float32)
     with open_session(tmp_path / "a.dpm2map", settings, "", resume=False) as store:
-        made = SlamSystem(settings, store=store)
+        made = make_slam(settings, store=store)
         for number in range(2):
             made.process(Frame(number * 10**8, points))
-        made.mapper.finish()
+        made.finish()
     with open_for_localization(tmp_path / "a.dpm2map", settings) as store:
-        LocalizationSystem(settings, store).process(Frame(0, points))
+        make_slam(settings, store=store).process(Frame(0, points))
     assert opened == {"tiny.safetensors": 1, "filter.safetensors": 1}
 
 
@@ -101,9 +96,7 @@ def test_a_link_to_the_file_and_a_relative_path_are_the_same_file(
     assert opened.total() == 1
 
 
-def test_what_one_user_registered_to_is_not_given_to_another(
-    network_file: Path, street: Callable[..., np.ndarray], noise: np.random.Generator
-) -> None:
+def test_what_one_user_registered_to_is_not_given_to_another(network_file: Path, noise: np.random.Generator) -> None:
     """A network keeps its part of the work on the last target; the SLAM has one per thread."""
     one, other = load_network(str(network_file), 1), load_network(str(network_file), 1)
     assert one is not other
@@ -111,9 +104,19 @@ def test_what_one_user_registered_to_is_not_given_to_another(
 
 
 def test_weights_of_another_network_are_rejected_though_the_file_is_loaded(network_file: Path) -> None:
-    """The memory of one loader does not answer another one."""
+    """What one loader has loaded is not given to another one."""
     load_network(str(network_file), 1)
     with pytest.raises(UsageError, match="not of movers"):
         load_once(network_file, 1, dynamic_objects.load)
     with pytest.raises(UsageError, match=r"none\.safetensors: No such file"):
         load_once(network_file.parent / "none.safetensors", 1, dynamic_objects.load)
+
+
+def test_loading_does_not_import_the_compiler_of_torch() -> None:
+    """torch._dynamo and sympy take 2 s at the start of every node and command that has a network."""
+    program = (
+        "import sys; from dpm2_core.network.pretrained import load_network; load_network('small', 1); "
+        "sys.exit(', '.join({'torch._dynamo', 'sympy'} & set(sys.modules)) or 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr

@@ -17,6 +17,8 @@ from dpm2_core.errors import UsageError
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.weights import load_model, load_weights, save_weights
 
+from ...helpers.networks import tiny
+
 
 @pytest.fixture
 def saved(model: DeepPointMap2, tmp_path: Path) -> Path:
@@ -35,7 +37,7 @@ def test_round_trip(model: DeepPointMap2, saved: Path) -> None:
 
 
 def test_overlap_is_checked_after_overlap_alone(model: DeepPointMap2, saved: Path, tmp_path: Path) -> None:
-    """An untrained head says NaN, never a figure that a gate would believe."""
+    """An untrained head says NaN, never a figure that would pass a gate."""
     noise = np.random.default_rng(0)
     descriptors = Descriptors(
         noise.uniform(-9, 9, (40, 3)).astype(np.float32), noise.normal(size=(40, 32)).astype("f2")
@@ -49,14 +51,14 @@ def test_overlap_is_checked_after_overlap_alone(model: DeepPointMap2, saved: Pat
     assert 0 < trained < 1
 
 
-def test_wrong_preset_is_rejected(saved: Path, tiny: Callable) -> None:
+def test_wrong_preset_is_rejected(saved: Path) -> None:
     """With both names."""
     other = DeepPointMap2(tiny().model_copy(update={"preset": "huge"}))
     with pytest.raises(UsageError, match="weights of preset tiny, the network is preset huge"):
         load_weights(other, saved)
 
 
-def test_wrong_shape_under_the_right_name_is_rejected(saved: Path, tiny: Callable) -> None:
+def test_wrong_shape_under_the_right_name_is_rejected(saved: Path) -> None:
     """Also when a whole layer is missing; nothing is loaded then."""
     other = DeepPointMap2(tiny(decoder={"layers": 2}))
     before = {name: value.clone() for name, value in other.state_dict().items()}

@@ -13,12 +13,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dpm2_core.config import settings_from
 from dpm2_core.data.kitti import KittiSource
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.geometry import se3
 from dpm2_core.sim.drive import simulate
 from dpm2_core.sim.materials import Label
-from dpm2_core.sim.settings import CameraConfig, LidarConfig
+from dpm2_core.sim.settings import CameraConfig, DriveConfig, LidarConfig
 
 LIDAR = LidarConfig(beams=16, columns=360)
 CAMERA = CameraConfig(width=160, height=48, focal=95)
@@ -29,20 +30,20 @@ def _files(root: Path) -> dict[str, bytes]:
 
 
 @pytest.fixture(scope="module")
-def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("sim") / "drive"
-    assert simulate(out, frames=4, seed=3, road="loop", lidar=LIDAR, camera=CAMERA, workers=2)
+    assert simulate(out, DriveConfig(frames=4, seed=3, road="loop", lidar=LIDAR, camera=CAMERA), workers=2)
     return out
 
 
-def test_any_kitti_reader_reads_it(drive: Path) -> None:
-    source = KittiSource(drive)
+def test_any_kitti_reader_reads_it(recording: Path) -> None:
+    source = KittiSource(recording)
     assert source.notes == []
     assert source.vertical_angle_correction_deg == 0  # simulated beams are where they say
     frames = list(source.frames())
     assert [f.index for f in frames] == [0, 1, 2, 3]
     np.testing.assert_allclose(np.diff([f.stamp for f in frames]), 1e8, rtol=1e-6)
-    sequence = drive / "sequences" / "00"
+    sequence = recording / "sequences" / "00"
     for frame in frames:
         assert frame.problem is None
         assert len(frame.points) > 2000
@@ -55,44 +56,44 @@ def test_any_kitti_reader_reads_it(drive: Path) -> None:
     np.testing.assert_allclose(source.camera.K[:2, 2], [79.5, 23.5])
 
 
-def test_poses_are_relative_to_the_first_camera_and_line_the_scans_up(drive: Path) -> None:
-    source = KittiSource(drive)
-    rows = np.loadtxt(drive / "poses" / "00.txt")
+def test_poses_are_relative_to_the_first_camera_and_line_the_scans_up(recording: Path) -> None:
+    source = KittiSource(recording)
+    rows = np.loadtxt(recording / "poses" / "00.txt")
     np.testing.assert_allclose(rows[0].reshape(3, 4), np.eye(4)[:3], atol=1e-8)
-    np.testing.assert_array_equal(rows, np.loadtxt(drive / "sequences" / "00" / "poses.txt"))
+    np.testing.assert_array_equal(rows, np.loadtxt(recording / "sequences" / "00" / "poses.txt"))
     assert (rows[1:, 11] > 0).all()  # camera z is ahead
-    world = np.load(drive / "sequences" / "00" / "ground.npz")
+    world = np.load(recording / "sequences" / "00" / "ground.npz")
     T_grid_lidar0 = world["T_grid_cam0"] @ source.T_cam_lidar
     for frame, T in zip(source.frames(), source.poses, strict=True):
-        label = np.fromfile(drive / "sequences" / "00" / "labels" / f"{frame.index:06d}.label", np.uint32)
+        label = np.fromfile(recording / "sequences" / "00" / "labels" / f"{frame.index:06d}.label", np.uint32)
         points = se3.transform(T_grid_lidar0 @ T, frame.points[label == Label.ROAD, :3].astype(float))
         column, row = ((points[:, :2] - world["origin"]) / world["resolution"]).round().astype(int).T
         assert np.median(np.abs(world["elevation"][row, column] - points[:, 2])) < 0.03  # kerbs and noise apart
 
 
-def test_the_number_of_workers_changes_nothing(drive: Path, tmp_path: Path) -> None:
-    simulate(tmp_path / "one", frames=4, seed=3, road="loop", lidar=LIDAR, camera=CAMERA, workers=1)
-    assert _files(tmp_path / "one") == _files(drive)
+def test_the_number_of_workers_changes_nothing(recording: Path, tmp_path: Path) -> None:
+    simulate(tmp_path / "one", DriveConfig(frames=4, seed=3, road="loop", lidar=LIDAR, camera=CAMERA), workers=1)
+    assert _files(tmp_path / "one") == _files(recording)
 
 
-def test_a_complete_drive_is_reused_and_another_one_rejected(drive: Path) -> None:
-    before = _files(drive)
-    assert not simulate(drive, frames=4, seed=3, road="loop", lidar=LIDAR, camera=CAMERA)
-    assert _files(drive) == before
+def test_a_complete_drive_is_reused_and_another_one_rejected(recording: Path) -> None:
+    before = _files(recording)
+    assert not simulate(recording, DriveConfig(frames=4, seed=3, road="loop", lidar=LIDAR, camera=CAMERA))
+    assert _files(recording) == before
     with pytest.raises(UsageError, match="other seed"):
-        simulate(drive, frames=4, seed=4, road="loop", lidar=LIDAR, camera=CAMERA)
+        simulate(recording, DriveConfig(frames=4, seed=4, road="loop", lidar=LIDAR, camera=CAMERA))
 
 
 def test_another_folder_is_never_touched(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("words")
     with pytest.raises(UsageError, match="no simulated drive"):
-        simulate(tmp_path, frames=2, lidar=LIDAR, images=False)
+        simulate(tmp_path, DriveConfig(frames=2, lidar=LIDAR, images=False))
     assert _files(tmp_path) == {"thesis.tex": b"words"}
 
 
 def test_without_images_there_are_none(tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()  # an empty folder is as good as none
-    simulate(tmp_path / "out", frames=1, images=False, lidar=LIDAR)
+    simulate(tmp_path / "out", DriveConfig(frames=1, images=False, lidar=LIDAR))
     assert not (tmp_path / "out" / "sequences" / "00" / "image_2").exists()
     assert len(KittiSource(tmp_path / "out")) == 1
 
@@ -102,15 +103,16 @@ def test_a_failure_leaves_nothing(tmp_path: Path) -> None:
         raise RuntimeError("no more")
 
     with pytest.raises(RuntimeError, match="no more"):
-        simulate(tmp_path / "out", frames=5, images=False, lidar=LIDAR, progress=fail)
+        simulate(tmp_path / "out", DriveConfig(frames=5, images=False, lidar=LIDAR), progress=fail)
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.slow
 def test_a_killed_run_leaves_nothing_that_looks_whole_and_the_next_one_cleans_up(tmp_path: Path) -> None:
     program = (
-        "import sys, pathlib; from dpm2_core.sim.drive import simulate; from dpm2_core.sim.settings import LidarConfig;"
-        "simulate(pathlib.Path(sys.argv[1]), frames=2000, images=False, lidar=LidarConfig(beams=16, columns=360))"
+        "import sys, pathlib; from dpm2_core.sim.drive import simulate; from dpm2_core.sim.settings import DriveConfig;"
+        "drive = DriveConfig(frames=2000, images=False, lidar={'beams': 16, 'columns': 360});"
+        "simulate(pathlib.Path(sys.argv[1]), drive)"
     )
     child = subprocess.Popen([sys.executable, "-c", program, str(tmp_path / "out")])
     try:
@@ -124,14 +126,14 @@ def test_a_killed_run_leaves_nothing_that_looks_whole_and_the_next_one_cleans_up
         child.wait()
     assert not (tmp_path / "out").exists()
     assert list(tmp_path.glob(".out.*.part"))
-    assert simulate(tmp_path / "out", frames=1, images=False, lidar=LIDAR)
+    assert simulate(tmp_path / "out", DriveConfig(frames=1, images=False, lidar=LIDAR))
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
 
 
 def test_a_file_gives_its_own_frames_and_rejects_more(poses_file: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="has 235"):
-        simulate(tmp_path / "out", frames=236, road=str(poses_file), images=False, lidar=LIDAR)
-    simulate(tmp_path / "out", frames=60, road=str(poses_file), images=False, lidar=LIDAR)
+        simulate(tmp_path / "out", DriveConfig(frames=236, road=str(poses_file), images=False, lidar=LIDAR))
+    simulate(tmp_path / "out", DriveConfig(frames=60, road=str(poses_file), images=False, lidar=LIDAR))
     file = np.loadtxt(poses_file).reshape(-1, 3, 4)[:60, :, 3]
     written = KittiSource(tmp_path / "out").poses[:, :3, 3]
     steps = np.linalg.norm(np.diff(written, axis=0), axis=1)
@@ -144,18 +146,18 @@ def test_a_file_gives_its_own_frames_and_rejects_more(poses_file: Path, tmp_path
     ("arguments", "message"),
     [
         ({"frames": 0}, "at least 1"),
-        ({"preset": "moon"}, "want one of city"),
+        ({"preset": "moon"}, "should be 'city'"),
         ({"road": "no/such/file"}, "or a file of KITTI poses"),
         ({"seed": -3}, "0 or more"),
     ],
 )
 def test_bad_arguments_are_rejected_before_anything_is_written(tmp_path: Path, arguments: dict, message: str) -> None:
     with pytest.raises(UsageError, match=message):
-        simulate(tmp_path / "out", **{"frames": 2, **arguments})
+        simulate(tmp_path / "out", settings_from(DriveConfig, {"frames": 2, **arguments}))
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_place_that_cannot_be_written_is_a_failure_of_the_work(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(Dpm2Error, match="not written"):
-        simulate(tmp_path / "file" / "out", frames=1, images=False, lidar=LIDAR)
+        simulate(tmp_path / "file" / "out", DriveConfig(frames=1, images=False, lidar=LIDAR))

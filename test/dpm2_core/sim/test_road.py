@@ -11,7 +11,7 @@ import pytest
 from dpm2_core.errors import UsageError
 from dpm2_core.sim.drive import fitting_length
 from dpm2_core.sim.road import make_road, read_drive
-from dpm2_core.sim.settings import PRESETS
+from dpm2_core.sim.settings import PRESETS, DriveConfig
 from dpm2_core.sim.world import own_preset, random_stream
 
 
@@ -52,7 +52,7 @@ def test_the_drive_keeps_to_its_speed_and_slows_in_curves(kind: str) -> None:
 def test_the_lap_fits_the_number_of_frames(preset: str) -> None:
     """150 frames end 10 m or more beyond their start, but not a lap."""
     for seed in range(4):
-        length = fitting_length("loop", preset, seed, 150)
+        length = fitting_length(DriveConfig(preset=preset, seed=seed))
         road = make_road("loop", own_preset(preset, seed), random_stream(seed, preset, 0), length)
         overlap = float(road.distance(14.9)) - road.drive.length
         assert 10 < overlap < 25

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Traffic as dense as asked: none at all, or columns on every lane with nobody inside anybody else."""
+"""Traffic as dense as asked: none at all, or columns on every lane with none inside another one."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from dpm2_core.errors import UsageError
 from dpm2_core.sim.drive import NOTE, simulate
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.materials import Label
-from dpm2_core.sim.settings import LidarConfig
+from dpm2_core.sim.settings import DriveConfig, LidarConfig
 from dpm2_core.sim.world import World, build_world
 
 LIDAR = LidarConfig(columns=256)
@@ -68,11 +68,11 @@ def test_columns_keep_clear_of_each_other_of_the_car_and_of_what_stands(dense: W
 
 def test_the_note_of_a_drive_names_its_traffic_and_another_one_is_rejected(tmp_path: Path) -> None:
     out = tmp_path / "drive"
-    assert simulate(out, 2, 3, "straight", images=False, lidar=LIDAR, traffic=5)
+    assert simulate(out, DriveConfig(frames=2, seed=3, road="straight", images=False, lidar=LIDAR, traffic=5))
     assert json.loads((out / "sequences" / "00" / NOTE).read_text())["traffic"] == 5
-    assert not simulate(out, 2, 3, "straight", images=False, lidar=LIDAR, traffic=5)
+    assert not simulate(out, DriveConfig(frames=2, seed=3, road="straight", images=False, lidar=LIDAR, traffic=5))
     with pytest.raises(UsageError, match="other traffic"):
-        simulate(out, 2, 3, "straight", images=False, lidar=LIDAR)
+        simulate(out, DriveConfig(frames=2, seed=3, road="straight", images=False, lidar=LIDAR))
 
 
 @pytest.mark.parametrize("traffic", [-1.0, 2000.0, float("nan")])

@@ -14,10 +14,10 @@ from dpm2_core.frame import Frame
 from dpm2_core.network.perception.dslr import Dslr, DslrSettings
 from dpm2_core.network.perception.dynamic_objects import DynamicObjectNetSettings
 from dpm2_core.network.perception.gndnet import GroundNet, GroundSettings
-from dpm2_core.slam.filters import DynamicObjectFilter, FilterSettings, GroundFilter, StaticFilter, make_filter
+from dpm2_core.slam.build import make_slam
+from dpm2_core.slam.filters import FilterSettings, make_filter, without_dynamic_objects, without_ground, without_traffic
 from dpm2_core.slam.preprocess import Preprocessor, PreprocessSettings
 from dpm2_core.slam.settings import SlamSettings
-from dpm2_core.slam.system import SlamSystem
 from dpm2_core.tasks.dynamic_objects_task import DynamicObjectTask, DynamicObjectTraining
 from dpm2_core.tasks.training import save_task
 
@@ -44,12 +44,12 @@ class _High:
 
 def test_dynamic_objects_are_left_out_but_never_more_than_the_limit(points: np.ndarray) -> None:
     high = points[:, 2] > -1
-    left = DynamicObjectFilter(_High(-1.0), 0.5, 0.7)(points)  # type: ignore[arg-type]
+    left = without_dynamic_objects(_High(-1.0), 0.5, 0.7, points)  # type: ignore[arg-type]
     np.testing.assert_array_equal(left, points[~(high & (0.6 + 0.1 * points[:, 2] > 0.5))])
-    some = DynamicObjectFilter(_High(-9.0), 0.1, 0.3)(points)  # type: ignore[arg-type]
+    some = without_dynamic_objects(_High(-9.0), 0.1, 0.3, points)  # type: ignore[arg-type]
     assert len(some) >= 0.7 * len(points)
     assert some[:, 2].max() < points[:, 2].max()  # the most likely went first
-    assert len(DynamicObjectFilter(_High(0), 0.5, 0.7)(points[:0])) == 0  # type: ignore[arg-type]
+    assert len(without_dynamic_objects(_High(0), 0.5, 0.7, points[:0])) == 0  # type: ignore[arg-type]
 
 
 def test_ground_is_left_out(points: np.ndarray) -> None:
@@ -58,18 +58,18 @@ def test_ground_is_left_out(points: np.ndarray) -> None:
     with torch.no_grad():
         for parameter in net.head.parameters():
             parameter.zero_()
-    np.testing.assert_array_equal(GroundFilter(net)(points), points[:1000])
+    np.testing.assert_array_equal(without_ground(net, points), points[:1000])
 
 
 def test_what_stands_in_front_of_the_static_scan_is_left_out(points: np.ndarray) -> None:
     """A translation that is 12 m away everywhere: what is in the image and nearer than 0.8 of that and 1 m goes."""
     net = Dslr(DslrSettings()).eval()
     net.forward = lambda images: torch.full_like(images, 12 / 120)  # type: ignore[method-assign]
-    left = StaticFilter(net)(points)
+    left = without_traffic(net, points)
     gone = points[~np.isin(points.view([("", points.dtype)] * 4), left.view([("", left.dtype)] * 4)).ravel()]
     assert 0 < len(gone) < len(points)
     assert np.hypot(gone[:, 0], gone[:, 1]).max() <= 0.8 * 12 - 1 + 1e-4
-    assert len(StaticFilter(net)(points[:0])) == 0
+    assert len(without_traffic(net, points[:0])) == 0
 
 
 def test_cloud_source_and_measured_are_what_the_filter_leaves(points: np.ndarray) -> None:
@@ -83,8 +83,8 @@ def test_a_slam_with_a_filter_runs_and_tells_what_is_missing(tmp_path: Path, poi
     task = DynamicObjectTask(DynamicObjectTraining(network=DynamicObjectNetSettings(cells=32, cell=1.0, channels=4)))
     path = tmp_path / "movers.safetensors"
     save_task(task, path, {})
-    system = SlamSystem(SlamSettings(filter=FilterSettings(kind="movers", weights=path), threads=1))
-    assert [system.process(Frame(i * 10**8, points)).registration.ok for i in range(3)] == [True] * 3
+    slam = make_slam(SlamSettings(filter=FilterSettings(kind="movers", weights=path), threads=1))
+    assert [slam.process(Frame(i * 10**8, points)).odometry.registration.ok for i in range(3)] == [True] * 3
     assert make_filter(FilterSettings(), 1) is None
     with pytest.raises(UsageError, match="weights of movers, not of gndnet"):
         make_filter(FilterSettings(kind="ground", weights=path), 1)

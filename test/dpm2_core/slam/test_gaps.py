@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
-from benchmarks.gaps import gaps, judged, summary
+from benchmarks.gaps import evaluated, gaps, summary
 from dpm2_core.data.open import open_source
 from dpm2_core.frame import Array, Frame, OdometryResult, State
 from dpm2_core.geometry import se3
@@ -23,7 +23,7 @@ Pose = Callable[[float], Array]  # seconds to T_world_lidar (4, 4)
 
 
 @pytest.fixture(scope="module")
-def street() -> World:
+def world() -> World:
     return build_world("straight", "suburb", seed=11, length=400.0)
 
 
@@ -62,10 +62,10 @@ def along(world: World, turn: float = 0.0) -> Pose:
 
 @pytest.mark.parametrize("turn", [0.0, 15.0, -15.0])
 @pytest.mark.parametrize("gap", [1.0, 2.0])
-def test_a_gap_across_which_the_views_overlap_is_bridged(street: World, gap: float, turn: float) -> None:
-    frames, poses = scanned(street, along(street, turn), with_gap(10, gap, 6))
+def test_a_gap_across_which_the_views_overlap_is_bridged(world: World, gap: float, turn: float) -> None:
+    frames, poses = scanned(world, along(world, turn), with_gap(10, gap, 6))
     tracked = run(frames)
-    # one scan could fit at many places: it is believed when three scans say the same
+    # one scan could fit at many places: it is accepted when three scans agree
     assert [t.state for t in tracked[10:12]] == [State.DEGRADED] * 2
     assert not any(t.registration.ok or t.keyframe for t in tracked[10:12])
     assert [t.state for t in tracked[13:]] == [State.TRACKING] * 3
@@ -73,21 +73,21 @@ def test_a_gap_across_which_the_views_overlap_is_bridged(street: World, gap: flo
     assert tracked[-1].breaks == 0
 
 
-def test_a_gap_at_a_halt_does_no_harm(street: World) -> None:
-    frames, poses = scanned(street, lambda s: street.drive_pose(2.0), with_gap(6, 10.0, 5))
+def test_a_gap_at_a_halt_does_no_harm(world: World) -> None:
+    frames, poses = scanned(world, lambda s: world.drive_pose(2.0), with_gap(6, 10.0, 5))
     tracked = run(frames)
     assert [t.state for t in tracked[8:]] == [State.TRACKING] * 3
     assert off(tracked, poses).max() < 0.02
     assert tracked[-1].breaks == 0
 
 
-def test_what_cannot_be_confirmed_is_lost_then_a_break_whose_uncertainty_covers_the_error(street: World) -> None:
-    """Ten seconds: braked to a halt meanwhile, in a part of the street that nobody has seen."""
+def test_what_cannot_be_confirmed_is_lost_then_a_break_whose_uncertainty_covers_the_error(world: World) -> None:
+    """Ten seconds: braked to a halt meanwhile, in a part of the street that is not in the map."""
 
     def pose(s: float) -> Array:
-        return street.drive_pose(2.0 + s) if s < 2 else street.drive_pose(24.0 + 0.2 * s)
+        return world.drive_pose(2.0 + s) if s < 2 else world.drive_pose(24.0 + 0.2 * s)
 
-    frames, poses = scanned(street, pose, with_gap(8, 10.0, 16))
+    frames, poses = scanned(world, pose, with_gap(8, 10.0, 16))
     tracked = run(frames)
     states = [t.state for t in tracked[8:]]
     assert State.TRACKING not in states
@@ -111,18 +111,18 @@ def test_what_cannot_be_confirmed_is_lost_then_a_break_whose_uncertainty_covers_
     assert np.linalg.norm((se3.inverse(T_true) @ T)[:3, 3]) < 0.05
 
 
-def test_one_or_two_missing_frames_are_no_gap(street: World) -> None:
+def test_one_or_two_missing_frames_are_no_gap(world: World) -> None:
     for period, missing in ((0.1, 2), (0.2, 2)):
         seconds = [period * i for i in range(11) if not 6 <= i < 6 + missing]
-        frames, poses = scanned(street, along(street), seconds)
+        frames, poses = scanned(world, along(world), seconds)
         tracked = run(frames)
         assert all(t.registration.ok for t in tracked)
         assert [t.state for t in tracked[1:]] == [State.TRACKING] * (len(frames) - 1)
         assert off(tracked, poses).max() < 0.06
 
 
-def test_a_stream_of_a_frame_a_second_is_no_gap(street: World) -> None:
-    frames, _ = scanned(street, lambda s: street.drive_pose(2.0 + 0.1 * s), [float(i) for i in range(6)])
+def test_a_stream_of_a_frame_a_second_is_no_gap(world: World) -> None:
+    frames, _ = scanned(world, lambda s: world.drive_pose(2.0 + 0.1 * s), [float(i) for i in range(6)])
     assert [t.state for t in run(frames)[1:]] == [State.TRACKING] * 5
 
 
@@ -139,17 +139,17 @@ def test_real_gaps(kitti_root: object) -> None:
     assert off(tracked[14:], source.poses[kept[14:]]).max() < 0.5
 
 
-def test_bench_places_gaps_and_counts_what_is_wrong(street: World) -> None:
+def test_bench_places_gaps_and_counts_what_is_wrong(world: World) -> None:
     assert [(g.first, g.stop) for g in gaps([10**8 * i for i in range(31)])] == [(10, 20), (11, 21)]
-    frames, poses = scanned(street, along(street), [0.1 * i for i in range(31)])
+    frames, poses = scanned(world, along(world), [0.1 * i for i in range(31)])
     gap = next(gaps([frame.stamp for frame in frames]))
-    right = judged(frames, poses, gap, SlamSettings(threads=1))
+    right = evaluated(frames, poses, gap, SlamSettings(threads=1))
     assert (right["silently_wrong_frames"], right["breaks"]) == (0, 0)
     assert 3 <= right["tracking_after_frames"] <= 4
-    # with a truth that is 2 m off after the gap, the same answers are wrong, and none of them says so
+    # with a truth that is 2 m off after the gap, the same results are wrong, and none of them says so
     moved = poses.copy()
     moved[gap.stop :, 1, 3] += 2.0
-    wrong = judged(frames, moved, gap, SlamSettings(threads=1))
+    wrong = evaluated(frames, moved, gap, SlamSettings(threads=1))
     assert wrong["silently_wrong_frames"] > 0
     assert wrong["uncovered_frames"] > 0
     assert summary([right, wrong])["all"] == {

@@ -3,29 +3,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from dpm2_core.geometry import se3
 from dpm2_core.network.perception.range_image import RangeImageSettings
+
+from ...helpers.scenes import boxes
 
 MOTION = se3.exp([0, 0, 0.01, 0.6, 0.0, 0.0])
 BUILDING, CAR, ROAD, UNLABELLED = 50, 10, 40, 0
 SENSOR = RangeImageSettings(beams=((2.0, -14.0, 16),), first=0, rows=16, columns=64, scale=60.0)
 """Small enough for tests; what `pairs` writes fits it."""
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """With several, gradients of indexing are summed in any order: equal weights, bit for bit, are for one alone."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def street_image(along: float, car: bool) -> np.ndarray:
@@ -59,7 +51,7 @@ def pairs(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def write_drive(street: Callable[..., np.ndarray]) -> Callable[..., Path]:
+def write_drive() -> Callable[..., Path]:
     """write_drive(folder, numbers=range(6), points=1500, seed=0): a sequence folder; returns it.
 
     Scans 0.6 m apart of a flat road and boxes: every 50th point unlabelled, the last 100 those of a car, which the twin
@@ -68,7 +60,7 @@ def write_drive(street: Callable[..., np.ndarray]) -> Callable[..., Path]:
 
     def write(folder: Path, numbers: Iterable[int] = range(6), points: int = 1500, seed: int = 0) -> Path:
         noise = np.random.default_rng(seed)
-        world = street(noise, points).astype(np.float64)
+        world = boxes(noise, points).astype(np.float64)
         labels = np.where(np.arange(len(world)) < points // 2, ROAD, BUILDING).astype("<u4")
         labels[::50] = UNLABELLED
         car = noise.uniform([4, 2, -1.6], [7, 4, -0.2], (100, 3))

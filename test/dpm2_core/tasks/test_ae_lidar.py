@@ -15,7 +15,7 @@ from dpm2_core.errors import UsageError
 from dpm2_core.tasks.ae_lidar import AeLidarImage, AeLidarSettings, LidarAutoencoder, load
 from dpm2_core.tasks.ae_lidar_task import AeLidarTask, AeLidarTraining
 from dpm2_core.tasks.open import open_scans
-from dpm2_core.tasks.training import WEIGHTS, draw, measure, train_task
+from dpm2_core.tasks.training import WEIGHTS, draw, measure, new_task, train_task
 
 SENSOR = AeLidarImage(beams=((2.0, -14.0, 16),), first=0, rows=16, columns=64, scale=60.0)
 
@@ -91,7 +91,7 @@ def test_learns_and_can_be_loaded(pairs: Path, tmp_path: Path, variational: bool
     """The loss falls to less than half with the SLAM loss on; figures, clouds and an image of what was written."""
     scans = open_scans(pairs)
     settings = training(network=network(variational=variational), slam=ScheduleSettings(gamma=1.0, every=5))
-    task = train_task("ae_lidar", settings, scans, tmp_path)
+    task = train_task(new_task("ae_lidar", settings), scans, tmp_path)
     log = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
     assert log[-1]["task_loss"] < 0.5 * log[0]["task_loss"]
     assert [row["step"] for row in log if row.get("slam_loss") is not None] == [8, 9, 18, 19]

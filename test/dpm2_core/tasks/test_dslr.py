@@ -18,8 +18,9 @@ from dpm2_core.network.perception.range_image import RangeImageSettings
 from dpm2_core.network.weights import read_tensors
 from dpm2_core.tasks.dslr_task import DslrTask, DslrTraining
 from dpm2_core.tasks.open import open_scans
+from dpm2_core.tasks.range_scans import RangeReader
 from dpm2_core.tasks.scan import TaskScan, TaskScans
-from dpm2_core.tasks.training import WEIGHTS, draw, measure, train_task
+from dpm2_core.tasks.training import WEIGHTS, draw, measure, new_task, train_task
 
 SENSOR = RangeImageSettings(beams=((2.0, -14.0, 16),), first=0, rows=16, columns=64, scale=60.0)
 NETWORK = DslrSettings(image=SENSOR, channels=8, latent=16)
@@ -121,7 +122,7 @@ def test_slam_loss_reaches_the_dynamic_encoder_and_is_zero_for_the_truth(
     value.backward()
     assert value.item() > 0
     assert gradients(task) == {"dynamic_encoder"}
-    truth = task._reader.read(window, static=True).images
+    truth = RangeReader(SENSOR).read(window, static=True).images
     monkeypatch.setattr(task.network.decoder, "forward", lambda codes: truth)
     _, slam = task.losses(window)
     assert slam is not None
@@ -137,12 +138,12 @@ def test_learns_and_survives_being_stopped(pairs: Path, tmp_path: Path) -> None:
         autoencoder_epochs=13, discriminator_epochs=1, epochs=22, batch=1, slam=ScheduleSettings(gamma=1.0, every=10)
     )
     scans = open_scans(pairs)
-    task = train_task("dslr", settings, scans, tmp_path / "whole")
+    task = train_task(new_task("dslr", settings), scans, tmp_path / "whole")
     log = [json.loads(line) for line in (tmp_path / "whole" / "log.jsonl").read_text().splitlines()]
     assert log[51]["task_loss"] < 0.5 * log[0]["task_loss"]
     assert [row["step"] for row in log if row.get("slam_loss") is not None] == [76, 77, 78, 79]
-    train_task("dslr", settings, scans, tmp_path / "parts", until=18)
-    train_task("dslr", settings, scans, tmp_path / "parts", resume=True)
+    train_task(new_task("dslr", settings), scans, tmp_path / "parts", until=18)
+    train_task(new_task("dslr", settings), scans, tmp_path / "parts", resume=True)
     weights = (tmp_path / "whole" / WEIGHTS, tmp_path / "parts" / WEIGHTS)
     (whole, _), (parts, _) = (read_tensors(path) for path in weights)
     assert all(torch.equal(value, parts[name]) for name, value in whole.items())
@@ -153,7 +154,7 @@ def test_learns_and_survives_being_stopped(pairs: Path, tmp_path: Path) -> None:
         "target_varies_m",
     }  # fmt: skip
     assert figures["moved_m"] < figures["input_moved_m"]  # the car is taken away
-    twins = torch.stack([task._reader.read([scans[i]], static=True).images[0, 0] for i in range(len(scans))])
+    twins = torch.stack([RangeReader(SENSOR).read([scans[i]], static=True).images[0, 0] for i in range(len(scans))])
     assert figures["target_varies_m"] == pytest.approx(float(twins.std(0, correction=0).mean()) * 60.0, rel=1e-5)
     assert 0 < figures["varies_m"] < 2 * figures["target_varies_m"]
     draw(task, scans, 3, tmp_path / "picture.png")

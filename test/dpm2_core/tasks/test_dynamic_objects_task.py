@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The dynamic objects' task: it learns to tell a car from a wall, its figures are counts, and what does not fit is
+"""The dynamic objects' task: it learns cars from walls, its figures are counts, and what does not fit is
 rejected."""
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from dpm2_core.network.perception.gndnet import GroundSettings
 from dpm2_core.network.perception.task_weights import write_weights
 from dpm2_core.tasks.dynamic_objects_task import MOVABLE, DynamicObjectTask, DynamicObjectTraining
 from dpm2_core.tasks.scan import TaskScan, TaskScans
-from dpm2_core.tasks.training import save_task, train_task
+from dpm2_core.tasks.training import new_task, save_task, train_task
 
 SMALL = DynamicObjectTraining(
     network=DynamicObjectNetSettings(cells=32, cell=1.0, channels=8), epochs=12, every=1, batch=1, drop=0.3
@@ -56,7 +56,7 @@ def test_it_learns_what_can_move_parked_or_not(tmp_path: Path) -> None:
     untrained = DynamicObjectTask(SMALL).eval()
     with torch.no_grad():
         before = untrained.evaluate(val)
-    task = train_task("movers", SMALL, train, tmp_path / "run")
+    task = train_task(new_task("movers", SMALL), train, tmp_path / "run")
     with torch.no_grad():
         after = task.evaluate(val)
     assert before["iou"] < 0.4

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from dpm2_core.network.perception.gndnet import elevation_labels, load
 from dpm2_core.tasks.drives import TaskDriveSettings, make_task_drives
-from dpm2_core.tasks.ground_task import GroundTask, GroundTraining, _tilt, filled, ground_of
+from dpm2_core.tasks.ground_task import GroundTask, GroundTraining, filled, ground_of, random_tilt
 from dpm2_core.tasks.open import open_scans
 from dpm2_core.tasks.scan import TaskScan, TaskScans
 from dpm2_core.tasks.training import load_task, measure
@@ -117,7 +117,7 @@ def test_gaps_count_as_much_as_they_are_told_to(scans: TaskScans) -> None:
 def test_tilt_is_a_rotation_of_the_whole_window(scans: TaskScans) -> None:
     """By roll and pitch within the bound; the labels turn along, and it is another one each time."""
     torch.manual_seed(0)
-    turns = [_tilt(0.1) for _ in range(20)]
+    turns = [random_tilt(0.1) for _ in range(20)]
     for turn in turns:
         torch.testing.assert_close(turn @ turn.T, torch.eye(3))
         assert float(turn.det()) == pytest.approx(1.0, abs=1e-5)

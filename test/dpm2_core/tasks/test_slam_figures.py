@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Odometry on the clouds that a task makes, judged by the true poses of a small synthetic drive."""
+"""Odometry on the clouds that a task makes, evaluated by the true poses of a small synthetic drive."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import torch
 
 from dpm2_core.errors import UsageError
 from dpm2_core.sim.drive import simulate
-from dpm2_core.sim.settings import LidarConfig
+from dpm2_core.sim.settings import DriveConfig, LidarConfig
 from dpm2_core.tasks.ae_lidar import AeLidarImage, AeLidarSettings
 from dpm2_core.tasks.ae_lidar_task import AeLidarTask, AeLidarTraining
 from dpm2_core.tasks.ground_task import GroundTask, GroundTraining
@@ -23,7 +23,10 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two drives of 4 scans; both sequences are called 00."""
     root = tmp_path_factory.mktemp("drives")
     for seed in range(2):
-        simulate(root / f"{seed}", 4, seed, "straight", images=False, lidar=LidarConfig(columns=128))
+        simulate(
+            root / f"{seed}",
+            DriveConfig(frames=4, seed=seed, road="straight", images=False, lidar=LidarConfig(columns=128)),
+        )
     return root
 
 
@@ -51,7 +54,7 @@ def test_a_perfect_network_is_as_good_as_its_input(
     assert found["input_rpe_m"] < 0.1
     assert untrained["output_ate_m"] > 10 * found["output_ate_m"]
     alone = [untrained["input_ate_m"], slam_figures(task, drives / "1")["input_ate_m"]]
-    assert found["input_ate_m"] == pytest.approx(sum(alone) / 2)  # each drive is judged by its own scans
+    assert found["input_ate_m"] == pytest.approx(sum(alone) / 2)  # each drive is evaluated by its own scans
 
 
 def test_what_cannot_be_checked_is_rejected(drives: Path, task: AeLidarTask, tmp_path: Path) -> None:

@@ -26,6 +26,7 @@ from dpm2_core.tasks.training import (
     load_task,
     mean_figures,
     measure,
+    new_task,
     save_task,
     train_task,
 )
@@ -56,7 +57,7 @@ def rows(out: Path) -> list[dict[str, Any]]:
 def test_it_learns_and_logs(scans: TaskScans, tmp_path: Path) -> None:
     """The loss of the task falls by half in 40 steps; both losses are logged, that of the SLAM where it counts."""
     out = tmp_path / "out"
-    train_task("gndnet", settings(epochs=20), scans, out, val=scans)
+    train_task(new_task("gndnet", settings(epochs=20)), scans, out, val=scans)
     log = rows(out)
     steps = [row for row in log if "norm" in row]
     assert [row["step"] for row in steps] == list(range(40))
@@ -85,7 +86,8 @@ def test_scans_are_contiguous_only_where_the_slam_loss_counts(
     orders = []
     for gamma in (0.5, 0.0):
         seen.clear()
-        train_task("gndnet", settings(epochs=8, slam={"gamma": gamma, "every": 2}), scans, tmp_path / f"{gamma}")
+        task = new_task("gndnet", settings(epochs=8, slam={"gamma": gamma, "every": 2}))
+        train_task(task, scans, tmp_path / f"{gamma}")
         orders.append([*seen])
     assert orders[0] == orders[1]
     epochs = [orders[0][i : i + 2] for i in range(0, 16, 2)]
@@ -99,10 +101,10 @@ def test_scans_are_contiguous_only_where_the_slam_loss_counts(
 def test_resumed_equals_uninterrupted(scans: TaskScans, tmp_path: Path) -> None:
     """Stopped after 1 of 4 epochs and resumed: the same losses in the log and the same weights, bit for bit."""
     whole, halves = tmp_path / "whole", tmp_path / "halves"
-    train_task("gndnet", settings(), scans, whole)
-    train_task("gndnet", settings(), scans, halves, until=1)
+    train_task(new_task("gndnet", settings()), scans, whole)
+    train_task(new_task("gndnet", settings()), scans, halves, until=1)
     assert len(rows(halves)) == 2
-    train_task("gndnet", settings(), scans, halves, resume=True)
+    train_task(new_task("gndnet", settings()), scans, halves, resume=True)
     curve = [[(row["step"], row["loss"], row["norm"]) for row in rows(out)] for out in (whole, halves)]
     assert curve[0] == curve[1]
     one, other = (load_file(out / WEIGHTS) for out in (whole, halves))
@@ -112,7 +114,7 @@ def test_resumed_equals_uninterrupted(scans: TaskScans, tmp_path: Path) -> None:
 def test_gamma_zero_is_the_task_alone(scans: TaskScans, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The SLAM is not even run."""
     monkeypatch.setattr(SlamLoss, "forward", None)
-    train_task("gndnet", settings(slam={"gamma": 0.0, "every": 1}), scans, tmp_path / "out")
+    train_task(new_task("gndnet", settings(slam={"gamma": 0.0, "every": 1})), scans, tmp_path / "out")
     assert not any("slam_loss" in row for row in rows(tmp_path / "out"))
 
 
@@ -140,7 +142,7 @@ def test_what_is_not_finite_never_reaches_a_checkpoint(
 
     monkeypatch.setattr(GroundTask, "losses", losses)
     out = tmp_path / "out"
-    train_task("gndnet", settings(), scans, out)
+    train_task(new_task("gndnet", settings()), scans, out)
     assert [row["step"] for row in rows(out) if row["norm"] is None] == [3]
     assert all(row["loss"] is not None for row in rows(out) if row["step"] > 3)
     state = torch.load(out / "checkpoint.pt", weights_only=True)
@@ -163,7 +165,7 @@ def test_measuring_changes_nothing(scans: TaskScans) -> None:
 
 def test_weights_come_back(scans: TaskScans, tmp_path: Path) -> None:
     """With the settings of the network, for the task and for the SLAM; in fp16 to its precision."""
-    task = train_task("gndnet", settings(), scans, tmp_path / "out")
+    task = train_task(new_task("gndnet", settings()), scans, tmp_path / "out")
     requested = measure(task, scans)
     assert measure(load_task("gndnet", tmp_path / "out" / WEIGHTS), scans) == requested
     save_task(task, tmp_path / "half.safetensors", {}, half=True)
@@ -212,9 +214,9 @@ def test_wrong_weights_are_rejected(scans: TaskScans, tmp_path: Path) -> None:
 def test_windows_that_do_not_fit(scans: TaskScans, tmp_path: Path) -> None:
     """Longer than any sequence; nothing to resume; a checkpoint of another network."""
     with pytest.raises(UsageError, match="no sequence has the 13 scans"):
-        train_task("gndnet", settings(window=7, every=2), scans, tmp_path / "out")
+        train_task(new_task("gndnet", settings(window=7, every=2)), scans, tmp_path / "out")
     with pytest.raises(UsageError, match="no checkpoint"):
-        train_task("gndnet", settings(), scans, tmp_path / "out", resume=True)
-    train_task("gndnet", settings(), scans, tmp_path / "out", until=1)
+        train_task(new_task("gndnet", settings()), scans, tmp_path / "out", resume=True)
+    train_task(new_task("gndnet", settings()), scans, tmp_path / "out", until=1)
     with pytest.raises(UsageError, match="checkpoint of another network"):
-        train_task("gndnet", settings(network={**TINY, "channels": 8}), scans, tmp_path / "out", resume=True)
+        train_task(new_task("gndnet", settings(network={**TINY, "channels": 8})), scans, tmp_path / "out", resume=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Robust optimization on graphs whose answer is known; covariances against the closed form."""
+"""Robust optimization on graphs whose solution is known; covariances against the closed form."""
 
 from __future__ import annotations
 

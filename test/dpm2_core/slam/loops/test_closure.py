@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from dpm2_core.descriptors import Descriptors
-from dpm2_core.frame import Array, Keyframe, Points, Registration
+from dpm2_core.frame import Array, Edge, Keyframe, Points, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.network.decoder import Correlated, Decoder
 from dpm2_core.network.model import DeepPointMap2
@@ -22,7 +22,6 @@ from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import LidarConfig
 from dpm2_core.sim.world import World, build_world
 from dpm2_core.slam.loops.closure import LoopCloser, LoopSettings
-from dpm2_core.slam.loops.consistency import Loop
 from dpm2_core.slam.registration.icp import GeometricSettings
 
 FIRM = np.diag([1e-3] * 3 + [0.02] * 3) ** 2
@@ -59,7 +58,7 @@ def closer(**settings: object) -> LoopCloser:
     return LoopCloser(LoopSettings.model_validate(settings), GeometricSettings(), 2, network())
 
 
-def drive(places: Sequence[tuple[float, float, float]], jump: Array, **settings: object) -> tuple[list[Loop], Array]:
+def drive(places: Sequence[tuple[float, float, float]], jump: Array, **settings: object) -> tuple[list[Edge], Array]:
     """The loops that are tried along the street and then at `places`, before which the odometry errs by `jump`."""
     at = [(s, 0.0, 0.0) for s in STREET] + list(places)
     truth = np.array([where(*place) for place in at])
@@ -75,10 +74,10 @@ def drive(places: Sequence[tuple[float, float, float]], jump: Array, **settings:
     return loops, truth
 
 
-def errors(loops: Sequence[Loop], truth: Array) -> list[float]:
+def errors(loops: Sequence[Edge], truth: Array) -> list[float]:
     """Distances of the accepted ones from the truth, m."""
     true = [se3.inverse(truth[loop.from_node]) @ truth[loop.to_node] for loop in loops]
-    off = [se3.inverse(T) @ loop.registration.T_target_source for T, loop in zip(true, loops, strict=True)]
+    off = [se3.inverse(T) @ loop.T_from_to for T, loop in zip(true, loops, strict=True)]
     return [float(np.linalg.norm(T[:3, 3])) for T in off]
 
 
@@ -149,12 +148,12 @@ def test_places_that_hardly_overlap_are_left_to_no_one(monkeypatch: pytest.Monke
     jump = se3.exp(np.array([0, 0, 0, 12.0, 0, 0]))  # the nearest by pose is no help
 
     def probability(value: float) -> Callable:
-        def judge(
+        def predict(
             decoder: Decoder, source: Tokens, target: Tokens, correlated: Correlated, solved: Solved
         ) -> torch.Tensor:
             return torch.full(source.mask.shape[:1], value)
 
-        return judge
+        return predict
 
     reasons = []
     for value in (0.1, float("nan")):

@@ -17,6 +17,7 @@ from dpm2_core.sim.world import World, build_world
 from dpm2_core.slam.loops.localizer import Localizer
 from dpm2_core.slam.loops.place_recognition import PlaceRecognition
 from dpm2_core.slam.loops.relocalization import RelocalizationSettings, Relocalizer
+from dpm2_core.slam.loops.verification import Verifier
 from dpm2_core.slam.registration.icp import GeometricSettings
 
 pytestmark = pytest.mark.weights
@@ -44,7 +45,9 @@ def relocalizer() -> Relocalizer:
     poses = np.array([world().pose_at(s) for s in at])
     clouds = [seen(s) for s in at]
     keyframes = [Keyframe(i, i, i, poses[i], cloud[:0], None, "", describe(cloud)) for i, cloud in enumerate(clouds)]
-    return Relocalizer(RelocalizationSettings(), GeometricSettings(), network, keyframes, clouds, poses)
+    settings = RelocalizationSettings()
+    verifier = Verifier(settings.verification, GeometricSettings(), threads=2)
+    return Relocalizer(settings, verifier, network, keyframes, clouds, poses)
 
 
 def off(found: Registration, truth: Array) -> tuple[float, float]:
@@ -105,7 +108,7 @@ def test_localization_tracks_notices_kidnapping_and_admits_being_lost(relocalize
     assert again.state is State.RELOCALIZED
     assert again.jumped
     assert np.linalg.norm(again.T_map_kf[:3, 3] - world().pose_at(95.0)[:3, 3]) < 0.1
-    # a place that the map does not show: doubted, then lost, and said so in the covariance
+    # a place that the map does not show: degraded, then lost, with a covariance that covers it
     states, sigmas = [], []
     for node in range(3, 7):
         located = localizer.add(keyframe(node, 95.0 + node, broken, of=world("city", 5)))

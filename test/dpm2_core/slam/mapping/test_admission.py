@@ -126,4 +126,4 @@ def test_a_step_that_fails_leaves_no_node_behind(monkeypatch: pytest.MonkeyPatch
                 mapper.add(keyframe(1))
         assert len(mapper.keyframes) == len(mapper.poses) == len(mapper.clouds) == in_map
     mapper.add(keyframe(2))
-    assert [(a, b) for a, b, _, _ in mapper.edges] == [(0, 1), (1, 2)]
+    assert [(e.from_node, e.to_node) for e in mapper.edges] == [(0, 1), (1, 2)]

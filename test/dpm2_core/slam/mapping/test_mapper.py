@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from dpm2_core.evaluation.metrics import ape_rmse
-from dpm2_core.frame import Array, Keyframe, OdometryResult, Registration, State
+from dpm2_core.frame import Array, Edge, Keyframe, OdometryResult, Registration, State
 from dpm2_core.geometry import se3
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import LidarConfig
@@ -52,10 +52,10 @@ def test_a_loop_edge_spreads_the_drift() -> None:
     poses = circle(40)
     graph = PoseGraph(PoseGraphSettings())
     for keyframe in drifting(poses, np.array([0, 0, 5e-4, 0.01, 0, 0.005]), np.zeros((0, 4), np.float32)):
-        edge = keyframe.edge
-        graph.add_node(keyframe.T_odom_kf, edge and edge.T_target_source, edge and edge.covariance)
+        n = len(graph)
+        graph.add_node(keyframe.T_odom_kf, keyframe.edge and Edge("odometry", n - 1, n, keyframe.edge))
     before = np.linalg.norm(graph.poses[:, :3, 3] - poses[:, :3, 3], axis=1)
-    graph.add_loop(0, 39, se3.inverse(poses[0]) @ poses[39], SIGMA)
+    graph.add_loop(Edge("loop", 0, 39, Registration(se3.inverse(poses[0]) @ poses[39], SIGMA)))
     graph.optimize()
     after = np.linalg.norm(graph.poses[:, :3, 3] - poses[:, :3, 3], axis=1)
     assert after[-1] < 0.1 * before[-1]
@@ -67,10 +67,10 @@ def test_one_wrong_loop_among_right_ones_bends_little() -> None:
     poses = circle(40)
     graph = PoseGraph(PoseGraphSettings())
     for keyframe in drifting(poses, np.zeros(6), np.zeros((0, 4), np.float32)):
-        edge = keyframe.edge
-        graph.add_node(keyframe.T_odom_kf, edge and edge.T_target_source, edge and edge.covariance)
-    graph.add_loop(0, 39, se3.inverse(poses[0]) @ poses[39], SIGMA)
-    graph.add_loop(3, 20, np.eye(4), SIGMA)  # 40 m wrong
+        n = len(graph)
+        graph.add_node(keyframe.T_odom_kf, keyframe.edge and Edge("odometry", n - 1, n, keyframe.edge))
+    graph.add_loop(Edge("loop", 0, 39, Registration(se3.inverse(poses[0]) @ poses[39], SIGMA)))
+    graph.add_loop(Edge("loop", 3, 20, Registration(np.eye(4), SIGMA)))  # 40 m wrong
     graph.optimize()
     assert np.linalg.norm(graph.poses[:, :3, 3] - poses[:, :3, 3], axis=1).max() < 0.5
 
@@ -79,8 +79,8 @@ def test_g2o_reads_back_at_full_precision(tmp_path: Path) -> None:
     graph = PoseGraph(PoseGraphSettings())
     poses = circle(5)
     for keyframe in drifting(poses, np.array([1e-3, 2e-3, 3e-3, 0.1, 0.2, 0.3]), np.zeros((0, 4), np.float32)):
-        edge = keyframe.edge
-        graph.add_node(keyframe.T_odom_kf, edge and edge.T_target_source, edge and edge.covariance)
+        n = len(graph)
+        graph.add_node(keyframe.T_odom_kf, keyframe.edge and Edge("odometry", n - 1, n, keyframe.edge))
     graph.write_g2o(tmp_path / "graph.g2o")
     factors, values = gtsam.readG2o(str(tmp_path / "graph.g2o"), True)
     for node in range(5):
@@ -91,10 +91,10 @@ def test_g2o_reads_back_at_full_precision(tmp_path: Path) -> None:
         off = se3.exp(np.array([1e-3, -2e-3, 1e-3, 0.01, 0.02, -0.01]) * node)
         moved.insert(node, gtsam.Pose3(graph.poses[node] @ off))
     expected = 0.0
-    for a, b, T, covariance in graph.edges:
-        pose_a, pose_b = moved.atPose3(a).matrix(), moved.atPose3(b).matrix()
-        off = se3.log(se3.inverse(T) @ se3.inverse(pose_a) @ pose_b)
-        expected += 0.5 * off @ np.linalg.solve(covariance, off)
+    for edge in graph.edges:
+        a, b = (moved.atPose3(node).matrix() for node in (edge.from_node, edge.to_node))
+        off = se3.log(se3.inverse(edge.T_from_to) @ se3.inverse(a) @ b)
+        expected += 0.5 * off @ np.linalg.solve(edge.covariance, off)
     assert factors.error(moved) == pytest.approx(expected, rel=1e-3)  # quaternion against tangent, to second order
 
 
@@ -120,12 +120,12 @@ def test_a_lap_is_closed(lap: tuple[list[Keyframe], Array]) -> None:
     open_ended = make_mapper(SlamSettings.model_validate({"loops": {"enabled": False}}))
     for keyframe in keyframes:
         open_ended.add(keyframe)
-    assert open_ended.closures == []
-    accepted = [c for c in mapper.closures if c.registration.ok]
+    assert open_ended.loops == []
+    accepted = [loop for loop in mapper.loops if loop.ok]
     assert accepted
-    for closure in accepted:  # each tells the true relative pose
-        true = se3.inverse(truth[closure.from_id]) @ truth[closure.to_id]
-        assert np.linalg.norm((se3.inverse(true) @ closure.registration.T_target_source)[:3, 3]) < 0.1
+    for loop in accepted:  # each is the true relative pose
+        true = se3.inverse(truth[loop.from_node]) @ truth[loop.to_node]
+        assert se3.magnitude(se3.inverse(true) @ loop.T_from_to)[0] < 0.1
     end, open_end = (np.linalg.norm((m.poses[-1] - truth[-1])[:3, 3]) for m in (mapper, open_ended))
     assert end < 0.1 * open_end
     assert ape_rmse(truth, mapper.poses) < 0.8 * ape_rmse(truth, open_ended.poses)  # the drift bends each step alike
@@ -203,12 +203,12 @@ def test_each_robot_has_its_own_odometry_and_is_placed_when_tied() -> None:
     for one in drifting(poses, np.zeros(6), cloud):
         for robot in ("red", "blue"):
             mapper.add(replace(one, robot=robot))
-    assert [(a, b) for a, b, *_ in mapper.edges] == [(n, n + 2) for n in range(10)]
+    assert [(e.from_node, e.to_node) for e in mapper.edges] == [(n, n + 2) for n in range(10)]
     np.testing.assert_allclose(mapper.T_map_odom_of("red"), np.eye(4), atol=1e-9)
     assert mapper.T_map_odom_of("blue") is None  # nothing says where it is in red's map
     assert mapper.T_map_odom_of("green") is None
     for one in drifting(poses, np.zeros(6), cloud)[:2]:  # red again
         mapper.add(replace(one, robot="red"))
     assert [k.id for k in mapper.keyframes if k.robot == "red"] == list(range(8))
-    assert mapper.edges[-1][:2] == (12, 13)
+    assert (mapper.edges[-1].from_node, mapper.edges[-1].to_node) == (12, 13)
     assert mapper.T_map_odom_of("red") is None

@@ -12,11 +12,10 @@ import numpy as np
 import pytest
 
 from dpm2_core.errors import UsageError
-from dpm2_core.frame import Array, Keyframe, Points, Registration
+from dpm2_core.frame import Array, Edge, Keyframe, Points, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.pose_graph import PoseGraph, PoseGraphSettings
 from dpm2_core.slam.loops.closure import LoopCloser
-from dpm2_core.slam.loops.consistency import Loop
 from dpm2_core.slam.mapping.mapper import Mapper, MapSettings
 from dpm2_core.slam.store.map_data import load_map
 from dpm2_core.slam.store.map_store import MapStore
@@ -36,14 +35,13 @@ class KnownLoops(LoopCloser):
     def described(self, keyframe: Keyframe) -> Keyframe:
         return keyframe
 
-    def close(self, keyframes: Sequence[Keyframe], clouds: Sequence[Points], poses: Array) -> list[Loop]:
+    def close(self, keyframes: Sequence[Keyframe], clouds: Sequence[Points], poses: Array) -> list[Edge]:
         node = len(keyframes) - 1
         if node < LAP:
             return []
         T = se3.exp([0, 0, 1e-4, 2e-3, 1e-3, 0])
-        return [
-            Loop(node - LAP, node, Registration(T, SIGMA, 0.9, 0.05, "known", node % 7 != 0, "no" * (node % 7 == 0)))
-        ]
+        loop = Edge("loop", node - LAP, node, Registration(T, SIGMA, 0.9, 0.05, "known"))
+        return [loop if node % 7 else loop.rejected("no")]
 
 
 def make(store: MapStore | None = None, **settings: object) -> Mapper:
@@ -75,7 +73,7 @@ def test_the_file_holds_what_the_mapper_holds(tmp_path: Path) -> None:
         data = load_map(store)
         np.testing.assert_allclose(data.poses, mapper.poses, atol=1.1e-4)  # smaller moves are not written
         assert len(data.constraints) == len(mapper.edges)
-        assert sum(not edge.ok for edge in data.edges) == sum(not c.registration.ok for c in mapper.closures) == 3
+        assert sum(not edge.ok for edge in data.edges) == sum(not loop.ok for loop in mapper.loops) == 3
         again = make(store)
         assert len(again.keyframes) == again.session_start == 40
         for before, after in zip(clouds, again.clouds, strict=True):
@@ -92,7 +90,7 @@ def test_four_laps_have_the_clouds_of_one(tmp_path: Path) -> None:
             mapper = make(store)
             for keyframe in laps(count):
                 mapper.add(keyframe)
-            own = sum(mapper._clouds.loan(node) is None for node in range(len(mapper.keyframes)))
+            own = sum(not mapper.borrows(node) for node in range(len(mapper.keyframes)))
         sizes.append((own, path.stat().st_size))
     (own_1, _), (own_4, _) = sizes
     assert own_1 == LAP
@@ -101,7 +99,7 @@ def test_four_laps_have_the_clouds_of_one(tmp_path: Path) -> None:
     off = make(redundancy={"distance": 0})
     for keyframe in laps(2):
         off.add(keyframe)
-    assert all(off._clouds.loan(node) is None for node in range(40))
+    assert not any(off.borrows(node) for node in range(40))
 
 
 def test_a_borrowed_cloud_lies_where_the_loop_says(tmp_path: Path) -> None:
@@ -114,7 +112,7 @@ def test_a_borrowed_cloud_lies_where_the_loop_says(tmp_path: Path) -> None:
     far = make(redundancy={"distance": 1e-3})
     for keyframe in keyframes:
         far.add(keyframe)
-    assert far._clouds.loan(25) is None  # 2 mm apart
+    assert not far.borrows(25)  # 2 mm apart
 
 
 def test_a_second_session_counts_on(tmp_path: Path) -> None:

@@ -81,7 +81,7 @@ def test_each_keyframe_is_checked_once() -> None:
 
 
 @pytest.fixture(scope="module")
-def street() -> list[tuple[Points, np.ndarray, Array]]:
+def labeled_scans() -> list[tuple[Points, np.ndarray, Array]]:
     """Keyframes of a city street with traffic: points, whether they move, true pose."""
     world = build_world("straight", "city", seed=7, length=250.0)
     lidar, rng = Lidar(LidarConfig(columns=1024)), np.random.default_rng(0)
@@ -95,16 +95,16 @@ def street() -> list[tuple[Points, np.ndarray, Array]]:
     return out
 
 
-def test_traffic_of_a_synthetic_street_is_left_out(street: list[tuple[Points, np.ndarray, Array]]) -> None:
+def test_traffic_of_a_synthetic_street_is_left_out(labeled_scans: list[tuple[Points, np.ndarray, Array]]) -> None:
     """Here 55 % of the moving points go (80 % on longer drives), and next to none of the static ones."""
     mapper = make_mapper(GEOMETRIC)
-    for node, (points, _, T) in enumerate(street):
+    for node, (points, _, T) in enumerate(labeled_scans):
         mapper.add(Keyframe(node, node, node, T, points))
     mapper.finish()
     removed = static = dynamic = static_removed = 0
-    for node, (points, moves, _) in enumerate(street):
+    for node, (points, moves, _) in enumerate(labeled_scans):
         left = {tuple(xyz) for xyz in np.round(mapper.clouds[node][:, :3], 2)}
-        gone = np.array([tuple(xyz) not in left for xyz in np.round(mapper._clouds.whole(node)[:, :3], 2)])
+        gone = np.array([tuple(xyz) not in left for xyz in np.round(mapper.clouds.whole(node)[:, :3], 2)])
         assert len(gone) == len(points)
         removed, dynamic = removed + (gone & moves).sum(), dynamic + moves.sum()
         static_removed, static = static_removed + (gone & ~moves).sum(), static + (~moves).sum()
@@ -112,7 +112,7 @@ def test_traffic_of_a_synthetic_street_is_left_out(street: list[tuple[Points, np
     assert removed / dynamic > 0.45
     assert static_removed / static < 1e-3
     off = make_mapper(SlamSettings.model_validate({"loops": {"enabled": False}, "map": {"moving": {"window": 0}}}))
-    for node, (points, _, T) in enumerate(street[:8]):
+    for node, (points, _, T) in enumerate(labeled_scans[:8]):
         off.add(Keyframe(node, node, node, T, points))
     off.finish()
-    assert [len(cloud) for cloud in off.clouds] == [len(points) for points, _, _ in street[:8]]
+    assert [len(cloud) for cloud in off.clouds] == [len(points) for points, _, _ in labeled_scans[:8]]

@@ -12,7 +12,7 @@ import yaml
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Points
 from dpm2_core.geometry import se3
-from dpm2_core.slam.mapping.occupancy import OccupancySettings, ground_below, occupancy_grid, write_grid
+from dpm2_core.slam.mapping.occupancy import OccupancySettings, occupancy_grid, write_grid
 
 SETTINGS = OccupancySettings(resolution=0.25, reach=20.0)
 
@@ -71,11 +71,6 @@ def test_a_thing_that_most_keyframes_see_through_is_free() -> None:
         grid = occupancy_grid(clouds, poses, SETTINGS)
         row = grid.cells.shape[0] - 1 - int((0.1 - grid.origin[1]) // 0.25)
         assert grid.cells[row, int((5.1 - grid.origin[0]) // 0.25)] == expected
-
-
-def test_ground_below_a_roof() -> None:
-    points = room().astype(float)[:, :3]
-    np.testing.assert_allclose(ground_below(points), -1.7, atol=1e-6)
 
 
 def test_nothing_and_too_much() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.frame import Array, Keyframe
+from dpm2_core.frame import Array, Edge, Keyframe, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.pose_graph import PoseGraph, PoseGraphSettings
 from dpm2_core.slam.mapping.merge import align, merge_maps, optimized
@@ -19,7 +19,7 @@ from dpm2_core.slam.store.cloud_codec import pack_cloud
 from dpm2_core.slam.store.cloud_store import CloudStore, Loan
 from dpm2_core.slam.store.map_data import NO_POINTS, MapData, load_map, save_as, trajectory
 from dpm2_core.slam.store.map_store import MapStore
-from dpm2_core.slam.store.rows import Edge, Session
+from dpm2_core.slam.store.rows import Session
 
 SIGMA = np.diag([1e-3, 2e-3, 3e-3, 0.01, 0.02, 0.03]) ** 2
 
@@ -36,7 +36,7 @@ def laps(count: int, steps: int = 40, session: bool = False) -> MapData:
         for other, kind in ((node - 1, "odometry"), (node - steps, "loop")):
             if other >= 0:
                 T_other_node = se3.inverse(poses[other]) @ T
-                edges.append(Edge(kind, other, node, T_other_node, SIGMA))
+                edges.append(Edge(kind, other, node, Registration(T_other_node, SIGMA)))
     numbers = [1 + session * (node // steps) for node in range(len(poses))]
     return MapData(keyframes, numbers, poses, edges, [], [Session(1, "", "", "", "")], clouds)
 
@@ -49,7 +49,7 @@ def test_composition_and_inversion_carry_the_covariance() -> None:
     """Against samples: 20 thousand noisy pairs; 5 % is four standard errors of a variance."""
     rng = np.random.default_rng(0)
     Ta, Tb = se3.exp([0.1, -0.2, 0.5, 3, 1, 0.2]), se3.exp([-0.1, 0.3, 1.0, 2, -4, 0.5])
-    a, b = Edge("odometry", 0, 1, Ta, SIGMA), Edge("loop", 1, 2, Tb, 2 * SIGMA)
+    a, b = Edge("odometry", 0, 1, Registration(Ta, SIGMA)), Edge("loop", 1, 2, Registration(Tb, 2 * SIGMA))
     noisy_a = Ta @ se3.exp(rng.multivariate_normal(np.zeros(6), a.covariance, 20000))
     noisy_b = Tb @ se3.exp(rng.multivariate_normal(np.zeros(6), b.covariance, 20000))
     ab, back = composed(a, b), inverted(a)
@@ -96,8 +96,12 @@ def test_the_optimum_stays_when_nodes_go() -> None:
     """A lap with drift and a loop: solving before or after pruning gives about the same poses."""
     data = laps(1)
     drift = se3.exp([0, 0, 0.002, 0.01, 0.02, 0])
-    edges = [replace(edge, T_from_to=edge.T_from_to @ drift) for edge in data.edges]
-    edges.append(Edge("loop", 0, 39, se3.inverse(data.poses[0]) @ data.poses[39], SIGMA * 0.01))
+    edges = [
+        replace(edge, registration=replace(edge.registration, T_target_source=edge.T_from_to @ drift))
+        for edge in data.edges
+    ]
+    T_first_last = se3.inverse(data.poses[0]) @ data.poses[39]
+    edges.append(Edge("loop", 0, 39, Registration(T_first_last, SIGMA * 0.01)))
     data = replace(data, edges=edges)
     before = optimized(data, PoseGraph(PoseGraphSettings())).poses
     gone = [n for n in range(1, 39) if n % 3]
@@ -138,8 +142,8 @@ def test_maps_are_aligned_by_their_loops_though_one_of_them_is_off() -> None:
     a, b = laps(1), laps(1)
     T_a_b = se3.exp([0, 0, 1.0, 50, 20, 1])
     b = replace(b, poses=se3.inverse(T_a_b) @ b.poses)  # the same places, in another frame
-    loops = [Edge("loop", n, n, np.eye(4), SIGMA) for n in (3, 13, 23)]
-    loops.append(Edge("loop", 5, 30, np.eye(4), SIGMA))
+    same = Registration(np.eye(4), SIGMA)
+    loops = [Edge("loop", a, b, same) for a, b in ((3, 3), (13, 13), (23, 23), (5, 30))]
     T, used = align(a, b, lambda one, two: loops)
     np.testing.assert_allclose(T, T_a_b, atol=1e-6)
     both = optimized(merge_maps(a, b, T, used[:3]), PoseGraph(PoseGraphSettings()))

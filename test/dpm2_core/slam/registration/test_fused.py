@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who answers when network and points agree, when one is silent, and when they contradict each other.
+"""Whose result it is when network and points agree, when one is silent, and when they contradict each other.
 
 The points are real scans of the synthetic city; what the network says is chosen, so that it can be wrong on purpose.
 """
@@ -14,25 +14,26 @@ import pytest
 from dpm2_core.frame import Array, Frame, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.slam.preprocess import Preprocessor, PreprocessSettings, Scan
-from dpm2_core.slam.registration.fused import RefinedScanRegistration
+from dpm2_core.slam.registration.fused import FusedScanRegistration
 from dpm2_core.slam.registration.icp import GeometricRegistration, GeometricSettings
 from dpm2_core.slam.registration.local_map import LocalMap, LocalMapSettings
 from dpm2_core.slam.registration.points import GeometricScanRegistration
 from dpm2_core.slam.registration.protocol import Prediction
 
-from ..conftest import Drive
+from ....helpers.drives import Drive
 
 SIGMA = np.repeat([0.001, 0.04], 3)  # rad, m, that the network claims
 
 
 class Oracle:
-    """A network that says what it is told."""
+    """A network with a given result."""
 
     uses_images = False
     T: Array = np.eye(4)
     ok = True
     size = 1
     scale = 1.0
+    asked = 0
 
     def __len__(self) -> int:
         return self.size
@@ -47,6 +48,7 @@ class Oracle:
         self.size += 1
 
     def register(self, scan: Scan, prediction: Prediction) -> Registration:
+        self.asked += 1
         reason = "" if self.ok else "no idea"
         return Registration(self.T, np.diag((self.scale * SIGMA) ** 2), 0.9, 0.1, "neural", self.ok, reason)
 
@@ -54,13 +56,13 @@ class Oracle:
 class Case:
     """The sixth scan of a drive, to be registered to the five before."""
 
-    def __init__(self, drive: Drive) -> None:
+    def __init__(self, drive: Drive, always: bool = True) -> None:
         frames, truth = drive
         self.oracle = Oracle()
         geometric = GeometricScanRegistration(
             Preprocessor(PreprocessSettings()), GeometricRegistration(GeometricSettings()), LocalMap(LocalMapSettings())
         )
-        self.registration = RefinedScanRegistration(self.oracle, geometric)  # type: ignore[arg-type]
+        self.registration = FusedScanRegistration(self.oracle, geometric, always)  # type: ignore[arg-type]
         for frame, T in zip(frames[:5], truth[:5], strict=True):
             self.registration.update(self.registration.prepare(frame, np.zeros(6)), T)
         self.scan = self.registration.prepare(frames[5], np.zeros(6))
@@ -68,7 +70,7 @@ class Case:
         self.prediction = Prediction([self.truth @ se3.exp([0, 0, 0.005, 0.05, 0, 0])], information=100 * np.eye(6))
 
     def register(self, off: list[float], **oracle: object) -> tuple[Registration, float]:
-        """Answer and its error, m, when the network is off by a tangent vector."""
+        """Result and its error, m, when the network is off by a tangent vector."""
         self.oracle.T = self.truth @ se3.exp(off)
         for name, value in oracle.items():
             setattr(self.oracle, name, value)
@@ -77,8 +79,8 @@ class Case:
 
 
 @pytest.fixture
-def case(suburb: Drive) -> Case:
-    return Case(suburb)
+def case(suburb_drive: Drive) -> Case:
+    return Case(suburb_drive)
 
 
 def test_points_refine_the_network_where_both_agree(case: Case) -> None:
@@ -143,9 +145,35 @@ def test_while_no_motion_is_known_the_network_gives_one_more_start(case: Case) -
     assert error < 0.02
 
 
-def test_along_a_tunnel_the_network_has_it(tunnel: Drive) -> None:
+def test_where_two_disagree_the_likelier_is_taken(case: Case) -> None:
+    """Of the motion so far little is known: points that start 12 m off fit somewhere, but not as well."""
+    case.prediction = Prediction([case.truth @ se3.exp([0, 0, 0, 12, 0, 0])], widen=2.0, information=np.eye(6) / 100)
+    result, error = case.register([0, 0, 0, 0.05, 0.02, 0])
+    assert (result.ok, result.method) == (True, "refined")
+    assert error < 0.02
+
+
+def test_the_network_is_asked_only_where_the_points_do_not_know(suburb_drive: Drive, tunnel_drive: Drive) -> None:
+    """Sure points are the result to the bit; a motion that is hardly known, or a tunnel, is a reason to ask."""
+    case, always = Case(suburb_drive, always=False), Case(suburb_drive)
+    result, error = case.register([0, 0, 0, 5, 0, 0])
+    assert (result.ok, result.method, result.reason, case.oracle.asked) == (True, "geometric", "", 0)
+    assert error < 0.02
+    alone, _ = always.register([0, 0, 0, 0, 0, 0], size=0)
+    np.testing.assert_array_equal(result.T_target_source, alone.T_target_source)
+    case.prediction = replace(case.prediction, information=np.eye(6) / 4)  # 2 m
+    assert case.register([0, 0, 0.001, 0.05, -0.03, 0])[0].method == "refined"
+    case.prediction = Prediction(case.prediction.starts)
+    assert case.register([0, 0, 0.001, 0.05, -0.03, 0])[0].method == "refined"
+    assert case.oracle.asked == 2
+    tunnel = Case(tunnel_drive, always=False)
+    assert tunnel.register([0, 0, 0, 0.02, 0.03, 0])[0].method == "refined"
+    assert tunnel.oracle.asked == 1
+
+
+def test_along_a_tunnel_the_network_has_it(tunnel_drive: Drive) -> None:
     """There the points know every direction but one."""
-    case = Case(tunnel)
+    case = Case(tunnel_drive)
     result, _ = case.register([0, 0, 0, 0.02, 0.03, 0])
     assert (result.ok, result.method) == (True, "refined")
     off = se3.log(se3.inverse(case.truth) @ result.T_target_source)

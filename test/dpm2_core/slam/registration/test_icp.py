@@ -15,7 +15,7 @@ from dpm2_core.slam.registration.local_map import LocalMap, LocalMapSettings
 from dpm2_core.slam.registration.points import GeometricScanRegistration
 from dpm2_core.slam.registration.protocol import Prediction, agree
 
-from ..conftest import Drive
+from ....helpers.drives import Drive
 
 PRIOR = np.eye(6) / 0.1**2  # information of a velocity known to 1 m/s, 10 Hz
 Case = tuple[GeometricScanRegistration, Scan, Array]
@@ -37,8 +37,8 @@ def make_case(drive: Drive, seen: float) -> Case:
 
 
 @pytest.fixture
-def occluded(suburb: Drive) -> Case:
-    return make_case(suburb, 0.4)
+def occluded(suburb_drive: Drive) -> Case:
+    return make_case(suburb_drive, 0.4)
 
 
 def error(T: Array, truth: Array) -> float:
@@ -68,14 +68,14 @@ def test_a_wrong_prediction_in_a_map_of_one_scan_is_never_confirmed_without_unce
     assert not result.ok or result.worst_sigma > max(OdometrySettings().degraded_sigma, wrong / 3)
 
 
-def test_a_scan_of_elsewhere_is_rejected_where_it_was_expected(occluded: Case, tunnel: Drive) -> None:
+def test_a_scan_of_elsewhere_is_rejected_where_it_was_expected(occluded: Case, tunnel_drive: Drive) -> None:
     registration, _, truth = occluded
-    elsewhere = Preprocessor(PreprocessSettings()).prepare(tunnel[0][0], np.zeros(6))
+    elsewhere = Preprocessor(PreprocessSettings()).prepare(tunnel_drive[0][0], np.zeros(6))
     assert not registration.register(elsewhere, Prediction([truth], information=PRIOR)).ok
 
 
-def test_the_most_likely_start_wins_whatever_its_place(suburb: Drive) -> None:
-    registration, scan, truth = make_case(suburb, 1.0)
+def test_the_most_likely_start_wins_whatever_its_place(suburb_drive: Drive) -> None:
+    registration, scan, truth = make_case(suburb_drive, 1.0)
     off = truth @ se3.exp([0, 0, 0, 6, 1, 0])  # too far to come back from
     for starts in ([off, truth], [truth, off]):
         result = registration.register(scan, Prediction(starts))
@@ -83,8 +83,8 @@ def test_the_most_likely_start_wins_whatever_its_place(suburb: Drive) -> None:
         assert error(result.T_target_source, truth) < 0.05
 
 
-def test_likelihood_is_greatest_at_the_truth(suburb: Drive) -> None:
-    frames, truth = suburb
+def test_likelihood_is_greatest_at_the_truth(suburb_drive: Drive) -> None:
+    frames, truth = suburb_drive
     scan = Preprocessor(PreprocessSettings()).prepare(frames[4], np.zeros(6))
     local_map = LocalMap(LocalMapSettings())
     local_map.insert(Preprocessor(PreprocessSettings()).prepare(frames[0], np.zeros(6)).cloud, np.eye(4))
@@ -94,9 +94,9 @@ def test_likelihood_is_greatest_at_the_truth(suburb: Drive) -> None:
     assert method.likelihood(scan.source + 1e3, local_map, truth[4]) == 0  # no counterpart at all
 
 
-def test_along_a_tunnel_answers_agree_and_the_least_motion_is_kept(tunnel: Drive) -> None:
+def test_along_a_tunnel_answers_agree_and_the_least_motion_is_kept(tunnel_drive: Drive) -> None:
     """How far the car went cannot be seen there: starts that end meters apart do not contradict each other."""
-    registration, scan, _ = make_case(tunnel, 1.0)
+    registration, scan, _ = make_case(tunnel_drive, 1.0)
     starts = [se3.exp([0, 0, 0, x, 0, 0]) for x in (1.0, 2.0)]
     alone = [registration.register(scan, Prediction([T])) for T in starts]
     assert np.linalg.norm(alone[0].T_target_source[:3, 3] - alone[1].T_target_source[:3, 3]) > 0.3

@@ -12,32 +12,34 @@ import numpy as np
 import pytest
 import torch
 
-from dpm2_core.descriptors import Descriptors
+from dpm2_core.descriptors import Descriptors, LazyDescriptors
 from dpm2_core.errors import UsageError
-from dpm2_core.frame import Frame, Image, State
+from dpm2_core.frame import Frame, State
 from dpm2_core.geometry import se3
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pretrained import load_network
-from dpm2_core.network.settings import NetworkSettings, preset
+from dpm2_core.network.settings import preset
 from dpm2_core.network.tokens import to_tokens
 from dpm2_core.network.weights import save_weights
-from dpm2_core.slam.build import make_registration
+from dpm2_core.slam.build import make_registration, make_slam
 from dpm2_core.slam.preprocess import Preprocessor, PreprocessSettings
 from dpm2_core.slam.registration.descriptor_map import DescriptorMap
 from dpm2_core.slam.registration.neural import NeuralScanRegistration, NeuralSettings
 from dpm2_core.slam.registration.protocol import Prediction
 from dpm2_core.slam.settings import SlamSettings
-from dpm2_core.slam.system import SlamSystem
+
+from ....helpers.networks import tiny
+from ....helpers.scenes import boxes, make_image
 
 Street = Callable[..., np.ndarray]
 
 
 @pytest.fixture
-def weights(tiny: Callable[..., NetworkSettings], street: Street, tmp_path: Path) -> Path:
+def weights(tmp_path: Path) -> Path:
     """The tiny network as a file: random weights, but similarities centered, so that equal descriptors match best."""
     torch.manual_seed(0)
     model = DeepPointMap2(tiny(decoder={"temperature": 0.01})).eval().requires_grad_(False)
-    some = model.describe(Frame(0, cloud(street(np.random.default_rng(1)))))
+    some = model.describe(Frame(0, cloud(boxes(np.random.default_rng(1)))))
     tokens = to_tokens([some], model.settings.points.view_aligned)
     last = model.decoder.similarity[-1]
     assert isinstance(last.bias, torch.Tensor)
@@ -56,13 +58,23 @@ def descriptors(noise: np.random.Generator) -> Descriptors:
     return Descriptors(noise.normal(size=(5, 3)).astype(np.float32), noise.normal(size=(5, 8)).astype(np.float16))
 
 
+def lazy(value: Descriptors | None) -> LazyDescriptors:
+    return LazyDescriptors(lambda: value)
+
+
+def around(places: DescriptorMap, T: np.ndarray) -> tuple[np.ndarray, Descriptors]:
+    found = places.around(T)
+    assert found is not None
+    return found
+
+
 def test_the_nearest_frames_are_merged_in_the_frame_of_the_nearest(noise: np.random.Generator) -> None:
     places = DescriptorMap(spacing=3, frames=2, radius=20)
     poses = [se3.exp([0, 0, 0.2 * i, 4.0 * i, 0, 0]) for i in range(4)]
     sets = [descriptors(noise) for _ in poses]
     for pose, s in zip(poses, sets, strict=True):
-        places.insert(s, pose)
-    T, merged = places.around(poses[2] @ se3.exp([0, 0, 0, 1.0, 0, 0]))
+        places.insert(lazy(s), pose)
+    T, merged = around(places, poses[2] @ se3.exp([0, 0, 0, 1.0, 0, 0]))
     np.testing.assert_array_equal(T, poses[2])
     world = se3.transform(T, merged.xyz.astype(np.float64))
     for part, i in ((world[:5], 2), (world[5:], 3)):
@@ -72,34 +84,47 @@ def test_the_nearest_frames_are_merged_in_the_frame_of_the_nearest(noise: np.ran
 def test_frames_out_of_reach_are_left_out_unless_there_is_no_other(noise: np.random.Generator) -> None:
     places = DescriptorMap(spacing=3, frames=3, radius=10)
     for x in (0.0, 30.0):
-        places.insert(descriptors(noise), se3.make(np.eye(3), [x, 0, 0]))
-    assert len(places.around(se3.make(np.eye(3), [28, 0, 0]))[1]) == 5
-    assert len(places.around(se3.make(np.eye(3), [200, 0, 0]))[1]) == 5
+        places.insert(lazy(descriptors(noise)), se3.make(np.eye(3), [x, 0, 0]))
+    assert len(around(places, se3.make(np.eye(3), [28, 0, 0]))[1]) == 5
+    assert len(around(places, se3.make(np.eye(3), [200, 0, 0]))[1]) == 5
 
 
 def test_a_frame_enters_after_motion_or_a_turn(noise: np.random.Generator) -> None:
     places = DescriptorMap(spacing=3, frames=2, radius=20)
     assert places.wants(np.eye(4))
-    places.insert(descriptors(noise), np.eye(4))
+    places.insert(lazy(descriptors(noise)), np.eye(4))
     assert not places.wants(se3.exp([0, 0, 0.1, 2.9, 0, 0]))
     assert places.wants(se3.exp([0, 0, 0, 3.1, 0, 0]))
     assert places.wants(se3.exp([0, 0, 0.3, 0, 0, 0]))
 
 
+def test_frames_are_described_when_they_are_registered_to(noise: np.random.Generator) -> None:
+    """One that has too few points for descriptors is passed over; without any there is nothing to register to."""
+    places = DescriptorMap(spacing=3, frames=2, radius=20)
+    described = [lazy(None), lazy(descriptors(noise)), lazy(descriptors(noise))]
+    for i, one in enumerate(described):
+        places.insert(one, se3.make(np.eye(3), [4.0 * i, 0, 0]))
+    assert places.around(np.eye(4)) is not None
+    assert [one.made for one in described] == [True, True, False]
+    T, _ = around(places, np.eye(4))
+    np.testing.assert_array_equal(T[:3, 3], [4, 0, 0])
+    empty = DescriptorMap(spacing=3, frames=2, radius=20)
+    empty.insert(lazy(None), np.eye(4))
+    assert empty.around(np.eye(4)) is None
+
+
 def test_memory_is_bounded(noise: np.random.Generator) -> None:
     places = DescriptorMap(spacing=3, frames=2, radius=20)
     for i in range(100):
-        places.insert(descriptors(noise), se3.make(np.eye(3), [3.0 * i, 0, 0]))
+        places.insert(lazy(descriptors(noise)), se3.make(np.eye(3), [3.0 * i, 0, 0]))
     assert len(places) == 20
 
 
-def test_a_frame_seen_again_is_found_without_any_prior(
-    weights: Path, street: Street, noise: np.random.Generator
-) -> None:
+def test_a_frame_seen_again_is_found_without_any_prior(weights: Path, noise: np.random.Generator) -> None:
     """True of any weights: equal descriptors match, and untrained offsets are zero."""
     s = SlamSettings(registration="neural", neural=NeuralSettings(weights=str(weights), min_confidence=0))
     registration = make_registration(s)
-    frame = Frame(0, cloud(street(noise)))
+    frame = Frame(0, cloud(boxes(noise)))
     scan = registration.prepare(frame, np.zeros(6))
     place = se3.exp([0.02, 0.01, 1.3, 50.0, -20.0, 1.0])
     registration.update(scan, place)
@@ -115,12 +140,12 @@ def test_a_frame_seen_again_is_found_without_any_prior(
 
 
 def test_standing_still_from_the_first_frame_to_a_keyframe_with_descriptors(
-    weights: Path, street: Street, noise: np.random.Generator
+    weights: Path, noise: np.random.Generator
 ) -> None:
     s = SlamSettings(registration="neural", neural=NeuralSettings(weights=str(weights), min_confidence=0))
-    system = SlamSystem(s)
-    points = cloud(street(noise))
-    tracked = [system.process(Frame(i * 10**8, points, index=i)) for i in range(4)]
+    slam = make_slam(s)
+    points = cloud(boxes(noise))
+    tracked = [slam.process(Frame(i * 10**8, points, index=i)).odometry for i in range(4)]
     assert all(t.registration.ok for t in tracked)
     np.testing.assert_allclose(tracked[-1].T_odom_lidar, np.eye(4), atol=0.01)
     keyframe = tracked[0].keyframe
@@ -129,17 +154,15 @@ def test_standing_still_from_the_first_frame_to_a_keyframe_with_descriptors(
     assert len(keyframe.descriptors) == 48
 
 
-def test_bad_frames_are_rejected_in_words_and_survived(
-    weights: Path, street: Street, noise: np.random.Generator
-) -> None:
+def test_bad_frames_are_rejected_in_words_and_survived(weights: Path, noise: np.random.Generator) -> None:
     s = SlamSettings(registration="neural", neural=NeuralSettings(weights=str(weights), min_confidence=0))
-    system = SlamSystem(s)
-    points = cloud(street(noise))
+    slam = make_slam(s)
+    points = cloud(boxes(noise))
     good = [Frame(i * 10**8, points, index=i) for i in range(7)]
     bad = [np.zeros((0, 4)), np.full((500, 4), np.nan), points[:10]]
     frames = [Frame(0, bad[0].astype(np.float32)), *good[:3]]
     frames += [Frame((3 + i) * 10**8, b.astype(np.float32)) for i, b in enumerate(bad)] + [good[6]]
-    tracked = [system.process(frame) for frame in frames]
+    tracked = [slam.process(frame).odometry for frame in frames]
     for t in (tracked[0], *tracked[4:7]):
         assert not t.registration.ok
         assert "too few for descriptors" in t.registration.reason
@@ -148,22 +171,20 @@ def test_bad_frames_are_rejected_in_words_and_survived(
     assert all(np.isfinite(t.T_odom_lidar).all() and np.isfinite(t.covariance).all() for t in tracked)
 
 
-def test_unsure_matches_are_no_answer(weights: Path, street: Street, noise: np.random.Generator) -> None:
+def test_unsure_matches_are_no_answer(weights: Path, noise: np.random.Generator) -> None:
     s = SlamSettings(registration="neural", neural=NeuralSettings(weights=str(weights), min_confidence=1))
     registration = make_registration(s)
-    first, other = (registration.prepare(Frame(0, cloud(street(noise))), np.zeros(6)) for _ in range(2))
+    first, other = (registration.prepare(Frame(0, cloud(boxes(noise))), np.zeros(6)) for _ in range(2))
     registration.update(first, np.eye(4))
     result = registration.register(other, Prediction([np.eye(4)]))
     assert not result.ok
     assert "confidence of only" in result.reason
 
 
-def test_images_are_asked_for_and_used_where_the_network_has_a_camera(
-    tiny: Callable[..., NetworkSettings], street: Street, make_image: Callable[..., Image], noise: np.random.Generator
-) -> None:
+def test_images_are_asked_for_and_used_where_the_network_has_a_camera(noise: np.random.Generator) -> None:
     torch.manual_seed(0)
     preprocessor = Preprocessor(PreprocessSettings())
-    frame = Frame(0, cloud(street(noise)), images=(make_image(noise),))
+    frame = Frame(0, cloud(boxes(noise)), images=(make_image(noise),))
     for backbone, requested in (("convnext", True), ("none", False)):
         model = DeepPointMap2(tiny(image={"backbone": backbone})).eval().requires_grad_(False)
         registration = NeuralScanRegistration(NeuralSettings(), preprocessor, model)
@@ -176,10 +197,10 @@ def test_images_are_asked_for_and_used_where_the_network_has_a_camera(
         assert np.array_equal(with_image.features, without.features) is not requested
 
 
-def test_descriptors_of_a_keyframe_take_70_kb(street: Street, noise: np.random.Generator) -> None:
+def test_descriptors_of_a_keyframe_take_70_kb(noise: np.random.Generator) -> None:
     torch.manual_seed(0)
     model = DeepPointMap2(preset("small")).eval().requires_grad_(False)
-    result = model.describe(Frame(0, cloud(street(noise, 20_000))))
+    result = model.describe(Frame(0, cloud(boxes(noise, 20_000))))
     assert (len(result), result.features.dtype) == (256, np.float16)
     assert result.nbytes <= 70_000
 
@@ -202,22 +223,18 @@ def test_a_camera_branch_that_was_never_trained_is_left_out(
 
 
 def test_threads_are_those_of_the_settings(weights: Path) -> None:
-    before = torch.get_num_threads()
-    try:
-        load_network(str(weights), 1)
-        assert torch.get_num_threads() == 1
-    finally:
-        torch.set_num_threads(before)
+    load_network(str(weights), 3)
+    assert torch.get_num_threads() == 3
 
 
 def test_the_geometric_slam_imports_neither_torch_nor_matplotlib() -> None:
     """torch takes seconds and 200 MB, for nothing where no loop asks for descriptors."""
     program = (
-        "import sys, numpy as np; from dpm2_core.slam.system import SlamSettings, SlamSystem; "
+        "import sys, numpy as np; from dpm2_core.slam.build import SlamSettings, make_slam; "
         "from dpm2_core.frame import Frame; import dpm2_core.commands.run; "
         "points = np.random.default_rng(0).uniform(-20, 20, (3000, 4)).astype(np.float32); "
-        "system = SlamSystem(SlamSettings(loops={'descriptors': False})); "
-        "[system.process(Frame(i, points)) for i in range(2)]; "
+        "slam = make_slam(SlamSettings(loops={'descriptors': False})); "
+        "[slam.process(Frame(i, points)) for i in range(2)]; "
         "sys.exit(len({'torch', 'matplotlib'} & set(sys.modules)))"
     )
     assert subprocess.run([sys.executable, "-c", program], timeout=120).returncode == 0

@@ -65,7 +65,7 @@ def frame(x: float, paint: Paint, index: int = 0, gain: float = 1.0) -> Frame:
 
 
 def registered(first: Frame, second: Frame, **visual: object) -> tuple[Array, Array, str, str]:
-    """Pose and covariance of the second in the frame of the first, who answered, and why."""
+    """Pose and covariance of the second in the frame of the first, method and reason."""
     registration = make_registration(SlamSettings(visual=VisualSettings.model_validate(visual)))
     registration.update(registration.prepare(first, np.zeros(6)), np.eye(4))
     result = registration.register(registration.prepare(second, np.zeros(6)), Prediction([np.eye(4)]))
@@ -74,7 +74,7 @@ def registered(first: Frame, second: Frame, **visual: object) -> tuple[Array, Ar
 
 
 def test_the_way_along_a_corridor_is_read_from_its_walls() -> None:
-    """1.7 m that no point can tell, to 3 cm, a step of the fine search, whatever the exposure; its covariance knows."""
+    """1.7 m that no point constrains, to 3 cm, a step of the fine search, at any exposure; its covariance shows it."""
     paint = random_paint()
     first, second = frame(0.0, paint), frame(1.7, paint, 1, gain=0.6)
     blind, covariance, method, _ = registered(first, second, enabled=False)
@@ -93,8 +93,8 @@ def test_the_way_along_a_corridor_is_read_from_its_walls() -> None:
     ("paint", "why"),
     [(stripes, "several places are alike"), (lambda p: np.full(len(p), 99.0), "a correlation of only")],
 )
-def test_what_does_not_tell_is_not_believed(paint: Paint, why: str) -> None:
-    """Paint that repeats, or none: the answer stays the points', with their uncertainty, and says why."""
+def test_an_image_that_does_not_constrain_is_not_used(paint: Paint, why: str) -> None:
+    """Paint that repeats, or none: the result stays that of the points, with their uncertainty, and says why."""
     T, covariance, method, reason = registered(frame(0.0, paint), frame(0.7, paint, 1))
     assert method == "geometric"
     assert why in reason
@@ -129,7 +129,7 @@ def test_an_odometry_that_brakes_in_a_tunnel() -> None:
 
 
 def test_points_and_images_of_a_real_drive_agree(kitti_root: Path) -> None:
-    """Asked where nothing is open, the image moves the answer by centimeters: two measurements of one motion."""
+    """Asked where nothing is open, the image moves the result by centimeters: two measurements of one motion."""
     frames = list(open_source(kitti_root / "sequences" / "04").frames(0, 12))
     tracks = []
     for sigma in (0.08, 1e-4):

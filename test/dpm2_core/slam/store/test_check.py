@@ -37,12 +37,12 @@ def recovered(path: Path) -> MapData:
         return load_map(store)
 
 
-def test_a_sound_map_has_no_problems(map_file: Path, drive: list[Keyframe]) -> None:
+def test_a_sound_map_has_no_problems(map_file: Path, keyframes: list[Keyframe]) -> None:
     result = check_map(map_file)
     assert (result.problems, result.keyframes, result.lost) == ([], 12, 0)
     data = recovered(map_file)
     assert len(data.edges) == 13
-    np.testing.assert_array_equal(data.poses[11], drive[11].T_odom_kf)
+    np.testing.assert_array_equal(data.poses[11], keyframes[11].T_odom_kf)
 
 
 def test_rounding_is_no_damage(map_file: Path) -> None:
@@ -54,7 +54,7 @@ def test_rounding_is_no_damage(map_file: Path) -> None:
     assert check_map(map_file).problems == []
 
 
-def test_each_kind_of_damage_is_named(map_file: Path, drive: list[Keyframe]) -> None:
+def test_each_kind_of_damage_is_named(map_file: Path, keyframes: list[Keyframe]) -> None:
     nan, eye6 = np.full((4, 4), np.nan).tobytes(), np.eye(6).tobytes()
     execute(
         map_file,
@@ -78,7 +78,7 @@ def test_each_kind_of_damage_is_named(map_file: Path, drive: list[Keyframe]) -> 
     data = recovered(map_file)
     assert [k.id for k in data.keyframes] == [0, 1, 2, 3, 4, 5, 6, 7, 9, 10, 11]
     # The lost pose follows from the odometry, and the holes in the chain are bridged by it.
-    np.testing.assert_allclose(data.poses[4], drive[4].T_odom_kf, atol=1e-9)
+    np.testing.assert_allclose(data.poses[4], keyframes[4].T_odom_kf, atol=1e-9)
     chain = {(e.from_node, e.to_node) for e in data.edges if e.kind == "odometry"}
     assert chain == {(i, i + 1) for i in range(10)}
     with MapStore.open(map_file.with_name("recovered.dpm2map")) as store:
@@ -97,7 +97,7 @@ def test_damaged_pages_cost_only_what_is_on_them(map_file: Path, seed: int) -> N
     assert len(data) >= 8  # each page holds a few keyframes or less
 
 
-def test_a_destroyed_header(map_file: Path, drive: list[Keyframe]) -> None:
+def test_a_destroyed_header(map_file: Path, keyframes: list[Keyframe]) -> None:
     content = bytearray(map_file.read_bytes())
     content[:2000] = bytes(2000)
     map_file.write_bytes(content)
@@ -105,7 +105,7 @@ def test_a_destroyed_header(map_file: Path, drive: list[Keyframe]) -> None:
         MapStore.open(map_file)
     data = recovered(map_file)
     assert len(data) == 12
-    np.testing.assert_array_equal(data.poses[11], drive[11].T_odom_kf)
+    np.testing.assert_array_equal(data.poses[11], keyframes[11].T_odom_kf)
 
 
 def test_a_map_that_was_cut_off(map_file: Path) -> None:

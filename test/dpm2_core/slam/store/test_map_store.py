@@ -10,6 +10,7 @@ import sqlite3
 import subprocess
 import sys
 import time
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ from dpm2_core.frame import Keyframe
 from dpm2_core.slam.store import schema
 from dpm2_core.slam.store.check import check_map
 from dpm2_core.slam.store.cloud_codec import pack_cloud
-from dpm2_core.slam.store.cloud_store import Loan
+from dpm2_core.slam.store.cloud_store import CloudStore, Loan
 from dpm2_core.slam.store.map_data import load_map, save_as
 from dpm2_core.slam.store.map_store import Change, MapStore
 
@@ -29,9 +30,8 @@ import sys
 from pathlib import Path
 import numpy as np
 from dpm2_core.descriptors import Descriptors
-from dpm2_core.frame import Keyframe
+from dpm2_core.frame import Edge, Keyframe, Registration
 from dpm2_core.slam.store.cloud_codec import pack_cloud
-from dpm2_core.slam.store.rows import Edge
 from dpm2_core.slam.store.map_store import Change, MapStore
 rng = np.random.default_rng(0)
 store = MapStore.create(Path(sys.argv[1]))
@@ -41,7 +41,7 @@ for node in range(int(sys.argv[2])):
     cloud = rng.uniform(0, 1, (2000, 4)).astype(np.float32)
     d = Descriptors(np.zeros((64, 3), np.float32), np.zeros((64, 128), np.float16))
     k = Keyframe(node, node, node, np.eye(4), cloud, None, "", d)
-    edges = [Edge("odometry", node - 1, node, np.eye(4), np.eye(6))] if node else []
+    edges = [Edge("odometry", node - 1, node, Registration(np.eye(4), np.eye(6)))] if node else []
     store.write(Change([(node, k, pack_cloud(cloud), None)], edges, {n: np.eye(4) for n in range(node + 1)}))
     print(node, flush=True)
 """
@@ -57,7 +57,7 @@ def whole_prefix(path: Path) -> int:
         return len(data)
 
 
-def test_everything_comes_back(tmp_path: Path, map_file: Path, drive: list[Keyframe]) -> None:
+def test_everything_comes_back(tmp_path: Path, map_file: Path, keyframes: list[Keyframe]) -> None:
     """Poses and covariances to the last bit, clouds to half a centimeter, descriptors as the float16 they are."""
     for path in (map_file, tmp_path / "again.dpm2map"):
         if path != map_file:
@@ -68,7 +68,7 @@ def test_everything_comes_back(tmp_path: Path, map_file: Path, drive: list[Keyfr
             assert [(s.number, s.config, s.weights) for s in data.sessions] == [
                 (1, "slam: {}", "small 0123456789abcdef")
             ]
-            for node, (k, back) in enumerate(zip(drive, data.keyframes, strict=True)):
+            for node, (k, back) in enumerate(zip(keyframes, data.keyframes, strict=True)):
                 assert (back.id, back.stamp, back.index, back.robot) == (k.id, k.stamp, k.index, k.robot)
                 np.testing.assert_array_equal(back.T_odom_kf, k.T_odom_kf)
                 np.testing.assert_array_equal(data.poses[node], k.T_odom_kf)
@@ -81,17 +81,17 @@ def test_everything_comes_back(tmp_path: Path, map_file: Path, drive: list[Keyfr
                     assert back.edge is not None
                     np.testing.assert_array_equal(back.edge.covariance, k.edge.covariance)
             assert [(e.kind, e.ok) for e in data.edges[-2:]] == [("loop", True), ("loop", False)]
-            assert data.edges[-1].reason == "too far"
-            assert data.edges[-1].rmse == np.inf
+            assert data.edges[-1].registration.reason == "too far"
+            assert data.edges[-1].registration.rmse == np.inf
 
 
-def test_a_loan_and_a_thumbnail_come_back(map_file: Path, drive: list[Keyframe]) -> None:
+def test_a_loan_and_a_thumbnail_come_back(map_file: Path, keyframes: list[Keyframe]) -> None:
     T = np.eye(4)
     T[0, 3] = 2.0
     with MapStore.open(map_file, read_only=False) as store:
         store.begin_session()
-        store.write(Change([(12, drive[0], Loan(3, T), None)], poses={12: np.eye(4)}))
-        store.write(Change([(13, drive[1], pack_cloud(drive[1].cloud), b"jpeg")], poses={13: np.eye(4)}))
+        store.write(Change([(12, keyframes[0], Loan(3, T), None)], poses={12: np.eye(4)}))
+        store.write(Change([(13, keyframes[1], pack_cloud(keyframes[1].cloud), b"jpeg")], poses={13: np.eye(4)}))
     with MapStore.open(map_file) as store:
         data = load_map(store)
         assert data.session[-2:] == [2, 2]
@@ -212,13 +212,13 @@ CREATE TABLE edges (kind TEXT, from_node INTEGER, to_node INTEGER, T_from_to BLO
 """
 
 
-def version_1(path: Path, drive: list[Keyframe]) -> None:
+def version_1(path: Path, keyframes: list[Keyframe]) -> None:
     with sqlite3.connect(path) as sql:
         sql.executescript(VERSION_1)
         sql.execute(f"PRAGMA application_id = {schema.APPLICATION_ID}")
         sql.execute("PRAGMA user_version = 1")
         sql.execute("INSERT INTO about VALUES ('0.0.1', '2026-01-01T00:00:00', 'a: 1', '')")
-        for node, k in enumerate(drive):
+        for node, k in enumerate(keyframes):
             T = k.T_odom_kf.tobytes()
             row = (node, "", k.stamp, k.index, T, T, pack_cloud(k.cloud), None)
             sql.execute("INSERT INTO keyframes VALUES (?,?,?,?,?,?,?,?)", row)
@@ -228,9 +228,9 @@ def version_1(path: Path, drive: list[Keyframe]) -> None:
     sql.close()
 
 
-def test_an_older_map_is_read_and_brought_up_to_date(tmp_path: Path, drive: list[Keyframe]) -> None:
+def test_an_older_map_is_read_and_brought_up_to_date(tmp_path: Path, keyframes: list[Keyframe]) -> None:
     path = tmp_path / "old.dpm2map"
-    version_1(path, drive)
+    version_1(path, keyframes)
     before = path.read_bytes()
     for read_only in (True, False, True):
         with MapStore.open(path, read_only=read_only) as store:
@@ -238,8 +238,8 @@ def test_an_older_map_is_read_and_brought_up_to_date(tmp_path: Path, drive: list
             assert len(data) == 12
             assert [s.config for s in data.sessions] == ["a: 1"]
             assert len(data.edges) == 11
-            np.testing.assert_array_equal(data.poses[7], drive[7].T_odom_kf)
-            np.testing.assert_allclose(data.clouds[7], drive[7].cloud, atol=0.0051)
+            np.testing.assert_array_equal(data.poses[7], keyframes[7].T_odom_kf)
+            np.testing.assert_allclose(data.clouds[7], keyframes[7].cloud, atol=0.0051)
         assert (path.read_bytes() == before) == read_only or not read_only
         if read_only is False:
             before = path.read_bytes()
@@ -266,22 +266,23 @@ def test_what_is_no_map_is_rejected_in_one_line(tmp_path: Path, map_file: Path) 
         MapStore.create(text)
 
 
-def test_two_writers(map_file: Path, drive: list[Keyframe], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("dpm2_core.slam.store.map_store._BUSY_S", 0.1)
-    with MapStore.open(map_file, read_only=False) as one, MapStore.open(map_file, read_only=False) as two:
-        one._connection.execute("BEGIN IMMEDIATE")
+def test_two_writers(map_file: Path, keyframes: list[Keyframe], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("dpm2_core.slam.store.map_store.BUSY", 0.1)
+    with closing(sqlite3.connect(map_file)) as one, MapStore.open(map_file, read_only=False) as two:
+        one.execute("BEGIN IMMEDIATE")
         with pytest.raises(Dpm2Error, match="locked"):
             two.begin_session()
-        one._connection.execute("ROLLBACK")
 
 
-def test_an_unfinished_copy_leaves_nothing_behind(tmp_path: Path, map_file: Path) -> None:
-    with sqlite3.connect(map_file) as sql:
-        sql.execute("UPDATE payloads SET cloud = x'00' WHERE node = 5")
-    sql.close()
+def test_an_unfinished_copy_leaves_nothing_behind(
+    tmp_path: Path, map_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def gone(store: CloudStore, index: int) -> bytes:
+        raise Dpm2Error("disk gone")
+
+    monkeypatch.setattr(CloudStore, "packed", gone)
     with MapStore.open(map_file) as store:
         data = load_map(store, descriptors=False)
-        data.clouds._stored = lambda node: (_ for _ in ()).throw(Dpm2Error("disk gone"))
         with pytest.raises(Dpm2Error, match="disk gone"):
             save_as(data, tmp_path / "copy.dpm2map")
         with pytest.raises(UsageError, match="already"):

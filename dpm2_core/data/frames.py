@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From messages that belong together to a `Frame`. What cannot be used is reported once, never replaced by a guess."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from dpm2_core.data.image_messages import decode_camera, decode_image
+from dpm2_core.data.messages import MessageError, decode_points
+from dpm2_core.data.settings import InputSettings
+from dpm2_core.data.transforms import TransformTree
+from dpm2_core.data.vertical_angle import HDL64_CORRECTION_DEG, correct_vertical_angle
+from dpm2_core.errors import UsageError, printable
+from dpm2_core.frame import Camera, Frame, Image
+
+_MOST_REPORTED = 20  # damaged data may be damaged in endless ways
+_LENGTH = 300  # characters of a problem, whatever is in the message
+
+
+@dataclass(eq=False)
+class Calibration:
+    """What is known of the sensors: of a recording from the start, of topics as it comes in.
+
+    Attributes:
+        points_topic, image_topic: full names; no image_topic where there are no images.
+        camera_info: sensor_msgs/CameraInfo; None as long as there is none.
+        transforms: of /tf_static.
+        angle_correction_deg: what the recording says of its vertical angles; None if it says nothing.
+    """
+
+    points_topic: str
+    image_topic: str = ""
+    camera_info: Any = None
+    transforms: TransformTree = field(default_factory=TransformTree)
+    angle_correction_deg: float | None = None
+
+
+class FrameBuilder:
+    """Makes frames of messages.
+
+    Args:
+        settings: how to read the messages.
+        calibration: looked at anew for each frame.
+        complain: called once with each different problem.
+        decode: makes a message of a topic's bytes, or raises MessageError; the default takes messages as they are.
+
+    Attributes:
+        image_problem: why the last image could not be used; empty if it could, or if there was none.
+    """
+
+    def __init__(
+        self,
+        settings: InputSettings,
+        calibration: Calibration,
+        complain: Callable[[str], None],
+        decode: Callable[[str, Any], Any] = lambda topic, message: message,
+    ) -> None:
+        self._settings, self._calibration, self._complain, self._decode = settings, calibration, complain, decode
+        self._told: set[str] = set()
+        self.image_problem = ""
+
+    def frame(self, stamp: int, cloud: Any, image: Any | None, index: int) -> Frame:
+        """A cloud with its stamp (ns), and its image, if it has one; an unreadable cloud comes with `problem` set."""
+        settings = self._settings
+        try:
+            cloud = self._decode(self._calibration.points_topic, cloud)
+            points, offset = decode_points(cloud, settings.time_field, settings.time_unit, settings.intensity_max)
+        except MessageError as error:
+            problem = self._tell(self._calibration.points_topic, error)
+            return Frame(stamp, np.empty((0, 4), np.float32), index=index, problem=problem)
+        points = correct_vertical_angle(points, self.angle_correction_deg)
+        return Frame(stamp, points, offset, self._images(cloud.header.frame_id, image), index)
+
+    def camera(self, lidar_frame: str, image_frame: str) -> Camera:
+        """The camera by what is known now; `image_frame` counts where its CameraInfo names no frame.
+
+        Raises:
+            UsageError: CameraInfo or extrinsics are missing, or cannot be used.
+        """
+        info, T_lidar_cam = self._calibration.camera_info, self._settings.extrinsic()
+        if info is None:
+            raise UsageError("no CameraInfo yet")
+        frame = info.header.frame_id or image_frame
+        if T_lidar_cam is None:
+            try:
+                T_lidar_cam = self._calibration.transforms.lookup(lidar_frame, frame)
+            except UsageError as error:
+                hint = "set input.T_lidar_cam, publish it on /tf_static, or leave images out with input.images=false"
+                raise UsageError(f"{error}; {hint}") from None
+        return decode_camera(info, T_lidar_cam, frame or self._calibration.image_topic)
+
+    @property
+    def angle_correction_deg(self) -> float:
+        """Added to the elevation of each point: what is set, else what the recording says, else KITTI's for KITTI."""
+        requested, known = self._settings.vertical_angle_correction_deg, self._calibration
+        if requested != "auto":
+            return requested
+        usual = HDL64_CORRECTION_DEG if known.points_topic.startswith("/kitti/") else 0.0
+        return usual if known.angle_correction_deg is None else known.angle_correction_deg
+
+    def _images(self, lidar_frame: str, message: Any | None) -> tuple[Image, ...]:
+        if message is None:
+            return ()
+        topic = self._calibration.image_topic
+        try:
+            message = self._decode(topic, message)
+            camera = self.camera(lidar_frame, message.header.frame_id)
+            images = (Image(decode_image(message, camera.size), camera),)
+        except (UsageError, ValueError) as error:
+            self.image_problem = self._tell(topic, error, "; images are left out")
+            return ()
+        self.image_problem = ""
+        return images
+
+    def _tell(self, topic: str, error: Exception, more: str = "") -> str:
+        """Complain unless it is known already; returns the problem as one line."""
+        problem = printable(str(error)[:_LENGTH])
+        text = f"{topic}: {problem.removeprefix(f'{topic}: ')}{more}"  # a message that is damaged names its topic
+        if text not in self._told and len(self._told) < _MOST_REPORTED:
+            self._told.add(text)
+            self._complain(text)
+        return problem

@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which image goes with which cloud, of a recording as of topics. Pure rules: no ROS, no clock, no thread.
+
+The cloud leads: every cloud leaves once, with the image nearest in time of those that came before it left.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Collection, Iterable, Iterator
+from typing import Any
+
+from dpm2_core.data.messages import serialized_stamp
+
+JUMP = 1_000_000_000
+"""ns by which a stamp goes back, or ahead beyond the time that has passed, only if it is wrong or time itself has
+jumped: a looped bag, a clock that was set, a recording with a gap."""
+LATE = 500_000_000
+"""ns of log time that a cloud of a recording waits for its image."""
+BUFFER = 32
+"""Images kept; bounds memory where no cloud comes, or the stamps are of no use."""
+
+RawMessage = tuple[str, int, bytes]
+"""Topic, log time (ns) and serialized message of a recording."""
+
+
+class Images:
+    """Those of one camera that may belong to a cloud, in the order in which they came.
+
+    Args:
+        tolerance: greatest difference of stamps that belong together, s.
+
+    Attributes:
+        last: stamp of the last one, ns.
+    """
+
+    def __init__(self, tolerance: float) -> None:
+        self.tolerance = round(tolerance * 1e9)
+        self.last = -float("inf")
+        self._images: deque[tuple[int, Any]] = deque(maxlen=BUFFER)
+
+    def add(self, stamp: int, image: Any) -> None:
+        """Take one with its stamp (ns)."""
+        self.last = stamp
+        self._images.append((stamp, image))
+
+    def nearest(self, stamp: int) -> Any | None:
+        """The image for a cloud with that stamp (ns); None if none is within the tolerance."""
+        taken, image = min(self._images, key=lambda image: abs(image[0] - stamp), default=(stamp, None))
+        return image if abs(taken - stamp) <= self.tolerance else None
+
+    def forget(self, stamp: int) -> None:
+        """A cloud with that stamp (ns) has left: drop what is too old for the next, or from before time went back."""
+        while self._images and not -self.tolerance <= self._images[0][0] - stamp < JUMP:
+            self._images.popleft()
+
+
+def passed(image: float, cloud: int) -> bool:
+    """Whether a camera whose last image has that stamp (ns) has none to come that is nearer to the cloud's (ns)."""
+    return cloud <= image < cloud + JUMP
+
+
+def clouds_after_images(
+    messages: Iterable[RawMessage], clouds: Collection[str], images: Collection[str], offset: int = 0
+) -> Iterator[RawMessage]:
+    """The messages of a recording, each cloud held back until every camera has passed it, or it has waited too long.
+
+    Args:
+        messages: in recorded order.
+        clouds, images: topics.
+        offset: ns, added to the stamps of images.
+    """
+    latest = dict.fromkeys(images, -float("inf"))
+    waiting: deque[tuple[int, RawMessage]] = deque()  # with their stamps
+    for message in messages:
+        topic, time, data = message
+        if topic in clouds:
+            waiting.append((serialized_stamp(data, time), message))
+        else:
+            yield message
+        if topic in latest:
+            latest[topic] = serialized_stamp(data, time) + offset
+        while waiting and (
+            time - waiting[0][1][1] >= LATE or all(passed(image, waiting[0][0]) for image in latest.values())
+        ):
+            yield waiting.popleft()[1]
+    yield from (message for _, message in waiting)

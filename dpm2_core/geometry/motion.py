@@ -1,0 +1,31 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The motion of a vehicle while no sensor shows it: at constant velocity, and how far off that may be by then."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dpm2_core.geometry import se3
+from dpm2_core.geometry.se3 import Array
+
+_HORIZON = 10.0  # s: farther ahead no motion is extrapolated
+_TURN = 0.3  # rad/s, standard deviation of the yaw rate in traffic
+_TILT = 0.1  # of the heading's: slopes
+
+
+def predicted(T: Array, twist: Array, seconds: float) -> Array:
+    """The pose (4, 4) after that time at a constant `twist` (6,) [rad/s, m/s]."""
+    return T @ se3.exp(twist * min(seconds, _HORIZON))
+
+
+def covariance(speed: float, seconds: float, acceleration: float) -> Array:
+    """Covariance (6, 6) [rad, m] of the pose that `predicted` gives; no heading is worse than any heading."""
+    meters = 0.5 * seconds * velocity_change(speed, seconds, acceleration)
+    heading = min(_TURN * seconds, np.pi / np.sqrt(3))
+    return np.diag([_TILT * heading, _TILT * heading, heading, meters, meters, meters]) ** 2
+
+
+def velocity_change(speed: float, seconds: float, acceleration: float) -> float:
+    """Standard deviation of the velocity after that time, m/s: by that acceleration (m/s2) in every direction, but not
+    more than a vehicle as fast as this one can change it."""
+    return min(acceleration * seconds, speed + acceleration)

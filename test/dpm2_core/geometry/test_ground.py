@@ -1,0 +1,29 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What stands is distinguished from the ground: on a slope, under a roof, and for either precision of points."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dpm2_core.geometry.ground import ground_below, height_above_ground
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_wall_stands_and_a_slope_does_not(dtype: type) -> None:
+    x, y = np.meshgrid(np.arange(-20, 20, 0.5), np.arange(-20, 20, 0.5))
+    ground = np.stack([x.ravel(), y.ravel(), 0.1 * x.ravel()], -1)  # 10 %: 0.2 m within a cell of 2 m
+    wall = np.stack([np.full(30, 5.0), np.zeros(30), 0.5 + np.linspace(0.6, 3, 30)], -1)
+    height = height_above_ground(np.concatenate([ground, wall]).astype(dtype), 2.0, reach=0)
+    assert height.dtype == dtype
+    assert (height[: len(ground)] <= 0.5).all()
+    assert (height[len(ground) :] > 0.5).all()
+    assert len(height_above_ground(np.zeros((0, 3), dtype))) == 0
+
+
+def test_the_ground_below_a_roof_is_not_the_roof() -> None:
+    """A roof of 5 by 5 m over ground that is seen around it alone: shorter than the opening of 7 cells of 1 m."""
+    x, y = np.meshgrid(np.arange(-15, 15, 0.25), np.arange(-15, 15, 0.25))
+    under = (np.abs(x) < 2.5) & (np.abs(y) < 2.5)
+    points = np.stack([x.ravel(), y.ravel(), np.where(under, 3.0, -1.7).ravel()], -1)
+    np.testing.assert_allclose(ground_below(points), -1.7)

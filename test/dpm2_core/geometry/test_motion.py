@@ -1,0 +1,36 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Constant velocity: predictions compose, and their uncertainty grows with time up to what a vehicle can do."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dpm2_core.geometry import se3
+from dpm2_core.geometry.motion import covariance, predicted
+
+TWIST = np.array([0.01, -0.02, 0.3, 15.0, 0.2, -0.1])
+
+
+@given(st.floats(0, 5), st.floats(0, 5))
+def test_two_predictions_in_turn_are_one(a: float, b: float) -> None:
+    T = se3.exp([0.1, 0.2, 0.3, 1, 2, 3])
+    np.testing.assert_allclose(predicted(predicted(T, TWIST, a), TWIST, b), predicted(T, TWIST, a + b), atol=1e-9)
+
+
+def test_no_motion_is_predicted_farther_than_ten_seconds() -> None:
+    np.testing.assert_array_equal(predicted(np.eye(4), TWIST, 60.0), predicted(np.eye(4), TWIST, 10.0))
+
+
+@given(st.floats(0, 40), st.floats(0.01, 60), st.floats(0.01, 60))
+def test_uncertainty_grows_with_time(speed: float, a: float, b: float) -> None:
+    early, late = (np.diag(covariance(speed, t, 10.0)) for t in sorted((a, b)))
+    assert (late >= early).all()
+    assert se3.is_covariance(covariance(speed, a, 10.0))
+
+
+def test_a_heading_of_which_nothing_is_known_is_uniform() -> None:
+    """The standard deviation of a uniform angle is pi over the root of 3."""
+    assert np.sqrt(covariance(10.0, 60.0, 10.0)[2, 2]) == pytest.approx(np.pi / np.sqrt(3))

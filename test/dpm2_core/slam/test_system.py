@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`Slam.process` is the whole algorithm: its two steps give the same in turn, and a frame passes few modules."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import FrameType
+
+import numpy as np
+import pytest
+
+from dpm2_core.frame import Array, Frame, State
+from dpm2_core.pipeline import OfflineRun
+from dpm2_core.slam.build import make_slam
+from dpm2_core.slam.loops.localizer import LocalizationResult
+from dpm2_core.slam.session import open_for_localization, open_session
+from dpm2_core.slam.settings import Config, SlamSettings
+
+from ...helpers.scenes import make_image
+
+GEOMETRIC = SlamSettings.model_validate({"threads": 1, "loops": {"descriptors": False}})
+
+
+class Frames:
+    """A recording that is in memory already."""
+
+    name, notes, truth, poses, T_cam_lidar = "frames", (), "", None, None
+
+    def __init__(self, frames: list[Frame]) -> None:
+        self._frames = frames
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
+        yield from self._frames[start:stop]
+
+
+def test_the_steps_in_turn_are_the_whole(suburb_drive: tuple[list[Frame], Array]) -> None:
+    """As the ROS node runs them in two threads: pose for pose and keyframe for keyframe the same."""
+    frames = suburb_drive[0][:15]
+    whole, steps = make_slam(GEOMETRIC), make_slam(GEOMETRIC)
+    results = [whole.process(frame) for frame in frames]
+    for frame, result in zip(frames, results, strict=True):
+        odometry = steps.odometry_step(frame)
+        if odometry.keyframe is not None:
+            steps.map_step(odometry.keyframe)
+        np.testing.assert_array_equal(odometry.T_odom_lidar, result.odometry.T_odom_lidar)
+        assert (odometry.keyframe is None) == (result.map is None)
+        assert result.state is odometry.state
+    np.testing.assert_array_equal(whole.mapper.poses, steps.mapper.poses)
+    assert len(whole.mapper.keyframes) > 1
+
+
+def test_without_corrections_the_map_is_the_odometry(suburb_drive: tuple[list[Frame], Array]) -> None:
+    slam = make_slam(GEOMETRIC)
+    for frame in suburb_drive[0][:5]:
+        result = slam.process(frame)
+        assert result.T_map_lidar is not None
+        np.testing.assert_allclose(result.T_map_lidar, result.odometry.T_odom_lidar, atol=1e-9)  # rounding
+
+
+def test_a_frame_passes_at_most_eight_modules(suburb_drive: tuple[list[Frame], Array]) -> None:
+    """Between the recording and the recorded pose; functions of `geometry` and nouns are no stops."""
+    names: dict[str, None] = {}
+
+    def note(frame: FrameType, event: str, _: object) -> None:
+        name = frame.f_globals.get("__name__", "")
+        if event == "call" and name.startswith("dpm2_core.slam."):
+            names[name] = None
+
+    def between(number: int) -> None:
+        sys.setprofile(note if number == 8 else None)  # of the ninth frame: the drive is under way
+
+    numbers = iter(range(len(suburb_drive[0])))
+    config = Config(slam=GEOMETRIC)
+    try:
+        with OfflineRun(Frames(suburb_drive[0][:12]), config) as drive:
+            drive.run(lambda result: between(next(numbers)))
+    finally:
+        sys.setprofile(None)
+    names = names.keys() - {"dpm2_core.slam.output", "dpm2_core.slam.registration.protocol"}  # the result; a noun
+    assert "dpm2_core.slam.registration.icp" in names
+    assert len(names) <= 8, "\n".join(names)
+
+
+@pytest.mark.weights
+@pytest.mark.slow
+def test_in_a_map_that_stays_the_place_is_known_when_it_is_found(
+    suburb_drive: tuple[list[Frame], Array], tmp_path: Path
+) -> None:
+    """Somewhere else first: `T_map_lidar` is None and keyframes are asked for; then the mapped street."""
+    frames, truth = suburb_drive
+    settings = SlamSettings(threads=1)
+    path = tmp_path / "street.dpm2map"
+    with open_session(path, settings, "", resume=False) as store:
+        slam = make_slam(settings, store=store)
+        for frame in frames[:25]:
+            slam.process(frame)
+        slam.finish()
+    rng = np.random.default_rng(0)
+    nowhere = rng.uniform(-20, 20, (5000, 4)).astype(np.float32)
+    with open_for_localization(path, settings) as store:
+        slam = make_slam(settings, store=store)
+        results = [slam.process(Frame(n * 10**8, nowhere, index=n)) for n in range(21)]
+        assert all(result.T_map_lidar is None for result in results)
+        assert all(result.state in (State.INITIALIZING, State.RELOCALIZING) for result in results)
+        tried = [n for n, result in enumerate(results) if result.map is not None]
+        assert tried == [0, 10, 20]  # once per second, at a standstill
+        slam.odometry.reset()
+        found = slam.process(Frame(21 * 10**8 + 9 * 10**8, frames[10].points))
+        assert isinstance(found.map and found.map.located, LocalizationResult)
+        assert found.T_map_lidar is not None
+        assert np.linalg.norm(found.T_map_lidar[:3, 3] - truth[10, :3, 3]) < 0.1
+        assert slam.mapper.loops == []
+
+
+def test_a_keyframe_carries_its_thumbnail_into_the_map_file(
+    suburb_drive: tuple[list[Frame], Array], noise: np.random.Generator, tmp_path: Path
+) -> None:
+    settings = GEOMETRIC.model_copy(update={"map": GEOMETRIC.map.model_copy(update={"thumbnail": 32})})
+    image = make_image(noise)
+    with open_session(tmp_path / "a.dpm2map", settings, "", resume=False) as store:
+        slam = make_slam(settings, store=store)
+        assert slam.uses_images
+        slam.process(Frame(0, suburb_drive[0][0].points, images=(image,)))
+        slam.finish()
+        jpeg = store.payload(0, "thumbnail")
+    assert jpeg is not None
+    assert jpeg.startswith(b"\xff\xd8")
+    assert slam.mapper.keyframes[0].thumbnail is None  # in the file, not in memory

@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Drives through the synthetic city, in memory and as the start of a recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from dpm2_core.frame import Array, Frame
+from dpm2_core.geometry import se3
+from dpm2_core.sim.lidar import Lidar
+from dpm2_core.sim.settings import LidarConfig, PresetName
+from dpm2_core.sim.world import build_world
+
+Drive = tuple[list[Frame], Array]
+"""Frames and their (N, 4, 4) true poses relative to the first."""
+
+
+def make_drive(preset: PresetName, frames: int, *, deskewed: bool = True, start: float = 2.0) -> Drive:
+    """A drive at 10 Hz, from `start` s of the way on."""
+    world = build_world("straight", preset, seed=11, length=200.0)
+    lidar = Lidar(LidarConfig(columns=1024))
+    rng = np.random.default_rng(0)
+    poses = np.array([world.drive_pose(start + 0.1 * i) for i in range(frames)])
+    out = []
+    for i, T in enumerate(poses):
+        twist = None
+        if not deskewed:
+            after = world.drive_pose(start + 0.1 * i + 0.01)
+            twist = se3.log(se3.inverse(T) @ after) / 0.01
+        scan = lidar.scan(world, T, start + 0.1 * i, rng, twist=twist)
+        out.append(Frame(i * 10**8, scan.points, None if deskewed else scan.time_offset, index=i))
+    return out, se3.inverse(poses[0]) @ poses
+
+
+def first_scans(recording: Path, count: int, out: Path) -> Path:
+    """The first scans of a simulated recording without images as one of its own, in `out`; scans are links."""
+    for file in sorted(path for path in recording.rglob("*") if path.is_file()):
+        to = out / file.relative_to(recording)
+        to.parent.mkdir(parents=True, exist_ok=True)
+        if file.name in ("times.txt", "poses.txt") or file.parent.name == "poses":
+            to.write_text("".join(file.read_text().splitlines(keepends=True)[:count]))
+        elif not file.stem.isdigit() or int(file.stem) < count:
+            to.symlink_to(file)
+    return out
