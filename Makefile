@@ -8,6 +8,7 @@ PYTHON ?= $(firstword $(shell for p in python3.11 python3.12 python3; do \
 BIN := .venv/bin
 READY := .venv/.ready
 EXTRAS ?= plot,sim,test
+JOBS ?= -n 2 --dist worksteal
 
 # The environment is self-contained: a sourced ROS 2, another environment's bootstrap or its libraries must not leak in.
 unexport PYTHONPATH PYTHONHOME VIRTUAL_ENV AMENT_PREFIX_PATH ROS_DISTRO LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
@@ -32,10 +33,10 @@ ros:  # of all targets the demo alone is nothing without it
 	@$(BIN)/python -c 'import rclpy' 2>/dev/null || { echo "rclpy has no wheel for $$(uname -m): docs/ros2.md says how to run the demo with an installed ROS 2" >&2; exit 2; }
 
 test: setup  ## all tests, and which of them took longest
-	$(BIN)/python -m pytest --durations=15 $(ARGS)
+	$(BIN)/python -m pytest $(JOBS) --durations=15 $(ARGS)
 
 test-fast: setup  ## all but the tests marked slow or ros
-	$(BIN)/python -m pytest -m "not slow and not ros" $(ARGS)
+	$(BIN)/python -m pytest $(JOBS) -m "not slow and not ros" $(ARGS)
 
 fuzz: setup  ## a minute of random messages, a thousand per second, on all that the nodes listen to, beside a drive
 	DPM2_FUZZ_SECONDS=60 DPM2_FUZZ_RATE=1000 $(BIN)/python -m pytest -s test/dpm2_ros/test_fuzz.py $(ARGS)

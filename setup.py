@@ -43,7 +43,13 @@ EXTRAS = {
         "embreex>=2.17.7,<5; platform_machine == 'x86_64'",  # ray casting; on aarch64 there is none for Linux
         "contourpy>=1.2,<2",  # lines along the kerbs
     ],
-    "test": ["import-linter>=2.1,<3", "pytest>=8,<10", "pytest-timeout>=2.3,<3", "hypothesis>=6.100,<7"],
+    "test": [
+        "import-linter>=2.1,<3",
+        "pytest>=8,<10",
+        "pytest-timeout>=2.3,<3",
+        "pytest-xdist>=3.6,<4",
+        "hypothesis>=6.100,<7",
+    ],
     "lint": ["ruff>=0.9,<0.18", "mypy>=1.13,<3", "types-PyYAML", "import-linter>=2.1,<3", "grimp>=3.2,<4"],
     "las": ["laspy>=2.5,<3"],  # dpm2 map export MAP OUT.las
     "timm": ["timm>=1,<2"],  # image backbones timm:NAME

@@ -32,10 +32,12 @@ hypothesis.settings.load_profile("dpm2")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Marker `ros` for all that lies in test/dpm2_ros, before -m selects."""
+    """Markers, before -m selects: `ros` for all in test/dpm2_ros, `slow` for what unpacks the real excerpt."""
     for item in items:
         if ROS in item.path.parents:
             item.add_marker("ros")
+        if "kitti_root" in getattr(item, "fixturenames", ()):
+            item.add_marker("slow")
 
 
 @pytest.fixture(scope="session")

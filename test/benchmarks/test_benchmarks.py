@@ -73,6 +73,7 @@ def test_the_geometric_benchmark_records_errors_speed_and_origin(sequence: Path,
     assert set(ours["stages_ms"]) == {"preprocess", "register", "update", "map"}
 
 
+@pytest.mark.slow
 def test_kiss_icp_runs_beside_it_on_the_same_scans(sequence: Path, tmp_path: Path) -> None:
     pytest.importorskip("kiss_icp")
     bench(None, source=[sequence], out=tmp_path, repetitions=1, threads=2)
@@ -111,6 +112,7 @@ def test_memory_that_grows_and_memory_that_levels_off_are_told_apart() -> None:
     assert levelling([(0, 100.0)])["growth_mb_per_1000_frames_second_half"] is None
 
 
+@pytest.mark.slow
 def test_the_resident_set_follows_what_is_allocated() -> None:
     """In a process of its own: what other tests have left is freed at any time, by a collection or by a thread."""
     program = (

@@ -35,6 +35,7 @@ def test_summary_by_hand() -> None:
     assert one == {"mse": {"without": {"mean": 1.0, "std": None}}}
 
 
+@pytest.mark.slow
 def test_comparison_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A training that ended is not repeated, one of other settings is; the file keeps the other tasks' parts."""
     drives = TaskDriveSettings.model_validate(
@@ -72,6 +73,7 @@ def test_comparison_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         tasks.bench_tasks(Options(only="nonsense"))
 
 
+@pytest.mark.slow
 def test_arms_share_their_first_epochs_and_slam_is_checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What comes before the SLAM loss is trained once; odometry on the clouds of both arms is in the figures."""
     drives = TaskDriveSettings.model_validate(

@@ -150,6 +150,7 @@ def rejected(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     return info
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("attack", MAPS)
 def test_a_hostile_map(tmp_path: Path, map_file: Path, attack: str, capsys: pytest.CaptureFixture[str]) -> None:
     """Writing its cloud needs everything but descriptors, pruning those too; both leave nothing behind."""

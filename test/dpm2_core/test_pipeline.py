@@ -44,6 +44,7 @@ def result(recording: Path) -> Result:
     return OfflineRun(recording, CONFIG).run()
 
 
+@pytest.mark.slow
 def test_it_is_the_slam_frame_by_frame(recording: Path, result: Result) -> None:
     """Reading ahead and recording change no bit of a pose."""
     slam = make_slam(CONFIG.slam)
@@ -59,6 +60,7 @@ def test_it_is_the_slam_frame_by_frame(recording: Path, result: Result) -> None:
     assert result.metrics.ape_rmse_m < 0.03
 
 
+@pytest.mark.slow
 def test_a_saved_result_is_every_file_and_reads_back(result: Result, tmp_path: Path) -> None:
     assert result.save(tmp_path / "new" / "out") == []
     out = tmp_path / "new" / "out"

@@ -49,6 +49,7 @@ def test_odometry_of_a_folder_in_ten_lines(recording: Path, truth: np.ndarray, t
     assert len([line for line in lines if line and not line.startswith(("#", '"""'))]) <= 10
 
 
+@pytest.mark.slow
 def test_register_two_scans_and_draw_them(recording: Path, truth: np.ndarray, tmp_path: Path) -> None:
     """Some 5 m apart; the network alone is right to a few decimeters."""
     done = example("register_two_scans", recording, 0, 5, tmp_path / "matches.png")
@@ -58,6 +59,7 @@ def test_register_two_scans_and_draw_them(recording: Path, truth: np.ndarray, tm
     assert (tmp_path / "matches.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_map_then_localize(recording: Path, truth: np.ndarray, tmp_path: Path) -> None:
     done = example("map_then_localize", recording, recording, tmp_path / "street.dpm2map")
     assert done.returncode == 0, done.stderr

@@ -136,6 +136,7 @@ def aligned(data: MapData) -> dict[int, Array]:
 RUN = ("--set", "slam.loops.descriptors=false")
 
 
+@pytest.mark.slow
 def test_run_writes_a_map_and_goes_on_with_it(tmp_path: Path, recording: Path) -> None:
     whole, parts = tmp_path / "whole.dpm2map", tmp_path / "parts.dpm2map"
     assert dpm2("run", recording, "--out", tmp_path / "a", "--map", whole, *RUN).returncode == 0
@@ -189,6 +190,7 @@ def _rejected(path: Path) -> int:
         return 0
 
 
+@pytest.mark.slow
 def test_a_map_of_another_drive_is_not_gone_on_with(tmp_path: Path, recording: Path, map_file: Path) -> None:
     done = dpm2("run", recording, "--out", tmp_path / "a", "--map", map_file, "--resume", *RUN)
     assert done.returncode == 2

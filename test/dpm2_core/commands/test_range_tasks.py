@@ -31,6 +31,7 @@ def pairs(tmp_path: Path) -> Path:
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "stages", "figures"),
     [

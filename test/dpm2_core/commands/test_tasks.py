@@ -37,6 +37,7 @@ def train(recording: Path, out: Path, *more: object) -> Done:
     return dpm2("train", "gndnet", recording, "--out", out, *settings, *more)
 
 
+@pytest.mark.slow
 def test_train_resume_and_measure(recording: Path, tmp_path: Path) -> None:
     """With the SLAM loss in the third epoch; a second training does not overwrite; figures, table and image."""
     out = tmp_path / "out"
@@ -86,6 +87,7 @@ def test_errors_of_use(recording: Path, tmp_path: Path) -> None:
     assert "000001.label: No such file" in error("train", "gndnet", recording, "--out", out)
 
 
+@pytest.mark.slow
 def test_data_of_the_tasks(tmp_path: Path) -> None:
     """`dpm2 train tasks-data` fills train/ and val/, and takes the settings of the sensor."""
     settings = ["train=1", "val=1", "train_frames=2", "val_frames=2", "lidar.columns=48", "lidar.beams=16"]

@@ -66,6 +66,7 @@ def test_batch_and_padding_change_nothing(noisy: list[Tensor]) -> None:
     torch.testing.assert_close(both, torch.cat(alone), atol=1e-9, rtol=0)
 
 
+@pytest.mark.slow
 def test_gradcheck_in_double(noisy: list[Tensor]) -> None:
     """Of the pose by points and weights of both clouds, 12 points, through 2 iterations.
 

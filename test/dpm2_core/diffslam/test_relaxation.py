@@ -68,6 +68,7 @@ def test_weights_decide_between_loops(ring: Tensor) -> None:
     assert float((relax(ring, EDGES, wrong) - ring)[:, :3, 3].abs().max()) > 0.3
 
 
+@pytest.mark.slow
 def test_gradients_agree_with_finite_differences_and_each_other(ring: Tensor) -> None:
     """Of every third pose by measurements (as tangents) and weights; inconsistent ones: residuals are not zero."""
     measured = moved(relative(ring), 0.05)

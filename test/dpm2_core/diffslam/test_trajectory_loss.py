@@ -44,6 +44,7 @@ def test_equal_clouds_have_no_loss_and_no_gradient(noisy: list[Tensor], gradient
         assert max(float(cloud.grad.abs().max()) for cloud in pred) < 1e-12  # type: ignore[union-attr]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gradient", ["unrolled", "implicit"])
 def test_slope_by_one_point_is_the_finite_difference(noisy: list[Tensor], scans: list[Tensor], gradient: str) -> None:
     """Within 1 %: for the points with the largest slope, of the last scan, which is a source, and of one that is a

@@ -35,6 +35,7 @@ def _orange(make_image: np.ndarray) -> np.ndarray:
     return np.argwhere(np.abs(make_image - ORANGE).max(-1) < 12)
 
 
+@pytest.mark.slow
 def test_the_trajectory_is_drawn_to_scale_and_the_map_beneath_it(tmp_path: Path) -> None:
     """A quarter circle is as wide as it is high; the map lights up what is dark without it."""
     trajectory_png(tmp_path / "with.png", _arc(), cloud=_cloud(), title="")
@@ -49,6 +50,7 @@ def test_the_trajectory_is_drawn_to_scale_and_the_map_beneath_it(tmp_path: Path)
     assert (make_image.max(-1) > 60).mean() > 5 * (bare.max(-1) > 60).mean()
 
 
+@pytest.mark.slow
 def test_the_ground_truth_is_brought_into_the_map_frame(tmp_path: Path) -> None:
     """Ground truth of another world frame, with unknown frames, gives the image of one in the map frame."""
     gt = _arc()

@@ -5,6 +5,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from dpm2_core.experiments.ablation import TABLE_4, AblationSettings, ablation
 from dpm2_core.learning.dataset import DataSettings
 from dpm2_core.learning.registration_loss import LossSettings
@@ -14,6 +16,7 @@ from dpm2_core.learning.trainer import OptimizerSettings
 from ...helpers.networks import tiny
 
 
+@pytest.mark.slow
 def test_every_alternative_is_trained_and_measured_once(packed: Path, tmp_path: Path) -> None:
     """All of Table 4; a second call trains nothing and finds the same figures."""
     training = RegistrationTrainingSettings(

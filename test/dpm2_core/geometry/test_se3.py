@@ -49,6 +49,7 @@ def test_inverse_and_product(a: np.ndarray, b: np.ndarray) -> None:
     np.testing.assert_allclose(se3.inverse(A @ B), se3.inverse(B) @ se3.inverse(A), atol=1e-11)
 
 
+@pytest.mark.slow
 @given(tangents(), tangents(turn=0.1, reach=1.0))
 def test_adjoint_moves_a_perturbation_from_right_to_left(t: np.ndarray, xi: np.ndarray) -> None:
     T = se3.exp(t)

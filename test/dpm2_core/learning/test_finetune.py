@@ -131,6 +131,7 @@ def _truth(recording: Path) -> Array:
     return poses
 
 
+@pytest.mark.slow
 def test_the_reference_is_the_trajectory_of_the_slam_and_frames_without_one_have_none(recording: Path) -> None:
     """No ground truth goes in: from scan to scan it is within 2 cm of it."""
     referenced = refer(open_source(recording), SlamSettings(threads=1))
@@ -139,6 +140,7 @@ def test_the_reference_is_the_trajectory_of_the_slam_and_frames_without_one_have
     assert np.linalg.norm(steps[0][:, :3, 3] - steps[1][:, :3, 3], axis=1).max() < 0.02
 
 
+@pytest.mark.slow
 def test_a_stopped_training_goes_on_to_the_same_weights(
     recording: Path, tmp_path: Path, settings: FinetuneSettings
 ) -> None:
@@ -158,6 +160,7 @@ def test_a_stopped_training_goes_on_to_the_same_weights(
     assert (metadata["phase"], metadata["finetuned_from"]) == ("2", "start")
 
 
+@pytest.mark.slow
 def test_a_drive_that_cannot_be_followed_is_an_error_of_use(
     recording: Path, tmp_path: Path, settings: FinetuneSettings
 ) -> None:
@@ -168,6 +171,7 @@ def test_a_drive_that_cannot_be_followed_is_an_error_of_use(
         prepare([source], settings, network, blind, tmp_path / "data")
 
 
+@pytest.mark.slow
 def test_errors_of_use_are_one_line(recording: Path, tmp_path: Path, settings: FinetuneSettings) -> None:
     for arguments, message in (
         ([str(tmp_path / "none")], "none"),

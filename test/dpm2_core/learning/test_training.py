@@ -57,6 +57,7 @@ def losses(out: Path) -> dict[int, float]:
     return {row["step"]: row["loss"] for row in rows if "loss" in row}
 
 
+@pytest.mark.slow
 def test_resumed_equals_uninterrupted(settings: RegistrationTrainingSettings, tmp_path: Path) -> None:
     """A run stopped after 2 of 4 steps and resumed logs the same losses and ends with the same weights, bit for bit."""
     whole, halves = tmp_path / "whole", tmp_path / "halves"
@@ -92,6 +93,7 @@ def test_images_have_a_loss_of_their_own(settings: RegistrationTrainingSettings)
     assert "image" not in module(batch.points, None, plans)[1]
 
 
+@pytest.mark.slow
 def test_a_checkpoint_of_another_network_is_rejected(settings: RegistrationTrainingSettings, tmp_path: Path) -> None:
     """And so is a file of another kind."""
     train_registration(settings, tmp_path / "out")

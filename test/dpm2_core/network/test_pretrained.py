@@ -50,6 +50,7 @@ def network_file(model: DeepPointMap2, tmp_path: Path) -> Path:
     return tmp_path / "tiny.safetensors"
 
 
+@pytest.mark.slow
 def test_a_run_with_every_part_that_has_a_network_opens_each_file_once(
     network_file: Path, tmp_path: Path, opened: Counter[str],
     noise: np.random.Generator,
@@ -112,6 +113,7 @@ def test_weights_of_another_network_are_rejected_though_the_file_is_loaded(netwo
         load_once(network_file.parent / "none.safetensors", 1, dynamic_objects.load)
 
 
+@pytest.mark.slow
 def test_loading_does_not_import_the_compiler_of_torch() -> None:
     """torch._dynamo and sympy take 2 s at the start of every node and command that has a network."""
     program = (

@@ -22,6 +22,7 @@ def _picture(world: World, T_world_lidar: np.ndarray, config: CameraConfig = SMA
     return render(world, config, T_world_cam, 1.0, np.random.default_rng(seed))
 
 
+@pytest.mark.slow
 def test_a_image_is_exposed_varied_and_repeatable(city: World) -> None:
     noisy = SMALL.model_copy(update={"noise": 2.0})
     one, same, other = (_picture(city, city.pose_at(40.0), noisy, seed) for seed in (1, 1, 2))

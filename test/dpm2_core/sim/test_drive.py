@@ -130,6 +130,7 @@ def test_a_killed_run_leaves_nothing_that_looks_whole_and_the_next_one_cleans_up
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
 
 
+@pytest.mark.slow
 def test_a_file_gives_its_own_frames_and_rejects_more(poses_file: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="has 235"):
         simulate(tmp_path / "out", DriveConfig(frames=236, road=str(poses_file), images=False, lidar=LIDAR))

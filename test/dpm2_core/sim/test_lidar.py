@@ -131,6 +131,7 @@ def test_one_place_seen_from_two_poses_agrees_within_the_noise(city: World) -> N
     assert miss(T_world_b) > 0.06  # so the check does notice an error of the pose
 
 
+@pytest.mark.slow
 def test_a_turn_in_motion_is_undone_by_the_twist(tunnel: World) -> None:
     world = build_world("straight", "city", seed=1, length=60)
     lidar, T = Lidar(LidarConfig(noise=0.0, dropout=0.0)), world.pose_at(130.0)

@@ -33,6 +33,7 @@ def _share_moving(world: World) -> float:
     return float(np.mean(ratios))
 
 
+@pytest.mark.slow
 def test_dense_traffic_takes_a_third_of_the_points(dense: World) -> None:
     assert 0.2 < _share_moving(dense) < 0.55
     usual = build_world("straight", "city", seed=2, length=200)
@@ -41,6 +42,7 @@ def test_dense_traffic_takes_a_third_of_the_points(dense: World) -> None:
     assert none.dynamic_objects(3.0, none.drive_pose(3.0)[:3, 3]) is None
 
 
+@pytest.mark.slow
 def test_columns_keep_clear_of_each_other_of_the_car_and_of_what_stands(dense: World) -> None:
     """Vehicles as lines of points along their middles: apart, 3 m from the sensor, half a truck from what stands."""
     traffic = dense.traffic
@@ -66,6 +68,7 @@ def test_columns_keep_clear_of_each_other_of_the_car_and_of_what_stands(dense: W
         assert cKDTree(parked[:, :2]).query(lines)[0].min() > 1.3  # half a truck
 
 
+@pytest.mark.slow
 def test_the_note_of_a_drive_names_its_traffic_and_another_one_is_rejected(tmp_path: Path) -> None:
     out = tmp_path / "drive"
     assert simulate(out, DriveConfig(frames=2, seed=3, road="straight", images=False, lidar=LIDAR, traffic=5))

@@ -17,6 +17,7 @@ from dpm2_core.sim.world import World, build_world
 GROUND = [Label.ROAD, Label.PARKING, Label.SIDEWALK, Label.OTHER_GROUND, Label.TERRAIN]
 
 
+@pytest.mark.slow
 def test_equal_arguments_give_equal_worlds_and_other_seeds_others() -> None:
     one, same, other = (build_world("random", "suburb", seed, 120) for seed in (5, 5, 6))
     for name in ("vertices", "faces", "label", "material", "color", "uv", "texture"):
@@ -34,6 +35,7 @@ def _low_vertices(world: World, labels: list[Label] | None = None) -> np.ndarray
     return vertices[vertices[:, 2] < world.terrain.height_at(vertices[:, :2]) + 2.2, :2]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("road", "preset"),
     [("loop", "city"), ("figure8", "suburb"), ("random", "rural"), ("straight", "tunnel"),
@@ -46,6 +48,7 @@ def test_nothing_stands_in_the_way(road: str, preset: str, poses_file: Path) -> 
     assert world.terrain.edge_at(drive).max() < 0.3  # it keeps to the roads
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("road", ["figure8", "file"])
 def test_no_building_reaches_onto_any_street(road: str, poses_file: Path) -> None:
     world = build_world(str(poses_file) if road == "file" else road, "city", seed=4, length=200)
@@ -87,6 +90,7 @@ def _information(world: World) -> tuple[float, float]:
     return float((normals[:, 0] ** 2).mean()), float((normals[:, 1] ** 2).mean())
 
 
+@pytest.mark.slow
 def test_highway_and_tunnel_are_degenerate_along_the_road_and_a_city_is_not(tunnel: World, highway: World) -> None:
     for world in (tunnel, highway):
         along, across = _information(world)

@@ -60,6 +60,7 @@ def along(world: World, turn: float = 0.0) -> Pose:
     return lambda s: world.drive_pose(2.0) @ se3.exp(s * np.array([0, 0, np.radians(turn), 6.0, 0, 0]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turn", [0.0, 15.0, -15.0])
 @pytest.mark.parametrize("gap", [1.0, 2.0])
 def test_a_gap_across_which_the_views_overlap_is_bridged(world: World, gap: float, turn: float) -> None:
@@ -73,6 +74,7 @@ def test_a_gap_across_which_the_views_overlap_is_bridged(world: World, gap: floa
     assert tracked[-1].breaks == 0
 
 
+@pytest.mark.slow
 def test_a_gap_at_a_halt_does_no_harm(world: World) -> None:
     frames, poses = scanned(world, lambda s: world.drive_pose(2.0), with_gap(6, 10.0, 5))
     tracked = run(frames)
@@ -81,6 +83,7 @@ def test_a_gap_at_a_halt_does_no_harm(world: World) -> None:
     assert tracked[-1].breaks == 0
 
 
+@pytest.mark.slow
 def test_what_cannot_be_confirmed_is_lost_then_a_break_whose_uncertainty_covers_the_error(world: World) -> None:
     """Ten seconds: braked to a halt meanwhile, in a part of the street that is not in the map."""
 
@@ -111,6 +114,7 @@ def test_what_cannot_be_confirmed_is_lost_then_a_break_whose_uncertainty_covers_
     assert np.linalg.norm((se3.inverse(T_true) @ T)[:3, 3]) < 0.05
 
 
+@pytest.mark.slow
 def test_one_or_two_missing_frames_are_no_gap(world: World) -> None:
     for period, missing in ((0.1, 2), (0.2, 2)):
         seconds = [period * i for i in range(11) if not 6 <= i < 6 + missing]
@@ -121,6 +125,7 @@ def test_one_or_two_missing_frames_are_no_gap(world: World) -> None:
         assert off(tracked, poses).max() < 0.06
 
 
+@pytest.mark.slow
 def test_a_stream_of_a_frame_a_second_is_no_gap(world: World) -> None:
     frames, _ = scanned(world, lambda s: world.drive_pose(2.0 + 0.1 * s), [float(i) for i in range(6)])
     assert [t.state for t in run(frames)[1:]] == [State.TRACKING] * 5
@@ -139,6 +144,7 @@ def test_real_gaps(kitti_root: object) -> None:
     assert off(tracked[14:], source.poses[kept[14:]]).max() < 0.5
 
 
+@pytest.mark.slow
 def test_bench_places_gaps_and_counts_what_is_wrong(world: World) -> None:
     assert [(g.first, g.stop) for g in gaps([10**8 * i for i in range(31)])] == [(10, 20), (11, 21)]
     frames, poses = scanned(world, along(world), [0.1 * i for i in range(31)])

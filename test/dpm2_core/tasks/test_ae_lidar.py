@@ -86,6 +86,7 @@ def test_divergence_counts_for_more_with_every_epoch(pairs: Path) -> None:
     assert values[1] - values[0] == pytest.approx(0.75 * 5.0, rel=0.05)  # an untrained one is below the least
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variational", [False, True])
 def test_learns_and_can_be_loaded(pairs: Path, tmp_path: Path, variational: bool) -> None:
     """The loss falls to less than half with the SLAM loss on; figures, clouds and an image of what was written."""

@@ -105,6 +105,7 @@ def test_no_scans(tmp_path: Path) -> None:
         open_scans(tmp_path)
 
 
+@pytest.mark.slow
 def test_synthetic_drives(tmp_path: Path) -> None:
     """Train and validation apart, of exact labels and twins; a second call changes nothing."""
     settings = TaskDriveSettings.model_validate(

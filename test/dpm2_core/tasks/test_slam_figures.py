@@ -38,6 +38,7 @@ def task() -> AeLidarTask:
     return AeLidarTask(AeLidarTraining(network=AeLidarSettings(image=image, channels=4, latent=8))).eval()
 
 
+@pytest.mark.slow
 def test_a_perfect_network_is_as_good_as_its_input(
     drives: Path, task: AeLidarTask, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -57,6 +58,7 @@ def test_a_perfect_network_is_as_good_as_its_input(
     assert found["input_ate_m"] == pytest.approx(sum(alone) / 2)  # each drive is evaluated by its own scans
 
 
+@pytest.mark.slow
 def test_what_cannot_be_checked_is_rejected(drives: Path, task: AeLidarTask, tmp_path: Path) -> None:
     """No poses, a task that makes no clouds."""
     copied = tmp_path / "00"

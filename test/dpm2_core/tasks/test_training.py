@@ -54,6 +54,7 @@ def rows(out: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
 
 
+@pytest.mark.slow
 def test_it_learns_and_logs(scans: TaskScans, tmp_path: Path) -> None:
     """The loss of the task falls by half in 40 steps; both losses are logged, that of the SLAM where it counts."""
     out = tmp_path / "out"
@@ -70,6 +71,7 @@ def test_it_learns_and_logs(scans: TaskScans, tmp_path: Path) -> None:
     assert [row["step"] for row in log if "miou" in row] == [9, 19, 29, 39]  # every fifth epoch
 
 
+@pytest.mark.slow
 def test_scans_are_contiguous_only_where_the_slam_loss_counts(
     scans: TaskScans, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -118,6 +120,7 @@ def test_gamma_zero_is_the_task_alone(scans: TaskScans, tmp_path: Path, monkeypa
     assert not any("slam_loss" in row for row in rows(tmp_path / "out"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("where", ["task", "slam", "gradient"])
 def test_what_is_not_finite_never_reaches_a_checkpoint(
     scans: TaskScans, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str
@@ -163,6 +166,7 @@ def test_measuring_changes_nothing(scans: TaskScans) -> None:
     assert mean_figures([{"a": 1.0, "b": math.nan}, {"a": 2.0, "b": 3.0}]) == {"a": 1.5, "b": 3.0}
 
 
+@pytest.mark.slow
 def test_weights_come_back(scans: TaskScans, tmp_path: Path) -> None:
     """With the settings of the network, for the task and for the SLAM; in fp16 to its precision."""
     task = train_task(new_task("gndnet", settings()), scans, tmp_path / "out")

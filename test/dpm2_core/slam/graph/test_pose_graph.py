@@ -116,6 +116,7 @@ def solvers(parent: int) -> list[int]:
     return found
 
 
+@pytest.mark.slow
 def test_a_killed_process_is_replaced(background: PoseGraph) -> None:
     background.optimize()
     background.collect(wait=True)
@@ -131,6 +132,7 @@ def test_a_killed_process_is_replaced(background: PoseGraph) -> None:
     assert background.loops[1].registration.reason
 
 
+@pytest.mark.slow
 def test_no_process_outlives_a_killed_program() -> None:
     program = (
         "import time, numpy as np\n"

@@ -96,6 +96,7 @@ def test_a_revisit_is_found_whatever_the_drift_and_heading(heading: float) -> No
     assert len(waited) <= 1  # the first, for the second
 
 
+@pytest.mark.slow
 @pytest.mark.weights
 def test_a_place_never_seen_closes_no_loop_and_each_candidate_has_its_reason() -> None:
     world = build_world("straight", "city", seed=5, length=160.0)
@@ -114,6 +115,7 @@ def test_a_place_never_seen_closes_no_loop_and_each_candidate_has_its_reason() -
     assert all(not loop.registration.ok and loop.registration.reason for loop in loops)
 
 
+@pytest.mark.slow
 def test_without_descriptors_the_pose_alone_leads_to_loops() -> None:
     jump = se3.exp(np.array([0, 0, 0, 0.5, 0.5, 0]))
     at = [(s, 0.0, 0.0) for s in STREET] + [(62.0, 1.0, 0.0)]

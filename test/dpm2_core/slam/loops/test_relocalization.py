@@ -69,6 +69,7 @@ def test_found_from_one_cloud_with_other_traffic(
     assert degrees < 0.2
 
 
+@pytest.mark.slow
 def test_another_street_is_not_found_and_a_wrong_hint_finds_nothing(relocalizer: Relocalizer) -> None:
     elsewhere = world("city", 5)
     for s in (60.0, 80.0):
@@ -78,6 +79,7 @@ def test_another_street_is_not_found_and_a_wrong_hint_finds_nothing(relocalizer:
     assert not relocalizer.find(cloud, hint=world().pose_at(70.0) @ se3.make(np.eye(3), np.array([500.0, 0, 0]))).ok
 
 
+@pytest.mark.slow
 def test_an_empty_cloud_is_no_place(relocalizer: Relocalizer) -> None:
     result = relocalizer.find(np.zeros((0, 4), np.float32))
     assert not result.ok
@@ -91,6 +93,7 @@ def keyframe(node: int, s: float, T_world_odom: Array, covariance: Array = FIRM,
     return Keyframe(node, node, node, T_odom_kf, seen(s, time=3.0, of=of), edge)
 
 
+@pytest.mark.slow
 def test_localization_tracks_notices_kidnapping_and_admits_being_lost(relocalizer: Relocalizer) -> None:
     localizer = Localizer(relocalizer)
     origin = se3.exp(np.array([0, 0, 1.0, 30, -20, 0.5]))

@@ -33,6 +33,7 @@ def verifier() -> Verifier:
     return Verifier(VerificationSettings(), GeometricSettings(), 2)
 
 
+@pytest.mark.slow
 def test_a_right_pose_is_accepted_and_improved(suburb_scans: tuple[list[Points], Array]) -> None:
     clouds, poses = suburb_scans
     v = verifier()
@@ -46,6 +47,7 @@ def test_a_right_pose_is_accepted_and_improved(suburb_scans: tuple[list[Points],
     assert 0.3 < e.moved < 0.8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("meters", [-15.0, 12.0, 25.0])
 def test_a_wrong_place_in_the_same_street_is_rejected(suburb_scans: tuple[list[Points], Array], meters: float) -> None:
     """The road fits wherever one is put on it; what stands beside it does not."""

@@ -134,6 +134,7 @@ def test_a_lap_is_closed(lap: tuple[list[Keyframe], Array]) -> None:
     np.testing.assert_allclose(last, mapper.poses[-1], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_look_alikes_are_rejected_with_a_reason(lap: tuple[list[Keyframe], Array]) -> None:
     """The odometry claims to be back at the start, but the points come from elsewhere."""
     keyframes, _ = lap
@@ -147,6 +148,7 @@ def test_look_alikes_are_rejected_with_a_reason(lap: tuple[list[Keyframe], Array
             assert closure.registration.reason
 
 
+@pytest.mark.slow
 def test_map_is_one_point_a_voxel_in_the_map_frame(lap: tuple[list[Keyframe], Array]) -> None:
     mapper = make_mapper(BY_POSE)
     assert mapper.cloud().shape == (0, 4)
@@ -182,6 +184,7 @@ def test_no_keyframe_no_correction() -> None:
     np.testing.assert_array_equal(recorder.poses(np.zeros((0, 4, 4))), np.eye(4)[None])
 
 
+@pytest.mark.slow
 def test_saved_map_holds_all_of_it(tmp_path: Path, lap: tuple[list[Keyframe], Array]) -> None:
     from dpm2_core.data.trajectory import read_trajectory
 

@@ -95,6 +95,7 @@ def labeled_scans() -> list[tuple[Points, np.ndarray, Array]]:
     return out
 
 
+@pytest.mark.slow
 def test_traffic_of_a_synthetic_street_is_left_out(labeled_scans: list[tuple[Points, np.ndarray, Array]]) -> None:
     """Here 55 % of the moving points go (80 % on longer drives), and next to none of the static ones."""
     mapper = make_mapper(GEOMETRIC)

@@ -37,6 +37,7 @@ def suburb_tracked(suburb_drive: Drive) -> list[OdometryResult]:
     return run(suburb_drive[0])
 
 
+@pytest.mark.slow
 def test_follows_a_drive_to_centimeters(suburb_drive: Drive, suburb_tracked: list[OdometryResult]) -> None:
     (frames, truth), tracked = suburb_drive, suburb_tracked
     # 2 cm range noise on thousands of points averages out to millimeters a frame; 5 cm over 25 m leaves room for drift
@@ -46,12 +47,14 @@ def test_follows_a_drive_to_centimeters(suburb_drive: Drive, suburb_tracked: lis
     assert all(t.registration.confidence > 0.5 for t in tracked)
 
 
+@pytest.mark.slow
 def test_velocity_is_measured(suburb_drive: Drive, suburb_tracked: list[OdometryResult]) -> None:
     truth, last = suburb_drive[1], suburb_tracked[-1]
     true = se3.log(se3.inverse(truth[-2]) @ truth[-1]) / 0.1
     np.testing.assert_allclose(last.twist[3:], true[3:], atol=0.15)  # two errors of 5 mm over 0.1 s
 
 
+@pytest.mark.slow
 def test_covariance_covers_the_error_of_a_frame(suburb_drive: Drive, suburb_tracked: list[OdometryResult]) -> None:
     truth, tracked = suburb_drive[1], suburb_tracked
     steps = [se3.inverse(a.T_odom_lidar) @ b.T_odom_lidar for a, b in pairwise(tracked[1:])]
@@ -76,12 +79,14 @@ def test_a_tunnel_is_never_reported_as_tracking(tunnel_drive: Drive) -> None:
     assert abs(worst[0]) > 0.95
 
 
+@pytest.mark.slow
 def test_follows_a_drive_with_skewed_scans() -> None:
     """Also right at the start, where the first scan is taken before any velocity is known."""
     frames, truth = make_drive("suburb", 12, deskewed=False)
     assert errors(run(frames), truth)[:, 0].max() < 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "bad"),
     [
@@ -133,6 +138,7 @@ def test_an_unreadable_scan_keeps_its_reason(suburb_drive: Drive) -> None:
     assert run([*frames[:6], broken])[-1].registration.reason == "000006.bin: 13 bytes"
 
 
+@pytest.mark.slow
 def test_lost_after_a_long_gap_and_back_again(suburb_drive: Drive) -> None:
     frames, _ = suburb_drive
     gap = [replace(f, points=np.zeros((0, 4), np.float32)) for f in frames[8:14]]
@@ -166,6 +172,7 @@ def test_a_new_map_is_begun_when_nothing_fits_for_long(suburb_drive: Drive) -> N
     assert np.sqrt(edges[0].covariance[3, 3]) > 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stamps", [[0] * 8, [0, 1, 2, 3, 2, 1, 0, 1], [0, 1, 2, 600, 601, 602, 603, 604]])
 def test_stamps_that_repeat_jump_back_or_pause(suburb_drive: Drive, stamps: list[int]) -> None:
     frames = [replace(f, stamp=s * 10**8) for f, s in zip(suburb_drive[0], stamps, strict=False)]
@@ -180,6 +187,7 @@ def test_fast_start(suburb_drive: Drive) -> None:
     assert errors(run(frames), suburb_drive[1][::3])[:, 0].max() < 0.06
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("x", "yaw"), [(1.1, 7.0), (1.6, -9.0)])
 def test_a_drive_may_begin_in_a_curve(x: float, yaw: float) -> None:
     """Round a corner at 5 Hz (35 and 45 deg/s), from the first scan on."""
@@ -192,6 +200,7 @@ def test_a_drive_may_begin_in_a_curve(x: float, yaw: float) -> None:
     assert tracked[1].state == State.TRACKING
 
 
+@pytest.mark.slow
 def test_a_drive_may_begin_in_a_column() -> None:
     """Half of the points are on cars that go about as fast, and they hide ever other parts of what stands."""
     world, lidar = build_world("straight", "rural", 900_001, traffic=40.0), Lidar(LidarConfig(columns=1024))
@@ -205,6 +214,7 @@ def test_a_drive_may_begin_in_a_column() -> None:
     assert errors(tracked, se3.inverse(truth[0]) @ truth)[:, 0].max() < 0.15
 
 
+@pytest.mark.slow
 def test_real_scans_follow_the_ground_truth(kitti_root: object) -> None:
     from dpm2_core.data.open import open_source
     from dpm2_core.evaluation.metrics import evaluate

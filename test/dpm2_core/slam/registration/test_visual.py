@@ -110,6 +110,7 @@ def test_without_images_nothing_changes() -> None:
         assert np.array_equal(one, other)
 
 
+@pytest.mark.slow
 def test_an_odometry_that_brakes_in_a_tunnel() -> None:
     """Twelve scans at 1 m, then ever shorter: by its velocity alone it would overshoot, and it would say `degraded`."""
     paint = random_paint(3)

@@ -57,6 +57,7 @@ def test_a_step_that_no_cloud_has_is_rejected(quantum: float) -> None:
         unpack_cloud(good[:4] + struct.pack("<f", quantum) + good[8:])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [10, 1_000_000, 0xFFFFFFFF])
 def test_a_bomb_is_not_inflated(count: int) -> None:
     """200 kB that would become 200 MB: no more memory is taken than so many points need, whatever is claimed."""
