@@ -35,6 +35,7 @@ def _bench(function: str, options: str) -> Bench:
 
 
 BENCHES: dict[str, Bench] = {
+    "covariance": _bench("covariance:bench_covariance", "source kitti threads set weights pairs only"),
     "diffslam": _bench("diffslam:bench_diffslam", "repetitions threads set"),
     "finetune": _bench("finetune:bench_finetune", "repetitions threads set pairs only"),
     "gaps": _bench("gaps:bench_gaps", "source kitti threads set weights only"),

@@ -95,6 +95,7 @@ class Registration:
         method: how it was found.
         ok: False: do not use it; `reason` says why in words.
         overlap: probability that both saw the same place, 0..1; NaN where it was not estimated.
+        floor: standard deviation of each coordinate, m, that grew with the distance; part of `covariance`.
     """
 
     T_target_source: Array
@@ -105,11 +106,12 @@ class Registration:
     ok: bool = True
     reason: str = ""
     overlap: float = float("nan")
+    floor: float = 0.0
 
     @property
     def worst_sigma(self) -> float:
-        """Standard deviation of the position in its least certain direction, m."""
-        return float(np.sqrt(np.linalg.eigvalsh(self.covariance[3:, 3:])[-1]))
+        """Standard deviation of the position in the direction that the scene leaves most open, m: without `floor`."""
+        return float(np.sqrt(max(np.linalg.eigvalsh(self.covariance[3:, 3:])[-1] - self.floor**2, 0.0)))
 
 
 class State(StrEnum):

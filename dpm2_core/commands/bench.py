@@ -17,8 +17,8 @@ def bench(
     names: Annotated[
         list[str] | None,
         typer.Argument(
-            help="diffslam, finetune, gaps, geometric (default), hard, loop-cost, map, memory, neural, pose-graph, "
-            "relocalise, roads, tasks, traffic."
+            help="covariance, diffslam, finetune, gaps, geometric (default), hard, loop-cost, map, memory, neural, "
+            "pose-graph, relocalise, roads, tasks, traffic."
         ),
     ] = None,
     source: Annotated[
@@ -42,7 +42,8 @@ def bench(
         Path | None, typer.Option(help="neural: packed drives (`dpm2 train data`) instead of new unseen worlds.")
     ] = None,
     pairs: Annotated[
-        int | None, typer.Option(min=1, help="finetune, neural: pairs of each kind; relocalise: visits [60].")
+        int | None,
+        typer.Option(min=1, help="covariance, finetune, neural: pairs of each kind; relocalise: visits [60]."),
     ] = None,
     only: Annotated[
         str | None,

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from dpm2_core.frame import Registration
 from dpm2_core.geometry import se3
+from dpm2_core.geometry.calibration import with_calibration
 from dpm2_core.geometry.kabsch import transform, weighted_kabsch
 from dpm2_core.network.consensus import TOLERANCE, consensus
 from dpm2_core.network.decoder import Correlated, Decoder
@@ -205,7 +206,8 @@ def _registration(
         return _nothing(f"{count} matching descriptors, want 3")
     # Rigid to float64: the solver composes many steps, and an exponential of a large one leaves 1 + 2e-15 behind.
     rigid = se3.orthonormalized(T.double().numpy())
-    return Registration(rigid, covariance.numpy(), confidence, rmse, "neural", overlap=overlap)
+    result = Registration(rigid, covariance.numpy(), confidence, rmse, "neural", overlap=overlap)
+    return with_calibration(result, rigid)
 
 
 def _nothing(reason: str) -> Registration:

@@ -94,6 +94,22 @@ def test_frames_farther_apart_are_measured_as_far_as_a_drive_has_them(sequence: 
     assert rates["every 1"]["geometric"]["failed_frames"] == 0
 
 
+@pytest.mark.weights
+@pytest.mark.slow
+def test_the_covariance_benchmark_has_a_ratio_for_each_method_and_kind_of_pair(sequence: Path, tmp_path: Path) -> None:
+    bench(["covariance"], source=[sequence], out=tmp_path, threads=1, only="real")
+    kinds = json.loads((tmp_path / "covariance.json").read_text())["real"][sequence.name]
+    assert set(kinds) == {"consecutive", "8 apart", "10-20 m"}
+    near = kinds["consecutive"]
+    assert near["geometric"]["registered"] == near["geometric"]["pairs"] == FRAMES - 1
+    assert 0 < near["geometric"]["chi2_ratio"]["pose"] < 4  # noise without any error of calibration
+    assert kinds["8 apart"]["neural"] == {
+        "pairs": 0,
+        **dict.fromkeys(("median_m", "median_deg", "chi2_ratio")),
+        "registered": 0,
+    }
+
+
 def test_the_memory_benchmark_samples_the_resident_set(sequence: Path, tmp_path: Path) -> None:
     bench(["memory"], source=[sequence], out=tmp_path)
     result = json.loads((tmp_path / "memory.json").read_text())["drives"][sequence.name]

@@ -74,7 +74,7 @@ class Verifier:
         """The map of (M, 4) clouds taken at (N, 4, 4) poses, in the frame of those poses, to be verified against."""
         local_map = LocalMap(LocalMapSettings(), self._threads)
         parts = [se3.transform(T, cloud) for T, cloud in zip(poses, clouds, strict=True)]
-        local_map.insert(np.concatenate(parts), np.eye(4))
+        local_map.insert(np.concatenate(parts), np.eye(4), poses)
         return local_map
 
     def verify(self, cloud: Points, around: LocalMap, T_proposed: Array, widen: float = 1.0) -> VerificationResult:

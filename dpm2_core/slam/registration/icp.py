@@ -8,6 +8,7 @@ import numpy as np
 from dpm2_core.config import Settings
 from dpm2_core.frame import Array, Registration
 from dpm2_core.geometry import se3
+from dpm2_core.geometry.calibration import with_calibration
 from dpm2_core.slam.registration.local_map import LocalMap
 
 
@@ -56,7 +57,7 @@ class GeometricRegistration:
             T_guess: (4, 4) prediction.
             widen: factor on the first gate, for a prediction that is known to be poor.
             prior: (6, 6) information [rad, m] of the prediction. Along a tunnel nothing else says how far the car went;
-                anywhere else the points outweigh it. The covariance of the result is that of the points alone.
+                anywhere else the points outweigh it. It is no part of the covariance of the result.
         """
         s = self._settings
         if len(source) < s.min_points or len(target) < s.min_points:
@@ -87,7 +88,8 @@ class GeometricRegistration:
         least = s.min_inliers_expected if expected else s.min_inliers
         ok = inliers >= s.min_points and ratio >= least
         reason = "" if ok else f"{inliers} of {len(points)} points fit the map"
-        return Registration(T, _covariance(H), ratio, rmse, "geometric", ok, reason)
+        result = Registration(T, _covariance(H), ratio, rmse, "geometric", ok, reason)
+        return with_calibration(result, target.from_nearest_scan(T))
 
     def likelihood(self, source: Array, target: LocalMap, T: Array) -> float:
         """Mean log likelihood of the (N, 3) points at a pose T_target_source: the greater, the better a pose fits.

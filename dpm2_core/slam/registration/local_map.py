@@ -44,6 +44,7 @@ class LocalMap:
         self._entered: NDArray[np.int32] = np.zeros(0, np.int32)
         self._inserted = 0
         self._T_last: Array | None = None
+        self._taken = np.zeros((0, 4, 4))
 
     def fresh(self) -> LocalMap:
         """Another one, empty."""
@@ -64,8 +65,19 @@ class LocalMap:
         meters, degrees = se3.magnitude(se3.inverse(self._T_last) @ T_odom_lidar)
         return meters > self._settings.spacing or degrees > 10
 
-    def insert(self, points: NDArray[np.floating], T_odom_lidar: Array) -> None:
-        """Add the (N, 3+) points of a scan where the map has none yet; drop what is far or old."""
+    def from_nearest_scan(self, T_odom_lidar: Array) -> Array:
+        """A pose (4, 4) as seen from the nearest one that a scan of the map was taken at."""
+        away = self._taken[:, :3, 3] - T_odom_lidar[:3, 3]
+        return se3.inverse(self._taken[np.einsum("ij,ij->i", away, away).argmin()]) @ T_odom_lidar
+
+    def insert(self, points: NDArray[np.floating], T_odom_lidar: Array, taken: Array | None = None) -> None:
+        """Add the (N, 3+) points of a scan where the map has none yet; drop what is far or old.
+
+        Args:
+            taken: (K, 4, 4) where the scans were taken that the points are merged from, as seen from T_odom_lidar.
+        """
+        taken = T_odom_lidar @ (np.eye(4)[None] if taken is None else taken)
+        self._taken = np.concatenate([self._taken, taken])[-max(self._settings.scans, len(taken)) :]
         new = points[:, :3].astype(np.float64) @ T_odom_lidar[:3, :3].T + T_odom_lidar[:3, 3]
         joined = np.concatenate([self.points, new])
         entered = np.concatenate([self._entered, np.full(len(new), self._inserted, np.int32)])

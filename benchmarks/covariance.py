@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Is the covariance of a registration that of its errors? Pairs of frames near and far, real and simulated."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from rich.console import Group
+from rich.progress import Progress
+from scipy.stats import chi2
+
+from benchmarks.harness import (
+    Options,
+    Report,
+    drives,
+    processors,
+    requested,
+    rounded,
+    settings_of,
+    truth_of,
+    unique_name,
+)
+from benchmarks.pairs import pairs_of
+from dpm2_core.data.open import open_source
+from dpm2_core.data.source import Source
+from dpm2_core.frame import Array, Frame, Registration
+from dpm2_core.geometry import se3
+from dpm2_core.sim.drive import simulate
+from dpm2_core.sim.settings import DriveConfig, LidarConfig
+from dpm2_core.slam.build import make_registration
+from dpm2_core.slam.preprocess import Scan
+from dpm2_core.slam.registration.protocol import Prediction
+from dpm2_core.tables import FigureTable
+
+METHODS = ("geometric", "neural")
+PARTS = ("real", "simulated")
+_WORLDS = (("city", 64), ("suburb", 64), ("rural", 64), ("city", 32), ("suburb", 16))
+_SEED = 940_000  # training begins at 1,000, validation at 900,000
+_FRAMES = 60
+_SPANS = {"pose": slice(0, 6), "rotation": slice(0, 3), "translation": slice(3, 6)}
+
+Found = dict[tuple[int, int], tuple[Array, Registration]]
+"""By the positions of a pair: its true pose (4, 4), and the registration that was accepted."""
+
+
+def bench_covariance(options: Options) -> Report:
+    """Points and network on every drive; `--only` chooses the real drives or the simulated ones.
+
+    The truth counts as exact: what it is off itself is held against the covariance. How far the two methods are apart,
+    which share no error but those of the sensor, says how much that is.
+
+    Raises:
+        UsageError: there is no drive, or one has no ground truth.
+    """
+    results: dict[str, dict[str, Any]] = {}
+    with processors(options.threads), Progress(transient=True) as progress:
+        for part in requested(options, PARTS):
+            rows = results[part] = {}
+            with drives(options) if part == "real" else _simulated(options) as sources:
+                for source in progress.track(sources, description=part):
+                    rows[unique_name(source, rows)] = _of_drive(source, options)
+    return Report(results, Group(*(_table(part, rows) for part, rows in results.items())))
+
+
+@contextmanager
+def _simulated(options: Options) -> Iterator[list[Source]]:
+    """Drives whose truth is exact, of sensors that have noise but no error of calibration."""
+    sources = []
+    for number, (preset, beams) in enumerate(_WORLDS):
+        out = options.cache / "covariance" / f"{preset}_{beams}"
+        tree = {"frames": _FRAMES, "seed": _SEED + number, "road": "random", "preset": preset, "images": False}
+        simulate(out, DriveConfig(**tree, lidar=LidarConfig(beams=beams)), options.threads)
+        sources.append(open_source(out / "sequences" / "00"))
+        sources[-1].name = out.name
+    yield sources
+
+
+def _of_drive(source: Source, options: Options) -> dict[str, Any]:
+    poses, frames = truth_of(source), list(source.frames())
+    out: dict[str, Any] = {}
+    for kind, pairs in pairs_of(poses, options.pairs).items():
+        found = {method: _registered(method, frames, poses, pairs, options) for method in METHODS}
+        out[kind] = {method: {"pairs": len(pairs), **calibration(list(f.values()))} for method, f in found.items()}
+        both = found["geometric"].keys() & found["neural"].keys()
+        between = [(found["geometric"][pair][1].T_target_source, found["neural"][pair][1]) for pair in both]
+        out[kind]["between the two"] = {name: calibration(between)[name] for name in ("median_m", "median_deg")}
+    return out
+
+
+def _registered(
+    method: str, frames: Sequence[Frame], poses: Array, pairs: Sequence[tuple[int, int]], options: Options
+) -> Found:
+    """Pairs registered to a map of one scan.
+
+    The points start at the truth, as from a good prediction: whether they find the place is another question. The
+    network has no prior.
+    """
+    settings = settings_of(options, f"slam.registration={method}", "slam.visual.enabled=false")
+    registration = make_registration(settings)
+    scans: dict[int, Scan] = {}
+    found: Found = {}
+    for a, b in pairs:
+        for i in {a, b} - scans.keys():
+            scans[i] = registration.prepare(frames[i], np.zeros(6))
+        T = se3.inverse(poses[a]) @ poses[b]
+        registration.clear()
+        registration.update(scans[a], np.eye(4))
+        result = registration.register(scans[b], Prediction([T if method == "geometric" else np.eye(4)]))
+        if result.ok:
+            found[a, b] = T, result
+    return found
+
+
+def calibration(rows: Sequence[tuple[Array, Registration]]) -> dict[str, Any]:
+    """Median errors, and the medians of xi^T S^-1 xi by what they should be, of the pose, its rotation and translation.
+
+    Args:
+        rows: true pose (4, 4), and a registration with its covariance S (6, 6). 1 is right; more: S is too small.
+    """
+    if not rows:
+        return {"registered": 0, "median_m": None, "median_deg": None, "chi2_ratio": None}
+    xi = np.array([se3.log(se3.inverse(r.T_target_source) @ T) for T, r in rows])
+    S = np.array([r.covariance for _, r in rows])
+    ratio = {}
+    for name, span in _SPANS.items():
+        part = xi[:, span, None]
+        squared = np.swapaxes(part, 1, 2) @ np.linalg.solve(S[:, span, span], part)
+        ratio[name] = rounded(float(np.median(squared) / chi2.median(part.shape[1])))
+    turn, way = np.median(np.linalg.norm(xi.reshape(-1, 2, 3), axis=2), axis=0)
+    errors = {"median_m": rounded(float(way)), "median_deg": rounded(float(np.degrees(turn)))}
+    return {"registered": len(rows), **errors, "chi2_ratio": ratio}
+
+
+def _table(part: str, drives: dict[str, Any]) -> FigureTable:
+    names = ["drive", "pairs", "method"]
+    figures = ("registered", "m", "deg", *(f"chi2 {span}" for span in _SPANS))
+    table = FigureTable(f"Covariance, {part}: median chi2 by its expectation", names=names, figures=figures)
+    for drive, kinds in drives.items():
+        for kind, methods in kinds.items():
+            for method, row in methods.items():
+                errors = [row["median_m"], row["median_deg"], *(row.get("chi2_ratio") or {}).values()]
+                texts = ["-" if value is None else f"{value:.3g}" for value in errors]
+                registered = f"{row['registered']}/{row['pairs']}" if "pairs" in row else ""
+                table.add_row(drive, kind, method, registered, *texts, *[""] * (5 - len(texts)))
+    return table
