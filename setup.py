@@ -17,7 +17,7 @@ REQUIREMENTS = [
     "scipy>=1.11,<2",  # rotations, nearest neighbors
     "torch>=2.6,<2.14",  # the network; its CPU wheels serve, README.md
     "safetensors>=0.4,<1",  # weights: data that cannot execute code
-    "small_gicp>=1.0,<2",  # scan registration, multi-threaded, without the GIL
+    "numba>=0.61,<1",  # loops over points as machine code: scan registration, sampling
     "gtsam>=4.3,<4.4",  # pose graph; the first with wheels for numpy 2
     "pydantic>=2.7,<3",  # typed configuration
     "annotated-types>=0.6,<1",  # the bounds of its fields, as ROS parameters
@@ -54,7 +54,7 @@ EXTRAS = {
     "las": ["laspy>=2.5,<3"],  # dpm2 map export MAP OUT.las
     "timm": ["timm>=1,<2"],  # image backbones timm:NAME
     "train": ["tensorboard>=2.16,<3"],  # curves beside log.jsonl
-    "bench": ["kiss-icp>=1.2,<2", "pypose>=0.9,<1"],  # what the benchmarks compare with
+    "bench": ["kiss-icp>=1.2,<2", "small_gicp>=1.0,<2", "pypose>=0.9,<1"],  # what the benchmarks compare with
 }
 EXTRAS["dev"] = [line for name in ("plot", "sim", "test", "lint", "bench") for line in EXTRAS[name]]
 

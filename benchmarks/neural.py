@@ -106,7 +106,8 @@ def real_pairs(poses: Array, frames: list[Frame], network: DeepPointMap2, option
         for name in ("neural", "refined", "geometric")
     }
     neural = {"neural": methods["neural"]}
-    methods["small_gicp"] = gicp_from_identity(options.threads)
+    if (gicp := gicp_from_identity(options.threads)) is not None:
+        methods["small_gicp"] = gicp
     if (config := kiss_config(options)) is not None:
         methods[BASELINE] = kiss_from_identity(config)
     kinds = {"consecutive": neural, "8 apart": neural, "10-20 m": methods}

@@ -59,7 +59,7 @@ def bench_relocalise(options: Options) -> Report:
         with MapStore.open(file) as store:
             data = load_map(store)
             network = load_network(settings.neural.weights, settings.threads, settings.neural.preset)
-            verifier = Verifier(settings.relocalise.verification, settings.geometric, settings.threads)
+            verifier = Verifier(settings.relocalise.verification, settings.geometric)
             relocalizer = Relocalizer(settings.relocalise, verifier, network, data.keyframes, data.clouds, data.poses)
             task = progress.add_task("relocalise", total=options.pairs)
             rows = []

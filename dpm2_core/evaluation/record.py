@@ -16,7 +16,7 @@ from typing import Any
 from dpm2_core.files import atomic_write
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-_PACKAGES = ("numpy", "scipy", "small_gicp", "gtsam", "torch", "kiss-icp")
+_PACKAGES = ("numpy", "scipy", "numba", "small_gicp", "gtsam", "torch", "kiss-icp")
 
 
 def write_record(path: Path, name: str, results: dict[str, Any], program: str = "dpm2", threads: int = 2) -> None:

@@ -6,7 +6,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-_BITS = 20
+from dpm2_core.geometry.compiled import compiled
+
 _HALF = 1 << 20  # cells per axis on either side of the origin: 21 bits each fit one int64 key
 
 
@@ -16,14 +17,29 @@ def voxel_first(points: NDArray[np.floating], size: float) -> NDArray[np.int64]:
     Keeping a measured point, not the mean, keeps surfaces sharp; and points put first stay when a map grows.
     Coordinates must be finite and within 2^20 cells of the origin.
     """
-    cell = np.floor(points[:, :3] * points.dtype.type(1 / size)).astype(np.int64) + _HALF
-    key = (cell[:, 0] << 42) | (cell[:, 1] << 21) | cell[:, 2]
-    slot = (key.view(np.uint64) * np.uint64(0x9E3779B97F4A7C15) >> np.uint64(64 - _BITS)).astype(np.int32)
-    order = np.arange(len(points), dtype=np.int32)
-    table = np.empty(1 << _BITS, np.int32)
-    table[slot[::-1]] = order[::-1]  # the last assignment wins, so the first point does
-    holder = table[slot]
-    first = holder == order
-    displaced = np.flatnonzero(key[holder] != key)  # cells that share a slot with another: few, so sort those
-    first[displaced[np.unique(key[displaced], return_index=True)[1]]] = True
-    return np.flatnonzero(first)
+    return _first_in_cells(np.ascontiguousarray(points), points.dtype.type(1 / size))
+
+
+@compiled(["i8[::1](f4[:, ::1], f4)", "i8[::1](f8[:, ::1], f8)"])
+def _first_in_cells(points: NDArray[np.floating], scale: np.floating) -> NDArray[np.int64]:
+    """`voxel_first` by a hash table of the cells seen so far."""
+    bits = 10
+    while (1 << bits) < 2 * len(points):
+        bits += 1
+    table = np.full(1 << bits, -1, np.int64)
+    mask, shift = (1 << bits) - 1, np.uint64(64 - bits)
+    first, count, before = np.empty(len(points), np.int64), 0, np.int64(-1)
+    for i in range(len(points)):
+        x, y, z = np.floor(points[i, 0] * scale), np.floor(points[i, 1] * scale), np.floor(points[i, 2] * scale)
+        key = (np.int64(x) + _HALF << 42) | (np.int64(y) + _HALF << 21) | (np.int64(z) + _HALF)
+        if key == before:  # as its neighbor on the beam's ring
+            continue
+        before = key
+        slot = np.int64(np.uint64(key) * np.uint64(0x9E3779B97F4A7C15) >> shift)
+        while table[slot] >= 0 and table[slot] != key:
+            slot = (slot + 1) & mask
+        if table[slot] < 0:
+            table[slot] = key
+            first[count] = i
+            count += 1
+    return first[:count].copy()

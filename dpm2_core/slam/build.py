@@ -64,9 +64,7 @@ def make_registration(s: SlamSettings) -> ScanRegistration:
         UsageError: the network, or that of the filter, has no weights to run with.
     """
     preprocessor = Preprocessor(s.preprocess, make_filter(s.filter, s.threads))
-    geometric = GeometricScanRegistration(
-        preprocessor, GeometricRegistration(s.geometric), LocalMap(s.local_map, s.threads)
-    )
+    geometric = GeometricScanRegistration(preprocessor, GeometricRegistration(s.geometric), LocalMap(s.local_map))
     chosen: ScanRegistration = geometric
     if s.registration != "geometric":
         neural = NeuralScanRegistration(s.neural, preprocessor, _network(s))
@@ -89,7 +87,7 @@ def make_localizer(s: SlamSettings, mapper: Mapper) -> Localizer:
     Raises:
         UsageError: the network has no weights to run with.
     """
-    verifier = Verifier(s.relocalise.verification, s.geometric, s.threads)
+    verifier = Verifier(s.relocalise.verification, s.geometric)
     relocalizer = Relocalizer(s.relocalise, verifier, _network(s), mapper.keyframes, mapper.clouds, mapper.poses)
     return Localizer(relocalizer, s.relocalise.max_failures)
 
@@ -101,7 +99,7 @@ def make_loops(s: SlamSettings) -> LoopCloser:
         UsageError: the network has no weights to run with.
     """
     described = s.loops.enabled and s.loops.descriptors
-    return LoopCloser(s.loops, s.geometric, s.threads, _network(s) if described else None)
+    return LoopCloser(s.loops, s.geometric, _network(s) if described else None)
 
 
 def _network(s: SlamSettings) -> DeepPointMap2:

@@ -64,11 +64,10 @@ class LoopCloser:
         self,
         settings: LoopSettings,
         registration: GeometricSettings,
-        threads: int = 2,
         network: DeepPointMap2 | None = None,
     ) -> None:
         self._settings = settings
-        self._verifier = Verifier(settings.verification, registration, threads)
+        self._verifier = Verifier(settings.verification, registration)
         self._places = PlaceRecognition(network) if network is not None else None
         self._path = OdometryChain()
         self._consistency = Consistency(settings.consistency, self._path)

@@ -63,16 +63,15 @@ class VerificationResult:
 class Verifier:
     """Registers a cloud to the keyframes around a place, from a proposed pose, and checks the result."""
 
-    def __init__(self, settings: VerificationSettings, registration: GeometricSettings, threads: int) -> None:
+    def __init__(self, settings: VerificationSettings, registration: GeometricSettings) -> None:
         self._settings = settings
         self._noise = registration.noise
         self._gate = registration.final_gate
         self._registration = GeometricRegistration(registration)
-        self._threads = threads
 
     def surroundings(self, clouds: Sequence[Points], poses: Array) -> LocalMap:
         """The map of (M, 4) clouds taken at (N, 4, 4) poses, in the frame of those poses, to be verified against."""
-        local_map = LocalMap(LocalMapSettings(), self._threads)
+        local_map = LocalMap(LocalMapSettings())
         parts = [se3.transform(T, cloud) for T, cloud in zip(poses, clouds, strict=True)]
         local_map.insert(np.concatenate(parts), np.eye(4), poses)
         return local_map
@@ -103,11 +102,8 @@ class Verifier:
 
     def _fits(self, source: Array, around: LocalMap, T: Array) -> NDArray[np.bool_]:
         """Which points (N,) lie on a surface of the map."""
-        moved = source @ T[:3, :3].T + T[:3, 3]
-        index, squared = around.nearest(moved)
-        normals, spread = around.planes(index)
-        residual = np.einsum("ij,ij->i", moved - around.points[index], normals)
-        return (squared < self._gate**2) & (residual**2 < 9 * (self._noise**2 + spread))
+        residual, _, spread = around.match(source @ T[:3, :3].T + T[:3, 3], self._gate)
+        return residual**2 < 9 * (self._noise**2 + spread)  # False for NaN
 
     def _objection(self, e: VerificationResult, share: float, widen: float) -> str:
         """Why it is not accepted; empty if it is."""

@@ -10,6 +10,7 @@ from dpm2_core.frame import Array, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.calibration import with_calibration
 from dpm2_core.slam.registration.local_map import LocalMap
+from dpm2_core.slam.registration.point_to_plane import linearize
 
 
 class GeometricSettings(Settings):
@@ -70,7 +71,7 @@ class GeometricRegistration:
         predicted = prior is not None
         prior = 1e-6 * np.eye(6) if prior is None else _CORRELATED * prior
         for _ in range(s.iterations):
-            points = source[::4] if coarse else source
+            points = np.ascontiguousarray(source[::4]) if coarse else source
             H, gradient, inliers, rmse = self._linearize(points, target, T, gate)
             if inliers < s.min_points / 4:
                 return _failed(T_guess, f"{inliers} of {len(points)} points near the map")
@@ -96,31 +97,19 @@ class GeometricRegistration:
 
         Distances along the normals are Cauchy distributed; a point without a counterpart has a density of 1 per meter.
         """
-        _, _, residual, variance = self._matched(source, target, T, self._settings.final_gate)
+        residual, _, variance = self._matched(source, target, T, self._settings.final_gate)
         log_density = -0.5 * np.log(variance) - np.log1p(residual * residual / variance)
-        return float(np.maximum(log_density, 0).sum() / len(source))
+        return float(np.fmax(log_density, 0).sum() / len(source))
 
     def _linearize(self, source: Array, target: LocalMap, T: Array, gate: float) -> tuple[Array, Array, int, float]:
         """Hessian (6, 6) and gradient (6,) for a step on the right of T, number of inliers, their rmse in m."""
-        source, normals, residual, variance = self._matched(source, target, T, gate)
-        normalized = residual * residual / variance
-        weight = 1 / (variance * (1 + normalized))  # Cauchy kernel
-        normals_body = normals @ T[:3, :3]
-        J = np.concatenate([np.cross(source, normals_body), normals_body], 1)
-        H = J.T @ (J * weight[:, None])
-        fits = normalized < 9
-        rmse = float(np.sqrt(np.mean(residual[fits] ** 2))) if fits.any() else np.inf
-        return H, J.T @ (weight * residual), int(fits.sum()), rmse
+        return linearize(source, np.ascontiguousarray(T[:3, :3]), *self._matched(source, target, T, gate))
 
-    def _matched(self, source: Array, target: LocalMap, T: Array, gate: float) -> tuple[Array, Array, Array, Array]:
-        """Points (K, 3) with a counterpart within the gate; normals (K, 3), distances (K,) m and variances (K,) m2."""
-        moved = source @ T[:3, :3].T + T[:3, 3]
-        index, squared = target.nearest(moved)
-        near = squared < gate * gate
-        index, moved = index[near], moved[near]
-        normals, spread = target.planes(index)
-        residual = np.einsum("ij,ij->i", moved - target.points[index], normals)
-        return source[near], normals, residual, self._settings.noise**2 + spread
+    def _matched(self, source: Array, target: LocalMap, T: Array, gate: float) -> tuple[Array, Array, Array]:
+        """Of each point (N, 3) its distance (N,) m from the surface within the gate, its normal (N, 3) and variance
+        (N,) m2; NaN where there is none."""
+        residual, normals, spread = target.match(source @ T[:3, :3].T + T[:3, 3], gate)
+        return residual, normals, self._settings.noise**2 + spread
 
 
 def _close(T: Array, T_other: Array) -> bool:

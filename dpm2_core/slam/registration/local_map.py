@@ -1,19 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The surroundings that a scan is registered to: recent points, a k-d tree, planes fitted where they are asked for."""
+"""The surroundings that a scan is registered to: recent points, and planes fitted where they are asked for."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from small_gicp import KdTree
 
 from dpm2_core.config import Settings
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.planes import fit_planes
+from dpm2_core.geometry.point_grid import PointGrid
 from dpm2_core.geometry.voxel import voxel_first
+from dpm2_core.slam.registration.point_to_plane import distances
 
 _YOUNG = 3  # scans
+_CELL = 3.0  # voxels: edge of the cells in which neighbors are searched
 
 
 class LocalMapSettings(Settings):
@@ -32,11 +34,10 @@ class LocalMapSettings(Settings):
 
 
 class LocalMap:
-    """Points (M, 3) float64 in the odometry frame, the oldest first; empty until the first `insert`."""
+    """Points (M, 3) float64 in the odometry frame, empty until the first `insert`."""
 
-    def __init__(self, settings: LocalMapSettings, threads: int = 2) -> None:
+    def __init__(self, settings: LocalMapSettings) -> None:
         self._settings = settings
-        self._threads = threads
         self.clear()
 
     def clear(self) -> None:
@@ -48,7 +49,7 @@ class LocalMap:
 
     def fresh(self) -> LocalMap:
         """Another one, empty."""
-        return LocalMap(self._settings, self._threads)
+        return LocalMap(self._settings)
 
     def __len__(self) -> int:
         return len(self.points)
@@ -86,26 +87,29 @@ class LocalMap:
         kept &= entered > self._inserted - self._settings.scans
         joined, entered = joined[kept], entered[kept]
         first = voxel_first(joined, self._settings.voxel)
-        self.points, self._entered = joined[first], entered[first]
+        self._grid = PointGrid(joined[first], _CELL * self._settings.voxel)
+        self.points, self._entered = self._grid.points, entered[first][self._grid.order]
         self._inserted += 1
         self._T_last = T_odom_lidar
-        self._tree = KdTree(self.points, num_threads=self._threads)
         self._normals = np.empty((len(self.points), 3))
         self._variances = np.full(len(self.points), np.nan)
 
-    def nearest(self, queries: Array) -> tuple[NDArray[np.int64], Array]:
-        """Index of and squared distance (m2) to the nearest map point of each of the (Q, 3) queries."""
-        index, squared = self._tree.batch_nearest_neighbor_search(queries, num_threads=self._threads)
-        return np.asarray(index).view(np.int64), np.asarray(squared)
+    def match(self, queries: Array, radius: float) -> tuple[Array, Array, Array]:
+        """The surface at the map point nearest to each of the (Q, 3) queries, among those closer than `radius`, m.
 
-    def planes(self, index: NDArray[np.int64]) -> tuple[Array, Array]:
-        """Unit normal (Q, 3) and variance along it (Q,), m2, of the surface around each of those map points."""
+        Returns:
+            Distance of the query from it (Q,), m, its unit normal (Q, 3) and the variance along that (Q,), m2; NaN
+            where no point is so close.
+        """
+        index = self._grid.nearest(queries, radius)
+        self._fit_planes(index[index >= 0])
+        return distances(queries, index, self.points, self._normals, self._variances)
+
+    def _fit_planes(self, index: NDArray[np.int32]) -> None:
+        """Where there are none yet."""
         requested = index[np.isnan(self._variances[index])]
         if len(requested):
             requested = np.unique(requested)
             k = min(self._settings.plane_neighbours, len(self.points))
-            around, _ = self._tree.batch_knn_search(self.points[requested], k, num_threads=self._threads)
-            self._normals[requested], self._variances[requested] = fit_planes(
-                self.points[np.asarray(around).view(np.int64)]
-            )
-        return self._normals[index], self._variances[index]
+            around = self._grid.neighbors(self.points[requested], k)
+            self._normals[requested], self._variances[requested] = fit_planes(self.points[around])

@@ -55,7 +55,7 @@ def where(s: float, lateral: float = 0.0, heading: float = 0.0) -> Array:
 
 
 def closer(**settings: object) -> LoopCloser:
-    return LoopCloser(LoopSettings.model_validate(settings), GeometricSettings(), 2, network())
+    return LoopCloser(LoopSettings.model_validate(settings), GeometricSettings(), network())
 
 
 def drive(places: Sequence[tuple[float, float, float]], jump: Array, **settings: object) -> tuple[list[Edge], Array]:
@@ -122,7 +122,7 @@ def test_without_descriptors_the_pose_alone_leads_to_loops() -> None:
     truth = np.array([where(*place) for place in at])
     poses = truth.copy()
     poses[-1] = jump @ poses[-1]
-    search = LoopCloser(LoopSettings(gap=30.0), GeometricSettings(), 2)
+    search = LoopCloser(LoopSettings(gap=30.0), GeometricSettings())
     clouds = [scan(*place) for place in at]
     keyframes = [
         Keyframe(i, i, i, poses[i], clouds[i], Registration(np.eye(4), FIRM, 1.0, 0.1, "test") if i else None)

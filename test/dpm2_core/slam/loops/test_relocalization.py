@@ -46,7 +46,7 @@ def relocalizer() -> Relocalizer:
     clouds = [seen(s) for s in at]
     keyframes = [Keyframe(i, i, i, poses[i], cloud[:0], None, "", describe(cloud)) for i, cloud in enumerate(clouds)]
     settings = RelocalizationSettings()
-    verifier = Verifier(settings.verification, GeometricSettings(), threads=2)
+    verifier = Verifier(settings.verification, GeometricSettings())
     return Relocalizer(settings, verifier, network, keyframes, clouds, poses)
 
 

@@ -30,7 +30,7 @@ def suburb_scans() -> tuple[list[Points], Array]:
 
 
 def verifier() -> Verifier:
-    return Verifier(VerificationSettings(), GeometricSettings(), 2)
+    return Verifier(VerificationSettings(), GeometricSettings())
 
 
 @pytest.mark.slow

@@ -1,0 +1,28 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Loops over points as machine code, by numba."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeVar
+
+import numba
+
+F = TypeVar("F", bound=Callable[..., object])
+
+
+def compiled(signature: str | list[str]) -> Callable[[F], F]:
+    """Decorator: compile for these types when the module is imported, in double precision as written, without the GIL.
+
+    The machine code is kept in `__pycache__` beside the source, or in the user's cache folder, so that it is made once
+    after an installation. Where neither can be written, every start compiles anew; `NUMBA_CACHE_DIR` names another
+    folder. A function may call compiled ones of its own file alone: the cache does not see that another file changed.
+    """
+
+    def decorate(function: F) -> F:
+        try:
+            return numba.njit(signature, cache=True, nogil=True, error_model="numpy")(function)
+        except RuntimeError:  # "cannot cache function: no locator available"
+            return numba.njit(signature, nogil=True, error_model="numpy")(function)
+
+    return decorate

@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The inner loops of the point-to-plane registration."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dpm2_core.frame import Array
+from dpm2_core.geometry.compiled import compiled
+
+
+@compiled("Tuple((f8[::1], f8[:, ::1], f8[::1]))(f8[:, ::1], i4[::1], f8[:, ::1], f8[:, ::1], f8[::1])")
+def distances(
+    queries: Array, index: NDArray[np.int32], points: Array, normals: Array, variances: Array
+) -> tuple[Array, Array, Array]:
+    """Distances (Q,), m, of queries (Q, 3) from the planes through points[index] (M, 3), and these planes' normals
+    (Q, 3) and variances (Q,), m2. All are NaN where the index is negative."""
+    residual, variance = np.full(len(queries), np.nan), np.full(len(queries), np.nan)
+    normal = np.full((len(queries), 3), np.nan)
+    for q in range(len(queries)):
+        i = index[q]
+        if i < 0:
+            continue
+        normal[q], variance[q] = normals[i], variances[i]
+        residual[q] = (
+            (queries[q, 0] - points[i, 0]) * normals[i, 0]
+            + (queries[q, 1] - points[i, 1]) * normals[i, 1]
+            + (queries[q, 2] - points[i, 2]) * normals[i, 2]
+        )
+    return residual, normal, variance
+
+
+@compiled("Tuple((f8[:, ::1], f8[::1], i8, f8))(f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[::1])")
+def linearize(
+    source: Array, R: Array, residual: Array, normals: Array, variances: Array
+) -> tuple[Array, Array, int, float]:
+    """One step of least squares with a Cauchy kernel.
+
+    Args:
+        source: (N, 3) points in the sensor frame; R: (3, 3) the rotation of the pose.
+        residual: (N,) distances from planes, m, NaN where there is none; normals: (N, 3); variances: (N,), m2.
+
+    Returns:
+        Hessian (6, 6) and gradient (6,) of a step [rad, m] on the right of the pose; how many residuals lie within
+        three deviations, and the root of their mean square, m.
+    """
+    H, gradient, J = np.zeros((6, 6)), np.zeros(6), np.empty(6)
+    fits, total = 0, 0.0
+    for n in range(len(source)):
+        if np.isnan(residual[n]):
+            continue
+        a, b, c = normals[n, 0], normals[n, 1], normals[n, 2]
+        J[3] = a * R[0, 0] + b * R[1, 0] + c * R[2, 0]
+        J[4] = a * R[0, 1] + b * R[1, 1] + c * R[2, 1]
+        J[5] = a * R[0, 2] + b * R[1, 2] + c * R[2, 2]
+        J[0] = source[n, 1] * J[5] - source[n, 2] * J[4]
+        J[1] = source[n, 2] * J[3] - source[n, 0] * J[5]
+        J[2] = source[n, 0] * J[4] - source[n, 1] * J[3]
+        squared = residual[n] * residual[n]
+        weight = 1 / (variances[n] + squared)
+        for row in range(6):
+            gradient[row] += J[row] * weight * residual[n]
+            for column in range(row + 1):
+                H[row, column] += J[row] * weight * J[column]
+        if squared < 9 * variances[n]:
+            fits += 1
+            total += squared
+    for row in range(6):
+        for column in range(row):
+            H[column, row] = H[row, column]
+    return H, gradient, fits, np.sqrt(total / fits) if fits else np.inf
