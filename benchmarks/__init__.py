@@ -49,6 +49,7 @@ BENCHES: dict[str, Bench] = {
     "relocalise": _bench("relocalise:bench_relocalise", "source kitti threads set pairs"),
     "roads": _bench("roads:bench_roads", "source kitti threads set"),
     "tasks": _bench("tasks:bench_tasks", "repetitions threads set only"),
+    "tilt": _bench("tilt:bench_tilt", "source kitti threads set weights pairs"),
     "traffic": _bench("traffic:bench_traffic", "repetitions threads set weights only"),
 }
 """By the name that `dpm2 bench NAME` and `benchmarks/NAME.json` share."""

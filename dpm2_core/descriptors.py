@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+_LEVEL = np.cos(np.radians(5))  # a tilt that is smaller is that of the road
+
 
 @dataclass(frozen=True, eq=False)
 class Descriptors:
@@ -17,13 +19,16 @@ class Descriptors:
     Attributes:
         xyz: (N, 3) float32 m, in the frame of the set.
         features: (N, 128) float16.
-        axis: (N, 2) float32, horizontal unit vectors from the sensor to each descriptor; None for a single frame, where
-            they follow from `xyz`.
+        axis: (N, 2) float32, horizontal unit vectors from the sensor to each descriptor, in level axes; None for a
+            single frame, where they follow from `xyz`.
+        up: (3,) float32 unit vector, in the frame of the set, where the sensor was tilted and the features are those
+            of its scan in level axes; None: the frame of the set counts as level.
     """
 
     xyz: NDArray[np.float32]
     features: NDArray[np.float16]
     axis: NDArray[np.float32] | None = None
+    up: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
         n = len(self.xyz)
@@ -43,16 +48,51 @@ class Descriptors:
         """(N, 2) `axis`, computed for a single frame."""
         if self.axis is not None:
             return self.axis
-        length = np.linalg.norm(self.xyz[:, :2], axis=1, keepdims=True)
-        unit = self.xyz[:, :2] / np.maximum(length, 1e-3)
+        xy = self.level().xyz[:, :2]
+        length = np.linalg.norm(xy, axis=1, keepdims=True)
+        unit = xy / np.maximum(length, 1e-3)
         return np.where(length > 1e-3, unit, (1.0, 0.0)).astype(np.float32)
 
     def moved(self, T: NDArray[np.float64]) -> Descriptors:
         """The same descriptors in another frame; T (4, 4) is T_new_old."""
         R = T[:3, :3].astype(np.float32)
-        axis = self.axes @ R[:2, :2].T
-        axis /= np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), 1e-6)
-        return Descriptors(self.xyz @ R.T + T[:3, 3].astype(np.float32), self.features, axis)
+        up = None if self.up is None or is_level(R @ self.up) else R @ self.up
+        turn = R if self.up is None else R @ self.R_level_set.T
+        turn = turn if up is None else levelling(up) @ turn
+        axis = _turned(self.axes, turn.astype(np.float32))
+        xyz = self.xyz @ R.T + T[:3, 3].astype(np.float32)
+        return Descriptors(xyz, self.features, axis, up)
+
+    @property
+    def R_level_set(self) -> NDArray[np.float32]:
+        """(3, 3) turns the frame of the set into the level axes nearest to it."""
+        return np.eye(3, dtype=np.float32) if self.up is None else levelling(self.up)
+
+    def level(self) -> Descriptors:
+        """The same in level axes, `R_level_set`; itself where the frame of the set counts as level."""
+        if self.up is None:
+            return self
+        return Descriptors(self.xyz @ self.R_level_set.T, self.features, self.axis)
+
+
+def is_level(up: NDArray[np.floating]) -> bool:
+    """Whether a unit vector (3,) is so near to the z axis that its frame counts as level."""
+    return bool(up[2] >= _LEVEL)
+
+
+def levelling(up: NDArray[np.floating]) -> NDArray[np.float32]:
+    """(3, 3) the smallest rotation that turns a unit vector (3,), which points up by and large, into the z axis."""
+    x, y, z = (float(value) for value in up)
+    c = 1 / (1 + max(z, -0.999))
+    R = [[1 - c * x * x, -c * x * y, -x], [-c * x * y, 1 - c * y * y, -y], [x, y, z]]
+    return np.array(R, np.float32)
+
+
+def _turned(axis: NDArray[np.float32], R: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Horizontal unit vectors (N, 2) turned by the heading of R (3, 3)."""
+    turned = axis @ R[:2, :2].T
+    turned /= np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-6)
+    return turned
 
 
 class LazyDescriptors:
@@ -83,8 +123,10 @@ def merge(sets: Sequence[Descriptors]) -> Descriptors:
     """
     if not sets:
         raise ValueError("merge: want at least one set of descriptors")
+    up = next((s.up for s in sets if s.up is not None), None)
+    axes = [s.axes for s in sets]
+    if up is not None:  # each estimated its own
+        axes = [_turned(axis, levelling(up) @ s.R_level_set.T) for axis, s in zip(axes, sets, strict=True)]
     return Descriptors(
-        np.concatenate([s.xyz for s in sets]),
-        np.concatenate([s.features for s in sets]),
-        np.concatenate([s.axes for s in sets]),
+        np.concatenate([s.xyz for s in sets]), np.concatenate([s.features for s in sets]), np.concatenate(axes), up
     )

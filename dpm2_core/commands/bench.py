@@ -18,7 +18,7 @@ def bench(
         list[str] | None,
         typer.Argument(
             help="covariance, diffslam, finetune, gaps, geometric (default), hard, loop-cost, map, memory, neural, "
-            "pose-graph, relocalise, roads, tasks, traffic."
+            "pose-graph, relocalise, roads, tasks, tilt, traffic."
         ),
     ] = None,
     source: Annotated[
@@ -43,7 +43,7 @@ def bench(
     ] = None,
     pairs: Annotated[
         int | None,
-        typer.Option(min=1, help="covariance, finetune, neural: pairs of each kind; relocalise: visits [60]."),
+        typer.Option(min=1, help="covariance, finetune, neural, tilt: pairs of each kind; relocalise: visits [60]."),
     ] = None,
     only: Annotated[
         str | None,

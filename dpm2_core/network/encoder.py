@@ -4,15 +4,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import nn
 
-from dpm2_core.descriptors import Descriptors
+from dpm2_core.descriptors import Descriptors, is_level, levelling
 from dpm2_core.frame import Frame, Image
+from dpm2_core.geometry import se3
+from dpm2_core.geometry.tilt import up_of
 from dpm2_core.network.convnext import FeatureMap
 from dpm2_core.network.fusion import Fusion
 from dpm2_core.network.pointnext import Scale, view_axes
@@ -63,14 +67,24 @@ class Encoder(nn.Module):
 
     @torch.inference_mode()
     def encode(self, frame: Frame) -> Descriptors:
-        """Descriptors of one frame, from its raw points and its images, if any.
+        """Descriptors of one frame, from its raw points and its images, if any; of a tilted sensor in level axes.
 
         Raises:
             Dpm2Error: too few points in range.
         """
         device = next(self.parameters()).device
-        points = collate([build_pyramid(crop(frame.points, self.settings.points), self.settings)])
-        views = collate_views([frame.images], self.settings.image) if self.image is not None else None
+        cloud, images = crop(frame.points, self.settings.points), frame.images
+        up = up_of(cloud)
+        if up is None or is_level(up):  # no ground to tell by, or as the network was trained
+            return self._encode(cloud, images, device)
+        R = levelling(up)
+        made = self._encode(np.ascontiguousarray(cloud @ R.T), [_turned(image, R) for image in images], device)
+        return replace(made, xyz=made.xyz @ R, up=up)
+
+    def _encode(self, cloud: NDArray[np.float32], images: Sequence[Image], device: torch.device) -> Descriptors:
+        """Descriptors of a cropped (M, 3) cloud, in its own axes."""
+        points = collate([build_pyramid(cloud, self.settings)])
+        views = collate_views([images], self.settings.image) if self.image is not None else None
         return self.encode_batch(points, views, device)[0]
 
     @torch.inference_mode()
@@ -80,6 +94,12 @@ class Encoder(nn.Module):
             tokens = self(*to_device((points, views), device)).tokens
         xyz, features, mask = (field.cpu() for field in (tokens.xyz, tokens.features.half(), tokens.mask))
         return [Descriptors(x[m].numpy(), f[m].numpy()) for x, f, m in zip(xyz, features, mask, strict=True)]
+
+
+def _turned(image: Image, R: NDArray[np.float32]) -> Image:
+    """An image whose camera stands in other axes: R (3, 3) turns the LiDAR's into those."""
+    T_lidar_cam = se3.make(R, np.zeros(3)) @ image.camera.T_lidar_cam
+    return replace(image, camera=replace(image.camera, T_lidar_cam=T_lidar_cam))
 
 
 def collate_views(images: Sequence[Sequence[Image]], settings: ImageSettings) -> Views | None:

@@ -4,12 +4,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import nn
 
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.frame import Array, Frame, Registration
+from dpm2_core.geometry import se3
 from dpm2_core.network.decoder import Decoder, Prepared
 from dpm2_core.network.encoder import Encoder
 from dpm2_core.network.matching import correspond, match_scores
@@ -44,22 +47,24 @@ class DeepPointMap2(nn.Module):
         """
         device = next(self.parameters()).device
         decoder = self.decoder
-        x = to_tokens([source], decoder.view_aligned, device)
+        x = to_tokens([source.level()], decoder.view_aligned, device)
         with torch.autocast(device.type, torch.bfloat16):
             if self._target is None or self._target[0] is not target:
-                y = to_tokens([target], decoder.view_aligned, device)
+                y = to_tokens([target.level()], decoder.view_aligned, device)
                 self._target = (target, y, decoder.prepare(y))
             _, y, prepared = self._target
-            return register_batch(decoder, x, y, decoder.correlate(decoder.prepare(x), prepared))[0]
+            level = register_batch(decoder, x, y, decoder.correlate(decoder.prepare(x), prepared))[0]
+            return _tilted(level, source, target)
 
     @torch.inference_mode()
     def register_many(self, sources: list[Descriptors], targets: list[Descriptors]) -> list[Registration]:
         """`register` for a batch of pairs; nothing is kept."""
         device = next(self.parameters()).device
-        source = to_tokens(sources, self.decoder.view_aligned, device)
-        target = to_tokens(targets, self.decoder.view_aligned, device)
+        source = to_tokens([s.level() for s in sources], self.decoder.view_aligned, device)
+        target = to_tokens([t.level() for t in targets], self.decoder.view_aligned, device)
         with torch.autocast(device.type, torch.bfloat16):
-            return register_batch(self.decoder, source, target, self.decoder(source, target))
+            level = register_batch(self.decoder, source, target, self.decoder(source, target))
+        return [_tilted(*row) for row in zip(level, sources, targets, strict=True)]
 
     def overlap(self, sources: Sequence[Descriptors], targets: Sequence[Descriptors]) -> list[float]:
         """Probability 0..1 that each pair was seen from within 20 m; NaN while the overlap head is untrained."""
@@ -69,10 +74,21 @@ class DeepPointMap2(nn.Module):
     def matches(self, source: Descriptors, target: Descriptors) -> tuple[Array, Array, Array]:
         """The descriptors that `register` pairs: positions (K, 3) in each frame, m, and confidence (K,) 0..1."""
         device = next(self.parameters()).device
-        x, y = (to_tokens([descriptors], self.decoder.view_aligned, device) for descriptors in (source, target))
+        x, y = (to_tokens([d.level()], self.decoder.view_aligned, device) for d in (source, target))
         with torch.autocast(device.type, torch.bfloat16):
             correlated = self.decoder(x, y)
             pairs = correspond(self.decoder, x, y, correlated, match_scores(self.decoder, correlated))
         half = pairs.weight.shape[1] // 2  # then the same pairs again, in the other direction
         at_source, at_target = pairs.source[0, half:].double().cpu(), pairs.target[0, :half].double().cpu()
-        return at_source.numpy(), at_target.numpy(), pairs.weight[0, :half].double().cpu().numpy()
+        weight = pairs.weight[0, :half].double().cpu().numpy()
+        return at_source.numpy() @ source.R_level_set, at_target.numpy() @ target.R_level_set, weight
+
+
+def _tilted(level: Registration, source: Descriptors, target: Descriptors) -> Registration:
+    """A registration of sets in level axes as one of the sets themselves."""
+    if source.up is None and target.up is None:
+        return level
+    at_source, at_target = (se3.make(d.R_level_set, np.zeros(3)) for d in (source, target))
+    T = se3.orthonormalized(se3.inverse(at_target) @ level.T_target_source @ at_source)
+    A = se3.adjoint(se3.inverse(at_source))
+    return replace(level, T_target_source=T, covariance=A @ level.covariance @ A.T)

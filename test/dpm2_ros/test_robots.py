@@ -8,6 +8,7 @@ import subprocess
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.slam.store.map_data import MapData, load_map
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_ros.conversions import cloud_to_msg
-from dpm2_ros.keyframes import descriptors_from_msg, payload_to_msgs
+from dpm2_ros.keyframes import descriptors_from_msg, descriptors_to_msg, payload_to_msgs
 from dpm2_ros.tf import TFMessage
 from tools.replay import ros_environment, start
 
@@ -197,6 +198,8 @@ def test_a_keyframe_is_at_most_100_kB_on_the_wire(recording: Path) -> None:
     points = next(iter(open_source(recording, InputSettings(images=False)).frames(0, 1))).points
     descriptors = PlaceRecognition(load_network("small", 1)).describe(points)
     assert descriptors is not None
+    tilted = replace(descriptors, up=np.array([0.6, 0, 0.8], np.float32))  # no base says what level is: not sent
+    assert descriptors_from_msg(descriptors_to_msg(tilted, 5, "red/kf_1.00000000")) == (None, "")
     for cloud in (points, points[::50]):
         keyframe = Keyframe(1, 2, 3, np.eye(4), cloud, None, "", descriptors)
         seen, packed = payload_to_msgs(keyframe, "red/kf_1.00000000", "0123456789abcdef")

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dpm2_core.descriptors import Descriptors
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Keyframe
 from dpm2_core.slam.store import schema
@@ -25,6 +26,7 @@ from dpm2_core.slam.store.cloud_codec import pack_cloud
 from dpm2_core.slam.store.cloud_store import CloudStore, Loan
 from dpm2_core.slam.store.map_data import load_map, save_as
 from dpm2_core.slam.store.map_store import Change, MapStore
+from dpm2_core.slam.store.rows import pack_descriptors, unpack_descriptors
 
 WRITER = """
 import sys
@@ -84,6 +86,23 @@ def test_everything_comes_back(tmp_path: Path, map_file: Path, keyframes: list[K
             assert [(e.kind, e.ok) for e in data.edges[-2:]] == [("loop", True), ("loop", False)]
             assert data.edges[-1].registration.reason == "too far"
             assert data.edges[-1].registration.rmse == np.inf
+
+
+def test_descriptors_of_a_tilted_lidar_come_back_with_where_up_is(noise: np.random.Generator) -> None:
+    xyz, features = noise.normal(size=(9, 3)).astype("f4"), noise.normal(size=(9, 8)).astype("f2")
+    up = np.array([0.6, 0, 0.8], "f4")
+    for axis in (None, noise.normal(size=(9, 2)).astype("f4")):
+        packed = pack_descriptors(Descriptors(xyz, features, axis, up))
+        back = unpack_descriptors(packed)
+        assert back.up is not None
+        np.testing.assert_array_equal(back.up, up)
+        np.testing.assert_array_equal(back.features, features)
+        assert (back.axis is None) == (axis is None)
+        for wrong in ([0.6, 0, -0.8], [0, 0, 2], [np.nan, 0, 1]):
+            with pytest.raises(ValueError, match="no descriptors"):
+                unpack_descriptors(packed[:-12] + np.array(wrong, "f4").tobytes())
+        with pytest.raises(ValueError, match="bytes for 9 of 8"):
+            unpack_descriptors(packed[:-4])
 
 
 def test_a_loan_and_a_thumbnail_come_back(map_file: Path, keyframes: list[Keyframe]) -> None:

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A LiDAR that is mounted at an angle: pairs of real frames by the network, facing the same way and the other one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import product
+from typing import Any
+
+import numpy as np
+from rich.console import Group
+from rich.progress import Progress
+
+from benchmarks.harness import Options, Report, drives, processors, settings_of, truth_of, unique_name
+from benchmarks.pairs import summarized
+from dpm2_core.data.source import Source
+from dpm2_core.descriptors import Descriptors
+from dpm2_core.frame import Array, Frame
+from dpm2_core.geometry import se3
+from dpm2_core.network.model import DeepPointMap2
+from dpm2_core.network.pretrained import load_network
+from dpm2_core.network.pyramid import build_pyramid, collate, crop
+from dpm2_core.tables import FigureTable
+
+TILTS = (0, 15, 30)
+"""Degrees of pitch, the same for all scans: as a LiDAR is mounted that looks down ahead."""
+APART = (1, 3, 8)
+AXES = ("level", "sensor")
+"""What the descriptors are made in: level axes where the sensor is tilted, as the SLAM does, or always the sensor's."""
+_RANDOM = 35.0  # degrees: also each scan by up to this, about an axis of its own
+
+
+def bench_tilt(options: Options) -> Report:
+    """Success of pairs on every drive at every tilt and heading.
+
+    Raises:
+        UsageError: there is no drive, or one has no ground truth.
+    """
+    s = settings_of(options)
+    network = load_network(s.neural.weights, options.threads, s.neural.preset)
+    results: dict[str, Any] = {}
+    with drives(options) as sources, processors(options.threads), Progress(transient=True) as progress:
+        for source in progress.track(sources):
+            results[unique_name(source, results)] = _of_drive(source, network, options.pairs)
+    return Report({"drives": results}, Group(_table(results)))
+
+
+def _of_drive(source: Source, network: DeepPointMap2, most: int) -> dict[str, Any]:
+    poses, frames = truth_of(source), list(source.frames())
+    first = [(np.linspace(0, len(frames) - 1 - n, min(most, len(frames) - n)).astype(int), n) for n in APART]
+    pairs = [(int(a), int(a) + n) for starts, n in first if len(frames) > n for a in np.unique(starts)]
+    noise = np.random.default_rng(0)
+    out: dict[str, Any] = {}
+    for tilt, turned in product((*map(str, TILTS), "random"), (False, True)):
+        mounts = [_mount(tilt, noise) for _ in frames]
+        others = [mount @ se3.exp([0, 0, np.pi * turned, 0, 0, 0]) for mount in mounts]
+        row = out.setdefault(tilt, {})["opposite" if turned else "same"] = {}
+        for axes in AXES:
+            target = _described(network, frames, mounts, {a for a, _ in pairs}, axes)
+            seen = _described(network, frames, others, {b for _, b in pairs}, axes)
+            errors: dict[int, list[tuple[float, float]]] = {n: [] for n in APART}
+            for a, b in pairs:
+                T_true = mounts[a] @ se3.inverse(poses[a]) @ poses[b] @ se3.inverse(others[b])
+                T = network.register(seen[b], target[a]).T_target_source
+                errors[b - a].append(se3.magnitude(se3.inverse(T_true) @ T))
+            row[axes] = {f"{n} apart": summarized(np.array(rows).reshape(-1, 2)) for n, rows in errors.items()}
+    return out
+
+
+def _mount(tilt: str, noise: np.random.Generator) -> Array:
+    """T_tilted_level (4, 4) of a scan."""
+    if tilt != "random":
+        return se3.exp([0, np.radians(int(tilt)), 0, 0, 0, 0])
+    heading, angle = noise.uniform(0, 2 * np.pi), np.radians(noise.uniform(0, _RANDOM))
+    return se3.exp([angle * np.cos(heading), angle * np.sin(heading), 0, 0, 0, 0])
+
+
+def _described(
+    network: DeepPointMap2, frames: Sequence[Frame], mounts: Sequence[Array], wanted: set[int], axes: str
+) -> dict[int, Descriptors]:
+    out = {}
+    for i in sorted(wanted):
+        points = se3.transform(mounts[i], frames[i].points).astype(np.float32)
+        if axes == "level":
+            out[i] = network.describe(Frame(i, points))
+            continue
+        pyramid = build_pyramid(crop(points, network.settings.points), network.settings)
+        out[i] = network.encoder.encode_batch(collate([pyramid]), None, next(network.parameters()).device)[0]
+    return out
+
+
+def _table(results: dict[str, Any]) -> FigureTable:
+    names = ["drive", "tilt deg", "heading", "axes"]
+    figures = [f"{name} {n} apart" for n in APART for name in ("success", "m")]
+    table = FigureTable("A tilted LiDAR: pairs by the network", names=names, figures=figures)
+    for drive, tilts in results.items():
+        for tilt, headings in tilts.items():
+            for heading, row in headings.items():
+                for axes, kinds in row.items():
+                    texts = [
+                        "-" if kinds[f"{n} apart"][name] is None else f"{kinds[f'{n} apart'][name]:.3g}"
+                        for n in APART
+                        for name in ("success", "median_m")
+                    ]
+                    table.add_row(drive, tilt, heading, axes, *texts)
+    return table

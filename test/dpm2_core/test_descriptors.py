@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Descriptors of a tilted sensor keep their place, and their level axes, wherever they are moved."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dpm2_core.descriptors import Descriptors, levelling, merge
+from dpm2_core.frame import Array
+from dpm2_core.geometry import se3
+
+LEAN = se3.exp([0.1, 0.5, 0, 0, 0, 0])  # 29 degrees
+
+
+def level(noise: np.random.Generator) -> Descriptors:
+    """As a level sensor sees them."""
+    return Descriptors(noise.normal(size=(30, 3)).astype("f4") * 20, noise.normal(size=(30, 8)).astype("f2"))
+
+
+def leaning(d: Descriptors, R: Array) -> Descriptors:
+    """The same as a sensor sees them in whose frame R (3, 3) turns level axes."""
+    return replace(d, xyz=(d.xyz @ R.T).astype("f4"), up=R[:, 2].astype("f4"))
+
+
+@pytest.mark.parametrize("up", [[0, 0, 1], [0.6, 0, 0.8], [-0.3, 0.4, 0.75**0.5]])
+def test_levelling_is_the_smallest_turn_that_brings_up_to_z(up: list[float]) -> None:
+    R = levelling(np.array(up)).astype(float)
+    np.testing.assert_allclose(R @ up, [0, 0, 1], atol=1e-6)
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-6)
+    assert np.arccos((np.trace(R) - 1) / 2) == pytest.approx(np.arccos(up[2]), abs=1e-3)
+
+
+def test_the_heights_of_a_tilted_set_are_those_of_a_level_one(noise: np.random.Generator) -> None:
+    plain = level(noise)
+    again = leaning(plain, LEAN[:3, :3]).level()
+    np.testing.assert_allclose(again.xyz[:, 2], plain.xyz[:, 2], atol=1e-5)
+    assert plain.level() is plain
+
+
+def test_axes_point_to_the_descriptors_after_any_move(noise: np.random.Generator) -> None:
+    T = se3.exp([0.05, -0.04, 2.5, 3, 4, 1])
+    plain = level(noise)
+    moved = leaning(plain, LEAN[:3, :3]).moved(LEAN @ T @ se3.inverse(LEAN))
+    at = moved.R_level_set.astype(float)
+    origin = at @ LEAN[:3, :3] @ T[:3, 3]  # where the sensor was that saw them
+    seen = moved.level().xyz[:, :2] - origin[:2]
+    seen /= np.linalg.norm(seen, axis=1, keepdims=True)
+    np.testing.assert_allclose(np.linalg.norm(moved.axes, axis=1), 1, atol=1e-5)
+    # T leans by 4 degrees itself: what is high up is seen beside where it stands.
+    low = np.abs(plain.xyz[:, 2]) < np.linalg.norm(plain.xyz[:, :2], axis=1)
+    assert (np.einsum("ij,ij->i", seen, moved.axes)[low] > 0.98).all()
+
+
+def test_in_a_level_base_they_are_those_of_a_level_sensor(noise: np.random.Generator) -> None:
+    plain = level(noise)
+    base = leaning(plain, LEAN[:3, :3]).moved(se3.inverse(LEAN))
+    assert base.up is None
+    np.testing.assert_allclose(base.xyz, plain.xyz, atol=1e-4)
+    np.testing.assert_allclose(base.axes, plain.axes, atol=1e-4)
+
+
+def test_merged_sets_have_one_way_up(noise: np.random.Generator) -> None:
+    """Though each has estimated its own."""
+    plain = level(noise)
+    one = leaning(plain, LEAN[:3, :3])
+    wobble = se3.exp([0.01, -0.02, 0, 0, 0, 0])[:3, :3].astype("f4")
+    other = replace(one, up=wobble @ one.up)
+    both = merge([one, other])
+    assert both.up is not None
+    np.testing.assert_array_equal(both.up, one.up)
+    low = np.abs(plain.xyz[:, 2]) < np.linalg.norm(plain.xyz[:, :2], axis=1)
+    np.testing.assert_allclose(both.axes[30:][low], both.axes[:30][low], atol=0.05)  # twice the 0.02 rad at 45 degrees
+    np.testing.assert_allclose(both.axes[:30], one.axes, atol=1e-5)
