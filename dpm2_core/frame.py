@@ -95,7 +95,8 @@ class Registration:
         method: how it was found.
         ok: False: do not use it; `reason` says why in words.
         overlap: probability that both saw the same place, 0..1; NaN where it was not estimated.
-        floor: standard deviation of each coordinate, m, that grew with the distance; part of `covariance`.
+        floor: standard deviations, rad and m, in every direction, that grew with the motion between the scans: part of
+            `covariance`, and common to all registrations over the same way.
     """
 
     T_target_source: Array
@@ -106,12 +107,17 @@ class Registration:
     ok: bool = True
     reason: str = ""
     overlap: float = float("nan")
-    floor: float = 0.0
+    floor: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def of_scene(self) -> Array:
+        """(6, 6) `covariance` without `floor`: how well the scans determine the pose."""
+        return self.covariance - np.diag(np.repeat(self.floor, 3) ** 2)
 
     @property
     def worst_sigma(self) -> float:
-        """Standard deviation of the position in the direction that the scene leaves most open, m: without `floor`."""
-        return float(np.sqrt(max(np.linalg.eigvalsh(self.covariance[3:, 3:])[-1] - self.floor**2, 0.0)))
+        """Standard deviation of the position in the direction that the scene leaves most open, m."""
+        return float(np.sqrt(max(np.linalg.eigvalsh(self.of_scene[3:, 3:])[-1], 0.0)))
 
 
 class State(StrEnum):

@@ -30,6 +30,5 @@ def with_calibration(result: Registration, T_near_source: Array) -> Registration
         T_near_source: (4, 4) the source in the nearest scan of the target.
     """
     meters, degrees = se3.magnitude(T_near_source)
-    floor = _AXES * meters
-    sigma = np.repeat([_SWEEP * np.sin(np.radians(degrees)), floor], 3)
-    return replace(result, covariance=result.covariance + np.diag(sigma**2), floor=floor)
+    floor = _SWEEP * float(np.sin(np.radians(degrees))), _AXES * meters
+    return replace(result, covariance=result.covariance + np.diag(np.repeat(floor, 3) ** 2), floor=floor)

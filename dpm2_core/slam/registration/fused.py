@@ -108,14 +108,15 @@ def _mean(points: Registration, neural: Registration, prior: Array | None) -> Re
     Elsewhere its errors would count for more than it adds: its covariance is too small and that of the points too
     large. The information of the prediction, prior (6, 6), holds the points but is no part of the uncertainty.
     """
-    of_points, of_network = np.linalg.inv(points.covariance), np.linalg.inv(neural.covariance + MAP_NOISE)
+    of_points, of_network = np.linalg.inv(points.of_scene), np.linalg.inv(neural.of_scene + MAP_NOISE)
     held = of_points if prior is None else of_points + prior
     ratio, axes = eigh(of_network, of_points)
     dual = of_points @ axes
     of_network = (dual * np.where(ratio < 1, 0, ratio)) @ dual.T
     step = np.linalg.solve(held + of_network, of_network @ _difference(points, neural))
     T = se3.orthonormalized(points.T_target_source @ se3.exp(step))
-    return replace(points, T_target_source=T, covariance=np.linalg.inv(of_points + of_network), method="refined")
+    covariance = np.linalg.inv(of_points + of_network) + points.covariance - points.of_scene
+    return replace(points, T_target_source=T, covariance=covariance, method="refined")
 
 
 def _difference(a: Registration, b: Registration) -> Array:

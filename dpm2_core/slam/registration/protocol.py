@@ -21,9 +21,12 @@ MAP_NOISE = np.diag(np.repeat([np.radians(0.1), 0.03], 3) ** 2)
 
 
 def agree(a: Registration, b: Registration) -> bool:
-    """Whether two results may be one pose: xi^T (S_a + S_b + S_map)^-1 xi <= `CHI2`, xi (6,) being their difference."""
+    """Whether two results may be one pose: xi^T (S_a + S_b + S_map)^-1 xi <= `CHI2`, xi (6,) being their difference.
+
+    Errors of calibration are the same in both.
+    """
     xi = se3.log(se3.inverse(a.T_target_source) @ b.T_target_source)
-    return bool(xi @ np.linalg.solve(a.covariance + b.covariance + MAP_NOISE, xi) <= CHI2)
+    return bool(xi @ np.linalg.solve(a.of_scene + b.of_scene + MAP_NOISE, xi) <= CHI2)
 
 
 @dataclass(frozen=True, eq=False)

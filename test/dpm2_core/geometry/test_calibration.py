@@ -9,6 +9,7 @@ import pytest
 from dpm2_core.frame import Array, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.calibration import with_calibration
+from dpm2_core.slam.registration.protocol import agree
 
 
 def registration() -> Registration:
@@ -31,7 +32,7 @@ def test_every_direction_of_the_position_is_less_certain_far_away() -> None:
     positions = [np.diag(g)[3:] for g in grown]
     assert (positions[1] > 0).all()
     np.testing.assert_allclose(positions[2], 15**2 * positions[1])
-    assert sigmas(grown[2])[1] == pytest.approx(far[2].floor)
+    assert sigmas(grown[2])[1] == pytest.approx(far[2].floor[1])
 
 
 @pytest.mark.parametrize("meters", [0.0, 2.0, 40.0])
@@ -39,6 +40,19 @@ def test_what_the_scene_leaves_open_does_not_depend_on_the_distance(meters: floa
     own = registration()
     result = with_calibration(own, se3.exp([0, 0, 1.0, 0, meters, 0]))
     assert result.worst_sigma == pytest.approx(own.worst_sigma)  # rounding
+    np.testing.assert_allclose(result.of_scene, own.covariance, atol=1e-12)
+
+
+def test_errors_that_two_registrations_share_do_not_make_them_agree() -> None:
+    """What is 0.3 m apart is so 40 m away as well."""
+    known = np.eye(6) * 0.01**2
+    one, other = (
+        with_calibration(Registration(T, known), se3.exp([0, 0, 0, 40, 0, 0]))
+        for T in (np.eye(4), se3.exp([0, 0, 0, 0.3, 0, 0]))
+    )
+    assert one.floor[1] > 0.1
+    assert not agree(one, other)
+    assert agree(one, one)
 
 
 def test_a_turn_costs_certainty_and_facing_the_other_way_none() -> None:
