@@ -19,12 +19,14 @@ from dpm2_core.geometry.calibration import with_calibration
 from dpm2_core.geometry.kabsch import transform, weighted_kabsch
 from dpm2_core.network.consensus import TOLERANCE, consensus
 from dpm2_core.network.decoder import Correlated, Decoder
+from dpm2_core.network.gauss_newton import solve_pose
 from dpm2_core.network.matching import Correspondences, correspond, guided_scores, match_scores
 from dpm2_core.network.tokens import Tokens
 
 MIN_INLIERS = 30
 CONFIDENT = 30  # pairs whose mean confidence is that of the registration
 CHI2 = 11.3  # 99 % quantile with 3 degrees of freedom: inliers of the precision-weighted solve
+ROUNDS = 8  # of the precision-weighted solve
 SOFT = 3.0  # degrees of freedom of the Student weights in the precision-weighted solve
 
 
@@ -79,7 +81,7 @@ def whitened_residuals(T: Tensor, pairs: Correspondences) -> tuple[Tensor, Tenso
     return residual, jacobian
 
 
-def weighted_gauss_newton(T: Tensor, pairs: Correspondences, rounds: int = 8) -> tuple[Tensor, Tensor]:
+def weighted_gauss_newton(T: Tensor, pairs: Correspondences, rounds: int = ROUNDS) -> tuple[Tensor, Tensor]:
     """Iteratively reweighted Gauss-Newton on the residuals weighed with their predicted precision.
 
     Args:
@@ -173,10 +175,26 @@ def register_batch(decoder: Decoder, source: Tokens, target: Tokens, correlated:
 
 
 def _solve_precise(pairs: Correspondences, T: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Pose, information and inliers by the predicted precisions."""
-    T, information = weighted_gauss_newton(T, pairs)
-    residual, _ = whitened_residuals(T, pairs)
-    return T, information, ((residual * residual).sum(-1) <= CHI2) & (pairs.weight > 0)
+    """Pose, information and inliers by the predicted precisions; as machine code where no gradient is asked for."""
+    if T.device.type == "cpu" and not torch.is_grad_enabled():
+        T, information, squared = _solve_compiled(pairs, T)
+    else:
+        T, information = weighted_gauss_newton(T, pairs)
+        squared = whitened_residuals(T, pairs)[0].square().sum(-1)
+    return T, information, (squared <= CHI2) & (pairs.weight > 0)
+
+
+def _solve_compiled(pairs: Correspondences, T: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """`weighted_gauss_newton`, and the squared residuals after it."""
+    poses = T.double().clone()
+    fields = (pairs.source, pairs.target, pairs.weight, pairs.L)
+    arrays = [np.ascontiguousarray(field.double().numpy()) for field in fields]
+    solved = [
+        solve_pose(pose, source, target, weight, L, (SOFT, float(ROUNDS)))
+        for pose, source, target, weight, L in zip(poses.numpy(), *arrays, strict=True)
+    ]
+    information, squared = (torch.from_numpy(np.stack(parts)) for parts in zip(*solved, strict=True))
+    return poses, information, squared
 
 
 def _solve_svd(pairs: Correspondences, T: Tensor) -> tuple[Tensor, Tensor, Tensor]:

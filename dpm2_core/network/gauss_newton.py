@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The precision-weighted solve of `pose_solver` as machine code, for inference: the same steps without gradients."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dpm2_core.geometry.compiled import compiled
+
+Array = NDArray[np.float64]
+_DAMPING = 1e-6
+
+
+@compiled("void(f8[:, ::1], f8[::1], f8[::1])")
+def _solve(A: Array, b: Array, x: Array) -> None:
+    """x (6,) with A x = b, A (6, 6) symmetric and positive definite, by Cholesky; NaN if it is not."""
+    L = np.zeros((6, 6))
+    for i in range(6):
+        for j in range(i + 1):
+            s = A[i, j]
+            for k in range(j):
+                s -= L[i, k] * L[j, k]
+            L[i, j] = np.sqrt(s) if i == j else s / L[j, j]
+    for i in range(6):
+        s = b[i]
+        for k in range(i):
+            s -= L[i, k] * x[k]
+        x[i] = s / L[i, i]
+    for i in range(5, -1, -1):
+        s = x[i]
+        for k in range(i + 1, 6):
+            s -= L[k, i] * x[k]
+        x[i] = s / L[i, i]
+
+
+@compiled("void(f8[:, ::1], f8[::1])")
+def _move(T: Array, xi: Array) -> None:
+    """T (4, 4) becomes T exp(xi), xi (6,) [rotation, translation]."""
+    square = xi[0] * xi[0] + xi[1] * xi[1] + xi[2] * xi[2]
+    angle = np.sqrt(square)
+    if square < 1e-8:  # the series' next terms are below the rounding
+        a, b, c = 1 - square / 6, 0.5 - square / 24, 1 / 6 - square / 120
+    else:
+        a, b, c = np.sin(angle) / angle, (1 - np.cos(angle)) / square, (angle - np.sin(angle)) / (square * angle)
+    W, E, V = np.zeros((3, 3)), np.eye(3), np.eye(3)
+    W[0, 1], W[0, 2], W[1, 2] = -xi[2], xi[1], -xi[0]
+    W[1, 0], W[2, 0], W[2, 1] = xi[2], -xi[1], xi[0]
+    for i in range(3):
+        for j in range(3):
+            W2 = W[i, 0] * W[0, j] + W[i, 1] * W[1, j] + W[i, 2] * W[2, j]
+            E[i, j] += a * W[i, j] + b * W2
+            V[i, j] += b * W[i, j] + c * W2
+    for i in range(3):
+        x, y, z = T[i, 0], T[i, 1], T[i, 2]
+        for j in range(3):
+            T[i, j] = x * E[0, j] + y * E[1, j] + z * E[2, j]
+            T[i, 3] += (x * V[0, j] + y * V[1, j] + z * V[2, j]) * xi[3 + j]
+
+
+@compiled("void(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1])")
+def _whiten(T: Array, source: Array, target: Array, L: Array, residual: Array, jacobian: Array) -> None:
+    """Residuals (N, 3) in units of their deviation and their Jacobian (N, 3, 6), of which the first half of the pairs
+    has its precision L L^T in the source frame, the other in the target frame."""
+    half, arm, back, P = len(source) // 2, np.empty(3), np.empty(3), np.empty((3, 3))
+    for n in range(len(source)):
+        x, y, z = target[n, 0] - T[0, 3], target[n, 1] - T[1, 3], target[n, 2] - T[2, 3]
+        for i in range(3):
+            back[i] = T[0, i] * x + T[1, i] * y + T[2, i] * z
+            arm[i] = back[i] if n < half else source[n, i]
+            for j in range(3):
+                if n < half:
+                    P[i, j] = L[n, i, j]
+                else:
+                    P[i, j] = T[0, i] * L[n, 0, j] + T[1, i] * L[n, 1, j] + T[2, i] * L[n, 2, j]
+        for j in range(3):
+            p, q, r = P[0, j], P[1, j], P[2, j]
+            residual[n, j] = p * (source[n, 0] - back[0]) + q * (source[n, 1] - back[1]) + r * (source[n, 2] - back[2])
+            jacobian[n, j, 0] = r * arm[1] - q * arm[2]
+            jacobian[n, j, 1] = p * arm[2] - r * arm[0]
+            jacobian[n, j, 2] = q * arm[0] - p * arm[1]
+            jacobian[n, j, 3], jacobian[n, j, 4], jacobian[n, j, 5] = p, q, r
+
+
+@compiled("Tuple((f8[:, ::1], f8[::1]))(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, :, ::1], UniTuple(f8, 2))")
+def solve_pose(
+    T: Array, source: Array, target: Array, weight: Array, L: Array, how: tuple[float, float]
+) -> tuple[Array, Array]:
+    """`pose_solver.weighted_gauss_newton` of one set of pairs.
+
+    Args:
+        T: (4, 4) start; it becomes the result. source, target: (N, 3), m; weight: (N,); L: (N, 3, 3): see
+            `Correspondences`.
+        how: degrees of freedom of the Student weights, and how many steps.
+
+    Returns:
+        Information matrix (6, 6) of xi in T exp(xi) at the last step, and the squared residuals (N,) after it.
+    """
+    soft, rounds = how
+    n_pairs = len(source)
+    residual, jacobian, squared = np.empty((n_pairs, 3)), np.empty((n_pairs, 3, 6)), np.empty(n_pairs)
+    information, gradient, step = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
+    for _ in range(int(rounds)):
+        _whiten(T, source, target, L, residual, jacobian)
+        information[:], gradient[:] = _DAMPING * np.eye(6), 0.0
+        for n in range(n_pairs):
+            s = residual[n, 0] ** 2 + residual[n, 1] ** 2 + residual[n, 2] ** 2
+            w = weight[n] * (soft + 3) / (soft + s)
+            for axis in range(3):
+                for i in range(6):
+                    weighted = w * jacobian[n, axis, i]
+                    gradient[i] -= weighted * residual[n, axis]
+                    for j in range(6):
+                        information[i, j] += weighted * jacobian[n, axis, j]
+        _solve(information, gradient, step)
+        _move(T, step)
+    _whiten(T, source, target, L, residual, jacobian)
+    for n in range(n_pairs):
+        squared[n] = residual[n, 0] ** 2 + residual[n, 1] ** 2 + residual[n, 2] ** 2
+    return information, squared
