@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from dpm2_core.geometry.sampling import Index, Points
+from dpm2_core.geometry.point_grid import PointGrid
+from dpm2_core.geometry.sampling import Index, Points, neighbours
 from dpm2_core.geometry.voxel import voxel_first
 
 SPACING = 1.5  # m between two edges
@@ -19,21 +20,20 @@ _CELL = 0.45  # m, of the columns that may hold an edge, and of the grid that th
 _KEPT = 16  # best candidates for each edge wanted: more than are within the spacing of one
 
 
-def vertical_edges(cloud: Points, tree: cKDTree, most: int) -> Points:
+def vertical_edges(cloud: Points, grid: PointGrid, most: int) -> Points:
     """Up to `most` (k, 3) places on vertical edges and poles, the clearest first, `SPACING` m apart.
 
     A place is the mean of 16 neighbors whose extent is linear and vertical. Sparse beams, and places without vertical
     structure, give fewer or none: each must have been seen at heights no farther apart than 0.5 m, over 1 m.
 
     Args:
-        cloud: (N, 3) m, of one point a voxel of about 0.3 m. tree: of the cloud.
+        cloud: (N, 3) m, of one point a voxel of about 0.3 m. grid: of the cloud.
     """
     candidates = cloud[_in_tall_columns(cloud)]
     candidates = candidates[voxel_first(candidates, _CELL)]
     if most <= 0 or not len(candidates):
         return np.zeros((0, 3), np.float32)
-    distance, index = tree.query(candidates, _NEIGHBOURS)
-    index = np.where(distance <= _RADIUS, index, index[:, :1])  # a missing neighbor has distance inf
+    index = neighbours(grid, candidates, _NEIGHBOURS, _RADIUS)
     height = np.sort(cloud[index, 2], 1)
     known = (height[:, -1] - height[:, 0] >= _LENGTH) & (np.diff(height, axis=1).max(1) <= _GAP)
     around = cloud[index[known]] - candidates[known, None]

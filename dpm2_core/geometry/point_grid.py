@@ -21,7 +21,7 @@ _FIRST = 0.8  # cells: how far `neighbors` looks at first
 
 
 class PointGrid:
-    """Where the (M, 3) float64 points of a cloud are; all finite, M >= 1.
+    """Where the (M, 3) float64 points of a cloud are; all finite.
 
     The occupied blocks are numbered in a dense table; the points of a block follow one another, cell by cell.
 
@@ -31,8 +31,8 @@ class PointGrid:
 
     def __init__(self, points: Array, cell: float) -> None:
         """`cell` is the edge of the cells, m: about as far as the neighbors are that will be asked for."""
-        low = points.min(0)
-        extent = points.max(0) - low
+        low = points.min(0) if len(points) else np.zeros(3)
+        extent = points.max(0) - low if len(points) else np.zeros(3)
         while np.prod(blocks := np.floor(extent / (_SIDE * cell)) + 1) > _BLOCKS:
             cell *= 2
         corner = np.append(low, cell)
@@ -46,9 +46,17 @@ class PointGrid:
         none."""
         return _nearest(np.ascontiguousarray(queries), radius, self._grid)
 
-    def neighbors(self, queries: Array, k: int) -> Index:
-        """Places (Q, k) in `points` of the k <= M nearest to each of the finite (Q, 3) queries, nearest first."""
-        return _neighbors(np.ascontiguousarray(queries), k, self._grid)
+    def neighbors(self, queries: Array, k: int, radius: float = np.inf) -> Index:
+        """Places (Q, k) in `points` of the k nearest to each of the finite (Q, 3) queries, nearest first.
+
+        Where there are fewer, or fewer within `radius`, m, the nearest one is repeated; it may be farther.
+
+        Raises:
+            ValueError: the cloud is empty.
+        """
+        if not len(self.points):
+            raise ValueError("an empty cloud has no neighbors")
+        return _neighbors(np.ascontiguousarray(queries), k, radius, self._grid)
 
 
 @compiled("Tuple((i4[::1], i4[::1]))(f8[:, ::1], f8[::1], i4[:, :, ::1])")
@@ -203,17 +211,19 @@ def _select(squared: Array, index: Index, count: int, k: int) -> None:
         squared[j], index[j] = s, of_s
 
 
-@compiled(f"i4[:, ::1](f8[:, ::1], i8, {_GRID})")
-def _neighbors(queries: Array, k: int, grid: _Grid) -> Index:
-    """See `PointGrid.neighbors`: all within a radius, which is doubled until there are enough."""
+@compiled(f"i4[:, ::1](f8[:, ::1], i8, f8, {_GRID})")
+def _neighbors(queries: Array, k: int, radius: float, grid: _Grid) -> Index:
+    """See `PointGrid.neighbors`: all within a distance, which is doubled until there are enough."""
     out = np.empty((len(queries), k), np.int32)
     squared, index = np.empty(len(grid[0]) + 1), np.empty(len(grid[0]) + 1, np.int32)
+    wanted = min(k, len(grid[0]))
     for q in range(len(queries)):
-        reach = _FIRST * grid[1][3]
+        reach = min(_FIRST * grid[1][3], radius)
         found = _within(queries[q], reach, grid, squared, index)
-        while found < k:
-            reach *= 2
+        while found == 0 or (found < wanted and reach < radius):
+            reach = 2 * reach if found == 0 else min(2 * reach, radius)
             found = _within(queries[q], reach, grid, squared, index)
-        _select(squared, index, found, k)
-        out[q] = index[:k]
+        _select(squared, index, found, min(wanted, found))
+        for j in range(k):
+            out[q, j] = index[j] if j < found and squared[j] <= radius * radius else index[0]
     return out

@@ -1,21 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Point sampling in numpy: range crop, farthest points, hybrid neighbor query."""
+"""Point sampling: farthest points, hybrid neighbor query."""
 
 from __future__ import annotations
 
 import fpsample
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+
+from dpm2_core.geometry.point_grid import PointGrid
 
 Points = NDArray[np.float32]
 Index = NDArray[np.int64]
-
-
-def in_range(points: Points, near: float, far: float) -> NDArray[np.bool_]:
-    """Mask of the (N, 3) points whose distance from the origin is near..far m; NaN and inf are outside."""
-    squared = np.einsum("ij,ij->i", points, points)
-    return (squared >= near * near) & (squared <= far * far)
 
 
 def farthest_points(points: Points, count: int) -> Index:
@@ -44,10 +39,9 @@ def interleaved(points: Points, special: Points, first: int) -> Points:
     return out
 
 
-def neighbours(tree: cKDTree, queries: Points, k: int, radius: float) -> Index:
+def neighbours(grid: PointGrid, queries: Points, k: int, radius: float) -> Index:
     """(M, k) indices of the neighbors of each query, nearest first; those beyond `radius` m repeat the nearest.
 
-    The hybrid of a ball query and k nearest neighbors. The tree holds at least one point.
+    The hybrid of a ball query and k nearest neighbors, in the cloud that the grid was made of.
     """
-    distance, index = tree.query(queries, [*range(1, k + 1)])
-    return np.where(distance <= radius, index, index[:, :1])  # a missing neighbor has distance inf
+    return grid.order[grid.neighbors(queries.astype(np.float64), k, radius)].astype(np.int64)

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from dpm2_core.data.kitti import KittiSource
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.edges import SPACING, spaced, vertical_edges, verticality
+from dpm2_core.geometry.point_grid import PointGrid
 from dpm2_core.geometry.sampling import Points, farthest_points, interleaved
 from dpm2_core.network.pyramid import build_pyramid, crop
 from dpm2_core.network.settings import preset
@@ -40,7 +41,7 @@ def wall() -> Points:
 
 
 def edges_of(cloud: Points, most: int = 128) -> Points:
-    return vertical_edges(cloud, cKDTree(cloud), most)
+    return vertical_edges(cloud, PointGrid(cloud.astype(float), 1.5), most)
 
 
 def horizontally(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -42,6 +42,19 @@ def test_neighbors_are_exact_and_nearest_first(seed: int, count: int, cell: floa
     np.testing.assert_allclose(distance, np.sort(cdist(queries, points))[:, :k], rtol=1e-12, atol=1e-12)
 
 
+@given(st.integers(0, 10_000), st.integers(1, 60), st.floats(0.05, 20), st.integers(1, 20), st.floats(0.01, 100))
+def test_neighbors_beyond_the_radius_or_missing_repeat_the_nearest(
+    seed: int, count: int, cell: float, k: int, radius: float
+) -> None:
+    points, queries = spread_points(seed, count), spread_points(seed + 1, 50)
+    distance = np.pad(np.sort(cdist(queries, points)), ((0, 0), (0, 20)), constant_values=np.inf)[:, :k]
+    expected = np.where(distance <= radius, distance, distance[:, :1])
+    grid = PointGrid(points, cell)
+    found = np.linalg.norm(grid.points[grid.neighbors(queries, k, radius)] - queries[:, None], axis=2)
+    clear = np.abs(distance - radius) > 1e-9 * radius  # else rounding decides
+    np.testing.assert_allclose(found[clear], expected[clear], rtol=1e-12, atol=1e-12)
+
+
 def test_points_come_sorted_with_their_order() -> None:
     points = spread_points(3, 1000)
     grid = PointGrid(points, 0.5)
@@ -60,3 +73,10 @@ def test_a_query_that_is_not_finite_or_far_away_has_no_nearest_point() -> None:
     grid = PointGrid(spread_points(0, 100), 0.5)
     queries = np.array([[np.nan, 0, 0], [0, np.inf, 0], [1e9, 0, 0], [-1e300, 0, 0]])
     assert (grid.nearest(queries, 10.0) == -1).all()
+
+
+def test_an_empty_cloud() -> None:
+    grid = PointGrid(np.zeros((0, 3)), 0.5)
+    assert grid.nearest(np.zeros((2, 3)), 1.0).tolist() == [-1, -1]
+    with pytest.raises(ValueError, match="empty"):
+        grid.neighbors(np.zeros((2, 3)), 3)

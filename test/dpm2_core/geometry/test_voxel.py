@@ -29,3 +29,10 @@ def test_many_cells_that_share_slots() -> None:
 
 def test_nothing_in_nothing_out() -> None:
     assert len(voxel_first(np.zeros((0, 4), np.float32), 0.5)) == 0
+
+
+def test_range_rejects_what_is_not_finite() -> None:
+    """NaN, inf and the origin of a lost return are outside, and hide nothing in their cell."""
+    points = np.array([[np.nan, 0, 0], [np.inf, 0, 0], [0, 0, 0], [0.1, 0.1, 0.1], [3, 4, 0], [61, 0, 0]], np.float32)
+    assert voxel_first(points, 2.0, 1, 60).tolist() == [4]
+    assert voxel_first(points, 2.0, 0.1, 60).tolist() == [3, 4]
