@@ -47,8 +47,10 @@ def bench_tilt(options: Options) -> Report:
 
 def _of_drive(source: Source, network: DeepPointMap2, most: int) -> dict[str, Any]:
     poses, frames = truth_of(source), list(source.frames())
-    first = [(np.linspace(0, len(frames) - 1 - n, min(most, len(frames) - n)).astype(int), n) for n in APART]
-    pairs = [(int(a), int(a) + n) for starts, n in first if len(frames) > n for a in np.unique(starts)]
+    pairs = []
+    for n in APART:
+        starts = np.linspace(0, len(frames) - 1 - n, max(min(most, len(frames) - n), 0))
+        pairs += [(a, a + n) for a in np.unique(starts.astype(int)).tolist()]
     noise = np.random.default_rng(0)
     out: dict[str, Any] = {}
     for tilt, turned in product((*map(str, TILTS), "random"), (False, True)):

@@ -110,6 +110,18 @@ def test_the_covariance_benchmark_has_a_ratio_for_each_method_and_kind_of_pair(s
     }
 
 
+@pytest.mark.weights
+@pytest.mark.slow
+def test_the_tilt_benchmark_compares_level_axes_with_those_of_the_sensor(sequence: Path, tmp_path: Path) -> None:
+    bench(["tilt"], source=[sequence], out=tmp_path, threads=1, pairs=1)
+    tilts = json.loads((tmp_path / "tilt.json").read_text())["drives"][sequence.name]
+    assert set(tilts) == {"0", "15", "30", "random"}
+    level, sensor = (tilts["0"]["opposite"][axes] for axes in ("level", "sensor"))
+    assert level == sensor  # of a level sensor both are the same
+    assert level["1 apart"]["pairs"] == 1
+    assert level["8 apart"]["pairs"] == 0  # the drive is shorter
+
+
 def test_the_memory_benchmark_samples_the_resident_set(sequence: Path, tmp_path: Path) -> None:
     bench(["memory"], source=[sequence], out=tmp_path)
     result = json.loads((tmp_path / "memory.json").read_text())["drives"][sequence.name]
