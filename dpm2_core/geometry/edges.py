@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
+from dpm2_core.geometry.compiled import compiled
 from dpm2_core.geometry.point_grid import PointGrid
 from dpm2_core.geometry.sampling import Index, Points, neighbours
 from dpm2_core.geometry.voxel import voxel_first
@@ -42,7 +42,7 @@ def vertical_edges(cloud: Points, grid: PointGrid, most: int) -> Points:
     order = np.argsort(-score, kind="stable")[: _KEPT * most]
     order = order[score[order] >= _SCORE]
     at = (candidates[known] + mean)[order]
-    return at[spaced(at, SPACING)[:most]]
+    return at[spaced(at, SPACING, most)]
 
 
 def verticality(centered: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -68,19 +68,30 @@ def verticality(centered: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.clip(1 - ratio, 0, 1) * vertical
 
 
-def spaced(points: Points, spacing: float) -> Index:
-    """Ascending indices of the (N, 3) points that stay if, in order, each drops those closer than `spacing` m."""
-    near = cKDTree(points).query_pairs(spacing, output_type="ndarray") if len(points) else np.zeros((0, 2), np.int64)
-    first, second = near.min(1, initial=len(points)), near.max(1, initial=0)
-    stays = np.ones(len(points), bool)
-    while len(first):  # at once all that no open point before them is close to; a few rounds decide all
-        blocked = np.zeros(len(points), bool)
-        blocked[second] = True
-        dropped = second[~blocked[first]]
-        stays[dropped] = False
-        open_ = stays[first] & stays[second]
-        first, second = first[open_], second[open_]
-    return np.flatnonzero(stays)
+def spaced(points: Points, spacing: float, most: int) -> Index:
+    """Ascending indices of the first `most` of the (N, 3) points that stay if, in order, each drops those within
+    `spacing` m of it."""
+    return _spaced(points.astype(np.float64), spacing * spacing, most)
+
+
+@compiled("i8[::1](f8[:, ::1], f8, i8)")
+def _spaced(points: NDArray[np.float64], squared: float, most: int) -> Index:
+    """Each is compared with those that stay, which are few."""
+    stays, count = np.empty(min(most, len(points)), np.int64), 0
+    for i in range(len(points)):
+        if count == len(stays):
+            break
+        free = True
+        for j in range(count):
+            k = stays[j]
+            x, y, z = points[i, 0] - points[k, 0], points[i, 1] - points[k, 1], points[i, 2] - points[k, 2]
+            if x * x + y * y + z * z <= squared:
+                free = False
+                break
+        if free:
+            stays[count] = i
+            count += 1
+    return stays[:count].copy()
 
 
 def _in_tall_columns(cloud: Points) -> NDArray[np.bool_]:

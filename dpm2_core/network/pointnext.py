@@ -95,7 +95,7 @@ def pool_neighbors(own: Tensor | None, index: Tensor | None, relative: Tensor, w
         if own is not None and index is not None:
             sums = gather(own, index).add_(sums)
         if torch.is_inference_mode_enabled():
-            return sums.amax(2)
+            return max_neighbor(sums)
         best = argmax_neighbor(sums)
     n_places = relative.shape[-1]
     chosen = relative.gather(2, best[..., None].expand(*best.shape, n_places))
@@ -103,6 +103,14 @@ def pool_neighbors(own: Tensor | None, index: Tensor | None, relative: Tensor, w
     if own is not None and index is not None:
         out = out + own.gather(1, index.gather(2, best))
     return out
+
+
+def max_neighbor(sums: Tensor) -> Tensor:
+    """Maximum (B, n, C) of (B, n, k, C) over k, by halves: `amax` over an inner one is slow in bf16 on the CPU."""
+    while (k := sums.shape[2]) > 1:
+        half = (k + 1) // 2
+        sums = torch.maximum(sums[:, :, :half], sums[:, :, k - half :])
+    return sums[:, :, 0]
 
 
 def argmax_neighbor(sums: Tensor) -> Tensor:

@@ -108,7 +108,8 @@ def test_spacing_is_that_of_one_after_the_other(noise: np.random.Generator, n: i
     for i, point in enumerate(points):
         if all(np.linalg.norm(point - points[j]) > SPACING for j in stays):
             stays.append(i)
-    assert spaced(points, SPACING).tolist() == stays
+    assert spaced(points, SPACING, len(points)).tolist() == stays
+    assert spaced(points, SPACING, 5).tolist() == stays[:5]
 
 
 @pytest.mark.parametrize(("n", "k", "first"), [(100, 0, 40), (100, 20, 40), (100, 13, 40), (30, 15, 40), (40, 40, 40)])

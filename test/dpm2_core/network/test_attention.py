@@ -101,3 +101,11 @@ def test_sine_code_of_known_values() -> None:
     assert code.shape == (256,)
     torch.testing.assert_close(code[[0, 1, 84, 85, 168, 169]], torch.tensor([1.0, 0, 0, 1, 0, -1]), atol=1e-6, rtol=0)
     assert (code[252:] == 0).all()
+
+
+def test_a_mask_that_hides_nothing_changes_nothing() -> None:
+    torch.manual_seed(0)
+    attention = Attention(16, 4)
+    x, tokens, bias = torch.randn(2, 6, 16), torch.randn(2, 9, 16), torch.randn(2, 1, 6, 9)
+    shown = attention(x, tokens, bias, torch.ones(2, 1, 1, 9, dtype=torch.bool))
+    assert torch.equal(shown, attention(x, tokens, bias, None))

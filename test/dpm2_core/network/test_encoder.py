@@ -15,7 +15,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.network.convnext import FeatureMap
 from dpm2_core.network.encoder import Encoder, collate_views, resize
 from dpm2_core.network.model import DeepPointMap2
-from dpm2_core.network.pointnext import argmax_neighbor
+from dpm2_core.network.pointnext import argmax_neighbor, max_neighbor
 from dpm2_core.network.pretrained import weights_path
 from dpm2_core.network.pyramid import build_pyramid, collate, crop
 from dpm2_core.network.settings import PRESETS, preset
@@ -214,3 +214,10 @@ def test_the_feature_of_the_own_pixel_begins_as_nothing(noise: np.random.Generat
     fusion = Encoder(tiny()).fusion
     assert fusion is not None
     assert fusion.pixel_in.weight.abs().max() == 0
+
+
+@pytest.mark.parametrize("k", [1, 2, 5, 16, 24])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_the_maximum_over_neighbors_is_exact(k: int, dtype: torch.dtype) -> None:
+    sums = torch.randn(2, 7, k, 5).to(dtype)
+    assert (max_neighbor(sums) == sums.amax(2)).all()
