@@ -25,10 +25,8 @@ def up_of(points: NDArray[np.floating]) -> NDArray[np.float32] | None:
 
     None of a scan that shows no ground, such as of a room full of things, or whose ground is steeper than 40 degrees.
     """
-    xyz = np.ascontiguousarray(points[:, :3], np.float32)
-    squared = np.einsum("ij,ij->i", xyz, xyz)
-    xyz = xyz[(squared > 0.25) & (squared < _REACH**2)]  # False for NaN
-    xyz = xyz[voxel_first(xyz, _VOXEL)].astype(np.float64)
+    points = points.astype(np.float32, copy=False)
+    xyz = points[voxel_first(points, _VOXEL, 0.5, _REACH), :3].astype(np.float64)
     if len(xyz) < 64:
         return None
     normals, heights = _planes(xyz)
