@@ -20,6 +20,8 @@ from dpm2_core.network.pose_solver import register_batch
 from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.network.tokens import Tokens, to_tokens
 
+_KEPT = 4  # sets that are prepared: a scan, the map before a pause and the one after it
+
 
 class DeepPointMap2(nn.Module):
     """The whole network."""
@@ -29,7 +31,7 @@ class DeepPointMap2(nn.Module):
         self.settings = settings
         self.encoder = Encoder(settings)
         self.decoder = Decoder(settings)
-        self._target: tuple[Descriptors, Tokens, Prepared] | None = None  # of the last call of `register`
+        self._prepared: tuple[tuple[Descriptors, Tokens, Prepared], ...] = ()  # by `register`, the last used first
 
     def describe(self, frame: Frame) -> Descriptors:
         """Descriptors of a frame's points and, if the network has an image branch, its images.
@@ -43,18 +45,22 @@ class DeepPointMap2(nn.Module):
     def register(self, source: Descriptors, target: Descriptors) -> Registration:
         """Pose of the source in the frame of the target; either may be merged from several frames.
 
-        The target's part of the work is kept for the next call with the same object, such as the map of an odometry.
+        What is done for each set alone is kept for the next calls with the same object, such as the map of an odometry.
         """
-        device = next(self.parameters()).device
-        decoder = self.decoder
-        x = to_tokens([source.level()], decoder.view_aligned, device)
-        with torch.autocast(device.type, torch.bfloat16):
-            if self._target is None or self._target[0] is not target:
-                y = to_tokens([target.level()], decoder.view_aligned, device)
-                self._target = (target, y, decoder.prepare(y))
-            _, y, prepared = self._target
-            level = register_batch(decoder, x, y, decoder.correlate(decoder.prepare(x), prepared))[0]
-            return _tilted(level, source, target)
+        with torch.autocast(next(self.parameters()).device.type, torch.bfloat16):
+            (y, prepared_target), (x, prepared_source) = self._prepare(target), self._prepare(source)
+            correlated = self.decoder.correlate(prepared_source, prepared_target)
+            return _tilted(register_batch(self.decoder, x, y, correlated)[0], source, target)
+
+    def _prepare(self, descriptors: Descriptors) -> tuple[Tokens, Prepared]:
+        """A set for the decoder, made or kept."""
+        entry = next((kept for kept in self._prepared if kept[0] is descriptors), None)
+        if entry is None:
+            tokens = to_tokens([descriptors.level()], self.decoder.view_aligned, next(self.parameters()).device)
+            entry = descriptors, tokens, self.decoder.prepare(tokens)
+        others = tuple(kept for kept in self._prepared if kept[0] is not descriptors)
+        self._prepared = (entry, *others)[:_KEPT]  # a new tuple: the SLAM's threads have shallow copies of the network
+        return entry[1:]
 
     @torch.inference_mode()
     def register_many(self, sources: list[Descriptors], targets: list[Descriptors]) -> list[Registration]:
