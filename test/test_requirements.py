@@ -18,7 +18,7 @@ import pytest
 from packaging.requirements import Requirement
 
 ROOT = Path(__file__).resolve().parents[1]
-WITH_ANOTHER_WAY = {"kiss_icp", "pypose"}  # a benchmark says that there is nothing to compare with
+WITH_ANOTHER_WAY = {"kiss_icp", "pypose", "small_gicp"}  # a benchmark says that there is nothing to compare with
 FILES = sorted(
     path
     for folder in ("dpm2_core", "dpm2_ros", "benchmarks", "tools", "launch")

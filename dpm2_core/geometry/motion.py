@@ -9,6 +9,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.geometry.se3 import Array
 
 _HORIZON = 10.0  # s: farther ahead no motion is extrapolated
+_STEPS = 10  # of a motion that changes
 _TURN = 0.3  # rad/s, standard deviation of the yaw rate in traffic
 _TILT = 0.1  # of the heading's: slopes
 
@@ -16,6 +17,15 @@ _TILT = 0.1  # of the heading's: slopes
 def predicted(T: Array, twist: Array, seconds: float) -> Array:
     """The pose (4, 4) after that time at a constant `twist` (6,) [rad/s, m/s]."""
     return T @ se3.exp(twist * min(seconds, _HORIZON))
+
+
+def between(T: Array, before: Array, after: Array, seconds: float) -> Array:
+    """The pose (4, 4) after that time if the motion changes evenly from one twist (6,) [rad/s, m/s] to the other."""
+    step = seconds / _STEPS
+    for i in range(_STEPS):
+        part = (i + 0.5) / _STEPS
+        T = T @ se3.exp(((1 - part) * before + part * after) * step)
+    return T
 
 
 def covariance(speed: float, seconds: float, acceleration: float) -> Array:

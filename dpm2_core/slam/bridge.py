@@ -9,27 +9,30 @@ of each other, move as the stretch does, when no direction is left open, and whe
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from dpm2_core.frame import Array, Registration
 from dpm2_core.geometry import se3
-from dpm2_core.geometry.motion import covariance, predicted, velocity_change
+from dpm2_core.geometry.motion import between, covariance, predicted, velocity_change
 from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration, agree
 
 _TIES = 3
-"""So many results must agree: two meet by chance."""
+"""So many results must agree, and most of all that there are: two meet by chance."""
 _MOVED = 1.0
 """They are evidence only when the robot has moved in between, m..."""
 _AS_WELL = 0.9
 """...or when the scan fits the map before at least this much as well as its own stretch: one stands where one stood."""
-_SPEEDS = (1.0, 0.75, 0.5, 0.25, 0.0, 1.25)
-"""Fractions of the motion so far from which the pose is searched: a vehicle brakes and stops sooner than it
-gains."""
-_TURNS = (0.15, -0.15, 0.3, -0.3)  # rad/s: the same for the change of the yaw rate
+_BRAKES = 0.35  # m/s2: the way is searched so far around that of an even change of the motion, times seconds squared
+_STEERS = 0.06  # rad/s2: the same for the heading
+_PARTS = (0.75, 0.5, 0.25, 0.0)  # of that way, that are searched too if the robot, braking by
+_STOPS = 4.0  # m/s2, may have stood for a while
+_RIVALS = 4.0  # m: at least so far, for other places that may fit as well
+_FARTHEST, _WIDEST = 12.0, 0.6  # m and rad: no farther
+_STEP, _TURN = 1.0, 0.07  # m and rad between two starts: the points find their place from within
+_SWAY = 0.05  # rad/s
 
 
 @dataclass(frozen=True)
@@ -64,12 +67,13 @@ class Bridge:
         self.tries = 0
         self._T = T
         self._limits = limits
-        self._ties: deque[_Tie] = deque(maxlen=_TIES)
+        self._ties: list[_Tie] = []
 
     def begin(self, seconds: float) -> Array:
         """A new stretch, so long after the last pose before the pause: where it begins (4, 4)."""
         self._seconds = seconds
         self._ties.clear()
+        self._after: Array | None = None
         self._T_begin = predicted(self._T, self._motion, seconds)
         return self._T_begin
 
@@ -94,50 +98,93 @@ class Bridge:
                 `own` is how it was registered there.
         """
         self.tries += 1
+        if self._after is None:
+            self._after = twist
         T_begin_this = se3.inverse(self._T_begin) @ T_stretch
-        motions = [part * self._motion for part in _SPEEDS]
-        motions += [self._motion + np.array([0, 0, turn, 0, 0, 0]) for turn in _TURNS]
-        if twist is not None:  # as if the motion had changed evenly
-            motions.insert(1, (self._motion + twist) / 2)
-        starts = [predicted(self._T, motion, self._seconds) @ T_begin_this for motion in motions]
-        result = self.registration.register(scan, Prediction(starts, widen=2.0))
-        problem = self._problem(result, twist)
+        starts = self._beginnings() @ T_begin_this
+        result = self.registration.register(scan, Prediction(list(starts), unique=True))
+        problem = self._problem(result, result.T_target_source @ se3.inverse(T_begin_this))
         if problem:
             return replace(result, ok=False, reason=problem), False
         self._ties.append(_Tie(result, T_stretch))
         return result, self._together(result.confidence >= _AS_WELL * own.confidence)
+
+    def _beginnings(self) -> Array:
+        """Where the stretch may begin (P, 4, 4), the most likely first."""
+        before, after = (_steered(twist) for twist in self._motions)
+        seconds = self._seconds
+        far = min(max(_BRAKES * seconds**2, _RIVALS), _FARTHEST)
+        wide = min(_STEERS * seconds**2, _WIDEST)
+        ahead = _direction(before, after)
+        left, up = np.array([-ahead[1], ahead[0], 0.0]), np.array([0.0, 0.0, 1.0])
+        asides = _STEP * np.array([np.zeros(3), left, -left, up, -up])
+        offsets = np.array([way * ahead + aside for aside in asides for way in _spread(far, _STEP / 2)])
+        rates = [np.array([0, 0, turn / seconds, 0, 0, 0]) for turn in _spread(wide, _TURN)]
+        ends = [between(self._T, before + rate, after + rate, seconds) for rate in rates]
+        way = seconds * float(np.linalg.norm(before[3:] + after[3:])) / 2
+        parts = [part for part in _PARTS if (1 - part) * way <= _STOPS * seconds**2 / 4]
+        ends += [between(self._T, part * before, part * after, seconds) for part in parts]
+        poses = np.repeat(ends, len(offsets), 0)
+        poses[:, :3, 3] += np.concatenate([offsets @ T[:3, :3].T for T in ends])
+        return poses
 
     @property
     def _motion(self) -> Array:
         return np.zeros(6) if self.twist is None else self.twist
 
     @property
+    def _motions(self) -> tuple[Array, Array]:
+        """Before the pause and after it (6,); each for the other while that is not known."""
+        known = [twist for twist in (self.twist, self._after) if twist is not None] or [self._motion]
+        return known[0], known[-1]
+
+    @property
     def _speed(self) -> float:
         return float(np.linalg.norm(self._motion[3:]))
 
-    def _problem(self, result: Registration, twist: Array | None) -> str:
-        """Why a result cannot be right."""
+    def _problem(self, result: Registration, T_begin: Array) -> str:
+        """Why a result, by which the stretch begins at T_begin (4, 4), cannot be right."""
         if not result.ok:
             return result.reason
         if (sigma := result.worst_sigma) > self._limits.sigma:
             return f"after a pause: position uncertain by {sigma:.2f} m"
-        if twist is None or self.twist is None:
+        if self._after is None or self.twist is None:
             return ""
         # Between two known velocities, with a bounded acceleration, nothing is farther from their mean times the time.
-        way = self._T[:3, :3].T @ (result.T_target_source[:3, 3] - self._T[:3, 3])
-        turned = (se3.inverse(self._T) @ result.T_target_source)[:3, :3]
-        off = float(np.linalg.norm(way - self._seconds / 2 * (self.twist[3:] + turned @ twist[3:])))
+        T_before_begin = se3.inverse(self._T) @ T_begin
+        mean = (self.twist[3:] + T_before_begin[:3, :3] @ self._after[3:]) / 2
+        off = float(np.linalg.norm(T_before_begin[:3, 3] - self._seconds * mean))
         if off > _MOVED + self._limits.acceleration * self._seconds**2 / 4:
             return f"after a pause: {off:.0f} m from where the motion before and after leads"
         return ""
 
     def _together(self, fits: bool) -> bool:
-        """Whether the last results move as the stretch does; at a halt that says little, unless the scan `fits`."""
+        """Whether most results move as the stretch does; at a halt that says little, unless the scan `fits`."""
         last = self._ties[-1]
-        moved = [se3.inverse(tie.T_stretch) @ last.T_stretch for tie in self._ties]
-        if len(moved) < _TIES or not (fits or np.linalg.norm(moved[0][:3, 3]) >= _MOVED):
+        ways = [se3.inverse(tie.T_stretch) @ last.T_stretch for tie in self._ties]
+        agreeing = [
+            float(np.linalg.norm(way[:3, 3]))
+            for tie, way in zip(self._ties, ways, strict=True)
+            if agree(replace(tie.before, T_target_source=tie.before.T_target_source @ way), last.before)
+        ]
+        if len(agreeing) < _TIES or 2 * len(agreeing) <= len(self._ties):
             return False
-        return all(
-            agree(replace(tie.before, T_target_source=tie.before.T_target_source @ way), last.before)
-            for tie, way in zip(self._ties, moved, strict=True)
-        )
+        return fits or max(agreeing) >= _MOVED
+
+
+def _direction(before: Array, after: Array) -> Array:
+    """Unit vector (3,) in which the robot moves; ahead if it stands."""
+    v = before[3:] + after[3:]
+    speed = np.linalg.norm(v)
+    return v / speed if speed > 0.1 else np.array([1.0, 0.0, 0.0])
+
+
+def _steered(twist: Array) -> Array:
+    """A twist (6,) without the sway of the body: what turns more slowly would not go on for seconds."""
+    return twist if np.linalg.norm(twist[:3]) > _SWAY else np.concatenate([np.zeros(3), twist[3:]])
+
+
+def _spread(most: float, step: float) -> Array:
+    """Multiples of a step up to `most` to both sides, the smallest first."""
+    values = np.arange(np.ceil(most / step) + 1) * step
+    return np.stack([values, -values], 1).ravel()[1:]

@@ -67,7 +67,7 @@ def make_registration(s: SlamSettings) -> ScanRegistration:
     geometric = GeometricScanRegistration(preprocessor, GeometricRegistration(s.geometric), LocalMap(s.local_map))
     chosen: ScanRegistration = geometric
     if s.registration != "geometric":
-        neural = NeuralScanRegistration(s.neural, preprocessor, _network(s))
+        neural = NeuralScanRegistration(s.neural, preprocessor, _network(s), s.registration != "adaptive")
         chosen = (
             neural
             if s.registration == "neural"

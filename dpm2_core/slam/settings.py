@@ -26,9 +26,10 @@ from dpm2_core.slam.registration.visual import VisualSettings
 class SlamSettings(Settings):
     """The SLAM, stage by stage."""
 
-    registration: Literal["geometric", "neural", "refined", "adaptive"] = "geometric"
+    registration: Literal["geometric", "neural", "refined", "adaptive"] = "adaptive"
     """How a scan finds its pose: by points, by neural descriptors, by both (refined), or by points that ask the network
-    where they do not know (adaptive): at the start, after a pause, at few frames per second, along a tunnel."""
+    where they do not know (adaptive): at the start, after a pause, at few frames per second, along a tunnel. Adaptive
+    describes the scans of the LiDAR alone."""
     threads: int = Field(2, ge=1)
     """Threads of the neighbor search and of the network."""
     filter: FilterSettings = FilterSettings()

@@ -58,7 +58,7 @@ def slam_figures(task: Task, path: Path) -> dict[str, float]:
 
 def _odometry(clouds: list[np.ndarray]) -> Array:
     """Poses (N, 4, 4) of clouds (M, 3), m."""
-    odometry = make_odometry(SlamSettings())
+    odometry = make_odometry(SlamSettings(registration="geometric"))
     poses = []
     for i, cloud in enumerate(clouds):
         points = np.concatenate([cloud, np.zeros((len(cloud), 1))], 1).astype(np.float32)

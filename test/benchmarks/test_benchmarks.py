@@ -58,10 +58,10 @@ def test_the_geometric_benchmark_records_errors_speed_and_origin(sequence: Path,
         out=tmp_path,
         repetitions=2,
         threads=1,
-        settings=["slam.map.voxel=1"],
+        settings=["slam.registration=geometric"],
     )
     record = json.loads((tmp_path / "geometric.json").read_text())
-    assert (record["benchmark"], record["overrides"]) == ("geometric", ["slam.map.voxel=1"])
+    assert (record["benchmark"], record["overrides"]) == ("geometric", ["slam.registration=geometric"])
     assert record["machine"]["threads"] == 1
     assert record["versions"]["numpy"] == np.__version__
     assert set(record["drives"]) == {sequence.name, f"{sequence.name} (2)"}

@@ -66,7 +66,7 @@ class FusedScanRegistration:
     def register(self, scan: Scan, prediction: Prediction) -> Registration:
         if not self._always and prediction.sigma <= _SURE_MOTION:
             points = self._geometric.register(scan, prediction)
-            if points.ok and points.confidence >= _SURE_FIT and points.worst_sigma <= _SURE_SIGMA:
+            if _sure(points):
                 return points
         neural = self._neural.register(scan, prediction) if len(self._neural) else None
         if neural is not None and neural.ok and prediction.information is None:
@@ -84,6 +84,8 @@ class FusedScanRegistration:
             if likelier.ok and agree(likelier, neural):
                 return _mean(likelier, neural, None)
             return _because(points, f"neural and points {_apart(points, neural)} apart")
+        if not self._always and _sure(points):
+            return points  # all that they needed was the start
         return _mean(points, neural, prediction.information)
 
     def _led(self, scan: Scan, neural: Registration) -> Registration:
@@ -100,6 +102,11 @@ class FusedScanRegistration:
     def update(self, scan: Scan, T_odom_lidar: Array) -> None:
         self._geometric.update(scan, T_odom_lidar)
         self._neural.update(scan, T_odom_lidar)
+
+
+def _sure(points: Registration) -> bool:
+    """Whether they fit well, with no direction left open."""
+    return points.ok and points.confidence >= _SURE_FIT and points.worst_sigma <= _SURE_SIGMA
 
 
 def _mean(points: Registration, neural: Registration, prior: Array | None) -> Registration:

@@ -46,6 +46,7 @@ class GeometricRegistration:
     def __init__(self, settings: GeometricSettings) -> None:
         self._settings = settings
         self.min_points = settings.min_points
+        self.min_inliers_expected = settings.min_inliers_expected
 
     def register(
         self, source: Array, target: LocalMap, T_guess: Array, widen: float = 1.0, prior: Array | None = None

@@ -12,6 +12,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.geometry.planes import fit_planes
 from dpm2_core.geometry.point_grid import PointGrid
 from dpm2_core.geometry.voxel import voxel_first
+from dpm2_core.slam.registration.occupancy import Occupancy
 from dpm2_core.slam.registration.point_to_plane import distances
 
 _YOUNG = 3  # scans
@@ -46,6 +47,7 @@ class LocalMap:
         self._inserted = 0
         self._T_last: Array | None = None
         self._taken = np.zeros((0, 4, 4))
+        self._occupancy: Occupancy | None = None  # made when it is needed
 
     def fresh(self) -> LocalMap:
         """Another one, empty."""
@@ -90,7 +92,7 @@ class LocalMap:
         self._grid = PointGrid(joined[first], _CELL * self._settings.voxel)
         self.points, self._entered = self._grid.points, entered[first][self._grid.order]
         self._inserted += 1
-        self._T_last = T_odom_lidar
+        self._T_last, self._occupancy = T_odom_lidar, None
         self._normals = np.empty((len(self.points), 3))
         self._variances = np.full(len(self.points), np.nan)
 
@@ -104,6 +106,13 @@ class LocalMap:
         index = self._grid.nearest(queries, radius)
         self._fit_planes(index[index >= 0])
         return distances(queries, index, self.points, self._normals, self._variances)
+
+    def fit(self, source: Array, poses: Array) -> Array:
+        """How well a scan (N, 3) fits at each of the poses (P, 4, 4), roughly; see `Occupancy`."""
+        if self._occupancy is None:
+            assert self._T_last is not None
+            self._occupancy = Occupancy(self.points, self._T_last[:3, 3])
+        return self._occupancy.fit(source, poses)
 
     def _fit_planes(self, index: NDArray[np.int32]) -> None:
         """Where there are none yet."""

@@ -13,8 +13,9 @@ from pydantic import Field
 from dpm2_core.config import Settings
 from dpm2_core.descriptors import Descriptors, LazyDescriptors
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.frame import Array, Frame, Points, Registration
+from dpm2_core.frame import Array, Frame, Image, Points, Registration
 from dpm2_core.geometry import se3
+from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.slam.preprocess import Preprocessor, Scan
 from dpm2_core.slam.registration.descriptor_map import DescriptorMap
 from dpm2_core.slam.registration.protocol import Prediction, agree
@@ -45,15 +46,15 @@ class NeuralSettings(Settings):
 class NeuralScanRegistration:
     """Descriptors to the descriptors of earlier frames. The prediction only chooses which those are."""
 
-    def __init__(self, settings: NeuralSettings, preprocessor: Preprocessor, model: DeepPointMap2) -> None:
+    def __init__(
+        self, settings: NeuralSettings, preprocessor: Preprocessor, model: DeepPointMap2, images: bool = True
+    ) -> None:
+        """`images` False: by the LiDAR alone."""
+        self.uses_images = images and model.encoder.image is not None
         self._settings = settings
         self._preprocessor = preprocessor
         self._model = model
         self._map = DescriptorMap(settings.spacing, settings.frames, settings.radius)
-
-    @property
-    def uses_images(self) -> bool:
-        return self._model.encoder.image is not None
 
     def __len__(self) -> int:
         return len(self._map)
@@ -62,19 +63,20 @@ class NeuralScanRegistration:
         self._map.clear()
 
     def fresh(self) -> NeuralScanRegistration:
-        return NeuralScanRegistration(self._settings, self._preprocessor, self._model)
+        return NeuralScanRegistration(self._settings, self._preprocessor, self._model, self.uses_images)
 
     def prepare(self, frame: Frame, twist: Array) -> Scan:
         return self.described(frame, Scan(self._preprocessor.measured(frame, twist)))
 
     def described(self, frame: Frame, scan: Scan) -> Scan:
         """The scan with a description, which is made when it is needed."""
-        return replace(scan, description=LazyDescriptors(partial(self._describe, frame, scan.points)))
+        images = frame.images if self.uses_images else ()
+        return replace(scan, description=LazyDescriptors(partial(self._describe, scan.points, images)))
 
-    def _describe(self, frame: Frame, points: Points) -> Descriptors | None:
+    def _describe(self, points: Points, images: tuple[Image, ...] = ()) -> Descriptors | None:
         """None of too few points."""
         try:
-            return self._model.describe(replace(frame, points=points, time_offset=None))
+            return self._model.describe(Frame(0, points, images=images))
         except Dpm2Error:
             return None
 
@@ -103,8 +105,13 @@ class NeuralScanRegistration:
         return result
 
     def update(self, scan: Scan, T_odom_lidar: Array) -> None:
-        if scan.description is not None and self._map.wants(T_odom_lidar):
-            self._map.insert(scan.description, T_odom_lidar)
+        if scan.description is None or not self._map.wants(T_odom_lidar):
+            return
+        description = scan.description
+        if not description.made and not self.uses_images:  # a whole scan, which may never be needed, takes megabytes
+            few = scan.points[voxel_first(scan.points, self._model.settings.points.voxel)]
+            description = LazyDescriptors(partial(self._describe, few))
+        self._map.insert(description, T_odom_lidar)
 
 
 def _failed(T_predicted: Array, reason: str) -> Registration:

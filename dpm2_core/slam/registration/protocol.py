@@ -37,11 +37,14 @@ class Prediction:
         starts: (4, 4) T_odom_lidar, the most likely first; several while the velocity is unknown.
         widen: factor on how far from them the pose is searched.
         information: (6, 6) [rotation rad, translation m] of the first; None: nothing to go by.
+        unique: the starts are a search for a place: a result needs fewer points that fit, since a scan from afar shows
+            much that the map does not have, but no other start may lead to a place that fits nearly as well.
     """
 
     starts: Sequence[Array]
     widen: float = 1.0
     information: Array | None = None
+    unique: bool = False
 
     @property
     def sigma(self) -> float:

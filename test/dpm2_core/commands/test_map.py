@@ -133,7 +133,7 @@ def aligned(data: MapData) -> dict[int, Array]:
     return {k.index: T for k, T in zip(data.keyframes, data.poses, strict=True)}
 
 
-RUN = ("--set", "slam.loops.descriptors=false")
+RUN = ("--set", "slam.loops.descriptors=false", "--set", "slam.registration=geometric")
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dpm2_core.geometry import se3
-from dpm2_core.geometry.motion import covariance, predicted
+from dpm2_core.geometry.motion import between, covariance, predicted
 
 TWIST = np.array([0.01, -0.02, 0.3, 15.0, 0.2, -0.1])
 
@@ -22,6 +22,13 @@ def test_two_predictions_in_turn_are_one(a: float, b: float) -> None:
 
 def test_no_motion_is_predicted_farther_than_ten_seconds() -> None:
     np.testing.assert_array_equal(predicted(np.eye(4), TWIST, 60.0), predicted(np.eye(4), TWIST, 10.0))
+
+
+def test_an_even_change_of_the_motion_covers_its_mean() -> None:
+    """Straight on, braking from 10 to 4 m/s; and at one motion it is that motion."""
+    before, after = np.array([0, 0, 0, 10.0, 0, 0]), np.array([0, 0, 0, 4.0, 0, 0])
+    np.testing.assert_allclose(between(np.eye(4), before, after, 3.0)[:3, 3], [21, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(between(np.eye(4), TWIST, TWIST, 3.0), predicted(np.eye(4), TWIST, 3.0), atol=1e-9)
 
 
 @given(st.floats(0, 40), st.floats(0.01, 60), st.floats(0.01, 60))

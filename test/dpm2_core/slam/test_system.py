@@ -20,7 +20,7 @@ from dpm2_core.slam.settings import Config, SlamSettings
 
 from ...helpers.scenes import make_image
 
-GEOMETRIC = SlamSettings.model_validate({"threads": 1, "loops": {"descriptors": False}})
+GEOMETRIC = SlamSettings.model_validate({"registration": "geometric", "threads": 1, "loops": {"descriptors": False}})
 
 
 class Frames:
@@ -63,7 +63,7 @@ def test_without_corrections_the_map_is_the_odometry(suburb_drive: tuple[list[Fr
 
 
 def test_a_frame_passes_at_most_eight_modules(suburb_drive: tuple[list[Frame], Array]) -> None:
-    """Between the recording and the recorded pose; functions of `geometry` and nouns are no stops."""
+    """Of the points, between the recording and the recorded pose; functions of `geometry` and nouns are no stops."""
     names: dict[str, None] = {}
 
     def note(frame: FrameType, event: str, _: object) -> None:

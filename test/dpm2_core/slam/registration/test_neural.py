@@ -233,7 +233,7 @@ def test_the_geometric_slam_imports_neither_torch_nor_matplotlib() -> None:
         "import sys, numpy as np; from dpm2_core.slam.build import SlamSettings, make_slam; "
         "from dpm2_core.frame import Frame; import dpm2_core.commands.run; "
         "points = np.random.default_rng(0).uniform(-20, 20, (3000, 4)).astype(np.float32); "
-        "slam = make_slam(SlamSettings(loops={'descriptors': False})); "
+        "slam = make_slam(SlamSettings(registration='geometric', loops={'descriptors': False})); "
         "[slam.process(Frame(i, points)) for i in range(2)]; "
         "sys.exit(len({'torch', 'matplotlib'} & set(sys.modules)))"
     )

@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How well a scan fits a map at hundreds of poses, roughly: which of its points fall into occupied voxels.
+
+After E. Olson, "Real-time correlative scan matching", ICRA 2009, in three dimensions.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dpm2_core.frame import Array
+
+_VOXEL = 0.5  # m
+_RANGE, _HEIGHT = 60.0, 15.0  # m from the center: what lies farther says little of a position
+_INSIDE, _BESIDE = 2, 1  # what a point counts in a voxel that is occupied, and in one next to it
+
+
+class Occupancy:
+    """The voxels around a center that hold map points."""
+
+    def __init__(self, points: Array, center: Array) -> None:
+        """`points` (M, 3) and `center` (3,) in the map frame, m."""
+        half = np.array([_RANGE, _RANGE, _HEIGHT])
+        self._origin = center - half
+        shape = np.ceil(2 * half / _VOXEL).astype(int)
+        near = (np.abs(points - center) < half - 2 * _VOXEL).all(1)
+        x, y, z = ((points[near] - self._origin) / _VOXEL).astype(int).T
+        self._value = np.zeros(shape, np.uint8)
+        for dx in (-1, 0, 1):
+            for dy in (-1, 0, 1):
+                for dz in (-1, 0, 1):
+                    self._value[x + dx, y + dy, z + dz] = _BESIDE
+        self._value[x, y, z] = _INSIDE
+
+    def fit(self, source: Array, poses: Array) -> Array:
+        """Mean value of the voxels that the points (N, 3) of a scan fall into at each of the poses (P, 4, 4)."""
+        R, t = poses[:, :3, :3].astype(np.float32), (poses[:, :3, 3] - self._origin).astype(np.float32)
+        moved = np.einsum("pij,nj->pni", R, source.astype(np.float32), optimize=True) + t[:, None]
+        cell = (moved / np.float32(_VOXEL)).astype(np.int32)
+        inside = ((moved >= 0) & (cell < self._value.shape)).all(-1)
+        cell[~inside] = 0  # a corner, which is empty
+        value = self._value[cell[..., 0], cell[..., 1], cell[..., 2]]
+        return np.asarray(value.mean(1))
