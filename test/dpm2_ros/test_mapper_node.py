@@ -251,7 +251,6 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(feed, "BESIDE", 0.3)
 
 
-@pytest.mark.usefixtures("quick")
 def test_two_drives_in_one_namespace_are_kept_apart(mapper: Any) -> None:
     """A forged session, or a second robot by accident: it is reported, and each gets on as if alone."""
     mapper.hear(DiagnosticArray, "/diagnostics")

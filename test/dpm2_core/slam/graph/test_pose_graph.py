@@ -102,13 +102,14 @@ def solvers(parent: int) -> list[int]:
 
 def test_nodes_and_loops_added_meanwhile_are_not_lost(background: PoseGraph) -> None:
     background.optimize()
-    (pid,) = solvers(os.getpid())
-    os.kill(pid, signal.SIGSTOP)  # so that all of this is meanwhile
+    while not (pids := solvers(os.getpid())):
+        time.sleep(0.001)
+    os.kill(pids[0], signal.SIGSTOP)  # so that all of this is meanwhile
     drive(background, 10)
     before = background.poses
     background.add_loop(loop(10, 60))
     background.optimize()  # busy: it waits for its turn
-    os.kill(pid, signal.SIGCONT)
+    os.kill(pids[0], signal.SIGCONT)
     while not background.collect():
         time.sleep(0.02)
     after = background.poses
