@@ -31,7 +31,7 @@ class SlamSettings(Settings):
     where they do not know (adaptive): at the start, after a pause, at few frames per second, along a tunnel. Adaptive
     describes the scans of the LiDAR alone."""
     threads: int = Field(2, ge=1)
-    """Threads of the neighbor search and of the network."""
+    """Threads of the network."""
     filter: FilterSettings = FilterSettings()
     preprocess: PreprocessSettings = PreprocessSettings()
     geometric: GeometricSettings = GeometricSettings()
