@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -223,7 +224,8 @@ def test_the_neural_benchmark_measures_pairs_odometry_and_stages(
     assert parts["synthetic"]["pairs"]["up to 20 m, any yaw"]["neural"]["pairs"] > 0
     ours = parts["real"]["drives"][sequence.name]
     assert list(ours["consecutive"]) == ["neural"]
-    assert set(ours["10-20 m"]) >= {"neural", "refined", "geometric", "small_gicp"}
+    assert set(ours["10-20 m"]) >= {"neural", "refined", "geometric"}
+    assert ("small_gicp" in ours["10-20 m"]) == (find_spec("small_gicp") is not None)  # of the extra bench
     assert ours["8 apart"]["neural"]["pairs"] == 0  # six frames
     assert parts["odometry"]["drives"][sequence.name]["geometric"]["ape_rmse_m"] < 0.02
     assert set(parts["corruption"]["error_ratio"]) == {"LiDAR obstruction 100 %", "camera failure 100 %"}
