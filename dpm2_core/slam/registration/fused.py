@@ -64,6 +64,7 @@ class FusedScanRegistration:
         return self._geometric.rejection(scan)
 
     def register(self, scan: Scan, prediction: Prediction) -> Registration:
+        points = None
         if not self._always and prediction.sigma <= _SURE_MOTION:
             points = self._geometric.register(scan, prediction)
             if _sure(points):
@@ -71,7 +72,7 @@ class FusedScanRegistration:
         neural = self._neural.register(scan, prediction) if len(self._neural) else None
         if neural is not None and neural.ok and prediction.information is None:
             prediction = replace(prediction, starts=[neural.T_target_source, *prediction.starts])
-        points = self._geometric.register(scan, prediction)
+        points = points or self._geometric.register(scan, prediction)
         if neural is None:
             return _because(points, "neural: no descriptors yet")
         if not neural.ok:
