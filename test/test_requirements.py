@@ -88,6 +88,7 @@ def _of_ros(module: str) -> bool:
     return module in depends or any(name.startswith("ros-") for name in _distributions().get(module, []))
 
 
+@pytest.mark.slow
 def test_every_import_is_declared_where_it_is_needed(declared: dict[str, list[Requirement]]) -> None:
     wrong, seen = [], set()
     extras = {_normal(r.name): extra for extra, rows in declared.items() if extra not in ("", "dev") for r in rows}
@@ -109,6 +110,7 @@ def test_every_import_is_declared_where_it_is_needed(declared: dict[str, list[Re
     assert {"numpy", "annotated_types", "contourpy", "matplotlib", "laspy", "rclpy"} <= seen  # the scan sees them
 
 
+@pytest.mark.slow
 def test_what_is_declared_for_the_base_install_is_imported(declared: dict[str, list[Requirement]]) -> None:
     imported = {
         name for path in FILES for module, *_ in _imports(ast.parse(path.read_text())) for name in _distribution(module)

@@ -123,6 +123,7 @@ def test_the_tilt_benchmark_compares_level_axes_with_those_of_the_sensor(sequenc
     assert level["8 apart"]["pairs"] == 0  # the drive is shorter
 
 
+@pytest.mark.slow
 def test_the_memory_benchmark_samples_the_resident_set(sequence: Path, tmp_path: Path) -> None:
     bench(["memory"], source=[sequence], out=tmp_path)
     result = json.loads((tmp_path / "memory.json").read_text())["drives"][sequence.name]

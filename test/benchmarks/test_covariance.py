@@ -11,6 +11,7 @@ from dpm2_core.frame import Registration
 from dpm2_core.geometry import se3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("claimed", [0.25, 1.0, 4.0])
 def test_errors_drawn_from_a_covariance_have_a_ratio_of_one(claimed: float) -> None:
     rng = np.random.default_rng(0)

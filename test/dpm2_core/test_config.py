@@ -107,6 +107,7 @@ def test_an_override_of_one_of_two_keys_with_the_same_anchor_leaves_the_other(tm
     assert (settings.second.voxel, settings.middle.inner.voxel) == (9, 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "message"),
     [

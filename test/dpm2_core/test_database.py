@@ -13,6 +13,7 @@ import pytest
 from dpm2_core.database import check_schema, connect
 
 
+@pytest.mark.slow
 def test_a_query_without_end_is_ended(tmp_path: Path) -> None:
     with closing(connect(tmp_path / "a", "rwc")) as sql:
         for _ in range(2):  # the next statement starts from nothing

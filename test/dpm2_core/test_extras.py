@@ -67,6 +67,7 @@ def test_a_run_needs_no_extra_and_says_which_file_is_not_there(sequence: Path, t
     assert "pip install 'dpm2_ros[plot]'" in done.stderr
 
 
+@pytest.mark.slow
 def test_the_simulator_says_in_one_line_which_extra_it_needs(tmp_path: Path) -> None:
     done = dpm2("sim", tmp_path / "city", "--frames", 1)
     assert done.returncode == 2

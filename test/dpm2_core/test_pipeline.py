@@ -79,6 +79,7 @@ def test_a_saved_result_is_every_file_and_reads_back(result: Result, tmp_path: P
     assert list(timing["stages_ms"])[-2:] == ["map", "total"]
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_keeps_what_there_is(recording: Path, tmp_path: Path) -> None:
     seen: list[int] = []
 
@@ -96,6 +97,7 @@ def test_an_interrupted_run_keeps_what_there_is(recording: Path, tmp_path: Path)
     assert json.loads((tmp_path / "metrics.json").read_text())["frames"] == 4
 
 
+@pytest.mark.slow
 def test_interrupted_before_the_first_frame(recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source = open_source(recording)
 

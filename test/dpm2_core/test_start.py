@@ -37,6 +37,7 @@ def test_the_help_imports_no_command_and_no_array() -> None:
     assert all(name in output for name in COMMANDS)
 
 
+@pytest.mark.slow
 def test_an_import_sets_no_environment_variable() -> None:
     """Beyond those that cv2 sets for itself."""
     python(
@@ -46,6 +47,7 @@ def test_an_import_sets_no_environment_variable() -> None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("entry", [
     "from dpm2_core.cli import main as entry; arguments = ['version']",
     "from dpm2_ros.executables import bag_player as entry; arguments = ['nowhere']",
@@ -70,6 +72,7 @@ def test_what_the_user_chose_stays() -> None:
     assert output == "active\n"
 
 
+@pytest.mark.slow
 def test_the_compiled_loops_need_no_folder_to_write_to() -> None:
     """They are compiled anew then, and give the same."""
     output = python(

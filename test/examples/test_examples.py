@@ -39,6 +39,7 @@ def example(name: str, *arguments: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
 
 
+@pytest.mark.slow
 def test_odometry_of_a_folder_in_ten_lines(recording: Path, truth: np.ndarray, tmp_path: Path) -> None:
     done = example("odometry_of_a_folder", recording, tmp_path / "poses.txt")
     assert done.returncode == 0, done.stderr
@@ -68,6 +69,7 @@ def test_map_then_localize(recording: Path, truth: np.ndarray, tmp_path: Path) -
     assert np.linalg.norm(rows[:, 1:] - truth[:, :3, 3], axis=1).max() < 0.1  # as in test_localise.py
 
 
+@pytest.mark.slow
 def test_a_recording_that_is_not_there_is_one_clear_error(tmp_path: Path) -> None:
     done = example("odometry_of_a_folder", tmp_path / "nowhere", tmp_path / "poses.txt")
     assert done.returncode != 0

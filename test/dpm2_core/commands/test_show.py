@@ -32,6 +32,7 @@ def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_draws_an_image(sequence: Path, tmp_path: Path) -> None:
     weights = str(sequence / "tiny.safetensors")
     done = dpm2("show", sequence, "--frames", "0,1", "--out", str(tmp_path / "m.png"), "--weights", weights)

@@ -184,6 +184,7 @@ def run(code: str, *arguments: object) -> subprocess.Popen[str]:
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
 
 
+@pytest.mark.slow
 def test_a_killed_conversion_leaves_nothing_that_looks_whole(kitti_folder: MakeFolder, tmp_path: Path) -> None:
     folder, out = kitti_folder(), tmp_path / "bag"
     code = """
@@ -208,6 +209,7 @@ convert_kitti(KittiSource(sys.argv[1]), Path(sys.argv[2]), progress=progress)
     assert len(BagSource(out)) == 5
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_an_error_without_leftovers(kitti_folder: MakeFolder, tmp_path: Path) -> None:
     """A limit on the size of files raises the OSError that a full disk does; the bag that was there survives."""
     folder, out = kitti_folder(), tmp_path / "bag"

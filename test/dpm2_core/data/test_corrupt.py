@@ -92,6 +92,7 @@ def test_a_part_of_the_drive_is_corrupted_as_the_whole() -> None:
         assert same(a, b)
 
 
+@pytest.mark.slow
 @given(share=st.floats(0, 1), seed=st.integers(0, 2**32))
 def test_exactly_that_share_of_frames_is_hit(share: float, seed: int) -> None:
     frames = corrupted(camera=share, no_image=0, seed=seed)
@@ -116,6 +117,7 @@ def segment_meets(box: Box, point: np.ndarray) -> bool:
     return bool(inside.all(1).any())
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 2**32))
 def test_hidden_points_are_those_whose_ray_meets_the_box(seed: int) -> None:
     rng = np.random.default_rng(seed)

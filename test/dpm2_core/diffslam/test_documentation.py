@@ -6,6 +6,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import pytest
 import torch
 from torch import Tensor
 
@@ -23,6 +24,7 @@ class Denoiser(torch.nn.Module):
         return points + 0.1 * self.layers(points / 20)
 
 
+@pytest.mark.slow
 def test_the_example_runs_and_the_slam_loss_takes_part(scans: list[Tensor]) -> None:
     """Twenty lines, two sequences of five scans, six epochs, the fifth with the SLAM loss; all weights move."""
     example = re.search(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.S)

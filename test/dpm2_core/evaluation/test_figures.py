@@ -61,6 +61,7 @@ def test_the_ground_truth_is_brought_into_the_map_frame(tmp_path: Path) -> None:
     assert (difference > 8).mean() < 1e-3  # alignment leaves 1e-9 m, which may turn a pixel at an edge
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("est", "cloud"),
     [

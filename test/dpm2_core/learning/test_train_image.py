@@ -44,6 +44,7 @@ def settings(packed: Path, network: NetworkSettings, tmp_path: Path) -> ImageTra
     )
 
 
+@pytest.mark.slow
 def test_it_changes_the_image_branch_alone(settings: ImageTrainingSettings, tmp_path: Path) -> None:
     """LiDAR, fusion and decoder stay bit for bit, and resuming gives the weights of one run."""
     whole = load_file(train_image(settings, tmp_path / "whole"))

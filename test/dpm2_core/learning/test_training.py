@@ -70,6 +70,7 @@ def test_resumed_equals_uninterrupted(settings: RegistrationTrainingSettings, tm
     assert all(torch.equal(one[name], other[name]) for name in one)
 
 
+@pytest.mark.slow
 def test_log_has_figures_and_validation(settings: RegistrationTrainingSettings, tmp_path: Path) -> None:
     """One JSON object a line; validation gives medians and success of near, far and turned pairs."""
     train_registration(settings, tmp_path / "out")
@@ -104,6 +105,7 @@ def test_a_checkpoint_of_another_network_is_rejected(settings: RegistrationTrain
         train_registration(settings, tmp_path / "out", resume=True)
 
 
+@pytest.mark.slow
 def test_overlap_changes_the_overlap_head_alone(settings: RegistrationTrainingSettings, tmp_path: Path) -> None:
     """Every other tensor of the weights stays as the registration training left it."""
     start = train_registration(settings, tmp_path / "one")

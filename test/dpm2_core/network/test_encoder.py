@@ -146,6 +146,7 @@ def test_only_reference_points_in_view_read_the_image(model: DeepPointMap2, nois
     assert not torch.equal(one.features[0][~behind], other.features[0][~behind])
 
 
+@pytest.mark.slow
 def test_several_cameras(model: DeepPointMap2, noise: np.random.Generator) -> None:
     """Their order does not matter."""
     pyramid = build_pyramid(boxes(noise), model.settings)

@@ -34,6 +34,7 @@ def test_a_image_is_exposed_varied_and_repeatable(city: World) -> None:
     assert 1.0 < np.abs(one.astype(int) - other).mean() < 4.0  # two draws of a noise of 2
 
 
+@pytest.mark.slow
 def test_lidar_points_project_onto_the_pixels_that_show_them(city: World) -> None:
     """The ray through a point's pixel ends on a thing of the class that the point is labelled with."""
     config = CameraConfig()

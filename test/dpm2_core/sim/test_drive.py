@@ -98,6 +98,7 @@ def test_without_images_there_are_none(tmp_path: Path) -> None:
     assert len(KittiSource(tmp_path / "out")) == 1
 
 
+@pytest.mark.slow
 def test_a_failure_leaves_nothing(tmp_path: Path) -> None:
     def fail(done: int, total: int) -> None:
         raise RuntimeError("no more")

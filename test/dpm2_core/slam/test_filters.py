@@ -79,6 +79,7 @@ def test_cloud_source_and_measured_are_what_the_filter_leaves(points: np.ndarray
     assert min(scan.points[:, 2].min(), scan.cloud[:, 2].min(), scan.source[:, 2].min()) > -1.5
 
 
+@pytest.mark.slow
 def test_a_slam_with_a_filter_runs_and_tells_what_is_missing(tmp_path: Path, points: np.ndarray) -> None:
     task = DynamicObjectTask(DynamicObjectTraining(network=DynamicObjectNetSettings(cells=32, cell=1.0, channels=4)))
     path = tmp_path / "movers.safetensors"

@@ -87,6 +87,7 @@ def test_figures_are_counts_of_points() -> None:
         assert all(np.isnan(value) for value in task.evaluate(TaskScans([_One(still)])).values())
 
 
+@pytest.mark.slow
 def test_scans_without_classes_and_weights_of_others_are_errors_of_use(tmp_path: Path) -> None:
     scan = TaskScan(torch.zeros(10, 4), None, None, "drive", 3)
     with pytest.raises(UsageError, match="drive, scan 3: no labels"):

@@ -144,6 +144,7 @@ def test_gaps_take_the_nearest_cell_that_is_known() -> None:
     assert float(found[3, 3]) == pytest.approx(-1.2)
 
 
+@pytest.mark.slow
 @pytest.mark.weights
 def test_the_shipped_weights_know_an_unseen_suburb(tmp_path: Path) -> None:
     """The file is small, loads strictly, finds the ground of another world to 30 cm (RMS, out to 50 m), and most of

@@ -100,6 +100,7 @@ def test_scans_are_contiguous_only_where_the_slam_loss_counts(
     assert (0, 1, 2, 3, 4, 5) not in shuffled
 
 
+@pytest.mark.slow
 def test_resumed_equals_uninterrupted(scans: TaskScans, tmp_path: Path) -> None:
     """Stopped after 1 of 4 epochs and resumed: the same losses in the log and the same weights, bit for bit."""
     whole, halves = tmp_path / "whole", tmp_path / "halves"

@@ -18,6 +18,7 @@ def place(seed: int, noise: float = 0.0, count: int = 256) -> Descriptors:
     return Descriptors(rng.normal(size=(count, 3)).astype(np.float32), features.astype(np.float16))
 
 
+@pytest.mark.slow
 def test_a_place_is_found_among_a_thousand() -> None:
     index = PlaceIndex()
     for seed in range(1000):

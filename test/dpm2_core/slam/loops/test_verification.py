@@ -60,6 +60,7 @@ def test_a_wrong_place_in_the_same_street_is_rejected(suburb_scans: tuple[list[P
     assert e.registration.reason
 
 
+@pytest.mark.slow
 def test_bare_ground_is_rejected(suburb_scans: tuple[list[Points], Array]) -> None:
     clouds, poses = suburb_scans
     ground = [cloud[height_above_ground(cloud, 2.0, 0) <= 0.5] for cloud in clouds]

@@ -172,6 +172,7 @@ print(problems[10])
 """
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_survived_and_the_file_catches_up(tmp_path: Path) -> None:
     """In a process that for ten keyframes may write no more than it has."""
     arguments = [str(tmp_path / "a.dpm2map"), str(Path(__file__).parent)]

@@ -64,11 +64,13 @@ def test_covariance_covers_the_error_of_a_frame(suburb_drive: Drive, suburb_trac
         assert off @ np.linalg.solve(2 * t.covariance, off) < 30  # chi2 of 6: 22.5 at 99.9 %
 
 
+@pytest.mark.slow
 def test_same_input_same_result(suburb_drive: Drive, suburb_tracked: list[OdometryResult]) -> None:
     for a, b in zip(suburb_tracked[:8], run(suburb_drive[0][:8]), strict=True):
         np.testing.assert_array_equal(a.T_odom_lidar, b.T_odom_lidar)
 
 
+@pytest.mark.slow
 def test_a_tunnel_is_never_reported_as_tracking(tunnel_drive: Drive) -> None:
     frames, _ = tunnel_drive
     tracked = run(frames)
@@ -112,6 +114,7 @@ def test_one_bad_cloud_among_good_ones(suburb_drive: Drive, name: str, bad: np.n
     assert all(np.isfinite(t.T_odom_lidar).all() and np.isfinite(t.covariance).all() for t in tracked)
 
 
+@pytest.mark.slow
 def test_some_nan_points_are_dropped(suburb_drive: Drive) -> None:
     frames, truth = suburb_drive
     dirty = []
@@ -123,6 +126,7 @@ def test_some_nan_points_are_dropped(suburb_drive: Drive) -> None:
     assert errors(run(dirty), truth[:6])[:, 0].max() < 0.05
 
 
+@pytest.mark.slow
 def test_bad_frames_before_the_first_good_one(suburb_drive: Drive) -> None:
     frames, truth = suburb_drive
     empty = Frame(-(10**8), np.zeros((0, 4), np.float32))
@@ -150,6 +154,7 @@ def test_lost_after_a_long_gap_and_back_again(suburb_drive: Drive) -> None:
     assert tracked[-1].state == State.TRACKING
 
 
+@pytest.mark.slow
 def test_velocity_after_a_gap_is_that_since_the_last_registered_scan(suburb_drive: Drive) -> None:
     """The car slowed down unseen: what the prediction was off by is no motion of the last period."""
     frames, truth = suburb_drive

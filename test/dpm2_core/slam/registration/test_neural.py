@@ -227,6 +227,7 @@ def test_threads_are_those_of_the_settings(weights: Path) -> None:
     assert torch.get_num_threads() == 3
 
 
+@pytest.mark.slow
 def test_the_geometric_slam_imports_neither_torch_nor_matplotlib() -> None:
     """torch takes seconds and 200 MB, for nothing where no loop asks for descriptors."""
     program = (

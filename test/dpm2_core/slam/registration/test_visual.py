@@ -73,6 +73,7 @@ def registered(first: Frame, second: Frame, **visual: object) -> tuple[Array, Ar
     return result.T_target_source, result.covariance, result.method, result.reason
 
 
+@pytest.mark.slow
 def test_the_way_along_a_corridor_is_read_from_its_walls() -> None:
     """1.7 m that no point constrains, to 3 cm, a step of the fine search, at any exposure; its covariance shows it."""
     paint = random_paint()
@@ -89,6 +90,7 @@ def test_the_way_along_a_corridor_is_read_from_its_walls() -> None:
     assert np.linalg.eigvalsh(covariance)[0] > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("paint", "why"),
     [(stripes, "several places are alike"), (lambda p: np.full(len(p), 99.0), "a correlation of only")],
@@ -102,6 +104,7 @@ def test_an_image_that_does_not_constrain_is_not_used(paint: Paint, why: str) ->
     assert np.isfinite(T).all()
 
 
+@pytest.mark.slow
 def test_without_images_nothing_changes() -> None:
     """Frames whose camera fails go the way they always went."""
     paint = random_paint()
