@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from scipy.linalg import eigh
 
+from dpm2_core.descriptors import LazyDescriptors
 from dpm2_core.frame import Array, Frame, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.slam.preprocess import Scan
@@ -42,10 +44,7 @@ class FusedScanRegistration:
         self._neural = neural
         self._geometric = geometric
         self._always = always
-
-    @property
-    def uses_images(self) -> bool:
-        return self._neural.uses_images
+        self.uses_images = neural.uses_images
 
     def __len__(self) -> int:
         return len(self._geometric)
@@ -58,7 +57,9 @@ class FusedScanRegistration:
         return FusedScanRegistration(self._neural.fresh(), self._geometric.fresh(), self._always)
 
     def prepare(self, frame: Frame, twist: Array) -> Scan:
-        return self._neural.described(frame, self._geometric.prepare(frame, twist))
+        scan = self._geometric.prepare(frame, twist)
+        images = frame.images if self.uses_images else ()
+        return replace(scan, description=LazyDescriptors(partial(self._neural.describe, scan.points, images)))
 
     def rejection(self, scan: Scan) -> str:
         return self._geometric.rejection(scan)
@@ -100,9 +101,11 @@ class FusedScanRegistration:
         why = f"neural and points {_apart(points, neural)} apart"
         return replace(neural, covariance=neural.covariance + np.outer(xi, xi), reason=why)
 
-    def update(self, scan: Scan, T_odom_lidar: Array) -> None:
-        self._geometric.update(scan, T_odom_lidar)
-        self._neural.update(scan, T_odom_lidar)
+    def update(self, scan: Scan, T_odom_lidar: Array) -> bool:
+        kept = self._geometric.update(scan, T_odom_lidar)
+        if kept:  # both remember the same scans, and the network's part is not passed on every frame
+            self._neural.keep(scan, T_odom_lidar)
+        return kept
 
 
 def _sure(points: Registration) -> bool:

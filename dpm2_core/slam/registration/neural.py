@@ -66,15 +66,12 @@ class NeuralScanRegistration:
         return NeuralScanRegistration(self._settings, self._preprocessor, self._model, self.uses_images)
 
     def prepare(self, frame: Frame, twist: Array) -> Scan:
-        return self.described(frame, Scan(self._preprocessor.measured(frame, twist)))
-
-    def described(self, frame: Frame, scan: Scan) -> Scan:
-        """The scan with a description, which is made when it is needed."""
+        points = self._preprocessor.measured(frame, twist)
         images = frame.images if self.uses_images else ()
-        return replace(scan, description=LazyDescriptors(partial(self._describe, scan.points, images)))
+        return Scan(points, description=LazyDescriptors(partial(self.describe, points, images)))
 
-    def _describe(self, points: Points, images: tuple[Image, ...] = ()) -> Descriptors | None:
-        """None of too few points."""
+    def describe(self, points: Points, images: tuple[Image, ...] = ()) -> Descriptors | None:
+        """The descriptors of a prepared scan (P, 4); None of too few points."""
         try:
             return self._model.describe(Frame(0, points, images=images))
         except Dpm2Error:
@@ -104,13 +101,20 @@ class NeuralScanRegistration:
                 return replace(result, ok=False, reason="contradicts the motion so far")
         return result
 
-    def update(self, scan: Scan, T_odom_lidar: Array) -> None:
-        if scan.description is None or not self._map.wants(T_odom_lidar):
+    def update(self, scan: Scan, T_odom_lidar: Array) -> bool:
+        wanted = self._map.wants(T_odom_lidar)
+        if wanted:
+            self.keep(scan, T_odom_lidar)
+        return wanted
+
+    def keep(self, scan: Scan, T_odom_lidar: Array) -> None:
+        """Remember a scan that was taken there."""
+        if scan.description is None:
             return
         description = scan.description
         if not description.made and not self.uses_images:  # a whole scan, which may never be needed, takes megabytes
             few = scan.points[voxel_first(scan.points, self._model.settings.points.voxel)]
-            description = LazyDescriptors(partial(self._describe, few))
+            description = LazyDescriptors(partial(self.describe, few))
         self._map.insert(description, T_odom_lidar)
 
 

@@ -93,9 +93,11 @@ class GeometricScanRegistration:
         result = self._registration.register(source, self._local_map, T)
         return result, self._registration.likelihood(source, self._local_map, result.T_target_source)
 
-    def update(self, scan: Scan, T_odom_lidar: Array) -> None:
-        if self._local_map.wants(T_odom_lidar):
+    def update(self, scan: Scan, T_odom_lidar: Array) -> bool:
+        wanted = self._local_map.wants(T_odom_lidar)
+        if wanted:
             self._local_map.insert(scan.cloud, T_odom_lidar)
+        return wanted
 
 
 def _apart(T: Array, T_other: Array) -> bool:

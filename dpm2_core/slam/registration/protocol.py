@@ -88,6 +88,6 @@ class ScanRegistration(Protocol):
         """Find the pose of a scan; needs a map."""
         ...
 
-    def update(self, scan: Scan, T_odom_lidar: Array) -> None:
-        """Remember a scan that was taken there, if it shows enough that is new."""
+    def update(self, scan: Scan, T_odom_lidar: Array) -> bool:
+        """Remember a scan that was taken there, if it shows enough that is new; whether it did."""
         ...

@@ -121,15 +121,15 @@ class VisualScanRegistration:
             return result
         return self._along(result, scan.image, prediction.information)
 
-    def update(self, scan: Scan, T_odom_lidar: Array) -> None:
-        self._registration.update(scan, T_odom_lidar)
-        if scan.image is None:
-            return
-        if self._last is not None:
-            moved = np.linalg.norm(self._last[1][:3, 3] - T_odom_lidar[:3, 3])
-            if self._reference is not None and moved < self._settings.baseline:
-                return
-        self._last, self._reference = (scan, T_odom_lidar), None
+    def update(self, scan: Scan, T_odom_lidar: Array) -> bool:
+        if scan.image is not None and self._wants(T_odom_lidar):
+            self._last, self._reference = (scan, T_odom_lidar), None
+        return self._registration.update(scan, T_odom_lidar)
+
+    def _wants(self, T_odom_lidar: Array) -> bool:
+        if self._last is None or self._reference is None:
+            return True
+        return bool(np.linalg.norm(self._last[1][:3, 3] - T_odom_lidar[:3, 3]) >= self._settings.baseline)
 
     def _along(self, result: Registration, image: Image, information: Array | None) -> Registration:
         """The result moved along its open direction to where the images agree; unchanged if they do not."""

@@ -62,8 +62,13 @@ def test_without_corrections_the_map_is_the_odometry(suburb_drive: tuple[list[Fr
         np.testing.assert_allclose(result.T_map_lidar, result.odometry.T_odom_lidar, atol=1e-9)  # rounding
 
 
-def test_a_frame_passes_at_most_eight_modules(suburb_drive: tuple[list[Frame], Array]) -> None:
-    """Of the points, between the recording and the recorded pose; functions of `geometry` and nouns are no stops."""
+@pytest.mark.weights
+@pytest.mark.parametrize(("registration", "most"), [("geometric", 8), ("adaptive", 9)])
+def test_a_frame_passes_few_modules(suburb_drive: tuple[list[Frame], Array], registration: str, most: int) -> None:
+    """Between the recording and the recorded pose; functions of `geometry` and nouns are no stops.
+
+    By default one more than the points: what decides whether the network is asked. One that is kept goes there, too.
+    """
     names: dict[str, None] = {}
 
     def note(frame: FrameType, event: str, _: object) -> None:
@@ -72,10 +77,10 @@ def test_a_frame_passes_at_most_eight_modules(suburb_drive: tuple[list[Frame], A
             names[name] = None
 
     def between(number: int) -> None:
-        sys.setprofile(note if number == 8 else None)  # of the ninth frame: the drive is under way
+        sys.setprofile(note if number == 7 else None)  # of the ninth frame: the drive is under way
 
     numbers = iter(range(len(suburb_drive[0])))
-    config = Config(slam=GEOMETRIC)
+    config = Config(slam=GEOMETRIC.model_copy(update={"registration": registration}))
     try:
         with OfflineRun(Frames(suburb_drive[0][:12]), config) as drive:
             drive.run(lambda result: between(next(numbers)))
@@ -83,7 +88,7 @@ def test_a_frame_passes_at_most_eight_modules(suburb_drive: tuple[list[Frame], A
         sys.setprofile(None)
     names = names.keys() - {"dpm2_core.slam.output", "dpm2_core.slam.registration.protocol"}  # the result; a noun
     assert "dpm2_core.slam.registration.icp" in names
-    assert len(names) <= 8, "\n".join(names)
+    assert len(names) <= most, "\n".join(names)
 
 
 @pytest.mark.weights

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dpm2_core.frame import Array, Frame, Registration
+from dpm2_core.frame import Array, Frame, Image, Points, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.slam.preprocess import Preprocessor, PreprocessSettings, Scan
 from dpm2_core.slam.registration.fused import FusedScanRegistration
@@ -41,10 +41,10 @@ class Oracle:
     def clear(self) -> None:
         self.size = 0
 
-    def described(self, frame: Frame, scan: Scan) -> Scan:
-        return scan
+    def describe(self, points: Points, images: tuple[Image, ...]) -> None:
+        return None
 
-    def update(self, scan: Scan, T_odom_lidar: Array) -> None:
+    def keep(self, scan: Scan, T_odom_lidar: Array) -> None:
         self.size += 1
 
     def register(self, scan: Scan, prediction: Prediction) -> Registration:
