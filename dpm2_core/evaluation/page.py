@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One-file HTML pages: everything is inside, nothing is fetched, and what comes from files is text."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+from typing import Any
+
+_PAGE = """<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta http-equiv="Content-Security-Policy" content="{policy}">
+<title>{title}</title>
+<style>
+{style}
+</style>
+</head>
+<body>
+{body}
+{data}{script}</body>
+</html>
+"""
+# What the page may do, whatever is written into it: its own scripts and styles, nothing from elsewhere.
+_POLICY = "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data: blob:"
+
+
+def page(title: str, body: str, *, style: str = "", script: str = "", data: Any = None) -> str:
+    """An HTML page that needs no other file and no network.
+
+    Args:
+        title: text. body: HTML; what is in it from elsewhere must have gone through `escape`. style: CSS.
+        script: JavaScript, run at the end of the page. data: what JSON can hold; the script reads it by
+            `JSON.parse(document.getElementById("data").textContent)`.
+
+    Raises:
+        ValueError: a number in `data` is not finite, or `style` or `script` would end its own element.
+    """
+    for name, text in (("style", style), ("script", script)):
+        if f"</{name}" in text.lower():
+            raise ValueError(f"</{name} within the {name} of a page")
+    held = "" if data is None else f'<script type="application/json" id="data">{_json(data)}</script>\n'
+    run = f"<script>\n{script}\n</script>\n" if script else ""
+    return _PAGE.format(policy=_POLICY, title=escape(title), style=style, body=body, data=held, script=run)
+
+
+def escape(text: object) -> str:
+    """Text for the body or an attribute."""
+    return html.escape(str(text))
+
+
+def data_url(content: bytes, media: str) -> str:
+    """Content such as a PNG as the address of an image, `media` being its type: `image/png`."""
+    return f"data:{media};base64,{base64.b64encode(content).decode('ascii')}"
+
+
+def _json(data: Any) -> str:
+    """JSON that cannot end the element that it is in."""
+    text = json.dumps(data, allow_nan=False, separators=(",", ":"))
+    return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
