@@ -7,43 +7,59 @@ A command's module is imported when it is called, not to list it: numpy, gtsam a
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib import import_module
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 
 from dpm2_core._version import __version__
+from dpm2_core.console import QUIET
 from dpm2_core.errors import exit_code
 from dpm2_core.openmp import wait_passively
 
-COMMANDS = {
-    "run": ("run:run", "Run the SLAM on a recording and write trajectory, map, image, timing and metrics."),
-    "eval": ("eval:eval_", "Evaluate a trajectory: KITTI metric, APE, RPE and final drift."),
-    "show": (
-        "show:show",
-        "Draw two scans from above with their matched descriptors, colored by confidence, and how they fit.",
-    ),
-    "sim": (
-        "sim:sim",
-        "Simulate a drive: scans, images, poses, point labels, scans without moving objects, and a map of the ground.",
-    ),
-    "bench": (
-        "bench:bench",
-        "Measure accuracy and speed beside KISS-ICP on the same scans, memory over a long drive, or the network.",
-    ),
-    "finetune": (
-        "finetune:finetune",
-        "Fine-tune the network on drives without ground truth: the reference is the trajectory of the SLAM.",
-    ),
-    "eval-task": ("tasks:eval_task", "Measure a trained task on scans that it has not learned from."),
-    "convert": ("convert:app", "Convert a recording to a rosbag2 (MCAP) folder."),
-    "config": ("config:app", "Look at the configuration."),
-    "map": ("map:app", "Map files: info, export, merge, prune, check; pose graphs: optimize."),
-    "train": ("tasks:train", "Make training data and train the network."),
+GROUPS = {
+    "Drives": {
+        "run": ("run:run", "Run the SLAM on a recording and write trajectory, map, image, timing and metrics."),
+        "eval": ("eval:eval_", "Evaluate a trajectory: KITTI metric, APE, RPE and final drift."),
+        "show": (
+            "show:show",
+            "Draw two scans from above with their matched descriptors, colored by confidence, and how they fit.",
+        ),
+        "convert": ("convert:app", "Convert a recording to a rosbag2 (MCAP) folder."),
+        "sim": (
+            "sim:sim",
+            "Simulate a drive: scans, images, poses, point labels, scans without moving objects, "
+            "and a map of the ground.",
+        ),
+    },
+    "Maps": {
+        "map": ("map:app", "Map files: info, export, merge, prune, check; pose graphs: optimize."),
+    },
+    "Learning": {
+        "finetune": (
+            "finetune:finetune",
+            "Fine-tune the network on drives without ground truth: the reference is the trajectory of the SLAM.",
+        ),
+        "train": ("tasks:train", "Make training data and train the network."),
+        "eval-task": ("tasks:eval_task", "Measure a trained task on scans that it has not learned from."),
+    },
+    "This machine": {
+        "doctor": (
+            "doctor:doctor",
+            "Check this machine: versions, processor, GPU, memory, disk, ROS 2 and DDS; then ten seconds of SLAM.",
+        ),
+        "config": ("config:app", "Look at the configuration."),
+        "bench": (
+            "bench:bench",
+            "Measure accuracy and speed beside KISS-ICP on the same scans, memory over a long drive, or the network.",
+        ),
+    },
 }
-"""Each command: its function or Typer in `dpm2_core.commands`, MODULE:NAME, and what `dpm2 --help` says of it."""
+"""The commands as `dpm2 --help` groups them: function or Typer in `dpm2_core.commands`, MODULE:NAME, and the help."""
+COMMANDS = {name: command for group in GROUPS.values() for name, command in group.items()}
+_LAST = "This machine"
 
 
 class Commands(TyperGroup):
@@ -51,7 +67,11 @@ class Commands(TyperGroup):
 
     def __init__(self, **attributes: Any) -> None:
         super().__init__(**attributes)
-        listed = {name: TyperCommand(name, help=text) for name, (_, text) in COMMANDS.items()}
+        listed = {
+            name: TyperCommand(name, help=text, rich_help_panel=group)
+            for group, commands in GROUPS.items()
+            for name, (_, text) in commands.items()
+        }
         self.commands = {**listed, **self.commands}
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
@@ -61,27 +81,49 @@ class Commands(TyperGroup):
 
 
 def load_command(name: str) -> TyperCommand | TyperGroup:
-    """Import a command of `COMMANDS`."""
+    """Import a command of `COMMANDS`; it and its subcommands take `--quiet`."""
     module, attribute = COMMANDS[name][0].split(":")
     found = getattr(import_module(f"dpm2_core.commands.{module}"), attribute)
-    if isinstance(found, typer.Typer):
-        return typer.main.get_group(found)
+    command = typer.main.get_group(found) if isinstance(found, typer.Typer) else _command(name, found)
+    for single in command.commands.values() if isinstance(command, TyperGroup) else (command,):
+        single.params.extend(_command("quiet", _quiet).params)
+    return command
+
+
+def _command(name: str, function: Callable[..., Any]) -> TyperCommand:
     single = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-    single.command(name)(found)
+    single.command(name)(function)
     return typer.main.get_command(single)  # type: ignore[return-value]
 
 
+def _quiet(
+    quiet: Annotated[
+        bool,
+        typer.Option(
+            "--quiet", "-q", help="No notes, no progress: results on stdout, errors on stderr.",
+            callback=lambda value: QUIET.set(value), expose_value=False,
+        ),
+    ] = False,
+) -> None:  # fmt: skip
+    """What has the option that all commands have."""
+
+
 app = typer.Typer(
-    cls=Commands, help="LiDAR-visual SLAM.", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False
+    cls=Commands,
+    help="LiDAR-visual SLAM.",
+    epilog="dpm2 COMMAND --help has its options. First: dpm2 doctor; then dpm2 run DRIVE --out out/mine.",
+    invoke_without_command=True,
+    pretty_exceptions_enable=False,
 )
 
 
 @app.callback()
-def _dpm2() -> None:
-    pass
+def _dpm2(context: typer.Context) -> None:
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help(), nl=False)
 
 
-@app.command()
+@app.command(rich_help_panel=_LAST)
 def version() -> None:
     """Print the version."""
     typer.echo(__version__)
@@ -95,7 +137,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _status(arguments: Sequence[str] | None) -> int:
     args = None if arguments is None else list(arguments)
-    return exit_code(lambda: app(args=args, standalone_mode=False), "dpm2")
+    try:
+        return exit_code(lambda: app(args=args, standalone_mode=False), "dpm2")
+    except typer.Abort:  # Ctrl-C where the command itself makes nothing of it
+        return 130
 
 
 if __name__ == "__main__":

@@ -3,11 +3,15 @@
 
 from __future__ import annotations
 
+from contextvars import ContextVar
 from typing import Any
 
 import rich.console
 
 from dpm2_core.errors import printable
+
+QUIET: ContextVar[bool] = ContextVar("quiet", default=False)
+"""Whether notes and progress, all that goes to stderr but errors, are left out: `--quiet` of every command."""
 
 
 class Console(rich.console.Console):
@@ -15,7 +19,7 @@ class Console(rich.console.Console):
 
     def __init__(self, *, stderr: bool = False, **options: Any) -> None:
         """As rich's."""
-        super().__init__(stderr=stderr, markup=False, emoji=False, **options)
+        super().__init__(stderr=stderr, markup=False, emoji=False, quiet=stderr and QUIET.get(), **options)
 
     def print(self, *objects: Any, **options: Any) -> None:
         """As rich's; in text, every line for itself."""

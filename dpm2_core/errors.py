@@ -30,8 +30,9 @@ def exit_code(work: Callable[[], int | None], name: str = "error") -> int:
             raise
         text = str(error)
         if hasattr(error, "format_message"):  # click's own errors of use: an unknown option, a missing argument
-            text = " ".join(error.format_message().split()) or "see --help"
-        print(f"{name}: {printable(text)}", file=sys.stderr)
+            text = " ".join(error.format_message().split())
+        if text:  # a group of commands that is called without one has shown its help
+            print(f"{name}: {printable(text)}", file=sys.stderr)
         return int(code)
 
 

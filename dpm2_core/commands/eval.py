@@ -3,15 +3,14 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 import typer
 
+from dpm2_core.commands.options import JsonFile, show
 from dpm2_core.config import load_settings
-from dpm2_core.console import Console
 from dpm2_core.data.kitti import read_calib
 from dpm2_core.data.open import open_source
 from dpm2_core.data.settings import InputSettings
@@ -20,7 +19,6 @@ from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.kitti_metric import OFFICIAL_LENGTHS
 from dpm2_core.evaluation.metrics import evaluate
 from dpm2_core.evaluation.report import metrics_table
-from dpm2_core.files import atomic_write
 from dpm2_core.geometry import se3
 
 FRAME_AS_GIVEN = "as in the files; both must be poses of the same sensor"
@@ -33,7 +31,7 @@ def eval_(
         typer.Option(help="Ground truth: a KITTI, KITTI-360 or TUM file, or a drive whose poses are known."),
     ],
     est: Annotated[Path, typer.Option(help="The estimate, in either format.")],
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures to this file.")] = None,
+    json_file: JsonFile = None,
     lengths: Annotated[
         str | None, typer.Option(help="Segment lengths of the KITTI metric, m, such as 10,20,30,40,50.")
     ] = None,
@@ -55,11 +53,8 @@ def eval_(
         estimate = in_camera_frame(estimate, calib)
     metrics = evaluate(*matched(truth, estimate), chosen).model_copy(update={"truth": str(gt)})
     frame = FRAME_CAMERA if calib else FRAME_AS_GIVEN
-    Console().print(metrics_table(metrics, title=f"{est} against {gt}", frame=frame))
-    if json_file is not None:
-        result = {"gt": str(gt), "est": str(est), "frame": frame, **metrics.model_dump()}
-        with atomic_write(json_file) as file:
-            file.write(json.dumps(result, indent=2) + "\n")
+    figures = {"gt": str(gt), "est": str(est), "frame": frame, **metrics.model_dump()}
+    show(metrics_table(metrics, title=f"{est} against {gt}", frame=frame), figures, json_file)
 
 
 def _of_drive(path: Path, settings: list[str]) -> Trajectory:

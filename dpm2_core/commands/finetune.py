@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from dpm2_core.commands.options import JsonFile, show
 from dpm2_core.commands.train import ConfigOption, OutOption, ResumeOption, SetOption, reject_overwriting
 from dpm2_core.config import load_settings
 from dpm2_core.console import Console
@@ -22,6 +23,7 @@ def finetune(
     config: ConfigOption = None,
     settings: SetOption = None,
     resume: ResumeOption = False,
+    json_file: JsonFile = None,
 ) -> None:
     """Fine-tune the network on drives without ground truth: the reference is the trajectory of the SLAM.
 
@@ -52,5 +54,5 @@ def finetune(
     for name, figures in before.items():
         for figure in (figure for figure in figures if figure in after[name]):
             table.add_row(f"{name}, {figure}", f"{figures[figure]:.3f}", f"{after[name][figure]:.3f}")
-    console.print(table)
+    show(table, {"weights": str(written), "before": before, "after": after}, json_file)
     console.print(f"{written}: written", soft_wrap=True)

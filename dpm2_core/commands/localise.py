@@ -92,8 +92,11 @@ class LocalizationReport:
         }
 
 
-def run_localized(drive: OfflineRun, out: Path, hint: Array | None, config: Config) -> None:
-    """The drive through a map: localisation.json, trajectory.tum of the frames whose place was known, config.yaml."""
+def run_localized(drive: OfflineRun, out: Path, hint: Array | None, config: Config) -> tuple[str, dict[str, Any]]:
+    """The drive through a map: localisation.json, trajectory.tum of the frames whose place was known, config.yaml.
+
+    Returns what came out as a sentence, and the content of localisation.json.
+    """
     localizer, name = drive.slam.localizer, drive.source.name
     assert localizer is not None
     report = LocalizationReport(localizer)
@@ -118,7 +121,5 @@ def run_localized(drive: OfflineRun, out: Path, hint: Array | None, config: Conf
         file.write(json.dumps(summary, indent=2) + "\n")
     until = summary["frames_until_found"]
     found = "not found" if until is None else f"found after {until} frames"
-    Console().print(
-        f"{name}: {found}, place known in {len(report.stamps)} of {summary['frames']} frames; results in {out}",
-        soft_wrap=True,
-    )
+    located = f"place known in {len(report.stamps)} of {summary['frames']} frames"
+    return f"{name}: {found}, {located}; results in {out}", summary

@@ -6,14 +6,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import typer
 from scipy.spatial.transform import Rotation
 
 from dpm2_core.commands.map_graph import optimize
-from dpm2_core.commands.options import ConfigFile, Overrides
+from dpm2_core.commands.options import ConfigFile, JsonFile, Overrides, show
 from dpm2_core.config import load_settings
 from dpm2_core.console import Console
 from dpm2_core.data.pcd import write_las, write_pcd
@@ -34,33 +34,57 @@ MapFile = Annotated[Path, typer.Argument(metavar="MAP", help="Map file, as `dpm2
 
 
 @app.command()
-def info(path: MapFile) -> None:
+def info(path: MapFile, json_file: JsonFile = None) -> None:
     """What is in a map."""
     with MapStore.open(path) as store:
         data = load_map(store, descriptors=False)
-        with_descriptors = sum(row[0] or 0 for row in store.rows("payloads", "descriptors IS NOT NULL"))
-        extent = _extent(data)
-    size = sum(file.stat().st_size for suffix in ("", "-wal") if (file := Path(f"{path}{suffix}")).exists())
-    loops = [edge for edge in data.edges if edge.kind == "loop"]
-    own = sum(data.clouds.loan(node) is None for node in range(len(data)))
+        figures = _figures(path, data, sum(row[0] or 0 for row in store.rows("payloads", "descriptors IS NOT NULL")))
+    f = figures
     table = FigureTable(str(path), names=["what"], text=["value"], header=False)
-    robots = ", ".join(sorted({keyframe.robot or "(one)" for keyframe in data.keyframes})) or "-"
+    own = f"{f['own_clouds']} of them with their own cloud, {f['with_descriptors']} with descriptors"
+    extent = " x ".join(f"{size:.1f}" for size in f["extent_m"])
     rows = (
-        ("keyframes", f"{len(data)}, {own} of them with their own cloud, {with_descriptors} with descriptors"),
-        ("pruned", str(len(data.trail))),
-        ("robots", robots),
-        ("length", f"{_length(data):.1f} m"),
-        ("extent", extent),
-        ("loops", f"{sum(edge.ok for edge in loops)} accepted of {len(loops)} tried"),
-        ("size", f"{size / 1e6:.2f} MB, {size / max(len(data), 1) / 1e3:.1f} kB per keyframe"),
+        ("keyframes", f"{f['keyframes']}, {own}"),
+        ("pruned", str(f["pruned"])),
+        ("robots", ", ".join(robot or "(one)" for robot in f["robots"]) or "-"),
+        ("length", f"{f['length_m']:.1f} m"),
+        ("extent", f"{extent} m, of the keyframes" if extent else "-"),
+        ("loops", f"{f['loops_accepted']} accepted of {f['loops_tried']} tried"),
+        ("size", f"{f['bytes'] / 1e6:.2f} MB, {f['bytes'] / max(f['keyframes'], 1) / 1e3:.1f} kB per keyframe"),
     )
     for row in rows:
         table.add_row(*row)
-    for s in data.sessions:
-        count = data.session.count(s.number)
-        info = f"{count} keyframes, {s.started}, dpm2 {s.program}, weights {s.weights or 'none'}"
-        table.add_row(f"session {s.number}", info)
-    Console().print(table)
+    for s in figures["sessions"]:
+        info = f"{s['keyframes']} keyframes, {s['started']}, dpm2 {s['program']}, weights {s['weights'] or 'none'}"
+        table.add_row(f"session {s['session']}", info)
+    show(table, figures, json_file)
+
+
+def _figures(path: Path, data: MapData, with_descriptors: int) -> dict[str, Any]:
+    loops = [edge for edge in data.edges if edge.kind == "loop"]
+    return {
+        "map": str(path),
+        "keyframes": len(data),
+        "own_clouds": sum(data.clouds.loan(node) is None for node in range(len(data))),
+        "with_descriptors": with_descriptors,
+        "pruned": len(data.trail),
+        "robots": sorted({keyframe.robot for keyframe in data.keyframes}),
+        "length_m": _length(data),
+        "extent_m": np.ptp(data.poses[:, :3, 3], axis=0).tolist() if len(data) else [],
+        "loops_accepted": sum(edge.ok for edge in loops),
+        "loops_tried": len(loops),
+        "bytes": sum(file.stat().st_size for suffix in ("", "-wal") if (file := Path(f"{path}{suffix}")).exists()),
+        "sessions": [
+            {
+                "session": s.number,
+                "keyframes": data.session.count(s.number),
+                "started": s.started,
+                "program": s.program,
+                "weights": s.weights,
+            }
+            for s in data.sessions
+        ],
+    }
 
 
 @app.command()
@@ -191,13 +215,6 @@ def _length(data: MapData) -> float:
     steps = np.linalg.norm(np.diff(data.poses[:, :3, 3], axis=0), axis=1)
     same = np.diff(data.session) == 0
     return float(steps[same].sum()) if len(data) > 1 else 0.0
-
-
-def _extent(data: MapData) -> str:
-    if not len(data):
-        return "-"
-    size = np.ptp(data.poses[:, :3, 3], axis=0)
-    return f"{size[0]:.1f} x {size[1]:.1f} x {size[2]:.1f} m, of the keyframes"
 
 
 def _export_g2o(data: MapData, out: Path) -> None:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -12,20 +11,20 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from dpm2_core.console import Console
+from dpm2_core.commands.options import JsonFile, show
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.files import atomic_write
 from dpm2_core.tables import FigureTable
 
 
 def optimize(
     graph: Annotated[Path, typer.Argument(metavar="GRAPH.g2o", help="SE2 or SE3:QUAT; VERTEX lines may be absent.")],
     out: Annotated[Path, typer.Option(help="New g2o file: optimized vertices, odometry, the loops that were kept.")],
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="The figures, and for each loop the result and why.")
-    ] = None,
+    json_file: JsonFile = None,
 ) -> None:
-    """Optimize a pose graph and reject the loops that cannot be true."""
+    """Optimize a pose graph and reject the loops that cannot be true.
+
+    --json has the result for each loop, and why.
+    """
     from dpm2_core.slam.graph.g2o import read_g2o, require_connected, write_g2o
     from dpm2_core.slam.graph.graph_data import total_chi2
     from dpm2_core.slam.graph.robust import RobustSettings, least_squares, optimize
@@ -52,18 +51,15 @@ def optimize(
         "seconds": seconds,
     }
     write_g2o(out, optimized, solution.kept)
-    if json_file is not None:
-        verdicts = [
-            {"from": int(a), "to": int(b), "kept": bool(kept), "reason": solution.reason(loop)}
-            for loop, ((a, b), kept) in enumerate(zip(file.ids[data.ends], solution.kept, strict=True))
-        ]
-        record = {**figures, "settled": solution.settled, "ignored": file.ignored, "verdicts": verdicts}
-        with atomic_write(json_file) as text:
-            text.write(json.dumps(record, indent=1) + "\n")
-    _show(graph, figures, file.ignored, solution.settled)
+    verdicts = [
+        {"from": int(a), "to": int(b), "kept": bool(kept), "reason": solution.reason(loop)}
+        for loop, ((a, b), kept) in enumerate(zip(file.ids[data.ends], solution.kept, strict=True))
+    ]
+    record = {**figures, "settled": solution.settled, "ignored": file.ignored, "verdicts": verdicts}
+    show(_table(graph, figures, file.ignored, solution.settled), record, json_file)
 
 
-def _show(graph: Path, figures: dict[str, Any], ignored: dict[str, int], settled: bool) -> None:
+def _table(graph: Path, figures: dict[str, Any], ignored: dict[str, int], settled: bool) -> FigureTable:
     table = FigureTable(str(graph), names=["what"], text=["value"], header=False)
     for name, value in figures.items():
         note = {"chi2_before": ", with every loop", "chi2_after": ", with the loops kept"}.get(name, "")
@@ -73,4 +69,4 @@ def _show(graph: Path, figures: dict[str, Any], ignored: dict[str, int], settled
         table.add_row("ignored", f"{count} lines {tag}")
     if not settled:
         table.add_row("note", "the results had not come to rest; these are the last ones")
-    Console().print(table)
+    return table

@@ -3,19 +3,47 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
+import sys
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.console import RenderableType
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from dpm2_core.console import Console
 from dpm2_core.data.source import Span
 from dpm2_core.errors import UsageError, exit_code
+from dpm2_core.files import atomic_write
 
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="YAML file; `dpm2 config dump` shows every key.")]
 Overrides = Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, such as slam.map.voxel=0.3.")]
+JsonFile = Annotated[
+    Path | None, typer.Option("--json", metavar="FILE", help="Write the figures to a file; -: to stdout, alone.")
+]
+
+
+def show(table: RenderableType, figures: Mapping[str, Any], json_file: Path | None) -> None:
+    """What a command found: a table or a sentence, and the figures as JSON where they are wanted.
+
+    Args:
+        table: printed to stdout; an empty text is not.
+        json_file: `--json`; "-" prints them instead of the table, so that stdout is JSON and nothing else.
+
+    Raises:
+        Dpm2Error: the file cannot be written.
+    """
+    text = "" if json_file is None else json.dumps(figures, indent=2) + "\n"
+    if str(json_file) == "-":
+        sys.stdout.write(text)
+        return
+    if table:
+        Console().print(table, soft_wrap=isinstance(table, str))
+    if json_file is not None:
+        with atomic_write(json_file) as file:
+            file.write(text)
 
 
 def parse_range(text: str) -> Span:
@@ -37,7 +65,28 @@ def run_command(command: Callable[..., int | None]) -> int:
     return exit_code(lambda: app(standalone_mode=False))
 
 
+class Lines(Progress):
+    """Progress where no terminal is: a line each tenth of the way, so that a log shows it."""
+
+    def update(self, task_id: TaskID, **fields: Any) -> None:
+        """As rich's."""
+        before = self._tasks[task_id].percentage // 10
+        super().update(task_id, **fields)
+        task = self._tasks[task_id]
+        if task.total and task.percentage // 10 > before:
+            left = task.time_remaining
+            when = f", {left:.0f} s left" if left else ""
+            self.console.print(f"{task.description}: {task.completed:.0f}/{task.total:.0f}{when}", soft_wrap=True)
+
+    def advance(self, task_id: TaskID, advance: float = 1) -> None:
+        """As rich's."""
+        self.update(task_id, advance=advance)
+
+
 def progress_bar(console: Console | None = None) -> Progress:
-    """A bar with a description, the count and the time left; on stderr by default."""
+    """A bar with a description, the count and the time left; on stderr by default. Lines where that is no terminal."""
+    console = console or Console(stderr=True)
+    if not console.is_terminal:
+        return Lines(console=console, disable=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    return Progress(*columns, console=console or Console(stderr=True))
+    return Progress(*columns, console=console)

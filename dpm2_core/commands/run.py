@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from dpm2_core.commands.localise import parse_hint, run_localized
-from dpm2_core.commands.options import ConfigFile, Overrides, parse_range, progress_bar
+from dpm2_core.commands.options import ConfigFile, JsonFile, Overrides, parse_range, progress_bar, show
 from dpm2_core.config import load_settings
 from dpm2_core.console import Console
 from dpm2_core.data.corrupt import CorruptedSource, parse_corruption
@@ -49,6 +49,7 @@ def run(
     ] = None,
     config: ConfigFile = None,
     settings: Overrides = None,
+    json_file: JsonFile = None,
 ) -> None:
     """Run the SLAM on a recording and write trajectory, map, image, timing and metrics."""
     overrides = [*(settings or []), *(["input.images=false"] if no_image else [])]
@@ -70,13 +71,14 @@ def run(
         source = CorruptedSource(open_recording(src, chosen, wanted), corruption)
     if localise is not None:
         with OfflineRun(source, chosen, span, map_file=localise, map_mode="localize") as drive:
-            run_localized(drive, out, T_hint, chosen)
+            found, figures = run_localized(drive, out, T_hint, chosen)
+            show(found, figures, json_file)
         return
     mode: MapMode = "resume" if resume else "extend" if extend else "create"
     with OfflineRun(source, chosen, span, gt, map_file, mode) as drive:
         out.mkdir(parents=True, exist_ok=True)
         save_config(chosen, out)  # now: whatever becomes of the run, it says how it was made
-        _report(_drive(drive), out)
+        _report(_drive(drive), out, json_file)
 
 
 def _drive(drive: OfflineRun) -> Result:
@@ -100,7 +102,7 @@ def _drive(drive: OfflineRun) -> Result:
         return drive.run(progress)
 
 
-def _report(result: Result, out: Path) -> None:
+def _report(result: Result, out: Path, json_file: Path | None) -> None:
     """Write the files, and say what came out."""
     console, source = Console(stderr=True), result.source
     if result.interrupted:
@@ -113,7 +115,9 @@ def _report(result: Result, out: Path) -> None:
         console.print(f"map file incomplete: {problem}", style="red", soft_wrap=True)
     for missing in result.save(out):
         console.print(missing, soft_wrap=True)
-    if result.metrics is not None:
-        sensor = "LiDAR" if source.T_cam_lidar is None else "left camera"
-        Console().print(metrics_table(result.metrics, title=f"{source.name}, {len(result)} frames", frame=sensor))
+    metrics, sensor = result.metrics, "LiDAR" if source.T_cam_lidar is None else "left camera"
+    title = f"{source.name}, {len(result)} frames"
+    shown = "" if metrics is None else metrics_table(metrics, title=title, frame=sensor)
+    figures = {"source": source.name, **result.timing, "metrics": None if metrics is None else metrics.model_dump()}
+    show(shown, figures, json_file)
     console.print(f"Results in {out}", soft_wrap=True)

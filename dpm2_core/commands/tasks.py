@@ -3,14 +3,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from dpm2_core.commands.options import progress_bar
+from dpm2_core.commands.options import JsonFile, progress_bar, show
 from dpm2_core.commands.train import ConfigOption, OutOption, ResumeOption, SetOption, reject_overwriting, train
 from dpm2_core.config import load_settings
 from dpm2_core.console import Console
@@ -100,14 +99,14 @@ def _train(
     chosen = load_settings(kind.training_type, *settings)
     scans = open_scans(src, kind.needs)
     train_task(new_task(name, chosen), scans, out, resume, None if val is None else open_scans(val, kind.needs))
-    typer.echo(f"{out / WEIGHTS}: written", err=True)
+    Console(stderr=True).print(f"{out / WEIGHTS}: written", soft_wrap=True)
 
 
 def eval_task(
     name: Annotated[str, typer.Argument(metavar="TASK", help="gndnet, dslr, ae_lidar or movers.")],
     weights: Annotated[Path, typer.Argument(help="What `dpm2 train TASK` wrote: weights.safetensors.")],
     src: SourceArgument,
-    as_json: Annotated[bool, typer.Option("--json", help="Figures as JSON on stdout.")] = False,
+    json_file: JsonFile = None,
     picture: Annotated[Path | None, typer.Option(help="PNG of one scan to write.")] = None,
     frame: Annotated[int, typer.Option(min=0, help="Scan of the image, counted through all sequences.")] = 0,
     slam: Annotated[bool, typer.Option("--slam", help="Odometry on what the task makes, too; needs poses.")] = False,
@@ -122,16 +121,13 @@ def eval_task(
     scans = open_scans(src, needs)
     if picture is not None:
         draw(task, scans, frame, picture)
-        typer.echo(f"{picture}: written", err=True)
+        Console(stderr=True).print(f"{picture}: written", soft_wrap=True)
     figures = measure(task, scans)
     if slam:
         from dpm2_core.tasks.slam_figures import slam_figures  # imports the whole SLAM
 
         figures |= slam_figures(task, src)
-    if as_json:
-        typer.echo(json.dumps({"task": name, "weights": str(weights), "scans": len(scans), **figures}))
-        return
     table = FigureTable(f"{name}, {len(scans)} scans of {src}", names=["figure"], figures=["value"])
     for figure, value in figures.items():
         table.add_row(figure, f"{value:.4g}")
-    Console().print(table)
+    show(table, {"task": name, "weights": str(weights), "scans": len(scans), **figures}, json_file)

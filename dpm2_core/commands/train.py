@@ -10,6 +10,7 @@ import typer
 
 from dpm2_core.commands.options import parse_range, progress_bar
 from dpm2_core.config import load_settings
+from dpm2_core.console import Console
 from dpm2_core.errors import UsageError
 
 train = typer.Typer(help="Make training data and train the network.", no_args_is_help=True)
@@ -65,9 +66,10 @@ def pack(
     with progress_bar() as bar:
         task = bar.add_task(f"{source.name} -> {out}", total=len(chosen))
         packed = write(source, out, network, chosen, lambda: bar.advance(task))
+    console = Console(stderr=True)
     for note in source.notes:
-        typer.echo(note, err=True)
-    typer.echo(f"{out}: {packed} frames", err=True)
+        console.print(note, soft_wrap=True)
+    console.print(f"{out}: {packed} frames", soft_wrap=True)
 
 
 @train.command()
@@ -120,7 +122,6 @@ def ablation(
     report: Annotated[Path, typer.Option("--json", help="Table to write.")] = Path("benchmarks/ablation.json"),
 ) -> None:
     """The paper's Table 4: alternatives of the fusion, trained alike; continues where it was stopped."""
-    from dpm2_core.console import Console
     from dpm2_core.evaluation.record import write_record
     from dpm2_core.experiments.ablation import AblationSettings
     from dpm2_core.experiments.ablation import ablation as compare

@@ -49,7 +49,7 @@ def test_train_and_measure(pairs: Path, tmp_path: Path, name: str, stages: list[
     assert [row["step"] for row in log if "slam_loss" in row] == [4, 5]
 
     weights, image = out / "weights.safetensors", tmp_path / "scan.png"
-    done = dpm2("eval-task", name, weights, pairs, "--json", "--picture", image, "--frame", "2")
+    done = dpm2("eval-task", name, weights, pairs, "--json", "-", "--picture", image, "--frame", "2")
     assert done.returncode == 0, done.stderr
     printed = json.loads(done.stdout)
     assert printed["scans"] == 6

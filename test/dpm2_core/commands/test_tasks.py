@@ -52,7 +52,7 @@ def test_train_resume_and_measure(recording: Path, tmp_path: Path) -> None:
     assert len((out / "log.jsonl").read_text().splitlines()) == len(log)
 
     weights, image = out / "weights.safetensors", tmp_path / "ground.png"
-    done = dpm2("eval-task", "gndnet", weights, recording, "--json", "--picture", image)
+    done = dpm2("eval-task", "gndnet", weights, recording, "--json", "-", "--picture", image)
     assert done.returncode == 0, done.stderr
     printed = json.loads(done.stdout)
     assert printed["scans"] == 4

@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`dpm2 doctor`: what this machine has, what is missing, and how fast it is."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from dpm2_core.commands.options import JsonFile, show
+from dpm2_core.console import Console
+from dpm2_core.errors import Dpm2Error
+from dpm2_core.tables import FigureTable
+
+
+def doctor(
+    folder: Annotated[Path, typer.Option(help="Where results will be written: how much room there is.")] = Path(),
+    no_test: Annotated[bool, typer.Option("--no-test", help="Without the self-test, which takes ten seconds.")] = False,
+    json_file: JsonFile = None,
+) -> None:
+    """Check this machine: versions, processor, GPU, memory, disk, ROS 2 and DDS; then ten seconds of SLAM.
+
+    The exit code is 1 where something does not work; what is only missing or slow is said, and is no error.
+    """
+    from dpm2_core.evaluation.machine import Finding, check_machine
+    from dpm2_core.evaluation.self_test import self_test  # the self-test imports everything
+
+    findings: list[Finding] = []
+    with Console(stderr=True).status("") as status:
+        for finding in check_machine(folder):
+            findings.append(finding)
+            status.update(f"{finding.what}: {finding.found}")
+        if not no_test:
+            status.update("ten seconds of SLAM")
+            findings.append(self_test().finding())
+    table = FigureTable("This machine", names=["what", "how"], text=["found"])
+    for finding in findings:
+        advice = f"; {finding.advice}" if finding.advice else ""
+        table.add_row(finding.what, finding.level, finding.found + advice)
+    show(table, {"findings": [asdict(finding) for finding in findings]}, json_file)
+    if broken := [finding.what for finding in findings if finding.level == "error"]:
+        raise Dpm2Error(f"doctor: does not work: {', '.join(broken)}")

@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Manners in a terminal: help, widths, --quiet, --json, NO_COLOR, completion, Ctrl-C."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from io import StringIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.core import TyperCommand, TyperGroup
+
+from dpm2_core.cli import COMMANDS, GROUPS, load_command
+from dpm2_core.commands.options import progress_bar
+from dpm2_core.console import Console
+from dpm2_core.data.trajectory import write_kitti
+from dpm2_core.geometry import se3
+
+from ..helpers.command import dpm2, dpm2_process
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def all_commands() -> Iterator[tuple[str, TyperCommand]]:
+    """Every command and subcommand, by its words."""
+    for name in COMMANDS:
+        command = load_command(name)
+        if isinstance(command, TyperGroup):
+            yield from ((f"{name} {sub}", single) for sub, single in command.commands.items())  # type: ignore[misc]
+        else:
+            yield name, command
+
+
+@pytest.fixture
+def straight(tmp_path: Path) -> Path:
+    """A trajectory of 130 m."""
+    poses = np.array([se3.make(np.eye(3), [0, 0, 1.3 * i]) for i in range(101)])
+    write_kitti(tmp_path / "poses.txt", poses)
+    return tmp_path / "poses.txt"
+
+
+def test_without_arguments_there_is_the_help_in_groups() -> None:
+    done = dpm2()
+    assert done.returncode == 0
+    assert not done.stderr
+    places = [done.stdout.index(f"─ {group} ─") for group in GROUPS]
+    assert places == sorted(places)
+    for name in (*COMMANDS, "version"):
+        assert re.search(rf"^│ {name} ", done.stdout, re.MULTILINE)
+
+
+def test_a_group_of_commands_without_one_shows_its_help_and_no_error_line() -> None:
+    done = dpm2("map")
+    assert done.returncode == 2
+    assert "Usage" in done.stdout + done.stderr
+    assert "dpm2:" not in done.stderr
+
+
+@pytest.mark.parametrize("width", [60, 100, 200])
+def test_help_fits_the_terminal(width: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", str(width))
+    monkeypatch.setenv("TERMINAL_WIDTH", str(width))
+    monkeypatch.setattr("typer.rich_utils.MAX_WIDTH", width, raising=False)
+    for words in ([], ["run"], ["map", "export"], ["doctor"]):
+        shown = dpm2(*words, "--help").stdout
+        assert max(map(len, shown.splitlines())) <= width
+        assert "…" not in shown
+
+
+def test_every_command_takes_quiet() -> None:
+    missing = [name for name, command in all_commands() if not any("--quiet" in p.opts for p in command.params)]
+    assert missing == []
+
+
+def test_every_command_that_prints_a_table_takes_json() -> None:
+    """The figures are written beside the table by `show`; `bench` and `train ablation` write theirs always."""
+    modules = {path.stem: path.read_text() for path in (ROOT / "dpm2_core" / "commands").glob("*.py")}
+    tables = {name for name, text in modules.items() if "_table(" in text or "FigureTable(" in text}
+    assert tables - {"train"} == {name for name, text in modules.items() if "json_file: JsonFile" in text}
+
+
+def test_json_alone_is_on_stdout(straight: Path, tmp_path: Path) -> None:
+    arguments = ["eval", "--gt", straight, "--est", straight, "--lengths", "100"]
+    done = dpm2(*arguments, "--json", "-")
+    assert json.loads(done.stdout)["ape_rmse_m"] == pytest.approx(0, abs=1e-9)
+    written = dpm2(*arguments, "--json", tmp_path / "figures.json")
+    assert "APE" in written.stdout
+    assert json.loads((tmp_path / "figures.json").read_text()) == json.loads(done.stdout)
+
+
+def test_quiet_leaves_results_and_errors(recording: Path, tmp_path: Path) -> None:
+    arguments = ["run", recording, "--frames", "0:3", "--set", "slam.registration=geometric"]
+    arguments += ["--set", "slam.loops.descriptors=false"]
+    loud = dpm2(*arguments, "--out", tmp_path / "loud")
+    quiet = dpm2(*arguments, "--out", tmp_path / "quiet", "--quiet")
+    assert "Results in" in loud.stderr
+    assert quiet.returncode == 0
+    assert quiet.stderr == ""
+    assert "APE" in quiet.stdout
+    again = dpm2("run", recording, "--out", tmp_path / "no", "--frames", "90:", "-q")
+    assert (again.returncode, again.stderr.count("\n")) == (2, 1)
+    assert "Results in" in dpm2(*arguments, "--out", tmp_path / "loud").stderr  # the next call is not quiet
+
+
+def test_progress_survives_a_pipe() -> None:
+    out = StringIO()
+    with progress_bar(Console(file=out)) as bar:
+        task = bar.add_task("drive", total=200)
+        for _ in range(200):
+            bar.update(task, advance=1, description="drive tracking")
+    shown = out.getvalue().splitlines()
+    assert len(shown) == 10
+    assert shown[0].startswith("drive tracking: 20/200")
+    assert shown[-1].startswith("drive tracking: 200/200")
+    assert "\x1b" not in out.getvalue()
+
+
+def test_no_color_means_none(straight: Path) -> None:
+    """Whatever the terminal can do."""
+    environment = {**os.environ, "FORCE_COLOR": "1", "NO_COLOR": "1"}
+    done = dpm2_process("eval", "--gt", straight, "--est", straight, "--lengths", "100", env=environment)
+    assert "APE" in done.stdout
+    assert not re.search(r"\x1b\[(3\d|4\d|9\d|38|48)", done.stdout)
+
+
+@pytest.mark.parametrize(("words", "offered"), [
+    ("dpm2 doc", ["doctor"]), ("dpm2 map exp", ["export"]), ("dpm2 run --loc", ["--localise"]),
+])  # fmt: skip
+def test_completion(words: str, offered: list[str]) -> None:
+    program = "import sys; sys.argv = ['dpm2']; from dpm2_core.cli import main; main()"
+    environment = {
+        **os.environ, "_DPM2_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(words.count(" ")),
+    }  # fmt: skip
+    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=False)
+    assert done.stdout.split() == offered
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_a_command_without_a_traceback_and_at_once(tmp_path: Path) -> None:
+    """500 frames would take a minute."""
+    program = (
+        "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "from dpm2_core.cli import main; main(['sim', sys.argv[1], '--frames', '500', '--no-images'])"
+    )
+    command = [sys.executable, "-c", program, str(tmp_path / "drive")]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        while process.poll() is None and not list(tmp_path.rglob("*.bin")):
+            time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+        began = time.monotonic()
+        _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "Traceback" not in errors
+    assert time.monotonic() - began < 10
+
+
+def test_a_reader_that_stops_early_is_no_error() -> None:
+    command = f"{sys.executable} -m dpm2_core.cli config dump | head -1"
+    done = subprocess.run(["sh", "-c", command], capture_output=True, text=True, check=False, timeout=60)
+    assert done.stdout
+    assert "Traceback" not in done.stderr
+
+
+def test_the_page_of_exit_codes_lists_those_that_there_are() -> None:
+    page = (ROOT / "docs" / "exit_codes.md").read_text()
+    assert re.findall(r"^\| (\d+) \|", page, re.MULTILINE) == ["0", "1", "2", "130"]
