@@ -48,6 +48,7 @@ BENCHES: dict[str, Bench] = {
     "pose-graph": _bench("pose_graph:bench_pose_graph", "kitti repetitions"),
     "relocalise": _bench("relocalise:bench_relocalise", "source kitti threads set pairs"),
     "roads": _bench("roads:bench_roads", "source kitti threads set"),
+    "sensor": _bench("sensor:bench_sensor", "source kitti"),
     "tasks": _bench("tasks:bench_tasks", "repetitions threads set only"),
     "tilt": _bench("tilt:bench_tilt", "source kitti threads set weights pairs"),
     "traffic": _bench("traffic:bench_traffic", "repetitions threads set weights only"),

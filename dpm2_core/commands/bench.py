@@ -18,7 +18,7 @@ def bench(
         list[str] | None,
         typer.Argument(
             help="covariance, diffslam, finetune, gaps, geometric (default), hard, loop-cost, map, memory, neural, "
-            "pose-graph, relocalise, roads, tasks, tilt, traffic."
+            "pose-graph, relocalise, roads, sensor, tasks, tilt, traffic."
         ),
     ] = None,
     source: Annotated[

@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from dpm2_core.commands.options import progress_bar
 from dpm2_core.config import settings_from
 from dpm2_core.console import Console
+from dpm2_core.sim.sensors import real_sensor
 from dpm2_core.sim.settings import DriveConfig, PresetName
 
 
@@ -26,6 +27,12 @@ def sim(
     traffic: Annotated[
         float, typer.Option(help="Times the preset's; above 1 in columns on every lane, 20 is full.")
     ] = 1.0,
+    sensor: Annotated[
+        Literal["clean", "real"], typer.Option(help="clean: exact but for noise; real: errs as KITTI's does.")
+    ] = "clean",
+    pattern: Annotated[
+        Literal["spinning", "rosette"], typer.Option(help="rosette: 70 deg ahead, never the same twice (Livox).")
+    ] = "spinning",
     beams: Annotated[int, typer.Option(help="Of the LiDAR: 16, 32, 64 or 128.")] = 64,
     height: Annotated[float, typer.Option(help="Of the LiDAR above the ground, m.")] = 1.73,
     reach: Annotated[float, typer.Option("--range", help="Of the LiDAR, m.")] = 80.0,
@@ -34,9 +41,11 @@ def sim(
     """Simulate a drive: scans, images, poses, point labels, scans without moving objects, and a map of the ground."""
     from dpm2_core.sim.drive import simulate  # embree and the rest are slow to import for the other commands
 
-    lidar = {"beams": beams, "height": height, "range": reach}
+    lidar = {"pattern": pattern, "beams": beams, "height": height, "range": reach}
     tree = {"frames": frames, "seed": seed, "road": road, "preset": preset, "images": images, "traffic": traffic}
     drive = settings_from(DriveConfig, {**tree, "lidar": lidar}, default="dpm2 sim")
+    if sensor == "real":
+        drive = drive.model_copy(update={"lidar": real_sensor(drive.lidar)})
     console = Console(stderr=True)
     with progress_bar(console) as bar:
         task = bar.add_task(f"{preset} -> {out}", total=None)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -91,6 +91,39 @@ def success_png(path: Path | str, kinds: Mapping[str, Mapping[str, Mapping[str, 
     axes.set_xlabel("pairs registered, %; median error beside the bar", color=_INK)
     axes.tick_params(colors=_INK)
     figure.text(0.02, 0.95, title, color=_INK, fontsize=11)
+    with atomic_write(path, "wb") as file:
+        FigureCanvasAgg(figure).print_png(file)
+
+
+def lines_png(
+    path: Path | str,
+    panels: Mapping[str, Mapping[str, tuple[Sequence[float], Sequence[float | None]]]],
+    title: str = "",
+) -> None:
+    """Panels beside one another, each with a line a name.
+
+    Args:
+        panels: title of a panel, name of a line, and its values along x and y; None: a gap.
+
+    Raises:
+        Dpm2Error: the file could not be written.
+    """
+    with needs("plot", "drawing"):
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+    rows = -(-len(panels) // 3)
+    figure = Figure(figsize=(15, 4.2 * rows + 0.6), dpi=100)
+    for k, (name, lines) in enumerate(panels.items(), 1):
+        axes = figure.add_subplot(rows, min(3, len(panels)), k)
+        for label, (x, y) in lines.items():
+            axes.plot(x, np.array(y, float), marker=".", label=label)
+        axes.set_title(name, fontsize=10)
+        axes.set_ylim(bottom=0)
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize=9)
+    figure.suptitle(title)
+    figure.tight_layout()
     with atomic_write(path, "wb") as file:
         FigureCanvasAgg(figure).print_png(file)
 

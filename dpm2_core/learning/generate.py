@@ -23,6 +23,7 @@ from dpm2_core.network.pyramid import crop
 from dpm2_core.network.settings import NetworkSettings, preset
 from dpm2_core.sim.camera import calibration, render
 from dpm2_core.sim.lidar import Lidar
+from dpm2_core.sim.sensors import drawn_sensor
 from dpm2_core.sim.settings import CameraConfig, LidarConfig, PresetName
 from dpm2_core.sim.world import build_world
 
@@ -46,6 +47,11 @@ class GenerateSettings(Settings):
     """Of the LiDAR."""
     height: float = Field(1.73, gt=0.5, le=10)
     """Of the LiDAR above the ground, m; each world's own is up to 0.2 m lower or 0.3 m higher."""
+    real: float = Field(0.0, ge=0, le=1)
+    """Fraction of the worlds whose LiDAR has the errors of a real one, each its own."""
+    others: float = Field(0.0, ge=0, le=1)
+    """Fraction of the worlds with another LiDAR than `beams` and `height` say: 16 to 128 beams or a rosette, on a
+    robot or on a truck, tilted at times."""
     traffic: float = Field(1.0, ge=0, le=1000)
     """Factor on the preset's traffic; 20 fills every lane."""
     images: bool = False
@@ -63,19 +69,23 @@ def generate_world(folder: Path, seed: int, settings: GenerateSettings) -> None:
     network = preset(settings.preset)
     world = build_world("random", kind, seed, settings.length, settings.traffic)
     columns, height = int(noise.choice([1448, 1810, 2170])), settings.height + noise.uniform(-0.2, 0.3)
-    lidar = Lidar(LidarConfig(beams=settings.beams, columns=columns, height=height))
+    config = LidarConfig(beams=settings.beams, columns=columns, height=height)
+    lidar = Lidar(drawn_sensor(config, settings.real, settings.others, np.random.default_rng([seed, 79])))
+    height, sway = lidar.config.height, lidar.config.real.sway
     camera = _camera(network)
     samples = []
     for _ in range(settings.frames):
-        T, time = world.sample_pose(noise, height=lidar.config.height)
-        scan = lidar.scan(world, T, time, noise)
+        T, time = world.sample_pose(noise, height=height, sway=sway)
+        scan = lidar.drive_scan(world, T, time, noise, world.drive_twist(time, height, sway))
+        points = se3.transform(lidar.T_level_lidar, scan.points).astype(np.float32)  # what the network is given
         images: tuple[Image, ...] = ()
         if settings.images:
             view = calibration(camera)
             pixels = render(world, camera, T @ view.T_lidar_cam, time, noise)
             images = (small_image(Image(pixels, view), network),)
-        samples.append(Sample(crop(scan.points, network.points), T, images))
-    write_packed(folder, samples, {"source": "synthetic city", "preset": kind, "seed": seed})
+        samples.append(Sample(crop(points, network.points), T, images))
+    sensor = lidar.config.model_dump(mode="json", exclude_defaults=True)
+    write_packed(folder, samples, {"source": "synthetic city", "preset": kind, "seed": seed, "sensor": sensor})
 
 
 def _camera(network: NetworkSettings) -> CameraConfig:

@@ -23,7 +23,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.sim.camera import calibration, render
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.road import FRAME_PERIOD, ROAD_KINDS, make_road, read_drive
-from dpm2_core.sim.settings import DriveConfig
+from dpm2_core.sim.settings import DriveConfig, LidarConfig
 from dpm2_core.sim.world import World, build_world, own_preset, random_stream
 
 Array = NDArray[np.float64]
@@ -94,7 +94,10 @@ def fitting_length(drive: DriveConfig) -> float:
 
 def _recipe(drive: DriveConfig) -> dict[str, Any]:
     """What the drive is made from, of a file its name and checksum; usual traffic goes without saying."""
-    recipe = {"generator": "dpm2 sim 1", "vertical_angle_correction_deg": 0, **drive.model_dump()}
+    recipe = {"generator": "dpm2 sim 1", "vertical_angle_correction_deg": 0, **drive.model_dump(mode="json")}
+    for name in ("pattern", "roll", "pitch", "real"):  # and so does a level, clean sensor that turns
+        if recipe["lidar"][name] == LidarConfig().model_dump(mode="json")[name]:
+            del recipe["lidar"][name]
     if drive.road not in ROAD_KINDS:
         path = Path(drive.road)
         recipe["road"] = f"{path.name} sha256:{hashlib.sha256(path.read_bytes()).hexdigest()}"
@@ -156,12 +159,17 @@ class _Drive:
     def __init__(self, world: World, drive: DriveConfig) -> None:
         self.world, self.lidar, self.camera = world, Lidar(drive.lidar), drive.camera if drive.images else None
         self.times = np.arange(_frames(drive)) * FRAME_PERIOD
-        self.T_world_lidar = np.stack([world.drive_pose(t, drive.lidar.height) for t in self.times])
+        height, sway = drive.lidar.height, drive.lidar.real.sway
+        self.T_world_level = np.stack([world.drive_pose(t, height, sway) for t in self.times])
+        self.twists = np.stack([world.drive_twist(t, height, sway) for t in self.times])
+        self.T_world_lidar = self.T_world_level @ self.lidar.T_level_lidar
         color = calibration(drive.camera)
         # The poses and Tr of the layout are of the left gray camera 0; the color camera 2 sits beside it.
-        self.T_lidar_cam0 = color.T_lidar_cam.copy()
-        self.T_lidar_cam0[1, 3] = 0.0
-        self.T_lidar_cam2, self.K = color.T_lidar_cam, color.K
+        T_level_cam0 = color.T_lidar_cam.copy()
+        T_level_cam0[1, 3] = 0.0
+        T_lidar_level = se3.inverse(self.lidar.T_level_lidar)
+        self.T_lidar_cam0, self.T_lidar_cam2 = T_lidar_level @ T_level_cam0, T_lidar_level @ color.T_lidar_cam
+        self.K, self.baseline = color.K, color.T_lidar_cam[1, 3]
 
     def write(self, root: Path, recipe: dict[str, Any], workers: int, progress: Callable[[int, int], None]) -> None:
         sequence = root / "sequences" / "00"
@@ -179,7 +187,8 @@ class _Drive:
 
     def _write_frame(self, sequence: Path, i: int) -> None:
         world, time, T = self.world, float(self.times[i]), self.T_world_lidar[i]
-        scan = self.lidar.scan(world, T, time, np.random.default_rng([world.seed, _LIDAR_STREAM, i]))
+        rng = np.random.default_rng([world.seed, _LIDAR_STREAM, i])
+        scan = self.lidar.drive_scan(world, self.T_world_level[i], time, rng, self.twists[i])
         scan.points.tofile(sequence / "velodyne" / f"{i:06d}.bin")
         scan.label.tofile(sequence / "labels" / f"{i:06d}.label")
         scan.static.tofile(sequence / "static" / f"{i:06d}.bin")
@@ -197,7 +206,7 @@ class _Drive:
             np.savetxt(path, rows, "%.9e")
         np.savetxt(sequence / "times.txt", self.times, "%.6e")
         calib = io.StringIO()
-        for k, left in enumerate((0.0, -0.54, self.T_lidar_cam2[1, 3], -0.48)):
+        for k, left in enumerate((0.0, -0.54, self.baseline, -0.48)):
             P = np.concatenate([self.K, self.K @ [[left], [0], [0]]], 1)
             calib.write(f"P{k}: " + " ".join(f"{v:.12e}" for v in P.ravel()) + "\n")
         calib.write("Tr: " + " ".join(f"{v:.12e}" for v in se3.inverse(self.T_lidar_cam0)[:3].ravel()) + "\n")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A spinning multi-beam LiDAR by ray casting: points, labels, and the twin of each scan without what moves."""
+"""A multi-beam LiDAR by ray casting: points, labels, and the twin of each scan without what moves."""
 
 from __future__ import annotations
 
@@ -7,8 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from dpm2_core.geometry import se3
+from dpm2_core.geometry.deskew import deskew
+from dpm2_core.sim.beams import Beams
+from dpm2_core.sim.imperfections import Returns, SensorErrors
 from dpm2_core.sim.materials import DARK, MISS, MOVING_LABEL, REFLECTANCE, RETRO, ROUGHNESS, Label
 from dpm2_core.sim.mesh import Hits, Mesh, rotated
 from dpm2_core.sim.settings import LidarConfig
@@ -17,20 +21,6 @@ from dpm2_core.sim.world import World
 
 Array = NDArray[np.float64]
 Float = NDArray[np.float32]
-
-_CAR_BODY = (1.5, 1.67, 0.85, 0.56)
-"""Edges of the roof ahead, behind and aside, and the sensor's height over it, m: hides what it hides on KITTI's car."""
-
-
-def elevations(beams: int) -> Array:
-    """(beams,) rad above the horizon, top beam first."""
-    degrees = {
-        16: np.linspace(15, -15, 16),
-        32: np.linspace(10.67, -30.67, 32),
-        64: np.concatenate([np.linspace(2, -8.33, 32), np.linspace(-8.83, -24.8, 32)]),
-        128: np.linspace(15, -25, 128),
-    }[beams]
-    return np.radians(degrees)
 
 
 @dataclass(eq=False)
@@ -55,30 +45,30 @@ class Scan:
 
 
 class Lidar:
-    """Scans worlds. Holds no state between scans: one may serve many threads."""
+    """Scans worlds. Holds no state between scans: one may serve many threads.
+
+    Attributes:
+        T_level_lidar: (4, 4) of its mount, a turn alone.
+    """
 
     def __init__(self, config: LidarConfig | None = None) -> None:
         self.config = config = config or LidarConfig()
-        elevation = elevations(config.beams)[:, None]
-        azimuth = np.arange(config.columns)[None] * (2 * np.pi / config.columns)
-        directions = np.stack(
-            [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation) + 0 * azimuth],
-            -1,
-        ).reshape(-1, 3)
-        ring, column = np.divmod(np.arange(len(directions)), config.columns)
-        if config.car_body:
-            keep = ~_hidden_by_car(directions)
-            directions, ring, column = directions[keep], ring[keep], column[keep]
-        self.directions = np.ascontiguousarray(directions, np.float32)
-        self.ring, self.column = ring.astype(np.uint8), column
+        turn = Rotation.from_euler("xy", (config.roll, config.pitch), degrees=True)
+        self.T_level_lidar = se3.make(turn.as_matrix(), np.zeros(3))
+        self.beams = Beams(config, self.T_level_lidar)
+        self.errors = SensorErrors(config, self.beams.ring, self.beams.column)
         # No two laser-receiver pairs are equally sensitive.
-        self.gain = np.random.default_rng(config.beams).normal(1, 0.12, config.beams).astype(np.float32)[ring]
-        # It turns clockwise and looks straight ahead at the stamp.
-        turn = -np.remainder(azimuth[0] + np.pi, 2 * np.pi) + np.pi
-        self.column_time = (turn / (2 * np.pi) * config.period).astype(np.float32)
+        gain = np.random.default_rng(config.beams).normal(1, 0.12, config.beams).astype(np.float32)
+        self.gain = gain[self.beams.ring]
 
     def scan(
-        self, world: World, T_world_lidar: Array, time: float, rng: np.random.Generator, twist: Array | None = None
+        self,
+        world: World,
+        T_world_lidar: Array,
+        time: float,
+        rng: np.random.Generator,
+        twist: Array | None = None,
+        believed: Array | None = None,
     ) -> Scan:
         """One turn at a pose (4, 4).
 
@@ -86,51 +76,88 @@ class Lidar:
             time: s, where the dynamic objects are. They stand still during the turn.
             twist: (6,) [rad/s, m/s] of the sensor in its own frame during the turn: each point is then given in the
                 frame of its own moment, as a driver delivers it. None: already corrected for motion, as KITTI's are.
+            believed: (6,) twist by which the points of a turn in motion are then taken to the stamp.
         """
-        origins, directions = self._rays(T_world_lidar, twist)
+        aim = self.beams.directions(time)
+        origins, directions = self._rays(T_world_lidar, self.errors.aimed(aim), twist)
         chance = rng.random((2, len(directions)), np.float32)
         jitter = rng.standard_normal((2, len(directions)), np.float32)
+        draws = self.errors.draws(rng)
         still = world.scene.cast(origins, directions, self.config.range)
-        points, back = self._returns(world.static, still, directions, chance, jitter)
+        returns = self._returns(world.static, still, directions, chance, jitter)
         label = world.static.label[np.maximum(still.face, 0)].astype(np.uint32)
         if not world.terrain.preset.degenerate:  # there, intensity would reveal the motion
-            self._paint(world, T_world_lidar, points, label, back)
-        static = points[back]
+            self._paint(world, T_world_lidar, aim, returns, label)
+        twin = returns.copy()
+        self.errors.finish(twin, draws)
+        static = self._points(aim, twin, believed)
         moving = np.zeros(len(directions), bool)
         if dynamic_objects := world.dynamic_objects(time, T_world_lidar[:3, 3]):
-            hits, toward = dynamic_objects.cast(
-                origins if twist is not None else origins[0], directions, self.config.range
-            )
+            one_eye = twist is None and not any(self.config.real.emitters)
+            hits, toward = dynamic_objects.cast(origins[0] if one_eye else origins, directions, self.config.range)
             near = hits.distance < still.distance[toward]
             hits, which = hits.part(near), toward[near]
             moving[which] = True
-            points[which], back[which] = self._returns(
-                dynamic_objects.scene.mesh, hits, directions[which], chance[:, which], jitter[:, which], which
-            )
-            kind = MOVING_LABEL[dynamic_objects.scene.mesh.label[hits.face]]
-            label[which] = kind | dynamic_objects.number[hits.face].astype(np.uint32) << 16
-        time_offset = self.column_time[self.column[back]]
-        return Scan(points[back], label[back], moving[back], self.ring[back], time_offset, static)
+            mesh = dynamic_objects.scene.mesh
+            nearer = self._returns(mesh, hits, directions[which], chance[:, which], jitter[:, which], which)
+            returns.put(which, nearer)
+            number = dynamic_objects.number[hits.face].astype(np.uint32)
+            label[which] = MOVING_LABEL[mesh.label[hits.face]] | number << 16
+        stray = self.errors.finish(returns, draws)
+        label[stray], moving[stray] = Label.OUTLIER, False
+        back = returns.back
+        time_offset = self.beams.column_time[self.beams.column[back]]
+        points = self._points(aim, returns, believed)
+        return Scan(points, label[back], moving[back], self.beams.ring[back], time_offset, static)
+
+    def drive_scan(
+        self, world: World, T_world_level: Array, time: float, rng: np.random.Generator, twist: Array
+    ) -> Scan:
+        """One turn of the mounted sensor in motion, with what a driver leaves of the motion (`Imperfections.skew`).
+
+        Args:
+            T_world_level: (4, 4), without the turn of the mount. twist: (6,) [rad/s, m/s] of that frame.
+        """
+        T_world_lidar = T_world_level @ self.T_level_lidar
+        if not self.config.real.skew:
+            return self.scan(world, T_world_lidar, time, rng)
+        own = (np.asarray(twist).reshape(2, 3) @ self.T_level_lidar[:3, :3]).ravel()
+        return self.scan(world, T_world_lidar, time, rng, own, own * (1 + self.config.real.skew * rng.normal()))
 
     def _paint(
-        self, world: World, T_world_lidar: Array, points: Float, label: NDArray[np.uint32], back: NDArray[np.bool_]
+        self, world: World, T_world_lidar: Array, aim: Float, returns: Returns, label: NDArray[np.uint32]
     ) -> None:
         """Brightens and labels the returns from lane markings, in place."""
-        road = np.flatnonzero(back & (label == Label.ROAD))
-        xy = points[road, :3] @ T_world_lidar[:2, :3].T.astype(np.float32) + T_world_lidar[:2, 3].astype(np.float32)
+        road = np.flatnonzero(returns.back & (label == Label.ROAD))
+        at = aim[road] * returns.distance[road, None]
+        xy = at @ T_world_lidar[:2, :3].T.astype(np.float32) + T_world_lidar[:2, 3].astype(np.float32)
         footprint = np.full(len(xy), 0.03, np.float32)
         painted = road[road_marking(*world.terrain.lane_coordinates(xy), footprint, world.terrain) > 0.5]
         label[painted] = Label.MARKING
-        points[painted, 3] = np.minimum(points[painted, 3] * np.float32(1.7), 1)
+        returns.intensity[painted] = np.minimum(returns.intensity[painted] * np.float32(1.7), 1)
 
-    def _rays(self, T_world_lidar: Array, twist: Array | None) -> tuple[Float, Float]:
+    def _rays(self, T_world_lidar: Array, aim: Float, twist: Array | None) -> tuple[Float, Float]:
+        """Origins and directions (R, 3) in the world."""
+        height = self.errors.origin_height[:, None]
         if twist is None:
-            directions = rotated(self.directions, T_world_lidar[:3, :3])
-            return np.broadcast_to(T_world_lidar[:3, 3].astype(np.float32), directions.shape).copy(), directions
-        T = T_world_lidar @ se3.exp(np.asarray(twist) * self.column_time[:, None].astype(float))
-        R = T[:, :3, :3].astype(np.float32)[self.column]
-        directions = np.einsum("nij,nj->ni", R, self.directions)
-        return T[:, :3, 3].astype(np.float32)[self.column], directions
+            directions = rotated(aim, T_world_lidar[:3, :3])
+            origin = T_world_lidar[:3, 3].astype(np.float32)
+            return origin + height * T_world_lidar[:3, 2].astype(np.float32), directions
+        T = T_world_lidar @ se3.exp(np.asarray(twist) * self.beams.column_time[:, None].astype(float))
+        R = T[:, :3, :3].astype(np.float32)[self.beams.column]
+        directions = np.einsum("nij,nj->ni", R, aim)
+        return T[:, :3, 3].astype(np.float32)[self.beams.column] + height * R[:, :, 2], directions
+
+    def _points(self, aim: Float, returns: Returns, believed: Array | None) -> Float:
+        """(N, 4) of the pulses that came back, at the stamp if the motion is `believed`."""
+        back = returns.back
+        points = np.empty((int(back.sum()), 4), np.float32)
+        points[:, :3] = aim[back] * returns.distance[back, None]
+        points[:, 2] += self.errors.origin_height[back]
+        points[:, 3] = returns.intensity[back]
+        if believed is None:
+            return points
+        return deskew(points, self.beams.column_time[self.beams.column[back]], believed)
 
     def _returns(
         self,
@@ -140,9 +167,9 @@ class Lidar:
         chance: Float,
         jitter: Float,
         which: NDArray[np.intp] | slice = slice(None),
-    ) -> tuple[Float, NDArray[np.bool_]]:
-        """Points (R, 4) in the LiDAR frame and whether each pulse came back (R,)."""
-        config = self.config
+    ) -> Returns:
+        """What the pulses (R,) that hit something bring back."""
+        config, real = self.config, self.config.real
         face = np.maximum(hits.face, 0)
         material = mesh.material[face]
         cosine = np.abs(np.einsum("ij,ij->i", hits.normal, directions))
@@ -152,27 +179,20 @@ class Lidar:
         distance = np.where(hits.face >= 0, hits.distance, 0).astype(np.float32)
         # What is left of the pulse against what the receiver needs.
         strength = reflectance * (cosine + np.float32(0.02)) * (np.float32(30) / np.maximum(distance, 5)) ** 2
+        strength *= self.errors.clear[which]
         # Whole panes and panels vanish rather than single pulses: half of the fraction is drawn once a quad.
         panel = ((face >> 1) * 40503 & 0xFFFF).astype(np.float32) / np.float32(0xFFFF)
-        lost = config.dropout + MISS[material] * 2 * panel + np.exp(-strength / np.float32(0.006))
+        gone = panel < MISS[material] if real.panes else MISS[material] * 2 * panel
+        lost = config.dropout + gone + np.exp(-strength / np.float32(0.006 * (1 + real.weak)))
         back = (hits.face >= 0) & (chance[0] > lost)
         sigma = np.hypot(np.float32(config.noise), ROUGHNESS[material])
-        measured = distance + sigma * jitter[0]
+        if real.growth or real.footprint:
+            sigma = np.hypot(sigma, self.errors.noise(distance, cosine))
+        measured = distance + sigma * jitter[0] + self.errors.range_bias[which]
         back &= (measured >= config.min_range) & (measured <= config.range)
-        points = np.empty((len(distance), 4), np.float32)
-        points[:, :3] = self.directions[which] * measured[:, None]
         facing = np.where(RETRO[material], 1, 0.55 + 0.45 * np.sqrt(cosine)).astype(np.float32)
-        intensity = reflectance * facing * np.exp(-distance / 160) * self.gain[which] + np.float32(0.03) * jitter[1]
+        intensity = reflectance * facing * np.exp(-distance / 160) * self.gain[which] * self.errors.clear[which]
+        intensity += np.float32(0.03) * jitter[1]
         faint = DARK[material] + np.float32(0.6) / (1 + np.exp((np.float32(38) - distance) / 7))
-        points[:, 3] = np.where(chance[1] < faint, 0, np.rint(intensity.clip(0, 1) * 100) / 100)
-        return points, back
-
-
-def _hidden_by_car(directions: Array) -> NDArray[np.bool_]:
-    ahead, behind, aside, clearance = _CAR_BODY
-    flat = np.hypot(directions[:, 0], directions[:, 1]) + 1e-9
-    along, across = directions[:, 0] / flat, np.abs(directions[:, 1]) / flat
-    reach = np.minimum(
-        np.where(along > 0, ahead, behind) / np.maximum(np.abs(along), 1e-9), aside / np.maximum(across, 1e-9)
-    )
-    return -directions[:, 2] / flat * reach > clearance
+        intensity = np.where(chance[1] < faint, 0, np.rint(intensity.clip(0, 1) * 100) / 100).astype(np.float32)
+        return Returns(measured, intensity, back, RETRO[material])

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 class Label(IntEnum):
     """SemanticKITTI class ids, those that the worlds contain."""
 
+    OUTLIER = 1
     CAR = 10
     BICYCLE = 11
     TRUCK = 18

@@ -15,13 +15,49 @@ PresetName = Literal["city", "suburb", "rural", "highway", "tunnel"]
 PRESET_NAMES: tuple[PresetName, ...] = ("city", "suburb", "rural", "highway", "tunnel")
 
 
-class LidarConfig(Settings):
-    """A spinning LiDAR on a car."""
+class Imperfections(Settings):
+    """What a real LiDAR adds to an exact one. By default nothing: the clean sensor."""
 
+    serial: int = Field(default=0, ge=0)
+    """Which sensor of its kind: the seed of what sets it apart."""
+    emitters: tuple[float, float] = (0.0, 0.0)
+    """Height of the origins of the upper and of the lower half of the beams over that of the sensor, m."""
+    uneven: float = Field(default=0.0, ge=0, le=1)
+    """Deviation of the beams' elevations from even spacing, deg, as the driver knows it."""
+    angle_bias: float = Field(default=0.0, ge=0, le=1)
+    """Deviation of the beams' elevations and azimuths from what the driver believes, deg."""
+    range_bias: float = Field(default=0.0, ge=0, le=1)
+    """Deviation of the beams' errors of range, m."""
+    growth: float = Field(default=0.0, ge=0, le=0.1)
+    """Noise of a range, m, for each m of it."""
+    footprint: float = Field(default=0.0, ge=0, le=0.1)
+    """Divergence of a beam, rad: noise at grazing incidence, and ranges between two surfaces at edges."""
+    panes: bool = False
+    """Glass and paint swallow the pulses of a whole pane or panel, or of none of it, rather than single ones."""
+    weak: float = Field(default=0.0, ge=0, le=20)
+    """The receiver needs 1 + this times the light: dark, far and grazing surfaces are lost."""
+    glare: float = Field(default=0.0, ge=0, le=1)
+    """Probability that a pulse just beside a retro-reflector returns at its distance."""
+    drops: float = Field(default=0.0, ge=0, le=1)
+    """Rain, snow or dust: returns from drops for each m of a pulse's way."""
+    dirt: float = Field(default=0.0, ge=0, lt=1)
+    """Fraction of the window with dirt on it."""
+    skew: float = Field(default=0.0, ge=0, le=2)
+    """Deviation, as a fraction, of the motion during a turn that the points are corrected by."""
+    sway: float = Field(default=1.0, ge=0, le=20)
+    """Times the usual pitch and roll of the body."""
+
+
+class LidarConfig(Settings):
+    """A LiDAR on a car."""
+
+    pattern: Literal["spinning", "rosette"] = "spinning"
+    """A turning row of beams, or a row of lasers behind two prisms that draws a rosette of 70 deg ahead and never
+    repeats it, as Livox sensors do."""
     beams: Literal[16, 32, 64, 128] = 64
-    """Number of beams, with the angles of the VLP-16, HDL-32E, HDL-64E or, for 128, +15 to -25 deg."""
+    """Number of beams, spinning with the angles of the VLP-16, HDL-32E, HDL-64E or, for 128, +15 to -25 deg."""
     columns: int = Field(default=2170, ge=16, le=8192)
-    """Firings per turn; 2170 gives about 120 thousand returns with 64 beams, as KITTI has."""
+    """Firings per turn of each beam; 2170 gives about 120 thousand returns with 64 beams, as KITTI has."""
     height: float = Field(default=1.73, gt=0, le=10)
     """Of the sensor above the ground, m."""
     range: float = Field(default=80.0, gt=1, le=300)
@@ -35,7 +71,23 @@ class LidarConfig(Settings):
     period: float = Field(default=0.1, gt=0)
     """Of one turn, s."""
     car_body: bool = True
-    """The car's own roof hides the lowest beams ahead and behind, as on KITTI's car."""
+    """The car's own roof hides the lowest beams ahead and behind, as on KITTI's car; of a spinning sensor."""
+    roll: float = Field(default=0.0, ge=-180, le=180)
+    """Of the mount, deg, to the right."""
+    pitch: float = Field(default=0.0, ge=-90, le=90)
+    """Of the mount, deg, downwards."""
+    real: Imperfections = Imperfections()
+
+
+HDL64E = LidarConfig(
+    noise=0.007, dropout=0.001,
+    real=Imperfections(
+        emitters=(0.205, 0.13), uneven=0.036, angle_bias=0.02, range_bias=0.02, growth=0.0005, footprint=0.0015,
+        panes=True, glare=0.3, skew=0.05, sway=0.4,
+    ),
+)  # fmt: skip
+"""As KITTI's, by `dpm2 bench sensor`. Its lasers sit up to 0.2 m above the origin of the points, which the driver does
+not hide: how far down a beam looks depends on what it meets."""
 
 
 class CameraConfig(Settings):

@@ -67,20 +67,33 @@ class World:
         R[:, 1] = np.cross(R[:, 2], R[:, 0])
         return se3.make(R, np.array([*xy, z.mean()]) + height * R[:, 2])
 
-    def drive_pose(self, time: float, height: float = 1.73) -> Array:
-        """T_world_lidar (4, 4) of the drive at a time, s, with the small motions of its suspension."""
+    def drive_pose(self, time: float, height: float = 1.73, sway: float = 1.0) -> Array:
+        """T_world_lidar (4, 4) of the drive at a time, s, with `sway` times the small motions of its suspension."""
         t = time * 2 * np.pi
-        sway = np.array([np.sin(0.9 * t) + 0.6 * np.sin(1.7 * t + 1), np.sin(1.1 * t + 2) + 0.5 * np.sin(2.3 * t), 0])
-        bounce = 0.006 * np.sin(1.3 * t) + 0.004 * np.sin(2.1 * t + 1)
-        T_body_lidar = se3.make(Rotation.from_rotvec(sway * (0.003, 0.004, 0)).as_matrix(), (0, 0, bounce))
+        turn = np.array([np.sin(0.9 * t) + 0.6 * np.sin(1.7 * t + 1), np.sin(1.1 * t + 2) + 0.5 * np.sin(2.3 * t), 0])
+        bounce = sway * (0.006 * np.sin(1.3 * t) + 0.004 * np.sin(2.1 * t + 1))
+        T_body_lidar = se3.make(Rotation.from_rotvec(sway * turn * (0.003, 0.004, 0)).as_matrix(), (0, 0, bounce))
         return self.pose_at(float(self.road.distance(time)), 0.0, self.road.slip_at(time), height) @ T_body_lidar
 
+    def drive_twist(self, time: float, height: float = 1.73, sway: float = 1.0) -> Array:
+        """(6,) [rad/s, m/s] of the sensor in its own frame at a time of the drive, s."""
+        before, after = (self.drive_pose(time + half, height, sway) for half in (-0.02, 0.02))
+        return se3.log(se3.inverse(before) @ after) / 0.04
+
     def sample_pose(
-        self, rng: np.random.Generator, lateral: float = 1.0, heading: float = 0.1, height: float = 1.73
+        self,
+        rng: np.random.Generator,
+        lateral: float = 1.0,
+        heading: float = 0.1,
+        height: float = 1.73,
+        sway: float = 1.0,
     ) -> tuple[Array, float]:
-        """T_world_lidar (4, 4) at a random place, up to `lateral` m and `heading` rad off the drive; its time, s."""
+        """T_world_lidar (4, 4) at a random place, up to `lateral` m and `heading` rad off the drive; its time, s.
+
+        It is tilted by as much as the suspension does, `sway` times.
+        """
         time = float(rng.uniform(0, self.road.times[-1]))
-        tilt = Rotation.from_rotvec([*rng.normal(0, 0.006, 2), 0]).as_matrix()
+        tilt = Rotation.from_rotvec([*rng.normal(0, 0.006 * sway, 2), 0]).as_matrix()
         T = self.pose_at(
             float(self.road.distance(time)),
             rng.uniform(-lateral, lateral),

@@ -10,7 +10,8 @@ import pytest
 from scipy.spatial import cKDTree
 
 from dpm2_core.geometry import se3
-from dpm2_core.sim.lidar import Lidar, Scan, elevations
+from dpm2_core.sim.beams import elevations
+from dpm2_core.sim.lidar import Lidar, Scan
 from dpm2_core.sim.materials import Label
 from dpm2_core.sim.settings import LidarConfig
 from dpm2_core.sim.world import World, build_world
@@ -154,9 +155,10 @@ def test_a_turn_in_motion_is_undone_by_the_twist(tunnel: World) -> None:
 
 def test_the_car_hides_the_lowest_beams_ahead_and_behind_only() -> None:
     with_car, without = (Lidar(LidarConfig(car_body=body)) for body in (True, False))
-    assert len(with_car.directions) < len(without.directions) == 64 * 2170
+    assert len(with_car.beams.directions(0.0)) < len(without.beams.directions(0.0)) == 64 * 2170
     hidden = np.setdiff1d(
-        without.ring.astype(int) * 4096 + without.column, with_car.ring.astype(int) * 4096 + with_car.column
+        without.beams.ring.astype(int) * 4096 + without.beams.column,
+        with_car.beams.ring.astype(int) * 4096 + with_car.beams.column,
     )
     rings, columns = np.divmod(hidden, 4096)
     side = np.abs(np.abs(np.remainder(columns / 2170 * 360 + 90, 180) - 90) - 90) < 25
@@ -169,7 +171,7 @@ def test_losses_are_as_on_a_road(city: World) -> None:
     lidar = Lidar()
     T = city.pose_at(40.0)
     scan = lidar.scan(city, T, 1.0, np.random.default_rng(0))
-    directions = (lidar.directions @ T[:3, :3].T).astype(np.float32)
+    directions = (lidar.beams.directions(0.0) @ T[:3, :3].T).astype(np.float32)
     hits = city.scene.cast(np.tile(T[:3, 3].astype(np.float32), (len(directions), 1)), directions, 20.0)
     road = (hits.face >= 0) & (city.static.label[np.maximum(hits.face, 0)] == Label.ROAD)
     near = np.linalg.norm(scan.points[:, :3], axis=1) < 20

@@ -82,7 +82,7 @@ def _information(world: World) -> tuple[float, float]:
     """Mean squared components, along and across the road, of the normals of what a sensor sees of the static world."""
     T = world.pose_at(150.0)
     lidar = Lidar()
-    directions = (lidar.directions @ T[:3, :3].T).astype(np.float32)
+    directions = (lidar.beams.directions(0.0) @ T[:3, :3].T).astype(np.float32)
     origins = np.tile(T[:3, 3].astype(np.float32), (len(directions), 1))
     hits = world.scene.cast(origins, directions, 80.0)
     normals = hits.normal[hits.face >= 0] @ T[:3, :3].astype(np.float32)
@@ -102,7 +102,7 @@ def test_highway_and_tunnel_are_degenerate_along_the_road_and_a_city_is_not(tunn
 
 def test_a_degenerate_scan_does_not_change_along_the_road(tunnel: World) -> None:
     """Two places 3 m apart: the same noise-free ranges, to the float's last digits."""
-    directions = Lidar().directions
+    directions = Lidar().beams.directions(0.0)
     ranges = []
     for s in (120.0, 123.0):
         T = tunnel.pose_at(s)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dpm2_core.errors import UsageError
 from dpm2_core.network.perception.range_image import RangeImageSettings, azimuths, elevations, fill, project, to_points
-from dpm2_core.sim.lidar import elevations as sensor_elevations
+from dpm2_core.sim.beams import elevations as sensor_elevations
 
 SETTINGS = RangeImageSettings()
 VLP16 = RangeImageSettings(beams=((15.0, -15.0, 16),), first=0, rows=16, columns=128)

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether the simulated LiDAR errs as a real one does: the same figures of both, and of the clean sensor."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from rich.console import Group
+
+from benchmarks.harness import Options, Report, drives
+from benchmarks.scan_statistics import RANGES, statistics
+from dpm2_core.evaluation.figures import lines_png
+from dpm2_core.sim.lidar import Lidar
+from dpm2_core.sim.settings import HDL64E, LidarConfig, PresetName
+from dpm2_core.sim.world import build_world
+from dpm2_core.tables import FigureTable
+
+_SCANS = 20
+_SEEDS = (900_500, 900_501)
+_KINDS: tuple[PresetName, ...] = ("city", "suburb")
+
+
+def bench_sensor(options: Options) -> Report:
+    """Statistics of the real scans, of `HDL64E` and of the clean sensor in the same worlds, and a figure of them.
+
+    Raises:
+        UsageError: there is no drive.
+    """
+    real = []
+    with drives(options) as sources:
+        for source in sources:
+            chosen = set(np.linspace(0, len(source) - 1, _SCANS // len(sources)).astype(int).tolist())
+            real += [frame.points for i, frame in enumerate(source.frames()) if i in chosen]
+    results = {
+        "real": statistics(real),
+        "HDL64E": statistics(_simulated(HDL64E)),
+        "clean": statistics(_simulated(LidarConfig())),
+    }
+    _figure(options, results)
+    return Report({"ranges_m": RANGES, "sensors": results}, Group(_table(results)))
+
+
+def _simulated(config: LidarConfig) -> list[np.ndarray]:
+    """Scans of drives in towns, as the drives of the excerpts are."""
+    lidar, sway = Lidar(config), config.real.sway
+    out = []
+    for kind in _KINDS:
+        for seed in _SEEDS:
+            world, rng = build_world("random", kind, seed, 300.0), np.random.default_rng(seed)
+            for time in np.linspace(0, 15, _SCANS // (len(_KINDS) * len(_SEEDS))):
+                T, twist = (of(float(time), config.height, sway) for of in (world.drive_pose, world.drive_twist))
+                out.append(lidar.drive_scan(world, T, float(time), rng, twist).points)
+    return out
+
+
+def _figure(options: Options, results: dict[str, Any]) -> None:
+    middle = [float(np.sqrt(a * b)) for a, b in pairwise(RANGES)]
+    gaps = {name: (-np.diff(row["elevations_deg"])).tolist() for name, row in results.items()}
+    panels: dict[str, dict[str, tuple[list[float], list[float | None]]]] = {
+        "gap to the next ring, deg, by ring": {
+            name: ([float(k) for k in range(len(row))], row) for name, row in gaps.items()
+        },
+        "noise along a ring, m, by range": {n: (middle, row["ring_range_noise_m"]) for n, row in results.items()},
+        "distance of ground to its plane, m, by range": {n: (middle, r["plane_rms_m"]) for n, r in results.items()},
+        "pulses lost between two of one surface, by range": {n: (middle, r["lost"]) for n, r in results.items()},
+        "intensity, fraction of returns": {
+            n: (np.linspace(0.025, 0.975, 20).tolist(), r["intensity"]["histogram"]) for n, r in results.items()
+        },
+    }
+    lines_png(options.out / "sensor.png", panels, "A real LiDAR (KITTI) and the simulated one")
+
+
+def _table(results: dict[str, Any]) -> FigureTable:
+    names = list(results)
+    table = FigureTable("The sensor's own errors", names=["figure"], figures=names)
+    rows: list[tuple[str, Sequence[Any]]] = [
+        ("points", [results[n]["points"] for n in names]),
+        ("gap between upper rings, deviation, deg", [results[n]["ring_gap_deg"][0][1] for n in names]),
+        ("gap between lower rings, deviation, deg", [results[n]["ring_gap_deg"][1][1] for n in names]),
+        ("origin of the upper beams over the sensor's, m", [results[n]["upper_origin_m"] for n in names]),
+        ("elevation beside that, deviation, deg", [results[n]["wobble_deg"] for n in names]),
+        ("mean of a ring over the ground, deviation, m", [results[n]["ring_bias_m"] for n in names]),
+        ("noise along a ring at 10 to 15 m, m", [results[n]["ring_range_noise_m"][1] for n in names]),
+        ("at 30 to 45 m, m", [results[n]["ring_range_noise_m"][4] for n in names]),
+        ("lost at 5 to 10 m", [results[n]["lost"][0] for n in names]),
+        ("lost at 45 to 75 m", [results[n]["lost"][5] for n in names]),
+        ("intensity 0", [results[n]["intensity"]["zeros"] for n in names]),
+    ]
+    for name, values in rows:
+        table.add_row(name, *("-" if value is None else f"{value:.3g}" for value in values))
+    return table

@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the pulses of a LiDAR go: the patterns of spinning sensors, and of one with two prisms that never repeats."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dpm2_core.sim.settings import LidarConfig
+
+Array = NDArray[np.float64]
+Float = NDArray[np.float32]
+
+_CAR_BODY = (1.5, 1.67, 0.85, 0.56)
+"""Edges of the roof ahead, behind and aside, and the sensor's height over it, m: hides what it hides on KITTI's car."""
+_PRISMS = ((7294 / 60, np.radians(17.6)), (-4664 / 60, np.radians(17.6)))
+"""Turns a second and deflection, rad, of the two prisms of the rosette, as in Livox' Mid-40 and Avia."""
+_LASERS = np.radians(0.28)
+"""Between two lasers of the rosette, rad."""
+
+
+def elevations(beams: int) -> Array:
+    """(beams,) rad above the horizon of a spinning sensor, top beam first."""
+    degrees = {
+        16: np.linspace(15, -15, 16),
+        32: np.linspace(10.67, -30.67, 32),
+        64: np.concatenate([np.linspace(2, -8.33, 32), np.linspace(-8.83, -24.8, 32)]),
+        128: np.linspace(15, -25, 128),
+    }[beams]
+    return np.radians(degrees)
+
+
+class Beams:
+    """The pulses of a turn (of a period, where nothing turns), by beam, within a beam by column.
+
+    Attributes:
+        ring, column: (R,) beam, 0 is the top one, and number of the firing.
+        column_time: (columns,) float32 s from the stamp.
+    """
+
+    def __init__(self, config: LidarConfig, T_level_lidar: Array) -> None:
+        self.config = config
+        self._spinning = config.pattern == "spinning"
+        n = config.columns
+        ring, column = np.divmod(np.arange(config.beams * n), n)
+        self._kept: NDArray[np.bool_] | slice = slice(None)
+        self._always: Float | None = None  # a spinning one's directions
+        if self._spinning:
+            turn = self._turn()
+            if config.car_body:
+                self._kept = ~_hidden_by_car(turn @ T_level_lidar[:3, :3].T)
+            self._always = np.ascontiguousarray(turn[self._kept], np.float32)
+        self.ring, self.column = ring.astype(np.uint8)[self._kept], column[self._kept]
+        azimuth = np.arange(n) * (2 * np.pi / n)
+        # A spinning one turns clockwise and looks straight ahead at the stamp.
+        phase = -np.remainder(azimuth + np.pi, 2 * np.pi) + np.pi if self._spinning else azimuth - np.pi
+        self.column_time = (phase / (2 * np.pi) * config.period).astype(np.float32)
+
+    def directions(self, time: float) -> Float:
+        """(R, 3) unit directions in the LiDAR frame of the turn at a time, s."""
+        return self._rosette(time) if self._always is None else self._always
+
+    def _turn(self) -> Array:
+        config = self.config
+        angle = elevations(config.beams)
+        if config.real.uneven:
+            own = np.random.default_rng([config.real.serial, config.beams, 1])
+            angle = angle + np.radians(config.real.uneven) * own.standard_normal(config.beams)
+        elevation, azimuth = angle[:, None], np.arange(config.columns)[None] * (2 * np.pi / config.columns)
+        parts = (
+            np.cos(elevation) * np.cos(azimuth),
+            np.cos(elevation) * np.sin(azimuth),
+            np.sin(elevation) + 0 * azimuth,
+        )
+        return np.stack(parts, -1).reshape(-1, 3)
+
+    def _rosette(self, time: float) -> Float:
+        """A row of lasers behind two prisms that turn against each other: the sum of two deflections, ever shifting."""
+        when = time + self.column_time.astype(float)
+        aside, up = (
+            sum(bend * wave(2 * np.pi * rate * when) for rate, bend in _PRISMS) for wave in (np.cos, np.sin)
+        )  # rad
+        laser = (0.5 * (self.config.beams - 1) - np.arange(self.config.beams)) * _LASERS
+        y = np.tan(np.broadcast_to(aside, (self.config.beams, len(when))))
+        z = np.tan(np.add.outer(laser, up))
+        rays = np.stack([np.ones_like(y), y, z], -1).reshape(-1, 3)
+        return (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32)
+
+
+def _hidden_by_car(directions: Array) -> NDArray[np.bool_]:
+    ahead, behind, aside, clearance = _CAR_BODY
+    flat = np.hypot(directions[:, 0], directions[:, 1]) + 1e-9
+    along, across = directions[:, 0] / flat, np.abs(directions[:, 1]) / flat
+    reach = np.minimum(
+        np.where(along > 0, ahead, behind) / np.maximum(np.abs(along), 1e-9), aside / np.maximum(across, 1e-9)
+    )
+    return -directions[:, 2] / flat * reach > clearance

@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a real LiDAR adds to exact ranges: errors of its beams, of the pulse, of the window and of the air."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dpm2_core.sim.settings import LidarConfig
+
+Float = NDArray[np.float32]
+Bool = NDArray[np.bool_]
+_EDGE = (0.2, 1.5)
+"""Two surfaces so far apart along the beam, m, answer one pulse as one surface between them."""
+_HALO = 2
+"""Beams and columns beside a retro-reflector that its glare reaches."""
+_NEAR = 25.0
+"""Drops farther away return too little, m."""
+
+
+@dataclass(eq=False)
+class Returns:
+    """What each of R pulses brings back.
+
+    Attributes:
+        distance: (R,) float32 m. intensity: (R,) float32 0..1. back: (R,) bool, whether it came back at all.
+        retro: (R,) bool, it met a retro-reflector.
+    """
+
+    distance: Float
+    intensity: Float
+    back: Bool
+    retro: Bool
+
+    def copy(self) -> Returns:
+        """The same in arrays of its own."""
+        return Returns(*(getattr(self, field.name).copy() for field in fields(self)))
+
+    def put(self, which: NDArray[np.intp], others: Returns) -> None:
+        """Replace those of some pulses (K,) by `others` of K."""
+        for field in fields(self):
+            getattr(self, field.name)[which] = getattr(others, field.name)
+
+
+class Draws(NamedTuple):
+    """Random numbers (R,) of one scan, one each for edges, glare and drops: the static twin sees the same weather."""
+
+    edge: Float
+    halo: Float
+    drop: Float
+
+
+class SensorErrors:
+    """Errors of one sensor, made by its serial number; holds no state between scans.
+
+    Attributes:
+        range_bias: (R,) m. origin_height: (R,) m over the sensor. clear: (R,) fraction of the light that the window
+            lets pass.
+    """
+
+    def __init__(self, config: LidarConfig, ring: NDArray[np.uint8], column: NDArray[np.intp]) -> None:
+        self.config, self.settings = config, config.real
+        self.ring, self.column = ring, column
+        real, beams = config.real, config.beams
+        own = np.random.default_rng([real.serial, beams, 2])
+        self.range_bias = (real.range_bias * own.standard_normal(beams)).astype(np.float32)[ring]
+        self._angles = np.radians(real.angle_bias * own.standard_normal((2, beams))).astype(np.float32)
+        upper, lower = real.emitters
+        self.origin_height = np.where(ring < beams // 2, upper, lower).astype(np.float32)
+        self.clear = self._window(own)[ring, column]
+
+    def _window(self, own: np.random.Generator) -> Float:
+        """(beams, columns) fraction of the light that passes: spots of dirt, each some degrees wide."""
+        shape = (self.config.beams, self.config.columns)
+        if not self.settings.dirt:
+            return np.ones(shape, np.float32)
+        spots = cv2.resize(own.standard_normal((6, 48)).astype(np.float32), shape[::-1], interpolation=cv2.INTER_CUBIC)
+        limit = np.quantile(spots, 1 - self.settings.dirt)
+        return np.exp(-4 * np.maximum(spots - limit, 0) / max(float(spots.std()), 1e-6)).astype(np.float32)
+
+    def aimed(self, directions: Float) -> Float:
+        """Where the pulses really go that the driver believes to go along (R, 3)."""
+        if not self.settings.angle_bias:
+            return directions
+        up, left = (row[self.ring, None] for row in self._angles)
+        x, y, z = directions.T
+        flat = np.sqrt(x * x + y * y) + np.float32(1e-6)
+        turned = directions + left * np.stack([-y, x, np.zeros_like(x)], -1)
+        turned += up * np.stack([-x * z / flat, -y * z / flat, flat], -1)
+        return turned / np.linalg.norm(turned, axis=1, keepdims=True)
+
+    def noise(self, distance: Float, cosine: Float) -> Float:
+        """(R,) deviation of ranges (R,) m beside the sensor's own: it grows with range and grazing incidence."""
+        tangent = np.sqrt(1 - np.minimum(cosine, 1) ** 2) / np.maximum(cosine, np.float32(0.05))
+        slanted = np.minimum(np.float32(0.04 * self.settings.footprint) * distance * tangent, np.float32(0.2))
+        return np.hypot(np.float32(self.settings.growth) * distance, slanted)
+
+    def draws(self, rng: np.random.Generator) -> Draws | None:
+        """The random numbers that `finish` needs, if it has anything to do."""
+        real = self.settings
+        if not (real.footprint or real.glare or real.drops):
+            return None
+        return Draws(*rng.random((3, len(self.ring)), np.float32))
+
+    def finish(self, returns: Returns, draws: Draws | None) -> Bool:
+        """Edges, glare and drops: changes the returns of a whole scan in place; which (R,) are of no surface."""
+        stray = np.zeros(len(self.ring), bool)
+        if draws is None:
+            return stray
+        distance, intensity, back, retro = returns.distance, returns.intensity, returns.back, returns.retro
+        if self.settings.footprint:
+            self._mix_edges(distance, back, draws.edge)
+        if self.settings.glare:
+            stray |= self._glare(distance, intensity, back, retro, draws.halo)
+        if self.settings.drops:
+            stray |= self._drops(distance, intensity, back, draws.drop)
+        return stray
+
+    def _mix_edges(self, distance: Float, back: Bool, chance: Float) -> None:
+        """A pulse that meets two surfaces comes back from between them."""
+        after = np.diff(distance, append=distance[-1:])
+        gap = np.abs(after)
+        step = 2 * np.pi / self.config.columns
+        both = back & np.append(back[1:], False) & np.append(self.ring[1:] == self.ring[:-1], False)
+        share = min(0.5, self.settings.footprint / step)
+        mixed = both & (gap > _EDGE[0]) & (gap < _EDGE[1]) & (chance < share)
+        distance[mixed] += after[mixed] * (chance[mixed] / np.float32(share))
+
+    def _glare(self, distance: Float, intensity: Float, back: Bool, retro: Bool, chance: Float) -> Bool:
+        """Pulses beside a retro-reflector, with nothing nearer, return at its distance."""
+        seen = np.full((self.config.beams, self.config.columns), np.inf, np.float32)
+        shown = np.flatnonzero(retro & back)
+        seen[self.ring[shown], self.column[shown]] = distance[shown]
+        halo = cv2.erode(seen, np.ones((2 * _HALO + 1, 2 * _HALO + 1), np.uint8), borderValue=float("inf"))
+        at = halo[self.ring, self.column]
+        lit = np.isfinite(at) & ~retro & (chance < self.settings.glare) & (~back | (distance > at))
+        distance[lit], intensity[lit], back[lit] = at[lit], np.float32(0.3), True
+        return lit
+
+    def _drops(self, distance: Float, intensity: Float, back: Bool, chance: Float) -> Bool:
+        """Rain, snow or dust: pulses that return from a drop before they reach anything."""
+        density = np.float32(self.settings.drops)
+        at = -np.log(np.maximum(chance, np.float32(1e-7))) / density  # m, from an even density along the beam
+        reach = np.where(back, distance, np.float32(_NEAR))
+        hit = (at < np.minimum(reach, _NEAR)) & (at > self.config.min_range)
+        distance[hit], intensity[hit], back[hit] = at[hit], np.float32(0.02), True
+        return hit
