@@ -54,6 +54,7 @@ EXTRAS = {
     "las": ["laspy>=2.5,<3"],  # dpm2 map export MAP OUT.las
     "timm": ["timm>=1,<2"],  # image backbones timm:NAME
     "train": ["tensorboard>=2.16,<3"],  # curves beside log.jsonl
+    "peers": ["kiss-slam>=0.0.2,<1"],  # dpm2 experiment --peer kiss-slam
     "bench": ["kiss-icp>=1.2,<2", "small_gicp>=1.0,<2", "pypose>=0.9,<1"],  # what the benchmarks compare with
 }
 EXTRAS["dev"] = [line for name in ("plot", "sim", "test", "lint", "bench") for line in EXTRAS[name]]

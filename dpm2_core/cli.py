@@ -45,6 +45,12 @@ GROUPS = {
         "train": ("tasks:train", "Make training data and train the network."),
         "eval-task": ("tasks:eval_task", "Measure a trained task on scans that it has not learned from."),
     },
+    "Papers": {
+        "experiment": (
+            "experiment:experiment",
+            "Make a table or figure of the papers on your copy of the data, theirs beside it.",
+        ),
+    },
     "This machine": {
         "doctor": (
             "doctor:doctor",

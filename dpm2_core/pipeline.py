@@ -23,8 +23,19 @@ from dpm2_core.data.source import Source, Span
 from dpm2_core.data.trajectory import Trajectory, matched, write_kitti, write_tum
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.figures import trajectory_png
-from dpm2_core.evaluation.ground_truth import in_other_frame, read_ground_truth
+from dpm2_core.evaluation.ground_truth import in_other_frame, read_ground_truth, truth_by_stamp
 from dpm2_core.evaluation.metrics import Metrics, evaluate
+from dpm2_core.evaluation.run_folder import (
+    FRAMES,
+    LOOPS,
+    METRICS,
+    TIMING,
+    TRAJECTORY,
+    TRUTH,
+    write_frames,
+    write_loops,
+    write_truth,
+)
 from dpm2_core.extras import MissingPackageError
 from dpm2_core.files import atomic_write
 from dpm2_core.frame import Array, OdometryResult
@@ -125,8 +136,7 @@ class Result:
         ground_truth: LiDAR poses (N, 4, 4) of the frames, or a trajectory to be matched by stamp or number, or None.
         ground_truth_name: what it was read from.
         recorder: the odometry's pose of every frame.
-        registered: of each frame, whether its registration succeeded.
-        methods: how many frames were registered how; "failed" for those that were not. states: frames in each.
+        frame_methods: of each frame, how it was registered, "failed" if it was not. frame_states: after each.
         seconds: wall time of each frame by stage.
         wall_s: of the whole run, reading included.
     """
@@ -137,9 +147,8 @@ class Result:
     ground_truth: Array | Trajectory | None
     ground_truth_name: str
     recorder: TrajectoryRecorder = field(default_factory=TrajectoryRecorder)
-    registered: list[bool] = field(default_factory=list)
-    methods: Counter[str] = field(default_factory=Counter)
-    states: Counter[str] = field(default_factory=Counter)
+    frame_methods: list[str] = field(default_factory=list)
+    frame_states: list[str] = field(default_factory=list)
     seconds: dict[str, list[float]] = field(default_factory=dict)
     wall_s: float = 0.0
     interrupted: bool = False
@@ -151,11 +160,25 @@ class Result:
     def add(self, tracked: OdometryResult) -> None:
         """Take in the next frame."""
         self.recorder.add(tracked)
-        self.registered.append(tracked.registration.ok)
-        self.methods[tracked.registration.method if tracked.registration.ok else "failed"] += 1
-        self.states[str(tracked.state)] += 1
+        self.frame_methods.append(tracked.registration.method if tracked.registration.ok else "failed")
+        self.frame_states.append(str(tracked.state))
         for stage, time in tracked.seconds.items():
             self.seconds.setdefault(stage, []).append(time)
+
+    @property
+    def registered(self) -> list[bool]:
+        """Of each frame, whether its registration succeeded."""
+        return [method != "failed" for method in self.frame_methods]
+
+    @property
+    def methods(self) -> Counter[str]:
+        """How many frames were registered how; "failed" for those that were not."""
+        return Counter(self.frame_methods)
+
+    @property
+    def states(self) -> Counter[str]:
+        """Frames in each state."""
+        return Counter(self.frame_states)
 
     @cached_property
     def poses(self) -> Array:
@@ -216,8 +239,11 @@ class Result:
         metrics = evaluate(truth, poses, failed_frames=failed, breaks=self.recorder.breaks, fps=self.fps)
         return metrics.model_copy(update={"truth": self.ground_truth_name})
 
-    def save(self, out: Path) -> list[str]:
+    def save(self, out: Path, cloud: bool = True) -> list[str]:
         """Write all files, each whole or not at all; returns what could not be done, in words.
+
+        Args:
+            cloud: map.ply, too, and the map in trajectory.png; a long drive's takes hundreds of megabytes.
 
         Raises:
             Dpm2Error: a file could not be written; the old one survives. UsageError: see `metrics`.
@@ -225,18 +251,26 @@ class Result:
         out.mkdir(parents=True, exist_ok=True)
         save_config(self.config, out)
         write_kitti(out / "trajectory_kitti.txt", self.sensor_poses)
-        write_tum(out / "trajectory.tum", self.recorder.stamps, self.poses)
-        cloud = self.mapper.cloud()
-        write_ply(out / "map.ply", cloud)
+        write_tum(out / TRAJECTORY, self.recorder.stamps, self.poses)
+        points = self.mapper.cloud() if cloud else None
+        if points is not None:
+            write_ply(out / "map.ply", points)
         self.mapper.write_g2o(out / "pose_graph.g2o")
-        _write_json(out / "timing.json", self.timing)
+        keys = zip(self.recorder.index, self.recorder.stamps, self.frame_states, self.frame_methods, strict=True)
+        write_frames(out / FRAMES, list(keys), self.seconds)
+        write_loops(out / LOOPS, self.mapper.loops, self.mapper.poses)
+        _write_json(out / TIMING, self.timing)
         if self.metrics is not None:
-            _write_json(out / "metrics.json", self.metrics.model_dump())
+            _write_json(out / METRICS, self.metrics.model_dump())
+            assert self.ground_truth is not None
+            write_truth(out / TRUTH, *truth_by_stamp(self.ground_truth, self.recorder.stamps, self.recorder.index,
+                                                     self.source.T_cam_lidar))  # fmt: skip
         if not len(self):
             return ["no trajectory.png: no frame was processed"]
         truth, poses = self._compared()
+        title = f"{self.source.name}: {len(self)} frames"
         try:
-            trajectory_png(out / "trajectory.png", poses, truth, cloud, title=f"{self.source.name}: {len(self)} frames")
+            trajectory_png(out / "trajectory.png", poses, truth, points, title)
         except MissingPackageError as error:
             return [f"no trajectory.png: {error}"]
         return []

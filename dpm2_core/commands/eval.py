@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from dpm2_core.commands.options import JsonFile, show
+from dpm2_core.commands.options import JsonFile, parse_lengths, show
 from dpm2_core.config import load_settings
 from dpm2_core.data.kitti import read_calib
 from dpm2_core.data.open import open_source
@@ -66,17 +66,6 @@ def _of_drive(path: Path, settings: list[str]) -> Trajectory:
     numbers = getattr(source, "numbers", np.arange(len(source)))  # those in the file names
     known = np.isfinite(source.poses).all((1, 2))
     return Trajectory(T @ source.poses[known] @ se3.inverse(T), numbers[known], "kitti-indexed")
-
-
-def parse_lengths(text: str) -> tuple[float, ...]:
-    """`10,20,30` to meters."""
-    try:
-        lengths = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        raise UsageError(f"--lengths {text}: want meters separated by commas, such as 10,20,30,40,50") from None
-    if not all(0 < length < float("inf") for length in lengths):
-        raise UsageError(f"--lengths {text}: every length must be above 0 m")
-    return lengths
 
 
 def in_camera_frame(trajectory: Trajectory, calib: Path) -> Trajectory:

@@ -58,6 +58,17 @@ def parse_range(text: str) -> Span:
     return int(first or 0), int(last) if last else None
 
 
+def parse_lengths(text: str) -> tuple[float, ...]:
+    """`10,20,30` to meters."""
+    try:
+        lengths = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        raise UsageError(f"--lengths {text}: want meters separated by commas, such as 10,20,30,40,50") from None
+    if not all(0 < length < float("inf") for length in lengths):
+        raise UsageError(f"--lengths {text}: every length must be above 0 m")
+    return lengths
+
+
 def run_command(command: Callable[..., int | None]) -> int:
     """Entry point of a program of one command: a function whose parameters are the options. Returns the exit code."""
     app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)

@@ -15,7 +15,7 @@ from dpm2_core.evaluation.kitti_metric import known
 from dpm2_core.evaluation.metrics import align
 from dpm2_core.extras import needs
 from dpm2_core.files import atomic_write
-from dpm2_core.frame import Array, Points
+from dpm2_core.frame import Array, Frame, Points
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -61,6 +61,55 @@ def trajectory_png(
     axes.legend(loc="upper right", facecolor=_BACKGROUND, edgecolor="none", labelcolor=_INK, framealpha=0.7)
     _scale_bar(axes, low, high)
     figure.text(0.02, 0.955, title, color=_INK, fontsize=14)
+    with atomic_write(path, "wb") as file:
+        FigureCanvasAgg(figure).print_png(file)
+
+
+def trajectories_png(path: Path | str, ways: Mapping[str, Array], truth: Array | None = None, title: str = "") -> None:
+    """Draw the ways (N, 3), m, of several methods and the true one from above, all in one frame.
+
+    Raises:
+        Dpm2Error: the file could not be written.
+    """
+    with needs("plot", "drawing"):
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 9), dpi=130, facecolor=_BACKGROUND)
+    axes = figure.add_axes((0.07, 0.05, 0.9, 0.9), facecolor=_BACKGROUND, aspect="equal")
+    if truth is not None:
+        axes.plot(truth[:, 0], truth[:, 1], "--", color=_TRUTH, lw=1.5, label="ground truth", zorder=9)
+    for name, way in ways.items():
+        axes.plot(way[:, 0], way[:, 1], lw=1.5, label=name)
+    axes.tick_params(colors=_INK)
+    axes.set_xlabel("m", color=_INK)
+    axes.legend(facecolor=_BACKGROUND, edgecolor="none", labelcolor=_INK)
+    figure.text(0.07, 0.965, title, color=_INK, fontsize=13)
+    with atomic_write(path, "wb") as file:
+        FigureCanvasAgg(figure).print_png(file)
+
+
+def corrupted_png(path: Path | str, before: Frame, after: Frame, title: str = "") -> None:
+    """Draw a frame as it is and as a failing sensor delivers it: the scan from above, and the image.
+
+    Raises:
+        Dpm2Error: the file could not be written.
+    """
+    with needs("plot", "drawing"):
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+    rows = 2 if before.images else 1
+    figure = Figure(figsize=(12, 6.4 * rows - 3 * (rows - 1)), dpi=110, facecolor=_BACKGROUND)
+    for column, frame in enumerate((before, after)):
+        axes = figure.add_subplot(rows, 2, 1 + column, facecolor=_BACKGROUND, aspect="equal")
+        axes.scatter(frame.points[:, 0], frame.points[:, 1], s=0.15, c=_ESTIMATE, linewidths=0)
+        axes.set(xlim=(-40, 40), ylim=(-40, 40), xticks=[], yticks=[])
+        if frame.images:
+            axes = figure.add_subplot(rows, 2, 3 + column, facecolor=_BACKGROUND)
+            axes.imshow(frame.images[0].pixels)
+            axes.set_axis_off()
+    figure.suptitle(title, color=_INK)
     with atomic_write(path, "wb") as file:
         FigureCanvasAgg(figure).print_png(file)
 

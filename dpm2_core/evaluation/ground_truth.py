@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from dpm2_core.data.source import Source
@@ -36,6 +37,23 @@ def read_ground_truth(source: Source, path: Path | None, start: int, stop: int) 
     else:
         poses = truth.poses[start:stop]
     return poses if source.T_cam_lidar is None else in_other_frame(poses, se3.inverse(source.T_cam_lidar))
+
+
+def truth_by_stamp(
+    truth: Array | Trajectory, stamps: Sequence[int], index: Sequence[int], T_cam_lidar: Array | None
+) -> tuple[Sequence[int], Array]:
+    """Stamps, ns, and true poses (M, 4, 4) of the LiDAR during a drive, given the stamps and numbers of its frames."""
+    if not isinstance(truth, Trajectory):
+        return stamps, truth[: len(stamps)]
+    if truth.kind == "tum":
+        during = (truth.keys >= stamps[0]) & (truth.keys <= stamps[-1])
+        return truth.keys[during].tolist(), truth.poses[during]
+    at = dict(zip(index, stamps, strict=True))
+    found = [i for i, key in enumerate(truth.keys.tolist()) if key in at]
+    poses = truth.poses[found]
+    if T_cam_lidar is not None:
+        poses = in_other_frame(poses, se3.inverse(T_cam_lidar))
+    return [at[int(truth.keys[i])] for i in found], poses
 
 
 def in_other_frame(poses: Array, T_other_sensor: Array) -> Array:

@@ -18,6 +18,8 @@ from dpm2_core.geometry import se3
 
 OFFICIAL_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 """Segment lengths of the benchmark, m."""
+FRAME_PERIOD = 0.1
+"""Of KITTI's scans, s, by which the development kit gives each segment a speed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,19 +30,27 @@ class SegmentErrors:
         length: (S,) m.
         t_err: (S,) error of the relative translation over the length, a ratio.
         r_err: (S,) error of the relative rotation over the length, rad/m.
+        speed: (S,) mean speed at 10 frames a second, m/s.
     """
 
     length: Array
     t_err: Array
     r_err: Array
+    speed: Array
 
     def __len__(self) -> int:
         return len(self.length)
 
     def of_length(self, length: float) -> SegmentErrors:
         """Those of one length."""
-        chosen = self.length == length
-        return SegmentErrors(self.length[chosen], self.t_err[chosen], self.r_err[chosen])
+        return self._chosen(self.length == length)
+
+    def of_speed(self, low: float, high: float) -> SegmentErrors:
+        """Those driven at `low` <= speed < `high`, m/s."""
+        return self._chosen((self.speed >= low) & (self.speed < high))
+
+    def _chosen(self, chosen: NDArray[np.bool_]) -> SegmentErrors:
+        return SegmentErrors(self.length[chosen], self.t_err[chosen], self.r_err[chosen], self.speed[chosen])
 
     def mean(self) -> tuple[float, float] | None:
         """(t_err, r_err) as the benchmark ranks them; None where the drive is shorter than every length."""
@@ -63,7 +73,8 @@ def segment_errors(gt: Array, est: Array, lengths: Sequence[float] = OFFICIAL_LE
     both = known(est)[first] & known(est)[last]
     first, last, length = first[both], last[both], length[both]
     error = se3.inverse(relative(est, first, last)) @ relative(gt, first, last)
-    return SegmentErrors(length, np.linalg.norm(error[:, :3, 3], axis=1) / length, se3.angle(error) / length)
+    speed = length / (FRAME_PERIOD * (last - first + 1))  # as the development kit counts the frames
+    return SegmentErrors(length, np.linalg.norm(error[:, :3, 3], axis=1) / length, se3.angle(error) / length, speed)
 
 
 def known(poses: Array) -> NDArray[np.bool_]:

@@ -29,6 +29,21 @@ class LengthErrors(BaseModel):
     r_err_deg_per_100m: float | None
 
 
+class SpeedErrors(BaseModel):
+    """The KITTI metric of the segments driven at a speed within `speed_mps` +- half a step."""
+
+    model_config = ConfigDict(frozen=True)
+
+    speed_mps: float
+    segments: int
+    t_err_percent: float | None
+    r_err_deg_per_100m: float | None
+
+
+SPEED_STEP = 2.0
+"""Width of a class of speed, m/s, as in the development kit's plots."""
+
+
 class Metrics(BaseModel):
     """The figures of one run; None where the drive or the ground truth does not allow them."""
 
@@ -56,8 +71,12 @@ class Metrics(BaseModel):
     """Segments that the KITTI metric averages over."""
     per_length: tuple[LengthErrors, ...] = ()
     """The KITTI metric by segment length."""
+    per_speed: tuple[SpeedErrors, ...] = ()
+    """The KITTI metric by mean speed of the segments; speeds that none has are left out."""
     ape_rmse_m: float | None = None
     """Root mean square position error after the best SE(3) alignment (Umeyama, without scale), m."""
+    ape_mean_m: float | None = None
+    """Mean position error after the same alignment, m."""
     rpe_trans_m: float | None = None
     """Mean error of the translation from one frame to the next, m."""
     rpe_rot_deg: float | None = None
@@ -110,7 +129,9 @@ def evaluate(
         lengths_m=tuple(lengths),
         segments=len(segments),
         per_length=tuple(_of_length(segments, length) for length in lengths),
+        per_speed=_by_speed(segments),
         ape_rmse_m=ape_rmse(gt[both], est[both]),
+        ape_mean_m=float(position_errors(gt[both], est[both]).mean()),
         rpe_trans_m=rpe_trans,
         rpe_rot_deg=rpe_rot,
         final_drift_percent=final_drift_percent(gt[both], est[both]),
@@ -130,9 +151,13 @@ def align(source: Array, target: Array) -> Array:
 
 def ape_rmse(gt: Array, est: Array) -> float:
     """Root mean square position error, m, of (N, 4, 4) poses after alignment of all positions."""
+    return float(np.sqrt((position_errors(gt, est) ** 2).mean()))
+
+
+def position_errors(gt: Array, est: Array) -> Array:
+    """(N,) position errors, m, of (N, 4, 4) poses after alignment of all positions."""
     T_gt_est = align(est[:, :3, 3], gt[:, :3, 3])
-    residual = (T_gt_est @ est)[:, :3, 3] - gt[:, :3, 3]
-    return float(np.sqrt((residual**2).sum(1).mean()))
+    return np.asarray(np.linalg.norm((T_gt_est @ est)[:, :3, 3] - gt[:, :3, 3], axis=1))
 
 
 def rpe(gt: Array, est: Array) -> tuple[float | None, float | None]:
@@ -161,6 +186,18 @@ def _of_length(segments: SegmentErrors, length: float) -> LengthErrors:
     chosen = segments.of_length(length)
     t_err, r_err = _percent(chosen)
     return LengthErrors(length_m=length, segments=len(chosen), t_err_percent=t_err, r_err_deg_per_100m=r_err)
+
+
+def _by_speed(segments: SegmentErrors) -> tuple[SpeedErrors, ...]:
+    out = []
+    for step in sorted({round(speed / SPEED_STEP) for speed in segments.speed.tolist()}):
+        center = step * SPEED_STEP
+        chosen = segments.of_speed(center - SPEED_STEP / 2, center + SPEED_STEP / 2)
+        t_err, r_err = _percent(chosen)
+        if len(chosen):
+            errors = {"t_err_percent": t_err, "r_err_deg_per_100m": r_err}
+            out.append(SpeedErrors(speed_mps=center, segments=len(chosen), **errors))
+    return tuple(out)
 
 
 def _percent(segments: SegmentErrors) -> tuple[float | None, float | None]:

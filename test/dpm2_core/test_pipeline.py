@@ -28,7 +28,7 @@ CONFIG = load_settings(Config, None, ["slam.loops.enabled=false", "slam.threads=
 """Without loops, which so short a drive has none of: no network is loaded."""
 FILES = {
     "trajectory_kitti.txt", "trajectory.tum", "map.ply", "pose_graph.g2o", "timing.json", "metrics.json",
-    "trajectory.png", "config.yaml",
+    "trajectory.png", "config.yaml", "frames.csv", "loops.csv", "ground_truth.tum",
 }  # fmt: skip
 
 
@@ -108,7 +108,7 @@ def test_interrupted_before_the_first_frame(recording: Path, tmp_path: Path, mon
     result = OfflineRun(source, CONFIG).run()
     assert result.interrupted
     assert result.save(tmp_path) == ["no trajectory.png: no frame was processed"]
-    assert {path.name for path in tmp_path.iterdir()} == FILES - {"trajectory.png", "metrics.json"}
+    assert {path.name for path in tmp_path.iterdir()} == FILES - {"trajectory.png", "metrics.json", "ground_truth.tum"}
 
 
 def test_ground_truth_as_poses_and_as_a_tum_file(recording: Path, tmp_path: Path) -> None:

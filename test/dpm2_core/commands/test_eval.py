@@ -11,7 +11,8 @@ import pytest
 from typer.testing import CliRunner
 
 from dpm2_core.cli import app
-from dpm2_core.commands.eval import eval_, parse_lengths
+from dpm2_core.commands.eval import eval_
+from dpm2_core.commands.options import parse_lengths
 from dpm2_core.data.kitti import read_calib
 from dpm2_core.data.trajectory import read_trajectory, write_kitti, write_tum
 from dpm2_core.errors import UsageError

@@ -31,7 +31,7 @@ pytestmark = pytest.mark.slow
 FRAMES = 12
 RESULTS = {
     "trajectory_kitti.txt", "trajectory.tum", "map.ply", "trajectory.png", "timing.json", "config.yaml",
-    "metrics.json", "pose_graph.g2o",
+    "metrics.json", "pose_graph.g2o", "frames.csv", "loops.csv", "ground_truth.tum",
 }  # fmt: skip
 
 

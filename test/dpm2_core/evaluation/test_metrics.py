@@ -130,3 +130,26 @@ def test_the_fixed_keys_are_there() -> None:
     keys = set(evaluate(_straight(), _straight()).model_dump())
     assert keys >= {"frames", "failed_frames", "fps", "t_err_percent", "r_err_deg_per_100m", "lengths_m"}
     assert keys >= {"ape_rmse_m", "rpe_trans_m", "rpe_rot_deg", "final_drift_percent"}
+
+
+def test_errors_by_speed_add_up_to_all_segments() -> None:
+    """100 frames at 10 m/s, then 100 at 20 m/s, by the steps of the way; a scale error of 2 % shows at both."""
+    steps = np.r_[np.zeros(1), np.full(100, 1.0), np.full(100, 2.0)]
+    truth = np.tile(np.eye(4), (201, 1, 1))
+    truth[:, 0, 3] = np.cumsum(steps)
+    est = truth.copy()
+    est[:, 0, 3] *= 1.02
+    found = evaluate(truth, est, (10.0, 20.0))
+    assert sum(row.segments for row in found.per_speed) == found.segments
+    assert {row.speed_mps for row in found.per_speed} >= {8.0, 16.0}
+    # 10 m at 1 m a frame end at the first frame beyond: 11 m or 12 frames, as the development kit counts
+    assert all(row.t_err_percent == pytest.approx(2.0, rel=0.25) for row in found.per_speed)
+
+
+def test_mean_and_root_mean_square_of_the_position_error() -> None:
+    """A zigzag of 1 and 3 m across the way: aligned, its mean is below its root mean square."""
+    truth, est = _straight(), _straight()
+    est[:, 1, 3] = np.tile([1, -1, 3, -3], 26)[:101]
+    found = evaluate(truth, est)
+    assert found.ape_mean_m == pytest.approx(2.0, abs=0.1)
+    assert found.ape_rmse_m == pytest.approx(np.sqrt(5), abs=0.1)

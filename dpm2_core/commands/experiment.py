@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`dpm2 experiment`: the tables and figures of the papers, each by one command."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from dpm2_core.commands.options import parse_lengths, parse_range, progress_bar
+from dpm2_core.console import Console
+from dpm2_core.errors import UsageError
+from dpm2_core.tables import FigureTable
+
+
+def experiment(
+    name: Annotated[str | None, typer.Argument(help="Which; --list shows them.")] = None,
+    data: Annotated[Path | None, typer.Argument(help="Root of the data set.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for the results; what is done there stays.")] = None,
+    listed: Annotated[bool, typer.Option("--list", help="List the experiments.")] = False,
+    sequences: Annotated[
+        str | None, typer.Option(help="To be tested on, with commas; else those of the paper that are there.")
+    ] = None,
+    learn: Annotated[str | None, typer.Option(help="To be learned from, likewise.")] = None,
+    weights: Annotated[str | None, typer.Option(help="Of the network: a name or a .safetensors file.")] = None,
+    registration: Annotated[
+        str | None, typer.Option(help="Of the SLAM: geometric, neural, refined, adaptive; several with commas.")
+    ] = None,
+    peer: Annotated[
+        list[str] | None,
+        typer.Option(help="kiss-icp, kiss-slam, small_gicp, or NAME=FILE with {sequence} in it; repeat for more."),
+    ] = None,
+    lengths: Annotated[
+        str | None, typer.Option(help="Segments of the KITTI metric, m, with commas, instead of 100 to 800.")
+    ] = None,
+    frames: Annotated[str | None, typer.Option(help="Of each sequence, a:b by position from 0.")] = None,
+    seeds: Annotated[int | None, typer.Option(min=1, help="Trainings of each arm.")] = None,
+    config: Annotated[Path | None, typer.Option(help="YAML of the trainings.")] = None,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", help="KEY=VALUE of the SLAM, or of the trainings.")
+    ] = None,
+    workers: Annotated[int, typer.Option(min=1, help="Parts at a time, each in a process of its own.")] = 1,
+) -> None:
+    """Make a table or figure of the papers on your copy of the data, theirs beside it.
+
+    What was stopped goes on where it was: every part (a method on a sequence, a training) is done once.
+    """
+    from dpm2_core.experiments.part import Progress
+    from dpm2_core.experiments.registry import EXPERIMENTS, carry_out  # imports what the lists need, not torch
+    from dpm2_core.experiments.request import Request
+
+    if listed:
+        table = FigureTable("Experiments", names=["name", "of"], text=["what"])
+        for key, entry in EXPERIMENTS.items():
+            table.add_row(key, entry.paper, entry.summary)
+        Console().print(table)
+        return
+    if name is None or data is None or out is None:
+        raise UsageError("dpm2 experiment: want NAME DATA --out DIR, or --list")
+    request = Request(
+        data,
+        out,
+        sequences=_split(sequences),
+        learn=_split(learn),
+        weights=weights,
+        registrations=_split(registration),
+        peers=tuple(peer or ()),
+        lengths=None if lengths is None else parse_lengths(lengths),
+        frames=None if frames is None else parse_range(frames),
+        seeds=seeds,
+        config=config,
+        overrides=tuple(settings or ()),
+        workers=workers,
+    )
+    with progress_bar() as bar:
+        parts, frame = bar.add_task(name, total=None), bar.add_task("", total=None, visible=False)
+
+        def frames_done(part: str, done: int, total: int) -> None:
+            bar.update(frame, description=part, completed=done, total=total, visible=done < total)
+
+        def part_done(part: str, done: int, total: int) -> None:
+            bar.update(parts, completed=done, total=total)
+            bar.console.print(f"{part}: done", soft_wrap=True)
+
+        outcome = carry_out(name, request, Progress(frames_done, part_done))
+    for table_of in outcome.tables:
+        Console().print(table_of.view())
+    console = Console(stderr=True)
+    for note in outcome.notes:
+        console.print(note, style="yellow", soft_wrap=True)
+    console.print(f"Results in {out / name}.json", soft_wrap=True)
+
+
+def _split(text: str | None) -> tuple[str, ...]:
+    return () if text is None else tuple(part.strip() for part in text.split(",") if part.strip())

@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a run leaves for those who look at it later: every frame, every loop that was tried, and the true way, as text.
+
+`frames.csv`, `loops.csv` and `ground_truth.tum` stand beside the trajectory. The report and any spreadsheet read them.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dpm2_core.data.trajectory import Trajectory, read_trajectory, write_tum
+from dpm2_core.errors import UsageError
+from dpm2_core.files import atomic_write
+from dpm2_core.frame import Array, Edge
+
+TRAJECTORY, FRAMES, LOOPS, TRUTH = "trajectory.tum", "frames.csv", "loops.csv", "ground_truth.tum"
+METRICS, TIMING = "metrics.json", "timing.json"
+_LOOP_COLUMNS = ("from_x", "from_y", "from_z", "to_x", "to_y", "to_z", "accepted", "method", "confidence", "overlap",
+                 "reason")  # fmt: skip
+
+
+@dataclass(frozen=True)
+class LoopRow:
+    """A loop that was tried: where in the map its two keyframes are, m, and what became of it."""
+
+    start: tuple[float, float, float]
+    end: tuple[float, float, float]
+    accepted: bool
+    reason: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class RunFolder:
+    """A folder that `dpm2 run` or an experiment wrote.
+
+    Attributes:
+        trajectory: T_map_lidar, by stamp. truth: the same in a world frame of its own, or None.
+        states: of each frame. stages_ms: wall time of each frame by stage, (N,) each; {} of other programs.
+        loops: that were tried. metrics, timing: content of these files; {} without.
+    """
+
+    path: Path
+    trajectory: Trajectory
+    truth: Trajectory | None = None
+    states: list[str] = field(default_factory=list)
+    stages_ms: dict[str, Array] = field(default_factory=dict)
+    loops: list[LoopRow] = field(default_factory=list)
+    metrics: dict[str, Any] = field(default_factory=dict)
+    timing: dict[str, Any] = field(default_factory=dict)
+
+
+def write_frames(path: Path, keys: Sequence[Sequence[object]], seconds: dict[str, list[float]]) -> None:
+    """Write frames.csv: (frame, stamp ns, state, method) of each, and wall time of each stage, ms.
+
+    Raises:
+        Dpm2Error: it could not be written.
+    """
+    with atomic_write(path) as file:
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(["frame", "stamp_ns", "state", "method", *(f"{stage}_ms" for stage in seconds)])
+        for row, times in zip(keys, zip(*seconds.values(), strict=True), strict=True):
+            table.writerow([*row, *(f"{1e3 * time:.3f}" for time in times)])
+
+
+def write_loops(path: Path, loops: Sequence[Edge], poses: Array) -> None:
+    """Write loops.csv; `poses` (K, 4, 4) T_map_kf of the keyframes.
+
+    Raises:
+        Dpm2Error: it could not be written.
+    """
+    with atomic_write(path) as file:
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(_LOOP_COLUMNS)
+        for loop in loops:
+            r = loop.registration
+            ends = (f"{x:.3f}" for node in (loop.from_node, loop.to_node) for x in poses[node, :3, 3])
+            table.writerow([*ends, int(r.ok), r.method, f"{r.confidence:.4f}", f"{r.overlap:.4f}", r.reason])
+
+
+def write_truth(path: Path, stamps: Sequence[int], poses: Array) -> None:
+    """Write ground_truth.tum: (N, 4, 4) poses of the LiDAR; rows of NaN, which are not known, are left out.
+
+    Raises:
+        Dpm2Error: it could not be written.
+    """
+    known = np.isfinite(poses).all((1, 2))
+    write_tum(path, np.asarray(stamps, np.int64)[known], poses[known])
+
+
+def read_run(path: Path) -> RunFolder:
+    """Read such a folder; only its trajectory must be there.
+
+    Raises:
+        UsageError: no trajectory in it, or a damaged file; it names that.
+    """
+    if not (path / TRAJECTORY).is_file():
+        raise UsageError(f"{path}: no run; want a folder with {TRAJECTORY}, as `dpm2 run` and `dpm2 experiment` write")
+    trajectory = read_trajectory(path / TRAJECTORY)
+    if trajectory.kind != "tum":
+        raise UsageError(f"{path / TRAJECTORY}: want 8 numbers a line, the stamp first")
+    frames, loops = _rows(path / FRAMES), _rows(path / LOOPS)
+    stages = [name for name in (frames[0] if frames else {}) if name.endswith("_ms")]
+    try:
+        return RunFolder(
+            path,
+            trajectory,
+            read_trajectory(path / TRUTH) if (path / TRUTH).is_file() else None,
+            [row["state"] for row in frames],
+            {name.removesuffix("_ms"): np.array([float(row[name]) for row in frames]) for name in stages},
+            [_loop(row) for row in loops],
+            _json(path / METRICS),
+            _json(path / TIMING),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise UsageError(f"{path}: {FRAMES} or {LOOPS} is damaged: {error}") from None
+
+
+def _loop(row: dict[str, str]) -> LoopRow:
+    x, y, z, *end = (float(row[name]) for name in _LOOP_COLUMNS[:6])
+    return LoopRow((x, y, z), (end[0], end[1], end[2]), row["accepted"] == "1", row["reason"])
+
+
+def _rows(path: Path) -> list[dict[str, str]]:
+    if not path.is_file():
+        return []
+    with path.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def _json(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        return {}
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise UsageError(f"{path}: not JSON: {error}") from None
+    if not isinstance(content, dict):
+        raise UsageError(f"{path}: want a mapping")
+    return content

@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""DeepPointMap2's table 1, KITTI, and its KITTI-360 trajectories: our SLAM and other programs on every sequence."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from dpm2_core.data.trajectory import Trajectory, matched
+from dpm2_core.evaluation.figures import trajectories_png
+from dpm2_core.evaluation.kitti_metric import known
+from dpm2_core.evaluation.metrics import align
+from dpm2_core.evaluation.run_folder import read_run
+from dpm2_core.experiments.part import Figures, Part
+from dpm2_core.experiments.request import Experiment, Outcome, Request
+from dpm2_core.experiments.sequences import (
+    SHOWN,
+    cells,
+    missing_note,
+    own_part,
+    peer_names,
+    peer_parts,
+    present,
+    registrations,
+    run_folders,
+)
+from dpm2_core.experiments.table import MEAN, Cells, ResultTable
+from dpm2_core.extras import MissingPackageError
+from dpm2_core.frame import Array
+
+USES = frozenset({"weights", "registrations", "peers", "lengths", "frames"})
+TESTED = ("06", "07", "08", "09", "10")
+"""Sequences that the paper is tested on; it learns from 00 to 05."""
+TESTED_360 = ("0007", "0009")
+ORIGINAL_POSES = ["input.kitti_poses=kitti"]
+"""The paper is tested with KITTI's own poses; those of SemanticKITTI are of another SLAM."""
+_T = (0.47, 0.39, 0.77, 0.62, 0.75)
+_R = (0.20, 0.25, 0.22, 0.23, 0.40)
+PAPER: Cells = {
+    sequence: {"t_err_percent": t, "r_err_deg_per_100m": r} for sequence, t, r in zip(TESTED, _T, _R, strict=True)
+}
+"""DeepPointMap2's row of table 1."""
+_APE = {"ape_mean_m": ".2f", "ape_rmse_m": ".2f", **SHOWN}
+
+
+def _parts(request: Request, paper: Sequence[str], settings: Sequence[str]) -> Sequence[Sequence[Part]]:
+    sequences = present(request, paper, settings)
+    own = [
+        own_part(name, sequence, request, [*settings, *chosen])
+        for name, chosen in registrations(request)
+        for sequence in sequences
+    ]
+    return [[*own, *peer_parts(sequences, request, settings)]]
+
+
+def _kitti_parts(request: Request) -> Sequence[Sequence[Part]]:
+    return _parts(request, TESTED, ORIGINAL_POSES)
+
+
+def _kitti_outcome(request: Request, figures: Mapping[str, Figures]) -> Outcome:
+    sequences = present(request, TESTED, ORIGINAL_POSES)
+    title = "KITTI odometry: t_err % / r_err deg per 100 m"
+    caption = "KITTI metric of the left camera's poses, mean over all segments; mean: over the sequences."
+    table = ResultTable(title, [*sequences, MEAN], SHOWN, caption)
+    names = [name for name, _ in registrations(request)] + peer_names(request)
+    for name in names:
+        table.add(name, cells(name, sequences, figures, list(SHOWN)))
+    table.add("DeepPointMap2", {s: PAPER[s] for s in sequences if s in PAPER}, "the paper")
+    notes = missing_note(sequences, TESTED)
+    if not all(sequence in PAPER for sequence in sequences) or request.frames or request.lengths:
+        notes.append("other sequences, frames or lengths than the paper's: its row is no comparison")
+    runs = run_folders(names, sequences, request.out)
+    return Outcome([table], notes, runs, *_pictures(runs, sequences, request.out, notes))
+
+
+def _kitti360_parts(request: Request) -> Sequence[Sequence[Part]]:
+    return _parts(request, TESTED_360, [])
+
+
+def _kitti360_outcome(request: Request, figures: Mapping[str, Figures]) -> Outcome:
+    sequences = present(request, TESTED_360)
+    title = "KITTI-360: APE mean m / APE rmse m / t_err % / r_err deg per 100 m"
+    table = ResultTable(title, [*sequences, MEAN], _APE, "APE: positions after SE(3) alignment, of the known poses.")
+    names = [name for name, _ in registrations(request)] + peer_names(request)
+    for name in names:
+        table.add(name, cells(name, sequences, figures, list(_APE)))
+    for name, ape in (("DeepPointMap2", 26.00), ("DeepPointMap", 93.77)):
+        table.add(name, {"0007": {"ape_mean_m": ape}}, "the paper", "of 0009 it says: accurate")
+    runs = run_folders(names, sequences, request.out)
+    notes = missing_note(sequences, TESTED_360)
+    return Outcome([table], notes, runs, *_pictures(runs, sequences, request.out, notes))
+
+
+def _pictures(
+    runs: Sequence[tuple[str, Path]], sequences: Sequence[str], out: Path, notes: list[str]
+) -> tuple[list[Path]]:
+    """The paper's figure 5: the trajectories of all methods and the truth, a picture a sequence."""
+    pictures = []
+    for sequence in sequences:
+        folders = {label.rpartition(", ")[0]: path for label, path in runs if path.name == sequence}
+        path = out / f"trajectories_{sequence}.png"
+        try:
+            trajectories_png(path, *aligned_ways(folders), title=sequence)
+        except MissingPackageError as error:
+            notes.append(f"no {path.name}: {error}")
+            break
+        pictures.append(path)
+    return (pictures,)
+
+
+def aligned_ways(folders: Mapping[str, Path]) -> tuple[dict[str, Array], Array | None]:
+    """Positions (N, 3) of each run, m, in the frame of the truth, and those of the truth (M, 3)."""
+    ways: dict[str, Array] = {}
+    truth: Array | None = None
+    for name, folder in folders.items():
+        run = read_run(folder)
+        T = np.eye(4)
+        if run.truth is not None:
+            truth = run.truth.poses[:, :3, 3]
+            T = _alignment(run.truth, run.trajectory)
+        ways[name] = (T @ run.trajectory.poses)[:, :3, 3]
+    return ways, truth
+
+
+def _alignment(truth: Trajectory, own: Trajectory) -> Array:
+    """T_truth_map (4, 4)."""
+    true, est = matched(truth, own)
+    both = known(true) & known(est)
+    return align(est[both, :3, 3], true[both, :3, 3])
+
+
+KITTI = Experiment(USES, _kitti_parts, _kitti_outcome)
+KITTI_360 = Experiment(USES, _kitti360_parts, _kitti360_outcome)

@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Other programs on the same frames: each takes one frame after the other, and in the end gives all poses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import numpy as np
+
+from dpm2_core.errors import UsageError
+from dpm2_core.extras import needs
+from dpm2_core.frame import Array, Frame
+
+_REACH = 100.0  # m, KISS-ICP's default
+
+
+class Peer(Protocol):
+    """Another odometry or SLAM."""
+
+    def add(self, frame: Frame) -> None:
+        """Take the next frame in."""
+        ...
+
+    def poses(self) -> Array:
+        """(N, 4, 4) T_first_lidar of all frames."""
+        ...
+
+
+class KissIcp:
+    """I. Vizzo et al., "KISS-ICP", RA-L 2023, as its pipeline runs it with its defaults."""
+
+    def __init__(self, threads: int, deskew: bool) -> None:
+        """`deskew`: the points carry their time.
+
+        Raises:
+            UsageError: it is not installed.
+        """
+        with needs("bench", "the peer kiss-icp"):
+            from kiss_icp.config import load_config
+            from kiss_icp.kiss_icp import KissICP
+
+        config = load_config(None)
+        config.data.deskew, config.data.max_range = deskew, _REACH
+        config.mapping.voxel_size = _REACH / 100
+        config.registration.max_num_threads = threads
+        self._odometry, self._poses = KissICP(config), list[Array]()
+
+    def add(self, frame: Frame) -> None:
+        """As `Peer`."""
+        self._odometry.register_frame(*cloud_and_times(frame))
+        self._poses.append(np.array(self._odometry.last_pose))
+
+    def poses(self) -> Array:
+        """As `Peer`."""
+        return np.array(self._poses)
+
+
+class KissSlam:
+    """T. Guadagnino et al., "KISS-SLAM", IROS 2025, as its pipeline runs it with its defaults."""
+
+    def __init__(self, threads: int, deskew: bool) -> None:
+        """As `KissIcp`."""
+        with needs("peers", "the peer kiss-slam"):
+            from kiss_slam.config import load_config
+            from kiss_slam.slam import KissSLAM
+
+        config = load_config(None)
+        config.odometry.preprocessing.deskew = deskew
+        config.odometry.registration.max_num_threads = threads
+        self._slam, self._frames = KissSLAM(config), 0
+
+    def add(self, frame: Frame) -> None:
+        """As `Peer`."""
+        self._slam.process_scan(*cloud_and_times(frame))
+        self._frames += 1
+
+    def poses(self) -> Array:
+        """As `Peer`; after its last optimization."""
+        self._slam.generate_new_node()
+        self._slam.local_map_graph.erase_last_local_map()
+        found, _ = self._slam.fine_grained_optimization()
+        return np.array(found)[-self._frames :]
+
+
+class SmallGicp:
+    """K. Koide, "small_gicp", JOSS 2024: its voxelized GICP, frame to model, from constant velocity."""
+
+    def __init__(self, threads: int, deskew: bool) -> None:
+        """As `KissIcp`; it has no means to deskew."""
+        with needs("bench", "the peer small_gicp"):
+            import small_gicp
+
+        self._library: Any = small_gicp
+        self._map = small_gicp.GaussianVoxelMap(1.0)
+        self._threads, self._poses = threads, list[Array]()
+
+    def add(self, frame: Frame) -> None:
+        """As `Peer`."""
+        cloud, _ = self._library.preprocess_points(cloud_and_times(frame)[0], 0.25, 10, self._threads)
+        T = np.eye(4) if not self._poses else self._poses[-1]
+        if len(self._poses) > 1:
+            T = T @ np.linalg.inv(self._poses[-2]) @ T
+        if self._poses:
+            T = np.asarray(self._library.align(self._map, cloud, T, 3.0, self._threads, 20).T_target_source)
+        self._map.insert(cloud, T)
+        self._poses.append(T)
+
+    def poses(self) -> Array:
+        """As `Peer`."""
+        return np.array(self._poses)
+
+
+PEERS: dict[str, Callable[[int, bool], Peer]] = {"kiss-icp": KissIcp, "kiss-slam": KissSlam, "small_gicp": SmallGicp}
+
+
+def make_peer(name: str, threads: int, deskew: bool) -> Peer:
+    """The program of that name.
+
+    Raises:
+        UsageError: there is none, or it is not installed.
+    """
+    if name not in PEERS:
+        raise UsageError(f"--peer {name}: want {', '.join(PEERS)}, or NAME=FILE with a trajectory")
+    return PEERS[name](threads, deskew)
+
+
+def cloud_and_times(frame: Frame) -> tuple[Array, Array]:
+    """(M, 3) float64 points without those that are no measurement, and (M,) their times within the sweep, 0..1; ()."""
+    sound = np.isfinite(frame.points[:, :3]).all(1)
+    cloud = frame.points[sound, :3].astype(np.float64)
+    if frame.time_offset is None:
+        return cloud, np.array([])
+    times = frame.time_offset[sound].astype(np.float64)
+    span = float(np.ptp(times)) if len(times) else 0.0
+    return cloud, (times - times.min()) / span if span > 0 else np.zeros(len(times))

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The experiments of both papers by name, and how one is carried out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from dpm2_core.errors import UsageError
+from dpm2_core.evaluation.record import write_record
+from dpm2_core.experiments.part import Figures, Progress, run_parts
+from dpm2_core.experiments.request import Experiment, Outcome, Request
+
+_ALWAYS = frozenset({"data", "out", "sequences", "workers", "overrides"})
+
+
+@dataclass(frozen=True)
+class Listed:
+    """An experiment in the list: where in which paper, what it measures, and where it is."""
+
+    paper: str
+    summary: str
+    where: str
+
+
+EXPERIMENTS: dict[str, Listed] = {
+    "kitti": Listed(
+        "DeepPointMap2, table 1", "t_rel and r_rel on KITTI 06 to 10, beside other programs", "kitti:KITTI"
+    ),
+    "kitti360": Listed(
+        "DeepPointMap2, 5.2 and figure 5", "mean position error on KITTI-360 07 and 09", "kitti:KITTI_360"
+    ),
+    "robustness": Listed(
+        "DeepPointMap2, table 2 and figure 6",
+        "black images, or a box before the LiDAR, in 5 to 100 % of the frames",
+        "robustness:ROBUSTNESS",
+    ),
+}
+
+
+def load(name: str) -> Experiment:
+    """The experiment of that name; its module is imported now.
+
+    Raises:
+        UsageError: there is none.
+    """
+    if name not in EXPERIMENTS:
+        raise UsageError(f"{name}: no such experiment; choose from {', '.join(EXPERIMENTS)}")
+    module, _, attribute = EXPERIMENTS[name].where.partition(":")
+    found: Experiment = getattr(import_module(f"dpm2_core.experiments.{module}"), attribute)
+    return found
+
+
+def carry_out(name: str, request: Request, progress: Progress | None = None) -> Outcome:
+    """Do all parts that are not done yet, and write OUT/NAME.json.
+
+    Raises:
+        UsageError: an option that the experiment has no use for, or data that it cannot use. Dpm2Error: a part failed.
+    """
+    experiment = load(name)
+    _check_options(name, request, experiment)
+    figures: dict[str, Figures] = {}
+    for stage in experiment.parts(request):
+        figures |= run_parts(stage, request.out, request.workers, progress)
+    outcome = experiment.outcome(request, figures)
+    write_record(request.out / f"{name}.json", name, _record(request, outcome, figures), threads=request.workers)
+    return outcome
+
+
+def _check_options(name: str, request: Request, experiment: Experiment) -> None:
+    useless = [
+        field.name
+        for field in fields(request)
+        if field.name not in _ALWAYS | experiment.uses and getattr(request, field.name) not in (None, ())
+    ]
+    if useless:
+        raise UsageError(f"{name}: has no use for --{useless[0]}")
+
+
+def _record(request: Request, outcome: Outcome, figures: dict[str, Figures]) -> dict[str, Any]:
+    listed = {field.name: getattr(request, field.name) for field in fields(request)}
+    return {
+        "request": {key: str(value) if isinstance(value, Path) else value for key, value in listed.items()},
+        "tables": [table.record() for table in outcome.tables],
+        "notes": outcome.notes,
+        **outcome.extra,
+        "parts": figures,
+    }

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What `dpm2 experiment` was asked for, what an experiment is, and what comes out of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from dpm2_core.data.source import Span
+from dpm2_core.experiments.part import Figures, Part
+from dpm2_core.experiments.table import ResultTable
+
+
+@dataclass(frozen=True)
+class Request:
+    """Options of `dpm2 experiment`; None or empty where they were not given.
+
+    Attributes:
+        data: root of the data set. out: folder of the results.
+        sequences: to be tested on; by default those of the paper that the data set has.
+        learn: to be learned from, likewise.
+        weights: a name or a file. registrations: of the SLAM, a row each.
+        peers: other programs, or NAME=FILE with trajectories of theirs.
+        lengths: segment lengths of the KITTI metric, m. frames: of each sequence.
+        seeds: trainings of each arm. config: YAML of the training. overrides: KEY=VALUE.
+    """
+
+    data: Path
+    out: Path
+    sequences: tuple[str, ...] = ()
+    learn: tuple[str, ...] = ()
+    weights: str | None = None
+    registrations: tuple[str, ...] = ()
+    peers: tuple[str, ...] = ()
+    lengths: tuple[float, ...] | None = None
+    frames: Span | None = None
+    seeds: int | None = None
+    config: Path | None = None
+    overrides: tuple[str, ...] = ()
+    workers: int = 1
+
+
+@dataclass
+class Outcome:
+    """What an experiment found.
+
+    Attributes:
+        tables: the paper's, with ours beside. notes: what a reader must know, in words.
+        runs: folders of runs by label and sequence, for the report. pictures: files.
+    """
+
+    tables: list[ResultTable]
+    notes: list[str] = field(default_factory=list)
+    runs: list[tuple[str, Path]] = field(default_factory=list)
+    pictures: list[Path] = field(default_factory=list)
+    extra: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A table or figure of a paper, as parts and what is made of them.
+
+    Attributes:
+        uses: the options of `Request` beside data, out, sequences, workers and overrides that have a meaning for it;
+            any other one that is given is an error.
+        parts: stages; the parts of one may read what those before have written.
+        outcome: the tables, from the figures of all parts by their names.
+    """
+
+    uses: frozenset[str]
+    parts: Callable[[Request], Sequence[Sequence[Part]]]
+    outcome: Callable[[Request, Mapping[str, Figures]], Outcome]

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""DeepPointMap2's table 2 and figure 6: a camera that sees nothing, and a box that stands before the LiDAR."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+
+from dpm2_core.config import load_settings
+from dpm2_core.data.corrupt import CorruptedSource, parse_corruption
+from dpm2_core.data.open import open_source
+from dpm2_core.evaluation.figures import corrupted_png
+from dpm2_core.experiments.kitti import ORIGINAL_POSES, PAPER, TESTED
+from dpm2_core.experiments.part import Figures, Part
+from dpm2_core.experiments.request import Experiment, Outcome, Request
+from dpm2_core.experiments.sequences import SHOWN, cells, missing_note, own_part, present, registrations, run_folders
+from dpm2_core.experiments.table import MEAN, ResultTable
+from dpm2_core.extras import MissingPackageError
+from dpm2_core.slam.build import make_odometry
+from dpm2_core.slam.settings import Config
+
+SHARES = (0.05, 0.3, 0.5, 1.0)
+"""Fractions of the frames that are hit."""
+KINDS = {"camera": "camera black", "obstruction": "box before the LiDAR"}
+_PAPER_MEAN = {"camera": (0.62, 0.61, 0.69, 1.04), "obstruction": (0.62, 0.66, 0.71, 0.74)}
+"""Mean t_err of 06 to 10, percent, of the paper's table 2."""
+_PICTURED = 4
+"""Position of the frame that is drawn."""
+
+
+def _variants(request: Request) -> list[tuple[str, list[str], str | None]]:
+    """Name, settings and corruption of every row."""
+    rows: list[tuple[str, list[str], str | None]] = []
+    for name, settings in registrations(request):
+        rows.append((f"{name}, whole", settings, None))
+        for kind, label in KINDS.items():
+            if kind == "camera" and not _sees(request, settings):
+                continue
+            rows += [(f"{name}, {label} {share:.0%}", settings, f"{kind}={share},seed=0") for share in SHARES]
+    return rows
+
+
+def _sees(request: Request, settings: Sequence[str]) -> bool:
+    """Whether there are images, and a camera would be used: where not, black images change nothing."""
+    weights = [] if request.weights is None else [f"slam.neural.weights={request.weights}"]
+    config = load_settings(Config, None, [*settings, *weights, *request.overrides])
+    return make_odometry(config.slam).uses_images and _first_with_images(request) != ""
+
+
+def _first_with_images(request: Request) -> str:
+    """A sequence whose first frame has an image; empty if there is none."""
+    for sequence in present(request, TESTED, ORIGINAL_POSES):
+        settings = load_settings(Config, None, [f"input.sequence='{sequence}'", *ORIGINAL_POSES])
+        source = open_source(request.data, settings.input)
+        if any(frame.images for frame in islice(source.frames(0, 1), 1)):
+            return sequence
+    return ""
+
+
+def _parts(request: Request) -> Sequence[Sequence[Part]]:
+    sequences = present(request, TESTED, ORIGINAL_POSES)
+    return [
+        [
+            own_part(name, sequence, request, [*ORIGINAL_POSES, *settings], corrupt=corrupt)
+            for name, settings, corrupt in _variants(request)
+            for sequence in sequences
+        ]
+    ]
+
+
+def _outcome(request: Request, figures: Mapping[str, Figures]) -> Outcome:
+    sequences = present(request, TESTED, ORIGINAL_POSES)
+    caption = "KITTI metric; change: of the mean t_err from the row that is whole. Hit frames are drawn with seed 0."
+    table = ResultTable("Failing sensors: t_err % / r_err deg per 100 m", [*sequences, MEAN], SHOWN, caption)
+    variants = _variants(request)
+    changes: dict[str, float | None] = {}
+    whole: float | None = None
+    for name, _, corrupt in variants:
+        table.add(name, cells(name, sequences, figures, list(SHOWN)))
+        mean = table.value(table.rows[-1], MEAN, "t_err_percent")
+        whole = mean if corrupt is None else whole
+        change = 100 * (mean / whole - 1) if mean is not None and whole else None
+        if corrupt is not None:
+            changes[name] = change
+            table.rows[-1] = replace(table.rows[-1], note="" if change is None else f"{change:+.0f} %")
+    table.add("DeepPointMap2, whole", {s: PAPER[s] for s in sequences if s in PAPER}, "the paper")
+    for kind, means in _PAPER_MEAN.items():
+        for share, mean in zip(SHARES, means, strict=True):
+            table.add(f"DeepPointMap2, {KINDS[kind]} {share:.0%}", {MEAN: {"t_err_percent": mean}}, "the paper",
+                      f"{100 * (mean / 0.60 - 1):+.0f} %")  # fmt: skip
+    notes = missing_note(sequences, TESTED)
+    if not any(corrupt and corrupt.startswith("camera") for _, _, corrupt in variants):
+        notes.append("no rows with a black camera: there are no images, or this configuration makes no use of them")
+    runs = run_folders([name for name, _, _ in variants], sequences, request.out)
+    pictures = _picture(request, sequences[0], notes)
+    return Outcome([table], notes, runs, pictures, {"change_percent": changes})
+
+
+def _picture(request: Request, sequence: str, notes: list[str]) -> list[Path]:
+    """The paper's figure 6: a frame as it is, and with both sensors hit."""
+    settings = load_settings(Config, None, [f"input.sequence='{sequence}'", *ORIGINAL_POSES]).input
+    source = open_source(request.data, settings)
+    at = min(_PICTURED, len(source) - 1)
+    hit = CorruptedSource(source, parse_corruption("camera=1,obstruction=1,seed=0"))
+    (before,), (after,) = (list(of.frames(at, at + 1)) for of in (source, hit))
+    path = request.out / f"corrupted_{sequence}.png"
+    try:
+        corrupted_png(path, before, after, f"{sequence}, frame {before.index}: camera black, box before the LiDAR")
+    except MissingPackageError as error:
+        notes.append(f"no {path.name}: {error}")
+        return []
+    return [path]
+
+
+ROBUSTNESS = Experiment(frozenset({"weights", "registrations", "lengths", "frames"}), _parts, _outcome)

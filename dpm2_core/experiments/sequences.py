@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The parts that experiments with the SLAM have in common: our rows, other programs' rows, on every sequence."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from dpm2_core.errors import UsageError
+from dpm2_core.evaluation.kitti_metric import OFFICIAL_LENGTHS
+from dpm2_core.experiments.part import Figures, Part
+from dpm2_core.experiments.request import Request
+from dpm2_core.experiments.slam_part import GIVEN, OWN, PEER, has_sequence
+from dpm2_core.experiments.table import Cells
+
+SHOWN = {"t_err_percent": ".3f", "r_err_deg_per_100m": ".3f"}
+"""Figures of the KITTI metric, and how they are printed."""
+
+
+def present(request: Request, paper: Sequence[str], more: Sequence[str] = ()) -> list[str]:
+    """The sequences to be tested on: those asked for, or those of the paper that the data set has.
+
+    Raises:
+        UsageError: one that was asked for is not there, or none of the paper's.
+    """
+    if request.sequences:
+        for sequence in request.sequences:
+            if problem := has_sequence(request.data, [f"input.sequence='{sequence}'", *more]):
+                raise UsageError(problem)
+        return list(request.sequences)
+    problems = {sequence: has_sequence(request.data, [f"input.sequence='{sequence}'", *more]) for sequence in paper}
+    found = [sequence for sequence, problem in problems.items() if not problem]
+    if not found:
+        raise UsageError(f"{next(iter(problems.values()))}; or choose others with --sequences")
+    return found
+
+
+def missing_note(found: Sequence[str], paper: Sequence[str]) -> list[str]:
+    """What is to be said where sequences of the paper are missing."""
+    missing = [sequence for sequence in paper if sequence not in found]
+    return [f"not measured, since they are not there or were not asked for: {', '.join(missing)}"] if missing else []
+
+
+def registrations(request: Request) -> list[tuple[str, list[str]]]:
+    """Name and settings of each of our rows."""
+    chosen = request.registrations or ("",)
+    return [(f"dpm2 {name}".strip(), [f"slam.registration={name}"] if name else []) for name in chosen]
+
+
+def own_part(name: str, sequence: str, request: Request, settings: Sequence[str], **more: Any) -> Part:
+    """Our SLAM on a sequence; `settings` count for less than the user's."""
+    weights = [] if request.weights is None else [f"slam.neural.weights={request.weights}"]
+    asked = [f"input.sequence='{sequence}'", *settings, *weights, *request.overrides]
+    files = [Path(setting.partition("=")[2]) for setting in asked if setting.endswith(".safetensors")]
+    return Part(f"{_folder(name)}/{sequence}", OWN, {"drive": _drive(request, asked), **more}, files)
+
+
+def peer_parts(sequences: Sequence[str], request: Request, settings: Sequence[str]) -> list[Part]:
+    """What `--peer` names, on every sequence.
+
+    Raises:
+        UsageError: a file's name does not say which sequence it is of.
+    """
+    parts = []
+    for text in request.peers:
+        name, equals, file = text.partition("=")
+        if equals and "{sequence}" not in file and len(sequences) > 1:
+            raise UsageError(f"--peer {text}: of {len(sequences)} sequences; put {{sequence}} where its name stands")
+        for sequence in sequences:
+            asked = [f"input.sequence='{sequence}'", *settings, *_input(request.overrides)]
+            drive = _drive(request, asked)
+            if equals:
+                path = Path(file.replace("{sequence}", sequence))
+                part = Part(f"{_folder(name)}/{sequence}", GIVEN, {"drive": drive, "file": str(path)}, [path])
+            else:
+                part = Part(f"{_folder(name)}/{sequence}", PEER, {"drive": drive, "name": name})
+            parts.append(part)
+    return parts
+
+
+def peer_names(request: Request) -> list[str]:
+    """Of the rows of other programs."""
+    return [text.partition("=")[0] for text in request.peers]
+
+
+def cells(name: str, sequences: Sequence[str], figures: Mapping[str, Figures], shown: Sequence[str]) -> Cells:
+    """The figures of a row."""
+    return {
+        sequence: {figure: figures[f"{_folder(name)}/{sequence}"].get(figure) for figure in shown}
+        for sequence in sequences
+    }
+
+
+def run_folders(names: Sequence[str], sequences: Sequence[str], out: Path) -> list[tuple[str, Path]]:
+    """Folders of the runs, by what they are called in the report."""
+    return [(f"{name}, {sequence}", out / _folder(name) / sequence) for sequence in sequences for name in names]
+
+
+def _drive(request: Request, settings: Sequence[str]) -> dict[str, Any]:
+    return {
+        "data": str(request.data),
+        "settings": list(settings),
+        "frames": list(request.frames or (0, None)),
+        "lengths": list(request.lengths or OFFICIAL_LENGTHS),
+    }
+
+
+def _input(overrides: Sequence[str]) -> list[str]:
+    """Those that say how frames are read: other programs have no use for the rest."""
+    return [text for text in overrides if text.startswith(("input.", "slam.threads"))]
+
+
+def _folder(name: str) -> str:
+    return re.sub(r"[^\w.+-]+", "_", name)

@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One method on one sequence: our SLAM, another program, or a trajectory that somebody made elsewhere."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from time import perf_counter
+from typing import TypedDict
+
+import numpy as np
+
+from dpm2_core.config import load_settings
+from dpm2_core.data.corrupt import CorruptedSource, parse_corruption
+from dpm2_core.data.open import open_source
+from dpm2_core.data.prefetch import prefetch
+from dpm2_core.data.source import Source, Span
+from dpm2_core.data.trajectory import Trajectory, matched, read_trajectory, write_tum
+from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.evaluation.ground_truth import in_other_frame, read_ground_truth
+from dpm2_core.evaluation.kitti_metric import known
+from dpm2_core.evaluation.metrics import Metrics, evaluate
+from dpm2_core.evaluation.run_folder import METRICS, TIMING, TRAJECTORY, TRUTH, write_frames, write_truth
+from dpm2_core.experiments.part import Advance, Figures
+from dpm2_core.experiments.peers import make_peer
+from dpm2_core.files import atomic_write
+from dpm2_core.frame import Array
+from dpm2_core.geometry import se3
+from dpm2_core.pipeline import OfflineRun, open_recording, span_of
+from dpm2_core.slam.settings import Config
+from dpm2_core.slam.system import SlamResult
+
+OWN = "dpm2_core.experiments.slam_part:own"
+PEER = "dpm2_core.experiments.slam_part:peer"
+GIVEN = "dpm2_core.experiments.slam_part:given"
+
+
+class Drive(TypedDict):
+    """What is driven: root of the data set, settings KEY=VALUE of `Config`, positions of the first frame and of the one
+    after the last, and the segment lengths of the KITTI metric, m."""
+
+    data: str
+    settings: Sequence[str]
+    frames: Span
+    lengths: Sequence[float]
+
+
+def own(folder: Path, advance: Advance, drive: Drive, corrupt: str | None = None) -> Figures:
+    """Our SLAM; leaves the files of `dpm2 run` but for the map's points.
+
+    Raises:
+        UsageError: no such sequence, no ground truth, or settings that there are not. Dpm2Error: files not written.
+    """
+    config = load_settings(Config, None, drive["settings"])
+    source: Source | str = drive["data"]
+    if corrupt is not None:
+        source = CorruptedSource(open_recording(drive["data"], config, True), parse_corruption(corrupt))
+    with OfflineRun(source, config, _span(drive)) as run:
+        done = 0
+
+        def progress(result: SlamResult) -> None:
+            nonlocal done
+            done += 1
+            advance(done, len(run))
+
+        result = run.run(progress)
+        if result.interrupted:
+            raise KeyboardInterrupt
+        result.save(folder, cloud=False)
+        truth = _truth(run.source, _span(drive))
+        seconds = {stage: float(np.sum(times)) for stage, times in result.seconds.items()}
+        accepted = sum(loop.ok for loop in result.mapper.loops)
+        figures = _measured(folder, run.source, (truth, result.poses), drive, result.fps)
+        return {
+            **figures,
+            "failed_frames": result.methods["failed"],
+            "states": dict(result.states),
+            "loops": {"accepted": accepted, "rejected": len(result.mapper.loops) - accepted},
+            "stage_ms": {stage: round(1e3 * total / len(result), 3) for stage, total in seconds.items()},
+        }
+
+
+def peer(folder: Path, advance: Advance, drive: Drive, name: str) -> Figures:
+    """Another program on the same frames, read one at a time.
+
+    Raises:
+        UsageError: it is not installed, or as `own`. Dpm2Error: it gave another number of poses than frames.
+    """
+    config = load_settings(Config, None, drive["settings"])
+    source = open_recording(drive["data"], config, False)
+    start, stop = span_of(source, _span(drive))
+    program, stamps, index, seconds = None, list[int](), list[int](), list[float]()
+    for frame in prefetch(source.frames(start, stop)):
+        if program is None:
+            program = make_peer(name, config.slam.threads, frame.time_offset is not None)
+        began = perf_counter()
+        program.add(frame)
+        seconds.append(perf_counter() - began)
+        stamps.append(frame.stamp)
+        index.append(frame.index)
+        advance(len(stamps), stop - start)
+    assert program is not None  # there are frames
+    poses = program.poses()
+    if len(poses) != len(stamps):
+        raise Dpm2Error(f"{name}: {len(poses)} poses for {len(stamps)} frames")
+    write_tum(folder / TRAJECTORY, stamps, poses)
+    write_frames(folder / "frames.csv", [(i, s, "", name) for i, s in zip(index, stamps, strict=True)],
+                 {"total": seconds})  # fmt: skip
+    truth = _truth(source, (start, stop))
+    write_truth(folder / TRUTH, stamps, truth)
+    fps = len(seconds) / sum(seconds)
+    _write_json(folder / TIMING, {"frames": len(stamps), "fps": fps})
+    return _measured(folder, source, (truth, poses), drive, fps)
+
+
+def given(folder: Path, advance: Advance, drive: Drive, file: str) -> Figures:
+    """A trajectory from a file: TUM, of the LiDAR by stamp, or KITTI's, of the left camera.
+
+    Raises:
+        UsageError: no such file, or nothing in it belongs to the sequence.
+    """
+    config = load_settings(Config, None, drive["settings"])
+    source = open_recording(drive["data"], config, False)
+    start, stop = span_of(source, _span(drive))
+    found, truth = read_trajectory(Path(file)), _truth(source, (start, stop))
+    # Only names and stamps are wanted, but a source gives them with its frames alone.
+    keys = [(frame.index, frame.stamp) for frame in prefetch(source.frames(start, stop))]
+    index, stamps = (np.array(column, np.int64) for column in zip(*keys, strict=True))
+    if found.kind == "kitti" and len(found) == len(source) != len(truth):
+        found = Trajectory(found.poses[start:stop], found.keys[start:stop], found.kind)
+    own_keys = {"tum": stamps, "kitti-indexed": index, "kitti": np.arange(len(truth))}[found.kind]
+    try:
+        _, poses = matched(Trajectory(truth, own_keys, found.kind), found)
+    except UsageError as error:
+        raise UsageError(f"{file}: {error}") from None
+    if len(poses) != len(truth):
+        raise UsageError(f"{file}: {len(poses)} poses belong to the {len(truth)} frames of {source.name}")
+    if found.kind != "tum" and source.T_cam_lidar is not None:
+        poses = in_other_frame(poses, se3.inverse(source.T_cam_lidar))
+    there = known(poses)
+    write_tum(folder / TRAJECTORY, stamps[there].tolist(), poses[there])
+    write_truth(folder / TRUTH, stamps.tolist(), truth)
+    advance(len(truth), len(truth))
+    return _measured(folder, source, (truth, poses), drive, None)
+
+
+def _truth(source: Source, frames: Span) -> Array:
+    truth = read_ground_truth(source, None, *span_of(source, frames))
+    if truth is None or isinstance(truth, Trajectory):
+        raise UsageError(f"{source.name}: no ground truth to compare with")
+    return truth
+
+
+def _span(drive: Drive) -> Span:
+    return drive["frames"][0], drive["frames"][1]
+
+
+def _measured(folder: Path, source: Source, poses: tuple[Array, Array], drive: Drive, fps: float | None) -> Figures:
+    """Figures of true and estimated (N, 4, 4) poses of the LiDAR; of KITTI's left camera where its place is known."""
+    truth, est = poses
+    if source.T_cam_lidar is not None:
+        truth, est = in_other_frame(truth, source.T_cam_lidar), in_other_frame(est, source.T_cam_lidar)
+    metrics: Metrics = evaluate(truth, est, tuple(drive["lengths"]), fps=fps).model_copy(update={"truth": source.truth})
+    _write_json(folder / METRICS, metrics.model_dump())
+    return metrics.model_dump(exclude={"per_length", "per_speed"})
+
+
+def _write_json(path: Path, content: object) -> None:
+    with atomic_write(path) as file:
+        file.write(json.dumps(content, indent=2) + "\n")
+
+
+def has_sequence(data: Path, settings: Sequence[str]) -> str:
+    """Why a sequence cannot be opened; empty where it can."""
+    config = load_settings(Config, None, settings)
+    try:
+        open_source(data, config.input.model_copy(update={"images": False}))
+    except UsageError as error:
+        return str(error)
+    return ""

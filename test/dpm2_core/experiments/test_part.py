@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parts are done once, again when what they read has changed, and one that failed is named."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from dpm2_core.errors import UsageError
+from dpm2_core.experiments.part import DONE, Part, Progress, run_parts
+from dpm2_core.experiments.table import MEAN, ResultTable
+
+WORK = "part_work:count"
+SOURCE = """
+import os
+from dpm2_core.errors import UsageError
+
+def count(folder, advance, start):
+    log = folder / "log"
+    log.write_text(log.read_text() + "x" if log.exists() else "x")
+    for i in range(3):
+        advance(i + 1, 3)
+    if start < 0:
+        raise UsageError("below zero")
+    return {"value": start + 1, "times": len(log.read_text()), "process": os.getpid()}
+"""
+"""A part that leaves how often it was done."""
+
+
+@pytest.fixture(autouse=True)
+def _importable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`part_work`, also in other processes."""
+    (tmp_path / "part_work.py").write_text(SOURCE)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "part_work", raising=False)
+
+
+def test_what_is_done_is_not_done_again_unless_its_input_changed(tmp_path: Path) -> None:
+    weights = tmp_path / "weights"
+    weights.write_text("1")
+    parts = [Part("a/0", WORK, {"start": 1}), Part("a/1", WORK, {"start": 2}, [weights])]
+    frames: list[tuple[str, int, int]] = []
+    told: list[tuple[str, int, int]] = []
+    progress = Progress(lambda *now: frames.append(now), lambda *now: told.append(now))
+    found = run_parts(parts, tmp_path, progress=progress)
+    assert [found[name]["value"] for name in ("a/0", "a/1")] == [2, 3]
+    assert told == [("a/0", 1, 2), ("a/1", 2, 2)]
+    assert frames[-1] == ("a/1", 3, 3)
+    assert found["a/0"]["part"]["peak_memory_mb"] > 0
+    assert run_parts(parts, tmp_path) == found
+    weights.write_text("2")
+    again = run_parts([*parts, Part("a/2", WORK, {"start": 5})], tmp_path)
+    assert [again[name]["times"] for name in again] == [1, 2, 1]
+    changed = run_parts([Part("a/0", WORK, {"start": 7})], tmp_path)
+    assert changed["a/0"]["value"] == 8
+
+
+@pytest.mark.slow
+def test_parts_in_processes_of_their_own_give_the_same(tmp_path: Path) -> None:
+    """In the order that was asked for; one that fails is named all the same."""
+    parts = [Part(str(i), WORK, {"start": i}) for i in range(3)]
+    found = run_parts(parts, tmp_path, workers=2)
+    assert [figures["value"] for figures in found.values()] == [1, 2, 3]
+    assert os.getpid() not in [figures["process"] for figures in found.values()]
+    with pytest.raises(UsageError, match=r"^bad: below zero$"):
+        run_parts([Part("bad", WORK, {"start": -1}), Part("good", WORK, {"start": 1})], tmp_path, workers=2)
+
+
+def test_a_part_that_fails_is_named_and_is_not_done(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"^bad: below zero$"):
+        run_parts([Part("good", WORK, {"start": 0}), Part("bad", WORK, {"start": -1})], tmp_path)
+    assert json.loads((tmp_path / "good" / DONE).read_text())["figures"]["value"] == 1
+    assert not (tmp_path / "bad" / DONE).exists()
+
+
+def test_a_damaged_record_is_made_anew(tmp_path: Path) -> None:
+    part = Part("a", WORK, {"start": 1})
+    run_parts([part], tmp_path)
+    (tmp_path / "a" / DONE).write_text("{")
+    assert run_parts([part], tmp_path)["a"]["times"] == 2
+
+
+def test_a_mean_is_of_all_columns_or_there_is_none() -> None:
+    """A mean over the sequences that happened to be there would compare different drives."""
+    table = ResultTable("t", ["06", "07", MEAN], {"a": ".1f", "b": ".2f"})
+    table.add("ours", {"06": {"a": 1.0, "b": None}, "07": {"a": 2.0, "b": 1.0}})
+    table.add("theirs", {"06": {"a": 1.0}}, "the paper")
+    assert [cells for _, cells in table.texts()] == [["1.0 / -", "2.0 / 1.00", "1.5 / -"], ["1.0 / -", "-", "-"]]
+    assert table.record()["rows"][1]["origin"] == "the paper"

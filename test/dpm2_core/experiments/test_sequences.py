@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The experiments with the SLAM, called as a user calls them, on small trees in the layout of each data set."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dpm2_core.data.trajectory import read_trajectory, write_tum
+from dpm2_core.geometry import se3
+
+from ...helpers.command import dpm2
+from ...helpers.layouts import DRIVE_360, kitti_360, kitti_odometry
+
+QUICK = ("--registration", "geometric", "--set", "slam.loops.enabled=false", "--set", "slam.threads=1")
+"""No network is loaded."""
+
+
+@pytest.fixture(scope="module")
+def kitti(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Sequences 06 and 10, six scans each, with images."""
+    return kitti_odometry(recording, tmp_path_factory.mktemp("kitti"), ("06", "10"), 6, images=True)
+
+
+def rows(path: Path) -> dict[str, dict[str, dict[str, float]]]:
+    """Cells of the first table of an experiment's JSON."""
+    return {row["name"]: row["cells"] for row in json.loads(path.read_text())["tables"][0]["rows"]}
+
+
+@pytest.mark.slow
+def test_kitti_beside_other_programs(kitti: Path, tmp_path: Path) -> None:
+    """Table 1 with a peer, a trajectory from a file, which is the truth shifted, and the paper's row; then again."""
+    out = tmp_path / "out"
+    for name in ("06", "10"):
+        truth = read_trajectory(kitti / "poses" / f"{name}.txt").poses
+        rows_of = [" ".join(f"{x:.9g}" for x in (se3.exp([0, 0, 0, 5, 0, 0]) @ T)[:3].ravel()) for T in truth]
+        (tmp_path / f"given_{name}.txt").write_text("\n".join(rows_of) + "\n")
+    call = ("experiment", "kitti", kitti, "--out", out, "--lengths", "2,3", *QUICK, "--peer", "kiss-icp",
+            "--peer", "small_gicp", "--peer", f"somebody={tmp_path}/given_{{sequence}}.txt")  # fmt: skip
+    done = dpm2(*call)
+    assert done.returncode == 0, done.stderr
+    found = rows(out / "kitti.json")
+    assert list(found) == ["dpm2 geometric", "kiss-icp", "small_gicp", "somebody", "DeepPointMap2"]
+    assert found["somebody"]["06"]["t_err_percent"] == pytest.approx(0, abs=1e-4)
+    assert 0 < found["dpm2 geometric"]["mean"]["t_err_percent"] < 5
+    assert found["DeepPointMap2"]["06"] == {"t_err_percent": 0.47, "r_err_deg_per_100m": 0.20}
+    assert "07, 08, 09" in done.stderr
+    assert "no comparison" in done.stderr
+    record = json.loads((out / "kitti.json").read_text())
+    assert record["request"]["lengths"] == [2.0, 3.0]
+    assert record["parts"]["dpm2_geometric/06"]["truth"] == "poses/06.txt"
+    assert (out / "trajectories_10.png").stat().st_size > 5000
+    before = {path: path.stat().st_mtime_ns for path in out.rglob("part.json")}
+    assert len(before) == 8
+    again = dpm2(*call)
+    assert rows(out / "kitti.json") == found
+    assert again.stdout == done.stdout
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+
+
+@pytest.mark.slow
+def test_kitti_360_by_mean_position_error(recording: Path, tmp_path: Path) -> None:
+    data = kitti_360(recording, tmp_path / "data", ("0007",), 8)
+    out = tmp_path / "out"
+    done = dpm2("experiment", "kitti360", data, "--out", out, "--lengths", "2", *QUICK)
+    assert done.returncode == 0, done.stderr
+    found = rows(out / "kitti360.json")
+    cell = found["dpm2 geometric"]["0007"]
+    assert 0 < cell["ape_mean_m"] <= cell["ape_rmse_m"] < 0.3
+    assert found["DeepPointMap2"]["0007"]["ape_mean_m"] == 26.00
+    assert json.loads((out / "kitti360.json").read_text())["parts"]["dpm2_geometric/0007"]["truth"].startswith(
+        f"data_poses/{DRIVE_360.format('0007')}"
+    )
+
+
+@pytest.mark.slow
+def test_robustness_at_every_share(kitti: Path, tmp_path: Path) -> None:
+    """Both kinds, with the change against the drive that is whole."""
+    done = dpm2("experiment", "robustness", kitti, "--out", tmp_path, "--sequences", "10", "--lengths", "2",
+                "--frames", "0:4", *QUICK)  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    record = json.loads((tmp_path / "robustness.json").read_text())
+    ours = [row["name"] for row in record["tables"][0]["rows"] if row["origin"] == "this run"]
+    assert len(ours) == 9
+    whole = record["parts"]["dpm2_geometric_whole/10"]
+    assert record["parts"]["dpm2_geometric_camera_black_100_/10"]["ape_rmse_m"] == whole["ape_rmse_m"]
+    assert record["parts"]["dpm2_geometric_box_before_the_LiDAR_100_/10"]["ape_rmse_m"] != whole["ape_rmse_m"]
+    assert set(record["change_percent"]) == set(ours[1:])
+    assert (tmp_path / "corrupted_10.png").stat().st_size > 5000
+
+
+@pytest.mark.parametrize(
+    ("arguments", "problem"),
+    [
+        (("kiti", "DATA", "--out", "OUT"), "kiti: no such experiment; choose from kitti, "),
+        (("kitti", "DATA"), "want NAME DATA --out DIR, or --list"),
+        (("kitti", "DATA", "--out", "OUT", "--sequences", "42"), "42"),
+        (("kitti", "DATA", "--out", "OUT", "--seeds", "3"), "kitti: has no use for --seeds"),
+        (("robustness", "DATA", "--out", "OUT", "--peer", "kiss-icp"), "robustness: has no use for --peer"),
+        (("kitti", "DATA", "--out", "OUT", "--lengths", "0"), "--lengths 0"),
+        (("kitti", "DATA", "--out", "OUT", "--peer", "x=a.txt"), "put {sequence} where its name stands"),
+        (("kitti360", "DATA", "--out", "OUT"), "choose others with --sequences"),
+    ],
+)
+def test_what_cannot_be_done_is_said_in_one_line(
+    kitti: Path, tmp_path: Path, arguments: tuple[str, ...], problem: str
+) -> None:
+    places = {"DATA": kitti, "OUT": tmp_path / "out"}
+    done = dpm2("experiment", *(places.get(argument, argument) for argument in arguments))
+    assert done.returncode == 2
+    assert done.stderr.strip().count("\n") <= 1  # the bar, and the line
+    assert problem in done.stderr
+
+
+@pytest.mark.slow
+def test_a_peer_or_a_file_that_is_not_there_is_named_with_its_part(kitti: Path, tmp_path: Path) -> None:
+    call = ("experiment", "kitti", kitti, "--out", tmp_path, "--sequences", "10", *QUICK, "--frames", "0:2")
+    assert "nobody/10: --peer nobody: want kiss-icp" in dpm2(*call, "--peer", "nobody").stderr
+    assert "x/10: no.txt: No such file" in dpm2(*call, "--peer", "x=no.txt").stderr
+    write_tum(tmp_path / "other.tum", [10**12, 2 * 10**12], np.stack([np.eye(4)] * 2))
+    assert "other.tum" in dpm2(*call, "--peer", f"x={tmp_path}/other.tum").stderr
+
+
+def test_the_list_has_every_experiment() -> None:
+    done = dpm2("experiment", "--list")
+    assert done.returncode == 0
+    assert all(name in done.stdout for name in ("kitti", "kitti360", "robustness"))
