@@ -7,13 +7,13 @@ PYTHON ?= $(firstword $(shell for p in python3.11 python3.12 python3; do \
 	$$p -c 'import sys; sys.exit(sys.version_info[:2] not in ((3, 11), (3, 12)))' 2>/dev/null && echo $$p; done))
 BIN := .venv/bin
 READY := .venv/.ready
-EXTRAS ?= plot,sim,test
+EXTRAS ?= plot,sim,test,docs
 JOBS ?= -n 2 --dist worksteal
 
 # The environment is self-contained: a sourced ROS 2, another environment's bootstrap or its libraries must not leak in.
 unexport PYTHONPATH PYTHONHOME VIRTUAL_ENV AMENT_PREFIX_PATH ROS_DISTRO LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: help setup demo test test-fast fuzz lint bench bench-ros bench-robots bench-memory train-data train-small train-movers train-ground ablation sim diagrams parameters clean
+.PHONY: help setup demo test test-fast fuzz lint bench bench-ros bench-robots bench-memory train-data train-small train-movers train-ground ablation sim diagrams parameters topics docs clean
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:[^#]*##/\t/' | expand -t 16
 
@@ -112,6 +112,13 @@ diagrams: setup  ## redraw the imports in docs/architecture.md
 
 parameters: setup  ## regenerate docs/parameters.md
 	$(BIN)/python -m dpm2_ros.parameters > docs/parameters.md
+
+topics: setup ros  ## regenerate docs/topics.md from running nodes
+	$(BIN)/python -m dpm2_ros.topics > docs/topics.md
+
+docs: setup  ## the documentation as a site in out/site: strict, dead links and anchors are errors
+	@$(BIN)/python -c 'import mkdocs, material' 2>/dev/null || $(BIN)/python -m pip install -qq --disable-pip-version-check -e '.[docs]'
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
 clean:  ## remove what was built and measured, keep the environment
 	rm -rf build dist install log out *.egg-info

@@ -50,6 +50,7 @@ EXTRAS = {
         "pytest-xdist>=3.6,<4",
         "hypothesis>=6.100,<7",
     ],
+    "docs": ["mkdocs>=1.6,<2", "mkdocs-material>=9.5,<10", "mkdocstrings[python]>=0.27,<2"],  # make docs
     "lint": ["ruff>=0.9,<0.18", "mypy>=1.13,<3", "types-PyYAML", "import-linter>=2.1,<3", "grimp>=3.2,<4"],
     "las": ["laspy>=2.5,<3"],  # dpm2 map export MAP OUT.las
     "timm": ["timm>=1,<2"],  # image backbones timm:NAME
@@ -57,7 +58,7 @@ EXTRAS = {
     "peers": ["kiss-slam>=0.0.2,<1"],  # dpm2 experiment --peer kiss-slam
     "bench": ["kiss-icp>=1.2,<2", "small_gicp>=1.0,<2", "pypose>=0.9,<1"],  # what the benchmarks compare with
 }
-EXTRAS["dev"] = [line for name in ("plot", "sim", "test", "lint", "bench") for line in EXTRAS[name]]
+EXTRAS["dev"] = [line for name in ("plot", "sim", "test", "docs", "lint", "bench") for line in EXTRAS[name]]
 
 
 def ros2_run_stubs() -> list[str]:

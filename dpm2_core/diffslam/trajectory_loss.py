@@ -119,7 +119,7 @@ class SlamLoss(torch.nn.Module):
         """Scalar float64, m2; zero, with zero gradient, where prediction and target are the same.
 
         Args:
-            pred_clouds, target_clouds: windows of the same T scans; the counts of points may differ.
+            pred_clouds: a window of T scans. target_clouds: of the same; the counts of points may differ.
             weights: of the predicted points, with gradient: how a selection reaches the loss. target_weights: without.
             guess: see `odometry`, for both. frames: (sequence, number) of each scan: checks that the window is
                 contiguous, and the reference is computed once and kept. Only where the targets are always the same.

@@ -1,0 +1,24 @@
+# SPDX-License-Identifier: Apache-2.0
+"""docs/topics.md is what the nodes have, and names no topic twice."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dpm2_ros.topics import describe, node_makers, page
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "topics.md"
+
+
+@pytest.mark.slow
+def test_the_page_is_that_of_the_nodes(ros: Callable[..., Any]) -> None:
+    """`make topics` writes it. Without the network, which adds no topic."""
+    ros("slam.registration:=geometric", "slam.loops.descriptors:=false", namespace="")
+    found = describe(node_makers())
+    assert page(found) == PAGE.read_text()
+    for endpoints in found.values():
+        assert len({(e.name, e.role) for e in endpoints}) == len(endpoints)

@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Hooks of mkdocs: pages link to files outside docs/ as in the repository, and those become part of the site."""
+
+from __future__ import annotations
+
+import posixpath
+import re
+from pathlib import Path
+from typing import Any
+
+from mkdocs.structure.files import File, Files
+
+ROOT = Path(__file__).resolve().parents[1]
+PLACE = "repository"
+"""Folder of the site for files of the repository that are not in docs/."""
+_LINK = re.compile(r"\[(?P<text>[^\]]*)\]\((?P<target>[^)#\s]+)(?P<anchor>(?:#[^)\s]*)?)\)")
+
+
+def on_files(files: Files, config: Any) -> Files:
+    """Take in what the pages link to, and what that links to."""
+    wanted = [page.src_uri for page in files.documentation_pages()]
+    while wanted:
+        page = wanted.pop()
+        for target in _linked(page):
+            uri = f"{PLACE}/{target}"
+            if not target.startswith("docs/") and (ROOT / target).is_file() and files.get_file_from_path(uri) is None:
+                files.append(File.generated(config, uri, abs_src_path=str(ROOT / target)))
+                if uri.endswith(".md"):
+                    wanted.append(uri)
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """Links of a page to where their targets are in the site."""
+    here = page.file.src_uri
+
+    def there(match: re.Match[str]) -> str:
+        target = _in_repository(here, match["target"])
+        if target is None:
+            return match[0]
+        if (ROOT / target).is_dir():  # which a site cannot show
+            return match["text"]
+        uri = target.removeprefix("docs/") if target.startswith("docs/") else f"{PLACE}/{target}"
+        relative = posixpath.relpath(uri, posixpath.dirname(here) or ".")
+        return f"[{match['text']}]({relative}{match['anchor']})"
+
+    return _LINK.sub(there, markdown)
+
+
+def _linked(page: str) -> list[str]:
+    text = (ROOT / (page.removeprefix(f"{PLACE}/") if page.startswith(f"{PLACE}/") else f"docs/{page}")).read_text()
+    targets = (_in_repository(page, match["target"]) for match in _LINK.finditer(text))
+    return [target for target in targets if target is not None]
+
+
+def _in_repository(page: str, link: str) -> str | None:
+    """Path below the root that a link of a page means; None for an address elsewhere."""
+    if "://" in link or link.startswith("mailto:"):
+        return None
+    own = page.removeprefix(f"{PLACE}/") if page.startswith(f"{PLACE}/") else f"docs/{page}"
+    return posixpath.normpath(posixpath.join(posixpath.dirname(own), link))
