@@ -8,6 +8,8 @@ import numpy as np
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.se3 import Array
 
+OPEN = 0.9
+"""Standard deviation of a registered position, m, from which the scene leaves a direction open: it ends at 1 m."""
 _HORIZON = 10.0  # s: farther ahead no motion is extrapolated
 _STEPS = 10  # of a motion that changes
 _TURN = 0.3  # rad/s, standard deviation of the yaw rate in traffic
@@ -28,14 +30,24 @@ def between(T: Array, before: Array, after: Array, seconds: float) -> Array:
     return T
 
 
-def covariance(speed: float, seconds: float, acceleration: float) -> Array:
-    """Covariance (6, 6) [rad, m] of the pose that `predicted` gives; no heading is worse than any heading."""
+def covariance(speed: float, seconds: float, acceleration: float, of_velocity: Array) -> Array:
+    """Covariance (6, 6) [rad, m] of the pose that `predicted` gives, of a velocity with the covariance `of_velocity`
+    (3, 3) [m/s]; no heading is worse than any heading."""
     meters = 0.5 * seconds * velocity_change(speed, seconds, acceleration)
     heading = min(_TURN * seconds, np.pi / np.sqrt(3))
-    return np.diag([_TILT * heading, _TILT * heading, heading, meters, meters, meters]) ** 2
+    result = np.diag([_TILT * heading, _TILT * heading, heading, meters, meters, meters]) ** 2
+    result[3:, 3:] += of_velocity * seconds**2
+    return result
 
 
 def velocity_change(speed: float, seconds: float, acceleration: float) -> float:
     """Standard deviation of the velocity after that time, m/s: by that acceleration (m/s2) in every direction, but not
     more than a vehicle as fast as this one can change it."""
     return min(acceleration * seconds, speed + acceleration)
+
+
+def combined(of_scene: Array, of_prediction: Array) -> Array:
+    """Covariance (3, 3) [m] of a position that the scene and the motion so far show; 1 m of the scene says nothing."""
+    information, axes = np.linalg.eigh(np.linalg.inv(of_scene))
+    shown = (axes * np.maximum(information - 1, 0)) @ axes.T
+    return np.asarray(np.linalg.inv(shown + np.linalg.inv(of_prediction)))

@@ -60,10 +60,13 @@ class Bridge:
         tries: scans of the stretch that were registered to the map before.
     """
 
-    def __init__(self, registration: ScanRegistration, T: Array, twist: Array | None, limits: Limits) -> None:
-        """`T` (4, 4) is the last pose before the pause."""
+    def __init__(
+        self, registration: ScanRegistration, T: Array, twist: Array | None, of_velocity: Array, limits: Limits
+    ) -> None:
+        """`T` (4, 4) is the last pose before the pause, `of_velocity` (3, 3) [m/s] the covariance of that there."""
         self.registration = registration
         self.twist = twist
+        self._of_velocity = of_velocity
         self.tries = 0
         self._T = T
         self._limits = limits
@@ -80,12 +83,14 @@ class Bridge:
     def expected(self, T: Array, dt: float) -> Prediction:
         """Of the second scan of the stretch, `dt` s after the first at T (4, 4): the motion before, less certain."""
         sigma = dt * velocity_change(self._speed, self._seconds, self._limits.acceleration)
-        return Prediction([predicted(T, self._motion, dt)], 2.0, np.eye(6) / sigma**2)
+        unknown = sigma**2 * np.eye(6)
+        unknown[3:, 3:] += self._of_velocity * dt**2
+        return Prediction([predicted(T, self._motion, dt)], 2.0, np.linalg.inv(unknown).astype(np.float64))
 
     def covariance(self, T_stretch: Array) -> Array:
         """(6, 6) [rad, m] of a pose (4, 4) of the stretch relative to the last one before the pause."""
         A = se3.adjoint(se3.inverse(T_stretch) @ self._T_begin)
-        of_begin = covariance(self._speed, self._seconds, self._limits.acceleration)
+        of_begin = covariance(self._speed, self._seconds, self._limits.acceleration, self._of_velocity)
         return np.asarray(A @ of_begin @ A.T)
 
     def register(

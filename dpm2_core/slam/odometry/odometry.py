@@ -12,7 +12,7 @@ import numpy as np
 from dpm2_core.config import Settings
 from dpm2_core.frame import Array, Frame, OdometryResult, Registration, State
 from dpm2_core.geometry import se3
-from dpm2_core.geometry.motion import covariance, predicted
+from dpm2_core.geometry.motion import OPEN, combined, covariance, predicted
 from dpm2_core.slam.bridge import Bridge, Limits
 from dpm2_core.slam.odometry.keyframe_selection import KeyframeSelector
 from dpm2_core.slam.preprocess import Scan
@@ -50,6 +50,7 @@ _FITS_WELL = 0.7
 _SLOWEST = 2.0  # s: no stream has a longer period
 _KNOWN = 0.5  # m and rad, standard deviation of the second pose, still skewed: where the points find it alone
 _RHYTHM = 9  # periods: their median is that of the stream
+_ANY_VELOCITY = 15.0**2 * np.eye(3)  # covariance, m/s: so much until two scans are registered
 
 
 class Odometry:
@@ -74,6 +75,7 @@ class Odometry:
         """Forget everything; the next scan is the first."""
         self._T = np.eye(4)
         self._twist: Array | None = None  # unknown until two scans are registered
+        self._of_velocity = _ANY_VELOCITY
         self._covariance = np.zeros((6, 6))
         self._stamp: int | None = None
         self._registered = np.eye(4), 0.0  # the last registered pose, and the seconds since
@@ -146,9 +148,10 @@ class Odometry:
         T_registered, seconds = self._registered
         if self._bridge is None:
             limits = Limits(self._settings.steadiness, self._settings.degraded_sigma)
-            self._bridge = Bridge(self._registration, T_registered, self._twist, limits)
+            self._bridge = Bridge(self._registration, T_registered, self._twist, self._of_velocity, limits)
             self._left = self._clock - seconds - dt
         self._registration, self._twist, self._first = self._registration.fresh(), None, None
+        self._of_velocity = _ANY_VELOCITY
         self._T = self._bridge.begin(self._clock - self._left)
         return self._T
 
@@ -181,7 +184,7 @@ class Odometry:
             return self._registered_from_rest(scan, T_predicted, dt)
         seconds = self._registered[1] + dt
         widen = min(seconds / dt, 5.0)
-        information = np.eye(6) / (self._settings.steadiness * seconds * seconds) ** 2
+        information = np.linalg.inv(self._of_prediction(seconds)).astype(np.float64)
         result = self._registration.register(scan, Prediction([T_predicted], widen, information))
         return self._gated(result, T_predicted, dt)
 
@@ -202,7 +205,8 @@ class Odometry:
         """Reject what no vehicle can do; the allowance grows while nothing has been registered."""
         time = self._registered[1] + dt
         meters, degrees = se3.magnitude(se3.inverse(T_predicted) @ result.T_target_source)
-        if result.ok and meters > 0.5 + self._settings.max_acceleration * time * time:
+        unknown = 3 * float(np.linalg.eigvalsh(self._of_velocity)[-1]) ** 0.5 * time
+        if result.ok and meters > 0.5 + unknown + self._settings.max_acceleration * time * time:
             return replace(result, ok=False, reason=f"{meters:.1f} m from the prediction")
         if result.ok and degrees > 3 + self._settings.max_turn * time:
             return replace(result, ok=False, reason=f"{degrees:.0f} deg from the prediction")
@@ -227,16 +231,20 @@ class Odometry:
             self._coast(dt)
             return
         if registration.method != "first":
+            of_motion = combined(registration.of_scene[3:, 3:], self._of_prediction(seconds + dt)[3:, 3:])
+            self._of_velocity = of_motion / (seconds + dt) ** 2
             # Not from the predicted pose of the frame before, of which an error would count as motion in one period.
             self._twist = se3.log(se3.inverse(T_registered) @ registration.T_target_source) / (seconds + dt)
         if self._bridge is None:
             self._failures = 0
         self._follow(scan, registration)
+        if registration.method != "first" and registration.worst_sigma >= OPEN:
+            self._covariance[3:, 3:] += of_motion  # what the scene leaves open ends at 1 m; the motion does not
 
     def _follow(self, scan: Scan, registration: Registration) -> None:
         self._T = registration.T_target_source
         self._registered = self._T, 0.0
-        self._covariance = registration.covariance
+        self._covariance = registration.covariance.copy()
         self._registration.update(scan, self._T)
 
     def _coast(self, dt: float) -> None:
@@ -252,10 +260,16 @@ class Odometry:
         if self._bridge is not None:
             self._covariance = self._covariance + self._bridge.covariance(self._T)
 
+    def _of_prediction(self, seconds: float) -> Array:
+        """Covariance (6, 6) [rad, m] of a pose that is predicted from one that was registered so long before."""
+        result = np.eye(6) * (self._settings.steadiness * seconds * seconds) ** 2
+        result[3:, 3:] += self._of_velocity * seconds**2
+        return result
+
     def _unknown(self, dt: float) -> Array:
         """Covariance (6, 6) of what is only predicted."""
         speed = 0.0 if self._twist is None else float(np.linalg.norm(self._twist[3:]))
-        return covariance(speed, self._registered[1] + dt, self._settings.steadiness)
+        return covariance(speed, self._registered[1] + dt, self._settings.steadiness, self._of_velocity)
 
     def _state(self, registration: Registration) -> State:
         if self._failures >= self._settings.lost_after:

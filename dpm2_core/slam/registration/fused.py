@@ -24,6 +24,9 @@ _LED = np.diag(np.repeat([np.radians(2), 0.5], 3) ** -2.0)
 _SURE_MOTION = 1.0  # m, standard deviation of a prediction from which the points alone find their pose
 _SURE_FIT = 0.5  # fraction of the points that fit
 _SURE_SIGMA = 0.08  # m, standard deviation of a position with no direction left open
+_AT_MOST = 25.0
+"""Times the information of the points. Where they leave a direction open, as on a highway, most of what a scan shows
+looks alike all along it: the network then matches what moves with the sensor, and is sure of standing still."""
 
 
 class FusedScanRegistration:
@@ -84,11 +87,11 @@ class FusedScanRegistration:
             starts = [points.T_target_source, neural.T_target_source]
             likelier = self._geometric.register(scan, replace(prediction, starts=starts))
             if likelier.ok and agree(likelier, neural):
-                return _mean(likelier, neural, None)
+                return self._mean(likelier, neural, None)
             return _because(points, f"neural and points {_apart(points, neural)} apart")
         if not self._always and _sure(points):
             return points  # all that they needed was the start
-        return _mean(points, neural, prediction.information)
+        return self._mean(points, neural, prediction.information)
 
     def _led(self, scan: Scan, neural: Registration) -> Registration:
         """The points from the pose of the network, when the motion so far did not lead them to a result."""
@@ -96,10 +99,28 @@ class FusedScanRegistration:
         if not points.ok:
             return replace(neural, reason=f"not refined: {points.reason}")
         if agree(points, neural):
-            return _mean(points, neural, None)
+            return self._mean(points, neural, None)
         xi = _difference(points, neural)
         why = f"neural and points {_apart(points, neural)} apart"
         return replace(neural, covariance=neural.covariance + np.outer(xi, xi), reason=why)
+
+    def _mean(self, points: Registration, neural: Registration, prior: Array | None) -> Registration:
+        """Both by their information, along the directions that the network claims to know better than the points.
+
+        Elsewhere its errors would count for more than it adds: its covariance is too small and that of the points too
+        large. Without images, what it claims to know and the points leave open altogether counts for nothing. The
+        information of the prediction, prior (6, 6), holds the points but is no part of the uncertainty.
+        """
+        of_points, of_network = np.linalg.inv(points.of_scene), np.linalg.inv(neural.of_scene + MAP_NOISE)
+        held = of_points if prior is None else of_points + prior
+        ratio, axes = eigh(of_network, of_points)
+        dual = of_points @ axes
+        most = np.inf if self.uses_images else _AT_MOST
+        of_network = (dual * np.where((ratio < 1) | (ratio > most), 0, ratio)) @ dual.T
+        step = np.linalg.solve(held + of_network, of_network @ _difference(points, neural))
+        T = se3.orthonormalized(points.T_target_source @ se3.exp(step))
+        covariance = np.linalg.inv(of_points + of_network) + points.covariance - points.of_scene
+        return replace(points, T_target_source=T, covariance=covariance, method="refined")
 
     def update(self, scan: Scan, T_odom_lidar: Array) -> bool:
         kept = self._geometric.update(scan, T_odom_lidar)
@@ -111,23 +132,6 @@ class FusedScanRegistration:
 def _sure(points: Registration) -> bool:
     """Whether they fit well, with no direction left open."""
     return points.ok and points.confidence >= _SURE_FIT and points.worst_sigma <= _SURE_SIGMA
-
-
-def _mean(points: Registration, neural: Registration, prior: Array | None) -> Registration:
-    """Both by their information, along the directions that the network claims to know better than the points.
-
-    Elsewhere its errors would count for more than it adds: its covariance is too small and that of the points too
-    large. The information of the prediction, prior (6, 6), holds the points but is no part of the uncertainty.
-    """
-    of_points, of_network = np.linalg.inv(points.of_scene), np.linalg.inv(neural.of_scene + MAP_NOISE)
-    held = of_points if prior is None else of_points + prior
-    ratio, axes = eigh(of_network, of_points)
-    dual = of_points @ axes
-    of_network = (dual * np.where(ratio < 1, 0, ratio)) @ dual.T
-    step = np.linalg.solve(held + of_network, of_network @ _difference(points, neural))
-    T = se3.orthonormalized(points.T_target_source @ se3.exp(step))
-    covariance = np.linalg.inv(of_points + of_network) + points.covariance - points.of_scene
-    return replace(points, T_target_source=T, covariance=covariance, method="refined")
 
 
 def _difference(a: Registration, b: Registration) -> Array:

@@ -9,9 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dpm2_core.geometry import se3
-from dpm2_core.geometry.motion import between, covariance, predicted
+from dpm2_core.geometry.motion import between, combined, covariance, predicted
 
 TWIST = np.array([0.01, -0.02, 0.3, 15.0, 0.2, -0.1])
+OF_VELOCITY = np.diag([0.2, 0.2, 0.2]) ** 2
 
 
 @given(st.floats(0, 5), st.floats(0, 5))
@@ -33,11 +34,30 @@ def test_an_even_change_of_the_motion_covers_its_mean() -> None:
 
 @given(st.floats(0, 40), st.floats(0.01, 60), st.floats(0.01, 60))
 def test_uncertainty_grows_with_time(speed: float, a: float, b: float) -> None:
-    early, late = (np.diag(covariance(speed, t, 10.0)) for t in sorted((a, b)))
+    early, late = (np.diag(covariance(speed, t, 10.0, OF_VELOCITY)) for t in sorted((a, b)))
     assert (late >= early).all()
-    assert se3.is_covariance(covariance(speed, a, 10.0))
+    assert se3.is_covariance(covariance(speed, a, 10.0, OF_VELOCITY))
 
 
 def test_a_heading_of_which_nothing_is_known_is_uniform() -> None:
     """The standard deviation of a uniform angle is pi over the root of 3."""
-    assert np.sqrt(covariance(10.0, 60.0, 10.0)[2, 2]) == pytest.approx(np.pi / np.sqrt(3))
+    assert np.sqrt(covariance(10.0, 60.0, 10.0, OF_VELOCITY)[2, 2]) == pytest.approx(np.pi / np.sqrt(3))
+
+
+def test_an_unknown_velocity_makes_the_prediction_uncertain_along_it() -> None:
+    """10 m/s along x for 3 s: 30 m, and what the vehicle may have done since."""
+    sigma = np.sqrt(np.diag(covariance(0.0, 3.0, 1.0, np.diag([10.0, 0, 0]) ** 2)))
+    assert sigma[3] == pytest.approx(np.hypot(30, sigma[4]))
+    assert sigma[4] < 5
+
+
+@given(st.floats(0.01, 5), st.floats(0.01, 0.3), st.floats(-3, 3))
+def test_a_direction_that_the_scene_leaves_open_keeps_the_uncertainty_of_the_prediction(
+    predicted_sigma: float, seen_sigma: float, heading: float
+) -> None:
+    """Scene: `seen_sigma` across, 1 m along, which says nothing; prediction alike in both."""
+    R = se3.exp([0, 0, heading, 0, 0, 0])[:3, :3]
+    of_scene = R @ np.diag([1.0, seen_sigma**2, seen_sigma**2]) @ R.T
+    result = R.T @ combined(of_scene, predicted_sigma**2 * np.eye(3)) @ R
+    assert result[0, 0] == pytest.approx(predicted_sigma**2)
+    assert result[1, 1] <= min(predicted_sigma**2, seen_sigma**2 / (1 - seen_sigma**2)) * (1 + 1e-9)
