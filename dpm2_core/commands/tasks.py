@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -13,7 +13,11 @@ from dpm2_core.commands.options import JsonFile, progress_bar, show
 from dpm2_core.commands.train import ConfigOption, OutOption, ResumeOption, SetOption, reject_overwriting, train
 from dpm2_core.config import load_settings
 from dpm2_core.console import Console
+from dpm2_core.errors import UsageError
 from dpm2_core.tables import FigureTable
+
+if TYPE_CHECKING:  # torch is slow to import
+    from dpm2_core.tasks.task import TaskTraining
 
 SourceArgument = Annotated[
     Path,
@@ -38,6 +42,12 @@ def tasks_data(
             task, description=f"{out}/{name}", completed=done, total=total))  # fmt: skip
 
 
+SequencesOption = Annotated[
+    str | None,
+    typer.Option(
+        help="Sequences of SRC, or numbers of its pairs, with commas, such as 00,01; all there are otherwise."
+    ),
+]
 ValOption = Annotated[Path | None, typer.Option("--val", help="Scans to measure on during training, as SRC.")]
 
 
@@ -51,6 +61,8 @@ def _add(name: str, help_: str) -> None:
         out: OutOption = Path("out") / name,
         resume: ResumeOption = False,
         val: ValOption = None,
+        sequences: SequencesOption = None,
+        val_sequences: SequencesOption = None,
         slam_weight: Annotated[
             float | None,
             typer.Option(min=0, help="gamma: weight of the SLAM loss; 0 without. Same as slam.gamma."),
@@ -59,9 +71,15 @@ def _add(name: str, help_: str) -> None:
             int | None, typer.Option(min=1, help="The SLAM loss counts in every K-th epoch. Same as slam.every.")
         ] = None,
     ) -> None:
+        from dpm2_core.tasks.task import task_type  # torch is slow to import
+
         short = {"slam.gamma": slam_weight, "slam.every": slam_every}
         overrides = [*(settings or []), *(f"{key}={value}" for key, value in short.items() if value is not None)]
-        _train(name, src, (config, overrides), out, resume, val)
+        chosen = load_settings(task_type(name).training_type, config, overrides)
+        sets = (src, _names(sequences)), None if val is None else (val, _names(val_sequences))
+        if val is None and val_sequences is not None:
+            raise UsageError("--val-sequences: of which folder? give --val")
+        _train(name, chosen, out, resume, sets)
 
     command: Callable[..., None] = run
     command.__doc__ = help_
@@ -81,25 +99,36 @@ def movers(
     out: OutOption = Path("out/movers"),
     resume: ResumeOption = False,
     val: ValOption = None,
+    sequences: SequencesOption = None,
 ) -> None:
     """Movers: which points are of things that move or could. It has no SLAM loss."""
-    _train("movers", src, (config, settings or []), out, resume, val)
+    from dpm2_core.tasks.task import task_type  # torch is slow to import
+
+    chosen = load_settings(task_type("movers").training_type, config, settings or [])
+    _train("movers", chosen, out, resume, ((src, _names(sequences)), None if val is None else (val, ())))
 
 
-def _train(
-    name: str, src: Path, settings: tuple[Path | None, Sequence[str]], out: Path, resume: bool, val: Path | None
-) -> None:
-    """Train a task with the settings of a YAML file and of overrides."""
+Scans = tuple[Path, Sequence[str]]
+"""A folder, and the sequences in it."""
+
+
+def _train(name: str, settings: TaskTraining, out: Path, resume: bool, sets: tuple[Scans, Scans | None]) -> None:
+    """Train a task on the first scans, measuring on the second."""
     from dpm2_core.tasks.open import open_scans  # torch is slow to import
     from dpm2_core.tasks.task import task_type
     from dpm2_core.tasks.training import WEIGHTS, new_task, train_task
 
     reject_overwriting(out, resume)
     kind = task_type(name)
-    chosen = load_settings(kind.training_type, *settings)
-    scans = open_scans(src, kind.needs)
-    train_task(new_task(name, chosen), scans, out, resume, None if val is None else open_scans(val, kind.needs))
-    Console(stderr=True).print(f"{out / WEIGHTS}: written", soft_wrap=True)
+    (src, sequences), val = sets
+    scans = open_scans(src, kind.learns_from(settings), sequences)
+    measured = None if val is None else open_scans(val[0], kind.needs, val[1])
+    train_task(new_task(name, settings), scans, out, resume, measured)
+    typer.echo(f"{out / WEIGHTS}: written", err=True)
+
+
+def _names(text: str | None) -> tuple[str, ...]:
+    return () if text is None else tuple(part.strip() for part in text.split(",") if part.strip())
 
 
 def eval_task(
@@ -109,6 +138,7 @@ def eval_task(
     json_file: JsonFile = None,
     picture: Annotated[Path | None, typer.Option(help="PNG of one scan to write.")] = None,
     frame: Annotated[int, typer.Option(min=0, help="Scan of the image, counted through all sequences.")] = 0,
+    sequences: SequencesOption = None,
     slam: Annotated[bool, typer.Option("--slam", help="Odometry on what the task makes, too; needs poses.")] = False,
 ) -> None:
     """Measure a trained task on scans that it has not learned from."""
@@ -118,7 +148,7 @@ def eval_task(
 
     needs = task_type(name).needs
     task = load_task(name, weights)
-    scans = open_scans(src, needs)
+    scans = open_scans(src, needs, _names(sequences))
     if picture is not None:
         draw(task, scans, frame, picture)
         Console(stderr=True).print(f"{picture}: written", soft_wrap=True)
@@ -126,7 +156,7 @@ def eval_task(
     if slam:
         from dpm2_core.tasks.slam_figures import slam_figures  # imports the whole SLAM
 
-        figures |= slam_figures(task, src)
+        figures |= slam_figures(task, src, _names(sequences))
     table = FigureTable(f"{name}, {len(scans)} scans of {src}", names=["figure"], figures=["value"])
     for figure, value in figures.items():
         table.add_row(figure, f"{value:.4g}")

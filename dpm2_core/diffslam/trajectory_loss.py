@@ -45,6 +45,10 @@ class SlamLossSettings(Settings):
     truncate: int = Field(default=0, ge=0)
     """Gradients do not pass beyond every so many scans of the trajectory: long windows do not explode. 0: they pass."""
 
+    placebo: bool = False
+    """For experiments: a window is compared with the trajectory of the window before. The same loss and bound, without
+    what it has to say."""
+
 
 def trajectory_loss(poses: Tensor, reference: Tensor, rotation_weight: float = 25.0) -> Tensor:
     """Eq. 3: mean of |t - t_ref|^2 + rotation_weight |Log(R_ref^T R)|^2 over all poses but the first; a scalar, m2.
@@ -105,6 +109,7 @@ class SlamLoss(torch.nn.Module):
         super().__init__()
         self.settings = settings or SlamLossSettings()
         self._references: dict[tuple[tuple[str, int], ...], tuple[Tensor, Tensor | None]] = {}
+        self._before: Tensor | None = None
 
     def forward(
         self,
@@ -132,6 +137,8 @@ class SlamLoss(torch.nn.Module):
         if frames is not None:
             check_contiguous(frames, len(pred_clouds))
         reference, guess = self._reference(target_clouds, target_weights, guess, frames)
+        if self.settings.placebo:
+            reference, self._before = reference if self._before is None else self._before, reference
         poses = odometry(pred_clouds, weights, guess, self.settings, "predicted clouds")
         return trajectory_loss(poses, reference.to(poses.device), self.settings.rotation_weight)
 

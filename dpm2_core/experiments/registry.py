@@ -37,6 +37,16 @@ EXPERIMENTS: dict[str, Listed] = {
         "black images, or a box before the LiDAR, in 5 to 100 % of the frames",
         "robustness:ROBUSTNESS",
     ),
+    "gndnet": Listed(
+        "Differentiable SLAM, table 1", "the ground by GndNet, without and with the SLAM loss", "task_tables:gndnet"
+    ),
+    "dslr": Listed("Differentiable SLAM, table 2", "scans without what moves by DSLR, likewise", "task_tables:dslr"),
+    "dslr-slam": Listed(
+        "Differentiable SLAM, table 3 and figure 3", "odometry on what DSLR makes, likewise", "task_tables:dslr_slam"
+    ),
+    "ae-lidar": Listed(
+        "Differentiable SLAM, table 4", "scans as short codes by AE_lidar, likewise", "task_tables:ae_lidar"
+    ),
 }
 
 
@@ -65,6 +75,9 @@ def carry_out(name: str, request: Request, progress: Progress | None = None) -> 
     for stage in experiment.parts(request):
         figures |= run_parts(stage, request.out, request.workers, progress)
     outcome = experiment.outcome(request, figures)
+    commits = sorted({str(part["part"]["commit"]) for part in figures.values()})
+    if len(commits) > 1:
+        outcome.notes.append(f"parts were made at several commits: {', '.join(commits)}")
     write_record(request.out / f"{name}.json", name, _record(request, outcome, figures), threads=request.workers)
     return outcome
 

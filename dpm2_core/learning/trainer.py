@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The loop that all trainings share: AdamW, warm-up and cosine, clipping, EMA, checkpoints, several processes."""
+"""The loop that all trainings share: optimizer, warm-up and cosine, clipping, EMA, checkpoints, several processes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from pydantic import Field
@@ -28,6 +28,14 @@ from dpm2_core.network.encoder import to_device
 class OptimizerSettings(Settings):
     """Optimisation."""
 
+    kind: Literal["adamw", "adam", "sgd"] = "adamw"
+    """AdamW; Adam, whose decay is a part of the gradient; or stochastic gradient descent with momentum."""
+    momentum: float = Field(0.9, ge=0, lt=1)
+    """Of sgd; of the others the first beta."""
+    drop_every: int = Field(0, ge=0)
+    """Steps after which the rate is multiplied by `drop`, again and again, instead of the cosine; 0: the cosine."""
+    drop: float = Field(0.8, gt=0, le=1)
+    """See `drop_every`."""
     steps: int = Field(3000, gt=0)
     """Batches."""
     rate: float = Field(1e-3, gt=0)
@@ -81,9 +89,11 @@ def process_group() -> Iterator[tuple[int, int, torch.device]]:
 
 
 def learning_rate(settings: OptimizerSettings, step: int) -> float:
-    """Linear warm-up, then a cosine from `rate` to `final_rate`."""
+    """Linear warm-up, then a cosine from `rate` to `final_rate`, or drops."""
     if step < settings.warmup:
         return settings.rate * (step + 1) / settings.warmup
+    if settings.drop_every:
+        return float(settings.rate * settings.drop ** (step // settings.drop_every))
     done = (step - settings.warmup) / max(1, settings.steps - settings.warmup)
     return settings.final_rate + (settings.rate - settings.final_rate) * (1 + math.cos(math.pi * min(done, 1))) / 2
 
@@ -95,6 +105,17 @@ def parameter_groups(module: nn.Module, decay: float) -> list[dict[str, Any]]:
         {"params": [p for p in trained if p.ndim >= 2], "weight_decay": decay},
         {"params": [p for p in trained if p.ndim < 2], "weight_decay": 0.0},
     ]
+
+
+def make_optimizer(module: nn.Module, settings: OptimizerSettings) -> torch.optim.Optimizer:
+    """What the settings name; AdamW's decay is on matrices only, that of the others on all, as their users have it."""
+    if settings.kind == "adamw":
+        groups = parameter_groups(module, settings.decay)
+        return torch.optim.AdamW(groups, settings.rate, betas=(settings.momentum, 0.999))
+    trained = [p for p in module.parameters() if p.requires_grad]
+    if settings.kind == "adam":
+        return torch.optim.Adam(trained, settings.rate, (settings.momentum, 0.999), weight_decay=settings.decay)
+    return torch.optim.SGD(trained, settings.rate, settings.momentum, weight_decay=settings.decay)
 
 
 @torch.no_grad()
@@ -140,7 +161,7 @@ class Trainer:
         with process_group() as (rank, world, device):
             module = self.module.to(device)
             ema = copy.deepcopy(module).requires_grad_(False)
-            optimizer = torch.optim.AdamW(parameter_groups(module, self.settings.decay), self.settings.rate)
+            optimizer = make_optimizer(module, self.settings)
             start = load_checkpoint(self.out / "checkpoint.pt", module, ema, optimizer) if resume else 0
             steps = range(start, self.settings.steps if until is None else min(until, self.settings.steps))
             batches = self.batches(start, rank)

@@ -38,7 +38,7 @@ class AeLidarTraining(SlamTaskTraining):
     divergence_warmup: int = Field(default=150, ge=1)
     """Epochs until the divergence of a VAE counts in full."""
     rate: float = Field(default=5e-4, gt=0)
-    """Peak learning rate of AdamW."""
+    """Peak learning rate."""
     batch: int = Field(default=4, ge=1)
     """Windows of a step: means are over more than one place."""
     clip: float = Field(default=1000.0, gt=0)

@@ -44,6 +44,10 @@ class DslrTraining(SlamTaskTraining):
     """All, those of the third stage included; only there does the SLAM loss count."""
     adversarial: float = Field(default=10.0, ge=0)
     """What the discriminator's cross entropy counts for, beside the sum of absolute errors of an image."""
+    adversarial_shared: bool = False
+    """Divide that by the scans of a step, as the authors do in the third stage: theirs is 10 over 128."""
+    static_only: bool = True
+    """The autoencoder learns from static scans alone. False: from the others, too, as the authors'."""
     batch: int = Field(default=4, ge=1)
     """Windows of a step: pairs of codes are of different places, and means are over more than one place."""
     clip: float = Field(default=1000.0, gt=0)
@@ -88,9 +92,12 @@ class DslrTask(Task):
         """Loss of the stage; SLAM on the translated scans against that on the static twins."""
         static = self._reader.read(window, static=True, keep=True)
         network = self.network
-        if self.stage == 1:
+        if self.stage == 1 and self.settings.static_only:
             return image_error(network.decoder(network.static_encoder(static.images)), static.images), None
         dynamic = self._reader.read(window, keep=True)
+        if self.stage == 1:
+            both = torch.cat([static.images, dynamic.images])
+            return image_error(network.decoder(network.static_encoder(both)), both), None
         other = torch.randperm(len(window))
         if self.stage == 2:
             codes, moved = network.static_encoder(torch.cat([static.images, dynamic.images])).chunk(2)
@@ -109,7 +116,8 @@ class DslrTask(Task):
         def slam() -> Tensor:
             return slam_of(self.slam_loss, made, static, self.settings.network.image.scale, self.windows(len(made)))
 
-        return image_error(made, static.images) + self.settings.adversarial * passes, slam
+        weight = self.settings.adversarial / (len(window) if self.settings.adversarial_shared else 1)
+        return image_error(made, static.images) + weight * passes, slam
 
     def evaluate(self, scans: TaskScans) -> dict[str, float]:
         """Means over the scans.

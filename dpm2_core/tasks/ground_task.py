@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
@@ -22,8 +22,8 @@ from dpm2_core.network.perception.gndnet import (
     ground_metrics,
     obstacle_weight,
 )
-from dpm2_core.tasks.scan import TaskScan, TaskScans
-from dpm2_core.tasks.task import SlamTaskTraining, Task
+from dpm2_core.tasks.scan import RequiredData, TaskScan, TaskScans
+from dpm2_core.tasks.task import SlamTaskTraining, Task, TaskTraining
 from dpm2_core.tasks.training import mean_figures
 
 GROUND = (40, 44, 48, 49, 60, 72)
@@ -67,15 +67,25 @@ class GroundTask(Task):
         self.net = GroundNet(settings.network)
         self.slam_loss = SlamLoss(settings.slam_loss)
 
+    @classmethod
+    def learns_from(cls, settings: TaskTraining) -> Sequence[RequiredData]:
+        """Labels, unless the SLAM loss can learn from scans without."""
+        assert isinstance(settings, GroundTraining)
+        return () if settings.slam.gamma > 0 else cls.needs
+
     def losses(self, window: list[TaskScan]) -> tuple[Tensor, Callable[[], Tensor]]:
         """Loss of the elevation; SLAM on all points, weighted by how far they are above the predicted ground.
 
-        The reference sees the same points by their height above the true ground.
+        The reference sees the same points by their height above the true ground; of a scan without labels, which has no
+        loss of its own but the curvature, it sees all.
+
+        Raises:
+            UsageError: a scan without labels in a training that has no SLAM loss to learn from it.
         """
         network = self.settings.network
         turn, up = self._moved()
         clouds = [scan.points @ turn.T + up for scan in window]
-        pairs = [elevation_labels(c, ground_of(scan)[0], network) for c, scan in zip(clouds, window, strict=True)]
+        pairs = [elevation_labels(c, self._ground(scan), network) for c, scan in zip(clouds, window, strict=True)]
         known = torch.stack([known for _, known in pairs])
         labels = torch.stack([filled(label, k) for label, k in pairs])
         elevation = self.net(clouds)
@@ -83,13 +93,22 @@ class GroundTask(Task):
         def slam() -> Tensor:
             xyz = [cloud[:, :3] for cloud in clouds]
             found = [obstacle_weight(c, e, network) for c, e in zip(xyz, elevation, strict=True)]
-            requested = [obstacle_weight(c, e, network) for c, e in zip(xyz, labels, strict=True)]
+            requested = [
+                torch.ones_like(w) if scan.labels is None else obstacle_weight(c, e, network)
+                for scan, c, e, w in zip(window, xyz, labels, found, strict=True)
+            ]
             parts = self.windows(len(xyz))
             return torch.stack([self.slam_loss(xyz[p], xyz[p], found[p], requested[p]) for p in parts]).mean()
 
         counts = known + self.settings.gaps * (~known & known.flatten(1).any(1)[:, None, None])
         loss = ground_loss(elevation, labels, counts, network)
         return loss, slam
+
+    def _ground(self, scan: TaskScan) -> Tensor:
+        """Which points (N,) are known to be of the ground."""
+        if scan.labels is None and self.settings.slam.gamma > 0:
+            return torch.zeros(len(scan.points), dtype=torch.bool, device=scan.points.device)
+        return ground_of(scan)[0]
 
     def _moved(self) -> tuple[Tensor, Tensor]:
         """A random roll, pitch and lift: (4, 4) and (4,) that points (N, 4) are turned and moved by."""
@@ -99,7 +118,7 @@ class GroundTask(Task):
         return turn.to(self.device), up.to(self.device)
 
     def evaluate(self, scans: TaskScans) -> dict[str, float]:
-        """Means over the scans of `ground_metrics`: mse (m2), miou, precision, recall."""
+        """Means over the scans of `ground_metrics`."""
         rows = []
         for i in range(len(scans)):
             scan = scans[i].to(self.device)

@@ -7,15 +7,18 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from dpm2_core.errors import UsageError
-from dpm2_core.tasks.pairs import open_pairs
+from dpm2_core.tasks.pairs import ArrayPair, open_pairs
 from dpm2_core.tasks.scan import RequiredData, ScanSequence, TaskScans
 from dpm2_core.tasks.semantic_kitti import kitti_runs, sequence_folders
 
 
-def open_scans(path: Path | str, needs: Sequence[RequiredData] = ()) -> TaskScans:
+def open_scans(path: Path | str, needs: Sequence[RequiredData] = (), sequences: Sequence[str] = ()) -> TaskScans:
     """The scans below a folder: a sequence, a data set of sequences/NN, or a folder of such; or pairs as DSLR has them.
 
     A gap in the numbers of the scans ends a sequence: what lies across it is no motion from one scan to the next.
+
+    Args:
+        sequences: names of their folders, such as 05, or numbers of pairs; empty: all there are.
 
     Raises:
         UsageError: no scans, something needed is missing, or a file of the wrong length; it names file and reason.
@@ -23,9 +26,30 @@ def open_scans(path: Path | str, needs: Sequence[RequiredData] = ()) -> TaskScan
     path = Path(path)
     if not path.is_dir():
         raise UsageError(f"{path}: no such folder")
-    sequences: list[ScanSequence] = list(open_pairs(path))
-    for folder in sequence_folders(path):
-        sequences += kitti_runs(folder, path, needs)
-    if not sequences:
+    found: list[ScanSequence] = [pair for pair in open_pairs(path) if not sequences or is_among(pair.number, sequences)]
+    for folder in folders_of(path, sequences):
+        found += kitti_runs(folder, path, needs)
+    if sequences:
+        _check_found(path, sequences, found)
+    if not found:
         raise UsageError(f"{path}: no scans; want sequences/NN/velodyne/NNNNNN.bin in or below it, or DSLR's pairs")
-    return TaskScans(sequences)
+    return TaskScans(found)
+
+
+def folders_of(path: Path, sequences: Sequence[str] = ()) -> list[Path]:
+    """The sequence folders below `path` of these names; all of them if none is named."""
+    return [folder for folder in sequence_folders(path) if not sequences or folder.name in sequences]
+
+
+def is_among(number: int, sequences: Sequence[str]) -> bool:
+    """Whether a pair of that number is named."""
+    return any(name.isdecimal() and int(name) == number for name in sequences)
+
+
+def _check_found(path: Path, sequences: Sequence[str], found: Sequence[ScanSequence]) -> None:
+    folders = {folder.name for folder in sequence_folders(path)}
+    pairs = {pair.number for pair in found if isinstance(pair, ArrayPair)}
+    missing = [name for name in sequences if name not in folders and not (name.isdecimal() and int(name) in pairs)]
+    if missing:
+        there = sorted(folders) + sorted(str(pair.number) for pair in open_pairs(path))
+        raise UsageError(f"{path}: no sequence {missing[0]}; there are {', '.join(there) or 'none'}")

@@ -4,7 +4,11 @@
 A pair is s3.npy and d3.npy in one folder (a prefix, as in tests3.npy and testd3.npy, is allowed), or files of the same
 number in two: s/ and d/, static/ and dynamic/, or static_out_npy/ and dynamic_out_npy/. An array is (N, 2, rows,
 columns) of d and z in units of 120 m, filled; or, before that, (N, rows, columns, 3 or 4) of x, y, z in m with zeros
-where there is no point.
+where there is no point; of these the authors leave out points whose x, y or z is among the least or the greatest
+hundredth of the array.
+
+True poses, where they are known, are in poses3.txt beside the pair of that number: a line of 12 numbers for each scan,
+T_world_lidar row by row.
 """
 
 from __future__ import annotations
@@ -18,13 +22,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dpm2_core.data.trajectory import read_trajectory
 from dpm2_core.errors import UsageError
+from dpm2_core.frame import Array
 from dpm2_core.network.perception.range_image import CHANNELS, RangeImageSettings, fill, to_points
-from dpm2_core.tasks.scan import ScanSequence, TaskScan
+from dpm2_core.tasks.scan import TaskScan
 
 SCALE = 120.0
 """What a value of one stands for in the preprocessed arrays, m."""
 _FOLDERS = (("s", "d"), ("static", "dynamic"), ("static_out_npy", "dynamic_out_npy"))
+_LOOKED_AT = 64
+"""Scans of an array whose percentiles are taken: those of all would read gigabytes."""
 _NAMED = re.compile(r"(.*?)([sd])(\d+)")
 
 
@@ -48,18 +56,17 @@ class ImageScan(TaskScan):
         return replace(self, **{name: getattr(self, name).to(device) for name in names})
 
 
-def open_pairs(path: Path) -> list[ScanSequence]:
+def open_pairs(path: Path) -> list[ArrayPair]:
     """A sequence for each pair of arrays in a folder, by number; none if it holds no arrays of these names.
 
     Raises:
         UsageError: an array without its twin, of another shape than it, or no array of numbers.
     """
-    found = [_ArrayPair.open(static, dynamic) for static, dynamic in _pairs(path)]
-    return [*found]
+    return [ArrayPair.open(static, dynamic, number, path) for number, static, dynamic in _pairs(path)]
 
 
-def _pairs(path: Path) -> Iterator[tuple[Path, Path]]:
-    """Static and dynamic files that belong together."""
+def _pairs(path: Path) -> Iterator[tuple[int, Path, Path]]:
+    """Number, static and dynamic file of those that belong together."""
     groups: list[tuple[dict[tuple[str, int], Path], dict[tuple[str, int], Path]]] = [
         (_numbered(path / s), _numbered(path / d)) for s, d in _FOLDERS
     ]
@@ -71,7 +78,7 @@ def _pairs(path: Path) -> Iterator[tuple[Path, Path]]:
         for key in sorted(static.keys() ^ dynamic.keys()):
             alone = static.get(key) or dynamic[key]
             raise UsageError(f"{alone}: no {'dynamic' if key in static else 'static'} twin of the same number")
-        yield from ((static[key], dynamic[key]) for key in sorted(static))
+        yield from ((key[1], static[key], dynamic[key]) for key in sorted(static))
 
 
 def _numbered(folder: Path) -> dict[tuple[str, int], Path]:
@@ -81,45 +88,89 @@ def _numbered(folder: Path) -> dict[tuple[str, int], Path]:
 
 
 @dataclass(frozen=True, eq=False)
-class _ArrayPair:
-    """One pair of arrays as a sequence of scans; the files stay on the disk."""
+class ArrayPair:
+    """One pair of arrays as a sequence of scans; the files stay on the disk.
+
+    Attributes:
+        number: of the pair. limits: (2, 3) least and greatest x, y, z of points that count, m; None for filled arrays.
+        root: folder of the pairs.
+    """
 
     static: np.ndarray
     dynamic: np.ndarray
     path: Path
+    number: int
+    root: Path
+    limits: Array | None = None
+    static_limits: Array | None = None
 
     @staticmethod
-    def open(static: Path, dynamic: Path) -> _ArrayPair:
+    def open(static: Path, dynamic: Path, number: int, root: Path) -> ArrayPair:
+        """Open two files.
+
+        Raises:
+            UsageError: as `open_pairs`.
+        """
         arrays = [_mapped(static), _mapped(dynamic)]
         if arrays[0].shape != arrays[1].shape:
             raise UsageError(f"{dynamic}: shape {arrays[1].shape}, its static twin {static.name} has {arrays[0].shape}")
-        return _ArrayPair(arrays[0], arrays[1], dynamic)
+        static_limits, limits = (_limits(array) for array in arrays)
+        return ArrayPair(arrays[0], arrays[1], dynamic, number, root, limits, static_limits)
+
+    @property
+    def name(self) -> str:
+        """What reports call it."""
+        return f"{self.path.parent.name}/{self.path.stem}"
+
+    @property
+    def poses(self) -> Array | None:
+        """(N, 4, 4) T_world_lidar; None where there is no file of them.
+
+        Raises:
+            UsageError: it does not have a pose for each scan.
+        """
+        path = self.root / f"poses{self.number}.txt"
+        if not path.is_file():
+            return None
+        found = read_trajectory(path)
+        if found.kind != "kitti" or len(found) != len(self):
+            raise UsageError(f"{path}: {len(found)} poses for {len(self)} scans; want 12 numbers a line, one for each")
+        return found.poses
 
     def __len__(self) -> int:
         return len(self.dynamic)
 
     def __getitem__(self, index: int) -> ImageScan:
-        image, mask = self._image(self.dynamic, index)
-        static_image, static_mask = self._image(self.static, index)
+        image, mask = self._image(self.dynamic, self.limits, index)
+        static_image, static_mask = self._image(self.static, self.static_limits, index)
         points, static = (_cloud(of, known) for of, known in ((image, mask), (static_image, static_mask)))
-        name = f"{self.path.parent.name}/{self.path.stem}"
-        return ImageScan(points, None, static, name, index, image, static_image, mask, static_mask)
+        return ImageScan(points, None, static, self.name, index, image, static_image, mask, static_mask)
 
-    def _image(self, array: np.ndarray, index: int) -> tuple[Tensor, Tensor]:
+    def _image(self, array: np.ndarray, limits: Array | None, index: int) -> tuple[Tensor, Tensor]:
         """Filled image and where it had points."""
         values = torch.from_numpy(np.array(array[index], np.float32))
         if not bool(values.isfinite().all()):
             raise UsageError(f"{self.path}: scan {index} of the pair has values that are not finite")
-        if _preprocessed(array):
+        if limits is None:
             return values, values[0] > 0
         d = torch.hypot(values[..., 0], values[..., 1])
-        mask = (d >= RangeImageSettings().min_distance) & (d < SCALE)
+        low, high = torch.from_numpy(limits).to(values)
+        usual = ((values[..., :3] >= low) & (values[..., :3] <= high)).all(-1)
+        mask = (d >= RangeImageSettings().min_distance) & (d < SCALE) & usual
         image = torch.stack([d, values[..., 2]]) * mask / SCALE
         return fill(image, mask), mask
 
 
 def _preprocessed(array: np.ndarray) -> bool:
     return array.shape[1] == CHANNELS
+
+
+def _limits(array: np.ndarray) -> Array | None:
+    """(2, 3) between which 98 % of all x, of all y and of all z lie, empty slots included, as the authors have it."""
+    if _preprocessed(array):
+        return None
+    some = np.asarray(array[:: max(1, len(array) // _LOOKED_AT), ..., :3], np.float64).reshape(-1, 3)
+    return np.asarray(np.nanpercentile(some, [1, 99], axis=0))
 
 
 def _mapped(path: Path) -> np.ndarray:

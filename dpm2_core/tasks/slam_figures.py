@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,46 +16,82 @@ from dpm2_core.evaluation.metrics import evaluate
 from dpm2_core.frame import Array, Frame
 from dpm2_core.slam.build import make_odometry
 from dpm2_core.slam.settings import SlamSettings
-from dpm2_core.tasks.open import open_scans
-from dpm2_core.tasks.semantic_kitti import sequence_folders
+from dpm2_core.tasks.open import folders_of, is_among, open_scans
+from dpm2_core.tasks.pairs import open_pairs
+from dpm2_core.tasks.scan import TaskScans
 from dpm2_core.tasks.task import Task
 from dpm2_core.tasks.training import mean_figures
 
 _PERIOD = 100_000_000  # ns between scans
 
 
-@torch.no_grad()
-def slam_figures(task: Task, path: Path) -> dict[str, float]:
+@dataclass(frozen=True, eq=False)
+class TaskRun:
+    """Odometry on each kind of cloud of one sequence: (N, 4, 4) poses by kind, and the true ones."""
+
+    sequence: str
+    truth: Array
+    poses: dict[str, Array]
+
+
+def slam_figures(task: Task, path: Path, sequences: Sequence[str] = ()) -> dict[str, float]:
     """Of each kind of cloud that the task has: `KIND_ate_m`, `KIND_rpe_m` and `KIND_rpe_deg`, means over the sequences.
 
     ATE is the root mean square position error after alignment (Umeyama, without scale), RPE the mean error from one
-    scan to the next. Loops are not closed.
+    scan to the next. Loops are not closed. `still_...` are those of a pose that never moves.
 
     Args:
-        path: as for `open_scans`, with the true poses of every sequence.
+        path: as for `open_scans`, with the true poses of every sequence. sequences: likewise.
 
     Raises:
         UsageError: the task makes no clouds, or there are no poses.
     """
-    rows = []
-    for folder in sequence_folders(path):
-        truth = open_source(folder).poses
-        scans = open_scans(folder, task.needs)
-        if truth is None or len(truth) != len(scans):
-            raise UsageError(f"{folder}: no true poses of its {len(scans)} scans; the SLAM cannot be evaluated")
+    return mean_figures([figures_of(run) for run in slam_runs(task, path, sequences)])
+
+
+def figures_of(run: TaskRun) -> dict[str, float]:
+    """The figures of one sequence."""
+    row: dict[str, float] = {}
+    for kind, poses in {**run.poses, "still": np.tile(np.eye(4), (len(run.truth), 1, 1))}.items():
+        figures = evaluate(run.truth, poses)
+        row[f"{kind}_ate_m"] = _number(figures.ape_rmse_m)
+        row[f"{kind}_rpe_m"] = _number(figures.rpe_trans_m)
+        row[f"{kind}_rpe_deg"] = _number(figures.rpe_rot_deg)
+    return row
+
+
+@torch.no_grad()
+def slam_runs(task: Task, path: Path, sequences: Sequence[str] = ()) -> Iterator[TaskRun]:
+    """The odometry on every sequence.
+
+    Raises:
+        UsageError: as `slam_figures`.
+    """
+    found = False
+    for name, truth, scans in _with_poses(task, path, sequences):
+        found = True
         made = [task.clouds(scans[i].to(task.device)) for i in range(len(scans))]
         if not made[0]:
             raise UsageError(f"{task.name}: makes no clouds that SLAM could run on")
-        row: dict[str, float] = {}
-        for kind in made[0]:
-            figures = evaluate(truth, _odometry([of[kind].cpu().numpy() for of in made]))
-            row[f"{kind}_ate_m"] = _number(figures.ape_rmse_m)
-            row[f"{kind}_rpe_m"] = _number(figures.rpe_trans_m)
-            row[f"{kind}_rpe_deg"] = _number(figures.rpe_rot_deg)
-        rows.append(row)
-    if not rows:
+        poses = {kind: _odometry([of[kind].cpu().numpy() for of in made]) for kind in made[0]}
+        yield TaskRun(name, truth, poses)
+    if not found:
         raise UsageError(f"{path}: no sequences with poses; want sequences/NN/velodyne and its poses")
-    return mean_figures(rows)
+
+
+def _with_poses(task: Task, path: Path, sequences: Sequence[str]) -> Iterator[tuple[str, Array, TaskScans]]:
+    """Name, true poses (N, 4, 4) and scans of every sequence."""
+    for pair in open_pairs(path):
+        if sequences and not is_among(pair.number, sequences):
+            continue
+        if (truth := pair.poses) is None:
+            raise UsageError(f"{path}: no poses{pair.number}.txt beside the pairs; the SLAM cannot be evaluated")
+        yield pair.name, truth, TaskScans([pair])
+    for folder in folders_of(path, sequences):
+        truth, scans = open_source(folder).poses, open_scans(folder, task.needs)
+        if truth is None or len(truth) != len(scans):
+            raise UsageError(f"{folder}: no true poses of its {len(scans)} scans; the SLAM cannot be evaluated")
+        yield folder.name, truth, scans
 
 
 def _odometry(clouds: list[np.ndarray]) -> Array:

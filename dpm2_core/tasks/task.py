@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import torch
 from pydantic import Field
@@ -41,8 +41,16 @@ class TaskTraining(Settings):
     """Windows of a step."""
     every: int = Field(default=2, ge=1)
     """Distance of these scans (the paper: every second)."""
+    optimizer: Literal["adamw", "adam", "sgd"] = "adamw"
+    """AdamW, or what the authors of the tasks use: sgd for GndNet, adam for DSLR and AE_lidar."""
+    momentum: float = Field(default=0.9, ge=0, lt=1)
+    """Of sgd; of the others the first beta (DSLR's authors: 0.1)."""
+    drop_every: int = Field(default=0, ge=0)
+    """Epochs after which the rate is multiplied by `drop`, instead of the cosine (GndNet's authors: 15); 0: cosine."""
+    drop: float = Field(default=0.8, gt=0, le=1)
+    """See `drop_every`."""
     rate: float = Field(default=1e-3, gt=0)
-    """Peak learning rate of AdamW."""
+    """Peak learning rate."""
     final_rate: float = Field(default=1e-5, ge=0)
     """At the end of the cosine."""
     warmup: int = Field(default=20, ge=0)
@@ -89,6 +97,11 @@ class Task(nn.Module, ABC):
     def __init__(self, settings: TaskTraining) -> None:
         super().__init__()
         self.settings = settings
+
+    @classmethod
+    def learns_from(cls, settings: TaskTraining) -> Sequence[RequiredData]:
+        """What scans must have to be learned from; to be measured on, always `needs`."""
+        return cls.needs
 
     @abstractmethod
     def losses(self, window: list[TaskScan]) -> tuple[Tensor, Callable[[], Tensor] | None]:

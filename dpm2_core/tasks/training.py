@@ -50,9 +50,10 @@ def train_task(
     windows = ContiguousWindows(scans.lengths, settings.window, settings.every, settings.seed)
     epoch = max(1, len(windows) // settings.batch)
     optimizer = OptimizerSettings(
-        steps=settings.epochs * epoch, rate=settings.rate, final_rate=settings.final_rate, warmup=settings.warmup,
-        decay=settings.decay, clip=settings.clip, ema=0.0, seed=settings.seed, compile=False, bf16=False,
-        save_every=epoch, validate_every=settings.validate_every * epoch,
+        kind=settings.optimizer, momentum=settings.momentum, drop_every=settings.drop_every * epoch,
+        drop=settings.drop, steps=settings.epochs * epoch, rate=settings.rate, final_rate=settings.final_rate,
+        warmup=settings.warmup, decay=settings.decay, clip=settings.clip, ema=0.0, seed=settings.seed, compile=False,
+        bf16=False, save_every=epoch, validate_every=settings.validate_every * epoch,
     )  # fmt: skip
 
     def batches(start: int, rank: int) -> Iterator[tuple[list[TaskScan], int]]:

@@ -234,3 +234,13 @@ def test_trajectory_loss_by_hand() -> None:
         trajectory_loss(poses, poses[:2])
     with pytest.raises(UsageError, match="trajectory loss"):
         trajectory_loss(poses[:1], poses[:1])
+
+
+def test_a_placebo_compares_with_the_window_before(scans: list[Tensor]) -> None:
+    """The first window has none before it and no loss; the next, which goes the other way, that of the first."""
+    loss = SlamLoss(SlamLossSettings(placebo=True, icp=CONVERGED.icp))
+    assert float(loss(scans, scans)) == 0
+    backwards = scans[::-1]
+    requested = trajectory_loss(odometry(backwards, settings=CONVERGED), odometry(scans, settings=CONVERGED))
+    assert float(loss(backwards, backwards)) == pytest.approx(float(requested), rel=1e-6)
+    assert float(requested) > 1

@@ -27,7 +27,7 @@ from dpm2_core.learning.train_registration import (
     set_pairs_of,
     train_registration,
 )
-from dpm2_core.learning.trainer import OptimizerSettings, learning_rate
+from dpm2_core.learning.trainer import OptimizerSettings, learning_rate, make_optimizer
 from dpm2_core.network.weights import network_settings, read_metadata
 
 from ...helpers import ranks
@@ -202,6 +202,24 @@ def _errors(module: RegistrationTraining, batch: object, plans: tuple) -> list[f
         float((torch.from_numpy(result.T_target_source[:3, 3]) - T[:3, 3]).norm())
         for result, T in zip(results, plan.T_target_source, strict=True)
     ]
+
+
+def test_the_rate_drops_instead() -> None:
+    """By 0.8 after every 15 steps, as GndNet's authors have it, after the warm-up."""
+    settings = OptimizerSettings(rate=1.0, warmup=2, drop_every=15, drop=0.8)
+    assert [round(learning_rate(settings, s), 6) for s in (0, 1, 2, 14, 15, 30, 45)] == [0.5, 1, 1, 1, 0.8, 0.64, 0.512]
+
+
+@pytest.mark.parametrize(("kind", "after"), [("adamw", 0.8), ("adam", 0.9), ("sgd", 0.7)])
+def test_one_step_of_each_optimizer_by_hand(kind: str, after: float) -> None:
+    """A weight of 1, a gradient of 2, rate 0.1, decay 1: AdamW steps by the rate and decays by it, Adam's decay is lost
+    in the size of the gradient, and SGD steps by the rate times gradient and decay together."""
+    module = torch.nn.Linear(1, 1, bias=False)
+    torch.nn.init.ones_(module.weight)
+    optimizer = make_optimizer(module, OptimizerSettings(kind=kind, rate=0.1, decay=1.0))
+    module.weight.grad = torch.full((1, 1), 2.0)
+    optimizer.step()
+    assert float(module.weight.detach()) == pytest.approx(after, abs=1e-6)
 
 
 def test_learning_rate() -> None:

@@ -50,30 +50,31 @@ def pairs(tmp_path: Path) -> Path:
     return write_pairs(tmp_path / "pairs")
 
 
-@pytest.fixture
-def write_drive() -> Callable[..., Path]:
-    """write_drive(folder, numbers=range(6), points=1500, seed=0): a sequence folder; returns it.
+def labelled_drive(folder: Path, numbers: Iterable[int] = range(6), points: int = 1500, seed: int = 0) -> Path:
+    """A sequence folder; returns it.
 
     Scans 0.6 m apart of a flat road and boxes: every 50th point unlabelled, the last 100 those of a car, which the twin
     in static/ lacks. The number of an object is in the upper half of its labels.
     """
+    noise = np.random.default_rng(seed)
+    world = boxes(noise, points).astype(np.float64)
+    labels = np.where(np.arange(len(world)) < points // 2, ROAD, BUILDING).astype("<u4")
+    labels[::50] = UNLABELLED
+    car = noise.uniform([4, 2, -1.6], [7, 4, -0.2], (100, 3))
+    for kind in ("velodyne", "labels", "static"):
+        (folder / kind).mkdir(parents=True)
+    T_world_scan = np.eye(4)
+    for number in numbers:
+        seen = se3.transform(se3.inverse(T_world_scan), world) + noise.normal(scale=0.01, size=world.shape)
+        cloud = np.column_stack([np.vstack([seen, car]), np.full(len(world) + 100, 0.5)]).astype("<f4")
+        cloud.tofile(folder / "velodyne" / f"{number:06d}.bin")
+        np.append(labels, np.full(100, CAR + (7 << 16), "<u4")).tofile(folder / "labels" / f"{number:06d}.label")
+        cloud[: len(world)].tofile(folder / "static" / f"{number:06d}.bin")
+        T_world_scan = T_world_scan @ MOTION
+    return folder
 
-    def write(folder: Path, numbers: Iterable[int] = range(6), points: int = 1500, seed: int = 0) -> Path:
-        noise = np.random.default_rng(seed)
-        world = boxes(noise, points).astype(np.float64)
-        labels = np.where(np.arange(len(world)) < points // 2, ROAD, BUILDING).astype("<u4")
-        labels[::50] = UNLABELLED
-        car = noise.uniform([4, 2, -1.6], [7, 4, -0.2], (100, 3))
-        for kind in ("velodyne", "labels", "static"):
-            (folder / kind).mkdir(parents=True)
-        T_world_scan = np.eye(4)
-        for number in numbers:
-            seen = se3.transform(se3.inverse(T_world_scan), world) + noise.normal(scale=0.01, size=world.shape)
-            cloud = np.column_stack([np.vstack([seen, car]), np.full(len(world) + 100, 0.5)]).astype("<f4")
-            cloud.tofile(folder / "velodyne" / f"{number:06d}.bin")
-            np.append(labels, np.full(100, CAR + (7 << 16), "<u4")).tofile(folder / "labels" / f"{number:06d}.label")
-            cloud[: len(world)].tofile(folder / "static" / f"{number:06d}.bin")
-            T_world_scan = T_world_scan @ MOTION
-        return folder
 
-    return write
+@pytest.fixture
+def write_drive() -> Callable[..., Path]:
+    """`labelled_drive`."""
+    return labelled_drive

@@ -212,3 +212,26 @@ def test_what_is_no_dslr_is_rejected(pairs: Path, tmp_path: Path) -> None:
         torch.rand(100, 4).numpy().tofile(drive / f"{i:06d}.bin")
     with pytest.raises(UsageError, match="no static/"):
         open_scans(tmp_path / "drive", DslrTask.needs)
+
+
+def test_the_authors_weights(pairs: Path) -> None:
+    """Stage 1 on both kinds of scans; in stage 3 the cross entropy counts for 10 over the scans of a step."""
+    scans = open_scans(pairs)
+    window = [scans[i] for i in range(4)]
+    losses = {}
+    for shared in (False, True):
+        torch.manual_seed(0)
+        task = DslrTask(training(network=NETWORK, adversarial=10.0, adversarial_shared=shared, static_only=not shared))
+        task.start_epoch(0)
+        torch.manual_seed(1)
+        first = float(task.losses(window)[0].detach())
+        task.start_epoch(task.settings.third)
+        torch.manual_seed(1)
+        losses[shared] = first, float(task.losses(window)[0].detach())
+    torch.manual_seed(0)
+    plain = DslrTask(training(network=NETWORK, adversarial=0.0))
+    plain.start_epoch(plain.settings.third)
+    torch.manual_seed(1)
+    bare = float(plain.losses(window)[0].detach())
+    assert losses[True][0] != losses[False][0]
+    assert losses[True][1] - bare == pytest.approx((losses[False][1] - bare) / 4, rel=0.02)

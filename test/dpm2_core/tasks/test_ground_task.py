@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from dpm2_core.diffslam.schedule import ScheduleSettings
+from dpm2_core.errors import UsageError
 from dpm2_core.network.perception.gndnet import elevation_labels, load
 from dpm2_core.tasks.drives import TaskDriveSettings, make_task_drives
 from dpm2_core.tasks.ground_task import GroundTask, GroundTraining, filled, ground_of, random_tilt
@@ -156,3 +159,22 @@ def test_the_shipped_weights_know_an_unseen_suburb(tmp_path: Path) -> None:
     found = measure(load_task("gndnet", SHIPPED), open_scans(tmp_path))
     assert found["mse"] < 0.3**2
     assert found["miou"] > 0.8
+
+
+def test_a_scan_without_labels_teaches_by_its_slam_alone(scans: TaskScans, tmp_path: Path) -> None:
+    """Its own loss is the curvature; the reference sees all its points, so that a ground that hides them costs. Without
+    a SLAM loss there is nothing to learn from it; a labelled scan's loss is as it was."""
+    task, window, offset = with_elevation(scans, 0.0)
+    labelled, _ = task.losses(window)
+    bare = [replace(scan, labels=None) for scan in window]
+    with pytest.raises(UsageError, match="scan 0: no labels"):
+        task.losses(bare)
+    task.settings = SETTINGS.model_copy(update={"slam": ScheduleSettings(gamma=1.0)})
+    loss, slam = task.losses(bare)
+    assert slam is not None
+    bend = SETTINGS.network.smoothness * sum(task.net.truth.diff(n=2, dim=a).square().mean() for a in (1, 2))
+    assert float(loss.detach()) == pytest.approx(float(bend))
+    assert float(torch.autograd.grad(slam(), offset)[0].abs()) > 0
+    assert float(task.losses(window)[0].detach()) == pytest.approx(float(labelled.detach()))
+    assert GroundTask.learns_from(task.settings) == ()
+    assert GroundTask.learns_from(SETTINGS) == ("labels",)

@@ -97,13 +97,44 @@ def test_metrics_by_hand() -> None:
     everything = torch.ones(600, dtype=torch.bool)
     flat = torch.full((16, 16), -1.733)
     perfect = ground_metrics(points, ground, everything, flat, SMALL)
-    assert perfect == {"mse": pytest.approx(0.0, abs=1e-9), "miou": 1.0, "precision": 1.0, "recall": 1.0}
+    shares = ("miou", "precision", "recall", "ground_iou", "ground_precision", "ground_recall")
+    assert {name: perfect[name] for name in shares} == dict.fromkeys(shares, 1.0)
+    assert perfect["mse"] == pytest.approx(0.0, abs=1e-9)
     low = ground_metrics(points, ground, everything, flat - 0.3, SMALL)
     assert low["mse"] == pytest.approx(0.09, abs=1e-5)
     assert (low["precision"], low["recall"], low["miou"]) == (0.1, 1.0, 0.05)
     counted = everything.clone()
     counted[60:330] = False  # half of the ground
     assert ground_metrics(points, ground, counted, flat - 0.3, SMALL)["precision"] == pytest.approx(60 / 330)
+
+
+def test_the_authors_figures_are_of_the_ground_and_count_points_from_one() -> None:
+    """Four points of ground 0.5 m above the car's level in one cell: their mean is 0.5 m, the authors' 2 / 5 m. Ground
+    that is found 0.3 m too low makes obstacles of all of it: precision of the ground 0 of 0, recall 0 of 4."""
+    points = torch.tensor([[0.5, 0.5, 0.5 - 1.733, 0.0]] * 4 + [[0.5, 0.5, 1.0, 0.0]] * 2)
+    ground = torch.tensor([True] * 4 + [False] * 2)
+    everything, true = torch.ones(6, dtype=torch.bool), torch.full((16, 16), 0.5 - 1.733)
+    found = ground_metrics(points, ground, everything, true, SMALL)
+    assert found["mse"] == pytest.approx(0.0, abs=1e-9)
+    assert found["mse_authors"] == pytest.approx((0.5 - 2.0 / 5) ** 2, rel=1e-4)
+    low = ground_metrics(points, ground, everything, true - 0.3, SMALL)
+    assert [low[f"ground_{name}"] for name in ("iou", "precision", "recall")] == [0, 0, 0]
+    high = ground_metrics(points, ground, everything, true + 5, SMALL)  # nothing stands on it
+    assert [high[f"ground_{name}"] for name in ("iou", "precision", "recall")] == pytest.approx([4 / 6, 4 / 6, 1])
+    none = ground_metrics(points, ~everything, everything, true, SMALL)
+    assert none["mse_authors"] != none["mse_authors"]  # NaN: no ground to compare with
+
+
+def test_the_authors_curvature_is_absolute_and_has_the_mixed_differences() -> None:
+    """One cell 0.1 m up: 1, 2, 1 times that along an axis, four cells in each mixed difference, over their numbers."""
+    bump = torch.zeros(1, 16, 16)
+    bump[0, 8, 8] = 0.1
+    nothing = torch.zeros(1, 16, 16)
+    settings = SMALL.model_copy(update={"smoothness": 1.0, "curvature": "absolute"})
+    found = float(ground_loss(bump, nothing, nothing, settings))
+    assert found == pytest.approx(2 * 0.4 / (14 * 16) + 2 * 0.4 / (15 * 15), rel=1e-5)
+    squared = float(ground_loss(bump, nothing, nothing, settings.model_copy(update={"curvature": "squared"})))
+    assert squared == pytest.approx(2 * 0.06 / (14 * 16), rel=1e-5)
 
 
 def test_soft_threshold_is_the_threshold_with_a_slope() -> None:

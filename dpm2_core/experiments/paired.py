@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Two arms that share all but one thing, seed by seed: what that thing gains, and how sure that is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import mean, stdev
+
+from scipy.stats import t as student
+
+
+@dataclass(frozen=True)
+class Gain:
+    """Relative improvement, positive where the second arm is better.
+
+    Attributes:
+        mean: over the seeds. low, high: its 95 % interval by Student's t of the paired differences; None of one seed.
+        better: seeds in which the second arm is better. seeds: their number.
+    """
+
+    mean: float
+    low: float | None
+    high: float | None
+    better: int
+    seeds: int
+
+    def __str__(self) -> str:
+        if self.low is None or self.high is None:
+            return f"{self.mean:+.1%}, one seed"
+        return f"{self.mean:+.1%} [{self.low:+.1%}, {self.high:+.1%}], {self.better} of {self.seeds} better"
+
+
+def paired_gain(without: Sequence[float], with_: Sequence[float], lower_is_better: bool) -> Gain | None:
+    """The gain of the second arm over the mean of the first; None where that is zero or there are no seeds.
+
+    Args:
+        without, with_: a figure of each seed, in the same order.
+    """
+    size = abs(mean(without)) if without else 0.0
+    if not size:
+        return None
+    sign = -1 if lower_is_better else 1
+    gains = [sign * (b - a) / size for a, b in zip(without, with_, strict=True)]
+    center, n = mean(gains), len(gains)
+    half = float(student.ppf(0.975, n - 1)) * stdev(gains) / n**0.5 if n > 1 else None
+    low, high = (None, None) if half is None else (center - half, center + half)
+    return Gain(center, low, high, sum(gain > 0 for gain in gains), n)

@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One training of a task, one measuring of it: the parts of the experiments of the differentiable SLAM paper."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import median
+from typing import Literal, TypedDict
+
+from dpm2_core.config import dump_settings, load_settings
+from dpm2_core.data.trajectory import write_tum
+from dpm2_core.evaluation.run_folder import TRAJECTORY, write_truth
+from dpm2_core.experiments.part import Advance, Figures
+from dpm2_core.files import atomic_write
+from dpm2_core.tasks.open import open_scans
+from dpm2_core.tasks.slam_figures import figures_of, slam_runs
+from dpm2_core.tasks.task import SlamTaskTraining, task_type
+from dpm2_core.tasks.training import WEIGHTS, load_task, mean_figures, measure, new_task, train_task
+
+TRAIN = "dpm2_core.experiments.task_part:train"
+MEASURE = "dpm2_core.experiments.task_part:measure_on"
+SLAM = "dpm2_core.experiments.task_part:slam_on"
+Arm = Literal["without", "with", "placebo"]
+_BEGUN = "begun.yaml"
+_PERIOD = 100_000_000  # ns between scans
+
+
+class Training(TypedDict):
+    """What an arm is trained by: its task, root of the data set, sequences, YAML file, settings KEY=VALUE, seed."""
+
+    task: str
+    data: str
+    learn: Sequence[str]
+    config: str | None
+    settings: Sequence[str]
+    seed: int
+    arm: Arm
+
+
+def settings_of(training: Training) -> SlamTaskTraining:
+    """The settings of an arm: without the SLAM loss, with it, or with that of the window before as a placebo."""
+    config = None if training["config"] is None else Path(training["config"])
+    chosen = load_settings(task_type(training["task"]).training_type, config, training["settings"])
+    assert isinstance(chosen, SlamTaskTraining)
+    arm = training["arm"]
+    gamma = 0.0 if arm == "without" else chosen.slam.gamma
+    return chosen.model_copy(
+        update={
+            "seed": training["seed"],
+            "slam": chosen.slam.model_copy(update={"gamma": gamma}),
+            "slam_loss": chosen.slam_loss.model_copy(update={"placebo": arm == "placebo"}),
+        }
+    )
+
+
+def first_slam_epoch(settings: SlamTaskTraining) -> int:
+    """Epochs before the SLAM loss counts for the first time, which the arms of a seed have in common."""
+    return next((epoch for epoch in range(settings.epochs) if settings.has_windows(epoch)), 0)
+
+
+def train(
+    folder: Path, advance: Advance, training: Training, until: int | None = None, start: str | None = None
+) -> Figures:
+    """Train an arm; weights, log and checkpoint stay in the folder, and one that was stopped goes on.
+
+    Args:
+        until: only so many epochs. start: folder of a training that stopped at such an epoch, to go on from.
+
+    Raises:
+        UsageError: no such scans, or too few.
+    """
+    settings = settings_of(training)
+    kind = task_type(training["task"])
+    # All arms are to see the same scans, so what one can learn from decides for all.
+    needs = kind.learns_from(settings_of({**training, "arm": "with"}))
+    scans = open_scans(training["data"], needs, training["learn"])
+    text = dump_settings(settings) + json.dumps({"training": training, "until": until}) + "\n"
+    begun = folder / _BEGUN
+    if not (begun.is_file() and begun.read_text(encoding="utf-8") == text):
+        for old in ("checkpoint.pt", "log.jsonl", WEIGHTS):
+            (folder / old).unlink(missing_ok=True)
+        if start is not None:
+            for kept in ("checkpoint.pt", "log.jsonl"):
+                shutil.copy(Path(start) / kept, folder / kept)
+        with atomic_write(begun) as file:
+            file.write(text)
+    task = new_task(training["task"], settings)
+    train_task(task, scans, folder, (folder / "checkpoint.pt").exists(), until=until)
+    advance(1, 1)
+    return {"scans": len(scans), "epochs": until or settings.epochs, **_logged(folder, settings)}
+
+
+def measure_on(folder: Path, advance: Advance, task: str, weights: str, drive: tuple[str, Sequence[str]]) -> Figures:
+    """Figures of a training on a data set's sequences.
+
+    Raises:
+        UsageError: no such scans, or they lack what the task needs.
+    """
+    scans = open_scans(drive[0], task_type(task).needs, drive[1])
+    figures = measure(load_task(task, Path(weights)), scans)
+    advance(1, 1)
+    return {"scans": len(scans), **figures}
+
+
+def slam_on(folder: Path, advance: Advance, task: str, weights: str, drive: tuple[str, Sequence[str]]) -> Figures:
+    """Odometry on what a training makes of a data set's sequences; leaves the trajectories.
+
+    Raises:
+        UsageError: as `slam_runs`.
+    """
+    rows = {}
+    for run in slam_runs(load_task(task, Path(weights)), Path(drive[0]), drive[1]):
+        rows[run.sequence] = figures_of(run)
+        stamps = [(i + 1) * _PERIOD for i in range(len(run.truth))]
+        for kind, poses in run.poses.items():
+            place = folder / run.sequence.replace("/", "_") / kind
+            place.mkdir(parents=True, exist_ok=True)
+            write_tum(place / TRAJECTORY, stamps, poses)
+            write_truth(place / "ground_truth.tum", stamps, run.truth)
+        advance(len(rows), len(rows))
+    return {"sequences": rows, **mean_figures(list(rows.values()))}
+
+
+def _logged(folder: Path, settings: SlamTaskTraining) -> Figures:
+    """The losses of the last epoch, and what the SLAM loss was beside the task's when it first counted."""
+    lines = (folder / "log.jsonl").read_text(encoding="utf-8").splitlines()
+    # A training that was stopped may have logged steps twice, and goes on after the last checkpoint.
+    rows = list({row["step"]: row for row in map(json.loads, lines) if "norm" in row}.values())
+    epoch = max(1, len(rows) // settings.epochs)
+    first = [row for row in rows if row.get("slam_loss") is not None][:epoch]
+    share = [settings.slam.gamma * row["slam_loss"] / row["task_loss"] for row in first]
+    return {
+        "last_task_loss": median(row["task_loss"] for row in rows[-epoch:]),
+        "slam_share_at_first": median(share) if share else None,
+        "skipped_steps": sum(row["norm"] is None for row in rows),
+    }

@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The tables of the differentiable SLAM paper on small trees in the layouts of SemanticKITTI and CARLA-64."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dpm2_core.config import load_settings
+from dpm2_core.experiments.paired import paired_gain
+from dpm2_core.tasks.task import task_type
+
+from ...helpers.command import dpm2
+from ..tasks.conftest import labelled_drive, write_pairs
+
+QUICK = ("window=2", "every=1", "batch=1", "warmup=0", "slam_loss.points=150", "slam.gamma=0.5", "slam.every=2")
+RANGE = (
+    "network.image={beams: [[2, -14, 16]], first: 0, rows: 16, columns: 64, scale: 60}",
+    "network.channels=4",
+    "network.latent=8",
+)
+
+
+def options(*settings: str) -> Iterator[str]:
+    """`--set` before each."""
+    for setting in settings:
+        yield from ("--set", setting)
+
+
+def table(path: Path) -> dict[str, dict[str, dict[str, float]]]:
+    """Cells of the first table."""
+    return {row["name"]: row["cells"] for row in json.loads(path.read_text())["tables"][0]["rows"]}
+
+
+@pytest.mark.slow
+def test_gndnet_in_three_arms(tmp_path: Path) -> None:
+    """Trained on one sequence, tested on another, an unlabelled one beside them; a second call only reads."""
+    data, out = tmp_path / "semantic", tmp_path / "out"
+    for name in ("00", "05"):
+        labelled_drive(data / "sequences" / name, range(4), points=600, seed=int(name))
+    (data / "sequences" / "11" / "velodyne").mkdir(parents=True)
+    small = options(*QUICK, "network.cells=32", "network.cell=3", "network.channels=4", "epochs=3", "slam.begin=0")
+    call = ("experiment", "gndnet", data, "--out", out, "--learn", "00", "--sequences", "05", "--seeds", "1", *small)
+    done = dpm2(*call)
+    assert done.returncode == 0, done.stderr
+    found = table(out / "gndnet.json")
+    assert list(found)[:3] == ["without SLAM loss", "with SLAM loss", "with that of another window"]
+    assert found["GndNet with SLAM loss"]["ground_recall"] == {"mean": 0.97}
+    arms = [found[name]["mse"]["mean"] for name in list(found)[:3]]
+    assert len(set(arms)) == 3  # the placebo differs from the loss, and both from nothing
+    record = json.loads((out / "gndnet.json").read_text())
+    gain = record["gains"]["with"]["mse"]
+    assert gain["low"] is None  # of one seed
+    assert gain["mean"] == pytest.approx((arms[0] - arms[1]) / arms[0])
+    before = {path: path.stat().st_mtime_ns for path in out.rglob("*.safetensors")}
+    assert len(before) == 1 + 3  # the epochs that the arms share, and the arms
+    again = dpm2(*call).stdout
+    assert again.startswith("Table 1")
+    assert done.stdout.endswith(again)  # after the bars of the trainings
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+
+
+@pytest.mark.slow
+def test_dslr_both_tables_from_the_same_trainings(tmp_path: Path) -> None:
+    """Chamfer distances, then the odometry, by poses beside the pairs; Table 3 trains nothing anew."""
+    data, out = write_pairs(tmp_path / "pairs", scans=3), tmp_path / "out"
+    along = "".join(f"1 0 0 {0.5 * i} 0 1 0 0 0 0 1 0\n" for i in range(3))
+    for number in (0, 1):
+        (data / f"poses{number}.txt").write_text(along)
+    small = [*options(*QUICK, *RANGE, "autoencoder_epochs=1", "discriminator_epochs=0", "epochs=3", "slam.begin=1")]
+    rest = (data, "--out", out, "--learn", "0", "--sequences", "1", "--seeds", "1", *small)
+    done = dpm2("experiment", "dslr", *rest)
+    assert done.returncode == 0, done.stderr
+    assert table(out / "dslr.json")["DSLR, CARLA-64"]["chamfer"] == {"mean": 7.85}
+    assert "DSLR-UDA" in done.stderr
+    trained = {path: path.stat().st_mtime_ns for path in out.rglob("*.safetensors")}
+    done = dpm2("experiment", "dslr-slam", *rest)
+    assert done.returncode == 0, done.stderr
+    assert {path: path.stat().st_mtime_ns for path in trained} == trained
+    figures = json.loads((out / "dslr-slam.json").read_text())["parts"]["dslr/seed_0/with/slam"]
+    assert figures["still_rpe_m"] == pytest.approx(0.5)
+    assert figures["target_rpe_m"] < figures["still_rpe_m"]
+    assert (out / "trajectories_pairs_d1.png").stat().st_size > 5000
+    (data / "poses1.txt").unlink()
+    again = dpm2("experiment", "dslr-slam", *rest[:2], tmp_path / "new", *rest[3:])
+    assert again.returncode == 2
+    assert "no poses1.txt beside the pairs" in again.stderr
+
+
+@pytest.mark.slow
+def test_ae_lidar_says_that_its_last_epoch_has_the_slam_loss(tmp_path: Path) -> None:
+    data, out = write_pairs(tmp_path / "pairs", scans=4), tmp_path / "out"
+    rest = (data, "--out", out, "--learn", "0", "--sequences", "1", "--seeds", "1")
+    done = dpm2("experiment", "ae-lidar", *rest, *options(*QUICK, *RANGE, "epochs=2", "slam.begin=0"))
+    assert done.returncode == 0, done.stderr
+    assert "the last epoch has the SLAM loss" in done.stderr
+    assert table(out / "ae-lidar.json")["AE_lidar with SLAM loss, CARLA-64"]["chamfer"] == {"mean": 2.83}
+    missing = dpm2("experiment", "ae-lidar", data, "--out", out, "--learn", "7", "--sequences", "1")
+    assert missing.returncode == 2
+    assert "no sequence 7; there are 0, 1" in missing.stderr
+
+
+def test_a_gain_by_hand() -> None:
+    """Paired differences of 0.3 and 0.1 of a mean of 2: 10 % on average, t(1) = 12.7 makes the interval wide."""
+    gain = paired_gain([1.0, 3.0], [0.7, 2.9], lower_is_better=True)
+    assert gain is not None
+    assert gain.mean == pytest.approx(0.1)
+    half = 12.7062 * np.std([0.15, 0.05], ddof=1) / np.sqrt(2)
+    assert (gain.low, gain.high) == (pytest.approx(0.1 - half, rel=1e-4), pytest.approx(0.1 + half, rel=1e-4))
+    assert (gain.better, gain.seeds) == (2, 2)
+    one = paired_gain([2.0], [1.0], lower_is_better=False)
+    assert one is not None
+    assert (one.mean, one.low, str(one)) == (-0.5, None, "-50.0%, one seed")
+    assert paired_gain([0.0], [1.0], lower_is_better=True) is None
+
+
+@pytest.mark.parametrize(
+    ("name", "task", "epochs"), [("gndnet", "gndnet", 27), ("dslr", "dslr", 7), ("ae_lidar",) * 2 + (27,)]
+)
+def test_the_authors_recipes_have_the_papers_number_of_slam_epochs(name: str, task: str, epochs: int) -> None:
+    """27 of 150 for GndNet, 7 for DSLR; and the last epoch of DSLR is one without."""
+    path = Path(__file__).resolve().parents[3] / "config" / f"{name}_authors.yaml"
+    settings = load_settings(task_type(task).training_type, path)
+    found = [epoch for epoch in range(settings.epochs) if settings.has_windows(epoch)]
+    assert len(found) == epochs
