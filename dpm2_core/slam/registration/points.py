@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -61,7 +62,9 @@ class GeometricScanRegistration:
         ok = max(r.ok for r in found)
         best = max(value for r, value in zip(found, fit, strict=True) if r.ok == ok)
         # The first of equals: least motion, where a tunnel fits anywhere.
-        return next(r for r, value in zip(found, fit, strict=True) if r.ok == ok and value >= best - _EQUAL)
+        chosen = next(r for r, value in zip(found, fit, strict=True) if r.ok == ok and value >= best - _EQUAL)
+        likely = [r for r, value in zip(found, fit, strict=True) if r.ok == ok and value >= best - _DISTINCT]
+        return _with_spread(chosen, likely)
 
     def _searched(self, source: Array, prediction: Prediction) -> Registration:
         """The place that fits best, if no other one fits nearly as well."""
@@ -98,6 +101,13 @@ class GeometricScanRegistration:
         if wanted:
             self._local_map.insert(scan.cloud, T_odom_lidar)
         return wanted
+
+
+def _with_spread(chosen: Registration, likely: Sequence[Registration]) -> Registration:
+    """With the way (6,) to the farthest of the results that are nearly as likely in its covariance."""
+    T = se3.inverse(chosen.T_target_source)
+    way = max((se3.log(T @ other.T_target_source) for other in likely), key=lambda xi: float(np.linalg.norm(xi[3:])))
+    return replace(chosen, covariance=chosen.covariance + np.outer(way, way))
 
 
 def _apart(T: Array, T_other: Array) -> bool:
