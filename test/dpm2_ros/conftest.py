@@ -186,7 +186,7 @@ class Harness:
         )
 
     @staticmethod
-    def wait(condition: Callable[[], Any], what: str, timeout: float = 30.0) -> None:
+    def wait(condition: Callable[[], Any], what: str, timeout: float = 90.0) -> None:
         """Until it holds; fails saying what was waited for."""
         end = time.monotonic() + timeout
         while not condition():

@@ -68,7 +68,7 @@ def listener(ros: Callable[..., Any], tmp_path: Path) -> Iterator[Listener]:
 
 def test_everything_arrives_as_recorded_and_in_time(listener: Listener, bag: Path, drive: Any, tmp_path: Path) -> None:
     player = listener.play(str(bag), "--wait", "20", "--rate", "2", "--log", str(tmp_path / "times.csv"))
-    assert player.wait(30) == 0, listener.output()
+    assert player.wait(60) == 0, listener.output()
     listener.harness.wait(lambda: len(listener.clouds) == len(listener.images) == drive.frames, "every cloud and image")
     source = BagSource(bag, InputSettings(vertical_angle_correction_deg=0.0))
     for message, image, frame in zip(listener.clouds, listener.images, source.frames(), strict=True):
@@ -94,7 +94,7 @@ def test_everything_arrives_as_recorded_and_in_time(listener: Listener, bag: Pat
 
 def test_start_duration_and_topics(listener: Listener, bag: Path, drive: Any) -> None:
     arguments = ["--start", "0.45", "--duration", "0.4", "--topics", topics.POINTS, "--topics", topics.TF_STATIC]
-    assert listener.play(str(bag), "--wait", "20", *arguments).wait(30) == 0, listener.output()
+    assert listener.play(str(bag), "--wait", "20", *arguments).wait(60) == 0, listener.output()
     listener.harness.wait(lambda: len(listener.clouds) >= 4, "four clouds")
     stamps = BagSource(bag, InputSettings(images=False)).stamps.tolist()
     assert [stamp_ns(message.header) for message in listener.clouds] == stamps[5:9]
@@ -122,7 +122,7 @@ def test_it_waits_for_subscribers(ros: Callable[..., Any], bag: Path, tmp_path: 
         harness.wait(lambda: harness.node.count_publishers(topics.POINTS), "the player")
         time.sleep(0.3)
         clouds = harness.hear(PointCloud2, topics.POINTS)
-        assert player.wait(30) == 0
+        assert player.wait(60) == 0
         harness.wait(lambda: len(clouds) == drive.frames, "every cloud")
     finally:
         player.kill()
@@ -161,7 +161,7 @@ def test_a_truncated_bag_plays_what_is_left(listener: Listener, bag: Path, tmp_p
     (whole,) = bag.glob("*.mcap")
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(whole.read_bytes()[: whole.stat().st_size * 6 // 10])
-    assert listener.play(str(cut), "--wait", "20", "--rate", "4").wait(30) == 0, listener.output()
+    assert listener.play(str(cut), "--wait", "20", "--rate", "4").wait(60) == 0, listener.output()
     time.sleep(0.5)
     assert 0 < len(listener.clouds) < drive.frames
     assert "truncated" in listener.output()

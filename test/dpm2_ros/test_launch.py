@@ -77,7 +77,7 @@ def test_a_node_starts_from_a_file_of_defaults_and_empty_texts(
     try:
         harness.wait(lambda: name in harness.node.get_node_names() or process.poll() is not None, f"{name} to be there")
         process.send_signal(signal.SIGINT)
-        assert process.wait(30) == 0, (tmp_path / "log").read_text()
+        assert process.wait(60) == 0, (tmp_path / "log").read_text()
     finally:
         process.kill()
         process.wait()

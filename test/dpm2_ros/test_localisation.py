@@ -102,7 +102,7 @@ class Robot:
         client = self.harness.node.create_client(kind, name)
         assert client.wait_for_service(timeout_sec=10)
         future = client.call_async(kind.Request(**fields))
-        self.harness.wait(future.done, name, timeout=30)
+        self.harness.wait(future.done, name)
         return future.result()
 
     def point(self, T_map_lidar: Array, frame: str) -> None:
@@ -116,7 +116,7 @@ class Robot:
     def close(self) -> int:
         self.process.send_signal(signal.SIGINT)
         try:
-            return self.process.wait(30)
+            return self.process.wait(60)
         finally:
             self.process.kill()
 
@@ -223,7 +223,7 @@ def test_from_mapping_to_localizing_and_back(robot: Callable[..., Robot], tmp_pa
         assert digest(path) == before
         return r.call(SetBool, "/slam_node/localization_mode", data=False).success
 
-    r.harness.wait(extended, "the robot in its map", timeout=30)
+    r.harness.wait(extended, "the robot in its map")
     r.send(*range(10, 20))
     assert r.close() == 0
     from dpm2_core.slam.store.map_data import load_map

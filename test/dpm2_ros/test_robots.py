@@ -87,7 +87,7 @@ class Fleet:
             self._stamp += 100_000_000
             before = len(self._odom[name])
             self._lidars[name].publish(cloud_to_msg(frame.points, self._stamp, f"{name}/lidar"))
-            self.harness.wait(lambda before=before: len(self._odom[name]) > before, f"{name}: scan {n}", timeout=30)
+            self.harness.wait(lambda before=before: len(self._odom[name]) > before, f"{name}: scan {n}")
 
     def map(self, file: str = "map.dpm2map") -> MapData:
         """As it is in the file now."""
