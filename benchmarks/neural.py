@@ -29,6 +29,7 @@ from benchmarks.harness import (
 )
 from benchmarks.neural_view import view
 from benchmarks.pairs import PairMethod, all_pairs, by_registration, gicp_from_identity, kiss_from_identity
+from benchmarks.repeated import repeated
 from benchmarks.unseen import corruption, image_matters, overlap, synthetic
 from dpm2_core.evaluation.figures import success_png
 from dpm2_core.evaluation.record import git_commit
@@ -183,6 +184,7 @@ PARTS: Mapping[str, Part] = {
     "corruption": corruption,
     "image": image_matters,
     "overlap": overlap,
+    "reference": repeated,
     "speed": _of_drives(speed),
 }
 """By the name that `--only` and the JSON share."""

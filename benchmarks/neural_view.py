@@ -37,12 +37,27 @@ def view(parts: Mapping[str, Any]) -> Group:
             f"Overlap head: average precision {row['average_precision']:.3f} on {row['pairs']} pairs, "
             f"{row['positive']} within 20 m, {row['negative_20_40_m']} at 20-40 m."
         )
+    if "reference" in parts:
+        shown.append(_reference_table(parts["reference"]["shares"]))
     for drive, row in parts.get("speed", {}).get("drives", {}).items():
         shown.append(_stage_table(drive, row))
         shown.append(f"Descriptors of a frame: {row['descriptor_bytes']} bytes.")
         if "with the camera" in row:
             shown.append(f"with the camera: {row['with the camera']}")
     return Group(*shown)
+
+
+def _reference_table(shares: Mapping[str, Any]) -> FigureTable:
+    kinds = next(iter(next(iter(shares.values())).values()))
+    figures = [f"{within}, {apart}" for apart, row in kinds.items() for within in row if within != "pairs"]
+    title = "Reference points that are near one of another frame, share"
+    table = FigureTable(title, names=["drive", "chosen by"], figures=figures)
+    for drive, rows in shares.items():
+        for name, row in rows.items():
+            values = [value for apart in row.values() for within, value in apart.items() if within != "pairs"]
+            table.add_row(drive, name, *(f"{value:.2f}" for value in values))
+        table.add_section()
+    return table
 
 
 def _pair_table(title: str, kinds: Mapping[str, Any]) -> FigureTable:

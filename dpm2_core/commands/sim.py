@@ -22,7 +22,9 @@ def sim(
     road: Annotated[
         str, typer.Option(help="straight, loop, figure8, random, or a file of KITTI poses to drive along.")
     ] = "loop",
-    preset: Annotated[PresetName, typer.Option(help="city, suburb, rural, highway or tunnel.")] = "city",
+    preset: Annotated[
+        PresetName, typer.Option(help="city, suburb, rural, highway, tunnel, indoor or car_park.")
+    ] = "city",
     images: Annotated[bool, typer.Option("--images/--no-images", help="With image_2.")] = True,
     traffic: Annotated[
         float, typer.Option(help="Times the preset's; above 1 in columns on every lane, 20 is full.")

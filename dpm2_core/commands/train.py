@@ -44,19 +44,35 @@ def pack(
     frames: Annotated[str, typer.Option(help="Positions a:b to pack, from 0.")] = ":",
     preset: Annotated[str, typer.Option(help="Network preset: its crop and image size are stored.")] = "small",
     no_image: Annotated[bool, typer.Option("--no-image", help="Leave the images out.")] = False,
+    every: Annotated[
+        bool, typer.Option("--all", help="Every drive below SRC, each to OUT/NAME; those that are there already stay.")
+    ] = False,
     settings: Annotated[
         list[str] | None, typer.Option("--set", help="KEY=VALUE of input, such as sequence=04.")
     ] = None,
 ) -> None:
-    """A recorded drive with ground truth, packed for training."""
+    """A recorded drive with ground truth, or all of a data set, packed for training frame by frame."""
+    from dpm2_core.data.open import sequences_below
+
+    overrides = [*(settings or []), *(["images=false"] if no_image else [])]
+    if not every:
+        if out.exists():
+            raise UsageError(f"{out}: is there already; remove it, or choose another folder")
+        _pack_one(src, out, frames, preset, overrides)
+        return
+    if any(setting.startswith("sequence=") for setting in overrides):
+        raise UsageError("--all: packs every drive; leave --set sequence= out")
+    for name in sequences_below(src):
+        if not (out / name).exists():
+            _pack_one(src, out / name, frames, preset, [*overrides, f"sequence={name}"])
+
+
+def _pack_one(src: Path, out: Path, frames: str, preset: str, overrides: list[str]) -> None:
     from dpm2_core.data.open import open_source
     from dpm2_core.data.settings import InputSettings
     from dpm2_core.learning.generate import pack as write  # torch and embree are slow to import
     from dpm2_core.network.settings import preset as network_preset
 
-    if out.exists():
-        raise UsageError(f"{out}: is there already; remove it, or choose another folder")
-    overrides = [*(settings or []), *(["images=false"] if no_image else [])]
     source = open_source(src, load_settings(InputSettings, None, overrides))
     network = network_preset(preset)
     start, stop = parse_range(frames)
@@ -66,10 +82,9 @@ def pack(
     with progress_bar() as bar:
         task = bar.add_task(f"{source.name} -> {out}", total=len(chosen))
         packed = write(source, out, network, chosen, lambda: bar.advance(task))
-    console = Console(stderr=True)
     for note in source.notes:
-        console.print(note, soft_wrap=True)
-    console.print(f"{out}: {packed} frames", soft_wrap=True)
+        typer.echo(note, err=True)
+    typer.echo(f"{out}: {packed} frames", err=True)
 
 
 @train.command()

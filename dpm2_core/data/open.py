@@ -10,6 +10,25 @@ from dpm2_core.data.source import Source
 from dpm2_core.errors import UsageError
 
 
+def sequences_below(path: Path | str) -> list[str]:
+    """What `input.sequence` may be in a folder of KITTI odometry, KITTI-360 or KITTI-CARLA with several drives.
+
+    Raises:
+        UsageError: there is no such folder, or it holds none.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        raise UsageError(f"{path}: no such folder")
+    found = (
+        [p.parent.name for p in path.glob("data_3d_raw/*/velodyne_points")]
+        or [p.parent.parent.name for p in path.glob("*/generated/frames")]
+        or [p.parent.name for p in (path / "sequences" if (path / "sequences").is_dir() else path).glob("*/velodyne")]
+    )
+    if not found:
+        raise UsageError(f"{path}: no drives below it (sequences/NN, data_3d_raw/DRIVE or TOWN/generated)")
+    return sorted(found)
+
+
 def open_source(path: Path | str, settings: InputSettings | None = None) -> Source:
     """Open whatever `path` is: a folder of KITTI odometry, KITTI-360 or KITTI-CARLA, or a rosbag2 recording.
 

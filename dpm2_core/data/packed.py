@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -28,27 +28,103 @@ class Sample(NamedTuple):
     images: tuple[Image, ...] = ()
 
 
-def write_packed(folder: Path, samples: Sequence[Sample], about: dict[str, object]) -> None:
-    """Write the drive; a killed run leaves nothing that looks whole.
+class PackedWriter:
+    """Writes a drive frame by frame: what is in memory does not grow with it but for poses and calibration.
 
-    Every frame has the same number of images of the same size. `about` says where the drive is from.
+    A folder appears when the block ends well; a killed run leaves nothing that looks whole.
     """
-    part = folder.with_name(folder.name + ".part")
-    shutil.rmtree(part, ignore_errors=True)
-    part.mkdir(parents=True)
-    offsets = np.cumsum([0, *(len(s.cloud) for s in samples)])
-    flat = np.concatenate([s.cloud for s in samples])
-    np.save(part / "clouds.npy", np.round(flat / QUANTUM).clip(-32767, 32767).astype(np.int16))
-    np.save(part / "offsets.npy", offsets)
-    np.save(part / "poses.npy", np.stack([s.pose for s in samples]))
-    if samples[0].images:
-        np.save(part / "pixels.npy", np.stack([[image.pixels for image in s.images] for s in samples]))
-        np.save(part / "K.npy", np.stack([[image.camera.K for image in s.images] for s in samples]))
-        extrinsics = [[image.camera.T_lidar_cam for image in s.images] for s in samples]
-        np.save(part / "T_lidar_cam.npy", np.stack(extrinsics))
-    (part / "about.json").write_text(json.dumps({"format": FORMAT, **about}, indent=1))
-    shutil.rmtree(folder, ignore_errors=True)
-    os.replace(part, folder)
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.part = folder, folder.with_name(folder.name + ".part")
+        self.images: int | None = None  # of each frame, once there is one
+        self._offsets, self._poses = [0], list[Array]()
+        self._K, self._T_lidar_cam = list[list[Array]](), list[list[Array]]()
+        self._files: dict[str, _GrowingArray] = {}
+
+    def __len__(self) -> int:
+        return len(self._poses)
+
+    def __enter__(self) -> PackedWriter:
+        shutil.rmtree(self.part, ignore_errors=True)
+        self.part.mkdir(parents=True)
+        return self
+
+    def add(self, sample: Sample) -> None:
+        """The next frame.
+
+        Raises:
+            UsageError: it has more or fewer images, or of another size, than those before.
+        """
+        pixels = np.array([image.pixels for image in sample.images], np.uint8)
+        if self.images is None:
+            self.images = len(pixels)
+            self._files["clouds"] = _GrowingArray(self.part / "clouds.npy", np.int16, (3,))
+            if self.images:
+                self._files["pixels"] = _GrowingArray(self.part / "pixels.npy", np.uint8, pixels.shape)
+        if len(pixels) != self.images or (self.images and pixels.shape != self._files["pixels"].row):
+            raise UsageError(
+                f"{self.folder}: some frames have an image and some have none, or another size; "
+                "--no-image packs them without"
+            )
+        self._files["clouds"].append(np.round(sample.cloud / QUANTUM).clip(-32767, 32767).astype(np.int16))
+        self._offsets.append(self._offsets[-1] + len(sample.cloud))
+        self._poses.append(sample.pose)
+        if self.images:
+            self._files["pixels"].append(pixels[None])
+            self._K.append([image.camera.K for image in sample.images])
+            self._T_lidar_cam.append([image.camera.T_lidar_cam for image in sample.images])
+
+    def finish(self, about: dict[str, object]) -> None:
+        """The drive is complete; `about` says where it is from."""
+        for file in self._files.values():
+            file.close()
+        np.save(self.part / "offsets.npy", np.array(self._offsets))
+        np.save(self.part / "poses.npy", np.stack(self._poses))
+        if self.images:
+            np.save(self.part / "K.npy", np.array(self._K))
+            np.save(self.part / "T_lidar_cam.npy", np.array(self._T_lidar_cam))
+        (self.part / "about.json").write_text(json.dumps({"format": FORMAT, **about}, indent=1))
+        shutil.rmtree(self.folder, ignore_errors=True)
+        os.replace(self.part, self.folder)
+
+    def __exit__(self, *_: object) -> None:
+        for file in self._files.values():
+            file.close()
+        shutil.rmtree(self.part, ignore_errors=True)
+
+
+class _GrowingArray:
+    """A .npy file whose first axis grows: numpy leaves room for it in the header."""
+
+    def __init__(self, path: Path, dtype: type, row: tuple[int, ...]) -> None:
+        self.row, self._dtype, self._count = row, np.dtype(dtype), 0
+        self._file = path.open("wb")
+        self._header()
+
+    def append(self, rows: NDArray) -> None:
+        """(n, *row) more."""
+        np.ascontiguousarray(rows, self._dtype).tofile(self._file)
+        self._count += len(rows)
+
+    def close(self) -> None:
+        """Write how many there are; nothing, the second time."""
+        if not self._file.closed:
+            self._file.seek(0)
+            self._header()
+            self._file.close()
+
+    def _header(self) -> None:
+        shape = (self._count, *self.row)
+        head = {"descr": np.lib.format.dtype_to_descr(self._dtype), "fortran_order": False, "shape": shape}
+        np.lib.format.write_array_header_1_0(self._file, head)
+
+
+def write_packed(folder: Path, samples: Iterable[Sample], about: dict[str, object]) -> None:
+    """Write a drive of at least one frame; see `PackedWriter`."""
+    with PackedWriter(folder) as writer:
+        for sample in samples:
+            writer.add(sample)
+        writer.finish(about)
 
 
 class PackedDrive:

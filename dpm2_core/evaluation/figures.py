@@ -177,6 +177,37 @@ def lines_png(
         FigureCanvasAgg(figure).print_png(file)
 
 
+def bars_png(path: Path | str, groups: Mapping[str, Mapping[str, float]], title: str = "") -> None:
+    """Groups of bars, a color a name.
+
+    Args:
+        groups: name of a group, name of a bar, and its length; the same bars in all groups.
+
+    Raises:
+        Dpm2Error: the file could not be written.
+    """
+    with needs("plot", "drawing"):
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+    names = list(next(iter(groups.values())))
+    figure = Figure(figsize=(9, 0.4 * len(groups) * len(names) / 2 + 1.6), dpi=100)
+    axes = figure.add_subplot()
+    for k, name in enumerate(names):
+        at = np.arange(len(groups)) + (k - (len(names) - 1) / 2) * 0.8 / len(names)
+        lengths = [row[name] for row in groups.values()]
+        axes.barh(at, lengths, 0.8 / len(names), label=name)
+        for y, length in zip(at, lengths, strict=True):
+            axes.text(length, y, f" {length:.2f}", va="center", fontsize=8)
+    axes.set_yticks(range(len(groups)), list(groups))
+    axes.invert_yaxis()
+    axes.set_title(title, fontsize=10)
+    axes.legend()
+    figure.tight_layout()
+    with atomic_write(path, "wb") as file:
+        FigureCanvasAgg(figure).print_png(file)
+
+
 def _aligned(gt: Array, est: Array) -> Array | None:
     """Known positions of the ground truth (K, 3) in the map frame; None with fewer than two in common."""
     has_gt, common = known(gt), known(gt) & known(est)

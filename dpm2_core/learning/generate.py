@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import Field
 
 from dpm2_core.config import Settings
-from dpm2_core.data.packed import Sample, write_packed
+from dpm2_core.data.packed import PackedWriter, Sample, write_packed
 from dpm2_core.data.source import Source
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Camera, Frame, Image
@@ -24,7 +24,7 @@ from dpm2_core.network.settings import NetworkSettings, preset
 from dpm2_core.sim.camera import calibration, render
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.sensors import drawn_sensor
-from dpm2_core.sim.settings import CameraConfig, LidarConfig, PresetName
+from dpm2_core.sim.settings import PRESETS, CameraConfig, LidarConfig, PresetName
 from dpm2_core.sim.world import build_world
 
 
@@ -56,6 +56,10 @@ class GenerateSettings(Settings):
     """Factor on the preset's traffic; 20 fills every lane."""
     images: bool = False
     """Render an image with each scan."""
+    hours: float = Field(0.0, ge=0, le=6)
+    """The images of a world are taken up to so many hours before and after one another: its shadows move."""
+    wet: float = Field(0.0, ge=0, le=1)
+    """Fraction of the worlds with drops of water on the lens."""
     preset: str = "small"
     """Network preset: its crop and image size are stored."""
 
@@ -70,9 +74,14 @@ def generate_world(folder: Path, seed: int, settings: GenerateSettings) -> None:
     world = build_world("random", kind, seed, settings.length, settings.traffic)
     columns, height = int(noise.choice([1448, 1810, 2170])), settings.height + noise.uniform(-0.2, 0.3)
     config = LidarConfig(beams=settings.beams, columns=columns, height=height)
+    if PRESETS[kind].indoor == "rooms":  # on a small robot or in the hand
+        config = config.model_copy(update={"height": noise.uniform(0.3, 1.6), "car_body": False, "min_range": 0.4})
     lidar = Lidar(drawn_sensor(config, settings.real, settings.others, np.random.default_rng([seed, 79])))
     height, sway = lidar.config.height, lidar.config.real.sway
     camera = _camera(network)
+    weather = np.random.default_rng([seed, 81])
+    if weather.random() < settings.wet:
+        camera = camera.model_copy(update={"wet": float(weather.uniform(0.02, 0.3)), "lens": seed})
     samples = []
     for _ in range(settings.frames):
         T, time = world.sample_pose(noise, height=height, sway=sway)
@@ -81,7 +90,8 @@ def generate_world(folder: Path, seed: int, settings: GenerateSettings) -> None:
         images: tuple[Image, ...] = ()
         if settings.images:
             view = calibration(camera)
-            pixels = render(world, camera, T @ view.T_lidar_cam, time, noise)
+            hours = float(weather.uniform(-0.5, 0.5)) * settings.hours
+            pixels = render(world, camera, T @ view.T_lidar_cam, time, noise, hours)
             images = (small_image(Image(pixels, view), network),)
         samples.append(Sample(crop(points, network.points), T, images))
     sensor = lidar.config.model_dump(mode="json", exclude_defaults=True)
@@ -126,44 +136,42 @@ def pack(
     frames: range | None = None,
     advance: Callable[[], None] = lambda: None,
 ) -> int:
-    """Pack the frames of a source that have a pose; returns how many.
+    """Pack the frames of a source that have a pose, one after the other; returns how many.
 
     Points with time offsets are moved to where they are seen from at the stamp, by the true motion. `frames`: positions
     to look at; `advance` is called after each.
 
     Raises:
-        UsageError: the source has no poses, or its frames do not all have as many images.
+        UsageError: the source has no poses, or its frames do not all have as many images of one size.
     """
     if source.poses is None:
         raise UsageError(f"{source.name}: no ground truth poses, training needs them")
     chosen = frames or range(len(source))
-    samples: list[Sample] = []
-    before: tuple[Frame, Array] | None = None  # a motion needs the next pose, so each frame waits for it
+    with PackedWriter(folder) as writer:
+        before: tuple[Frame, Array] | None = None  # a motion needs the next pose, so each frame waits for it
+        twist = np.zeros(6)
+        for position, frame in enumerate(source.frames(chosen.start, chosen.stop), chosen.start):
+            advance()
+            pose = source.poses[position]
+            if position not in chosen or frame.problem is not None or not np.isfinite(pose).all():
+                continue
+            if before is not None:
+                twist = _twist(before, (frame, pose))
+                writer.add(_sample(*before, twist, network))
+            before = frame, pose
+        if before is None:
+            raise UsageError(f"{source.name}: no readable frame with a pose")
+        writer.add(_sample(*before, twist, network))
+        writer.finish({"source": source.name})
+    return len(writer)
 
-    def add(frame: Frame, pose: Array, twist: Array) -> None:
-        points = frame.points
-        if frame.time_offset is not None:
-            points = deskew(points, frame.time_offset, twist)
-        images = tuple(small_image(image, network) for image in frame.images)
-        samples.append(Sample(crop(points, network.points), pose, images))
 
-    twist = np.zeros(6)
-    for position, frame in enumerate(source.frames(chosen.start, chosen.stop), chosen.start):
-        advance()
-        pose = source.poses[position]
-        if position not in chosen or frame.problem is not None or not np.isfinite(pose).all():
-            continue
-        if before is not None:
-            twist = _twist(before, (frame, pose))
-            add(*before, twist)
-        before = frame, pose
-    if before is None:
-        raise UsageError(f"{source.name}: no readable frame with a pose")
-    add(*before, twist)
-    if len({len(sample.images) for sample in samples}) > 1:
-        raise UsageError(f"{source.name}: some frames have an image and some have none; --no-image packs them without")
-    write_packed(folder, samples, {"source": source.name})
-    return len(samples)
+def _sample(frame: Frame, pose: Array, twist: Array, network: NetworkSettings) -> Sample:
+    points = frame.points
+    if frame.time_offset is not None:
+        points = deskew(points, frame.time_offset, twist)
+    images = tuple(small_image(image, network) for image in frame.images)
+    return Sample(crop(points, network.points), pose, images)
 
 
 def _twist(before: tuple[Frame, Array], after: tuple[Frame, Array]) -> Array:

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from dpm2_core.frame import Camera
 from dpm2_core.geometry import se3
+from dpm2_core.sim.lens import through_lens
+from dpm2_core.sim.light import Light
 from dpm2_core.sim.materials import Material
 from dpm2_core.sim.mesh import Hits, Mesh, rotated
 from dpm2_core.sim.settings import CameraConfig
@@ -46,26 +48,31 @@ def _rays(config: CameraConfig) -> Float:
 
 
 def render(
-    world: World, config: CameraConfig, T_world_cam: Array, time: float, rng: np.random.Generator
+    world: World, config: CameraConfig, T_world_cam: Array, time: float, rng: np.random.Generator, hours: float = 0.0
 ) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8 RGB of a world from a pose (4, 4) at a time, s; `rng` makes the pixel noise."""
+    """(H, W, 3) uint8 RGB of a world from a pose (4, 4) at a time, s; `rng` makes the pixel noise.
+
+    `hours`: later in the day, the sun elsewhere.
+    """
+    light = world.light.later(hours)
     eye = T_world_cam[:3, 3].astype(np.float32)
     dynamic_objects = world.dynamic_objects(time, eye)
     radiance = np.empty((config.height, config.width, 3), np.float32)
     for top in range(0, config.height, _BAND):  # bands fit the processor's cache: a sixth less work
         rows = slice(top, min(top + _BAND, config.height))
         view = rotated(_rays(config)[rows].reshape(-1, 3), T_world_cam[:3, :3])
-        radiance[rows] = _band(world, dynamic_objects, eye, view, config).reshape(-1, config.width, 3)
-    return _develop(radiance, world.light.exposure, config.noise, rng)
+        radiance[rows] = _band(world, light, dynamic_objects, eye, view, config).reshape(-1, config.width, 3)
+    return through_lens(_develop(radiance, light.exposure, config.noise, rng), config)
 
 
-def _band(world: World, dynamic_objects: DynamicObjects | None, eye: Float, view: Float, config: CameraConfig) -> Float:
+def _band(
+    world: World, light: Light, dynamic_objects: DynamicObjects | None, eye: Float, view: Float, config: CameraConfig
+) -> Float:
     """(R, 3) light that comes from the directions (R, 3), some rows of pixels."""
-    light = world.light
     surface, seen, distance = _visible(world, dynamic_objects, eye, view, config)
     lit = np.ones(len(distance), np.float32)
     if config.shadows and not light.tunnel and light.overcast < 0.85:
-        lit = _sunlit(world, dynamic_objects, surface, seen, config.width)
+        lit = _sunlit(world, light.sun, dynamic_objects, surface, seen, config.width)
     color = light.textures.albedo(surface, world.terrain)
     color *= light.shine(surface, lit)
     color[surface.material == Material.LAMP] = 1.3
@@ -116,7 +123,12 @@ def _attributes(mesh: Mesh, hits: Hits) -> tuple[NDArray, NDArray, NDArray, NDAr
 
 
 def _sunlit(
-    world: World, dynamic_objects: DynamicObjects | None, surface: Surface, seen: NDArray[np.bool_], width: int
+    world: World,
+    sun: Float,
+    dynamic_objects: DynamicObjects | None,
+    surface: Surface,
+    seen: NDArray[np.bool_],
+    width: int,
 ) -> Float:
     """(P,) 0..1, from rays to the sun through every other pixel of every other row."""
     grid = np.full(seen.shape, -1, np.int32)
@@ -124,7 +136,7 @@ def _sunlit(
     sparse = grid.reshape(-1, width)[::2, ::2]
     point = sparse[sparse >= 0]
     origins = surface.position[point] + surface.normal[point] * np.float32(0.03)
-    towards = np.broadcast_to(world.light.sun, origins.shape).copy()
+    towards = np.broadcast_to(sun, origins.shape).copy()
     free = world.scene.cast(origins, towards, 150.0).face < 0
     if dynamic_objects is not None:
         free &= dynamic_objects.scene.cast(origins, towards, 150.0).face < 0

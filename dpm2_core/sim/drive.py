@@ -101,6 +101,9 @@ def _recipe(drive: DriveConfig) -> dict[str, Any]:
     if drive.road not in ROAD_KINDS:
         path = Path(drive.road)
         recipe["road"] = f"{path.name} sha256:{hashlib.sha256(path.read_bytes()).hexdigest()}"
+    for name in ("wet", "lens"):  # and a dry one
+        if recipe["camera"][name] == 0:
+            del recipe["camera"][name]
     if drive.traffic == 1:
         del recipe["traffic"]
     return recipe

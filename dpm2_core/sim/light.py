@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,6 +34,17 @@ class Light:
         self.tunnel = tunnel
         self.exposure = float(rng.uniform(0.85, 1.2))
         self.textures = Textures(seed)
+
+    def later(self, hours: float) -> Light:
+        """The same day so many hours later: the sun 15 deg an hour further round and 5 deg lower, 8 to 75 deg high."""
+        if not hours or self.tunnel:
+            return self
+        out = copy.copy(self)
+        elevation = np.clip(np.arcsin(self.sun[2]) - np.radians(5 * hours), np.radians(8), np.radians(75))
+        azimuth = np.arctan2(self.sun[1], self.sun[0]) - np.radians(15 * hours)
+        level = np.cos(elevation)
+        out.sun = np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], np.float32)
+        return out
 
     def sky(self, view: Float) -> Float:
         """(P, 3) color of the sky along directions (P, 3): a gradient, clouds, the glow round the sun."""

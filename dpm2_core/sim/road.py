@@ -13,6 +13,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
 from dpm2_core.errors import UsageError
+from dpm2_core.sim.floorplan import FloorPlan, car_park, office
 from dpm2_core.sim.settings import Preset
 
 Array = NDArray[np.float64]
@@ -68,6 +69,7 @@ class Road:
         drive: the path of the car. times: (K,) s and travelled: (K,) m, the drive's progress; a closed one goes on.
         heights: (M,) m of the samples of each main street, None where the terrain is free.
         slip: (K,) rad, heading of the car relative to the direction of the drive; None: it heads where it goes.
+        plan: of the building that the drive leads through.
     """
 
     streets: list[Path]
@@ -77,6 +79,7 @@ class Road:
     travelled: Array
     heights: list[Array] | None = None
     slip: Array | None = None
+    plan: FloorPlan | None = None
 
     def slip_at(self, time: float) -> float:
         """How far the car is turned to the left of where it goes, rad, at a time, s."""
@@ -100,6 +103,8 @@ def make_road(kind: str, preset: Preset, rng: np.random.Generator, length: float
     Raises:
         UsageError: no such kind or file, or the file holds no drive.
     """
+    if preset.indoor:
+        return _indoors(kind, preset, rng, length)
     if kind not in ROAD_KINDS:
         return _road_of_poses(FilePath(kind), preset, rng)
     center = _center(kind, preset, rng, length)
@@ -107,6 +112,17 @@ def make_road(kind: str, preset: Preset, rng: np.random.Generator, length: float
     start = 0.0 if center.closed else min(MARGIN, drive.length / 4)
     times, travelled = _progress(drive, preset.speed, start)
     return Road([center, *_side_streets([center], preset, rng)], 1, drive, times, travelled)
+
+
+def _indoors(kind: str, preset: Preset, rng: np.random.Generator, length: float) -> Road:
+    """The way through a building is a round: it leads through doors and comes back."""
+    if kind not in ("loop", "random"):
+        raise UsageError(f"--road {kind}: indoors the way leads through the rooms; want loop or random")
+    plan = (office if preset.indoor == "rooms" else car_park)(length, rng)
+    corners = Path(plan.way, True)
+    drive = Path(_smooth(corners.xy[:-1], 0.3 if preset.indoor == "rooms" else 1.5, True), True)
+    times, travelled = _progress(drive, preset.speed, 0.0)
+    return Road([drive], 1, drive, times, travelled, plan=plan)
 
 
 MARGIN = 110.0

@@ -11,8 +11,8 @@ from pydantic import Field
 from dpm2_core.config import Settings
 from dpm2_core.errors import UsageError
 
-PresetName = Literal["city", "suburb", "rural", "highway", "tunnel"]
-PRESET_NAMES: tuple[PresetName, ...] = ("city", "suburb", "rural", "highway", "tunnel")
+PresetName = Literal["city", "suburb", "rural", "highway", "tunnel", "indoor", "car_park"]
+PRESET_NAMES: tuple[PresetName, ...] = ("city", "suburb", "rural", "highway", "tunnel", "indoor", "car_park")
 
 
 class Imperfections(Settings):
@@ -103,6 +103,10 @@ class CameraConfig(Settings):
     """Cast shadows of the sun."""
     noise: float = Field(default=2.0, ge=0)
     """Standard deviation of a pixel value, of 255."""
+    wet: float = Field(default=0.0, ge=0, le=0.8)
+    """Fraction of the lens behind drops of water."""
+    lens: int = Field(default=0, ge=0)
+    """Seed of the drops."""
 
 
 class DriveConfig(Settings):
@@ -172,6 +176,8 @@ class Preset(Settings):
     """Amplitude of unevenness beside the road, m."""
     degenerate: bool = False
     """Constant section: nothing in the geometry constrains the motion along the road."""
+    indoor: Literal["", "rooms", "deck"] = ""
+    """Inside a building: the way leads through rooms or along a deck, and nothing is beside it but them."""
 
 
 PRESETS: dict[PresetName, Preset] = {
@@ -192,6 +198,8 @@ PRESETS: dict[PresetName, Preset] = {
     ),
     "highway": Preset(half_width=11.0, lane=6.5, speed=25.0, hills=0.0, roughness=0.0, traffic=1.5, degenerate=True),
     "tunnel": Preset(half_width=4.2, speed=14.0, hills=0.0, roughness=0.0, traffic=0.3, degenerate=True),
+    "indoor": Preset(half_width=1.0, lane=0.0, speed=1.2, hills=0.0, roughness=0.0, indoor="rooms"),
+    "car_park": Preset(half_width=3.0, lane=0.0, speed=4.0, hills=0.0, roughness=0.0, indoor="deck"),
 }  # fmt: skip
 _DENSITIES = (
     "buildings", "side_streets", "trees", "forest", "bushes", "boundaries", "parked", "poles", "clutter", "tufts",
@@ -201,6 +209,8 @@ _DENSITIES = (
 
 def varied(preset: Preset, rng: np.random.Generator) -> Preset:
     """One world's own values: variety of worlds is what makes a network trained on them work elsewhere."""
+    if preset.indoor:
+        return preset
     if preset.degenerate:
         return preset.model_copy(update={"traffic": preset.traffic * rng.uniform(0.3, 1.7)})
     own = {name: getattr(preset, name) * rng.uniform(0.3, 1.6) for name in _DENSITIES}
@@ -225,6 +235,8 @@ def with_traffic(own: Preset, nominal: Preset, factor: float) -> Preset:
     """
     if not 0 <= factor <= 1000:
         raise UsageError(f"--traffic {factor:g}: want 0 to 1000 times the preset's")
+    if own.indoor and factor > 1:
+        raise UsageError(f"--traffic {factor:g}: there is none indoors; want 0 to 1")
     if factor <= 1:
         return own.model_copy(update={"traffic": own.traffic * factor, "people": own.people * factor})
     wide = {} if own.half_width > 10 else {"lane": 1.8, "half_width": 9.4 if own.parked else 7.2}

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from dpm2_core.errors import UsageError
 from dpm2_core.geometry import se3
 from dpm2_core.sim import sections
+from dpm2_core.sim.indoor import Interior
 from dpm2_core.sim.layout import Layout
 from dpm2_core.sim.light import Light
 from dpm2_core.sim.mesh import Mesh, Scene, merge
@@ -83,15 +84,16 @@ class World:
     def sample_pose(
         self,
         rng: np.random.Generator,
-        lateral: float = 1.0,
+        lateral: float | None = None,
         heading: float = 0.1,
         height: float = 1.73,
         sway: float = 1.0,
     ) -> tuple[Array, float]:
         """T_world_lidar (4, 4) at a random place, up to `lateral` m and `heading` rad off the drive; its time, s.
 
-        It is tilted by as much as the suspension does, `sway` times.
+        `lateral` is 1 m by default, indoors 0.15 m. It is tilted by as much as the suspension does, `sway` times.
         """
+        lateral = (0.15 if self.road.plan else 1.0) if lateral is None else lateral
         time = float(rng.uniform(0, self.road.times[-1]))
         tilt = Rotation.from_rotvec([*rng.normal(0, 0.006 * sway, 2), 0]).as_matrix()
         T = self.pose_at(
@@ -114,7 +116,7 @@ def build_world(
 
     Args:
         road: straight, loop, figure8, random, or a file of KITTI poses.
-        preset: city, suburb, rural, highway or tunnel.
+        preset: city, suburb, rural, highway, tunnel, indoor or car_park.
         length: of the road (a lap, where it is closed), m; a file has its own.
         traffic: times that of the preset; see `with_traffic`.
 
@@ -127,15 +129,25 @@ def build_world(
     rngs = [random_stream(seed, preset, k) for k in range(4)]
     streets = make_road(road, kind, rngs[0], length)
     terrain = Terrain(streets, kind, rngs[1])
-    meshes = [terrain.ground()]
-    if preset == "highway":
+    meshes = [terrain.ground()] if streets.plan is None else []
+    if streets.plan is not None:
+        meshes += Interior(streets.plan, streets.drive.xy, rngs[2]).meshes()
+    elif preset == "highway":
         meshes += sections.clear(sections.highway(streets, terrain, rngs[2]), streets, terrain)
     elif preset == "tunnel":
         meshes += sections.clear(sections.tunnel(streets, terrain, rngs[2]), streets, terrain)
     else:
         meshes += Layout(streets, terrain, kind, rngs[2]).meshes()
     moving = make_traffic(streets, terrain, kind, rngs[3])
-    return World(preset, seed, streets, terrain, moving, Scene(merge(meshes)), Light(seed, preset == "tunnel"))
+    return World(
+        preset,
+        seed,
+        streets,
+        terrain,
+        moving,
+        Scene(merge(meshes)),
+        Light(seed, bool(kind.indoor) or preset == "tunnel"),
+    )
 
 
 def own_preset(preset: PresetName, seed: int, traffic: float = 1.0) -> Preset:

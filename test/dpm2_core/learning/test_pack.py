@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import shutil
+import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,7 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from dpm2_core.cli import app
-from dpm2_core.data.packed import PackedDrive
+from dpm2_core.data.packed import PackedDrive, Sample, open_packed, write_packed
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
@@ -128,3 +130,41 @@ def test_a_bag_with_poses_packs_like_its_drive(kitti: Path, tmp_path: Path) -> N
     assert len(one) == len(other) == 4
     motions = [se3.inverse(d.poses[0]) @ d.poses[3] for d in (one, other)]
     np.testing.assert_allclose(motions[0], motions[1], atol=1e-6)
+
+
+def test_all_drives_of_a_data_set_are_packed_and_a_second_run_makes_only_what_is_missing(
+    kitti: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(kitti / "sequences" / "03", kitti / "sequences" / "05")
+    out, arguments = tmp_path / "all", ["train", "pack", str(kitti), str(tmp_path / "all"), "--all"]
+    assert CliRunner().invoke(app, arguments).exit_code == 0
+    assert [drive.name for drive in open_packed(out)] == ["03", "05"]
+    shutil.rmtree(out / "05")
+    kept = (out / "03" / "clouds.npy").stat().st_mtime_ns
+    assert CliRunner().invoke(app, arguments).exit_code == 0
+    assert (out / "03" / "clouds.npy").stat().st_mtime_ns == kept
+    assert len(PackedDrive(out / "05")) == 4
+    one_of_all = CliRunner().invoke(app, [*arguments, "--set", "sequence=03"])
+    assert "packs every drive" in str(one_of_all.exception)
+    nothing = CliRunner().invoke(app, ["train", "pack", str(tmp_path / "all" / "03"), str(tmp_path / "x"), "--all"])
+    assert "no drives below" in str(nothing.exception)
+
+
+def test_packing_holds_a_frame_at_a_time(tmp_path: Path) -> None:
+    """A hundred frames cost less memory than thirty of them together."""
+    frame = Sample(np.random.default_rng(0).uniform(-50, 50, (30_000, 3)).astype(np.float32), np.eye(4))
+    tracemalloc.start()
+    write_packed(tmp_path / "d", (frame for _ in range(100)), {})
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 30 * frame.cloud.nbytes
+    drive = PackedDrive(tmp_path / "d")
+    assert len(drive) == 100
+    np.testing.assert_allclose(drive[99].cloud, frame.cloud, atol=0.0011)
+
+
+def test_frames_that_differ_leave_nothing_behind(tmp_path: Path) -> None:
+    frame = Sample(np.zeros((10, 3), np.float32), np.eye(4), (make_image(np.random.default_rng(0)),))
+    with pytest.raises(UsageError, match="some frames have an image and some have none"):
+        write_packed(tmp_path / "d", [frame, frame._replace(images=())], {})
+    assert not list(tmp_path.iterdir())

@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+import copy
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -119,3 +122,30 @@ def test_images_without_sky_and_without_anything_else(city: World) -> None:
     up = render(city, SMALL, se3.make(axes * [[1], [-1], [-1]], (x, y, z + 60)), 0.0, np.random.default_rng(0))
     assert down.std() > 3
     assert up.mean() > 80
+
+
+def test_drops_on_the_lens_blur_their_share_of_the_image_and_stay_where_they_are(city: World) -> None:
+    dry = CameraConfig(width=320, height=100, focal=180, noise=0.0)
+    wet = dry.model_copy(update={"wet": 0.2, "lens": 3})
+    changed = []
+    for s in (20.0, 60.0):
+        T = city.pose_at(s) @ calibration(dry).T_lidar_cam
+        clear, blurred = (render(city, config, T, 0.0, np.random.default_rng(0)) for config in (dry, wet))
+        changed.append((clear != blurred).any(-1))
+    assert all(0.15 < part.mean() < 0.45 for part in changed)
+    assert (changed[0] & changed[1]).mean() > 0.6 * min(part.mean() for part in changed)
+
+
+def test_hours_later_the_shadows_lie_elsewhere_and_the_scene_is_the_same(city: World) -> None:
+    config = CameraConfig(width=320, height=100, focal=180, noise=0.0)
+    city = replace(city, light=copy.copy(city.light))
+    city.light.overcast = 0.0
+    T = city.pose_at(40.0) @ calibration(config).T_lidar_cam
+    now, same, later = (
+        render(city, config, T, 0.0, np.random.default_rng(0), hours).astype(float) for hours in (0.0, 0.0, 3.0)
+    )
+    np.testing.assert_array_equal(now, same)
+    assert 2 < np.abs(now - later).mean() < 60
+    sun = city.light.later(3.0).sun
+    assert np.linalg.norm(sun) == pytest.approx(1, abs=1e-5)
+    assert np.degrees(np.arcsin(sun[2])) < np.degrees(np.arcsin(city.light.sun[2])) or sun[2] < 0.15

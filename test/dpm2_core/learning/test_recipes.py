@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The recipes in config/ are of the settings that read them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from dpm2_core.config import Settings, load_settings
+from dpm2_core.experiments.ablation import AblationSettings
+from dpm2_core.learning.generate import GenerateSettings
+from dpm2_core.learning.train_image import ImageTrainingSettings
+from dpm2_core.learning.train_overlap import OverlapTrainingSettings
+from dpm2_core.learning.train_registration import RegistrationTrainingSettings
+from dpm2_core.network.settings import preset
+
+CONFIG = Path(__file__).parents[3] / "config"
+READ_BY: dict[str, type[Settings]] = {
+    "ablation": AblationSettings,
+    "train_paper_overlap": OverlapTrainingSettings,
+    "train_paper_registration": RegistrationTrainingSettings,
+    "train_small": RegistrationTrainingSettings,
+    "train_small_camera": RegistrationTrainingSettings,
+    "train_small_image": ImageTrainingSettings,
+    "train_small_phase2": OverlapTrainingSettings,
+    "train_small_pose": RegistrationTrainingSettings,
+    "worlds_camera": GenerateSettings,
+}
+
+
+@pytest.mark.parametrize("path", sorted(CONFIG.glob("*.yaml")), ids=lambda path: path.stem)
+def test_every_key_of_a_recipe_is_a_setting(path: Path) -> None:
+    if path.stem in READ_BY:
+        load_settings(READ_BY[path.stem], path)
+    else:
+        assert path.stem.startswith("sros2"), f"{path.name}: say here what reads it"
+
+
+def test_the_recipes_of_the_paper_are_of_its_network_and_fit_each_other() -> None:
+    first = load_settings(RegistrationTrainingSettings, CONFIG / "train_paper_registration.yaml")
+    second = load_settings(OverlapTrainingSettings, CONFIG / "train_paper_overlap.yaml")
+    assert preset(first.preset) == preset("paper")
+    assert first.data.packed == second.data.packed
+    assert second.start == "out/paper/registration/weights.safetensors"
+    assert second.optimiser.rate == pytest.approx(first.optimiser.rate / 10)
+    assert second.optimiser.decay == pytest.approx(first.optimiser.decay / 10)
+    assert (first.loss.pairing, first.loss.coarse, first.loss.backbone, first.loss.offset) == (1, 0.1, 0.1, 1)
