@@ -145,3 +145,28 @@ def test_modules_that_are_named_exist(path: str) -> None:
     ]
     assert not stale
     assert names or path != "architecture.md"
+
+
+def test_the_first_table_of_the_readme_is_what_was_measured() -> None:
+    cells = {
+        row[2].split("](")[0].strip("["): row[1]
+        for row in rows("README.md", "| what sets it apart | measured | where |")
+    }
+    found = record("relocalise.json")
+    right, visits = round(found["right"] * found["visits"]), found["visits"]
+    said = f"{right} of {visits} places found, {found['no_answer']} said to be unknown, none wrong"
+    assert cells["relocalise"].endswith(said)
+    assert found["wrong"] == 0
+    tenth = record("hard.json")["drives"]["00"]["every 10"]
+    ours, theirs = re.findall(r"([\d.]+) m\b", cells["hard"])
+    assert equals(ours, tenth["adaptive"]["rpe_trans_m"])
+    assert equals(theirs, tenth["kiss-icp"]["rpe_trans_m"])
+    gaps = [drive["adaptive"]["summary"]["all"] for drive in record("gaps.json")["drives"].values()]
+    assert f"of {sum(drive['gaps'] for drive in gaps)} gaps" in cells["gaps"]
+    assert sum(drive["silently_wrong"] for drive in gaps) == 0
+    robots = record("robots.json")
+    assert len(robots["robots"]) == 3
+    assert (robots["packet_loss"], robots["outage"]["seconds"]) == (0.01, 30)
+    assert all(robot["keyframes_missing"] == 0 for robot in robots["robots"].values())
+    crash = record("map.json")["crash"]
+    assert (crash["kills"], crash["maps_that_open"], crash["most_keyframes_lost"]) == (50, 50, 0)

@@ -45,7 +45,7 @@ def moments(drive: Path, title: str) -> list[Picture]:
         poses.append(result.T_odom_lidar)
         near = frame.points[np.einsum("ij,ij->i", frame.points[:, :2], frame.points[:, :2]) < 40.0**2]
         near = near[voxel_first(near, _SPACING)]
-        clouds.append(se3.transform(result.T_odom_lidar, near)[:, :3])
+        clouds.append(se3.transform(result.T_odom_lidar, near)[:, :3].astype(np.float64))
     if len(poses) < 2:
         raise UsageError(f"{drive}: want a drive of two frames or more")
     way = np.array([T[:3, 3] for T in poses])

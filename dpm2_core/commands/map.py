@@ -92,12 +92,12 @@ def export(
     path: MapFile,
     out: Annotated[Path, typer.Argument(help="File to write; its ending says what, unless --format does.")],
     format: Annotated[
-        str, typer.Option(help="ply, pcd, las, occupancy (YAML and PGM for Nav2), tum, kitti or g2o.")
+        str, typer.Option(help="ply, pcd, las, html, occupancy (YAML and PGM for Nav2), tum, kitti or g2o.")
     ] = "",
     voxel: Annotated[float | None, typer.Option(min=0.01, help="Spacing of the points of a cloud, m [0.3].")] = None,
     resolution: Annotated[float | None, typer.Option(min=0.01, help="Cell of the occupancy grid, m [0.1].")] = None,
 ) -> None:
-    """Write a map as a point cloud, an occupancy grid, a trajectory of its keyframes, or a pose graph."""
+    """Write a map as a point cloud, a page for the browser, an occupancy grid, a trajectory, or a pose graph."""
     kind = format or _ENDINGS.get(out.suffix.lower(), "")
     if kind not in _EXPORTS:
         raise UsageError(f"{out}: choose --format from {', '.join(_EXPORTS)}")
@@ -225,6 +225,12 @@ def _export_g2o(data: MapData, out: Path) -> None:
     graph.write_g2o(out)
 
 
+def _export_page(data: MapData, out: Path, voxel: float) -> None:
+    from dpm2_core.evaluation.map_page import write_map_page
+
+    write_map_page(out, data, voxel)
+
+
 def _export_occupancy(data: MapData, out: Path, resolution: float) -> None:
     from dpm2_core.slam.mapping.occupancy import OccupancySettings, occupancy_grid, write_grid
 
@@ -237,6 +243,7 @@ _EXPORTS: dict[str, tuple[Callable[[MapData, Path, float], None], str]] = {
     "ply": (lambda data, out, voxel: write_ply(out, map_cloud(data.clouds, data.poses, voxel)), "voxel"),
     "pcd": (lambda data, out, voxel: write_pcd(out, map_cloud(data.clouds, data.poses, voxel)), "voxel"),
     "las": (lambda data, out, voxel: write_las(out, map_cloud(data.clouds, data.poses, voxel)), "voxel"),
+    "html": (_export_page, "voxel"),
     "occupancy": (_export_occupancy, "resolution"),
     "tum": (lambda data, out, _: write_tum(out, *trajectory(data)), ""),
     "kitti": (lambda data, out, _: write_kitti(out, trajectory(data)[1]), ""),
@@ -245,5 +252,5 @@ _EXPORTS: dict[str, tuple[Callable[[MapData, Path, float], None], str]] = {
 """How each kind is written, and the option that is its spacing."""
 _ENDINGS = {
     ".ply": "ply", ".pcd": "pcd", ".las": "las", ".yaml": "occupancy", ".pgm": "occupancy", ".tum": "tum",
-    ".g2o": "g2o",
+    ".g2o": "g2o", ".html": "html",
 }  # fmt: skip

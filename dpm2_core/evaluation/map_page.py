@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A map as one HTML file: points in level of detail, trajectory, keyframes with images, loops with their verdicts."""
+
+from __future__ import annotations
+
+import base64
+from collections import defaultdict
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from dpm2_core.data.compressed import decode_compressed
+from dpm2_core.evaluation.page import data_url, escape, page
+from dpm2_core.files import atomic_write
+from dpm2_core.frame import Array, Edge, Points
+from dpm2_core.geometry.voxel import voxel_first
+from dpm2_core.slam.store.map_data import MapData, map_cloud
+
+MOST_POINTS = 1_000_000
+"""6 MB, 8 MB as text."""
+IMAGES = 6_000_000
+"""Bytes that all images together may take, 8 MB as text."""
+_COARSEST = 12.8  # m, the first level of detail
+_SHARPEST = 60  # quality of a JPEG that had to be made smaller
+
+
+def write_map_page(path: Path, data: MapData, voxel: float) -> None:
+    """Write the page; needs at least one keyframe.
+
+    Args:
+        voxel: spacing of its points, m; of more than `MOST_POINTS` those are left out that show least.
+
+    Raises:
+        Dpm2Error: the file could not be written.
+    """
+    text = map_page(data, voxel, path.stem)
+    with atomic_write(path) as file:
+        file.write(text)
+
+
+def map_page(data: MapData, voxel: float, title: str) -> str:
+    """The page as text."""
+    assets = files("dpm2_core.evaluation") / "assets"
+    style, body, script = (assets.joinpath(f"map.{kind}").read_text("utf-8") for kind in ("css", "html", "js"))
+    return page(title, body.replace("TITLE", escape(title)), style=style, script=script, data=_content(data, voxel))
+
+
+def by_detail(cloud: Points, finest: float) -> Points:
+    """The points in an order of which every beginning shows the whole cloud evenly, and more of it the longer it is.
+
+    Args:
+        cloud: (N, 4). finest: m between points that nothing is gained by telling apart.
+    """
+    noise = np.random.default_rng(0)
+    rest, order, size = np.arange(len(cloud)), [], _COARSEST
+    while len(rest):
+        chosen = voxel_first(cloud[rest], size) if size > finest else np.arange(len(rest))
+        order.append(noise.permutation(rest[chosen]))
+        rest = np.delete(rest, chosen)
+        size /= 2
+    return cloud[np.concatenate(order)] if order else cloud
+
+
+def _content(data: MapData, voxel: float) -> dict[str, Any]:
+    """What the script of the page shows: positions relative to the middle of the keyframes."""
+    middle = data.poses[:, :3, 3].mean(0)
+    cloud = by_detail(map_cloud(data.clouds, data.poses, voxel), 2 * voxel)[:MOST_POINTS]
+    local = cloud[:, :3].astype(np.float64) - middle
+    scale = max(0.005, float(np.abs(local).max(initial=0.0)) / 32_000)
+    packed = np.round(local / scale).astype("<i2")
+    low, high = np.percentile(local[:, 2], [2, 98]) if len(local) else (0.0, 1.0)
+    return {
+        "scale": scale,
+        "heights": [float(low), float(max(high, low + 1.0))],
+        "points": base64.b64encode(packed.tobytes()).decode("ascii"),
+        "middle": middle.round(3).tolist(),
+        "keyframes": _keyframes(data, middle),
+        "tracks": _tracks(data, middle),
+        "loops": [_loop(edge) for edge in data.edges if edge.kind == "loop"],
+    }
+
+
+def _keyframes(data: MapData, middle: Array) -> list[dict[str, Any]]:
+    jpegs = [data.thumbnail(node) for node in range(len(data))]
+    room = IMAGES // max(1, sum(jpeg is not None for jpeg in jpegs))
+    return [
+        {
+            "at": (T[:3, 3] - middle).round(3).tolist(),
+            "stamp": str(keyframe.stamp),  # ns are more than a number of JavaScript holds
+            "frame": keyframe.index,
+            "robot": keyframe.robot,
+            "session": session,
+            "image": None if (small := _within(jpeg, room)) is None else data_url(small, "image/jpeg"),
+        }
+        for keyframe, session, T, jpeg in zip(data.keyframes, data.session, data.poses, jpegs, strict=True)
+    ]
+
+
+def _tracks(data: MapData, middle: Array) -> list[list[list[float]]]:
+    """The way of each session, through keyframes that were pruned as well."""
+    ways = defaultdict(list)
+    for keyframe, session, T in zip(data.keyframes, data.session, data.poses, strict=True):
+        ways[keyframe.robot, session].append((keyframe.stamp, T[:3, 3]))
+    for removed in data.trail:
+        T = data.poses[removed.node] @ removed.T_node_kf
+        ways[removed.robot, removed.session].append((removed.stamp, T[:3, 3]))
+    tracks = [np.array([position for _, position in sorted(way, key=lambda step: step[0])]) for way in ways.values()]
+    return [(track - middle).round(3).tolist() for track in tracks]
+
+
+def _loop(edge: Edge) -> dict[str, Any]:
+    r = edge.registration
+    rmse = round(r.rmse, 3) if np.isfinite(r.rmse) else None
+    return {
+        "from": edge.from_node, "to": edge.to_node, "ok": edge.ok, "reason": r.reason, "method": r.method,
+        "confidence": round(r.confidence, 3) if np.isfinite(r.confidence) else None, "rmse": rmse,
+    }  # fmt: skip
+
+
+def _within(jpeg: bytes | None, room: int) -> bytes | None:
+    """The image in at most so many bytes, smaller if it must be; None where there is none, or something else."""
+    if jpeg is None or not jpeg.startswith(b"\xff\xd8"):
+        return None
+    try:
+        pixels = decode_compressed(jpeg)[:, :, ::-1]
+    except ValueError:
+        return None
+    while len(jpeg) > room and min(pixels.shape[:2]) > 16:
+        pixels = cv2.resize(pixels, None, fx=0.7, fy=0.7, interpolation=cv2.INTER_AREA)
+        jpeg = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, _SHARPEST])[1].tobytes()
+    return jpeg if len(jpeg) <= room else None

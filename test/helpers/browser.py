@@ -1,0 +1,35 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A real browser for the pages that are written."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+
+@contextmanager
+def opened(path: Path, width: int = 800, height: int = 600) -> Iterator[tuple[Any, list[str]]]:
+    """A page in headless Chromium without a network, and what its console says; skips where there is no browser."""
+    api = pytest.importorskip("playwright.sync_api", reason="no playwright: pip install '.[test]'")
+    program = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if program is None:
+        pytest.skip("no Chromium (Debian: apt install chromium)")
+    said: list[str] = []
+    with api.sync_playwright() as playwright:
+        options = ["--no-sandbox", "--enable-unsafe-swiftshader", "--use-gl=angle", "--use-angle=swiftshader"]
+        browser = playwright.chromium.launch(executable_path=program, args=options)
+        try:
+            context = browser.new_context(viewport={"width": width, "height": height}, offline=True)
+            page = context.new_page()
+            page.set_default_timeout(120_000)  # software rendering beside other work
+            page.on("console", lambda message: said.append(f"{message.type}: {message.text}"))
+            page.on("pageerror", lambda error: said.append(f"error: {error}"))
+            page.goto(path.as_uri())
+            yield page, said
+        finally:
+            browser.close()

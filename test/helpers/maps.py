@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A map of a ring road, made without a drive: for what shows or writes maps."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from dpm2_core.frame import Edge, Keyframe, Registration
+from dpm2_core.geometry import se3
+from dpm2_core.slam.store.cloud_codec import pack_cloud
+from dpm2_core.slam.store.cloud_store import CloudStore
+from dpm2_core.slam.store.map_data import MapData
+from dpm2_core.slam.store.rows import NO_POINTS, Session
+
+SPACING = 5.0
+"""m between keyframes."""
+
+
+def ring(count: int, points: int = 2000, image: tuple[int, int] | None = None) -> MapData:
+    """Keyframes around a circle, counterclockwise from its rightmost place; walls of 8 m on both sides of the road.
+
+    Args:
+        points: of each cloud. image: width and height of the thumbnails, which are noise; None: none.
+    """
+    rng = np.random.default_rng(1)
+    radius = max(15.0, SPACING * count / (2 * np.pi))
+    angles = 2 * np.pi * np.arange(count) / count
+    poses = np.array([_pose(radius, angle) for angle in angles])
+    clouds = CloudStore()
+    for T in poses:
+        clouds.append(pack_cloud(_walls(rng, T, radius, points)))
+    keyframes = [Keyframe(i, 10**9 * i, 10 * i, T, NO_POINTS) for i, T in enumerate(poses)]
+    steps = [_edge("odometry", i, i + 1, poses) for i in range(count - 1)]
+    loops = [_edge("loop", 0, count - 1, poses), _edge("loop", 0, count // 2, poses).rejected("<b>points</b> disagree")]
+    session = Session(1, "0", "2026-01-01T00:00:00Z", "", "")
+    pictures = [None if image is None else _noise(rng, image) for _ in range(3)]
+    return MapData(
+        keyframes, [1] * count, poses, [*steps, *loops], [], [session], clouds, lambda node: pictures[node % 3]
+    )
+
+
+def _pose(radius: float, angle: float) -> np.ndarray:
+    turn = se3.exp(np.array([0, 0, angle + np.pi / 2, 0, 0, 0]))[:3, :3]
+    return se3.make(turn, np.array([radius * np.cos(angle), radius * np.sin(angle), 1.0]))
+
+
+def _walls(rng: np.random.Generator, T: np.ndarray, radius: float, points: int) -> np.ndarray:
+    at = np.arctan2(T[1, 3], T[0, 3]) + rng.uniform(-30, 30, points) / radius
+    out = radius + rng.choice([-8.0, 8.0], points)
+    world = np.column_stack([out * np.cos(at), out * np.sin(at), rng.uniform(0, 8, points)])
+    local = se3.transform(se3.inverse(T), world)
+    return np.column_stack([local, np.full(points, 0.5)]).astype(np.float32)
+
+
+def _edge(kind: str, a: int, b: int, poses: np.ndarray) -> Edge:
+    T = se3.inverse(poses[a]) @ poses[b]
+    return Edge(kind, a, b, Registration(T, np.eye(6) * 1e-4, 0.9, 0.1, "points"))  # type: ignore[arg-type]
+
+
+def _noise(rng: np.random.Generator, size: tuple[int, int]) -> bytes:
+    pixels = rng.integers(0, 255, (size[1], size[0], 3), dtype=np.uint8)
+    return bytes(cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, 95])[1])
