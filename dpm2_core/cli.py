@@ -50,6 +50,10 @@ GROUPS = {
             "experiment:experiment",
             "Make a table or figure of the papers on your copy of the data, theirs beside it.",
         ),
+        "report": (
+            "report:report",
+            "Show runs on one page: trajectories, loops, errors by length and speed, times and states.",
+        ),
     },
     "This machine": {
         "doctor": (

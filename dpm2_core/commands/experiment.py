@@ -89,7 +89,7 @@ def experiment(
     console = Console(stderr=True)
     for note in outcome.notes:
         console.print(note, style="yellow", soft_wrap=True)
-    console.print(f"Results in {out / name}.json", soft_wrap=True)
+    console.print(f"Results in {out / name}.json and .html", soft_wrap=True)
 
 
 def _split(text: str | None) -> tuple[str, ...]:

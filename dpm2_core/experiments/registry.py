@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, fields
 from importlib import import_module
 from pathlib import Path
@@ -10,8 +11,11 @@ from typing import Any
 
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.record import write_record
+from dpm2_core.evaluation.run_page import HtmlTable, runs_page
 from dpm2_core.experiments.part import Figures, Progress, run_parts
 from dpm2_core.experiments.request import Experiment, Outcome, Request
+from dpm2_core.experiments.table import html_table
+from dpm2_core.files import atomic_write
 
 _ALWAYS = frozenset({"data", "out", "sequences", "workers", "overrides"})
 
@@ -63,8 +67,26 @@ def load(name: str) -> Experiment:
     return found
 
 
+def tables_in(folder: Path) -> list[HtmlTable]:
+    """The tables of the experiments whose results are in a folder.
+
+    Raises:
+        UsageError: one is damaged.
+    """
+    tables = []
+    for name in EXPERIMENTS:
+        path = folder / f"{name}.json"
+        if not path.is_file():
+            continue
+        try:
+            tables += [html_table(record) for record in json.loads(path.read_text(encoding="utf-8"))["tables"]]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise UsageError(f"{path}: no record of an experiment: {error}") from None
+    return tables
+
+
 def carry_out(name: str, request: Request, progress: Progress | None = None) -> Outcome:
-    """Do all parts that are not done yet, and write OUT/NAME.json.
+    """Do all parts that are not done yet, and write OUT/NAME.json and OUT/NAME.html.
 
     Raises:
         UsageError: an option that the experiment has no use for, or data that it cannot use. Dpm2Error: a part failed.
@@ -79,6 +101,9 @@ def carry_out(name: str, request: Request, progress: Progress | None = None) -> 
     if len(commits) > 1:
         outcome.notes.append(f"parts were made at several commits: {', '.join(commits)}")
     write_record(request.out / f"{name}.json", name, _record(request, outcome, figures), threads=request.workers)
+    tables = [html_table(table.record()) for table in outcome.tables]
+    with atomic_write(request.out / f"{name}.html") as file:
+        file.write(runs_page(f"{name}: {EXPERIMENTS[name].paper}", outcome.runs, tables))
     return outcome
 
 

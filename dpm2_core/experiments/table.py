@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from dpm2_core.evaluation.run_page import HtmlTable
 from dpm2_core.tables import FigureTable
 
 MEAN = "mean"
@@ -54,7 +55,10 @@ class ResultTable:
 
     def record(self) -> dict[str, Any]:
         """For JSON."""
-        rows = [{"name": r.name, "origin": r.origin, "note": r.note, "cells": r.cells} for r in self.rows]
+        rows = [
+            {"name": r.name, "origin": r.origin, "note": r.note, "cells": r.cells, "texts": texts}
+            for r, texts in self.texts()
+        ]
         return {"title": self.title, "columns": list(self.columns), "caption": self.caption, "rows": rows}
 
     def texts(self) -> list[tuple[Row, list[str]]]:
@@ -83,3 +87,14 @@ def _mean(cells: Cells, columns: Sequence[str], figure: str) -> float | None:
     values = [cells.get(column, {}).get(figure) for column in columns]
     there = [value for value in values if value is not None]
     return sum(there) / len(there) if there and len(there) == len(values) else None
+
+
+def html_table(record: Mapping[str, Any]) -> HtmlTable:
+    """A table that `ResultTable.record` has written, for a page.
+
+    Raises:
+        KeyError, TypeError: it is none.
+    """
+    headings = ["method", "figures of", *record["columns"], "note"]
+    rows = [[row["name"], row["origin"], *row["texts"], row["note"]] for row in record["rows"]]
+    return HtmlTable(record["title"], headings, rows, record["caption"])

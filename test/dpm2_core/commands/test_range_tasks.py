@@ -58,7 +58,7 @@ def test_train_and_measure(pairs: Path, tmp_path: Path, name: str, stages: list[
 
     rejected = dpm2("eval-task", name, weights, pairs, "--slam")
     assert rejected.returncode == 2
-    assert "no sequences with poses" in rejected.stderr
+    assert "no poses0.txt beside the pairs" in rejected.stderr
     other = "ae_lidar" if name == "dslr" else "dslr"
     rejected = dpm2("eval-task", other, weights, pairs)
     assert rejected.returncode == 2

@@ -53,6 +53,11 @@ def test_kitti_beside_other_programs(kitti: Path, tmp_path: Path) -> None:
     assert record["request"]["lengths"] == [2.0, 3.0]
     assert record["parts"]["dpm2_geometric/06"]["truth"] == "poses/06.txt"
     assert (out / "trajectories_10.png").stat().st_size > 5000
+    assert "DeepPointMap2" in (out / "kitti.html").read_text()
+    page = tmp_path / "report.html"
+    assert dpm2("report", out, "--out", page).returncode == 0
+    assert "somebody/10" in page.read_text()
+    assert "KITTI odometry: t_err" in page.read_text()  # the experiment's table
     before = {path: path.stat().st_mtime_ns for path in out.rglob("part.json")}
     assert len(before) == 8
     again = dpm2(*call)

@@ -1,0 +1,31 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`dpm2 report`: runs and experiments as one HTML page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from dpm2_core.console import Console
+
+
+def report(
+    folders: Annotated[list[Path], typer.Argument(help="Folders of `dpm2 run` or `dpm2 experiment`, or above such.")],
+    out: Annotated[Path, typer.Option(help="HTML file to write.")] = Path("report.html"),
+) -> None:
+    """Show runs on one page: trajectories, loops, errors by length and speed, times and states.
+
+    Runs of one drive are drawn together. The page needs no network and no other file.
+    """
+    from dpm2_core.evaluation.run_page import find_runs, runs_page  # scipy is slow to import
+    from dpm2_core.experiments.registry import tables_in
+    from dpm2_core.files import atomic_write
+
+    runs = find_runs(folders)
+    tables = [table for folder in folders for table in tables_in(folder)]
+    text = runs_page(", ".join(folder.resolve().name for folder in folders), runs, tables)
+    with atomic_write(out) as file:
+        file.write(text)
+    Console(stderr=True).print(f"{out}: {len(runs)} runs, {len(text) / 1e6:.1f} MB", soft_wrap=True)

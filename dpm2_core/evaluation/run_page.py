@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One or many runs on one HTML page: trajectories, loops, errors, times and states, without another file or network."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dpm2_core.data.trajectory import matched
+from dpm2_core.errors import UsageError
+from dpm2_core.evaluation.kitti_metric import known
+from dpm2_core.evaluation.metrics import align
+from dpm2_core.evaluation.page import escape, page
+from dpm2_core.evaluation.run_folder import TRAJECTORY, RunFolder, read_run
+from dpm2_core.frame import Array
+
+_BINS = 300  # of the time along a drive
+_FIGURES = {
+    "t_err_percent": ("t_err %", ".3f"), "r_err_deg_per_100m": ("r_err deg/100 m", ".3f"),
+    "ape_rmse_m": ("APE rmse m", ".3f"), "ape_mean_m": ("APE mean m", ".3f"), "rpe_trans_m": ("RPE m", ".4f"),
+    "final_drift_percent": ("drift %", ".3f"), "failed_frames": ("failed", "d"), "breaks": ("breaks", "d"),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class HtmlTable:
+    """A table on the page: its title, headings, rows of text, and what stands below."""
+
+    title: str
+    headings: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    caption: str = ""
+
+
+def find_runs(folders: Sequence[Path]) -> list[tuple[str, Path]]:
+    """Every run in or below the folders, with a name: its folder's, and those above it as far as they are below.
+
+    Raises:
+        UsageError: no such folder, or no run in it.
+    """
+    found = []
+    for folder in folders:
+        if not folder.is_dir():
+            raise UsageError(f"{folder}: no such folder")
+        below = sorted(path.parent for path in folder.rglob(TRAJECTORY))
+        if not below:
+            raise UsageError(f"{folder}: no run in or below it; want {TRAJECTORY}, which `dpm2 run` writes")
+        found += [(str(path.relative_to(folder)) if path != folder else folder.resolve().name, path) for path in below]
+    return found
+
+
+def runs_page(title: str, runs: Sequence[tuple[str, Path]], tables: Sequence[HtmlTable] = ()) -> str:
+    """The page of such runs; those with the same truth are drawn in one frame.
+
+    Raises:
+        UsageError: a file of a run is damaged.
+    """
+    read = [(name, read_run(path)) for name, path in runs]
+    groups = _by_truth(read)
+    parts = [f"<h1>{escape(title)}</h1>", *(_table(table) for table in [*tables, *([_figures(read)] if read else [])])]
+    if groups:
+        parts.append('<div id="groups"></div><noscript>The drawings need JavaScript.</noscript>')
+    assets = Path(__file__).with_name("assets")
+    return page(
+        title,
+        "\n".join(parts),
+        style=(assets / "run_page.css").read_text(encoding="utf-8"),
+        script=(assets / "run_page.js").read_text(encoding="utf-8") if groups else "",
+        data=[_group(group) for group in groups] if groups else None,
+    )
+
+
+def _by_truth(runs: Sequence[tuple[str, RunFolder]]) -> list[list[tuple[str, RunFolder]]]:
+    """Runs of one drive together; one without a truth stands alone."""
+
+    def key(item: tuple[str, RunFolder]) -> str:
+        name, run = item
+        if run.truth is None:
+            return f"1 {name}"
+        first = run.truth.poses[[0, -1], :3, 3].round(2).tolist()
+        return f"0 {run.truth.keys[0]:020d} {len(run.truth)} {first}"
+
+    return [list(group) for _, group in groupby(sorted(runs, key=key), key)]
+
+
+def _group(runs: Sequence[tuple[str, RunFolder]]) -> dict[str, Any]:
+    truth = runs[0][1].truth
+    way = [] if truth is None else _flat(truth.poses[:, :3, 3])
+    name = ", ".join(name for name, _ in runs) if len(runs) < 3 else f"{runs[0][0]} and {len(runs) - 1} more"
+    return {"name": name, "truth": way, "runs": [_run(name, run) for name, run in runs]}
+
+
+def _run(name: str, run: RunFolder) -> dict[str, Any]:
+    T = _alignment(run)
+    positions = (T @ run.trajectory.poses)[:, :3, 3]
+    ends = np.array([[loop.start, loop.end] for loop in run.loops]).reshape(-1, 2, 3) @ T[:3, :3].T + T[:3, 3]
+    total = run.stages_ms.get("total", np.sum(list(run.stages_ms.values()), axis=0) if run.stages_ms else np.zeros(0))
+    stages = {stage: round(float(times.mean()), 3) for stage, times in run.stages_ms.items() if len(times)}
+    return {
+        "name": name,
+        "way": _flat(positions),
+        "loops": [
+            [*np.round(end[:, :2].ravel(), 2).tolist(), loop.accepted, loop.reason]
+            for end, loop in zip(ends, run.loops, strict=True)
+        ],
+        "states": _runs_of(run.states),
+        "stages": stages,
+        "time": [
+            round(float(part.mean()), 2) for part in np.array_split(total, max(1, min(_BINS, len(total)))) if len(part)
+        ],
+        "byLength": _errors(run.metrics.get("per_length", ()), "length_m"),
+        "bySpeed": _errors(run.metrics.get("per_speed", ()), "speed_mps"),
+    }
+
+
+def _alignment(run: RunFolder) -> Array:
+    """T_truth_map (4, 4); the identity where too few poses belong together."""
+    if run.truth is None:
+        return np.eye(4)
+    try:
+        true, est = matched(run.truth, run.trajectory)
+    except UsageError:
+        return np.eye(4)
+    both = known(true) & known(est)
+    return align(est[both, :3, 3], true[both, :3, 3]) if both.sum() > 1 else np.eye(4)
+
+
+def _flat(positions: Array) -> list[float]:
+    """x, y of (N, 3) positions one after the other, to the centimeter."""
+    sound = positions[np.isfinite(positions).all(1), :2]
+    found: list[float] = np.round(sound, 2).ravel().tolist()
+    return found
+
+
+def _runs_of(states: Sequence[str]) -> list[tuple[str, int]]:
+    """Each state that lasts, and for how many frames."""
+    return [(state, len(list(group))) for state, group in groupby(states)]
+
+
+def _errors(rows: Sequence[dict[str, Any]], key: str) -> list[list[float]]:
+    names = (key, "t_err_percent", "r_err_deg_per_100m")
+    return [[row[name] for name in names] for row in rows if all(row.get(name) is not None for name in names)]
+
+
+def _figures(runs: Sequence[tuple[str, RunFolder]]) -> HtmlTable:
+    headings = ["run", "frames", *(heading for heading, _ in _FIGURES.values()), "frames/s", "loops", "rejected"]
+    rows = []
+    for name, run in runs:
+        values = [run.metrics.get(key) for key in _FIGURES]
+        shown = zip(values, (form for _, form in _FIGURES.values()), strict=True)
+        accepted = sum(loop.accepted for loop in run.loops)
+        fps = run.timing.get("fps")
+        rows.append([
+            name, str(len(run.trajectory)), *("-" if value is None else format(value, form) for value, form in shown),
+            "-" if fps is None else f"{fps:.1f}", str(accepted), str(len(run.loops) - accepted),
+        ])  # fmt: skip
+    return HtmlTable("Runs", headings, rows, "APE after SE(3) alignment, RPE and the KITTI metric unaligned.")
+
+
+def _table(table: HtmlTable) -> str:
+    head = "".join(f"<th>{escape(text)}</th>" for text in table.headings)
+    body = "".join(f"<tr>{''.join(f'<td>{escape(text)}</td>' for text in row)}</tr>\n" for row in table.rows)
+    caption = f"<p>{escape(table.caption)}</p>" if table.caption else ""
+    title = escape(table.title)
+    return f'<h2>{title}</h2><div class="wide"><table><tr>{head}</tr>\n{body}</table></div>{caption}'
