@@ -25,7 +25,7 @@ from benchmarks.harness import (
     unique_name,
 )
 from dpm2_core.evaluation.metrics import Metrics, evaluate
-from dpm2_core.frame import Array, Frame
+from dpm2_core.frame import Array, Frame, State
 from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.output import TrajectoryRecorder
 from dpm2_core.tables import FigureTable
@@ -48,6 +48,7 @@ class Outcome:
         cpu_seconds: of all frames and threads; other programs disturb it less.
         stages: (N,) wall time of each stage, s.
         failed: frames without a registration.
+        states: of each frame; empty where the method has none.
     """
 
     poses: Array
@@ -55,6 +56,7 @@ class Outcome:
     cpu_seconds: float
     stages: dict[str, Array] = field(default_factory=dict)
     failed: int = 0
+    states: list[State] = field(default_factory=list)
 
 
 Method = Callable[[Sequence[Frame]], Outcome]
@@ -77,7 +79,8 @@ def dpm2(options: Options, *more: str) -> Method:
         failed = sum(not t.registration.ok for t in tracked)
         for t in tracked:
             recorder.add(t)
-        return Outcome(recorder.poses(slam.mapper.poses), seconds, cpu, stages, failed)
+        states = [t.state for t in tracked]
+        return Outcome(recorder.poses(slam.mapper.poses), seconds, cpu, stages, failed, states)
 
     return run
 

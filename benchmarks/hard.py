@@ -1,68 +1,112 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Few frames per second: every 3rd, 6th and 10th frame of the drives, for each registration and for KISS-ICP."""
+"""Who survives what: the hardships of `hardships.py` for each registration and for KISS-ICP, with a picture."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from rich.console import Group
 from rich.progress import Progress
 
 from benchmarks.geometric import BASELINE, Method, Outcome, dpm2, kiss_icp
+from benchmarks.hardships import EVERY, Case, cases, judged
 from benchmarks.harness import Options, Report, drives, processors, requested, truth_of, unique_name
+from dpm2_core.data.source import Source
+from dpm2_core.evaluation.figures import verdicts_png
 from dpm2_core.evaluation.metrics import evaluate
-from dpm2_core.frame import Array
+from dpm2_core.frame import State
+from dpm2_core.sim.settings import PresetName
+from dpm2_core.sim.simulated_drive import SimulatedDrive
 from dpm2_core.tables import FigureTable
 
-EVERY = (1, 3, 6, 10)
-"""Every so manieth frame: at 10 Hz and 50 km/h 1.4, 4, 8 and 14 m apart."""
 REGISTRATIONS = ("adaptive", "refined", "neural", "geometric")
+_MOST = 150  # frames of a drive
+_RATES = tuple(f"every {every}" for every in EVERY)
+_SYNTHETIC: tuple[tuple[str, PresetName, int], ...] = (("loop", "city", 940_000), ("random", "suburb", 940_001))
+"""Worlds that no training has seen, beside the real drives."""
 
 
 def bench_hard(options: Options) -> Report:
-    """Every method on every drive at every rate, once, without loops and images; `--only` chooses one method.
+    """Every method in every hardship on every drive, once, without images; `--only` chooses one method.
+
+    The picture is `hard.png` beside the record.
 
     Raises:
         UsageError: there is no drive, or one has no ground truth.
     """
     methods: dict[str, Method] = {}
     for name in requested(options, (*REGISTRATIONS, BASELINE)):
-        run = kiss_icp(options) if name == BASELINE else _odometry(options, name)
+        run = kiss_icp(options) if name == BASELINE else _slam(options, name)
         if run is not None:
             methods[name] = run
     results: dict[str, Any] = {}
-    with drives(options) as sources, processors(options.threads), Progress(transient=True) as progress:
-        task = progress.add_task("benchmark", total=len(sources) * len(EVERY) * len(methods))
+    with drives(options) as real, processors(options.threads), Progress(transient=True) as progress:
+        synthetic = (
+            [] if options.sources else [SimulatedDrive(road, preset, seed, preset) for road, preset, seed in _SYNTHETIC]
+        )
+        sources: list[Source] = [*real, *synthetic]
         for source in sources:
-            poses, frames = truth_of(source), list(source.frames())
-            rates: dict[str, Any] = {}
-            for every in [every for every in EVERY if len(frames) > every]:  # two frames at least
-                rates[f"every {every}"] = row = {}
-                for name, run in methods.items():
-                    progress.update(task, description=f"{source.name}: {name}, every {every}")
-                    row[name] = _figures(poses[::every], run(frames[::every]))
+            frames = list(source.frames(0, _MOST))
+            hard = list(cases(frames, truth_of(source)[: len(frames)]))
+            name, task = unique_name(source, results), progress.add_task(source.name, total=len(hard) * len(methods))
+            results[name] = {}
+            for case in hard:
+                results[name][case.name] = row = {}
+                for method, run in methods.items():
+                    progress.update(task, description=f"{source.name}: {case.name}, {method}")
+                    row[method] = _figures(case, run(case.frames))
                     progress.advance(task)
-            results[unique_name(source, results)] = rates
-    return Report({"drives": results}, Group(_table(results)))
+    options.out.mkdir(parents=True, exist_ok=True)
+    draw(options.out / "hard.png", results)
+    return Report({"drives": results}, Group(_table(results), *_rates(results)))
 
 
-def _odometry(options: Options, registration: str) -> Method:
-    return dpm2(options, f"slam.registration={registration}", "slam.loops.enabled=false", "slam.visual.enabled=false")
+def draw(path: Path, results: Mapping[str, Any]) -> None:
+    """The picture: a row for each hardship of each drive, a column for each method."""
+    rows = {
+        f"{drive}: {case}": {method: (figures["verdict"], figures["error_m"]) for method, figures in methods.items()}
+        for drive, hard in results.items()
+        for case, methods in hard.items()
+    }
+    verdicts_png(path, rows, "Who survives what: worst error afterwards, m")
 
 
-def _figures(truth: Array, outcome: Outcome) -> dict[str, Any]:
-    metrics = evaluate(truth, outcome.poses, failed_frames=outcome.failed)
-    names: Sequence[str] = ("frames", "failed_frames", "rpe_trans_m", "rpe_rot_deg", "final_drift_percent")
-    return {name: getattr(metrics, name) for name in names}
+def _slam(options: Options, registration: str) -> Method:
+    return dpm2(options, f"slam.registration={registration}", "slam.visual.enabled=false")
 
 
-def _table(results: dict[str, Any]) -> FigureTable:
+def _figures(case: Case, outcome: Outcome) -> dict[str, Any]:
+    states: Sequence[State | None] = outcome.states or [None] * len(case.frames)
+    figures = {"frames": len(case.frames), "failed_frames": outcome.failed, **judged(case, outcome.poses, states)}
+    if case.name in _RATES:
+        metrics = evaluate(case.truth, outcome.poses, failed_frames=outcome.failed)
+        figures |= {key: getattr(metrics, key) for key in ("rpe_trans_m", "rpe_rot_deg", "final_drift_percent")}
+    return figures
+
+
+def _table(results: Mapping[str, Any]) -> FigureTable:
+    methods: Sequence[str] = list(next(iter(next(iter(results.values())).values())))
+    table = FigureTable(
+        "Worst error afterwards, m. ?: wrong, and says so; !: wrong without a word.",
+        names=["drive", "hardship"],
+        figures=methods,
+    )
+    marks = {"right": "", "said": " ?", "silent": " !"}
+    for drive, hard in results.items():
+        for case, row in hard.items():
+            cells = (f"{figures['error_m']:.2f}{marks[figures['verdict']]}" for figures in row.values())
+            table.add_row(drive, case, *cells)
+    return table
+
+
+def _rates(results: Mapping[str, Any]) -> list[FigureTable]:
     figures = ("RPE m", "RPE deg", "drift %", "failed")
     table = FigureTable("Few frames per second", names=["drive", "frames", "method"], figures=figures)
-    for drive, rates in results.items():
-        for rate, methods in rates.items():
-            for name, row in methods.items():
+    for drive, hard in results.items():
+        for rate in [rate for rate in _RATES if rate in hard]:
+            for name, row in hard[rate].items():
                 errors = [f"{row[key]:.3f}" for key in ("rpe_trans_m", "rpe_rot_deg", "final_drift_percent")]
                 table.add_row(drive, rate, name, *errors, str(row["failed_frames"]))
-    return table
+    return [table]

@@ -73,8 +73,10 @@ def test_the_figures_at_few_frames_per_second_are_those_of_the_record() -> None:
         for every, cell in zip((1, 3, 6, 10), cells[2:], strict=True):
             assert equals(cell, drives[drive][f"every {every}"][method]["rpe_trans_m"]), (drive, method, every)
         seen += 1
-    assert seen == len(drives) * len(methods)
-    assert all(rate["adaptive"]["failed_frames"] == 0 for drive in drives.values() for rate in drive.values())
+    real = [name for name in drives if name.isdigit()]
+    assert seen == len(real) * len(methods)
+    rates = [drives[name][f"every {every}"] for name in real for every in (1, 3, 6, 10)]
+    assert all(rate["adaptive"]["failed_frames"] == 0 for rate in rates)
 
 
 def test_bold_is_what_is_best() -> None:

@@ -93,6 +93,8 @@ def test_frames_farther_apart_are_measured_as_far_as_a_drive_has_them(sequence: 
     assert [(rate, row["geometric"]["frames"]) for rate, row in rates.items()] == [("every 1", 6), ("every 3", 2)]
     assert rates["every 1"]["geometric"]["rpe_trans_m"] < 0.02
     assert rates["every 1"]["geometric"]["failed_frames"] == 0
+    assert rates["every 1"]["geometric"]["verdict"] == "right"
+    assert (tmp_path / "hard.png").read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.weights

@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What breaks odometries, made of any drive: few frames per second, gaps, a blind sensor, a bad start, kidnapping."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from dpm2_core.frame import Array, Frame, State
+from dpm2_core.geometry import se3
+
+EVERY = (1, 3, 6, 10)
+"""Every so manieth frame: at 10 Hz and 50 km/h 1.4, 4, 8 and 14 m apart."""
+GAPS, BLIND = (1.0, 2.0, 3.0, 5.0), (1.0, 2.0, 3.0)  # s
+_BEFORE, _AFTER = 20, 20  # frames around a gap or a blind sensor
+_START = 25  # frames of a drive that begins at a bad moment
+_AWAY = 2.0  # s that a robot is carried
+_RIGHT = 0.5, 0.02  # m, and of the way: no farther off is right
+_STILL = 3.0  # m/s, and
+_TURNING = 0.1  # rad/s: less is no curve
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """One hardship.
+
+    Attributes:
+        frames: what the method is given. truth: (N, 4, 4) their poses.
+        event: the first frame after what happens; errors are those of the way from the frame before it.
+    """
+
+    name: str
+    frames: list[Frame]
+    truth: Array
+    event: int = 1
+
+
+def cases(frames: Sequence[Frame], truth: Array) -> Iterator[Case]:
+    """All that a drive, its frames and their poses (N, 4, 4), has room for."""
+    count = len(frames)
+    for every in [every for every in EVERY if count > every]:  # two frames at least
+        yield Case(f"every {every}", list(frames[::every]), truth[::every])
+    stamps = np.array([frame.stamp for frame in frames]) * 1e-9
+    period = float(np.median(np.diff(stamps)))
+    for kind, lengths in (("gap", GAPS), ("blind", BLIND)):
+        for seconds in lengths:
+            missing = round(seconds / period)
+            first = (count - missing) // 2
+            if min(first, count - first - missing) >= _AFTER // 2:
+                yield _interrupted(f"{kind} {seconds:g} s", frames, truth, first, missing)
+    yield from _starts(frames, truth, period)
+    if count >= 3 * _AFTER // 2:
+        yield _kidnapped(frames, truth)
+
+
+def judged(case: Case, poses: Array, states: Sequence[State | None]) -> dict[str, Any]:
+    """How far off the second half of what follows is, and what the method said of it.
+
+    Args:
+        poses: (N, 4, 4). states: of each frame; None where the method has none, and so never doubts.
+
+    Returns:
+        `error_m`, the worst, m; `verdict`: `right`, `said` (wrong, but no wrong frame claimed to be tracking) or
+        `silent` (wrong without a word).
+    """
+    base = case.event - 1
+    steps = np.linalg.norm(np.diff(case.truth[:, :3, 3], axis=0), axis=1)
+    worst, verdict = 0.0, "right"
+    for i in range(case.event + (len(case.frames) - case.event) // 2, len(case.frames)):
+        T_true, T = se3.inverse(case.truth[base]) @ case.truth[i], se3.inverse(poses[base]) @ poses[i]
+        error = float(np.linalg.norm((se3.inverse(T_true) @ T)[:3, 3]))
+        worst = max(worst, error)
+        if error > _RIGHT[0] + _RIGHT[1] * steps[base:i].sum():
+            claimed = states[i] in (None, State.TRACKING)
+            verdict = "silent" if claimed or verdict == "silent" else "said"
+    return {"error_m": round(worst, 3), "verdict": verdict}
+
+
+def _interrupted(name: str, frames: Sequence[Frame], truth: Array, first: int, missing: int) -> Case:
+    """Without some frames, or, for `blind`, with frames that show nothing but dirt on the window."""
+    start, stop = max(first - _BEFORE, 0), min(first + missing + _AFTER, len(frames))
+    between = range(first, first + missing) if name.startswith("blind") else range(0)
+    indices = [*range(start, first), *between, *range(first + missing, stop)]
+    seen = [_dirty(frames[i]) if i in between else frames[i] for i in indices]
+    # The way is that from the last frame that showed something.
+    kept = Case(name, seen, truth[indices], first - start)
+    return kept if not between else replace(kept, event=first - start + missing)
+
+
+def _dirty(frame: Frame) -> Frame:
+    """Some returns from the window itself."""
+    rng = np.random.default_rng(frame.index)
+    points = np.c_[rng.uniform(-0.5, 0.5, (300, 3)), np.zeros(300)].astype(np.float32)
+    return Frame(frame.stamp, points, index=frame.index)
+
+
+def _starts(frames: Sequence[Frame], truth: Array, period: float) -> Iterator[Case]:
+    """From where the vehicle is fastest, and from where it turns fastest."""
+    room = len(frames) - _START
+    if room < 1:
+        return
+    motion = np.array([se3.log(se3.inverse(a) @ b) / period for a, b in pairwise(truth)])
+    fast, turning = np.linalg.norm(motion[:room, 3:], axis=1), np.abs(motion[:room, 2])
+    for name, rate, least in (("start at speed", fast, _STILL), ("start in a curve", turning, _TURNING)):
+        i = int(rate.argmax())
+        if rate[i] >= least:
+            yield Case(name, list(frames[i : i + _START]), truth[i : i + _START])
+
+
+def _kidnapped(frames: Sequence[Frame], truth: Array) -> Case:
+    """Carried back to where one has been, 2 s later: the stamps go on."""
+    half = len(frames) // 2
+    back = half // 4
+    indices = [*range(half), *range(back, min(back + _AFTER, half))]
+    late = frames[half - 1].stamp + round(_AWAY * 1e9) - frames[back].stamp
+    seen = [frame if k < half else replace(frame, stamp=frame.stamp + late) for k, frame in
+            ((k, frames[i]) for k, i in enumerate(indices))]  # fmt: skip
+    return Case("kidnapped", seen, truth[indices], half)
