@@ -169,7 +169,8 @@ def earlier(path: Path, key: str, **same: Any) -> dict[str, Any]:
     """What an earlier run left under a key of its JSON; {} if it is not there, is damaged or differs in `same`."""
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
-        return dict(record[key]) if all(record[name] == value for name, value in same.items()) else {}
+        as_written = json.loads(json.dumps(same))  # where tuples are lists
+        return dict(record[key]) if all(record[name] == value for name, value in as_written.items()) else {}
     except (OSError, ValueError, KeyError, TypeError):
         return {}
 
