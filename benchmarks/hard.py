@@ -64,13 +64,15 @@ def bench_hard(options: Options) -> Report:
 
 
 def draw(path: Path, results: Mapping[str, Any]) -> None:
-    """The picture: a row for each hardship of each drive, a column for each method."""
-    rows = {
-        f"{drive}: {case}": {method: (figures["verdict"], figures["error_m"]) for method, figures in methods.items()}
+    """The picture: a table for each drive, a row for each hardship, a column for each method."""
+    panels = {
+        drive: {
+            case: {method: (figures["verdict"], figures["error_m"]) for method, figures in methods.items()}
+            for case, methods in hard.items()
+        }
         for drive, hard in results.items()
-        for case, methods in hard.items()
     }
-    verdicts_png(path, rows, "Who survives what: worst error afterwards, m")
+    verdicts_png(path, panels, "Who survives what: worst error afterwards, m")
 
 
 def _slam(options: Options, registration: str) -> Method:

@@ -208,11 +208,21 @@ def bars_png(path: Path | str, groups: Mapping[str, Mapping[str, float]], title:
         FigureCanvasAgg(figure).print_png(file)
 
 
-def verdicts_png(path: Path | str, rows: Mapping[str, Mapping[str, tuple[str, float]]], title: str = "") -> None:
-    """A table whose colors say at one look who was right, who was wrong and said so, and who was silently wrong.
+_VERDICTS = {
+    "right": ("#b7dfb0", "right"),
+    "said": ("#f6df9a", "wrong, and says so"),
+    "silent": ("#e79a92", "wrong, without a word"),
+}
+
+
+def verdicts_png(
+    path: Path | str, panels: Mapping[str, Mapping[str, Mapping[str, tuple[str, float]]]], title: str = ""
+) -> None:
+    """Tables beside one another whose colors say at one look who was right, and who was wrong without a word.
 
     Args:
-        rows: name of a row, name of a column, and the verdict (`right`, `said`, `silent`) with the figure to write.
+        panels: title of a table, name of a row, name of a column, and the verdict (`right`, `said`, `silent`) with the
+            figure to write; rows are those of all tables.
 
     Raises:
         Dpm2Error: the file could not be written.
@@ -222,41 +232,34 @@ def verdicts_png(path: Path | str, rows: Mapping[str, Mapping[str, tuple[str, fl
         from matplotlib.figure import Figure
         from matplotlib.patches import Rectangle
 
-    meaning = {
-        "right": ("#b7dfb0", "right"),
-        "said": ("#f6df9a", "wrong, and says so"),
-        "silent": ("#e79a92", "wrong, without a word"),
-    }
-    columns = list(dict.fromkeys(name for row in rows.values() for name in row))
-    figure = Figure(figsize=(1.6 + 1.3 * len(columns) + 1.2, 0.22 * len(rows) + 1.2), dpi=110)
-    axes = figure.add_subplot()
-    for y, row in enumerate(rows.values()):
-        for name, (verdict, value) in row.items():
-            x = columns.index(name)
-            axes.add_patch(Rectangle((x, y), 0.98, 0.94, color=meaning[verdict][0]))
-            axes.text(
-                x + 0.49,
-                y + 0.5,
-                f"{value:.2f}" if value < 10 else f"{value:.0f}",
-                ha="center",
-                va="center",
-                fontsize=7,
-            )
-    axes.set_xlim(0, len(columns))
-    axes.set_ylim(len(rows), 0)
-    axes.set_xticks(np.arange(len(columns)) + 0.5, columns, fontsize=9)
-    axes.set_yticks(np.arange(len(rows)) + 0.5, list(rows), fontsize=7)
-    axes.xaxis.tick_top()
-    axes.tick_params(length=0)
-    for side in axes.spines.values():
-        side.set_visible(False)
-    figure.legend(
-        [Rectangle((0, 0), 1, 1, color=color) for color, _ in meaning.values()],
-        [words for _, words in meaning.values()],
-        loc="lower center", ncols=3, fontsize=8, frameon=False,
-    )  # fmt: skip
+    rows = list(dict.fromkeys(row for table in panels.values() for row in table))
+    columns = list(dict.fromkeys(name for table in panels.values() for row in table.values() for name in row))
+    figure = Figure(figsize=(1.2 + 0.55 * len(columns) * len(panels), 0.24 * len(rows) + 1.7), dpi=120)
+    for k, (name, table) in enumerate(panels.items(), 1):
+        axes = figure.add_subplot(1, len(panels), k)
+        for row, cells in table.items():
+            for column, (verdict, value) in cells.items():
+                x, y = columns.index(column), rows.index(row)
+                axes.add_patch(Rectangle((x, y), 0.96, 0.92, color=_VERDICTS[verdict][0]))
+                axes.text(
+                    x + 0.48,
+                    y + 0.5,
+                    f"{value:.2f}" if value < 9.95 else f"{value:.0f}",
+                    ha="center",
+                    va="center",
+                    fontsize=7,
+                )
+        axes.set(xlim=(0, len(columns)), ylim=(len(rows), 0), xlabel=name)
+        axes.set_xticks(np.arange(len(columns)) + 0.5, columns, fontsize=8, rotation=50, ha="left")
+        axes.set_yticks(np.arange(len(rows)) + 0.5, rows if k == 1 else [""] * len(rows), fontsize=8)
+        axes.xaxis.tick_top()
+        axes.tick_params(length=0)
+        axes.spines[:].set_visible(False)
+    patches = [Rectangle((0, 0), 1, 1, color=color) for color, _ in _VERDICTS.values()]
+    words = [meaning for _, meaning in _VERDICTS.values()]
+    figure.legend(patches, words, loc="lower center", ncols=3, fontsize=8, frameon=False)
     figure.suptitle(title, fontsize=10)
-    figure.tight_layout(rect=(0, 0.03, 1, 1))
+    figure.tight_layout(rect=(0, 0.05, 1, 1), w_pad=0.3)
     with atomic_write(path, "wb") as file:
         FigureCanvasAgg(figure).print_png(file)
 

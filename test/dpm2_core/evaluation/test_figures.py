@@ -83,8 +83,8 @@ def test_verdicts_have_the_colors_of_their_meaning(tmp_path: Path) -> None:
     """One cell each of right, said and silent: the red of `silent` is in the picture where that verdict is given."""
 
     def reds(verdict: str) -> int:
-        rows = {"00: gap": {"ours": ("right", 0.1), "theirs": (verdict, 12.0)}}
-        verdicts_png(tmp_path / "verdicts.png", rows)
+        panels = {"00": {"gap": {"ours": ("right", 0.1), "theirs": (verdict, 12.0)}}, "04": {"blind": {}}}
+        verdicts_png(tmp_path / "verdicts.png", panels)
         return int((np.abs(_picture(tmp_path / "verdicts.png") - [231, 154, 146]).max(-1) < 6).sum())
 
     legend = reds("said")
