@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.console import Group
 
-from dpm2_core.commands.options import parse_lengths, parse_range, progress_bar
+from dpm2_core.commands.options import JsonFile, parse_lengths, parse_range, progress_bar, show
 from dpm2_core.console import Console
 from dpm2_core.errors import UsageError
 from dpm2_core.tables import FigureTable
@@ -41,6 +42,7 @@ def experiment(
         list[str] | None, typer.Option("--set", help="KEY=VALUE of the SLAM, or of the trainings.")
     ] = None,
     workers: Annotated[int, typer.Option(min=1, help="Parts at a time, each in a process of its own.")] = 1,
+    json_file: JsonFile = None,
 ) -> None:
     """Make a table or figure of the papers on your copy of the data, theirs beside it.
 
@@ -54,7 +56,7 @@ def experiment(
         table = FigureTable("Experiments", names=["name", "of"], text=["what"])
         for key, entry in EXPERIMENTS.items():
             table.add_row(key, entry.paper, entry.summary)
-        Console().print(table)
+        show(table, {key: {"of": entry.paper, "what": entry.summary} for key, entry in EXPERIMENTS.items()}, json_file)
         return
     if name is None or data is None or out is None:
         raise UsageError("dpm2 experiment: want NAME DATA --out DIR, or --list")
@@ -84,8 +86,8 @@ def experiment(
             bar.console.print(f"{part}: done", soft_wrap=True)
 
         outcome = carry_out(name, request, Progress(frames_done, part_done))
-    for table_of in outcome.tables:
-        Console().print(table_of.view())
+    views = Group(*(table_of.view() for table_of in outcome.tables))
+    show(views, {"tables": [table_of.record() for table_of in outcome.tables], "notes": outcome.notes}, json_file)
     console = Console(stderr=True)
     for note in outcome.notes:
         console.print(note, style="yellow", soft_wrap=True)

@@ -8,7 +8,9 @@ here from what the last fusion layer's image attention was given and its own pro
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -18,6 +20,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dpm2_core.errors import UsageError
+from dpm2_core.extras import needs
+from dpm2_core.files import atomic_write
 from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry.rays import project
 from dpm2_core.network.attention import Attention
@@ -117,6 +121,26 @@ def _projected(xyz: Tensor, views: Any) -> Array:
     """(N, 2) pixels of reference points (1, N, 3) in the first image."""
     uv, _ = project(xyz, views.K[:, 0].float(), views.T_lidar_cam[:, 0].float())
     return uv[0].cpu().numpy().astype(np.float64)
+
+
+def attention_png(path: Path, looked: Mapping[str, ImageAttention], title: str = "") -> None:
+    """A panel of several networks' attention, one below the other (the paper's Figure 7).
+
+    Raises:
+        Dpm2Error: the file could not be written.
+    """
+    with needs("plot", "drawing"):
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10, 3.4 * max(1, len(looked)) + 0.6), dpi=100, facecolor="#0d1117")
+    for row, (name, attention) in enumerate(looked.items()):
+        axes = figure.add_subplot(len(looked), 1, 1 + row, facecolor="#0d1117")
+        draw_attention(axes, attention)
+        axes.set_title(f"{name}: {axes.get_title()}", color=_INK)
+    figure.suptitle(title, color=_INK)
+    with atomic_write(path, "wb") as file:
+        FigureCanvasAgg(figure).print_png(file)
 
 
 def draw_attention(axes: Any, looked: ImageAttention) -> None:

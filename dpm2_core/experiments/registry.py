@@ -41,6 +41,13 @@ EXPERIMENTS: dict[str, Listed] = {
         "black images, or a box before the LiDAR, in 5 to 100 % of the frames",
         "robustness:ROBUSTNESS",
     ),
+    "reference-points": Listed(
+        "DeepPointMap2, table 3", "128 to 4096 reference points, sampled or at random", "variants:reference_points"
+    ),
+    "fusion": Listed("DeepPointMap2, table 4", "other fusions of LiDAR and image", "variants:fusion"),
+    "attention": Listed(
+        "DeepPointMap2, figure 7", "attention maps of the same networks, one below the other", "variants:attention"
+    ),
     "gndnet": Listed(
         "Differentiable SLAM, table 1", "the ground by GndNet, without and with the SLAM loss", "task_tables:gndnet"
     ),

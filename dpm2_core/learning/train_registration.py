@@ -25,7 +25,7 @@ from dpm2_core.network.pyramid import PointBatch
 from dpm2_core.network.settings import NetworkSettings, preset
 from dpm2_core.network.spatial import Views, image_features
 from dpm2_core.network.tokens import Tokens
-from dpm2_core.network.weights import load_weights, save_weights
+from dpm2_core.network.weights import load_fitting, load_weights, save_weights
 
 
 class RegistrationTraining(nn.Module):
@@ -41,7 +41,7 @@ class RegistrationTraining(nn.Module):
         self.backbone_head = nn.Linear(channels[self.level], network.channels)
         fusion = self.model.encoder.fusion
         self.image_head: nn.Module | None = None
-        if network.image.backbone != "none" and loss.image > 0:
+        if network.image.backbone != "none" and not self.model.encoder.painted and loss.image > 0:
             own = None if fusion is None else fusion.pixel
             self.image_head = nn.Linear(network.image.pyramid, network.channels) if own is None else own
 
@@ -113,6 +113,8 @@ class RegistrationTrainingSettings(Settings):
     """Fraction of steps that also register merged sets: one frame to the others, or half to half."""
     start: str = ""
     """Weights (safetensors) to start from; empty: random."""
+    partial: bool = False
+    """Take from `start` what fits, where the network is another; the rest is random, and named in the new weights."""
 
 
 def set_pairs_of(poses: Tensor, settings: RegistrationTrainingSettings, step: int) -> tuple[SetPairs, ...]:
@@ -137,7 +139,10 @@ def train_registration(
     torch.manual_seed(optimizer.seed)
     network = preset(settings.preset, settings.network)
     module = RegistrationTraining(network, settings.loss)
-    if settings.start:
+    random: list[str] = []
+    if settings.start and settings.partial:
+        random = load_fitting(module.model, Path(settings.start))
+    elif settings.start:
         load_weights(module.model, Path(settings.start))
     data = GroupDataset(settings.data, network, settings.data.draw, optimizer.seed)
 
@@ -148,6 +153,8 @@ def train_registration(
     def save(averaged: nn.Module) -> None:
         assert isinstance(averaged, RegistrationTraining)
         about = {"phase": "1", "steps": str(optimizer.steps), "images": str(settings.data.images).lower()}
+        if settings.partial:
+            about |= {"start": Path(settings.start).stem, "random_at_start": ", ".join(random)}
         save_weights(averaged.model, weights, about)
 
     validate = validator(settings, network) if settings.validation else None

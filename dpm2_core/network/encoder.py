@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import nn
+from torch import Tensor, nn
 
 from dpm2_core.descriptors import Descriptors, is_level, levelling
 from dpm2_core.frame import Frame, Image
@@ -23,7 +23,7 @@ from dpm2_core.network.pointnext import Scale, view_axes
 from dpm2_core.network.pyramid import PointBatch, build_pyramid, collate, crop
 from dpm2_core.network.registry import image_backbone, point_backbone
 from dpm2_core.network.settings import ImageSettings, NetworkSettings
-from dpm2_core.network.spatial import Views
+from dpm2_core.network.spatial import Views, paint
 from dpm2_core.network.tokens import Tokens
 
 
@@ -41,8 +41,10 @@ class Encoder(nn.Module):
     def __init__(self, settings: NetworkSettings) -> None:
         super().__init__()
         self.settings = settings
-        self.points = point_backbone(settings.points)
-        self.image = image_backbone(settings.image)
+        self.painted = settings.fusion.kind == "point_painting" and settings.image.backbone != "none"
+        self.points = point_backbone(settings.points, self.painted)
+        # A painted cloud carries its colors through the point backbone; images are read, but have no features.
+        self.image: nn.Module | None = nn.Identity() if self.painted else image_backbone(settings.image)
         channels: list[int] = self.points.channels  # type: ignore[assignment]
         self.fusion = Fusion(settings, channels) if settings.fusion.kind != "none" else None
         self.level = len(channels) - 1 - settings.points.upsample  # descriptors of the version without fusion
@@ -51,7 +53,9 @@ class Encoder(nn.Module):
 
     def forward(self, points: PointBatch, views: Views | None = None) -> Encoded:
         """Encode a batch; `views` None where no frame of it has an image."""
-        scales = self.points(points)
+        if self.image is None:
+            views = None
+        scales = self.points(points, self._colors(points, views)) if self.painted else self.points(points)
         if self.fusion is None:
             scale = scales[self.level]
             axis = view_axes(scale.xyz)
@@ -59,11 +63,19 @@ class Encoder(nn.Module):
                 axis = torch.zeros_like(axis) + torch.tensor([1.0, 0.0], device=axis.device)
             return Encoded(Tokens(scale.xyz, scale.features, axis, scale.mask), scales, [])
         maps = []
-        if self.image is None:
+        if self.painted:
             views = None
         if views is not None and self.image is not None:
             maps = self.image(views.pixels.flatten(0, 1))
         return Encoded(self.fusion(scales, views, maps), scales, maps)
+
+    @staticmethod
+    def _colors(points: PointBatch, views: Views | None) -> Tensor | None:
+        """Of every raw point of the first neighborhoods (B, n, k, 4); None without images."""
+        if views is None:
+            return None
+        raw = points.xyz[:, : points.patches.shape[1], None] + points.patches
+        return paint(raw.flatten(1, 2), views).unflatten(1, raw.shape[1:3])
 
     @torch.inference_mode()
     def encode(self, frame: Frame) -> Descriptors:

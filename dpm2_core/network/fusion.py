@@ -13,7 +13,7 @@ from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.network.spatial import Views, image_features, point_bias, ray_bias, sample_at_points, token_pixels
 from dpm2_core.network.tokens import Tokens
 
-SAMPLED = {"point_painting": 1, "roi_pooling": 3}  # side of the window that replaces the image attention
+SAMPLED = {"roi_pooling": 3}  # side of the window that replaces the image attention
 
 
 class ReferencePoints(nn.Module):
@@ -68,7 +68,8 @@ class FusionLayer(nn.Module):
         sampled = fusion.kind in SAMPLED
         self.self_attention = Attention(width, fusion.heads)
         self.lidar = Attention(width, fusion.heads, learnable)
-        self.image = Attention(width, fusion.heads, learnable) if camera and not sampled else None
+        attends = camera and not sampled and fusion.kind != "point_painting"
+        self.image = Attention(width, fusion.heads, learnable) if attends else None
         self.sampled = nn.Linear(width, width) if camera and sampled else None
         self.norms = nn.ModuleList(nn.LayerNorm(width) for _ in range(2))
         self.fuse = nn.Sequential(
@@ -117,11 +118,12 @@ class Fusion(nn.Module):
         self.settings = fusion
         self.references = ReferencePoints(settings, scale_channels)
         self.lidar_in = nn.ModuleList(nn.Linear(scale_channels[i], width) for i in fusion.levels)
-        if settings.image.backbone != "none":
+        reads = settings.image.backbone != "none" and fusion.kind != "point_painting"
+        if reads:
             self.image_in = nn.Linear(settings.image.pyramid, width)
             self.image_norm = nn.LayerNorm(width)
         self.pixel = None
-        if settings.image.backbone != "none" and fusion.pixel:
+        if reads and fusion.pixel:
             self.pixel = nn.Linear(settings.image.pyramid, settings.channels)
             self.pixel_in = nn.Linear(settings.channels, settings.channels, bias=False)
             nn.init.zeros_(self.pixel_in.weight)  # begins as the network without

@@ -13,6 +13,8 @@ from dpm2_core.network.pyramid import PointBatch
 from dpm2_core.network.settings import PointsSettings, StageSettings
 
 MOMENTS = 9  # mean (3) and scatter matrix (6) of a neighborhood
+COLORS = 4
+"""Numbers of a painted point: red, green, blue, 0..1, and whether it is in an image."""
 
 
 class Scale(NamedTuple):
@@ -149,7 +151,8 @@ class PatchAbstraction(nn.Module):
     The stem is linear, so it is applied to center and offset apart: the same result without a stem per neighbor.
     """
 
-    def __init__(self, settings: PointsSettings) -> None:
+    def __init__(self, settings: PointsSettings, painted: bool = False) -> None:
+        """`painted`: every raw point comes with the color of its pixel, which counts for nothing before training."""
         super().__init__()
         stage = settings.stages[0]
         self.radius, self.far = stage.radius, settings.far
@@ -158,9 +161,12 @@ class PatchAbstraction(nn.Module):
         self.linear = nn.Linear(settings.stem + 3, stage.channels)
         self.norm = nn.LayerNorm(stage.channels)
         self.moments = ConvNormAct(stage.channels + MOMENTS, stage.channels) if settings.moments else None
+        self.paint = nn.Linear(COLORS, stage.channels, bias=False) if painted else None
+        if self.paint is not None:
+            nn.init.zeros_(self.paint.weight)
 
-    def forward(self, centers: Tensor, patches: Tensor) -> Tensor:
-        """centers (B, n, 3), patches (B, n, k, 3), both m: (B, n, channels)."""
+    def forward(self, centers: Tensor, patches: Tensor, colors: Tensor | None = None) -> Tensor:
+        """centers (B, n, 3), patches (B, n, k, 3), both m, colors (B, n, k, 4) of these points: (B, n, channels)."""
         if self.view_aligned:
             axis = view_axes(centers)
             centers, patches = to_view(centers, axis), to_view(patches, axis[:, :, None])
@@ -168,10 +174,14 @@ class PatchAbstraction(nn.Module):
         of_stem, of_place = self.linear.weight.split((self.stem.out_features, 3), 1)
         of_delta = of_place + of_stem @ self.stem.weight * (self.radius / self.far)
         at_center = self.linear(nn.functional.pad(self.stem(centers / self.far), (0, 3)))
+        given, weight = local, of_delta
+        if self.paint is not None:
+            painted = local.new_zeros(*local.shape[:-1], COLORS) if colors is None else colors.to(local)
+            given, weight = torch.cat([local, painted], -1), torch.cat([of_delta, self.paint.weight], 1)
         if self.pool_first:
-            out = torch.relu(self.norm(pool_neighbors(None, None, local, of_delta) + at_center))
+            out = torch.relu(self.norm(pool_neighbors(None, None, given, weight) + at_center))
         else:
-            out = nn.functional.linear(local, of_delta) + at_center[:, :, None]
+            out = nn.functional.linear(given, weight) + at_center[:, :, None]
             out = torch.relu(self.norm(out)).amax(2)
         if self.moments is None:
             return out
@@ -222,11 +232,11 @@ class FeaturePropagation(nn.Module):
 class PointNeXt(nn.Module):
     """The backbone; `channels` lists those of the scales it returns, fine to coarse."""
 
-    def __init__(self, settings: PointsSettings) -> None:
+    def __init__(self, settings: PointsSettings, painted: bool = False) -> None:
         super().__init__()
         stages = settings.stages
         self.sizes = [stage.points for stage in stages]
-        self.patch = PatchAbstraction(settings)
+        self.patch = PatchAbstraction(settings, painted)
         self.abstractions = nn.ModuleList(
             Aggregation(before.channels, stage.channels, stage.radius, settings) for before, stage in pairwise(stages)
         )
@@ -240,13 +250,13 @@ class PointNeXt(nn.Module):
     def _residuals(stage: StageSettings, settings: PointsSettings) -> list[InvertedResidual]:
         return [InvertedResidual(stage.channels, radius, settings) for radius in stage.residual_radii]
 
-    def forward(self, batch: PointBatch) -> list[Scale]:
-        """All levels, fine to coarse."""
+    def forward(self, batch: PointBatch, colors: Tensor | None = None) -> list[Scale]:
+        """All levels, fine to coarse; `colors` as for `PatchAbstraction`."""
         scales: list[Scale] = []
         for level, size in enumerate(self.sizes):
             xyz = batch.xyz[:, :size]
             if level == 0:
-                features = self.patch(xyz, batch.patches)
+                features = self.patch(xyz, batch.patches, colors)
             else:
                 before = scales[-1]
                 features = self.abstractions[level - 1](before.xyz, xyz, before.features, batch.groups[level - 1])

@@ -13,8 +13,9 @@ from dpm2_core.network.convnext import ConvNeXt, ImagePyramid
 from dpm2_core.network.pointnext import PointNeXt
 from dpm2_core.network.settings import ImageSettings, PointsSettings
 
-POINT_BACKBONES: dict[str, Callable[[PointsSettings], nn.Module]] = {"pointnext": PointNeXt}
-"""Each has `channels`, a list with those of every scale it returns, fine to coarse."""
+POINT_BACKBONES: dict[str, Callable[[PointsSettings, bool], nn.Module]] = {"pointnext": PointNeXt}
+"""Each takes whether its points come with colors, and has `channels`, a list with those of every scale it returns, fine
+to coarse."""
 
 IMAGE_BACKBONES: dict[str, Callable[[ImageSettings], nn.Module]] = {
     "convnext": lambda s: ConvNeXt(s.depths, s.channels)
@@ -22,15 +23,15 @@ IMAGE_BACKBONES: dict[str, Callable[[ImageSettings], nn.Module]] = {
 """Each has `channels` and `strides` lists and returns one (B, C, h, w) map a stride, fine to coarse."""
 
 
-def point_backbone(settings: PointsSettings) -> nn.Module:
-    """The point backbone that the settings name.
+def point_backbone(settings: PointsSettings, painted: bool = False) -> nn.Module:
+    """The point backbone that the settings name; `painted`: its points come with colors.
 
     Raises:
         UsageError: no such backbone.
     """
     if settings.backbone not in POINT_BACKBONES:
         raise UsageError(f"points.backbone {settings.backbone}: want one of {', '.join(POINT_BACKBONES)}")
-    return POINT_BACKBONES[settings.backbone](settings)
+    return POINT_BACKBONES[settings.backbone](settings, painted)
 
 
 def image_backbone(settings: ImageSettings) -> ImagePyramid | None:

@@ -87,7 +87,8 @@ class FusionSettings(Settings):
 
     kind: FusionKind = "biased"
     """How LiDAR and image features reach the reference points; none is DeepPointMap v1, the backbone's own points.
-    The others than biased are the alternatives of the paper's Table 4."""
+    The others than biased are the alternatives of the paper's Table 4; point_painting gives every point of the cloud
+    the color of its pixel before the point backbone, and has no image backbone."""
     reference: Literal["salient", "fps", "uniform", "normal"] = "salient"
     """How reference points are chosen: vertical edges and poles of the cloud among its farthest points, farthest points
     alone, or random positions. The last three are those of the paper's Table 3."""

@@ -109,6 +109,23 @@ def sample_at_points(points: Tensor, views: Views, features: Tensor, window: int
     return samples.mean(-1).transpose(1, 2)
 
 
+def paint(points: Tensor, views: Views) -> Tensor:
+    """Colors of points (B, N, 3), m: (B, N, 4) red, green, blue, 0..1, of the first image that shows a point, and 1;
+    zeros for one that none shows.
+
+    S. Vora et al., "PointPainting: Sequential Fusion for 3D Object Detection", CVPR 2020, with colors for classes.
+    """
+    out = points.new_zeros(*points.shape[:2], 4)
+    for view in range(views.pixels.shape[1]):
+        seen = seen_from(points, views, view) & (out[..., 3] == 0)
+        pixels = views.pixels[:, view].float() / 255
+        sampled = sample_at_points(points, views, torch.cat([pixels, torch.ones_like(pixels[:, :1])], 1), 1, view)
+        covered = sampled[..., 3:]  # less than 1 within half a pixel of the border, where nothing is mixed in
+        color = torch.cat([sampled[..., :3] / covered.clamp(min=1e-3), torch.ones_like(covered)], -1)
+        out = torch.where(seen[..., None], color, out)
+    return out
+
+
 def image_features(points: Tensor, views: Views, maps: list[FeatureMap]) -> tuple[Tensor, Tensor]:
     """Features of the finest maps where points project.
 

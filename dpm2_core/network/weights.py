@@ -79,6 +79,23 @@ def load_weights(model: DeepPointMap2, path: Path) -> dict[str, str]:
     return metadata
 
 
+def load_fitting(model: DeepPointMap2, path: Path) -> list[str]:
+    """Load the tensors that the network has with the same name and shape; returns the names of its others, which stay.
+
+    Raises:
+        UsageError: missing file, another format, values that are not finite, or nothing that fits.
+    """
+    state, _ = read_tensors(path)
+    own = model.state_dict()
+    fitting = {name: value for name, value in state.items() if name in own and own[name].shape == value.shape}
+    if not fitting:
+        raise UsageError(f"{path}: nothing in it fits this network")
+    if bad := [name for name, value in fitting.items() if not bool(value.isfinite().all())]:
+        raise UsageError(f"{path}: {bad[0]} holds values that are not finite")
+    model.load_state_dict(fitting, strict=False)
+    return sorted(own.keys() - fitting.keys())
+
+
 def _fill(model: DeepPointMap2, path: Path, state: Mapping[str, torch.Tensor], metadata: Mapping[str, str]) -> None:
     stored = metadata.get("preset", "unknown")
     if stored != model.settings.preset:

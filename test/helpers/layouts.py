@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from dpm2_core.data.kitti import KittiSource
+from dpm2_core.data.kitti import KittiSource, read_calib
 from dpm2_core.geometry import se3
 
 from .drives import first_scans
@@ -31,8 +31,10 @@ def kitti_odometry(recording: Path, root: Path, names: tuple[str, ...], count: i
         (root / "poses" / f"{name}.txt").write_text((one / "poses" / "00.txt").read_text())
         if images:
             (folder / "image_2").mkdir()
+            K = read_calib(folder / "calib.txt")["P2"]
+            size = round(2 * K[0, 2] + 1), round(2 * K[1, 2] + 1)  # the principal point is in the middle
             for number in range(count):
-                pixels = noise.integers(0, 255, (94, 310, 3), np.uint8)
+                pixels = cv2.resize(noise.integers(0, 255, (47, 155, 3), np.uint8), size)
                 cv2.imwrite(str(folder / "image_2" / f"{number:06d}.png"), pixels)
     return root
 

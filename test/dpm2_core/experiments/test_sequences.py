@@ -130,6 +130,10 @@ def test_a_peer_or_a_file_that_is_not_there_is_named_with_its_part(kitti: Path, 
 
 
 def test_the_list_has_every_experiment() -> None:
-    done = dpm2("experiment", "--list")
+    done = dpm2("experiment", "--list", "--json", "-")
     assert done.returncode == 0
-    assert all(name in done.stdout for name in ("kitti", "kitti360", "robustness"))
+    assert list(json.loads(done.stdout)) == [
+        "kitti", "kitti360", "robustness", "reference-points", "fusion", "attention", "gndnet", "dslr", "dslr-slam",
+        "ae-lidar",
+    ]  # fmt: skip
+    assert "Differentiable SLAM, table 4" in dpm2("experiment", "--list").stdout

@@ -19,7 +19,7 @@ from dpm2_core.network.pointnext import argmax_neighbor, max_neighbor
 from dpm2_core.network.pretrained import weights_path
 from dpm2_core.network.pyramid import build_pyramid, collate, crop
 from dpm2_core.network.settings import PRESETS, preset
-from dpm2_core.network.spatial import Views, image_features
+from dpm2_core.network.spatial import Views, image_features, paint, seen_from
 from dpm2_core.network.weights import network_settings
 
 from ...helpers.networks import tiny
@@ -172,6 +172,35 @@ def test_alternatives_of_the_ablations(noise: np.random.Generator, kind: str, re
     without = {name for name, p in fusion.named_parameters() if p.grad is None}
     assert not without
     assert features.isfinite().all()
+
+
+def test_a_painted_cloud_carries_the_color_of_its_pixel(noise: np.random.Generator) -> None:
+    """Points ahead have that of a red image, the others none; untrained, it changes no feature, then it does, and a
+    missing image is as one that shows no point."""
+    torch.manual_seed(0)
+    model = DeepPointMap2(tiny(fusion={"kind": "point_painting"})).eval()
+    cloud = boxes(noise)
+    points = collate([build_pyramid(cloud, model.settings)])
+    image = make_image(noise)
+    red = replace(image, pixels=np.full_like(image.pixels, 0))
+    red.pixels[..., 0] = 255
+    views = views_of(model, [red])
+    assert views is not None
+    colors = paint(points.xyz, views)
+    seen = seen_from(points.xyz, views, 0)
+    assert 0 < int(seen.sum()) < seen.numel()
+    assert (colors[seen][:, 0] > 0.99).all()
+    assert (colors[seen][:, 3] == 1).all()
+    assert not colors[..., 1:3].any()
+    assert not colors[~seen].any()
+    with torch.no_grad():
+        plain = model.encoder(points).tokens.features
+        torch.testing.assert_close(model.encoder(points, views).tokens.features, plain)
+        weight = model.encoder.get_parameter("points.patch.paint.weight")
+        weight.normal_(generator=torch.Generator().manual_seed(1))
+        painted = model.encoder(points, views).tokens.features
+        torch.testing.assert_close(model.encoder(points).tokens.features, plain)
+    assert not torch.allclose(painted, plain, atol=1e-3)
 
 
 def test_resize_moves_the_intrinsics_with_the_pixels() -> None:

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.errors import UsageError
 from dpm2_core.network.model import DeepPointMap2
-from dpm2_core.network.weights import load_model, load_weights, save_weights
+from dpm2_core.network.weights import load_fitting, load_model, load_weights, save_weights
 
 from ...helpers.networks import tiny
 
@@ -93,3 +93,20 @@ def test_missing_truncated_and_foreign_files(saved: Path, tmp_path: Path) -> Non
     save_file({"x": torch.zeros(1)}, tmp_path / "foreign.safetensors")
     with pytest.raises(UsageError, match="without a network description"):
         load_model(tmp_path / "foreign.safetensors")
+
+
+def test_weights_that_fit_in_part(tmp_path: Path) -> None:
+    """What has the same name and shape is taken, the rest stays and is named; nothing that fits is an error."""
+    torch.manual_seed(0)
+    path = tmp_path / "a.safetensors"
+    save_weights(DeepPointMap2(tiny()), path, {}, half=False)
+    other = DeepPointMap2(tiny(fusion={"kind": "point_painting", "reference_features": False}))
+    before = {name: value.clone() for name, value in other.state_dict().items()}
+    random = load_fitting(other, path)
+    assert {"encoder.points.patch.paint.weight", "encoder.fusion.references.embed.0.weight"} <= set(random)
+    stored = load_file(path)
+    for name, value in other.state_dict().items():
+        assert torch.equal(value, before[name] if name in random else stored[name]), name
+    save_file({"nothing": torch.zeros(1)}, tmp_path / "b.safetensors")
+    with pytest.raises(UsageError, match="nothing in it fits"):
+        load_fitting(other, tmp_path / "b.safetensors")

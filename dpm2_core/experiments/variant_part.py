@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parts of the tables that compare networks: a drive packed for training, and one network trained."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from dpm2_core.config import dump_settings, load_settings, merged
+from dpm2_core.data.open import open_source
+from dpm2_core.experiments.part import Advance, Figures
+from dpm2_core.files import atomic_write
+from dpm2_core.learning.generate import pack as write_packed_drive
+from dpm2_core.learning.train_registration import RegistrationTrainingSettings, train_registration
+from dpm2_core.network.pretrained import weights_path
+from dpm2_core.network.weights import network_settings, read_metadata
+from dpm2_core.slam.settings import Config
+
+PACK = "dpm2_core.experiments.variant_part:pack"
+TRAIN = "dpm2_core.experiments.variant_part:train"
+WEIGHTS = "weights.safetensors"
+_BEGUN = "begun.yaml"
+
+
+def pack(folder: Path, advance: Advance, data: str, settings: Sequence[str], weights: str) -> Figures:
+    """The frames of a sequence that have a pose, packed below the folder for the network of these weights.
+
+    Raises:
+        UsageError: no such sequence, no poses, or images of some frames only.
+    """
+    source = open_source(data, load_settings(Config, None, settings).input)
+    done = 0
+
+    def count() -> None:
+        nonlocal done
+        done += 1
+        advance(done, len(source))
+
+    network = network_settings(weights_path(weights))
+    return {"frames": write_packed_drive(source, folder / "drive", network, None, count)}
+
+
+def training_of(
+    config: str | None, settings: Sequence[str], start: str, network: dict[str, Any], packed: Path
+) -> RegistrationTrainingSettings:
+    """The training of a variant, `network` being its changes to the network of the weights that it starts from."""
+    chosen = load_settings(RegistrationTrainingSettings, None if config is None else Path(config), settings)
+    path = weights_path(start)
+    own = network_settings(path)
+    tree = merged(merged(own.model_dump(mode="json"), chosen.network), network)
+    data = chosen.data
+    if not data.packed:
+        images = any(packed.rglob("pixels.npy"))
+        data = data.model_copy(update={"packed": {str(packed): 1.0}, "images": images})
+    # The changes say all there is to the network, its name included, so it does not matter to which preset.
+    changes = {"preset": "small", "network": tree, "start": str(path), "partial": True, "data": data}
+    return chosen.model_copy(update=changes)
+
+
+def train(folder: Path, advance: Advance, training: dict[str, Any], packed: str, network: dict[str, Any]) -> Figures:
+    """Fine-tune a variant of a network from weights, as far as they fit; one that was stopped goes on.
+
+    Raises:
+        UsageError: no such weights, or no packed drive.
+    """
+    chosen = training_of(training["config"], training["settings"], training["start"], network, Path(packed))
+    text = dump_settings(chosen)
+    begun = folder / _BEGUN
+    if not (begun.is_file() and begun.read_text(encoding="utf-8") == text):
+        for old in ("checkpoint.pt", "log.jsonl", WEIGHTS):
+            (folder / old).unlink(missing_ok=True)
+        with atomic_write(begun) as file:
+            file.write(text)
+    weights = train_registration(chosen, folder, resume=(folder / "checkpoint.pt").exists())
+    steps = chosen.optimiser.steps
+    advance(steps, steps)
+    losses = [json.loads(line).get("loss") for line in (folder / "log.jsonl").read_text().splitlines()]
+    last = [loss for loss in losses if loss is not None][-50:]
+    random = read_metadata(weights).get("random_at_start", "")
+    return {"steps": steps, "last_loss": sum(last) / len(last), "random_at_start": random.split(", ") if random else []}

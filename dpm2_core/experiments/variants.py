@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""DeepPointMap2's tables 3 and 4 and figure 7: networks that differ in one thing, fine-tuned alike, judged by SLAM."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from dpm2_core.config import load_settings
+from dpm2_core.data.open import open_source
+from dpm2_core.errors import UsageError
+from dpm2_core.evaluation.image_attention import attention_png, image_attention
+from dpm2_core.experiments.ablation import TABLE_4 as TRAINED_ALIKE
+from dpm2_core.experiments.kitti import ORIGINAL_POSES, TESTED
+from dpm2_core.experiments.part import Figures, Part
+from dpm2_core.experiments.request import Experiment, Outcome, Request
+from dpm2_core.experiments.sequences import SHOWN, cells, missing_note, own_part, present, run_folders
+from dpm2_core.experiments.table import MEAN, ResultTable
+from dpm2_core.experiments.variant_part import PACK, TRAIN, WEIGHTS
+from dpm2_core.extras import MissingPackageError
+from dpm2_core.network.pretrained import weights_path
+from dpm2_core.network.weights import load_model
+from dpm2_core.slam.settings import Config
+
+LEARNED = ("00", "01", "02", "03", "04", "05")
+AS_PAPER: dict[str, Any] = {
+    "fusion": {"reference": "fps", "reference_features": False, "relative": False, "pixel": False}
+}
+"""What all variants have in common: nothing but the fusion tells where a reference point is, and what is there."""
+TABLE_3: dict[str, dict[str, Any]] = {
+    "FPS 128": {"fusion": {"points": 128}},
+    "FPS 256": {"fusion": {"points": 256}},
+    "FPS 512": {"fusion": {"points": 512}},
+    "uniform 256": {"fusion": {"reference": "uniform", "points": 256}},
+    "uniform 4096": {"fusion": {"reference": "uniform", "points": 4096}},
+    "normal 256": {"fusion": {"reference": "normal", "points": 256}},
+    "normal 4096": {"fusion": {"reference": "normal", "points": 4096}},
+}
+_PAPER_3 = {
+    "FPS 128": (0.49, None, 0.94, 0.85, None), "FPS 256": (0.47, 0.39, 0.77, 0.62, 0.75),
+    "FPS 512": (0.57, None, 0.88, 0.74, None),
+}  # fmt: skip
+_PAPER_4 = {
+    "biased attention": (0.47, 0.39, 0.77, 0.62, 0.75), "PointPainting": (0.56, 0.56, 1.15, 0.94, 1.55),
+    "RoI pooling 3x3": (2.34, 1.56, 4.12, 4.24, 17.83), "scale-dot attention": (2.73, 1.00, 9.63, 6.48, 6.48),
+    "without learnable": (0.72, 0.46, 18.00, 1.16, 1.21), "without spatial": (41.5, 21.5, 29.9, 26.3, 20.9),
+}  # fmt: skip
+TABLE_4 = {name: TRAINED_ALIKE[name] for name in _PAPER_4}
+_FOR_SLAM = ("slam.", "input.")  # settings of the user that are not of the training
+
+
+@dataclass(frozen=True)
+class VariantTable:
+    """Variants of a network by name; `paper`: t_err of 06 to 10 of each, percent. `judged` False: only pictures."""
+
+    title: str
+    variants: Mapping[str, Mapping[str, Any]]
+    paper: Mapping[str, Sequence[float | None]]
+    judged: bool = True
+
+    def experiment(self) -> Experiment:
+        """As the registry wants it."""
+        uses = {"learn", "weights", "config", *(("lengths", "frames") if self.judged else ())}
+        return Experiment(frozenset(uses), self.parts, self.outcome)
+
+    def parts(self, request: Request) -> Sequence[Sequence[Part]]:
+        """Packed drives, a training of each variant, and each on every sequence."""
+        sequences = present(request, TESTED, ORIGINAL_POSES)
+        start = request.weights or "small"
+        packs = [
+            Part(f"packed/{sequence}", PACK, {"data": str(request.data), "weights": start,
+                 "settings": [f"input.sequence='{sequence}'"]}, [weights_path(start)])
+            for sequence in _learned(request)
+        ]  # fmt: skip
+        training = {
+            "config": None if request.config is None else str(request.config),
+            "settings": [text for text in request.overrides if not text.startswith(_FOR_SLAM)],
+            "start": start,
+        }
+        arguments = {"training": training, "packed": str(request.out / "packed")}
+        trained = [
+            Part(self._training(name), TRAIN, {**arguments, "network": _joined(change)}, [weights_path(start)])
+            for name, change in self.variants.items()
+        ]
+        stages: list[list[Part]] = [packs, trained]
+        if self.judged:
+            stages.append([self._run(request, v, sequence) for v in self.variants for sequence in sequences])
+        return stages
+
+    def outcome(self, request: Request, figures: Mapping[str, Figures]) -> Outcome:
+        """The table, and the panel of attention maps."""
+        sequences = present(request, TESTED, ORIGINAL_POSES)
+        notes: list[str] = []
+        tables = []
+        if self.judged:
+            table = ResultTable(self.title, [*sequences, MEAN], SHOWN, "t_err % / r_err deg per 100 m, network alone.")
+            for variant in self.variants:
+                random = len(figures[self._training(variant)]["random_at_start"])
+                note = f"{random} tensors began at random" if random else ""
+                table.add(variant, cells(self._name(variant), sequences, figures, list(SHOWN)), note=note)
+            for variant, row in self.paper.items():
+                there = {s: {"t_err_percent": t} for s, t in zip(TESTED, row, strict=True) if s in sequences}
+                table.add(variant, there, "the paper")
+            tables.append(table)
+            notes.append("every variant was fine-tuned from the same weights, as far as they fit it")
+            notes += missing_note(sequences, TESTED)
+        names = [self._name(variant) for variant in self.variants] if self.judged else []
+        runs = run_folders(names, sequences, request.out)
+        pictures = [] if self.variants is TABLE_3 else self._panel(request, sequences[0], notes)
+        return Outcome(tables, notes, runs, pictures)
+
+    def _run(self, request: Request, variant: str, sequence: str) -> Part:
+        weights = request.out / self._training(variant) / WEIGHTS
+        settings = ["slam.registration=neural", "slam.visual.enabled=false"]  # the network alone, as in the paper
+        slam = tuple(text for text in request.overrides if text.startswith(_FOR_SLAM))
+        own = replace(request, weights=str(weights), overrides=slam)
+        return own_part(self._name(variant), sequence, own, [*ORIGINAL_POSES, *settings])
+
+    def _panel(self, request: Request, sequence: str, notes: list[str]) -> list[Path]:
+        """The paper's figure 7: what one reference point reads from the image, by every variant that attends."""
+        source = open_source(request.data, load_settings(Config, None, [f"input.sequence='{sequence}'"]).input)
+        (frame,) = islice(source.frames(0, 1), 1)
+        if not frame.images:
+            notes.append("no attention maps: the data set has no images")
+            return []
+        looked = {}
+        for variant in self.variants:
+            model = load_model(request.out / self._training(variant) / WEIGHTS)
+            try:
+                looked[variant] = image_attention(model, frame)
+            except UsageError as error:  # what pools or paints has no attention
+                notes.append(f"no attention map of {variant}: {error}")
+        path = request.out / f"attention_{sequence}.png"
+        try:
+            attention_png(path, looked, f"{sequence}, frame {frame.index}: attention of one reference point")
+        except MissingPackageError as error:
+            notes.append(f"no {path.name}: {error}")
+            return []
+        return [path]
+
+    def _name(self, variant: str) -> str:
+        return f"variant {variant}"
+
+    def _training(self, variant: str) -> str:
+        return f"trained/{variant.replace(' ', '_')}"
+
+
+def _joined(change: Mapping[str, Any]) -> dict[str, Any]:
+    return {"fusion": {**AS_PAPER["fusion"], **change.get("fusion", {})}}
+
+
+def _learned(request: Request) -> list[str]:
+    """The sequences to learn from: those asked for, or those of the paper that the data set has."""
+    return present(replace(request, sequences=request.learn), LEARNED)
+
+
+reference_points = VariantTable("Table 3: reference points", TABLE_3, _PAPER_3).experiment()
+fusion = VariantTable("Table 4: fusion of LiDAR and image", TABLE_4, _PAPER_4).experiment()
+attention = VariantTable("Figure 7: attention maps", TABLE_4, {}, judged=False).experiment()

@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tables 3 and 4 and figure 7 on a small tree: drives packed, every variant fine-tuned from weights, judged by SLAM."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from dpm2_core.experiments.variants import TABLE_3
+from dpm2_core.network.model import DeepPointMap2
+from dpm2_core.network.weights import save_weights
+
+from ...helpers.command import dpm2
+from ...helpers.layouts import kitti_odometry
+from ...helpers.networks import tiny
+
+QUICK = [
+    word
+    for setting in (
+        "optimiser.steps=1", "optimiser.compile=false", "optimiser.bf16=false", "optimiser.warmup=0", "pairs=1",
+        "sets=0", "data.groups=1", "data.frames=2", "data.workers=0", "slam.loops.enabled=false", "slam.threads=1",
+    )
+    for word in ("--set", setting)
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def kitti(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Sequences 00 to learn from and 06 to be tested on, four scans each, with images."""
+    return kitti_odometry(recording, tmp_path_factory.mktemp("kitti"), ("00", "06"), 4, images=True)
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of a tiny network."""
+    torch.manual_seed(0)
+    path = tmp_path_factory.mktemp("weights") / "tiny.safetensors"
+    save_weights(DeepPointMap2(tiny()), path, {"phase": "1"})
+    return path
+
+
+@pytest.mark.slow
+def test_fusion_then_its_attention_maps(kitti: Path, weights: Path, tmp_path: Path) -> None:
+    """Every variant starts from what fits it, the biased one from all; figure 7 needs no training of its own."""
+    call = (kitti, "--out", tmp_path, "--weights", weights, *QUICK)
+    done = dpm2("experiment", "fusion", *call, "--lengths", "1", "--frames", "0:3")
+    assert done.returncode == 0, done.stderr
+    record = json.loads((tmp_path / "fusion.json").read_text())
+    names = [row["name"] for row in record["tables"][0]["rows"] if row["origin"] == "this run"]
+    assert names == ["biased attention", "PointPainting", "RoI pooling 3x3", "scale-dot attention", "without learnable",
+                     "without spatial"]  # fmt: skip
+    parts = record["parts"]
+    assert parts["packed/00"]["frames"] == 4
+    # What the tiny network has beyond the paper's is left out; only the first layer of the reference points differs.
+    random = {name: parts[f"trained/{name.replace(' ', '_')}"]["random_at_start"] for name in names}
+    assert set(random["biased attention"]) < set(random["PointPainting"])
+    assert "encoder.points.patch.paint.weight" in random["PointPainting"]
+    assert not any("decoder" in tensor for tensors in random.values() for tensor in tensors)
+    assert [parts[f"variant_{name.replace(' ', '_')}/06"]["frames"] for name in names] == [3] * 6
+    trained = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.safetensors")}
+    done = dpm2("experiment", "attention", *call)
+    assert done.returncode == 0, done.stderr
+    assert {path: path.stat().st_mtime_ns for path in trained} == trained
+    assert (tmp_path / "attention_06.png").stat().st_size > 20_000
+
+
+@pytest.mark.slow
+def test_reference_points(kitti: Path, weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every row; 4,096 points would take minutes here."""
+    for name in ("uniform", "normal"):
+        monkeypatch.setitem(TABLE_3, f"{name} 4096", {"fusion": {"reference": name, "points": 96}})
+    call = ("experiment", "reference-points", kitti, "--out", tmp_path, "--weights", weights, *QUICK, "--lengths", "1")
+    done = dpm2(*call, "--frames", "0:2")
+    assert done.returncode == 0, done.stderr
+    record = json.loads((tmp_path / "reference-points.json").read_text())
+    rows = record["tables"][0]["rows"]
+    assert [row["name"] for row in rows if row["origin"] == "this run"] == [
+        "FPS 128", "FPS 256", "FPS 512", "uniform 256", "uniform 4096", "normal 256", "normal 4096"
+    ]  # fmt: skip
+    paper = {row["name"]: row["cells"] for row in rows if row["origin"] == "the paper"}
+    assert paper["FPS 256"]["06"] == {"t_err_percent": 0.47}
