@@ -38,13 +38,16 @@ from dpm2_core.evaluation.run_folder import (
 )
 from dpm2_core.extras import MissingPackageError
 from dpm2_core.files import atomic_write
-from dpm2_core.frame import Array, OdometryResult
+from dpm2_core.frame import Array, Frame, OdometryResult
 from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.output import TrajectoryRecorder
 from dpm2_core.slam.session import MapMode, open_map, resume_at
 from dpm2_core.slam.settings import Config
 from dpm2_core.slam.system import SlamResult
+
+Watch = Callable[[Frame, SlamResult, Mapper], None]
+"""Looks at a frame, what became of it, and the map as it is then."""
 
 
 class OfflineRun:
@@ -108,11 +111,15 @@ class OfflineRun:
         """Close the map file; a `Result` must be saved before."""
         self._resources.close()
 
-    def run(self, progress: Callable[[SlamResult], None] = lambda result: None) -> Result:
+    def run(
+        self,
+        progress: Callable[[SlamResult], None] = lambda result: None,
+        watch: Watch | None = None,
+    ) -> Result:
         """All frames through the SLAM, once; Ctrl-C ends it early, and the result is of the frames until then.
 
         Args:
-            progress: called after each frame.
+            progress: called after each frame. watch: the same, with the frame and the map as they are then.
         """
         result = Result(self.source, self._config, self.slam.mapper, self._truth, self._truth_name)
         began = perf_counter()
@@ -120,6 +127,8 @@ class OfflineRun:
             for frame in prefetch(self.source.frames(self._start, self._stop)):
                 step = self.slam.process(frame)
                 result.add(step.odometry)
+                if watch is not None:
+                    watch(frame, step, self.slam.mapper)
                 progress(step)
         except KeyboardInterrupt:
             result.interrupted = True

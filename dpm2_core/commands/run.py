@@ -15,8 +15,9 @@ from dpm2_core.console import Console
 from dpm2_core.data.corrupt import CorruptedSource, parse_corruption
 from dpm2_core.data.source import Source
 from dpm2_core.errors import UsageError
+from dpm2_core.evaluation.live_view import LiveView
 from dpm2_core.evaluation.report import metrics_table
-from dpm2_core.pipeline import OfflineRun, Result, open_recording, save_config
+from dpm2_core.pipeline import OfflineRun, Result, Watch, open_recording, save_config
 from dpm2_core.slam.session import MapMode
 from dpm2_core.slam.settings import Config
 from dpm2_core.slam.system import SlamResult
@@ -49,6 +50,10 @@ def run(
     ] = None,
     config: ConfigFile = None,
     settings: Overrides = None,
+    view: Annotated[bool, typer.Option("--view", help="Show the run as it goes on, in rerun's viewer.")] = False,
+    record: Annotated[
+        Path | None, typer.Option(help="The same to a file, such as run.rrd: `rerun run.rrd` shows it.")
+    ] = None,
     json_file: JsonFile = None,
 ) -> None:
     """Run the SLAM on a recording and write trajectory, map, image, timing and metrics."""
@@ -62,6 +67,8 @@ def run(
         raise UsageError(f"--{'resume' if resume else 'extend'}: in which map? give --map FILE")
     if localise is not None and (gt is not None or map_file is not None):
         raise UsageError("--localise: the map stays as it is, and its frame is its own: without --map and --gt")
+    if localise is not None and (view or record is not None):
+        raise UsageError("--view, --record: a map that grows is shown: without --localise")
     if localise is None and hint is not None:
         raise UsageError("--hint: only with --localise")
     T_hint = None if hint is None else parse_hint(hint)
@@ -78,10 +85,15 @@ def run(
     with OfflineRun(source, chosen, span, gt, map_file, mode) as drive:
         out.mkdir(parents=True, exist_ok=True)
         save_config(chosen, out)  # now: whatever becomes of the run, it says how it was made
-        _report(_drive(drive), out, json_file)
+        if view or record is not None:
+            with LiveView(drive.source.name, view, record) as live:
+                result = _drive(drive, live.add)
+        else:
+            result = _drive(drive, None)
+        _report(result, out, json_file)
 
 
-def _drive(drive: OfflineRun) -> Result:
+def _drive(drive: OfflineRun, watch: Watch | None) -> Result:
     """The run with a progress bar; says at once what fails."""
     name, problem = drive.source.name, ""
     with progress_bar() as bar:
@@ -99,7 +111,7 @@ def _drive(drive: OfflineRun) -> Result:
                 )
             bar.update(task, advance=1, description=f"{name} {tracked.state}")
 
-        return drive.run(progress)
+        return drive.run(progress, watch)
 
 
 def _report(result: Result, out: Path, json_file: Path | None) -> None:

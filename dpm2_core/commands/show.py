@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from dpm2_core.console import Console
+from dpm2_core.data.corrupt import CorruptedSource, parse_corruption
 from dpm2_core.data.open import open_source
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.source import Source
@@ -21,7 +22,13 @@ def show(
     src: Annotated[Path, typer.Argument(help="KITTI sequence or root, rosbag2 folder, .mcap or .db3 file.")],
     frames: Annotated[str, typer.Option(help="Two frames a,b by position from 0; b is registered to a.")],
     out: Annotated[Path, typer.Option(help="PNG to write.")] = Path("matches.png"),
-    weights: Annotated[str, typer.Option(help="Name of shipped weights, or a .safetensors file.")] = "small",
+    weights: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Name of shipped weights, or a .safetensors file; several are drawn below each other. [small]"
+        ),
+    ] = None,
+    corrupt: Annotated[str | None, typer.Option(help="Let sensors fail, as `dpm2 run --corrupt` does.")] = None,
     point: Annotated[
         int | None, typer.Option(help="Reference point whose attention to the image of b is shown.")
     ] = None,
@@ -31,17 +38,23 @@ def show(
     With weights that have a camera, also what a reference point reads from the image.
     """
     from dpm2_core.evaluation.image_attention import image_attention
-    from dpm2_core.evaluation.matches import matches_png
+    from dpm2_core.evaluation.matches import compared_png
     from dpm2_core.network.pretrained import load_network
 
     first, second = _two(frames)
-    model = load_network(weights, threads=2)
-    source = open_source(src, InputSettings(images=model.encoder.image is not None))
+    corruption = None if corrupt is None else parse_corruption(corrupt)
+    models = {name: load_network(name, threads=2) for name in weights or ["small"]}
+    source: Source = open_source(src, InputSettings(images=any(m.encoder.image is not None for m in models.values())))
+    if corruption is not None:
+        source = CorruptedSource(source, corruption)
     target, moving = _frame(source, src, first), _frame(source, src, second)
-    requested = point is not None or (model.encoder.image is not None and moving.images)
-    looked = image_attention(model, moving, point) if requested else None
-    title = f"{source.name}, frame {moving.index} to frame {target.index}"
-    matches_png(out, model, moving, target, title, looked)
+    title = f"{source.name}, frame {moving.index} to frame {target.index}{f', {corrupt}' if corrupt else ''}"
+    panels = []
+    for name, model in models.items():
+        requested = point is not None or (model.encoder.image is not None and moving.images)
+        looked = image_attention(model, moving, point) if requested else None
+        panels.append((f"{title}, {Path(name).stem}" if len(models) > 1 else title, model, looked))
+    compared_png(out, panels, moving, target)
     Console(stderr=True).print(f"{out}: {title}", soft_wrap=True)
 
 

@@ -3,8 +3,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 
 from dpm2_core.evaluation.image_attention import ImageAttention, draw_attention
@@ -13,6 +16,9 @@ from dpm2_core.files import atomic_write
 from dpm2_core.frame import Frame
 from dpm2_core.geometry import se3
 from dpm2_core.network.model import DeepPointMap2
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _BACKGROUND, _INK, _TARGET, _SOURCE = "#0d1117", "#c9d1d9", "#3f7fbf", "#ff9f1c"
 _REACH = 50.0  # m of each scan that is drawn around its sensor
@@ -35,12 +41,32 @@ def matches_png(
     Raises:
         Dpm2Error: too few points, or the file could not be written.
     """
+    _write(path, [_figure(network, source, target, title, looked)])
+
+
+def compared_png(
+    path: Path | str,
+    networks: Sequence[tuple[str, DeepPointMap2, ImageAttention | None]],
+    source: Frame,
+    target: Frame,
+) -> None:
+    """`matches_png` of several networks, one below the other.
+
+    Args:
+        networks: title, network, and what to draw of the image or None, of each.
+
+    Raises:
+        Dpm2Error: too few points, or the file could not be written.
+    """
+    _write(path, [_figure(network, source, target, title, looked) for title, network, looked in networks])
+
+
+def _figure(network: DeepPointMap2, source: Frame, target: Frame, title: str, looked: ImageAttention | None) -> Figure:
     of_source, of_target = network.describe(source), network.describe(target)
     result = network.register(of_source, of_target)
     at_source, at_target, confidence = network.matches(of_source, of_target)
     with needs("plot", "drawing"):
-        from matplotlib.backends.backend_agg import FigureCanvasAgg  # half a second to import: not for every command
-        from matplotlib.collections import LineCollection
+        from matplotlib.collections import LineCollection  # half a second to import: not for every command
         from matplotlib.figure import Figure
 
     low = 0.0 if looked is None else 0.43  # the image's fraction of the height, below the scans
@@ -83,5 +109,17 @@ def matches_png(
         else f"not registered: {result.reason}"
     )
     figure.text(0.02, low + 0.945 * (1 - low), f"{title}: {outcome}", color=_INK, fontsize=13)
+    return figure
+
+
+def _write(path: Path | str, figures: Sequence[Figure]) -> None:
+    """All figures, which are equally wide, below each other."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    images = []
+    for figure in figures:
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+        images.append(np.asarray(canvas.buffer_rgba())[:, :, 2::-1])  # BGR
     with atomic_write(path, "wb") as file:
-        FigureCanvasAgg(figure).print_png(file)
+        file.write(cv2.imencode(".png", np.vstack(images))[1].tobytes())

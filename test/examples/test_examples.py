@@ -3,14 +3,17 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from dpm2_core import open_source
+from dpm2_core.data.settings import InputSettings
 from dpm2_core.geometry import se3
 
 from ..helpers.drives import first_scans
@@ -76,3 +79,48 @@ def test_a_recording_that_is_not_there_is_one_clear_error(tmp_path: Path) -> Non
     assert (
         done.stderr.splitlines()[-1] == f"dpm2_core.errors.UsageError: {tmp_path / 'nowhere'}: no such file or folder"
     )
+
+
+@pytest.mark.slow
+def test_a_loader_of_ones_own(recording: Path, tmp_path: Path) -> None:
+    """With ground truth for all scans but one, a scan that is no array, and one of another shape."""
+    folder = tmp_path / "clouds"
+    folder.mkdir()
+    source = open_source(recording, InputSettings(images=False))
+    assert source.poses is not None
+    rows = []
+    for frame, T in zip(source.frames(0, 8), source.poses, strict=False):
+        np.save(folder / f"{frame.stamp}.npy", frame.points)
+        rows.append([frame.stamp, *T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat()])
+    np.savetxt(folder / "poses.csv", rows[:-1], delimiter=",", fmt=["%d"] + ["%.9f"] * 7)
+    (folder / "9000000000000000000.npy").write_bytes(b"nothing")
+    np.save(folder / "9000000000100000000.npy", np.zeros((5, 3)))
+    done = example("custom_loader", folder, tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    frames, failed, error = (part.split()[0] for part in done.stdout.split(","))
+    assert (frames, failed) == ("10", "2")
+    assert error == "APE"
+    assert float(done.stdout.split()[-2]) < 0.1
+    assert json.loads((tmp_path / "out" / "metrics.json").read_text())["failed_frames"] == 2
+    empty = example("custom_loader", tmp_path, tmp_path / "out")
+    assert "no STAMP.npy" in empty.stderr.splitlines()[-1]
+
+
+@pytest.mark.slow
+def test_wheel_odometry_carries_over_what_the_points_cannot(recording: Path) -> None:
+    """Every eighth scan, 8 m apart."""
+    done = example("wheel_odometry", recording, 8)
+    assert done.returncode == 0, done.stderr
+    alone, fused = (float(line.split(": ")[1].split(" m")[0]) for line in done.stdout.splitlines())
+    assert fused < 0.3
+    assert fused < alone
+
+
+@pytest.mark.slow
+def test_the_slam_loss_on_a_model_of_ones_own(recording: Path) -> None:
+    """Both losses fall."""
+    done = example("slam_loss", recording, 8)
+    assert done.returncode == 0, done.stderr
+    before, after = ([float(line.split()[3]), float(line.split()[5])] for line in done.stdout.splitlines())
+    assert after[0] < before[0] / 2
+    assert after[1] < before[1]

@@ -61,9 +61,28 @@ def test_draws_the_image_with_attention(sequence: Path, tmp_path: Path) -> None:
     assert sizes[1][1] == sizes[0][1]
 
 
+@pytest.mark.slow
+def test_several_weights_are_drawn_below_each_other_of_a_sensor_that_fails(sequence: Path, tmp_path: Path) -> None:
+    torch.manual_seed(1)
+    save_weights(DeepPointMap2(tiny()), tmp_path / "other.safetensors", {})
+    weights = ["--weights", sequence / "tiny.safetensors", "--weights", tmp_path / "other.safetensors"]
+    shapes, pictures = [], []
+    for name, arguments in (
+        ("one", weights[:2]), ("two", weights), ("half", [*weights[:2], "--corrupt", "obstruction=1,seed=1"])
+    ):  # fmt: skip
+        done = dpm2("show", sequence, "--frames", "0,1", "--out", tmp_path / f"{name}.png", *arguments)
+        assert done.returncode == 0, done.stderr
+        pictures.append(cv2.imread(str(tmp_path / f"{name}.png")))
+        shapes.append(pictures[-1].shape)
+    assert shapes[1] == (2 * shapes[0][0], shapes[0][1], 3)
+    assert np.abs(pictures[2].astype(int) - pictures[0]).mean() > 0.1  # half of the view is covered
+    assert "obstruction=1,seed=1" in done.stderr
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
+        (["--frames", "0,1", "--corrupt", "nothing=1"], "nothing"),
         (["--frames", "0"], "want two positions"),
         (["--frames", "0,7"], "2 frames"),
         (["--frames", "0,1", "--weights", "/nowhere"], "/nowhere"),

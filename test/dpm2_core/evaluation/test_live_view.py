@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a run shows, read back from its recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from ...helpers.command import dpm2
+from ...helpers.drives import first_scans
+
+_SETTINGS = ("slam.registration=geometric", "slam.loops.descriptors=false", "slam.visual.enabled=false")
+FAST = tuple(part for pair in _SETTINGS for part in ("--set", pair))
+FRAMES = 9
+
+
+def test_a_view_that_is_of_no_use_is_rejected(tmp_path: Path) -> None:
+    done = dpm2("run", ".", "--out", tmp_path, "--localise", "m", "--record", tmp_path / "run.rrd")
+    assert done.returncode == 2
+    assert "--record" in done.stderr
+
+
+@pytest.fixture(scope="module")
+def recorded(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of 9 frames, recorded."""
+    pytest.importorskip("rerun", reason="no rerun: pip install '.[view]'")
+    folder = tmp_path_factory.mktemp("view")
+    drive = first_scans(recording, FRAMES, folder / "drive")
+    done = dpm2("run", drive, "--out", folder / "out", "--record", folder / "run.rrd", *FAST)
+    assert done.returncode == 0, done.stderr
+    return folder / "run.rrd"
+
+
+@pytest.mark.slow
+def test_the_recording_has_the_pose_of_every_frame_the_map_and_the_figures(recorded: Path) -> None:
+    names = entities(recorded)
+    assert {"/map/lidar", "/map/lidar/scan", "/map/way", "/map/keyframes/0/cloud"} <= set(names)
+    assert names["/map/lidar"] == FRAMES
+    assert min(names["/times"], names["/quality"]) >= FRAMES
+
+
+@pytest.mark.slow
+def test_a_recording_that_cannot_be_written_is_said_before_the_run(recording: Path, tmp_path: Path) -> None:
+    pytest.importorskip("rerun", reason="no rerun: pip install '.[view]'")
+    done = dpm2("run", recording, "--out", tmp_path / "out", "--record", tmp_path / "no" / "run.rrd", *FAST)
+    assert done.returncode == 2
+    assert "no such folder" in done.stderr
+
+
+def entities(path: Path) -> dict[str, int]:
+    """Rows of each entity of a recording."""
+    from rerun.chunk import RrdReader
+
+    counts: dict[str, int] = {}
+    for chunk in RrdReader(path).stream():
+        counts[chunk.entity_path] = counts.get(chunk.entity_path, 0) + chunk.num_rows
+    return counts
