@@ -37,7 +37,7 @@ ROS = [  # wheels for x86_64 alone; elsewhere ROS 2 itself must be installed
     "ros-jazzy-common-interfaces>=5.3,<6; platform_machine == 'x86_64'",  # sensor_msgs, nav_msgs, ...
 ]
 EXTRAS = {
-    "plot": ["matplotlib>=3.8,<4"],  # trajectory.png, dpm2 show
+    "plot": ["matplotlib>=3.8,<4", "pillow>=10,<15"],  # trajectory.png, dpm2 show
     "sim": [  # dpm2 sim, and the synthetic worlds of training and benchmarks
         "trimesh>=4,<6",  # meshes
         "embreex>=2.17.7,<5; platform_machine == 'x86_64'",  # ray casting; on aarch64 there is none for Linux

@@ -8,7 +8,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from mkdocs.structure.files import File, Files
+from dpm2_core.extras import needs
 
 ROOT = Path(__file__).resolve().parents[1]
 PLACE = "repository"
@@ -16,8 +16,10 @@ PLACE = "repository"
 _LINK = re.compile(r"\[(?P<text>[^\]]*)\]\((?P<target>[^)#\s]+)(?P<anchor>(?:#[^)\s]*)?)\)")
 
 
-def on_files(files: Files, config: Any) -> Files:
+def on_files(files: Any, config: Any) -> Any:
     """Take in what the pages link to, and what that links to."""
+    with needs("docs", "the site"):
+        from mkdocs.structure.files import File
     wanted = [page.src_uri for page in files.documentation_pages()]
     while wanted:
         page = wanted.pop()

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from dpm2_core.data.open import open_source
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.errors import Dpm2Error, UsageError, exit_code
+from dpm2_core.extras import needs
 from dpm2_core.files import atomic_write
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.voxel import voxel_first
@@ -106,7 +107,8 @@ def write_apng(path: Path, images: list[Picture]) -> None:
     Raises:
         Dpm2Error: it is larger, or could not be written.
     """
-    from PIL import Image  # with the extra plot
+    with needs("plot", "drawing"):
+        from PIL import Image
 
     reduced = [Image.fromarray(image).quantize(48, dither=Image.Dither.NONE) for image in images]
     durations = [110] * (len(reduced) - 1) + [_HOLD]
