@@ -31,13 +31,16 @@ _FRAMES, _SEED = 30, 950_000
 
 
 def repeated(network: DeepPointMap2, options: Options) -> dict[str, Any]:
-    """Shares of every drive and of one simulated drive of each kind, as a real sensor sees it, and a figure of them."""
+    """Shares of every drive and of one simulated drive of each kind, as a real sensor sees it, and a figure of them.
+
+    No simulated ones with `--unseen`.
+    """
     found: dict[str, Any] = {}
     with drives(options) as sources:
         for source in sources:
             name = unique_name(source, found)
             found[name] = shares([f.points for f in source.frames()], truth_of(source), network.settings, options.pairs)
-    for kind in _SIMULATED:
+    for kind in _SIMULATED if options.unseen is None else ():
         found[f"simulated {kind}"] = shares(*_simulated(kind), network.settings, options.pairs)
     groups = {
         drive: {name: row["1 apart"][f"{WITHIN[0]} m"] for name, row in rows.items()} for drive, rows in found.items()

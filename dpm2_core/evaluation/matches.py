@@ -114,7 +114,8 @@ def _figure(network: DeepPointMap2, source: Frame, target: Frame, title: str, lo
 
 def _write(path: Path | str, figures: Sequence[Figure]) -> None:
     """All figures, which are equally wide, below each other."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    with needs("plot", "drawing"):
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     images = []
     for figure in figures:

@@ -223,7 +223,7 @@ def test_the_neural_benchmark_measures_pairs_odometry_and_stages(
     record = json.loads(path.read_text())
     assert (record["weights"]["preset"], record["weights"]["steps"]) == ("tiny", "0")
     parts = record["parts"]
-    assert list(parts) == ["synthetic", "real", "odometry", "corruption", "image", "overlap", "speed"]
+    assert list(parts) == ["synthetic", "real", "odometry", "corruption", "image", "overlap", "reference", "speed"]
     assert parts["synthetic"]["pairs"]["up to 20 m, any yaw"]["neural"]["pairs"] > 0
     ours = parts["real"]["drives"][sequence.name]
     assert list(ours["consecutive"]) == ["neural"]

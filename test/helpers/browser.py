@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import shutil
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -33,3 +34,11 @@ def opened(path: Path, width: int = 800, height: int = 600) -> Iterator[tuple[An
             yield page, said
         finally:
             browser.close()
+
+
+def wait(page: Any, expression: str, seconds: float = 120.0) -> None:
+    """Until an expression of JavaScript holds; `wait_for_function` evaluates a string, which our pages forbid."""
+    end = time.monotonic() + seconds
+    while not page.evaluate(expression):
+        assert time.monotonic() < end, f"waited {seconds} s for {expression}"
+        page.wait_for_timeout(50)

@@ -16,7 +16,7 @@ import pytest
 
 from dpm2_core.evaluation.map_page import by_detail, map_page, write_map_page
 
-from ...helpers.browser import opened
+from ...helpers.browser import opened, wait
 from ...helpers.maps import ring
 
 
@@ -73,7 +73,7 @@ def test_in_a_browser(tmp_path: Path) -> None:
     data = ring(24, image=(64, 48))
     write_map_page(tmp_path / "<i>ring.html", data, 0.3)
     with opened(tmp_path / "<i>ring.html") as (page, said):
-        page.wait_for_function("window.dpm2 && dpm2.drawn === dpm2.points")
+        wait(page, "window.dpm2 && dpm2.drawn === dpm2.points")
         assert page.title() == "<i>ring"
         assert "24 keyframes, 1 loops accepted of 2 tried" in page.inner_text("#status")
         colors = len(set(page.screenshot(type="jpeg", quality=50)))
@@ -100,7 +100,7 @@ def test_in_a_browser(tmp_path: Path) -> None:
         assert page.evaluate("dpm2.project(0)") != pytest.approx(a, abs=1)
         page.click("#home")
         assert page.evaluate("dpm2.project(0)") == pytest.approx(a, abs=1)
-        page.wait_for_function("dpm2.drawn === dpm2.points")
+        wait(page, "dpm2.drawn === dpm2.points")
 
         # From above, the outer wall at keyframe 0 and at keyframe 12 are two radii and twice 8 m from each other.
         page.mouse.click(400, 590)
