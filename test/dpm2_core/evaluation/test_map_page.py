@@ -113,7 +113,7 @@ def test_in_a_browser(tmp_path: Path) -> None:
         length = float(page.inner_text("#distance").split(" m")[0])
         assert length == pytest.approx(2 * (radius + 8), abs=3.0)  # a click is 8 pixels wide, of 0.2 m each
         page.click("#measure")
-        assert page.is_hidden("#distance")
+        page.wait_for_selector("#distance", state="hidden")
         assert said == []
 
 
