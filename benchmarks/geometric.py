@@ -25,6 +25,8 @@ from benchmarks.harness import (
     unique_name,
 )
 from dpm2_core.evaluation.metrics import Metrics, evaluate
+from dpm2_core.experiments.peers import kiss_icp_config
+from dpm2_core.extras import MissingPackageError
 from dpm2_core.frame import Array, Frame, State
 from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.output import TrajectoryRecorder
@@ -86,17 +88,11 @@ def dpm2(options: Options, *more: str) -> Method:
 
 
 def kiss_config(options: Options) -> Any | None:
-    """KISS-ICP's configuration for KITTI; None where it is not installed."""
+    """KISS-ICP's configuration for KITTI, whose scans are deskewed already; None where it is not installed."""
     try:
-        from kiss_icp.config import load_config
-    except ImportError:
+        return kiss_icp_config(options.threads, deskew=False)
+    except MissingPackageError:
         return None
-    config = load_config(None)
-    config.data.deskew = False  # KITTI's scans are compensated already
-    config.data.max_range = 100.0
-    config.mapping.voxel_size = 1.0  # its default: a hundredth of the range
-    config.registration.max_num_threads = options.threads
-    return config
 
 
 def kiss_icp(options: Options) -> Method | None:

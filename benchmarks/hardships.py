@@ -86,9 +86,7 @@ def _interrupted(name: str, frames: Sequence[Frame], truth: Array, first: int, m
     between = range(first, first + missing) if name.startswith("blind") else range(0)
     indices = [*range(start, first), *between, *range(first + missing, stop)]
     seen = [_dirty(frames[i]) if i in between else frames[i] for i in indices]
-    # The way is that from the last frame that showed something.
-    kept = Case(name, seen, truth[indices], first - start)
-    return kept if not between else replace(kept, event=first - start + missing)
+    return Case(name, seen, truth[indices], first - start + len(between))
 
 
 def _dirty(frame: Frame) -> Frame:
@@ -115,8 +113,7 @@ def _kidnapped(frames: Sequence[Frame], truth: Array) -> Case:
     """Carried back to where one has been, 2 s later: the stamps go on."""
     half = len(frames) // 2
     back = half // 4
-    indices = [*range(half), *range(back, min(back + _AFTER, half))]
+    again = range(back, min(back + _AFTER, half))
     late = frames[half - 1].stamp + round(_AWAY * 1e9) - frames[back].stamp
-    seen = [frame if k < half else replace(frame, stamp=frame.stamp + late) for k, frame in
-            ((k, frames[i]) for k, i in enumerate(indices))]  # fmt: skip
-    return Case("kidnapped", seen, truth[indices], half)
+    seen = [*frames[:half], *(replace(frames[i], stamp=frames[i].stamp + late) for i in again)]
+    return Case("kidnapped", seen, truth[[*range(half), *again]], half)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -41,3 +42,13 @@ def atomic_write(path: Path | str, mode: Literal["w", "wb"] = "w") -> Iterator[I
     finally:
         with suppress(OSError):
             part.unlink()
+
+
+def write_json(path: Path | str, content: object) -> None:
+    """JSON for people, too: indented, as one file.
+
+    Raises:
+        Dpm2Error: as `atomic_write`.
+    """
+    with atomic_write(path) as file:
+        file.write(json.dumps(content, indent=2) + "\n")

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -37,7 +36,7 @@ from dpm2_core.evaluation.run_folder import (
     write_truth,
 )
 from dpm2_core.extras import MissingPackageError
-from dpm2_core.files import atomic_write
+from dpm2_core.files import atomic_write, write_json
 from dpm2_core.frame import Array, Frame, OdometryResult
 from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.mapping.mapper import Mapper
@@ -268,9 +267,9 @@ class Result:
         keys = zip(self.recorder.index, self.recorder.stamps, self.frame_states, self.frame_methods, strict=True)
         write_frames(out / FRAMES, list(keys), self.seconds)
         write_loops(out / LOOPS, self.mapper.loops, self.mapper.poses)
-        _write_json(out / TIMING, self.timing)
+        write_json(out / TIMING, self.timing)
         if self.metrics is not None:
-            _write_json(out / METRICS, self.metrics.model_dump())
+            write_json(out / METRICS, self.metrics.model_dump())
             assert self.ground_truth is not None
             write_truth(out / TRUTH, *truth_by_stamp(self.ground_truth, self.recorder.stamps, self.recorder.index,
                                                      self.source.T_cam_lidar))  # fmt: skip
@@ -335,8 +334,3 @@ def _check_span(source: Source, start: int, stop: int, frames: Span) -> None:
 def _summary(times: list[float]) -> dict[str, float]:
     median, p95 = np.percentile(np.array(times) * 1e3, [50, 95]) if times else (0.0, 0.0)
     return {"median": round(float(median), 3), "p95": round(float(p95), 3)}
-
-
-def _write_json(path: Path, content: object) -> None:
-    with atomic_write(path) as file:
-        file.write(json.dumps(content, indent=2) + "\n")

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from dpm2_core.evaluation.canvas import new_figure, save_png
 from dpm2_core.evaluation.kitti_metric import known
 from dpm2_core.evaluation.metrics import align
 from dpm2_core.extras import needs
-from dpm2_core.files import atomic_write
 from dpm2_core.frame import Array, Frame, Points
 
 if TYPE_CHECKING:
@@ -39,15 +39,13 @@ def trajectory_png(
     Raises:
         Dpm2Error: the file could not be written.
     """
-    with needs("plot", "drawing"):
-        from matplotlib.backends.backend_agg import FigureCanvasAgg  # half a second to import: not for every command
-        from matplotlib.figure import Figure
-
     truth = None if gt is None else _aligned(gt, est)
     est = est[known(est)]
     low, high = _bounds(est[:, :3, 3], cloud)
     width, height = high - low
-    figure = Figure(figsize=(12, float(np.clip(12 * height / width, 3.5, 12)) + 0.8), dpi=150, facecolor=_BACKGROUND)
+    figure = new_figure(
+        figsize=(12, float(np.clip(12 * height / width, 3.5, 12)) + 0.8), dpi=150, facecolor=_BACKGROUND
+    )
     axes = figure.add_axes((0.01, 0.01, 0.98, 0.92), facecolor=_BACKGROUND, aspect="equal")
     axes.set_axis_off()
     if cloud is not None and len(cloud):
@@ -61,8 +59,7 @@ def trajectory_png(
     axes.legend(loc="upper right", facecolor=_BACKGROUND, edgecolor="none", labelcolor=_INK, framealpha=0.7)
     _scale_bar(axes, low, high)
     figure.text(0.02, 0.955, title, color=_INK, fontsize=14)
-    with atomic_write(path, "wb") as file:
-        FigureCanvasAgg(figure).print_png(file)
+    save_png(path, figure)
 
 
 def trajectories_png(path: Path | str, ways: Mapping[str, Array], truth: Array | None = None, title: str = "") -> None:
@@ -71,11 +68,7 @@ def trajectories_png(path: Path | str, ways: Mapping[str, Array], truth: Array |
     Raises:
         Dpm2Error: the file could not be written.
     """
-    with needs("plot", "drawing"):
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9, 9), dpi=130, facecolor=_BACKGROUND)
+    figure = new_figure(figsize=(9, 9), dpi=130, facecolor=_BACKGROUND)
     axes = figure.add_axes((0.07, 0.05, 0.9, 0.9), facecolor=_BACKGROUND, aspect="equal")
     if truth is not None:
         axes.plot(truth[:, 0], truth[:, 1], "--", color=_TRUTH, lw=1.5, label="ground truth", zorder=9)
@@ -85,8 +78,7 @@ def trajectories_png(path: Path | str, ways: Mapping[str, Array], truth: Array |
     axes.set_xlabel("m", color=_INK)
     axes.legend(facecolor=_BACKGROUND, edgecolor="none", labelcolor=_INK)
     figure.text(0.07, 0.965, title, color=_INK, fontsize=13)
-    with atomic_write(path, "wb") as file:
-        FigureCanvasAgg(figure).print_png(file)
+    save_png(path, figure)
 
 
 def corrupted_png(path: Path | str, before: Frame, after: Frame, title: str = "") -> None:
@@ -95,12 +87,8 @@ def corrupted_png(path: Path | str, before: Frame, after: Frame, title: str = ""
     Raises:
         Dpm2Error: the file could not be written.
     """
-    with needs("plot", "drawing"):
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-
     rows = 2 if before.images else 1
-    figure = Figure(figsize=(12, 6.4 * rows - 3 * (rows - 1)), dpi=110, facecolor=_BACKGROUND)
+    figure = new_figure(figsize=(12, 6.4 * rows - 3 * (rows - 1)), dpi=110, facecolor=_BACKGROUND)
     for column, frame in enumerate((before, after)):
         axes = figure.add_subplot(rows, 2, 1 + column, facecolor=_BACKGROUND, aspect="equal")
         axes.scatter(frame.points[:, 0], frame.points[:, 1], s=0.15, c=_ESTIMATE, linewidths=0)
@@ -110,8 +98,7 @@ def corrupted_png(path: Path | str, before: Frame, after: Frame, title: str = ""
             axes.imshow(frame.images[0].pixels)
             axes.set_axis_off()
     figure.suptitle(title, color=_INK)
-    with atomic_write(path, "wb") as file:
-        FigureCanvasAgg(figure).print_png(file)
+    save_png(path, figure)
 
 
 def success_png(path: Path | str, kinds: Mapping[str, Mapping[str, Mapping[str, Any]]], title: str = "") -> None:
@@ -123,12 +110,8 @@ def success_png(path: Path | str, kinds: Mapping[str, Mapping[str, Mapping[str, 
     Raises:
         Dpm2Error: the file could not be written.
     """
-    with needs("plot", "drawing"):
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-
     rows = [(kind, method, figures) for kind, methods in kinds.items() for method, figures in methods.items()]
-    figure = Figure(figsize=(9, 0.36 * len(rows) + 1.4), dpi=120, facecolor=_BACKGROUND)
+    figure = new_figure(figsize=(9, 0.36 * len(rows) + 1.4), dpi=120, facecolor=_BACKGROUND)
     axes = figure.add_axes((0.38, 0.12, 0.58, 0.8), facecolor=_BACKGROUND)
     for y, (_, method, figures) in enumerate(rows):
         axes.barh(y, 100 * figures["success"], color=_ESTIMATE if "with camera" in method else _HEIGHTS[0])
@@ -140,8 +123,7 @@ def success_png(path: Path | str, kinds: Mapping[str, Mapping[str, Mapping[str, 
     axes.set_xlabel("pairs registered, %; median error beside the bar", color=_INK)
     axes.tick_params(colors=_INK)
     figure.text(0.02, 0.95, title, color=_INK, fontsize=11)
-    with atomic_write(path, "wb") as file:
-        FigureCanvasAgg(figure).print_png(file)
+    save_png(path, figure)
 
 
 def lines_png(
@@ -157,12 +139,8 @@ def lines_png(
     Raises:
         Dpm2Error: the file could not be written.
     """
-    with needs("plot", "drawing"):
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-
     rows = -(-len(panels) // 3)
-    figure = Figure(figsize=(15, 4.2 * rows + 0.6), dpi=100)
+    figure = new_figure(figsize=(15, 4.2 * rows + 0.6), dpi=100)
     for k, (name, lines) in enumerate(panels.items(), 1):
         axes = figure.add_subplot(rows, min(3, len(panels)), k)
         for label, (x, y) in lines.items():
@@ -173,8 +151,7 @@ def lines_png(
         axes.legend(fontsize=9)
     figure.suptitle(title)
     figure.tight_layout()
-    with atomic_write(path, "wb") as file:
-        FigureCanvasAgg(figure).print_png(file)
+    save_png(path, figure)
 
 
 def bars_png(path: Path | str, groups: Mapping[str, Mapping[str, float]], title: str = "") -> None:
@@ -186,12 +163,8 @@ def bars_png(path: Path | str, groups: Mapping[str, Mapping[str, float]], title:
     Raises:
         Dpm2Error: the file could not be written.
     """
-    with needs("plot", "drawing"):
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-
     names = list(next(iter(groups.values())))
-    figure = Figure(figsize=(9, 0.4 * len(groups) * len(names) / 2 + 1.6), dpi=100)
+    figure = new_figure(figsize=(9, 0.4 * len(groups) * len(names) / 2 + 1.6), dpi=100)
     axes = figure.add_subplot()
     for k, name in enumerate(names):
         at = np.arange(len(groups)) + (k - (len(names) - 1) / 2) * 0.8 / len(names)
@@ -204,8 +177,7 @@ def bars_png(path: Path | str, groups: Mapping[str, Mapping[str, float]], title:
     axes.set_title(title, fontsize=10)
     axes.legend()
     figure.tight_layout()
-    with atomic_write(path, "wb") as file:
-        FigureCanvasAgg(figure).print_png(file)
+    save_png(path, figure)
 
 
 _VERDICTS = {
@@ -228,13 +200,11 @@ def verdicts_png(
         Dpm2Error: the file could not be written.
     """
     with needs("plot", "drawing"):
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
         from matplotlib.patches import Rectangle
 
     rows = list(dict.fromkeys(row for table in panels.values() for row in table))
     columns = list(dict.fromkeys(name for table in panels.values() for row in table.values() for name in row))
-    figure = Figure(figsize=(1.2 + 0.55 * len(columns) * len(panels), 0.24 * len(rows) + 1.7), dpi=120)
+    figure = new_figure(figsize=(1.2 + 0.55 * len(columns) * len(panels), 0.24 * len(rows) + 1.7), dpi=120)
     for k, (name, table) in enumerate(panels.items(), 1):
         axes = figure.add_subplot(1, len(panels), k)
         for row, cells in table.items():
@@ -260,8 +230,7 @@ def verdicts_png(
     figure.legend(patches, words, loc="lower center", ncols=3, fontsize=8, frameon=False)
     figure.suptitle(title, fontsize=10)
     figure.tight_layout(rect=(0, 0.05, 1, 1), w_pad=0.3)
-    with atomic_write(path, "wb") as file:
-        FigureCanvasAgg(figure).print_png(file)
+    save_png(path, figure)
 
 
 def _aligned(gt: Array, est: Array) -> Array | None:

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dpm2_core.errors import UsageError
-from dpm2_core.extras import needs
-from dpm2_core.files import atomic_write
+from dpm2_core.evaluation.canvas import new_figure, save_png
 from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry.rays import project
 from dpm2_core.network.attention import Attention
@@ -129,18 +128,13 @@ def attention_png(path: Path, looked: Mapping[str, ImageAttention], title: str =
     Raises:
         Dpm2Error: the file could not be written.
     """
-    with needs("plot", "drawing"):
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(10, 3.4 * max(1, len(looked)) + 0.6), dpi=100, facecolor="#0d1117")
+    figure = new_figure(figsize=(10, 3.4 * max(1, len(looked)) + 0.6), dpi=100, facecolor="#0d1117")
     for row, (name, attention) in enumerate(looked.items()):
         axes = figure.add_subplot(len(looked), 1, 1 + row, facecolor="#0d1117")
         draw_attention(axes, attention)
         axes.set_title(f"{name}: {axes.get_title()}", color=_INK)
     figure.suptitle(title, color=_INK)
-    with atomic_write(path, "wb") as file:
-        FigureCanvasAgg(figure).print_png(file)
+    save_png(path, figure)
 
 
 def draw_attention(axes: Any, looked: ImageAttention) -> None:

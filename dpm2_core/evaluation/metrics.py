@@ -118,6 +118,7 @@ def evaluate(
     segments = segment_errors(gt[has_gt], est[has_gt], lengths)
     t_err, r_err = _percent(segments)
     rpe_trans, rpe_rot = rpe(gt, est)
+    position = _position_errors(gt[both], est[both])
     return Metrics(
         frames=len(est),
         failed_frames=int((~has_est).sum()) if failed_frames is None else failed_frames,
@@ -130,8 +131,8 @@ def evaluate(
         segments=len(segments),
         per_length=tuple(_of_length(segments, length) for length in lengths),
         per_speed=_by_speed(segments),
-        ape_rmse_m=ape_rmse(gt[both], est[both]),
-        ape_mean_m=float(position_errors(gt[both], est[both]).mean()),
+        ape_rmse_m=_rms(position),
+        ape_mean_m=float(position.mean()),
         rpe_trans_m=rpe_trans,
         rpe_rot_deg=rpe_rot,
         final_drift_percent=final_drift_percent(gt[both], est[both]),
@@ -151,10 +152,14 @@ def align(source: Array, target: Array) -> Array:
 
 def ape_rmse(gt: Array, est: Array) -> float:
     """Root mean square position error, m, of (N, 4, 4) poses after alignment of all positions."""
-    return float(np.sqrt((position_errors(gt, est) ** 2).mean()))
+    return _rms(_position_errors(gt, est))
 
 
-def position_errors(gt: Array, est: Array) -> Array:
+def _rms(errors: Array) -> float:
+    return float(np.sqrt((errors**2).mean()))
+
+
+def _position_errors(gt: Array, est: Array) -> Array:
     """(N,) position errors, m, of (N, 4, 4) poses after alignment of all positions."""
     T_gt_est = align(est[:, :3, 3], gt[:, :3, 3])
     return np.asarray(np.linalg.norm((T_gt_est @ est)[:, :3, 3] - gt[:, :3, 3], axis=1))

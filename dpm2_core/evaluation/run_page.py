@@ -96,7 +96,7 @@ def _group(runs: Sequence[tuple[str, RunFolder]]) -> dict[str, Any]:
 
 
 def _run(name: str, run: RunFolder) -> dict[str, Any]:
-    T = _alignment(run)
+    T = aligned(run)
     positions = (T @ run.trajectory.poses)[:, :3, 3]
     ends = np.array([[loop.start, loop.end] for loop in run.loops]).reshape(-1, 2, 3) @ T[:3, :3].T + T[:3, 3]
     total = run.stages_ms.get("total", np.sum(list(run.stages_ms.values()), axis=0) if run.stages_ms else np.zeros(0))
@@ -118,8 +118,8 @@ def _run(name: str, run: RunFolder) -> dict[str, Any]:
     }
 
 
-def _alignment(run: RunFolder) -> Array:
-    """T_truth_map (4, 4); the identity where too few poses belong together."""
+def aligned(run: RunFolder) -> Array:
+    """T_truth_map (4, 4) of a run; the identity where too few poses belong together."""
     if run.truth is None:
         return np.eye(4)
     try:

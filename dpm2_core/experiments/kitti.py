@@ -4,17 +4,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
-import numpy as np
-
-from dpm2_core.data.trajectory import Trajectory, matched
 from dpm2_core.evaluation.figures import trajectories_png
-from dpm2_core.evaluation.kitti_metric import known
-from dpm2_core.evaluation.metrics import align
 from dpm2_core.evaluation.run_folder import read_run
+from dpm2_core.evaluation.run_page import aligned
 from dpm2_core.experiments.part import Figures, Part
-from dpm2_core.experiments.request import Experiment, Outcome, Request
+from dpm2_core.experiments.request import Experiment, Outcome, Request, drawn
 from dpm2_core.experiments.sequences import (
     SHOWN,
     cells,
@@ -27,7 +24,6 @@ from dpm2_core.experiments.sequences import (
     run_folders,
 )
 from dpm2_core.experiments.table import MEAN, Cells, ResultTable
-from dpm2_core.extras import MissingPackageError
 from dpm2_core.frame import Array
 
 USES = frozenset({"weights", "registrations", "peers", "lengths", "frames"})
@@ -72,7 +68,7 @@ def _kitti_outcome(request: Request, figures: Mapping[str, Figures]) -> Outcome:
     if not all(sequence in PAPER for sequence in sequences) or request.frames or request.lengths:
         notes.append("other sequences, frames or lengths than the paper's: its row is no comparison")
     runs = run_folders(names, sequences, request.out)
-    return Outcome([table], notes, runs, *_pictures(runs, sequences, request.out, notes))
+    return Outcome([table], notes, runs, _pictures(runs, sequences, request.out, notes))
 
 
 def _kitti360_parts(request: Request) -> Sequence[Sequence[Part]]:
@@ -90,24 +86,21 @@ def _kitti360_outcome(request: Request, figures: Mapping[str, Figures]) -> Outco
         table.add(name, {"0007": {"ape_mean_m": ape}}, "the paper", "of 0009 it says: accurate")
     runs = run_folders(names, sequences, request.out)
     notes = missing_note(sequences, TESTED_360)
-    return Outcome([table], notes, runs, *_pictures(runs, sequences, request.out, notes))
+    return Outcome([table], notes, runs, _pictures(runs, sequences, request.out, notes))
 
 
-def _pictures(
-    runs: Sequence[tuple[str, Path]], sequences: Sequence[str], out: Path, notes: list[str]
-) -> tuple[list[Path]]:
+def _pictures(runs: Sequence[tuple[str, Path]], sequences: Sequence[str], out: Path, notes: list[str]) -> list[Path]:
     """The paper's figure 5: the trajectories of all methods and the truth, a picture a sequence."""
-    pictures = []
+    pictures: list[Path] = []
     for sequence in sequences:
         folders = {label.rpartition(", ")[0]: path for label, path in runs if path.name == sequence}
-        path = out / f"trajectories_{sequence}.png"
-        try:
-            trajectories_png(path, *aligned_ways(folders), title=sequence)
-        except MissingPackageError as error:
-            notes.append(f"no {path.name}: {error}")
-            break
-        pictures.append(path)
-    return (pictures,)
+        ways, truth = aligned_ways(folders)
+        draw = partial(trajectories_png, ways=ways, truth=truth, title=sequence)
+        made = drawn(out / f"trajectories_{sequence}.png", notes, draw)
+        if not made:
+            break  # the others would say the same
+        pictures += made
+    return pictures
 
 
 def aligned_ways(folders: Mapping[str, Path]) -> tuple[dict[str, Array], Array | None]:
@@ -116,19 +109,10 @@ def aligned_ways(folders: Mapping[str, Path]) -> tuple[dict[str, Array], Array |
     truth: Array | None = None
     for name, folder in folders.items():
         run = read_run(folder)
-        T = np.eye(4)
         if run.truth is not None:
             truth = run.truth.poses[:, :3, 3]
-            T = _alignment(run.truth, run.trajectory)
-        ways[name] = (T @ run.trajectory.poses)[:, :3, 3]
+        ways[name] = (aligned(run) @ run.trajectory.poses)[:, :3, 3]
     return ways, truth
-
-
-def _alignment(truth: Trajectory, own: Trajectory) -> Array:
-    """T_truth_map (4, 4)."""
-    true, est = matched(truth, own)
-    both = known(true) & known(est)
-    return align(est[both, :3, 3], true[both, :3, 3])
 
 
 KITTI = Experiment(USES, _kitti_parts, _kitti_outcome)

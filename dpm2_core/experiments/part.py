@@ -7,6 +7,7 @@ import hashlib
 import json
 import multiprocessing
 import resource
+import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field
@@ -20,6 +21,7 @@ from dpm2_core.errors import Dpm2Error
 from dpm2_core.evaluation.record import git_commit
 from dpm2_core.files import atomic_write
 
+_BEGUN, _CHECKPOINT, LOG = "begun.yaml", "checkpoint.pt", "log.jsonl"
 DONE = "part.json"
 """In the folder of a part that ended: what it was asked for, and its figures."""
 
@@ -58,6 +60,26 @@ class Progress:
 
     frame: Callable[[str, int, int], None] = lambda name, done, total: None
     part: Callable[[str, int, int], None] = lambda name, done, total: None
+
+
+def begin_training(folder: Path, text: str, weights: str, start: Path | None = None) -> bool:
+    """Ready a folder for a training that is asked for by `text`; whether there is a checkpoint to go on from.
+
+    What a training asked for by another text has left there, the file `weights` among it, is removed.
+
+    Args:
+        start: folder of a training whose checkpoint and log a new one goes on from.
+    """
+    begun = folder / _BEGUN
+    if not (begun.is_file() and begun.read_text(encoding="utf-8") == text):
+        for old in (_CHECKPOINT, LOG, weights):
+            (folder / old).unlink(missing_ok=True)
+        if start is not None:
+            for kept in (_CHECKPOINT, LOG):
+                shutil.copy(start / kept, folder / kept)
+        with atomic_write(begun) as file:  # the last: what is killed before is begun anew
+            file.write(text)
+    return (folder / _CHECKPOINT).exists()
 
 
 def run_parts(

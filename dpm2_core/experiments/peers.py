@@ -37,14 +37,9 @@ class KissIcp:
             UsageError: it is not installed.
         """
         with needs("bench", "the peer kiss-icp"):
-            from kiss_icp.config import load_config
             from kiss_icp.kiss_icp import KissICP
 
-        config = load_config(None)
-        config.data.deskew, config.data.max_range = deskew, _REACH
-        config.mapping.voxel_size = _REACH / 100
-        config.registration.max_num_threads = threads
-        self._odometry, self._poses = KissICP(config), list[Array]()
+        self._odometry, self._poses = KissICP(kiss_icp_config(threads, deskew)), list[Array]()
 
     def add(self, frame: Frame) -> None:
         """As `Peer`."""
@@ -54,6 +49,22 @@ class KissIcp:
     def poses(self) -> Array:
         """As `Peer`."""
         return np.array(self._poses)
+
+
+def kiss_icp_config(threads: int, deskew: bool) -> Any:
+    """KISS-ICP's configuration, as by default for sweeps of 100 m.
+
+    Raises:
+        MissingPackageError: it is not installed.
+    """
+    with needs("bench", "the peer kiss-icp"):
+        from kiss_icp.config import load_config
+
+    config = load_config(None)
+    config.data.deskew, config.data.max_range = deskew, _REACH
+    config.mapping.voxel_size = _REACH / 100
+    config.registration.max_num_threads = threads
+    return config
 
 
 class KissSlam:

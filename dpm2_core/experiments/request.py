@@ -11,6 +11,7 @@ from typing import Any
 from dpm2_core.data.source import Span
 from dpm2_core.experiments.part import Figures, Part
 from dpm2_core.experiments.table import ResultTable
+from dpm2_core.extras import MissingPackageError
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,16 @@ class Outcome:
     runs: list[tuple[str, Path]] = field(default_factory=list)
     pictures: list[Path] = field(default_factory=list)
     extra: dict[str, Any] = field(default_factory=dict)
+
+
+def drawn(path: Path, notes: list[str], draw: Callable[[Path], None]) -> list[Path]:
+    """The picture, drawn; none, and a note, where what draws is not installed."""
+    try:
+        draw(path)
+    except MissingPackageError as error:
+        notes.append(f"no {path.name}: {error}")
+        return []
+    return [path]
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,9 @@ from dpm2_core.data.open import open_source
 from dpm2_core.evaluation.figures import corrupted_png
 from dpm2_core.experiments.kitti import ORIGINAL_POSES, PAPER, TESTED
 from dpm2_core.experiments.part import Figures, Part
-from dpm2_core.experiments.request import Experiment, Outcome, Request
+from dpm2_core.experiments.request import Experiment, Outcome, Request, drawn
 from dpm2_core.experiments.sequences import SHOWN, cells, missing_note, own_part, present, registrations, run_folders
 from dpm2_core.experiments.table import MEAN, ResultTable
-from dpm2_core.extras import MissingPackageError
 from dpm2_core.slam.build import make_odometry
 from dpm2_core.slam.settings import Config
 
@@ -106,12 +105,8 @@ def _picture(request: Request, sequence: str, notes: list[str]) -> list[Path]:
     hit = CorruptedSource(source, parse_corruption("camera=1,obstruction=1,seed=0"))
     (before,), (after,) = (list(of.frames(at, at + 1)) for of in (source, hit))
     path = request.out / f"corrupted_{sequence}.png"
-    try:
-        corrupted_png(path, before, after, f"{sequence}, frame {before.index}: camera black, box before the LiDAR")
-    except MissingPackageError as error:
-        notes.append(f"no {path.name}: {error}")
-        return []
-    return [path]
+    title = f"{sequence}, frame {before.index}: camera black, box before the LiDAR"
+    return drawn(path, notes, lambda to: corrupted_png(to, before, after, title))
 
 
 ROBUSTNESS = Experiment(frozenset({"weights", "registrations", "lengths", "frames"}), _parts, _outcome)

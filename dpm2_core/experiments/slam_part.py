@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One method on one sequence: our SLAM, another program, or a trajectory that somebody made elsewhere."""
+"""One method on one sequence: our SLAM, another program, or a trajectory from a file."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from time import perf_counter
@@ -24,7 +23,7 @@ from dpm2_core.evaluation.metrics import Metrics, evaluate
 from dpm2_core.evaluation.run_folder import METRICS, TIMING, TRAJECTORY, TRUTH, write_frames, write_truth
 from dpm2_core.experiments.part import Advance, Figures
 from dpm2_core.experiments.peers import make_peer
-from dpm2_core.files import atomic_write
+from dpm2_core.files import write_json
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.pipeline import OfflineRun, open_recording, span_of
@@ -110,7 +109,7 @@ def peer(folder: Path, advance: Advance, drive: Drive, name: str) -> Figures:
     truth = _truth(source, (start, stop))
     write_truth(folder / TRUTH, stamps, truth)
     fps = len(seconds) / sum(seconds)
-    _write_json(folder / TIMING, {"frames": len(stamps), "fps": fps})
+    write_json(folder / TIMING, {"frames": len(stamps), "fps": fps})
     return _measured(folder, source, (truth, poses), drive, fps)
 
 
@@ -162,13 +161,8 @@ def _measured(folder: Path, source: Source, poses: tuple[Array, Array], drive: D
     if source.T_cam_lidar is not None:
         truth, est = in_other_frame(truth, source.T_cam_lidar), in_other_frame(est, source.T_cam_lidar)
     metrics: Metrics = evaluate(truth, est, tuple(drive["lengths"]), fps=fps).model_copy(update={"truth": source.truth})
-    _write_json(folder / METRICS, metrics.model_dump())
+    write_json(folder / METRICS, metrics.model_dump())
     return metrics.model_dump(exclude={"per_length", "per_speed"})
-
-
-def _write_json(path: Path, content: object) -> None:
-    with atomic_write(path) as file:
-        file.write(json.dumps(content, indent=2) + "\n")
 
 
 def has_sequence(data: Path, settings: Sequence[str]) -> str:

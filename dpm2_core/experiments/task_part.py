@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
@@ -12,9 +11,8 @@ from typing import Literal, TypedDict
 
 from dpm2_core.config import dump_settings, load_settings
 from dpm2_core.data.trajectory import write_tum
-from dpm2_core.evaluation.run_folder import TRAJECTORY, write_truth
-from dpm2_core.experiments.part import Advance, Figures
-from dpm2_core.files import atomic_write
+from dpm2_core.evaluation.run_folder import TRAJECTORY, TRUTH, write_truth
+from dpm2_core.experiments.part import LOG, Advance, Figures, begin_training
 from dpm2_core.tasks.open import open_scans
 from dpm2_core.tasks.slam_figures import figures_of, slam_runs
 from dpm2_core.tasks.task import SlamTaskTraining, task_type
@@ -24,7 +22,6 @@ TRAIN = "dpm2_core.experiments.task_part:train"
 MEASURE = "dpm2_core.experiments.task_part:measure_on"
 SLAM = "dpm2_core.experiments.task_part:slam_on"
 Arm = Literal["without", "with", "placebo"]
-_BEGUN = "begun.yaml"
 _PERIOD = 100_000_000  # ns between scans
 
 
@@ -78,17 +75,9 @@ def train(
     needs = kind.learns_from(settings_of({**training, "arm": "with"}))
     scans = open_scans(training["data"], needs, training["learn"])
     text = dump_settings(settings) + json.dumps({"training": training, "until": until}) + "\n"
-    begun = folder / _BEGUN
-    if not (begun.is_file() and begun.read_text(encoding="utf-8") == text):
-        for old in ("checkpoint.pt", "log.jsonl", WEIGHTS):
-            (folder / old).unlink(missing_ok=True)
-        if start is not None:
-            for kept in ("checkpoint.pt", "log.jsonl"):
-                shutil.copy(Path(start) / kept, folder / kept)
-        with atomic_write(begun) as file:
-            file.write(text)
+    resume = begin_training(folder, text, WEIGHTS, None if start is None else Path(start))
     task = new_task(training["task"], settings)
-    train_task(task, scans, folder, (folder / "checkpoint.pt").exists(), until=until)
+    train_task(task, scans, folder, resume, until=until)
     advance(1, 1)
     return {"scans": len(scans), "epochs": until or settings.epochs, **_logged(folder, settings)}
 
@@ -119,14 +108,14 @@ def slam_on(folder: Path, advance: Advance, task: str, weights: str, drive: tupl
             place = folder / run.sequence.replace("/", "_") / kind
             place.mkdir(parents=True, exist_ok=True)
             write_tum(place / TRAJECTORY, stamps, poses)
-            write_truth(place / "ground_truth.tum", stamps, run.truth)
+            write_truth(place / TRUTH, stamps, run.truth)
         advance(len(rows), len(rows))
     return {"sequences": rows, **mean_figures(list(rows.values()))}
 
 
 def _logged(folder: Path, settings: SlamTaskTraining) -> Figures:
     """The losses of the last epoch, and what the SLAM loss was beside the task's when it first counted."""
-    lines = (folder / "log.jsonl").read_text(encoding="utf-8").splitlines()
+    lines = (folder / LOG).read_text(encoding="utf-8").splitlines()
     # A training that was stopped may have logged steps twice, and goes on after the last checkpoint.
     rows = list({row["step"]: row for row in map(json.loads, lines) if "norm" in row}.values())
     epoch = max(1, len(rows) // settings.epochs)

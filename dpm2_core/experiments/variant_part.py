@@ -10,8 +10,7 @@ from typing import Any
 
 from dpm2_core.config import dump_settings, load_settings, merged
 from dpm2_core.data.open import open_source
-from dpm2_core.experiments.part import Advance, Figures
-from dpm2_core.files import atomic_write
+from dpm2_core.experiments.part import LOG, Advance, Figures, begin_training
 from dpm2_core.learning.generate import pack as write_packed_drive
 from dpm2_core.learning.train_registration import RegistrationTrainingSettings, train_registration
 from dpm2_core.network.pretrained import weights_path
@@ -21,7 +20,6 @@ from dpm2_core.slam.settings import Config
 PACK = "dpm2_core.experiments.variant_part:pack"
 TRAIN = "dpm2_core.experiments.variant_part:train"
 WEIGHTS = "weights.safetensors"
-_BEGUN = "begun.yaml"
 
 
 def pack(folder: Path, advance: Advance, data: str, settings: Sequence[str], weights: str) -> Figures:
@@ -66,17 +64,11 @@ def train(folder: Path, advance: Advance, training: dict[str, Any], packed: str,
         UsageError: no such weights, or no packed drive.
     """
     chosen = training_of(training["config"], training["settings"], training["start"], network, Path(packed))
-    text = dump_settings(chosen)
-    begun = folder / _BEGUN
-    if not (begun.is_file() and begun.read_text(encoding="utf-8") == text):
-        for old in ("checkpoint.pt", "log.jsonl", WEIGHTS):
-            (folder / old).unlink(missing_ok=True)
-        with atomic_write(begun) as file:
-            file.write(text)
-    weights = train_registration(chosen, folder, resume=(folder / "checkpoint.pt").exists())
+    resume = begin_training(folder, dump_settings(chosen), WEIGHTS)
+    weights = train_registration(chosen, folder, resume=resume)
     steps = chosen.optimiser.steps
     advance(steps, steps)
-    losses = [json.loads(line).get("loss") for line in (folder / "log.jsonl").read_text().splitlines()]
+    losses = [json.loads(line).get("loss") for line in (folder / LOG).read_text().splitlines()]
     last = [loss for loss in losses if loss is not None][-50:]
     random = read_metadata(weights).get("random_at_start", "")
     return {"steps": steps, "last_loss": sum(last) / len(last), "random_at_start": random.split(", ") if random else []}

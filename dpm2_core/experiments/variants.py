@@ -16,11 +16,10 @@ from dpm2_core.evaluation.image_attention import attention_png, image_attention
 from dpm2_core.experiments.ablation import TABLE_4 as TRAINED_ALIKE
 from dpm2_core.experiments.kitti import ORIGINAL_POSES, TESTED
 from dpm2_core.experiments.part import Figures, Part
-from dpm2_core.experiments.request import Experiment, Outcome, Request
+from dpm2_core.experiments.request import Experiment, Outcome, Request, drawn
 from dpm2_core.experiments.sequences import SHOWN, cells, missing_note, own_part, present, run_folders
 from dpm2_core.experiments.table import MEAN, ResultTable
 from dpm2_core.experiments.variant_part import PACK, TRAIN, WEIGHTS
-from dpm2_core.extras import MissingPackageError
 from dpm2_core.network.pretrained import weights_path
 from dpm2_core.network.weights import load_model
 from dpm2_core.slam.settings import Config
@@ -133,13 +132,9 @@ class VariantTable:
                 looked[variant] = image_attention(model, frame)
             except UsageError as error:  # what pools or paints has no attention
                 notes.append(f"no attention map of {variant}: {error}")
+        title = f"{sequence}, frame {frame.index}: attention of one reference point"
         path = request.out / f"attention_{sequence}.png"
-        try:
-            attention_png(path, looked, f"{sequence}, frame {frame.index}: attention of one reference point")
-        except MissingPackageError as error:
-            notes.append(f"no {path.name}: {error}")
-            return []
-        return [path]
+        return drawn(path, notes, lambda to: attention_png(to, looked, title))
 
     def _name(self, variant: str) -> str:
         return f"variant {variant}"

@@ -46,6 +46,14 @@ def velocity_change(speed: float, seconds: float, acceleration: float) -> float:
     return min(acceleration * seconds, speed + acceleration)
 
 
+def spread(sigma: float, seconds: float, of_velocity: Array) -> Array:
+    """Covariance (6, 6) [rad, m] of `sigma` in every direction, and of a velocity with the covariance `of_velocity`
+    (3, 3) [m/s] over that time."""
+    result = sigma**2 * np.eye(6)
+    result[3:, 3:] += of_velocity * seconds**2
+    return result
+
+
 def combined(of_scene: Array, of_prediction: Array) -> Array:
     """Covariance (3, 3) [m] of a position that the scene and the motion so far show; 1 m of the scene says nothing."""
     information, axes = np.linalg.eigh(np.linalg.inv(of_scene))

@@ -15,7 +15,7 @@ import numpy as np
 
 from dpm2_core.frame import Array, Registration
 from dpm2_core.geometry import se3
-from dpm2_core.geometry.motion import between, covariance, predicted, velocity_change
+from dpm2_core.geometry.motion import between, covariance, predicted, spread, velocity_change
 from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration, agree
 
@@ -83,9 +83,8 @@ class Bridge:
     def expected(self, T: Array, dt: float) -> Prediction:
         """Of the second scan of the stretch, `dt` s after the first at T (4, 4): the motion before, less certain."""
         sigma = dt * velocity_change(self._speed, self._seconds, self._limits.acceleration)
-        unknown = sigma**2 * np.eye(6)
-        unknown[3:, 3:] += self._of_velocity * dt**2
-        return Prediction([predicted(T, self._motion, dt)], 2.0, np.linalg.inv(unknown).astype(np.float64))
+        information = np.linalg.inv(spread(sigma, dt, self._of_velocity)).astype(np.float64)
+        return Prediction([predicted(T, self._motion, dt)], 2.0, information)
 
     def covariance(self, T_stretch: Array) -> Array:
         """(6, 6) [rad, m] of a pose (4, 4) of the stretch relative to the last one before the pause."""

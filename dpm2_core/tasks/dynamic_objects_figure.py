@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dpm2_core.extras import needs
-from dpm2_core.files import atomic_write
+from dpm2_core.evaluation.canvas import new_figure, save_png
 
 
 def dynamic_objects_png(
@@ -20,11 +19,7 @@ def dynamic_objects_png(
     Raises:
         Dpm2Error: the file could not be written.
     """
-    with needs("plot", "drawing"):
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8, 8), dpi=120, layout="constrained")
+    figure = new_figure(figsize=(8, 8), dpi=120, layout="constrained")
     axes = figure.subplots()
     kinds = (
         (~found & ~truth, "standing", "0.7"),
@@ -36,5 +31,4 @@ def dynamic_objects_png(
         axes.plot(points[which, 1], points[which, 0], ".", ms=1, mew=0, color=color, label=f"{name}: {which.sum()}")
     axes.set(xlim=(40, -40), ylim=(-40, 40), xlabel="y, m", ylabel="x (ahead), m", aspect="equal")
     axes.legend(markerscale=12, loc="upper right")
-    with atomic_write(path, "wb") as file:
-        FigureCanvasAgg(figure).print_png(file)
+    save_png(path, figure)

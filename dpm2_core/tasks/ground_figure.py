@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
-from dpm2_core.extras import needs
-from dpm2_core.files import atomic_write
+from dpm2_core.evaluation.canvas import new_figure, save_png
 from dpm2_core.network.perception.gndnet import GroundSettings, cell_of, height_above
 
 
@@ -21,17 +20,13 @@ def ground_png(path: Path, found: Tensor, truth: Tensor, points: Tensor, setting
     Raises:
         Dpm2Error: the file could not be written.
     """
-    with needs("plot", "drawing"):
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-
     above = (height_above(points, found, settings) > settings.threshold) & cell_of(points, settings)[1]
     half = settings.cells * settings.cell / 2
     seen = truth[truth.isfinite()].cpu().numpy()
     low, high = (
         np.percentile(seen, [1, 99]) if len(seen) else (-settings.sensor_height - 1, -settings.sensor_height + 1)
     )
-    figure = Figure(figsize=(15, 5), dpi=120, layout="constrained")
+    figure = new_figure(figsize=(15, 5), dpi=120, layout="constrained")
     views = (("elevation found, points above it", found, (low, high), "viridis"),
              ("elevation of the labels", truth, (low, high), "viridis"),
              ("found - labels", found - truth, (-0.3, 0.3), "RdBu"))  # fmt: skip
@@ -50,5 +45,4 @@ def ground_png(path: Path, found: Tensor, truth: Tensor, points: Tensor, setting
         if grid is found:
             xy = points[above, :2].cpu().numpy()
             axes.plot(xy[:, 1], xy[:, 0], ",", color="crimson", alpha=0.4)
-    with atomic_write(path, "wb") as file:
-        FigureCanvasAgg(figure).print_png(file)
+    save_png(path, figure)

@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
-from dpm2_core.extras import needs
-from dpm2_core.files import atomic_write
+from dpm2_core.evaluation.canvas import new_figure, save_png
 from dpm2_core.network.perception.range_image import to_points
 
 _BACKGROUND, _INK = "#0d1117", "#c9d1d9"
@@ -26,11 +25,7 @@ def range_png(path: Path | str, rows: Mapping[str, tuple[Tensor, Tensor]], scale
     Raises:
         Dpm2Error: the file could not be written.
     """
-    with needs("plot", "drawing"):
-        from matplotlib.backends.backend_agg import FigureCanvasAgg  # half a second to import: not for every command
-        from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(14, 3.4 * len(rows) + 0.6), dpi=90, facecolor=_BACKGROUND)
+    figure = new_figure(figsize=(14, 3.4 * len(rows) + 0.6), dpi=90, facecolor=_BACKGROUND)
     figure.text(0.01, 1 - 0.3 / (3.4 * len(rows) + 0.6), title, color=_INK, fontsize=13, va="center")
     for k, (name, (image, mask)) in enumerate(rows.items()):
         bottom, height = (len(rows) - 1 - k) / len(rows) * 0.94, 0.94 / len(rows)
@@ -47,5 +42,4 @@ def range_png(path: Path | str, rows: Mapping[str, tuple[Tensor, Tensor]], scale
             points[order, 0], points[order, 1], c=points[order, 2], s=0.6, cmap="viridis", vmin=-2, vmax=2, lw=0
         )
         above.set(xlim=(-_FAR, _FAR), ylim=(-_FAR, _FAR), xticks=[], yticks=[])
-    with atomic_write(path, "wb") as file:
-        FigureCanvasAgg(figure).print_png(file)
+    save_png(path, figure)

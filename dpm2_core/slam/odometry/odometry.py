@@ -12,7 +12,7 @@ import numpy as np
 from dpm2_core.config import Settings
 from dpm2_core.frame import Array, Frame, OdometryResult, Registration, State
 from dpm2_core.geometry import se3
-from dpm2_core.geometry.motion import OPEN, combined, covariance, predicted
+from dpm2_core.geometry.motion import OPEN, combined, covariance, predicted, spread
 from dpm2_core.slam.bridge import Bridge, Limits
 from dpm2_core.slam.odometry.keyframe_selection import KeyframeSelector
 from dpm2_core.slam.preprocess import Scan
@@ -262,9 +262,7 @@ class Odometry:
 
     def _of_prediction(self, seconds: float) -> Array:
         """Covariance (6, 6) [rad, m] of a pose that is predicted from one that was registered so long before."""
-        result = np.eye(6) * (self._settings.steadiness * seconds * seconds) ** 2
-        result[3:, 3:] += self._of_velocity * seconds**2
-        return result
+        return spread(self._settings.steadiness * seconds * seconds, seconds, self._of_velocity)
 
     def _unknown(self, dt: float) -> Array:
         """Covariance (6, 6) of what is only predicted."""
