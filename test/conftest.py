@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import hypothesis
 import pytest
+from filelock import FileLock
 
 from dpm2_core.openmp import wait_passively
 
@@ -40,6 +41,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker("slow")
 
 
+def of_all_workers(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of this call of pytest that its workers (pytest-xdist) share."""
+    base = tmp_path_factory.getbasetemp()
+    return base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+
 @pytest.fixture(scope="session")
 def kitti_excerpt() -> Path:
     """The packed real KITTI excerpt (its README.md lists what is in it)."""
@@ -51,8 +58,13 @@ def kitti_excerpt() -> Path:
 @pytest.fixture(scope="session")
 def kitti_root(kitti_excerpt: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The excerpt in KITTI odometry layout: sequences/{00,04} and poses/."""
-    root = tmp_path_factory.mktemp("kitti")
-    subprocess.run([sys.executable, str(kitti_excerpt / "unpack.py"), str(root)], check=True, capture_output=True)
+    root = of_all_workers(tmp_path_factory) / "kitti"
+    with FileLock(f"{root}.lock"):
+        if not root.is_dir():  # unpacked by whichever worker wants it first
+            part = root.with_suffix(".part")
+            command = [sys.executable, str(kitti_excerpt / "unpack.py"), str(part)]
+            subprocess.run(command, check=True, capture_output=True)
+            part.rename(root)
     return root
 
 
@@ -62,10 +74,12 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from dpm2_core.sim.drive import simulate
     from dpm2_core.sim.settings import DriveConfig, LidarConfig
 
-    root = tmp_path_factory.mktemp("recording") / "sim"
-    lidar = LidarConfig(columns=900)
-    drive = DriveConfig(frames=30, seed=2, road="straight", preset="suburb", images=False, lidar=lidar)
-    simulate(root, drive)
+    root = of_all_workers(tmp_path_factory) / "recording"
+    with FileLock(f"{root}.lock"):
+        if not root.is_dir():
+            lidar = LidarConfig(columns=900)
+            drive = DriveConfig(frames=30, seed=2, road="straight", preset="suburb", images=False, lidar=lidar)
+            simulate(root, drive)  # it is there when it is whole
     return root
 
 

@@ -30,7 +30,7 @@ GEOMETRIC = ["-p", "input.images:=false", "-p", "slam.loops.descriptors:=false"]
 SAVED = ["map.ply", "pose_graph.g2o", "trajectory.tum"]
 
 
-@pytest.mark.parametrize(("name", "times"), [("SIGINT", 2), ("SIGTERM", 1), ("SIGTERM", 2)])
+@pytest.mark.parametrize(("name", "times"), [("SIGINT", 2), ("SIGTERM", 1)])
 def test_slam_node_saves_its_map_when_stopped(
     ros: Callable[..., Any], drive: Any, tmp_path: Path, name: str, times: int
 ) -> None:

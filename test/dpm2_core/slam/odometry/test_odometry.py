@@ -15,13 +15,14 @@ from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import LidarConfig
 from dpm2_core.sim.world import build_world
 from dpm2_core.slam.build import make_odometry
+from dpm2_core.slam.odometry.odometry import OdometrySettings
 from dpm2_core.slam.settings import SlamSettings
 
 from ....helpers.drives import Drive, make_drive
 
 
-def run(frames: list[Frame]) -> list[OdometryResult]:
-    odometry = make_odometry(SlamSettings())
+def run(frames: list[Frame], settings: SlamSettings | None = None) -> list[OdometryResult]:
+    odometry = make_odometry(settings or SlamSettings())
     return [odometry.process(frame) for frame in frames]
 
 
@@ -174,8 +175,8 @@ def test_velocity_after_a_gap_is_that_since_the_last_registered_scan(suburb_driv
 def test_a_new_map_is_begun_when_nothing_fits_for_long(suburb_drive: Drive) -> None:
     """Carried elsewhere: the odometry goes on, and the next edge of the pose graph says that it knows nothing."""
     elsewhere = np.random.default_rng(5).uniform(-40, 40, (3000, 4)).astype(np.float32)
-    frames = [*suburb_drive[0][:8], *(Frame((8 + i) * 10**8, elsewhere) for i in range(24))]
-    tracked = run(frames)
+    frames = [*suburb_drive[0][:8], *(Frame((8 + i) * 10**8, elsewhere) for i in range(12))]
+    tracked = run(frames, SlamSettings(odometry=OdometrySettings(restart_after=4)))
     assert State.LOST in {t.state for t in tracked}
     assert tracked[-1].registration.ok
     edges = [t.keyframe.edge for t in tracked[10:] if t.keyframe and t.keyframe.edge]
