@@ -87,6 +87,7 @@ def test_kiss_icp_runs_beside_it_on_the_same_scans(sequence: Path, tmp_path: Pat
     assert ratio["ape_rmse_m"] == pytest.approx(methods["dpm2"]["ape_rmse_m"] / methods["kiss-icp"]["ape_rmse_m"])
 
 
+@pytest.mark.slow
 def test_frames_farther_apart_are_measured_as_far_as_a_drive_has_them(sequence: Path, tmp_path: Path) -> None:
     bench(["hard"], source=[sequence], out=tmp_path, threads=1, only="geometric")
     rates = json.loads((tmp_path / "hard.json").read_text())["drives"][sequence.name]

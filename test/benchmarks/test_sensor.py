@@ -50,6 +50,7 @@ def test_rings_are_told_apart_where_azimuth_starts_again() -> None:
     np.testing.assert_array_equal(np.bincount(rings_of(points)), [100, 100, 100])
 
 
+@pytest.mark.slow
 def test_reference_points_of_the_same_scan_meet_and_of_another_place_do_not(street: World) -> None:
     """Twice the same cloud: all; 20 m apart with a wrong motion: hardly any."""
     cloud = _scans(street)[0]

@@ -96,6 +96,7 @@ def test_json_alone_is_on_stdout(straight: Path, tmp_path: Path) -> None:
     assert json.loads((tmp_path / "figures.json").read_text()) == json.loads(done.stdout)
 
 
+@pytest.mark.slow
 def test_quiet_leaves_results_and_errors(recording: Path, tmp_path: Path) -> None:
     arguments = ["run", recording, "--frames", "0:3", "--set", "slam.registration=geometric"]
     arguments += ["--set", "slam.loops.descriptors=false"]
@@ -134,6 +135,7 @@ def test_no_color_means_none(straight: Path) -> None:
 @pytest.mark.parametrize(("words", "offered"), [
     ("dpm2 doc", ["doctor"]), ("dpm2 map exp", ["export"]), ("dpm2 run --loc", ["--localise"]),
 ])  # fmt: skip
+@pytest.mark.slow
 def test_completion(words: str, offered: list[str]) -> None:
     program = "import sys; sys.argv = ['dpm2']; from dpm2_core.cli import main; main()"
     environment = {

@@ -111,6 +111,7 @@ def test_interrupted_before_the_first_frame(recording: Path, tmp_path: Path, mon
     assert {path.name for path in tmp_path.iterdir()} == FILES - {"trajectory.png", "metrics.json", "ground_truth.tum"}
 
 
+@pytest.mark.slow
 def test_ground_truth_as_poses_and_as_a_tum_file(recording: Path, tmp_path: Path) -> None:
     """The same truth in either form gives nearly the same error: of the LiDAR by a TUM file, else of the camera."""
     source = open_source(recording)

@@ -68,6 +68,7 @@ def test_a_missing_ros_is_a_warning() -> None:
     assert json.loads(done.stdout) == ["warning", "note"]
 
 
+@pytest.mark.slow
 def test_a_cloud_comes_back_over_dds_or_it_is_said() -> None:
     if machine.ros().level == "ok":
         assert machine.dds().level == "ok"

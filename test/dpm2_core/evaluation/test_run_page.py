@@ -77,6 +77,7 @@ def test_runs_of_one_drive_are_drawn_together_in_the_frame_of_its_truth(tmp_path
     assert "http://" not in text.replace("http://www.w3.org/2000/svg", "").replace("http://example.org", "")
 
 
+@pytest.mark.slow
 def test_a_whole_kitti_sequence_of_four_methods_is_below_five_megabytes(tmp_path: Path) -> None:
     runs = [(str(i), write_run(tmp_path / str(i), 4541, 1 + i / 100)) for i in range(4)]
     assert len(runs_page("08", runs)) < 5_000_000

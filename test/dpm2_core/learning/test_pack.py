@@ -52,6 +52,7 @@ class Sweeps:
             yield Frame(n * 10**8, points, offsets, images, index=n)
 
 
+@pytest.mark.slow
 def test_packed_sweeps_are_rigid_and_fit_each_other(tmp_path: Path) -> None:
     """Undistorted by the true motion, the points of all frames are the same in the world; no pose, no sample."""
     world = boxes(np.random.default_rng(0), 1000)

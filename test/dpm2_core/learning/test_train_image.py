@@ -63,6 +63,7 @@ def _spread(points: torch.Tensor) -> torch.Tensor:
     return (points[:, :, None] - points[:, None]).norm(dim=-1)
 
 
+@pytest.mark.slow
 def test_points_of_a_pair_are_the_same_in_the_world(settings: ImageTrainingSettings, network: NetworkSettings) -> None:
     """The second half of each pair is the first half seen from the other frame: an isometry, in front of the camera."""
     batch = next(ImageDataset(settings.data, network, 0).pairs(settings.points))

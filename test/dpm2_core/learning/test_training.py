@@ -133,6 +133,7 @@ def test_overlap_keeps_a_tenth_of_the_rate_whatever_else_is_set() -> None:
     assert (chosen.steps, chosen.rate, chosen.decay, chosen.warmup) == (2000, 1e-4, 3e-5, 20)
 
 
+@pytest.mark.slow
 def test_overlap_keeps_the_network_of_registration(settings: RegistrationTrainingSettings, tmp_path: Path) -> None:
     """Also settings that change no shape and differ from the preset: the weights that it writes have them again."""
     changed = {"decoder": {"temperature": 0.5}, "fusion": {"image_mask": "front"}}

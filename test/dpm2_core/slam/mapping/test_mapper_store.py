@@ -80,6 +80,7 @@ def test_the_file_holds_what_the_mapper_holds(tmp_path: Path) -> None:
             np.testing.assert_array_equal(after, before)
 
 
+@pytest.mark.slow
 def test_four_laps_have_the_clouds_of_one(tmp_path: Path) -> None:
     """A keyframe whose loop was rejected keeps its own: three in the second lap; later ones borrow from these, too."""
     sizes = []

@@ -142,6 +142,7 @@ def test_bad_frames_before_the_first_good_one(suburb_drive: Drive) -> None:
     assert errors(tracked[1:], truth[:6])[:, 0].max() < 0.05
 
 
+@pytest.mark.slow
 def test_an_unreadable_scan_keeps_its_reason(suburb_drive: Drive) -> None:
     frames, _ = suburb_drive
     broken = Frame(6 * 10**8, np.zeros((0, 4), np.float32), problem="000006.bin: 13 bytes")
@@ -192,6 +193,7 @@ def test_stamps_that_repeat_jump_back_or_pause(suburb_drive: Drive, stamps: list
     assert all(np.isfinite(t.twist).all() for t in tracked)
 
 
+@pytest.mark.slow
 def test_fast_start(suburb_drive: Drive) -> None:
     """Three meters between the first two scans: no velocity is known yet."""
     frames = [replace(f, stamp=i * 10**8) for i, f in enumerate(suburb_drive[0][::3])]
