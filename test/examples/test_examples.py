@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import os
 import runpy
 import sys
 from contextlib import redirect_stderr, redirect_stdout
@@ -137,3 +138,21 @@ def test_the_slam_loss_on_a_model_of_ones_own(recording: Path) -> None:
     before, after = ([float(line.split()[3]), float(line.split()[5])] for line in done.stdout.splitlines())
     assert after[0] < before[0] / 2
     assert after[1] < before[1]
+
+
+@pytest.mark.slow
+@pytest.mark.weights
+def test_the_notebook(recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All of its cells run, and it is kept without what they print."""
+    nbclient = pytest.importorskip("nbclient", reason="no nbclient: pip install '.[test]'")
+    nbformat = pytest.importorskip("nbformat")
+    notebook = nbformat.read(EXAMPLES / "tour.ipynb", as_version=4)
+    assert not [cell for cell in notebook.cells if cell.get("outputs")]
+    monkeypatch.setenv("DPM2_RECORDING", str(recording))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
+    nbclient.NotebookClient(notebook, timeout=200, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    printed = "".join(output.get("text", "") for cell in notebook.cells for output in cell.get("outputs", ()))
+    assert "tracking confidence" in printed
+    assert "(256, 3) (256, 128)" in printed
+    assert (tmp_path / "trajectory.png").read_bytes().startswith(b"\x89PNG")
+    assert any("image/png" in output.get("data", {}) for output in notebook.cells[-1].outputs)

@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An action for a behavior tree that makes a lost robot find itself in its map (py_trees, ROS 2).
+
+python examples/relocalise_action.py [TIMEOUT]
+
+Beside a slam_node with ros.localization_mode: a tree that is content while the robot knows where it is, and calls
+`Relocalise` when it does not. Ends when the place is known (exit code 0), or could not be found within TIMEOUT s (1).
+"""
+
+import sys
+import time
+from typing import Any
+
+import py_trees
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from py_trees.common import Status
+from rclpy.node import Node
+from std_srvs.srv import Trigger
+
+LOCATED = ("tracking", "degraded", "relocalised")
+
+
+class Localization:
+    """What slam_node says of the robot's place, from /diagnostics."""
+
+    def __init__(self, node: Node) -> None:
+        self.node, self.state = node, "unknown"
+        node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.name.endswith(": localisation"):
+                self.state = status.message.split(":")[0].split(" ")[0]
+
+
+class IsLocated(py_trees.behaviour.Behaviour):
+    """SUCCESS while the place in the map is known."""
+
+    def __init__(self, localization: Localization) -> None:
+        super().__init__("is located")
+        self._localization = localization
+
+    def update(self) -> Status:
+        """As py_trees calls it."""
+        return Status.SUCCESS if self._localization.state in LOCATED else Status.FAILURE
+
+
+class Relocalise(py_trees.behaviour.Behaviour):
+    """Lets slam_node search the whole map anew; RUNNING until it is found, FAILURE after `timeout` s."""
+
+    def __init__(self, localization: Localization, timeout: float = 20.0) -> None:
+        super().__init__("relocalise")
+        self._localization, self._timeout = localization, timeout
+        self._client = localization.node.create_client(Trigger, "/slam_node/load_map")
+        self._reply: Any = None
+
+    def initialise(self) -> None:
+        """The search begins."""
+        self._began, self._reply, self._searching = time.monotonic(), None, False
+        self.feedback_message = "searching"
+
+    def update(self) -> Status:
+        """One tick."""
+        if time.monotonic() - self._began > self._timeout:
+            self.feedback_message = f"not found within {self._timeout:g} s"
+            return Status.FAILURE
+        if self._reply is None:
+            if self._client.service_is_ready():
+                self._reply = self._client.call_async(Trigger.Request())
+            return Status.RUNNING
+        if not self._reply.done():
+            return Status.RUNNING
+        if not self._reply.result().success:
+            self.feedback_message = self._reply.result().message
+            return Status.FAILURE
+        if not self._searching:  # what was said before does not count
+            self._searching, self._localization.state = True, "searching"
+            return Status.RUNNING
+        return Status.SUCCESS if self._localization.state in LOCATED else Status.RUNNING
+
+
+def main() -> int:
+    """Tick the tree ten times a second until it knows."""
+    timeout = float(sys.argv[1]) if len(sys.argv) > 1 else 20.0
+    rclpy.init()
+    node = rclpy.create_node("behavior")
+    localization = Localization(node)
+    tree = py_trees.composites.Selector("where am I", memory=True)
+    relocalise = Relocalise(localization, timeout)
+    tree.add_children([IsLocated(localization), relocalise])
+    while tree.status not in (Status.SUCCESS, Status.FAILURE):
+        end = time.monotonic() + 0.1
+        while time.monotonic() < end:
+            rclpy.spin_once(node, timeout_sec=0.05)
+        tree.tick_once()
+    print(f"{tree.status.value.lower()}: {localization.state} {relocalise.feedback_message}")
+    rclpy.try_shutdown()
+    return 0 if tree.status is Status.SUCCESS else 1
+
+
+sys.exit(main())

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""examples/relocalise_action.py beside a real node: it ends when the place is known, and says so where it is not."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sensor_msgs.msg import PointCloud2
+
+from dpm2_core.data import topics
+from dpm2_core.data.open import open_source
+from dpm2_core.data.settings import InputSettings
+from dpm2_ros.conversions import cloud_to_msg
+from dpm2_ros.slam_node import SlamNode
+
+from ..helpers.command import dpm2
+from ..helpers.drives import first_scans
+
+EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "relocalise_action.py"
+pytest.importorskip("py_trees", reason="no py_trees: pip install '.[test]'")
+
+
+def action(harness: Any, timeout: float) -> subprocess.Popen[str]:
+    """The example, in the domain of a harness."""
+    environment = {**os.environ, "ROS_DOMAIN_ID": str(harness.node.context.get_domain_id())}
+    command = [sys.executable, str(EXAMPLE), str(timeout)]
+    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
+
+
+@pytest.mark.slow
+@pytest.mark.weights
+def test_a_robot_that_is_lost_finds_itself(ros: Callable[..., Any], recording: Path, tmp_path: Path) -> None:
+    drive = first_scans(recording, 10, tmp_path / "drive")
+    made = dpm2("run", drive, "--out", tmp_path / "out", "--map", tmp_path / "street.dpm2map")
+    assert made.returncode == 0, made.stderr
+    harness = ros(f"ros.map_file:={tmp_path / 'street.dpm2map'}", "ros.localization_mode:=true", "input.images:=false")
+    lidar = harness.publisher(PointCloud2, topics.POINTS)
+    harness.add(SlamNode())
+    harness.wait(lidar.get_subscription_count, "the subscription to the clouds")
+    process = action(harness, 60.0)
+    (scan,) = open_source(drive, InputSettings(images=False)).frames(4, 5)
+    stamp = 100 * 10**9
+    while process.poll() is None:  # the robot stands
+        stamp += 10**8
+        lidar.publish(cloud_to_msg(scan.points, stamp, "lidar"))
+        time.sleep(0.2)
+    assert process.stdout is not None
+    said = process.stdout.read()
+    assert process.returncode == 0, said
+    assert said.startswith("success: ")
+
+
+@pytest.mark.slow
+def test_without_a_node_it_fails_after_its_time(ros: Callable[..., Any]) -> None:
+    process = action(ros(), 1.0)
+    said, _ = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert "not found within 1 s" in said
