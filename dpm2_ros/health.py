@@ -163,6 +163,8 @@ class Diagnostics:
             }
         silence, topic = _silence(synchronizer.last_arrival), self._inputs.calibration.points_topic
         last = health.last
+        if silence is None and (problem := self._inputs.subscriptions[0].problem):
+            return self._status("odometry", ERROR, problem, figures)
         if silence is None:
             found = self._inputs.candidates()
             hint = f"; point clouds are published on {', '.join(found)}" if found else ""
@@ -180,6 +182,9 @@ class Diagnostics:
             level, text = ERROR, f"{text}; {self.frame_problem}"
         if synchronizer.dropped and len(synchronizer):
             level, text = max(level, WARN), f"{text}; cannot keep up, {synchronizer.dropped} clouds dropped"
+        if problem := self._frames.time_problem:
+            self._node.get_logger().warning(f"{topic}: {problem}", once=True)
+            text = f"{text}; {problem}"
         if problem := self._clock_problem():
             self._node.get_logger().warning(problem, once=True)
             level, text = max(level, WARN), f"{text}; {problem}"

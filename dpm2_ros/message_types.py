@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Message classes by the names that recordings give: of ROS' own packages only, since a name is imported."""
+"""Message classes by the names that others give: of ROS' own packages and Livox' only, since a name is imported."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import re
 from typing import Any
 
 PACKAGES = (
-    "actionlib_msgs", "builtin_interfaces", "diagnostic_msgs", "geometry_msgs", "nav_msgs", "rcl_interfaces",
-    "rosgraph_msgs", "sensor_msgs", "shape_msgs", "std_msgs", "stereo_msgs", "tf2_msgs", "trajectory_msgs",
-    "unique_identifier_msgs", "visualization_msgs",
+    "actionlib_msgs", "builtin_interfaces", "diagnostic_msgs", "geometry_msgs", "livox_ros_driver",
+    "livox_ros_driver2", "nav_msgs", "rcl_interfaces", "rosgraph_msgs", "sensor_msgs", "shape_msgs", "std_msgs",
+    "stereo_msgs", "tf2_msgs", "trajectory_msgs", "unique_identifier_msgs", "visualization_msgs",
 )  # fmt: skip
 _NAME = re.compile(r"(\w+)/(?:msg/)?([A-Z]\w*)")
 

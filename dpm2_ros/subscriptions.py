@@ -21,12 +21,14 @@ from dpm2_core.data import topics
 from dpm2_core.data.frames import Calibration
 from dpm2_core.data.image_messages import decode_camera
 from dpm2_core.data.kitti import checked_correction
+from dpm2_core.data.livox import LIVOX, cloud_of_custom
 from dpm2_core.data.messages import stamp_ns
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.errors import UsageError
 from dpm2_core.slam.mapping.admission import RejectedError
 from dpm2_ros.checks import check_header, check_size, extended, unreadable
 from dpm2_ros.losses import Losses
+from dpm2_ros.message_types import message_type
 from dpm2_ros.settings import RosSettings
 from dpm2_ros.synchronizer import Bundle, StampCheck, Synchronizer
 from dpm2_ros.tf import TFMessage
@@ -42,18 +44,21 @@ class MatchedSubscription:
     """A subscription with the reliability that the publishers offer.
 
     A reliable subscriber never connects to a best-effort publisher, and a best-effort one loses data that a reliable
-    publisher would have sent again. So it starts reliable, and `refresh`, called often, follows the publishers.
+    publisher would have sent again. So it starts reliable, and `refresh`, called often, follows the publishers. It also
+    follows one of PointCloud2 that finds a Livox' CustomMsg on its topic, whose messages come serialized.
 
     Attributes:
         topic: its full name, after remapping.
+        problem: why nothing comes although there is a publisher; else empty.
     """
 
     def __init__(self, node: Node, kind: type, topic: str, callback: Callable[..., None], ros: RosSettings) -> None:
-        self._node, self._kind, self._callback = node, kind, callback
+        self._node, self._kind, self._wanted, self._callback = node, kind, kind, callback
         self._setting, self._depth = ros.reliability, ros.queue_depth
         self._given, self.topic = topic, node.resolve_topic_name(topic)
         self.reliability = ReliabilityPolicy.RELIABLE
         self._subscription: Any = None
+        self._raw, self.problem = False, ""
         self.refresh()
 
     def take(self) -> None:
@@ -61,26 +66,45 @@ class MatchedSubscription:
         handle = self._subscription.handle
         with handle:  # not to be destroyed meanwhile
             for _ in range(self._depth):
-                if (taken := handle.take_message(self._kind, False)) is None:
+                if (taken := handle.take_message(self._kind, self._raw)) is None:
                     return
                 self._subscription.callback(taken[0])
 
     def refresh(self) -> None:
         """Follow the publishers of this moment."""
-        requested = self.reliability
+        requested, offered = self.reliability, self._node.get_publishers_info_by_topic(self.topic)
         if self._setting != "auto":
             requested = ReliabilityPolicy[self._setting.upper()]
-        elif offered := self._node.get_publishers_info_by_topic(self.topic):
+        elif offered:
             reliable = all(info.qos_profile.reliability != ReliabilityPolicy.BEST_EFFORT for info in offered)
             requested = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
-        if self._subscription is not None and requested == self.reliability:
+        kind = self._kind_of({info.topic_type for info in offered})
+        if self._subscription is not None and (requested, kind) == (self.reliability, self._kind):
             return
-        before, self.reliability = self._subscription, requested
-        qos = QoSProfile(depth=self._depth, history=HistoryPolicy.KEEP_LAST, reliability=requested)
-        self._subscription = self._node.create_subscription(self._kind, self._given, self._callback, qos)
-        if before is not None:
+        before, other_type = self._subscription, kind is not self._kind
+        self.reliability, self._kind, self._raw = requested, kind, kind is not self._wanted
+        if before is not None and other_type:  # DDS allows one type a topic
             self._node.destroy_subscription(before)
-            self._node.get_logger().info(f"{self.topic}: {requested.name.lower()}, as its publisher")
+        qos = QoSProfile(depth=self._depth, history=HistoryPolicy.KEEP_LAST, reliability=requested)
+        self._subscription = self._node.create_subscription(kind, self._given, self._callback, qos, raw=self._raw)
+        if before is not None:
+            if not other_type:
+                self._node.destroy_subscription(before)
+            self._node.get_logger().info(f"{self.topic}: {requested.name.lower()} {kind.__name__}, as its publisher")
+
+    def _kind_of(self, offered: set[str]) -> type:
+        """What to subscribe to, given the types of the publishers."""
+        self.problem, custom = "", sorted(offered.intersection(LIVOX))
+        if self._wanted is not PointCloud2 or not custom or "sensor_msgs/msg/PointCloud2" in offered:
+            return self._wanted
+        found = message_type(custom[0])
+        if found is None:
+            self.problem = (
+                f"{self.topic} is a {custom[0]}, whose package is not installed here: install it, or let the driver "
+                f"send PointCloud2 (xfer_format: 0)"
+            )
+            self._node.get_logger().error(self.problem, once=True)
+        return found or self._wanted
 
 
 class Inputs:
@@ -157,11 +181,11 @@ class Inputs:
         """Other topics with point clouds."""
         own = {topic for topic, _ in self._node.get_publisher_names_and_types_by_node(
             self._node.get_name(), self._node.get_namespace())}  # fmt: skip
-        kind = "sensor_msgs/msg/PointCloud2"
+        wanted = {"sensor_msgs/msg/PointCloud2", *LIVOX}
         return sorted(
             topic
             for topic, kinds in self._node.get_topic_names_and_types()
-            if kind in kinds and topic not in own and self._node.count_publishers(topic)
+            if wanted.intersection(kinds) and topic not in own and self._node.count_publishers(topic)
         )
 
     def _check_cloud(self, message: PointCloud2) -> None:
@@ -177,7 +201,9 @@ class Inputs:
             raise RejectedError("unreadable", problem)
         self._frame = frame
 
-    def _on_cloud(self, message: PointCloud2, info: Mapping[str, Any]) -> None:
+    def _on_cloud(self, message: PointCloud2 | bytes, info: Mapping[str, Any]) -> None:
+        if isinstance(message, bytes):
+            message = cloud_of_custom(message)
         cloud, *others = self.subscriptions
         for other in reversed(others):  # what was sent before the cloud is to be there before it; calibration first
             other.take()

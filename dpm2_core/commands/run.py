@@ -24,7 +24,9 @@ from dpm2_core.slam.system import SlamResult
 
 
 def run(
-    src: Annotated[Path, typer.Argument(help="KITTI odometry sequence or root, rosbag2 folder, .mcap or .db3 file.")],
+    src: Annotated[
+        Path, typer.Argument(help="KITTI odometry sequence or root, or a bag: rosbag2 folder, .mcap, .db3, .bag.")
+    ],
     out: Annotated[Path, typer.Option(help="Folder for the results.")],
     gt: Annotated[Path | None, typer.Option(help="Ground truth (KITTI: left camera; TUM: LiDAR).")] = None,
     frames: Annotated[str, typer.Option(help="Which frames, a:b by position from 0.")] = ":",

@@ -19,7 +19,7 @@ from dpm2_core.frame import Frame
 
 
 def show(
-    src: Annotated[Path, typer.Argument(help="KITTI sequence or root, rosbag2 folder, .mcap or .db3 file.")],
+    src: Annotated[Path, typer.Argument(help="KITTI sequence or root, or a bag: rosbag2 folder, .mcap, .db3, .bag.")],
     frames: Annotated[str, typer.Option(help="Two frames a,b by position from 0; b is registered to a.")],
     out: Annotated[Path, typer.Option(help="PNG to write.")] = Path("matches.png"),
     weights: Annotated[

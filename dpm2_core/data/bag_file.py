@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""rosbag2 recordings without ROS: what is in them, their messages in order, and what is left of damaged ones.
+"""Bags of ROS 2 and ROS 1 without ROS: what is in them, their messages in order, and what is left of damaged ones.
 
 A bag defines its own message types; they are not used: a reader for them would be code made of what the file says.
-Types that ROS 2 Jazzy defines are read, others are only named.
+Types that ROS 2 Jazzy defines are read, and Livox' CustomMsg; others are only named. Messages of ROS 1 come as ROS 2
+has them (CDR), so that all that follows is the same.
 """
 
 from __future__ import annotations
@@ -19,10 +20,12 @@ from typing import Any
 
 from mcap.records import Channel, Message, Schema
 from mcap.stream_reader import StreamReader
+from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
+from dpm2_core.data.livox import LIVOX, cloud_of_custom, custom_of_ros1
 from dpm2_core.data.messages import MessageError
 from dpm2_core.database import check_plain
 from dpm2_core.errors import UsageError
@@ -67,12 +70,14 @@ class Bag:
             )
 
     def decode(self, topic: str, data: bytes) -> Any:
-        """A message object of rosbags.
+        """A message object of rosbags; a Livox CustomMsg as a PointCloud2.
 
         Raises:
             MessageError: the bytes are no message of the topic's type.
         """
         try:
+            if self.types[topic] in LIVOX:
+                return cloud_of_custom(data)
             return _jazzy().deserialize_cdr(data, self.types[topic])
         except Exception as error:  # overwritten bytes raise anything from SerdeError to UnicodeDecodeError
             raise MessageError(f"{topic}: message of {len(data)} bytes is damaged ({_reason(error)})") from None
@@ -90,11 +95,13 @@ class Bag:
 
 
 def open_bag(path: Path) -> Bag:
-    """Open a rosbag2 folder, or a bare .mcap or .db3 file. A truncated MCAP file gives the messages that are whole.
+    """Open a rosbag2 folder, or a .mcap, .db3 or ROS 1 .bag file. A truncated MCAP file gives what is whole.
 
     Raises:
         UsageError: there is nothing that can be read, and why.
     """
+    if path.suffix == ".bag" and path.is_file():
+        return _open_ros1(path)
     attempts: list[list[Path]] = [[path]]
     files = [path]
     if path.is_dir():
@@ -151,6 +158,33 @@ def _read_indexed(paths: list[Path], topics: Collection[str]) -> RawMessages:
         streams = [reader.messages(connections=c) for reader, c in zip(readers, requested, strict=True) if c]
         for connection, time, data in merge(*streams, key=lambda message: message[1]):
             yield connection.topic, time, data
+
+
+def _open_ros1(path: Path) -> Bag:
+    try:
+        with Ros1Reader(path) as reader:
+            connections = list(reader.connections)  # closing forgets them
+    except Exception as error:  # damaged files raise anything from ReaderError to struct.error
+        raise UsageError(f"{path}: cannot be read as a ROS 1 bag: {_reason(error)}") from None
+    counts: Counter[str] = Counter()
+    for connection in connections:
+        counts[connection.topic] += connection.msgcount
+    types = {connection.topic: connection.msgtype for connection in connections}
+    return Bag(path, types, dict(counts), partial(_read_ros1, path))
+
+
+def _read_ros1(path: Path, topics: Collection[str]) -> RawMessages:
+    with Ros1Reader(path) as reader:
+        requested = [connection for connection in reader.connections if connection.topic in topics]
+        for connection, time, data in reader.messages(connections=requested):
+            yield connection.topic, time, _as_ros2(data, connection.msgtype)
+
+
+def _as_ros2(data: bytes, kind: str) -> bytes:
+    """A message of ROS 1 as ROS 2 serializes it; damaged ones, and types that are not known, as no bytes."""
+    with suppress(Exception):  # SerdeError, KeyError, struct.error by the kind of damage
+        return custom_of_ros1(data) if kind in LIVOX else bytes(_jazzy().ros1_to_cdr(data, kind))
+    return b""
 
 
 def _salvage(path: Path, files: list[Path], reason: str) -> Bag:

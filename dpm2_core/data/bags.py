@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A rosbag2 recording as a `Source`: clouds with the image nearest in time, calibration and ground truth."""
+"""A bag of ROS 2 or ROS 1 as a `Source`: clouds with the image nearest in time, calibration and ground truth."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from dpm2_core.data import topics
 from dpm2_core.data.bag_file import open_bag
 from dpm2_core.data.frames import Calibration, FrameBuilder
 from dpm2_core.data.kitti import checked_correction
+from dpm2_core.data.livox import LIVOX
 from dpm2_core.data.messages import serialized_stamp, stamp_ns
 from dpm2_core.data.pairing import Images, clouds_after_images
 from dpm2_core.data.settings import InputSettings
@@ -27,6 +28,7 @@ from dpm2_core.geometry import se3
 Stamps = NDArray[np.int64]
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
+CLOUDS = (CLOUD, *LIVOX)
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 _TRUTH = ("nav_msgs/msg/Odometry", "nav_msgs/msg/Path")
@@ -34,7 +36,7 @@ _TRUTH_GAP = 1_000_000_000  # ns between two true poses beyond which nothing is 
 
 
 class BagSource:
-    """A rosbag2 folder, .mcap or .db3 file. See `Source` for what it offers; `Frame.index` is the message count.
+    """A rosbag2 folder, or a .mcap, .db3 or .bag file. See `Source`; `Frame.index` is the message count.
 
     Raises:
         UsageError: it cannot be read, has no point clouds, leaves the choice of a topic open, or has a camera with
@@ -75,6 +77,8 @@ class BagSource:
                 self._note_once("time stamps do not increase", f"at frame {index}: {(stamp - before) * 1e-9:+.3f} s")
             frame = self._frames.frame(stamp, cloud, image, index)
             before, without, count = stamp, without + (not frame.images), count + 1
+            if self._frames.time_problem:
+                self._note_once(f"{self.points_topic}: {self._frames.time_problem}", f"first at frame {index}")
             yield frame
         if self.camera and without:
             within = f"within {self._settings.image_tolerance} s"
@@ -101,7 +105,7 @@ class BagSource:
         return next((topic for topic in (asked, topics.ODOMETRY, topics.PATH) if topic in found), "")
 
     def _choose_points(self) -> str:
-        asked, found = self._settings.points_topic, self._bag.topics(CLOUD)
+        asked, found = self._settings.points_topic, self._bag.topics(*CLOUDS)
         if asked or not found:
             if asked in found:
                 return asked

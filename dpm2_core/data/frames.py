@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from dpm2_core.data.image_messages import decode_camera, decode_image
-from dpm2_core.data.messages import MessageError, decode_points
+from dpm2_core.data.image_messages import decode_camera, decode_image, is_fisheye, rectified
+from dpm2_core.data.messages import MessageError, decode_points, why_untimed
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.transforms import TransformTree
 from dpm2_core.data.vertical_angle import HDL64_CORRECTION_DEG, correct_vertical_angle
@@ -50,6 +50,7 @@ class FrameBuilder:
 
     Attributes:
         image_problem: why the last image could not be used; empty if it could, or if there was none.
+        time_problem: why the last cloud cannot be de-skewed; empty if it can, or needs not.
     """
 
     def __init__(
@@ -61,7 +62,7 @@ class FrameBuilder:
     ) -> None:
         self._settings, self._calibration, self._complain, self._decode = settings, calibration, complain, decode
         self._told: set[str] = set()
-        self.image_problem = ""
+        self.image_problem = self.time_problem = ""
 
     def frame(self, stamp: int, cloud: Any, image: Any | None, index: int) -> Frame:
         """A cloud with its stamp (ns), and its image, if it has one; an unreadable cloud comes with `problem` set."""
@@ -72,6 +73,10 @@ class FrameBuilder:
         except MessageError as error:
             problem = self._tell(self._calibration.points_topic, error)
             return Frame(stamp, np.empty((0, 4), np.float32), index=index, problem=problem)
+        expected = (
+            settings.time_field is None and not self._calibration.points_topic.startswith("/kitti/") and len(points)
+        )
+        self.time_problem = f"{why_untimed(cloud)}: not de-skewed" if offset is None and expected else ""
         points = correct_vertical_angle(points, self.angle_correction_deg)
         return Frame(stamp, points, offset, self._images(cloud.header.frame_id, image), index)
 
@@ -109,7 +114,10 @@ class FrameBuilder:
         try:
             message = self._decode(topic, message)
             camera = self.camera(lidar_frame, message.header.frame_id)
-            images = (Image(decode_image(message, camera.size), camera),)
+            pixels, info = decode_image(message, camera.size), self._calibration.camera_info
+            if is_fisheye(info) and pixels.shape[1::-1] == camera.size:
+                pixels = rectified(pixels, info)
+            images = (Image(pixels, camera),)
         except (UsageError, ValueError) as error:
             self.image_problem = self._tell(topic, error, "; images are left out")
             return ()

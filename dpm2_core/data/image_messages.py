@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -25,6 +26,14 @@ _IMAGE_ENCODINGS: dict[str, tuple[str, int, int | None]] = {
     "8uc1": ("u1", 1, cv2.COLOR_GRAY2RGB),
     "mono16": ("u2", 1, cv2.COLOR_GRAY2RGB),
     "16uc1": ("u2", 1, cv2.COLOR_GRAY2RGB),
+    "uyvy": ("u1", 2, cv2.COLOR_YUV2RGB_UYVY),
+    "yuv422": ("u1", 2, cv2.COLOR_YUV2RGB_UYVY),
+    "yuyv": ("u1", 2, cv2.COLOR_YUV2RGB_YUY2),
+    "yuv422_yuy2": ("u1", 2, cv2.COLOR_YUV2RGB_YUY2),
+    "yvyu": ("u1", 2, cv2.COLOR_YUV2RGB_YVYU),
+    # Half as many rows of color below those of brightness.
+    "nv12": ("u1", 1, cv2.COLOR_YUV2RGB_NV12),
+    "nv21": ("u1", 1, cv2.COLOR_YUV2RGB_NV21),
     # OpenCV names a Bayer pattern by its second row, ROS by its first.
     "bayer_rggb8": ("u1", 1, cv2.COLOR_BayerBG2RGB),
     "bayer_bggr8": ("u1", 1, cv2.COLOR_BayerRG2RGB),
@@ -35,6 +44,10 @@ _IMAGE_ENCODINGS: dict[str, tuple[str, int, int | None]] = {
     "bayer_gbrg16": ("u2", 1, cv2.COLOR_BayerGR2RGB),
     "bayer_grbg16": ("u2", 1, cv2.COLOR_BayerGB2RGB),
 }
+
+_HALF_COLOR = ("nv12", "nv21")
+_FISHEYE = ("equidistant", "fisheye")
+_FISHEYE_COUNT = 4
 
 
 def decode_image(msg: Any, size: tuple[int, int] | None = None) -> NDArray[np.uint8]:
@@ -57,6 +70,9 @@ def decode_image(msg: Any, size: tuple[int, int] | None = None) -> NDArray[np.ui
     kind, channels, conversion = _IMAGE_ENCODINGS[encoding.lower()]
     dtype = np.dtype((">" if msg.is_bigendian else "<") + kind)
     height, width, pixel = int(msg.height), int(msg.width), channels * dtype.itemsize
+    _check_even(encoding, width, height)
+    if encoding.lower() in _HALF_COLOR:
+        height += height // 2
     step = int(msg.step) or width * pixel
     need, have = (height - 1) * step + width * pixel, len(msg.data)
     if not height * width or step < width * pixel or have < need:
@@ -67,6 +83,15 @@ def decode_image(msg: Any, size: tuple[int, int] | None = None) -> NDArray[np.ui
         pixels = (pixels >> 8).astype(np.uint8)
     pixels = np.ascontiguousarray(pixels)
     return pixels if conversion is None else cv2.cvtColor(pixels, conversion)
+
+
+def _check_even(encoding: str, width: int, height: int) -> None:
+    """Raises MessageError where two pixels share a color, and one has none to share it with."""
+    two_rows = encoding.lower() in _HALF_COLOR
+    if (two_rows or "yu" in encoding.lower() or "yv" in encoding.lower()) and (width % 2 or (two_rows and height % 2)):
+        raise MessageError(
+            f"image of {width} x {height} {encoding}: pixels share their color in pairs, want even sizes"
+        )
 
 
 def _decode_compressed(msg: Any, size: tuple[int, int] | None) -> NDArray[np.uint8]:
@@ -82,8 +107,10 @@ def _decode_compressed(msg: Any, size: tuple[int, int] | None) -> NDArray[np.uin
 def decode_camera(info: Any, T_lidar_cam: Array, name: str) -> Camera:
     """sensor_msgs/CameraInfo to `Camera`: K and D as they are; P's left block where D is zero, the image rectified.
 
+    A fisheye (equidistant) comes as the pinhole camera of the same focal length that `rectified` makes of its images.
+
     Args:
-        info: with model plumb_bob or rational_polynomial (whose 8 coefficients stay in OpenCV's order).
+        info: with model plumb_bob, rational_polynomial (whose 8 coefficients stay in OpenCV's order) or equidistant.
         T_lidar_cam: (4, 4) optical frame of the camera to LiDAR frame.
         name: what messages call it.
 
@@ -94,13 +121,36 @@ def decode_camera(info: Any, T_lidar_cam: Array, name: str) -> Camera:
     K, P = K.reshape(3, 3), P.reshape(3, 4)
     if not D.any():
         D, K = D[:0], P[:, :3].copy() if P[0, 0] else K
-    elif info.distortion_model not in ("plumb_bob", "rational_polynomial"):
+    elif info.distortion_model not in ("plumb_bob", "rational_polynomial", *_FISHEYE):
         raise MessageError(f"{name}: distortion model {info.distortion_model[:40]!r} is not supported; "
-                           "supported: plumb_bob, rational_polynomial")  # fmt: skip
+                           "supported: plumb_bob, rational_polynomial, equidistant")  # fmt: skip
     if not (K[0, 0] > 0 and K[1, 1] > 0 and np.isfinite(K).all()):
         raise MessageError(f"{name}: CameraInfo has no focal length (the camera is not calibrated)")
-    if len(D) not in _DISTORTIONS or not np.isfinite(D).all():
+    if len(D) not in _DISTORTIONS or not np.isfinite(D).all() or (is_fisheye(info) and len(D) != _FISHEYE_COUNT):
         raise MessageError(f"{name}: CameraInfo has {len(D)} distortion coefficients, or some that are not finite")
     if not (0 < info.width <= _WIDEST_IMAGE and 0 < info.height <= _WIDEST_IMAGE):
         raise MessageError(f"{name}: CameraInfo has no image size, or one beyond {_WIDEST_IMAGE} pixels")
-    return Camera(K, T_lidar_cam, (int(info.width), int(info.height)), tuple(D.tolist()), name)
+    kept = () if is_fisheye(info) else tuple(D.tolist())
+    return Camera(K, T_lidar_cam, (int(info.width), int(info.height)), kept, name)
+
+
+def is_fisheye(info: Any) -> bool:
+    """Whether images of a CameraInfo that `decode_camera` takes are to be `rectified`."""
+    return info.distortion_model in _FISHEYE and bool(np.any(info.d))
+
+
+def rectified(pixels: NDArray[np.uint8], info: Any) -> NDArray[np.uint8]:
+    """(H, W, 3) of an equidistant fisheye as a pinhole camera with the same K would see it, black where it cannot.
+
+    What is 90 degrees and more off the axis is left out, and what is far off it as the image's border says.
+    J. Kannala, S. Brandt, "A generic camera model and calibration method", PAMI 2006, with 4 coefficients.
+    """
+    maps = _fisheye_maps(tuple(map(float, info.k)), tuple(map(float, info.d)), pixels.shape[1::-1])
+    return np.asarray(cv2.remap(pixels, *maps, cv2.INTER_LINEAR), np.uint8)
+
+
+@lru_cache(maxsize=4)
+def _fisheye_maps(k: tuple[float, ...], d: tuple[float, ...], size: tuple[int, int]) -> tuple[Any, Any]:
+    K = np.array(k).reshape(3, 3)
+    maps = cv2.fisheye.initUndistortRectifyMap(K, np.array(d), np.eye(3), K, size, cv2.CV_16SC2)
+    return maps[0], maps[1]

@@ -6,9 +6,10 @@ Nothing here imports ROS. Message fields are those of sensor_msgs; `transforms.T
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Callable, Collection, Mapping
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,17 +22,24 @@ TimeUnit = Literal["auto", "s", "ms", "us", "ns"]
 # sensor_msgs/PointField datatype to numpy, without byte order.
 _POINT_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _INTENSITY_NAMES = ("intensity", "intensities", "i", "reflectivity", "reflectance", "signal")
+# Without underscores and unit: time_stamp is timestamp, time_offset_ns is timeoffset.
 _TIME_NAMES = (
     "t",
     "time",
     "timestamp",
-    "time_stamp",
-    "offset_time",
-    "time_offset",
+    "offsettime",
     "timeoffset",
+    "pointtime",
+    "relativetime",
+    "deltatime",
+    "reltime",
+    "ts",
+    "dt",
     "stamp",
+    "times",
     "timestamps",
 )
+_TIME_NAME = re.compile(r"(?P<name>[a-z_]+?)(?:_?(?P<unit>ns|us|ms|s)|_(?P<long>nsec|usec|msec|sec))?")
 _XYZ = ("x", "y", "z")
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 # No sweep is longer, no useful one a thousand times shorter: so exactly one unit puts the span of a scan in this range.
@@ -122,9 +130,9 @@ def decode_points(
 
     Intensity becomes 0..1 as `scale_intensity` says, and is 0 where the cloud has none.
 
-    Time is looked for under its usual names. The unit is the one in which the points span 2 ms to 2 s (integers: us
-    or ns). Values beyond 2 s are absolute and become relative to `msg.header.stamp`, or to the earliest point if that
-    is another clock's.
+    Time is looked for under its usual names. The unit is the one that the name ends in (time_offset_ns), else the one
+    in which the points span 2 ms to 2 s (integers: us or ns). Values beyond 2 s are absolute and become relative to
+    `msg.header.stamp`, or to the earliest point if that is another clock's.
 
     Args:
         msg: the message.
@@ -145,14 +153,35 @@ def decode_points(
     if time_field and time_field not in available:
         raise MessageError(f"PointCloud2 has no time field {time_field}; fields: {', '.join(available)}")
     intensity = _usual(available, _INTENSITY_NAMES)
-    time = _usual(available, _TIME_NAMES) if time_field is None else time_field
+    time, unit = _usual_time(available) if time_field is None else (time_field, "auto")
+    if time_unit == "auto":
+        time_unit = unit
     view = cloud_view(msg, [name for name in (*_XYZ, intensity, time) if name])
     points = _points(view, intensity, intensity_max)
     return points, _time_offset(view[time], points, stamp_ns(msg.header), time_unit) if time else None
 
 
+def why_untimed(msg: Any) -> str:
+    """Why `decode_points` found no times in a PointCloud2, in words."""
+    time, _ = _usual_time([field.name for field in msg.fields])
+    return "no time field" if time is None else f"all points have the same {time}"
+
+
 def _usual(available: list[str], names: tuple[str, ...]) -> str | None:
     return next((field for name in names for field in available if field.lower() == name), None)
+
+
+def _usual_time(available: list[str]) -> tuple[str | None, TimeUnit]:
+    """The field with the time of each point and the unit that its name ends in; None without one."""
+    found: dict[str, tuple[str, TimeUnit]] = {}
+    for field in available:
+        name = field.lower()
+        if name.replace("_", "") in _TIME_NAMES:  # whole names first: the s of ts is no unit
+            found.setdefault(name.replace("_", ""), (field, "auto"))
+        elif match := _TIME_NAME.fullmatch(name):
+            unit = match["unit"] or (match["long"] or "auto").removesuffix("ec")
+            found.setdefault(match["name"].replace("_", ""), (field, cast(TimeUnit, unit)))
+    return next((found[name] for name in _TIME_NAMES if name in found), (None, "auto"))
 
 
 def _first(column: NDArray[Any]) -> NDArray[Any]:

@@ -30,7 +30,7 @@ def sequences_below(path: Path | str) -> list[str]:
 
 
 def open_source(path: Path | str, settings: InputSettings | None = None) -> Source:
-    """Open whatever `path` is: a folder of KITTI odometry, KITTI-360 or KITTI-CARLA, or a rosbag2 recording.
+    """Open whatever `path` is: a folder of KITTI odometry, KITTI-360 or KITTI-CARLA, or a bag of ROS 2 or ROS 1.
 
     Raises:
         UsageError: there is nothing, or nothing that can be read; the message says what was found.
@@ -38,8 +38,6 @@ def open_source(path: Path | str, settings: InputSettings | None = None) -> Sour
     path, settings = Path(path), settings or InputSettings()
     if not path.exists():
         raise UsageError(f"{path}: no such file or folder")
-    if path.is_file() and path.suffix == ".bag":
-        raise UsageError(f"{path}: a ROS 1 bag; convert it first: rosbags-convert --src {path.name} --dst NEW_FOLDER")
     # rosbags and its type store are slow to import, and of no use for a KITTI folder.
     if path.is_file() or any(
         file.suffix in (".mcap", ".db3") or file.name == "metadata.yaml" for file in path.iterdir()

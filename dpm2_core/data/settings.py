@@ -34,7 +34,7 @@ class InputSettings(Settings):
     publishes (semantic_kitti), or the latter where it is there, else the former (auto)."""
 
     points_topic: str = ""
-    """PointCloud2 topic of a bag; empty takes /kitti/velo/pointcloud, else the only one."""
+    """PointCloud2 or Livox CustomMsg topic of a bag; empty takes /kitti/velo/pointcloud, else the only one."""
 
     images: bool = True
     """Use the camera where there is one."""
@@ -55,10 +55,10 @@ class InputSettings(Settings):
     """Added to the stamps of images before they are compared with those of clouds, s."""
 
     time_field: str | None = None
-    """PointCloud2 field with the time of each point; null looks for a usual name (t, time, stamp...), "": none."""
+    """PointCloud2 field with the time of each point; null looks for a usual name (t, time_offset_ns, ...), "": none."""
 
     time_unit: Literal["auto", "s", "ms", "us", "ns"] = "auto"
-    """Unit of that field; auto takes the one in which a scan lasts 2 ms to 2 s."""
+    """Unit of that field; auto takes that of its name (_ns), else the one in which a scan lasts 2 ms to 2 s."""
 
     intensity_max: Annotated[float, Field(gt=0)] | None = None
     """Intensity that becomes 1; null takes 1, 255 or 65535 by the largest value of each cloud."""

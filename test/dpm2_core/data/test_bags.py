@@ -399,4 +399,4 @@ def test_a_damaged_chunk_ends_the_drive_and_says_so(bags: Any, tmp_path: Path) -
     frames = list(source.frames())
     assert [frame.points[0, 0] for frame in frames] == list(range(len(frames)))
     assert 0 < len(frames) < len(source) == 100
-    assert f"damaged after {len(frames)} messages of /points" in source.notes[0]
+    assert any(f"damaged after {len(frames)} messages of /points" in note for note in source.notes)

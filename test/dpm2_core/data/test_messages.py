@@ -125,6 +125,12 @@ RAMP = np.linspace(0, 0.1, 5)
     [
         ("t", (RAMP * 1e9).astype(np.uint32), RAMP, 1e-8),  # Ouster
         ("offset_time", (RAMP * 1e9).astype(np.uint32), RAMP, 1e-8),  # Livox CustomMsg
+        ("time_offset_ns", (RAMP * 1e9).astype(np.int32), RAMP, 1e-8),
+        ("timestamp_ns", STAMP + RAMP * 1e9, RAMP, 1e-6),
+        ("ts", RAMP.astype(np.float32), RAMP, 1e-8),
+        ("point_time", RAMP, RAMP, 1e-8),
+        ("Time_us", (RAMP * 1e6).astype(np.uint32), RAMP, 1e-6),
+        ("t_sec", RAMP, RAMP, 1e-8),
         ("time", RAMP.astype(np.float32), RAMP, 1e-8),  # Velodyne
         ("time", (RAMP - 0.1).astype(np.float32), RAMP - 0.1, 1e-8),  # stamped at the end of the sweep
         ("t", (RAMP * 1e6).astype(np.uint32), RAMP, 1e-6),
@@ -153,6 +159,24 @@ def test_times_that_tell_nothing() -> None:
     np.testing.assert_allclose(time, [0, 5e-4, 1e-3], rtol=1e-6)
     with pytest.raises(MessageError, match="no time field t; fields: x, y, z, sweep"):
         messages.decode_points(named, time_field="t")
+
+
+def test_a_unit_in_the_name_outweighs_the_span() -> None:
+    """Returns of a scan of 1 ms, the first of a sensor that was just switched on: by the span alone they were s."""
+    ramp = np.float64([0, 0.5, 1.0])
+    np.testing.assert_allclose(messages.decode_points(cloud(xyz(3, time_ms=ramp)))[1], ramp * 1e-3, atol=1e-9)
+    np.testing.assert_allclose(messages.decode_points(cloud(xyz(3, time_ms=ramp)), time_unit="s")[1], ramp, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("columns", "reason"),
+    [({}, "no time field"), ({"ring": np.uint8([1, 2, 3])}, "no time field"),
+     ({"status": np.uint8([0, 1, 2])}, "no time field"), ({"T": np.uint32([7, 7, 7])}, "all points have the same T")],
+)  # fmt: skip
+def test_why_there_are_no_times_is_said(columns: dict[str, np.ndarray], reason: str) -> None:
+    msg = cloud(xyz(3, **columns))
+    assert messages.decode_points(msg)[1] is None
+    assert messages.why_untimed(msg) == reason
 
 
 def test_few_points_take_the_unit_of_their_type() -> None:
@@ -262,6 +286,32 @@ def test_image_encodings(encoding: str, pixels: np.ndarray, want: np.ndarray, pa
         np.testing.assert_array_equal(decoded, want)
 
 
+@pytest.mark.parametrize("padding", [0, 6])
+@pytest.mark.parametrize("encoding", ["uyvy", "yuv422", "yuyv", "yuv422_yuy2", "yvyu", "nv12", "nv21"])
+def test_yuv_gives_the_color_it_was_made_from(encoding: str, padding: int) -> None:
+    """ITU-R BT.601 by its definition, with video range, as cameras and their drivers send it."""
+    r, g, b = 200.0, 120.0, 40.0
+    y = np.full((4, 6), round(16 + (65.481 * r + 128.553 * g + 24.966 * b) / 255), np.uint8)
+    u = round(128 + (-37.797 * r - 74.203 * g + 112.0 * b) / 255)
+    v = round(128 + (112.0 * r - 93.786 * g - 18.214 * b) / 255)
+    if encoding.startswith("nv"):
+        pair = (u, v) if encoding == "nv12" else (v, u)
+        pixels = np.vstack([y, np.tile(np.uint8(pair), (2, 3))])
+    else:
+        u_first = encoding in ("uyvy", "yuv422", "yuyv", "yuv422_yuy2")
+        color = np.tile(np.uint8((u, v) if u_first else (v, u)), (4, 3))
+        pixels = np.dstack([color, y] if encoding in ("uyvy", "yuv422") else [y, color])
+    msg = image(pixels, encoding, padding)
+    msg.height = 4
+    assert np.abs(image_messages.decode_image(msg).astype(int) - [r, g, b]).max() <= 3
+
+
+@pytest.mark.parametrize(("encoding", "size"), [("uyvy", (4, 5)), ("nv12", (5, 6)), ("nv21", (4, 5))])
+def test_colors_that_are_not_shared_in_pairs(encoding: str, size: tuple[int, int]) -> None:
+    with pytest.raises(MessageError, match="in pairs"):
+        image_messages.decode_image(image(np.zeros((*size, 3), np.uint8), encoding))
+
+
 @pytest.mark.parametrize("bits", [8, 16])
 @pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
 def test_bayer_patterns_give_the_color_they_were_made_from(pattern: str, bits: int) -> None:
@@ -314,6 +364,28 @@ def test_camera_of_a_rectified_image_has_the_rectified_intrinsics() -> None:
     assert unrectified.K[0, 0] == 500
 
 
+def test_a_fisheye_becomes_a_pinhole_camera() -> None:
+    """A light at a known direction is where the pinhole camera says, to a pixel; the fisheye had it elsewhere."""
+    d = (0.05, -0.01, 0.002, -0.0005)
+    msg = info(distortion_model="equidistant", d=list(d), p=np.zeros(12), k=[300.0, 0, 320, 0, 300, 240, 0, 0, 1])
+    ray = np.array([0.6, -0.4, 1.0])
+    angle = np.arctan(np.hypot(*ray[:2]))
+    radius = 300 * angle * (1 + sum(c * angle ** (2 * i + 2) for i, c in enumerate(d)))
+    u, v = np.array([320, 240]) + radius * ray[:2] / np.hypot(*ray[:2])
+    pixels = np.zeros((480, 640, 3), np.uint8)
+    cv2.circle(pixels, (round(u), round(v)), 3, (255, 255, 255), -1)
+    assert image_messages.is_fisheye(msg)
+    camera = image_messages.decode_camera(msg, np.eye(4), "front")
+    assert camera.distortion == ()
+    spot = np.argwhere(image_messages.rectified(pixels, msg)[..., 0] > 128).mean(0)[::-1]
+    want = (camera.K @ ray)[:2]
+    np.testing.assert_allclose(spot, want, atol=1.0)
+    assert np.linalg.norm(np.array([u, v]) - want) > 10
+    assert not image_messages.is_fisheye(info())
+    with pytest.raises(MessageError, match="5 distortion coefficients"):
+        image_messages.decode_camera(info(distortion_model="equidistant", d=[0.1] * 5), np.eye(4), "front")
+
+
 @pytest.mark.parametrize(("model", "count"), [("plumb_bob", 5), ("rational_polynomial", 8)])
 def test_camera_with_distortion_keeps_it(model: str, count: int) -> None:
     D = [-0.3, 0.1, 0.001, -0.002, 0.01, 0.02, 0.03, 0.04][:count]
@@ -325,7 +397,7 @@ def test_camera_with_distortion_keeps_it(model: str, count: int) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"d": [0.1] * 4, "distortion_model": "equidistant"}, "left: distortion model 'equidistant' is not supported"),
+        ({"d": [0.1] * 4, "distortion_model": "omni"}, "left: distortion model 'omni' is not supported"),
         ({"k": np.zeros(9), "p": np.zeros(12)}, "left: CameraInfo has no focal length"),
         ({"width": 0}, "left: CameraInfo has no image size"),
     ],

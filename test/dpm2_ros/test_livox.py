@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Livox' CustomMsg on a topic: followed where its package is installed, named where it is not."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import rclpy
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from sensor_msgs.msg import PointCloud2
+
+from dpm2_core.data.frames import FrameBuilder
+from dpm2_core.data.settings import InputSettings
+from dpm2_ros.conversions import cloud_to_msg
+from dpm2_ros.message_types import message_type
+from dpm2_ros.settings import RosSettings
+from dpm2_ros.subscriptions import Inputs, MatchedSubscription
+from test.dpm2_ros.test_subscriptions import node  # noqa: F401
+from test.helpers.livox import custom_message
+
+CUSTOM = "livox_ros_driver2/msg/CustomMsg"
+POINTS = np.random.default_rng(0).uniform(-20, 20, (50, 3)).astype(np.float32)
+SECONDS = np.linspace(0, 0.1, 50)
+
+
+def offering(node: Node, kind: str) -> Node:  # noqa: F811
+    """The node, told by the graph that its topics have publishers of that type."""
+    info = SimpleNamespace(topic_type=kind, qos_profile=SimpleNamespace(reliability=None))
+    node.get_publishers_info_by_topic = lambda topic: [info]  # type: ignore[assignment,return-value]
+    return node
+
+
+def test_a_missing_package_is_named(node: Callable[..., Node]) -> None:  # noqa: F811
+    """A driver that sends the type cannot run where it is missing, so that the graph's answer is made up here."""
+    if message_type(CUSTOM) is not None:
+        pytest.skip("the package is installed")
+    made = MatchedSubscription(offering(node(), CUSTOM), PointCloud2, "/livox/lidar", print, RosSettings())
+    assert made.problem.startswith(f"/livox/lidar is a {CUSTOM}, whose package is not installed here")
+    assert "xfer_format: 0" in made.problem
+
+
+def test_other_types_are_left_alone(node: Callable[..., Node]) -> None:  # noqa: F811
+    made = MatchedSubscription(offering(node(), "my_msgs/msg/Cloud"), PointCloud2, "/points", print, RosSettings())
+    assert made.problem == ""
+
+
+def test_points_of_a_custom_message_arrive(node: Callable[..., Node]) -> None:  # noqa: F811
+    """From the driver's type, over DDS, into a frame with the time of each point; a PointCloud2 comes after it."""
+    kind: Any = message_type(CUSTOM)
+    if kind is None:
+        pytest.skip("livox_ros_driver2 is not installed")
+    n, other = node(), rclpy.Context()
+    rclpy.init(context=other, domain_id=n.context.get_domain_id(), signal_handler_options=SignalHandlerOptions.NO)
+    driver = rclpy.create_node("driver", context=other)
+    inputs = Inputs(n, InputSettings(points_topic="/livox/lidar", images=False), RosSettings())
+    publisher = driver.create_publisher(kind, "/livox/lidar", 10)
+    bundle, end, i = None, time.monotonic() + 30, 0
+    while bundle is None and time.monotonic() < end:
+        i += 1
+        publisher.publish(custom_message(10**9 + i * 10**8, POINTS, SECONDS))
+        rclpy.spin_once(n, timeout_sec=0.1)
+        bundle = inputs.take(0.0)
+    rclpy.shutdown(context=other)
+    assert bundle is not None
+    frame = FrameBuilder(InputSettings(), inputs.calibration, pytest.fail).frame(bundle.stamp, bundle.cloud, None, 0)
+    np.testing.assert_array_equal(frame.points[:, :3], POINTS)
+    np.testing.assert_allclose(frame.time_offset, SECONDS, atol=1e-8)
+    assert cloud_to_msg(frame.points, 1, "lidar").width == 50
