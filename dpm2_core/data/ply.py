@@ -5,8 +5,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dpm2_core.errors import UsageError
 from dpm2_core.files import atomic_write
@@ -45,10 +47,22 @@ _TYPES = {
 
 
 def read_ply(path: Path | str, names: Sequence[str]) -> Array:
-    """(N, len(names)) float64 of these properties of the vertices, the first element of a little-endian binary PLY.
+    """(N, len(names)) float64 of these properties of the vertices, as of `read_vertices`.
 
     Raises:
         UsageError: not such a file, cut short, or without one of the properties.
+    """
+    vertices = read_vertices(path)
+    if missing := [name for name in names if name not in vertices]:
+        raise UsageError(f"{path}: no property {missing[0]}; it has {', '.join(vertices)}")
+    return np.stack([vertices[name].astype(np.float64) for name in names], 1)
+
+
+def read_vertices(path: Path | str) -> dict[str, NDArray[Any]]:
+    """Every property (N,) of the vertices, the first element of a little-endian binary PLY, by its name.
+
+    Raises:
+        UsageError: not such a file, or cut short.
     """
     try:
         data = Path(path).read_bytes()
@@ -66,9 +80,7 @@ def read_ply(path: Path | str, names: Sequence[str]) -> Array:
         layout = np.dtype([(line[2], _TYPES[line[1]]) for line in header[first + 1 : last] if line[0] == "property"])
     except (IndexError, ValueError, KeyError) as error:
         raise UsageError(f"{path}: header of the PLY is damaged ({error})") from None
-    if missing := [name for name in names if name not in (layout.names or ())]:
-        raise UsageError(f"{path}: no property {missing[0]}; it has {', '.join(layout.names or ())}")
     if count < 0 or len(data) - start < count * layout.itemsize:
         raise UsageError(f"{path}: ends before its {count} points do")
     vertices = np.frombuffer(data, layout, count, start)
-    return np.stack([vertices[name].astype(np.float64) for name in names], 1)
+    return {name: vertices[name] for name in layout.names or ()}

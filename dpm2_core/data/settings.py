@@ -29,6 +29,10 @@ class InputSettings(Settings):
     """Sequence of a root folder: 04 of KITTI odometry, 0009 of KITTI-360, Town01 of KITTI-CARLA; empty takes the only
     one."""
 
+    dataset: str = ""
+    """Loader of KISS-ICP's that reads the recording (extra datasets): mulran, ncd, nclt, helipr, boreas, apollo, ouster
+    (a pcap file), ...; empty recognizes the recording by itself."""
+
     kitti_poses: Literal["auto", "kitti", "semantic_kitti"] = "auto"
     """Ground truth of KITTI odometry: poses/NN.txt (kitti), poses.txt in the sequence's folder, which SemanticKITTI
     publishes (semantic_kitti), or the latter where it is there, else the former (auto)."""

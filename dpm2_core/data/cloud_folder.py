@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A folder of PCD or PLY files, one a scan, as a `Source`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dpm2_core.data.frames import Calibration, FrameBuilder
+from dpm2_core.data.messages import cloud_fields
+from dpm2_core.data.ply import read_vertices
+from dpm2_core.data.settings import InputSettings
+from dpm2_core.errors import UsageError
+from dpm2_core.extras import needs
+from dpm2_core.frame import Array, Frame
+
+SUFFIXES = (".pcd", ".ply")
+_PERIOD = 0.1  # s between scans whose names are no times
+_EPOCHS = ((1e8, 1e11, 1.0), (1e11, 1e14, 1e-3), (1e14, 1e17, 1e-6), (1e17, 1e20, 1e-9))
+"""From, to, s: a number in a name that is a time since 1970 after 1973."""
+
+
+class CloudFolder:
+    """Scans in the order of the numbers in their names. See `Source`; neither images nor ground truth.
+
+    Fields are those of PointCloud2: intensity, and the time of each point, under their usual names. The stamp is the
+    number in the name where all of them are times since 1970 (s, ms, us or ns), else they are 0.1 s apart.
+
+    Raises:
+        UsageError: no such file in the folder, or what reads PCD is not installed.
+    """
+
+    T_cam_lidar: Array | None = None
+    poses: Array | None = None
+    truth = ""
+
+    def __init__(self, path: Path | str, settings: InputSettings | None = None) -> None:
+        folder = Path(path)
+        self.name, self.notes = folder.resolve().name, list[str]()
+        found = [file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES] if folder.is_dir() else []
+        self._files = sorted(found, key=lambda file: (_number(file) is None, _number(file) or 0.0, file.name))
+        if not self._files:
+            raise UsageError(f"{folder}: no .pcd or .ply file in this folder")
+        if any(file.suffix.lower() == ".pcd" for file in self._files):
+            _pcd_type()  # now, rather than at the first scan
+        self._frames = FrameBuilder(settings or InputSettings(), Calibration(str(folder)), self.notes.append)
+        self.stamps = _stamps(self._files)
+
+    def __len__(self) -> int:
+        return len(self._files)
+
+    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
+        """Frames start..stop-1 by position; one whose file cannot be read has `problem` set."""
+        for index in range(*slice(start, stop).indices(len(self))):
+            stamp = int(self.stamps[index])
+            try:
+                frame = self._frames.frame(stamp, _cloud(self._files[index], stamp), None, index)
+            except UsageError as error:
+                self.notes.append(str(error))
+                yield Frame(stamp, np.empty((0, 4), np.float32), index=index, problem=str(error))
+                continue
+            if self._frames.time_problem and not any(self._frames.time_problem in note for note in self.notes):
+                self.notes.append(f"{self._files[index]}: {self._frames.time_problem}")
+            yield frame
+
+
+def _cloud(path: Path, stamp: int) -> Any:
+    """As a sensor_msgs/PointCloud2, that all that is known of clouds holds."""
+    columns = _read_pcd(path) if path.suffix.lower() == ".pcd" else read_vertices(path)
+    # PointField has no 64-bit integers: times since 1970 in ns, whose differences count.
+    parts = {name: part.astype(np.float64) if part.dtype.itemsize == 8 else part for name, part in columns.items()}
+    if not parts:
+        raise UsageError(f"{path}: no fields")
+    time = SimpleNamespace(sec=stamp // 10**9, nanosec=stamp % 10**9)
+    return SimpleNamespace(header=SimpleNamespace(stamp=time, frame_id=""), **cloud_fields(parts, SimpleNamespace))
+
+
+def _read_pcd(path: Path) -> Mapping[str, NDArray[Any]]:
+    try:
+        cloud = _pcd_type().from_path(path)
+        return {name: np.ascontiguousarray(cloud.pc_data[name]) for name in cloud.fields}
+    except Exception as error:  # damaged headers and data raise anything from ValueError to lzf's own errors
+        raise UsageError(f"{path}: cannot be read as PCD: {' '.join(str(error).split())[:200]}") from None
+
+
+def _pcd_type() -> Any:
+    with needs("datasets", "reading PCD"):
+        from pypcd4 import PointCloud
+    return PointCloud
+
+
+def _number(file: Path) -> float | None:
+    """The last number in a name: 12 of scan_012.pcd."""
+    found = re.findall(r"\d+(?:\.\d+)?", file.stem)
+    return float(found[-1]) if found else None
+
+
+def _stamps(files: list[Path]) -> NDArray[np.int64]:
+    numbers = [_number(file) for file in files]
+    for low, high, scale in _EPOCHS:
+        if all(number is not None and low <= number < high for number in numbers) and len(set(numbers)) == len(files):
+            return np.array([round((number or 0.0) * scale * 1e9) for number in numbers], np.int64)
+    return np.round(np.arange(len(files)) * _PERIOD * 1e9).astype(np.int64)

@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The data sets that KISS-ICP reads, as a `Source`: MulRan, Newer College, NCLT, HeLiPR, Boreas, Ouster pcap, ...
+
+I. Vizzo et al., "KISS-ICP", RA-L 2023; its package `kiss_icp.datasets` (MIT) has the loaders.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dpm2_core.data.settings import InputSettings
+from dpm2_core.errors import UsageError
+from dpm2_core.extras import needs
+from dpm2_core.frame import Array, Frame
+
+_PERIOD = 0.1  # s between sweeps, where the loader knows no times of them
+_OWN = ("generic", "mcap", "rosbag")  # read without it, with times and intensities
+
+
+class KissSource:
+    """A drive by the loader `input.dataset` of KISS-ICP. See `Source`; there are no images and no intensities.
+
+    The times of the points are, as KISS-ICP takes them, fractions of the sweep, whose end is the stamp.
+
+    Raises:
+        UsageError: no such loader, a package that it needs is missing, or it cannot read the folder.
+    """
+
+    T_cam_lidar: Array | None = None
+
+    def __init__(self, path: Path | str, settings: InputSettings | None = None) -> None:
+        self._settings, self.path = settings or InputSettings(), Path(path)
+        self.name, self.notes = self.path.resolve().stem, list[str]()
+        kind = self._settings.dataset
+        with needs("datasets", f"input.dataset={kind}"):
+            from kiss_icp.datasets import available_dataloaders, dataset_factory
+        names = sorted(set(available_dataloaders()).difference(_OWN))
+        if kind not in names:
+            raise UsageError(f"input.dataset={kind}: there is no such loader; there are {', '.join(names)}")
+        arguments = {"data_dir": self.path, "sequence": self._settings.sequence}
+        if kind == "ouster":
+            arguments = {"data_dir": self.path}
+        self._set = self._asked(lambda: dataset_factory(kind, **arguments))
+        self._count = int(self._asked(lambda: len(self._set)))
+        if not self._count:
+            raise UsageError(f"{self.path}: KISS-ICP's loader {kind} finds no scans here")
+        self.poses = self._poses()
+        self.truth = f"gt_poses of KISS-ICP's loader {kind}" if self.poses is not None else ""
+
+    def __len__(self) -> int:
+        return self._count
+
+    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
+        """Frames start..stop-1; one that the loader cannot read has `problem` set."""
+        for index in range(*slice(start, stop).indices(self._count)):
+            points, offset, problem = np.empty((0, 4), np.float32), None, None
+            try:
+                xyz, times = self._asked(lambda index=index: self._set[index])
+                points = np.zeros((len(xyz), 4), np.float32)
+                points[:, :3] = np.asarray(xyz)[:, :3]
+                offset = self._offsets(np.asarray(times, np.float64).ravel(), len(points))
+            except UsageError as error:
+                problem = str(error)
+            stamps = self._stamps()
+            yield Frame(int(stamps[index]), points, offset, index=index, problem=problem)
+
+    def _asked(self, what: Any) -> Any:
+        """What the loader answers; it prints, exits and asserts where something is missing."""
+        said = io.StringIO()
+        try:
+            with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+                return what()
+        except (Exception, SystemExit) as error:
+            words = " ".join(said.getvalue().split()[-30:] if isinstance(error, SystemExit) else str(error).split())
+            raise UsageError(
+                f"{self.path}: KISS-ICP's loader {self._settings.dataset}: {words or type(error).__name__}"
+            ) from None
+
+    def _poses(self) -> Array | None:
+        poses = getattr(self._set, "gt_poses", None)
+        if poses is None:
+            return None
+        poses = np.asarray(poses, np.float64)
+        if poses.shape == (self._count, 4, 4) and np.isfinite(poses).all():
+            return poses
+        self.notes.append(f"{self.path}: no ground truth: {poses.shape} poses for {self._count} scans")
+        return None
+
+    def _stamps(self) -> Array:
+        """(len,) ns."""
+        known = getattr(self._set, "get_frames_timestamps", None)
+        seconds = np.arange(self._count) * _PERIOD
+        if known is not None:
+            found = np.asarray(self._asked(known), np.float64).ravel()
+            if len(found) == self._count and np.isfinite(found).all():
+                seconds = found
+        return np.asarray(np.round(seconds * 1e9), np.int64)
+
+    def _offsets(self, times: Array, count: int) -> Any:
+        """(count,) s relative to the end of the sweep; None where the points have no times."""
+        if len(times) != count or not count or np.ptp(times) == 0:
+            note = f"{self.path}: no time field: not de-skewed"
+            if note not in self.notes:
+                self.notes.append(note)
+            return None
+        return ((times - times.max()) / np.ptp(times) * _PERIOD).astype(np.float32)
