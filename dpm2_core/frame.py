@@ -57,6 +57,24 @@ class Image:
 
 
 @dataclass(frozen=True, eq=False)
+class Guess:
+    """Where another odometry has the LiDAR. Only the way between two of them counts.
+
+    Attributes:
+        T_other_lidar: (4, 4) in a frame of its own, which may drift away from everything.
+        covariance: (6, 6) as in `Registration`, of that pose, as the odometry states it; None where it states none.
+    """
+
+    T_other_lidar: Array
+    covariance: Array | None = None
+
+    def __post_init__(self) -> None:
+        for name, array, shape in (("pose", self.T_other_lidar, (4, 4)), ("covariance", self.covariance, (6, 6))):
+            if array is not None and (array.shape != shape or not np.isfinite(array).all()):
+                raise ValueError(f"guess: its {name} is not {shape} finite numbers")
+
+
+@dataclass(frozen=True, eq=False)
 class Frame:
     """What the sensors saw at one time.
 
@@ -67,6 +85,7 @@ class Frame:
         images: zero, one or several images.
         index: position in its source (KITTI frame number, message count of a bag).
         problem: why the scan could not be read; `points` is then empty and the frame counts as failed, not lost.
+        guess: where another odometry has the LiDAR at that time; the search for the pose begins there.
     """
 
     stamp: int
@@ -75,6 +94,7 @@ class Frame:
     images: tuple[Image, ...] = ()
     index: int = 0
     problem: str | None = None
+    guess: Guess | None = None
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 4:
@@ -196,6 +216,22 @@ class Edge:
 
 
 @dataclass(frozen=True, eq=False)
+class Comparison:
+    """Another odometry (`Frame.guess`) beside the scans, over the way since the last registered frame.
+
+    Attributes:
+        T_other, T_scans: (4, 4) T_before_now, as each of the two has it.
+        used: whether the pose was searched from where the other one leads; else it was outweighed.
+        doubt: so many times as far as assumed it has been off of late; 1: as assumed, or better.
+    """
+
+    T_other: Array
+    T_scans: Array
+    used: bool
+    doubt: float
+
+
+@dataclass(frozen=True, eq=False)
 class OdometryResult:
     """The state of the odometry after one frame.
 
@@ -209,6 +245,7 @@ class OdometryResult:
         breaks: pauses so far across which the way is not known; since the last one the pose is a guess, `covariance` of
             the frame in which it was given up says how good.
         seconds: wall time of each stage.
+        comparison: with another odometry, where there is one and the frame was registered.
     """
 
     stamp: int
@@ -221,3 +258,4 @@ class OdometryResult:
     keyframe: Keyframe | None = None
     breaks: int = 0
     seconds: dict[str, float] = field(default_factory=dict)
+    comparison: Comparison | None = None

@@ -18,6 +18,7 @@ from dpm2_ros.diagnostics import ERROR, OK, STALE, WARN, DiagnosticsPublisher, m
 from dpm2_ros.guard import GuardedNode
 from dpm2_ros.keyframes import BEHIND, KeyframeSender
 from dpm2_ros.mapping import MapperThread
+from dpm2_ros.other_odometry import OtherOdometry
 from dpm2_ros.subscriptions import Inputs
 from dpm2_ros.synchronizer import CameraState, StampCheck
 
@@ -105,6 +106,8 @@ class Diagnostics:
         self._mapper, self._sender = mapper, sender
         self.frame_problem = ""
         """Set while there is no pose of the frame that was asked for."""
+        self.other: OtherOdometry | None = None
+        """Another odometry, if there is one."""
         self._lost_before = 0
         self._publisher = DiagnosticsPublisher(node, self._statuses)
 
@@ -116,6 +119,8 @@ class Diagnostics:
         out = [self._odometry()]
         if camera := self._inputs.synchronizer.camera:
             out.append(self._camera(camera))
+        if self.other is not None:
+            out.append(self._other_odometry(self.other))
         if self._mapper is None:
             delivered, made = self._sender.delivered
             text = f"{delivered} of {made} keyframes have arrived at the mapper"
@@ -215,6 +220,18 @@ class Diagnostics:
         else:
             text += f": {result.reason}"
         return self._status("localisation", _LEVEL[located.state], text, figures)
+
+    def _other_odometry(self, other: OtherOdometry) -> DiagnosticStatus:
+        verdict = other.verdict
+        text = f"{verdict}; going on without" if other.problem else verdict or "in use"
+        figures: dict[str, object] = {
+            "clouds with it": other.found,
+            "without": other.missed,
+            "outweighed": other.outweighed,
+        }
+        if not np.isnan(other.slip):
+            figures |= {"its ways too long by (%)": f"{100 * other.slip:.1f}"}
+        return self._status("other odometry", WARN if verdict else OK, text, figures)
 
     def _camera(self, camera: CameraState) -> DiagnosticStatus:
         figures = {"received": camera.received, "used": camera.matched, "late": camera.late}

@@ -55,8 +55,9 @@ class MapperThread:
         self._lock, self._waiting = threading.Lock(), 0
         self._changes = self.keyframes
         ros = config.ros
-        self._ahead = round(ros.transform_tolerance * 1e9)
-        self._tf = TransformBroadcaster(node, ros.map_frame, ros.publish_tf_map)
+        self._tf = TransformBroadcaster(
+            node, ros.map_frame, ros.publish_tf_map, ros.invert_odom_tf and ros.odom_source == "own"
+        )
         self._loop_candidates = node.create_publisher(DiagnosticArray, "dpm2/loop_candidates", KEEP_ALL)
         self._loop_closures = node.create_publisher(Odometry, "dpm2/loop_closure", KEEP_ALL)
         self._displays = [
@@ -116,12 +117,17 @@ class MapperThread:
         """What became of the last keyframe in a map that stays as it is."""
         return self._active.located
 
-    def broadcast(self, stamp: int, robot: str, odom_frame: str) -> None:
-        """Send map -> odom of a robot, valid from that stamp (ns) on, if it is known."""
+    def broadcast(self, stamp: int, robot: str, odom_frame: str, T_own_odom: Array | None = None) -> None:
+        """Send map -> odom of a robot, valid from that stamp (ns) on, if it is known.
+
+        Args:
+            T_own_odom: (4, 4) frame `odom_frame` in that of the robot's keyframes; None: it is the same.
+        """
         restarting = robot == self._robot and self._restarted is not None and not self._restarted.done()
         T_map_odom = None if restarting else self._active.T_map_odom(robot)
         if T_map_odom is not None:
-            self._tf.send(T_map_odom, stamp + self._ahead, odom_frame)
+            T = T_map_odom if T_own_odom is None else T_map_odom @ T_own_odom
+            self._tf.send(T, stamp + self._config.ros.ahead, odom_frame)
 
     def add(self, make: Callable[[], Keyframe]) -> None:
         """Take in the keyframe that `make`, called in this thread, returns."""

@@ -30,7 +30,19 @@ class RosSettings(Settings):
     """Frame of the optimized map."""
 
     odom_frame: FrameName = "odom"
-    """Frame of the continuous odometry."""
+    """Frame of the continuous odometry, whosever it is."""
+
+    odom_source: Literal["own", "tf", "topic"] = "own"
+    """Whose odometry `odom_frame` belongs to. own: slam_node publishes odom -> base. Else the robot has one already,
+    which goes on publishing it: scans are registered from where it leads, map -> odom corrects it, and nobody else is a
+    parent of the base. tf: its odom -> base on /tf; topic: nav_msgs/Odometry on `odom_topic`."""
+
+    odom_topic: str = Field(default="odom", min_length=1)
+    """nav_msgs/Odometry, with `odom_source` topic."""
+
+    invert_odom_tf: bool = False
+    """Publish what slam_node and its mapper know of the pose as children of the base, for a tree that is another's:
+    base -> odom -> map, or, with another odometry, the leaf base -> ODOM_FRAME_dpm2 beside map -> odom."""
 
     base_frame: str = ""
     """Frame whose pose is published. Before /tf_static connects it with the LiDAR no pose is; up to 300 are kept. Empty
@@ -39,12 +51,13 @@ class RosSettings(Settings):
     tf_timeout: float = Field(default=0.5, ge=0, le=60)
     """How long the first cloud waits for all who publish /tf_static, s."""
 
-    transform_tolerance: float = Field(default=0.5, ge=0, le=10)
+    transform_tolerance: Literal["auto"] | Annotated[float, Field(ge=0, le=10)] = "auto"
     """Added to the stamp of map -> odom, so that it is valid until the next one comes, s. Poses at the latest stamps of
-    odometry or sensors can be looked up then without an extrapolation into the future."""
+    odometry or sensors can be looked up then without an extrapolation into the future. auto: 0.5, or 0 with another
+    odometry (`odom_source`), whose error changes with every cloud: exact at the stamps of the clouds."""
 
     publish_tf_odom: bool = True
-    """slam_node publishes odom -> base on /tf."""
+    """slam_node publishes odom -> base on /tf, unless `odom_source` is another."""
 
     publish_tf_map: bool = True
     """The mapper publishes map -> odom on /tf."""
@@ -73,6 +86,17 @@ class RosSettings(Settings):
 
     localization_mode: bool = False
     """slam_node finds itself in `map_file`, which stays as it is, and makes no map of its own."""
+
+    @property
+    def own_frame(self) -> str:
+        """Frame of slam_node's own odometry."""
+        return self.odom_frame if self.odom_source == "own" else f"{self.odom_frame}_dpm2"
+
+    @property
+    def ahead(self) -> int:
+        """Of `transform_tolerance`, ns."""
+        usual = 0.5 if self.odom_source == "own" else 0.0
+        return round((usual if self.transform_tolerance == "auto" else self.transform_tolerance) * 1e9)
 
 
 class NodeConfig(Config):

@@ -18,7 +18,7 @@ from std_srvs.srv import SetBool, Trigger
 from dpm2_core.data.frames import Calibration, FrameBuilder
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.errors import UsageError
-from dpm2_core.frame import Array, Keyframe, OdometryResult, State
+from dpm2_core.frame import Array, Frame, Keyframe, OdometryResult, State
 from dpm2_core.geometry import se3
 from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.loops.localizer import LOST
@@ -30,6 +30,7 @@ from dpm2_ros.guard import GuardedNode
 from dpm2_ros.health import Diagnostics, Health
 from dpm2_ros.keyframes import KeyframeSender, weights_identity
 from dpm2_ros.mapping import MapperThread, respond, robot_name, yield_to_odometry
+from dpm2_ros.other_odometry import OtherOdometry
 from dpm2_ros.parameters import load_parameters
 from dpm2_ros.settings import NodeConfig
 from dpm2_ros.subscriptions import Inputs
@@ -54,29 +55,35 @@ class SlamNode(GuardedNode):
         ros, self._robot = self._config.ros, robot_name(self)
         if ros.localization_mode and not ros.embed_mapper:
             raise UsageError("ros.localization_mode: needs ros.embed_mapper")
+        beside = ros.odom_source != "own"
+        if beside and ros.invert_odom_tf and not ros.embed_mapper:
+            raise UsageError("ros.invert_odom_tf: needs ros.embed_mapper where ros.odom_source is another's")
         self._mapper = MapperThread(self, self._config, self._robot) if ros.embed_mapper else None
         self._slam = make_slam(self._config.slam, self._robot) if self._mapper is None else self._mapper.slam
         self._health = Health()
         weights = weights_identity(self._config.slam)
-        self._sender = KeyframeSender(self, self._robot, ros.odom_frame, not ros.embed_mapper, weights)
+        self._sender = KeyframeSender(self, self._robot, ros.own_frame, not ros.embed_mapper, weights)
         self._odom = self.create_publisher(Odometry, "dpm2/odom", 10)
         # Idle with the mapper, which has its own.
         self._line = ThreadPoolExecutor(1, thread_name_prefix="keyframes", initializer=yield_to_odometry)
-        self._tf = TransformBroadcaster(self, ros.odom_frame, ros.publish_tf_odom)
+        sends = ros.publish_tf_odom and (not beside or ros.invert_odom_tf or not ros.embed_mapper)
+        self._tf = TransformBroadcaster(self, ros.own_frame, sends, ros.invert_odom_tf)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(Trigger, "~/load_map", self._on_load_map)
         self.create_service(SetBool, "~/localization_mode", self._on_localization_mode)
         self.create_subscription(PoseWithCovarianceStamped, "initialpose", self._on_initial_pose, 10)
         self._reset_wanted = threading.Event()
         self._stopping = threading.Event()
-        self._base = BaseFrame(ros.base_frame, (ros.odom_frame, ros.map_frame))
+        self._base = BaseFrame(ros.base_frame, (ros.odom_frame, ros.own_frame, ros.map_frame))
         self._waited = False  # for the base frame
         warm_up(self._config.slam)
         # Last of all: who is subscribed is ready, and whoever waits for subscribers loses nothing.
         reading = self._config.input.model_copy(update={"images": self._config.input.images and self._slam.uses_images})
         self._inputs = Inputs(self, reading, ros)
+        self._other = OtherOdometry(self, ros, lambda: self._inputs.calibration.transforms) if beside else None
         self._frames = FrameBuilder(reading, self._inputs.calibration, self.get_logger().error)
         self._diagnostics = Diagnostics(self, self._inputs, self._frames, self._health, self._mapper, self._sender)
+        self._diagnostics.other = self._other
         self._begin()
         self._index = 0
         self._worker = threading.Thread(target=self._work, name="worker")
@@ -149,7 +156,7 @@ class SlamNode(GuardedNode):
                 self._mapper.restart()
         self._look_for_base(bundle.cloud.header.frame_id or "lidar")
         frame = self._frames.frame(bundle.stamp, bundle.cloud, bundle.image, self._index)
-        tracked = self._slam.odometry_step(frame)
+        tracked = self._tracked(frame)
         self._index += 1
         self._held.append(tracked)
         if self._base.name:
@@ -160,6 +167,17 @@ class SlamNode(GuardedNode):
             self._give_up()
             self._begin()
         self._health.add(tracked, time.monotonic() - bundle.arrival)
+
+    def _tracked(self, frame: Frame) -> OdometryResult:
+        """A step of the odometry, beside another one if there is one."""
+        other, base = self._other, self._base
+        if other is None or not base.name:
+            return self._slam.odometry_step(frame)
+        guess = other.guess(frame.stamp, base.name, base.T_base_start @ base.T_start_lidar)
+        tracked = self._slam.odometry_step(replace(frame, guess=guess))
+        if problem := other.judge(tracked.comparison):
+            self.get_logger().warning(f"{other.source}: {problem}", throttle_duration_sec=5)
+        return tracked
 
     def _give_up(self) -> None:
         """Say that the poses that are kept will not be published."""
@@ -211,10 +229,23 @@ class SlamNode(GuardedNode):
             covariance = covariance + LOST
         A = se3.adjoint(self._base.T_base_start)
         motion, covariance = motion.of_other(self._base.T_base_start), A @ covariance @ A.T
-        self._odom.publish(odometry_to_msg(motion, covariance, seconds, ros.odom_frame, self._base.name))
-        self._tf.send(motion.T_odom_body, motion.stamp, self._base.name)
+        self._odom.publish(odometry_to_msg(motion, covariance, seconds, ros.own_frame, self._base.name))
+        if self._other is None or ros.invert_odom_tf:
+            self._tf.send(motion.T_odom_body, motion.stamp, self._base.name)
+        self._send_map(motion)
+
+    def _send_map(self, motion: BodyMotion) -> None:
+        """Where odom is: in the map, or, where the mapper is elsewhere, another's in our own."""
+        ros, T_own_odom = self._config.ros, None
+        if self._other is not None:
+            T_odom_base = self._other.T_odom_base(motion.stamp, self._base.name)
+            if T_odom_base is None:  # nothing to correct
+                return
+            T_own_odom = se3.orthonormalized(motion.T_odom_body @ se3.inverse(T_odom_base))
         if self._mapper is not None:
-            self._mapper.broadcast(motion.stamp, self._robot, ros.odom_frame)
+            self._mapper.broadcast(motion.stamp, self._robot, ros.odom_frame, T_own_odom)
+        elif T_own_odom is not None:
+            self._tf.send(T_own_odom, motion.stamp + ros.ahead, ros.odom_frame)
 
     def _finished(self, keyframe: Keyframe, T_base_lidar: Array) -> Keyframe:
         """Not in the worker's thread: the keyframe in the base's frame, sent; with descriptors as the LiDAR sees it."""

@@ -9,6 +9,7 @@ from typing import Any
 from rclpy.node import Node
 
 from dpm2_core.frame import Array
+from dpm2_core.geometry import se3
 from dpm2_ros.conversions import transform_to_msg
 
 TFMessage: Any = None
@@ -21,10 +22,11 @@ class TransformBroadcaster:
 
     Args:
         enabled: False publishes nothing.
+        inverted: the parent becomes the child.
     """
 
-    def __init__(self, node: Node, parent: str, enabled: bool) -> None:
-        self._parent = parent
+    def __init__(self, node: Node, parent: str, enabled: bool, inverted: bool = False) -> None:
+        self._parent, self._inverted = parent, inverted
         self._publisher = None
         if not enabled:
             return
@@ -35,7 +37,9 @@ class TransformBroadcaster:
 
     def send(self, T_parent_child: Array, stamp: int, child: str) -> None:
         """(4, 4) at a stamp in ns."""
-        if self._publisher is not None:
-            self._publisher.publish(
-                TFMessage(transforms=[transform_to_msg(T_parent_child, stamp, self._parent, child)])
-            )
+        if self._publisher is None:
+            return
+        link = (T_parent_child, stamp, self._parent, child)
+        if self._inverted:
+            link = (se3.inverse(T_parent_child), stamp, child, self._parent)
+        self._publisher.publish(TFMessage(transforms=[transform_to_msg(*link)]))

@@ -63,6 +63,10 @@ class TransformTree:
         """Whether the frame has a parent."""
         return _name(frame) in self._parents
 
+    def parent(self, frame: str) -> tuple[str, Array] | None:
+        """What the frame is placed in, and T_parent_frame (4, 4); None where it is not."""
+        return self._parents.get(_name(frame))
+
     def set(self, parent: str, child: str, T_parent_child: Array) -> None:
         """Place `child` in `parent`; a later call replaces an earlier one."""
         self._parents[_name(child)] = (_name(parent), np.asarray(T_parent_child, np.float64))

@@ -72,12 +72,14 @@ class Bridge:
         self._limits = limits
         self._ties: list[_Tie] = []
 
-    def begin(self, seconds: float) -> Array:
-        """A new stretch, so long after the last pose before the pause: where it begins (4, 4)."""
+    def begin(self, seconds: float, T_other: Array | None = None) -> Array:
+        """A new stretch, so long after the last pose before the pause: where it begins (4, 4); there, if another
+        odometry knows the way."""
         self._seconds = seconds
         self._ties.clear()
         self._after: Array | None = None
-        self._T_begin = predicted(self._T, self._motion, seconds)
+        self._T_other = T_other
+        self._T_begin = predicted(self._T, self._motion, seconds) if T_other is None else T_other
         return self._T_begin
 
     def expected(self, T: Array, dt: float) -> Prediction:
@@ -124,7 +126,8 @@ class Bridge:
         asides = _STEP * np.array([np.zeros(3), left, -left, up, -up])
         offsets = np.array([way * ahead + aside for aside in asides for way in _spread(far, _STEP / 2)])
         rates = [np.array([0, 0, turn / seconds, 0, 0, 0]) for turn in _spread(wide, _TURN)]
-        ends = [between(self._T, before + rate, after + rate, seconds) for rate in rates]
+        ends = [] if self._T_other is None else [self._T_other]
+        ends += [between(self._T, before + rate, after + rate, seconds) for rate in rates]
         way = seconds * float(np.linalg.norm(before[3:] + after[3:])) / 2
         parts = [part for part in _PARTS if (1 - part) * way <= _STOPS * seconds**2 / 4]
         ends += [between(self._T, part * before, part * after, seconds) for part in parts]

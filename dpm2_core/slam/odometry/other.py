@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Another odometry, such as that of wheels, beside ours: what it says of the way, and how far it is believed.
+
+Only its steps count, from the last registered frame to this one, so that its drift does no harm. A step that the motion
+before makes impossible (a jump, a restart) is not used, nor is one that the scan contradicts; those that are far off
+again and again make all that follow doubtful, until they are right for a while. Where the scene leaves a direction
+open, as in a tunnel, nothing contradicts it: it decides.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dpm2_core.frame import Array, Comparison, Guess, Registration
+from dpm2_core.geometry import se3
+from dpm2_core.geometry.motion import predicted
+from dpm2_core.slam.registration.protocol import CHI2, MAP_NOISE
+
+# Standard deviations of a step: of a robot that stands, and for each m (or rad) of the way. Points outweigh so much.
+_STANDING = np.array([0.5 * np.pi / 180, 0.05])
+_SHARE = 0.05
+_POSSIBLE = 9.0  # squared sigmas from the motion before, of which one is hard braking already
+_MEMORY = 0.1  # fraction of the newest frame in how far the steps are doubted
+_WORST = 25.0  # squared sigmas of one frame count so much: a single jump is forgiven
+_CREDIBLE = 4.0  # doubt up to which it is used
+_USUAL = 3.0  # squared sigmas that it may be off; more makes it doubtful
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """T_before_now (4, 4) since the last registered frame, and its covariance (6, 6) [rad, m] if it does not slip."""
+
+    T: Array
+    covariance: Array
+
+
+class OtherMotion:
+    """The steps of another odometry, judged by what the scans show.
+
+    Attributes:
+        step: since the last registered frame; None without one, or where it is not used.
+        comparison: of this frame, if there was a step and the frame was registered.
+    """
+
+    def __init__(self) -> None:
+        self.step: Step | None = None
+        self.comparison: Comparison | None = None
+        self._raw: Array | None = None  # the step, possible or not
+        self._now: Guess | None = None
+        self._last: Guess | None = None  # that of the last registered frame
+        self._doubt = 1.0  # squared sigmas by which it has been off of late
+
+    def look(self, guess: Guess | None, twist: Array | None, seconds: float, of_prediction: Array) -> None:
+        """Of a new frame, `seconds` after the last registered one.
+
+        Args:
+            twist: (6,) [rad/s, m/s] there; None if it is not known.
+            of_prediction: covariance (6, 6) of the pose that follows from it.
+        """
+        self._now, self.step, self._raw, self.comparison = guess, None, None, None
+        if guess is None or self._last is None:
+            return
+        T = self._raw = se3.orthonormalized(se3.inverse(self._last.T_other_lidar) @ guess.T_other_lidar)
+        grown = _grown(self._last, guess)
+        covariance = _spread(T) + grown
+        if twist is not None:
+            off = se3.log(se3.inverse(predicted(np.eye(4), twist, seconds)) @ T)
+            impossible = off @ np.linalg.solve(covariance + of_prediction, off) > _POSSIBLE
+            unsure = np.trace(grown[3:, 3:]) > np.trace(of_prediction[3:, 3:])  # by its own account
+            if impossible or unsure or self._doubt > _CREDIBLE:
+                return
+        self.step = Step(T, covariance)
+
+    def agrees(self, T_before: Array, result: Registration) -> bool:
+        """Whether a scan that was registered from the step's end (the last one at T_before (4, 4)) confirms it."""
+        assert self.step is not None
+        off = se3.log(se3.inverse(T_before @ self.step.T) @ result.T_target_source)
+        return bool(off @ np.linalg.solve(result.of_scene + self.step.covariance + MAP_NOISE, off) <= CHI2)
+
+    def compare(self, T_scans: Array, of_scene: Array, used: bool) -> None:
+        """With the step (4, 4) that the scans show, to a covariance (6, 6)."""
+        if self._raw is None:
+            return
+        off = se3.log(se3.inverse(self._raw) @ T_scans)
+        squared = float(off @ np.linalg.solve(of_scene + _spread(self._raw) + MAP_NOISE, off)) / _USUAL
+        self._doubt = max(1.0, (1 - _MEMORY) * self._doubt + _MEMORY * min(squared, _WORST))
+        self.comparison = Comparison(self._raw, T_scans, used, self._doubt**0.5)
+
+    def keep(self) -> None:
+        """This frame was registered: the next step begins here."""
+        self._last = self._now
+
+
+def _spread(T: Array) -> Array:
+    """Covariance (6, 6) of a step (4, 4)."""
+    meters, degrees = se3.magnitude(T)
+    return np.diag(np.repeat(_STANDING + _SHARE * np.array([np.radians(degrees), meters]), 3) ** 2)
+
+
+def _grown(before: Guess, now: Guess) -> Array:
+    """By how much the covariance (6, 6) that the odometry itself states has grown, along fixed axes; 0 where it states
+    none, or always the same."""
+    if before.covariance is None or now.covariance is None:
+        return np.zeros((6, 6))
+    turn = np.kron(np.eye(2), now.T_other_lidar[:3, :3].T @ before.T_other_lidar[:3, :3])
+    values, axes = np.linalg.eigh(now.covariance - turn @ before.covariance @ turn.T)
+    return np.asarray((axes * np.maximum(values, 0.0)) @ axes.T)

@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The odometry that a robot has already: `odom -> base` on /tf, or nav_msgs/Odometry on a topic, at a cloud's stamp."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+from nav_msgs.msg import Odometry
+from rclpy.qos import QoSProfile
+
+from dpm2_core.data.messages import stamp_ns
+from dpm2_core.data.transforms import TransformTree, transform_matrix
+from dpm2_core.errors import UsageError
+from dpm2_core.frame import Array, Comparison, Guess
+from dpm2_core.geometry import se3
+from dpm2_core.slam.mapping.admission import RejectedError, check_covariance, check_pose
+from dpm2_ros.checks import check_header
+from dpm2_ros.conversions import check_frame, covariance_from_ros
+from dpm2_ros.guard import GuardedNode
+from dpm2_ros.settings import RosSettings
+from dpm2_ros.subscriptions import MatchedSubscription
+from dpm2_ros.tf import TFMessage
+from dpm2_ros.transform_history import TransformHistory
+
+WAIT = 0.1
+"""s that a cloud waits for the odometry that comes after it."""
+PATIENCE = 5
+"""Clouds in a row without it, after which none waits any more until it is there again."""
+_MOST_TRANSFORMS = 500  # in a message
+_MEMORY = 0.02  # fraction of the newest step in how much longer its ways are than those of the scans
+_SLIPS = 0.01  # so much is said
+_DOUBTFUL = 1.5  # times as far off as assumed
+_RECENT = 10.0  # s
+
+
+class OtherOdometry:
+    """What `ros.odom_source` names; its callbacks are the executor's, all else the worker's.
+
+    Attributes:
+        problem: why it was not there at the last cloud, in words; empty if it was.
+        missed: clouds for which it was not there. found: those for which it was. outweighed: those of the latter whose
+            scans contradicted it.
+    """
+
+    def __init__(self, node: GuardedNode, ros: RosSettings, static: Callable[[], TransformTree]) -> None:
+        """`static`: the frames that do not move, by now.
+
+        Raises:
+            UsageError: what it needs is missing.
+        """
+        self._static, self._frame = static, ros.odom_frame
+        self._history, self._changed = TransformHistory(), threading.Condition()
+        self._child = ""  # whose pose the topic has
+        self.source = node.resolve_topic_name("/tf" if ros.odom_source == "tf" else ros.odom_topic)
+        self.problem, self.missed, self.found, self.outweighed = f"nothing on {self.source} yet", 0, 0, 0
+        self._in_a_row = 0
+        self._comparison: Comparison | None = None
+        self._struck: tuple[float, str] | None = None  # when it was outweighed last, and why
+        self._ways = np.zeros(2)  # m, of late: its own, and those of the scans
+        if ros.odom_source == "topic":
+            self._subscription = MatchedSubscription(node, Odometry, ros.odom_topic, self._on_odometry, ros)
+            node.create_timer(0.5, self._subscription.refresh)
+        elif TFMessage is None:
+            raise UsageError("ros.odom_source: tf needs tf2_msgs; `python -m dpm2_ros.build_tf2_msgs` builds it")
+        else:
+            node.create_subscription(TFMessage, "/tf", self._on_tf, QoSProfile(depth=100))
+
+    def guess(self, stamp: int, base: str, T_base_lidar: Array) -> Guess | None:
+        """Where it has the LiDAR at a stamp (ns), as soon as it says so; None where it does not."""
+        end = time.monotonic() + (WAIT if self._in_a_row < PATIENCE else 0.0)
+        with self._changed:
+            while (found := self._look(stamp, base)) is None and (left := end - time.monotonic()) > 0:
+                self._changed.wait(left)
+        self.found, self.missed = self.found + (found is not None), self.missed + (found is None)
+        self._in_a_row = 0 if found is not None else self._in_a_row + 1
+        if found is None:
+            self._comparison = None
+            return None
+        T_odom_base, covariance = found
+        if covariance is not None:
+            covariance = _turned(covariance, T_base_lidar)
+        return Guess(T_odom_base @ T_base_lidar, covariance)
+
+    def T_odom_base(self, stamp: int, base: str) -> Array | None:
+        """(4, 4) at a stamp (ns), if it is known already."""
+        with self._changed:
+            found = self._look(stamp, base)
+        return None if found is None else found[0]
+
+    def judge(self, comparison: Comparison | None) -> str:
+        """What the scan of the last cloud said to it; returns why it was outweighed, or an empty text."""
+        self._comparison = comparison
+        if comparison is None:
+            return ""
+        if comparison.used:  # a jump is no slip
+            ways = [np.linalg.norm(T[:3, 3]) for T in (comparison.T_other, comparison.T_scans)]
+            self._ways = (1 - _MEMORY) * self._ways + _MEMORY * np.array(ways)
+            return ""
+        self.outweighed += 1
+        meters, degrees = se3.magnitude(se3.inverse(comparison.T_other) @ comparison.T_scans)
+        text = f"outweighed: {meters:.2f} m, {degrees:.1f} deg from what the scans show"
+        self._struck = time.monotonic(), text
+        return text
+
+    @property
+    def slip(self) -> float:
+        """By what fraction its ways are longer than those of the scans, of late; NaN while the robot stands."""
+        other, scans = self._ways
+        return float(other / scans - 1) if scans > 1e-3 else float("nan")
+
+    @property
+    def verdict(self) -> str:
+        """How far it is to be believed, in words; empty where there is nothing to say against it."""
+        if self.problem:
+            return self.problem
+        said = []
+        if self._struck is not None and (ago := time.monotonic() - self._struck[0]) < _RECENT:
+            said.append(f"{self._struck[1]}, {ago:.0f} s ago")
+        if self._comparison is not None and self._comparison.doubt > _DOUBTFUL:
+            said.append(f"{self._comparison.doubt:.1f} times as far off as assumed")
+        if abs(self.slip) > _SLIPS:
+            said.append(f"its ways are {abs(self.slip):.1%} too {'long' if self.slip > 0 else 'short'}")
+        return "; ".join(said)
+
+    def _look(self, stamp: int, base: str) -> tuple[Array, Array | None] | None:
+        static = self._static()
+        try:
+            source = self._child or base
+            T, covariance = self._history.lookup(self._frame, source, stamp, static)
+            if source != base:
+                T_child_base = static.lookup(source, base)
+                T = T @ T_child_base
+                covariance = None if covariance is None else _turned(covariance, T_child_base)
+        except UsageError as error:
+            self.problem = f"{self.source}: {error}"
+            return None
+        self.problem = ""
+        return T, covariance
+
+    def _on_tf(self, message: Any) -> None:
+        if len(message.transforms) > _MOST_TRANSFORMS:
+            raise RejectedError("size", f"{len(message.transforms)} transforms; at most {_MOST_TRANSFORMS} are read")
+        with self._changed:
+            for stamped in message.transforms:
+                parent, child = stamped.header.frame_id.lstrip("/"), stamped.child_frame_id.lstrip("/")
+                check_frame(parent)
+                check_frame(child)
+                self._history.add(parent, child, stamp_ns(stamped.header), stamped.transform)
+            self._changed.notify()
+
+    def _on_odometry(self, message: Odometry) -> None:
+        check_header(message.header)
+        frame, child = message.header.frame_id.lstrip("/"), message.child_frame_id.lstrip("/")
+        if frame != self._frame:
+            raise RejectedError("frame", f"odometry in frame {frame[:80]!r}; ros.odom_frame is {self._frame!r}")
+        T = transform_matrix(message.pose.pose)
+        check_pose(T)
+        stated, covariance = covariance_from_ros(message.pose.covariance, T[:3, :3]), None
+        with suppress(RejectedError):  # all zero, or -1 for "unknown"
+            check_covariance(stated)
+            covariance = stated
+        check_frame(child)  # it may be empty
+        with self._changed:
+            self._child = child
+            self._history.add(frame, child, stamp_ns(message.header), message.pose.pose, covariance)
+            self._changed.notify()
+
+
+def _turned(covariance: Array, T_body_other: Array) -> Array:
+    """A covariance (6, 6) along the axes of another frame of the same body. Not moved there: what drivers state of
+    directions that they do not measure, such as 1e6, would with a lever arm be everywhere."""
+    turn = np.kron(np.eye(2), T_body_other[:3, :3].T)
+    return np.asarray(turn @ covariance @ turn.T)

@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frames that move, over the last seconds: where one was in another at a stamp. Pure: no ROS, no clock, no thread.
+
+tf2's buffer is not part of ROS from pip, and knows no covariances.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from dpm2_core.data.pairing import JUMP
+from dpm2_core.data.transforms import TransformTree, transform_matrix
+from dpm2_core.errors import UsageError
+from dpm2_core.frame import Array
+from dpm2_core.geometry import se3
+from dpm2_core.slam.mapping.admission import RejectedError, check_pose
+
+GAP = 500_000_000
+"""ns: samples farther apart say nothing of the time between."""
+_KEPT = 20_000_000_000  # ns
+_MOST_SAMPLES = 4000  # of a frame
+_MOST_FRAMES = 200
+_DEEPEST = 20  # frames above one another
+
+
+@dataclass(eq=False)
+class _Track:
+    """A frame in its parent; samples are messages, of which few are ever looked at."""
+
+    parent: str
+    stamps: list[int] = field(default_factory=list)
+    samples: list[tuple[Any, Array | None]] = field(default_factory=list)
+
+    def add(self, stamp: int, pose: Any, covariance: Array | None) -> None:
+        if self.stamps and stamp < self.stamps[-1] - JUMP:
+            self.stamps.clear()  # a looped bag, or a stray stamp before
+            self.samples.clear()
+        if self.stamps and stamp <= self.stamps[-1]:
+            return
+        self.stamps.append(stamp)
+        self.samples.append((pose, covariance))
+        old = bisect_left(self.stamps, stamp - _KEPT)
+        if old > 100 or len(self.stamps) > _MOST_SAMPLES:  # now and then: it moves the whole list
+            old = max(old, len(self.stamps) - _MOST_SAMPLES // 2)
+            del self.stamps[:old], self.samples[:old]
+
+    def at(self, stamp: int, child: str) -> tuple[Array, Array | None]:
+        """(4, 4), and the covariance (6, 6) of the nearest sample.
+
+        Raises:
+            UsageError: there is none before or after, or they are too far apart.
+        """
+        after = bisect_left(self.stamps, stamp)
+        if after < len(self.stamps) and self.stamps[after] == stamp:
+            return _matrix(self.samples[after][0], child), self.samples[after][1]
+        link = f"{self.parent} -> {child}"
+        if after in (0, len(self.stamps)):
+            begins, nearest = after == 0, self.stamps[-1 if after else 0]
+            seconds, side = abs(stamp - nearest) * 1e-9, "after" if begins else "before"
+            raise UsageError(f"{link} {'begins' if begins else 'ends'} {seconds:.2f} s {side} the cloud")
+        begin, end = self.stamps[after - 1], self.stamps[after]
+        if end - begin > GAP:
+            raise UsageError(f"{link} has a gap of {(end - begin) * 1e-9:.2f} s")
+        (pose, before), (later, then) = self.samples[after - 1 : after + 1]
+        T, part = _matrix(pose, child), (stamp - begin) / (end - begin)
+        step = se3.log(se3.inverse(T) @ _matrix(later, child))
+        return T @ se3.exp(part * step), before if part < 0.5 else then
+
+
+class TransformHistory:
+    """Moving frames by name, each with its parent."""
+
+    def __init__(self) -> None:
+        self._tracks: dict[str, _Track] = {}
+
+    def add(self, parent: str, child: str, stamp: int, pose: Any, covariance: Array | None = None) -> None:
+        """Place `child` in `parent` at a stamp (ns).
+
+        Args:
+            pose: geometry_msgs Pose or Transform.
+            covariance: (6, 6) as in `Registration`.
+
+        Raises:
+            RejectedError: there are too many frames.
+        """
+        track = self._tracks.get(child)
+        if track is None and len(self._tracks) >= _MOST_FRAMES:
+            raise RejectedError("frame", f"{_MOST_FRAMES} frames move already")
+        if track is None or track.parent != parent:
+            track = self._tracks[child] = _Track(parent)
+        track.add(stamp, pose, covariance)
+
+    def newest(self, child: str) -> int | None:
+        """Stamp (ns) of its last sample."""
+        track = self._tracks.get(child)
+        return track.stamps[-1] if track is not None and track.stamps else None
+
+    def lookup(self, target: str, source: str, stamp: int, static: TransformTree) -> tuple[Array, Array | None]:
+        """T_target_source (4, 4) at a stamp (ns), between two samples, and its covariance (6, 6) if one is stated.
+
+        Args:
+            static: the frames that do not move.
+
+        Raises:
+            UsageError: why it is not known, in words.
+        """
+        T, covariance, frame = np.eye(4), None, source
+        for _ in range(_DEEPEST):
+            if frame == target:
+                return T, covariance
+            if (track := self._tracks.get(frame)) is not None:
+                T_parent, covariance = track.at(stamp, frame)
+                frame, T = track.parent, T_parent @ T
+            elif (up := static.parent(frame)) is not None:
+                frame, T = up[0], up[1] @ T
+            else:
+                break
+        raise UsageError(f"no transform from {source!r} to {target!r}: {frame!r} has no parent")
+
+
+def _matrix(pose: Any, child: str) -> Array:
+    T = transform_matrix(pose)
+    try:
+        check_pose(T)
+    except RejectedError as error:
+        raise UsageError(f"{child}: {error}") from None
+    return T

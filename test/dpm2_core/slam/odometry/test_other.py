@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Another odometry leads where the scene is silent, is outweighed where it slips or jumps, and is missed by nobody."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from dpm2_core.frame import Array, Frame, Guess, OdometryResult, State
+from dpm2_core.geometry import se3
+from dpm2_core.slam.build import make_odometry
+from dpm2_core.slam.settings import SlamSettings
+
+from ....helpers.drives import Drive
+
+pytestmark = pytest.mark.slow
+JUMP = 12  # frame
+
+
+def run(frames: list[Frame]) -> list[OdometryResult]:
+    odometry = make_odometry(SlamSettings(registration="geometric"))
+    return [odometry.process(frame) for frame in frames]
+
+
+def off(tracked: list[OdometryResult], truth: Array) -> Array:
+    """(N,) m."""
+    return np.linalg.norm((se3.inverse(truth) @ np.array([t.T_odom_lidar for t in tracked]))[:, :3, 3], axis=1)
+
+
+def wheels(truth: Array, slip: float = 0.0, jump: float = 0.0) -> list[Guess]:
+    """From an origin of their own, each step too long by `slip`, and once too far by `jump` m."""
+    T = se3.exp([0.0, 0.0, 2.0, 50.0, -20.0, 0.0])
+    guesses = [Guess(T)]
+    for n, (before, now) in enumerate(pairwise(truth), 1):
+        step = se3.log(se3.inverse(before) @ now)
+        step[3:] *= 1 + slip
+        step[3] += jump * (n == JUMP)
+        T = T @ se3.exp(step)
+        guesses.append(Guess(T))
+    return guesses
+
+
+def beside(drive: Drive, **wrong: float) -> list[Frame]:
+    frames, truth = drive
+    return [replace(frame, guess=guess) for frame, guess in zip(frames, wheels(truth, **wrong), strict=True)]
+
+
+def test_in_a_tunnel_it_tells_the_way(tunnel_drive: Drive) -> None:
+    """Where points do not: 2 % of slip is all that is left of the error, and the state says what it is."""
+    truth = tunnel_drive[1]
+    alone, led = run(tunnel_drive[0]), run(beside(tunnel_drive, slip=0.02))
+    way = np.linalg.norm(truth[-1, :3, 3])
+    assert off(led, truth)[-1] < 0.03 * way
+    assert off(led, truth)[-1] < 0.5 * off(alone, truth)[-1]
+    assert all(t.comparison is not None and t.comparison.used for t in led[2:])
+
+
+@pytest.mark.parametrize("jump", [0.5, 1000.0])
+def test_slip_and_jumps_are_outweighed_and_told(suburb_drive: Drive, jump: float) -> None:
+    """The error is that without another odometry; the jump, and no other frame, is said to be one."""
+    truth = suburb_drive[1]
+    alone, led = run(suburb_drive[0]), run(beside(suburb_drive, slip=0.02, jump=jump))
+    assert off(led, truth).max() < off(alone, truth).max() + 0.01
+    assert [t.index for t in led[1:] if t.comparison is None or not t.comparison.used] == [JUMP]
+    at_jump = led[JUMP].comparison
+    assert at_jump is not None
+    apart = np.linalg.norm(at_jump.T_other[:3, 3]) - np.linalg.norm(at_jump.T_scans[:3, 3])
+    assert apart == pytest.approx(jump, rel=0.1, abs=0.05)
+    assert at_jump.doubt > led[JUMP - 1].comparison.doubt  # type: ignore[union-attr]
+    assert all(t.state is State.TRACKING for t in led[2:])
+
+
+def test_one_that_turns_wheels_on_the_spot_is_doubted(suburb_drive: Drive) -> None:
+    """Half as long again, at every step: within what a vehicle can do, and wrong by 0.4 m a frame."""
+    truth = suburb_drive[1]
+    led = run(beside(suburb_drive, slip=0.5))
+    assert off(led, truth).max() < 0.05
+    assert led[-1].comparison is not None
+    assert led[-1].comparison.doubt > 2
+
+
+@pytest.mark.parametrize("present", [lambda n: n % 3, lambda n: n < 8, lambda n: n > 8], ids=["gaps", "ends", "late"])
+def test_without_it_the_drive_goes_on(suburb_drive: Drive, present: Callable[[int], bool]) -> None:
+    truth = suburb_drive[1]
+    led = run([f if present(f.index) else replace(f, guess=None) for f in beside(suburb_drive)])
+    assert off(led, truth).max() < 0.05
+    assert all(t.comparison is None for t in led if not present(t.index))
+    assert all(t.registration.ok for t in led)
+
+
+def test_scans_that_fail_are_bridged_by_it(suburb_drive: Drive) -> None:
+    """The pose follows the wheels while no scan can be read, with the uncertainty that they have."""
+    truth = suburb_drive[1]
+    frames = beside(suburb_drive)
+    blind = [replace(f, points=f.points[:0], problem="unreadable") if 8 <= f.index < 13 else f for f in frames]
+    led = run(blind)
+    assert off(led, truth).max() < 0.05
+    assert [t.registration.ok for t in led[8:13]] == [False] * 5
+    sigmas = [float(np.sqrt(np.linalg.eigvalsh(t.covariance[3:, 3:])[-1])) for t in led[8:13]]
+    assert sigmas == sorted(sigmas)
+    assert sigmas[-1] > 0.05
+
+
+def test_one_that_says_it_does_not_know_is_not_followed(suburb_drive: Drive) -> None:
+    """It states a covariance that grows by 9 m2 a frame: the motion before knows more."""
+    frames = beside(suburb_drive)[:8]
+    unsure = [
+        replace(f, guess=Guess(f.guess.T_other_lidar, 9.0 * (f.index + 1) * np.eye(6))) for f in frames if f.guess
+    ]
+    assert [t.comparison.used for t in run(unsure) if t.comparison][1:] == [False] * 6
+    constant = [replace(f, guess=Guess(f.guess.T_other_lidar, 9.0 * np.eye(6))) for f in frames if f.guess]
+    assert [t.comparison.used for t in run(constant) if t.comparison] == [True] * 7  # what does not grow says nothing
+
+
+@pytest.mark.parametrize(
+    ("T", "covariance"),
+    [(np.full((4, 4), np.nan), None), (np.eye(3), None), (np.eye(4), np.full((6, 6), np.inf)), (np.eye(4), np.eye(3))],
+)
+def test_what_is_no_pose_is_refused(T: Array, covariance: Array | None) -> None:
+    with pytest.raises(ValueError, match="finite numbers"):
+        Guess(T, covariance)

@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: Apache-2.0
+"""slam_node beside an odometry that the robot has already, over real DDS: one tree, whatever that odometry does."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import PointCloud2
+
+from dpm2_core.data.messages import stamp_ns
+from dpm2_core.data.topics import POINTS
+from dpm2_core.data.transforms import transform_matrix
+from dpm2_core.errors import UsageError
+from dpm2_core.frame import Array
+from dpm2_core.geometry import se3
+from dpm2_ros.conversions import edge_to_msg, transform_to_msg
+from dpm2_ros.slam_node import SlamNode
+from dpm2_ros.tf import TFMessage
+
+T_BASE_LIDAR = se3.exp([0.0, 0.0, 0.2, 0.8, 0.0, 1.2])
+JUMP, SLIP = 9, 0.02  # cloud before which the wheels jump by 0.5 m; fraction by which their ways are too long
+STEPS = 5  # samples of the wheels to a cloud
+ACCURATE = 0.05
+
+
+class Robot:
+    """Its wheels, its LiDAR 0.8 m ahead of the base and 1.2 m above, and slam_node."""
+
+    def __init__(self, ros: Callable[..., Any], drive: Any, source: str, *parameters: str) -> None:
+        given = ("input.images:=false", f"ros.odom_source:={source}", *parameters)
+        self.harness, self.drive = ros(*given), drive
+        self.wait = self.harness.wait
+        publisher = self.harness.publisher
+        self.lidar, self.tf = publisher(PointCloud2, POINTS), publisher(TFMessage, "/tf")
+        self.topic = publisher(Odometry, "/odom") if source == "topic" else None
+        static = publisher(TFMessage, "/tf_static", latched=True)
+        static.publish(TFMessage(transforms=[transform_to_msg(T_BASE_LIDAR, 0, "base_link", "lidar")]))
+        self.heard = self.harness.hear(TFMessage, "/tf")
+        self.odom = self.harness.hear(Odometry, "/dpm2/odom")
+        self.diagnostics = self.harness.hear(DiagnosticArray, "/diagnostics")
+        self.node: SlamNode = self.harness.add(SlamNode())
+        wheels = self.topic or self.tf
+        self.wait(lambda: self.lidar.get_subscription_count() and wheels.get_subscription_count(), "subscriptions")
+        self.wait(lambda: "lidar" in self.node.calibration.transforms.frames, "/tf_static")
+        self._T, self.wheels = se3.exp([0.0, 0.0, 1.0, 5.0, 0.0, 0.0]), {}  # an origin of their own
+
+    def base(self, t: float) -> Array:
+        """Truth, T_start_base at a cloud's number."""
+        begin, end = self.drive.pose(int(t)), self.drive.pose(int(t) + 1)
+        T = begin @ se3.exp((t - int(t)) * se3.log(se3.inverse(begin) @ end))
+        return T_BASE_LIDAR @ T @ se3.inverse(T_BASE_LIDAR)
+
+    def turn_wheels(self, n: int) -> None:
+        """From the cloud before to this one, and a sample beyond."""
+        for step in range(1 if n else 0, STEPS + 1):
+            t = n - 1 + step / STEPS if n else 0.0
+            if n:
+                way = se3.log(se3.inverse(self.base(t - 1 / STEPS)) @ self.base(t))
+                way[3:] *= 1 + SLIP
+                way[3] += 0.5 * (n == JUMP and step == 3)
+                self._T = self._T @ se3.exp(way)
+            stamp = round(self.drive.start + t * self.drive.period)
+            self.wheels[stamp] = self._T
+            if self.topic:
+                self.topic.publish(edge_to_msg(self._T, 1e-4 * np.eye(6), stamp, "odom", "base_link"))
+            self.tf.publish(TFMessage(transforms=[transform_to_msg(self._T, stamp, "odom", "base_link")]))
+            if not n:
+                break
+
+    def send(self, *numbers: int, wheels: bool = True) -> None:
+        for n in numbers:
+            before = len(self.odom)
+            if wheels:
+                self.turn_wheels(n)
+            self.lidar.publish(self.drive.cloud(n))
+            self.wait(lambda before=before: len(self.odom) > before, f"the odometry of cloud {n}")
+
+    def links(self) -> dict[tuple[str, str], dict[int, Array]]:
+        """What is on /tf by parent and child, at each stamp."""
+        out: dict[tuple[str, str], dict[int, Array]] = {}
+        for message in self.heard:
+            for t in message.transforms:
+                link = out.setdefault((t.header.frame_id, t.child_frame_id), {})
+                link[stamp_ns(t.header)] = transform_matrix(t.transform)
+        return out
+
+    def status(self, condition: Callable[[DiagnosticStatus], bool]) -> DiagnosticStatus:
+        """Of the other odometry, once it is so."""
+
+        def last() -> list[DiagnosticStatus]:
+            statuses = self.diagnostics[-1].status if self.diagnostics else []
+            return [s for s in statuses if s.name.endswith("other odometry") and condition(s)]
+
+        self.wait(last, "a status of the other odometry")
+        return last()[0]
+
+
+@pytest.fixture
+def robot(ros: Callable[..., Any], drive: Any, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Robot]:
+    monkeypatch.setattr("dpm2_ros.diagnostics.PERIOD", 0.1)
+    return lambda *parameters: Robot(ros, drive, *parameters)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("source", ["tf", "topic"])
+def test_slip_and_a_jump_of_half_a_meter(robot: Callable[..., Robot], drive: Any, source: str) -> None:
+    """At the stamp of every cloud map -> odom and the wheels' odom -> base make our pose, right to centimeters."""
+    r = robot(source)
+    r.send(*range(drive.frames))
+    r.wait(lambda: len(r.links().get(("map", "odom"), {})) == drive.frames, "map -> odom of every cloud")
+    links = r.links()
+    assert set(links) == {("map", "odom"), ("odom", "base_link")}  # one parent each
+    for n, message in enumerate(r.odom):
+        stamp = drive.stamp(n)
+        assert (message.header.frame_id, message.child_frame_id) == ("odom_dpm2", "base_link")
+        T_map_base = links["map", "odom"][stamp] @ r.wheels[stamp]
+        np.testing.assert_allclose(T_map_base, transform_matrix(message.pose.pose), atol=1e-6)
+        assert np.linalg.norm((T_map_base - r.base(n))[:3, 3]) < ACCURATE
+    said = r.status(lambda s: "outweighed" in s.message)
+    assert said.level == DiagnosticStatus.WARN
+    assert float(said.message.split()[1]) == pytest.approx(0.5, abs=0.05)
+    values = {value.key: value.value for value in said.values}
+    assert float(values["its ways too long by (%)"]) == pytest.approx(100 * SLIP, abs=0.3)
+    assert (values["clouds with it"], values["outweighed"]) == (str(drive.frames), "1")
+
+
+@pytest.mark.slow
+def test_late_stopping_and_coming_back(robot: Callable[..., Robot], drive: Any) -> None:
+    """The drive goes on without it, /diagnostics says so, and map -> odom is sent where it is known alone."""
+    r = robot("tf")
+    r.send(0, 1, 2, wheels=False)
+    assert "no transform from 'base_link' to 'odom'" in r.status(lambda s: "going on without" in s.message).message
+    for n in range(3):
+        r.turn_wheels(n)  # too late
+    r.send(*range(3, 7))
+    assert "too long" in r.status(lambda s: "going on without" not in s.message).message
+    r.send(7, 8, wheels=False)
+    assert "ends 0." in r.status(lambda s: "going on without" in s.message).message
+    for n in (7, 8):
+        r.turn_wheels(n)
+    r.send(*range(9, 12))
+    r.wait(lambda: len(r.links().get(("map", "odom"), {})) >= 7, "map -> odom")
+    assert sorted(r.links()["map", "odom"]) == [drive.stamp(n) for n in (3, 4, 5, 6, 9, 10, 11)]
+    for n, message in enumerate(r.odom):
+        assert np.linalg.norm((transform_matrix(message.pose.pose) - r.base(n))[:3, 3]) < ACCURATE
+
+
+def test_what_is_no_odometry_is_rejected(robot: Callable[..., Robot], drive: Any) -> None:
+    """Another frame, numbers that are none: counted, and the drive goes on."""
+    r = robot("topic")
+    r.send(0, 1)
+    good, nan = np.eye(4), np.full((6, 6), np.nan)
+    r.topic.publish(edge_to_msg(good, np.eye(6), drive.stamp(2), "elsewhere", "base_link"))
+    r.topic.publish(edge_to_msg(good, np.eye(6), drive.stamp(2), "odom", ""))
+    far = edge_to_msg(good, nan, drive.stamp(2), "odom", "base_link")
+    far.pose.pose.position.x = float("inf")
+    r.topic.publish(far)
+    r.wait(lambda: sum(r.node.rejections.values()) == 3, "three rejections")
+    stated = edge_to_msg(r.wheels[drive.stamp(1)], nan, drive.stamp(1) + 1, "odom", "base_link")
+    r.topic.publish(stated)  # a sound pose; its covariance is left out
+    r.send(2, 3)
+    assert sum(r.node.rejections.values()) == 3
+    for n, message in enumerate(r.odom):
+        assert np.linalg.norm((transform_matrix(message.pose.pose) - r.base(n))[:3, 3]) < ACCURATE
+
+
+@pytest.mark.parametrize(
+    ("parameters", "expected"),
+    [
+        (("own", "ros.invert_odom_tf:=true"), {("base_link", "odom"), ("odom", "map")}),
+        (("tf", "ros.invert_odom_tf:=true"), {("map", "odom"), ("odom", "base_link"), ("base_link", "odom_dpm2")}),
+        (("tf", "ros.embed_mapper:=false"), {("odom_dpm2", "odom"), ("odom", "base_link")}),
+    ],
+    ids=["own, inverted", "another's, inverted", "mapper apart"],
+)
+def test_every_frame_has_one_parent(robot: Callable[..., Robot], parameters: tuple[str], expected: set) -> None:
+    r = robot(*parameters)
+    r.send(0, 1, 2, wheels=parameters[0] == "tf")
+    r.wait(lambda: set(r.links()) == expected and min(map(len, r.links().values())) >= 2, f"{expected}")
+    children = [child for _, child in r.links()]
+    assert len(children) == len(set(children))
+    links = r.links()
+    if leaf := links.get(("base_link", "odom_dpm2")) or links.get(("base_link", "odom")):
+        poses = {stamp_ns(message.header): transform_matrix(message.pose.pose) for message in r.odom}
+        for stamp, T in leaf.items():
+            np.testing.assert_allclose(T @ poses[stamp], np.eye(4), atol=1e-6)
+
+
+def test_a_leaf_beside_a_mapper_elsewhere_is_refused(ros: Callable[..., Any]) -> None:
+    ros("ros.odom_source:=tf", "ros.invert_odom_tf:=true", "ros.embed_mapper:=false")
+    with pytest.raises(UsageError, match=r"ros\.invert_odom_tf: needs ros\.embed_mapper"):
+        SlamNode()
