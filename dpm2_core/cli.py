@@ -37,6 +37,9 @@ GROUPS = {
     "Maps": {
         "map": ("map:app", "Map files: info, export, merge, prune, check; pose graphs: optimize."),
     },
+    "Fleets": {
+        "fleet": ("fleet:app", "Many drives, on this machine or on a cluster of Ray: run."),
+    },
     "Learning": {
         "finetune": (
             "finetune:finetune",

@@ -48,9 +48,9 @@ def experiment(
 
     What was stopped goes on where it was: every part (a method on a sequence, a training) is done once.
     """
-    from dpm2_core.experiments.part import Progress
     from dpm2_core.experiments.registry import EXPERIMENTS, carry_out  # imports what the lists need, not torch
     from dpm2_core.experiments.request import Request
+    from dpm2_core.fleet.part import Progress
 
     if listed:
         table = FigureTable("Experiments", names=["name", "of"], text=["what"])

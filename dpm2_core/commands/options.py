@@ -14,7 +14,7 @@ from rich.console import RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from dpm2_core.console import Console
-from dpm2_core.data.source import Span
+from dpm2_core.data.source import parse_range as parse_range
 from dpm2_core.errors import UsageError, exit_code
 from dpm2_core.files import atomic_write
 
@@ -44,18 +44,6 @@ def show(table: RenderableType, figures: Mapping[str, Any], json_file: Path | No
     if json_file is not None:
         with atomic_write(json_file) as file:
             file.write(text)
-
-
-def parse_range(text: str) -> Span:
-    """`a:b`, `a:`, `:b` or `:` to (a, b or None).
-
-    Raises:
-        UsageError: it is something else.
-    """
-    first, colon, last = text.partition(":")
-    if not colon or not all(part.isdecimal() or not part for part in (first, last)):
-        raise UsageError(f"--frames {text}: want a:b, such as 0:100")
-    return int(first or 0), int(last) if last else None
 
 
 def parse_lengths(text: str) -> tuple[float, ...]:

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Protocol
 
+from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Frame
 
 Span = tuple[int, int | None]
@@ -44,3 +45,15 @@ class Source(Protocol):
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
         """Frames start..stop-1 by position, read one at a time; an unreadable one comes with `problem` set."""
         ...
+
+
+def parse_range(text: str) -> Span:
+    """`a:b`, `a:`, `:b` or `:` to (a, b or None).
+
+    Raises:
+        UsageError: it is something else.
+    """
+    first, colon, last = text.partition(":")
+    if not colon or not all(part.isdecimal() or not part for part in (first, last)):
+        raise UsageError(f"--frames {text}: want a:b, such as 0:100")
+    return int(first or 0), int(last) if last else None

@@ -10,7 +10,6 @@ from pathlib import Path
 from dpm2_core.evaluation.figures import trajectories_png
 from dpm2_core.evaluation.run_folder import read_run
 from dpm2_core.evaluation.run_page import aligned
-from dpm2_core.experiments.part import Figures, Part
 from dpm2_core.experiments.request import Experiment, Outcome, Request, drawn
 from dpm2_core.experiments.sequences import (
     SHOWN,
@@ -24,6 +23,7 @@ from dpm2_core.experiments.sequences import (
     run_folders,
 )
 from dpm2_core.experiments.table import MEAN, Cells, ResultTable
+from dpm2_core.fleet.part import Figures, Part
 from dpm2_core.frame import Array
 
 USES = frozenset({"weights", "registrations", "peers", "lengths", "frames"})

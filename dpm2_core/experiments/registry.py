@@ -12,10 +12,10 @@ from typing import Any
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.record import write_record
 from dpm2_core.evaluation.run_page import HtmlTable, runs_page
-from dpm2_core.experiments.part import Figures, Progress, run_parts
 from dpm2_core.experiments.request import Experiment, Outcome, Request
 from dpm2_core.experiments.table import html_table
 from dpm2_core.files import atomic_write
+from dpm2_core.fleet.part import Figures, Progress, run_parts
 
 _ALWAYS = frozenset({"data", "out", "sequences", "workers", "overrides"})
 

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from dpm2_core.data.source import Span
-from dpm2_core.experiments.part import Figures, Part
 from dpm2_core.experiments.table import ResultTable
 from dpm2_core.extras import MissingPackageError
+from dpm2_core.fleet.part import Figures, Part
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,10 @@ from dpm2_core.data.corrupt import CorruptedSource, parse_corruption
 from dpm2_core.data.open import open_source
 from dpm2_core.evaluation.figures import corrupted_png
 from dpm2_core.experiments.kitti import ORIGINAL_POSES, PAPER, TESTED
-from dpm2_core.experiments.part import Figures, Part
 from dpm2_core.experiments.request import Experiment, Outcome, Request, drawn
 from dpm2_core.experiments.sequences import SHOWN, cells, missing_note, own_part, present, registrations, run_folders
 from dpm2_core.experiments.table import MEAN, ResultTable
+from dpm2_core.fleet.part import Figures, Part
 from dpm2_core.slam.build import make_odometry
 from dpm2_core.slam.settings import Config
 

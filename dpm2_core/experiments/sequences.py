@@ -10,10 +10,10 @@ from typing import Any
 
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.kitti_metric import OFFICIAL_LENGTHS
-from dpm2_core.experiments.part import Figures, Part
 from dpm2_core.experiments.request import Request
 from dpm2_core.experiments.slam_part import GIVEN, OWN, PEER, has_sequence
 from dpm2_core.experiments.table import Cells
+from dpm2_core.fleet.part import Figures, Part
 
 SHOWN = {"t_err_percent": ".3f", "r_err_deg_per_100m": ".3f"}
 """Figures of the KITTI metric, and how they are printed."""

@@ -21,9 +21,9 @@ from dpm2_core.evaluation.ground_truth import in_other_frame, read_ground_truth
 from dpm2_core.evaluation.kitti_metric import known
 from dpm2_core.evaluation.metrics import Metrics, evaluate
 from dpm2_core.evaluation.run_folder import METRICS, TIMING, TRAJECTORY, TRUTH, write_frames, write_truth
-from dpm2_core.experiments.part import Advance, Figures
 from dpm2_core.experiments.peers import make_peer
 from dpm2_core.files import write_json
+from dpm2_core.fleet.part import Advance, Figures
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.pipeline import OfflineRun, open_recording, span_of

@@ -12,7 +12,8 @@ from typing import Literal, TypedDict
 from dpm2_core.config import dump_settings, load_settings
 from dpm2_core.data.trajectory import write_tum
 from dpm2_core.evaluation.run_folder import TRAJECTORY, TRUTH, write_truth
-from dpm2_core.experiments.part import LOG, Advance, Figures, begin_training
+from dpm2_core.experiments.begun import LOG, begin_training
+from dpm2_core.fleet.part import Advance, Figures
 from dpm2_core.tasks.open import open_scans
 from dpm2_core.tasks.slam_figures import figures_of, slam_runs
 from dpm2_core.tasks.task import SlamTaskTraining, task_type

@@ -13,11 +13,11 @@ from typing import Any
 from dpm2_core.evaluation.figures import trajectories_png
 from dpm2_core.experiments.kitti import aligned_ways
 from dpm2_core.experiments.paired import paired_gain
-from dpm2_core.experiments.part import Figures, Part
 from dpm2_core.experiments.request import Experiment, Outcome, Request
 from dpm2_core.experiments.table import Cells, ResultTable
 from dpm2_core.experiments.task_part import MEASURE, SLAM, TRAIN, Arm, Training, first_slam_epoch, settings_of
 from dpm2_core.extras import MissingPackageError
+from dpm2_core.fleet.part import Figures, Part
 from dpm2_core.tasks.training import WEIGHTS
 
 SEEDS = 3

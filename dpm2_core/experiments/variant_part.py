@@ -10,7 +10,8 @@ from typing import Any
 
 from dpm2_core.config import dump_settings, load_settings, merged
 from dpm2_core.data.open import open_source
-from dpm2_core.experiments.part import LOG, Advance, Figures, begin_training
+from dpm2_core.experiments.begun import LOG, begin_training
+from dpm2_core.fleet.part import Advance, Figures
 from dpm2_core.learning.generate import pack as write_packed_drive
 from dpm2_core.learning.train_registration import RegistrationTrainingSettings, train_registration
 from dpm2_core.network.pretrained import weights_path

@@ -15,11 +15,11 @@ from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.image_attention import attention_png, image_attention
 from dpm2_core.experiments.ablation import TABLE_4 as TRAINED_ALIKE
 from dpm2_core.experiments.kitti import ORIGINAL_POSES, TESTED
-from dpm2_core.experiments.part import Figures, Part
 from dpm2_core.experiments.request import Experiment, Outcome, Request, drawn
 from dpm2_core.experiments.sequences import SHOWN, cells, missing_note, own_part, present, run_folders
 from dpm2_core.experiments.table import MEAN, ResultTable
 from dpm2_core.experiments.variant_part import PACK, TRAIN, WEIGHTS
+from dpm2_core.fleet.part import Figures, Part
 from dpm2_core.network.pretrained import weights_path
 from dpm2_core.network.weights import load_model
 from dpm2_core.slam.settings import Config

@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 
 from dpm2_core.errors import UsageError
-from dpm2_core.experiments.part import DONE, Part, Progress, run_parts
-from dpm2_core.experiments.table import MEAN, ResultTable
+from dpm2_core.fleet.part import DONE, Part, Progress, do_part, figures_of, remove_attempts, run_parts
 
 WORK = "part_work:count"
 SOURCE = """
@@ -84,10 +83,20 @@ def test_a_damaged_record_is_made_anew(tmp_path: Path) -> None:
     assert run_parts([part], tmp_path)["a"]["times"] == 2
 
 
-def test_a_mean_is_of_all_columns_or_there_is_none() -> None:
-    """A mean over the sequences that happened to be there would compare different drives."""
-    table = ResultTable("t", ["06", "07", MEAN], {"a": ".1f", "b": ".2f"})
-    table.add("ours", {"06": {"a": 1.0, "b": None}, "07": {"a": 2.0, "b": 1.0}})
-    table.add("theirs", {"06": {"a": 1.0}}, "the paper")
-    assert [cells for _, cells in table.texts()] == [["1.0 / -", "2.0 / 1.00", "1.5 / -"], ["1.0 / -", "-", "-"]]
-    assert table.record()["rows"][1]["origin"] == "the paper"
+def test_a_fresh_part_is_whole_or_not_there(tmp_path: Path) -> None:
+    """Its folder appears when all is in it; what is cut short later, or left by a kill, is not taken for whole."""
+    part, out = Part("a", WORK, {"start": 1}, fresh=True), tmp_path / "out"
+    with pytest.raises(UsageError, match="below zero"):
+        do_part(Part("a", WORK, {"start": -1}, fresh=True), out)
+    assert not list(out.iterdir())
+    assert do_part(part, out)["value"] == 2
+    assert (found := figures_of(part, out)) is not None
+    assert found["times"] == 1
+    assert figures_of(Part("a", WORK, {"start": 2}, fresh=True), out) is None
+    (out / "a" / "log").write_text("")
+    assert figures_of(part, out) is None
+    assert do_part(part, out)["times"] == 1, "it began with what was there before"
+    (out / ".a.0.attempt").mkdir()
+    (out / ".ab.0.attempt").mkdir()
+    remove_attempts(part, out)
+    assert sorted(path.name for path in out.iterdir()) == [".ab.0.attempt", "a"]

@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`dpm2 fleet`: many drives on Ray, on this machine or on a cluster."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from dpm2_core.commands.options import ConfigFile, JsonFile, Overrides, show
+from dpm2_core.console import Console
+from dpm2_core.errors import Dpm2Error
+from dpm2_core.fleet.cluster import Cluster
+from dpm2_core.fleet.drives import parts_of, read_drives
+from dpm2_core.fleet.part import Part
+from dpm2_core.fleet.run import SUMMARY, carry_out, summary_table
+from dpm2_core.fleet.view import TerminalView
+
+app = typer.Typer(help="Many drives, on this machine or on a cluster of Ray: run.", no_args_is_help=True)
+
+Drives = Annotated[
+    list[Path], typer.Argument(metavar="DRIVE... | MANIFEST.yaml", help="Recordings, or a list of them as YAML.")
+]
+Out = Annotated[Path, typer.Option(help="Folder for the results, which all workers can write; what is whole stays.")]
+Address = Annotated[
+    str | None, typer.Option("--ray", metavar="ADDRESS", help="Of a cluster, HOST:PORT or auto; else this machine.")
+]
+Workers = Annotated[int | None, typer.Option(min=1, help="Drives at a time [as many as there are processors for].")]
+
+
+@app.callback()
+def _fleet() -> None:
+    """A group, however many commands it has."""
+
+
+@app.command()
+def run(
+    drives: Drives,
+    out: Out,
+    address: Address = None,
+    workers: Workers = None,
+    config: ConfigFile = None,
+    settings: Overrides = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Run the SLAM on many drives; each has a folder of its own, with the files of `dpm2 run` and its map.
+
+    What is whole is not done again: the same call goes on with what was stopped or has failed.
+    """
+    _carry_out(parts_of(read_drives(drives), config, settings or ()), out, (address, workers), json_file)
+
+
+def _carry_out(parts: list[Part], out: Path, where: tuple[str | None, int | None], json_file: Path | None) -> None:
+    """Do the parts and say what came out.
+
+    Raises:
+        Dpm2Error: some failed.
+    """
+    cores = max(part.cores for part in parts)
+    with TerminalView(Console(stderr=True)) as view:
+        outcomes = carry_out(parts, out, Cluster(*where, cores), view)
+    show(summary_table(str(out), outcomes), {"drives": [outcome._asdict() for outcome in outcomes]}, json_file)
+    if any(outcome.state == "stopped" for outcome in outcomes):
+        raise typer.Abort
+    if failed := [outcome.name for outcome in outcomes if outcome.state == "failed"]:
+        raise Dpm2Error(f"{len(failed)} of {len(outcomes)} failed: {', '.join(failed)}; why: {out / SUMMARY}")

@@ -1,0 +1,235 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Ray: functions in processes of their own, here or on a cluster, each tried again when its worker dies.
+
+Ray is imported here alone, and only when it is used. It sends no usage statistics; a cluster that was started here ends
+with this process, whatever ends that.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+import tempfile
+import time
+import traceback
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from dpm2_core._version import __version__
+from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.extras import needs
+
+ATTEMPTS = 3
+"""Workers that may die over one job."""
+_POLL = 0.5  # s between two looks at what goes on, and between two reports of a job
+_PATIENCE = 5.0  # s for an address to answer
+_STORE = 100 * 2**20  # bytes of shared memory of a cluster on this machine: jobs hand over little
+_LONGEST = 25  # characters of the folder for temporary files, in which Ray makes sockets, whose names have 107
+
+
+@dataclass(frozen=True)
+class Job:
+    """A call in another process.
+
+    Attributes:
+        key: its name. function: of a module, with `arguments`; where `tells`, also with a keyword `advance`, to be told
+            of the progress.
+        cores, memory: processors and bytes that it takes at most.
+    """
+
+    key: str
+    function: Callable[..., Any]
+    arguments: tuple[Any, ...]
+    tells: bool = False
+    cores: int = 1
+    memory: int = 0
+
+
+class Ended(NamedTuple):
+    """A job that ended: what its function returned, or the reason why it has nothing."""
+
+    key: str
+    value: Any
+    reason: str = ""
+
+
+class Status(NamedTuple):
+    """Of a job that runs or has run: attempts, frames done, frames in all, and where: HOST:PROCESS."""
+
+    attempts: int
+    done: int = 0
+    total: int = 0
+    where: str = ""
+
+
+Watch = Callable[[Mapping[str, Status]], None]
+
+
+class Cluster:
+    """The connection to Ray. A context manager: leaving it ends the jobs, and the cluster if it was started here.
+
+    In a program that is connected to Ray already that connection serves, and stays.
+    """
+
+    def __init__(self, address: str | None = None, workers: int | None = None, cores: int = 1) -> None:
+        """Nothing is started yet.
+
+        Args:
+            address: of a cluster, as `ray.init` takes it; None starts one on this machine.
+            workers: at most so many jobs at a time; None: as many as there are processors for.
+            cores: of a job, for a cluster that is started here.
+        """
+        self._address, self._workers, self._cores = address, workers, cores
+        self._folder: Path | None = None
+        self._connected = False
+        self._ray: Any = None  # the package, once it is imported
+        self._board: Any = None
+
+    def __enter__(self) -> Cluster:
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+        os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+        os.environ.setdefault("RAY_worker_niceness", "0")  # 15 by default: beside other programs next to nothing
+        with needs("fleet", "a fleet"):
+            import ray
+        self._ray = ray
+        if not ray.is_initialized():
+            try:
+                self._connect(ray)
+            except (ConnectionError, RuntimeError, ValueError, TimeoutError) as error:
+                self.__exit__()
+                where = "Ray" if self._address is None else f"--ray {self._address}"
+                raise UsageError(f"{where}: {' '.join(str(error).split())}") from None
+        self._board = ray.remote(num_cpus=0, max_restarts=-1, max_task_retries=-1)(_Board).remote()
+        return self
+
+    def _connect(self, ray: Any) -> None:
+        quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
+        self._connected = True
+        if self._address is not None:
+            _check_address(self._address)
+            ray.init(self._address, **quiet)
+            return
+        temporary = tempfile.gettempdir()
+        self._folder = Path(tempfile.mkdtemp(prefix="ray_", dir=temporary if len(temporary) < _LONGEST else "/tmp"))
+        workers = self._workers or max(len(os.sched_getaffinity(0)) // self._cores, 1)
+        ray.init(
+            "local", num_cpus=workers * self._cores, include_dashboard=False, object_store_memory=_STORE,
+            _temp_dir=str(self._folder), **quiet,
+        )  # fmt: skip
+
+    def __exit__(self, *_: object) -> None:
+        if self._connected:
+            self._ray.shutdown()
+            self._connected = False
+        if self._folder is not None:
+            shutil.rmtree(self._folder, ignore_errors=True)
+            self._folder = None
+
+    def run(self, jobs: Iterable[Job], watch: Watch = lambda status: None) -> Iterator[Ended]:
+        """Do the jobs, each as it ends; those that fail end with the reason, and the rest goes on.
+
+        Args:
+            watch: told twice a second of the jobs that have begun.
+        """
+        ray = self._ray
+        waiting, most = deque(jobs), self._limits(ray)
+        running: dict[Any, str] = {}
+        while waiting or running:
+            while waiting and len(running) < (self._workers or most["window"]):
+                job = waiting.popleft()
+                running[self._submit(ray, job, most)] = job.key
+            ended, _ = ray.wait(list(running), timeout=_POLL)
+            for reference in ended:
+                yield _ended(ray, running.pop(reference), reference)
+            watch(self._status(ray))
+
+    def _limits(self, ray: Any) -> dict[str, float]:
+        """What the largest node has: a job that declares more would wait for ever; and how many jobs to hand over."""
+        nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+        cpus = [node.get("CPU", 0) for node in nodes]
+        if max(cpus, default=0) < 1:
+            raise UsageError(f"--ray {self._address}: no node of that cluster has a processor to work with")
+        return {"CPU": max(cpus), "memory": max(node.get("memory", 0) for node in nodes), "window": 4 * sum(cpus)}
+
+    def _submit(self, ray: Any, job: Job, most: Mapping[str, float]) -> Any:
+        remote = ray.remote(_attempt).options(
+            num_cpus=min(job.cores, most["CPU"]),
+            memory=min(job.memory, most["memory"]),
+            max_retries=ATTEMPTS - 1,
+            name=job.key,
+        )
+        return remote.remote(job, self._board, __version__)
+
+    def _status(self, ray: Any) -> Mapping[str, Status]:
+        try:
+            status: Mapping[str, Status] = ray.get(self._board.all.remote(), timeout=_POLL)
+        except ray.exceptions.RayError:  # it is only for show, and begins anew
+            return {}
+        return status
+
+
+def _check_address(address: str) -> None:
+    """Raise ConnectionError where nobody answers: Ray would go on asking for minutes."""
+    host, colon, port = address.removeprefix("ray://").rpartition(":")
+    if not colon or not port.isdecimal():
+        return  # "auto", and what else Ray knows by name
+    try:
+        socket.create_connection((host, int(port)), _PATIENCE).close()
+    except (OSError, OverflowError) as error:
+        raise ConnectionError(f"nobody answers there: {error}") from None
+
+
+class _Board:
+    """Where jobs say how far they are: an actor of Ray, which lives in a process of its own."""
+
+    def __init__(self) -> None:
+        self._status: dict[str, Status] = {}
+
+    def begin(self, key: str, where: str) -> None:
+        before = self._status.get(key, Status(0))
+        self._status[key] = Status(before.attempts + 1, where=where)
+
+    def tell(self, key: str, done: int, total: int) -> None:
+        self._status[key] = self._status.get(key, Status(1))._replace(done=done, total=total)
+
+    def all(self) -> dict[str, Status]:
+        return self._status
+
+
+def _attempt(job: Job, board: Any, version: str) -> Ended:
+    """In the worker: what a function raises is a result, and only a death is tried again."""
+    board.begin.remote(job.key, f"{socket.gethostname()}:{os.getpid()}")
+    told = 0.0
+
+    def advance(done: int, total: int) -> None:
+        nonlocal told
+        if done == total or time.monotonic() - told >= _POLL:
+            told = time.monotonic()
+            board.tell.remote(job.key, done, total)
+
+    try:
+        if version != __version__:
+            raise Dpm2Error(f"{socket.gethostname()} has dpm2 {__version__}, the caller {version}")
+        return Ended(job.key, job.function(*job.arguments, **({"advance": advance} if job.tells else {})))
+    except Dpm2Error as error:
+        return Ended(job.key, None, str(error))
+    except Exception as error:  # a bug ends its job, not the hours of the others
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        return Ended(job.key, None, f"{type(error).__name__}: {error} ({Path(last.filename).name}:{last.lineno})")
+
+
+def _ended(ray: Any, key: str, reference: Any) -> Ended:
+    try:
+        ended: Ended = ray.get(reference)
+    except ray.exceptions.OutOfMemoryError:
+        return Ended(key, None, "its worker was ended: the machine was short of memory")
+    except ray.exceptions.RayTaskError as error:
+        return Ended(key, None, f"not sent back: {error.cause}")
+    except ray.exceptions.RayError as error:
+        lines = str(error).strip().splitlines() or [type(error).__name__]
+        return Ended(key, None, f"{ATTEMPTS} workers died over it: {lines[0]}")
+    return ended

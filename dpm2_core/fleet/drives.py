@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Drives of a fleet: as paths or as a manifest in; each run by the code of `dpm2 run`, in a folder of its own."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field
+
+from dpm2_core.config import Settings, load_settings, read_yaml, settings_from
+from dpm2_core.data.source import parse_range
+from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.fleet.part import Advance, Figures, Part
+from dpm2_core.network.pretrained import weights_path
+from dpm2_core.pipeline import OfflineRun
+from dpm2_core.slam.settings import Config
+from dpm2_core.slam.system import SlamResult
+
+MAP = "drive.dpm2map"
+"""In the folder of a drive: its map file."""
+_WORK = "dpm2_core.fleet.drives:run_drive"
+_MANIFEST = (".yaml", ".yml")
+
+
+class ManifestDrive(Settings):
+    """A drive of a manifest."""
+
+    path: str
+    """The recording; relative to the manifest's folder."""
+    name: str = ""
+    """Its folder in the results; that of its last folder or file by default."""
+    frames: str = ":"
+    """Which frames, a:b by position from 0."""
+    gt: str = ""
+    """Ground truth (KITTI: left camera; TUM: LiDAR), relative to the manifest's folder."""
+    set: tuple[str, ...] = ()
+    """KEY=VALUE of its own, such as input.points_topic=/ouster/points."""
+
+
+class Manifest(Settings):
+    """Drives, and what is particular to each."""
+
+    drives: list[ManifestDrive] = Field(min_length=1)
+
+
+def read_drives(given: Sequence[Path]) -> list[ManifestDrive]:
+    """Drives by their paths, or those of the one manifest that is given; all with names, no two alike.
+
+    Raises:
+        UsageError: a manifest that is none, a name twice, or one that is no name of a folder.
+    """
+    drives = [ManifestDrive(path=str(path)) for path in given]
+    root = Path()
+    if len(given) == 1 and given[0].suffix in _MANIFEST:
+        drives, root = settings_from(Manifest, read_yaml(given[0]), default=str(given[0])).drives, given[0].parent
+    named = [_named(drive, root.resolve()) for drive in drives]
+    twice = [name for name, count in Counter(drive.name for drive in named).items() if count > 1]
+    if twice:
+        paths = " and ".join(drive.path for drive in named if drive.name == twice[0])
+        raise UsageError(f"{paths}: both would be called {twice[0]}; a manifest can give them names")
+    return named
+
+
+def _named(drive: ManifestDrive, root: Path) -> ManifestDrive:
+    path = (root / drive.path).resolve()
+    name = drive.name or (path.stem if path.is_file() else path.name)
+    if not name or name.startswith(".") or "/" in name:
+        raise UsageError(f"{drive.path}: {name!r} is no name for a folder")
+    gt = str((root / drive.gt).resolve()) if drive.gt else ""
+    return drive.model_copy(update={"path": str(path), "name": name, "gt": gt})
+
+
+def parts_of(
+    drives: Sequence[ManifestDrive], config: Path | None, overrides: Sequence[str], prefix: str = ""
+) -> list[Part]:
+    """A part for each drive.
+
+    Args:
+        config, overrides: as of `dpm2 run`, for all drives; those of a drive's own come last.
+        prefix: before the name of each.
+
+    Raises:
+        UsageError: a setting or a span of frames that is none.
+    """
+    return [_part(drive, load_settings(Config, config, [*overrides, *drive.set]), prefix) for drive in drives]
+
+
+def _part(drive: ManifestDrive, config: Config, prefix: str) -> Part:
+    slam, inputs = config.slam, []
+    if slam.uses_descriptors:
+        inputs.append(weights_path(slam.neural.weights).resolve())
+        if Path(slam.neural.weights).is_file():  # a worker has another working directory
+            neural = slam.neural.model_copy(update={"weights": str(inputs[0])})
+            config = config.model_copy(update={"slam": slam.model_copy(update={"neural": neural})})
+    arguments = {
+        "path": drive.path,
+        "frames": parse_range(drive.frames),
+        "gt": drive.gt,
+        "config": config.model_dump(mode="json"),
+    }
+    return Part(prefix + drive.name, _WORK, arguments, inputs, fresh=True, cores=slam.threads)
+
+
+def run_drive(
+    folder: Path, advance: Advance, path: str, frames: tuple[int, int | None], gt: str, config: Mapping[str, Any]
+) -> Figures:
+    """Run a drive; leaves the files of `dpm2 run` and its map in the folder.
+
+    Raises:
+        UsageError: a recording that cannot be opened. Dpm2Error: results that cannot be written.
+    """
+    chosen, truth = settings_from(Config, dict(config)), Path(gt) if gt else None
+    with OfflineRun(path, chosen, (frames[0], frames[1]), truth, folder / MAP) as run:
+        done = 0
+
+        def progress(result: SlamResult) -> None:
+            nonlocal done
+            done += 1
+            advance(done, len(run))
+
+        result = run.run(progress)
+        if result.interrupted:
+            raise KeyboardInterrupt
+        if problem := result.mapper.store_problem:
+            raise Dpm2Error(f"map file incomplete: {problem}")
+        notes = [*run.source.notes, *result.save(folder)]
+        loops, metrics = [loop.ok for loop in result.mapper.loops], result.metrics
+        return {
+            "frames": len(result),
+            "failed_frames": result.methods["failed"],
+            "breaks": result.recorder.breaks,
+            "keyframes": len(result.mapper.keyframes),
+            "loops": {"accepted": sum(loops), "rejected": len(loops) - sum(loops)},
+            "fps": result.fps,
+            "metrics": None if metrics is None else metrics.model_dump(exclude={"per_length", "per_speed"}),
+            "notes": notes,
+        }

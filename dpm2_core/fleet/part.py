@@ -1,0 +1,221 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parts of a larger work: each is done once, in a folder of its own, so that what was stopped goes on."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import multiprocessing
+import resource
+import shutil
+import uuid
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import lru_cache, partial
+from importlib import import_module
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+from dpm2_core.errors import Dpm2Error
+from dpm2_core.evaluation.record import git_commit
+from dpm2_core.files import atomic_write
+
+DONE = "part.json"
+"""In the folder of a part that ended: what it was asked for, and its figures."""
+
+Figures = dict[str, Any]
+Advance = Callable[[int, int], None]
+"""Told how many frames are done, of how many."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """A piece of work.
+
+    Attributes:
+        name: also its folder below that of the whole, such as dpm2/06.
+        work: MODULE:FUNCTION, called with the folder, a function to be told of the progress, and the arguments;
+            returns figures.
+        arguments: whatever JSON can hold.
+        inputs: files that it reads and another part may write, such as weights; a part whose inputs changed is done
+            again.
+        fresh: it begins with an empty folder, which takes its name when all is in it. Else the work finds what an
+            attempt before has left, and goes on with that.
+        cores: processors that it uses.
+    """
+
+    name: str
+    work: str
+    arguments: Mapping[str, Any]
+    inputs: Sequence[Path] = field(default=())
+    fresh: bool = False
+    cores: int = 1
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What is called as parts go on.
+
+    Attributes:
+        frame: name of the part, frames done, frames in all; only where one part runs at a time.
+        part: name of the part that is done, parts done, parts in all.
+    """
+
+    frame: Callable[[str, int, int], None] = lambda name, done, total: None
+    part: Callable[[str, int, int], None] = lambda name, done, total: None
+
+
+def run_parts(
+    parts: Sequence[Part], out: Path, workers: int = 1, progress: Progress | None = None
+) -> dict[str, Figures]:
+    """Figures of every part by its name. Those that are done, with the same arguments and inputs, are only read.
+
+    Args:
+        workers: parts at a time; more than one run in processes of their own.
+
+    Raises:
+        Dpm2Error: a part failed; it is named. Those that are done stay.
+    """
+    progress = progress or Progress()
+    found = {part.name: figures for part in parts if (figures := figures_of(part, out)) is not None}
+    missing = [part for part in parts if part.name not in found]
+    for name, figures in _fresh(missing, out, workers, progress):
+        found[name] = figures
+        progress.part(name, len(found), len(parts))
+    return {part.name: found[part.name] for part in parts}
+
+
+def _fresh(parts: Sequence[Part], out: Path, workers: int, progress: Progress) -> Iterator[tuple[str, Figures]]:
+    """Do the parts, each as it ends."""
+    if workers < 2 or len(parts) < 2:
+        for part in parts:
+            yield part.name, _named(part, out, partial(progress.frame, part.name))
+        return
+    context = multiprocessing.get_context("spawn")  # a fork would inherit torch's threads half
+    with ProcessPoolExecutor(workers, mp_context=context) as pool:
+        running = {pool.submit(_named, part, out): part.name for part in parts}
+        try:
+            for future in as_completed(running):
+                yield running[future], future.result()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def _named(part: Part, out: Path, advance: Advance = lambda done, total: None) -> Figures:
+    try:
+        return do_part(part, out, advance)
+    except Dpm2Error as error:
+        raise type(error)(f"{part.name}: {error}") from error
+
+
+def do_part(part: Part, out: Path, advance: Advance = lambda done, total: None) -> Figures:
+    """Do a part in this process, whether it was done before or not; returns its figures.
+
+    Raises:
+        Dpm2Error: it failed, or its results could not be written. Of a fresh part nothing is left then.
+    """
+    module, _, name = part.work.partition(":")
+    work = getattr(import_module(module), name)
+    began = perf_counter()
+    with _folder(part, out) as folder:
+        figures: Figures = work(folder, advance, **part.arguments)
+        record = {
+            **_asked(part),
+            "commit": git_commit(),
+            "seconds": round(perf_counter() - began, 1),
+            "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),  # of the process so far
+            "files": _sizes(folder) if part.fresh else {},
+            "figures": figures,
+        }
+        with atomic_write(folder / DONE) as file:
+            file.write(json.dumps(record, indent=1) + "\n")
+    return _read(record)
+
+
+def figures_of(part: Part, out: Path) -> Figures | None:
+    """What a part that ended has found; None where it has not, was asked for something else, or is not whole."""
+    try:
+        record = json.loads((out / part.name / DONE).read_text(encoding="utf-8"))
+        if {key: record[key] for key in ("arguments", "inputs")} != json.loads(json.dumps(_asked(part))):
+            return None
+        there = _sizes(out / part.name)
+        if any(there.get(name) != size for name, size in record.get("files", {}).items()):
+            return None  # copied in part, or a disk that lost what it had taken
+        return _read(record)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return None
+
+
+def remove_attempts(part: Part, out: Path) -> None:
+    """Remove what attempts that were killed have left; none may be running."""
+    folder = out / part.name
+    for left in folder.parent.glob(f".{folder.name}.*.attempt"):
+        shutil.rmtree(left, ignore_errors=True)
+
+
+@contextmanager
+def _folder(part: Part, out: Path) -> Iterator[Path]:
+    """The folder to work in: its own, or one that takes its place at the end of the block.
+
+    No two attempts work in the same one: that of a worker that was given up for dead may still be at it.
+    """
+    folder = out / part.name
+    if not part.fresh:
+        folder.mkdir(parents=True, exist_ok=True)
+        yield folder
+        return
+    attempt, old = (folder.with_name(f".{folder.name}.{uuid.uuid4().hex}.attempt") for _ in range(2))
+    try:
+        with _explained(folder):
+            attempt.mkdir(parents=True)
+            made = attempt.stat().st_ino
+        yield attempt
+        with _explained(folder):
+            if attempt.stat().st_ino != made:  # removed meanwhile, and made anew by what was written later
+                raise Dpm2Error(f"{attempt}: removed while it was written to")
+            if figures_of(part, out) is None:  # else another attempt was first, with the same
+                if folder.exists():
+                    folder.rename(old)
+                attempt.rename(folder)
+    finally:
+        shutil.rmtree(attempt, ignore_errors=True)
+        shutil.rmtree(old, ignore_errors=True)
+
+
+@contextmanager
+def _explained(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise Dpm2Error(f"{folder}: not written: {error.strerror or error}") from error
+
+
+def _sizes(folder: Path) -> dict[str, int]:
+    """Bytes of each file in a folder and below."""
+    return {str(path.relative_to(folder)): path.stat().st_size for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def _read(record: Mapping[str, Any]) -> Figures:
+    return {**record["figures"], "part": {key: record[key] for key in ("commit", "seconds", "peak_memory_mb")}}
+
+
+def _asked(part: Part) -> dict[str, Any]:
+    return {"arguments": dict(part.arguments), "inputs": {str(path): _digest(path) for path in part.inputs}}
+
+
+def _digest(path: Path) -> str | None:
+    if not path.is_file():
+        return None
+    stat = path.stat()
+    return _hashed(path, stat.st_mtime_ns, stat.st_size)
+
+
+@lru_cache
+def _hashed(path: Path, mtime_ns: int, size: int) -> str:
+    """SHA-256 of a file; many parts read the same weights. `mtime_ns` and `size`: as it is now."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

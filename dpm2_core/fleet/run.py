@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The parts of a fleet on a cluster: what is whole is kept, what fails is named, and the rest goes on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+from dpm2_core.files import write_json
+from dpm2_core.fleet.cluster import Cluster, Job, Status
+from dpm2_core.fleet.part import Figures, Part, do_part, figures_of, remove_attempts
+from dpm2_core.tables import FigureTable
+
+SUMMARY = "fleet.json"
+"""In the folder of the results: what became of each drive."""
+MEMORY = 2 * 10**9
+"""Bytes that a drive declares; 1.2 GB were measured with the network, the rest is room."""
+
+
+class Outcome(NamedTuple):
+    """What became of a part: done now, kept from before, failed with the reason, or not done when it was stopped."""
+
+    name: str
+    state: Literal["done", "kept", "failed", "stopped"]
+    figures: Figures | None = None
+    reason: str = ""
+
+
+class View:
+    """What is told as a fleet goes on; this one says nothing."""
+
+    def begun(self, names: Sequence[str]) -> None:
+        """These are to be done."""
+
+    def running(self, status: Mapping[str, Status]) -> None:
+        """Twice a second: those that have begun."""
+
+    def ended(self, outcome: Outcome) -> None:
+        """This one is whole, or failed."""
+
+
+def carry_out(parts: Sequence[Part], out: Path, cluster: Cluster, view: View | None = None) -> list[Outcome]:
+    """Do all parts that are not whole yet and write OUT/fleet.json; Ctrl-C ends it early, and the rest is "stopped".
+
+    Args:
+        cluster: not entered yet; Ray is started only where there is something to do.
+
+    Raises:
+        UsageError: no Ray. Dpm2Error: the folder or the summary cannot be written.
+    """
+    view, out = view or View(), out.resolve()  # a worker has another working directory
+    kept = {part.name: figures for part in parts if (figures := figures_of(part, out)) is not None}
+    outcomes = {name: Outcome(name, "kept", figures) for name, figures in kept.items()}
+    missing = [part for part in parts if part.name not in kept]
+    view.begun([part.name for part in missing])
+    try:
+        if missing:
+            with cluster:
+                for name, figures, reason in cluster.run([_job(part, out) for part in missing], view.running):
+                    outcomes[name] = Outcome(name, "failed" if reason else "done", figures, reason)
+                    view.ended(outcomes[name])
+    except KeyboardInterrupt:
+        pass
+    finally:
+        for part in missing:
+            remove_attempts(part, out)
+    found = [outcomes.get(part.name, Outcome(part.name, "stopped")) for part in parts]
+    write_json(out / SUMMARY, {"drives": [outcome._asdict() for outcome in found]})
+    return found
+
+
+def _job(part: Part, out: Path) -> Job:
+    return Job(part.name, do_part, (part, out), tells=True, cores=part.cores, memory=MEMORY)
+
+
+def summary_table(title: str, outcomes: Sequence[Outcome]) -> FigureTable:
+    """A row for each drive, those that failed last."""
+    figures = ("frames", "keyframes", "loops", "breaks", "t_err %", "APE m", "s", "MB")
+    table = FigureTable(title, names=["drive", "state"], figures=figures, text=["notes"])
+    order = sorted(outcomes, key=lambda outcome: outcome.state in ("failed", "stopped"))
+    for outcome in order:
+        table.add_row(outcome.name, outcome.state, *_cells(outcome.figures), outcome.reason)
+    return table
+
+
+def _cells(figures: Figures | None) -> list[str]:
+    if figures is None:
+        return ["-"] * 8
+    metrics: Mapping[str, Any] = figures["metrics"] or {}
+    errors = [_number(metrics.get(name)) for name in ("t_err_percent", "ape_rmse_m")]
+    part = figures["part"]
+    counts = (figures["frames"], figures["keyframes"], figures["loops"]["accepted"], figures["breaks"])
+    return [*map(str, counts), *errors, f"{part['seconds']:.0f}", str(part["peak_memory_mb"])]
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"

@@ -1,0 +1,201 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A fleet on a real Ray cluster: results are those of `dpm2 run`, and no fault costs more than what it hits."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dpm2_core.errors import UsageError
+from dpm2_core.fleet.cluster import Cluster, Job
+from dpm2_core.fleet.drives import MAP, parts_of, read_drives
+from dpm2_core.fleet.run import SUMMARY, carry_out
+from dpm2_core.slam.store.check import check_map
+from dpm2_core.slam.store.map_store import MapStore
+
+from ...helpers.command import dpm2
+from ...helpers.drives import first_scans
+
+FAST = ["slam.registration=geometric", "slam.loops.descriptors=false", "slam.threads=1"]
+SET = [word for setting in FAST for word in ("--set", setting)]
+SAME = ("trajectory_kitti.txt", "trajectory.tum", "map.ply", "pose_graph.g2o", "loops.csv", "config.yaml")
+WORK = """
+import os
+import resource
+import signal
+from dpm2_core.fleet import drives
+
+def full_disk(folder, advance, **arguments):
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, before[1]))
+    try:
+        return drives.run_drive(folder, advance, **arguments)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+def killed_once(folder, advance, **arguments):
+    marker = folder.parent / "killed"
+    def dying(done, total):
+        if done == 6 and not marker.exists():
+            marker.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+    return drives.run_drive(folder, dying, **arguments)
+
+def divide(value):
+    if value < 0:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return 10 // value
+"""
+"""A drive on a disk on which no file can grow beyond 50 kB; one whose first worker dies half-way; a function that kills
+its worker, has a bug, or neither."""
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
+    """Two workers, which every command of this module uses; they can import `fleet_work`."""
+    pytest.importorskip("ray", reason="no ray: pip install 'dpm2_ros[fleet]'")
+    folder = tmp_path_factory.mktemp("work")
+    (folder / "fleet_work.py").write_text(WORK)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(folder)
+        patch.setenv("PYTHONPATH", os.pathsep.join([str(folder), os.environ.get("PYTHONPATH", "")]))
+        with Cluster(workers=2) as cluster:
+            yield cluster
+
+
+@pytest.fixture(scope="module")
+def drives(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Two drives of 12 scans, and a folder that is none."""
+    root = tmp_path_factory.mktemp("drives")
+    (root / "nothing").mkdir()
+    return [*(first_scans(recording, 12, root / name) for name in ("one", "two")), root / "nothing"]
+
+
+@pytest.fixture(scope="module")
+def alone(drives: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The results of `dpm2 run` on the first drive."""
+    out = tmp_path_factory.mktemp("alone")
+    assert dpm2("run", drives[0], "--out", out, "--map", out / MAP, *SET).returncode == 0
+    return out
+
+
+def equal(one: Path, other: Path) -> None:
+    """Every file that holds no times is the same, byte for byte; and every row of the maps."""
+    for name in SAME:
+        assert (one / name).read_bytes() == (other / name).read_bytes(), name
+    with MapStore.open(one / MAP) as a, MapStore.open(other / MAP) as b:
+        for table in ("keyframes", "payloads", "edges", "poses", "moving", "trail"):
+            assert list(a.rows(table)) == list(b.rows(table)), table
+
+
+def test_without_ray_or_without_its_cluster_one_line_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    done = dpm2("fleet", "run", tmp_path, "--out", tmp_path / "out")
+    assert done.returncode == 2
+    assert "pip install 'dpm2_ros[fleet]'" in done.stderr
+    monkeypatch.undo()
+    ray = pytest.importorskip("ray", reason="no ray: pip install 'dpm2_ros[fleet]'")
+    if ray.is_initialized():
+        pytest.skip("this process is connected to a cluster, which is then used")
+    with pytest.raises(UsageError, match=r"^--ray 127\.0\.0\.1:9: nobody answers there"):
+        Cluster("127.0.0.1:9").__enter__()
+
+
+@pytest.mark.slow
+def test_a_fleet_gives_what_runs_give_and_goes_on_where_it_was(
+    cluster: Cluster, drives: list[Path], alone: Path, tmp_path: Path
+) -> None:
+    """A drive that cannot be read is named; what is whole stays as it is, what is damaged is done again."""
+    out = tmp_path / "out"
+    done = dpm2("fleet", "run", *drives, "--out", out, *SET)
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1].startswith("dpm2: 1 of 3 failed: nothing")
+    summary = {row["name"]: row for row in json.loads((out / SUMMARY).read_text())["drives"]}
+    assert {name: row["state"] for name, row in summary.items()} == {"one": "done", "two": "done", "nothing": "failed"}
+    assert str(drives[2]) in summary["nothing"]["reason"]
+    assert summary["one"]["figures"]["frames"] == 12
+    assert sorted(path.name for path in out.iterdir()) == [SUMMARY, "one", "two"], "nothing half-written is left"
+    equal(out / "one", alone)
+    equal(out / "two", alone)  # the same scans
+    assert not check_map(out / "two" / MAP).problems
+    before = (out / "one" / MAP).stat().st_mtime_ns
+    (out / "two" / "map.ply").write_bytes((out / "two" / "map.ply").read_bytes()[:100])
+    assert dpm2("fleet", "run", *drives[:2], "--out", out, *SET).returncode == 0
+    again = json.loads((out / SUMMARY).read_text())["drives"]
+    assert [row["state"] for row in again] == ["kept", "done"]
+    assert (out / "one" / MAP).stat().st_mtime_ns == before
+    equal(out / "two", alone)
+
+
+@pytest.mark.slow
+def test_faults_cost_only_what_they_hit(cluster: Cluster, drives: list[Path], alone: Path, tmp_path: Path) -> None:
+    """A worker that is killed with -9 is replaced, a full disk leaves no drive behind; all in one fleet."""
+    parts = parts_of(read_drives(drives[:2]), None, FAST)
+    names = ("killed_once", "full_disk")
+    parts = [replace(part, work=f"fleet_work:{name}") for part, name in zip(parts, names, strict=True)]
+    out = tmp_path / "out"
+    whole, full = carry_out(parts, out, Cluster())
+    assert (whole.state, full.state) == ("done", "failed")
+    assert any(words in full.reason for words in ("File too large", "disk", "full")), full.reason
+    equal(out / "one", alone)
+    assert sorted(path.name for path in out.iterdir()) == [SUMMARY, "killed", "one"]
+
+
+@pytest.mark.slow
+def test_what_kills_every_worker_ends_with_a_reason(cluster: Cluster) -> None:
+    """And a bug is one line, with its place; the other jobs go on."""
+    divide = import_module("fleet_work").divide
+    jobs = [Job(str(value), divide, (value,), memory=10**15) for value in (-1, 0, 2)]  # bytes that no machine has
+    found = {ended.key: ended for ended in cluster.run(jobs)}
+    assert found["2"].value == 5
+    assert found["-1"].reason.startswith("3 workers died over it")
+    assert found["0"].reason.startswith("ZeroDivisionError: ")
+    assert "fleet_work.py:" in found["0"].reason
+
+
+def test_drives_of_a_manifest_have_names_and_settings_of_their_own(tmp_path: Path) -> None:
+    manifest = tmp_path / "fleet.yaml"
+    manifest.write_text(
+        "drives: [{path: a/00}, {path: b/00, name: b00, frames: '5:9', gt: true.txt, set: [slam.threads=1]}]"
+    )
+    parts = parts_of(read_drives([manifest]), None, ["slam.registration=geometric"])
+    assert [part.name for part in parts] == ["00", "b00"]
+    assert parts[1].arguments["path"] == str(tmp_path / "b" / "00")
+    assert parts[1].arguments["gt"] == str(tmp_path / "true.txt")
+    assert parts[1].arguments["frames"] == (5, 9)
+    assert [part.cores for part in parts] == [2, 1]
+    assert parts[0].arguments["config"]["slam"]["registration"] == "geometric"
+
+
+@pytest.mark.parametrize(("text", "words"), [
+    ("drives: []", "drives"),
+    ("drives: [{path: a, speed: 3}]", "speed"),
+    ("drives: [{path: a}, {path: b/a}]", "both would be called a"),
+    ("drives: [{path: a, name: ../b}]", "no name for a folder"),
+    ("drives: [{path: a, frames: x}]", "want a:b"),
+])  # fmt: skip
+def test_a_bad_manifest_is_an_error_of_use(text: str, words: str, tmp_path: Path) -> None:
+    manifest = tmp_path / "fleet.yaml"
+    manifest.write_text(text)
+    done = dpm2("fleet", "run", manifest, "--out", tmp_path / "out")
+    assert done.returncode == 2
+    assert words in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_weights_are_found_from_any_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(Path(__file__), "own.safetensors")
+    (part,) = parts_of(read_drives([Path("00")]), None, ["slam.neural.weights=own.safetensors"])
+    config: Any = part.arguments["config"]
+    assert config["slam"]["neural"]["weights"] == str(tmp_path / "own.safetensors")
+    assert part.inputs == [tmp_path / "own.safetensors"]
