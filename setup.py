@@ -102,7 +102,7 @@ setup(
     maintainer="The dpm2 developers",
     maintainer_email="dpm2@example.org",
     packages=find_packages(include=["dpm2_core", "dpm2_core.*", "dpm2_ros", "dpm2_ros.*"]),
-    package_data={"dpm2_core": ["py.typed", "weights/*", "network/presets/*", "evaluation/assets/*"]},
+    package_data={"dpm2_core": ["py.typed", "weights/*", "network/presets/*", "slam/presets/*", "evaluation/assets/*"]},
     data_files=data_files,
     python_requires=">=3.11,<3.13",
     # On a machine with ROS 2 sourced, its own packages serve, and the wheels would shadow them.

@@ -45,6 +45,7 @@ BENCHES: dict[str, Bench] = {
     "map": _bench("map:bench_map", "source set"),
     "memory": _bench("memory:bench_memory", "source threads set"),
     "neural": _bench("neural:bench_neural", "source kitti repetitions threads set weights unseen pairs only"),
+    "paper": _bench("paper:bench_paper", "source kitti threads set weights only"),
     "pose-graph": _bench("pose_graph:bench_pose_graph", "kitti repetitions"),
     "relocalise": _bench("relocalise:bench_relocalise", "source kitti threads set pairs"),
     "roads": _bench("roads:bench_roads", "source kitti threads set"),

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import annotated_types
 from pydantic.fields import FieldInfo
 
-from dpm2_core.config import Settings, flat_fields, load_settings, settings_from
+from dpm2_core.config import Settings, flat_fields, load_settings, read_yaml, settings_from
 from dpm2_core.errors import UsageError
 
 if TYPE_CHECKING:
@@ -54,12 +54,13 @@ def load_parameters(node: Node, kind: type[T]) -> T:
         raise UsageError("qos_overrides is not supported; ros.reliability and ros.queue_depth are the inputs' QoS")
     if unknown := sorted(set(given) - set(fields)):
         raise UsageError(f"unknown parameter {', '.join(unknown)}; docs/parameters.md lists them")
-    tree = load_settings(kind, Path(file) if file else None).model_dump()
+    load_settings(kind, Path(file) if file else None)  # its mistakes are its own
+    tree = read_yaml(Path(file)) if file else {}  # only what is given: a preset may change the rest
     for name, value in given.items():
         branch = tree
         *path, leaf = name.split(".")
         for part in path:
-            branch = branch[part]
+            branch = branch.setdefault(part, {})
         branch[leaf] = value.tolist() if hasattr(value, "tolist") else value
     config = settings_from(kind, tree, dict.fromkeys(given, "ROS parameter"))
     for name in declared:
@@ -132,7 +133,7 @@ def _type_name(annotation: Any) -> str:
     if origin is typing.Annotated:
         return _type_name(args[0])
     if origin is typing.Literal:
-        return " or ".join(str(arg) for arg in args)
+        return " or ".join(str(arg) or "empty" for arg in args)
     if origin in (typing.Union, types.UnionType):
         return " or ".join(_type_name(arg) for arg in args)
     if origin in (tuple, list):

@@ -16,7 +16,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.network.decoder import Decoder, Prepared
 from dpm2_core.network.encoder import Encoder
 from dpm2_core.network.matching import correspond, match_scores
-from dpm2_core.network.pose_solver import register_batch
+from dpm2_core.network.pose_solver import Solver, register_batch
 from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.network.tokens import Tokens, to_tokens
 
@@ -24,11 +24,16 @@ _KEPT = 4  # sets that are prepared: a scan, the map before a pause and the one 
 
 
 class DeepPointMap2(nn.Module):
-    """The whole network."""
+    """The whole network.
+
+    Attributes:
+        solver: how pairs of descriptors become a pose.
+    """
 
     def __init__(self, settings: NetworkSettings) -> None:
         super().__init__()
         self.settings = settings
+        self.solver: Solver = "consensus"
         self.encoder = Encoder(settings)
         self.decoder = Decoder(settings)
         self._prepared: tuple[tuple[Descriptors, Tokens, Prepared], ...] = ()  # by `register`, the last used first
@@ -50,7 +55,7 @@ class DeepPointMap2(nn.Module):
         with torch.autocast(next(self.parameters()).device.type, torch.bfloat16):
             (y, prepared_target), (x, prepared_source) = self._prepare(target), self._prepare(source)
             correlated = self.decoder.correlate(prepared_source, prepared_target)
-            return _tilted(register_batch(self.decoder, x, y, correlated)[0], source, target)
+            return _tilted(register_batch(self.decoder, x, y, correlated, self.solver)[0], source, target)
 
     def _prepare(self, descriptors: Descriptors) -> tuple[Tokens, Prepared]:
         """A set for the decoder, made or kept."""
@@ -69,7 +74,8 @@ class DeepPointMap2(nn.Module):
         source = to_tokens([s.level() for s in sources], self.decoder.view_aligned, device)
         target = to_tokens([t.level() for t in targets], self.decoder.view_aligned, device)
         with torch.autocast(device.type, torch.bfloat16):
-            level = register_batch(self.decoder, source, target, self.decoder(source, target))
+            correlated = self.decoder(source, target)
+            level = register_batch(self.decoder, source, target, correlated, self.solver)
         return [_tilted(*row) for row in zip(level, sources, targets, strict=True)]
 
     def overlap(self, sources: Sequence[Descriptors], targets: Sequence[Descriptors]) -> list[float]:

@@ -2,12 +2,12 @@
 """Pairs of points to a pose: consensus, precision-weighted solve or robust SVD, and its overlap probability.
 
 Beyond the paper: the first pose is a consensus of pairs that keep each other's distances, and with it the descriptors
-are matched again, each to what lies near it.
+are matched again, each to what lies near it. The paper's own way is the solver `confident`.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -28,6 +28,11 @@ CONFIDENT = 30  # pairs whose mean confidence is that of the registration
 CHI2 = 11.3  # 99 % quantile with 3 degrees of freedom: inliers of the precision-weighted solve
 ROUNDS = 8  # of the precision-weighted solve
 SOFT = 3.0  # degrees of freedom of the Student weights in the precision-weighted solve
+MOST_CONFIDENT, SURE = 64, 0.5  # the solver `confident` starts from so many pairs, and from those that are so probable
+
+Solver = Literal["consensus", "confident"]
+"""How pairs become a pose: by a consensus and matched again with the pose at hand; or, as in the paper, by a robust SVD
+that starts from the most confident pairs, matched once."""
 
 
 def first_pose(pairs: Correspondences) -> Tensor:
@@ -36,20 +41,31 @@ def first_pose(pairs: Correspondences) -> Tensor:
     return consensus(pairs.source[:, :half], pairs.target[:, :half], pairs.weight[:, :half])
 
 
-def robust_kabsch(pairs: Correspondences, T: Tensor, rounds: int = 3) -> tuple[Tensor, Tensor]:
+def supporting(pairs: Correspondences, T: Tensor) -> Tensor:
+    """The pairs (B, 2K) within `TOLERANCE` of a rough pose (B, 4, 4); all where they are few."""
+    usable = pairs.weight > 0
+    error = (transform(T, pairs.source) - pairs.target).norm(dim=-1)
+    inliers = (error <= TOLERANCE) & usable
+    few = inliers.sum(1, keepdim=True) < MIN_INLIERS
+    return torch.where(few, usable, inliers)
+
+
+def most_confident(pairs: Correspondences) -> Tensor:
+    """The pairs (B, 2K) that the paper's solver starts from: the `MOST_CONFIDENT`, and all that are `SURE`."""
+    least = pairs.weight.topk(min(MOST_CONFIDENT, pairs.weight.shape[1]))[0][:, -1:]
+    return (pairs.weight >= least.clamp(max=SURE)) & (pairs.weight > 0)
+
+
+def robust_kabsch(pairs: Correspondences, inliers: Tensor, rounds: int = 3) -> tuple[Tensor, Tensor]:
     """Weighted SVD on inliers that are chosen anew each round: those within mean + 3 deviations of the inliers.
 
     Args:
-        T: (B, 4, 4), rough pose; the first inliers are the pairs within `TOLERANCE` of it.
+        inliers: (B, 2K), the first.
 
     Returns:
         T (B, 4, 4) float64 and inliers (B, 2K).
     """
     usable = pairs.weight > 0
-    error = (transform(T, pairs.source) - pairs.target).norm(dim=-1)
-    inliers = (error <= TOLERANCE) & usable
-    few = inliers.sum(1, keepdim=True) < MIN_INLIERS
-    inliers = torch.where(few, usable, inliers)
     T = weighted_kabsch(pairs.source, pairs.target, pairs.weight * inliers)
     for _ in range(rounds):
         error = (transform(T, pairs.source) - pairs.target).norm(dim=-1)
@@ -129,14 +145,19 @@ class Solved(NamedTuple):
     confidence: Tensor
 
 
-def solve_batch(decoder: Decoder, source: Tokens, target: Tokens, correlated: Correlated) -> Solved | None:
+def solve_batch(
+    decoder: Decoder, source: Tokens, target: Tokens, correlated: Correlated, solver: Solver = "consensus"
+) -> Solved | None:
     """Match and solve; None where there is nothing to match."""
     scores = match_scores(decoder, correlated)
     unguided = pairs = correspond(decoder, source, target, correlated, scores)
     if pairs.weight.shape[1] == 0:
         return None
+    if solver == "confident":
+        T, information, inliers = _solve_svd(pairs, most_confident(pairs))
+        return Solved(T, information, pairs, inliers, _confidence(pairs, T))
     T = first_pose(pairs)
-    solve = _solve_precise if decoder.settings.precision else _solve_svd
+    solve = _solve_precise if decoder.settings.precision else _solve_svd_near
     T, information, inliers = solve(pairs, T)
     for _ in range(decoder.settings.guided):
         pairs = correspond(decoder, source, target, correlated, guided_scores(scores, T, source, target))
@@ -159,9 +180,11 @@ def overlap_probability(
     return decoder.overlap(*correlated, source.mask, target.mask, overlap_features(solved)).sigmoid()
 
 
-def register_batch(decoder: Decoder, source: Tokens, target: Tokens, correlated: Correlated) -> list[Registration]:
+def register_batch(
+    decoder: Decoder, source: Tokens, target: Tokens, correlated: Correlated, solver: Solver = "consensus"
+) -> list[Registration]:
     """The registrations of a batch, T_target_source each."""
-    solved = solve_batch(decoder, source, target, correlated)
+    solved = solve_batch(decoder, source, target, correlated, solver)
     if solved is None:
         return [_nothing("0 matching descriptors, want 3")] * len(source.xyz)
     T, inliers = solved.T, solved.inliers
@@ -197,9 +220,14 @@ def _solve_compiled(pairs: Correspondences, T: Tensor) -> tuple[Tensor, Tensor, 
     return poses, information, squared
 
 
-def _solve_svd(pairs: Correspondences, T: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _solve_svd_near(pairs: Correspondences, T: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """`_solve_svd` from the pairs that support a pose."""
+    return _solve_svd(pairs, supporting(pairs, T))
+
+
+def _solve_svd(pairs: Correspondences, inliers: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Pose, information and inliers by the robust SVD: every offset counts as known like the others."""
-    T, inliers = robust_kabsch(pairs, T)
+    T, inliers = robust_kabsch(pairs, inliers)
     error = (transform(T, pairs.source.double()) - pairs.target).norm(dim=-1)
     rmse = ((error**2 * inliers).sum(1) / inliers.sum(1).clamp(min=1)).sqrt()
     sigma = rmse.clamp(min=0.02)[:, None, None, None] / 3**0.5

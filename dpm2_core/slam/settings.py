@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal, get_args
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from dpm2_core.config import Settings
+from dpm2_core.config import Settings, merged, read_yaml
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.slam.filters import FilterSettings
 from dpm2_core.slam.graph.pose_graph import PoseGraphSettings
@@ -26,6 +28,9 @@ from dpm2_core.slam.registration.visual import VisualSettings
 class SlamSettings(Settings):
     """The SLAM, stage by stage."""
 
+    preset: Literal["", "paper"] = ""
+    """Changes to the other defaults of `slam`; what is set besides has precedence. paper: the SLAM of DeepPointMap2 as
+    published, by the network alone (docs/experiments.md)."""
     registration: Literal["geometric", "neural", "refined", "adaptive"] = "adaptive"
     """How a scan finds its pose: by points, by neural descriptors, by both (refined), or by points that ask the network
     where they do not know (adaptive): at the start, after a pause, at few frames per second, along a tunnel. Adaptive
@@ -44,6 +49,14 @@ class SlamSettings(Settings):
     relocalise: RelocalizationSettings = RelocalizationSettings()
     pose_graph: PoseGraphSettings = PoseGraphSettings()
     map: MapSettings = MapSettings()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_preset(cls, given: Any) -> Any:
+        """What the preset changes, under what is given."""
+        name = given.get("preset") if isinstance(given, Mapping) else None
+        path = Path(__file__).with_name("presets") / f"{name}.yaml"
+        return merged(read_yaml(path), given) if name in get_args(cls.model_fields["preset"].annotation)[1:] else given
 
     @property
     def uses_descriptors(self) -> bool:

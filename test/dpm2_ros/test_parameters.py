@@ -134,3 +134,16 @@ def test_malformed_ros_arguments_are_an_error_of_use(arguments: tuple[str, ...],
 
 def test_the_page_of_parameters_is_up_to_date() -> None:
     assert DOCS.read_text() == page(NodeConfig), "run `make parameters`"
+
+
+def test_a_preset_changes_what_is_not_given_and_shows_in_the_parameters(tmp_path: Path) -> None:
+    """Also above a file of settings: neither its defaults nor those of the node count as given."""
+    file = tmp_path / "config.yaml"
+    file.write_text("slam: {keyframes: {distance: 7.0}}")
+    config, node = load("slam.preset:=paper", f"config_file:={file}", "slam.neural.refined:=4")
+    assert (config.slam.neural.solver, config.slam.neural.refined, config.slam.keyframes.distance) == (
+        "confident",
+        4,
+        7,
+    )
+    assert node.get_parameter("slam.neural.solver").value == "confident"

@@ -71,7 +71,7 @@ class Fleet:
         )
         message = self.folder / f"{name}.log"
         new = lambda: "waiting for clouds" in message.read_text() and self._listeners(name) - before  # noqa: E731
-        self.harness.wait(new, name, timeout=60)
+        self.harness.wait(new, name)
         time.sleep(0.5)  # until the new one knows of this end, too
         return process
 
@@ -101,6 +101,12 @@ class Fleet:
         except Dpm2Error:  # the file is being made
             return []
 
+    def received(self, name: str, count: int, file: str = "map.dpm2map") -> None:
+        """Wait until the first keyframes of a robot are in the map, and no others."""
+        with suppress(AssertionError):
+            self.harness.wait(lambda: self.ids(name, file) == list(range(count)), f"{name}'s keyframes")
+        assert self.ids(name, file) == list(range(count)), (self.folder / "mapper.log").read_text()[-2000:]
+
     def T_map_lidar(self, name: str) -> Array | None:
         """By the last transforms; None before map -> odom is known."""
         last = {t.child_frame_id: transform_matrix(t.transform) for m in list(self.tf) for t in m.transforms}
@@ -128,7 +134,7 @@ def test_two_robots_one_map_each_with_its_own_correction(fleet: Fleet) -> None:
     fleet.robot("red")
     fleet.drive("red", *range(19))
     wait = fleet.harness.wait
-    wait(lambda: fleet.ids("red") == list(range(7)), "red's keyframes", timeout=40)
+    fleet.received("red", 7)
     for scan in range(19, 24):  # keyframes are sent again, odometry is not: the mapper may begin to listen late
         fleet.drive("red", scan)
         with suppress(AssertionError):
@@ -137,8 +143,8 @@ def test_two_robots_one_map_each_with_its_own_correction(fleet: Fleet) -> None:
     wait(lambda: fleet.T_map_lidar("red") is not None, "map -> red/odom")
     fleet.robot("blue")
     fleet.drive("blue", *range(6, 24))
-    wait(lambda: fleet.ids("blue") == list(range(6)), "blue's keyframes", timeout=40)
-    wait(lambda: "blue: its place" in (fleet.folder / "mapper.log").read_text(), "blue in red's map", timeout=40)
+    fleet.received("blue", 6)
+    wait(lambda: "blue: its place" in (fleet.folder / "mapper.log").read_text(), "blue in red's map")
     fleet.drive("blue", 24, 25)
     poses = fleet.source.poses
     assert poses is not None
@@ -159,17 +165,17 @@ def test_an_outage_costs_nothing(fleet: Fleet) -> None:
     fleet.robot("red")
     fleet.drive("red", *range(6))
     wait = fleet.harness.wait
-    wait(lambda: fleet.ids("red", "first.dpm2map"), "the first keyframe", timeout=40)
+    wait(lambda: fleet.ids("red", "first.dpm2map"), "the first keyframe")
     first.send_signal(signal.SIGSTOP)
     fleet.drive("red", *range(6, 18))
     first.send_signal(signal.SIGCONT)
     # 2 m between keyframes, 0.93 m between scans
-    wait(lambda: fleet.ids("red", "first.dpm2map") == list(range(6)), "what it missed", timeout=40)
+    fleet.received("red", 6, "first.dpm2map")
     first.kill()
     first.wait()
     fleet.drive("red", *range(18, 24))
     fleet.mapper("second.dpm2map")
-    wait(lambda: fleet.ids("red", "second.dpm2map") == list(range(8)), "the whole drive", timeout=60)
+    fleet.received("red", 8, "second.dpm2map")
 
 
 def test_a_robot_that_is_killed_and_comes_back(fleet: Fleet) -> None:
@@ -178,12 +184,12 @@ def test_a_robot_that_is_killed_and_comes_back(fleet: Fleet) -> None:
     red = fleet.robot("red")
     fleet.drive("red", *range(9))
     wait = fleet.harness.wait
-    wait(lambda: len(fleet.ids("red")) == 3, "the keyframes of the first drive", timeout=40)
+    wait(lambda: len(fleet.ids("red")) == 3, "the keyframes of the first drive")
     red.kill()
     red.wait()
     fleet.robot("red")
     fleet.drive("red", *range(4, 13))
-    wait(lambda: fleet.ids("red") == list(range(6)), "those of the second", timeout=40)
+    fleet.received("red", 6)
     odometry = [(e.from_node, e.to_node) for e in fleet.map().constraints if e.kind == "odometry"]
     assert odometry == [(0, 1), (1, 2), (3, 4), (4, 5)]
 

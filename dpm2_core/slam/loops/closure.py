@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from pydantic import Field
@@ -47,6 +47,9 @@ class LoopSettings(Settings):
     """Of the network's registration, below which the points are not asked."""
     min_overlap: float = Field(0.2, ge=0, le=1)
     """Probability of the network's overlap head, below which the points are not asked either."""
+    decided_by: Literal["points", "overlap"] = "points"
+    """What accepts a candidate of the network: the points and a second loop; or, as in the paper, its overlap head
+    alone, which then also chooses the best of the candidates."""
     radius: float = 8.0
     """The keyframe nearest by the pose is a candidate, too, if nearer than this, m; `drift` widens it."""
     drift: float = 0.01
@@ -106,6 +109,9 @@ class LoopCloser:
             if number >= self._settings.verified:
                 tried.append(proposal.rejected("others are more likely"))
                 continue
+            if self._settings.decided_by == "overlap":
+                tried.append(proposal)
+                break
             loop = self._verified(proposal, keyframes, clouds, poses)
             if not loop.ok:
                 tried.append(loop)
@@ -120,18 +126,21 @@ class LoopCloser:
     ) -> tuple[list[Edge], list[Edge]]:
         """Candidates that the network rejected, and those for the points to verify, the most likely first."""
         s, descriptors = self._settings, keyframes[node].descriptors
-        nearest = self._nearest(since, poses)
+        nearest = self._nearest(since, poses) if s.decided_by == "points" else None
         rejections: list[Edge] = []
         proposals: list[Edge] = []
         if self._places is not None and descriptors is not None:
             similar = self._places.similar(descriptors, since > s.gap, s.candidates)
             found = self._registered(node, similar, keyframes)
-            for loop in sorted(found, key=lambda loop: -loop.registration.confidence):
+            rank = "overlap" if s.decided_by == "overlap" else "confidence"
+            for loop in sorted(found, key=lambda loop: -getattr(loop.registration, rank)):
                 r = loop.registration
                 if not r.ok:
                     rejections.append(loop)
                 elif r.confidence < s.min_confidence:
                     rejections.append(loop.rejected(f"descriptors match with a confidence of only {r.confidence:.2f}"))
+                elif s.decided_by == "overlap" and np.isnan(r.overlap):
+                    rejections.append(loop.rejected("the overlap head of these weights is not trained"))
                 elif r.overlap < s.min_overlap:  # NaN of an untrained head rejects nothing
                     rejections.append(loop.rejected(f"the places overlap with a probability of only {r.overlap:.2f}"))
                 else:

@@ -6,12 +6,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from pydantic import Field
 
 from dpm2_core.config import Settings
 from dpm2_core.frame import Array, Frame, Keyframe, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.slam.preprocess import Scan
+from dpm2_core.slam.registration.spacing import Spacing
 
 
 class KeyframeSettings(Settings):
@@ -21,6 +23,9 @@ class KeyframeSettings(Settings):
     """Motion after which a scan becomes a keyframe, m."""
     angle: float = 25.0
     """Turn after which a scan becomes a keyframe, degrees."""
+    residual: float = Field(0.0, ge=0)
+    """Residual of registrations, m, at which `distance` shrinks to 1 m; without one it grows to twice its value, as in
+    DeepPointMap. 0: it stays as it is."""
     voxel: float = 0.3
     """Spacing of the points of a keyframe, m."""
     range: float = 60.0
@@ -43,6 +48,7 @@ class KeyframeSelector:
         self._last: Keyframe | None = None
         self._uncertainty = np.zeros((6, 6))
         self._requested = False
+        self._spacing = Spacing(self._settings.distance, self._settings.residual)
 
     def request(self) -> None:
         """Make a keyframe of the next registered scan at any distance: relocalization needs one even at standstill."""
@@ -57,10 +63,12 @@ class KeyframeSelector:
         if not registration.ok:
             return None
         s, last, edge = self._settings, self._last, None
+        if s.residual:
+            self._spacing.registered(registration.rmse)
         if last is not None:
             T_last_this = se3.inverse(last.T_odom_kf) @ T_odom_lidar
             meters, degrees = se3.magnitude(T_last_this)
-            if not self._requested and meters < s.distance and degrees < s.angle:
+            if not self._requested and meters < self._spacing.meters and degrees < s.angle:
                 return None
             sigma = np.repeat([np.radians(s.drift_rotation), s.drift_translation], 3) * max(meters, 1.0)
             covariance = registration.covariance + np.diag(sigma**2) + self._uncertainty

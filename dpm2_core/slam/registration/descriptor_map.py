@@ -11,6 +11,7 @@ import numpy as np
 from dpm2_core.descriptors import Descriptors, LazyDescriptors, merge
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
+from dpm2_core.slam.registration.spacing import Spacing
 
 _KEPT = 20  # frames: at least as many as can lie around the next one
 
@@ -26,8 +27,8 @@ class _Place:
 class DescriptorMap:
     """The descriptors of the last keyframes of the odometry."""
 
-    def __init__(self, spacing: float, frames: int, radius: float) -> None:
-        self._spacing, self._frames, self._radius = spacing, frames, radius
+    def __init__(self, spacing: Spacing, radius: float) -> None:
+        self._spacing, self._radius = spacing, radius
         self._places: deque[_Place] = deque(maxlen=_KEPT)
         self._merged: tuple[list[_Place], Descriptors] | None = None
 
@@ -42,19 +43,20 @@ class DescriptorMap:
         if not self._places:
             return True
         meters, degrees = se3.magnitude(se3.inverse(self._places[-1].T_odom_kf) @ T_odom_lidar)
-        return meters >= self._spacing or degrees >= 15
+        return meters >= self._spacing.meters or degrees >= 15
 
     def insert(self, description: LazyDescriptors, T_odom_lidar: Array) -> None:
         """Add those of a frame taken there."""
         self._places.append(_Place(T_odom_lidar, description))
 
-    def around(self, T_odom_lidar: Array) -> tuple[Array, Descriptors] | None:
-        """Pose T_odom_kf of the nearest frame, and the merged descriptors of it and its neighbors in its frame.
+    def around(self, T_odom_lidar: Array, frames: int) -> tuple[Array, Descriptors] | None:
+        """Pose T_odom_kf of the nearest frame, and the descriptors of it and its neighbors, up to `frames` in all,
+        merged in its frame.
 
         None where the frames nearby have no descriptors.
         """
         distance = [float(np.linalg.norm(p.T_odom_kf[:3, 3] - T_odom_lidar[:3, 3])) for p in self._places]
-        order = np.argsort(distance, kind="stable")[: self._frames]
+        order = np.argsort(distance, kind="stable")[:frames]
         near = [self._places[i] for i in order if distance[i] <= self._radius or i == order[0]]
         if self._merged is not None and self._merged[0] == near:  # the same object: the decoder keeps its part of it
             return near[0].T_odom_kf, self._merged[1]

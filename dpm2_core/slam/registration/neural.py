@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from pydantic import Field
@@ -19,6 +19,7 @@ from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.slam.preprocess import Preprocessor, Scan
 from dpm2_core.slam.registration.descriptor_map import DescriptorMap
 from dpm2_core.slam.registration.protocol import Prediction, agree
+from dpm2_core.slam.registration.spacing import Spacing
 
 if TYPE_CHECKING:  # torch takes seconds to import, and the geometric SLAM does without
     from dpm2_core.network.model import DeepPointMap2
@@ -33,10 +34,18 @@ class NeuralSettings(Settings):
     """Preset that the weights must have been trained for; empty takes any."""
     spacing: float = Field(2.0, gt=0)
     """A frame's descriptors enter the map after this much motion, m (or a turn of 15 degrees)."""
+    residual: float = Field(0.0, ge=0)
+    """Residual at which `spacing` shrinks, as `keyframes.residual`."""
     frames: int = Field(2, ge=1, le=16)
     """So many of the map's frames, the nearest to the predicted pose, are merged and registered to."""
     radius: float = Field(20.0, gt=0)
     """Frames farther than this from the predicted pose are not registered to, unless all are, m."""
+    solver: Literal["consensus", "confident"] = "consensus"
+    """How pairs of descriptors become a pose: by a consensus, and matched again with the pose at hand; or, as in the
+    paper, by a robust SVD that starts from the most confident pairs. Loops and relocalization follow it."""
+    refined: int = Field(0, ge=0, le=64)
+    """Register a frame that enters the map once more, to so many frames merged, and take the more certain pose: the
+    paper's refinement from scan to map. 0: not."""
     min_confidence: float = Field(0.1, ge=0, le=1)
     """Mean probability of the best matches below which there is no result."""
     max_sigma: float = Field(0.6, gt=0)
@@ -54,7 +63,8 @@ class NeuralScanRegistration:
         self._settings = settings
         self._preprocessor = preprocessor
         self._model = model
-        self._map = DescriptorMap(settings.spacing, settings.frames, settings.radius)
+        self._spacing = Spacing(settings.spacing, settings.residual)
+        self._map = DescriptorMap(self._spacing, settings.radius)
 
     def __len__(self) -> int:
         return len(self._map)
@@ -82,15 +92,14 @@ class NeuralScanRegistration:
 
     def register(self, scan: Scan, prediction: Prediction) -> Registration:
         T_predicted = prediction.starts[0]
-        if scan.descriptors is None:
-            return _failed(T_predicted, self.rejection(scan))
-        if (around := self._map.around(T_predicted)) is None:
-            return _failed(T_predicted, "no descriptors around")
-        T_odom_kf, target = around
-        result = self._model.register(scan.descriptors, target)
+        result = self._registered(scan, T_predicted, self._settings.frames)
         if not result.ok:
-            return _failed(T_predicted, result.reason)
-        result = replace(result, T_target_source=se3.orthonormalized(T_odom_kf @ result.T_target_source))
+            return result
+        self._spacing.registered(result.rmse)
+        if self._settings.refined and self._map.wants(result.T_target_source):
+            second = self._registered(scan, result.T_target_source, self._settings.refined)
+            if second.ok and second.worst_sigma < result.worst_sigma:
+                result = second
         if result.confidence < self._settings.min_confidence:
             return replace(result, ok=False, reason=f"matches with a confidence of only {result.confidence:.2f}")
         if (sigma := result.worst_sigma) > self._settings.max_sigma:
@@ -100,6 +109,18 @@ class NeuralScanRegistration:
             if not agree(result, Registration(T_predicted, covariance, 0.0, np.inf, "predicted")):
                 return replace(result, ok=False, reason="contradicts the motion so far")
         return result
+
+    def _registered(self, scan: Scan, T_near: Array, frames: int) -> Registration:
+        """T_odom_lidar by the descriptors of the frames nearest to a pose (4, 4), merged."""
+        if scan.descriptors is None:
+            return _failed(T_near, self.rejection(scan))
+        if (around := self._map.around(T_near, frames)) is None:
+            return _failed(T_near, "no descriptors around")
+        T_odom_kf, target = around
+        result = self._model.register(scan.descriptors, target)
+        if not result.ok:
+            return _failed(T_near, result.reason)
+        return replace(result, T_target_source=se3.orthonormalized(T_odom_kf @ result.T_target_source))
 
     def update(self, scan: Scan, T_odom_lidar: Array) -> bool:
         wanted = self._map.wants(T_odom_lidar)

@@ -14,7 +14,14 @@ from dpm2_core.network.heads import OffsetHead, into_set_frame
 from dpm2_core.network.matching import Correspondences, best_pairs, guided_scores, softmax_both
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pointnext import from_view, to_view
-from dpm2_core.network.pose_solver import first_pose, robust_kabsch, weighted_gauss_newton, whitened_residuals
+from dpm2_core.network.pose_solver import (
+    first_pose,
+    most_confident,
+    robust_kabsch,
+    supporting,
+    weighted_gauss_newton,
+    whitened_residuals,
+)
 from dpm2_core.network.tokens import Tokens, to_tokens
 
 
@@ -31,7 +38,7 @@ def perfect(noise: np.random.Generator, batch: int = 2, pairs: int = 60) -> tupl
 def test_perfect_matches_give_the_exact_pose(noise: np.random.Generator) -> None:
     """Weighted SVD to rounding; the precision-weighted solve stays there and gets there from 0.3 rad and 2 m off."""
     pairs, T = perfect(noise)
-    found, _ = robust_kabsch(pairs, first_pose(pairs))
+    found, _ = robust_kabsch(pairs, supporting(pairs, first_pose(pairs)))
     torch.testing.assert_close(found, T, atol=1e-6, rtol=0)
     off = T @ torch.from_numpy(se3.exp([0.1, -0.1, 0.3, 1, -2, 0.5]))
     torch.testing.assert_close(weighted_gauss_newton(off, pairs, rounds=30)[0], T, atol=1e-6, rtol=0)
@@ -43,9 +50,27 @@ def test_outliers_are_left_out(noise: np.random.Generator) -> None:
     wrong = torch.arange(pairs.source.shape[1]) % 5 == 0
     target = torch.where(wrong[:, None], pairs.target + 30 * torch.randn(pairs.target.shape), pairs.target)
     pairs = pairs._replace(target=target, weight=torch.where(wrong, 0.05, pairs.weight))
-    found, inliers = robust_kabsch(pairs, first_pose(pairs), rounds=10)
+    found, inliers = robust_kabsch(pairs, supporting(pairs, first_pose(pairs)), rounds=10)
     assert not inliers[:, wrong].any()
     torch.testing.assert_close(weighted_gauss_newton(found, pairs)[0], T, atol=1e-3, rtol=0)
+
+
+def test_the_papers_start_trusts_the_most_confident(noise: np.random.Generator) -> None:
+    """Right while those are right, however wrong the rest is; and lost where they are wrong, as a consensus is not."""
+    pairs, T = perfect(noise)
+    right = torch.arange(pairs.source.shape[1]) % 12 < 7  # 70 of 120, in both halves
+    target = torch.where(right[:, None], pairs.target, pairs.target + 30 * torch.randn(pairs.target.shape))
+    pairs = pairs._replace(target=target, weight=torch.where(right, 0.8, 0.01).expand(len(T), -1).double())
+    chosen = most_confident(pairs)
+    assert chosen[:, right].all()
+    found, _ = robust_kabsch(pairs, chosen, rounds=10)
+    torch.testing.assert_close(found, T, atol=1e-6, rtol=0)
+    misled = pairs._replace(weight=torch.where(right, 0.3, 0.6).expand(len(T), -1).double())
+    lost, _ = robust_kabsch(misled, most_confident(misled), rounds=10)
+    assert ((lost - T)[:, :3, 3].norm(dim=1) > 1).all()
+    torch.testing.assert_close(first_pose(misled), T, atol=1e-3, rtol=0)
+    few = Correspondences(*(field[:, :40] for field in pairs))
+    assert most_confident(few).all()  # fewer than it would start from
 
 
 @pytest.mark.parametrize("wrong", [0.5, 0.7])
@@ -91,7 +116,7 @@ def test_precision_tells_which_direction_to_trust(noise: np.random.Generator) ->
     target[0, half:] += slide[half:]
     across = torch.linalg.cholesky(1e4 * normal[:, :, None] * normal[:, None] + 1e-2 * torch.eye(3).double())
     pairs = Correspondences(source, target, torch.ones(1, n).double(), across[None])
-    svd, _ = robust_kabsch(pairs, first_pose(pairs))
+    svd, _ = robust_kabsch(pairs, supporting(pairs, first_pose(pairs)))
     solved, information = weighted_gauss_newton(svd, pairs)
     error = se3.log(se3.inverse(T[0].numpy()) @ solved[0].numpy())
     assert np.linalg.norm(error[3:]) < 0.01
@@ -123,7 +148,7 @@ def test_moving_both_clouds_moves_the_answer(noise: np.random.Generator) -> None
     moved = pairs._replace(source=transform(B, pairs.source), target=transform(A, pairs.target))
     for solve in (
         first_pose,
-        lambda p: robust_kabsch(p, first_pose(p))[0],
+        lambda p: robust_kabsch(p, supporting(p, first_pose(p)))[0],
         lambda p: weighted_gauss_newton(first_pose(p), p, rounds=30)[0],
     ):
         expected = A @ solve(pairs) @ torch.linalg.inv(B)

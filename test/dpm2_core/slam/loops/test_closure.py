@@ -22,6 +22,7 @@ from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import LidarConfig
 from dpm2_core.sim.world import World, build_world
 from dpm2_core.slam.loops.closure import LoopCloser, LoopSettings
+from dpm2_core.slam.loops.verification import Verifier
 from dpm2_core.slam.registration.icp import GeometricSettings
 
 FIRM = np.diag([1e-3] * 3 + [0.02] * 3) ** 2
@@ -164,3 +165,23 @@ def test_places_that_hardly_overlap_are_left_to_no_one(monkeypatch: pytest.Monke
         reasons.append([loop.registration.reason for loop in loops])
     assert any("overlap with a probability of only 0.10" in reason for reason in reasons[0])
     assert not any("overlap" in reason for reason in reasons[1])
+
+
+@pytest.mark.slow
+@pytest.mark.weights
+def test_the_overlap_head_alone_accepts_the_best_candidate(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The paper's way: the points are not asked, nor a second loop; a head that is not trained accepts nothing."""
+    places, jump = [(62.0, 2.5, 0.0)], se3.exp(np.array([0, 0, 0, 12.0, 0, 0]))
+    monkeypatch.setattr(Verifier, "verify", lambda *_: pytest.fail("the points were asked"))
+    loops, truth = drive(places, jump, gap=30.0, decided_by="overlap", min_overlap=0.7)
+    accepted = [loop for loop in loops if loop.registration.ok and loop.registration.reason == ""]
+    assert len(accepted) == 1
+    assert accepted[0].registration.overlap == max(loop.registration.overlap for loop in loops)
+    assert errors(accepted, truth)[0] < 0.5  # as the network registers
+    monkeypatch.setattr(
+        "dpm2_core.network.pose_solver.overlap_probability",
+        lambda decoder, source, *_: torch.full(source.mask.shape[:1], torch.nan),
+    )
+    loops, _ = drive(places, jump, gap=30.0, decided_by="overlap", min_overlap=0.7)
+    assert not any(loop.registration.ok for loop in loops)
+    assert "the overlap head of these weights is not trained" in {loop.registration.reason for loop in loops}

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -26,12 +25,12 @@ from dpm2_core.slam.preprocess import Preprocessor, PreprocessSettings
 from dpm2_core.slam.registration.descriptor_map import DescriptorMap
 from dpm2_core.slam.registration.neural import NeuralScanRegistration, NeuralSettings
 from dpm2_core.slam.registration.protocol import Prediction
+from dpm2_core.slam.registration.spacing import Spacing
 from dpm2_core.slam.settings import SlamSettings
 
+from ....helpers.drives import Drive
 from ....helpers.networks import tiny
 from ....helpers.scenes import boxes, make_image
-
-Street = Callable[..., np.ndarray]
 
 
 @pytest.fixture
@@ -62,14 +61,14 @@ def lazy(value: Descriptors | None) -> LazyDescriptors:
     return LazyDescriptors(lambda: value)
 
 
-def around(places: DescriptorMap, T: np.ndarray) -> tuple[np.ndarray, Descriptors]:
-    found = places.around(T)
+def around(places: DescriptorMap, T: np.ndarray, frames: int = 2) -> tuple[np.ndarray, Descriptors]:
+    found = places.around(T, frames)
     assert found is not None
     return found
 
 
 def test_the_nearest_frames_are_merged_in_the_frame_of_the_nearest(noise: np.random.Generator) -> None:
-    places = DescriptorMap(spacing=3, frames=2, radius=20)
+    places = DescriptorMap(Spacing(3, 0), radius=20)
     poses = [se3.exp([0, 0, 0.2 * i, 4.0 * i, 0, 0]) for i in range(4)]
     sets = [descriptors(noise) for _ in poses]
     for pose, s in zip(poses, sets, strict=True):
@@ -82,7 +81,7 @@ def test_the_nearest_frames_are_merged_in_the_frame_of_the_nearest(noise: np.ran
 
 
 def test_frames_out_of_reach_are_left_out_unless_there_is_no_other(noise: np.random.Generator) -> None:
-    places = DescriptorMap(spacing=3, frames=3, radius=10)
+    places = DescriptorMap(Spacing(3, 0), radius=10)
     for x in (0.0, 30.0):
         places.insert(lazy(descriptors(noise)), se3.make(np.eye(3), [x, 0, 0]))
     assert len(around(places, se3.make(np.eye(3), [28, 0, 0]))[1]) == 5
@@ -90,7 +89,7 @@ def test_frames_out_of_reach_are_left_out_unless_there_is_no_other(noise: np.ran
 
 
 def test_a_frame_enters_after_motion_or_a_turn(noise: np.random.Generator) -> None:
-    places = DescriptorMap(spacing=3, frames=2, radius=20)
+    places = DescriptorMap(Spacing(3, 0), radius=20)
     assert places.wants(np.eye(4))
     places.insert(lazy(descriptors(noise)), np.eye(4))
     assert not places.wants(se3.exp([0, 0, 0.1, 2.9, 0, 0]))
@@ -100,21 +99,21 @@ def test_a_frame_enters_after_motion_or_a_turn(noise: np.random.Generator) -> No
 
 def test_frames_are_described_when_they_are_registered_to(noise: np.random.Generator) -> None:
     """One that has too few points for descriptors is passed over; without any there is nothing to register to."""
-    places = DescriptorMap(spacing=3, frames=2, radius=20)
+    places = DescriptorMap(Spacing(3, 0), radius=20)
     described = [lazy(None), lazy(descriptors(noise)), lazy(descriptors(noise))]
     for i, one in enumerate(described):
         places.insert(one, se3.make(np.eye(3), [4.0 * i, 0, 0]))
-    assert places.around(np.eye(4)) is not None
+    assert places.around(np.eye(4), 2) is not None
     assert [one.made for one in described] == [True, True, False]
     T, _ = around(places, np.eye(4))
     np.testing.assert_array_equal(T[:3, 3], [4, 0, 0])
-    empty = DescriptorMap(spacing=3, frames=2, radius=20)
+    empty = DescriptorMap(Spacing(3, 0), radius=20)
     empty.insert(lazy(None), np.eye(4))
-    assert empty.around(np.eye(4)) is None
+    assert empty.around(np.eye(4), 2) is None
 
 
 def test_memory_is_bounded(noise: np.random.Generator) -> None:
-    places = DescriptorMap(spacing=3, frames=2, radius=20)
+    places = DescriptorMap(Spacing(3, 0), radius=20)
     for i in range(100):
         places.insert(lazy(descriptors(noise)), se3.make(np.eye(3), [3.0 * i, 0, 0]))
     assert len(places) == 20
@@ -239,3 +238,34 @@ def test_the_geometric_slam_imports_neither_torch_nor_matplotlib() -> None:
         "sys.exit(len({'torch', 'matplotlib'} & set(sys.modules)))"
     )
     assert subprocess.run([sys.executable, "-c", program], timeout=120).returncode == 0
+
+
+@pytest.mark.weights
+@pytest.mark.slow
+def test_the_papers_slam_follows_a_street(suburb_drive: Drive) -> None:
+    """All of its ways at once. Its odometry meets keyframes 10 m apart, and is coarser than ours."""
+    frames, truth = suburb_drive
+    slam = make_slam(SlamSettings(preset="paper"))
+    tracked = [slam.process(frame).odometry for frame in frames[:16]]
+    assert {t.registration.method for t in tracked[1:]} == {"neural"}
+    assert all(t.registration.ok for t in tracked)
+    off = [np.linalg.norm((t.T_odom_lidar - T)[:3, 3]) for t, T in zip(tracked, truth, strict=False)]
+    assert max(off) < 0.5
+
+
+@pytest.mark.weights
+@pytest.mark.slow
+def test_a_scan_that_enters_the_map_is_registered_once_more(suburb_drive: Drive) -> None:
+    frames, truth = suburb_drive
+    ends = []
+    for refined in (0, 16):
+        neural = NeuralSettings(frames=1, refined=refined)
+        registration = make_registration(SlamSettings(registration="neural", neural=neural))
+        for i in (0, 4, 8):
+            registration.update(registration.prepare(frames[i], np.zeros(6)), truth[i])
+        for i in (12, 9):
+            scan = registration.prepare(frames[i], np.zeros(6))
+            ends.append(registration.register(scan, Prediction([truth[i]])).T_target_source)
+    assert not np.array_equal(ends[0], ends[2])  # farther than `spacing` from the last one
+    assert np.array_equal(ends[1], ends[3])
+    assert np.linalg.norm((ends[2] - truth[12])[:3, 3]) < 0.2

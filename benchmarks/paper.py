@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What our deviations from DeepPointMap2's SLAM are worth: each of its ways put into ours, and all of them together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from rich.console import Group
+from rich.progress import Progress
+
+from benchmarks.harness import Options, Report, drives, processors, requested, settings_of, truth_of, unique_name
+from benchmarks.loops import check_loops
+from dpm2_core.data.source import Source
+from dpm2_core.evaluation.metrics import evaluate
+from dpm2_core.frame import Array, Frame
+from dpm2_core.sim.simulated_drive import SimulatedDrive
+from dpm2_core.slam.build import make_slam
+from dpm2_core.slam.output import TrajectoryRecorder
+from dpm2_core.slam.settings import SlamSettings
+from dpm2_core.tables import FigureTable
+
+_OURS = ("slam.registration=neural", "slam.visual.enabled=false")
+_NEAREST = ("slam.neural.spacing=10", "slam.neural.residual=2.5", "slam.neural.frames=1")
+WAYS: dict[str, Sequence[str]] = {
+    "ours": _OURS,
+    "start: most confident pairs": (*_OURS, "slam.neural.solver=confident"),
+    "nearest keyframe": (*_OURS, *_NEAREST),
+    "nearest keyframe, then scan to map": (*_OURS, *_NEAREST, "slam.neural.refined=16"),
+    "keyframes by residual": (
+        *_OURS, "slam.keyframes.distance=10", "slam.keyframes.residual=2.5", "slam.keyframes.angle=180",
+    ),
+    "loops by the overlap head": (
+        *_OURS, "slam.loops.decided_by=overlap", "slam.loops.min_overlap=0.7", "slam.loops.candidates=16",
+        "slam.loops.verified=1", "slam.pose_graph.loop_kernel=1e9", "slam.pose_graph.loop_sigmas=1e9",
+        "slam.pose_graph.odometry_sigmas=1e9",
+    ),
+    "the paper's": ("slam.preset=paper",),
+}  # fmt: skip
+_LAPS = 1.35
+"""So much of a lap is driven in the synthetic suburb: the last third shows places seen before..."""
+_EVERY = 2
+"""...with so many steps of 0.5 m between two scans."""
+
+
+def bench_paper(options: Options) -> Report:
+    """Every way on every drive, once, with the network alone and without images; `--only` chooses one way.
+
+    Raises:
+        UsageError: there is no drive, or one has no ground truth.
+    """
+    results: dict[str, Any] = {}
+    with drives(options) as real, processors(options.threads), Progress(transient=True) as progress:
+        synthetic: list[Source] = [] if options.sources else [_lap()]
+        for source in [*real, *synthetic]:
+            frames = list(source.frames())
+            name, truth = unique_name(source, results), truth_of(source)[: len(frames)]
+            results[name] = {}
+            ways = requested(options, WAYS)
+            for way in progress.track(ways, description=name):
+                results[name][way] = _driven(settings_of(options, *WAYS[way]), frames, truth)
+    return Report({"settings": WAYS, "drives": results}, Group(_table(results)))
+
+
+def _lap() -> SimulatedDrive:
+    """Round a block, and on into the street where it began."""
+    drive = SimulatedDrive("loop", "suburb", 950_000, "suburb")
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(drive.poses[:, :3, 3], axis=0), axis=1))])
+    again = np.linalg.norm(drive.poses[:, :3, 3] - drive.poses[0, :3, 3], axis=1)
+    lap = way[(way > 50) & (again < 10)]
+    end = int(np.searchsorted(way, _LAPS * lap[0])) if len(lap) else len(way)
+    drive.times, drive.T_world_lidar = drive.times[:end:_EVERY], drive.T_world_lidar[:end:_EVERY]
+    return drive
+
+
+def _driven(settings: SlamSettings, frames: Sequence[Frame], truth: Array) -> dict[str, Any]:
+    slam, recorder = make_slam(settings), TrajectoryRecorder()
+    tracked = [slam.process(frame).odometry for frame in frames]
+    for one in tracked:
+        recorder.add(one)
+    keyframes, failed = slam.mapper.keyframes, sum(not one.registration.ok for one in tracked)
+    metrics = evaluate(truth, recorder.poses(slam.mapper.poses), failed_frames=failed)
+    names = ("rpe_trans_m", "rpe_rot_deg", "ape_rmse_m", "final_drift_percent")
+    loops = check_loops(slam.mapper.loops, truth[[keyframe.index for keyframe in keyframes]])
+    return {
+        "frames": len(frames), "failed_frames": failed, "keyframes": len(keyframes),
+        **{name: getattr(metrics, name) for name in names},
+        "loops": {name: loops[name] for name in ("tried", "accepted", "wrong", "error_m")},
+    }  # fmt: skip
+
+
+def _table(results: dict[str, Any]) -> FigureTable:
+    figures = ("RPE m", "RPE deg", "ATE m", "drift %", "failed", "keyframes", "loops", "wrong")
+    table = FigureTable("The paper's ways, each put into ours", names=["drive", "way"], figures=figures)
+    for drive, ways in results.items():
+        for way, row in ways.items():
+            errors = [row[name] for name in ("rpe_trans_m", "rpe_rot_deg", "ape_rmse_m", "final_drift_percent")]
+            counts = (row["failed_frames"], row["keyframes"], row["loops"]["accepted"], row["loops"]["wrong"])
+            table.add_row(drive, way, *(f"{error:.3f}" for error in errors), *map(str, counts))
+    return table
