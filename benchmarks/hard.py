@@ -22,7 +22,7 @@ from dpm2_core.sim.simulated_drive import SimulatedDrive
 from dpm2_core.tables import FigureTable
 
 REGISTRATIONS = ("adaptive", "refined", "neural", "geometric")
-_MOST = 150  # frames of a drive
+_SYNTHETIC_FRAMES = 80
 _RATES = tuple(f"every {every}" for every in EVERY)
 _SYNTHETIC: tuple[tuple[str, PresetName, int], ...] = (("loop", "city", 940_000), ("random", "suburb", 940_001))
 """Worlds that no training has seen, beside the real drives."""
@@ -48,7 +48,7 @@ def bench_hard(options: Options) -> Report:
         )
         sources: list[Source] = [*real, *synthetic]
         for source in sources:
-            frames = list(source.frames(0, _MOST))
+            frames = list(source.frames(0, None if source in real else _SYNTHETIC_FRAMES))
             hard = list(cases(frames, truth_of(source)[: len(frames)]))
             name, task = unique_name(source, results), progress.add_task(source.name, total=len(hard) * len(methods))
             results[name] = {}

@@ -16,8 +16,8 @@ from dpm2_core.geometry import se3
 EVERY = (1, 3, 6, 10)
 """Every so manieth frame: at 10 Hz and 50 km/h 1.4, 4, 8 and 14 m apart."""
 GAPS, BLIND = (1.0, 2.0, 3.0, 5.0), (1.0, 2.0, 3.0)  # s
-_BEFORE, _AFTER = 20, 20  # frames around a gap or a blind sensor
-_START = 25  # frames of a drive that begins at a bad moment
+_BEFORE, _AFTER = 14, 14  # frames around a gap or a blind sensor
+_START = 18  # frames of a drive that begins at a bad moment
 _AWAY = 2.0  # s that a robot is carried
 _RIGHT = 0.5, 0.02  # m, and of the way: no farther off is right
 _STILL = 3.0  # m/s, and
