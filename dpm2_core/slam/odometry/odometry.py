@@ -15,7 +15,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.geometry.motion import OPEN, combined, covariance, predicted, spread
 from dpm2_core.slam.bridge import Bridge, Limits
 from dpm2_core.slam.odometry.keyframe_selection import KeyframeSelector
-from dpm2_core.slam.odometry.other import OtherMotion
+from dpm2_core.slam.odometry.other import OtherMotion, Step
 from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration
 
@@ -87,7 +87,7 @@ class Odometry:
         self._bridge: Bridge | None = None
         self._left = 0.0  # `_clock` at the last pose before the pause that is being bridged
         self._breaks = 0
-        self._other = OtherMotion()
+        self._other: OtherMotion | None = None  # since a frame came with a guess
         self._led = False  # by another odometry to the pose of this frame
         self._registration.clear()
         self._keyframes.reset()
@@ -98,7 +98,10 @@ class Odometry:
         dt = self._elapsed(frame.stamp)
         twist = np.zeros(6) if self._twist is None else self._twist
         seconds = self._registered[1] + dt
-        self._other.look(frame.guess, self._twist, seconds, self._of_prediction(seconds))
+        if frame.guess is not None and self._other is None:
+            self._other = OtherMotion()
+        if self._other is not None:
+            self._other.look(frame.guess, self._twist, seconds, self._of_prediction(seconds))
         scan = self._registration.prepare(frame, twist)
         clock.append(perf_counter())
         pauses = frame.problem is None and self._pauses(dt) and not self._registration.rejection(scan)
@@ -127,7 +130,7 @@ class Odometry:
             keyframe=keyframe,
             breaks=self._breaks,
             seconds=dict(zip(("preprocess", "register", "update"), np.diff(clock).tolist(), strict=True)),
-            comparison=self._other.comparison,
+            comparison=None if self._other is None else self._other.comparison,
         )
 
     def _elapsed(self, stamp: int) -> float:
@@ -158,7 +161,7 @@ class Odometry:
             self._left = self._clock - seconds - dt
         self._registration, self._twist, self._first = self._registration.fresh(), None, None
         self._of_velocity = _ANY_VELOCITY
-        step = self._other.step
+        step = self._step_of_other()
         self._T = self._bridge.begin(self._clock - self._left, None if step is None else T_registered @ step.T)
         return self._T
 
@@ -199,10 +202,14 @@ class Odometry:
         result = self._registration.register(scan, Prediction([T_predicted], widen, information))
         return self._gated(result, T_predicted, dt)
 
+    def _step_of_other(self) -> Step | None:
+        """What another odometry says of the way since the last registered frame."""
+        return None if self._other is None else self._other.step
+
     def _register_by_other(self, scan: Scan, dt: float) -> Registration | None:
         """From where another odometry leads; None without one, or where the scan does not confirm it."""
-        T_before, step = self._registered[0], self._other.step
-        if step is None:
+        T_before, step = self._registered[0], self._step_of_other()
+        if self._other is None or step is None:
             return None
         T = T_before @ step.T
         information = np.linalg.inv(step.covariance).astype(np.float64)
@@ -253,14 +260,15 @@ class Odometry:
             self._coast(dt)
             return
         if registration.method != "first":
-            step = self._other.step if self._led else None
+            step = self._step_of_other() if self._led else None
             of_prediction = self._of_prediction(seconds + dt) if step is None else step.covariance
             of_motion = combined(registration.of_scene[3:, 3:], of_prediction[3:, 3:])
             self._of_velocity = of_motion / (seconds + dt) ** 2
             # Not from the predicted pose of the frame before, of which an error would count as motion in one period.
             T_step = se3.inverse(T_registered) @ registration.T_target_source
             self._twist = se3.log(T_step) / (seconds + dt)
-            self._other.compare(T_step, registration.of_scene, self._led)
+            if self._other is not None:
+                self._other.compare(T_step, registration.of_scene, self._led)
         if self._bridge is None:
             self._failures = 0
         self._follow(scan, registration)
@@ -270,7 +278,8 @@ class Odometry:
     def _follow(self, scan: Scan, registration: Registration) -> None:
         self._T = registration.T_target_source
         self._registered = self._T, 0.0
-        self._other.keep()
+        if self._other is not None:
+            self._other.keep()
         self._covariance = registration.covariance.copy()
         self._registration.update(scan, self._T)
 
@@ -282,7 +291,7 @@ class Odometry:
         self._covariance = self._unknown(dt)
         T_registered, seconds = self._registered
         self._registered = T_registered, seconds + dt
-        if (step := self._other.step) is not None:
+        if (step := self._step_of_other()) is not None:
             self._T, self._covariance = T_registered @ step.T, step.covariance
         elif self._twist is not None:
             self._T = predicted(T_registered, self._twist, seconds + dt)
