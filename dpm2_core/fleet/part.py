@@ -142,12 +142,18 @@ def figures_of(part: Part, out: Path) -> Figures | None:
         record = json.loads((out / part.name / DONE).read_text(encoding="utf-8"))
         if {key: record[key] for key in ("arguments", "inputs")} != json.loads(json.dumps(_asked(part))):
             return None
-        there = _sizes(out / part.name)
-        if any(there.get(name) != size for name, size in record.get("files", {}).items()):
-            return None  # copied in part, or a disk that lost what it had taken
-        return _read(record)
+        return _read(record) if is_whole(out / part.name) else None
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
+
+
+def is_whole(folder: Path) -> bool:
+    """Whether a fresh part that ended is still there with all its files, and none was cut short since."""
+    try:
+        listed = json.loads((folder / DONE).read_text(encoding="utf-8"))["files"].items()
+        return all((folder / name).stat().st_size == size for name, size in listed)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return False
 
 
 def remove_attempts(part: Part, out: Path) -> None:

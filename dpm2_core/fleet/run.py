@@ -44,30 +44,37 @@ def carry_out(parts: Sequence[Part], out: Path, cluster: Cluster, view: View | N
     """Do all parts that are not whole yet and write OUT/fleet.json; Ctrl-C ends it early, and the rest is "stopped".
 
     Args:
-        cluster: not entered yet; Ray is started only where there is something to do.
+        cluster: not entered yet.
 
     Raises:
         UsageError: no Ray. Dpm2Error: the folder or the summary cannot be written.
     """
-    view, out = view or View(), out.resolve()  # a worker has another working directory
+    with cluster:
+        found = do_parts(parts, out.resolve(), cluster, view or View())  # a worker has another working directory
+    write_json(out / SUMMARY, {"drives": [outcome._asdict() for outcome in found]})
+    return found
+
+
+def do_parts(parts: Sequence[Part], out: Path, cluster: Cluster, view: View) -> list[Outcome]:
+    """What became of each part, in their order; Ray is started only where there is something to do.
+
+    Args:
+        out: absolute.
+    """
     kept = {part.name: figures for part in parts if (figures := figures_of(part, out)) is not None}
     outcomes = {name: Outcome(name, "kept", figures) for name, figures in kept.items()}
     missing = [part for part in parts if part.name not in kept]
     view.begun([part.name for part in missing])
     try:
-        if missing:
-            with cluster:
-                for name, figures, reason in cluster.run([_job(part, out) for part in missing], view.running):
-                    outcomes[name] = Outcome(name, "failed" if reason else "done", figures, reason)
-                    view.ended(outcomes[name])
+        for name, figures, reason in cluster.run([_job(part, out) for part in missing], view.running):
+            outcomes[name] = Outcome(name, "failed" if reason else "done", figures, reason)
+            view.ended(outcomes[name])
     except KeyboardInterrupt:
         pass
     finally:
         for part in missing:
             remove_attempts(part, out)
-    found = [outcomes.get(part.name, Outcome(part.name, "stopped")) for part in parts]
-    write_json(out / SUMMARY, {"drives": [outcome._asdict() for outcome in found]})
-    return found
+    return [outcomes.get(part.name, Outcome(part.name, "stopped")) for part in parts]
 
 
 def _job(part: Part, out: Path) -> Job:

@@ -46,6 +46,7 @@ class PoseGraph:
         self._trajectory: list[int] = []  # number of each node's
         self._ends: list[int] = []  # last node of each trajectory
         self._loops: list[Edge] = []
+        self._held: list[int] = []
         self._worker = GraphWorker()
         self._moved = False  # a part, since a graph was sent: its solution is of no use
         self._sent = 0  # loops in the graph that is being solved
@@ -122,6 +123,12 @@ class PoseGraph:
             T = T_to @ se3.inverse(self._poses[loop.to_node])
             self._move(max(a, b), T if b > a else se3.inverse(T), parts)
         self._loops.append(loop)
+
+    def hold(self, node: int, T_map_kf: Array) -> None:
+        """Put a node there (4, 4), where it stays."""
+        _check("node", node, T_map_kf)
+        self._poses[node] = T_map_kf
+        self._held.append(node)
 
     def part(self, node: int) -> int:
         """Number of the part of the graph that a node is in: nodes of two parts have nothing to do with each other."""
@@ -230,6 +237,7 @@ class PoseGraph:
             self._places()[ends],
             np.array([loop.T_from_to for loop in self._loops]).reshape(-1, 4, 4),
             np.array([loop.covariance for loop in self._loops]).reshape(-1, 6, 6),
+            self._places()[self._held],
         )
 
     def _parts(self) -> list[int]:

@@ -69,6 +69,7 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
         patch.syspath_prepend(folder)
         patch.setenv("PYTHONPATH", os.pathsep.join([str(folder), os.environ.get("PYTHONPATH", "")]))
         with Cluster(workers=2) as cluster:
+            cluster.start()
             yield cluster
 
 
@@ -107,7 +108,7 @@ def test_without_ray_or_without_its_cluster_one_line_says_so(tmp_path: Path, mon
     if ray.is_initialized():
         pytest.skip("this process is connected to a cluster, which is then used")
     with pytest.raises(UsageError, match=r"^--ray 127\.0\.0\.1:9: nobody answers there"):
-        Cluster("127.0.0.1:9").__enter__()
+        Cluster("127.0.0.1:9").start()
 
 
 @pytest.mark.slow

@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where two drives meet: stretches that look alike, and the loops between them that network and points affirm."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dpm2_core.config import settings_from
+from dpm2_core.fleet.part import Advance, Figures, Part
+from dpm2_core.frame import Array, Edge, Keyframe, Points, Registration
+from dpm2_core.slam.build import make_loops
+from dpm2_core.slam.settings import SlamSettings
+from dpm2_core.slam.store.map_data import MapData, borrowing, load_map
+from dpm2_core.slam.store.map_store import MapStore
+from dpm2_core.slam.store.rows import unpack_descriptors
+
+ENOUGH = 3
+"""Loops that a join of two drives needs: two can be wrong alike where houses are."""
+_WORK = "dpm2_core.fleet.joins:verify"
+_GAP = 8  # keyframes without a candidate, over which a stretch goes on
+_LONGEST = 40  # keyframes of a stretch: a task of a minute
+_AROUND = 6  # keyframes before and after a candidate that are looked at with it: 22 m of surroundings and more
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Keyframes of one drive and keyframes of another one that look like them; nodes are those of their maps."""
+
+    one: str
+    other: str
+    one_nodes: tuple[int, ...]
+    other_nodes: tuple[int, ...]
+
+
+def stretches(one: str, other: str, pairs: NDArray[np.int64]) -> Iterator[Stretch]:
+    """Group candidates (M, 2), node of one drive and of the other; what too few keyframes say is left out."""
+    pairs = pairs[np.argsort(pairs[:, 1], kind="stable")]
+    begins = [0]
+    for row in range(1, len(pairs)):
+        node = pairs[row, 1]
+        if node - pairs[row - 1, 1] > _GAP or node - pairs[begins[-1], 1] >= _LONGEST:
+            begins.append(row)
+    for begin, end in zip(begins, [*begins[1:], len(pairs)], strict=True):
+        group = pairs[begin:end]
+        if len(np.unique(group[:, 1])) >= ENOUGH:
+            near = {int(node) + step for node in group[:, 0] for step in range(-_AROUND, _AROUND + 1)}
+            last = int(group[-1, 1])
+            yield Stretch(one, other, tuple(sorted(near)), tuple(range(int(group[0, 1]), last + 1)))
+
+
+def join_part(number: int, stretch: Stretch, maps: Mapping[str, Mapping[str, Any]], slam: Mapping[str, Any]) -> Part:
+    """The part that looks for the loops of a stretch; `maps` has path and version of each drive's map."""
+    arguments = {
+        "one": maps[stretch.one],
+        "other": maps[stretch.other],
+        "nodes": [stretch.one_nodes, stretch.other_nodes],
+        "slam": slam,
+    }
+    return Part(f"joins/{stretch.one}/{stretch.other}/{number}", _WORK, arguments, fresh=True)
+
+
+def verify(
+    folder: Path,
+    advance: Advance,
+    one: Mapping[str, Any],
+    other: Mapping[str, Any],
+    nodes: Sequence[Sequence[int]],
+    slam: Mapping[str, Any],
+) -> Figures:
+    """Every loop that was tried from a node of the first drive to one of the other, as `edge_figures`.
+
+    Raises:
+        Dpm2Error: a map cannot be read.
+    """
+    del folder
+    closer = make_loops(settings_from(SlamSettings, dict(slam)))
+    with MapStore.open(Path(one["path"])) as a, MapStore.open(Path(other["path"])) as b:
+        first, second = _excerpt(a, nodes[0], "one"), _excerpt(b, nodes[1], "other")
+        clouds = _Clouds([first, second])
+        keyframes, poses = list(first.keyframes), np.concatenate([first.poses, second.poses])
+        tried: dict[tuple[int, int], Edge] = {}
+        for count, keyframe in enumerate(second.keyframes, 1):
+            keyframes.append(keyframe)
+            for loop in closer.close(keyframes, clouds, poses[: len(keyframes)]):
+                if loop.from_node < len(first.nodes) <= loop.to_node:
+                    ends = first.nodes[loop.from_node], second.nodes[loop.to_node - len(first.nodes)]
+                    tried[ends] = replace(loop, from_node=ends[0], to_node=ends[1])  # later: confirmed by another one
+            advance(count, len(second.keyframes))
+    return {"loops": [edge_figures(loop) for loop in tried.values()]}
+
+
+@dataclass(frozen=True, eq=False)
+class _Excerpt:
+    """Some keyframes of a map: nodes of theirs, keyframes with descriptors, poses (N, 4, 4), and all clouds."""
+
+    nodes: list[int]
+    keyframes: list[Keyframe]
+    poses: Array
+    data: MapData
+
+
+def _excerpt(store: MapStore, nodes: Sequence[int], robot: str) -> _Excerpt:
+    data = load_map(store, descriptors=False)
+    chosen = [node for node in nodes if 0 <= node < len(data)]
+    keyframes: list[Keyframe] = []
+    for node in chosen:
+        loan = data.clouds.loan(node)
+        owner = node if loan is None else loan.lender
+        packed = store.payload(owner, "descriptors")
+        lent = data.keyframes[owner]
+        lent = lent if packed is None else replace(lent, descriptors=unpack_descriptors(packed))
+        keyframe = lent if loan is None else borrowing(data.keyframes[node], {owner: lent}, loan)  # type: ignore[arg-type]
+        follows = node - 1 in chosen and data.keyframes[node - 1].robot == keyframe.robot
+        # Their own names keep the odometry of the two apart; a gap begins another stretch of it.
+        keyframes.append(replace(keyframe, robot=robot, edge=keyframe.edge if follows else None))
+    return _Excerpt(chosen, keyframes, data.poses[chosen], data)
+
+
+class _Clouds(Sequence[Points]):
+    """The clouds of excerpts, one after the other, read when they are asked for."""
+
+    def __init__(self, excerpts: Sequence[_Excerpt]) -> None:
+        self._where = [(excerpt.data, node) for excerpt in excerpts for node in excerpt.nodes]
+
+    def __len__(self) -> int:
+        return len(self._where)
+
+    @overload
+    def __getitem__(self, index: int) -> Points: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[Points]: ...
+
+    def __getitem__(self, index: int | slice) -> Points | list[Points]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(len(self))[index]]
+        data, node = self._where[index]
+        return data.clouds[node]
+
+
+def edge_figures(edge: Edge) -> Figures:
+    """A loop as JSON holds it."""
+    r = edge.registration
+    numbers = {"confidence": float(r.confidence), "rmse": float(r.rmse), "ok": bool(r.ok)}
+    matrices = {"T": r.T_target_source.tolist(), "covariance": r.covariance.tolist()}
+    return {
+        "ends": [int(edge.from_node), int(edge.to_node)],
+        **matrices,
+        **numbers,
+        "method": r.method,
+        "reason": r.reason,
+    }
+
+
+def edge_from(figures: Mapping[str, Any]) -> Edge:
+    """The inverse of `edge_figures`."""
+    T, covariance = np.array(figures["T"]), np.array(figures["covariance"])
+    numbers = figures["confidence"], figures["rmse"], figures["method"], figures["ok"], figures["reason"]
+    one, other = figures["ends"]
+    return Edge("loop", one, other, Registration(T, covariance, *numbers))

@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The pose graph of a fleet in stages: drives that meet often are solved as a region, then what ties the regions.
+
+A region gives to the second stage only the keyframes at which others touch it, with what it knows of their relative
+poses; where these come out elsewhere, it is solved again with them held. No stage needs a cloud.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dpm2_core.frame import Array, Edge, Registration
+from dpm2_core.geometry import se3
+from dpm2_core.slam.graph.pose_graph import PoseGraph, PoseGraphSettings
+from dpm2_core.slam.mapping.merge import merge_maps
+from dpm2_core.slam.mapping.restore import restore
+from dpm2_core.slam.store.map_data import MapData
+
+LARGEST = 20_000
+"""Keyframes of a region."""
+_MOVED = 1e-3  # m and rad: borders that moved by less leave their region as it is
+
+
+@dataclass(frozen=True, eq=False)
+class Join:
+    """A loop from a node of one drive to a node of another one, in the numbers of their maps."""
+
+    one: str
+    other: str
+    loop: Edge
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """Drives that are solved together: poses (N, 4, 4) by drive, and the joins within, checked."""
+
+    poses: dict[str, Array]
+    joins: list[Join]
+
+
+def regions_of(sizes: Mapping[str, int], joins: Sequence[Join], largest: int = LARGEST) -> list[list[str]]:
+    """Drives, in their order, into regions: each goes where most of its joins lead, if there is room.
+
+    Args:
+        sizes: keyframes of each drive. largest: of a region; a longer drive is one by itself.
+    """
+    regions: list[list[str]] = []
+    owner: dict[str, int] = {}
+    for name in sizes:
+        ties = Counter(owner[end] for join in joins if name in (join.one, join.other)
+                       for end in (join.one, join.other) if end in owner)  # fmt: skip
+        room = [r for r, _ in ties.most_common() if sum(sizes[d] for d in regions[r]) + sizes[name] <= largest]
+        if not room:
+            regions.append([])
+        owner[name] = room[0] if room else len(regions) - 1
+        regions[owner[name]].append(name)
+    return regions
+
+
+def solve(maps: Mapping[str, MapData], joins: Sequence[Join], settings: PoseGraphSettings,
+          largest: int = LARGEST) -> Region:  # fmt: skip
+    """The poses of all drives in one frame, that of the first, and each join accepted, or rejected with the reason.
+
+    Raises:
+        Dpm2Error: a graph cannot be solved.
+    """
+    regions = regions_of({name: len(data) for name, data in maps.items()}, joins, largest)
+    owner = {name: number for number, names in enumerate(regions) for name in names}
+    inner, outer = defaultdict(list), []
+    for join in joins:
+        if owner[join.one] == owner[join.other]:
+            inner[owner[join.one]].append(join)
+        else:
+            outer.append(join)
+    solved = [_region({name: maps[name] for name in names}, inner[number], settings)
+              for number, names in enumerate(regions)]  # fmt: skip
+    poses = {name: T for region in solved for name, T in region.poses.items()}
+    checked: list[Join] = []
+    if outer:
+        poses, checked = _borders(maps, solved, inner, outer, settings)
+    return Region(poses, [*(join for region in solved for join in region.joins), *checked])
+
+
+def side_by_side(maps: Mapping[str, MapData], joins: Sequence[Join]) -> MapData:
+    """The drives in one map, each with the poses that it has, and their joins as loops."""
+    first = first_nodes(maps)
+    loops = [
+        replace(
+            join.loop, from_node=join.loop.from_node + first[join.one], to_node=join.loop.to_node + first[join.other]
+        )
+        for join in joins
+    ]
+    both = _halved(list(maps.values()))
+    return replace(both, edges=[*both.edges, *loops])
+
+
+def first_nodes(maps: Mapping[str, MapData]) -> dict[str, int]:
+    """The node with which each drive begins where they are side by side."""
+    return dict(zip(maps, np.cumsum([0, *map(len, maps.values())]).tolist(), strict=False))
+
+
+def _halved(maps: Sequence[MapData]) -> MapData:
+    """One map of several; in halves, so that a cloud is a few calls away, however many there are."""
+    if len(maps) == 1:
+        return maps[0]
+    half = len(maps) // 2
+    return merge_maps(_halved(maps[:half]), _halved(maps[half:]), np.eye(4))
+
+
+def _region(maps: Mapping[str, MapData], joins: Sequence[Join], settings: PoseGraphSettings,
+            held: Mapping[tuple[str, int], Array] | None = None) -> Region:  # fmt: skip
+    """Solve drives and their joins; `held`: (4, 4) of nodes that stay there."""
+    data, first = side_by_side(maps, joins), first_nodes(maps)
+    graph = PoseGraph(settings)
+    restore(graph, data)
+    for (name, node), T in (held or {}).items():
+        graph.hold(first[name] + node, T)
+    graph.optimize()
+    verdicts = {(loop.from_node, loop.to_node): loop for loop in graph.loops}
+    out = [
+        replace(join, loop=replace(join.loop, registration=verdicts[ends].registration))
+        for join in joins
+        for ends in [(join.loop.from_node + first[join.one], join.loop.to_node + first[join.other])]
+    ]
+    return Region({name: graph.poses[at : at + len(maps[name])] for name, at in first.items()}, out)
+
+
+def _borders(maps: Mapping[str, MapData], solved: Sequence[Region], inner: Mapping[int, Sequence[Join]],
+             outer: Sequence[Join], settings: PoseGraphSettings) -> tuple[dict[str, Array], list[Join]]:  # fmt: skip
+    """Poses of all drives from those of the regions, and the joins between these, checked."""
+    ends = {(join.one, join.loop.from_node) for join in outer} | {(join.other, join.loop.to_node) for join in outer}
+    graph, where = PoseGraph(settings), dict[tuple[str, int], int]()
+    for region in solved:
+        own = {name: maps[name] for name in region.poses}
+        data, first = side_by_side(own, [join for join in region.joins if join.loop.ok]), first_nodes(own)
+        data = replace(data, poses=np.concatenate([region.poses[name] for name in own]))
+        within = PoseGraph(settings)
+        restore(within, data)
+        nodes = {end: first[end[0]] + end[1] for end in sorted(ends) if end[0] in own}
+        before: tuple[str, int] | None = None
+        for end in sorted(nodes, key=lambda end: (within.part(nodes[end]), end)):
+            where[end], step = len(graph), None
+            if before is not None and within.part(nodes[before]) == within.part(nodes[end]):
+                a, b = nodes[before], nodes[end]
+                T = se3.inverse(data.poses[a]) @ data.poses[b]
+                step = Edge("odometry", where[before], where[end], Registration(T, within.relative_covariance(a, b)))
+            graph.add_node(region.poses[end[0]][end[1]], step)
+            before = end
+    for join in outer:
+        graph.add_loop(replace(join.loop, from_node=where[join.one, join.loop.from_node],
+                               to_node=where[join.other, join.loop.to_node]))  # fmt: skip
+    graph.optimize()
+    checked = [replace(join, loop=replace(join.loop, registration=loop.registration))
+               for join, loop in zip(outer, graph.loops, strict=True)]  # fmt: skip
+    poses: dict[str, Array] = {}
+    for number, region in enumerate(solved):
+        held = {end: graph.pose(node) for end, node in where.items() if end[0] in region.poses}
+        poses |= _moved(maps, region, inner[number], held, settings)
+    return poses, checked
+
+
+def _moved(maps: Mapping[str, MapData], region: Region, joins: Sequence[Join],
+           held: Mapping[tuple[str, int], Array], settings: PoseGraphSettings) -> dict[str, Array]:  # fmt: skip
+    """Poses of a region whose borders have come to be elsewhere: moved as it is, or solved again where that differs."""
+    if not held:
+        return region.poses
+    moves = [T @ se3.inverse(region.poses[name][node]) for (name, node), T in held.items()]
+    shift = moves[0]
+    poses = {name: shift @ T for name, T in region.poses.items()}
+    if max(np.abs(poses[name][node] - T).max() for (name, node), T in held.items()) <= _MOVED:
+        return poses
+    own = {name: replace(maps[name], poses=poses[name]) for name in region.poses}
+    kept = [join for join, after in zip(joins, region.joins, strict=True) if after.loop.ok]
+    return _region(own, kept, settings, held).poses
