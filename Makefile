@@ -13,7 +13,7 @@ JOBS ?= -n 2 --dist worksteal
 # The environment is self-contained: a sourced ROS 2, another environment's bootstrap or its libraries must not leak in.
 unexport PYTHONPATH PYTHONHOME VIRTUAL_ENV AMENT_PREFIX_PATH ROS_DISTRO LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: help setup demo test test-fast fuzz lint bench bench-ros bench-robots bench-memory train-data train-small train-movers train-ground ablation sim diagrams parameters topics docs dist dist-check lint-release picture clean
+.PHONY: help setup demo test test-fast fuzz lint bench measure bench-ros bench-robots bench-memory train-data train-small train-movers train-ground ablation sim diagrams parameters topics docs dist dist-check lint-release picture clean
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:[^#]*##/\t/' | expand -t 16
 
@@ -61,6 +61,10 @@ bench-robots: setup  ## three robots and one mapper_node behind a link that lose
 bench-memory: setup  ## resident memory over a synthetic drive of 2,000 frames (8 GB on disk)
 	$(BIN)/python -m dpm2_core.cli sim out/memory --frames 2000 --seed 3 --no-images
 	$(BIN)/python -m dpm2_core.cli bench memory --source out/memory $(ARGS)
+
+measure: setup  ## every record that stands on the weights, again, at a clean commit; continues where it was stopped
+	@$(BIN)/python -c 'import kiss_icp' 2>/dev/null || $(BIN)/python -m pip install -qq -e '.[bench]'
+	$(BIN)/python -m tools.measure $(ARGS)
 
 # On a machine that does nothing else OpenMP threads may spin while they wait: a fifth faster.
 train-data: setup  ## the synthetic worlds that train-small and ablation learn from (2 cores: 40 minutes, 1.5 GB)

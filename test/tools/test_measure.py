@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is measured again: records of other code, and those that are not there or cannot be read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from benchmarks import BENCHES
+from dpm2_core.errors import UsageError
+from dpm2_core.evaluation.record import git_commit
+from tools import measure
+
+
+def test_every_record_is_a_benchmark_with_options_that_it_takes() -> None:
+    for name, options in measure.COMMANDS.items():
+        taken = BENCHES[name].options
+        assert {option.removeprefix("--") for option in options if option.startswith("--")} <= taken
+
+
+def test_records_of_this_code_are_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    commit = git_commit()
+    if commit is None:
+        pytest.skip("no git repository")
+    monkeypatch.setattr(measure, "RECORDS", tmp_path)
+    texts = {
+        "hard": f'{{"commit": "{commit.rstrip("+")}"}}',
+        "gaps": f'{{"commit": "{commit.rstrip("+")}+"}}',
+        "tilt": "[",
+        "neural": '{"commit": 5}',
+    }
+    for name, text in texts.items():
+        (tmp_path / f"{name}.json").write_text(text)
+    assert measure.remaining([*texts, "paper"]) == ["gaps", "tilt", "neural", "paper"]
+    assert "hard" not in measure.remaining([])
+    with pytest.raises(UsageError, match="harder: no such record; choose from geometric"):
+        measure.remaining(["harder"])
+
+
+def test_a_changed_checkout_is_not_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(measure, "git_commit", lambda: "abc+")
+    with pytest.raises(UsageError, match="commit what has changed"):
+        measure.main([])

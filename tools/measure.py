@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every record that stands on the weights, measured again: python -m tools.measure [NAME...] (`make measure`).
+
+What was stopped goes on: a record is whole if the code has not changed since the commit that it names.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from dpm2_core.errors import Dpm2Error, UsageError, exit_code
+from dpm2_core.evaluation.record import REPOSITORY, git_commit
+
+RECORDS = REPOSITORY / "benchmarks"
+COMMANDS: dict[str, Sequence[str]] = {
+    "geometric": (), "neural": (), "hard": (), "paper": (), "gaps": ("--only", "adaptive"),
+    "covariance": ("--threads", "1"), "tilt": (), "sensor": (), "relocalise": (), "roads": (), "finetune": (),
+}  # fmt: skip
+"""Benchmarks and their options, the quick ones first."""
+_CODE = ("dpm2_core", "benchmarks/*.py")
+
+
+def remaining(names: Sequence[str]) -> list[str]:
+    """Those of the records that are of other code, or not there.
+
+    Raises:
+        UsageError: no such record.
+    """
+    for name in names:
+        if name not in COMMANDS:
+            raise UsageError(f"{name}: no such record; choose from {', '.join(COMMANDS)}")
+    return [name for name in names or COMMANDS if not _is_current(measured_at(RECORDS / f"{name}.json"))]
+
+
+def measured_at(path: Path) -> str | None:
+    """The commit that a record names; None where there is no record that can be read."""
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    commit = record.get("commit") if isinstance(record, dict) else None
+    return commit if isinstance(commit, str) else None
+
+
+def _is_current(commit: str | None) -> bool:
+    """Whether the code is that of a commit."""
+    command = ["git", "diff", "--quiet", f"{commit}", "HEAD", "--", *_CODE]
+    return commit is not None and not subprocess.run(command, cwd=REPOSITORY, capture_output=True).returncode
+
+
+def main(names: Sequence[str]) -> None:
+    """Measure what is left, one after the other.
+
+    Raises:
+        UsageError: the checkout has changes that no commit has, or a name is wrong.
+        Dpm2Error: a benchmark failed.
+    """
+    commit = git_commit()
+    if commit is None or commit.endswith("+"):
+        raise UsageError("a record names the commit that it is of: commit what has changed first")
+    for name in remaining(names):
+        print(f"{name}: at {measured_at(RECORDS / f'{name}.json') or 'no commit'}, measured again", flush=True)
+        command = [sys.executable, "-m", "dpm2_core.cli", "bench", name, *COMMANDS[name]]
+        if subprocess.run(command, cwd=REPOSITORY, check=False).returncode:
+            raise Dpm2Error(f"{name}: the benchmark failed; what was measured before it is kept")
+
+
+if __name__ == "__main__":
+    sys.exit(exit_code(lambda: main(sys.argv[1:])))
