@@ -38,7 +38,7 @@ GROUPS = {
         "map": ("map:app", "Map files: info, export, merge, prune, check; pose graphs: optimize."),
     },
     "Fleets": {
-        "fleet": ("fleet:app", "Many drives, on this machine or on a cluster of Ray: run, merge."),
+        "fleet": ("fleet:app", "Many drives, on this machine or on a cluster of Ray: run, merge, sweep."),
     },
     "Learning": {
         "finetune": (

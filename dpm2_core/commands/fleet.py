@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -15,12 +17,12 @@ from dpm2_core.errors import Dpm2Error
 from dpm2_core.fleet.cluster import Cluster
 from dpm2_core.fleet.drives import parts_of, read_drives
 from dpm2_core.fleet.part import Part
-from dpm2_core.fleet.run import SUMMARY, carry_out, summary_table
+from dpm2_core.fleet.run import SUMMARY, Outcome, carry_out, summary_table
 from dpm2_core.fleet.view import TerminalView
 from dpm2_core.slam.settings import Config
 from dpm2_core.tables import FigureTable
 
-app = typer.Typer(help="Many drives, on this machine or on a cluster of Ray: run, merge.", no_args_is_help=True)
+app = typer.Typer(help="Many drives, on this machine or on a cluster of Ray: run, merge, sweep.", no_args_is_help=True)
 
 Drives = Annotated[
     list[Path], typer.Argument(metavar="DRIVE... | MANIFEST.yaml", help="Recordings, or a list of them as YAML.")
@@ -51,7 +53,8 @@ def run(
 
     What is whole is not done again: the same call goes on with what was stopped or has failed.
     """
-    _carry_out(parts_of(read_drives(drives), config, settings or ()), out, (address, workers), json_file)
+    parts = parts_of(read_drives(drives), config, settings or ())
+    _carry_out(parts, out, (address, workers), json_file, partial(summary_table, str(out)))
 
 
 @app.command()
@@ -88,7 +91,33 @@ def merge(
     )
 
 
-def _carry_out(parts: list[Part], out: Path, where: tuple[str | None, int | None], json_file: Path | None) -> None:
+@app.command()
+def sweep(
+    config: Annotated[Path, typer.Argument(metavar="CONFIG.yaml", help="Settings that all have in common.")],
+    drives: Drives,
+    out: Out,
+    settings: Annotated[
+        list[str], typer.Option("--set", help="KEY=VALUE,VALUE,...; of several, every combination is run.")
+    ],
+    address: Address = None,
+    workers: Workers = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Run the same drives with other settings, and show their figures in one table, a row for each combination."""
+    from dpm2_core.fleet.sweep import sweep_parts, sweep_table, variants
+
+    values = variants(settings)
+    parts = list(sweep_parts(read_drives(drives), config, values))
+    _carry_out(parts, out, (address, workers), json_file, partial(sweep_table, str(out), list(values)))
+
+
+def _carry_out(
+    parts: list[Part],
+    out: Path,
+    where: tuple[str | None, int | None],
+    json_file: Path | None,
+    table: Callable[[Sequence[Outcome]], FigureTable],
+) -> None:
     """Do the parts and say what came out.
 
     Raises:
@@ -97,7 +126,7 @@ def _carry_out(parts: list[Part], out: Path, where: tuple[str | None, int | None
     cores = max(part.cores for part in parts)
     with TerminalView(Console(stderr=True)) as view:
         outcomes = carry_out(parts, out, Cluster(*where, cores), view)
-    show(summary_table(str(out), outcomes), {"drives": [outcome._asdict() for outcome in outcomes]}, json_file)
+    show(table(outcomes), {"drives": [outcome._asdict() for outcome in outcomes]}, json_file)
     if any(outcome.state == "stopped" for outcome in outcomes):
         raise typer.Abort
     if failed := [outcome.name for outcome in outcomes if outcome.state == "failed"]:

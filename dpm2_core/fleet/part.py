@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import glob
 import hashlib
 import json
 import multiprocessing
@@ -159,7 +160,7 @@ def is_whole(folder: Path) -> bool:
 def remove_attempts(part: Part, out: Path) -> None:
     """Remove what attempts that were killed have left; none may be running."""
     folder = out / part.name
-    for left in folder.parent.glob(f".{folder.name}.*.attempt"):
+    for left in folder.parent.glob(f".{glob.escape(folder.name)}.*.attempt"):
         shutil.rmtree(left, ignore_errors=True)
 
 

@@ -19,6 +19,7 @@ from dpm2_core.errors import UsageError
 from dpm2_core.fleet.cluster import Cluster, Job
 from dpm2_core.fleet.drives import MAP, parts_of, read_drives
 from dpm2_core.fleet.run import SUMMARY, carry_out
+from dpm2_core.fleet.sweep import variants
 from dpm2_core.slam.store.check import check_map
 from dpm2_core.slam.store.map_store import MapStore
 
@@ -135,6 +136,37 @@ def test_a_fleet_gives_what_runs_give_and_goes_on_where_it_was(
     assert [row["state"] for row in again] == ["kept", "done"]
     assert (out / "one" / MAP).stat().st_mtime_ns == before
     equal(out / "two", alone)
+
+
+@pytest.mark.slow
+def test_a_sweep_has_a_row_for_each_combination(cluster: Cluster, drives: list[Path], tmp_path: Path) -> None:
+    """Each as it would be by itself; one that a drive fails with is counted, and compared on the others alone."""
+    config, out = tmp_path / "config.yaml", tmp_path / "out"
+    config.write_text("slam: {registration: geometric, threads: 1, loops: {descriptors: false}}")
+    values = ["--set", "slam.map.voxel=0.3,0.6", "--set", "slam.preprocess.max_range=30,60"]
+    done = dpm2("fleet", "sweep", config, drives[0], drives[2], "--out", out, *values)
+    assert done.returncode == 1
+    assert "means over 1 of 2 drives" in done.stdout
+    rows = json.loads((out / SUMMARY).read_text())["drives"]
+    assert sum(row["state"] == "done" for row in rows) == sum(row["state"] == "failed" for row in rows) == 4
+    maps = {len((out / row["name"] / "map.ply").read_bytes()) for row in rows if row["state"] == "done"}
+    assert len(maps) == 4, "the settings made no difference"
+
+
+@pytest.mark.parametrize(("settings", "words"), [
+    (["slam.map.voxel"], "want KEY=VALUE,VALUE"),
+    (["slam.map.voxel=1,,2"], "want KEY=VALUE,VALUE"),
+    (["a=1", "a=2"], "given twice"),
+])  # fmt: skip
+def test_a_sweep_of_nothing_is_an_error_of_use(settings: list[str], words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        variants(settings)
+
+
+def test_values_of_a_sweep_may_be_lists() -> None:
+    found = variants(["input.T=[1,2],[3,4]", "slam.neural.weights=a/b,c"])
+    assert list(found) == [f"T={T} weights={w}" for T in ("[1,2]", "[3,4]") for w in ("a_b", "c")]
+    assert found["T=[3,4] weights=a_b"] == ["input.T=[3,4]", "slam.neural.weights=a/b"]
 
 
 @pytest.mark.slow
