@@ -47,6 +47,8 @@ class Health:
         self._seconds: dict[str, deque[float]] = {}
         self.processed = self.failed = self.errors = 0
         self.last: OdometryResult | None = None
+        self.scale = ""
+        """What settings the odometry has chosen by its scans, if it chooses."""
         self._last_good: float | None = None
 
     def add(self, tracked: OdometryResult, latency: float) -> None:
@@ -74,6 +76,8 @@ class Health:
                 "internal errors": str(self.errors),
                 "rate (Hz)": f"{self._rate(now):.1f}",
             }
+            if self.scale:
+                out["scale"] = self.scale
             if self.last is not None:
                 out["confidence"] = f"{self.last.registration.confidence:.2f}"
                 out["breaks"] = str(self.last.breaks)

@@ -167,6 +167,9 @@ class SlamNode(GuardedNode):
             self._give_up()
             self._begin()
         self._health.add(tracked, time.monotonic() - bundle.arrival)
+        if (scale := self._slam.odometry.scale) != self._health.scale:
+            self.get_logger().info(f"slam.preset auto: {scale}, by what the scans show")
+            self._health.scale = scale
 
     def _tracked(self, frame: Frame) -> OdometryResult:
         """A step of the odometry, beside another one if there is one."""

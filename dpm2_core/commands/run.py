@@ -52,6 +52,9 @@ def run(
     ] = None,
     config: ConfigFile = None,
     settings: Overrides = None,
+    preset: Annotated[
+        str | None, typer.Option(help="slam.preset: auto (by what the scans show), outdoor, indoor or highway.")
+    ] = None,
     view: Annotated[bool, typer.Option("--view", help="Show the run as it goes on, in rerun's viewer.")] = False,
     record: Annotated[
         Path | None, typer.Option(help="The same to a file, such as run.rrd: `rerun run.rrd` shows it.")
@@ -60,6 +63,7 @@ def run(
 ) -> None:
     """Run the SLAM on a recording and write trajectory, map, image, timing and metrics."""
     overrides = [*(settings or []), *(["input.images=false"] if no_image else [])]
+    overrides += [] if preset is None else [f"slam.preset={preset}"]
     chosen = load_settings(Config, config, overrides)
     corruption = None if corrupt is None else parse_corruption(corrupt)
     span = parse_range(frames)
@@ -97,12 +101,12 @@ def run(
 
 def _drive(drive: OfflineRun, watch: Watch | None) -> Result:
     """The run with a progress bar; says at once what fails."""
-    name, problem = drive.source.name, ""
+    name, problem, seen = drive.source.name, "", ""
     with progress_bar() as bar:
         task = bar.add_task(name, total=len(drive))
 
         def progress(result: SlamResult) -> None:
-            nonlocal problem
+            nonlocal problem, seen
             tracked = result.odometry
             if (now := drive.slam.mapper.store_problem) and not problem:
                 bar.console.print(f"map file: {now}", style="red", soft_wrap=True)
@@ -111,6 +115,9 @@ def _drive(drive: OfflineRun, watch: Watch | None) -> Result:
                 bar.console.print(
                     f"frame {tracked.index}: {tracked.registration.reason}", style="yellow", soft_wrap=True
                 )
+            if (scale := drive.slam.odometry.scale) != seen:
+                bar.console.print(f"frame {tracked.index}: slam.preset auto: {scale}", soft_wrap=True)
+                seen = scale
             bar.update(task, advance=1, description=f"{name} {tracked.state}")
 
         return drive.run(progress, watch)

@@ -15,6 +15,7 @@ from dpm2_core.slam.loops.verification import Verifier
 from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.odometry.keyframe_selection import KeyframeSelector
 from dpm2_core.slam.odometry.odometry import Odometry
+from dpm2_core.slam.odometry.scaled import ScaledOdometry
 from dpm2_core.slam.preprocess import Preprocessor
 from dpm2_core.slam.registration.fused import FusedScanRegistration
 from dpm2_core.slam.registration.icp import GeometricRegistration
@@ -52,8 +53,16 @@ def make_map(s: SlamSettings, store: MapStore | None = None) -> tuple[Mapper, Lo
     return mapper, make_localizer(s, mapper) if store is not None and store.read_only else None
 
 
-def make_odometry(s: SlamSettings, robot: str = "") -> Odometry:
-    """The odometry with its collaborators."""
+def make_odometry(s: SlamSettings, robot: str = "") -> Odometry | ScaledOdometry:
+    """The odometry with its collaborators; with `preset: auto` one for streets and one for rooms."""
+    return (
+        ScaledOdometry(_odometry(s, robot), _odometry(s.indoors(), robot))
+        if s.preset == "auto"
+        else _odometry(s, robot)
+    )
+
+
+def _odometry(s: SlamSettings, robot: str) -> Odometry:
     return Odometry(s.odometry, make_registration(s), KeyframeSelector(s.keyframes, robot))
 
 
@@ -87,7 +96,9 @@ def make_localizer(s: SlamSettings, mapper: Mapper) -> Localizer:
     Raises:
         UsageError: the network has no weights to run with.
     """
-    verifier = Verifier(s.relocalise.verification, s.geometric)
+    i = s.indoors() if s.preset == "auto" else s
+    room = Verifier(i.relocalise.verification, i.geometric)
+    verifier = Verifier(s.relocalise.verification, s.geometric, room)
     relocalizer = Relocalizer(s.relocalise, verifier, _network(s), mapper.keyframes, mapper.clouds, mapper.poses)
     return Localizer(relocalizer, s.relocalise.max_failures)
 
@@ -99,7 +110,8 @@ def make_loops(s: SlamSettings) -> LoopCloser:
         UsageError: the network has no weights to run with.
     """
     described = s.loops.enabled and s.loops.descriptors
-    return LoopCloser(s.loops, s.geometric, _network(s) if described else None)
+    i = s.indoors() if s.preset == "auto" else s
+    return LoopCloser(s.loops, s.geometric, _network(s) if described else None, (i.loops, i.geometric))
 
 
 def _network(s: SlamSettings) -> DeepPointMap2:

@@ -28,9 +28,10 @@ from dpm2_core.slam.registration.visual import VisualSettings
 class SlamSettings(Settings):
     """The SLAM, stage by stage."""
 
-    preset: Literal["", "paper"] = ""
-    """Changes to the other defaults of `slam`; what is set besides has precedence. paper: the SLAM of DeepPointMap2 as
-    published, by the network alone (docs/experiments.md)."""
+    preset: Literal["auto", "outdoor", "indoor", "highway", "paper"] = "auto"
+    """Changes to the other defaults of `slam`; what is set besides has precedence. indoor: rooms and corridors at a
+    walk. highway: far and fast. outdoor: no change. auto: indoor where the scans show rooms, else outdoor. paper: the
+    SLAM of DeepPointMap2 as published, by the network alone (docs/experiments.md)."""
     registration: Literal["geometric", "neural", "refined", "adaptive"] = "adaptive"
     """How a scan finds its pose: by points, by neural descriptors, by both (refined), or by points that ask the network
     where they do not know (adaptive): at the start, after a pause, at few frames per second, along a tunnel. Adaptive
@@ -57,6 +58,10 @@ class SlamSettings(Settings):
         name = given.get("preset") if isinstance(given, Mapping) else None
         path = Path(__file__).with_name("presets") / f"{name}.yaml"
         return merged(read_yaml(path), given) if name in get_args(cls.model_fields["preset"].annotation)[1:] else given
+
+    def indoors(self) -> SlamSettings:
+        """With the preset for rooms under what differs from the defaults."""
+        return SlamSettings.model_validate({**self.model_dump(exclude_defaults=True), "preset": "indoor"})
 
     @property
     def uses_descriptors(self) -> bool:

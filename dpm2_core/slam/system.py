@@ -16,6 +16,7 @@ from dpm2_core.slam.loops.localizer import LocalizationResult, Localizer
 from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.mapping.thumbnail import thumbnail
 from dpm2_core.slam.odometry.odometry import Odometry
+from dpm2_core.slam.odometry.scaled import ScaledOdometry
 
 _LOST_ON_THE_WAY = 10_000_000_000  # ns after which a keyframe that has not come to the map will not come any more
 
@@ -65,7 +66,11 @@ class Slam:
     """
 
     def __init__(
-        self, odometry: Odometry, mapper: Mapper, localizer: Localizer | None = None, thumbnail_width: int = 0
+        self,
+        odometry: Odometry | ScaledOdometry,
+        mapper: Mapper,
+        localizer: Localizer | None = None,
+        thumbnail_width: int = 0,
     ) -> None:
         """`thumbnail_width`: of the image that a keyframe carries into a map file, pixels; 0: none."""
         self.odometry, self.mapper, self.localizer = odometry, mapper, localizer

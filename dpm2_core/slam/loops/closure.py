@@ -18,6 +18,7 @@ from pydantic import Field
 from dpm2_core.config import Settings
 from dpm2_core.frame import Array, Edge, Keyframe, Points, Registration
 from dpm2_core.geometry import se3
+from dpm2_core.geometry.scale import is_room
 from dpm2_core.slam.loops.consistency import Consistency, ConsistencySettings, OdometryChain
 from dpm2_core.slam.loops.place_recognition import PlaceRecognition, merged
 from dpm2_core.slam.loops.verification import VerificationSettings, Verifier
@@ -68,12 +69,15 @@ class LoopCloser:
         settings: LoopSettings,
         registration: GeometricSettings,
         network: DeepPointMap2 | None = None,
+        room: tuple[LoopSettings, GeometricSettings] | None = None,
     ) -> None:
-        self._settings = settings
-        self._verifier = Verifier(settings.verification, registration)
+        """`room`: for keyframes that show a room; None: as for all."""
+        self._usual = settings, Verifier(settings.verification, registration)
+        self._room = self._usual if room is None else (room[0], Verifier(room[0].verification, room[1]))
+        self._settings, self._verifier = self._usual
         self._places = PlaceRecognition(network) if network is not None else None
         self._path = OdometryChain()
-        self._consistency = Consistency(settings.consistency, self._path)
+        self._consistency = Consistency(self._path)
 
     @property
     def channels(self) -> int | None:
@@ -103,6 +107,8 @@ class LoopCloser:
         if not self._settings.enabled or len(keyframes) < 2:
             return []
         node = len(keyframes) - 1
+        if self._room is not self._usual:
+            self._settings, self._verifier = self._room if is_room(clouds[node]) else self._usual
         since = self._path.since(node)
         tried, proposals = self._proposals(node, since, keyframes, poses)
         for number, proposal in enumerate(proposals):
@@ -117,7 +123,7 @@ class LoopCloser:
                 tried.append(loop)
                 continue
             T_expected = se3.inverse(poses[loop.from_node]) @ poses[node]
-            tried += self._consistency.check(loop, T_expected)
+            tried += self._consistency.check(loop, T_expected, self._settings.consistency)
             break
         return tried
 

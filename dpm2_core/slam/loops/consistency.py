@@ -78,31 +78,30 @@ class OdometryChain:
 class Consistency:
     """Lets a verified loop pass when the odometry or another loop agrees; until then it waits."""
 
-    def __init__(self, settings: ConsistencySettings, path: OdometryChain) -> None:
-        self._settings = settings
+    def __init__(self, path: OdometryChain) -> None:
         self._path = path
         self._accepted: list[Edge] = []
         self._waiting: list[Edge] = []
 
-    def check(self, loop: Edge, T_expected: Array) -> list[Edge]:
+    def check(self, loop: Edge, T_expected: Array, settings: ConsistencySettings) -> list[Edge]:
         """Check a loop that the points have verified.
 
         Args:
-            T_expected: (4, 4) T_from_to as the map has it.
+            T_expected: (4, 4) T_from_to as the map has it. settings: for what the loop's new end shows.
 
         Returns:
             The loop, accepted or rejected with the reason; if accepted, with those that waited for one like it.
         """
-        s = self._settings
+        s = settings
         since = self._path.between(loop.from_node, loop.to_node)
         meters, degrees = se3.magnitude(se3.inverse(T_expected) @ loop.T_from_to)
         if np.isfinite(since):
             if meters > 1 + s.drift * since or degrees > 3 + s.drift_turn * since:
                 return [loop.rejected(f"{meters:.1f} m, {degrees:.1f} deg from the odometry")]
             if meters <= s.certain and degrees <= s.certain:
-                return self._accept([loop, *(w for w in self._waiting if self._agree(loop, w))])
-        confirmed = [w for w in self._waiting if self._agree(loop, w)]
-        if confirmed or any(self._agree(loop, a) for a in self._accepted[-200:]):
+                return self._accept([loop, *(w for w in self._waiting if self._agree(loop, w, s))])
+        confirmed = [w for w in self._waiting if self._agree(loop, w, s)]
+        if confirmed or any(self._agree(loop, a, s) for a in self._accepted[-200:]):
             return self._accept([loop, *confirmed])
         self._waiting.append(loop)
         return [loop.rejected(f"{meters:.1f} m from the odometry: waits for a second loop that agrees")]
@@ -112,9 +111,9 @@ class Consistency:
         self._waiting = [w for w in self._waiting if all(w is not loop for loop in loops)]
         return list(loops)
 
-    def _agree(self, one: Edge, other: Edge) -> bool:
+    def _agree(self, one: Edge, other: Edge, s: ConsistencySettings) -> bool:
         """Whether the circle through both closes."""
-        s, path = self._settings, self._path
+        path = self._path
         there = path.between(one.from_node, other.from_node)
         back = path.between(one.to_node, other.to_node)
         if one.to_node == other.to_node or max(there, back) > s.reach:

@@ -12,7 +12,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from dpm2_core.config import Settings
@@ -22,7 +21,6 @@ from dpm2_core.geometry import se3
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.slam.loops.place_recognition import PlaceRecognition
 from dpm2_core.slam.loops.verification import VerificationSettings, Verifier
-from dpm2_core.slam.registration.local_map import LocalMap
 
 if TYPE_CHECKING:  # torch takes seconds to import
     from dpm2_core.network.model import DeepPointMap2
@@ -108,13 +106,11 @@ class Relocalizer:
             return nowhere("outside the map")
         nodes = near[np.argsort(distance[near])[: self._settings.keyframes]]
         T_at_map = se3.inverse(self._poses[nodes[0]])
-        around = self._around(nodes, T_at_map)
-        result = self._verifier.verify(cloud, around, T_at_map @ T_map_lidar, widen).registration
+        verifier = self._verifier.suited_to(cloud)
+        around = verifier.surroundings([self._clouds[n] for n in nodes.tolist()], T_at_map @ self._poses[nodes])
+        result = verifier.verify(cloud, around, T_at_map @ T_map_lidar, widen).registration
         T = se3.orthonormalized(self._poses[nodes[0]] @ result.T_target_source)
         return replace(result, T_target_source=T, method="relocalisation")
-
-    def _around(self, nodes: NDArray[np.intp], T_at_map: Array) -> LocalMap:
-        return self._verifier.surroundings([self._clouds[n] for n in nodes.tolist()], T_at_map @ self._poses[nodes])
 
     def _proposals(self, descriptors: Descriptors, nodes: Sequence[int]) -> list[Registration]:
         """T_map_lidar by each keyframe, the most confident first, one for each place."""

@@ -8,16 +8,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from dpm2_core.config import Settings
 from dpm2_core.frame import Array, Points, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.ground import height_above_ground
+from dpm2_core.geometry.scale import is_room
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.slam.registration.icp import GeometricRegistration, GeometricSettings
 from dpm2_core.slam.registration.local_map import LocalMap, LocalMapSettings
 
-_SOURCE_VOXEL = 0.8  # m, spacing of the points that are registered, as in the odometry
 _CELL = 2.0  # m, of the grid whose lowest points are the ground
 _ABOVE = 0.5  # m over it: what stands there
 
@@ -25,6 +26,10 @@ _ABOVE = 0.5  # m over it: what stands there
 class VerificationSettings(Settings):
     """What a pose needs to be accepted."""
 
+    voxel: float = Field(0.8, gt=0)
+    """Spacing of the points that are registered, m, as in the odometry..."""
+    map_voxel: float = Field(0.5, gt=0)
+    """...and of those that they are registered to, m."""
     min_inliers: float = 0.6
     """Fraction of the points that must fit the map."""
     min_structure: float = 0.6
@@ -63,15 +68,23 @@ class VerificationResult:
 class Verifier:
     """Registers a cloud to the keyframes around a place, from a proposed pose, and checks the result."""
 
-    def __init__(self, settings: VerificationSettings, registration: GeometricSettings) -> None:
+    def __init__(
+        self, settings: VerificationSettings, registration: GeometricSettings, room: Verifier | None = None
+    ) -> None:
+        """`room`: another one for clouds that show a room; None: this one."""
         self._settings = settings
+        self._room = room
         self._noise = registration.noise
         self._gate = registration.final_gate
         self._registration = GeometricRegistration(registration)
 
+    def suited_to(self, cloud: Points) -> Verifier:
+        """The one for a cloud (M, 4), by what it shows."""
+        return self._room if self._room is not None and is_room(cloud) else self
+
     def surroundings(self, clouds: Sequence[Points], poses: Array) -> LocalMap:
         """The map of (M, 4) clouds taken at (N, 4, 4) poses, in the frame of those poses, to be verified against."""
-        local_map = LocalMap(LocalMapSettings())
+        local_map = LocalMap(LocalMapSettings(voxel=self._settings.map_voxel))
         parts = [se3.transform(T, cloud) for T, cloud in zip(poses, clouds, strict=True)]
         local_map.insert(np.concatenate(parts), np.eye(4), poses)
         return local_map
@@ -83,7 +96,7 @@ class Verifier:
             widen: factor on how far from the proposed pose the points may look for theirs.
         """
         near = cloud[np.einsum("ij,ij->i", cloud[:, :3], cloud[:, :3]) < self._settings.range**2]
-        source = near[voxel_first(near, _SOURCE_VOXEL), :3].astype(np.float64)
+        source = near[voxel_first(near, self._settings.voxel), :3].astype(np.float64)
         result = self._registration.register(source, around, T_proposed, widen)
         if not result.ok:
             return VerificationResult(result)

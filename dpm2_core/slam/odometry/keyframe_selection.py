@@ -50,6 +50,10 @@ class KeyframeSelector:
         self._requested = False
         self._spacing = Spacing(self._settings.distance, self._settings.residual)
 
+    def take_over(self, before: KeyframeSelector) -> None:
+        """Go on after the keyframes of another one."""
+        self._last, self._uncertainty, self._requested = before._last, before._uncertainty, before._requested
+
     def request(self) -> None:
         """Make a keyframe of the next registered scan at any distance: relocalization needs one even at standstill."""
         self._requested = True

@@ -8,6 +8,7 @@ from dataclasses import replace
 from time import perf_counter
 
 import numpy as np
+from pydantic import Field
 
 from dpm2_core.config import Settings
 from dpm2_core.frame import Array, Frame, OdometryResult, Registration, State
@@ -27,6 +28,9 @@ class OdometrySettings(Settings):
     """A registration that differs from the prediction by more than this allows is rejected, m/s2 (0.5 m are free)."""
     max_turn: float = 200.0
     """The same for rotation, deg/s of difference from the predicted rate (3 deg are free)."""
+    turns: float = Field(0.0, ge=0, le=180)
+    """A scan that does not fit is looked for at other headings as well, up to so many degrees to both sides: robots
+    that turn on the spot; 0: not."""
     steadiness: float = 10.0
     """Standard deviation of the acceleration, m/s2 (and, in rad/s2, of the angular one): how far the prediction is
     trusted where the points do not constrain the pose, as along a tunnel. Elsewhere they outweigh it."""
@@ -48,6 +52,7 @@ _PERIOD = 0.1  # s, assumed between two stamps that do not advance
 _AHEAD = ((0.0, 0), (1.0, 0), (2.0, 0), (3.0, 0), (-1.0, 0))
 _CURVES = tuple((x, yaw) for yaw in (4, -4, 8, -8) for x in (0.5, 1.5, 2.5))
 _FITS_WELL = 0.7
+_HEADINGS = 3  # to each side
 _SLOWEST = 2.0  # s: no stream has a longer period
 _KNOWN = 0.5  # m and rad, standard deviation of the second pose, still skewed: where the points find it alone
 _RHYTHM = 9  # periods: their median is that of the stream
@@ -56,6 +61,9 @@ _ANY_VELOCITY = 15.0**2 * np.eye(3)  # covariance, m/s: so much until two scans 
 
 class Odometry:
     """The pose of the LiDAR in the odometry frame, which is that of the first usable scan."""
+
+    scale = ""
+    """What the settings are for, where that follows the scans: see `ScaledOdometry`."""
 
     def __init__(self, settings: OdometrySettings, registration: ScanRegistration, keyframes: KeyframeSelector) -> None:
         self._settings = settings
@@ -91,6 +99,17 @@ class Odometry:
         self._led = False  # by another odometry to the pose of this frame
         self._registration.clear()
         self._keyframes.reset()
+
+    def take_over(self, before: Odometry, frame: Frame) -> None:
+        """Go on where another one has just registered a frame: its pose and motion, and a map of that scan alone."""
+        self.reset()
+        self._T, self._twist, self._of_velocity = before._T, before._twist, before._of_velocity
+        self._covariance, self._stamp, self._registered = before._covariance, before._stamp, before._registered
+        self._clock, self._breaks, self._other = before._clock, before._breaks, before._other
+        self._periods.extend(before._periods)
+        self._keyframes.take_over(before._keyframes)
+        twist = np.zeros(6) if self._twist is None else self._twist
+        self._registration.update(self._registration.prepare(frame, twist), self._T)
 
     def process(self, frame: Frame) -> OdometryResult:
         """Pose of one frame; never raises for what a sensor may deliver, and always gives a finite pose."""
@@ -200,7 +219,13 @@ class Odometry:
         widen = min(seconds / dt, 5.0)
         information = np.linalg.inv(self._of_prediction(seconds)).astype(np.float64)
         result = self._registration.register(scan, Prediction([T_predicted], widen, information))
-        return self._gated(result, T_predicted, dt)
+        result = self._gated(result, T_predicted, dt)
+        if result.ok or not self._settings.turns:
+            return result
+        yaws = np.radians(np.linspace(-self._settings.turns, self._settings.turns, 2 * _HEADINGS + 1))
+        starts = [T_predicted @ se3.exp([0, 0, yaw, 0, 0, 0]) for yaw in yaws if yaw]
+        turned = self._gated(self._registration.register(scan, Prediction(starts, widen)), T_predicted, dt)
+        return turned if turned.ok else result
 
     def _step_of_other(self) -> Step | None:
         """What another odometry says of the way since the last registered frame."""

@@ -103,7 +103,10 @@ def test_resolved_configuration_is_written_and_reads_back(recording: Path, tmp_p
         (["/nowhere"], "/nowhere: no such file"),
         (["SRC", "--frames", "5"], "--frames 5: want a:b"),
         (["SRC", "--frames", "50:60"], "12 frames"),
-        (["SRC", "--set", "slam.registraton=neural"], "unknown key slam.registraton; allowed here: registration"),
+        (
+            ["SRC", "--set", "slam.registraton=neural"],
+            "unknown key slam.registraton; allowed here: preset, registration",
+        ),
         (["SRC", "--set", "slam.registration=magic"], "slam.registration"),
         (["SRC", "--set", "slam.map.voxel=coarse"], "slam.map.voxel"),
         (["SRC", "--config", "/nowhere.yaml"], "/nowhere.yaml"),

@@ -45,5 +45,5 @@ def test_what_is_dumped_loads_back_equal(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["papers", "../paper", "3", "[paper]"])
 def test_another_name_is_an_error_that_names_the_choice(name: str) -> None:
-    with pytest.raises(UsageError, match=r"--set slam\.preset=.*'' or 'paper'"):
+    with pytest.raises(UsageError, match=r"--set slam\.preset=.*'highway' or 'paper'"):
         load_settings(Config, None, [f"slam.preset={name}"])

@@ -38,6 +38,10 @@ def expected(path: OdometryChain, a: int, b: int) -> Array:
     return path.T(a, b)
 
 
+def checked_by(consistency: Consistency, candidate: Edge, T_expected: np.ndarray) -> list[Edge]:
+    return consistency.check(candidate, T_expected, ConsistencySettings())
+
+
 def test_path_lengths_are_known_within_a_segment_alone() -> None:
     path = OdometryChain()
     nodes = [("a", None), ("a", FIRM), ("b", None), ("a", FIRM), ("b", FIRM), ("a", LOST), ("a", FIRM)]
@@ -52,35 +56,35 @@ def test_path_lengths_are_known_within_a_segment_alone() -> None:
 def test_a_loop_that_agrees_with_the_odometry_needs_no_other() -> None:
     path = straight()
     T = expected(path, 0, 100)
-    (checked,) = Consistency(ConsistencySettings(), path).check(loop(0, 100, T @ pose(1.5)), T)
+    (checked,) = checked_by(Consistency(path), loop(0, 100, T @ pose(1.5)), T)
     assert checked.ok
 
 
 def test_a_loop_beyond_all_drift_is_rejected() -> None:
     path = straight()
-    consistency = Consistency(ConsistencySettings(), path)
+    consistency = Consistency(path)
     T = expected(path, 0, 100)
     for off in (pose(12.0), pose(0, 0, np.radians(14))):  # 500 m of path allow 11 m and 13 degrees
-        (checked,) = consistency.check(loop(0, 100, T @ off), T)
+        (checked,) = checked_by(consistency, loop(0, 100, T @ off), T)
         assert not checked.ok
         assert "from the odometry" in checked.registration.reason
     # what was rejected confirms nothing
-    (checked,) = consistency.check(loop(1, 99, expected(path, 1, 99) @ pose(11.9)), expected(path, 1, 99))
+    (checked,) = checked_by(consistency, loop(1, 99, expected(path, 1, 99) @ pose(11.9)), expected(path, 1, 99))
     assert not checked.ok
 
 
 def test_two_loops_that_agree_are_accepted_together() -> None:
     path, drift = straight(), pose(6.0)
-    consistency = Consistency(ConsistencySettings(), path)
+    consistency = Consistency(path)
     first = loop(0, 99, drift @ expected(path, 0, 99))
-    (waiting,) = consistency.check(first, expected(path, 0, 99))
+    (waiting,) = checked_by(consistency, first, expected(path, 0, 99))
     assert not waiting.ok
     assert "waits" in waiting.registration.reason
-    accepted = consistency.check(loop(1, 100, drift @ expected(path, 1, 100)), expected(path, 1, 100))
+    accepted = checked_by(consistency, loop(1, 100, drift @ expected(path, 1, 100)), expected(path, 1, 100))
     assert [(a.from_node, a.to_node) for a in accepted] == [(1, 100), (0, 99)]
     assert all(a.ok for a in accepted)
     # a third one finds the two accepted, and none is accepted twice
-    third = consistency.check(loop(2, 98, drift @ expected(path, 2, 98)), expected(path, 2, 98))
+    third = checked_by(consistency, loop(2, 98, drift @ expected(path, 2, 98)), expected(path, 2, 98))
     assert [(a.from_node, a.to_node) for a in third] == [(2, 98)]
 
 
@@ -91,9 +95,9 @@ def test_two_loops_that_agree_are_accepted_together() -> None:
 )
 def test_a_loop_is_not_confirmed_by(a: int, b: int, off: Array) -> None:
     path = straight()
-    consistency = Consistency(ConsistencySettings(), path)
-    consistency.check(loop(0, 99, pose(6.0) @ expected(path, 0, 99)), expected(path, 0, 99))
-    (checked,) = consistency.check(loop(a, b, off @ expected(path, a, b)), expected(path, a, b))
+    consistency = Consistency(path)
+    checked_by(consistency, loop(0, 99, pose(6.0) @ expected(path, 0, 99)), expected(path, 0, 99))
+    (checked,) = checked_by(consistency, loop(a, b, off @ expected(path, a, b)), expected(path, a, b))
     assert not checked.ok
 
 
@@ -103,8 +107,8 @@ def test_between_robots_it_always_takes_two() -> None:
     for node in range(40):
         robot = "a" if node < 20 else "b"
         path.append(keyframe(node, pose(5.0 * (node % 20)), None if node % 20 == 0 else FIRM, robot))
-    consistency = Consistency(ConsistencySettings(), path)
+    consistency = Consistency(path)
     T = pose(0.5)
-    (first,) = consistency.check(loop(3, 23, T), np.eye(4))
+    (first,) = checked_by(consistency, loop(3, 23, T), np.eye(4))
     assert not first.ok
-    assert len(consistency.check(loop(4, 24, T), np.eye(4))) == 2
+    assert len(checked_by(consistency, loop(4, 24, T), np.eye(4))) == 2

@@ -1,0 +1,37 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether a scan was taken in a room or in the open: by how much surface it shows, and how far away that is."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dpm2_core.frame import Points
+from dpm2_core.geometry.voxel import voxel_first
+
+_CELL = 0.5  # m: so much surface counts once, however many beams meet it
+_FEW = 20_000  # points are enough
+_NEAREST = 0.3  # m
+# Cells seen, and the distance within which three quarters of them are, m. Measured: rooms and offices 130 to 530 cells
+# within 8 m; streets, tunnels, highways and car parks, also with 16 beams, 1,900 to 11,000 within 14 m and more.
+_ROOM = (800, 18.0)
+_OPEN = (1300, 25.0)
+_LEAST = 30  # cells: fewer say nothing
+
+
+def is_room(points: Points) -> bool | None:
+    """True for a room, a corridor or a hall, False for a street or a tunnel, None where it may be either.
+
+    Args:
+        points: (N, 4) a scan in the LiDAR frame, or a keyframe's cloud; NaN and zeros are passed over.
+    """
+    some = points[:: max(1, len(points) // _FEW), :3]
+    away = np.linalg.norm(some, axis=1)
+    valid = (away > _NEAREST) & (away < 1e4)  # False for NaN
+    some, away = some[valid], away[valid]
+    cells = voxel_first(some, _CELL) if len(some) else np.zeros(0, int)
+    if len(cells) < _LEAST:
+        return None
+    reach = float(np.percentile(away[cells], 75))
+    if len(cells) <= _ROOM[0] and reach <= _ROOM[1]:
+        return True
+    return False if len(cells) >= _OPEN[0] or reach >= _OPEN[1] else None

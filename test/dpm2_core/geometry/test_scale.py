@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rooms are told from streets, by scans of any LiDAR; in doubt nothing is said."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dpm2_core.data.kitti import KittiSource
+from dpm2_core.data.settings import InputSettings
+from dpm2_core.geometry import se3
+from dpm2_core.geometry.scale import is_room
+from dpm2_core.geometry.voxel import voxel_first
+from test.helpers.rooms import frames, walk
+
+MIDDLE = se3.make(np.eye(3), [0, 0, 0.6])
+
+
+@pytest.mark.parametrize("voxel", [0.0, 0.1, 0.3])
+def test_a_room_and_a_street(voxel: float) -> None:
+    """Of a whole scan and of a keyframe's cloud alike."""
+    room, street = frames(MIDDLE[None])[0].points, frames(MIDDLE[None], street=True)[0].points
+    if voxel:
+        room, street = room[voxel_first(room, voxel)], street[voxel_first(street, voxel)]
+    assert is_room(room) is True
+    assert is_room(street) is False
+
+
+def test_too_little_says_nothing() -> None:
+    points = frames(MIDDLE[None])[0].points
+    assert is_room(points[:10]) is None
+    assert is_room(np.zeros((1000, 4), np.float32)) is None
+    assert is_room(np.full((1000, 4), np.nan, np.float32)) is None
+    assert is_room(np.zeros((0, 4), np.float32)) is None
+    holes = points.copy()
+    holes[::3, :3] = np.nan
+    holes[1::3, :3] = 0
+    assert is_room(holes) is True
+    assert is_room(frames(walk(1))[0].points) is True
+
+
+@pytest.mark.parametrize("sequence", ["00", "04"])
+def test_no_scan_of_kitti_is_a_room(kitti_root: Path, sequence: str) -> None:
+    """What the defaults do on real streets stays as it is."""
+    source = KittiSource(kitti_root / "sequences" / sequence, InputSettings(images=False))
+    assert {is_room(frame.points) for frame in source.frames()} == {False}

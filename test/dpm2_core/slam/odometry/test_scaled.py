@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""With default settings a small room with 16 beams works, and a street is as if there were no rooms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dpm2_core.frame import Frame, State
+from dpm2_core.geometry import se3
+from dpm2_core.slam.build import make_odometry
+from dpm2_core.slam.odometry.scaled import ScaledOdometry
+from dpm2_core.slam.settings import SlamSettings
+from test.helpers.rooms import frames, walk
+
+
+def geometric(preset: str) -> SlamSettings:
+    return SlamSettings.model_validate({"preset": preset, "registration": "geometric", "visual": {"enabled": False}})
+
+
+def away(preset: str, drive: list[Frame], poses: np.ndarray) -> tuple[np.ndarray, list[bool], str]:
+    """Distances (N,) m from the true places, which frames were registered, and the scale at the end."""
+    odometry = make_odometry(geometric(preset))
+    results = [odometry.process(frame) for frame in drive]
+    T = np.stack([result.T_odom_lidar for result in results])
+    want = se3.inverse(poses[0]) @ poses
+    return np.linalg.norm(T[:, :3, 3] - want[:, :3, 3], axis=1), [r.registration.ok for r in results], odometry.scale
+
+
+def test_a_small_room_with_16_beams_works_unasked() -> None:
+    """5 x 4 m, furnished: every scan registered, to 3 cm; the settings for streets register none of them."""
+    poses = walk(40)
+    off, registered, scale = away("auto", frames(poses), poses)
+    assert scale == "indoor"
+    assert all(registered)
+    assert off.max() < 0.03
+    _, registered, scale = away("outdoor", frames(poses), poses)
+    assert sum(registered) < 4
+    assert scale == ""
+
+
+def test_a_street_is_as_if_there_were_no_rooms() -> None:
+    """To the last bit."""
+    poses = se3.exp(np.outer(np.arange(12), [0, 0, 0.01, 0.6, 0, 0])) @ se3.make(np.eye(3), [0, 0, 1.7])
+    drive = frames(poses, street=True)
+    auto, outdoor = (make_odometry(geometric(preset)) for preset in ("auto", "outdoor"))
+    for frame in drive:
+        np.testing.assert_array_equal(auto.process(frame).T_odom_lidar, outdoor.process(frame).T_odom_lidar)
+    assert auto.scale == "outdoor"
+
+
+@pytest.mark.slow
+def test_a_robot_that_leaves_its_room_goes_on() -> None:
+    """After 20 scans of the street, without a jump of the pose; ids of keyframes count on."""
+    inside, outside = walk(15), np.tile(np.eye(4), (45, 1, 1))
+    outside[:, 0, 3], outside[:, 2, 3] = 0.3 * np.arange(45), 0.6
+    odometry = make_odometry(geometric("auto"))
+    assert isinstance(odometry, ScaledOdometry)
+    for frame in frames(inside):
+        assert odometry.process(frame).registration.ok
+    assert odometry.scale == "indoor"
+    results = []
+    for frame in frames(outside, street=True, start=15):
+        results.append(odometry.process(frame))
+        if len(results) == 10:
+            assert odometry.scale == "indoor"
+    assert odometry.scale == "outdoor"
+    assert results[-1].state in (State.TRACKING, State.DEGRADED)
+    ids = [result.keyframe.id for result in results if result.keyframe is not None]
+    assert len(set(ids)) == len(ids)
+    registered = [r for r in results[-20:] if r.registration.ok]
+    assert len(registered) == 20
+    step = se3.inverse(registered[0].T_odom_lidar) @ registered[-1].T_odom_lidar
+    np.testing.assert_allclose(np.linalg.norm(step[:3, 3]), 19 * 0.3, atol=0.1)
+
+
+def test_a_glance_changes_nothing() -> None:
+    """A person before the LiDAR, a lorry beside it: rooms for a second and a half."""
+    poses = np.tile(se3.make(np.eye(3), [0, 0, 1.7]), (6, 1, 1))
+    odometry = make_odometry(geometric("auto"))
+    for frame in frames(poses, street=True):
+        odometry.process(frame)
+    for frame in frames(walk(15), start=6):
+        odometry.process(frame)
+    assert odometry.scale == "outdoor"
+    odometry.reset()
+    assert odometry.scale == ""
+
+
+def test_frames_that_say_nothing_decide_nothing() -> None:
+    odometry = make_odometry(geometric("auto"))
+    odometry.process(Frame(0, np.zeros((0, 4), np.float32)))
+    odometry.process(Frame(1, np.zeros((0, 4), np.float32), problem="damaged"))
+    assert odometry.scale == ""
+    odometry.process(frames(walk(1), start=1)[0])
+    assert odometry.scale == "indoor"
+
+
+@pytest.mark.parametrize("preset", ["indoor", "outdoor", "highway"])
+def test_presets_are_under_what_is_set(preset: str) -> None:
+    chosen = SlamSettings.model_validate({"preset": preset, "keyframes": {"distance": 2.5}})
+    assert chosen.keyframes.distance == 2.5
+    assert SlamSettings.model_validate(chosen.model_dump()) == chosen  # what a run has written is read back as it was
+    usual = SlamSettings(preset="outdoor", keyframes=chosen.keyframes.model_copy(update={"distance": 2.5}))
+    assert (chosen.preprocess == usual.preprocess) == (preset == "outdoor")
+
+
+def test_rooms_keep_what_is_set() -> None:
+    chosen = SlamSettings.model_validate({"geometric": {"noise": 0.02}, "threads": 1}).indoors()
+    assert (chosen.geometric.noise, chosen.geometric.gate, chosen.threads) == (0.02, 0.8, 1)

@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scans of a LiDAR with 16 beams in a box with boxes in it, by rays: a furnished room, or a street under the sky."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dpm2_core.frame import Array, Frame, Points
+from dpm2_core.geometry import se3
+
+_AZIMUTH, _ELEVATION = np.meshgrid(np.radians(np.arange(0, 360, 0.8)), np.radians(np.arange(-15, 16, 2.0)))
+RAYS = np.stack(
+    [np.cos(_ELEVATION) * np.cos(_AZIMUTH), np.cos(_ELEVATION) * np.sin(_AZIMUTH), np.sin(_ELEVATION)], -1
+).reshape(-1, 3)
+
+
+def boxes(low: tuple[float, float], high: tuple[float, float], count: int, size: Array, seed: int = 0) -> Array:
+    """(count, 2, 3) low and high corners of boxes on the floor, 1 m and more off the line y = 0."""
+    rng = np.random.default_rng(seed)
+    at = np.column_stack([rng.uniform(low[0], high[0], count), rng.uniform(1.0, high[1], count)])
+    at[:, 1] = np.where(rng.random(count) < 0.5, at[:, 1], at[:, 1] * low[1] / high[1] - size[1])
+    extent = size * rng.uniform(0.5, 1.5, (count, 3))
+    return np.stack([np.column_stack([at, np.zeros(count)]), np.column_stack([at + extent[:, :2], extent[:, 2]])], 1)
+
+
+def scan(T: Array, hull: Array, things: Array, seed: int) -> Points:
+    """(N, 4) from a pose T_world_lidar (4, 4) within a hull (2, 3) with things (K, 2, 3) in it; 1 cm of noise."""
+    origin, rays = T[:3, 3], RAYS @ T[:3, :3].T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance = np.fmax((hull[0] - origin) / rays, (hull[1] - origin) / rays).min(1)
+        for low, high in things:
+            near, far = np.sort(np.stack([(low - origin) / rays, (high - origin) / rays]), 0)
+            entry = near.max(1)
+            distance = np.where((entry < far.min(1)) & (entry > 0), np.minimum(distance, entry), distance)
+    rng = np.random.default_rng(seed)
+    seen = distance < 90
+    points = np.full((int(seen.sum()), 4), 0.5, np.float32)
+    points[:, :3] = RAYS[seen] * (distance[seen] + rng.normal(0, 0.01, int(seen.sum())))[:, None]
+    return points
+
+
+ROOM = np.array([[-2.5, -2, 0], [2.5, 2, 2.6]])
+FURNITURE = boxes((-2.3, -1.9), (2.0, 1.5), 6, np.array([0.6, 0.4, 0.9]))
+STREET = np.array([[-80, -20, 0], [200, 20, 500.0]])
+HOUSES = boxes((-70, -16), (190, 16), 40, np.array([6, 4, 7.0]), 1)
+
+
+def frames(poses: Array, street: bool = False, start: int = 0) -> list[Frame]:
+    """At 10 Hz, from the `start`-th on."""
+    hull, things = (STREET, HOUSES) if street else (ROOM, FURNITURE)
+    return [Frame((start + i) * 10**8, scan(T, hull, things, start + i), index=start + i) for i, T in enumerate(poses)]
+
+
+def walk(count: int) -> Array:
+    """(count, 4, 4) a circle of 0.7 m about the middle of the room, 0.6 m above the floor, begun at a halt."""
+    angle = np.cumsum(np.minimum(np.arange(count) * 0.01, 0.08))
+    return np.array([se3.exp([0, 0, a, 0, 0, 0]) @ se3.make(np.eye(3), [0.7, 0, 0.6]) for a in angle])
