@@ -18,7 +18,8 @@ from dpm2_core.evaluation.record import REPOSITORY, git_commit
 RECORDS = REPOSITORY / "benchmarks"
 COMMANDS: dict[str, Sequence[str]] = {
     "geometric": (), "neural": (), "hard": (), "paper": (), "gaps": ("--only", "adaptive"),
-    "covariance": ("--threads", "1"), "tilt": (), "sensor": (), "relocalise": (), "roads": (), "finetune": (),
+    "covariance": ("--threads", "1"), "tilt": (), "sensor": (), "relocalise": (), "roads": (), "indoor": (),
+    "finetune": (),
 }  # fmt: skip
 """Benchmarks and their options, the quick ones first."""
 _CODE = ("dpm2_core", "benchmarks/*.py")

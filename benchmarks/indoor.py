@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""SLAM in buildings with the settings of nobody: 16 beams that err as real ones, rooms, corridors, halls and stairs."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Group
+from rich.progress import Progress
+
+from benchmarks.harness import Options, Report, settings_of
+from dpm2_core.data.kitti import KittiSource
+from dpm2_core.data.settings import InputSettings
+from dpm2_core.evaluation.metrics import evaluate
+from dpm2_core.frame import Array
+from dpm2_core.geometry import se3
+from dpm2_core.sim.drive import simulate
+from dpm2_core.sim.sensors import real_sensor
+from dpm2_core.sim.settings import DriveConfig, LidarConfig, PresetName
+from dpm2_core.slam.build import make_slam
+from dpm2_core.slam.output import TrajectoryRecorder
+from dpm2_core.slam.settings import SlamSettings
+from dpm2_core.tables import FigureTable
+
+WORLDS: dict[str, tuple[PresetName, int, int]] = {
+    "building A": ("indoor", 900, 500), "building B": ("indoor", 901, 500), "car park": ("car_park", 902, 300),
+}  # fmt: skip
+"""Kind of world, its seed, and frames at 10 Hz."""
+BEAMS, HEIGHT = 16, 0.8
+LENGTHS = (5.0, 10.0, 20.0)
+"""Of the KITTI metric's segments, m."""
+WRONG_M, WRONG_DEG = 0.5, 5.0
+"""A loop that is off by more than either is wrong: the next room."""
+
+
+def bench_indoor(options: Options) -> Report:
+    """Each world once, with default settings: frames registered, errors, loops."""
+    settings, results = settings_of(options), dict[str, Any]()
+    with Progress(transient=True) as progress, tempfile.TemporaryDirectory() as folder:
+        for name, (preset, seed, frames) in WORLDS.items():
+            lidar = real_sensor(LidarConfig(beams=BEAMS, height=HEIGHT))
+            config = DriveConfig(frames=frames, seed=seed, road="loop", preset=preset, images=False, lidar=lidar)
+            simulate(Path(folder) / str(seed), config)
+            results[name] = _drive(Path(folder) / str(seed), settings, progress, name)
+            progress.console.print(f"{name}: {results[name]}", soft_wrap=True)
+    return Report({"beams": BEAMS, "height_m": HEIGHT, "lengths_m": LENGTHS, "worlds": results}, Group(_table(results)))
+
+
+def _drive(path: Path, settings: SlamSettings, progress: Progress, name: str) -> dict[str, Any]:
+    source = KittiSource(path, InputSettings(images=False))
+    assert source.poses is not None
+    slam, recorder, failed = make_slam(settings), TrajectoryRecorder(), 0
+    task = progress.add_task(name, total=len(source))
+    for frame in source.frames():
+        tracked = slam.process(frame).odometry
+        recorder.add(tracked)
+        failed += not tracked.registration.ok
+        progress.advance(task)
+    mapper = slam.mapper
+    alone = recorder.poses(np.array([k.T_odom_kf for k in mapper.keyframes]))
+    errors = {"odometry": evaluate(source.poses, alone, LENGTHS),
+              "slam": evaluate(source.poses, recorder.poses(mapper.poses), LENGTHS)}  # fmt: skip
+    truth = source.poses[[k.index for k in mapper.keyframes]]
+    off = [_off(truth, loop.from_node, loop.to_node, loop.T_from_to) for loop in mapper.loops if loop.ok]
+    return {
+        "preset": slam.odometry.scale,
+        "frames": len(source),
+        "failed_frames": failed,
+        "breaks": recorder.breaks,
+        "path_length_m": errors["slam"].path_length_m,
+        **{kind: {"t_err_percent": m.t_err_percent, "ape_rmse_m": m.ape_rmse_m} for kind, m in errors.items()},
+        "keyframes": len(mapper.keyframes),
+        "loops": len(off),
+        "wrong_loops": sum(meters > WRONG_M or degrees > WRONG_DEG for meters, degrees in off),
+        "worst_loop_m": max((meters for meters, _ in off), default=None),
+    }
+
+
+def _off(truth: Array, a: int, b: int, T_a_b: Array) -> tuple[float, float]:
+    return se3.magnitude(se3.inverse(se3.inverse(truth[a]) @ truth[b]) @ T_a_b)
+
+
+def _table(worlds: dict[str, Any]) -> FigureTable:
+    figures = ("preset", "registered", "path m", "t_err %", "APE m", "loops", "wrong")
+    title = f"{BEAMS} beams with a real one's errors, {HEIGHT} m above the floor; odometry alone -> SLAM"
+    table = FigureTable(title, names=["world"], figures=figures)
+    for name, r in worlds.items():
+        errors = [f"{r['odometry'][e]:.3f} -> {r['slam'][e]:.3f}" for e in ("t_err_percent", "ape_rmse_m")]
+        registered = f"{r['frames'] - r['failed_frames']}/{r['frames']}"
+        table.add_row(name, r["preset"], registered, f"{r['path_length_m']:.0f}", *errors, str(r["loops"]),
+                      str(r["wrong_loops"]))  # fmt: skip
+    return table
