@@ -38,6 +38,7 @@ BENCHES: dict[str, Bench] = {
     "covariance": _bench("covariance:bench_covariance", "source kitti threads set weights pairs only"),
     "diffslam": _bench("diffslam:bench_diffslam", "repetitions threads set"),
     "finetune": _bench("finetune:bench_finetune", "repetitions threads set pairs only"),
+    "fleet": _bench("fleet:bench_fleet", "source kitti only"),
     "gaps": _bench("gaps:bench_gaps", "source kitti threads set weights only"),
     "geometric": _bench("geometric:bench_geometric", "source kitti repetitions threads set"),
     "hard": _bench("hard:bench_hard", "source kitti threads set weights only"),

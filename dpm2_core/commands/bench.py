@@ -17,8 +17,8 @@ def bench(
     names: Annotated[
         list[str] | None,
         typer.Argument(
-            help="covariance, diffslam, finetune, gaps, geometric (default), hard, indoor, loop-cost, map, memory, "
-            "neural, pose-graph, relocalise, roads, sensor, tasks, tilt, traffic."
+            help="covariance, diffslam, finetune, fleet, gaps, geometric (default), hard, indoor, loop-cost, map, "
+            "memory, neural, pose-graph, relocalise, roads, sensor, tasks, tilt, traffic."
         ),
     ] = None,
     source: Annotated[
@@ -47,7 +47,7 @@ def bench(
     ] = None,
     only: Annotated[
         str | None,
-        typer.Option(help="finetune, neural, tasks, traffic: this part alone; else those that NAME.json lacks."),
+        typer.Option(help="finetune, fleet, neural, tasks, traffic: this part alone; else those that NAME.json lacks."),
     ] = None,
 ) -> None:
     """Measure accuracy and speed beside KISS-ICP on the same scans, memory over a long drive, or the network."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -141,15 +142,17 @@ def _borders(maps: Mapping[str, MapData], solved: Sequence[Region], inner: Mappi
         within = PoseGraph(settings)
         restore(within, data)
         nodes = {end: first[end[0]] + end[1] for end in sorted(ends) if end[0] in own}
-        before: tuple[str, int] | None = None
-        for end in sorted(nodes, key=lambda end: (within.part(nodes[end]), end)):
+        order = sorted(nodes, key=lambda end: (within.part(nodes[end]), end))
+        tied = [pair for pair in pairwise(order) if len({within.part(nodes[end]) for end in pair}) == 1]
+        covariances = within.relative_covariances([(nodes[a], nodes[b]) for a, b in tied])
+        steps = {pair[1]: (pair[0], covariance) for pair, covariance in zip(tied, covariances, strict=True)}
+        for end in order:
             where[end], step = len(graph), None
-            if before is not None and within.part(nodes[before]) == within.part(nodes[end]):
-                a, b = nodes[before], nodes[end]
-                T = se3.inverse(data.poses[a]) @ data.poses[b]
-                step = Edge("odometry", where[before], where[end], Registration(T, within.relative_covariance(a, b)))
+            if end in steps:
+                before, covariance = steps[end]
+                T = se3.inverse(data.poses[nodes[before]]) @ data.poses[nodes[end]]
+                step = Edge("odometry", where[before], where[end], Registration(T, covariance))
             graph.add_node(region.poses[end[0]][end[1]], step)
-            before = end
     for join in outer:
         graph.add_loop(replace(join.loop, from_node=where[join.one, join.loop.from_node],
                                to_node=where[join.other, join.loop.to_node]))  # fmt: skip

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from dpm2_core.slam.graph.worker import GraphWorker
 _log = logging.getLogger(__name__)
 SHORT = 50
 """Loops; fewer are solved in about 20 ms, sooner than they are sent to another process."""
+_TOGETHER = 40  # pairs of nodes whose covariances are asked for at once
 _ATTEMPTS = 2  # processes that may die over one graph
 
 
@@ -198,11 +200,26 @@ class PoseGraph:
         Raises:
             ValueError: it is one node.
         """
-        if a == b:
-            raise ValueError(f"covariance of node {a} relative to itself")
-        joint = self._joint([a, b])
-        J = np.hstack([-se3.adjoint(se3.inverse(self._poses[b]) @ self._poses[a]), np.eye(6)])
-        return np.asarray(J @ joint @ J.T)
+        return self.relative_covariances([(a, b)])[0]
+
+    def relative_covariances(self, pairs: Sequence[tuple[int, int]]) -> Array:
+        """(P, 6, 6) `relative_covariance` of each pair: the graph is factorized once for many.
+
+        Raises:
+            ValueError: a pair is one node.
+        """
+        if same := [a for a, b in pairs if a == b]:
+            raise ValueError(f"covariance of node {same[0]} relative to itself")
+        out = np.zeros((len(pairs), 6, 6))
+        for first in range(0, len(pairs), _TOGETHER):
+            part = pairs[first : first + _TOGETHER]
+            nodes = sorted({node for pair in part for node in pair})
+            joint = self._joint(nodes)
+            for number, (a, b) in enumerate(part, first):
+                rows = [6 * nodes.index(node) + k for node in (a, b) for k in range(6)]
+                J = np.hstack([-se3.adjoint(se3.inverse(self._poses[b]) @ self._poses[a]), np.eye(6)])
+                out[number] = J @ joint[np.ix_(rows, rows)] @ J.T
+        return out
 
     def write_g2o(self, path: Path) -> None:
         """All vertices, the odometry and the loops that are kept, in g2o's SE3:QUAT format at full precision."""

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.fleet_drives import write_drive
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.metrics import ape_rmse
 from dpm2_core.fleet.cluster import Cluster
@@ -29,8 +30,6 @@ from dpm2_core.slam.store.cloud_store import CloudStore
 from dpm2_core.slam.store.map_data import NO_POINTS, MapData, load_map
 from dpm2_core.slam.store.map_store import MapStore
 
-from ...helpers.fleets import write_drive
-
 NOISE = np.diag([1e-3] * 3 + [0.02] * 3) ** 2
 
 
@@ -41,8 +40,8 @@ def test_drives_that_share_a_road_become_one_map_and_others_stay_out(tmp_path: P
     pytest.importorskip("faiss", reason="no faiss: pip install 'dpm2_ros[fleet]'")
     town, other = (build_world("loop", "suburb", seed=seed, length=260.0) for seed in (3, 8))
     fleet, out = tmp_path / "fleet", tmp_path / "town.dpm2map"
-    truth = {"a": write_drive(fleet / "a", town, np.arange(0, 60, 5.0), 1)}
-    write_drive(fleet / "stranger", other, np.arange(0, 30, 5.0), 3)
+    truth = {"a": write_drive(fleet / "a", town, (0, 60), 1)}
+    write_drive(fleet / "stranger", other, (0, 30), 3)
     shutil.copytree(fleet / "a", fleet / "poison")
     content = bytearray((fleet / "poison" / MAP).read_bytes())
     middle = len(content) // 2
@@ -59,7 +58,7 @@ def test_drives_that_share_a_road_become_one_map_and_others_stay_out(tmp_path: P
         assert first.left_out["torn"].startswith("not whole")
         (known,) = (fleet / ".merge" / "joins").glob(f"a/stranger/*/{DONE}")
         before = known.stat().st_mtime_ns
-        truth["b"] = write_drive(fleet / "b", town, np.arange(25, 85, 5.0), 2)
+        truth["b"] = write_drive(fleet / "b", town, (25, 85), 2)
         both = merge(fleet, out, SlamSettings(), Cluster())
     assert both.drives == {"a": 12, "b": 12}
     assert both.left_out["stranger"] == "no place in common with a"

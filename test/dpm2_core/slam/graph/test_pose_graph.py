@@ -174,6 +174,24 @@ def test_the_relative_covariance_of_neighbors_is_that_of_their_edge() -> None:
     assert np.trace(graph.covariance(29)) > 20 * np.trace(STEP)
     with pytest.raises(ValueError, match="relative to itself"):
         graph.relative_covariance(3, 3)
+    pairs = [(node % 29, 29) for node in range(50)]  # more than are asked for at once
+    each = [graph.relative_covariance(a, b) for a, b in pairs]
+    np.testing.assert_allclose(graph.relative_covariances(pairs), each, rtol=1e-6, atol=1e-12)
+
+
+def test_a_node_that_is_held_stays_and_the_others_come_to_it() -> None:
+    graph = PoseGraph(PoseGraphSettings())
+    drive(graph, 20)
+    T = se3.exp(np.array([0, 0, 0.5, 30.0, 0, 0]))
+    before = graph.poses
+    graph.hold(10, T)
+    graph.add_loop(loop(0, 19))
+    graph.optimize()
+    np.testing.assert_allclose(graph.pose(10), T, atol=1e-5)
+    moved = se3.inverse(graph.pose(10)) @ graph.pose(11)
+    np.testing.assert_allclose(moved, se3.inverse(before[10]) @ before[11], atol=0.5)
+    with pytest.raises(Dpm2Error, match="not a finite rigid transform"):
+        graph.hold(3, np.full((4, 4), np.nan))
 
 
 def test_a_loop_makes_the_far_end_certain() -> None:

@@ -1,0 +1,243 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fleets on a local cluster of Ray: pieces of roads in one map, an index of 200,000 places, kills, and two workers."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import resource
+import signal
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console, Group
+
+from benchmarks.fleet_drives import write_drive
+from benchmarks.harness import Options, Report, requested
+from benchmarks.roads import FIRST_SEED, ROADS, road_files
+from dpm2_core.errors import Dpm2Error
+from dpm2_core.evaluation.metrics import ape_rmse
+from dpm2_core.fleet.cluster import Cluster, Status
+from dpm2_core.fleet.drives import MAP, parts_of, read_drives
+from dpm2_core.fleet.merge import merge
+from dpm2_core.fleet.part import Part
+from dpm2_core.fleet.places import WIDTH, FleetIndex
+from dpm2_core.fleet.run import Outcome, View, carry_out
+from dpm2_core.frame import Array
+from dpm2_core.sim.drive import simulate
+from dpm2_core.sim.settings import DriveConfig, LidarConfig
+from dpm2_core.sim.world import build_world
+from dpm2_core.slam.settings import SlamSettings
+from dpm2_core.slam.store.map_data import load_map
+from dpm2_core.slam.store.map_store import MapStore
+from dpm2_core.tables import FigureTable
+
+METERS = 1000.0
+"""Of each road; its two drives have the middle fifth in common."""
+PLACES, QUERIES, FOUND = 200_000, 500, 8
+KILLS = 20
+_SAME = ("trajectory_kitti.txt", "trajectory.tum", "map.ply", "pose_graph.g2o", "loops.csv")
+_FAST = ("slam.registration=geometric", "slam.loops.descriptors=false", "slam.threads=1")
+
+
+def bench_fleet(options: Options) -> Report:
+    """The parts of the issue's table, or the one that `--only` names: town, index, kills, workers."""
+    parts: dict[str, Callable[[Path, Options], dict[str, Any]]] = {
+        "town": bench_town, "index": bench_index, "kills": bench_kills, "workers": bench_workers
+    }  # fmt: skip
+    results: dict[str, Any] = {}
+    file = options.out / "fleet.json"
+    if options.only is not None and file.is_file():  # the other parts stay as they were measured
+        before = json.loads(file.read_text(encoding="utf-8"))
+        results = {name: before[name] for name in parts if name in before}
+    for name in requested(options, parts):
+        with tempfile.TemporaryDirectory(prefix="dpm2_bench_fleet_") as folder:
+            results[name] = parts[name](Path(folder), options)
+    table = FigureTable("Fleets", names=["part"], text=["figures"])
+    for name, figures in results.items():
+        table.add_row(name, json.dumps(figures))
+    return Report(results, Group(table))
+
+
+def bench_town(folder: Path, options: Options) -> dict[str, Any]:
+    """Two drives of each road, one after the other: true and wrong joins, errors, and what each added drive costs."""
+    truth, added = dict[str, Array](), []
+    console, out = Console(stderr=True), folder / "town.dpm2map"
+    with Cluster(workers=2) as cluster:
+        cluster.start()
+        for path in road_files(options):
+            world = build_world(str(path), ROADS.get(path.stem, "suburb"), FIRST_SEED + int(path.stem))
+            length = min(METERS, float(world.road.drive.length))
+            for number, (begin, end) in enumerate(((0.0, 0.6), (0.4, 1.0))):
+                name = f"{path.stem}{'ab'[number]}"
+                seed = 2 * int(path.stem) + number
+                truth[name] = write_drive(folder / "fleet" / name, world, (begin * length, end * length), seed)
+                before = time.perf_counter()
+                merged = merge(folder / "fleet", out, SlamSettings(), Cluster())
+                added.append({"drive": name, "keyframes": len(truth[name]), "s": time.perf_counter() - before})
+                console.print(f"{name}: {added[-1]}")
+    joined = {tuple(row["drives"]) for row in merged.joins if row["accepted"]}
+    true = {(f"{path.stem}a", f"{path.stem}b") for path in road_files(options)}
+    return {
+        "drives": len(truth),
+        "keyframes": sum(map(len, truth.values())),
+        "true_joins": len(true),
+        "joined": len(joined & true),
+        "wrong": len(joined - true),
+        "largest_map": merged.drives,
+        "ape_m": _errors(folder / "fleet", out, truth, merged.drives),
+        "rejected": merged.rejected,
+        "added": added,
+        "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024,
+    }
+
+
+def _errors(fleet: Path, out: Path, truth: Mapping[str, Array], names: Mapping[str, int]) -> dict[str, float]:
+    """APE, m, of the map of several drives, and of the worst of them alone."""
+    alone = []
+    for name in names:
+        with MapStore.open(fleet / name / MAP) as store:
+            alone.append(float(ape_rmse(truth[name], load_map(store, descriptors=False).poses)))
+    with MapStore.open(out) as store:
+        poses = load_map(store, descriptors=False).poses
+    return {"map": float(ape_rmse(np.concatenate([truth[name] for name in names]), poses)), "worst_drive": max(alone)}
+
+
+def bench_index(folder: Path, options: Options) -> dict[str, Any]:
+    """Places on smooth ways through a space of few directions, as those of a drive are; time of this process alone."""
+    rng = np.random.default_rng(0)
+    scale = 0.8 ** np.arange(24)
+    axes = np.linalg.qr(rng.normal(size=(WIDTH, 24)))[0].T
+    ways = np.concatenate([_way(rng, 400) * scale for _ in range(PLACES // 400)])
+    places = (ways @ axes + 0.03 * rng.normal(size=(PLACES, WIDTH))).astype(np.float32)
+    asked = ways[rng.integers(0, PLACES, QUERIES)] @ axes + 0.03 * rng.normal(size=(QUERIES, WIDTH))
+    queries = asked.astype(np.float32)
+    index = FleetIndex(folder)
+    build, _ = _timed(lambda: index.add("all", [0], places))
+    search, found = _timed(lambda: index.similar(queries, FOUND))
+    centered = places - places.mean(0)
+    centered /= np.linalg.norm(centered, axis=1, keepdims=True)
+    wanted = queries - places.mean(0)
+    brute, nearest = _timed(lambda: [_best(rows @ centered.T) for rows in np.array_split(wanted, 10)])
+    single, _ = _timed(lambda: [_best(row @ centered.T) for row in wanted[:50]])
+    recall = [len(set(a) & set(b)) / FOUND for a, b in zip(found, np.concatenate(nearest), strict=True)]
+    index.save()
+    return {
+        "places": PLACES,
+        "recall": float(np.mean(recall)),
+        "build_s": build,
+        "ms_a_query": {
+            "index": 1e3 * search / QUERIES,
+            "brute_in_batches": 1e3 * brute / QUERIES,
+            "brute_one_by_one": 1e3 * single / 50,
+        },
+        "bytes_a_place": (folder / "index.faiss").stat().st_size / PLACES,
+    }
+
+
+def _way(rng: np.random.Generator, count: int) -> Array:
+    steps, out = rng.normal(size=(count, 24)), np.zeros((count, 24))
+    for i in range(1, count):
+        out[i] = 0.97 * out[i - 1] + 0.243 * steps[i]
+    return out
+
+
+def _best(cosines: Array) -> Array:
+    return np.asarray(np.argpartition(-cosines, FOUND, axis=-1)[..., :FOUND])
+
+
+def _timed(work: Callable[[], Any]) -> tuple[float, Any]:
+    began = time.process_time()
+    found = work()
+    return time.process_time() - began, found
+
+
+class _Killer(View):
+    """Kills workers of running drives with -9 at random moments."""
+
+    def __init__(self, seed: int) -> None:
+        self.kills = 0
+        self._random = random.Random(seed)
+        self._next = 0.0
+        self._ended: set[str] = set()
+
+    def begun(self, names: Sequence[str]) -> None:
+        """As `View`."""
+        self._ended.clear()
+        self._next = time.monotonic() + self._random.uniform(0, 6)
+
+    def running(self, status: Mapping[str, Status]) -> None:
+        """As `View`."""
+        running = [now for name, now in status.items() if name not in self._ended and now.where]
+        if self.kills < KILLS and running and time.monotonic() >= self._next:
+            self._next = time.monotonic() + self._random.uniform(0, 6)
+            with suppress(ProcessLookupError):
+                os.kill(int(self._random.choice(running).where.rpartition(":")[2]), signal.SIGKILL)
+                self.kills += 1
+
+    def ended(self, outcome: Outcome) -> None:
+        """As `View`."""
+        self._ended.add(outcome.name)
+
+
+def _drives(folder: Path, count: int, frames: int) -> list[Part]:
+    for seed in range(count):
+        lidar = LidarConfig(columns=900)
+        simulate(folder / f"drive{seed}", DriveConfig(frames=frames, seed=seed, images=False, lidar=lidar))
+    return parts_of(read_drives([folder / f"drive{seed}" for seed in range(count)]), None, _FAST)
+
+
+def bench_kills(folder: Path, options: Options) -> dict[str, Any]:
+    """Fleets of four drives until 20 workers were killed, each called until it is whole; beside one left alone."""
+    parts, killer = _drives(folder, 4, 60), _Killer(0)
+    fleets, calls, equal = 0, 0, 0
+    with Cluster(workers=2) as cluster:
+        cluster.start()
+        carry_out(parts, folder / "alone", Cluster())
+        while killer.kills < KILLS:
+            fleets += 1
+            out = folder / f"out{fleets}"
+            for _ in range(10):
+                calls += 1
+                if all(outcome.figures is not None for outcome in carry_out(parts, out, Cluster(), killer)):
+                    break
+            equal += sum(_equal(out / part.name, folder / "alone" / part.name) for part in parts)
+            if left := [path.name for path in out.iterdir() if path.name.startswith(".")]:
+                raise Dpm2Error(f"{out}: left behind: {left}")
+    return {"kills": killer.kills, "drives": fleets * len(parts), "calls": calls, "equal": equal}
+
+
+def _equal(one: Path, other: Path) -> bool:
+    return all((one / name).read_bytes() == (other / name).read_bytes() for name in _SAME)
+
+
+def bench_workers(folder: Path, options: Options) -> dict[str, Any]:
+    """Wall time of four equal drives with one worker and with two, a thread each; what is not the drives' own time."""
+    parts = _drives(folder, 1, 200)
+    four = [Part(f"{n}", part.work, part.arguments, part.inputs, True, 1) for part in parts for n in range(4)]
+    out: dict[str, Any] = {"processors": len(os.sched_getaffinity(0))}
+    for workers in (1, 2):
+        with Cluster(workers=workers) as cluster:
+            cluster.start()
+            warm = [Part(f"w{n}", four[0].work, four[0].arguments, (), True, 1) for n in range(workers)]
+            list(_seconds(carry_out(warm, folder / f"warm{workers}", Cluster())))  # imports, compiled functions
+            began = time.perf_counter()
+            seconds = list(_seconds(carry_out(four, folder / f"by{workers}", Cluster())))
+            out[f"wall_s_{workers}"] = time.perf_counter() - began
+            out[f"own_s_{workers}"] = sum(seconds) / workers
+    out["speedup"] = out["wall_s_1"] / out["wall_s_2"]
+    out["overhead"] = out["wall_s_1"] / out["own_s_1"] - 1
+    return out
+
+
+def _seconds(outcomes: Sequence[Outcome]) -> Iterator[float]:
+    for outcome in outcomes:
+        if outcome.figures is None:
+            raise Dpm2Error(f"{outcome.name}: {outcome.reason}")
+        yield outcome.figures["part"]["seconds"]
