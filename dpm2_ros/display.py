@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import array
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -10,12 +11,14 @@ from typing import Any
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Point, PoseStamped, Vector3
-from nav_msgs.msg import Path
+from nav_msgs.msg import OccupancyGrid, Path
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
 from dpm2_core.frame import Array, Edge
+from dpm2_core.geometry import se3
 from dpm2_core.slam.mapping.mapper import Mapper
+from dpm2_core.slam.mapping.occupancy_map import FREE, OCCUPIED, Grid
 from dpm2_ros.conversions import header, pose_to_msg
 
 GRAY, GREEN, BLUE, RED = (0.7, 0.7, 0.7), (0.1, 0.8, 0.2), (0.2, 0.5, 1.0), (1.0, 0.2, 0.2)
@@ -74,6 +77,21 @@ def _ends(positions: Array, edges: Sequence[Edge]) -> Array:
     return positions[np.array([(edge.from_node, edge.to_node) for edge in edges], np.intp).reshape(-1)]
 
 
+def grid_to_msg(grid: Grid, stamp: int, frame_id: str) -> OccupancyGrid:
+    """nav_msgs/OccupancyGrid: 100 occupied, 0 free, -1 unknown, the row of the lowest y first."""
+    values = np.full(256, -1, np.int8)
+    values[[OCCUPIED, FREE]] = 100, 0
+    message = OccupancyGrid(header=header(stamp, frame_id))
+    message.info.map_load_time = message.header.stamp
+    message.info.resolution = grid.resolution
+    message.info.height, message.info.width = grid.cells.shape
+    message.info.origin = pose_to_msg(se3.make(np.eye(3), [*grid.origin, 0.0]))
+    cells = array.array("b")
+    cells.frombytes(values[grid.cells[::-1]].tobytes())
+    message.data = cells
+    return message
+
+
 class Display:
     """A large message that is built only if it has a subscriber, has changed, and its period has passed."""
 
@@ -90,6 +108,10 @@ class Display:
             return False
         self._working, self._shown, self._last = True, changes, time.monotonic()
         return True
+
+    def again(self) -> None:
+        """It is not complete yet: due once more."""
+        self._shown = -1
 
     def publish(self) -> None:
         """Build and send it."""

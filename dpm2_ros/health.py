@@ -19,13 +19,12 @@ from dpm2_ros.guard import GuardedNode
 from dpm2_ros.keyframes import BEHIND, KeyframeSender
 from dpm2_ros.mapping import MapperThread
 from dpm2_ros.other_odometry import OtherOdometry
+from dpm2_ros.state import SILENT
 from dpm2_ros.subscriptions import Inputs
 from dpm2_ros.synchronizer import CameraState, StampCheck
 
 OTHER_CLOCK = 1.0
 """Seconds between a cloud's stamp and the node's clock beyond which they are not of the same clock."""
-SILENT = 2.0
-"""Seconds without a message after which a sensor counts as silent."""
 
 _LEVEL = {
     State.TRACKING: OK,

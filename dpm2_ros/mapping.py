@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
-from nav_msgs.msg import Odometry
+from nav_msgs.msg import OccupancyGrid, Odometry
 from nav_msgs.msg import Path as PathMsg
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
@@ -24,17 +24,19 @@ from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Array, Edge, Keyframe
 from dpm2_core.slam.loops.localizer import LocalizationResult
 from dpm2_core.slam.mapping.admission import RejectedError
+from dpm2_core.slam.mapping.mapper import Mapper
+from dpm2_core.slam.mapping.occupancy_map import OccupancyMap
 from dpm2_core.slam.system import Slam
 from dpm2_ros.active_map import ActiveMap
 from dpm2_ros.conversions import cloud_to_msg, edge_to_msg, keyframe_name
-from dpm2_ros.display import Display, loop_to_msg, path_to_msg, pose_graph_to_msg
+from dpm2_ros.display import Display, grid_to_msg, loop_to_msg, path_to_msg, pose_graph_to_msg
 from dpm2_ros.guard import GuardedNode
 from dpm2_ros.settings import NodeConfig
-from dpm2_ros.subscriptions import STEADY
+from dpm2_ros.subscriptions import LAST_ONE, STEADY
 from dpm2_ros.tf import TransformBroadcaster
 
 KEEP_ALL = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
-LAST_ONE = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+_GRID_PERIOD, _GRID_WORK = 0.5, 0.3  # s between two grids, and at most of work at one
 _NICER = 10  # steps of niceness: a tenth of the fraction of the odometry where both want a processor
 
 
@@ -66,8 +68,10 @@ class MapperThread:
                 (PathMsg, "dpm2/path", ros.path_period, self._path),
                 (MarkerArray, "dpm2/pose_graph", ros.path_period, self._pose_graph),
                 (PointCloud2, "dpm2/map", ros.map_period, self._map),
+                (OccupancyGrid, "dpm2/grid", _GRID_PERIOD, self._grid),
             )
         ]
+        self._drawn: tuple[Mapper, OccupancyMap] | None = None  # a map and its grid
         node.create_timer(0.1, self._show, clock=STEADY)
         node.create_service(Trigger, "~/save_map", self._on_save)
 
@@ -237,6 +241,15 @@ class MapperThread:
 
     def _pose_graph(self) -> Any:
         return pose_graph_to_msg(self._active.mapper, self._stamp, self._config.ros.map_frame)
+
+    def _grid(self) -> Any:
+        mapper, ros = self._active.mapper, self._config.ros
+        if self._drawn is None or self._drawn[0] is not mapper:
+            self._drawn = mapper, OccupancyMap(ros.grid, ros.grid_max_cells)
+        grid = self._drawn[1]
+        if not mapper.update_grid(grid, _GRID_WORK):  # of a map that was loaded, or after a loop in a large one
+            self._displays[-1].again()
+        return grid_to_msg(grid.grid(), self._stamp, ros.map_frame)
 
     def _map(self) -> Any:
         points = self._active.mapper.cloud()

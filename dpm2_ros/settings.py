@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from dpm2_core.config import Settings
+from dpm2_core.slam.mapping.occupancy_map import OccupancySettings
 from dpm2_core.slam.settings import Config
 
 FrameName = Annotated[str, Field(pattern=r"^[^/\s]\S*$")]
@@ -70,6 +71,13 @@ class RosSettings(Settings):
 
     map_max_points: int = Field(default=200_000, ge=1000, le=10_000_000)
     """Largest /dpm2/map; a larger one is downsampled evenly for publishing, not in memory and not on disk."""
+
+    grid: OccupancySettings = OccupancySettings()
+    """Of /dpm2/grid."""
+
+    grid_max_cells: int = Field(default=16_000_000, ge=10_000, le=400_000_000)
+    """Largest /dpm2/grid; that of a larger map has cells of twice, four times, ... the edge. 16 million are 16 MB, and
+    400 by 400 m at 0.1 m."""
 
     path_period: Period = 1.0
     """Least time between two /dpm2/path and two /dpm2/pose_graph, s."""

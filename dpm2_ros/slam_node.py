@@ -33,6 +33,7 @@ from dpm2_ros.mapping import MapperThread, respond, robot_name, yield_to_odometr
 from dpm2_ros.other_odometry import OtherOdometry
 from dpm2_ros.parameters import load_parameters
 from dpm2_ros.settings import NodeConfig
+from dpm2_ros.state import StatePublisher
 from dpm2_ros.subscriptions import Inputs
 from dpm2_ros.synchronizer import Bundle
 from dpm2_ros.tf import TransformBroadcaster
@@ -64,6 +65,7 @@ class SlamNode(GuardedNode):
         weights = weights_identity(self._config.slam)
         self._sender = KeyframeSender(self, self._robot, ros.own_frame, not ros.embed_mapper, weights)
         self._odom = self.create_publisher(Odometry, "dpm2/odom", 10)
+        self._state = StatePublisher(self)
         # Idle with the mapper, which has its own.
         self._line = ThreadPoolExecutor(1, thread_name_prefix="keyframes", initializer=yield_to_odometry)
         sends = ros.publish_tf_odom and (not beside or ros.invert_odom_tf or not ros.embed_mapper)
@@ -218,6 +220,7 @@ class SlamNode(GuardedNode):
                 self._line.submit(make).add_done_callback(self._report)
         tracked = replace(tracked, keyframe=None, state=self._slam.state(tracked.state))
         self._publish(tracked, BodyMotion.of_lidar(tracked).of_base(T_start_lidar))
+        self._state.send(tracked.state)
         return tracked
 
     def _publish(self, tracked: OdometryResult, motion: BodyMotion) -> None:

@@ -37,6 +37,7 @@ _OTHER_FRAME = 2.0  # s without a cloud after which one in another frame begins 
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 """For timers that must go on when /clock stops at the end of a bag."""
 
+LAST_ONE = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 LATCHED = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 

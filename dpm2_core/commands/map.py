@@ -232,7 +232,8 @@ def _export_page(data: MapData, out: Path, voxel: float) -> None:
 
 
 def _export_occupancy(data: MapData, out: Path, resolution: float) -> None:
-    from dpm2_core.slam.mapping.occupancy import OccupancySettings, occupancy_grid, write_grid
+    from dpm2_core.slam.mapping.occupancy import occupancy_grid, write_grid
+    from dpm2_core.slam.mapping.occupancy_map import OccupancySettings
 
     write_grid(out, occupancy_grid(data.clouds, data.poses, OccupancySettings(resolution=resolution)))
 

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import TransformStamped
-from nav_msgs.msg import Odometry
+from nav_msgs.msg import OccupancyGrid, Odometry
 from nav_msgs.msg import Path as PathMsg
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
-from std_msgs.msg import UInt32MultiArray
+from std_msgs.msg import String, UInt32MultiArray
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
@@ -154,6 +154,53 @@ def test_the_map_is_bounded_and_built_only_for_listeners(rig: Callable[..., Rig]
     time.sleep(0.3)
     assert [m.width for m in maps] == [1000]  # and not again while nothing changes
     assert len(built) == 1
+
+
+def test_the_grid_is_latched_bounded_and_soon_there(rig: Callable[..., Rig], drive: Any) -> None:
+    """Built only for listeners; a late one gets it at once; house fronts occupied, the street free."""
+    r = rig("ros.grid.resolution:=0.25", "ros.grid_max_cells:=200000", "slam.loops.descriptors:=false")
+    r.send_and_wait(0, 1)
+    grids = r.harness.hear(OccupancyGrid, "/dpm2/grid", LATCHED)
+    r.wait(lambda: grids, "the grid, once there is a subscriber")
+    before = r.keyframes
+    while r.keyframes == before:
+        r.send_and_wait(len(r.odom))
+    changed = time.monotonic()
+    r.wait(lambda: stamp_ns(grids[-1].header) == r.node.slam.mapper.keyframes[-1].stamp, "the last keyframe's grid")
+    assert time.monotonic() - changed < 30.0  # 0.5 s on a quiet machine
+    late = r.harness.node.create_subscription(OccupancyGrid, "/dpm2/grid", grids.append, LATCHED)
+    count = len(grids)
+    r.wait(lambda: len(grids) > count, "the latched grid")
+    r.harness.node.destroy_subscription(late)
+    grid = grids[-1]
+    assert grid.header.frame_id == "map"
+    assert grid.info.height * grid.info.width == len(grid.data) <= 200_000
+    assert set(grid.data) == {-1, 0, 100}
+    cells = np.array(grid.data).reshape(grid.info.height, grid.info.width)
+    size, low = grid.info.resolution, grid.info.origin.position
+    y = (np.argwhere(cells == 100)[:, 0] + 0.5) * size + low.y
+    assert (np.abs(y) > 7.0).mean() > 0.95  # fronts are 8 to 12 m from the middle of the street
+    on_the_way = cells[int((0.1 - low.y) // size), int((1.0 - low.x) // size)]
+    assert on_the_way == 0
+
+
+def test_the_state_is_latched_and_sent_at_each_change(rig: Callable[..., Rig], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("dpm2_ros.state.SILENT", 1.0)
+    r = rig()
+    states = r.harness.hear(String, "/dpm2/state", LATCHED)
+    r.wait(lambda: states, "the latched state")
+    r.send_and_wait(0, 1, 2, 3)
+    r.wait(lambda: [s.data for s in states] == ["initialising", "tracking"], "tracking, once")
+    r.wait(lambda: states[-1].data == "silent", "no more clouds")
+    r.send_and_wait(4)
+    r.wait(lambda: states[-1].data == "tracking", "the next cloud")
+    late = r.harness.node.create_subscription(String, "/dpm2/state", states.append, LATCHED)
+    r.wait(lambda: len(states) >= 5, "the state, for who comes late")
+    assert [s.data for s in states[:5]] in (
+        ["initialising", "tracking", "silent", "tracking", "tracking"],
+        ["initialising", "tracking", "silent", "tracking", "silent"],
+    )
+    r.harness.node.destroy_subscription(late)
 
 
 def test_tf_can_be_switched_off(rig: Callable[..., Rig]) -> None:

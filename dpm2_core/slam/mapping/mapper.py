@@ -19,6 +19,7 @@ from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.loops.closure import LoopCloser
 from dpm2_core.slam.mapping.admission import check_keyframe
 from dpm2_core.slam.mapping.moving import MovingSettings, MovingWindow
+from dpm2_core.slam.mapping.occupancy_map import OccupancyMap
 from dpm2_core.slam.mapping.redundancy import RedundancySettings, lender
 from dpm2_core.slam.mapping.restore import restore
 from dpm2_core.slam.store.cloud_codec import pack_cloud
@@ -210,6 +211,12 @@ class Mapper:
     def cloud(self, voxel_size: float | None = None) -> Points:
         """The map (M, 4) float32 in the map frame, one point in each voxel of that size (default: settings)."""
         return map_cloud(self._clouds, self.poses, voxel_size or self._settings.voxel)
+
+    def update_grid(self, grid: OccupancyMap, seconds: float) -> bool:
+        """Bring a grid that is kept for this map up to date; False if there is more to do than `seconds` allow."""
+        if not self.keyframes:
+            return True
+        return grid.update(self._clouds, self.poses, self._clouds.version, seconds)
 
     def write_g2o(self, path: Path) -> None:
         """The pose graph as a g2o file."""

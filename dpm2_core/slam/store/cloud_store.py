@@ -122,6 +122,10 @@ class CloudStore(Sequence[Points]):
         """The packed mask of points that move; None: none is known."""
         return self._moving.get(index)
 
+    def version(self, index: int) -> object:
+        """Another object once the cloud is another one."""
+        return self._loans.get(index) or self._moving.get(index)
+
     def packed(self, index: int) -> bytes | None:
         """The bytes of a cloud; None where it is borrowed."""
         where = self._where[index]

@@ -12,7 +12,8 @@ import yaml
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Points
 from dpm2_core.geometry import se3
-from dpm2_core.slam.mapping.occupancy import OccupancySettings, occupancy_grid, write_grid
+from dpm2_core.slam.mapping.occupancy import occupancy_grid, write_grid
+from dpm2_core.slam.mapping.occupancy_map import OccupancySettings
 
 SETTINGS = OccupancySettings(resolution=0.25, reach=20.0)
 

@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The state in one word, latched, sent at each change: what a behavior tree or a supervisor waits for."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+from rclpy.node import Node
+from std_msgs.msg import String
+
+from dpm2_core.frame import State
+from dpm2_ros.subscriptions import LAST_ONE, STEADY
+
+SILENT = 2.0
+"""Seconds without a message after which a sensor counts as silent, and without a pose the whole."""
+NO_POSE = "silent"
+
+
+class StatePublisher:
+    """`dpm2/state`: a `State`, or silent while there is no pose. Any thread may call."""
+
+    def __init__(self, node: Node) -> None:
+        self._publisher = node.create_publisher(String, "dpm2/state", LAST_ONE)
+        self._lock, self._said, self._last = threading.Lock(), "", time.monotonic()
+        self.send(State.INITIALIZING)
+        node.create_timer(0.25, self._listen, clock=STEADY)
+
+    def send(self, state: State) -> None:
+        """That of a pose which is published now."""
+        self._last = time.monotonic()
+        self._say(str(state))
+
+    def _listen(self) -> None:
+        if self._said != State.INITIALIZING and time.monotonic() - self._last > SILENT:
+            self._say(NO_POSE)
+
+    def _say(self, word: str) -> None:
+        with self._lock:
+            if word != self._said:
+                self._said = word
+                self._publisher.publish(String(data=word))

@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The live grid has the walls of a simulated building, and is that of all keyframes at once whatever happened before."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import count
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
+
+from dpm2_core.frame import Array, Points
+from dpm2_core.geometry import se3
+from dpm2_core.sim.lidar import Lidar
+from dpm2_core.sim.materials import Label
+from dpm2_core.sim.settings import LidarConfig
+from dpm2_core.sim.world import World, build_world
+from dpm2_core.slam.mapping.occupancy import occupancy_grid
+from dpm2_core.slam.mapping.occupancy_map import FREE, OCCUPIED, UNKNOWN, Grid, OccupancyMap, OccupancySettings
+
+SENSOR = 0.6  # m above the floor
+SETTINGS = OccupancySettings(reach=20.0)
+Mask = NDArray[np.bool_]
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    """A floor of rooms."""
+    return build_world("loop", "indoor", seed=3, length=100.0, traffic=0.0)
+
+
+@pytest.fixture(scope="module")
+def drive(world: World) -> tuple[list[Points], Array]:
+    """20 scans with 32 beams, 1 s apart."""
+    lidar, noise = Lidar(LidarConfig(columns=1024, beams=32)), np.random.default_rng(0)
+    poses = np.array([world.drive_pose(2.0 + n, SENSOR) for n in range(20)])
+    return [lidar.scan(world, T, 2.0 + n, noise).points for n, T in enumerate(poses)], poses
+
+
+def same(a: Grid, b: Grid) -> bool:
+    return a.origin == b.origin and a.resolution == b.resolution and np.array_equal(a.cells, b.cells)
+
+
+class Truth:
+    """What the world has at 0.35 to 1.75 m above the floor, as seen from some poses: cells of 0.1 m."""
+
+    def __init__(self, world: World, poses: Array, grid: Grid) -> None:
+        self._low, self.shape = np.round(np.array(grid.origin) / 0.1).astype(int), grid.cells.T.shape
+        angle = np.radians(np.arange(0, 360, 0.25))
+        rays = np.column_stack([np.cos(angle), np.sin(angle), 0 * angle]).astype(np.float32)
+        self.walls, things, free = (np.zeros(self.shape, bool) for _ in range(3))
+        for T in poses:
+            nearest = np.full(len(rays), SETTINGS.reach)
+            for height in np.arange(0.35, 1.8, 0.2):
+                origin = np.tile((T[:3, 3] + [0, 0, height - SENSOR]).astype(np.float32), (len(rays), 1))
+                hits = world.scene.cast(origin, rays, SETTINGS.reach)
+                hit = hits.face >= 0
+                nearest = np.minimum(nearest, np.where(hit, hits.distance, SETTINGS.reach))
+                places = (origin + rays * hits.distance[:, None])[:, :2]
+                self._mark(things, places[hit])
+                wall = hit & (world.static.label[hits.face] == Label.BUILDING)
+                self._mark(self.walls, places[wall & (abs(height - 0.95) < 0.01)])
+            for ray, way in zip(rays[:, :2], nearest, strict=True):
+                self._mark(free, T[:2, 3] + np.arange(0.3, way - 0.15, 0.05)[:, None] * ray)
+        self.free = free & ~binary_dilation(things, np.ones((3, 3)))
+
+    def _mark(self, cells: Mask, places: Array) -> None:
+        at = np.floor(places / 0.1).astype(int) - self._low
+        at = at[((at >= 0) & (at < self.shape)).all(1)]
+        cells[at[:, 0], at[:, 1]] = True
+
+
+@pytest.mark.slow
+def test_walls_are_occupied_and_rooms_are_free(world: World, drive: tuple[list[Points], Array]) -> None:
+    """At least 95 % of the wall cells that a ray at 0.95 m meets, cell for cell, and less than 1 % of the free ones."""
+    clouds, poses = drive
+    whole = OccupancyMap(SETTINGS, 10**7)
+    assert whole.update(clouds, poses)
+    grid = whole.grid()
+    truth, cells = Truth(world, poses, grid), grid.cells[::-1].T
+    assert truth.walls.sum() > 500
+    assert truth.free.sum() > 5000
+    near = binary_dilation(cells == OCCUPIED, np.ones((3, 3)))
+    assert (cells[truth.walls] == OCCUPIED).mean() > 0.95  # exactly this cell of 0.1 m
+    assert near[truth.walls].mean() > 0.99
+    assert (cells[truth.free] == OCCUPIED).mean() < 0.01
+    assert (cells[truth.free] == FREE).mean() > 0.9
+
+
+@pytest.mark.slow
+def test_a_loop_that_moves_everything_leaves_no_trace(drive: tuple[list[Points], Array]) -> None:
+    """Keyframe by keyframe at drifting poses, then all poses corrected: as if it had known them from the start. Only
+    what turns by less than would show may stay, so the walls are compared to a cell."""
+    clouds, poses = drive
+    drifted = poses @ se3.exp([0.0, 0.0, 0.3, 2.0, -1.0, 0.0])
+    live = OccupancyMap(SETTINGS, 10**7)
+    for n in range(1, len(poses) + 1):
+        assert live.update(clouds, drifted[:n])
+    assert live.update(clouds, poses)
+    expected, found = occupancy_grid(clouds, poses, SETTINGS), live.grid()
+    assert np.abs(np.subtract(found.origin, expected.origin)).max() < 0.31  # a cell or two at the rim
+    low = np.round((np.subtract(found.origin, expected.origin)) / 0.1).astype(int)
+    padded = [np.pad((grid.cells[::-1].T == OCCUPIED), 10) for grid in (expected, found)]
+    a, b = padded[0], np.zeros_like(padded[0])
+    places = np.argwhere(padded[1]) + low
+    places = places[((places >= 0) & (places < a.shape)).all(1)]
+    b[places[:, 0], places[:, 1]] = True
+    assert (a & binary_dilation(b, np.ones((3, 3)))).sum() > 0.99 * a.sum()
+    assert (b & binary_dilation(a, np.ones((3, 3)))).sum() > 0.99 * b.sum()
+
+
+def room(thing: bool = False) -> Points:
+    """A floor 0.6 m below, walls at 3 m, and perhaps something at x = 1.55."""
+    x, y = (v.ravel() for v in np.meshgrid(np.arange(-2.95, 3, 0.1), np.arange(-2.95, 3, 0.1)))
+    floor = np.column_stack([x, y, np.full(len(x), -SENSOR)])
+    y, z = (v.ravel() for v in np.meshgrid(np.arange(-3, 3, 0.05), np.arange(-0.6, 1.5, 0.1)))
+    walls = [np.column_stack([np.full(len(y), side * 3.05), y, z]) for side in (-1, 1)]
+    box = np.array([[1.55, 0.05, z] for z in (-0.2, 0.0, 0.2, 0.4)]) if thing else np.zeros((0, 3))
+    points = np.concatenate([floor, *walls, box])
+    return np.column_stack([points, np.zeros(len(points))]).astype(np.float32)
+
+
+def at(grid: Grid, x: float, y: float) -> int:
+    row, column = ((v - low) // grid.resolution for v, low in ((y, grid.origin[1]), (x, grid.origin[0])))
+    return int(grid.cells[::-1][int(row), int(column)])
+
+
+def test_what_moved_away_is_left_out_once_it_is_known() -> None:
+    clouds, versions = [room(thing=True)], [object()]
+    live = OccupancyMap(SETTINGS, 10**7)
+    live.update(clouds, np.eye(4)[None], versions.__getitem__)
+    assert at(live.grid(), 1.55, 0.05) == OCCUPIED
+    clouds[0] = room()  # without the points that move
+    live.update(clouds, np.eye(4)[None], versions.__getitem__)
+    assert at(live.grid(), 1.55, 0.05) == OCCUPIED  # the same version: not read again
+    versions[0] = object()
+    live.update(clouds, np.eye(4)[None], versions.__getitem__)
+    assert at(live.grid(), 1.55, 0.05) == FREE
+    fresh = OccupancyMap(SETTINGS, 10**7)
+    fresh.update(clouds, np.eye(4)[None])
+    assert same(live.grid(), fresh.grid())
+
+
+def test_its_size_is_bounded_and_it_grows_fine_again() -> None:
+    """Poses that a wrong loop throws far off make cells coarse, not memory large; put right they are forgotten."""
+    live, clouds, poses = OccupancyMap(SETTINGS, 1_000_000), [room(), room()], np.repeat(np.eye(4)[None], 2, 0)
+    far = poses.copy()
+    far[1, :2, 3] = 5000.0
+    live.update(clouds, far)
+    grid = live.grid()
+    assert grid.cells.size <= 1_000_000
+    assert grid.resolution == pytest.approx(0.1 * 2**6)
+    live.update(clouds, poses)
+    assert live.grid().resolution == 0.1
+    assert at(live.grid(), 3.05, 0.0) == OCCUPIED
+
+
+def test_the_newest_come_first_when_time_is_short(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock: Callable[[], float] = count().__next__
+    monkeypatch.setattr("dpm2_core.slam.mapping.occupancy_map.time.monotonic", clock)
+    poses = np.repeat(np.eye(4)[None], 3, 0)
+    poses[:, 0, 3] = [0.0, 50.0, 100.0]
+    live = OccupancyMap(SETTINGS, 10**7)
+    assert not live.update([room()] * 3, poses, seconds=1.5)  # a second for each question what time it is
+    grid = live.grid()
+    assert grid.origin[0] > 90.0
+    while not live.update([room()] * 3, poses, seconds=1.5):
+        pass
+    assert [at(live.grid(), x + 3.05, 0.0) for x in (0.0, 50.0, 100.0)] == [OCCUPIED] * 3
+    assert at(live.grid(), 25.0, 0.0) == UNKNOWN
