@@ -42,7 +42,7 @@ class ActiveMap:
         ros = config.ros
         self._directory = Path(ros.map_directory) if ros.map_directory else None
         self._path = Path(ros.map_file) if ros.map_file not in ("", AUTO) else None  # written, or to be found in
-        self._folder: Path | None = None  # of the clouds of this drive
+        self._folders: dict[str, Path] = {}  # of this drive, by the name under which it was saved
         self.located: LocalizationResult | None = None
         self._T_map_odom: dict[str, Array] | None = None  # by robot, while the map grows; None before any keyframe
         self._store = self._opened() if ros.localization_mode else self._new_file()
@@ -78,12 +78,18 @@ class ActiveMap:
             self._log.info(f"robot {robot or '/'}: its place in the map is known")
         return result.loops
 
-    def localise(self) -> str:
-        """End the map that grows, if it does, and look for the robot in the file; says so in words.
+    def localise(self, name: str = "") -> str:
+        """End the map that grows, if it does, and look for the robot in its file; says so in words.
+
+        Args:
+            name: of another map in the folder of maps.
 
         Raises:
             UsageError, Dpm2Error: there is no file that would serve; what was before goes on.
         """
+        if name and (path := self._named_file(name)) != self._path:
+            self._exchange(path)
+            return self._looking()
         growing = self.localizer is None
         if growing:
             if self._store is None:
@@ -95,7 +101,27 @@ class ActiveMap:
             if growing:
                 self._resume()
             raise
+        return self._looking()
+
+    def _looking(self) -> str:
         return f"looking for the robot in {self._path}, {len(self.mapper.keyframes)} keyframes"
+
+    def _named_file(self, name: str) -> Path:
+        if self._directory is None:
+            raise UsageError("ros.map_name: ros.map_directory is empty")
+        return self._directory / f"{name.removesuffix(_SUFFIX)}{_SUFFIX}"
+
+    def _exchange(self, path: Path) -> None:
+        """Another map, to find oneself in; the one that was is complete in its file, if it has one."""
+        store = open_for_localization(path, self._config.slam)
+        try:
+            made = make_map(self._config.slam, store)
+            self.close()
+        except BaseException:
+            store.close()
+            raise
+        self._path, self._store, self.located, self._T_map_odom = path, store, None, None
+        self.slam.use(*made)
 
     def extend(self) -> str:
         """Let the map grow in which the robot was looked for, by a new session; says so in words.
@@ -142,8 +168,11 @@ class ActiveMap:
         """Whether `save` has a folder to write into."""
         return self._directory is not None and self.localizer is None
 
-    def save(self) -> str:
+    def save(self, name: str = "") -> str:
         """Cloud, trajectory and pose graph into the drive's own folder; says so in words.
+
+        Args:
+            name: of the folder, and then also of a copy of the map file; with a number, where another drive has it.
 
         Raises:
             UsageError: there is nothing to save. Dpm2Error: it cannot be written.
@@ -156,18 +185,24 @@ class ActiveMap:
             raise UsageError("no map is saved: there is no keyframe yet")
         folder = self._directory
         try:
-            folder = self._folder = self._folder or self._claimed(self._directory)
+            folder = self._folders[name] = self._folders.get(name) or self._claimed(self._directory, name)
             save_map(self.mapper, folder)
         except OSError as error:
             raise Dpm2Error(f"{folder}: no map saved: {error.strerror}") from None
-        file = f", and as {self._path.resolve()}" if self._store is not None and self._path is not None else ""
+        path = self._path
+        if name and self._store is not None:
+            path = folder.with_name(f"{folder.name}{_SUFFIX}")
+            self._store.copy_to(path)
+        file = f", and as {path.resolve()}" if self._store is not None and path is not None else ""
         return f"map of {len(self.mapper.keyframes)} keyframes saved in {folder.resolve()}{file}"
 
-    def _claimed(self, directory: Path) -> Path:
-        """A new folder of the drive's name: the same folder again for each save of the same drive, never another's."""
-        for folder in _numbered(
-            directory / (self._path.stem if self._path is not None else _named(_NAME, self._robot))
-        ):
+    def _claimed(self, directory: Path, name: str) -> Path:
+        """A new folder of that name, or of the drive's: the same again for each save of the same drive, never
+        another's."""
+        own = self._path.stem if self._path is not None else _named(_NAME, self._robot)
+        for folder in _numbered(directory / (name.removesuffix(_SUFFIX) or own)):
+            if name and folder.with_name(f"{folder.name}{_SUFFIX}").exists():
+                continue  # another drive's map
             with suppress(FileExistsError):
                 folder.mkdir(parents=True)
                 return folder
@@ -196,7 +231,7 @@ class ActiveMap:
 
     def _new_file(self) -> MapStore | None:
         """A map file, if there is to be one. A file that cannot be made is no reason not to map."""
-        ros, self._folder = self._config.ros, None
+        ros, self._folders = self._config.ros, {}
         requested = Path(ros.map_file)
         if ros.map_file == AUTO:
             requested = self._directory / f"{_NAME}{_SUFFIX}" if self._directory is not None else Path()
@@ -250,7 +285,7 @@ class ActiveMap:
     def _resume(self) -> None:
         """Go on with the file."""
         assert self._path is not None
-        self._folder = None
+        self._folders = {}
         self._store = open_session(self._path, self._config.slam, dump_settings(self._config), resume=True)
         self.slam.use(*make_map(self._config.slam, self._store))
 

@@ -95,7 +95,7 @@ def grid_to_msg(grid: Grid, stamp: int, frame_id: str) -> OccupancyGrid:
 class Display:
     """A large message that is built only if it has a subscriber, has changed, and its period has passed."""
 
-    def __init__(self, publisher: Any, period: float, make: Callable[[], Any]) -> None:
+    def __init__(self, publisher: Any, period: Callable[[], float], make: Callable[[], Any]) -> None:
         self._publisher, self._period, self._make = publisher, period, make
         self._shown = 0
         self._last = -np.inf
@@ -103,7 +103,7 @@ class Display:
 
     def due(self, changes: int) -> bool:
         """Whether to publish now; if so, `publish` is expected to follow."""
-        waited = time.monotonic() - self._last >= self._period
+        waited = time.monotonic() - self._last >= self._period()
         if self._working or changes == self._shown or not waited or not self._publisher.get_subscription_count():
             return False
         self._working, self._shown, self._last = True, changes, time.monotonic()

@@ -24,13 +24,13 @@ from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Array, Edge, Keyframe
 from dpm2_core.slam.loops.localizer import LocalizationResult
 from dpm2_core.slam.mapping.admission import RejectedError
-from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.mapping.occupancy_map import OccupancyMap
 from dpm2_core.slam.system import Slam
 from dpm2_ros.active_map import ActiveMap
 from dpm2_ros.conversions import cloud_to_msg, edge_to_msg, keyframe_name
 from dpm2_ros.display import Display, grid_to_msg, loop_to_msg, path_to_msg, pose_graph_to_msg
 from dpm2_ros.guard import GuardedNode
+from dpm2_ros.parameters import follow_changes
 from dpm2_ros.settings import NodeConfig
 from dpm2_ros.subscriptions import LAST_ONE, STEADY
 from dpm2_ros.tf import TransformBroadcaster
@@ -65,13 +65,14 @@ class MapperThread:
         self._displays = [
             Display(node.create_publisher(kind, topic, LAST_ONE), period, make)
             for kind, topic, period, make in (
-                (PathMsg, "dpm2/path", ros.path_period, self._path),
-                (MarkerArray, "dpm2/pose_graph", ros.path_period, self._pose_graph),
-                (PointCloud2, "dpm2/map", ros.map_period, self._map),
-                (OccupancyGrid, "dpm2/grid", _GRID_PERIOD, self._grid),
+                (PathMsg, "dpm2/path", lambda: self._config.ros.path_period, self._path),
+                (MarkerArray, "dpm2/pose_graph", lambda: self._config.ros.path_period, self._pose_graph),
+                (PointCloud2, "dpm2/map", lambda: self._config.ros.map_period, self._map),
+                (OccupancyGrid, "dpm2/grid", lambda: _GRID_PERIOD, self._grid),
             )
         ]
-        self._drawn: tuple[Mapper, OccupancyMap] | None = None  # a map and its grid
+        self._drawn: tuple[object, OccupancyMap] | None = None  # what the grid is of, and the grid
+        follow_changes(node, config, self._apply)
         node.create_timer(0.1, self._show, clock=STEADY)
         node.create_service(Trigger, "~/save_map", self._on_save)
 
@@ -151,6 +152,12 @@ class MapperThread:
         """End the map that is being made, if one is, and look for the robot in the map file; returns a message."""
         return self._thread.submit(self._change, self._active.localise)
 
+    def load(self) -> Future[str]:
+        """Look for the robot in the map that `ros.map_name` names, or in the same one again; returns a message."""
+        if not (name := self._config.ros.map_name) and not self.localizing:
+            raise UsageError("no map is loaded: ros.map_name is empty, and localization_mode is off")
+        return self._thread.submit(self._change, lambda: self._active.localise(name))
+
     def extend(self) -> Future[str]:
         """Let the map grow from now on: that in which the robot was looked for, by a new session."""
         return self._thread.submit(self._change, self._active.extend)
@@ -227,8 +234,13 @@ class MapperThread:
             self._node.get_logger().info(info)
 
     async def _on_save(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        await respond(self._thread.submit(self._active.save), response)
+        await respond(self._thread.submit(self._active.save, self._config.ros.map_name), response)
         return response
+
+    def _apply(self, config: NodeConfig) -> None:
+        """Settings that have changed while the node runs."""
+        self._config = config
+        self._changes += 1
 
     def _show(self) -> None:
         for display in self._displays:
@@ -244,8 +256,9 @@ class MapperThread:
 
     def _grid(self) -> Any:
         mapper, ros = self._active.mapper, self._config.ros
-        if self._drawn is None or self._drawn[0] is not mapper:
-            self._drawn = mapper, OccupancyMap(ros.grid, ros.grid_max_cells)
+        of = (mapper, ros.grid, ros.grid_max_cells)
+        if self._drawn is None or self._drawn[0] != of:
+            self._drawn = of, OccupancyMap(ros.grid, ros.grid_max_cells)
         grid = self._drawn[1]
         if not mapper.update_grid(grid, _GRID_WORK):  # of a map that was loaded, or after a loop in a large one
             self._displays[-1].again()

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every configuration value as a ROS parameter of the same name; `python -m dpm2_ros.parameters` writes their page.
 
-Order of precedence: defaults, the YAML file named by `config_file`, parameters. All are read once, at the start.
+Order of precedence: defaults, the YAML file named by `config_file`, parameters. They are read once, at the start, but
+for those that may change while a node runs.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import functools
 import json
 import types
 import typing
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -20,6 +21,7 @@ from pydantic.fields import FieldInfo
 
 from dpm2_core.config import Settings, flat_fields, load_settings, read_yaml, settings_from
 from dpm2_core.errors import UsageError
+from dpm2_ros.settings import CHANGEABLE
 
 if TYPE_CHECKING:
     from rcl_interfaces.msg import ParameterDescriptor
@@ -55,13 +57,8 @@ def load_parameters(node: Node, kind: type[T]) -> T:
     if unknown := sorted(set(given) - set(fields)):
         raise UsageError(f"unknown parameter {', '.join(unknown)}; docs/parameters.md lists them")
     load_settings(kind, Path(file) if file else None)  # its mistakes are its own
-    tree = read_yaml(Path(file)) if file else {}  # only what is given: a preset may change the rest
-    for name, value in given.items():
-        branch = tree
-        *path, leaf = name.split(".")
-        for part in path:
-            branch = branch.setdefault(part, {})
-        branch[leaf] = value.tolist() if hasattr(value, "tolist") else value
+    # Only what is given: a preset may change the rest.
+    tree = _with(read_yaml(Path(file)) if file else {}, given)
     config = settings_from(kind, tree, dict.fromkeys(given, "ROS parameter"))
     for name in declared:
         node.undeclare_parameter(name)
@@ -71,14 +68,47 @@ def load_parameters(node: Node, kind: type[T]) -> T:
     return config
 
 
+def follow_changes(node: Node, config: T, apply: Callable[[T], None]) -> None:
+    """Hand new settings on whenever one of `CHANGEABLE` is set; a value that is not allowed is refused, with why."""
+    from rcl_interfaces.msg import SetParametersResult
+
+    current = config
+
+    def on_set(parameters: Sequence[Any]) -> SetParametersResult:
+        nonlocal current
+        given = {parameter.name: parameter.value for parameter in parameters if parameter.name in CHANGEABLE}
+        try:
+            current = settings_from(type(config), _with(current.model_dump(), given), dict.fromkeys(given, "ROS parameter"))
+        except UsageError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        if given:
+            apply(current)
+        return SetParametersResult(successful=True)
+
+    node.add_on_set_parameters_callback(on_set)
+
+
+def _with(tree: dict[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """The same tree, with values by dotted names put in."""
+    for name, value in given.items():
+        branch = tree
+        *path, leaf = name.split(".")
+        for part in path:
+            branch = branch.setdefault(part, {})
+        branch[leaf] = value.tolist() if hasattr(value, "tolist") else value
+    return tree
+
+
 def _declare(node: Node, name: str, value: Any, description: str, info: FieldInfo | None) -> None:
-    node.declare_parameter(name, value, _descriptor(description, value, info), ignore_override=True)
+    descriptor = _descriptor(description, value, info)
+    descriptor.read_only = name not in CHANGEABLE
+    node.declare_parameter(name, value, descriptor, ignore_override=True)
 
 
 def _descriptor(description: str, value: Any, info: FieldInfo | None) -> ParameterDescriptor:
     from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 
-    descriptor = ParameterDescriptor(description=description, read_only=True, dynamic_typing=value is None)
+    descriptor = ParameterDescriptor(description=description, dynamic_typing=value is None)
     if info is None:
         return descriptor
     descriptor.additional_constraints = f"{_kind(info)} {_allowed(info)}".strip()
@@ -160,7 +190,8 @@ def _head() -> list[str]:
         "(`--ros-args -p slam.registration:=geometric`), `dpm2 run` as `--set slam.registration=geometric` (all but",
         "`ros.*`), and both from a YAML file (`-p config_file:=FILE`, `--config FILE`; `dpm2 config dump` writes one).",
         "Defaults are overridden by the file, the file by single values. An unknown name or a value that is not",
-        "allowed ends the program with exit code 2 and one line that says what is. All are read once, at the start.",
+        "allowed ends the program with exit code 2 and one line that says what is. They are read once, at the start;",
+        "those that are *changeable* can also be set while a node runs (`ros2 param set`).",
     ]
 
 
@@ -180,7 +211,8 @@ def _sections(kind: type[Settings]) -> Iterator[str]:
         allowed = _allowed(info)
         kind_text = f"{_kind(info)}, {allowed}" if allowed else _kind(info)
         default = json.dumps(_plain(info.get_default(call_default_factory=True)), default=str)
-        yield f"| `{name}` | {kind_text} | `{default}` | {_text(info).replace('|', '&#124;')} |"
+        text = _text(info).replace("|", "&#124;") + (" *Changeable.*" if name in CHANGEABLE else "")
+        yield f"| `{name}` | {kind_text} | `{default}` | {text} |"
 
 
 if __name__ == "__main__":

@@ -87,6 +87,10 @@ class RosSettings(Settings):
     namespace, if any, and a number, if it is taken; nothing is overwritten. NAME.dpm2map grows as the drive goes on;
     ~/save_map, ~/reset and the end of the node write a folder NAME with PLY, TUM and g2o. Empty: none of these."""
 
+    map_name: str = Field(default="", pattern=r"^(\w[\w.-]{0,99})?$")
+    """Name within `map_directory`, such as town: ~/save_map also writes NAME.dpm2map, beside the folder NAME, and
+    ~/load_map looks for the robot in that map. Empty: the drive's own."""
+
     map_file: str = "auto"
     """Map file that is written as the drive goes on, so that a crash costs no more than a keyframe; `dpm2 map` reads
     it. auto: in `map_directory`; else a path such as town.dpm2map, to which namespace and number are added likewise.
@@ -105,6 +109,16 @@ class RosSettings(Settings):
         """Of `transform_tolerance`, ns."""
         usual = 0.5 if self.odom_source == "own" else 0.0
         return round((usual if self.transform_tolerance == "auto" else self.transform_tolerance) * 1e9)
+
+
+CHANGEABLE = frozenset(
+    f"ros.{name}"
+    for name in (
+        "map_name", "map_period", "map_max_points", "path_period", "grid_max_cells",
+        "grid.resolution", "grid.lowest", "grid.highest", "grid.reach",
+    )
+)  # fmt: skip
+"""Parameters that can be set while a node runs."""
 
 
 class NodeConfig(Config):

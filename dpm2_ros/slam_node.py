@@ -277,10 +277,13 @@ class SlamNode(GuardedNode):
         return response
 
     async def _on_load_map(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        if self._mapper is None or not self._mapper.localizing:
-            response.success, response.message = False, "no map is loaded: localization_mode is off"
-        else:
-            await respond(self._mapper.localise(), response)
+        if self._mapper is None:
+            response.success, response.message = False, "the mapper is another node's: ros.embed_mapper is off"
+            return response
+        try:
+            await respond(self._mapper.load(), response)
+        except UsageError as error:
+            response.success, response.message = False, str(error)
         return response
 
     async def _on_localization_mode(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:

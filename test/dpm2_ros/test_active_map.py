@@ -85,6 +85,39 @@ def test_a_second_save_of_one_drive_replaces_the_first(tmp_path: Path) -> None:
     assert len((tmp_path / "drive" / "trajectory.tum").read_text().splitlines()) == 1 + 3
 
 
+def test_a_map_is_saved_under_a_name_as_well(tmp_path: Path) -> None:
+    """A whole copy, which does not grow; the same drive replaces it, another drive gets a name with a number."""
+    active = ActiveMap(config(map_directory=str(tmp_path)), "", LOG)
+    for keyframe in keyframes(2):
+        active.add(keyframe)
+    assert str(tmp_path / "town.dpm2map") in active.save("town")
+    active.add(Keyframe(**vars(keyframes(3)[2])))
+    assert check_map(tmp_path / "town.dpm2map").keyframes == 2
+    active.save("town")
+    active.close()
+    for name in ("town", "drive"):
+        result = check_map(tmp_path / f"{name}.dpm2map")
+        assert (result.problems, result.keyframes) == ([], 3)
+    before = contents(tmp_path)
+    other = ActiveMap(config(map_directory=str(tmp_path)), "", LOG)
+    other.add(keyframes(1)[0])
+    other.save("town.dpm2map")
+    other.close()
+    after = contents(tmp_path)
+    assert {path: after[path] for path in before} == before
+    assert check_map(tmp_path / "town-2.dpm2map").keyframes == 1
+    assert (tmp_path / "town-2" / "map.ply").is_file()
+
+
+@pytest.mark.parametrize("name", ["../town", "a/b", ".hidden", "", "x" * 200, "a b", "town\n"])
+def test_a_name_stays_within_the_folder(name: str) -> None:
+    if name:
+        with pytest.raises(ValueError, match="map_name"):
+            config(map_name=name)
+    else:
+        config(map_name=name)
+
+
 def test_an_empty_value_says_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Neither folder nor file, also where the other is given; a drive without a keyframe leaves nothing either."""
     monkeypatch.chdir(tmp_path)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import hashlib
+import shutil
 import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,6 +15,8 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import SetBool, Trigger
 
@@ -23,6 +26,7 @@ from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
+from dpm2_core.slam.store.check import check_map
 from dpm2_ros.conversions import cloud_to_msg, header, pose_to_msg
 from dpm2_ros.tf import TFMessage
 from tools.replay import ros_environment, start
@@ -233,6 +237,41 @@ def test_from_mapping_to_localizing_and_back(robot: Callable[..., Robot], tmp_pa
         data = load_map(store)
     assert set(data.session) == {1, 2}
     assert len({(k.robot, k.id) for k in data.keyframes}) == len(data)
+
+
+def test_another_map_by_its_name_while_the_node_runs(
+    robot: Callable[..., Robot], recording: Path, made: Path, tmp_path: Path
+) -> None:
+    """From a map that is being made to a saved one; what cannot be loaded leaves what was."""
+    maps = tmp_path / "maps"
+    maps.mkdir()
+    shutil.copy(made, maps / "town.dpm2map")
+    r = robot(f"ros.map_directory:={maps}", "slam.keyframes.distance:=2.0")
+    r.send(*range(6))
+
+    def named(name: str) -> Any:
+        value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=name)
+        request = [Parameter(name="ros.map_name", value=value)]
+        return r.call(SetParameters, "/slam_node/set_parameters", parameters=request).results[0]
+
+    refused = named("../town")
+    assert not refused.successful
+    assert "map_name" in refused.reason
+    assert not r.call(Trigger, "/slam_node/load_map").success  # nothing is named
+    assert named("nowhere").successful
+    lost = r.call(Trigger, "/slam_node/load_map")
+    assert (lost.success, "no such map file" in lost.message) == (False, True)
+    assert named("start").successful
+    assert "start.dpm2map" in r.call(Trigger, "/slam_node/save_map").message
+    assert named("town").successful
+    before = digest(maps / "town.dpm2map")
+    loaded = r.call(Trigger, "/slam_node/load_map")
+    assert loaded.success, loaded.message
+    r.stand(12, lambda: r.off(place(recording, 12)) < 0.2, "the robot in the other map")
+    assert r.close() == 0
+    assert digest(maps / "town.dpm2map") == before
+    for name in ("drive", "start"):
+        assert check_map(maps / f"{name}.dpm2map").problems == []
 
 
 def test_a_map_that_is_not_there_ends_the_node_with_one_line(run: Callable[..., Any], tmp_path: Path) -> None:

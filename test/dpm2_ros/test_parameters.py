@@ -14,9 +14,9 @@ from rclpy.parameter import Parameter
 
 from dpm2_core.config import flat_fields
 from dpm2_core.errors import UsageError
-from dpm2_ros.parameters import load_parameters, page
+from dpm2_ros.parameters import follow_changes, load_parameters, page
 from dpm2_ros.runtime import ros_context
-from dpm2_ros.settings import NodeConfig
+from dpm2_ros.settings import CHANGEABLE, NodeConfig
 
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "parameters.md"
 
@@ -44,9 +44,35 @@ def test_every_setting_is_declared_described_and_read_only() -> None:
     for name, info in flat_fields(NodeConfig):
         descriptor = node.describe_parameter(name)
         assert descriptor.description == " ".join(info.description.split()), name
-        assert descriptor.read_only, name
+        assert descriptor.read_only == (name not in CHANGEABLE), name
         (result,) = node.set_parameters([Parameter(name, value=node.get_parameter(name).value)])
+        assert result.successful == (name in CHANGEABLE), name
+    assert dict(flat_fields(NodeConfig)).keys() >= CHANGEABLE
+
+
+def test_some_change_while_a_node_runs() -> None:
+    """One at a time or together, all or none; what is not allowed is refused with the reason, as at the start."""
+    config, node = load("ros.map_period:=3.0")
+    seen: list[NodeConfig] = []
+    follow_changes(node, config, seen.append)
+    (done,) = node.set_parameters([Parameter("ros.grid.reach", value=12.0)])
+    assert done.successful
+    assert (seen[-1].ros.grid.reach, seen[-1].ros.map_period) == (12.0, 3.0)
+    assert seen[-1].ros.model_copy(update={"grid": config.ros.grid}) == config.ros
+    refused = [
+        ("ros.map_name", "../town"),
+        ("ros.grid.resolution", -1.0),
+        ("ros.map_period", "often"),
+        ("ros.map_frame", "m"),
+    ]
+    for name, value in refused:
+        (result,) = node.set_parameters([Parameter(name, value=value)])
         assert not result.successful, name
+        assert result.reason, name
+    both = [Parameter("ros.map_period", value=1.0), Parameter("ros.grid.reach", value=0.0)]
+    assert not node.set_parameters_atomically(both).successful
+    assert len(seen) == 1
+    assert node.get_parameter("ros.map_period").value == 3.0
 
 
 def test_types_and_ranges() -> None:

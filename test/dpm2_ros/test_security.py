@@ -50,7 +50,7 @@ def done(harness: Any, node: str, missing: Callable[[Graph], bool]) -> Graph:
 
 EMBEDDED = {"subscriber": {"/clock", "/dpm2/keyframes_received"}}
 APART = {
-    "publisher": {f"/dpm2/{name}" for name in ("loop_candidates", "loop_closure", "map", "path", "pose_graph")},
+    "publisher": {f"/dpm2/{name}" for name in ("grid", "loop_candidates", "loop_closure", "map", "path", "pose_graph")},
     "service": {"/slam_node/save_map"},
 }
 

@@ -215,6 +215,21 @@ class MapStore:
             finally:
                 self._connection.execute("ROLLBACK")
 
+    def copy_to(self, path: Path) -> None:
+        """All that is in it now as another map file, whole or not at all; an older one there is replaced.
+
+        Raises:
+            Dpm2Error: it could not be written.
+        """
+        part = path.with_name(f".{path.name}.part")
+        with _explained(path):
+            try:
+                with closing(sqlite3.connect(part)) as copy:
+                    self._connection.backup(copy)
+                part.replace(path)
+            finally:
+                part.unlink(missing_ok=True)
+
     @contextmanager
     def _transaction(self) -> Iterator[sqlite3.Connection]:
         with _explained(self.path):

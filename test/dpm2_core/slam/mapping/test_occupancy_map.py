@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The live grid has the walls of a simulated building, and is that of all keyframes at once whatever happened before."""
+"""The live grid has the walls of a simulated building, and is that of all keyframes whatever happened before."""
 
 from __future__ import annotations
 
