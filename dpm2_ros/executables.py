@@ -16,11 +16,15 @@ from dpm2_ros.runtime import catch_signals, spin_node
 
 
 def slam_node(arguments: Sequence[str] | None = None) -> int:
-    """Odometry and, by default, the map."""
+    """Odometry and, by default, the map; with `--lifecycle` a node that waits to be configured and activated."""
 
     def work(arguments: Sequence[str]) -> int:
         from dpm2_ros.slam_node import SlamNode
 
+        if "--lifecycle" in arguments:
+            from dpm2_ros.lifecycle import ManagedSlamNode
+
+            return spin_node(ManagedSlamNode, [text for text in arguments if text != "--lifecycle"])
         return spin_node(SlamNode, arguments)
 
     return _run(work, arguments)

@@ -15,7 +15,7 @@ from dpm2_ros.feed import ODOM, Feed
 from dpm2_ros.guard import GuardedNode
 from dpm2_ros.keyframes import weights_identity
 from dpm2_ros.mapping import MapperThread, robot_name
-from dpm2_ros.parameters import load_parameters
+from dpm2_ros.parameters import follow_changes, load_parameters
 from dpm2_ros.settings import NodeConfig
 from dpm2_ros.subscriptions import STEADY
 
@@ -37,6 +37,7 @@ class MapperNode(GuardedNode):
             raise UsageError("ros.localization_mode: is for slam_node")
         self._weights = weights_identity(config.slam)
         self._mapper = MapperThread(self, config, robot_name(self))
+        follow_changes(self, config, self._mapper.apply)
         self._feeds: dict[str, Feed] = {}
         self._own = self.get_namespace().rstrip("/")
         self._discover()

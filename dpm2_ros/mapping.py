@@ -30,7 +30,6 @@ from dpm2_ros.active_map import ActiveMap
 from dpm2_ros.conversions import cloud_to_msg, edge_to_msg, keyframe_name
 from dpm2_ros.display import Display, grid_to_msg, loop_to_msg, path_to_msg, pose_graph_to_msg
 from dpm2_ros.guard import GuardedNode
-from dpm2_ros.parameters import follow_changes
 from dpm2_ros.settings import NodeConfig
 from dpm2_ros.subscriptions import LAST_ONE, STEADY
 from dpm2_ros.tf import TransformBroadcaster
@@ -72,7 +71,6 @@ class MapperThread:
             )
         ]
         self._drawn: tuple[object, OccupancyMap] | None = None  # what the grid is of, and the grid
-        follow_changes(node, config, self._apply)
         node.create_timer(0.1, self._show, clock=STEADY)
         node.create_service(Trigger, "~/save_map", self._on_save)
 
@@ -162,6 +160,11 @@ class MapperThread:
         """Let the map grow from now on: that in which the robot was looked for, by a new session."""
         return self._thread.submit(self._change, self._active.extend)
 
+    def apply(self, config: NodeConfig) -> None:
+        """What is shown, and the map's name, by settings that have changed while the node runs."""
+        self._config = config
+        self._changes += 1
+
     def restart(self) -> None:
         """The odometry has started again: the map stays, the robot's place in it is no longer known."""
         self._restarted = self._submit(self._active.restart)
@@ -236,11 +239,6 @@ class MapperThread:
     async def _on_save(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         await respond(self._thread.submit(self._active.save, self._config.ros.map_name), response)
         return response
-
-    def _apply(self, config: NodeConfig) -> None:
-        """Settings that have changed while the node runs."""
-        self._config = config
-        self._changes += 1
 
     def _show(self) -> None:
         for display in self._displays:

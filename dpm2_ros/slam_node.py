@@ -31,7 +31,7 @@ from dpm2_ros.health import Diagnostics, Health
 from dpm2_ros.keyframes import KeyframeSender, weights_identity
 from dpm2_ros.mapping import MapperThread, respond, robot_name, yield_to_odometry
 from dpm2_ros.other_odometry import OtherOdometry
-from dpm2_ros.parameters import load_parameters
+from dpm2_ros.parameters import follow_changes, load_parameters
 from dpm2_ros.settings import NodeConfig
 from dpm2_ros.state import StatePublisher
 from dpm2_ros.subscriptions import Inputs
@@ -50,15 +50,31 @@ class SlamNode(GuardedNode):
         UsageError: a parameter that is not allowed.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, managed: bool = False) -> None:
+        """`managed`: wait for `configure` and `activate`; see `lifecycle.py`."""
         super().__init__("slam_node", automatically_declare_parameters_from_overrides=True)
         self._config = load_parameters(self, NodeConfig)
         ros, self._robot = self._config.ros, robot_name(self)
+        self._beside = ros.odom_source != "own"
         if ros.localization_mode and not ros.embed_mapper:
             raise UsageError("ros.localization_mode: needs ros.embed_mapper")
-        beside = ros.odom_source != "own"
-        if beside and ros.invert_odom_tf and not ros.embed_mapper:
+        if self._beside and ros.invert_odom_tf and not ros.embed_mapper:
             raise UsageError("ros.invert_odom_tf: needs ros.embed_mapper where ros.odom_source is another's")
+        follow_changes(self, self._config, self._apply)
+        self._mapper: MapperThread | None = None
+        self._configured = False
+        self._worker: threading.Thread | None = None  # set while active
+        if not managed:
+            self.configure()
+            self.activate()
+
+    def configure(self) -> None:
+        """Load the network, open the map, announce what will be published.
+
+        Raises:
+            UsageError, Dpm2Error: the map in which to find oneself cannot be used.
+        """
+        ros = self._config.ros
         self._mapper = MapperThread(self, self._config, self._robot) if ros.embed_mapper else None
         self._slam = make_slam(self._config.slam, self._robot) if self._mapper is None else self._mapper.slam
         self._health = Health()
@@ -68,7 +84,7 @@ class SlamNode(GuardedNode):
         self._state = StatePublisher(self)
         # Idle with the mapper, which has its own.
         self._line = ThreadPoolExecutor(1, thread_name_prefix="keyframes", initializer=yield_to_odometry)
-        sends = ros.publish_tf_odom and (not beside or ros.invert_odom_tf or not ros.embed_mapper)
+        sends = ros.publish_tf_odom and (not self._beside or ros.invert_odom_tf or not ros.embed_mapper)
         self._tf = TransformBroadcaster(self, ros.own_frame, sends, ros.invert_odom_tf)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(Trigger, "~/load_map", self._on_load_map)
@@ -79,15 +95,24 @@ class SlamNode(GuardedNode):
         self._base = BaseFrame(ros.base_frame, (ros.odom_frame, ros.own_frame, ros.map_frame))
         self._waited = False  # for the base frame
         warm_up(self._config.slam)
+        self._known: Calibration | None = None
+        self._begin()
+        self._index, self._configured = 0, True
+
+    def activate(self) -> None:
+        """Take clouds from now on; the drive goes on, if there was one."""
+        ros, self._waited = self._config.ros, False
+        self._stopping.clear()
+        self._other = None
+        if self._beside:
+            self._other = OtherOdometry(self, ros, lambda: self._inputs.calibration.transforms)
         # Last of all: who is subscribed is ready, and whoever waits for subscribers loses nothing.
         reading = self._config.input.model_copy(update={"images": self._config.input.images and self._slam.uses_images})
-        self._inputs = Inputs(self, reading, ros)
-        self._other = OtherOdometry(self, ros, lambda: self._inputs.calibration.transforms) if beside else None
-        self._frames = FrameBuilder(reading, self._inputs.calibration, self.get_logger().error)
+        self._inputs = Inputs(self, reading, ros, self._known)
+        self._known = self._inputs.calibration
+        self._frames = FrameBuilder(reading, self._known, self.get_logger().error)
         self._diagnostics = Diagnostics(self, self._inputs, self._frames, self._health, self._mapper, self._sender)
         self._diagnostics.other = self._other
-        self._begin()
-        self._index = 0
         self._worker = threading.Thread(target=self._work, name="worker")
         self._worker.start()
         self.get_logger().info(f"waiting for clouds on {self._inputs.subscriptions[0].topic}")
@@ -102,20 +127,44 @@ class SlamNode(GuardedNode):
         """What is known of the sensors so far."""
         return self._inputs.calibration
 
-    def close(self) -> None:
-        """End the worker after the frame it is at, then the mapper, which saves the map.
+    def deactivate(self) -> None:
+        """End the worker after the frame it is at: no more clouds; the map stays."""
+        if self._worker is not None:
+            self._stopping.set()
+            self._worker.join()
+            self._worker = None
+            self.get_logger().info(self._diagnostics.account())
+
+    def cleanup(self) -> None:
+        """End the mapper, which saves the map.
 
         Raises:
             Dpm2Error: the map could not be written.
         """
-        self._stopping.set()
-        self._worker.join()
+        if not self._configured:
+            return
+        self._configured = False
         self._give_up()
         self._line.shutdown(wait=True)
         self._sender.close()
-        self.get_logger().info(self._diagnostics.account())
+        mapper, self._mapper = self._mapper, None
+        if mapper is not None:
+            mapper.close()
+
+    def close(self) -> None:
+        """End everything, whatever is under way.
+
+        Raises:
+            Dpm2Error: the map could not be written.
+        """
+        self.deactivate()
+        self.cleanup()
+
+    def _apply(self, config: NodeConfig) -> None:
+        """Parameters that have changed while the node runs."""
+        self._config = config
         if self._mapper is not None:
-            self._mapper.close()
+            self._mapper.apply(config)
 
     def _begin(self) -> None:
         """The state of a drive at its start."""

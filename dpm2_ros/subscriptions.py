@@ -115,11 +115,12 @@ class Inputs:
         calibration: what is known by now; its topics are full names, after remapping.
     """
 
-    def __init__(self, node: Node, settings: InputSettings, ros: RosSettings) -> None:
+    def __init__(self, node: Node, settings: InputSettings, ros: RosSettings, known: Calibration | None = None) -> None:
+        """`known`: what an earlier one has learned."""
         self._node = node
         points_topic, image_topic = settings.points_topic or topics.POINTS, settings.image_topic or topics.IMAGE
         image_name = node.resolve_topic_name(image_topic) if settings.images else ""
-        self.calibration = Calibration(node.resolve_topic_name(points_topic), image_name)
+        self.calibration = known or Calibration(node.resolve_topic_name(points_topic), image_name)
         self._image_shift = round(settings.image_time_offset * 1e9)
         self._arrived = threading.Condition()
         self.synchronizer = Synchronizer(

@@ -103,6 +103,7 @@ class Robot:
 @pytest.fixture
 def robot(ros: Callable[..., Any], drive: Any, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Robot]:
     monkeypatch.setattr("dpm2_ros.diagnostics.PERIOD", 0.1)
+    monkeypatch.setattr("dpm2_ros.other_odometry.WAIT", 2.0)  # a busy machine may take its time
     return lambda *parameters: Robot(ros, drive, *parameters)
 
 
