@@ -23,15 +23,19 @@ ARGUMENTS = {
     "image_topic": ("", "images; empty: /kitti/camera_color_left/image_raw"),
     "base_frame": ("", "frame whose pose is published; empty: the root above the LiDAR in /tf_static"),
     "odom_frame": ("", "frame of the odometry; empty: odom"),
+    "odom_source": ("", "tf or topic: the robot has an odometry already; empty: own"),
     "embed_mapper": ("", "true: the mapper within slam_node; false: mapper_node beside it; empty: true"),
     "map_directory": ("", "where the map is saved at the end; empty: ros.map_directory"),
     "map_file": ("", "map file that is written, or, with localization_mode, read; empty: ros.map_file"),
     "localization_mode": ("", "true: slam_node finds itself in map_file"),
     "namespace": ("", "of all nodes: one a robot"),
+    "lifecycle": ("false", "true: slam_node waits for a lifecycle manager"),
     "rviz": ("true", "show the map in RViz, if it is installed"),
     "use_sim_time": ("auto", "follow /clock; auto: with a bag"),
 }
 CHOICES = {
+    "odom_source": ["", "own", "tf", "topic"],
+    "lifecycle": ["true", "false"],
     "embed_mapper": ["", "true", "false"],
     "localization_mode": ["", "true", "false"],
     "rviz": ["true", "false"],
@@ -43,6 +47,7 @@ PARAMETERS = {
     "image_topic": "input.image_topic",
     "base_frame": "ros.base_frame",
     "odom_frame": "ros.odom_frame",
+    "odom_source": "ros.odom_source",
     "embed_mapper": "ros.embed_mapper",
     "map_directory": "ros.map_directory",
     "map_file": "ros.map_file",
@@ -89,7 +94,8 @@ def _actions(context) -> list:
     given = parameters(value)
     common = {"package": "dpm2_ros", "namespace": value["namespace"], "output": "screen"}
     common["parameters"] = [*parameter_files(value), *_typed(given)]
-    actions = [Node(executable="slam_node", on_exit=Shutdown(), **common)]
+    managed = {"arguments": ["--lifecycle"]} if value["lifecycle"] == "true" else {}
+    actions = [Node(executable="slam_node", on_exit=Shutdown(), **managed, **common)]
     if value["embed_mapper"] == "false":
         actions.append(Node(executable="mapper_node", **common))
     if value["bag"]:

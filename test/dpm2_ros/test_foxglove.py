@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The layout for Foxglove names what the nodes have: topics, fields of messages, services; and no panel is lost."""
+"""The layouts for Foxglove name what the nodes have: topics, fields of messages, services; and no panel is lost."""
 
 from __future__ import annotations
 
@@ -9,10 +9,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from dpm2_ros.message_types import message_type
 
 ROOT = Path(__file__).resolve().parents[2]
-LAYOUT = json.loads((ROOT / "config" / "foxglove.json").read_text())
+LAYOUTS = sorted((ROOT / "config").glob("foxglove*.json"))
+ROBOTS = re.compile(r"^/(red|green|blue)(?=/)")  # their namespaces
 # docs/topics.md is compared with running nodes in test_topics.py
 ROWS = re.findall(r"^\| `([^`]+)` \| (\S+) \|", (ROOT / "docs" / "topics.md").read_text(), re.M)
 KINDS = dict(ROWS)
@@ -38,19 +41,29 @@ def panels(layout: Any) -> list[str]:
     return [*panels(layout["first"]), *panels(layout["second"])]
 
 
-def test_every_topic_and_service_is_there() -> None:
-    named = {text for text in texts(LAYOUT) if text.startswith("/")}
-    assert len(named) >= 9
+@pytest.fixture(params=LAYOUTS, ids=lambda path: path.stem)
+def layout(request: pytest.FixtureRequest) -> Any:
+    return json.loads(request.param.read_text())
+
+
+def test_there_are_layouts_for_mapping_localization_and_several_robots() -> None:
+    assert [path.stem for path in LAYOUTS] == ["foxglove", "foxglove_localization", "foxglove_robots"]
+
+
+def test_every_topic_and_service_is_there(layout: Any) -> None:
+    named = {ROBOTS.sub("", text) for text in texts(layout) if text.startswith("/")}
+    assert len(named) >= 8
     for text in named:
         name = re.split(r"[.\[]", text)[0]
-        known = name in KINDS or name.replace("/slam_node/", "~/") in KINDS
+        known = name in KINDS or re.sub(r"^/(slam|mapper)_node/", "~/", name) in KINDS
         assert known, f"{text} is neither a topic nor a service of the nodes"
 
 
-def test_every_field_that_is_plotted_is_in_its_message() -> None:
-    paths = [path["value"] for path in LAYOUT["configById"]["Plot!speed"]["paths"]]
-    for path in paths:
-        name, *fields = path.split(".")
+def test_every_field_that_is_drawn_is_in_its_message(layout: Any) -> None:
+    panels = [panel for name, panel in layout["configById"].items() if name.startswith(("Plot!", "StateTransitions!"))]
+    assert panels
+    for path in (path["value"] for panel in panels for path in panel["paths"]):
+        name, *fields = ROBOTS.sub("", path).split(".")
         kind = message_type(KINDS[name])
         assert kind is not None
         value: Any = kind()
@@ -58,8 +71,8 @@ def test_every_field_that_is_plotted_is_in_its_message() -> None:
             value = getattr(value, field.partition("[")[0])
         if "[" in path:
             value = value[int(path.split("[")[1].rstrip("]"))]
-        assert float(value) == 0.0
+        assert value in (0.0, "")
 
 
-def test_every_panel_has_its_place() -> None:
-    assert sorted(panels(LAYOUT["layout"])) == sorted(LAYOUT["configById"])
+def test_every_panel_has_its_place(layout: Any) -> None:
+    assert sorted(panels(layout["layout"])) == sorted(layout["configById"])

@@ -67,7 +67,7 @@ def test_a_node_starts_from_a_file_of_defaults_and_empty_texts(
     empty = {
         parameter: ""
         for parameter in launch_file.PARAMETERS.values()
-        if isinstance(DEFAULTS.get(parameter, ""), str) and parameter != "ros.odom_frame"
+        if isinstance(DEFAULTS.get(parameter, ""), str) and parameter not in ("ros.odom_frame", "ros.odom_source")
     }
     assert CONFIG_FILE in empty
     file = write({"use_sim_time": False} | empty | launch_file.parameters(defaults(launch_file)), tmp_path / "p.yaml")
@@ -96,6 +96,7 @@ def test_every_argument_is_a_parameter_that_is_taken(launch_file: ModuleType, tm
         "image_topic": "/cam/image",
         "base_frame": "base_link",
         "odom_frame": "red/odom",
+        "odom_source": "tf",
         "embed_mapper": "false",
         "map_directory": "maps",
         "map_file": "town.dpm2map",

@@ -122,7 +122,8 @@ def test_slip_and_a_jump_of_half_a_meter(robot: Callable[..., Robot], drive: Any
         T_map_base = links["map", "odom"][stamp] @ r.wheels[stamp]
         np.testing.assert_allclose(T_map_base, transform_matrix(message.pose.pose), atol=1e-6)
         assert np.linalg.norm((T_map_base - r.base(n))[:3, 3]) < ACCURATE
-    said = r.status(lambda s: "outweighed" in s.message)
+    whole = lambda s: s.values[0].value == str(drive.frames)  # noqa: E731
+    said = r.status(lambda s: "outweighed" in s.message and whole(s))
     assert said.level == DiagnosticStatus.WARN
     assert float(said.message.split()[1]) == pytest.approx(0.5, abs=0.05)
     values = {value.key: value.value for value in said.values}
