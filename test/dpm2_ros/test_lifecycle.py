@@ -92,13 +92,14 @@ def test_inactive_it_takes_no_cloud_and_keeps_the_map(ros: Callable[..., Any], d
     assert not m.lidar.get_subscription_count()
     assert m.change(ACTIVATE)
     m.send(*range(4))
+    m.harness.wait(lambda: m.node.slam.mapper.keyframes, "the first keyframe")
     keyframes = len(m.node.slam.mapper.keyframes)
     assert m.change(DEACTIVATE)
     m.harness.wait(lambda: not m.lidar.get_subscription_count(), "the end of the subscription")
     assert m.state == "inactive"
     assert m.change(ACTIVATE)
     m.send(*range(4, 10))
-    assert len(m.node.slam.mapper.keyframes) > keyframes >= 1
+    m.harness.wait(lambda: len(m.node.slam.mapper.keyframes) > keyframes, "a keyframe more")
     last = m.odom[-1].pose.pose.position.x
     assert last == pytest.approx(drive.pose(9)[0, 3], abs=0.1)
     assert m.change(Transition.TRANSITION_ACTIVE_SHUTDOWN)
