@@ -78,7 +78,8 @@ def follow_changes(node: Node, config: T, apply: Callable[[T], None]) -> None:
         nonlocal current
         given = {parameter.name: parameter.value for parameter in parameters if parameter.name in CHANGEABLE}
         try:
-            current = settings_from(type(config), _with(current.model_dump(), given), dict.fromkeys(given, "ROS parameter"))
+            tree = _with(current.model_dump(), given)
+            current = settings_from(type(config), tree, dict.fromkeys(given, "ROS parameter"))
         except UsageError as error:
             return SetParametersResult(successful=False, reason=str(error))
         if given:
