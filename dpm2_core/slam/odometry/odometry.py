@@ -222,14 +222,18 @@ class Odometry:
         result = self._gated(result, T_predicted, dt)
         if result.ok or not self._settings.turns:
             return result
-        yaws = np.radians(np.linspace(-self._settings.turns, self._settings.turns, 2 * _HEADINGS + 1))
-        starts = [T_predicted @ se3.exp([0, 0, yaw, 0, 0, 0]) for yaw in yaws if yaw]
+        starts = [T_predicted @ se3.exp([0, 0, yaw, 0, 0, 0]) for yaw in self._headings()]
         turned = self._gated(self._registration.register(scan, Prediction(starts, widen)), T_predicted, dt)
         return turned if turned.ok else result
 
     def _step_of_other(self) -> Step | None:
         """What another odometry says of the way since the last registered frame."""
         return None if self._other is None else self._other.step
+
+    def _headings(self) -> list[float]:
+        """Turns on the spot that are tried, rad."""
+        most = float(np.radians(self._settings.turns))
+        return [side * most * (i + 1) / _HEADINGS for i in range(_HEADINGS) for side in (1, -1)] if most else []
 
     def _register_by_other(self, scan: Scan, dt: float) -> Registration | None:
         """From where another odometry leads; None without one, or where the scan does not confirm it."""
@@ -248,7 +252,8 @@ class Odometry:
             result = self._registration.register(scan, self._bridge.expected(T, dt))
             if result.ok and result.confidence >= _FITS_WELL:
                 return result
-        for motions in (_AHEAD, _AHEAD + _CURVES):
+        turning = tuple((0.0, float(np.degrees(yaw))) for yaw in self._headings())
+        for motions in (_AHEAD, _AHEAD + _CURVES + turning):
             starts = [T @ se3.exp([0, 0, np.radians(yaw), x, 0, 0]) for x, yaw in motions]
             result = self._registration.register(scan, Prediction(starts, widen=2.0))
             if result.ok and result.confidence >= _FITS_WELL:

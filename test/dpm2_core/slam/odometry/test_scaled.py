@@ -108,3 +108,16 @@ def test_presets_are_under_what_is_set(preset: str) -> None:
 def test_rooms_keep_what_is_set() -> None:
     chosen = SlamSettings.model_validate({"geometric": {"noise": 0.02}, "threads": 1}).indoors()
     assert (chosen.geometric.noise, chosen.geometric.gate, chosen.threads) == (0.02, 0.8, 1)
+
+
+def test_a_robot_that_begins_turning_on_the_spot_is_followed() -> None:
+    """By 30 degrees a frame from the first one on, and then slower."""
+    yaws = np.radians(30.0 * np.array([0, 1, 2, 3, 4, 4.5]))
+    poses = np.array([se3.make(np.eye(3), [0.3, 0.2, 0.6]) @ se3.exp([0, 0, yaw, 0, 0, 0]) for yaw in yaws])
+    odometry = make_odometry(geometric("indoor"))
+    results = [odometry.process(frame) for frame in frames(poses)]
+    assert all(result.registration.ok for result in results)
+    for result, T in zip(results, se3.inverse(poses[0]) @ poses, strict=True):
+        meters, degrees = se3.magnitude(se3.inverse(T) @ result.T_odom_lidar)
+        assert meters < 0.05
+        assert degrees < 1.5
