@@ -12,14 +12,17 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Point, PoseStamped, Vector3
 from nav_msgs.msg import OccupancyGrid, Path
+from rclpy.node import Node
+from sensor_msgs.msg import Image
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
-from dpm2_core.frame import Array, Edge
+from dpm2_core.data.projection import painted
+from dpm2_core.frame import Array, Edge, Frame
 from dpm2_core.geometry import se3
 from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.mapping.occupancy_map import FREE, OCCUPIED, Grid
-from dpm2_ros.conversions import header, pose_to_msg
+from dpm2_ros.conversions import bytes_to_array, header, pose_to_msg
 
 GRAY, GREEN, BLUE, RED = (0.7, 0.7, 0.7), (0.1, 0.8, 0.2), (0.2, 0.5, 1.0), (1.0, 0.2, 0.2)
 
@@ -90,6 +93,23 @@ def grid_to_msg(grid: Grid, stamp: int, frame_id: str) -> OccupancyGrid:
     cells.frombytes(values[grid.cells[::-1]].tobytes())
     message.data = cells
     return message
+
+
+class Projection:
+    """The cloud painted into its image, for checking an extrinsic; made only while there is a subscriber."""
+
+    def __init__(self, node: Node) -> None:
+        self._publisher = node.create_publisher(Image, "dpm2/projection", 1)
+
+    def show(self, frame: Frame, frame_id: str) -> None:
+        """Of a frame with an image, which was in that frame."""
+        if not frame.images or not self._publisher.get_subscription_count():
+            return
+        pixels = painted(frame.images[0], frame.points)
+        height, width = pixels.shape[:2]
+        message = Image(header=header(frame.stamp, frame_id), height=height, width=width, encoding="rgb8")
+        message.step, message.data = 3 * width, bytes_to_array(pixels.tobytes())
+        self._publisher.publish(message)
 
 
 class Display:

@@ -26,6 +26,7 @@ from dpm2_core.slam.mapping.admission import check_pose
 from dpm2_core.slam.system import Slam
 from dpm2_ros.base_frame import BaseFrame
 from dpm2_ros.conversions import BodyMotion, keyframe_to_base, odometry_to_msg
+from dpm2_ros.display import Projection
 from dpm2_ros.guard import GuardedNode
 from dpm2_ros.health import Diagnostics, Health
 from dpm2_ros.keyframes import KeyframeSender, weights_identity
@@ -81,7 +82,7 @@ class SlamNode(GuardedNode):
         weights = weights_identity(self._config.slam)
         self._sender = KeyframeSender(self, self._robot, ros.own_frame, not ros.embed_mapper, weights)
         self._odom = self.create_publisher(Odometry, "dpm2/odom", 10)
-        self._state = StatePublisher(self)
+        self._state, self._projection = StatePublisher(self), Projection(self)
         # Idle with the mapper, which has its own.
         self._line = ThreadPoolExecutor(1, thread_name_prefix="keyframes", initializer=yield_to_odometry)
         sends = ros.publish_tf_odom and (not self._beside or ros.invert_odom_tf or not ros.embed_mapper)
@@ -208,6 +209,7 @@ class SlamNode(GuardedNode):
         self._look_for_base(bundle.cloud.header.frame_id or "lidar")
         frame = self._frames.frame(bundle.stamp, bundle.cloud, bundle.image, self._index)
         tracked = self._tracked(frame)
+        self._projection.show(frame, "" if bundle.image is None else bundle.image.header.frame_id)
         self._index += 1
         self._held.append(tracked)
         if self._base.name:

@@ -380,6 +380,22 @@ def test_an_image_joins_its_cloud(rig: Callable[..., Rig]) -> None:
     assert r.status("camera").level == DiagnosticStatus.OK
 
 
+def test_the_cloud_is_painted_into_its_image_for_who_looks(rig: Callable[..., Rig]) -> None:
+    r, camera = with_camera(rig, PLACE, "ros.sync_timeout:=2.0")
+    camera.send(0)
+    r.send_and_wait(0)
+    painted = r.harness.hear(Image, "/dpm2/projection", 1)
+    r.wait(lambda: r.node.count_subscribers("/dpm2/projection"), "the subscription")
+    camera.send(1)
+    r.send_and_wait(1)
+    r.wait(lambda: painted, "the projection")
+    assert (painted[0].height, painted[0].width, painted[0].encoding) == (6, 8, "rgb8")
+    assert (painted[0].header.frame_id, stamp_ns(painted[0].header)) == ("camera", r.drive.stamp(1))
+    assert any(painted[0].data)  # the image itself is black
+    r.send_and_wait(2)  # without an image
+    assert len(painted) == 1
+
+
 def test_extrinsics_come_from_tf_static(rig: Callable[..., Rig]) -> None:
     r, camera = with_camera(rig, "ros.sync_timeout:=2.0")
     T = se3.exp([0.1, -1.2, 1.2, 0.3, 0.0, -0.1])

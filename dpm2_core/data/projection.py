@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A cloud painted into the image of the same time: whether the extrinsics are right shows at every edge."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dpm2_core.frame import Image, Points
+from dpm2_core.geometry import se3
+
+_NEAREST, _FARTHEST = 0.5, 60.0  # m ahead of the camera
+_BESIDE = 0.2  # of the image's size: what lies farther outside of it would be folded back by the distortion
+
+
+def painted(image: Image, points: Points) -> NDArray[np.uint8]:
+    """The pixels (H, W, 3) with the points (N, 4) of the LiDAR frame on them, red near by to blue at 60 m, near ones
+    over far ones. Points are where they were measured: the motion during a sweep is not undone."""
+    camera, pixels = image.camera, image.pixels.copy()
+    width, height = camera.size
+    xyz = points[np.isfinite(points[:, :3]).all(1), :3].astype(np.float64)
+    xyz = np.asarray(se3.transform(se3.inverse(camera.T_lidar_cam), xyz), np.float64)
+    xyz = xyz[(xyz[:, 2] > _NEAREST) & (xyz[:, 2] < _FARTHEST)]
+    straight = (xyz @ camera.K.T)[:, :2] / xyz[:, 2:]
+    margin = _BESIDE * np.array([width, height])
+    xyz = xyz[((straight > -margin) & (straight < margin + np.array([width, height]))).all(1)]
+    if not len(xyz):
+        return pixels
+    xyz = xyz[np.argsort(-xyz[:, 2])]
+    uv, _ = cv2.projectPoints(xyz, np.zeros(3), np.zeros(3), camera.K, np.array(camera.distortion, np.float64))
+    at = np.round(uv[:, 0]).astype(np.int64)
+    depth = np.log(xyz[:, 2] / _NEAREST) / np.log(_FARTHEST / _NEAREST)
+    shades = cv2.applyColorMap((255 * (1 - depth)).astype(np.uint8)[:, None], cv2.COLORMAP_TURBO)[:, 0, ::-1]
+    half = max(0, round(width / 640) - 1) + (width >= 320)  # pixels to either side of a point
+    for dx in range(-half, half + 1):
+        for dy in range(-half, half + 1):
+            u, v = at[:, 0] + dx, at[:, 1] + dy
+            shown = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+            pixels[v[shown], u[shown]] = shades[shown]
+    return pixels
