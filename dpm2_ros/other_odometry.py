@@ -160,8 +160,9 @@ class OtherOdometry:
             raise RejectedError("frame", f"odometry in frame {frame[:80]!r}; ros.odom_frame is {self._frame!r}")
         T = transform_matrix(message.pose.pose)
         check_pose(T)
-        stated, covariance = covariance_from_ros(message.pose.covariance, T[:3, :3]), None
+        numbers, covariance = np.asarray(message.pose.covariance, np.float64), None
         with suppress(RejectedError):  # all zero, or -1 for "unknown"
+            stated = covariance_from_ros(np.nan_to_num(numbers, posinf=-1.0), T[:3, :3])
             check_covariance(stated)
             covariance = stated
         check_frame(child)  # it may be empty

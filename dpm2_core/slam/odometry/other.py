@@ -16,12 +16,12 @@ import numpy as np
 from dpm2_core.frame import Array, Comparison, Guess, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.motion import predicted
-from dpm2_core.slam.registration.protocol import CHI2, MAP_NOISE
+from dpm2_core.slam.registration.protocol import MAP_NOISE
 
 # Standard deviations of a step: of a robot that stands, and for each m (or rad) of the way. Points outweigh so much.
 _STANDING = np.array([0.5 * np.pi / 180, 0.05])
 _SHARE = 0.05
-_POSSIBLE = 9.0  # squared sigmas from the motion before, of which one is hard braking already
+_POSSIBLE = 9.0  # squared sigmas from the scan, or from the motion before, of which one is hard braking already
 _MEMORY = 0.1  # fraction of the newest frame in how far the steps are doubted
 _WORST = 25.0  # squared sigmas of one frame count so much: a single jump is forgiven
 _CREDIBLE = 4.0  # doubt up to which it is used
@@ -77,7 +77,7 @@ class OtherMotion:
         """Whether a scan that was registered from the step's end (the last one at T_before (4, 4)) confirms it."""
         assert self.step is not None
         off = se3.log(se3.inverse(T_before @ self.step.T) @ result.T_target_source)
-        return bool(off @ np.linalg.solve(result.of_scene + self.step.covariance + MAP_NOISE, off) <= CHI2)
+        return bool(off @ np.linalg.solve(result.of_scene + self.step.covariance + MAP_NOISE, off) <= _POSSIBLE)
 
     def compare(self, T_scans: Array, of_scene: Array, used: bool) -> None:
         """With the step (4, 4) that the scans show, to a covariance (6, 6)."""
