@@ -11,7 +11,8 @@ from dpm2_core.geometry import se3
 from dpm2_core.slam.build import make_odometry
 from dpm2_core.slam.odometry.scaled import ScaledOdometry
 from dpm2_core.slam.settings import SlamSettings
-from test.helpers.rooms import frames, walk
+
+from ....helpers.rooms import frames, walk
 
 
 def geometric(preset: str) -> SlamSettings:
