@@ -114,6 +114,11 @@ def test_a_drive_through_player_slam_node_and_mapper_node(
     harness = ros()
     odometry, keyframes = harness.hear(Odometry, "/dpm2/odom"), harness.hear(Odometry, "/dpm2/keyframe_odom", KEEP_ALL)
     diagnostics, paths = harness.hear(DiagnosticArray, "/diagnostics"), harness.hear(PathMsg, "/dpm2/path", LAST_ONE)
+
+    def made() -> int:
+        """Keyframes; one that the mapper has not acknowledged yet is sent again."""
+        return len({message.child_frame_id for message in keyframes})
+
     environment = ros_environment(harness.node.context.get_domain_id())
     apart = ["--ros-args", "-p", "ros.embed_mapper:=false", "-p", "ros.map_directory:=''", "-p", "use_sim_time:=true"]
     saving = ["--ros-args", "-p", f"ros.map_directory:={tmp_path / 'map'}"]
@@ -138,7 +143,7 @@ def test_a_drive_through_player_slam_node_and_mapper_node(
         harness.wait(lambda: len(odometry) == drive.frames, "every pose")
         processes["slam_node"].send_signal(signal.SIGINT)
         assert processes["slam_node"].wait(60) == 0
-        harness.wait(lambda: paths and len(paths[-1].poses) == len(keyframes), "the last keyframe in the map")
+        harness.wait(lambda: paths and len(paths[-1].poses) == made(), "the last keyframe in the map")
         processes["mapper_node"].send_signal(signal.SIGINT)
         assert processes["mapper_node"].wait(60) == 0
     finally:
@@ -146,8 +151,8 @@ def test_a_drive_through_player_slam_node_and_mapper_node(
             process.kill()
     stamps = BagSource(bag, InputSettings(images=False)).stamps.tolist()
     assert [stamp_ns(message.header) for message in odometry] == stamps
-    assert f"map of {len(keyframes)} keyframes saved" in (tmp_path / "mapper.log").read_text()
-    assert len(keyframes) >= 3
+    assert f"map of {made()} keyframes saved" in (tmp_path / "mapper.log").read_text()
+    assert made() >= 3
 
 
 def test_replay_is_checked_by_what_arrived(bag: Path, drive: Any, tmp_path: Path) -> None:
