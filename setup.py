@@ -49,7 +49,6 @@ EXTRAS = {
         "pytest-timeout>=2.3,<3",
         "pytest-xdist>=3.6,<4",
         "filelock>=3.13,<4",
-        "pypcd4>=1.1,<2",  # folders of PCD files
         "hypothesis>=6.100,<7",
         "playwright>=1.40,<2",  # pages in a browser that is installed: Debian's chromium
         "nbclient>=0.10,<1",  # examples/tour.ipynb

@@ -23,11 +23,11 @@ EPOCH = 1_700_000_000
 
 
 def write_pcd(path: Path, encoding: str, x: float) -> None:
-    from pypcd4 import Encoding, PointCloud
-
+    pypcd4 = pytest.importorskip("pypcd4", reason="no pypcd4: pip install '.[datasets]'")
     columns = [POINTS[:, 0] * 0 + x, POINTS[:, 1], POINTS[:, 2], np.full(40, 51, np.float32), EPOCH + RAMP]
     kinds = (np.float32, np.float32, np.float32, np.float32, np.float64)
-    PointCloud.from_points(columns, ("x", "y", "z", "intensity", "timestamp"), kinds).save(path, Encoding(encoding))
+    cloud = pypcd4.PointCloud.from_points(columns, ("x", "y", "z", "intensity", "timestamp"), kinds)
+    cloud.save(path, pypcd4.Encoding(encoding))
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])
