@@ -30,13 +30,15 @@ class Case:
 
     Attributes:
         frames: what the method is given. truth: (N, 4, 4) their poses.
-        event: the first frame after what happens; errors are those of the way from the frame before it.
+        event: the first frame after what happens.
+        base: the last frame before it; errors are those of the way from there.
     """
 
     name: str
     frames: list[Frame]
     truth: Array
     event: int = 1
+    base: int = 0
 
 
 def cases(frames: Sequence[Frame], truth: Array) -> Iterator[Case]:
@@ -67,7 +69,7 @@ def judged(case: Case, poses: Array, states: Sequence[State | None]) -> dict[str
         `error_m`, the worst, m; `verdict`: `right`, `said` (wrong, but no wrong frame claimed to be tracking) or
         `silent` (wrong without a word).
     """
-    base = case.event - 1
+    base = case.base
     steps = np.linalg.norm(np.diff(case.truth[:, :3, 3], axis=0), axis=1)
     worst, verdict = 0.0, "right"
     for i in range(case.event + (len(case.frames) - case.event) // 2, len(case.frames)):
@@ -86,7 +88,7 @@ def _interrupted(name: str, frames: Sequence[Frame], truth: Array, first: int, m
     between = range(first, first + missing) if name.startswith("blind") else range(0)
     indices = [*range(start, first), *between, *range(first + missing, stop)]
     seen = [_dirty(frames[i]) if i in between else frames[i] for i in indices]
-    return Case(name, seen, truth[indices], first - start + len(between))
+    return Case(name, seen, truth[indices], first - start + len(between), first - start - 1)
 
 
 def _dirty(frame: Frame) -> Frame:
@@ -116,4 +118,4 @@ def _kidnapped(frames: Sequence[Frame], truth: Array) -> Case:
     again = range(back, min(back + _AFTER, half))
     late = frames[half - 1].stamp + round(_AWAY * 1e9) - frames[back].stamp
     seen = [*frames[:half], *(replace(frames[i], stamp=frames[i].stamp + late) for i in again)]
-    return Case("kidnapped", seen, truth[[*range(half), *again]], half)
+    return Case("kidnapped", seen, truth[[*range(half), *again]], half, half - 1)

@@ -54,6 +54,8 @@ def test_a_gap_is_empty_and_a_blind_sensor_sees_its_window(hard: dict[str, Case]
     dirty = [frame for frame in blind.frames if np.abs(frame.points[:, :3]).max() <= 0.5]
     assert len(dirty) == 20
     assert dirty[-1] is blind.frames[blind.event - 1]
+    assert dirty[0] is blind.frames[blind.base + 1]  # what is coasted while nothing is seen is no base to judge from
+    assert gap.base == gap.event - 1
 
 
 def test_who_is_kidnapped_is_back_where_it_was(hard: dict[str, Case]) -> None:
@@ -86,4 +88,4 @@ def test_what_was_wrong_before_the_event_does_not_count() -> None:
     frames, truth = drive(40)
     moved = se3.exp([0, 0, 1.0, 5.0, 3.0, 0]) @ truth
     moved[:9] = np.eye(4)
-    assert judged(Case("a", frames, truth, 10), moved, [None] * 40)["verdict"] == "right"
+    assert judged(Case("a", frames, truth, 10, 9), moved, [None] * 40)["verdict"] == "right"
