@@ -38,6 +38,7 @@ WAYS: dict[str, Sequence[str]] = {
     ),
     "the paper's": ("slam.preset=paper",),
 }  # fmt: skip
+_ERRORS = ("rpe_trans_m", "rpe_rot_deg", "ape_rmse_m", "final_drift_percent")
 _LAPS = 1.35
 """So much of a lap is driven in the synthetic suburb: the last third shows places seen before..."""
 _EVERY = 2
@@ -81,11 +82,10 @@ def _driven(settings: SlamSettings, frames: Sequence[Frame], truth: Array) -> di
         recorder.add(one)
     keyframes, failed = slam.mapper.keyframes, sum(not one.registration.ok for one in tracked)
     metrics = evaluate(truth, recorder.poses(slam.mapper.poses), failed_frames=failed)
-    names = ("rpe_trans_m", "rpe_rot_deg", "ape_rmse_m", "final_drift_percent")
     loops = check_loops(slam.mapper.loops, truth[[keyframe.index for keyframe in keyframes]])
     return {
         "frames": len(frames), "failed_frames": failed, "keyframes": len(keyframes),
-        **{name: getattr(metrics, name) for name in names},
+        **{name: getattr(metrics, name) for name in _ERRORS},
         "loops": {name: loops[name] for name in ("tried", "accepted", "wrong", "error_m")},
     }  # fmt: skip
 
@@ -95,7 +95,7 @@ def _table(results: dict[str, Any]) -> FigureTable:
     table = FigureTable("The paper's ways, each put into ours", names=["drive", "way"], figures=figures)
     for drive, ways in results.items():
         for way, row in ways.items():
-            errors = [row[name] for name in ("rpe_trans_m", "rpe_rot_deg", "ape_rmse_m", "final_drift_percent")]
+            errors = [row[name] for name in _ERRORS]
             counts = (row["failed_frames"], row["keyframes"], row["loops"]["accepted"], row["loops"]["wrong"])
             table.add_row(drive, way, *(f"{error:.3f}" for error in errors), *map(str, counts))
     return table

@@ -50,7 +50,7 @@ def read_drives(given: Sequence[Path]) -> list[ManifestDrive]:
     """Drives by their paths, or those of the one manifest that is given; all with names, no two alike.
 
     Raises:
-        UsageError: a manifest that is none, a name twice, or one that is no name of a folder.
+        UsageError: an invalid manifest, a name twice, or one that cannot be a folder's.
     """
     drives = [ManifestDrive(path=str(path)) for path in given]
     root = Path()
@@ -83,7 +83,7 @@ def parts_of(
         prefix: before the name of each.
 
     Raises:
-        UsageError: a setting or a span of frames that is none.
+        UsageError: an invalid setting or span of frames.
     """
     return [_part(drive, load_settings(Config, config, [*overrides, *drive.set]), prefix) for drive in drives]
 
