@@ -96,7 +96,7 @@ def make_localizer(s: SlamSettings, mapper: Mapper) -> Localizer:
     Raises:
         UsageError: the network has no weights to run with.
     """
-    i = s.indoors() if s.preset == "auto" else s
+    i = s.indoors()
     room = Verifier(i.relocalise.verification, i.geometric)
     verifier = Verifier(s.relocalise.verification, s.geometric, room)
     relocalizer = Relocalizer(s.relocalise, verifier, _network(s), mapper.keyframes, mapper.clouds, mapper.poses)
@@ -110,7 +110,7 @@ def make_loops(s: SlamSettings) -> LoopCloser:
         UsageError: the network has no weights to run with.
     """
     described = s.loops.enabled and s.loops.descriptors
-    i = s.indoors() if s.preset == "auto" else s
+    i = s.indoors()
     return LoopCloser(s.loops, s.geometric, _network(s) if described else None, (i.loops, i.geometric))
 
 

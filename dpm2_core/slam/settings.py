@@ -60,7 +60,9 @@ class SlamSettings(Settings):
         return merged(read_yaml(path), given) if name in get_args(cls.model_fields["preset"].annotation)[1:] else given
 
     def indoors(self) -> SlamSettings:
-        """With the preset for rooms under what differs from the defaults."""
+        """What is used in rooms: with `preset: auto` the preset for rooms under what differs from the defaults."""
+        if self.preset != "auto":
+            return self
         return SlamSettings.model_validate({**self.model_dump(exclude_defaults=True), "preset": "indoor"})
 
     @property
