@@ -159,7 +159,7 @@ def summary(truth: Array, outcomes: Sequence[Outcome]) -> dict[str, Any]:
         **_median(checked),
         "ape_rmse_m_of_thirds": _thirds(truth, outcomes[0].poses),
         "fps": float(np.median(fps)),
-        "fps_of_repetitions": fps.round(2).tolist(),
+        "fps_of_repetitions": fps.round(4).tolist(),
         "cpu_ms": 1e3 * float(np.median([o.cpu_seconds / len(o.seconds) for o in outcomes])),
         "frame_ms": quantiles_ms(seconds),
         "stages_ms": {stage: quantiles_ms(values) for stage, values in stages.items()},

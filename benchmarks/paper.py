@@ -82,7 +82,8 @@ def _driven(settings: SlamSettings, frames: Sequence[Frame], truth: Array) -> di
         recorder.add(one)
     keyframes, failed = slam.mapper.keyframes, sum(not one.registration.ok for one in tracked)
     metrics = evaluate(truth, recorder.poses(slam.mapper.poses), failed_frames=failed)
-    loops = check_loops(slam.mapper.loops, truth[[keyframe.index for keyframe in keyframes]])
+    rows = {frame.index: row for row, frame in enumerate(frames)}  # an excerpt need not begin with scan 0
+    loops = check_loops(slam.mapper.loops, truth[[rows[keyframe.index] for keyframe in keyframes]])
     return {
         "frames": len(frames), "failed_frames": failed, "keyframes": len(keyframes),
         **{name: getattr(metrics, name) for name in _ERRORS},

@@ -3,7 +3,15 @@
 
 from __future__ import annotations
 
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
 from benchmarks.paper import WAYS
+from dpm2_core.commands.bench import bench
 from dpm2_core.config import load_settings
 from dpm2_core.slam.settings import Config
 
@@ -23,3 +31,20 @@ def test_each_way_is_a_part_of_the_preset() -> None:
         for key, value in values.items() if value != ours[part][key]
     }  # fmt: skip
     assert changed == differing
+
+
+@pytest.mark.slow
+def test_an_excerpt_keeps_the_numbers_of_its_scans(recording: Path, tmp_path: Path) -> None:
+    whole = recording / "sequences" / "00"
+    excerpt = tmp_path / "00"
+    (excerpt / "velodyne").mkdir(parents=True)
+    shutil.copy(whole / "calib.txt", excerpt)
+    scans = sorted((whole / "velodyne").iterdir())[20:24]
+    for scan in scans:
+        shutil.copy(scan, excerpt / "velodyne")
+    truth = whole / "poses.txt" if (whole / "poses.txt").is_file() else recording / "poses" / "00.txt"
+    np.savetxt(excerpt / "poses.txt", np.loadtxt(truth)[20:24])
+    bench(["paper"], source=[excerpt], out=tmp_path, only="ours", threads=1)
+    (row,) = json.loads((tmp_path / "paper.json").read_text())["drives"]["00"].values()
+    assert (row["frames"], row["failed_frames"]) == (4, 0)
+    assert row["rpe_trans_m"] < 0.05  # a street without a moving thing
