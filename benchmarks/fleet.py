@@ -3,43 +3,52 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import random
 import resource
+import shutil
 import signal
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console, Group
+from rich.console import Group
 
-from benchmarks.fleet_drives import write_drive
+from benchmarks.fleet_drives import STEP, chained, odometry_of, poses_of, write_drive
 from benchmarks.harness import Options, Report, requested
-from benchmarks.roads import FIRST_SEED, ROADS, road_files
-from dpm2_core.errors import Dpm2Error
+from benchmarks.roads import FIRST_SEED, road_files
+from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.evaluation.metrics import ape_rmse
 from dpm2_core.fleet.cluster import Cluster, Status
 from dpm2_core.fleet.drives import MAP, parts_of, read_drives
+from dpm2_core.fleet.growth import spans_of
+from dpm2_core.fleet.joins import ENOUGH
 from dpm2_core.fleet.merge import merge
 from dpm2_core.fleet.part import Part
 from dpm2_core.fleet.places import WIDTH, FleetIndex
 from dpm2_core.fleet.run import Outcome, View, carry_out
 from dpm2_core.frame import Array
+from dpm2_core.network.pretrained import weights_path
 from dpm2_core.sim.drive import simulate
 from dpm2_core.sim.settings import DriveConfig, LidarConfig
 from dpm2_core.sim.world import build_world
 from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.slam.store.map_data import load_map
 from dpm2_core.slam.store.map_store import MapStore
+from dpm2_core.slam.store.rows import weights_id
 from dpm2_core.tables import FigureTable
 
-METERS = 1000.0
-"""Of each road; its two drives have the middle fifth in common."""
+METERS, LENGTH, SHARED = 150.0, 110.0, 40.0
+"""Of each road; of each of the drives along all of them, and what a drive has in common with the next, m."""
+DRIVES = 12
 PLACES, QUERIES, FOUND = 200_000, 500, 8
 KILLS = 20
 _SAME = ("trajectory_kitti.txt", "trajectory.tum", "map.ply", "pose_graph.g2o", "loops.csv")
@@ -66,47 +75,75 @@ def bench_fleet(options: Options) -> Report:
 
 
 def bench_town(folder: Path, options: Options) -> dict[str, Any]:
-    """Two drives of each road, one after the other: true and wrong joins, errors, and what each added drive costs."""
-    truth, added = dict[str, Array](), []
-    console, out = Console(stderr=True), folder / "town.dpm2map"
+    """Roads end to end, driven piece by piece: true and wrong joins, errors, and what each added drive costs."""
+    files = list(road_files(options))
+    chained(files, METERS, folder / "way.txt")
+    world = build_world(str(folder / "way.txt"), "suburb", FIRST_SEED)
+    spans = [(first, first + LENGTH) for first in np.arange(DRIVES) * (LENGTH - SHARED)]
+    if spans[-1][1] > world.road.drive.length:
+        raise UsageError(f"{len(files)} roads of {METERS:g} m: {world.road.drive.length:.0f} m, want {spans[-1][1]:g}")
+    truth = {f"d{n:02d}": poses_of(world, span, n) for n, span in enumerate(spans)}
+    added, out = [], folder / "town.dpm2map"
     with Cluster(workers=2) as cluster:
         cluster.start()
-        for path in road_files(options):
-            world = build_world(str(path), ROADS.get(path.stem, "suburb"), FIRST_SEED + int(path.stem))
-            length = min(METERS, float(world.road.drive.length))
-            for number, (begin, end) in enumerate(((0.0, 0.6), (0.4, 1.0))):
-                name = f"{path.stem}{'ab'[number]}"
-                seed = 2 * int(path.stem) + number
-                truth[name] = write_drive(folder / "fleet" / name, world, (begin * length, end * length), seed)
-                before = time.perf_counter()
-                merged = merge(folder / "fleet", out, SlamSettings(), Cluster())
-                added.append({"drive": name, "keyframes": len(truth[name]), "s": time.perf_counter() - before})
-                console.print(f"{name}: {added[-1]}")
-    joined = {tuple(row["drives"]) for row in merged.joins if row["accepted"]}
-    true = {(f"{path.stem}a", f"{path.stem}b") for path in road_files(options)}
+        for number, (name, poses) in enumerate(truth.items()):
+            kept = options.cache / "fleet" / f"{name}_{_key(poses)}"
+            if not kept.exists():
+                write_drive(kept, world, poses, number)
+            shutil.copytree(kept, folder / "fleet" / name)
+            before = time.perf_counter()
+            merged = merge(folder / "fleet", out, SlamSettings(), Cluster())
+            added.append({"drive": name, "keyframes": len(poses), "s": time.perf_counter() - before})
+            print(f"{name}: {added[-1]}", file=sys.stderr)
+        grown = _errors(folder / "fleet", out, truth, merged.drives)
+        whole = merge(folder / "fleet", folder / "anew.dpm2map", SlamSettings(), Cluster())
+    joined = {tuple(row["drives"]) for row in merged.joins if row["accepted"] >= ENOUGH}
+    true = {(a, b) for a, b in combinations(truth, 2) if _meet(truth[a], truth[b])}
+    way = poses_of(world, (0.0, spans[-1][1]), DRIVES)
     return {
         "drives": len(truth),
         "keyframes": sum(map(len, truth.values())),
+        "in_the_map": len(merged.drives),
         "true_joins": len(true),
         "joined": len(joined & true),
         "wrong": len(joined - true),
-        "largest_map": merged.drives,
-        "ape_m": _errors(folder / "fleet", out, truth, merged.drives),
+        "ape_m": {
+            "one_drive_of_the_whole_way": float(ape_rmse(way, odometry_of(way))),
+            "map": grown.pop("map"),
+            "map_made_at_once": _errors(folder / "fleet", folder / "anew.dpm2map", truth, whole.drives)["map"],
+        },
+        "ape_of_each_drive_m": grown,
         "rejected": merged.rejected,
         "added": added,
         "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024,
     }
 
 
-def _errors(fleet: Path, out: Path, truth: Mapping[str, Array], names: Mapping[str, int]) -> dict[str, float]:
-    """APE, m, of the map of several drives, and of the worst of them alone."""
-    alone = []
-    for name in names:
-        with MapStore.open(fleet / name / MAP) as store:
-            alone.append(float(ape_rmse(truth[name], load_map(store, descriptors=False).poses)))
+def _key(poses: Array) -> str:
+    """Of a drive that is kept, so that another one is not taken for it."""
+    weights = weights_id(weights_path(SlamSettings().neural.weights))
+    return hashlib.sha256(poses.round(6).tobytes() + weights.encode()).hexdigest()[:12]
+
+
+def _meet(one: Array, other: Array) -> bool:
+    """Whether enough keyframes of two drives are within half a step of each other: they saw the same place."""
+    apart = np.linalg.norm(one[:, None, :2, 3] - other[None, :, :2, 3], axis=-1).min(0)
+    return int((apart <= STEP).sum()) >= ENOUGH
+
+
+def _errors(fleet: Path, out: Path, truth: Mapping[str, Array], sizes: Mapping[str, int]) -> dict[str, Any]:
+    """APE, m, of a map, and of each drive by itself: alone, and in the map."""
     with MapStore.open(out) as store:
         poses = load_map(store, descriptors=False).poses
-    return {"map": float(ape_rmse(np.concatenate([truth[name] for name in names]), poses)), "worst_drive": max(alone)}
+    errors: dict[str, Any] = {"map": float(ape_rmse(np.concatenate([truth[name] for name in sizes]), poses))}
+    for name, span in spans_of(sizes).items():
+        with MapStore.open(fleet / name / MAP) as store:
+            alone = load_map(store, descriptors=False).poses
+        errors[name] = {
+            "alone": float(ape_rmse(truth[name], alone)),
+            "in_the_map": float(ape_rmse(truth[name], poses[span.start : span.stop])),
+        }
+    return errors
 
 
 def bench_index(folder: Path, options: Options) -> dict[str, Any]:

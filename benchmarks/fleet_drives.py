@@ -4,10 +4,13 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
+from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
 
+from dpm2_core.data.trajectory import read_trajectory, write_kitti
 from dpm2_core.fleet.drives import MAP
 from dpm2_core.fleet.part import DONE
 from dpm2_core.frame import Array, Keyframe, Registration
@@ -25,35 +28,54 @@ from dpm2_core.slam.store.rows import weights_id
 STEP = 5.0
 """m between two keyframes."""
 _DRIFT = np.array([0, 0, 3e-4, 0.01, 0.006, 0.0])  # of the odometry, a keyframe, rad and m
+_COVARIANCE = np.diag([1e-3] * 3 + [0.03] * 3) ** 2
 _TRAFFIC = 100.0  # s between two drives: by then other cars are there
 
 
-def write_drive(folder: Path, world: World, span: tuple[float, float], seed: int) -> Array:
-    """A drive along the road of a world, a little beside the lane, with drifting odometry.
+def chained(files: Sequence[Path], meters: float, out: Path) -> None:
+    """Write the first so many meters of each of some files of KITTI poses as one way, each road where the last ends."""
+    parts, T_way_road = [], np.eye(4)
+    for file in files:
+        poses = read_trajectory(file).poses
+        far = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))])
+        part = T_way_road @ se3.inverse(poses[0]) @ poses[far < meters]
+        parts.append(part[:-1])
+        T_way_road = part[-1]
+    write_kitti(out, np.concatenate(parts))
+
+
+def poses_of(world: World, span: tuple[float, float], seed: int) -> Array:
+    """(N, 4, 4) true poses of a drive's keyframes, a little beside the lane; `span`: m of the way, `seed`: of where."""
+    rng = np.random.default_rng(seed)
+    aside = se3.exp(np.append(rng.normal(size=3) * [0, 0, 0.02], rng.normal(size=3) * [0, 0.3, 0]))
+    return np.array([world.pose_at(float(s)) for s in np.arange(*span, STEP)]) @ aside
+
+
+def odometry_of(poses: Array) -> Array:
+    """(N, 4, 4) where a drifting odometry has them."""
+    steps = se3.inverse(poses[:-1]) @ poses[1:] @ se3.exp(_DRIFT)
+    return np.array(list(accumulate(steps, np.matmul, initial=np.eye(4))))
+
+
+def write_drive(folder: Path, world: World, poses: Array, seed: int) -> None:
+    """A drive, as the SLAM maps it.
 
     Args:
-        folder: new. span: m of the way, first and last. seed: of noise, traffic and place in the lane.
-
-    Returns:
-        (N, 4, 4) true poses of its keyframes.
+        folder: new. poses: (N, 4, 4) true, of its keyframes. seed: of noise and traffic.
     """
-    rng, lidar, settings = np.random.default_rng(seed), Lidar(LidarConfig(columns=1024)), SlamSettings()
-    aside = se3.exp(np.append(rng.normal(size=3) * [0, 0, 0.02], rng.normal(size=3) * [0, 0.3, 0]))
-    poses = np.array([world.pose_at(float(s)) for s in np.arange(*span, STEP)]) @ aside
+    rng, lidar, settings = np.random.default_rng([seed, 1]), Lidar(LidarConfig(columns=1024)), SlamSettings()
+    odometry = odometry_of(poses)
     folder.mkdir(parents=True)
     with MapStore.create(folder / MAP) as store:
         store.begin_session("", weights_id(weights_path(settings.neural.weights)))
-        mapper, before = make_mapper(settings, store), None
+        mapper, edge = make_mapper(settings, store), None
         for number, T_world_kf in enumerate(poses):
             scan = lidar.scan(world, T_world_kf, _TRAFFIC * seed + number / 2, rng)
             near = scan.points[np.einsum("ij,ij->i", scan.points[:, :3], scan.points[:, :3]) < 60.0**2]
-            edge, T_odom_kf = None, np.eye(4)
-            if before is not None:
-                T = se3.inverse(poses[number - 1]) @ T_world_kf @ se3.exp(_DRIFT)
-                edge = Registration(T, np.diag([1e-3] * 3 + [0.03] * 3) ** 2, 0.9, 0.05, "simulated")
-                T_odom_kf = before.T_odom_kf @ T
-            before = Keyframe(number, number * 10**9, number, T_odom_kf, near[voxel_first(near, 0.3)], edge)
-            mapper.add(before)
+            if number:
+                T = se3.inverse(odometry[number - 1]) @ odometry[number]
+                edge = Registration(T, _COVARIANCE, 0.9, 0.05, "simulated")
+            cloud = near[voxel_first(near, 0.3)]
+            mapper.add(Keyframe(number, number * 10**9, number, odometry[number], cloud, edge))
         mapper.finish()
     (folder / DONE).write_text(json.dumps({"files": {MAP: (folder / MAP).stat().st_size}}))
-    return poses

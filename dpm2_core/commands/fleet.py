@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -71,7 +72,7 @@ def merge(
 ) -> None:
     """Join the drives of a folder into one map, by the places that they share, wherever they are.
 
-    Drives that came since the last call are added; what was found before is not searched again.
+    Drives that came since the last call are added to the map that is there, at the cost of what they touch.
     """
     from dpm2_core.fleet.merge import merge as merged_map
 
@@ -81,7 +82,7 @@ def merge(
     table = FigureTable(str(out), names=["drives"], figures=["loops", "rejected"])
     for row in merged.joins:
         table.add_row(" - ".join(row["drives"]), str(row["accepted"]), str(row["rejected"]))
-    show(table, vars(merged), json_file)
+    show(table, {**asdict(merged), "rejected": merged.rejected}, json_file)
     console = Console(stderr=True)
     for name, reason in merged.left_out.items():
         console.print(f"{name}: not in the map: {reason}", style="yellow", soft_wrap=True)

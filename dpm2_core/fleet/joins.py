@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +16,9 @@ from dpm2_core.fleet.part import Advance, Figures, Part
 from dpm2_core.frame import Array, Edge, Keyframe, Points, Registration
 from dpm2_core.slam.build import make_loops
 from dpm2_core.slam.settings import SlamSettings
+from dpm2_core.slam.store.lazy import LazySequence
 from dpm2_core.slam.store.map_data import MapData, borrowing, load_map
 from dpm2_core.slam.store.map_store import MapStore
-from dpm2_core.slam.store.rows import unpack_descriptors
 
 ENOUGH = 3
 """Loops that a join of two drives needs: two can be wrong alike where houses are."""
@@ -112,9 +112,7 @@ def _excerpt(store: MapStore, nodes: Sequence[int], robot: str) -> _Excerpt:
     for node in chosen:
         loan = data.clouds.loan(node)
         owner = node if loan is None else loan.lender
-        packed = store.payload(owner, "descriptors")
-        lent = data.keyframes[owner]
-        lent = lent if packed is None else replace(lent, descriptors=unpack_descriptors(packed))
+        lent = replace(data.keyframes[owner], descriptors=data.describe(owner))
         keyframe = lent if loan is None else borrowing(data.keyframes[node], {owner: lent}, loan)  # type: ignore[arg-type]
         follows = node - 1 in chosen and data.keyframes[node - 1].robot == keyframe.robot
         # Their own names keep the odometry of the two apart; a gap begins another stretch of it.
@@ -122,7 +120,7 @@ def _excerpt(store: MapStore, nodes: Sequence[int], robot: str) -> _Excerpt:
     return _Excerpt(chosen, keyframes, data.poses[chosen], data)
 
 
-class _Clouds(Sequence[Points]):
+class _Clouds(LazySequence[Points]):
     """The clouds of excerpts, one after the other, read when they are asked for."""
 
     def __init__(self, excerpts: Sequence[_Excerpt]) -> None:
@@ -131,15 +129,8 @@ class _Clouds(Sequence[Points]):
     def __len__(self) -> int:
         return len(self._where)
 
-    @overload
-    def __getitem__(self, index: int) -> Points: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> list[Points]: ...
-
-    def __getitem__(self, index: int | slice) -> Points | list[Points]:
-        if isinstance(index, slice):
-            return [self[i] for i in range(len(self))[index]]
+    def item(self, index: int) -> Points:
+        """(M, 4)."""
         data, node = self._where[index]
         return data.clouds[node]
 

@@ -49,6 +49,7 @@ class PoseGraph:
         self._ends: list[int] = []  # last node of each trajectory
         self._loops: list[Edge] = []
         self._held: list[int] = []
+        self._tied: list[int] | None = None  # `_parts`, until they change
         self._worker = GraphWorker()
         self._moved = False  # a part, since a graph was sent: its solution is of no use
         self._sent = 0  # loops in the graph that is being solved
@@ -96,6 +97,7 @@ class PoseGraph:
         if odometry is None:
             self._trajectory.append(len(self._ends))
             self._ends.append(node)
+            self._tied = None
         else:
             _check("edge to node", node, odometry.T_from_to, odometry.covariance)
             if odometry.to_node != node:
@@ -124,12 +126,17 @@ class PoseGraph:
             T_to = self._poses[loop.from_node] @ loop.T_from_to  # where the loop has that node
             T = T_to @ se3.inverse(self._poses[loop.to_node])
             self._move(max(a, b), T if b > a else se3.inverse(T), parts)
+            self._tied = None
         self._loops.append(loop)
+
+    def place(self, node: int, T_map_kf: Array) -> None:
+        """Put a node there (4, 4), for the next optimization to begin with."""
+        _check("node", node, T_map_kf)
+        self._poses[node] = T_map_kf
 
     def hold(self, node: int, T_map_kf: Array) -> None:
         """Put a node there (4, 4), where it stays."""
-        _check("node", node, T_map_kf)
-        self._poses[node] = T_map_kf
+        self.place(node, T_map_kf)
         self._held.append(node)
 
     def part(self, node: int) -> int:
@@ -259,12 +266,14 @@ class PoseGraph:
 
     def _parts(self) -> list[int]:
         """Of each trajectory, the oldest one that loops tie it to."""
-        parts = list(range(len(self._ends)))
-        for loop in self._loops:
-            one, other = sorted(parts[self._trajectory[node]] for node in (loop.from_node, loop.to_node))
-            if loop.ok and one != other:
-                parts = [one if part == other else part for part in parts]
-        return parts
+        if self._tied is None:
+            parts = list(range(len(self._ends)))
+            for loop in self._loops:
+                one, other = sorted(parts[self._trajectory[node]] for node in (loop.from_node, loop.to_node))
+                if loop.ok and one != other:
+                    parts = [one if part == other else part for part in parts]
+            self._tied = parts
+        return self._tied
 
     def _move(self, part: int, T: Array, parts: list[int]) -> None:
         """All of a part to T @ T_map_kf."""
@@ -290,6 +299,7 @@ class PoseGraph:
         for number, loop in enumerate(self._loops[:loops]):
             checked = replace(loop.registration, ok=bool(solution.kept[number]), reason=solution.reason(number))
             self._loops[number] = replace(loop, registration=checked)
+        self._tied = None
 
 
 def _check(what: str, node: int, T: Array, covariance: Array | None = None) -> None:

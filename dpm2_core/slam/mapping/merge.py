@@ -42,6 +42,7 @@ def merge_maps(a: MapData, b: MapData, T_a_b: Array, loops: Sequence[Edge] = ())
         [*a.sessions, *(replace(s, number=s.number + sessions) for s in b.sessions)],
         CloudStore(lambda i: a.clouds.packed(i) if i < n else b.clouds.packed(i - n), moving, loans),
         lambda i: a.thumbnail(i) if i < n else b.thumbnail(i - n),
+        lambda i: a.describe(i) if i < n else b.describe(i - n),
     )
 
 

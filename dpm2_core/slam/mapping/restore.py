@@ -3,15 +3,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+from dpm2_core.frame import Edge
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.store.map_data import MapData, odometry_by_node
 
 
 def restore(graph: PoseGraph, data: MapData) -> None:
-    """Fill an empty pose graph with the nodes and constraints of a map."""
-    chain = odometry_by_node(data.constraints)
+    """Take the nodes and constraints of a map into a pose graph, behind what is there."""
+    first, chain = len(graph), odometry_by_node(data.constraints)
     for node, T_map_kf in enumerate(data.poses):
-        graph.add_node(T_map_kf, chain.get(node))
+        graph.add_node(T_map_kf, shifted(chain[node], first) if node in chain else None)
     for edge in data.constraints:
         if chain.get(edge.to_node) is not edge:
-            graph.add_loop(edge)
+            graph.add_loop(shifted(edge, first))
+
+
+def shifted(edge: Edge, first: int) -> Edge:
+    """The edge where its node 0 is number `first`."""
+    return replace(edge, from_node=edge.from_node + first, to_node=edge.to_node + first)

@@ -7,7 +7,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from typing import BinaryIO, overload
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.store.cloud_codec import CodecError, pack_mask, unpack_cloud, unpack_mask
+from dpm2_core.slam.store.lazy import LazySequence
 
 Reader = Callable[[int], bytes | None]
 
@@ -65,7 +66,7 @@ class SpillFile:
         return self._file.read(where[1])
 
 
-class CloudStore(Sequence[Points]):
+class CloudStore(LazySequence[Points]):
     """The packed clouds of keyframes 0, 1, ...: in the map file where it holds them, else in a temporary one.
 
     An item is the (M, 4) float32 cloud without the points that were found to move; `whole` has them too. A keyframe
@@ -155,16 +156,12 @@ class CloudStore(Sequence[Points]):
     def __len__(self) -> int:
         return len(self._where)
 
-    @overload
-    def __getitem__(self, index: int) -> Points: ...
+    def item(self, index: int) -> Points:
+        """(M, 4) without the points that move.
 
-    @overload
-    def __getitem__(self, index: slice) -> list[Points]: ...
-
-    def __getitem__(self, index: int | slice) -> Points | list[Points]:
-        if isinstance(index, slice):
-            return [self[i] for i in range(len(self))[index]]
-        index = range(len(self))[index]
+        Raises:
+            Dpm2Error: it is damaged.
+        """
         if (loan := self._loans.get(index)) is not None:
             return se3.transform(loan.T_kf_lender, self[loan.lender])
         cloud = self.whole(index)

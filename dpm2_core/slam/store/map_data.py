@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from dpm2_core.descriptors import Descriptors
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Array, Edge, Keyframe, Points
 from dpm2_core.geometry import se3
@@ -32,6 +33,7 @@ from dpm2_core.slam.store.rows import (
 
 _T = TypeVar("_T")
 Thumbnail = Callable[[int], bytes | None]
+Describe = Callable[[int], Descriptors | None]
 
 
 @dataclass(eq=False)
@@ -43,6 +45,7 @@ class MapData:
         edges: odometry and loops, rejected ones too. trail: keyframes that were pruned. sessions: who wrote it.
         clouds: of each keyframe, read from the file when asked for.
         thumbnail: JPEG of a node, or None.
+        describe: descriptors of a node that are in the file, where `keyframes` were read without; or None.
     """
 
     keyframes: list[Keyframe]
@@ -53,6 +56,7 @@ class MapData:
     sessions: list[Session]
     clouds: CloudStore
     thumbnail: Thumbnail = field(default=lambda node: None)
+    describe: Describe = field(default=lambda node: None)
 
     def __len__(self) -> int:
         return len(self.keyframes)
@@ -106,6 +110,7 @@ def _load(store: MapStore, descriptors: bool) -> MapData:
         [made for _, made in _made(store, "sessions", session_of)],
         CloudStore(store.cloud, [moving.get(node) for node in nodes], loans, str(store.path)),
         lambda node: store.payload(node, "thumbnail"),
+        lambda node: None if (packed := store.payload(node, "descriptors")) is None else unpack_descriptors(packed),
     )
 
 
@@ -165,35 +170,50 @@ def save_as(data: MapData, path: Path) -> None:
         UsageError: there is a file already. Dpm2Error: it could not be written.
     """
     part = path.with_name(f".{path.name}.part")
-    _remove(part)
+    remove_map(part)
     MapStore.create(path).close()  # rejects a file that is there, and a folder that cannot be written
     try:
         with MapStore.create(part) as store:
-            _fill(store, data)
+            append_map(store, data)
         part.replace(path)
     except BaseException:
-        _remove(path)
+        remove_map(path)
         raise
     finally:
-        _remove(part)
+        remove_map(part)
 
 
-def _fill(store: MapStore, data: MapData) -> None:
-    store.add_sessions(data.sessions)
-    sessions = dict(enumerate(data.session))
+def append_map(store: MapStore, data: MapData) -> int:
+    """Write a map behind what is in the file; its nodes and sessions count on. Clouds pass through one at a time.
+
+    Returns:
+        The node that its first keyframe has in the file.
+
+    Raises:
+        Dpm2Error: it could not be written.
+    """
+    first, before = store.size, max((row[0] for row in store.rows("sessions", "session")), default=0)
+    store.add_sessions(replace(session, number=session.number + before) for session in data.sessions)
+    sessions = {first + node: number + before for node, number in enumerate(data.session)}
     for node, keyframe in enumerate(data.keyframes):
-        packed = data.clouds.loan(node) or data.clouds.packed(node)
-        mask = data.clouds.moving(node)
+        loan, mask = data.clouds.loan(node), data.clouds.moving(node)
+        packed = data.clouds.packed(node) if loan is None else replace(loan, lender=loan.lender + first)
+        if keyframe.descriptors is None and loan is None:
+            keyframe = replace(keyframe, descriptors=data.describe(node))
         change = Change(
-            keyframes=[(node, keyframe, packed, data.thumbnail(node))],
-            poses={node: data.poses[node]},
-            moving={} if mask is None else {node: mask},
+            keyframes=[(first + node, keyframe, packed, data.thumbnail(node))],
+            poses={first + node: data.poses[node]},
+            moving={} if mask is None else {first + node: mask},
         )
         store.write(change, sessions)
-    store.write(Change(edges=data.edges, trail=data.trail))
+    edges = [replace(edge, from_node=edge.from_node + first, to_node=edge.to_node + first) for edge in data.edges]
+    trail = [replace(p, node=p.node + first, session=p.session + before) for p in data.trail]
+    store.write(Change(edges=edges, trail=trail))
+    return first
 
 
-def _remove(path: Path) -> None:
+def remove_map(path: Path) -> None:
+    """Remove a map file, if it is there, with what SQLite keeps beside it."""
     for suffix in ("", "-wal", "-shm", "-journal"):
         Path(f"{path}{suffix}").unlink(missing_ok=True)
 
@@ -213,6 +233,7 @@ def subset(data: MapData, nodes: Sequence[int], edges: list[Edge], trail: list[R
         data.sessions,
         clouds,
         lambda node: data.thumbnail(where[node]),
+        lambda node: data.describe(where[node]),
     )
 
 

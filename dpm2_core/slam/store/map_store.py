@@ -48,6 +48,7 @@ class Change:
         keyframes: node, keyframe (its cloud is not looked at), packed cloud or whose it borrows, JPEG or None.
         edges: in the order of the map; appended to those of the file.
         poses: T_map_kf (4, 4) by node. moving: packed mask by node. trail: what was pruned.
+        judged: edges of the file by their number, as they are from now on.
     """
 
     keyframes: list[tuple[int, Keyframe, bytes | Loan | None, bytes | None]] = field(default_factory=list)
@@ -55,6 +56,7 @@ class Change:
     poses: dict[int, Array] = field(default_factory=dict)
     moving: dict[int, bytes] = field(default_factory=dict)
     trail: list[RemovedKeyframe] = field(default_factory=list)
+    judged: dict[int, Edge] = field(default_factory=dict)
 
 
 class MapStore:
@@ -66,6 +68,7 @@ class MapStore:
         self.read_only = read_only
         self.session = 0
         self._connection = connection
+        self._together = False
         self._copy: tempfile.TemporaryDirectory[str] | None = None
 
     @classmethod
@@ -149,12 +152,37 @@ class MapStore:
                     _insert(sql, "payloads", [with_crc(node, cloud, packed, thumbnail)])
             first = sql.execute("SELECT coalesce(max(id), -1) + 1 FROM edges").fetchone()[0]
             _insert(sql, "edges", [edge_row(first + i, edge) for i, edge in enumerate(change.edges)])
+            _insert(sql, "edges", [edge_row(number, edge) for number, edge in change.judged.items()])
             _insert(sql, "poses", [with_crc(node, array_bytes(T)) for node, T in change.poses.items()])
             _insert(sql, "moving", [with_crc(node, mask) for node, mask in change.moving.items()])
             _insert(sql, "trail", [removed_row(p) for p in change.trail])
 
-    def rows(self, table: str, columns: str = "", checked: bool = True) -> Iterator[tuple[Any, ...]]:
-        """Rows of a table in their order, without checksums.
+    @property
+    def size(self) -> int:
+        """Keyframes in it.
+
+        Raises:
+            Dpm2Error: it cannot be read.
+        """
+        with _explained(self.path):
+            return int(self._connection.execute("SELECT coalesce(max(node), -1) + 1 FROM keyframes").fetchone()[0])
+
+    @contextmanager
+    def together(self) -> Iterator[None]:
+        """All that is written in this block goes into the file at its end, or not at all.
+
+        Raises:
+            Dpm2Error: it could not be written.
+        """
+        with self._transaction():
+            self._together = True
+            try:
+                yield
+            finally:
+                self._together = False
+
+    def rows(self, table: str, columns: str = "", checked: bool = True, where: str = "") -> Iterator[tuple[Any, ...]]:
+        """Rows of a table in their order, without checksums; `where`: a condition of SQL.
 
         Raises:
             Dpm2Error: damage; `dpm2 map check` says how much.
@@ -163,7 +191,8 @@ class MapStore:
         requested = ", ".join((*names, "crc")) if names else columns or "*"
         with _explained(self.path):
             before = None
-            for key, *row in self._connection.execute(f"SELECT rowid, {requested} FROM {table} ORDER BY rowid"):
+            query = f"SELECT rowid, {requested} FROM {table} {where and f'WHERE {where}'} ORDER BY rowid"
+            for key, *row in self._connection.execute(query):
                 if before is not None and key <= before:  # a tree whose pages lead in a circle has no end
                     raise sqlite3.DatabaseError(f"malformed: {table} {key} comes after {before}")
                 before = key
@@ -233,6 +262,9 @@ class MapStore:
     @contextmanager
     def _transaction(self) -> Iterator[sqlite3.Connection]:
         with _explained(self.path):
+            if self._together:
+                yield self._connection
+                return
             self._connection.execute("BEGIN IMMEDIATE")
             try:
                 yield self._connection

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 
 import numpy as np
@@ -20,13 +20,16 @@ import pytest
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Keyframe
+from dpm2_core.slam.mapping.merge import merge_maps
+from dpm2_core.slam.mapping.prune import prune
 from dpm2_core.slam.store import schema
 from dpm2_core.slam.store.check import check_map
 from dpm2_core.slam.store.cloud_codec import pack_cloud
 from dpm2_core.slam.store.cloud_store import CloudStore, Loan
-from dpm2_core.slam.store.map_data import load_map, save_as
+from dpm2_core.slam.store.map_data import append_map, load_map, save_as
 from dpm2_core.slam.store.map_store import Change, MapStore
 from dpm2_core.slam.store.rows import pack_descriptors, unpack_descriptors
+from test.helpers.maps import ring
 
 WRITER = """
 import sys
@@ -62,10 +65,10 @@ def whole_prefix(path: Path) -> int:
 
 def test_everything_comes_back(tmp_path: Path, map_file: Path, keyframes: list[Keyframe]) -> None:
     """Poses and covariances to the last bit, clouds to half a centimeter, descriptors as the float16 they are."""
-    for path in (map_file, tmp_path / "again.dpm2map"):
+    for path in (map_file, tmp_path / "again.dpm2map", tmp_path / "without.dpm2map"):
         if path != map_file:
             with MapStore.open(map_file) as store:
-                save_as(load_map(store), path)
+                save_as(load_map(store, descriptors=path.stem == "again"), path)
         with MapStore.open(path) as store:
             data = load_map(store)
             assert [(s.number, s.config, s.weights) for s in data.sessions] == [
@@ -310,3 +313,36 @@ def test_an_unfinished_copy_leaves_nothing_behind(
         with pytest.raises(UsageError, match="already"):
             save_as(data, map_file)
     assert os.listdir(tmp_path) == [map_file.name]
+
+
+def test_what_is_written_together_is_there_together_or_not_at_all(tmp_path: Path, keyframes: list[Keyframe]) -> None:
+    """An error within takes back what was written before it, and what comes after the block stands by itself."""
+    with MapStore.create(tmp_path / "map") as store:
+        store.begin_session()
+        for node, keyframe in enumerate(keyframes[:3]):
+            change = Change([(node, keyframe, pack_cloud(keyframe.cloud), None)], poses={node: np.eye(4)})
+            with suppress(ZeroDivisionError), store.together():
+                store.write(change)
+                assert store.size == node + 1
+                raise ZeroDivisionError
+            assert store.size == node
+            store.write(change)
+    with MapStore.open(tmp_path / "map") as store:
+        assert len(load_map(store)) == 3
+
+
+def test_a_map_behind_another_one_is_the_map_of_both(tmp_path: Path, map_file: Path) -> None:
+    """Nodes, sessions, lenders, edges and what was pruned count on, as where two maps are joined in memory."""
+    with MapStore.open(map_file) as first, MapStore.create(tmp_path / "both") as both:
+        save_as(ring(30), tmp_path / "ring")
+        with MapStore.open(tmp_path / "ring") as second:
+            a, b = load_map(first), prune(load_map(second), [7, 8])
+            b.clouds.borrow(9, Loan(2, np.eye(4)))
+            for data in (a, b):
+                append_map(both, data)
+            save_as(merge_maps(a, b, np.eye(4)), tmp_path / "merged")
+        with MapStore.open(tmp_path / "merged") as merged:
+            for table in ("sessions", *schema.CONTENT):
+                assert list(both.rows(table)) == list(merged.rows(table)), table
+            assert len(list(both.rows("edges", where="from_node < 12"))) == 13
+    assert not check_map(tmp_path / "both").problems

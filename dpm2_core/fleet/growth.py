@@ -1,0 +1,283 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Drives into a map file, in one transaction: new ones beside what is there, of which only what they touch is moved.
+
+The graph that is solved has the new drives, those that they meet, and those on the ways between these, which share the
+error where a ring is closed; all others are held. Where that strains the loops to a drive by more than their own
+uncertainty, that drive is solved for as well.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import breadth_first_order
+
+from dpm2_core.fleet.joins import ENOUGH
+from dpm2_core.fleet.regions import Join
+from dpm2_core.fleet.search import affirmed, component
+from dpm2_core.frame import Array, Edge
+from dpm2_core.slam.graph.graph_data import loop_errors, mahalanobis
+from dpm2_core.slam.graph.pose_graph import PoseGraph, PoseGraphSettings
+from dpm2_core.slam.mapping.restore import restore
+from dpm2_core.slam.store.map_data import MapData, append_map, odometry_by_node
+from dpm2_core.slam.store.map_store import Change, MapStore
+from dpm2_core.slam.store.rows import edge_of, pose_of
+
+_STRAINED = 2.0  # standard deviations by which the loops to a drive have been pulled at, in all
+_STILL = 1e-4  # m and rad: poses that move by less are not worth writing
+_TOGETHER = 200  # nodes that are asked for at once
+
+
+def spans_of(sizes: Mapping[str, int]) -> dict[str, range]:
+    """The nodes of each drive in a file that has so many keyframes of each, one drive after the other."""
+    ends = np.cumsum([0, *sizes.values()]).tolist()
+    return {name: range(a, b) for name, a, b in zip(sizes, ends, ends[1:], strict=False)}
+
+
+@dataclass(frozen=True, eq=False)
+class Growth:
+    """Drives that come into a map.
+
+    Attributes:
+        maps: of these, with their poses in the map. joins: all that were checked, between drives that are there then.
+        moved: (4, 4) poses of nodes that are there, by node. judged: loops of the map that no longer hold, by number.
+    """
+
+    maps: dict[str, MapData]
+    joins: list[Join] = field(default_factory=list)
+    moved: dict[int, Array] = field(default_factory=dict)
+    judged: dict[int, Edge] = field(default_factory=dict)
+
+
+def add_drives(store: MapStore, inside: Mapping[str, int], growth: Growth, refused: Iterable[Join] = ()) -> None:
+    """Write them behind the drives in a file, each a robot by its name.
+
+    Args:
+        refused: joins that were rejected; those of drives that are not there are left out.
+
+    Raises:
+        Dpm2Error: it could not be written.
+    """
+    for name, data in growth.maps.items():
+        append_map(store, _renamed(name, data))
+    spans = spans_of({**inside, **{name: len(data) for name, data in growth.maps.items()}})
+    joins = [join for join in (*growth.joins, *refused) if join.one in spans and join.other in spans]
+    loops = [_in_file(join, {end: spans[end].start for end in (join.one, join.other)}) for join in joins]
+    store.write(Change(edges=loops, judged=growth.judged, poses=growth.moved))
+
+
+def joins_of(loops: Collection[Edge], inside: Mapping[str, int]) -> list[Join]:
+    """Loops of a file as joins of the drives in it; those within a drive, too."""
+    spans = spans_of(inside)
+    ones, others = (_owners([getattr(loop, end) for loop in loops], spans) for end in ("from_node", "to_node"))
+    return [
+        Join(one, other, replace(loop, from_node=loop.from_node - spans[one].start,
+                                 to_node=loop.to_node - spans[other].start))
+        for one, other, loop in zip(ones, others, loops, strict=True)
+    ]  # fmt: skip
+
+
+def _renamed(name: str, data: MapData) -> MapData:
+    return replace(
+        data,
+        keyframes=[replace(k, robot=f"{name}/{k.robot}".rstrip("/")) for k in data.keyframes],
+        trail=[replace(p, robot=f"{name}/{p.robot}".rstrip("/")) for p in data.trail],
+    )
+
+
+def _in_file(join: Join, first: Mapping[str, int]) -> Edge:
+    loop = join.loop
+    return replace(loop, from_node=loop.from_node + first[join.one], to_node=loop.to_node + first[join.other])
+
+
+@dataclass(frozen=True)
+class Standing:
+    """A map that is there.
+
+    Attributes:
+        store: its file. sizes: keyframes of each drive in it, in its order. ties: every two drives that are joined.
+        settings: of its graph. largest: keyframes that are solved for at once.
+    """
+
+    store: MapStore
+    sizes: Mapping[str, int]
+    ties: Collection[tuple[str, str]]
+    settings: PoseGraphSettings
+    largest: int
+
+    def between(self, names: Collection[str]) -> set[str]:
+        """These drives, and those on the shortest ways from the first of them to the others."""
+        order = list(self.sizes)
+        number = {name: at for at, name in enumerate(order)}
+        rows, columns = np.array([[number[one], number[other]] for one, other in self.ties]).reshape(-1, 2).T
+        graph = coo_array((np.ones(len(rows)), (rows, columns)), (len(order), len(order))).tocsr()
+        ends = sorted(number[name] for name in names)
+        before = breadth_first_order(graph, ends[0], directed=False)[1] if ends else []
+        found = set(ends)
+        for end in ends:
+            while (end := int(before[end])) >= 0:
+                found.add(end)
+        return {order[at] for at in found}
+
+
+def grown(there: Standing, maps: Mapping[str, MapData], joins: Sequence[Join]) -> Growth | None:
+    """Where new drives are in a map that is there, and what becomes of their joins and of what they touch.
+
+    Args:
+        maps: of the new drives, without descriptors. joins: accepted ones between two drives that have enough of them.
+
+    Returns:
+        None: the map must be made anew, since so much of it moves, or what was believed of it does not hold.
+
+    Raises:
+        Dpm2Error: the map cannot be read, or the graph not be solved.
+    """
+    refused: list[Join] = []
+    maps, joins = dict(maps), list(joins)
+    while maps:
+        part = _solved(there, _nearest_first(there.sizes, maps, joins), joins)
+        if part is None:
+            return None
+        joins, contradicted = affirmed(part.joins)
+        refused += contradicted
+        sizes = {**there.sizes, **{name: len(data) for name, data in maps.items()}}
+        together = component(sizes, joins, there.sizes)
+        if not set(there.sizes) <= set(together):
+            return None
+        if not any(join.loop.ok for join in contradicted) and len(together) == len(sizes):
+            return replace(part, joins=[*joins, *refused])
+        maps = {name: maps[name] for name in maps if name in together}
+    return Growth({}, refused)
+
+
+def _nearest_first(inside: Collection[str], maps: Mapping[str, MapData], joins: Sequence[Join]) -> dict[str, MapData]:
+    """New drives in the order in which their joins lead from the map to them."""
+    order: dict[str, MapData] = {}
+    while True:
+        there = {*inside, *order}
+        near = {end for join in joins if (join.one in there) != (join.other in there) for end in (join.one, join.other)}
+        if not near - there:
+            return {**order, **{name: maps[name] for name in maps if name not in order}}
+        order |= {name: maps[name] for name in maps if name in near - there}
+
+
+def _solved(there: Standing, maps: Mapping[str, MapData], joins: Sequence[Join]) -> Growth | None:
+    """Solve for new drives and for what they touch, and for more of the map as long as its borders are strained."""
+    sizes, spans = there.sizes, spans_of(there.sizes)
+    active = there.between({end for join in joins for end in (join.one, join.other) if end in sizes})
+    while sum(map(len, maps.values())) + sum(sizes[name] for name in active) <= there.largest:
+        region = _Region(there.store, [spans[name] for name in sizes if name in active], there.settings)
+        growth = region.with_drives(maps, joins, {name: spans[name].start for name in active})
+        further = region.strained(spans)
+        if any(join.loop.ok for join in affirmed(growth.joins)[1]) and len(active) < len(sizes):
+            further = set(sizes)  # it may be the held ones that are wrong
+        if not further:
+            return growth if region.holds(sizes) else None
+        active |= further
+    return None
+
+
+class _Region:
+    """Drives of a map file that are solved for; the nodes of others to which their loops lead are held."""
+
+    def __init__(self, store: MapStore, spans: Sequence[range], settings: PoseGraphSettings) -> None:
+        own = [node for span in spans for node in span]
+        edges = store.rows("edges", where=_within(spans, "from_node", "to_node"))
+        read = [(int(row[0]), edge_of(row)) for row in edges]
+        chain = odometry_by_node(edge for _, edge in read)
+        self._loops = {number: edge for number, edge in read if edge.ok and chain.get(edge.to_node) is not edge}
+        known = set(own)
+        self._outer = sorted({end for loop in self._loops.values() for end in (loop.from_node, loop.to_node)} - known)
+        beside = [range(node, node + 1) for node in self._outer]
+        self._poses = {row[0]: pose_of(row[1]) for part in (spans, beside) for row in _poses(store, part)}
+        self._graph, self._at = PoseGraph(settings), dict[int, int]()
+        self._add(own, self._poses, chain)
+        self._add(self._outer, self._poses, {})
+        for loop in self._loops.values():
+            self._graph.add_loop(_between(loop, self._at))
+        self._own = own
+
+    def _add(self, nodes: Iterable[int], poses: Mapping[int, Array], chain: Mapping[int, Edge]) -> None:
+        for node in nodes:
+            self._at[node] = len(self._graph)
+            self._graph.add_node(poses[node], _between(chain[node], self._at) if node in chain else None)
+
+    def with_drives(self, maps: Mapping[str, MapData], joins: Sequence[Join], first: Mapping[str, int]) -> Growth:
+        """Solve with new drives; `first`: node of the file with which each drive of the region begins."""
+        graph, begins = self._graph, {name: self._at[node] for name, node in first.items()}
+        for name, data in maps.items():
+            begins[name] = len(graph)
+            restore(graph, data)
+        loops = len(graph.loops)
+        for join in joins:
+            graph.add_loop(_in_file(join, begins))
+        for node in self._own:  # the first loop between two parts has moved one of them
+            graph.place(self._at[node], self._poses[node])
+        for node in self._outer:
+            graph.hold(self._at[node], self._poses[node])
+        graph.optimize()
+        checked = [replace(join, loop=replace(join.loop, registration=loop.registration))
+                   for join, loop in zip(joins, graph.loops[loops:], strict=True)]  # fmt: skip
+        solved = graph.poses
+        moved = {node: solved[self._at[node]] for node in self._own}
+        return Growth(
+            {name: replace(data, poses=solved[begins[name] :][: len(data)]) for name, data in maps.items()},
+            checked,
+            {node: T for node, T in moved.items() if np.abs(T - self._poses[node]).max() > _STILL},
+            {number: loop for number, loop in self._judged().items() if not loop.ok},
+        )
+
+    def _judged(self) -> dict[int, Edge]:
+        """The loops of the file as the graph has them now, by number."""
+        return {number: replace(loop, registration=now.registration)
+                for (number, loop), now in zip(self._loops.items(), self._graph.loops, strict=False)}  # fmt: skip
+
+    def strained(self, spans: Mapping[str, range]) -> set[str]:
+        """The drives beside the region whose loops to it the new poses pull at, all of a drive together."""
+        outer = set(self._outer)
+        border = [loop for loop in self._loops.values() if {loop.from_node, loop.to_node} & outer]
+        if not border:
+            return set()
+        before, after = (self._errors(border, moved) for moved in (False, True))
+        chi2 = mahalanobis(after - before, np.array([loop.covariance for loop in border]))
+        beside = _owners([end for loop in border for end in {loop.from_node, loop.to_node} & outer], spans)
+        return {name for name in beside if chi2[np.array(beside) == name].sum() > _STRAINED**2}
+
+    def _errors(self, loops: Sequence[Edge], moved: bool) -> Array:
+        """(E, 6) of loops, with the poses of the file or those that were solved for."""
+        nodes = sorted({end for loop in loops for end in (loop.from_node, loop.to_node)})
+        poses = np.array([self._graph.pose(self._at[node]) if moved else self._poses[node] for node in nodes])
+        ends = np.searchsorted(nodes, [(loop.from_node, loop.to_node) for loop in loops])
+        return loop_errors(poses, ends, np.array([loop.T_from_to for loop in loops]))
+
+    def holds(self, inside: Mapping[str, int]) -> bool:
+        """Whether all drives that were joined are joined by enough loops still."""
+        left: dict[tuple[str, str], set[int]] = defaultdict(set)
+        for join in joins_of(self._judged().values(), inside):
+            left[join.one, join.other] |= {join.loop.to_node} if join.loop.ok else set()
+        return all(len(nodes) >= ENOUGH for (one, other), nodes in left.items() if one != other)
+
+
+def _owners(nodes: Sequence[int], spans: Mapping[str, range]) -> list[str]:
+    """The drive of each node."""
+    names, begins = list(spans), [span.start for span in spans.values()]
+    return [names[number] for number in np.searchsorted(begins, nodes, side="right") - 1]
+
+
+def _within(spans: Sequence[range], *columns: str) -> str:
+    """The condition that a column of a table is a node of these."""
+    return " OR ".join(f"{column} BETWEEN {s.start} AND {s.stop - 1}" for s in spans for column in columns) or "FALSE"
+
+
+def _poses(store: MapStore, spans: Sequence[range]) -> Iterator[tuple[Any, ...]]:
+    for first in range(0, len(spans), _TOGETHER):  # SQLite's expressions have a depth
+        yield from store.rows("poses", where=_within(spans[first : first + _TOGETHER], "node"))
+
+
+def _between(edge: Edge, at: Mapping[int, int]) -> Edge:
+    return replace(edge, from_node=at[edge.from_node], to_node=at[edge.to_node])

@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which drives share a place: what each holds, where others look like it, and the loops that are affirmed there.
+
+What was found is kept in DIR/.merge, drive by drive and stretch by stretch: another drive costs what it touches.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from dpm2_core.errors import Dpm2Error
+from dpm2_core.files import write_json
+from dpm2_core.fleet.cluster import Cluster
+from dpm2_core.fleet.drives import MAP
+from dpm2_core.fleet.joins import ENOUGH, edge_from, join_part, stretches
+from dpm2_core.fleet.part import Figures, Part, is_whole
+from dpm2_core.fleet.places import FleetIndex, places_part, vectors_of
+from dpm2_core.fleet.regions import Join
+from dpm2_core.fleet.run import View, do_parts
+from dpm2_core.network.pretrained import weights_path
+from dpm2_core.slam.loops.retrieval import Vector
+from dpm2_core.slam.settings import SlamSettings
+from dpm2_core.slam.store.rows import weights_id
+
+_KEPT = ".merge"
+_CANDIDATES = 8
+"""Places that look alike, of each keyframe."""
+
+
+@dataclass(frozen=True)
+class Search:
+    """Where drives are, and how joins between them are looked for.
+
+    Attributes:
+        folder: of the drives. cluster: entered. view: told of what goes on.
+    """
+
+    folder: Path
+    settings: SlamSettings
+    cluster: Cluster
+    view: View
+
+    @property
+    def kept(self) -> Path:
+        """Folder of what was found."""
+        return self.folder / _KEPT
+
+    def drives(self, left_out: dict[str, str]) -> dict[str, Part]:
+        """The part that reads the places of each drive that is whole, in the order of their names."""
+        found = {}
+        for path in sorted(self.folder.glob(f"*/{MAP}")):
+            name = path.parent.name
+            if is_whole(path.parent):
+                found[name] = places_part(name, path)
+            else:
+                left_out[name] = "not whole: it is being written, or was cut short"
+        return found
+
+    def places(self, parts: Mapping[str, Part], left_out: dict[str, str]) -> dict[str, Figures]:
+        """What the drives' maps hold, of those that are sound and of the same weights.
+
+        Raises:
+            Dpm2Error: there is none.
+        """
+        own = weights_id(weights_path(self.settings.neural.weights))
+        found: dict[str, Figures] = {}
+        outcomes = do_parts(list(parts.values()), self.kept, self.cluster, self.view)
+        for name, outcome in zip(parts, outcomes, strict=True):
+            if outcome.figures is None:
+                left_out[name] = outcome.reason or "stopped"
+            elif outcome.figures["weights"] != [own]:
+                left_out[name] = f"made with weights {', '.join(outcome.figures['weights'])}, not with {own}"
+            else:
+                found[name] = outcome.figures
+        if not found:
+            raise Dpm2Error("; ".join(f"{name}: {reason}" for name, reason in left_out.items()))
+        return found
+
+    def index(self, parts: Mapping[str, Part]) -> FleetIndex:
+        """All these drives in one index. Candidates are found once for each drive, when it comes."""
+        index = FleetIndex(self.kept)
+        versions = {name: part.arguments["version"] for name, part in parts.items()}
+        if any(versions.get(name) != version for name, version, _ in index.drives):
+            index.clear()  # a drive is gone, or another one by now
+        new = [name for name in parts if name not in {known for known, *_ in index.drives}]
+        for name in new:
+            vectors = vectors_of(self.kept, parts[name])
+            write_json(self._candidates(name), _candidates(index, vectors))
+            index.add(name, versions[name], vectors)
+        if new:
+            index.save()
+        return index
+
+    def joins(self, parts: Mapping[str, Part], index: FleetIndex, inside: Collection[str] = ()) -> list[Join]:
+        """Every loop that was tried between two drives, one of them at least not in `inside`.
+
+        Raises:
+            Dpm2Error: a search failed.
+        """
+        slam = self.settings.model_dump(mode="json")
+        maps = {name: dict(part.arguments) for name, part in parts.items()}
+        work: dict[str, tuple[Part, str, str]] = {}
+        outside = False
+        for name, *_ in index.drives:
+            outside |= name not in inside
+            pairs = json.loads(self._candidates(name).read_text(encoding="utf-8")) if outside else {}
+            for one, rows in pairs.items():
+                if one not in inside or name not in inside:
+                    for number, stretch in enumerate(stretches(one, name, np.array(rows))):
+                        part = join_part(number, stretch, maps, slam)
+                        work[part.name] = part, one, name
+        outcomes = do_parts([part for part, *_ in work.values()], self.kept, self.cluster, self.view)
+        if failed := [outcome for outcome in outcomes if outcome.figures is None]:
+            raise Dpm2Error(f"{len(failed)} of {len(work)} stretches failed: {failed[0].name}: {failed[0].reason}")
+        found: dict[tuple[str, str, int, int], Join] = {}
+        for outcome in outcomes:
+            _, one, other = work[outcome.name]
+            for figures in (outcome.figures or {})["loops"]:
+                join = Join(one, other, edge_from(figures))
+                key = one, other, join.loop.from_node, join.loop.to_node
+                if key not in found or join.loop.ok:
+                    found[key] = join
+        return list(found.values())
+
+    def _candidates(self, name: str) -> Path:
+        return self.kept / "candidates" / f"{name}.json"
+
+
+def _candidates(index: FleetIndex, vectors: Vector) -> dict[str, list[list[int]]]:
+    """Of each drive in the index: node of it and node of the new drive, where they look alike."""
+    begins = np.cumsum([0, *(count for *_, count in index.drives)])
+    out: dict[str, list[list[int]]] = defaultdict(list)
+    for node, found in enumerate(index.similar(vectors, _CANDIDATES)):
+        for place in found[found >= 0].tolist():
+            number = int(np.searchsorted(begins, place, side="right")) - 1
+            out[index.drives[number][0]].append([int(place - begins[number]), node])
+    return out
+
+
+def affirmed(joins: Sequence[Join]) -> tuple[list[Join], list[Join]]:
+    """The accepted loops of drives that have enough of them; all others, with the reason."""
+    by_pair: dict[tuple[str, str], list[Join]] = defaultdict(list)
+    rejected = []
+    for join in joins:
+        if join.loop.ok:
+            by_pair[join.one, join.other].append(join)
+        else:
+            rejected.append(join)
+    enough: list[Join] = []
+    for of_pair in by_pair.values():
+        nodes = {join.loop.to_node for join in of_pair}
+        if len(nodes) >= ENOUGH:
+            enough += of_pair
+        else:
+            reason = f"only {len(nodes)} keyframes of the two drives agree, {ENOUGH} must"
+            rejected += [replace(join, loop=join.loop.rejected(reason)) for join in of_pair]
+    return enough, rejected
+
+
+def component(sizes: Mapping[str, int], joins: Sequence[Join], inside: Collection[str] = ()) -> list[str]:
+    """The drives that hang together and have the most keyframes, in their order.
+
+    Args:
+        sizes: keyframes of each. inside: that hang together already.
+    """
+    root = next(iter(inside), "")
+    part = {name: root if name in inside else name for name in sizes}
+    for join in joins:
+        one, other = part[join.one], part[join.other]
+        if one != other:
+            part = {name: one if root == other else root for name, root in part.items()}
+    total: dict[str, int] = defaultdict(int)
+    for name, root in part.items():
+        total[root] += sizes[name]
+    largest = max(total, key=lambda root: total[root])
+    return [name for name in sizes if part[name] == largest]

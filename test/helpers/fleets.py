@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Maps of drives without clouds, and the joins between them."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+
+from dpm2_core.fleet.regions import Join
+from dpm2_core.frame import Array, Edge, Keyframe, Registration
+from dpm2_core.geometry import se3
+from dpm2_core.slam.store.cloud_codec import pack_cloud
+from dpm2_core.slam.store.cloud_store import CloudStore
+from dpm2_core.slam.store.map_data import NO_POINTS, MapData
+from dpm2_core.slam.store.rows import Session
+
+NOISE = np.diag([1e-3] * 3 + [0.02] * 3) ** 2
+"""(6, 6) covariance of odometry and joins."""
+
+
+def drive_map(poses: Array, seed: int) -> MapData:
+    """The map of a drive whose odometry has drifted; it stands in a frame of its own."""
+    rng = np.random.default_rng(seed)
+    keyframes = [Keyframe(i, i, i, np.eye(4), NO_POINTS) for i in range(len(poses))]
+    edges, own = [], [se3.exp(rng.normal(size=6) * [0, 0, 1, 50, 50, 0])]
+    for i in range(1, len(poses)):
+        T = se3.inverse(poses[i - 1]) @ poses[i] @ se3.exp(rng.normal(size=6) * np.sqrt(np.diag(NOISE)))
+        edges.append(Edge("odometry", i - 1, i, Registration(T, NOISE)))
+        own.append(own[-1] @ T)
+    clouds, point = CloudStore(), pack_cloud(np.ones((1, 4), np.float32))
+    for _ in poses:
+        clouds.append(point)
+    sessions = [Session(1, "0", "2026-01-01T00:00:00Z", "", "")]
+    return MapData(keyframes, [1] * len(poses), np.array(own), edges, [], sessions, clouds)
+
+
+def fleet_maps(count: int, turn: float = 0.01) -> tuple[dict[str, Array], dict[str, MapData], list[Join]]:
+    """Drives along one way, each sharing its last 20 keyframes with the next; 10 true joins each, and a false one.
+
+    Args:
+        turn: rad a keyframe.
+    """
+    way = se3.exp(np.arange(40 * count + 40)[:, None] * np.array([0, 0, turn, 2.0, 0, 0]))
+    names = [f"d{number}" for number in range(count)]
+    truth = {name: way[40 * i : 40 * i + 60] for i, name in enumerate(names)}
+    maps = {name: drive_map(poses, i) for i, (name, poses) in enumerate(truth.items())}
+    joins = []
+    for one, other in pairwise(names):
+        for k in range(0, 20, 2):
+            T = se3.inverse(truth[one][40 + k]) @ truth[other][k]
+            joins.append(Join(one, other, Edge("loop", 40 + k, k, Registration(T, NOISE))))
+        wrong = T @ se3.exp(np.array([0, 0, 0.3, 8.0, 0, 0]))
+        joins.append(Join(one, other, Edge("loop", 5, 5, Registration(wrong, NOISE))))
+    return truth, maps, joins
