@@ -79,7 +79,9 @@ class OfflineRun:
         self._config = config or Config()
         self._resources = ExitStack()
         self._truth: Array | Trajectory | None = None
-        store = None if map_file is None else self._resources.enter_context(open_map(map_file, self._config, map_mode))
+        store = None if map_file is None else open_map(map_file, self._config, map_mode)
+        if store is not None:
+            self._resources.push(store)
         try:
             self.slam = make_slam(self._config.slam, store=store)
             if isinstance(source, (Path, str)):

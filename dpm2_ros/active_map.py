@@ -15,6 +15,7 @@ from dpm2_core.frame import Array, Edge, Keyframe, State
 from dpm2_core.slam.build import make_map, make_slam
 from dpm2_core.slam.loops.localizer import LocalizationResult, Localizer
 from dpm2_core.slam.mapping.mapper import Mapper
+from dpm2_core.slam.mapping.tiles import TiledMap
 from dpm2_core.slam.output import save_map
 from dpm2_core.slam.session import open_for_localization, open_session
 from dpm2_core.slam.store.map_store import MapStore
@@ -45,7 +46,7 @@ class ActiveMap:
         self._folders: dict[str, Path] = {}  # of this drive, by the name under which it was saved
         self.located: LocalizationResult | None = None
         self._T_map_odom: dict[str, Array] | None = None  # by robot, while the map grows; None before any keyframe
-        self._store = self._opened() if ros.localization_mode else self._new_file()
+        self._store: MapStore | TiledMap | None = self._opened() if ros.localization_mode else self._new_file()
         self.slam = make_slam(config.slam, robot, self._store)
 
     @property
@@ -271,8 +272,8 @@ class ActiveMap:
         self._store, self.located = store, None
         self.slam.use(*made)
 
-    def _opened(self) -> MapStore:
-        """The file, open for reading only."""
+    def _opened(self) -> MapStore | TiledMap:
+        """The file or folder of tiles, open for reading only."""
         if self._path is None:
             raise UsageError("no map to find oneself in: ros.map_file does not name one" + self._hint())
         return open_for_localization(self._path, self._config.slam)

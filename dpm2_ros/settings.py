@@ -94,7 +94,7 @@ class RosSettings(Settings):
     map_file: str = "auto"
     """Map file that is written as the drive goes on, so that a crash costs no more than a keyframe; `dpm2 map` reads
     it. auto: in `map_directory`; else a path such as town.dpm2map, to which namespace and number are added likewise.
-    Empty: none. With `localization_mode`: the path of the map to find oneself in."""
+    Empty: none. With `localization_mode`: the path of the map, or folder of tiles, to find oneself in."""
 
     localization_mode: bool = False
     """slam_node finds itself in `map_file`, which stays as it is, and makes no map of its own."""

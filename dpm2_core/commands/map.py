@@ -23,6 +23,7 @@ from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.slam.mapping.restore import restore
+from dpm2_core.slam.mapping.tiles import write_tiles
 from dpm2_core.slam.store.map_data import MapData, load_map, map_cloud, save_as, trajectory
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.tables import FigureTable
@@ -96,8 +97,19 @@ def export(
     ] = "",
     voxel: Annotated[float | None, typer.Option(min=0.01, help="Spacing of the points of a cloud, m [0.3].")] = None,
     resolution: Annotated[float | None, typer.Option(min=0.01, help="Cell of the occupancy grid, m [0.1].")] = None,
+    tiles: Annotated[
+        float | None,
+        typer.Option(metavar="METERS", help="A folder of map files, one for each square, for `dpm2 run --localise`."),
+    ] = None,
 ) -> None:
-    """Write a map as a point cloud, a page for the browser, an occupancy grid, a trajectory, or a pose graph."""
+    """Write a map as a point cloud, a page for the browser, an occupancy grid, a trajectory, a pose graph, or tiles."""
+    if tiles is not None:
+        if format or voxel is not None or resolution is not None:
+            raise UsageError("--tiles: squares of the map as it is; --format, --voxel and --resolution do not apply")
+        with MapStore.open(path) as store:
+            count = write_tiles(load_map(store, descriptors=False), out, tiles)
+        Console(stderr=True).print(f"{out} written: {count} tiles", highlight=False, soft_wrap=True)
+        return
     kind = format or _ENDINGS.get(out.suffix.lower(), "")
     if kind not in _EXPORTS:
         raise UsageError(f"{out}: choose --format from {', '.join(_EXPORTS)}")

@@ -45,7 +45,8 @@ def run(
     resume: Annotated[bool, typer.Option("--resume", help="Go on where --map ends: a run was cut off.")] = False,
     extend: Annotated[bool, typer.Option("--extend", help="Add this drive, another one, to --map.")] = False,
     localise: Annotated[
-        Path | None, typer.Option("--localise", help="Find the drive in this map file, which stays as it is.")
+        Path | None,
+        typer.Option("--localise", help="Find the drive in this map (a file, or tiles), which stays as it is."),
     ] = None,
     hint: Annotated[
         str | None, typer.Option(help="About where in --localise it begins: x,y,yaw in m and degrees.")

@@ -23,12 +23,11 @@ from dpm2_core.evaluation.metrics import Metrics, evaluate
 from dpm2_core.evaluation.run_folder import METRICS, TIMING, TRAJECTORY, TRUTH, write_frames, write_truth
 from dpm2_core.experiments.peers import make_peer
 from dpm2_core.files import write_json
-from dpm2_core.fleet.part import Advance, Figures
+from dpm2_core.fleet.part import Advance, Figures, counted
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.pipeline import OfflineRun, open_recording, span_of
 from dpm2_core.slam.settings import Config
-from dpm2_core.slam.system import SlamResult
 
 OWN = "dpm2_core.experiments.slam_part:own"
 PEER = "dpm2_core.experiments.slam_part:peer"
@@ -56,14 +55,7 @@ def own(folder: Path, advance: Advance, drive: Drive, corrupt: str | None = None
     if corrupt is not None:
         source = CorruptedSource(open_recording(drive["data"], config, True), parse_corruption(corrupt))
     with OfflineRun(source, config, _span(drive)) as run:
-        done = 0
-
-        def progress(result: SlamResult) -> None:
-            nonlocal done
-            done += 1
-            advance(done, len(run))
-
-        result = run.run(progress)
+        result = run.run(counted(advance, len(run)))
         if result.interrupted:
             raise KeyboardInterrupt
         result.save(folder, cloud=False)

@@ -15,6 +15,7 @@ import time
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -103,7 +104,7 @@ class Cluster:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
         os.environ.setdefault("RAY_worker_niceness", "0")  # 15 by default: beside other programs next to nothing
-        with needs("fleet", "a fleet"):
+        with _loopback(self._address is None), needs("fleet", "a fleet"):
             import ray
         self._ray = ray
         if not ray.is_initialized():
@@ -116,6 +117,7 @@ class Cluster:
         self._board = ray.remote(num_cpus=0, max_restarts=-1, max_task_retries=-1)(_Board).remote()
 
     def _connect(self, ray: Any) -> None:
+        _keep_private(Path.home() / ".ray")
         quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
         self._connected = True
         if self._address is not None:
@@ -184,6 +186,30 @@ class Cluster:
         except ray.exceptions.RayError:  # it is only for show, and begins anew
             return {}
         return status
+
+
+@contextmanager
+def _loopback(wanted: bool) -> Iterator[None]:
+    """Ray listens on 127.0.0.1 alone where it is told when it is imported that there are no other machines.
+
+    The variable is named for systems on which that is the default; it works on Linux, too. It is read once.
+    """
+    name = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
+    ours = wanted and name not in os.environ
+    if ours:
+        os.environ[name] = "0"
+    try:
+        yield
+    finally:
+        if ours:
+            del os.environ[name]
+
+
+def _keep_private(folder: Path) -> None:
+    """Ray writes the token by which a cluster is used into its folder, and lets everybody read it."""
+    with suppress(OSError):  # not ours, or a home that cannot be written: Ray says what it cannot do
+        folder.mkdir(mode=0o700, exist_ok=True)
+        folder.chmod(0o700)
 
 
 def _check_address(address: str) -> None:

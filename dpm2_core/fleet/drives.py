@@ -13,11 +13,10 @@ from pydantic import Field
 from dpm2_core.config import Settings, load_settings, read_yaml, settings_from
 from dpm2_core.data.source import parse_range
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.fleet.part import Advance, Figures, Part
+from dpm2_core.fleet.part import Advance, Figures, Part, counted
 from dpm2_core.network.pretrained import weights_path
 from dpm2_core.pipeline import OfflineRun
 from dpm2_core.slam.settings import Config
-from dpm2_core.slam.system import SlamResult
 
 MAP = "drive.dpm2map"
 """In the folder of a drive: its map file."""
@@ -114,14 +113,7 @@ def run_drive(
     """
     chosen, truth = settings_from(Config, dict(config)), Path(gt) if gt else None
     with OfflineRun(path, chosen, (frames[0], frames[1]), truth, folder / MAP) as run:
-        done = 0
-
-        def progress(result: SlamResult) -> None:
-            nonlocal done
-            done += 1
-            advance(done, len(run))
-
-        result = run.run(progress)
+        result = run.run(counted(advance, len(run)))
         if result.interrupted:
             raise KeyboardInterrupt
         if problem := result.mapper.store_problem:

@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from importlib import import_module
+from itertools import count
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -30,6 +31,12 @@ DONE = "part.json"
 Figures = dict[str, Any]
 Advance = Callable[[int, int], None]
 """Told how many frames are done, of how many."""
+
+
+def counted(advance: Advance, total: int) -> Callable[[object], None]:
+    """To be called after each of `total` frames."""
+    done = count(1)
+    return lambda _: advance(next(done), total)
 
 
 @dataclass(frozen=True)

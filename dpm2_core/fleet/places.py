@@ -19,12 +19,11 @@ from dpm2_core.errors import Dpm2Error
 from dpm2_core.extras import needs
 from dpm2_core.files import atomic_write, write_json
 from dpm2_core.fleet.part import Advance, Figures, Part
-from dpm2_core.slam.loops.retrieval import CHANNELS, Vector, pooled
+from dpm2_core.slam.loops.retrieval import WIDTH, Vector, centered, pooled
 from dpm2_core.slam.store.check import check_map
 from dpm2_core.slam.store.map_data import load_map
 from dpm2_core.slam.store.map_store import MapStore
 
-WIDTH = CHANNELS * (CHANNELS + 1) // 2
 _WORK = "dpm2_core.fleet.places:describe"
 _VECTORS = "places.npy"
 _INDEX, _LISTED = "index.faiss", "index.json"
@@ -105,7 +104,7 @@ class FleetIndex:
         if self._index is None:
             return np.full((len(vectors), count), -1)
         self._index.hnsw.efSearch = _SEARCH
-        _, found = self._index.search(self._unit(vectors), count)
+        _, found = self._index.search(centered(vectors, self._mean), count)
         found[~vectors.any(1)] = -1
         return np.asarray(found, np.int64)
 
@@ -115,7 +114,7 @@ class FleetIndex:
             self._mean = vectors[vectors.any(1)].mean(0)
             self._index = self._faiss.IndexHNSWFlat(WIDTH, _LINKS, self._faiss.METRIC_INNER_PRODUCT)
             self._index.hnsw.efConstruction = _BUILD
-        self._index.add(self._unit(vectors))
+        self._index.add(centered(vectors, self._mean))
         self.drives.append((name, list(version), len(vectors)))
 
     def save(self) -> None:
@@ -127,7 +126,3 @@ class FleetIndex:
         with atomic_write(self._folder / _INDEX, "wb") as file:
             file.write(self._faiss.serialize_index(self._index).tobytes())
         write_json(self._folder / _LISTED, {"drives": self.drives, "mean": self._mean.tolist()})
-
-    def _unit(self, vectors: Vector) -> Vector:
-        centered = np.where(np.any(vectors, axis=1, keepdims=True), vectors - self._mean, 0)
-        return np.asarray(centered / np.maximum(np.linalg.norm(centered, axis=1, keepdims=True), 1e-6), np.float32)

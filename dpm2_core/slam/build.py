@@ -10,9 +10,11 @@ from dpm2_core.slam.filters import make_filter
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.loops.closure import LoopCloser
 from dpm2_core.slam.loops.localizer import Localizer
+from dpm2_core.slam.loops.place_recognition import PlaceRecognition
 from dpm2_core.slam.loops.relocalization import Relocalizer
 from dpm2_core.slam.loops.verification import Verifier
 from dpm2_core.slam.mapping.mapper import Mapper
+from dpm2_core.slam.mapping.tiles import TiledMap, TiledRelocalizer
 from dpm2_core.slam.odometry.keyframe_selection import KeyframeSelector
 from dpm2_core.slam.odometry.odometry import Odometry
 from dpm2_core.slam.odometry.scaled import ScaledOdometry
@@ -25,6 +27,7 @@ from dpm2_core.slam.registration.points import GeometricScanRegistration
 from dpm2_core.slam.registration.protocol import ScanRegistration
 from dpm2_core.slam.registration.visual import VisualScanRegistration
 from dpm2_core.slam.settings import SlamSettings
+from dpm2_core.slam.store.map_data import MapData
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.slam.system import Slam
 
@@ -32,13 +35,14 @@ if TYPE_CHECKING:  # torch takes seconds to import
     from dpm2_core.network.model import DeepPointMap2
 
 
-def make_slam(settings: SlamSettings | None = None, robot: str = "", store: MapStore | None = None) -> Slam:
+def make_slam(settings: SlamSettings | None = None, robot: str = "", store: MapStore | TiledMap | None = None) -> Slam:
     """The SLAM with all its parts.
 
     Args:
         robot: namespace of its keyframes, "" for the only one.
         store: the map file: to write, or to go on with, its session begun (`open_session`); or, open for reading only
-            (`open_for_localization`), to find oneself in. None: the map is in memory, its clouds in a temporary file.
+            (`open_for_localization`), a folder of tiles, too, to find oneself in. None: the map is in memory, its
+            clouds in a temporary file.
 
     Raises:
         UsageError: a network has no weights to run with.
@@ -47,8 +51,13 @@ def make_slam(settings: SlamSettings | None = None, robot: str = "", store: MapS
     return Slam(make_odometry(s, robot), *make_map(s, store), s.map.thumbnail)
 
 
-def make_map(s: SlamSettings, store: MapStore | None = None) -> tuple[Mapper, Localizer | None]:
-    """The mapper, and in a map that stays as it is what finds keyframes there; `store` as for `make_slam`."""
+def make_map(s: SlamSettings, store: MapStore | TiledMap | None = None) -> tuple[Mapper, Localizer | None]:
+    """The mapper, and in a map that stays as it is what finds keyframes there; `store` as for `make_slam`.
+
+    The mapper of a folder of tiles is empty: they are never all in memory.
+    """
+    if isinstance(store, TiledMap):
+        return make_mapper(s), make_tiled_localizer(s, store)
     mapper = make_mapper(s, store)
     return mapper, make_localizer(s, mapper) if store is not None and store.read_only else None
 
@@ -96,11 +105,30 @@ def make_localizer(s: SlamSettings, mapper: Mapper) -> Localizer:
     Raises:
         UsageError: the network has no weights to run with.
     """
-    i = s.indoors()
-    room = Verifier(i.relocalise.verification, i.geometric)
-    verifier = Verifier(s.relocalise.verification, s.geometric, room)
-    relocalizer = Relocalizer(s.relocalise, verifier, _network(s), mapper.keyframes, mapper.clouds, mapper.poses)
+    relocalizer = Relocalizer(
+        s.relocalise, _verifier(s), _network(s), mapper.keyframes, mapper.clouds, mapper.poses
+    )  # fmt: skip
     return Localizer(relocalizer, s.relocalise.max_failures)
+
+
+def make_tiled_localizer(s: SlamSettings, tiles: TiledMap) -> Localizer:
+    """Finds keyframes in a map of which only the surroundings are in memory.
+
+    Raises:
+        UsageError: the network has no weights to run with.
+    """
+    verifier, network = _verifier(s), _network(s)
+
+    def around(data: MapData) -> Relocalizer:
+        return Relocalizer(s.relocalise, verifier, network, data.keyframes, data.clouds, data.poses)
+
+    relocalizer = TiledRelocalizer(s.relocalise, tiles, around, PlaceRecognition(network).describe)
+    return Localizer(relocalizer, s.relocalise.max_failures)
+
+
+def _verifier(s: SlamSettings) -> Verifier:
+    i = s.indoors() if s.preset == "auto" else s
+    return Verifier(s.relocalise.verification, s.geometric, Verifier(i.relocalise.verification, i.geometric))
 
 
 def make_loops(s: SlamSettings) -> LoopCloser:

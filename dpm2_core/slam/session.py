@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal
 
@@ -13,6 +14,7 @@ from dpm2_core.data.source import Source
 from dpm2_core.errors import UsageError
 from dpm2_core.network.pretrained import weights_path
 from dpm2_core.slam.mapping.mapper import Mapper
+from dpm2_core.slam.mapping.tiles import TiledMap
 from dpm2_core.slam.settings import Config, SlamSettings
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.slam.store.rows import Session, weights_id
@@ -22,7 +24,7 @@ MapMode = Literal["create", "resume", "extend", "localize"]
 _SAME_FRAME = np.diag([1e-4] * 3 + [1e-3] * 3) ** 2  # rad, m: the rounding of what is the same frame
 
 
-def open_map(path: Path, config: Config, mode: MapMode) -> MapStore:
+def open_map(path: Path, config: Config, mode: MapMode) -> MapStore | TiledMap:
     """The map file, for what `mode` says; see `open_session` and `open_for_localization`."""
     if mode == "localize":
         return open_for_localization(path, config.slam)
@@ -53,15 +55,20 @@ def open_session(path: Path, settings: SlamSettings, config: str, resume: bool) 
     return store
 
 
-def open_for_localization(path: Path, settings: SlamSettings) -> MapStore:
-    """The map file to find oneself in, open for reading only.
+def open_for_localization(path: Path, settings: SlamSettings) -> MapStore | TiledMap:
+    """The map file, or folder of tiles, to find oneself in, open for reading only.
 
     Raises:
         UsageError: no map, one without descriptors, or with those of other weights. Dpm2Error: it cannot be read.
     """
+    weights = weights_id(weights_path(settings.neural.weights))
+    if path.is_dir():
+        tiles = TiledMap(path)
+        _check_same(path, tiles.weights, weights)
+        return tiles
     store = MapStore.open(path)
     try:
-        _check_weights(store, weights_id(weights_path(settings.neural.weights)))
+        _check_weights(store, weights)
         if not any(store.payload(node, "descriptors") for node, *_ in store.rows("keyframes", "node")):
             raise UsageError(f"{path}: no keyframe has descriptors (made with slam.loops.descriptors off?)")
     except BaseException:
@@ -72,9 +79,14 @@ def open_for_localization(path: Path, settings: SlamSettings) -> MapStore:
 
 def _check_weights(store: MapStore, weights: str) -> None:
     """Descriptors of different weights have nothing in common; `weights` "": none are made."""
-    for row in store.rows("sessions"):
-        if (before := Session(*row).weights) and weights and before != weights:
-            raise UsageError(f"{store.path}: made with weights {before}, not with {weights}")
+    if weights:
+        _check_same(store.path, [Session(*row).weights for row in store.rows("sessions")], weights)
+
+
+def _check_same(path: Path, found: Iterable[str], weights: str) -> None:
+    for before in found:
+        if before and before != weights:
+            raise UsageError(f"{path}: made with weights {before}, not with {weights}")
 
 
 def resume_at(mapper: Mapper, source: Source, start: int) -> int:

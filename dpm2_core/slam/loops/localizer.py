@@ -10,7 +10,7 @@ import numpy as np
 from dpm2_core.frame import Array, Keyframe, Registration, State
 from dpm2_core.geometry import se3
 from dpm2_core.slam.loops.consistency import BROKEN
-from dpm2_core.slam.loops.relocalization import Relocalizer, nowhere
+from dpm2_core.slam.loops.relocalization import FindsPlaces, nowhere
 
 LOST = np.diag([1.0, 1.0, 1.0, 100.0, 100.0, 100.0]) ** 2
 """(6, 6) [rad, m] covariance of an uninformative prior."""
@@ -44,7 +44,7 @@ class Localizer:
             the map does not confirm the odometry, LOST when that lasts or the odometry is broken.
     """
 
-    def __init__(self, relocalizer: Relocalizer, max_failures: int = 3) -> None:
+    def __init__(self, relocalizer: FindsPlaces, max_failures: int = 3) -> None:
         self._relocalizer = relocalizer
         self._max_failures = max_failures
         self._hint: Array | None = None

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from pydantic import Field
@@ -46,6 +46,16 @@ class RelocalizationSettings(Settings):
     max_failures: int = Field(3, ge=1)
     """Keyframes in a row that do not fit the map where they are thought to be, after which one is lost."""
     verification: VerificationSettings = VerificationSettings()
+
+
+class FindsPlaces(Protocol):
+    """What a `Localizer` asks: see `Relocalizer`."""
+
+    def find(self, cloud: Points, hint: Array | None = None, descriptors: Descriptors | None = None) -> Registration:
+        """T_map_lidar of a cloud (M, 4), or why it is not known."""
+
+    def verify(self, cloud: Points, T_map_lidar: Array, widen: float = 1.0) -> Registration:
+        """Verifies a pose in the map by the points."""
 
 
 class Relocalizer:

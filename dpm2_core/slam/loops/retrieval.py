@@ -18,7 +18,9 @@ from dpm2_core.descriptors import Descriptors
 Vector = NDArray[np.float32]
 
 CHANNELS = 32
-"""Directions of feature space whose covariance is taken: the vector has 32 * 33 / 2 = 528 numbers."""
+"""Directions of feature space whose covariance is taken."""
+WIDTH = CHANNELS * (CHANNELS + 1) // 2
+"""Numbers of a vector: 528."""
 _FEW = 2 * CHANNELS  # descriptors; the covariance of fewer says little
 
 
@@ -35,6 +37,15 @@ def pooled(descriptors: Descriptors) -> Vector:
     return np.asarray(root[rows, columns] * np.where(rows == columns, 1.0, np.sqrt(2)), np.float32)
 
 
+def centered(vectors: Vector, mean: Vector) -> Vector:
+    """(N, 528) less the mean, of length 1: products are cosines. What is zero stays so.
+
+    The mean is subtracted since what all places share does not tell them apart.
+    """
+    less = np.where(np.any(vectors, axis=1, keepdims=True), vectors - mean, 0)
+    return np.asarray(less / np.maximum(np.linalg.norm(less, axis=1, keepdims=True), 1e-6), np.float32)
+
+
 @cache
 def _directions(channels: int) -> NDArray[np.float32]:
     """(channels, 32) orthonormal columns, always the same ones."""
@@ -46,7 +57,7 @@ class PlaceIndex:
     """The vectors of all keyframes in their order; a search is one matrix product, 10 ms for 20,000 of them."""
 
     def __init__(self) -> None:
-        self._vectors = np.zeros((256, CHANNELS * (CHANNELS + 1) // 2), np.float32)
+        self._vectors = np.zeros((256, WIDTH), np.float32)
         self._squared = np.zeros(256, np.float32)  # lengths
         self._sum = np.zeros(self._vectors.shape[1])
         self._used = 0  # vectors that are not zero

@@ -231,6 +231,8 @@ class Mapper:
         self.keyframes, self._clouds = data.keyframes, data.clouds
         try:
             restore(self._graph, data)
+            for node, T_map_kf in enumerate(data.poses):  # joined, parts have moved by the errors of their first loops
+                self._graph.place(node, T_map_kf)
         except (ValueError, Dpm2Error) as error:
             raise Dpm2Error(f"{store.path}: {error}; see dpm2 map check") from None
         for keyframe in data.keyframes:

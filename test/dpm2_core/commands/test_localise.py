@@ -43,15 +43,21 @@ def truth(recording: Path) -> np.ndarray:
     return np.asarray(se3.inverse(poses[0]) @ poses)
 
 
+@pytest.mark.parametrize("tiled", [False, True])
 @pytest.mark.parametrize("hint", [None, "8,3,170"])
 def test_the_drive_is_found_in_the_map_which_stays_as_it_is(
-    recording: Path, made: Path, tmp_path: Path, hint: str | None
+    recording: Path, made: Path, tmp_path: Path, hint: str | None, tiled: bool
 ) -> None:
-    """From scan 8 on, out to 4 m beyond the map; whatever heading is hinted."""
-    before = hashlib.sha256(made.read_bytes()).hexdigest()
+    """From scan 8 on, out to 4 m beyond the map, a file or tiles of 10 m; whatever heading is hinted."""
+    before, map_ = hashlib.sha256(made.read_bytes()).hexdigest(), made
+    if tiled:
+        map_ = tmp_path / "tiles"
+        exported = dpm2("map", "export", made, map_, "--tiles", "10")
+        assert exported.returncode == 0, exported.stderr
+        assert len(list(map_.glob("*.dpm2map"))) > 1
     hints = [] if hint is None else ["--hint", hint]
     out = tmp_path / "out"
-    done = dpm2("run", recording, "--out", out, "--frames", "8:24", "--localise", made, *hints)
+    done = dpm2("run", recording, "--out", out, "--frames", "8:24", "--localise", map_, *hints)
     assert done.returncode == 0, done.stderr
     assert hashlib.sha256(made.read_bytes()).hexdigest() == before
     assert sorted(path.name for path in made.parent.iterdir()) == ["drive.dpm2map", "out"]

@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
@@ -232,3 +233,22 @@ def test_weights_are_found_from_any_folder(tmp_path: Path, monkeypatch: pytest.M
     config: Any = part.arguments["config"]
     assert config["slam"]["neural"]["weights"] == str(tmp_path / "own.safetensors")
     assert part.inputs == [tmp_path / "own.safetensors"]
+
+
+@pytest.mark.slow
+def test_a_cluster_of_this_machine_is_not_reached_from_others(tmp_path: Path) -> None:
+    """In a process of its own, as a command is: Ray reads once, when it is imported, where it is to listen."""
+    pytest.importorskip("ray", reason="no ray: pip install 'dpm2_ros[fleet]'")
+    program = """
+from dpm2_core.fleet.cluster import Cluster
+with Cluster(workers=1) as cluster:
+    cluster.start()
+    import os, ray
+    print([node["NodeManagerAddress"] for node in ray.nodes()], "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER" in os.environ)
+"""
+    home = {**os.environ, "HOME": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", program], env=home, capture_output=True, text=True, timeout=200)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["['127.0.0.1']", "False"]
+    assert (tmp_path / ".ray").stat().st_mode & 0o77 == 0
+    assert (tmp_path / ".ray" / "auth_token").is_file()

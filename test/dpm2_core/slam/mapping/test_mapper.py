@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from dpm2_core.evaluation.metrics import ape_rmse
+from dpm2_core.fleet.regions import side_by_side
 from dpm2_core.frame import Array, Edge, Keyframe, OdometryResult, Registration, State
 from dpm2_core.geometry import se3
 from dpm2_core.sim.lidar import Lidar
@@ -20,6 +21,9 @@ from dpm2_core.slam.build import make_mapper
 from dpm2_core.slam.graph.pose_graph import PoseGraph, PoseGraphSettings
 from dpm2_core.slam.output import TrajectoryRecorder, save_map
 from dpm2_core.slam.settings import SlamSettings
+from dpm2_core.slam.store.map_data import save_as
+from dpm2_core.slam.store.map_store import MapStore
+from test.helpers.fleets import fleet_maps
 
 # Loops by descriptors have tests of their own; here the pose leads to the candidates, which is faster.
 BY_POSE = SlamSettings.model_validate({"loops": {"descriptors": False}})
@@ -215,3 +219,14 @@ def test_each_robot_has_its_own_odometry_and_is_placed_when_tied() -> None:
     assert [k.id for k in mapper.keyframes if k.robot == "red"] == list(range(8))
     assert (mapper.edges[-1].from_node, mapper.edges[-1].to_node) == (12, 13)
     assert mapper.T_map_odom_of("red") is None
+
+
+def test_a_map_of_several_drives_is_loaded_with_the_poses_of_its_file(tmp_path: Path) -> None:
+    """However far its loops are from them: they have been weighed against each other."""
+    _, maps, joins = fleet_maps(3)
+    poses = {name: se3.exp(np.full(6, 0.01 * i)) @ data.poses for i, (name, data) in enumerate(maps.items())}
+    data = replace(side_by_side(maps, joins), poses=np.concatenate(list(poses.values())))
+    save_as(data, tmp_path / "map")
+    with MapStore.open(tmp_path / "map") as store:
+        settings = SlamSettings.model_validate({"loops": {"descriptors": False}})
+        np.testing.assert_array_equal(make_mapper(settings, store).poses, data.poses)

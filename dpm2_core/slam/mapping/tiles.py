@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A map in squares of the ground: a folder with a map file for each, of which only those around a place are open.
+
+Beside the files, tiles.json says which there are, and a table has one vector for every keyframe, by which a robot that
+does not know where it is finds the squares that look like what it sees.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
+from functools import reduce
+from pathlib import Path
+
+import numpy as np
+
+from dpm2_core.descriptors import Descriptors
+from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.files import write_json
+from dpm2_core.frame import Array, Points, Registration
+from dpm2_core.slam.loops.relocalization import RelocalizationSettings, Relocalizer, nowhere
+from dpm2_core.slam.loops.retrieval import WIDTH, Vector, centered, pooled
+from dpm2_core.slam.mapping.merge import merge_maps
+from dpm2_core.slam.store.map_data import MapData, load_map, save_as, subset
+from dpm2_core.slam.store.map_store import MapStore
+
+INDEX, VECTORS = "tiles.json", "places.npy"
+_BLOCK = 65_536  # vectors that are compared at once: 140 MB
+_SMALLEST, _MOST = 10.0, 1_000_000  # m, side of a square; squares of a map
+
+Tile = tuple[int, int]
+"""A square: how many sides its corner is from the origin, in x and in y."""
+
+
+def write_tiles(data: MapData, folder: Path, size: float) -> int:
+    """Write a map as squares of so many meters; the folder appears whole or not at all.
+
+    A keyframe that borrows its cloud is left out: what it shows, its lender shows.
+
+    Returns:
+        The number of squares.
+
+    Raises:
+        UsageError: there is such a folder, or the squares are too small. Dpm2Error: it could not be written.
+    """
+    if not _SMALLEST <= size < math.inf:
+        raise UsageError(f"tiles of {size:g} m: want at least {_SMALLEST:g} m")
+    if folder.exists():
+        raise UsageError(f"{folder}: is there already")
+    squares: dict[Tile, list[int]] = {}
+    for node, (x, y) in enumerate(np.floor(data.poses[:, :2, 3] / size).astype(int).tolist()):
+        if data.clouds.loan(node) is None:
+            squares.setdefault((x, y), []).append(node)
+    part = folder.with_name(f".{folder.name}.part")
+    try:
+        shutil.rmtree(part, ignore_errors=True)
+        part.mkdir(parents=True)
+        vectors = np.array([_vector(data, node) for _, nodes in sorted(squares.items()) for node in nodes])
+        mean = np.asarray(vectors.sum(0) / max(int(vectors.any(1).sum()), 1), np.float32)
+        np.save(part / VECTORS, centered(vectors, mean))
+        for tile, nodes in squares.items():
+            save_as(_of(data, nodes), part / _name(tile))
+        counts = [[*tile, len(nodes)] for tile, nodes in sorted(squares.items())]
+        weights = sorted({session.weights for session in data.sessions if session.weights})
+        write_json(part / INDEX, {"size": size, "tiles": counts, "weights": weights, "mean": mean.tolist()})
+        part.rename(folder)
+    except OSError as error:
+        raise Dpm2Error(f"{folder}: not written: {error.strerror or error}") from error
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+    return len(squares)
+
+
+def _vector(data: MapData, node: int) -> Vector:
+    descriptors = data.keyframes[node].descriptors or data.describe(node)
+    return np.zeros(WIDTH, np.float32) if descriptors is None else pooled(descriptors)
+
+
+def _of(data: MapData, nodes: Sequence[int]) -> MapData:
+    """The map of some nodes, and the edges between them."""
+    new = {node: number for number, node in enumerate(nodes)}
+    within = [edge for edge in data.edges if edge.ok and edge.from_node in new and edge.to_node in new]
+    edges = [replace(edge, from_node=new[edge.from_node], to_node=new[edge.to_node]) for edge in within]
+    return subset(data, nodes, edges, [])
+
+
+def _name(tile: Tile) -> str:
+    return f"{tile[0]}_{tile[1]}.dpm2map"
+
+
+class TiledMap:
+    """A folder of squares, opened for reading. A context manager, as a `MapStore` is.
+
+    Attributes:
+        path: the folder. size: side of a square, m. weights: with which its descriptors were made.
+    """
+
+    read_only = True
+
+    def __init__(self, path: Path) -> None:
+        """Nothing but the index is read.
+
+        Raises:
+            UsageError: no such folder. Dpm2Error: its index is damaged.
+        """
+        self.path = path
+        self._files: dict[Tile, tuple[MapStore, MapData]] = {}
+        try:
+            read = json.loads((path / INDEX).read_text(encoding="utf-8"))
+            self.size, self.weights = float(read["size"]), [str(weights) for weights in read["weights"]]
+            self._counts: dict[Tile, int] = {(int(x), int(y)): int(count) for x, y, count in read["tiles"]}
+            self._mean = np.array(read["mean"], np.float32)
+            self._vectors = np.load(path / VECTORS, mmap_mode="r", allow_pickle=False)
+            sizes = _SMALLEST <= self.size < math.inf and 0 < len(self._counts) <= _MOST
+            shapes = self._mean.shape, self._vectors.shape, self._vectors.dtype
+            if not sizes or shapes != ((WIDTH,), (sum(self._counts.values()), WIDTH), np.float32):
+                raise ValueError
+            if min(self._counts.values()) < 1 or not np.isfinite(self._mean).all():
+                raise ValueError
+        except FileNotFoundError:
+            raise UsageError(f"{path}: no folder of tiles, as `dpm2 map export --tiles` writes it") from None
+        except (OSError, ValueError, KeyError, TypeError, OverflowError):
+            raise Dpm2Error(f"{path}: the index of its tiles is damaged") from None
+
+    def __enter__(self) -> TiledMap:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close all files."""
+        self._keep(())
+
+    def copy_to(self, path: Path) -> None:
+        """There is no one file.
+
+        Raises:
+            UsageError: always.
+        """
+        raise UsageError(f"{path}: {self.path} is a folder of tiles, which stays as it is: copy that")
+
+    @property
+    def open(self) -> set[Tile]:
+        """The squares whose keyframes are in memory."""
+        return set(self._files)
+
+    def around(self, xy: Array, reach: float) -> list[Tile]:
+        """The squares that are there within so many meters of a place (2,)."""
+        low, high = (np.floor((xy + side * reach) / self.size).astype(int).tolist() for side in (-1, 1))
+        every = ((x, y) for x in range(low[0], high[0] + 1) for y in range(low[1], high[1] + 1))
+        return [tile for tile in every if tile in self._counts]
+
+    def like(self, vector: Vector, count: int) -> list[Tile]:
+        """The squares of the `count` keyframes, of all there are, that look most like a place (528,)."""
+        (query,) = centered(vector[None], self._mean)
+        best: list[tuple[float, int]] = []
+        for first in range(0, len(self._vectors), _BLOCK):
+            cosine = np.nan_to_num(self._vectors[first : first + _BLOCK] @ query, nan=-1)
+            top = np.argsort(-cosine, kind="stable")[:count]
+            best = sorted([*best, *zip((-cosine[top]).tolist(), (top + first).tolist(), strict=True)])[:count]
+        tiles, ends = list(self._counts), np.cumsum(list(self._counts.values()))
+        return list(dict.fromkeys(tiles[int(np.searchsorted(ends, node, side="right"))] for _, node in best))
+
+    def read(self, tiles: Collection[Tile]) -> MapData:
+        """One map of some squares, at least one; all others are closed.
+
+        Raises:
+            Dpm2Error: one is missing or damaged.
+        """
+        self._keep(tiles)
+        for tile in tiles:
+            if tile not in self._files:
+                store = MapStore.open(self.path / _name(tile))
+                try:
+                    data = load_map(store)
+                    if len(data) != self._counts[tile]:
+                        raise Dpm2Error(f"{store.path}: {len(data)} keyframes, the index says {self._counts[tile]}")
+                except BaseException:
+                    store.close()
+                    raise
+                self._files[tile] = store, data
+        return reduce(lambda a, b: merge_maps(a, b, np.eye(4)), (self._files[tile][1] for tile in tiles))
+
+    def _keep(self, tiles: Collection[Tile]) -> None:
+        for tile in self.open - set(tiles):
+            self._files.pop(tile)[0].close()
+
+
+class TiledRelocalizer:
+    """Finds clouds in a map of squares as `Relocalizer` does in a map; in memory are those around the last place."""
+
+    def __init__(
+        self,
+        settings: RelocalizationSettings,
+        tiles: TiledMap,
+        make: Callable[[MapData], Relocalizer],
+        describe: Callable[[Points], Descriptors | None],
+    ) -> None:
+        """`make`: for a map that is in memory. `describe`: descriptors of a cloud; None of too few points."""
+        self._settings, self._tiles, self._make, self._describe = settings, tiles, make, describe
+        self._here: Relocalizer | None = None
+
+    def find(self, cloud: Points, hint: Array | None = None, descriptors: Descriptors | None = None) -> Registration:
+        """As `Relocalizer.find`: around a hint, or else in the squares that look like the cloud.
+
+        Raises:
+            Dpm2Error: a square is missing or damaged.
+        """
+        descriptors = descriptors or self._describe(cloud)
+        if descriptors is None:
+            return nowhere(f"{len(cloud)} points: too few for descriptors")
+        if hint is None:
+            tiles = self._tiles.like(pooled(descriptors), self._settings.candidates)
+        else:
+            tiles = self._tiles.around(hint[:2, 3], self._settings.hint_radius)
+        here = self._at(tiles)
+        return nowhere("outside the map") if here is None else here.find(cloud, hint, descriptors)
+
+    def verify(self, cloud: Points, T_map_lidar: Array, widen: float = 1.0) -> Registration:
+        """As `Relocalizer.verify`.
+
+        Raises:
+            Dpm2Error: a square is missing or damaged.
+        """
+        xy, reach = T_map_lidar[:2, 3], self._settings.surroundings
+        if not self._tiles.open or not set(self._tiles.around(xy, reach)) <= self._tiles.open:
+            self._at(self._tiles.around(xy, max(self._tiles.size, reach)))  # more: not again in the next moment
+        return nowhere("outside the map") if self._here is None else self._here.verify(cloud, T_map_lidar, widen)
+
+    def _at(self, tiles: Collection[Tile]) -> Relocalizer | None:
+        self._here = self._make(self._tiles.read(tiles)) if tiles else None
+        return self._here
