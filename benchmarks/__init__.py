@@ -42,6 +42,7 @@ BENCHES: dict[str, Bench] = {
     "gaps": _bench("gaps:bench_gaps", "source kitti threads set weights only"),
     "geometric": _bench("geometric:bench_geometric", "source kitti repetitions threads set"),
     "hard": _bench("hard:bench_hard", "source kitti threads set weights only"),
+    "imu": _bench("imu:bench_imu", "threads set"),
     "indoor": _bench("indoor:bench_indoor", "threads set"),
     "loop-cost": _bench("loop_cost:bench_loop_cost", "threads set"),
     "map": _bench("map:bench_map", "source set"),

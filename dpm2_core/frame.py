@@ -75,6 +75,31 @@ class Guess:
 
 
 @dataclass(frozen=True, eq=False)
+class Inertial:
+    """What an IMU measured around a scan, along the axes of the LiDAR.
+
+    Attributes:
+        stamps: (K,) int64 ns, increasing.
+        rates: (K, 3) rad/s. forces: (K, 3) m/s2, what an accelerometer shows: 9.8 upwards at rest; NaN where unknown.
+        up: (3,) unit vector along the LiDAR's axes at the start that is to be upwards in the odometry's frame where the
+            drive starts at rest; None: the LiDAR's first pose is the frame, however it is tilted.
+    """
+
+    stamps: NDArray[np.int64]
+    rates: Array
+    forces: Array
+    up: tuple[float, float, float] | None = (0.0, 0.0, 1.0)
+
+    def __post_init__(self) -> None:
+        shape = (len(self.stamps), 3)
+        if self.rates.shape != shape or self.forces.shape != shape:
+            raise ValueError(f"{shape[0]} samples of an IMU: rates {self.rates.shape}, forces {self.forces.shape}")
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+
+@dataclass(frozen=True, eq=False)
 class Frame:
     """What the sensors saw at one time.
 
@@ -86,6 +111,7 @@ class Frame:
         index: position in its source (KITTI frame number, message count of a bag).
         problem: why the scan could not be read; `points` is then empty and the frame counts as failed, not lost.
         guess: where another odometry has the LiDAR at that time; the search for the pose begins there.
+        imu: samples since those of the frame before, up to the last point; None where there is no IMU.
     """
 
     stamp: int
@@ -95,6 +121,7 @@ class Frame:
     index: int = 0
     problem: str | None = None
     guess: Guess | None = None
+    imu: Inertial | None = None
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 4:
@@ -246,6 +273,7 @@ class OdometryResult:
             the frame in which it was given up says how good.
         seconds: wall time of each stage.
         comparison: with another odometry, where there is one and the frame was registered.
+        imu: why the IMU was of no use, in words, empty where it was; None while there has been none.
     """
 
     stamp: int
@@ -259,3 +287,4 @@ class OdometryResult:
     breaks: int = 0
     seconds: dict[str, float] = field(default_factory=dict)
     comparison: Comparison | None = None
+    imu: str | None = None

@@ -146,6 +146,7 @@ class Result:
         ground_truth: LiDAR poses (N, 4, 4) of the frames, or a trajectory to be matched by stamp or number, or None.
         ground_truth_name: what it was read from.
         recorder: the odometry's pose of every frame.
+        imu: frames by why the IMU was of no use to them, "used" where it was; empty where there is none.
         frame_methods: of each frame, how it was registered, "failed" if it was not. frame_states: after each.
         seconds: wall time of each frame by stage.
         wall_s: of the whole run, reading included.
@@ -157,6 +158,7 @@ class Result:
     ground_truth: Array | Trajectory | None
     ground_truth_name: str
     recorder: TrajectoryRecorder = field(default_factory=TrajectoryRecorder)
+    imu: Counter[str] = field(default_factory=Counter)
     frame_methods: list[str] = field(default_factory=list)
     frame_states: list[str] = field(default_factory=list)
     seconds: dict[str, list[float]] = field(default_factory=dict)
@@ -172,6 +174,8 @@ class Result:
         self.recorder.add(tracked)
         self.frame_methods.append(tracked.registration.method if tracked.registration.ok else "failed")
         self.frame_states.append(str(tracked.state))
+        if tracked.imu is not None:
+            self.imu[tracked.imu or "used"] += 1
         for stage, time in tracked.seconds.items():
             self.seconds.setdefault(stage, []).append(time)
 
@@ -227,6 +231,7 @@ class Result:
             "answers": dict(self.methods),
             "states": dict(self.states),
             "breaks": self.recorder.breaks,
+            **({"imu": dict(self.imu)} if self.imu else {}),
             "stages_ms": {stage: _summary(times) for stage, times in stages.items()},
         }
 

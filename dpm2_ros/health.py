@@ -122,6 +122,8 @@ class Diagnostics:
         out = [self._odometry()]
         if camera := self._inputs.synchronizer.camera:
             out.append(self._camera(camera))
+        if self._inputs.imu_received:
+            out.append(self._imu())
         if self.other is not None:
             out.append(self._other_odometry(self.other))
         if self._mapper is None:
@@ -235,6 +237,15 @@ class Diagnostics:
         if not np.isnan(other.slip):
             figures |= {"its ways too long by (%)": f"{100 * other.slip:.1f}"}
         return self._status("other odometry", WARN if verdict else OK, text, figures)
+
+    def _imu(self) -> DiagnosticStatus:
+        inputs, last = self._inputs, self._health.last
+        problem = self._frames.imu_problem
+        if not problem and last is not None and last.imu:
+            problem, topic = last.imu, inputs.calibration.imu_topic
+            self._node.get_logger().warning(f"{topic}: {problem}; going on without the IMU", once=True)
+        text = f"{problem}; going on without" if problem else "in use"
+        return self._status("imu", WARN if problem else OK, text, {"received": inputs.imu_received})
 
     def _camera(self, camera: CameraState) -> DiagnosticStatus:
         figures = {"received": camera.received, "used": camera.matched, "late": camera.late}

@@ -15,9 +15,9 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from dpm2_core.data.bag_file import Bag
-from dpm2_core.data.bags import CAMERA_INFO, CLOUD, IMAGES
+from dpm2_core.data.bags import CAMERA_INFO, CLOUD, IMAGES, IMU
 from dpm2_core.data.messages import serialized_stamp, stamp_ns
-from dpm2_core.data.pairing import RawMessage, clouds_after_images, passed
+from dpm2_core.data.pairing import RawMessage, clouds_after_others, passed
 from dpm2_core.errors import Dpm2Error
 from dpm2_ros.runtime import STOP
 
@@ -75,9 +75,10 @@ class Lockstep:
                     publisher.publish(bytes(data))
 
     def order(self, messages: Iterable[RawMessage]) -> Iterator[RawMessage]:
-        """The same messages as `dpm2 run` takes them: a cloud after the images, if they have a subscriber."""
+        """The same messages as `dpm2 run` takes them: a cloud after images and IMU, if they have a subscriber."""
         listened = [topic for topic, publisher in self._publishers.items() if publisher.get_subscription_count()]
-        return clouds_after_images(messages, self._clouds, [t for t in listened if self._bag.types[t] in IMAGES])
+        others = {topic: 0 for topic in listened if self._bag.types[topic] in (*IMAGES, IMU)}
+        return clouds_after_others(messages, self._clouds, others)
 
     def turn(self, topic: str, data: bytes) -> None:
         """Before a message is published: wait, if it is a cloud, for the odometry of the one before.

@@ -111,7 +111,7 @@ class SlamNode(GuardedNode):
         reading = self._config.input.model_copy(update={"images": self._config.input.images and self._slam.uses_images})
         self._inputs = Inputs(self, reading, ros, self._known)
         self._known = self._inputs.calibration
-        self._frames = FrameBuilder(reading, self._known, self.get_logger().error)
+        self._frames = FrameBuilder(reading, self._known, self.get_logger().error, imu=self._inputs.imu)
         self._diagnostics = Diagnostics(self, self._inputs, self._frames, self._health, self._mapper, self._sender)
         self._diagnostics.other = self._other
         self._worker = threading.Thread(target=self._work, name="worker")
@@ -207,6 +207,8 @@ class SlamNode(GuardedNode):
             if self._mapper is not None:
                 self._mapper.restart()
         self._look_for_base(bundle.cloud.header.frame_id or "lidar")
+        x, y, z = self._base.T_start_lidar[2, :3].tolist()
+        self._frames.up = (x, y, z) if self._base.name else None  # what is up for the base is to be up in odom
         frame = self._frames.frame(bundle.stamp, bundle.cloud, bundle.image, self._index)
         tracked = self._tracked(frame)
         self._projection.show(frame, "" if bundle.image is None else bundle.image.header.frame_id)

@@ -14,12 +14,13 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, PointCloud2
 from std_msgs.msg import Float64
 
 from dpm2_core.data import topics
 from dpm2_core.data.frames import Calibration
 from dpm2_core.data.image_messages import decode_camera
+from dpm2_core.data.imu import ImuBuffer
 from dpm2_core.data.kitti import checked_correction
 from dpm2_core.data.livox import LIVOX, cloud_of_custom
 from dpm2_core.data.messages import stamp_ns
@@ -33,6 +34,7 @@ from dpm2_ros.settings import RosSettings
 from dpm2_ros.synchronizer import Bundle, StampCheck, Synchronizer
 from dpm2_ros.tf import TFMessage
 
+_IMU_DEPTH = 1000  # samples that may wait: those of a second
 _OTHER_FRAME = 2.0  # s without a cloud after which one in another frame begins another drive
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 """For timers that must go on when /clock stops at the end of a bag."""
@@ -55,7 +57,7 @@ class MatchedSubscription:
 
     def __init__(self, node: Node, kind: type, topic: str, callback: Callable[..., None], ros: RosSettings) -> None:
         self._node, self._kind, self._wanted, self._callback = node, kind, kind, callback
-        self._setting, self._depth = ros.reliability, ros.queue_depth
+        self._setting, self._depth = ros.reliability, _IMU_DEPTH if kind is Imu else ros.queue_depth
         self._given, self.topic = topic, node.resolve_topic_name(topic)
         self.reliability = ReliabilityPolicy.RELIABLE
         self._subscription: Any = None
@@ -109,9 +111,10 @@ class MatchedSubscription:
 
 
 class Inputs:
-    """Clouds, images and calibration as they come in. The callbacks only put them into the synchronizer's queue.
+    """Clouds, images, an IMU and calibration as they come in. The callbacks only put them into queues.
 
     Attributes:
+        imu: its samples; None where none is wanted. imu_received: messages so far.
         calibration: what is known by now; its topics are full names, after remapping.
     """
 
@@ -120,7 +123,11 @@ class Inputs:
         self._node = node
         points_topic, image_topic = settings.points_topic or topics.POINTS, settings.image_topic or topics.IMAGE
         image_name = node.resolve_topic_name(image_topic) if settings.images else ""
-        self.calibration = known or Calibration(node.resolve_topic_name(points_topic), image_name)
+        imu_topic = settings.imu_topic or topics.IMU.lstrip("/")
+        imu_name = node.resolve_topic_name(imu_topic) if settings.imu else ""
+        self.calibration = known or Calibration(node.resolve_topic_name(points_topic), image_name, imu_name)
+        self.imu = ImuBuffer() if settings.imu else None
+        self.imu_received = 0
         self._image_shift = round(settings.image_time_offset * 1e9)
         self._arrived = threading.Condition()
         self.synchronizer = Synchronizer(
@@ -142,6 +149,8 @@ class Inputs:
                 MatchedSubscription(node, image_type, image_topic, self._on_image, ros),
                 MatchedSubscription(node, CameraInfo, info_topic, self._on_camera_info, ros),
             ]
+        if settings.imu:
+            beside.append(MatchedSubscription(node, Imu, imu_topic, self._on_imu, ros))
         self._static_topic, self._static_messages = node.resolve_topic_name(topics.TF_STATIC), 0
         if TFMessage is not None:  # else extrinsics come from parameters alone
             node.create_subscription(TFMessage, topics.TF_STATIC, self._on_static, LATCHED)
@@ -241,6 +250,12 @@ class Inputs:
             stamp = self._stamp(message) + self._image_shift
             self.synchronizer.add_image(stamp, message, time.monotonic())
             self._arrived.notify()
+
+    def _on_imu(self, message: Imu) -> None:
+        check_header(message.header)
+        if self.imu is not None:
+            self.imu.add(self._stamp(message), message)
+            self.imu_received += 1
 
     def _stamp(self, message: Any) -> int:
         """ns; drivers that leave the stamp at 0 get the time of arrival."""

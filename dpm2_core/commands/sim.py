@@ -38,6 +38,9 @@ def sim(
     beams: Annotated[int, typer.Option(help="Of the LiDAR: 16, 32, 64 or 128.")] = 64,
     height: Annotated[float, typer.Option(help="Of the LiDAR above the ground, m.")] = 1.73,
     reach: Annotated[float, typer.Option("--range", help="Of the LiDAR, m.")] = 80.0,
+    imu: Annotated[
+        bool, typer.Option("--imu", help="With imu.txt, of an IMU at 100 Hz that errs as real ones.")
+    ] = False,
     workers: Annotated[int, typer.Option(min=1, help="Threads; they do not change the result.")] = 2,
 ) -> None:
     """Simulate a drive: scans, images, poses, point labels, scans without moving objects, and a map of the ground."""
@@ -45,7 +48,7 @@ def sim(
 
     lidar = {"pattern": pattern, "beams": beams, "height": height, "range": reach}
     tree = {"frames": frames, "seed": seed, "road": road, "preset": preset, "images": images, "traffic": traffic}
-    drive = settings_from(DriveConfig, {**tree, "lidar": lidar}, default="dpm2 sim")
+    drive = settings_from(DriveConfig, {**tree, "lidar": lidar, "imu": {} if imu else None}, default="dpm2 sim")
     if sensor == "real":
         drive = drive.model_copy(update={"lidar": real_sensor(drive.lidar)})
     console = Console(stderr=True)

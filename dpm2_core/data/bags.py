@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bag of ROS 2 or ROS 1 as a `Source`: clouds with the image nearest in time, calibration and ground truth."""
+"""A bag of ROS 2 or ROS 1 as a `Source`: clouds with the image nearest in time, IMU, calibration and ground truth."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from dpm2_core.data import topics
 from dpm2_core.data.bag_file import open_bag
 from dpm2_core.data.frames import Calibration, FrameBuilder
+from dpm2_core.data.imu import ImuBuffer
 from dpm2_core.data.kitti import checked_correction
 from dpm2_core.data.livox import LIVOX
-from dpm2_core.data.messages import serialized_stamp, stamp_ns
-from dpm2_core.data.pairing import Images, clouds_after_images
+from dpm2_core.data.messages import MessageError, serialized_stamp, stamp_ns
+from dpm2_core.data.pairing import Images, clouds_after_others
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.errors import UsageError
@@ -30,6 +31,7 @@ Stamps = NDArray[np.int64]
 CLOUD = "sensor_msgs/msg/PointCloud2"
 CLOUDS = (CLOUD, *LIVOX)
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+IMU = "sensor_msgs/msg/Imu"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 _TRUTH = ("nav_msgs/msg/Odometry", "nav_msgs/msg/Path")
 _TRUTH_GAP = 1_000_000_000  # ns between two true poses beyond which nothing is known in between
@@ -59,7 +61,10 @@ class BagSource:
         self.T_cam_lidar: Array | None = None
         if topics.GRAY_CAMERA in self.transforms.frames:
             self.T_cam_lidar = self.transforms.lookup(topics.GRAY_CAMERA, self.lidar_frame)
-        self._frames = FrameBuilder(self._settings, self._calibration, self.notes.append, self._bag.decode)
+        self.imu_topic = self._calibration.imu_topic = self._choose_imu()
+        self._imu, self._unsound, self._why_unsound = ImuBuffer(), 0, ""
+        imu = self._imu if self.imu_topic else None
+        self._frames = FrameBuilder(self._settings, self._calibration, self.notes.append, self._bag.decode, imu)
         self.vertical_angle_correction_deg = self._frames.angle_correction_deg
         self.image_topic = self._calibration.image_topic = self._choose_image()
         self.camera = self._camera() if self.image_topic else None
@@ -70,6 +75,8 @@ class BagSource:
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
         """Frames start..stop-1 as recorded, also where their stamps repeat or go back; `notes` says so."""
         before, without, count = None, 0, 0
+        self._imu.clear()
+        self._unsound = 0
         for index, (stamp, cloud, image) in enumerate(islice(self._pairs(), stop)):
             if index < start:
                 continue
@@ -80,6 +87,8 @@ class BagSource:
             if self._frames.time_problem:
                 self._note_once(f"{self.points_topic}: {self._frames.time_problem}", f"first at frame {index}")
             yield frame
+        if self._unsound:
+            self._note_once(f"{self.imu_topic}: {self._unsound} samples left out", f"the first: {self._why_unsound}")
         if self.camera and without:
             within = f"within {self._settings.image_tolerance} s"
             self._note_once(f"{without} of {count} frames have no image of {self.image_topic}", within)
@@ -135,6 +144,18 @@ class BagSource:
             return ""
         return topics.IMAGE if topics.IMAGE in found else "".join(found)
 
+    def _choose_imu(self) -> str:
+        """An IMU's topic, empty for none."""
+        asked, found = self._settings.imu_topic, self._bag.topics(IMU)
+        if not self._settings.imu:
+            return ""
+        if asked and asked not in found:
+            raise UsageError(f"{self.path}: no Imu messages on {asked}; {self._contents()}")
+        if not asked and len(found) > 1 and topics.IMU not in found:
+            self.notes.append(f"Imu topics {', '.join(found)}: none is used; choose one with input.imu_topic")
+            return ""
+        return asked or (topics.IMU if topics.IMU in found else "".join(found))
+
     def _camera(self) -> Camera | None:
         namespace = self.image_topic.removesuffix("/compressed").rpartition("/")[0]
         info_topic = self._settings.camera_info_topic or f"{namespace}/camera_info"
@@ -159,17 +180,28 @@ class BagSource:
         return None if message is None else checked_correction(float(message.data), f"{self.path}: {topic}")
 
     def _pairs(self) -> Iterator[tuple[int, bytes, bytes | None]]:
-        """(stamp, cloud, image or None), serialized."""
+        """(stamp, cloud, image or None), serialized; the IMU's samples before it are in the buffer then."""
         offset, images = round(self._settings.image_time_offset * 1e9), Images(self._settings.image_tolerance)
-        cameras = [self.image_topic] if self.camera else []
-        messages = self._bag.messages([self.points_topic, *cameras])
-        for topic, time, data in clouds_after_images(messages, [self.points_topic], cameras, offset):
+        others = {self.image_topic: offset} if self.camera else {}
+        if self.imu_topic:
+            others[self.imu_topic] = 0
+        messages = self._bag.messages([self.points_topic, *others])
+        for topic, time, data in clouds_after_others(messages, [self.points_topic], others):
             stamp = serialized_stamp(data, time)
             if topic == self.points_topic:
                 yield stamp, data, images.nearest(stamp)
                 images.forget(stamp)
+            elif topic == self.imu_topic:
+                self._add_imu(stamp, data)
             else:
                 images.add(stamp + offset, data)
+
+    def _add_imu(self, stamp: int, data: bytes) -> None:
+        try:
+            self._imu.add(stamp, self._bag.decode(self.imu_topic, data))
+        except MessageError as error:
+            self._why_unsound = str(error) if not self._unsound else self._why_unsound
+            self._unsound += 1
 
     def _truth(self, topic: str) -> tuple[Stamps, Array]:
         """Stamps (M,) ns and T_world_lidar (M, 4, 4); of several Path messages the last, the most complete, counts."""

@@ -100,8 +100,13 @@ class _KittiBag:
             self._put(topics.PATH, first, path, latched=True)
 
     def write(self, frame: Frame) -> None:
-        """Image first: who waits for the cloud then has it already."""
+        """IMU and image first: who waits for the cloud then has them already."""
         stamp = EPOCH_NS + frame.stamp
+        if frame.imu is not None:
+            R = self.source.R_lidar_imu  # back along its own axes
+            samples = zip(frame.imu.stamps.tolist(), frame.imu.rates @ R, frame.imu.forces @ R, strict=True)
+            for time, rates, forces in samples:
+                self._put(topics.IMU, EPOCH_NS + time, _imu(EPOCH_NS + time, rates, forces))
         if frame.problem:
             self.source.notes.append(f"{frame.problem}: written as an empty cloud")
         for image in frame.images:
@@ -156,6 +161,8 @@ def _static_frames(source: KittiSource) -> list[tuple[str, str, Array]]:
         frames.append((topics.LIDAR, topics.GRAY_CAMERA, se3.inverse(source.T_cam_lidar)))
     if source.camera is not None:
         frames.append((topics.LIDAR, topics.COLOR_CAMERA, source.camera.T_lidar_cam))
+    if source.imu is not None:
+        frames.append((topics.LIDAR, topics.IMU_LINK, se3.make(source.R_lidar_imu, np.zeros(3))))
     return frames
 
 
@@ -205,6 +212,17 @@ def _odometry(stamp: int, T: Array) -> Any:
         pose=_TYPES["geometry_msgs/msg/PoseWithCovariance"](pose=_pose(T), covariance=np.zeros(36)),
         twist=_TYPES["geometry_msgs/msg/TwistWithCovariance"](twist=twist, covariance=np.zeros(36)),
     )
+
+
+def _imu(stamp: int, rates: Array, forces: Array) -> Any:
+    vector, unknown = _TYPES["geometry_msgs/msg/Vector3"], np.zeros(9)  # covariances
+    no_orientation = np.array([-1.0, *np.zeros(8)])  # as REP-145 has it
+    return _TYPES["sensor_msgs/msg/Imu"](
+        header=_header(stamp, topics.IMU_LINK), orientation=_TYPES["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
+        orientation_covariance=no_orientation, angular_velocity=vector(*rates.tolist()),
+        angular_velocity_covariance=unknown, linear_acceleration=vector(*forces.tolist()),
+        linear_acceleration_covariance=unknown,
+    )  # fmt: skip
 
 
 def _image(stamp: int, pixels: np.ndarray) -> Any:

@@ -4,18 +4,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from dpm2_core.data.image_messages import decode_camera, decode_image, is_fisheye, rectified
+from dpm2_core.data.imu import ImuBuffer
 from dpm2_core.data.messages import MessageError, decode_points, why_untimed
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.transforms import TransformTree
 from dpm2_core.data.vertical_angle import HDL64_CORRECTION_DEG, correct_vertical_angle
 from dpm2_core.errors import UsageError, printable
-from dpm2_core.frame import Camera, Frame, Image
+from dpm2_core.frame import Array, Camera, Frame, Image, Inertial, Points
 
 _MOST_REPORTED = 20  # damaged data may be damaged in endless ways
 _LENGTH = 300  # characters of a problem, whatever is in the message
@@ -26,7 +27,7 @@ class Calibration:
     """What is known of the sensors: of a recording from the start, of topics as it comes in.
 
     Attributes:
-        points_topic, image_topic: full names; no image_topic where there are no images.
+        points_topic, image_topic, imu_topic: full names; empty where there is none.
         camera_info: sensor_msgs/CameraInfo; None as long as there is none.
         transforms: of /tf_static.
         angle_correction_deg: what the recording says of its vertical angles; None if it says nothing.
@@ -34,6 +35,7 @@ class Calibration:
 
     points_topic: str
     image_topic: str = ""
+    imu_topic: str = ""
     camera_info: Any = None
     transforms: TransformTree = field(default_factory=TransformTree)
     angle_correction_deg: float | None = None
@@ -47,8 +49,11 @@ class FrameBuilder:
         calibration: looked at anew for each frame.
         complain: called once with each different problem.
         decode: makes a message of a topic's bytes, or raises MessageError; the default takes messages as they are.
+        imu: where its samples come in; None where none is wanted.
 
     Attributes:
+        up: see `Inertial`.
+        imu_problem: why the last scan has no samples, or they cannot be used; empty if they can, or before the first.
         image_problem: why the last image could not be used; empty if it could, or if there was none.
         time_problem: why the last cloud cannot be de-skewed; empty if it can, or needs not.
     """
@@ -59,10 +64,13 @@ class FrameBuilder:
         calibration: Calibration,
         complain: Callable[[str], None],
         decode: Callable[[str, Any], Any] = lambda topic, message: message,
+        imu: ImuBuffer | None = None,
     ) -> None:
         self._settings, self._calibration, self._complain, self._decode = settings, calibration, complain, decode
         self._told: set[str] = set()
-        self.image_problem = self.time_problem = ""
+        self.image_problem = self.time_problem = self.imu_problem = ""
+        self._imu = imu
+        self.up: tuple[float, float, float] | None = (0.0, 0.0, 1.0)
 
     def frame(self, stamp: int, cloud: Any, image: Any | None, index: int) -> Frame:
         """A cloud with its stamp (ns), and its image, if it has one; an unreadable cloud comes with `problem` set."""
@@ -78,7 +86,9 @@ class FrameBuilder:
         )
         self.time_problem = f"{why_untimed(cloud)}: not de-skewed" if offset is None and expected else ""
         points = correct_vertical_angle(points, self.angle_correction_deg)
-        return Frame(stamp, points, offset, self._images(cloud.header.frame_id, image), index)
+        lidar_frame = cloud.header.frame_id
+        imu = None if self._imu is None else self._inertial(self._imu, lidar_frame, stamp, offset)
+        return Frame(stamp, points, offset, self._images(lidar_frame, image), index, imu=imu)
 
     def camera(self, lidar_frame: str, image_frame: str) -> Camera:
         """The camera by what is known now; `image_frame` counts where its CameraInfo names no frame.
@@ -106,6 +116,34 @@ class FrameBuilder:
             return requested
         usual = HDL64_CORRECTION_DEG if known.points_topic.startswith("/kitti/") else 0.0
         return usual if known.angle_correction_deg is None else known.angle_correction_deg
+
+    def _inertial(self, buffer: ImuBuffer, lidar_frame: str, stamp: int, offset: Points | None) -> Inertial | None:
+        """The samples up to the last point of a scan, along the LiDAR's axes."""
+        if buffer.last == -float("inf"):
+            return None
+        sweep = 0.0 if offset is None or not len(offset) else max(float(np.nanmax(offset)), 0.0)
+        found, topic = buffer.take(stamp, stamp + round(sweep * 1e9)), self._calibration.imu_topic
+        try:
+            if found is None:
+                raise UsageError("no samples at the time of the scan")
+            R = self._imu_rotation(lidar_frame, buffer.frame)
+        except UsageError as error:
+            self.imu_problem = self._tell(topic, error, "; going on without the IMU")
+            return None
+        self.imu_problem = ""
+        return replace(found, rates=found.rates @ R.T, forces=found.forces @ R.T, up=self.up)
+
+    def _imu_rotation(self, lidar_frame: str, imu_frame: str) -> Array:
+        """R_lidar_imu (3, 3)."""
+        R = self._settings.imu_rotation()
+        if R is not None:
+            return R
+        if lidar_frame.lstrip("/") == imu_frame.lstrip("/"):
+            return np.eye(3)
+        try:
+            return self._calibration.transforms.lookup(lidar_frame, imu_frame)[:3, :3]
+        except UsageError as error:
+            raise UsageError(f"{error}; set input.q_lidar_imu, or publish it on /tf_static") from None
 
     def _images(self, lidar_frame: str, message: Any | None) -> tuple[Image, ...]:
         if message is None:

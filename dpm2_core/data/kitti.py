@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The KITTI odometry layout: sequences/NN/{velodyne,image_2,calib.txt,times.txt} and poses/NN.txt.
+"""The KITTI odometry layout: sequences/NN/{velodyne,image_2,calib.txt,times.txt} and poses/NN.txt; with an IMU beside
+it imu.txt (a line for each sample: s, then rad/s and m/s2 along its axes) and Tr_imu_to_velo in calib.txt.
 
 A. Geiger, P. Lenz, R. Urtasun, "Are we ready for autonomous driving?", CVPR 2012.
 """
@@ -19,7 +20,7 @@ from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.text import parse_row, read_lines, read_numbers
 from dpm2_core.data.vertical_angle import HDL64_CORRECTION_DEG, correct_vertical_angle
 from dpm2_core.errors import UsageError
-from dpm2_core.frame import Array, Camera, Frame
+from dpm2_core.frame import Array, Camera, Frame, Inertial
 from dpm2_core.geometry import se3
 
 _MAX_CORRECTION_DEG = 5.0
@@ -66,13 +67,16 @@ class KittiSource:
         self.stamps = self._stamps()
         self.poses: Array | None = self._poses()
         self.camera = self._camera(calib)
+        self.imu, self.R_lidar_imu = self._imu(calib)
 
     def __len__(self) -> int:
         return len(self._scans)
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
         """Frames start..stop-1 by position; `Frame.index` is the number in the file name."""
+        before = None
         for scan, stamp in list(zip(self._scans, self.stamps, strict=True))[start:stop]:
+            imu, before = self._samples(before, int(stamp)), int(stamp)
             points, problem = read_scan(scan)
             points = scale_intensity(points, self._settings.intensity_max)  # KITTI's are in 0..1, not everyone's are
             yield Frame(
@@ -81,7 +85,31 @@ class KittiSource:
                 images=images_of(self._image_path(scan), self.camera, self.notes),
                 index=int(scan.stem),
                 problem=problem,
+                imu=imu,
             )
+
+    def _imu(self, calib: dict[str, Array]) -> tuple[Inertial | None, Array]:
+        """All samples along the IMU's axes, and R_lidar_imu (3, 3); no samples where there are none to use."""
+        path, R = self.path / "imu.txt", self._settings.imu_rotation()
+        rows = read_numbers(path, 7) if self._settings.imu else np.zeros((0, 7))
+        if R is None and "Tr_imu_to_velo" in calib:
+            R = calib["Tr_imu_to_velo"][:3, :3]
+        if len(rows) and R is None:
+            self.notes.append(f"{path} is left out: no Tr_imu_to_velo in calib.txt; set input.q_lidar_imu")
+        if not len(rows) or R is None:
+            return None, np.eye(3)
+        if (np.diff(rows[:, 0]) <= 0).any():
+            raise UsageError(f"{path}:{int(np.argmax(np.diff(rows[:, 0]) <= 0)) + 2}: times do not increase")
+        return Inertial(np.round(rows[:, 0] * 1e9).astype(np.int64), rows[:, 1:4], rows[:, 4:]), R
+
+    def _samples(self, before: int | None, stamp: int) -> Inertial | None:
+        """Those after the scan before (ns), of the first scan those of its last second, along the LiDAR's axes."""
+        s, R = self.imu, self.R_lidar_imu
+        if s is None:
+            return None
+        since = stamp - 10**9 if before is None else max(before, stamp - 10**9)
+        first, last = np.searchsorted(s.stamps, [since, stamp], "right")
+        return Inertial(s.stamps[first:last], s.rates[first:last] @ R.T, s.forces[first:last] @ R.T)
 
     def _correction(self) -> float:
         requested = self._settings.vertical_angle_correction_deg
@@ -173,7 +201,8 @@ class KittiSource:
 
 
 def read_calib(path: Path) -> dict[str, Array]:
-    """P0..P3 (3, 4) and Tr (4, 4, LiDAR to left gray camera), those that a calib.txt has; nothing if there is none.
+    """P0..P3 (3, 4), Tr (4, 4, LiDAR to left gray camera) and Tr_imu_to_velo (4, 4), those that a calib.txt has;
+    nothing if there is none.
 
     Raises:
         UsageError: a line is damaged; the message names it.
@@ -181,14 +210,14 @@ def read_calib(path: Path) -> dict[str, Array]:
     calib: dict[str, Array] = {}
     for number, line in enumerate(read_lines(path), 1):
         key, colon, text = line.partition(":")
-        if not colon or key.strip() not in ("P0", "P1", "P2", "P3", "Tr"):
+        if not colon or key.strip() not in ("P0", "P1", "P2", "P3", "Tr", "Tr_imu_to_velo"):
             continue  # raw and object calibrations have many more
         row, name = parse_row(text, 12, f"{path}:{number}: {key}"), key.strip()
         matrix = row.reshape(3, 4)
-        if name == "Tr":
+        if name.startswith("Tr"):
             R = matrix[:, :3]
             if np.abs(R @ R.T - np.eye(3)).max() > 0.01 or np.linalg.det(R) < 0:
-                raise UsageError(f"{path}:{number}: Tr is no rigid transform")
+                raise UsageError(f"{path}:{number}: {name} is no rigid transform")
             calib[name] = se3.from_rows(row)
         elif matrix[0, 0] <= 0 or matrix[1, 1] <= 0 or not np.allclose(matrix[2, :3], [0, 0, 1]):
             raise UsageError(f"{path}:{number}: {name} is no projection matrix of a rectified camera")

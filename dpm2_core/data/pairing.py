@@ -7,7 +7,7 @@ The cloud leads: every cloud leaves once, with the image nearest in time of thos
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Any
 
 from dpm2_core.data.messages import serialized_stamp
@@ -55,22 +55,22 @@ class Images:
             self._images.popleft()
 
 
-def passed(image: float, cloud: int) -> bool:
-    """Whether a camera whose last image has that stamp (ns) has none to come that is nearer to the cloud's (ns)."""
-    return cloud <= image < cloud + JUMP
+def passed(last: float, cloud: int) -> bool:
+    """Whether a sensor whose last message has that stamp (ns) has none to come that is nearer to the cloud's (ns)."""
+    return cloud <= last < cloud + JUMP
 
 
-def clouds_after_images(
-    messages: Iterable[RawMessage], clouds: Collection[str], images: Collection[str], offset: int = 0
+def clouds_after_others(
+    messages: Iterable[RawMessage], clouds: Collection[str], others: Mapping[str, int]
 ) -> Iterator[RawMessage]:
-    """The messages of a recording, each cloud held back until every camera has passed it, or it has waited too long.
+    """The messages of a recording, each cloud held back until every other sensor has passed it, or it has waited too
+    long.
 
     Args:
         messages: in recorded order.
-        clouds, images: topics.
-        offset: ns, added to the stamps of images.
+        clouds: topics. others: topics of cameras and an IMU, with what is added to their stamps, ns.
     """
-    latest = dict.fromkeys(images, -float("inf"))
+    latest = dict.fromkeys(others, -float("inf"))
     waiting: deque[tuple[int, RawMessage]] = deque()  # with their stamps
     for message in messages:
         topic, time, data = message
@@ -79,9 +79,9 @@ def clouds_after_images(
         else:
             yield message
         if topic in latest:
-            latest[topic] = serialized_stamp(data, time) + offset
+            latest[topic] = serialized_stamp(data, time) + others[topic]
         while waiting and (
-            time - waiting[0][1][1] >= LATE or all(passed(image, waiting[0][0]) for image in latest.values())
+            time - waiting[0][1][1] >= LATE or all(passed(last, waiting[0][0]) for last in latest.values())
         ):
             yield waiting.popleft()[1]
     yield from (message for _, message in waiting)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import AfterValidator, Field
 from scipy.spatial.transform import Rotation
 
@@ -16,10 +17,10 @@ from dpm2_core.geometry import se3
 Place = tuple[float, float, float, float, float, float, float]
 
 
-def _unit(place: Place) -> Place:
-    if abs(sum(q * q for q in place[3:]) - 1) > 0.01:
+def _unit_quaternion(numbers: tuple[float, ...]) -> tuple[float, ...]:
+    if abs(sum(q * q for q in numbers[-4:]) - 1) > 0.01:
         raise ValueError("qx, qy, qz, qw are no unit quaternion")
-    return place
+    return numbers
 
 
 class InputSettings(Settings):
@@ -49,7 +50,7 @@ class InputSettings(Settings):
     camera_info_topic: str = ""
     """CameraInfo topic of that image; empty takes the camera_info beside it."""
 
-    T_lidar_cam: Annotated[Place, AfterValidator(_unit)] | None = None
+    T_lidar_cam: Annotated[Place, AfterValidator(_unit_quaternion)] | None = None
     """Pose of the camera's optical frame in the LiDAR frame, [x, y, z (m), qx, qy, qz, qw]; null asks /tf_static."""
 
     image_tolerance: Annotated[float, Field(gt=0, le=10)] = 0.05
@@ -57,6 +58,15 @@ class InputSettings(Settings):
 
     image_time_offset: Annotated[float, Field(ge=-10, le=10)] = 0.0
     """Added to the stamps of images before they are compared with those of clouds, s."""
+
+    imu: bool = True
+    """Use the IMU where there is one."""
+
+    imu_topic: str = ""
+    """Imu topic; empty takes /imu (as a ROS name `imu`, to remap), else the only one of a bag."""
+
+    q_lidar_imu: Annotated[tuple[float, float, float, float], AfterValidator(_unit_quaternion)] | None = None
+    """Rotation of the IMU's frame in the LiDAR's, [qx, qy, qz, qw]; null asks /tf_static."""
 
     time_field: str | None = None
     """PointCloud2 field with the time of each point; null looks for a usual name (t, time_offset_ns, ...), "": none."""
@@ -78,3 +88,7 @@ class InputSettings(Settings):
         """T_lidar_cam as (4, 4); None if it is not set here."""
         place = self.T_lidar_cam
         return None if place is None else se3.make(Rotation.from_quat(place[3:]).as_matrix(), place[:3])
+
+    def imu_rotation(self) -> Array | None:
+        """R_lidar_imu (3, 3); None if it is not set here."""
+        return None if self.q_lidar_imu is None else np.asarray(Rotation.from_quat(self.q_lidar_imu).as_matrix())

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.geometry import se3
 from dpm2_core.sim.camera import calibration, render
+from dpm2_core.sim.imu import Imu
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.road import FRAME_PERIOD, ROAD_KINDS, make_road, read_drive
 from dpm2_core.sim.settings import DriveConfig, LidarConfig
@@ -32,7 +33,7 @@ OVERLAP = 16.0
 """How far a closed drive goes on beyond its start, m."""
 LONGEST_LAP = 800.0
 """A longer drive goes round again, m."""
-_LIDAR_STREAM, _CAMERA_STREAM = 10, 11
+_LIDAR_STREAM, _CAMERA_STREAM, _IMU_STREAM = 10, 11, 14
 
 
 def simulate(
@@ -106,6 +107,8 @@ def _recipe(drive: DriveConfig) -> dict[str, Any]:
             del recipe["camera"][name]
     if drive.traffic == 1:
         del recipe["traffic"]
+    if drive.imu is None:
+        del recipe["imu"]
     return recipe
 
 
@@ -161,6 +164,7 @@ class _Drive:
 
     def __init__(self, world: World, drive: DriveConfig) -> None:
         self.world, self.lidar, self.camera = world, Lidar(drive.lidar), drive.camera if drive.images else None
+        self.imu = None if drive.imu is None else Imu(drive.imu, np.random.default_rng([world.seed, _IMU_STREAM]))
         self.times = np.arange(_frames(drive)) * FRAME_PERIOD
         height, sway = drive.lidar.height, drive.lidar.real.sway
         self.T_world_level = np.stack([world.drive_pose(t, height, sway) for t in self.times])
@@ -180,6 +184,8 @@ class _Drive:
             (sequence / name).mkdir(parents=True)
         self._write_texts(root, sequence)
         self._write_ground(sequence / "ground.npz")
+        if self.imu is not None:
+            self._write_imu(self.imu, sequence / "imu.txt")
         pool = ThreadPoolExecutor(max(1, workers))
         try:
             for done, _ in enumerate(pool.map(lambda i: self._write_frame(sequence, i), range(len(self.times))), 1):
@@ -213,7 +219,21 @@ class _Drive:
             P = np.concatenate([self.K, self.K @ [[left], [0], [0]]], 1)
             calib.write(f"P{k}: " + " ".join(f"{v:.12e}" for v in P.ravel()) + "\n")
         calib.write("Tr: " + " ".join(f"{v:.12e}" for v in se3.inverse(self.T_lidar_cam0)[:3].ravel()) + "\n")
+        if self.imu is not None:
+            T_lidar_imu = se3.make(self.imu.R_lidar_imu, np.zeros(3))
+            calib.write("Tr_imu_to_velo: " + " ".join(f"{v:.12e}" for v in T_lidar_imu[:3].ravel()) + "\n")
         (sequence / "calib.txt").write_text(calib.getvalue(), encoding="utf-8")
+
+    def _write_imu(self, imu: Imu, path: Path) -> None:
+        """A line for each sample, from before the first scan to after the last: s, then rad/s and m/s2 of its axes."""
+        world, lidar = self.world, self.lidar
+        height, sway = lidar.config.height, lidar.config.real.sway
+
+        def poses(times: Array) -> Array:
+            return np.stack([world.drive_pose(float(t), height, sway) for t in times]) @ lidar.T_level_lidar
+
+        times = imu.times(-FRAME_PERIOD, self.times[-1] + FRAME_PERIOD)
+        np.savetxt(path, np.column_stack([times, *imu.measure(times, poses)]), "%.9e")
 
     def _write_ground(self, path: Path) -> None:
         """Height of the ground, kerbs included, NaN where unknown; T_grid_cam0 is the first pose in its frame."""

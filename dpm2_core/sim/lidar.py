@@ -74,8 +74,9 @@ class Lidar:
 
         Args:
             time: s, where the dynamic objects are. They stand still during the turn.
-            twist: (6,) [rad/s, m/s] of the sensor in its own frame during the turn: each point is then given in the
-                frame of its own moment, as a driver delivers it. None: already corrected for motion, as KITTI's are.
+            twist: (6,) [rad/s, m/s] of the sensor in its own frame during the turn, or its poses (columns, 4, 4)
+                T_stamp_column at the times of the columns: each point is then given in the frame of its own moment, as
+                a driver delivers it. None: already corrected for motion, as KITTI's are.
             believed: (6,) twist by which the points of a turn in motion are then taken to the stamp.
         """
         aim = self.beams.directions(time)
@@ -143,7 +144,9 @@ class Lidar:
             directions = rotated(aim, T_world_lidar[:3, :3])
             origin = T_world_lidar[:3, 3].astype(np.float32)
             return origin + height * T_world_lidar[:3, 2].astype(np.float32), directions
-        T = T_world_lidar @ se3.exp(np.asarray(twist) * self.beams.column_time[:, None].astype(float))
+        motion = np.asarray(twist)
+        T_stamp_column = se3.exp(motion * self.beams.column_time[:, None].astype(float)) if motion.ndim == 1 else motion
+        T = T_world_lidar @ T_stamp_column
         R = T[:, :3, :3].astype(np.float32)[self.beams.column]
         directions = np.einsum("nij,nj->ni", R, aim)
         return T[:, :3, 3].astype(np.float32)[self.beams.column] + height * R[:, :, 2], directions

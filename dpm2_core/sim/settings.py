@@ -90,6 +90,27 @@ HDL64E = LidarConfig(
 not hide: how far down a beam looks depends on what it meets."""
 
 
+class ImuConfig(Settings):
+    """An IMU in the LiDAR's housing, by default as the MEMS ones there are. Its errors are standard deviations."""
+
+    rate: float = Field(default=100.0, ge=10, le=2000)
+    """Samples per second; each is the mean over two periods, as its low-pass filter makes it."""
+    gyro_noise: float = Field(default=0.002, ge=0)
+    """Of a sample, rad/s."""
+    gyro_bias: float = Field(default=0.01, ge=0)
+    """Of the sensor, rad/s; it drifts by a hundredth of that in a second."""
+    acceleration_noise: float = Field(default=0.03, ge=0)
+    """Of a sample, m/s2."""
+    acceleration_bias: float = Field(default=0.05, ge=0)
+    """Of the sensor, m/s2."""
+    scale: float = Field(default=0.005, ge=0)
+    """Of each axis, as a fraction."""
+    misaligned: float = Field(default=0.3, ge=0)
+    """Of the mount from what the calibration says, deg about each axis."""
+    yaw: float = Field(default=90.0, ge=-180, le=180)
+    """Of the mount, deg to the left."""
+
+
 class CameraConfig(Settings):
     """A forward-looking rectified color camera, 0.27 m ahead of and 0.08 m below the LiDAR."""
 
@@ -127,6 +148,8 @@ class DriveConfig(Settings):
     """Times that of the preset; see `with_traffic`."""
     lidar: LidarConfig = LidarConfig()
     camera: CameraConfig = CameraConfig()
+    imu: ImuConfig | None = None
+    """None: there is none."""
 
 
 class Preset(Settings):

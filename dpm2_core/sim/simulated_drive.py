@@ -1,19 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A drive through the synthetic city as a source of frames that are simulated when they are asked for: no disk."""
+"""Drives through synthetic worlds as sources of frames that are simulated when they are asked for: no disk."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from dpm2_core.data.prefetch import prefetch
-from dpm2_core.frame import Array, Frame
+from dpm2_core.frame import Array, Frame, Inertial
+from dpm2_core.geometry import se3
+from dpm2_core.sim.imu import Imu
 from dpm2_core.sim.lidar import Lidar
-from dpm2_core.sim.settings import LidarConfig, PresetName
-from dpm2_core.sim.world import build_world
+from dpm2_core.sim.road import Road
+from dpm2_core.sim.settings import ImuConfig, LidarConfig, PresetName
+from dpm2_core.sim.world import World, build_world
 
-_STREAM = 12  # of random numbers, beside those of the other parts of a world
+_STREAM, _IMU_STREAM = 12, 13  # of random numbers, beside those of the other parts of a world
+_STEP = 0.01  # s between two poses of a robot; evenly in between
+_FASTEST = np.radians(100.0)  # rad/s
+_RAMP = 0.25  # s in which it begins to turn
 
 
 class SimulatedDrive:
@@ -58,3 +66,109 @@ class SimulatedDrive:
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
         """Frames start..stop-1, simulated ahead in another thread."""
         return prefetch(map(self.frame, range(len(self))[start:stop]))
+
+
+class TurningRobot:
+    """A `data.source.Source`: a robot that drives along a road and turns fast. Scans are as a driver delivers them,
+    with the time of each point, from poses that change within a sweep; an IMU measures beside.
+
+    Attributes:
+        T_world_lidar: (N, 4, 4) at the stamps, in the middle of the sweeps.
+    """
+
+    T_cam_lidar = None
+    truth = "simulation"
+    PERIOD = 0.1
+    """s between two scans."""
+
+    def __init__(
+        self,
+        world: World,
+        frames: int,
+        speed: float,
+        lidar: LidarConfig,
+        imu: ImuConfig | None = None,
+        swings: float = 0.0,
+    ) -> None:
+        """Stands for 1 s, then drives at up to `speed` m/s, slower in curves: no turn is faster than 100 deg/s.
+
+        Args:
+            swings: deg, by which it also turns to either side now and then while it drives; 0: not.
+        """
+        self.name, self.notes, self._count = f"{world.preset} {world.seed}", list[str](), frames
+        rng = np.random.default_rng([world.seed, _IMU_STREAM])
+        end = frames * self.PERIOD + 1
+        self._world = replace(world, road=_robot_progress(world.road, end, speed, swings, rng))
+        self._lidar = Lidar(lidar)
+        at = np.arange(0.0, end, _STEP)
+        self._T = np.stack([self._world.drive_pose(t, lidar.height, float(_moving(t))) for t in at])
+        self.T_world_lidar: Array = self.pose(self._time(np.arange(frames)))
+        self._imu = None if imu is None else Imu(imu, rng)
+        if self._imu is not None:
+            times = self._imu.times(0.1, end - 0.1)
+            self._rates, self._forces = (a @ self._imu.R_lidar_imu.T for a in self._imu.measure(times, self.pose))
+            self._stamps = np.round(times * 1e9).astype(np.int64)
+
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def poses(self) -> Array:
+        """(N, 4, 4) T_world_lidar, exact."""
+        return self.T_world_lidar
+
+    def pose(self, times: Array) -> Array:
+        """T_world_lidar (M, 4, 4) at times (M,) s."""
+        k = np.floor(times / _STEP).astype(int)
+        part = (times / _STEP - k)[:, None]
+        return np.asarray(self._T[k] @ se3.exp(part * se3.log(se3.inverse(self._T[k]) @ self._T[k + 1])))
+
+    def frame(self, i: int) -> Frame:
+        """Frame i, the same whenever it is asked for; its samples are those since the sweep before."""
+        time, T, offsets = float(self._time(i)), self.T_world_lidar[i], self._lidar.beams.column_time.astype(float)
+        turning = se3.inverse(T) @ self.pose(time + offsets)
+        rng = np.random.default_rng([self._world.seed, _STREAM, i])
+        scan = self._lidar.scan(self._world, T, time, rng, turning)
+        stamp, imu = round(time * 1e9), None
+        if self._imu is not None:
+            end = time + float(offsets.max())
+            first, last = np.searchsorted(
+                self._stamps, [round((end - (self.PERIOD if i else 1)) * 1e9), round(end * 1e9)]
+            )
+            imu = Inertial(self._stamps[first:last], self._rates[first:last], self._forces[first:last])
+        return Frame(stamp, scan.points, scan.time_offset, index=i, imu=imu)
+
+    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
+        """Frames start..stop-1, simulated ahead in another thread."""
+        return prefetch(map(self.frame, range(len(self))[start:stop]))
+
+    def _time(self, i: ArrayLike) -> Array:
+        return 0.5 + np.asarray(i) * self.PERIOD
+
+
+def _moving(time: ArrayLike) -> Array:
+    """0 while it stands, 1 from when it has begun to drive, at times s."""
+    return np.clip((np.asarray(time) - 1.5) / 1.0, 0, 1)
+
+
+def _robot_progress(road: Road, end: float, speed: float, swings: float, rng: np.random.Generator) -> Road:
+    """The road with the progress and the heading of a robot that drives for `end` s."""
+    times = np.arange(0.0, end + 1, _STEP)
+    s, curvature = road.drive.s, np.abs(np.diff(road.drive.yaw) / np.diff(road.drive.s))
+    paces = np.minimum(speed, _FASTEST / np.maximum(curvature, 1e-3))
+    travelled = np.zeros(len(times))
+    for k in range(1, len(times)):
+        segment = int(np.searchsorted(s, travelled[k - 1] % road.drive.length, "right")) - 1
+        pace = paces[min(segment, len(paces) - 1)]
+        travelled[k] = travelled[k - 1] + _STEP * pace * float(_moving(times[k]))
+    rate, k, side = np.zeros(len(times)), round(2.5 / _STEP), 1
+    while swings and k < len(times):
+        turn = np.radians(swings) * rng.uniform(0.5, 1)
+        ramp, steady = round(_RAMP / _STEP), max(round((turn / _FASTEST - _RAMP) / _STEP), 1)
+        shape = np.concatenate([np.linspace(0, 1, ramp), np.ones(steady), np.linspace(1, 0, ramp)]) * _FASTEST
+        for sign in (side, -side):  # there and back
+            part = rate[k : k + len(shape)]
+            part += sign * shape[: len(part)]
+            k += len(shape) + round(rng.uniform(0.2, 1.0) / _STEP)
+        side = -side
+    return replace(road, times=times, travelled=travelled, slip=np.cumsum(rate) * _STEP)

@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from pydantic import model_validator
@@ -12,6 +14,7 @@ from dpm2_core.config import Settings
 from dpm2_core.descriptors import Descriptors, LazyDescriptors
 from dpm2_core.frame import Array, Frame, Image, Points
 from dpm2_core.geometry.deskew import deskew
+from dpm2_core.geometry.turning import turned
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.slam.filters import PointFilter
 
@@ -28,7 +31,8 @@ class PreprocessSettings(Settings):
     source_voxel: float = 0.8
     """Spacing of the points that are registered, m; at least `map_voxel`."""
     deskew: bool = True
-    """Undo the motion during a sweep, at constant velocity; only scans with a time per point can be."""
+    """Undo the motion during a sweep, at constant velocity, its rotation as an IMU measured it where there is one; only
+    scans with a time per point can be."""
 
     @model_validator(mode="after")
     def _ordered(self) -> PreprocessSettings:
@@ -80,7 +84,7 @@ class Preprocessor:
         used = (squared >= s.min_range**2) & (squared <= s.max_range**2) & (squared > 0)  # False for NaN
         points = frame.points[used]
         if s.deskew and frame.time_offset is not None:
-            points = deskew(points, frame.time_offset[used], twist)
+            points = deskew(points, frame.time_offset[used], twist, _turn(frame))
         return points if self._filter is None else self._filter(points)
 
     def prepare(self, frame: Frame, twist: Array) -> Scan:
@@ -89,3 +93,9 @@ class Preprocessor:
         cloud = points[voxel_first(points, self._settings.map_voxel)]
         source = cloud[voxel_first(cloud, self._settings.source_voxel), :3].astype(np.float64)
         return Scan(points, cloud, source)
+
+
+def _turn(frame: Frame) -> Callable[[Array], Array | None] | None:
+    """How the LiDAR turned around the stamp, for `deskew`; None without an IMU."""
+    imu = frame.imu
+    return None if imu is None else partial(turned, (imu.stamps - frame.stamp) * 1e-9, imu.rates)

@@ -5,13 +5,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from dpm2_core.frame import Array, Frame, Points
+from dpm2_core.frame import Array, Frame, Inertial, Points
 from dpm2_core.geometry import se3
+from dpm2_core.sim.imu import Imu
+from dpm2_core.sim.settings import ImuConfig
 
 _AZIMUTH, _ELEVATION = np.meshgrid(np.radians(np.arange(0, 360, 0.8)), np.radians(np.arange(-15, 16, 2.0)))
 RAYS = np.stack(
     [np.cos(_ELEVATION) * np.cos(_AZIMUTH), np.cos(_ELEVATION) * np.sin(_AZIMUTH), np.sin(_ELEVATION)], -1
 ).reshape(-1, 3)
+
+
+REACH = 90.0
 
 
 def boxes(low: tuple[float, float], high: tuple[float, float], count: int, size: Array, seed: int = 0) -> Array:
@@ -24,16 +29,26 @@ def boxes(low: tuple[float, float], high: tuple[float, float], count: int, size:
 
 
 def scan(T: Array, hull: Array, things: Array, seed: int) -> Points:
-    """(N, 4) from a pose T_world_lidar (4, 4) within a hull (2, 3) with things (K, 2, 3) in it; 1 cm of noise."""
-    origin, rays = T[:3, 3], RAYS @ T[:3, :3].T
+    """(N, 4) from a pose T_world_lidar (4, 4), or one for each ray, within a hull (2, 3) with things (K, 2, 3) in it;
+    1 cm of noise."""
+    return _measured(_distances(T, hull, things), seed)
+
+
+def _distances(T: Array, hull: Array, things: Array) -> Array:
+    """Of each ray."""
+    origin, rays = T[..., :3, 3], np.einsum("...ij,...j->...i", T[..., :3, :3], RAYS)
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = np.fmax((hull[0] - origin) / rays, (hull[1] - origin) / rays).min(1)
         for low, high in things:
             near, far = np.sort(np.stack([(low - origin) / rays, (high - origin) / rays]), 0)
             entry = near.max(1)
             distance = np.where((entry < far.min(1)) & (entry > 0), np.minimum(distance, entry), distance)
+    return np.asarray(distance)
+
+
+def _measured(distance: Array, seed: int) -> Points:
     rng = np.random.default_rng(seed)
-    seen = distance < 90
+    seen = distance < REACH
     points = np.full((int(seen.sum()), 4), 0.5, np.float32)
     points[:, :3] = RAYS[seen] * (distance[seen] + rng.normal(0, 0.01, int(seen.sum())))[:, None]
     return points
@@ -49,6 +64,31 @@ def frames(poses: Array, street: bool = False, start: int = 0) -> list[Frame]:
     """At 10 Hz, from the `start`-th on."""
     hull, things = (STREET, HOUSES) if street else (ROOM, FURNITURE)
     return [Frame((start + i) * 10**8, scan(T, hull, things, start + i), index=start + i) for i, T in enumerate(poses)]
+
+
+def turning(count: int) -> tuple[list[Frame], Array]:
+    """Frames of a robot in the street and their (count, 4, 4) true poses: it stands for 1 s, then drives at 1.5 m/s and
+    swings at up to 100 deg/s, the LiDAR tilted by 0.1 rad. Points have times; an IMU errs as real ones do."""
+    since = lambda t: np.maximum(t - 1.5, 0)  # noqa: E731
+
+    def poses(t: Array) -> Array:
+        swing = 0.55 * np.sin(np.pi * since(t)) * np.minimum(since(t), 1)
+        twists = np.stack([0 * t, 0 * t, swing, 0 * t, 0 * t, 0 * t], -1)
+        place = np.stack([1.5 * np.maximum(since(t) - 0.5, 0), 0 * t, 0 * t + 1.5], -1)
+        return se3.make(np.eye(3), place) @ se3.exp(twists) @ se3.exp([0, 0.1, 0, 0, 0, 0])
+
+    imu, stamps = Imu(ImuConfig(), np.random.default_rng(5)), 0.5 + 0.1 * np.arange(count)
+    times = imu.times(0, stamps[-1] + 0.1)
+    rates, forces = (measured @ imu.R_lidar_imu.T for measured in imu.measure(times, poses))
+    offset = (_AZIMUTH.ravel() / (2 * np.pi) - 0.5) * 0.1
+    frames = []
+    for i, stamp in enumerate(stamps):
+        distance = _distances(poses(stamp + offset), STREET, HOUSES)
+        used = (times <= stamp + 0.05) & (times > (stamp - 0.05 if i else 0))
+        samples = Inertial(np.round(times[used] * 1e9).astype(np.int64), rates[used], forces[used])
+        when = offset[distance < REACH].astype(np.float32)
+        frames.append(Frame(round(stamp * 1e9), _measured(distance, i), when, index=i, imu=samples))
+    return frames, poses(stamps)
 
 
 def walk(count: int) -> Array:

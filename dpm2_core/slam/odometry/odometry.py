@@ -15,6 +15,7 @@ from dpm2_core.frame import Array, Frame, OdometryResult, Registration, State
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.motion import OPEN, combined, covariance, predicted, spread
 from dpm2_core.slam.bridge import Bridge, Limits
+from dpm2_core.slam.odometry.inertial import InertialMotion
 from dpm2_core.slam.odometry.keyframe_selection import KeyframeSelector
 from dpm2_core.slam.odometry.other import OtherMotion, Step
 from dpm2_core.slam.preprocess import Scan
@@ -97,6 +98,7 @@ class Odometry:
         self._breaks = 0
         self._other: OtherMotion | None = None  # since a frame came with a guess
         self._led = False  # by another odometry to the pose of this frame
+        self._inertial: InertialMotion | None = None  # since a frame came with samples of an IMU
         self._registration.clear()
         self._keyframes.reset()
 
@@ -106,6 +108,7 @@ class Odometry:
         self._T, self._twist, self._of_velocity = before._T, before._twist, before._of_velocity
         self._covariance, self._stamp, self._registered = before._covariance, before._stamp, before._registered
         self._clock, self._breaks, self._other = before._clock, before._breaks, before._other
+        self._inertial = before._inertial
         self._periods.extend(before._periods)
         self._keyframes.take_over(before._keyframes)
         twist = np.zeros(6) if self._twist is None else self._twist
@@ -117,14 +120,20 @@ class Odometry:
         dt = self._elapsed(frame.stamp)
         twist = np.zeros(6) if self._twist is None else self._twist
         seconds = self._registered[1] + dt
+        if frame.imu is not None and self._inertial is None:
+            self._inertial = InertialMotion(not len(self._registration) and self._bridge is None)
+        if self._inertial is not None:
+            frame = self._inertial.look(frame)
+            twist = self._turned(twist, seconds)
         if frame.guess is not None and self._other is None:
             self._other = OtherMotion()
         if self._other is not None:
-            self._other.look(frame.guess, self._twist, seconds, self._of_prediction(seconds))
+            known = None if self._twist is None else twist
+            self._other.look(frame.guess, known, seconds, self._of_prediction(seconds))
         scan = self._registration.prepare(frame, twist)
         clock.append(perf_counter())
         pauses = frame.problem is None and self._pauses(dt) and not self._registration.rejection(scan)
-        T_predicted = self._begin_stretch(dt) if pauses else predicted(self._T, twist, dt)
+        T_predicted = self._begin_stretch(dt) if pauses else self._predicted(twist, dt)
         registration = self._register(scan, T_predicted, dt, frame.problem)
         if self._first is not None and registration.ok:
             scan, registration = self._begin_again(self._first, frame, registration, dt)
@@ -136,6 +145,8 @@ class Odometry:
         if self._bridge is not None and registration.ok:
             registration = self._cross(self._bridge, scan, registration)
             T = registration.T_target_source
+        if self._inertial is not None:
+            T = self._inertial.T_level_odom @ T
         keyframe = self._keyframes.select(frame, scan, T, registration)
         clock.append(perf_counter())
         return OdometryResult(
@@ -150,7 +161,21 @@ class Odometry:
             breaks=self._breaks,
             seconds=dict(zip(("preprocess", "register", "update"), np.diff(clock).tolist(), strict=True)),
             comparison=None if self._other is None else self._other.comparison,
+            imu=None if self._inertial is None else self._inertial.problem,
         )
+
+    def _turned(self, twist: Array, seconds: float) -> Array:
+        """A twist (6,) with the turn since the last registered frame as it was measured, where it was."""
+        if self._inertial is None or self._inertial.turn is None:
+            return twist
+        R = se3.make(self._inertial.turn, np.zeros(3))
+        return np.concatenate([se3.log(R)[:3] / seconds, twist[3:]])
+
+    def _predicted(self, twist: Array, dt: float) -> Array:
+        """Pose (4, 4) of a frame, `dt` s after the one before, with a measured turn from the last registered one."""
+        if self._inertial is None or self._inertial.turn is None:
+            return predicted(self._T, twist, dt)
+        return predicted(self._registered[0], twist, self._registered[1] + dt)
 
     def _elapsed(self, stamp: int) -> float:
         """Seconds since the frame before; stamps that repeat or jump back count as one nominal period."""
@@ -190,7 +215,7 @@ class Odometry:
         if certain:
             self._bridge, self._registration = None, bridge.registration
             self._failures = 0
-            self._follow(scan, result)
+            self._follow(scan, result, None)
             return result
         self._covariance = bridge.covariance(self._T) + own.covariance
         if bridge.tries >= self._settings.restart_after and self._twist is not None:
@@ -220,6 +245,10 @@ class Odometry:
         information = np.linalg.inv(self._of_prediction(seconds)).astype(np.float64)
         result = self._registration.register(scan, Prediction([T_predicted], widen, information))
         result = self._gated(result, T_predicted, dt)
+        if not result.ok and self._inertial is not None and self._inertial.turn is not None:
+            T = predicted(self._registered[0], self._twist, seconds)  # should the IMU be wrong
+            steady = self._gated(self._registration.register(scan, Prediction([T], widen)), T, dt)
+            result = steady if steady.ok else result
         if result.ok or not self._settings.turns:
             return result
         starts = [T_predicted @ se3.exp([0, 0, yaw, 0, 0, 0]) for yaw in self._headings()]
@@ -301,12 +330,15 @@ class Odometry:
                 self._other.compare(T_step, registration.of_scene, self._led)
         if self._bridge is None:
             self._failures = 0
-        self._follow(scan, registration)
+        self._follow(scan, registration, None if registration.method == "first" else self._twist)
         if registration.method != "first" and registration.worst_sigma >= OPEN:
             self._covariance[3:, 3:] += of_motion  # what the scene leaves open ends at 1 m; the motion does not
 
-    def _follow(self, scan: Scan, registration: Registration) -> None:
-        self._T = registration.T_target_source
+    def _follow(self, scan: Scan, registration: Registration, twist: Array | None) -> None:
+        """Go on from a registered pose; `twist` (6,): the motion that led there, None where none did."""
+        T_before, self._T = self._registered[0], registration.T_target_source
+        if self._inertial is not None and self._stamp is not None:
+            self._inertial.registered(T_before, self._T, self._stamp, twist)
         self._registered = self._T, 0.0
         if self._other is not None:
             self._other.keep()
@@ -324,13 +356,16 @@ class Odometry:
         if (step := self._step_of_other()) is not None:
             self._T, self._covariance = T_registered @ step.T, step.covariance
         elif self._twist is not None:
-            self._T = predicted(T_registered, self._twist, seconds + dt)
+            self._T = predicted(T_registered, self._turned(self._twist, seconds + dt), seconds + dt)
         if self._bridge is not None:
             self._covariance = self._covariance + self._bridge.covariance(self._T)
 
     def _of_prediction(self, seconds: float) -> Array:
         """Covariance (6, 6) [rad, m] of a pose that is predicted from one that was registered so long before."""
-        return spread(self._settings.steadiness * seconds * seconds, seconds, self._of_velocity)
+        result = spread(self._settings.steadiness * seconds * seconds, seconds, self._of_velocity)
+        if self._inertial is not None and self._inertial.turn is not None:
+            result[:3, :3] = self._inertial.covariance(seconds)
+        return result
 
     def _unknown(self, dt: float) -> Array:
         """Covariance (6, 6) of what is only predicted."""

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The odometry for where the robot is: one for streets and one for rooms, by what the scans show (`slam.preset: auto`).
 
-The first scan decides. Later every fifth is looked at, and only several in a row that are clearly of the other kind
-change it: then the other odometry goes on from the same pose and motion, with the last scan as its map.
+The first scan that shows what it is decides. Later every fifth is looked at, and only several in a row that are clearly
+of the other kind change it. Then the other odometry goes on from the same pose and motion, with the last scan as its
+map.
 """
 
 from __future__ import annotations
@@ -55,12 +56,13 @@ class ScaledOdometry:
         if not self._undecided and self._scans % _EVERY:
             return self._active.process(frame)
         found = is_room(frame.points) if frame.problem is None else None
-        if self._undecided and found is not None:
-            self._undecided = False
+        decides = self._undecided and found is not None
+        if decides and self._scans == 1:
             self._active = self._room if found else self._open_air
+        self._undecided &= not decides
         result = self._active.process(frame)
         other = found is not None and found != (self._active is self._room)
-        self._others = self._others + 1 if other else 0
+        self._others = (_SURE if decides else self._others + 1) if other else 0
         if self._others >= _SURE and not self._undecided and result.registration.ok:
             before = self._active
             self._active = self._room if found else self._open_air

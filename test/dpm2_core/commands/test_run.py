@@ -20,6 +20,9 @@ from dpm2_core.data.convert import convert_kitti
 from dpm2_core.data.kitti import KittiSource
 from dpm2_core.data.trajectory import read_trajectory
 from dpm2_core.errors import Dpm2Error
+from dpm2_core.geometry import se3
+from dpm2_core.sim.imu import Imu
+from dpm2_core.sim.settings import ImuConfig
 from dpm2_core.slam.store.map_data import load_map
 from dpm2_core.slam.store.map_store import MapStore
 
@@ -47,6 +50,28 @@ def sequence(recording: Path, tmp_path: Path) -> Path:
     copy = tmp_path / "sequence"
     shutil.copytree(recording / "sequences" / "00", copy)
     return copy
+
+
+def test_the_imu_of_a_bag_is_used(sequence: Path, tmp_path: Path) -> None:
+    """Its samples stop 0.05 s before the ninth frame, which still has some; the drive goes on, and both are said."""
+    poses, imu = KittiSource(sequence).poses, Imu(ImuConfig(), np.random.default_rng(0))
+    assert poses is not None
+    steps, times = se3.log(se3.inverse(poses[:-1]) @ poses[1:]), imu.times(0.0, 0.75)
+
+    def pose(t: np.ndarray) -> np.ndarray:
+        k = np.clip(np.floor(t / 0.1).astype(int), 0, len(steps) - 1)
+        return poses[k] @ se3.exp((t / 0.1 - k)[:, None] * steps[k])
+
+    np.savetxt(sequence / "imu.txt", np.column_stack([times, *imu.measure(times, pose)]), "%.9e")
+    with (sequence / "calib.txt").open("a") as file:
+        file.write("Tr_imu_to_velo: 0 -1 0 0 1 0 0 0 0 0 1 0\n")
+    convert_kitti(KittiSource(sequence), tmp_path / "bag")
+    done = dpm2("run", tmp_path / "bag", "--out", tmp_path / "out", "--set", "slam.registration=geometric")
+    assert done.returncode == 0, done.stderr
+    assert "/imu: no samples at the time of the scan; going on without the IMU" in " ".join(done.stderr.split())
+    timing = json.loads((tmp_path / "out" / "timing.json").read_text())
+    assert timing["imu"] == {"used": 9, "no samples at the time of the scan": 3}
+    assert json.loads((tmp_path / "out" / "metrics.json").read_text())["ape_rmse_m"] < 0.1
 
 
 def test_writes_everything_and_is_right(recording: Path, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dpm2_core.data.pairing import BUFFER, JUMP, LATE, Images, RawMessage, clouds_after_images
+from dpm2_core.data.pairing import BUFFER, JUMP, LATE, Images, RawMessage, clouds_after_others
 
 MS = 1_000_000
 START = 1_700_000_000_000
@@ -32,7 +32,7 @@ def record(clouds: list[tuple[int, int]], images: list[tuple[int, int]]) -> list
 def paired(messages: list[RawMessage], tolerance: float = 0.05, offset: int = 0) -> dict[int, int | None]:
     """The stamp of each cloud to that of its image, ms after START."""
     images, out = Images(tolerance), {}
-    for topic, _, data in clouds_after_images(messages, ["/cloud"], ["/image"], offset * MS):
+    for topic, _, data in clouds_after_others(messages, ["/cloud"], {"/image": offset * MS}):
         second, ns = struct.unpack_from("<iI", data, 4)
         stamp = second * 1000 + ns // MS - START
         if topic == "/image":
@@ -88,7 +88,7 @@ def test_when_time_goes_back_the_images_of_before_are_not_used() -> None:
 
 def test_without_a_camera_nothing_is_held_back() -> None:
     messages = record([(100 * n, 0) for n in range(3)], [])
-    assert list(clouds_after_images(messages, ["/cloud"], [])) == messages
+    assert list(clouds_after_others(messages, ["/cloud"], {})) == messages
 
 
 def test_memory_is_bounded() -> None:
@@ -106,6 +106,6 @@ def test_memory_is_bounded() -> None:
             held += 1
             yield message
 
-    for _ in clouds_after_images(counted(), ["/cloud"], ["/image"]):
+    for _ in clouds_after_others(counted(), ["/cloud"], {"/image": 0}):
         most, held = max(most, held), held - 1
     assert most <= LATE // (100 * MS) + 1

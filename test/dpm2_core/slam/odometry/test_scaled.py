@@ -12,7 +12,7 @@ from dpm2_core.slam.build import make_odometry
 from dpm2_core.slam.odometry.scaled import ScaledOdometry
 from dpm2_core.slam.settings import SlamSettings
 
-from ....helpers.rooms import frames, walk
+from ....helpers.rooms import boxes, frames, scan, walk
 
 
 def geometric(preset: str) -> SlamSettings:
@@ -48,6 +48,23 @@ def test_a_street_is_as_if_there_were_no_rooms() -> None:
     for frame in drive:
         np.testing.assert_array_equal(auto.process(frame).T_odom_lidar, outdoor.process(frame).T_odom_lidar)
     assert auto.scale == "outdoor"
+
+
+def test_a_start_that_may_be_of_either_is_decided_without_a_jump() -> None:
+    """A small hall; then half of the view is covered, and what is left is a room's."""
+    hall = np.array([[-7, -3.5, 0], [7, 3.5, 4.0]])
+    things = boxes((-6, -2.5), (6, 2.5), 4, np.array([1.0, 1.0, 2.0]))
+    poses = se3.make(np.eye(3), [[-3 + 0.15 * i, 0, 1.0] for i in range(16)])
+    clouds = [scan(T, hall, things, i) for i, T in enumerate(poses)]
+    clouds[8:] = [points[points[:, 0] > 0.3] for points in clouds[8:]]
+    odometry, scales = make_odometry(geometric("auto")), []
+    for i, points in enumerate(clouds):
+        result = odometry.process(Frame(i * 10**8, points, index=i))
+        scales.append(odometry.scale)
+        assert result.registration.ok
+        np.testing.assert_allclose(result.T_odom_lidar[:3, 3], [0.15 * i, 0, 0], atol=0.05)
+    assert scales[7] == ""
+    assert scales[-1] == "indoor"
 
 
 @pytest.mark.slow

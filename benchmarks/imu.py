@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What an IMU is worth to a robot that turns at 100 deg/s: the same scans with it, without, and with one that stops."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Group
+from rich.progress import Progress
+
+from benchmarks.harness import Options, Report, settings_of
+from dpm2_core.evaluation.metrics import evaluate
+from dpm2_core.frame import Array, Frame
+from dpm2_core.geometry import se3
+from dpm2_core.sim.sensors import real_sensor
+from dpm2_core.sim.settings import ImuConfig, LidarConfig, PresetName
+from dpm2_core.sim.simulated_drive import TurningRobot
+from dpm2_core.sim.world import build_world
+from dpm2_core.slam.build import make_odometry
+from dpm2_core.slam.settings import SlamSettings
+from dpm2_core.tables import FigureTable
+
+WORLDS: dict[str, tuple[PresetName, int, float, float]] = {
+    "building": ("indoor", 910, 1.2, 0.0),
+    "car park": ("car_park", 911, 3.0, 90.0),
+    "suburb": ("suburb", 912, 2.0, 90.0),
+}
+"""Kind of world, its seed, speed in m/s, and by how many degrees the robot also turns to either side as it drives."""
+FRAMES = 200
+LIDAR = LidarConfig(beams=16, columns=1024, height=0.8, car_body=False, min_range=0.4)
+LENGTHS = (5.0, 10.0)
+"""Of the KITTI metric's segments, m."""
+WAYS: dict[str, Callable[[Frame], Frame]] = {
+    "without": lambda frame: replace(frame, imu=None),
+    "with": lambda frame: frame,
+    "stops": lambda frame: frame if frame.index < FRAMES // 2 else replace(frame, imu=None),
+}
+"""Of each frame, what the odometry is given."""
+
+
+def bench_imu(options: Options) -> Report:
+    """Each world once, the odometry alone with default settings."""
+    settings, results = settings_of(options), dict[str, Any]()
+    imu = ImuConfig()
+    with Progress(transient=True) as progress:
+        for name, (preset, seed, speed, swings) in WORLDS.items():
+            world = build_world("loop", preset, seed)
+            robot = TurningRobot(world, FRAMES, speed, real_sensor(LIDAR), imu, swings)
+            frames = list(progress.track(robot.frames(), total=FRAMES, description=name))
+            rates = _rates(robot.poses)
+            results[name] = {
+                "frames": FRAMES,
+                "path_length_m": float(np.linalg.norm(np.diff(robot.poses[:, :3, 3], axis=0), axis=1).sum()),
+                "fastest_turn_deg_s": float(rates.max()),
+                "frames_above_50_deg_s": int((rates > 50).sum()),
+                **{way: _drive(map(given, frames), robot.poses, settings) for way, given in WAYS.items()},
+            }
+            results[name]["ratio"] = results[name]["with"]["ape_rmse_m"] / results[name]["without"]["ape_rmse_m"]
+            progress.console.print(f"{name}: {results[name]}", soft_wrap=True)
+    known = {"beams": LIDAR.beams, "imu": imu.model_dump(), "lengths_m": LENGTHS}
+    return Report({**known, "worlds": results}, Group(_table(results)))
+
+
+def _drive(frames: Iterable[Frame], truth: Array, settings: SlamSettings) -> dict[str, Any]:
+    odometry, poses, failed, of_use = make_odometry(settings), list[Array](), 0, 0
+    for frame in frames:
+        tracked = odometry.process(frame)
+        poses.append(tracked.T_odom_lidar)
+        failed += not tracked.registration.ok
+        of_use += tracked.imu == ""
+    found = evaluate(truth, np.array(poses), LENGTHS)
+    return {
+        "failed_frames": failed,
+        "frames_with_imu": of_use,
+        "ape_rmse_m": found.ape_rmse_m,
+        "t_err_percent": found.t_err_percent,
+        "rpe_rot_deg": found.rpe_rot_deg,
+        "worst_tilt_deg": float(_tilt(np.array(poses), truth).max()),
+    }
+
+
+def _rates(poses: Array) -> NDArray[np.float64]:
+    """Of each step, deg/s."""
+    return np.degrees(se3.angle(se3.inverse(poses[:-1]) @ poses[1:])) / TurningRobot.PERIOD
+
+
+def _tilt(poses: Array, truth: Array) -> NDArray[np.float64]:
+    """Between the vertical that each pose says and the true one, degrees."""
+    up = np.einsum("nij,nkj->nik", poses[:, :3, :3], truth[:, :3, :3])[:, 2, 2]
+    return np.degrees(np.arccos(np.clip(up, -1, 1)))
+
+
+def _table(worlds: dict[str, Any]) -> FigureTable:
+    figures = [f"{figure}, {way}" for figure in ("APE m", "worst tilt deg") for way in WAYS]
+    table = FigureTable(
+        f"{LIDAR.beams} beams, turns of 100 deg/s", names=["world"], figures=[*figures, "with / without"]
+    )
+    for name, r in worlds.items():
+        row = [f"{r[way][key]:.3f}" for key in ("ape_rmse_m", "worst_tilt_deg") for way in WAYS]
+        table.add_row(name, *row, f"{r['ratio']:.2f}")
+    return table

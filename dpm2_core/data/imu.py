@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Samples of an IMU as they come in, until the scan that they belong to is there."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from typing import Any
+
+import numpy as np
+
+from dpm2_core.data.messages import MessageError
+from dpm2_core.data.pairing import JUMP
+from dpm2_core.frame import Array, Inertial
+
+_LARGEST = np.repeat([40.0, 300.0], 3)  # rad/s and m/s2: more than any sensor that is sold measures
+_CLOSEST = 400_000  # ns: no IMU is faster than 2500 Hz
+_MOST = 10_000  # samples kept; bounds memory where no cloud comes
+_RECENT = 1_000_000_000  # ns before a scan: what is older is of no use
+
+
+def decode_imu(message: Any) -> tuple[Array, Array]:
+    """Rates (3,) rad/s and forces (3,) m/s2, NaN where it has none, of a sensor_msgs/Imu.
+
+    Raises:
+        MessageError: it measures no rates, or numbers that cannot be.
+    """
+    rates, forces = message.angular_velocity, message.linear_acceleration
+    values = np.array([rates.x, rates.y, rates.z, forces.x, forces.y, forces.z])
+    if message.angular_velocity_covariance[0] == -1:
+        raise MessageError("an IMU without angular velocities")
+    if message.linear_acceleration_covariance[0] == -1:  # as REP-145 has it
+        values[3:] = np.nan
+    wrong = ~(np.abs(values) <= _LARGEST)
+    if wrong[:3].any() or (wrong[3:].any() and not np.isnan(values[3:]).all()):
+        raise MessageError(f"angular velocity {values[:3].tolist()} rad/s, acceleration {values[3:].tolist()} m/s2")
+    return values[:3], values[3:]
+
+
+class ImuBuffer:
+    """The latest samples in order of their stamps; any thread may add or take.
+
+    Attributes:
+        last: stamp of the newest, ns; -inf before there is one. frame: that they are measured in.
+    """
+
+    def __init__(self) -> None:
+        self.last, self.frame = -float("inf"), ""
+        self._lock = threading.Lock()
+        self._samples: deque[tuple[int, Array, Array]] = deque(maxlen=_MOST)
+
+    def clear(self) -> None:
+        """Forget everything."""
+        with self._lock:
+            self.last = -float("inf")
+            self._samples.clear()
+
+    def add(self, stamp: int, message: Any) -> None:
+        """Take a sensor_msgs/Imu with its stamp (ns); one that jumps by more than a second begins anew.
+
+        Raises:
+            MessageError: see `decode_imu`; or it is not newer than the last one, or follows too soon.
+        """
+        rates, forces = decode_imu(message)
+        with self._lock:
+            step = stamp - self.last
+            if -JUMP < step < _CLOSEST:
+                raise MessageError(f"a sample {step * 1e-6:.3f} ms after the one before")
+            if abs(step) > JUMP:
+                self._samples.clear()
+            self.last, self.frame = stamp, message.header.frame_id
+            self._samples.append((stamp, rates, forces))
+
+    def take(self, stamp: int, until: int) -> Inertial | None:
+        """Those up to `until` (ns) that were not taken before, for a scan with that stamp (ns); None if there are none
+        of its last second."""
+        with self._lock:
+            taken = []
+            while self._samples and self._samples[0][0] <= until:
+                taken.append(self._samples.popleft())
+        taken = [sample for sample in taken if sample[0] > stamp - _RECENT]
+        if not taken:
+            return None
+        stamps, rates, forces = zip(*taken, strict=True)
+        return Inertial(np.array(stamps, np.int64), np.array(rates), np.array(forces))

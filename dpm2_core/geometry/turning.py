@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How a sensor turned, from the angular rates that a gyroscope measured."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from dpm2_core.geometry.se3 import Array
+
+_LONGEST = 0.1  # s between two samples, across which the rate is taken to change evenly
+_BEYOND = 0.05  # s before the first sample or after the last, for which its rate is taken to go on
+
+
+def turned(seconds: NDArray[np.floating], rates: Array, at: ArrayLike) -> Array | None:
+    """Rotations R_0_t (M, 3, 3) from the axes at the times `at` (M,) s to those at 0 s.
+
+    Between two samples the rate changes evenly; the error falls with the square of their distance.
+
+    Args:
+        seconds: (K,) increasing times of the samples. rates: (K, 3) rad/s about the sensor's own axes.
+
+    Returns:
+        None where the samples do not tell: none within 0.1 s of each other, or of the times to within 0.05 s.
+    """
+    at = np.asarray(at, np.float64)
+    low, high = min(0.0, float(at.min())), max(0.0, float(at.max()))
+    near = (seconds > low - _LONGEST) & (seconds < high + _LONGEST)
+    seconds, rates = seconds[near], rates[near]
+    if len(seconds) > 1 and seconds[1] <= low:  # of those before, the last one alone
+        first = int(np.searchsorted(seconds, low, "right")) - 1
+        seconds, rates = seconds[first:], rates[first:]
+    if len(seconds) > 1 and seconds[0] < low and seconds[1] - seconds[0] > _LONGEST:
+        seconds, rates = seconds[1:], rates[1:]  # it stopped and has come back
+    last = int(np.searchsorted(seconds, high)) + 1
+    seconds, rates = seconds[:last], rates[:last]
+    if len(seconds) > 1 and seconds[-1] > high and seconds[-1] - seconds[-2] > _LONGEST:
+        seconds, rates = seconds[:-1], rates[:-1]
+    if not len(seconds) or seconds[0] > low + _BEYOND or seconds[-1] < high - _BEYOND:
+        return None
+    if len(seconds) > 1 and np.diff(seconds).max() > _LONGEST:
+        return None
+    before, after = min(low, float(seconds[0])), max(high, float(seconds[-1]))
+    seconds = np.concatenate([[before - 1e-9], seconds, [after + 1e-9]])
+    rates = np.concatenate([rates[:1], rates, rates[-1:]])
+    steps = np.diff(seconds)
+    whole = _exp((rates[1:] + rates[:-1]) / 2 * steps[:, None])
+    nodes = np.empty((len(seconds), 3, 3))
+    nodes[0] = np.eye(3)
+    for k, R in enumerate(whole):
+        nodes[k + 1] = nodes[k] @ R
+
+    def rotation(times: Array) -> Array:
+        k = np.clip(np.searchsorted(seconds, times, "right") - 1, 0, len(steps) - 1)
+        since = (times - seconds[k])[:, None]
+        mean = rates[k] + (rates[k + 1] - rates[k]) * since / (2 * np.maximum(steps[k], 1e-9)[:, None])
+        return nodes[k] @ _exp(mean * since)
+
+    return np.asarray(rotation(np.zeros(1))[0].T @ rotation(at))
+
+
+def leveled(up: ArrayLike, axis: ArrayLike = (0.0, 0.0, 1.0)) -> Array:
+    """The smallest rotation (3, 3) that turns the direction `up` (3,) into `axis` (3,); lengths do not matter."""
+    u, z = (np.asarray(v, np.float64) / np.linalg.norm(v) for v in (up, axis))
+    cross, cosine = np.cross(u, z), float(u @ z)
+    sine = float(np.linalg.norm(cross))
+    if sine < 1e-12:
+        if cosine > 0:
+            return np.eye(3)
+        cross = np.cross(u, np.eye(3)[int(np.abs(u).argmin())])  # upside down: about any level axis
+        return np.asarray(_exp(np.pi * cross / np.linalg.norm(cross)))
+    return np.asarray(_exp(cross / sine * np.arctan2(sine, cosine)))
+
+
+def _exp(vectors: NDArray[np.float64]) -> Array:
+    """Rotation vectors (..., 3) to (..., 3, 3)."""
+    return np.asarray(Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(*vectors.shape, 3))

@@ -1,0 +1,264 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An IMU beside the scans, loosely coupled: how the LiDAR turned, and which way is up.
+
+The turn between two scans, and during one, is measured instead of taken to be steady: all else of the motion model
+stays. The gyroscope's bias is what the scans say differently over a second or more: at rest, where they show no turn at
+all, as well as on the way, though there less surely. A gyroscope whose turns are not those of the scans, as with a
+wrong orientation in /tf_static, is left out until they agree for a while.
+
+Forces, averaged over a minute from which the changes of velocity are taken out, show which way is up. By that the
+odometry's frame is level at a start at rest, and stays so: it follows no faster than the odometry may drift.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from dpm2_core.frame import Array, Frame, Inertial
+from dpm2_core.geometry import se3
+from dpm2_core.geometry.turning import leveled, turned
+
+_KEPT = 5_000_000_000  # ns of samples, and so many at most
+_MOST = 20_000
+
+# Gyroscope, standard deviations: a turn is off by so much, rad, and this fraction of it (scale, axes, time).
+_TURN, _SHARE = np.radians(0.1), 0.02
+_BIAS, _BIAS_DRIFT = 0.03, 1e-4  # rad/s of an unknown one, and its change in 1 s
+_LARGEST_BIAS = 0.2  # rad/s
+_SPAN = 1.0  # s over which scans and gyroscope are compared for the bias
+_USUAL = 3.0  # squared sigmas of a turn that count as one in the doubt
+_CREDIBLE = 4.0  # doubt up to which it is used
+_MEMORY = 0.15  # fraction of the newest turn in the doubt
+_WORST, _UNSEEN = 25.0, 10.0  # so much a turn counts at most, and one at whose end the scan fits nowhere
+_TURNING = 0.1  # rad/s: slower turns prove nothing
+
+_GRAVITY = 9.81
+_POSSIBLE = 1.5  # m/s2 that a mean force without the changes of velocity may differ from it
+_STEADY = (0.05, 0.1, 0.3)  # noise and mean of the rates, rad/s, and noise of the forces, m/s2, of a sensor at rest
+_FEWEST = 5  # samples that show it
+_WEIGHT = 5.0  # s that a start at rest counts as much as
+_MINUTE = 60.0  # s of which the mean force shows the vertical
+_FOLLOWS = np.radians(0.02)  # rad for each m or s: so fast is the frame turned
+
+
+class InertialMotion:
+    """The samples so far, and what they say.
+
+    Attributes:
+        turn: R_before_now (3, 3) since the last registered frame; None where it is not known, or not believed.
+        problem: why it is None; empty if it is not.
+        T_level_odom: (4, 4), by which poses become level.
+    """
+
+    def __init__(self, starts: bool = True) -> None:
+        """`starts`: the drive begins with the next frame; else an IMU has come to one that is under way."""
+        self._starts = starts
+        self.turn: Array | None = None
+        self.problem = ""
+        self.T_level_odom = np.eye(4)
+        self._samples = Inertial(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
+        self._bias, self._variance = np.zeros(3), _BIAS**2  # of the bias, (rad/s)^2
+        self._measured: Array | None = None  # the turn, believed or not
+        self._before: int | None = None  # stamp of the last registered frame
+        self._doubt, self._turns = 1.0, False  # and whether it says that it turns, which no scan has confirmed yet
+        self._span = _Span(np.eye(3))
+        self._vertical = _Vertical()
+
+    def look(self, frame: Frame) -> Frame:
+        """Take in a new frame's samples; returns the frame with those around its sweep, without their bias, or none."""
+        if self._turns:  # the last frame was not registered
+            self._remember(_UNSEEN)
+        self._join(frame)
+        self.turn = self._measured = None
+        if self._before is None:
+            self.problem = "" if len(self._samples) else "no samples"
+        else:
+            self._measured = self._turned(frame.stamp, self._before)
+            self.problem = "" if self._measured is not None else "no samples at the time of the scan"
+        if not self.problem and self._doubt > _CREDIBLE:
+            self.problem = "its turns are not those of the scans: is its orientation right?"
+        if self.problem:
+            return frame if frame.imu is None else replace(frame, imu=None)
+        self.turn = self._measured
+        if self.turn is not None and self._before is not None:
+            self._turns = _angle(self.turn) > _TURNING * (frame.stamp - self._before) * 1e-9
+        return replace(frame, imu=replace(self._samples, rates=self._samples.rates - self._bias))
+
+    def covariance(self, seconds: float) -> Array:
+        """(3, 3) rad2 of `turn` over that time."""
+        angle = 0.0 if self.turn is None else se3.magnitude(se3.make(self.turn, np.zeros(3)))[1]
+        of_turn = _TURN**2 + (_SHARE * np.radians(angle)) ** 2
+        return np.asarray((of_turn + self._variance * seconds**2) * np.eye(3))
+
+    def registered(self, T_before: Array, T: Array, stamp: int, twist: Array | None) -> None:
+        """A frame was registered at T (4, 4), the last one at T_before.
+
+        Args:
+            twist: (6,) [rad/s, m/s] the motion between the two; None: nothing is known of it, T begins a map.
+        """
+        measured, before, self._before, self._turns = self._measured, self._before, stamp, False
+        if before is None and twist is None:
+            self._start_level(T)
+        if measured is None or before is None or twist is None:
+            self._span = _Span(T[:3, :3])
+            self._vertical.pause()
+            return
+        seconds = (stamp - before) * 1e-9
+        self._judge(measured, T_before[:3, :3].T @ T[:3, :3], seconds)
+        self._span.add(measured, seconds)
+        self._variance += _BIAS_DRIFT**2 * seconds
+        if self._span.seconds >= _SPAN:
+            self._correct(T[:3, :3])
+        force = self._force(before, stamp)
+        if force is None:
+            self._vertical.pause()
+            return
+        self._vertical.add(T_before[:3, :3] @ force, T[:3, :3] @ twist[3:], seconds)
+        self._follow(T_before, T, seconds)
+
+    def _start_level(self, T: Array) -> None:
+        """Where a drive begins at rest, the samples before the first frame show which way is up."""
+        s, starts, self._starts = self._samples, self._starts, False
+        if not starts or s.up is None or len(s) < _FEWEST or not _at_rest(s.rates, s.forces):
+            return
+        self._vertical.start(T[:3, :3] @ s.forces.mean(0), T[:3, :3] @ s.up)
+        R = self._vertical.turn
+        self.T_level_odom = se3.make(R, T[:3, 3] - R @ T[:3, 3])
+
+    def _join(self, frame: Frame) -> None:
+        """The samples with those of a frame; from anew where time has gone back."""
+        old, new = self._samples, frame.imu
+        if new is None or not len(new):
+            return
+        if len(old) and new.stamps[0] <= old.stamps[-1]:
+            self._before, self._samples = None, new
+            return
+        keep = (old.stamps > new.stamps[-1] - _KEPT) & (np.arange(len(old), 0, -1) < _MOST)
+        stamps, rates, forces = (
+            np.concatenate([before[keep], after])
+            for before, after in ((old.stamps, new.stamps), (old.rates, new.rates), (old.forces, new.forces))
+        )
+        self._samples = Inertial(stamps, rates, forces, new.up)
+
+    def _turned(self, stamp: int, before: int) -> Array | None:
+        """R_before_now (3, 3)."""
+        s = self._samples
+        found = turned((s.stamps - before) * 1e-9, s.rates - self._bias, [(stamp - before) * 1e-9])
+        return None if found is None else found[0]
+
+    def _judge(self, measured: Array, scans: Array, seconds: float) -> None:
+        """Compare two turns (3, 3)."""
+        angle = _angle(measured)
+        if max(angle, _angle(scans)) < _TURNING * seconds:
+            return
+        variance = (3 * _TURN) ** 2 + (0.05 * angle) ** 2 + self._variance * seconds**2
+        self._remember(min(_angle(measured.T @ scans) ** 2 / variance / _USUAL, _WORST))
+
+    def _remember(self, squared: float) -> None:
+        self._turns, self._doubt = False, (1 - _MEMORY) * self._doubt + _MEMORY * squared
+
+    def _correct(self, R: Array) -> None:
+        """The bias, by what the scans say of the last second or more; the last of them has the axes R (3, 3)."""
+        span, self._span = self._span, _Span(R)
+        if self._doubt > _CREDIBLE:
+            return
+        off = se3.log(se3.make(R.T @ span.R_start @ span.R_start_now, np.zeros(3)))[:3] / span.seconds
+        variance = (2 * _TURN**2 + (_SHARE * span.angle) ** 2) / span.seconds**2
+        gain = self._variance / (self._variance + variance)
+        self._bias = np.clip(self._bias + gain * off, -_LARGEST_BIAS, _LARGEST_BIAS)
+        self._variance *= 1 - gain
+
+    def _force(self, before: int, stamp: int) -> Array | None:
+        """Mean force (3,) between two stamps along the axes at the first; None where it is not known."""
+        s = self._samples
+        inside = (s.stamps > before) & (s.stamps <= stamp) & np.isfinite(s.forces).all(1)
+        if inside.sum() < 2:
+            return None
+        seconds = (s.stamps - before) * 1e-9
+        R = turned(seconds, s.rates - self._bias, seconds[inside])
+        return None if R is None else np.einsum("nij,nj->i", R, s.forces[inside]) / inside.sum()
+
+    def _follow(self, T_before: Array, T: Array, seconds: float) -> None:
+        """Turn the level frame a little about the LiDAR's position, so that no pose jumps."""
+        wanted = self._vertical.turn @ self.T_level_odom[:3, :3].T
+        angle = _angle(wanted)
+        if angle < 1e-9:
+            return
+        most = _FOLLOWS * max(float(np.linalg.norm(T[:3, 3] - T_before[:3, 3])), seconds)
+        part = se3.log(se3.make(wanted, np.zeros(3))) * min(1.0, most / angle)
+        here = (self.T_level_odom @ T)[:3, 3]
+        R = se3.exp(part)[:3, :3] @ self.T_level_odom[:3, :3]
+        self.T_level_odom = se3.orthonormalized(se3.make(R, here - R @ T[:3, 3]))
+
+
+class _Span:
+    """What the gyroscope says since axes R_start (3, 3) of the odometry's frame."""
+
+    def __init__(self, R_start: Array) -> None:
+        self.R_start, self.R_start_now, self.seconds, self.angle = R_start, np.eye(3), 0.0, 0.0
+
+    def add(self, R: Array, seconds: float) -> None:
+        self.R_start_now, self.seconds, self.angle = (
+            self.R_start_now @ R,
+            self.seconds + seconds,
+            self.angle + _angle(R),
+        )
+
+
+class _Vertical:
+    """Which way (3,) is up in the odometry's frame, of late, and which way it is to be."""
+
+    def __init__(self) -> None:
+        self._up = np.zeros(3)
+        self._axis: Array | None = None
+        self._seconds = 0.0  # that `_up` is the mean of
+        self._velocity: Array | None = None
+        self.pause()
+
+    def start(self, force: Array, axis: Array) -> None:
+        """At rest at the start; `axis` (3,) is to be up."""
+        self._up, self._axis, self._seconds = _metric(force), axis, _WEIGHT
+
+    def pause(self) -> None:
+        """What comes next does not follow on."""
+        self._velocity, self._sum, self._time = None, np.zeros(3), 0.0
+
+    def add(self, force: Array, velocity: Array, seconds: float) -> None:
+        """A step with its mean force (3,) m/s2, and the mean velocity (3,) m/s."""
+        if self._velocity is None:
+            self._velocity = velocity
+            return
+        self._sum, self._time = self._sum + _metric(force) * seconds, self._time + seconds
+        if self._time < _SPAN:
+            return
+        up, time = (self._sum - (velocity - self._velocity)) / self._time, self._time
+        self.pause()
+        self._velocity = velocity
+        if abs(np.linalg.norm(up) - _GRAVITY) > _POSSIBLE:
+            return
+        self._seconds = min(self._seconds + time, _MINUTE)
+        self._up = self._up + time / self._seconds * (up - self._up)
+        if self._axis is None and self._seconds >= 2 * _WEIGHT:
+            self._axis = self._up / np.linalg.norm(self._up)  # however tilted the start was: it stays like that
+
+    @property
+    def turn(self) -> Array:
+        """(3, 3) that makes it so."""
+        return np.eye(3) if self._axis is None else leveled(self._up, self._axis)
+
+
+def _angle(R: Array) -> float:
+    return float(se3.angle(se3.make(R, np.zeros(3))))
+
+
+def _metric(force: Array) -> Array:
+    """A mean force (3,) in m/s2; some drivers count in g."""
+    return force * _GRAVITY if np.linalg.norm(force) < _GRAVITY / 3 else force
+
+
+def _at_rest(rates: Array, forces: Array) -> bool:
+    noise, mean, shaking = _STEADY
+    still = rates.std(0).max() < noise and np.abs(rates.mean(0)).max() < mean
+    return bool(still and forces.std(0).max() < shaking)  # False where they are unknown

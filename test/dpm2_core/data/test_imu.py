@@ -1,0 +1,200 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Samples of an IMU, of bags, folders and hostile publishers: to the scan they belong to, or out, counted."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dpm2_core.data.bags import BagSource
+from dpm2_core.data.convert import EPOCH_NS, convert_kitti
+from dpm2_core.data.imu import ImuBuffer, decode_imu
+from dpm2_core.data.kitti import KittiSource
+from dpm2_core.data.messages import MessageError
+from dpm2_core.data.settings import InputSettings
+from dpm2_core.data.topics import POINTS
+from dpm2_core.errors import UsageError
+
+SECOND = 10**9
+NAN, INF = float("nan"), float("inf")
+
+
+def imu(bags: Any, stamp: float, rates: tuple = (0.1, 0.2, 0.3), forces: tuple = (0.0, 0.0, 9.8), **other: Any) -> Any:
+    """A message; `other`: frame, rates_known, forces_known."""
+    vector, known = lambda v: bags.new("geometry_msgs/Vector3", *map(float, v)), {True: 0.0, False: -1.0}
+    covariance = lambda name: np.array([known[other.get(name, True)], *np.zeros(8)])  # noqa: E731
+    return bags.new(
+        "sensor_msgs/Imu",
+        header=bags.header(stamp, other.get("frame", "imu_link")),
+        orientation=bags.new("geometry_msgs/Quaternion", 0.0, 0.0, 0.0, 1.0),
+        orientation_covariance=covariance("none"),
+        angular_velocity=vector(rates),
+        angular_velocity_covariance=covariance("rates_known"),
+        linear_acceleration=vector(forces),
+        linear_acceleration_covariance=covariance("forces_known"),
+    )
+
+
+def drive(bags: Any, until: float = 2.0, **other: Any) -> list[tuple[float, str, Any]]:
+    """Clouds at 1.0 to 1.9 s; samples at 100 Hz until a time, logged as they come."""
+    messages = [(1 + 0.1 * i, POINTS, bags.cloud(1 + 0.1 * i)) for i in range(10)]
+    samples = [(0.9 + 0.01 * i, "/imu", imu(bags, 0.9 + 0.01 * i, **other)) for i in range(120)]
+    return sorted(messages + [s for s in samples if s[0] < until], key=lambda m: m[0])
+
+
+def quarter(bags: Any) -> tuple[float, str, Any]:
+    """The IMU is turned by 90 degrees to the left in the LiDAR's frame."""
+    message = bags.transform("velo_link", "imu_link", (0.5, 0, 0))
+    rotation = message.transforms[0].transform.rotation
+    rotation.z = rotation.w = 0.5**0.5
+    return (0.5, "/tf_static", message)
+
+
+def test_each_cloud_has_the_samples_since_the_one_before(bags: Any, tmp_path: Path) -> None:
+    source = BagSource(bags.write(tmp_path / "b", [quarter(bags), *drive(bags)]))
+    frames = list(source.frames())
+    assert source.notes == []
+    counts = [len(frame.imu) for frame in frames if frame.imu is not None]
+    assert counts == [11, *[10] * 9]
+    for frame in frames:
+        assert frame.imu is not None
+        assert frame.imu.stamps[-1] == frame.stamp
+        np.testing.assert_allclose(frame.imu.rates[0], [-0.2, 0.1, 0.3], atol=1e-9)  # along the LiDAR's axes
+        np.testing.assert_allclose(frame.imu.forces[0], [0, 0, 9.8], atol=1e-9)
+    again = list(source.frames(3, 5))
+    assert [len(frame.imu) for frame in again if frame.imu is not None] == [41, 10]  # what was skipped, too
+
+
+def test_without_its_place_it_is_left_out_and_said(bags: Any, tmp_path: Path) -> None:
+    bag = bags.write(tmp_path / "b", drive(bags))
+    source = BagSource(bag)
+    assert all(frame.imu is None for frame in source.frames())
+    (note,) = source.notes
+    assert note.startswith("/imu: no transform from 'imu_link' to 'velo_link'")
+    assert "input.q_lidar_imu" in note
+    given = BagSource(bag, InputSettings(q_lidar_imu=(0, 0, 0.5**0.5, 0.5**0.5)))
+    first = next(given.frames())
+    assert first.imu is not None
+    np.testing.assert_allclose(first.imu.rates[0], [-0.2, 0.1, 0.3], atol=1e-9)
+    assert all(frame.imu is None for frame in BagSource(bag, InputSettings(imu=False)).frames())
+    own = BagSource(bags.write(tmp_path / "own", drive(bags, frame="velo_link")))
+    assert all(frame.imu is not None for frame in own.frames())  # in the LiDAR's own frame
+    with pytest.raises(ValueError, match="no unit quaternion"):
+        InputSettings(q_lidar_imu=(0, 0, 0, 2))
+
+
+def test_one_that_stops_is_missed_once(bags: Any, tmp_path: Path) -> None:
+    source = BagSource(bags.write(tmp_path / "b", [quarter(bags), *drive(bags, until=1.45)]))
+    assert [frame.imu is not None for frame in source.frames()] == [True] * 6 + [False] * 4
+    assert source.notes == ["/imu: no samples at the time of the scan; going on without the IMU"]
+
+
+def test_which_topic(bags: Any, tmp_path: Path) -> None:
+    two = [*drive(bags, frame="velo_link"), (0.9, "/other", imu(bags, 0.9, frame="velo_link"))]
+    usual = BagSource(bags.write(tmp_path / "usual", sorted(two, key=lambda m: m[0])))
+    assert usual.imu_topic == "/imu"
+    renamed = [(t, topic.replace("/imu", "/ouster/imu"), m) for t, topic, m in drive(bags, frame="velo_link")]
+    alone = BagSource(bags.write(tmp_path / "alone", renamed))
+    assert alone.imu_topic == "/ouster/imu"
+    both = bags.write(tmp_path / "both", sorted([*renamed, two[-1]], key=lambda m: m[0]))
+    unclear = BagSource(both)
+    assert unclear.imu_topic == ""
+    assert unclear.notes == ["Imu topics /other, /ouster/imu: none is used; choose one with input.imu_topic"]
+    assert BagSource(both, InputSettings(imu_topic="/other")).imu_topic == "/other"
+    with pytest.raises(UsageError, match=r"no Imu messages on /none; topics: .*/ouster/imu"):
+        BagSource(both, InputSettings(imu_topic="/none"))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "reason"),
+    [
+        ({"rates": (NAN, 0, 0)}, "angular velocity"),
+        ({"rates": (0, INF, 0)}, "angular velocity"),
+        ({"rates": (0, 0, 1e30)}, "angular velocity"),
+        ({"forces": (0, NAN, 9.8)}, "acceleration"),
+        ({"forces": (0, 0, 1e9)}, "acceleration"),
+        ({"rates_known": False}, "without angular velocities"),
+    ],
+)
+def test_numbers_that_cannot_be_are_rejected(bags: Any, wrong: dict, reason: str) -> None:
+    with pytest.raises(MessageError, match=reason):
+        decode_imu(imu(bags, 1.0, **wrong))
+
+
+def test_a_gyroscope_alone_is_enough(bags: Any) -> None:
+    for message in (imu(bags, 1.0, forces_known=False), imu(bags, 1.0, forces=(NAN, NAN, NAN))):
+        rates, forces = decode_imu(message)
+        np.testing.assert_allclose(rates, [0.1, 0.2, 0.3])
+        assert np.isnan(forces).all()
+
+
+def test_unsound_samples_of_a_bag_are_counted(bags: Any, tmp_path: Path) -> None:
+    messages = [quarter(bags), *drive(bags)]
+    messages[20:20] = [(messages[20][0], "/imu", imu(bags, 1.0, rates=(NAN, 0, 0)))] * 3
+    source = BagSource(bags.write(tmp_path / "b", messages))
+    assert all(frame.imu is not None for frame in source.frames())
+    (note,) = source.notes
+    assert note.startswith("/imu: 3 samples left out (the first: angular velocity [nan, 0.0, 0.0] rad/s")
+
+
+def test_stamps_that_repeat_go_back_or_flood(bags: Any) -> None:
+    """Out, unless time itself has gone back by more than a second, or ahead: then it begins anew."""
+    buffer = ImuBuffer()
+    buffer.add(10 * SECOND, imu(bags, 10))
+    for stamp in (10 * SECOND, 9_500_000_000, 10 * SECOND + 100_000):
+        with pytest.raises(MessageError, match="ms after the one before"):
+            buffer.add(stamp, imu(bags, 10))
+    buffer.add(8 * SECOND, imu(bags, 8))
+    assert buffer.take(10 * SECOND, 10 * SECOND) is None  # that at 8 s is too old, and that at 10 s gone
+    buffer.add(8 * SECOND + 10**7, imu(bags, 8))
+    buffer.add(10**18, imu(bags, 1))
+    buffer.add(8 * SECOND + 2 * 10**7, imu(bags, 8))  # a stray stamp costs what came before it, no more
+    found = buffer.take(8 * SECOND, 9 * SECOND)
+    assert found is not None
+    assert found.stamps.tolist() == [8 * SECOND + 2 * 10**7]
+
+
+def test_memory_is_bounded_where_no_cloud_comes(bags: Any) -> None:
+    buffer, message = ImuBuffer(), imu(bags, 1)
+    for k in range(12_000):
+        buffer.add(SECOND + k * 1_000_000, message)
+    assert buffer.take(13 * SECOND, 13 * SECOND) is not None
+    found = buffer.take(13 * SECOND, 13 * SECOND)
+    assert found is None  # taken
+
+
+def test_a_folder_becomes_a_bag_with_the_same_samples(kitti_folder: Any, tmp_path: Path) -> None:
+    folder = kitti_folder()
+    rng = np.random.default_rng(0)
+    rows = np.c_[np.arange(-10, 50) / 100, rng.normal(size=(60, 3)), rng.normal(0, 9, (60, 3))]
+    np.savetxt(folder / "imu.txt", rows, "%.9e")
+    assert "left out: no Tr_imu_to_velo" in KittiSource(folder).notes[-1]
+    with (folder / "calib.txt").open("a") as file:
+        file.write("Tr_imu_to_velo: 0 -1 0 0 1 0 0 0 0 0 1 0\n")
+    source = KittiSource(folder)
+    assert source.notes == []
+    convert_kitti(source, tmp_path / "bag")
+    bag = BagSource(tmp_path / "bag")
+    for ours, theirs in zip(bag.frames(), source.frames(), strict=True):
+        assert ours.imu is not None
+        assert theirs.imu is not None
+        np.testing.assert_array_equal(ours.imu.stamps, theirs.imu.stamps + EPOCH_NS)
+        np.testing.assert_allclose(ours.imu.rates, theirs.imu.rates, atol=1e-9)
+        np.testing.assert_allclose(ours.imu.forces, theirs.imu.forces, atol=1e-9)
+    assert KittiSource(folder, InputSettings(imu=False)).imu is None
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [("0 1 2 3\n", "imu.txt:1: 4 numbers, want 7"), ("0 0 0 0 0 0 9\n0 0 0 0 0 0 9\n", "imu.txt:2: times do not")],
+)
+def test_a_damaged_file_is_named(kitti_folder: Any, text: str, problem: str) -> None:
+    folder = kitti_folder()
+    (folder / "imu.txt").write_text(text)
+    with (folder / "calib.txt").open("a") as file:
+        file.write("Tr_imu_to_velo: 1 0 0 0 0 1 0 0 0 0 1 0\n")
+    with pytest.raises(UsageError, match=problem):
+        KittiSource(folder)

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A simulated IMU measures the motion of the drive that it is on, with its errors, and is written beside the scans."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dpm2_core.data.kitti import KittiSource
+from dpm2_core.frame import Array
+from dpm2_core.geometry import se3
+from dpm2_core.geometry.turning import turned
+from dpm2_core.sim.drive import simulate
+from dpm2_core.sim.imu import GRAVITY, Imu
+from dpm2_core.sim.settings import DriveConfig, ImuConfig, LidarConfig
+from dpm2_core.sim.simulated_drive import TurningRobot
+from dpm2_core.sim.world import World
+
+EXACT = ImuConfig(gyro_noise=0, gyro_bias=0, acceleration_noise=0, acceleration_bias=0, scale=0, misaligned=0)
+LIDAR = LidarConfig(beams=16, columns=360)
+
+
+def resting(times: Array) -> Array:
+    """Tilted by 0.2 rad, nose up."""
+    return np.tile(se3.exp([0, -0.2, 0, 1, 2, 3]), (len(times), 1, 1))
+
+
+def test_at_rest_it_shows_gravity_upwards_and_its_bias() -> None:
+    imu = Imu(ImuConfig(), np.random.default_rng(1))
+    rates, forces = imu.measure(imu.times(0, 20), resting)
+    up = imu.R_lidar_imu @ forces.mean(0)
+    np.testing.assert_allclose(up, GRAVITY * np.array([np.sin(0.2), 0, np.cos(0.2)]), atol=0.3)
+    assert 0.001 < np.linalg.norm(rates.mean(0)) < 0.05
+    assert rates.std(0) == pytest.approx(np.full(3, 0.002), rel=0.3)
+    assert forces.std(0) == pytest.approx(np.full(3, 0.03), rel=0.1)
+
+
+def test_its_rates_lead_along_the_drive(city: World) -> None:
+    robot = TurningRobot(city, 30, 2.0, LIDAR, EXACT, swings=90.0)
+    assert np.degrees(se3.angle(se3.inverse(robot.poses[:-1]) @ robot.poses[1:])).max() > 9  # deg in 0.1 s
+    frames = list(robot.frames())
+    for i, (last, frame) in enumerate(pairwise(frames), 1):
+        assert last.imu is not None
+        assert frame.imu is not None
+        seconds = (frame.imu.stamps - frame.stamp) * 1e-9
+        assert (seconds[0], seconds[-1], len(frame.imu)) == pytest.approx((-0.05, 0.04, 10), abs=0.011)
+        stamps = np.concatenate([last.imu.stamps, frame.imu.stamps])
+        rates = np.concatenate([last.imu.rates, frame.imu.rates])
+        R = turned((stamps - frame.stamp) * 1e-9, rates, [-0.1])
+        assert R is not None
+        T_now_before = se3.inverse(robot.poses[i]) @ robot.poses[i - 1]
+        assert np.degrees(se3.angle(se3.make(R[0].T @ T_now_before[:3, :3], np.zeros(3)))) < 0.1
+
+
+def test_each_point_has_its_own_moment(city: World) -> None:
+    """Undone with the true poses, the scans of a swing lie on each other."""
+    robot = TurningRobot(city, 36, 2.0, LIDAR.model_copy(update={"noise": 0.0, "dropout": 0.0}), swings=90.0)
+    frame = robot.frame(34)
+    assert frame.time_offset is not None
+    assert frame.imu is None
+    assert np.ptp(frame.time_offset) == pytest.approx(0.1, rel=0.01)
+    still = city.scene  # rays from where the robot was end where the points are
+    T = robot.pose(frame.stamp * 1e-9 + frame.time_offset.astype(float))
+    static = frame.points[:, :3].astype(float)
+    origins, ends = T[:, :3, 3], np.einsum("nij,nj->ni", T[:, :3, :3], static) + T[:, :3, 3]
+    rays = ends - origins
+    reach = np.linalg.norm(rays, axis=1)
+    hits = still.cast(origins.astype(np.float32), (rays / reach[:, None]).astype(np.float32), 100.0)
+    assert np.median(np.abs(hits.distance - reach)) < 0.01
+    assert (np.abs(hits.distance - reach) < 0.1).mean() > 0.85  # traffic, grass and rough surfaces apart
+
+
+def test_it_lies_beside_the_scans_and_changes_nothing_else(tmp_path: Path) -> None:
+    config = DriveConfig(frames=3, seed=3, lidar=LIDAR, images=False)
+    simulate(tmp_path / "without", config)
+    simulate(tmp_path / "with", config.model_copy(update={"imu": ImuConfig()}))
+    without, source = KittiSource(tmp_path / "without"), KittiSource(tmp_path / "with")
+    assert without.imu is None
+    assert not list((tmp_path / "without").rglob("imu.txt"))
+    frames = list(source.frames())
+    for a, b in zip(without.frames(), frames, strict=True):
+        np.testing.assert_array_equal(a.points, b.points)
+        assert a.imu is None
+    samples = [frame.imu for frame in frames if frame.imu is not None]
+    assert [len(s) for s in samples] == [11, 10, 10]  # from a tenth of a second before the first
+    assert all(s.stamps[-1] == f.stamp for s, f in zip(samples, frames, strict=True))
+    assert np.concatenate([s.forces for s in samples]).mean(0)[2] == pytest.approx(GRAVITY, abs=2.0)  # it drives

@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An IMU makes fast turns harmless and the map level; one that stops, errs or lies costs no more than it gave."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dpm2_core.frame import Array, Frame, Inertial, OdometryResult
+from dpm2_core.geometry import se3
+from dpm2_core.sim.imu import GRAVITY, Imu
+from dpm2_core.sim.settings import ImuConfig
+from dpm2_core.slam.build import make_odometry
+from dpm2_core.slam.odometry.inertial import InertialMotion
+from dpm2_core.slam.settings import SlamSettings
+
+from ....helpers.rooms import turning
+
+COUNT = 40
+
+
+@pytest.fixture(scope="module")
+def robot() -> tuple[list[Frame], Array]:
+    """A robot that stands for a second and then swings at up to 100 deg/s while it drives at 1.5 m/s."""
+    return turning(COUNT)
+
+
+def run(frames: list[Frame], **settings: object) -> list[OdometryResult]:
+    odometry = make_odometry(
+        SlamSettings.model_validate({"registration": "geometric", "preset": "outdoor", **settings})
+    )
+    return [odometry.process(frame) for frame in frames]
+
+
+def error(tracked: list[OdometryResult], truth: Array) -> float:
+    """Root mean square of the positions' errors, m."""
+    poses = np.array([t.T_odom_lidar for t in tracked])
+    off = se3.inverse(se3.inverse(truth[0]) @ truth) @ se3.inverse(poses[0]) @ poses
+    return float(np.sqrt((off[:, :3, 3] ** 2).sum(1).mean()))
+
+
+def without(frames: list[Frame], since: int = 0) -> list[Frame]:
+    return [frame if frame.index < since else replace(frame, imu=None) for frame in frames]
+
+
+def with_imu(frames: list[Frame], change: Callable[[Array, Array], tuple[Array, Array]]) -> list[Frame]:
+    """Other rates and forces."""
+    out = []
+    for frame in frames:
+        assert frame.imu is not None
+        rates, forces = change(frame.imu.rates, frame.imu.forces)
+        out.append(replace(frame, imu=replace(frame.imu, rates=rates, forces=forces)))
+    return out
+
+
+@pytest.mark.slow
+def test_fast_turns_cost_less_than_half(robot: tuple[list[Frame], Array]) -> None:
+    frames, truth = robot
+    plain, inertial = run(without(frames)), run(frames)
+    assert all(t.registration.ok for t in inertial)
+    assert error(inertial, truth) < 0.5 * error(plain, truth)
+    assert error(inertial, truth) < 0.02
+    assert {t.imu for t in plain} == {None}
+    assert {t.imu for t in inertial} == {""}
+
+
+@pytest.mark.slow
+def test_one_that_stops_is_missed_and_one_that_comes_late_is_used(robot: tuple[list[Frame], Array]) -> None:
+    frames, truth = robot
+    stops = run(without(frames, since=22))
+    gone = ["no samples at the time of the scan"] * 17
+    assert [t.imu for t in stops] == [""] * 23 + gone  # the last rate is taken to go on for 0.05 s
+    assert all(t.registration.ok for t in stops)
+    assert error(stops, truth) < 1.5 * error(run(without(frames)), truth)
+    late = run([replace(frame, imu=None) if frame.index < 20 else frame for frame in frames])
+    assert [t.imu for t in late[:20]] == [None] * 20
+    assert {t.imu for t in late[22:]} == {""}
+    poses = np.array([t.T_odom_lidar for t in late])
+    assert se3.magnitude(se3.inverse(poses[0]))[1] == 0  # no start is made level afterwards
+
+
+@pytest.mark.slow
+def test_a_wrong_orientation_is_noticed(robot: tuple[list[Frame], Array]) -> None:
+    """/tf_static says that it is upside down: it turns the other way."""
+    frames, truth = robot
+    upside_down = np.diag([1.0, -1.0, -1.0])
+    lies = run(with_imu(frames, lambda rates, forces: (rates @ upside_down, forces)))
+    assert lies[-1].imu == "its turns are not those of the scans: is its orientation right?"
+    assert sum(t.imu == "" for t in lies) < 25  # while it stands nothing shows it
+    assert error(lies, truth) < 3 * error(run(without(frames)), truth)
+
+
+@pytest.mark.slow
+def test_forces_that_are_not_known_cost_the_level_alone(robot: tuple[list[Frame], Array]) -> None:
+    frames, truth = robot
+    gyroscope = run(with_imu(frames, lambda rates, forces: (rates, np.full_like(forces, np.nan))))
+    assert error(gyroscope, truth) < 0.02
+    np.testing.assert_array_equal(gyroscope[0].T_odom_lidar, np.eye(4))
+
+
+def at_rest(seconds: float, T: Array, config: ImuConfig) -> tuple[Array, Array, Array]:
+    """Stamps, rates and forces along the LiDAR's axes of one that stands at a pose."""
+    imu = Imu(config, np.random.default_rng(3))
+    times = imu.times(0, seconds)
+    rates, forces = imu.measure(times, lambda at: np.tile(T, (len(at), 1, 1)))
+    return np.round(times * 1e9).astype(np.int64), rates @ imu.R_lidar_imu.T, forces @ imu.R_lidar_imu.T
+
+
+def standing(T: Array, count: int, config: ImuConfig | None = None) -> list[Frame]:
+    """Frames of one second on at 10 Hz, each with the samples since the one before."""
+    stamps, rates, forces = at_rest(1 + 0.1 * count, T, config or ImuConfig())
+    out = []
+    for i in range(count):
+        stamp = 10**9 + i * 10**8
+        used = (stamps <= stamp) & (stamps > (stamp - 10**8 if i else 0))
+        samples = Inertial(stamps[used], rates[used], forces[used])
+        out.append(Frame(stamp, np.zeros((0, 4), np.float32), imu=samples))
+    return out
+
+
+def test_the_bias_is_known_after_some_seconds_at_rest() -> None:
+    motion, T = InertialMotion(), np.eye(4)
+    frames = standing(T, 40, ImuConfig(gyro_bias=0.02))
+    for frame in frames:
+        corrected = motion.look(frame)
+        motion.registered(T, T, frame.stamp, np.zeros(6) if frame is not frames[0] else None)
+    assert corrected.imu is not None
+    assert frame.imu is not None
+    assert np.abs(frame.imu.rates.mean(0)).max() > 0.01
+    assert np.abs(corrected.imu.rates[-100:].mean(0)).max() < 0.0015
+    assert motion.turn is not None
+    assert motion.covariance(0.1)[0, 0] ** 0.5 < np.radians(0.15)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1 / GRAVITY], ids=["m/s2", "g"])
+@pytest.mark.parametrize("axis", [(0.0, 0.0, 1.0), (np.sin(0.3), 0.0, np.cos(0.3))], ids=["LiDAR", "tilted mount"])
+def test_a_start_at_rest_is_level(axis: tuple[float, float, float], unit: float) -> None:
+    """The LiDAR nods by 0.2 rad; the axis that is to be up, that of the base, comes out upright in its own axes."""
+    motion, T = InertialMotion(), np.eye(4)
+    frame = standing(se3.exp([0.05, 0.2, 0, 0, 0, 0]), 1, ImuConfig(acceleration_bias=0.02, misaligned=0.0))[0]
+    assert frame.imu is not None
+    frame = replace(frame, imu=replace(frame.imu, forces=unit * frame.imu.forces, up=axis))
+    motion.look(frame)
+    motion.registered(T, T, frame.stamp, None)
+    up = se3.exp([0.05, 0.2, 0, 0, 0, 0])[2, :3]  # along the LiDAR's axes
+    assert np.degrees(np.arccos(motion.T_level_odom[:3, :3] @ up @ np.array(axis))) < 0.3
+
+
+def test_a_start_in_motion_or_without_a_known_base_is_not() -> None:
+    frame, T = standing(se3.exp([0, 0.2, 0, 0, 0, 0]), 1)[0], np.eye(4)
+    assert frame.imu is not None
+    shaken = frame.imu.forces + np.random.default_rng(0).normal(0, 2, frame.imu.forces.shape)
+    for changed in ({"forces": shaken}, {"up": None}):
+        motion = InertialMotion()
+        motion.look(replace(frame, imu=replace(frame.imu, **changed)))
+        motion.registered(T, T, frame.stamp, None)
+        np.testing.assert_array_equal(motion.T_level_odom, np.eye(4))
+
+
+def test_the_level_follows_a_drifting_odometry_without_a_jump() -> None:
+    """The odometry tips over by 0.01 deg in each frame of 0.5 m, and the robot stays level."""
+    motion, drift = InertialMotion(), np.radians(0.01)
+    frames = standing(np.eye(4), 500, ImuConfig(acceleration_bias=0.0, misaligned=0.0))
+    before, outs = np.eye(4), []
+    step = se3.exp([0, drift, 0, 0.5, 0, 0])
+    for i, frame in enumerate(frames):
+        # What tips is the odometry's idea of the axes alone: neither gyroscope nor forces show it.
+        T = before @ step if i else before
+        motion.look(frame)
+        motion.registered(before, T, frame.stamp, np.r_[0, 0, 0, 5.0, 0, 0] if i else None)
+        outs.append(motion.T_level_odom @ T)
+        before = T
+    tilt = np.degrees(np.arccos(np.array(outs)[:, 2, 2]))
+    assert np.degrees(np.arccos(before[2, 2])) > 4.9
+    assert tilt[-1] < 3.5  # the mean of a minute lags
+    steps = se3.inverse(np.array(outs)[:-1]) @ np.array(outs)[1:]
+    np.testing.assert_allclose(np.linalg.norm(steps[:, :3, 3], axis=1), 0.5, atol=1e-6)
+    assert np.degrees(se3.angle(steps)).max() < 0.05
+
+
+def test_samples_from_before_time_went_back_are_forgotten() -> None:
+    motion, T = InertialMotion(), np.eye(4)
+    frames = standing(T, 10)
+    for i in (5, 6, 0, 1):
+        motion.look(frames[i])
+        assert motion.problem == ""
+        motion.registered(T, T, frames[i].stamp, np.zeros(6))
+    assert motion.turn is not None

@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""slam_node with an IMU on the topic `imu`, over real DDS: level, in use, gone, hostile; and the drive goes on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import Imu, PointCloud2
+
+from dpm2_core.data.topics import POINTS
+from dpm2_core.data.transforms import transform_matrix
+from dpm2_core.geometry import se3
+from dpm2_ros.conversions import header, transform_to_msg, vector
+from dpm2_ros.slam_node import SlamNode
+from dpm2_ros.tf import TFMessage
+
+PITCH = np.radians(10.0)  # the slope that the robot stands on, nose up
+T_BASE_LIDAR = se3.exp([0.0, 0.1, 0.3, 0.8, 0.0, 1.2])
+T_BASE_IMU = se3.exp([0.0, 0.0, 1.0, 0.1, 0.0, 0.2])
+BIAS = np.array([0.01, -0.02, 0.015])
+NAN = float("nan")
+
+pytestmark = pytest.mark.slow
+
+
+class Robot:
+    """Stands on a slope: clouds of one place at 10 Hz, samples at 100 Hz."""
+
+    def __init__(self, ros: Callable[..., Any], drive: Any, *parameters: str, place: bool = True) -> None:
+        self.harness, self.drive = ros("input.images:=false", "ros.base_frame:=base_link", *parameters), drive
+        self.wait, publisher = self.harness.wait, self.harness.publisher
+        self.lidar, self.imu = publisher(PointCloud2, POINTS), publisher(Imu, "/imu", reliable=False)
+        frames = {"lidar": T_BASE_LIDAR} | ({"imu_link": T_BASE_IMU} if place else {})
+        static = publisher(TFMessage, "/tf_static", latched=True)
+        static.publish(TFMessage(transforms=[transform_to_msg(T, 0, "base_link", n) for n, T in frames.items()]))
+        self.odom = self.harness.hear(Odometry, "/dpm2/odom")
+        self.diagnostics = self.harness.hear(DiagnosticArray, "/diagnostics")
+        self.node: SlamNode = self.harness.add(SlamNode())
+        self.wait(lambda: self.lidar.get_subscription_count() and self.imu.get_subscription_count(), "subscriptions")
+        self.wait(lambda: "lidar" in self.node.calibration.transforms.frames, "/tf_static")
+
+    def sample(self, stamp: int, rates: Any = BIAS) -> None:
+        """One of a robot at rest."""
+        up = T_BASE_IMU[:3, :3].T @ [np.sin(PITCH), 0, np.cos(PITCH)]
+        message = Imu(header=header(stamp, "imu_link"), linear_acceleration=vector(9.81 * up))
+        message.angular_velocity = vector(np.asarray(rates))
+        self.imu.publish(message)
+
+    def send(self, *numbers: int, samples: bool = True) -> None:
+        for n in numbers:
+            before, stamp = len(self.odom), self.drive.stamp(n)
+            for k in range(10 * samples):
+                self.sample(stamp - self.drive.period + (k + 1) * self.drive.period // 10)
+            cloud = self.drive.cloud(0)
+            cloud.header = header(stamp, "lidar")
+            self.lidar.publish(cloud)
+            self.wait(lambda before=before: len(self.odom) > before, f"the odometry of cloud {n}")
+
+    def status(self, condition: Callable[[DiagnosticStatus], bool]) -> DiagnosticStatus:
+        """Of the IMU, once it is so."""
+
+        def last() -> list[DiagnosticStatus]:
+            statuses = self.diagnostics[-1].status if self.diagnostics else []
+            return [s for s in statuses if s.name.endswith(": imu") and condition(s)]
+
+        self.wait(last, "a status of the IMU")
+        return last()[0]
+
+
+@pytest.fixture
+def robot(ros: Callable[..., Any], drive: Any, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Robot]:
+    monkeypatch.setattr("dpm2_ros.diagnostics.PERIOD", 0.1)
+    return lambda *parameters, **other: Robot(ros, drive, *parameters, **other)
+
+
+def test_a_start_on_a_slope_is_level_and_one_that_stops_is_missed(robot: Callable[..., Robot]) -> None:
+    """The pose of the base has the pitch of the slope; hostile samples are counted and change nothing."""
+    r = robot()
+    r.send(0, 1, 2)
+    assert r.status(lambda s: s.message == "in use").level == DiagnosticStatus.OK
+    first = transform_matrix(r.odom[0].pose.pose)
+    np.testing.assert_allclose(first[2, :3], [np.sin(PITCH), 0, np.cos(PITCH)], atol=0.01)  # base's axes, heights
+    assert abs(np.degrees(np.arctan2(first[1, 0], first[0, 0]))) < 1  # and no other heading
+    late = r.drive.stamp(2)
+    r.sample(late + 10**7, (NAN, 0.0, 0.0))
+    r.sample(late + 10**7, (0.0, 1e9, 0.0))
+    r.sample(late - 10**8)  # back
+    for k in range(20):  # a flood
+        r.sample(late + 10**6 * (k == 19) + k)
+    r.wait(lambda: sum(r.node.rejections.values()) >= 22, "rejections")
+    r.send(3, 4)
+    assert r.status(lambda s: "in use" in s.message)
+    r.send(5, 6, samples=False)
+    assert (
+        "no samples at the time of the scan; going on" in r.status(lambda s: s.level == DiagnosticStatus.WARN).message
+    )
+    r.send(7)
+    assert r.status(lambda s: s.message == "in use")
+    for message in r.odom:
+        T = se3.inverse(first) @ transform_matrix(message.pose.pose)
+        assert se3.magnitude(T)[0] < 0.02
+
+
+def test_without_its_place_it_is_left_out_and_said(robot: Callable[..., Robot]) -> None:
+    r = robot(place=False)
+    r.send(0, 1)
+    said = r.status(lambda s: s.level == DiagnosticStatus.WARN).message
+    assert said.startswith("no transform from 'imu_link' to 'lidar'")
+    assert "set input.q_lidar_imu" in said
+    np.testing.assert_allclose(transform_matrix(r.odom[0].pose.pose)[:3, :3], np.eye(3), atol=0.01)
