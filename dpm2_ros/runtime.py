@@ -16,6 +16,7 @@ from typing import Any
 
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_ros.share import share_directory
+from dpm2_ros.shared_memory import free_shared_memory
 
 _SWITCH = 5e-4
 """s until a thread must hand Python's lock on. The odometry asks for it tens of times per frame; with the usual 5 ms a
@@ -46,7 +47,10 @@ def use_dds_profile() -> None:
 
 
 def ros_context(arguments: Sequence[str], domain: int | None = None) -> None:
-    """rclpy.init with the DDS profile and without its signal handlers; `domain`: None takes that of the environment.
+    """rclpy.init with the DDS profile and without its signal handlers, and without what killed processes have left.
+
+    Args:
+        domain: None takes that of the environment.
 
     Raises:
         UsageError: `--ros-args` that ROS does not understand.
@@ -55,6 +59,7 @@ def ros_context(arguments: Sequence[str], domain: int | None = None) -> None:
     from rclpy.signals import SignalHandlerOptions
 
     use_dds_profile()
+    free_shared_memory()
     try:
         rclpy.init(args=list(arguments), domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # rclpy raises RCLError, UnknownROSArgsError and RuntimeError by the kind of mistake
