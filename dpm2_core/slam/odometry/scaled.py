@@ -49,6 +49,7 @@ class ScaledOdometry:
         self._open_air.reset()
         self._room.reset()
         self._active, self._undecided, self._others, self._scans = self._open_air, True, 0, 0
+        self._begun = False  # a scan has been registered while it was undecided
 
     def process(self, frame: Frame) -> OdometryResult:
         """Pose of one frame, as of `Odometry.process`."""
@@ -57,10 +58,11 @@ class ScaledOdometry:
             return self._active.process(frame)
         found = is_room(frame.points) if frame.problem is None else None
         decides = self._undecided and found is not None
-        if decides and self._scans == 1:
+        if decides and not self._begun:
             self._active = self._room if found else self._open_air
         self._undecided &= not decides
         result = self._active.process(frame)
+        self._begun |= result.registration.ok
         other = found is not None and found != (self._active is self._room)
         self._others = (_SURE if decides else self._others + 1) if other else 0
         if self._others >= _SURE and not self._undecided and result.registration.ok:
