@@ -23,6 +23,7 @@ import numpy as np
 from rich.console import Group
 
 from benchmarks.fleet_drives import STEP, chained, odometry_of, poses_of, write_drive
+from benchmarks.fleet_growth import bench_growth
 from benchmarks.harness import Options, Report, requested
 from benchmarks.roads import FIRST_SEED, road_files
 from dpm2_core.errors import Dpm2Error, UsageError
@@ -56,9 +57,10 @@ _FAST = ("slam.registration=geometric", "slam.loops.descriptors=false", "slam.th
 
 
 def bench_fleet(options: Options) -> Report:
-    """The parts of the issue's table, or the one that `--only` names: town, index, kills, workers."""
+    """The parts of the issue's table, or the one that `--only` names: town, index, kills, workers, growth."""
     parts: dict[str, Callable[[Path, Options], dict[str, Any]]] = {
-        "town": bench_town, "index": bench_index, "kills": bench_kills, "workers": bench_workers
+        "town": bench_town, "index": bench_index, "kills": bench_kills, "workers": bench_workers,
+        "growth": lambda folder, _: bench_growth(folder),
     }  # fmt: skip
     results: dict[str, Any] = {}
     file = options.out / "fleet.json"

@@ -21,6 +21,7 @@ from dpm2_core.fleet.joins import ENOUGH
 from dpm2_core.fleet.regions import Join
 from dpm2_core.fleet.search import affirmed, component
 from dpm2_core.frame import Array, Edge
+from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.graph_data import loop_errors, mahalanobis
 from dpm2_core.slam.graph.pose_graph import PoseGraph, PoseGraphSettings
 from dpm2_core.slam.mapping.restore import restore
@@ -223,7 +224,7 @@ class _Region:
         graph.optimize()
         checked = [replace(join, loop=replace(join.loop, registration=loop.registration))
                    for join, loop in zip(joins, graph.loops[loops:], strict=True)]  # fmt: skip
-        solved = graph.poses
+        solved = np.array([se3.orthonormalized(T) for T in graph.poses])  # else rounding doubles with each addition
         moved = {node: solved[self._at[node]] for node in self._own}
         return Growth(
             {name: replace(data, poses=solved[begins[name] :][: len(data)]) for name, data in maps.items()},

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a drive more costs a map that grows: its place in the index, in the graph and in the file."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dpm2_core.fleet.growth import Growth, Standing, add_drives, grown
+from dpm2_core.fleet.places import FleetIndex
+from dpm2_core.fleet.regions import LARGEST, Join
+from dpm2_core.frame import Array, Edge, Keyframe, Registration
+from dpm2_core.geometry import se3
+from dpm2_core.slam.graph.pose_graph import PoseGraphSettings
+from dpm2_core.slam.loops.retrieval import WIDTH
+from dpm2_core.slam.store.cloud_codec import pack_cloud
+from dpm2_core.slam.store.cloud_store import CloudStore
+from dpm2_core.slam.store.map_data import NO_POINTS, MapData
+from dpm2_core.slam.store.map_store import MapStore
+from dpm2_core.slam.store.rows import Session
+
+DRIVES, KEYFRAMES, SHARED = 52, 100, 20
+"""Drives; keyframes of each, 5 m apart; those that it has in common with the next."""
+_NOISE = np.diag([1e-3] * 3 + [0.02] * 3) ** 2
+_POINTS = 5000  # of a cloud
+_WINDOW = 5  # additions whose median is taken
+
+
+def bench_growth(folder: Path) -> dict[str, Any]:
+    """Processor time of each addition, without the search for loops, which is the same whatever the map has.
+
+    The drives are made up: true poses with noise, clouds of noise, loops of the truth, places that look alike where
+    they are the same.
+    """
+    rng = np.random.default_rng(0)
+    count = (KEYFRAMES - SHARED) * DRIVES + SHARED
+    way = se3.exp(np.arange(count)[:, None] * np.array([0, 0, 0.01, 5.0, 0, 0]))
+    looks = rng.normal(size=(count, WIDTH)).astype(np.float32)
+    index, sizes, rows = FleetIndex(folder), dict[str, int](), []
+    with MapStore.create(folder / "town.dpm2map") as store:
+        for number in range(DRIVES):
+            at = np.arange(KEYFRAMES) + number * (KEYFRAMES - SHARED)
+            name, data = f"d{number:02d}", _drive(way[at], rng)
+            vectors = looks[at] + 0.1 * rng.normal(size=(KEYFRAMES, WIDTH)).astype(np.float32)
+            joins = _joins(f"d{number - 1:02d}", name, way, at) if number else []
+            rows.append({"map": sum(sizes.values()), **_added(store, index, sizes, (name, data, vectors), joins)})
+            sizes[name] = KEYFRAMES
+    few, many = (_median(rows[last - _WINDOW : last]) for last in (5 + _WINDOW // 2 + 1, DRIVES))
+    return {
+        "keyframes": KEYFRAMES * DRIVES,
+        "cpu_ms_at_5_drives": few,
+        "cpu_ms_at_50_drives": many,
+        "ratio": {part: many[part] / few[part] for part in few},
+    }
+
+
+def _added(store: MapStore, index: FleetIndex, sizes: dict[str, int], drive: tuple[str, MapData, Any],
+           joins: list[Join]) -> dict[str, float]:  # fmt: skip
+    """Processor time, ms, of each part of an addition."""
+    name, data, vectors = drive
+    began = time.process_time()
+    index.similar(vectors, 8)
+    index.add(name, [0, 0], vectors)
+    index.save()
+    indexed = time.process_time()
+    growth: Growth | None = Growth({name: data})
+    if joins:
+        ties = list(zip(list(sizes), list(sizes)[1:], strict=False))
+        growth = grown(Standing(store, sizes, ties, PoseGraphSettings(), LARGEST), {name: data}, joins)
+    assert growth is not None
+    assert all(join.loop.ok for join in growth.joins)
+    solved = time.process_time()
+    with store.together():
+        add_drives(store, sizes, growth)
+    written = time.process_time()
+    parts = {"index": indexed - began, "graph": solved - indexed, "file": written - solved, "all": written - began}
+    return {part: 1e3 * seconds for part, seconds in parts.items()}
+
+
+def _median(rows: list[dict[str, float]]) -> dict[str, float]:
+    return {part: float(np.median([row[part] for row in rows])) for part in ("index", "graph", "file", "all")}
+
+
+def _drive(poses: Array, rng: np.random.Generator) -> MapData:
+    """The map of a drive in the frame of its first keyframe."""
+    clouds, own, edges = CloudStore(), [np.eye(4)], []
+    for number in range(len(poses)):
+        clouds.append(pack_cloud(rng.uniform(-40, 40, (_POINTS, 4)).astype(np.float32)))
+        if number:
+            T = se3.inverse(poses[number - 1]) @ poses[number] @ se3.exp(rng.normal(size=6) * np.sqrt(np.diag(_NOISE)))
+            own.append(own[-1] @ T)
+            edges.append(Edge("odometry", number - 1, number, Registration(T, _NOISE)))
+    keyframes = [Keyframe(i, i * 10**9, i, T, NO_POINTS) for i, T in enumerate(own)]
+    sessions = [Session(1, "0", "2026-01-01T00:00:00Z", "", "")]
+    return MapData(keyframes, [1] * len(own), np.array(own), edges, [], sessions, clouds)
+
+
+def _joins(one: str, other: str, way: Array, at: Any) -> list[Join]:
+    """Loops between the last keyframes of a drive and the first of the next, and to the neighbors of these."""
+    pairs = [(a, b) for b in range(SHARED) for a in range(max(b - 2, 0), min(b + 3, SHARED))]
+    first = KEYFRAMES - SHARED
+    return [
+        Join(one, other, Edge("loop", first + a, b,
+                              Registration(se3.inverse(way[at[a]]) @ way[at[b]], _NOISE)))
+        for a, b in pairs
+    ]  # fmt: skip
