@@ -94,6 +94,7 @@ def test_every_argument_is_a_parameter_that_is_taken(launch_file: ModuleType, tm
         "config_file": str(tmp_path / "settings.yaml"),
         "points_topic": "/ouster/points",
         "image_topic": "/cam/image",
+        "imu_topic": "/imu/data",
         "base_frame": "base_link",
         "odom_frame": "red/odom",
         "odom_source": "tf",
