@@ -8,7 +8,7 @@ PYTHON ?= $(firstword $(shell for p in python3.11 python3.12 python3; do \
 BIN := .venv/bin
 READY := .venv/.ready
 EXTRAS ?= plot,sim,test,docs,view,fleet
-JOBS ?= -n 3 --dist worksteal
+JOBS ?= -n 2 --dist worksteal
 
 # The environment is self-contained: a sourced ROS 2, another environment's bootstrap or its libraries must not leak in.
 unexport PYTHONPATH PYTHONHOME VIRTUAL_ENV AMENT_PREFIX_PATH ROS_DISTRO LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
