@@ -77,7 +77,7 @@ class Lockstep:
     def order(self, messages: Iterable[RawMessage]) -> Iterator[RawMessage]:
         """The same messages as `dpm2 run` takes them: a cloud after images and IMU, if they have a subscriber."""
         listened = [topic for topic, publisher in self._publishers.items() if publisher.get_subscription_count()]
-        others = {topic: 0 for topic in listened if self._bag.types[topic] in (*IMAGES, IMU)}
+        others = dict.fromkeys((t for t in listened if self._bag.types[t] in (*IMAGES, IMU)), 0)
         return clouds_after_others(messages, self._clouds, others)
 
     def turn(self, topic: str, data: bytes) -> None:

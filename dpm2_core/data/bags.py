@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
@@ -132,29 +132,28 @@ class BagSource:
         asked, found = self._settings.image_topic, self._bag.topics(*IMAGES)
         if not self._settings.images:
             return ""
-        if asked:
-            if asked not in found:
-                raise UsageError(f"{self.path}: no images on {asked}; {self._contents()}")
-            return asked
         silent = [topic for topic, kind in self._bag.types.items() if kind in IMAGES and topic not in found]
-        if silent:
+        if silent and not asked:
             self.notes.append(f"no message on the image topic {', '.join(silent)}")
-        if len(found) > 1 and topics.IMAGE not in found:
-            self.notes.append(f"image topics {', '.join(found)}: none is used; choose one with input.image_topic")
-            return ""
-        return topics.IMAGE if topics.IMAGE in found else "".join(found)
+        return self._one_of(found, asked, topics.IMAGE, "image", "images")
 
     def _choose_imu(self) -> str:
         """An IMU's topic, empty for none."""
-        asked, found = self._settings.imu_topic, self._bag.topics(IMU)
         if not self._settings.imu:
             return ""
-        if asked and asked not in found:
-            raise UsageError(f"{self.path}: no Imu messages on {asked}; {self._contents()}")
-        if not asked and len(found) > 1 and topics.IMU not in found:
-            self.notes.append(f"Imu topics {', '.join(found)}: none is used; choose one with input.imu_topic")
+        return self._one_of(self._bag.topics(IMU), self._settings.imu_topic, topics.IMU, "Imu", "Imu messages")
+
+    def _one_of(self, found: Sequence[str], asked: str, usual: str, kind: str, messages: str) -> str:
+        """The topic that is asked for, else the usual one, else the only one; empty where that leaves a choice."""
+        if asked:
+            if asked not in found:
+                raise UsageError(f"{self.path}: no {messages} on {asked}; {self._contents()}")
+            return asked
+        if len(found) > 1 and usual not in found:
+            key = f"input.{kind.lower()}_topic"
+            self.notes.append(f"{kind} topics {', '.join(found)}: none is used; choose one with {key}")
             return ""
-        return asked or (topics.IMU if topics.IMU in found else "".join(found))
+        return usual if usual in found else "".join(found)
 
     def _camera(self) -> Camera | None:
         namespace = self.image_topic.removesuffix("/compressed").rpartition("/")[0]

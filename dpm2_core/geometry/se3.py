@@ -55,15 +55,24 @@ def exp(xi: ArrayLike) -> Array:
     """(..., 6) tangent to (..., 4, 4)."""
     xi = np.asarray(xi, np.float64)
     w, rho = xi[..., :3], xi[..., 3:]
-    R = Rotation.from_rotvec(w.reshape(-1, 3)).as_matrix().reshape(*w.shape[:-1], 3, 3)
-    return make(R, (_left_jacobian(w) @ rho[..., None])[..., 0])
+    return make(rotation(w), (_left_jacobian(w) @ rho[..., None])[..., 0])
 
 
 def log(T: Array) -> Array:
     """(..., 4, 4) to (..., 6); inverse of `exp` for rotations below pi."""
-    w = Rotation.from_matrix(T[..., :3, :3].reshape(-1, 3, 3)).as_rotvec().reshape(*T.shape[:-2], 3)
+    w = rotation_vector(T[..., :3, :3])
     rho = np.linalg.solve(_left_jacobian(w), T[..., :3, 3:])[..., 0]
     return np.concatenate([w, rho], -1)
+
+
+def rotation(w: Array) -> Array:
+    """Rotation vectors (..., 3), rad, to (..., 3, 3)."""
+    return np.asarray(Rotation.from_rotvec(w.reshape(-1, 3)).as_matrix().reshape(*w.shape, 3))
+
+
+def rotation_vector(R: Array) -> Array:
+    """(..., 3, 3) to (..., 3), rad, up to pi."""
+    return np.asarray(Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec().reshape(*R.shape[:-1]))
 
 
 def adjoint(T: Array) -> Array:
@@ -77,7 +86,7 @@ def adjoint(T: Array) -> Array:
 
 def angle(T: Array) -> Array:
     """Rotation angle of (..., 4, 4), rad; exact near zero, where the trace formula is not."""
-    return np.linalg.norm(log(T)[..., :3], axis=-1)
+    return np.linalg.norm(rotation_vector(T[..., :3, :3]), axis=-1)
 
 
 def magnitude(T: Array) -> tuple[float, float]:

@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
+from dpm2_core.geometry import se3
 from dpm2_core.geometry.se3 import Array
 
 _LONGEST = 0.1  # s between two samples, across which the rate is taken to change evenly
@@ -45,7 +45,7 @@ def turned(seconds: NDArray[np.floating], rates: Array, at: ArrayLike) -> Array 
     seconds = np.concatenate([[before - 1e-9], seconds, [after + 1e-9]])
     rates = np.concatenate([rates[:1], rates, rates[-1:]])
     steps = np.diff(seconds)
-    whole = _exp((rates[1:] + rates[:-1]) / 2 * steps[:, None])
+    whole = se3.rotation((rates[1:] + rates[:-1]) / 2 * steps[:, None])
     nodes = np.empty((len(seconds), 3, 3))
     nodes[0] = np.eye(3)
     for k, R in enumerate(whole):
@@ -55,7 +55,7 @@ def turned(seconds: NDArray[np.floating], rates: Array, at: ArrayLike) -> Array 
         k = np.clip(np.searchsorted(seconds, times, "right") - 1, 0, len(steps) - 1)
         since = (times - seconds[k])[:, None]
         mean = rates[k] + (rates[k + 1] - rates[k]) * since / (2 * np.maximum(steps[k], 1e-9)[:, None])
-        return nodes[k] @ _exp(mean * since)
+        return nodes[k] @ se3.rotation(mean * since)
 
     return np.asarray(rotation(np.zeros(1))[0].T @ rotation(at))
 
@@ -69,10 +69,5 @@ def leveled(up: ArrayLike, axis: ArrayLike = (0.0, 0.0, 1.0)) -> Array:
         if cosine > 0:
             return np.eye(3)
         cross = np.cross(u, np.eye(3)[int(np.abs(u).argmin())])  # upside down: about any level axis
-        return np.asarray(_exp(np.pi * cross / np.linalg.norm(cross)))
-    return np.asarray(_exp(cross / sine * np.arctan2(sine, cosine)))
-
-
-def _exp(vectors: NDArray[np.float64]) -> Array:
-    """Rotation vectors (..., 3) to (..., 3, 3)."""
-    return np.asarray(Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(*vectors.shape, 3))
+        return np.asarray(se3.rotation(np.pi * cross / np.linalg.norm(cross)))
+    return np.asarray(se3.rotation(cross / sine * np.arctan2(sine, cosine)))

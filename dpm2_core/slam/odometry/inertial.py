@@ -88,8 +88,8 @@ class InertialMotion:
 
     def covariance(self, seconds: float) -> Array:
         """(3, 3) rad2 of `turn` over that time."""
-        angle = 0.0 if self.turn is None else se3.magnitude(se3.make(self.turn, np.zeros(3)))[1]
-        of_turn = _TURN**2 + (_SHARE * np.radians(angle)) ** 2
+        angle = 0.0 if self.turn is None else _angle(self.turn)
+        of_turn = _TURN**2 + (_SHARE * angle) ** 2
         return np.asarray((of_turn + self._variance * seconds**2) * np.eye(3))
 
     def registered(self, T_before: Array, T: Array, stamp: int, twist: Array | None) -> None:
@@ -164,7 +164,7 @@ class InertialMotion:
         span, self._span = self._span, _Span(R)
         if self._doubt > _CREDIBLE:
             return
-        off = se3.log(se3.make(R.T @ span.R_start @ span.R_start_now, np.zeros(3)))[:3] / span.seconds
+        off = se3.rotation_vector(R.T @ span.R_start @ span.R_start_now) / span.seconds
         variance = (2 * _TURN**2 + (_SHARE * span.angle) ** 2) / span.seconds**2
         gain = self._variance / (self._variance + variance)
         self._bias = np.clip(self._bias + gain * off, -_LARGEST_BIAS, _LARGEST_BIAS)
@@ -187,9 +187,9 @@ class InertialMotion:
         if angle < 1e-9:
             return
         most = _FOLLOWS * max(float(np.linalg.norm(T[:3, 3] - T_before[:3, 3])), seconds)
-        part = se3.log(se3.make(wanted, np.zeros(3))) * min(1.0, most / angle)
+        part = se3.rotation_vector(wanted) * min(1.0, most / angle)
         here = (self.T_level_odom @ T)[:3, 3]
-        R = se3.exp(part)[:3, :3] @ self.T_level_odom[:3, :3]
+        R = se3.rotation(part) @ self.T_level_odom[:3, :3]
         self.T_level_odom = se3.orthonormalized(se3.make(R, here - R @ T[:3, 3]))
 
 
@@ -250,7 +250,7 @@ class _Vertical:
 
 
 def _angle(R: Array) -> float:
-    return float(se3.angle(se3.make(R, np.zeros(3))))
+    return float(np.linalg.norm(se3.rotation_vector(R)))
 
 
 def _metric(force: Array) -> Array:

@@ -168,8 +168,7 @@ class Odometry:
         """A twist (6,) with the turn since the last registered frame as it was measured, where it was."""
         if self._inertial is None or self._inertial.turn is None:
             return twist
-        R = se3.make(self._inertial.turn, np.zeros(3))
-        return np.concatenate([se3.log(R)[:3] / seconds, twist[3:]])
+        return np.concatenate([se3.rotation_vector(self._inertial.turn) / seconds, twist[3:]])
 
     def _predicted(self, twist: Array, dt: float) -> Array:
         """Pose (4, 4) of a frame, `dt` s after the one before, with a measured turn from the last registered one."""
