@@ -26,6 +26,7 @@ _MOST = 20_000
 # Gyroscope, standard deviations: a turn is off by so much, rad, and this fraction of it (scale, axes, time).
 _TURN, _SHARE = np.radians(0.1), 0.02
 _BIAS, _BIAS_DRIFT = 0.03, 1e-4  # rad/s of an unknown one, and its change in 1 s
+_BIAS_AT_REST = 0.003  # rad/s of one that was measured at rest: "rest" may be a slow turn
 _LARGEST_BIAS = 0.2  # rad/s
 _SPAN = 1.0  # s over which scans and gyroscope are compared for the bias
 _USUAL = 3.0  # squared sigmas of a turn that count as one in the doubt
@@ -100,7 +101,7 @@ class InertialMotion:
         """
         measured, before, self._before, self._turns = self._measured, self._before, stamp, False
         if before is None and twist is None:
-            self._start_level(T)
+            self._start_at_rest(T)
         if measured is None or before is None or twist is None:
             self._span = _Span(T[:3, :3])
             self._vertical.pause()
@@ -118,10 +119,13 @@ class InertialMotion:
         self._vertical.add(T_before[:3, :3] @ force, T[:3, :3] @ twist[3:], seconds)
         self._follow(T_before, T, seconds)
 
-    def _start_level(self, T: Array) -> None:
-        """Where a drive begins at rest, the samples before the first frame show which way is up."""
+    def _start_at_rest(self, T: Array) -> None:
+        """Where a drive begins at rest, the samples before the first frame show the bias and which way is up."""
         s, starts, self._starts = self._samples, self._starts, False
-        if not starts or s.up is None or len(s) < _FEWEST or not _at_rest(s.rates, s.forces):
+        if not starts or len(s) < _FEWEST or not _at_rest(s.rates, s.forces):
+            return
+        self._bias, self._variance = s.rates.mean(0), _BIAS_AT_REST**2
+        if s.up is None:
             return
         self._vertical.start(T[:3, :3] @ s.forces.mean(0), T[:3, :3] @ s.up)
         R = self._vertical.turn

@@ -135,6 +135,34 @@ def test_the_bias_is_known_after_some_seconds_at_rest() -> None:
     assert motion.covariance(0.1)[0, 0] ** 0.5 < np.radians(0.15)
 
 
+@pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), None], ids=["base known", "base unknown"])
+def test_the_bias_is_known_from_the_first_frame_of_a_start_at_rest(up: tuple[float, float, float] | None) -> None:
+    motion, T = InertialMotion(), np.eye(4)
+    first, second = (
+        replace(frame, imu=replace(frame.imu, up=up))
+        for frame in standing(T, 2, ImuConfig(gyro_bias=0.02))
+        if frame.imu is not None
+    )
+    motion.look(first)
+    motion.registered(T, T, first.stamp, None)
+    motion.look(second)
+    assert motion.turn is not None
+    assert np.degrees(se3.angle(se3.make(motion.turn, np.zeros(3)))) < 0.02  # 0.2 by the bias alone
+
+
+def test_a_slow_turn_at_the_start_is_no_bias_for_long() -> None:
+    """A robot that turns at 1 deg/s looks as one at rest; the scans show that it turns."""
+    motion, rate, before = InertialMotion(), np.radians(1.0), np.eye(4)
+    for i, frame in enumerate(standing(np.eye(4), 100, ImuConfig(gyro_bias=0.0))):
+        assert frame.imu is not None
+        motion.look(replace(frame, imu=replace(frame.imu, rates=frame.imu.rates + [0, 0, rate])))
+        T = se3.exp([0, 0, 0.1 * i * rate, 0, 0, 0])
+        motion.registered(before, T, frame.stamp, np.r_[0, 0, rate, 0, 0, 0] if i else None)
+        before = T
+    assert motion.turn is not None
+    assert se3.rotation_vector(motion.turn)[2] == pytest.approx(0.1 * rate, rel=0.1)
+
+
 @pytest.mark.parametrize("unit", [1.0, 1 / GRAVITY], ids=["m/s2", "g"])
 @pytest.mark.parametrize("axis", [(0.0, 0.0, 1.0), (np.sin(0.3), 0.0, np.cos(0.3))], ids=["LiDAR", "tilted mount"])
 def test_a_start_at_rest_is_level(axis: tuple[float, float, float], unit: float) -> None:
