@@ -177,7 +177,7 @@ def _drive(source: SimulatedDrive, root: Path) -> tuple[MapData, dict[str, set[i
 
 def _arguments(name: str) -> list[str]:
     given = ["input.points_topic:=points", "input.images:=false", "ros.embed_mapper:=false",
-             f"ros.odom_frame:={name}/odom"]  # fmt: skip
+             f"ros.odom_frame:={name}/odom", "ros.map_directory:=''"]  # fmt: skip
     return ["--ros-args", "-r", f"__ns:=/{name}", *(part for pair in given for part in ("-p", pair))]
 
 

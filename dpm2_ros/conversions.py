@@ -24,7 +24,10 @@ from dpm2_core.frame import Array, Keyframe, OdometryResult, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.mapping.admission import MAX_ID, RejectedError
 
-_KEYFRAME = re.compile(r"(?:(?P<robot>[\w/]{1,200})/)?kf_(?P<id>[0-9]{1,10})(?:\.(?P<session>[0-9a-f]{8}))?", re.ASCII)
+_KEYFRAME = re.compile(
+    r"(?:(?P<robot>[\w/]{1,200})/)?kf_(?P<id>[0-9]{1,10})(?:\.(?P<session>[0-9a-f]{8}-?))?", re.ASCII
+)
+EARLIER = "-"
 _FRAME = re.compile(r"[^\s\x00-\x1f\x7f]{1,200}")
 _SWAP = np.roll(np.eye(6), 3, axis=0)  # [rotation, translation] to [translation, rotation], and its own inverse
 

@@ -22,7 +22,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.slam.mapping.admission import RejectedError, check_covariance, check_descriptors, check_pose
 from dpm2_core.slam.store.cloud_codec import CodecError, unpack_cloud
 from dpm2_core.slam.store.map_data import NO_POINTS
-from dpm2_ros.conversions import check_frame, covariance_from_ros, parse_keyframe_name
+from dpm2_ros.conversions import EARLIER, check_frame, covariance_from_ros, parse_keyframe_name
 from dpm2_ros.guard import GuardedNode
 from dpm2_ros.keyframes import BUDGET, WIRE, descriptors_from_msg, received_to_msg
 from dpm2_ros.mapping import MapperThread
@@ -46,6 +46,7 @@ class Feed:
 
     A new session is that of the robot that was started again, once the old one has been silent for `SILENT` s. If both
     are heard they are two robots, and the second gets a name of its own, `robot.session`. So no session ends another.
+    The robot itself says which drives are over: those it sends first, and its odometry is of none of them.
     """
 
     def __init__(self, node: GuardedNode, mapper: MapperThread, namespace: str, weights: str) -> None:
@@ -112,7 +113,7 @@ class Feed:
             return
         main = [self._robot] if self._robot in known else []
         for robot in (*main, *reversed(known)):  # of two that use the same frame the first
-            if known[robot].odom_frame == frame:
+            if known[robot].odom_frame == frame and known[robot].live:
                 self._mapper.broadcast(stamp_ns(message.header), robot, frame)
                 return
 
@@ -166,10 +167,10 @@ class Feed:
     def _hear(self, name: str) -> tuple[Stream, int]:
         """The drive of a keyframe with that name, and its id."""
         _, id, session = parse_keyframe_name(name)
-        now = time.monotonic()
+        now, live, session = time.monotonic(), not session.endswith(EARLIER), session.removesuffix(EARLIER)
         stream = self._streams.pop(session, None) or Stream(session, now)
         self._streams[session] = stream
-        stream.hear(now)
+        stream.hear(now, live)
         while len(self._streams) > _STREAMS:
             unknown = (s for s in self._streams.values() if not s.taken)
             oldest = next(unknown, None) or next(s for s in self._streams.values() if s is not self._main)
@@ -208,7 +209,7 @@ class Feed:
         main, name = self._main, self._robot or "/"
         if not stream.ready:
             return False
-        if main is None or main is stream or now - main.heard > SILENT:
+        if main is None or main is stream or not main.live or now - main.heard > SILENT:
             if main is not None and main is not stream:
                 self._node.get_logger().warning(f"robot {name} has started again: a new session of its own")
                 main.replaced()

@@ -1,26 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
 """Keyframes on the wire: three messages each, at most 100 kB together, sent again until the mapper has them.
 
-A robot keeps all keyframes of its drive, in a temporary file, and announces its last one every two seconds. The mapper
-acknowledges what it has: all below a number, and some above. So it costs nothing to be out of reach for a while, to
-join late, or to start the mapper again; DDS' own reliability ends with either process, and forgets what is too old.
+A robot keeps all keyframes of its drive, in a file (`unsent.py`), and announces its last one every two seconds. The
+mapper acknowledges what it has: all below a number, and some above. So it costs nothing to be out of reach for a while,
+to join late, to start the mapper again, or to be killed: the next start sends what is left of the drives before. DDS'
+own reliability ends with either process, and forgets what is too old.
 """
 
 from __future__ import annotations
 
-import functools
 import secrets
+import sqlite3
 import threading
 import time
-from collections.abc import Sequence, Set
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import numpy as np
 from nav_msgs.msg import Odometry
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rclpy.serialization import serialize_message
+from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import MultiArrayDimension, MultiArrayLayout, UInt8MultiArray, UInt32MultiArray
 
@@ -31,10 +32,12 @@ from dpm2_core.network.pretrained import weights_path
 from dpm2_core.slam.mapping.admission import RejectedError
 from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.slam.store.cloud_codec import pack_cloud
-from dpm2_core.slam.store.cloud_store import SpillFile
 from dpm2_core.slam.store.rows import weights_id
-from dpm2_ros.conversions import bytes_to_array, edge_to_msg, header, keyframe_name
+from dpm2_ros.conversions import EARLIER, bytes_to_array, edge_to_msg, header, keyframe_name
+from dpm2_ros.deliveries import Delivery
+from dpm2_ros.settings import RosSettings
 from dpm2_ros.subscriptions import STEADY
+from dpm2_ros.unsent import KeyframeFile, left_behind, path_of
 
 WIRE = QoSProfile(depth=64, reliability=ReliabilityPolicy.RELIABLE)
 """Of keyframes; what falls out of the queue is sent again."""
@@ -46,61 +49,102 @@ BEHIND = 10
 _FEATURE = "feature"
 _MOST_CHANNELS = 4096
 _MOST_ACKED = 1001  # numbers in an acknowledgment
-_SLOT, _MEMORY = 0.3, 0.8  # s; the mapper acknowledges twice a second
-_TICK, _PATIENCE, _ANNOUNCE, _BURST = 0.25, 1.5, 2.0, 8  # s; s until sent again; s; keyframes a tick
+_TICK, _BURST = 0.25, 8  # s, and the keyframes that are sent again in one
 _FAREWELL = 4.0  # s; DDS asks after 3 s for a receipt that has not come
 
 
 class KeyframeSender:
-    """Publishes a robot's keyframes, keeps them, and sends those again that the mapper misses. Any thread may call."""
+    """Publishes a robot's keyframes, keeps them, and sends those again that the mapper misses. Any thread may call.
 
-    def __init__(self, node: Node, robot: str, odom_frame: str, keep: bool, weights: str = "") -> None:
-        """`keep`: for a mapper elsewhere; else each is sent once. `weights`: see `weights_identity`."""
-        self._robot, self._odom_frame, self._keep, self._weights = robot, odom_frame, keep, weights
+    Drives are sent one after the other: what an earlier one still has to deliver comes before the next one's.
+    """
+
+    def __init__(self, node: Node, robot: str, ros: RosSettings, weights: str = "") -> None:
+        """`weights`: see `weights_identity`. With the mapper in the same process each keyframe is sent once."""
+        self._robot, self._odom_frame, self._weights = robot, ros.own_frame, weights
+        self._keep, self._log = not ros.embed_mapper, node.get_logger()
+        self._folder = Path(ros.map_directory) if ros.map_directory and self._keep else None
         self._lock = threading.Lock()
         self._descriptors = node.create_publisher(PointCloud2, "dpm2/keyframe", WIRE)
         self._cloud = node.create_publisher(UInt8MultiArray, "dpm2/keyframe_cloud", WIRE)
         self._pose = node.create_publisher(Odometry, "dpm2/keyframe_odom", WIRE)
+        self._drives = list(self._left_behind())  # those that are over and not delivered, then the one that goes on
         self.restart()
-        if keep:
+        if self._keep:
             node.create_subscription(UInt32MultiArray, "dpm2/keyframes_received", self._on_received, 10)
             node.create_timer(_TICK, self._repeat, clock=STEADY)
 
     @property
     def delivered(self) -> tuple[int, int]:
-        """Keyframes that the mapper has acknowledged, and all."""
+        """Keyframes that the mapper has acknowledged, and all, those of earlier drives included."""
         with self._lock:
-            below, above = self._acks.agreed
-            return below + len(above), len(self._kept)
+            return sum(drive.delivered for drive in self._drives), sum(len(drive.file) for drive in self._drives)
 
     def restart(self) -> None:
         """A new drive begins: a session of its own."""
+        session = secrets.token_hex(4)
+        drive = Delivery(session, self._file(session), False, time.monotonic())
         with self._lock:
-            self.session = secrets.token_hex(4) if self._keep else ""
-            self._kept: list[list[int]] = []  # numbers in the file of the three messages, by id
-            self._file = SpillFile()
-            self._sent: list[float] = []  # when each was sent last
-            self._acks = Acks()
-            self._announced = 0.0
+            for earlier in self._drives:
+                earlier.earlier = True
+            self._drives.append(drive)
 
     def send(self, keyframe: Keyframe) -> None:
         """A new one, in the frame whose pose is published."""
+        drive = self._drives[-1]
         covariance = np.zeros((6, 6)) if keyframe.edge is None else keyframe.edge.covariance
-        name = keyframe_name(self._robot, keyframe.id, self.session)
+        name = keyframe_name(self._robot, keyframe.id, drive.session if self._keep else "")
         pose = edge_to_msg(keyframe.T_odom_kf, covariance, keyframe.stamp, self._odom_frame, name)
         parts = [bytes(serialize_message(part)) for part in (pose, *payload_to_msgs(keyframe, name, self._weights))]
-        with self._lock:
-            if self._keep:
-                self._kept.append([self._file.append(part) for part in parts])
-                self._sent.append(time.monotonic())
-                self._announced = time.monotonic()
+        if self._keep:
+            with self._lock:
+                first = drive is self._drives[0]
+                drive.append(parts, time.monotonic() if first else None)
+            if not first:
+                return
         self._publish(parts)
 
     def close(self) -> None:
-        """Before the node ends: wait until a mapper elsewhere has received what was sent last, or for `_FAREWELL`."""
+        """Before the node ends: wait until a mapper elsewhere has received what was sent last, or for `_FAREWELL`.
+
+        What it has not received stays on the disk, for the next start.
+        """
         end = time.monotonic() + (_FAREWELL if self._keep else 0.0)
-        for publisher in (self._pose, self._descriptors, self._cloud):
+        received = [
             publisher.wait_for_all_acked(Duration(seconds=max(0.0, end - time.monotonic())))
+            for publisher in (self._pose, self._descriptors, self._cloud)
+        ]
+        with self._lock:
+            for k, drive in enumerate(self._drives):
+                late = len(drive.file) - drive.delivered
+                arrived = k == 0 and late <= BEHIND and all(received) and self._pose.get_subscription_count() > 0
+                keep = late > 0 and not arrived
+                drive.file.close(keep)
+                if keep and drive.file.path is not None:
+                    self._log.warning(f"{late} keyframes not delivered: sent at the next start from {drive.file.path}")
+
+    def _file(self, session: str) -> KeyframeFile:
+        """Of a new drive, on the disk if that can be."""
+        if self._folder is not None:
+            path = path_of(self._folder, self._robot, session)
+            try:
+                return KeyframeFile(path)
+            except (sqlite3.Error, OSError) as error:
+                self._log.error(f"{path}: {error}; keyframes that are not delivered end with this process")
+        return KeyframeFile()
+
+    def _left_behind(self) -> Iterator[Delivery]:
+        """Drives of processes that ended before everything was delivered."""
+        for session, path in [] if self._folder is None else left_behind(self._folder, self._robot):
+            try:
+                file = KeyframeFile(path)
+            except (sqlite3.Error, OSError) as error:
+                if "locked" not in str(error):  # else a robot of this name drives with it
+                    self._log.error(f"{path}: not sent: {error}")
+                continue
+            if len(file):
+                self._log.info(f"{len(file)} keyframes of an earlier drive are sent first, from {path}")
+            yield Delivery(session, file, True, time.monotonic())
 
     def _publish(self, parts: Sequence[bytes]) -> None:
         for publisher, message in zip((self._pose, self._descriptors, self._cloud), parts, strict=True):
@@ -112,70 +156,52 @@ class KeyframeSender:
                 "acknowledgment", f"an acknowledgment of {len(message.data)} numbers; want 1 to {_MOST_ACKED}"
             )
         with self._lock:
-            if message.layout.dim[0].label == self.session:
+            drive = self._drives[0]
+            if message.layout.dim[0].label == drive.session:
                 below, *above = message.data.tolist()
-                made = len(self._kept)
-                self._acks.add(min(below, made), {id for id in above if below <= id < made}, time.monotonic())
+                drive.acknowledge(below, set(above), time.monotonic())
 
     def _repeat(self) -> None:
         """Send a few of those again that have been missed for long; announce the last one."""
         now = time.monotonic()
         with self._lock:
-            below, above = self._acks.agreed
-            requested = range(below, len(self._kept))
-            late = [id for id in requested if id not in above and now - self._sent[id] > _PATIENCE][:_BURST]
-            for id in late:
-                self._sent[id] = now
-            again = [[self._file.read(number) for number in self._kept[id]] for id in late]
-            last = None
-            if self._kept and now - self._announced > _ANNOUNCE:
-                self._announced, last = now, self._file.read(self._kept[-1][0])
+            while len(self._drives) > 1 and self._drives[0].certain(now):
+                self._drives.pop(0).file.close(keep=False)
+            drive = self._drives[0]
+            try:
+                again = [self._read(drive, id) for id in drive.due(now, _BURST)]
+                last = self._read(drive, len(drive.file) - 1)[0] if drive.announces(now) else None
+            except (sqlite3.Error, RuntimeError) as error:
+                self._log.error(f"{drive.file.path}: not sent: {error}", throttle_duration_sec=10)
+                if drive.earlier:  # what cannot be read may not keep the others back
+                    drive.file.close(keep=True)
+                    self._drives.remove(drive)
+                return
         for parts in again:
             self._publish(parts)
         if last is not None:
             self._pose.publish(last)
 
+    @staticmethod
+    def _read(drive: Delivery, id: int) -> list[bytes]:
+        """The messages of a keyframe; those of an earlier drive say so."""
+        parts = drive.file.read(id)
+        return of_earlier_drive(parts) if drive.earlier else parts
 
-class Acks:
-    """What the mapper has: that on which all its acknowledgments of the last second agree.
 
-    Anyone can send one. One that claims too little costs a keyframe sent twice; one that claims too much would
-    cost the keyframe, so no single one is trusted.
+def of_earlier_drive(parts: Sequence[bytes]) -> list[bytes]:
+    """The serialized messages of a keyframe with a name that says that its drive is over.
+
+    Raises:
+        RuntimeError: they are no such messages.
     """
-
-    def __init__(self) -> None:
-        self._slots: list[_Slot] = []  # the oldest first
-
-    @property
-    def agreed(self) -> tuple[int, frozenset[int]]:
-        """All ids below the number, and some above."""
-        results = [(slot.below, slot.above) for slot in self._slots]
-        return functools.reduce(_both, results) if results else (0, frozenset())
-
-    def add(self, below: int, above: Set[int], now: float) -> None:
-        """One that came at that time, s."""
-        if not self._slots or now - self._slots[-1].begin > _SLOT:
-            self._slots.append(_Slot(now, now, below, frozenset(above)))
-        else:
-            last = self._slots[-1]
-            last.end = now
-            last.below, last.above = _both((last.below, last.above), (below, frozenset(above)))
-        self._slots = [slot for slot in self._slots if now - slot.end <= _MEMORY]
-
-
-@dataclass(eq=False)
-class _Slot:
-    """Those that came between two times, s, and on what they agree."""
-
-    begin: float
-    end: float
-    below: int
-    above: frozenset[int]
-
-
-def _both(a: tuple[int, frozenset[int]], b: tuple[int, frozenset[int]]) -> tuple[int, frozenset[int]]:
-    less, more = sorted((a, b), key=lambda result: result[0])
-    return less[0], frozenset(id for id in less[1] if id < more[0] or id in more[1])
+    kinds = (Odometry, PointCloud2, UInt8MultiArray)
+    pose, descriptors, cloud = (deserialize_message(part, kind) for part, kind in zip(parts, kinds, strict=True))
+    if not cloud.layout.dim:
+        raise RuntimeError("a cloud without the name of its keyframe")
+    name = pose.child_frame_id + EARLIER
+    pose.child_frame_id = descriptors.header.frame_id = cloud.layout.dim[0].label = name
+    return [bytes(serialize_message(part)) for part in (pose, descriptors, cloud)]
 
 
 def weights_identity(settings: SlamSettings) -> str:

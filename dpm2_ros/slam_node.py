@@ -80,7 +80,7 @@ class SlamNode(GuardedNode):
         self._slam = make_slam(self._config.slam, self._robot) if self._mapper is None else self._mapper.slam
         self._health = Health()
         weights = weights_identity(self._config.slam)
-        self._sender = KeyframeSender(self, self._robot, ros.own_frame, not ros.embed_mapper, weights)
+        self._sender = KeyframeSender(self, self._robot, ros, weights)
         self._odom = self.create_publisher(Odometry, "dpm2/odom", 10)
         self._state, self._projection = StatePublisher(self), Projection(self)
         # Idle with the mapper, which has its own.

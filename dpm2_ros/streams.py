@@ -47,11 +47,13 @@ class Stream:
         last: its keyframe that went on last, without the cloud.
         odom_frame: that its keyframes name.
         taken: keyframes that went on.
+        live: whether the robot's odometry is that of this drive.
     """
 
     def __init__(self, session: str, now: float) -> None:
         self.session, self.next, self.taken = session, 0, 0
         self.heard = self.since = now
+        self.live = True
         self.acknowledged = -float("inf")
         self.robot: str | None = None
         self.last: Keyframe | None = None
@@ -135,6 +137,6 @@ class Stream:
         self.robot, self.last, self.since = None, None, float("inf")
         self.drop()
 
-    def hear(self, now: float) -> None:
-        """A message came."""
-        self.heard, self.since = now, min(self.since, now)
+    def hear(self, now: float, live: bool = True) -> None:
+        """A message came; `live`: the robot still drives it."""
+        self.heard, self.since, self.live = now, min(self.since, now), live

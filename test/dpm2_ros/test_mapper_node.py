@@ -29,7 +29,7 @@ from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.store.map_data import load_map
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_ros import feed, mapper_node
-from dpm2_ros.conversions import edge_to_msg, keyframe_name
+from dpm2_ros.conversions import EARLIER, edge_to_msg, keyframe_name
 from dpm2_ros.feed import keyframe_from
 from dpm2_ros.keyframes import descriptors_to_msg, payload_to_msgs
 from dpm2_ros.mapper_node import MapperNode
@@ -278,6 +278,27 @@ def test_two_drives_in_one_namespace_are_kept_apart(mapper: Any) -> None:
         return any(f"two in one namespace: .{OTHER} kept apart" in status.message for status in heard)
 
     mapper.wait(reported, "the diagnostics")
+
+
+def test_what_is_left_of_an_earlier_drive_comes_before_the_next_one(mapper: Any) -> None:
+    """The robot was killed: until all of that drive is there, nobody knows where its odometry of now is in the map."""
+    odometry, heard = mapper.publisher(Odometry, "/dpm2/odom"), mapper.hear(TFMessage, "/tf")
+    mapper.wait(lambda: odometry.get_subscription_count() and mapper.mapper.count_subscribers("/tf"), "connections")
+    send_all(mapper, 0, 1)
+    mapper.wait(lambda: keyframes(mapper) == 2, "the drive")
+    send_all(mapper, 2, 3, session=f"{S}{EARLIER}")
+    mapper.wait(lambda: keyframes(mapper) == 4, "the rest of it")
+    for stamp in range(5):
+        odometry.publish(edge_to_msg(np.eye(4), np.eye(6), stamp, "odom", "base"))
+    time.sleep(1.0)
+    send_all(mapper, 0, 1, session=OTHER, shift=100.0)  # at once, without a silence
+    mapper.wait(lambda: keyframes(mapper) == 6, "the next drive")
+    odometry.publish(edge_to_msg(np.eye(4), np.eye(6), 77, "odom", "base"))
+    time.sleep(1.0)
+    assert not heard  # it is not placed yet, either
+    assert [k.robot for k in core(mapper).keyframes] == [""] * 6
+    assert [k.id for k in core(mapper).keyframes] == [0, 1, 2, 3, 4, 5]
+    assert [(e.from_node, e.to_node) for e in core(mapper).edges] == [(0, 1), (1, 2), (2, 3), (4, 5)]
 
 
 @pytest.mark.usefixtures("quick")

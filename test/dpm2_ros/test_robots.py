@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Odometry
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import PointCloud2
@@ -61,7 +62,8 @@ class Fleet:
     def robot(self, name: str) -> subprocess.Popen[bytes]:
         """A slam_node in a namespace."""
         pairs = ["input.points_topic:=points", "input.images:=false", "ros.embed_mapper:=false",
-                 f"ros.odom_frame:={name}/odom", "slam.keyframes.distance:=2.0"]  # fmt: skip
+                 f"ros.odom_frame:={name}/odom", "slam.keyframes.distance:=2.0",
+                 f"ros.map_directory:={self.folder / 'robots'}"]  # fmt: skip
         if name not in self._lidars:
             self._lidars[name] = self.harness.publisher(PointCloud2, f"/{name}/points")
             self._odom[name] = self.harness.hear(Odometry, f"/{name}/dpm2/odom")
@@ -192,6 +194,34 @@ def test_a_robot_that_is_killed_and_comes_back(fleet: Fleet) -> None:
     fleet.received("red", 6)
     odometry = [(e.from_node, e.to_node) for e in fleet.map().constraints if e.kind == "odometry"]
     assert odometry == [(0, 1), (1, 2), (3, 4), (4, 5)]
+
+
+def test_a_robot_that_is_killed_out_of_reach_loses_no_keyframe(fleet: Fleet) -> None:
+    """It was killed while the mapper stood still: its next start sends them first, then those of the drive that goes
+    on. What has arrived is deleted from its disk."""
+    mapper = fleet.mapper()
+    red = fleet.robot("red")
+    fleet.drive("red", *range(5))
+    fleet.received("red", 2)
+    mapper.send_signal(signal.SIGSTOP)
+    fleet.drive("red", *range(5, 13))
+    told = fleet.harness.hear(DiagnosticArray, "/diagnostics")
+    made = lambda: [status.message for m in told for status in m.status if "arrived at the mapper" in status.message]  # noqa: E731
+    fleet.harness.wait(lambda: any(" of 5 keyframes" in message for message in made()), "five keyframes")
+    red.kill()
+    red.wait()
+    left = fleet.folder / "robots"
+    assert len(list(left.glob("drive_red.*.unsent"))) == 1
+    red = fleet.robot("red")
+    fleet.drive("red", *range(6, 13))
+    mapper.send_signal(signal.SIGCONT)
+    fleet.received("red", 7)
+    odometry = [(e.from_node, e.to_node) for e in fleet.map().constraints if e.kind == "odometry"]
+    assert odometry == [(0, 1), (1, 2), (2, 3), (3, 4), (5, 6)]
+    fleet.harness.wait(lambda: len(list(left.glob("*.unsent"))) == 1, "the first drive's file deleted")
+    red.send_signal(signal.SIGINT)
+    red.wait(30)
+    assert not left.exists()
 
 
 def test_a_keyframe_is_at_most_100_kB_on_the_wire(recording: Path) -> None:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dpm2_ros.keyframes import Acks
+from dpm2_ros.deliveries import Acks
 from dpm2_ros.streams import AHEAD, Stream
 
 CLOUD = bytes(100_000)

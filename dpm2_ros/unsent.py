@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A robot's keyframes on its disk until the mapper has them: also those of a process that was killed."""
+
+from __future__ import annotations
+
+import re
+import sqlite3
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from urllib.parse import quote
+
+from dpm2_core.database import check_schema, connect, statements
+
+_SUFFIX = ".unsent"
+_TABLES = """
+CREATE TABLE keyframe (id INTEGER PRIMARY KEY, pose BLOB NOT NULL, descriptors BLOB NOT NULL, cloud BLOB NOT NULL)
+"""
+_LARGEST = 200_000  # bytes of a message: twice what a keyframe may have
+
+
+class KeyframeFile:
+    """The messages of a drive's keyframes, those of number 0 first, each added whole or not at all.
+
+    A disk that is full or not there is no reason to lose a keyframe: it then stays in memory.
+
+    Raises:
+        sqlite3.Error, OSError: the file cannot be made, is no such file, is damaged, or another process has it.
+    """
+
+    def __init__(self, path: Path | None = None) -> None:
+        """`path`: made where there is none; None: a temporary file without a name, gone when the process is."""
+        self.path = path
+        if path is None:
+            self._connection: sqlite3.Connection = sqlite3.connect("", isolation_level=None, check_same_thread=False)
+        else:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._connection = connect(path, "rwc", timeout=0.0)
+        try:
+            # One process alone: a second one of the same name in the same folder takes a file of its own.
+            self._connection.execute("PRAGMA locking_mode = EXCLUSIVE")
+            self._connection.execute("PRAGMA journal_mode = WAL")
+            self._connection.execute("PRAGMA synchronous = NORMAL")
+            self._connection.execute("BEGIN EXCLUSIVE")
+            if not self._connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]:
+                self._connection.execute(_TABLES)
+            self._connection.execute("COMMIT")
+            check_schema(self._connection, statements(_TABLES))
+            self._count = self._checked()
+        except BaseException:
+            self._connection.close()
+            raise
+        self._in_memory: dict[int, tuple[bytes, ...]] = {}
+
+    def _checked(self) -> int:
+        """How many there are.
+
+        Raises:
+            sqlite3.DatabaseError: what is there is not the keyframes of a drive.
+        """
+        query = "SELECT count(*), max(id), max(max(length(pose), length(descriptors), length(cloud))) FROM keyframe"
+        count, last, largest = self._connection.execute(query).fetchone()
+        if count and (last != count - 1 or largest > _LARGEST):
+            raise sqlite3.DatabaseError("malformed: not the keyframes of a drive")
+        return int(count)
+
+    def __len__(self) -> int:
+        return self._count
+
+    def append(self, parts: Sequence[bytes]) -> None:
+        """The next keyframe: its pose, its descriptors, its cloud, each serialized."""
+        id, self._count = self._count, self._count + 1
+        try:
+            if self._in_memory:  # those after it follow it, so that a file has no gap
+                raise sqlite3.OperationalError("disk full before")
+            self._connection.execute("INSERT INTO keyframe VALUES (?, ?, ?, ?)", (id, *parts))
+        except sqlite3.Error:
+            self._in_memory[id] = tuple(parts)
+
+    def read(self, id: int) -> list[bytes]:
+        """The three messages of a keyframe.
+
+        Raises:
+            sqlite3.DatabaseError: it is damaged.
+        """
+        if id in self._in_memory:
+            return list(self._in_memory[id])
+        query = "SELECT pose, descriptors, cloud FROM keyframe WHERE id = ?"
+        parts: tuple[object, ...] | None = self._connection.execute(query, (id,)).fetchone()
+        found = [part for part in parts or () if isinstance(part, bytes)]
+        if len(found) != 3:
+            raise sqlite3.DatabaseError(f"keyframe {id} is damaged")
+        return found
+
+    def close(self, keep: bool) -> None:
+        """`keep`: leave the file for the next start; else it is deleted."""
+        with suppress(sqlite3.Error):
+            self._connection.close()
+        if self.path is not None and not keep:
+            for path in (self.path, Path(f"{self.path}-wal")):
+                path.unlink(missing_ok=True)
+            with suppress(OSError):  # it is not empty
+                self.path.parent.rmdir()
+
+
+def path_of(folder: Path, robot: str, session: str) -> Path:
+    """The file of a robot's drive: `drive.5f3a9c01.unsent`, in a namespace `drive_red.5f3a9c01.unsent`."""
+    return folder / f"{_stem(robot)}.{session}{_SUFFIX}"
+
+
+def left_behind(folder: Path, robot: str) -> list[tuple[str, Path]]:
+    """Session and path of that robot's drives in a folder, the oldest first."""
+    pattern, found = re.compile(rf"{re.escape(_stem(robot))}\.([0-9a-f]{{8}}){re.escape(_SUFFIX)}"), []
+    with suppress(OSError):
+        for path in folder.iterdir():
+            if name := pattern.fullmatch(path.name):
+                found.append((path.stat().st_mtime, name[1], path))
+    return [(session, path) for _, session, path in sorted(found)]
+
+
+def _stem(robot: str) -> str:
+    return f"drive_{quote(robot, safe='')}" if robot else "drive"

@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Keyframes on a robot's disk: whole or not there at all, whatever becomes of the process, the disk or the file."""
+
+from __future__ import annotations
+
+import sqlite3
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from dpm2_ros.unsent import KeyframeFile, left_behind, path_of
+
+WRITER = """
+import resource, signal, sys
+from pathlib import Path
+from dpm2_ros.unsent import KeyframeFile
+most = int(sys.argv[2])
+if most:
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (most, most))  # as a full disk
+file = KeyframeFile(Path(sys.argv[1]))
+for id in range(50):
+    file.append([bytes([id]) * 1000, b"descriptors", bytes([id]) * 30000])
+assert all(file.read(id)[0] == bytes([id]) * 1000 for id in range(50)), "what does not fit stays in memory"
+print(len(file), flush=True)
+signal.pause()
+"""
+
+
+def killed_writer(path: Path, most: int = 0) -> None:
+    """A process that adds 50 keyframes and is killed; no file of it can be larger than `most` bytes."""
+    process = subprocess.Popen([sys.executable, "-c", WRITER, str(path), str(most)], stdout=subprocess.PIPE)
+    assert process.stdout is not None
+    line = process.stdout.readline()
+    process.kill()
+    process.wait()
+    assert line == b"50\n"
+
+
+def test_a_killed_process_leaves_every_keyframe(tmp_path: Path) -> None:
+    path = path_of(tmp_path / "maps", "red", "5f3a9c01")
+    killed_writer(path)
+    assert left_behind(tmp_path / "maps", "red") == [("5f3a9c01", path)]
+    file = KeyframeFile(path)
+    assert len(file) == 50
+    assert file.read(49) == [bytes([49]) * 1000, b"descriptors", bytes([49]) * 30000]
+    file.append([b"a", b"b", b"c"])
+    file.close(keep=True)
+    again = KeyframeFile(path)
+    assert again.read(50) == [b"a", b"b", b"c"]
+    again.close(keep=False)
+    assert not (tmp_path / "maps").exists()
+
+
+def test_a_full_disk_costs_no_keyframe_and_leaves_no_gap(tmp_path: Path) -> None:
+    path = path_of(tmp_path, "", "5f3a9c01")
+    killed_writer(path, 800_000)
+    file = KeyframeFile(path)
+    assert 5 < len(file) < 50
+    assert [file.read(id)[0][0] for id in range(len(file))] == list(range(len(file)))
+    file.close(keep=False)
+
+
+def test_a_file_belongs_to_one_process_and_one_robot(tmp_path: Path) -> None:
+    path = path_of(tmp_path, "red", "00000001")
+    file = KeyframeFile(path)
+    with pytest.raises(sqlite3.OperationalError, match="locked"):
+        KeyframeFile(path)
+    for name in ("drive_red.0000000g.unsent", "drive_red.00000001.unsent-wal", "drive_red.town.dpm2map"):
+        (tmp_path / name).touch()
+    assert [session for session, _ in left_behind(tmp_path, "red")] == ["00000001"]
+    for other in ("", "re", "red/a", "blue"):
+        assert not left_behind(tmp_path, other)
+    assert not left_behind(tmp_path / "nowhere", "red")
+    file.close(keep=False)
+    assert path_of(tmp_path, "a/b", "0" * 8) != path_of(tmp_path, "a_b", "0" * 8)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        "DELETE FROM keyframe WHERE id = 1",
+        "UPDATE keyframe SET cloud = zeroblob(1000000)",
+        "CREATE VIEW v AS SELECT 1",
+        "DROP TABLE keyframe",
+    ],
+)
+def test_what_is_no_such_file_is_an_error(tmp_path: Path, damage: str) -> None:
+    path = tmp_path / "drive.00000001.unsent"
+    file = KeyframeFile(path)
+    for _ in range(3):
+        file.append([b"a", b"b", b"c"])
+    file.close(keep=True)
+    with sqlite3.connect(path) as connection:
+        connection.execute(damage)
+        if damage.startswith("DROP"):
+            connection.execute("CREATE TABLE other (id INTEGER)")
+    connection.close()
+    with pytest.raises(sqlite3.DatabaseError, match="malformed"):
+        KeyframeFile(path)
+    path.write_bytes(b"no database " * 1000)
+    with pytest.raises(sqlite3.DatabaseError, match="not a database"):
+        KeyframeFile(path)
+
+
+def test_text_in_place_of_a_message_is_an_error_when_it_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "drive.00000001.unsent"
+    file = KeyframeFile(path)
+    file.append([b"a", b"b", b"c"])
+    file.close(keep=True)
+    with sqlite3.connect(path) as connection:
+        connection.execute("UPDATE keyframe SET cloud = 'text'")
+    connection.close()
+    file = KeyframeFile(path)
+    with pytest.raises(sqlite3.DatabaseError, match="keyframe 0 is damaged"):
+        file.read(0)
+
+
+def test_without_a_path_nothing_stays() -> None:
+    file = KeyframeFile()
+    for id in range(100):
+        file.append([bytes([id]), b"", bytes(50_000)])
+    assert file.read(99) == [bytes([99]), b"", bytes(50_000)]
+    file.close(keep=True)
