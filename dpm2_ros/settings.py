@@ -86,7 +86,8 @@ class RosSettings(Settings):
     """Folder of the maps, relative to the working directory. Every drive has a name of its own in it: `drive`, with the
     namespace, if any, and a number, if it is taken; nothing is overwritten. NAME.dpm2map grows as the drive goes on;
     ~/save_map, ~/reset and the end of the node write a folder NAME with PLY, TUM and g2o. With the mapper elsewhere
-    (`embed_mapper`): keyframes that it does not have yet, NAME.SESSION.unsent, for the next start. Empty: none of these."""
+    (`embed_mapper`): keyframes that it does not have yet, NAME.SESSION.unsent, for the next start. Empty: none of
+    these."""
 
     map_name: str = Field(default="", pattern=r"^(\w[\w.-]{0,99})?$")
     """Name within `map_directory`, such as town: ~/save_map also writes NAME.dpm2map, beside the folder NAME, and

@@ -30,6 +30,7 @@ ARGUMENTS = {
     "map_file": ("", "map file that is written, or, with localization_mode, read; empty: ros.map_file"),
     "localization_mode": ("", "true: slam_node finds itself in map_file"),
     "namespace": ("", "of all nodes: one a robot"),
+    "robots": ("", "red,blue,green: a slam_node for each, in that namespace, and one mapper_node; empty: one robot"),
     "lifecycle": ("false", "true: slam_node waits for a lifecycle manager"),
     "rviz": ("true", "show the map in RViz, if it is installed"),
     "use_sim_time": ("auto", "follow /clock; auto: with a bag"),
@@ -67,6 +68,26 @@ def parameters(value: dict[str, str]) -> dict[str, bool | str]:
     return {name: {"true": True, "false": False}.get(text, text) for name, text in given.items() if text}
 
 
+def robots(value: dict[str, str]) -> list[tuple[str, dict[str, str]]]:
+    """Namespace of each robot's slam_node, and its arguments' values; frames on /tf are global, so each has its own."""
+    if not value["robots"]:
+        return [(value["namespace"], value)]
+    names = [name.strip() for name in value["robots"].split(",")]
+    if len(set(names)) < len(names) or not all(re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII) for name in names):
+        raise RuntimeError(f"robots: {value['robots']}: want names that differ, such as red,blue")
+    if value["embed_mapper"] == "true" or value["localization_mode"] == "true":
+        raise RuntimeError(
+            "robots: they share one mapper_node, so neither embed_mapper nor localization_mode can be true"
+        )
+    found = []
+    for name in names:
+        own = {"embed_mapper": "false", "odom_frame": f"{name}/{value['odom_frame'] or 'odom'}"}
+        if value["base_frame"]:
+            own["base_frame"] = f"{name}/{value['base_frame']}"
+        found.append((f"{value['namespace'].rstrip('/')}/{name}", value | own))
+    return found
+
+
 def parameter_files(value: dict[str, str]) -> list[str]:
     """That of the user, if any; launch_ros itself only warns of one that is missing."""
     file = value["params_file"]
@@ -93,13 +114,17 @@ def _typed(given: dict[str, bool | str]) -> list[dict[str, bool | ParameterValue
 
 def _actions(context) -> list:
     value = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
-    given = parameters(value)
-    common = {"package": "dpm2_ros", "namespace": value["namespace"], "output": "screen"}
-    common["parameters"] = [*parameter_files(value), *_typed(given)]
+    given, common = parameters(value), {"package": "dpm2_ros", "output": "screen"}
     managed = {"arguments": ["--lifecycle"]} if value["lifecycle"] == "true" else {}
-    actions = [Node(executable="slam_node", on_exit=Shutdown(), **managed, **common)]
-    if value["embed_mapper"] == "false":
-        actions.append(Node(executable="mapper_node", **common))
+    last = {} if value["robots"] else {"on_exit": Shutdown()}  # one of several may come back
+    actions = []
+    for namespace, own in robots(value):
+        files = [*parameter_files(value), *_typed(parameters(own))]
+        actions.append(Node(executable="slam_node", namespace=namespace, parameters=files, **last, **managed, **common))
+    if value["embed_mapper"] == "false" or value["robots"]:
+        files = [*parameter_files(value), *_typed(given)]
+        ends = {"on_exit": Shutdown()} if value["robots"] else {}
+        actions.append(Node(executable="mapper_node", namespace=value["namespace"], parameters=files, **ends, **common))
     if value["bag"]:
         options = [value["bag"], "--rate", value["rate"], "--wait", "30"]
         actions.append(Node(package="dpm2_ros", executable="bag_player", output="screen", arguments=options))
@@ -124,7 +149,8 @@ def _rviz(value: dict[str, str], sim_time: bool) -> Node | LogInfo:
 
 
 def generate_launch_description() -> LaunchDescription:
-    """slam_node, and as asked for: mapper_node, bag_player, RViz. It ends when slam_node does."""
+    """slam_node, and as asked for: mapper_node, bag_player, RViz. It ends when slam_node does; of several robots, when
+    their mapper_node does."""
     declared = [
         DeclareLaunchArgument(name, default_value=default, description=text, choices=CHOICES.get(name))
         for name, (default, text) in ARGUMENTS.items()

@@ -116,6 +116,37 @@ def test_every_argument_is_a_parameter_that_is_taken(launch_file: ModuleType, tm
     assert (config.ros.embed_mapper, config.ros.localization_mode, config.ros.map_file) == (False, True, "town.dpm2map")
 
 
+def test_three_robots_have_namespaces_and_frames_of_their_own(launch_file: ModuleType) -> None:
+    value = defaults(launch_file) | {"robots": "red, blue,green", "namespace": "site", "points_topic": "points"}
+    found = launch_file.robots(value | {"base_frame": "base_link"})
+    assert [namespace for namespace, _ in found] == ["site/red", "site/blue", "site/green"]
+    assert launch_file.parameters(found[1][1]) == {
+        "input.points_topic": "points",
+        "ros.embed_mapper": False,
+        "ros.odom_frame": "blue/odom",
+        "ros.base_frame": "blue/base_link",
+    }
+    assert "base_frame" not in launch_file.parameters(launch_file.robots(value)[0][1])
+    alone = defaults(launch_file) | {"namespace": "red"}
+    assert launch_file.robots(alone) == [("red", alone)]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"robots": "red,red"}, "names that differ"),
+        ({"robots": "red,"}, "names that differ"),
+        ({"robots": "1st,2nd"}, "names that differ"),
+        ({"robots": "a b"}, "names that differ"),
+        ({"robots": "red,blue", "embed_mapper": "true"}, "one mapper_node"),
+        ({"robots": "red,blue", "localization_mode": "true"}, "one mapper_node"),
+    ],
+)
+def test_robots_that_cannot_be_are_an_error(launch_file: ModuleType, wrong: dict[str, str], message: str) -> None:
+    with pytest.raises(RuntimeError, match=message):
+        launch_file.robots(defaults(launch_file) | wrong)
+
+
 @pytest.mark.parametrize(
     ("bag", "asked", "given"), [("", "auto", None), ("b", "auto", True), ("b", "false", False), ("", "true", True)]
 )

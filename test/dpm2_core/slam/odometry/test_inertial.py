@@ -155,7 +155,7 @@ def test_a_slow_turn_at_the_start_is_no_bias_for_long() -> None:
     motion, rate, before = InertialMotion(), np.radians(1.0), np.eye(4)
     for i, frame in enumerate(standing(np.eye(4), 100, ImuConfig(gyro_bias=0.0))):
         assert frame.imu is not None
-        motion.look(replace(frame, imu=replace(frame.imu, rates=frame.imu.rates + [0, 0, rate])))
+        motion.look(replace(frame, imu=replace(frame.imu, rates=frame.imu.rates + np.array([0, 0, rate]))))
         T = se3.exp([0, 0, 0.1 * i * rate, 0, 0, 0])
         motion.registered(before, T, frame.stamp, np.r_[0, 0, rate, 0, 0, 0] if i else None)
         before = T
