@@ -8,7 +8,9 @@ Using Hierarchical Navigable Small World Graphs", TPAMI 2020.
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +28,9 @@ from dpm2_core.slam.store.map_store import MapStore
 
 _WORK = "dpm2_core.fleet.places:describe"
 _VECTORS = "places.npy"
-_INDEX, _LISTED = "index.faiss", "index.json"
+_INDEX, _ROWS, _LISTED = "index.faiss", "index.f32", "index.json"
+_LATE = 20_000
+"""Places up to which each is compared: 100 keyframes cost 30 ms then, and 0.3 s to take them into the graph."""
 _LINKS, _BUILD, _SEARCH = 32, 80, 64
 """Of the graph: neighbors of a place; how many are looked at when one is added, and when one is searched for."""
 
@@ -67,7 +71,8 @@ class FleetIndex:
     """The places of all drives in the order in which the drives came; kept in a folder.
 
     Vectors are compared by their cosine, less the mean of those that came first: what all places share does not tell
-    them apart.
+    them apart. Places that came late are compared one by one, until they are worth their way into the graph: so a
+    drive costs the same in a large map as in a small one.
 
     Attributes:
         drives: name, version, and number of keyframes of each.
@@ -79,50 +84,103 @@ class FleetIndex:
             import faiss
         self._faiss: Any = faiss
         self._folder = folder
-        self.drives: list[tuple[str, Sequence[int], int]] = []
-        self._mean = np.zeros(WIDTH, np.float32)
-        self._index: Any = None
+        self.clear()
         try:
             listed = json.loads((folder / _LISTED).read_text(encoding="utf-8"))
-            index = faiss.read_index(str(folder / _INDEX))
             drives: list[Any] = [(str(name), list(version), int(count)) for name, version, count in listed["drives"]]
-            if index.ntotal == sum(count for *_, count in drives) and index.d == WIDTH:
-                self.drives, self._index = drives, index
-                self._mean = np.array(listed["mean"], np.float32)
-        except (OSError, ValueError, KeyError, TypeError, RuntimeError):
-            pass  # none, or one that is not whole: it is made anew
+            mean = np.array(listed["mean"], np.float32).reshape(WIDTH)
+            total = sum(count for *_, count in drives)
+            vectors = np.memmap(folder / _ROWS, np.float32, "r", shape=(total, WIDTH))
+        except (OSError, ValueError, KeyError, TypeError):
+            return  # none, or one that is not whole: it is made anew
+        self.drives, self._mean, self._kept = drives, mean, total
+        with suppress(RuntimeError):  # none, or damaged: its places are compared one by one
+            graph = faiss.read_index(str(folder / _INDEX))
+            if graph.ntotal <= total and graph.d == WIDTH:
+                self._graph = graph
+        self._late = [np.array(vectors[self._linked :])]
 
     def clear(self) -> None:
         """Forget all: a drive has changed."""
-        self.drives, self._index = [], None
+        self.drives: list[tuple[str, Sequence[int], int]] = []
+        self._mean = np.zeros(WIDTH, np.float32)
+        self._graph: Any = None
+        self._late: list[Vector] = []  # those after the ones in the graph
+        self._new: list[Vector] = []  # those that are not in the file yet
+        self._kept, self._relinked = 0, True  # places in the file; whether the graph differs from its file
+
+    @property
+    def _linked(self) -> int:
+        """Places in the graph."""
+        return 0 if self._graph is None else int(self._graph.ntotal)
 
     def similar(self, vectors: Vector, count: int) -> NDArray[np.int64]:
         """(M, count) places of the drives in it that look most like each of (M, 528), the most similar first; -1: none.
 
         A place is a number over all drives: the keyframes of the first, then those of the second.
         """
-        if self._index is None:
-            return np.full((len(vectors), count), -1)
-        self._index.hnsw.efSearch = _SEARCH
-        _, found = self._index.search(centered(vectors, self._mean), count)
-        found[~vectors.any(1)] = -1
-        return np.asarray(found, np.int64)
+        queries, begin = centered(vectors, self._mean), self._linked
+        cosines = [np.full((len(vectors), count), -np.inf, np.float32)]
+        places = [np.full((len(vectors), count), -1)]
+        if self._graph is not None:
+            self._graph.hnsw.efSearch = _SEARCH
+            found = self._graph.search(queries, count)
+            cosines.append(found[0])
+            places.append(found[1])
+        for late in self._late:
+            found = self._faiss.knn(queries, late, min(count, len(late)), metric=self._faiss.METRIC_INNER_PRODUCT)
+            cosines.append(found[0])
+            places.append(found[1] + begin)
+            begin += len(late)
+        best = np.argsort(-np.hstack(cosines), axis=1, kind="stable")[:, :count]
+        out = np.take_along_axis(np.hstack(places), best, 1)
+        out[~vectors.any(1)] = -1
+        return np.asarray(out, np.int64)
 
     def add(self, name: str, version: Sequence[int], vectors: Vector) -> None:
         """Take a drive in."""
-        if self._index is None:
+        if not self.drives:
             self._mean = vectors[vectors.any(1)].mean(0)
-            self._index = self._faiss.IndexHNSWFlat(WIDTH, _LINKS, self._faiss.METRIC_INNER_PRODUCT)
-            self._index.hnsw.efConstruction = _BUILD
-        self._index.add(centered(vectors, self._mean))
+        rows = centered(vectors, self._mean)
         self.drives.append((name, list(version), len(vectors)))
+        self._new.append(rows)
+        self._late.append(rows)
+        while len(self._late) > 1 and len(self._late[-1]) >= len(self._late[-2]):  # few large ones are searched faster
+            self._late[-2:] = [np.concatenate(self._late[-2:])]
+        if sum(map(len, self._late)) > _LATE:
+            self._link()
+
+    def _link(self) -> None:
+        """Take the late ones into the graph."""
+        if self._graph is None:
+            self._graph = self._faiss.IndexHNSWFlat(WIDTH, _LINKS, self._faiss.METRIC_INNER_PRODUCT)
+        self._graph.hnsw.efConstruction = _BUILD
+        self._graph.add(np.concatenate(self._late))
+        self._late, self._relinked = [], True
 
     def save(self) -> None:
-        """Write it to its folder.
+        """Write what is new to its folder. What was there before stays usable until the last file has its name.
 
         Raises:
             Dpm2Error: it cannot be written.
         """
-        with atomic_write(self._folder / _INDEX, "wb") as file:
-            file.write(self._faiss.serialize_index(self._index).tobytes())
+        rows = self._folder / _ROWS
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            with rows.open("r+b" if self._kept else "wb") as file:
+                file.truncate(self._kept * WIDTH * 4)  # what a save that was cut short has left
+                file.seek(0, 2)
+                for vectors in self._new:
+                    file.write(vectors.tobytes())
+                file.flush()
+                os.fsync(file.fileno())
+            if self._graph is None:
+                (self._folder / _INDEX).unlink(missing_ok=True)
+        except OSError as error:
+            raise Dpm2Error(f"{rows}: not written: {error.strerror or error}") from error
+        self._kept, self._new = self._kept + sum(map(len, self._new)), []
+        if self._graph is not None and self._relinked:
+            with atomic_write(self._folder / _INDEX, "wb") as file:
+                file.write(self._faiss.serialize_index(self._graph).tobytes())
+        self._relinked = False
         write_json(self._folder / _LISTED, {"drives": self.drives, "mean": self._mean.tolist()})

@@ -97,8 +97,53 @@ def test_places_are_found_again_in_an_index_that_was_kept(tmp_path: Path, noise:
     assert kept.drives == [("a", [1, 2], 50), ("b", [1, 2], 50)]
     np.testing.assert_array_equal(kept.similar(again, 3)[:, 0], np.arange(50))
     assert (kept.similar(drives[1], 3)[7] == -1).all()
-    (tmp_path / "index.faiss").write_bytes((tmp_path / "index.faiss").read_bytes()[:1000])
+    (tmp_path / "index.f32").write_bytes((tmp_path / "index.f32").read_bytes()[:1000])
     assert not FleetIndex(tmp_path).drives
+
+
+def test_late_places_and_those_in_the_graph_are_found_alike(
+    tmp_path: Path, noise: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever came when, was kept, or was damaged; one that was cut short while it was saved goes on."""
+    pytest.importorskip("faiss", reason="no faiss: pip install 'dpm2_ros[fleet]'")
+    monkeypatch.setattr("dpm2_core.fleet.places._LATE", 120)
+    drives = [noise.normal(size=(50, WIDTH)).astype(np.float32) for _ in range(5)]
+    again = [vectors + 0.05 * noise.normal(size=vectors.shape).astype(np.float32) for vectors in drives]
+
+    def check(index: FleetIndex, count: int) -> None:
+        for number in range(count):
+            np.testing.assert_array_equal(index.similar(again[number], 3)[:, 0], np.arange(50) + 50 * number)
+        rows = index.similar(again[0], 40)
+        assert all(len(set(row)) == 40 for row in rows.tolist())  # none is found twice
+
+    index = FleetIndex(tmp_path)
+    for number in range(4):
+        index.add(f"d{number}", [0], drives[number])
+        index.save()
+        index = FleetIndex(tmp_path)
+        if number > 1:
+            check(index, number + 1)
+    graph = (tmp_path / "index.faiss").read_bytes()
+    index.add("d4", [0], drives[4])
+    check(index, 5)
+    with (tmp_path / "index.f32").open("ab") as file:
+        file.write(bytes(1234))  # by one that was killed
+    index = FleetIndex(tmp_path)
+    assert len(index.drives) == 4
+    index.add("d4", [0], drives[4])
+    index.save()
+    check(FleetIndex(tmp_path), 5)
+    for damaged in (graph[:1000], b""):
+        (tmp_path / "index.faiss").write_bytes(damaged)
+        check(FleetIndex(tmp_path), 5)
+    (tmp_path / "index.faiss").unlink()
+    check(FleetIndex(tmp_path), 5)
+    index = FleetIndex(tmp_path)
+    index.clear()
+    index.add("d0", [1], drives[0])
+    index.save()
+    assert FleetIndex(tmp_path).drives == [("d0", [1], 50)]
+    check(FleetIndex(tmp_path), 1)
 
 
 def test_stretches_hold_what_looks_alike_and_leave_out_single_keyframes() -> None:
