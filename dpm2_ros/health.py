@@ -7,6 +7,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Mapping
+from dataclasses import dataclass
 from datetime import UTC, datetime
 
 import numpy as np
@@ -21,7 +22,7 @@ from dpm2_ros.mapping import MapperThread
 from dpm2_ros.other_odometry import OtherOdometry
 from dpm2_ros.state import SILENT
 from dpm2_ros.subscriptions import Inputs
-from dpm2_ros.synchronizer import CameraState, StampCheck
+from dpm2_ros.synchronizer import SensorState, StampCheck
 
 OTHER_CLOCK = 1.0
 """Seconds between a cloud's stamp and the node's clock beyond which they are not of the same clock."""
@@ -120,8 +121,13 @@ class Diagnostics:
 
     def _statuses(self) -> list[DiagnosticStatus]:
         out = [self._odometry()]
-        if camera := self._inputs.synchronizer.camera:
-            out.append(self._camera(camera))
+        synchronizer, known, frames = self._inputs.synchronizer, self._inputs.calibration, self._frames
+        if camera := synchronizer.camera:
+            images = _Beside("camera", "image", known.image_topic, frames.image_problem, "LiDAR only")
+            out.append(self._beside(camera, images))
+        if second := synchronizer.second:
+            clouds = _Beside("second lidar", "cloud", known.second_topic, frames.second_problem, "going on without")
+            out.append(self._beside(second, clouds))
         if self._inputs.imu_received:
             out.append(self._imu())
         if self.other is not None:
@@ -247,23 +253,34 @@ class Diagnostics:
         text = f"{problem}; going on without" if problem else "in use"
         return self._status("imu", WARN if problem else OK, text, {"received": inputs.imu_received})
 
-    def _camera(self, camera: CameraState) -> DiagnosticStatus:
-        figures = {"received": camera.received, "used": camera.matched, "late": camera.late}
-        silence, topic = _silence(camera.last_arrival), self._inputs.calibration.image_topic
+    def _beside(self, sensor: SensorState, what: _Beside) -> DiagnosticStatus:
+        figures = {"received": sensor.received, "used": sensor.matched, "late": sensor.late}
+        silence = _silence(sensor.last_arrival)
         if silence is None:
-            level, text = WARN, f"no image on {topic} yet; LiDAR only"
+            level, text = WARN, f"no {what.message} on {what.topic} yet"
         elif silence > SILENT:
-            level, text = WARN, f"no image on {topic} for {silence:.0f} s; LiDAR only"
-        elif self._frames.image_problem:
-            level, text = ERROR, f"{self._frames.image_problem}; LiDAR only"
-        elif not camera.awaited:
-            level, text = WARN, "images come too late or have stamps of another clock; LiDAR only"
+            level, text = WARN, f"no {what.message} on {what.topic} for {silence:.0f} s"
+        elif what.problem:
+            level, text = ERROR, what.problem
+        elif not sensor.awaited:
+            level, text = WARN, f"{what.message}s come too late or have stamps of another clock"
         else:
-            level, text = OK, "in use"
-        return self._status("camera", level, text, figures)
+            return self._status(what.part, OK, "in use", figures)
+        return self._status(what.part, level, f"{text}; {what.without}", figures)
 
     def _status(self, part: str, level: bytes, text: str, figures: Mapping[str, object]) -> DiagnosticStatus:
         return status(self._node, part, level, text, figures)
+
+
+@dataclass(frozen=True)
+class _Beside:
+    """A sensor beside the LiDAR, in words: of /diagnostics, its messages and their topic, why they are not used."""
+
+    part: str
+    message: str
+    topic: str
+    problem: str
+    without: str
 
 
 def _date(stamp: int) -> str:

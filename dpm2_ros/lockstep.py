@@ -63,9 +63,16 @@ class Lockstep:
                 and self._publishers[cloud].get_subscription_count()
             ]
             if self._clouds and self._odometry.get_publisher_count():
+                self._check_alone()
                 return
             if time.monotonic() >= end:
                 raise Dpm2Error(f"lockstep: no node turns {' or '.join(clouds) or 'clouds'} into {topic}")
+
+    def _check_alone(self) -> None:
+        """Two LiDARs of one node make one odometry: which clouds get one is not known here."""
+        takers = [_node(info) for cloud in self._clouds for info in self._node.get_subscriptions_info_by_topic(cloud)]
+        if len(set(takers)) < len(takers):
+            raise Dpm2Error(f"lockstep: a node takes clouds of {' and '.join(self._clouds)}; replay without lockstep")
 
     def begin(self) -> None:
         """Before the first message: the calibration of each camera, which `dpm2 run` has from the start."""

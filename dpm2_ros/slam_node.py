@@ -209,7 +209,7 @@ class SlamNode(GuardedNode):
         self._look_for_base(bundle.cloud.header.frame_id or "lidar")
         x, y, z = self._base.T_start_lidar[2, :3].tolist()
         self._frames.up = (x, y, z) if self._base.name else None  # what is up for the base is to be up in odom
-        frame = self._frames.frame(bundle.stamp, bundle.cloud, bundle.image, self._index)
+        frame = self._frames.frame(bundle.stamp, bundle.cloud, self._index, bundle.image, bundle.second)
         tracked = self._tracked(frame)
         self._projection.show(frame, "" if bundle.image is None else bundle.image.header.frame_id)
         self._index += 1

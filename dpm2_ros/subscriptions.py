@@ -31,7 +31,7 @@ from dpm2_ros.checks import check_header, check_size, extended, unreadable
 from dpm2_ros.losses import Losses
 from dpm2_ros.message_types import message_type
 from dpm2_ros.settings import RosSettings
-from dpm2_ros.synchronizer import Bundle, StampCheck, Synchronizer
+from dpm2_ros.synchronizer import Bundle, SensorState, StampCheck, Synchronizer
 from dpm2_ros.tf import TFMessage
 
 _IMU_DEPTH = 1000  # samples that may wait: those of a second
@@ -125,7 +125,12 @@ class Inputs:
         image_name = node.resolve_topic_name(image_topic) if settings.images else ""
         imu_topic = settings.imu_topic or topics.IMU.lstrip("/")
         imu_name = node.resolve_topic_name(imu_topic) if settings.imu else ""
-        self.calibration = known or Calibration(node.resolve_topic_name(points_topic), image_name, imu_name)
+        second_topic = settings.second_points_topic
+        second_name = node.resolve_topic_name(second_topic) if second_topic else ""
+        points_name = node.resolve_topic_name(points_topic)
+        if second_name == points_name:
+            raise UsageError(f"input.second_points_topic: {second_name} is that of the first LiDAR")
+        self.calibration = known or Calibration(points_name, image_name, imu_name, second_name)
         self.imu = ImuBuffer() if settings.imu else None
         self.imu_received = 0
         self._image_shift = round(settings.image_time_offset * 1e9)
@@ -135,6 +140,7 @@ class Inputs:
             depth=ros.queue_depth,
             timeout=ros.sync_timeout,
             tolerance=settings.image_tolerance,
+            second=bool(second_topic),
         )
         self.losses = Losses()
         """Clouds that were sent, and never arrived."""
@@ -149,6 +155,13 @@ class Inputs:
                 MatchedSubscription(node, image_type, image_topic, self._on_image, ros),
                 MatchedSubscription(node, CameraInfo, info_topic, self._on_camera_info, ros),
             ]
+        self._awaited: list[tuple[SensorState, MatchedSubscription]] = []
+        if self.synchronizer.camera is not None:
+            self._awaited.append((self.synchronizer.camera, beside[0]))
+        if second_topic:
+            beside.append(MatchedSubscription(node, PointCloud2, second_topic, self._on_second, ros))
+            assert self.synchronizer.second is not None
+            self._awaited.append((self.synchronizer.second, beside[-1]))
         if settings.imu:
             beside.append(MatchedSubscription(node, Imu, imu_topic, self._on_imu, ros))
         self._static_topic, self._static_messages = node.resolve_topic_name(topics.TF_STATIC), 0
@@ -229,8 +242,8 @@ class Inputs:
             self._times.append((stamped, self._node.get_clock().now().nanoseconds))
         stamp = self._stamp(message)
         with self._arrived:
-            if camera := self.synchronizer.camera:
-                camera.present = bool(self._node.count_publishers(others[0].topic))
+            for sensor, subscription in self._awaited:
+                sensor.present = bool(self._node.count_publishers(subscription.topic))
             lost = self.losses.add(stamp, number)
             check = self.synchronizer.add_cloud(stamp, message, time.monotonic())
             self._arrived.notify()
@@ -249,6 +262,17 @@ class Inputs:
         with self._arrived:
             stamp = self._stamp(message) + self._image_shift
             self.synchronizer.add_image(stamp, message, time.monotonic())
+            self._arrived.notify()
+
+    def _on_second(self, message: PointCloud2 | bytes) -> None:
+        if isinstance(message, bytes):
+            message = cloud_of_custom(message)
+        check_header(message.header)
+        check_size(message, message.width * message.height)
+        if problem := unreadable(message):
+            raise RejectedError("unreadable", problem)
+        with self._arrived:
+            self.synchronizer.add_second(self._stamp(message), message, time.monotonic())
             self._arrived.notify()
 
     def _on_imu(self, message: Imu) -> None:

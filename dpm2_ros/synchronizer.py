@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which clouds are accepted, and when one has waited long enough for its image. Pure: no ROS, no clock, no thread.
+"""Which clouds are accepted, and when one has waited long enough for what goes with it. Pure: no ROS, no clock, no
+thread.
 
-Every accepted cloud leaves exactly once, in order, with its image by the rules of `dpm2_core.data.pairing`. It leaves
-as soon as there is one within the tolerance: a nearer one that may be on its way is not worth the wait.
+An image goes with it, and the cloud of a second LiDAR.
+
+Every accepted cloud leaves exactly once, in order, with these by the rules of `dpm2_core.data.pairing`. It leaves as
+soon as there is one of each within the tolerance: a nearer one that may be on its way is not worth the wait.
 """
 
 from __future__ import annotations
@@ -12,12 +15,12 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from dpm2_core.data.pairing import JUMP, Images, passed
+from dpm2_core.data.pairing import JUMP, Beside, passed
 
 HOLD = 0.5
 """Longest wait (s) for the next stamp, which confirms a jump."""
 PATIENCE = 5
-"""Clouds in a row that a camera may miss before clouds no longer wait for it (until it delivers again)."""
+"""Clouds in a row that a sensor may miss before clouds no longer wait for it (until it delivers again)."""
 
 
 class StampCheck(StrEnum):
@@ -38,51 +41,62 @@ class StampCheck(StrEnum):
 
 @dataclass(eq=False)
 class Bundle:
-    """A cloud and its image, ready to be processed; arrival and `now` are seconds of one clock."""
+    """A cloud and what goes with it, ready to be processed; arrival and `now` are seconds of one clock."""
 
     stamp: int
     cloud: Any
     arrival: float
     restarted: bool
     image: Any = None
+    second: tuple[int, Any] | None = None
+    """Stamp (ns) and cloud of a second LiDAR."""
 
 
 @dataclass(eq=False)
-class CameraState:
-    """What the camera has delivered."""
+class SensorState:
+    """What a sensor beside the LiDAR has delivered."""
 
+    messages: Beside
     received: int = 0
     matched: int = 0
     late: int = 0
-    """Images for which a cloud had not waited."""
+    """Messages for which a cloud had not waited."""
     missed: int = 0
-    """Clouds in a row that left without its image."""
+    """Clouds in a row that left without it."""
     last_arrival: float | None = None
     present: bool = True
-    """Whether there is a publisher; clouds do not wait for a camera without one."""
+    """Whether there is a publisher; clouds do not wait for a sensor without one."""
 
     @property
     def awaited(self) -> bool:
-        """Whether a cloud still waits for this camera."""
+        """Whether a cloud still waits for this sensor."""
         return self.missed < PATIENCE
+
+    def waits(self, stamp: int) -> bool:
+        """Whether a cloud of that stamp (ns) should."""
+        return self.present and self.awaited and not passed(self.messages.last, stamp)
 
 
 class Synchronizer:
-    """A bounded queue of clouds, each waiting for its image.
+    """A bounded queue of clouds, each waiting for what goes with it.
 
     Args:
-        camera: whether images are wanted; without, nothing waits.
+        camera: whether images are wanted. second: whether clouds of a second LiDAR are. Without, nothing waits.
         depth: clouds that may wait; when full, the oldest is dropped.
-        timeout: longest wait of a cloud for its image, s.
+        timeout: longest wait of a cloud, s.
         tolerance: greatest difference of stamps that belong together, s.
+
+    Attributes:
+        camera, second: None where it is not wanted.
     """
 
-    def __init__(self, camera: bool, depth: int, timeout: float, tolerance: float) -> None:
-        self.camera = CameraState() if camera else None
+    def __init__(self, camera: bool, depth: int, timeout: float, tolerance: float, second: bool = False) -> None:
+        self.camera = SensorState(Beside(tolerance)) if camera else None
+        self.second = SensorState(Beside(tolerance)) if second else None
         self.counts: dict[StampCheck, int] = dict.fromkeys(StampCheck, 0)
         self.dropped = 0
         self.last_arrival: float | None = None
-        self._timeout, self._images = timeout, Images(tolerance)
+        self._timeout = timeout
         self._queue: deque[Bundle] = deque()
         self._depth = depth
         self._newest: int | None = None  # stamp of the last cloud accepted
@@ -119,32 +133,44 @@ class Synchronizer:
 
     def add_image(self, stamp: int, image: Any, now: float) -> None:
         """Take an image with its stamp (ns); there must be a camera."""
-        camera, tolerance, (left, arrival) = self.camera, self._images.tolerance, self._left
-        assert camera is not None
-        camera.received += 1
-        camera.last_arrival = now
-        late = -JUMP < stamp - left <= (tolerance if camera.missed else -tolerance)
-        camera.late += late
+        assert self.camera is not None
+        self._add(self.camera, stamp, image, now)
+
+    def add_second(self, stamp: int, cloud: Any, now: float) -> None:
+        """Take a cloud of the second LiDAR, which there must be, with its stamp (ns)."""
+        assert self.second is not None
+        self._add(self.second, stamp, cloud, now)
+
+    def _add(self, sensor: SensorState, stamp: int, message: Any, now: float) -> None:
+        tolerance, (left, arrival) = sensor.messages.tolerance, self._left
+        sensor.received += 1
+        sensor.last_arrival = now
+        late = -JUMP < stamp - left <= (tolerance if sensor.missed else -tolerance)
+        sensor.late += late
         if not late or now <= arrival + self._timeout:
-            camera.missed = 0  # a late one would have come in time, had that cloud waited
-        self._images.add(stamp, image)
+            sensor.missed = 0  # a late one would have come in time, had that cloud waited
+        sensor.messages.add(stamp, message)
 
     def pop(self, now: float) -> Bundle | None:
-        """The next cloud that has its image or has waited long enough; None if there is none yet."""
+        """The next cloud that has what goes with it or has waited long enough; None if there is none yet."""
         if self._jumped is not None and now >= self._jumped.arrival + HOLD:
             self._settle(true=True)
         if not self._queue:
             return None
-        head, camera = self._queue[0], self.camera
-        head.image = self._images.nearest(head.stamp)
-        if camera is not None:
-            waits = camera.present and camera.awaited and not passed(self._images.last, head.stamp)
-            if head.image is None and waits and now < head.arrival + self._timeout:
-                return None
-            camera.matched += head.image is not None
-            camera.missed += head.image is None
+        head, sensors = self._queue[0], [sensor for sensor in (self.camera, self.second) if sensor is not None]
+        missing = [sensor for sensor in sensors if sensor.messages.nearest(head.stamp) is None]
+        if now < head.arrival + self._timeout and any(sensor.waits(head.stamp) for sensor in missing):
+            return None
+        for sensor in sensors:
+            sensor.matched += sensor not in missing
+            sensor.missed += sensor in missing
+        if self.camera is not None:
+            _, head.image = self.camera.messages.nearest(head.stamp) or (0, None)
+        if self.second is not None:
+            head.second = self.second.messages.nearest(head.stamp)
+        for sensor in sensors:
+            sensor.messages.forget(head.stamp)
         self._queue.popleft()
-        self._images.forget(head.stamp)
         self._left = head.stamp, head.arrival
         return head
 

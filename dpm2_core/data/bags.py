@@ -19,7 +19,7 @@ from dpm2_core.data.imu import ImuBuffer
 from dpm2_core.data.kitti import checked_correction
 from dpm2_core.data.livox import LIVOX
 from dpm2_core.data.messages import MessageError, serialized_stamp, stamp_ns
-from dpm2_core.data.pairing import Images, clouds_after_others
+from dpm2_core.data.pairing import Beside, clouds_after_others
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.errors import UsageError
@@ -54,7 +54,9 @@ class BagSource:
         self.points_topic = self._choose_points()
         first = self._bag.first(self.points_topic)
         self.lidar_frame: str = first.header.frame_id if first else ""
-        self._calibration = Calibration(self.points_topic, angle_correction_deg=self._recorded_correction())
+        second = self._choose_second()
+        correction = self._recorded_correction()
+        self._calibration = Calibration(self.points_topic, second_topic=second, angle_correction_deg=correction)
         self.transforms = self._calibration.transforms
         for _, _, data in self._bag.messages([topics.TF_STATIC]):
             self.transforms.add(self._bag.decode(topics.TF_STATIC, data))
@@ -77,12 +79,12 @@ class BagSource:
         before, without, count = None, 0, 0
         self._imu.clear()
         self._unsound = 0
-        for index, (stamp, cloud, image) in enumerate(islice(self._pairs(), stop)):
+        for index, (stamp, cloud, image, second) in enumerate(islice(self._pairs(), stop)):
             if index < start:
                 continue
             if before is not None and stamp <= before:
                 self._note_once("time stamps do not increase", f"at frame {index}: {(stamp - before) * 1e-9:+.3f} s")
-            frame = self._frames.frame(stamp, cloud, image, index)
+            frame = self._frames.frame(stamp, cloud, index, image, second)
             before, without, count = stamp, without + (not frame.images), count + 1
             if self._frames.time_problem:
                 self._note_once(f"{self.points_topic}: {self._frames.time_problem}", f"first at frame {index}")
@@ -126,6 +128,15 @@ class BagSource:
             self.notes.append(f"PointCloud2 topics {', '.join(found)}: {topics.POINTS} was chosen")
             return topics.POINTS
         return found[0]
+
+    def _choose_second(self) -> str:
+        """The topic of a second LiDAR, empty for none."""
+        asked = self._settings.second_points_topic
+        if asked and (asked == self.points_topic or asked not in self._bag.topics(*CLOUDS)):
+            raise UsageError(
+                f"{self.path}: input.second_points_topic: no other point clouds on {asked}; {self._contents()}"
+            )
+        return asked
 
     def _choose_image(self) -> str:
         """An image topic, empty for none."""
@@ -178,22 +189,27 @@ class BagSource:
         message = self._bag.first(topic) if wanted else None
         return None if message is None else checked_correction(float(message.data), f"{self.path}: {topic}")
 
-    def _pairs(self) -> Iterator[tuple[int, bytes, bytes | None]]:
-        """(stamp, cloud, image or None), serialized; the IMU's samples before it are in the buffer then."""
-        offset, images = round(self._settings.image_time_offset * 1e9), Images(self._settings.image_tolerance)
-        others = {self.image_topic: offset} if self.camera else {}
-        if self.imu_topic:
-            others[self.imu_topic] = 0
+    def _pairs(self) -> Iterator[tuple[int, bytes, bytes | None, tuple[int, bytes] | None]]:
+        """(stamp, cloud, image or None, second cloud with its stamp or None), serialized; the IMU's samples before it
+        are in the buffer then."""
+        second, tolerance = self._calibration.second_topic, self._settings.image_tolerance
+        beside = {topic: Beside(tolerance) for topic in (self.image_topic if self.camera else "", second) if topic}
+        others = dict.fromkeys([*beside, *[self.imu_topic] * bool(self.imu_topic)], 0)
+        if self.camera:
+            others[self.image_topic] = round(self._settings.image_time_offset * 1e9)
         messages = self._bag.messages([self.points_topic, *others])
         for topic, time, data in clouds_after_others(messages, [self.points_topic], others):
             stamp = serialized_stamp(data, time)
             if topic == self.points_topic:
-                yield stamp, data, images.nearest(stamp)
-                images.forget(stamp)
+                found = {other: sensor.nearest(stamp) for other, sensor in beside.items()}
+                _, image = found.get(self.image_topic) or (0, None)
+                yield stamp, data, image, found.get(second)
+                for sensor in beside.values():
+                    sensor.forget(stamp)
             elif topic == self.imu_topic:
                 self._add_imu(stamp, data)
             else:
-                images.add(stamp + offset, data)
+                beside[topic].add(stamp + others[topic], data)
 
     def _add_imu(self, stamp: int, data: bytes) -> None:
         try:

@@ -60,7 +60,7 @@ class CloudFolder:
         for index in range(*slice(start, stop).indices(len(self))):
             stamp = int(self.stamps[index])
             try:
-                frame = self._frames.frame(stamp, _cloud(self._files[index], stamp), None, index)
+                frame = self._frames.frame(stamp, _cloud(self._files[index], stamp), index)
             except UsageError as error:
                 self.notes.append(str(error))
                 yield Frame(stamp, np.empty((0, 4), np.float32), index=index, problem=str(error))

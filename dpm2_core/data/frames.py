@@ -17,6 +17,7 @@ from dpm2_core.data.transforms import TransformTree
 from dpm2_core.data.vertical_angle import HDL64_CORRECTION_DEG, correct_vertical_angle
 from dpm2_core.errors import UsageError, printable
 from dpm2_core.frame import Array, Camera, Frame, Image, Inertial, Points
+from dpm2_core.geometry import se3
 
 _MOST_REPORTED = 20  # damaged data may be damaged in endless ways
 _LENGTH = 300  # characters of a problem, whatever is in the message
@@ -27,7 +28,7 @@ class Calibration:
     """What is known of the sensors: of a recording from the start, of topics as it comes in.
 
     Attributes:
-        points_topic, image_topic, imu_topic: full names; empty where there is none.
+        points_topic, image_topic, imu_topic, second_topic: full names; empty where there is none.
         camera_info: sensor_msgs/CameraInfo; None as long as there is none.
         transforms: of /tf_static.
         angle_correction_deg: what the recording says of its vertical angles; None if it says nothing.
@@ -36,6 +37,7 @@ class Calibration:
     points_topic: str
     image_topic: str = ""
     imu_topic: str = ""
+    second_topic: str = ""
     camera_info: Any = None
     transforms: TransformTree = field(default_factory=TransformTree)
     angle_correction_deg: float | None = None
@@ -55,6 +57,7 @@ class FrameBuilder:
         up: see `Inertial`.
         imu_problem: why the last scan has no samples, or they cannot be used; empty if they can, or before the first.
         image_problem: why the last image could not be used; empty if it could, or if there was none.
+        second_problem: why the last cloud of a second LiDAR could not be used; empty likewise.
         time_problem: why the last cloud cannot be de-skewed; empty if it can, or needs not.
     """
 
@@ -68,27 +71,57 @@ class FrameBuilder:
     ) -> None:
         self._settings, self._calibration, self._complain, self._decode = settings, calibration, complain, decode
         self._told: set[str] = set()
-        self.image_problem = self.time_problem = self.imu_problem = ""
+        self.image_problem = self.second_problem = self.time_problem = self.imu_problem = ""
         self._imu = imu
         self.up: tuple[float, float, float] | None = (0.0, 0.0, 1.0)
 
-    def frame(self, stamp: int, cloud: Any, image: Any | None, index: int) -> Frame:
-        """A cloud with its stamp (ns), and its image, if it has one; an unreadable cloud comes with `problem` set."""
-        settings = self._settings
+    def frame(
+        self, stamp: int, cloud: Any, index: int, image: Any = None, second: tuple[int, Any] | None = None
+    ) -> Frame:
+        """A cloud with its stamp (ns), and what goes with it; an unreadable cloud comes with `problem` set.
+
+        Args:
+            image: a message. second: stamp (ns) and message of a second LiDAR.
+        """
+        topic = self._calibration.points_topic
         try:
-            cloud = self._decode(self._calibration.points_topic, cloud)
-            points, offset = decode_points(cloud, settings.time_field, settings.time_unit, settings.intensity_max)
+            cloud = self._decode(topic, cloud)
+            points, offset = self._points(cloud)
         except MessageError as error:
-            problem = self._tell(self._calibration.points_topic, error)
+            problem = self._tell(topic, error)
             return Frame(stamp, np.empty((0, 4), np.float32), index=index, problem=problem)
-        expected = (
-            settings.time_field is None and not self._calibration.points_topic.startswith("/kitti/") and len(points)
-        )
+        expected = self._settings.time_field is None and not topic.startswith("/kitti/") and len(points)
         self.time_problem = f"{why_untimed(cloud)}: not de-skewed" if offset is None and expected else ""
         points = correct_vertical_angle(points, self.angle_correction_deg)
         lidar_frame = cloud.header.frame_id
+        if second is not None:
+            points, offset = self._joined(points, offset, lidar_frame, (second[0] - stamp) * 1e-9, second[1])
         imu = None if self._imu is None else self._inertial(self._imu, lidar_frame, stamp, offset)
         return Frame(stamp, points, offset, self._images(lidar_frame, image), index, imu=imu)
+
+    def _points(self, cloud: Any) -> tuple[Points, Points | None]:
+        """(N, 4), and (N,) s after the stamp, of a decoded message."""
+        settings = self._settings
+        return decode_points(cloud, settings.time_field, settings.time_unit, settings.intensity_max)
+
+    def _joined(
+        self, points: Points, offset: Points | None, lidar_frame: str, late: float, second: Any
+    ) -> tuple[Points, Points | None]:
+        """Points (N, 4) with those of a second LiDAR, `late` s after them; their times (N,) with its."""
+        topic = self._calibration.second_topic
+        try:
+            second = self._decode(topic, second)
+            others, other_offset = self._points(second)
+            T = self._calibration.transforms.lookup(lidar_frame, second.header.frame_id)
+        except (MessageError, UsageError) as error:
+            self.second_problem = self._tell(topic, error, "; going on without the second LiDAR")
+            return points, offset
+        self.second_problem = ""
+        if offset is not None or other_offset is not None or late:
+            first = np.zeros(len(points), np.float32) if offset is None else offset
+            then = np.zeros(len(others), np.float32) if other_offset is None else other_offset
+            offset = np.concatenate([first, then + np.float32(late)])
+        return np.concatenate([points, se3.transform(T, others)]), offset
 
     def camera(self, lidar_frame: str, image_frame: str) -> Camera:
         """The camera by what is known now; `image_frame` counts where its CameraInfo names no frame.

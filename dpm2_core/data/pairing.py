@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which image goes with which cloud, of a recording as of topics. Pure rules: no ROS, no clock, no thread.
+"""What goes with which cloud, of a recording as of topics. Pure rules: no ROS, no clock, no thread.
 
-The cloud leads: every cloud leaves once, with the image nearest in time of those that came before it left.
+The cloud leads: every cloud leaves once, with that image, and that cloud of a second LiDAR, which is nearest in time of
+those that came before it left.
 """
 
 from __future__ import annotations
@@ -16,16 +17,16 @@ JUMP = 1_000_000_000
 """ns by which a stamp goes back, or ahead beyond the time that has passed, only if it is wrong or time itself has
 jumped: a looped bag, a clock that was set, a recording with a gap."""
 LATE = 500_000_000
-"""ns of log time that a cloud of a recording waits for its image."""
+"""ns of log time that a cloud of a recording waits for what goes with it."""
 BUFFER = 32
-"""Images kept; bounds memory where no cloud comes, or the stamps are of no use."""
+"""Messages kept; bounds memory where no cloud comes, or the stamps are of no use."""
 
 RawMessage = tuple[str, int, bytes]
 """Topic, log time (ns) and serialized message of a recording."""
 
 
-class Images:
-    """Those of one camera that may belong to a cloud, in the order in which they came.
+class Beside:
+    """Messages of one sensor beside the LiDAR that may belong to a cloud, in the order in which they came.
 
     Args:
         tolerance: greatest difference of stamps that belong together, s.
@@ -37,22 +38,22 @@ class Images:
     def __init__(self, tolerance: float) -> None:
         self.tolerance = round(tolerance * 1e9)
         self.last = -float("inf")
-        self._images: deque[tuple[int, Any]] = deque(maxlen=BUFFER)
+        self._messages: deque[tuple[int, Any]] = deque(maxlen=BUFFER)
 
-    def add(self, stamp: int, image: Any) -> None:
+    def add(self, stamp: int, message: Any) -> None:
         """Take one with its stamp (ns)."""
         self.last = stamp
-        self._images.append((stamp, image))
+        self._messages.append((stamp, message))
 
-    def nearest(self, stamp: int) -> Any | None:
-        """The image for a cloud with that stamp (ns); None if none is within the tolerance."""
-        taken, image = min(self._images, key=lambda image: abs(image[0] - stamp), default=(stamp, None))
-        return image if abs(taken - stamp) <= self.tolerance else None
+    def nearest(self, stamp: int) -> tuple[int, Any] | None:
+        """Stamp (ns) and message for a cloud with that stamp (ns); None if none is within the tolerance."""
+        found = min(self._messages, key=lambda message: abs(message[0] - stamp), default=None)
+        return found if found is not None and abs(found[0] - stamp) <= self.tolerance else None
 
     def forget(self, stamp: int) -> None:
         """A cloud with that stamp (ns) has left: drop what is too old for the next, or from before time went back."""
-        while self._images and not -self.tolerance <= self._images[0][0] - stamp < JUMP:
-            self._images.popleft()
+        while self._messages and not -self.tolerance <= self._messages[0][0] - stamp < JUMP:
+            self._messages.popleft()
 
 
 def passed(last: float, cloud: int) -> bool:
@@ -68,7 +69,7 @@ def clouds_after_others(
 
     Args:
         messages: in recorded order.
-        clouds: topics. others: topics of cameras and an IMU, with what is added to their stamps, ns.
+        clouds: topics. others: topics of the other sensors, with what is added to their stamps, ns.
     """
     latest = dict.fromkeys(others, -float("inf"))
     waiting: deque[tuple[int, RawMessage]] = deque()  # with their stamps

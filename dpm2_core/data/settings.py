@@ -41,6 +41,10 @@ class InputSettings(Settings):
     points_topic: str = ""
     """PointCloud2 or Livox CustomMsg topic of a bag; empty takes /kitti/velo/pointcloud, else the only one."""
 
+    second_points_topic: str = ""
+    """Topic of a second LiDAR, whose place /tf_static knows: each cloud of `points_topic` is joined by the nearest of
+    this one within `image_tolerance`; empty: none."""
+
     images: bool = True
     """Use the camera where there is one."""
 
@@ -54,7 +58,7 @@ class InputSettings(Settings):
     """Pose of the camera's optical frame in the LiDAR frame, [x, y, z (m), qx, qy, qz, qw]; null asks /tf_static."""
 
     image_tolerance: Annotated[float, Field(gt=0, le=10)] = 0.05
-    """Largest difference of time between a cloud and its image, s."""
+    """Largest difference of time between a cloud and its image, or that of a second LiDAR, s."""
 
     image_time_offset: Annotated[float, Field(ge=-10, le=10)] = 0.0
     """Added to the stamps of images before they are compared with those of clouds, s."""

@@ -84,7 +84,12 @@ class FleetIndex:
             import faiss
         self._faiss: Any = faiss
         self._folder = folder
-        self.clear()
+        self.drives: list[tuple[str, Sequence[int], int]] = []
+        self._mean = np.zeros(WIDTH, np.float32)
+        self._graph: Any = None
+        self._late: list[Vector] = []  # those after the ones in the graph
+        self._new: list[Vector] = []  # those that are not in the file yet
+        self._kept, self._relinked = 0, False  # places in the file; whether the graph differs from its file
         try:
             listed = json.loads((folder / _LISTED).read_text(encoding="utf-8"))
             drives: list[Any] = [(str(name), list(version), int(count)) for name, version, count in listed["drives"]]
@@ -102,12 +107,7 @@ class FleetIndex:
 
     def clear(self) -> None:
         """Forget all: a drive has changed."""
-        self.drives: list[tuple[str, Sequence[int], int]] = []
-        self._mean = np.zeros(WIDTH, np.float32)
-        self._graph: Any = None
-        self._late: list[Vector] = []  # those after the ones in the graph
-        self._new: list[Vector] = []  # those that are not in the file yet
-        self._kept, self._relinked = 0, True  # places in the file; whether the graph differs from its file
+        self.drives, self._graph, self._late, self._new, self._kept = [], None, [], [], 0
 
     @property
     def _linked(self) -> int:

@@ -68,7 +68,7 @@ def test_points_of_a_custom_message_arrive(node: Callable[..., Node]) -> None:  
         bundle = inputs.take(0.0)
     rclpy.shutdown(context=other)
     assert bundle is not None
-    frame = FrameBuilder(InputSettings(), inputs.calibration, pytest.fail).frame(bundle.stamp, bundle.cloud, None, 0)
+    frame = FrameBuilder(InputSettings(), inputs.calibration, pytest.fail).frame(bundle.stamp, bundle.cloud, 0)
     np.testing.assert_array_equal(frame.points[:, :3], POINTS)
     np.testing.assert_allclose(frame.time_offset, SECONDS, atol=1e-8)
     assert cloud_to_msg(frame.points, 1, "lidar").width == 50

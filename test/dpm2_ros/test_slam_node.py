@@ -31,6 +31,8 @@ from dpm2_ros.keyframes import received_to_msg
 from dpm2_ros.slam_node import SlamNode
 from dpm2_ros.tf import TFMessage
 
+from .conftest import pose, scan
+
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE)
 ACCURATE = 0.05  # m: the scans are exact, sampled at 0.35 m, and averaged into voxels of 0.5 m
 
@@ -420,6 +422,30 @@ def test_a_missing_extrinsic_rejects_the_images_and_says_so(rig: Callable[..., R
     assert status.level == DiagnosticStatus.ERROR
     assert "no transform from 'camera' to 'lidar'" in status.message
     assert "input.T_lidar_cam" in status.message
+
+
+def test_two_lidars_are_one_scan(rig: Callable[..., Rig], drive: Any) -> None:
+    """Each sees one side of the street; the second is turned and stands to the right. Then it stops."""
+    r = rig("input.second_points_topic:=/right", "ros.sync_timeout:=2.0", "input.vertical_angle_correction_deg:='0.0'")
+    T = se3.exp([0, 0, -1.5, 0.3, -0.5, 0.1])
+    publish_static(r, "lidar", "right", T)
+    right = r.harness.publisher(PointCloud2, "/right")
+    frames = record_frames(r)
+    for n in range(5):
+        points = scan(pose(n))
+        left = points[:, 1] > 0
+        others = se3.transform(se3.inverse(T), points[~left])
+        right.publish(cloud_to_msg(others, drive.stamp(n) - 20_000_000, "right"))
+        before = len(r.odom)
+        r.lidar.publish(cloud_to_msg(points[left], drive.stamp(n), "lidar"))
+        r.wait(lambda before=before: len(r.odom) > before, f"the odometry of cloud {n}")
+        np.testing.assert_allclose(frames[n].points, np.concatenate([points[left], points[~left]]), atol=1e-4)
+    assert frames[-1].time_offset is not None
+    assert set(np.round(frames[-1].time_offset, 6)) == {0.0, np.float32(-0.02)}
+    assert r.status("second lidar").message == "in use"
+    r.send_and_wait(5)  # alone
+    assert len(frames[5].points) == len(scan(pose(5)))
+    assert r.values("second lidar") == {"received": "5", "used": "5", "late": "0"}
 
 
 def test_a_camera_that_never_comes_comes_late_and_stops(rig: Callable[..., Rig], drive: Any) -> None:

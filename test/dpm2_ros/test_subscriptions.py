@@ -45,7 +45,7 @@ def inputs(node: Node, **settings: Any) -> Inputs:
 
 def raised(inputs: Inputs) -> float:
     """Degrees by which the points of a cloud have been raised."""
-    frame = FrameBuilder(InputSettings(), inputs.calibration, print).frame(0, cloud_to_msg(CLOUD, 1, "lidar"), None, 0)
+    frame = FrameBuilder(InputSettings(), inputs.calibration, print).frame(0, cloud_to_msg(CLOUD, 1, "lidar"), 0)
     return math.degrees(math.atan2(frame.points[0, 2], frame.points[0, 0]))
 
 

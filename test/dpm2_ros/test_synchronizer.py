@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dpm2_ros.synchronizer import HOLD, PATIENCE, Bundle, CameraState, StampCheck, Synchronizer
+from dpm2_ros.synchronizer import HOLD, PATIENCE, Bundle, SensorState, StampCheck, Synchronizer
 
 MS = 1_000_000
 
@@ -16,7 +16,7 @@ def make(camera: bool = True, depth: int = 10, timeout: float = 0.03, tolerance:
     return Synchronizer(camera, depth, timeout, tolerance)
 
 
-def camera_of(synchronizer: Synchronizer) -> CameraState:
+def camera_of(synchronizer: Synchronizer) -> SensorState:
     assert synchronizer.camera is not None
     return synchronizer.camera
 
@@ -29,6 +29,29 @@ def test_without_a_camera_nothing_waits() -> None:
     synchronizer = make(camera=False)
     synchronizer.add_cloud(100 * MS, "a", now=0.0)
     assert [bundle.cloud for bundle in drain(synchronizer, 0.0)] == ["a"]
+
+
+def test_a_cloud_waits_for_image_and_second_lidar_alike() -> None:
+    """Each with patience of its own: one that is silent does not cost the other."""
+    synchronizer = Synchronizer(camera=True, depth=10, timeout=0.03, tolerance=0.05, second=True)
+    synchronizer.add_cloud(100 * MS, "a", now=0.0)
+    synchronizer.add_image(110 * MS, "image", now=0.01)
+    assert not drain(synchronizer, 0.01)
+    synchronizer.add_second(60 * MS, "second", now=0.02)
+    (bundle,) = drain(synchronizer, 0.02)
+    assert (bundle.image, bundle.second) == ("image", (60 * MS, "second"))
+    for n in range(2, 2 + PATIENCE):  # the camera stops
+        synchronizer.add_second(100 * n * MS, n, now=0.1 * n)
+        synchronizer.add_cloud(100 * n * MS, n, now=0.1 * n)
+        assert not drain(synchronizer, 0.1 * n)
+        (bundle,) = drain(synchronizer, 0.1 * n + 0.03)
+        assert (bundle.image, bundle.second) == (None, (100 * n * MS, n))
+    synchronizer.add_cloud(2000 * MS, "last", now=2.0)
+    assert not drain(synchronizer, 2.0)
+    synchronizer.add_second(2000 * MS, "second", now=2.01)
+    assert [bundle.cloud for bundle in drain(synchronizer, 2.01)] == ["last"]  # nobody waits for the camera any more
+    assert synchronizer.second is not None
+    assert (synchronizer.second.matched, synchronizer.second.missed) == (PATIENCE + 2, 0)
 
 
 def test_a_camera_that_nobody_publishes_is_not_waited_for() -> None:

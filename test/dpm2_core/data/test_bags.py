@@ -95,6 +95,37 @@ def test_the_only_camera_is_taken_and_several_are_left(bags: Any, tmp_path: Path
         BagSource(tmp_path / "two", InputSettings(image_topic="/absent"))
 
 
+# --- a second LiDAR
+
+
+def test_clouds_of_a_second_lidar_join_in_the_frame_of_the_first(bags: Any, tmp_path: Path) -> None:
+    """It stands 2 m to the left, and is 40 ms late: its points say when they were taken."""
+    second = [(t + 0.04, "/second", bags.cloud(t + 0.04, x=10 * t, frame="left")) for t in (1, 1.1, 1.3)]
+    tree = (1, "/tf_static", bags.transform("velo_link", "left", (0, 2, 0)))
+    bag = bags.write(tmp_path / "b", by_time([*clouds(bags, [1, 1.1, 1.2, 1.3]), *second, tree]))
+    settings = InputSettings(points_topic=POINTS, second_points_topic="/second")
+    frames = list(BagSource(bag, settings).frames())
+    assert [len(frame.points) for frame in frames] == [120, 120, 60, 120]
+    for n, frame in enumerate(frames):
+        np.testing.assert_allclose(frame.points[:60], [[n, 2, 3, 0.5]] * 60, rtol=1e-6)
+    np.testing.assert_allclose(frames[1].points[60:], [[11, 4, 3, 0.5]] * 60, rtol=1e-6)
+    assert frames[1].time_offset is not None
+    np.testing.assert_allclose(frames[1].time_offset, [0.0] * 60 + [0.04] * 60, atol=1e-6)
+    assert frames[2].time_offset is None
+
+
+def test_a_second_lidar_without_a_place_is_left_out(bags: Any, tmp_path: Path) -> None:
+    second = [(1.01, "/second", bags.cloud(1.01, frame="left"))]
+    bag = bags.write(tmp_path / "b", [*clouds(bags, [1]), *second])
+    source = BagSource(bag, InputSettings(points_topic=POINTS, second_points_topic="/second"))
+    assert [len(frame.points) for frame in source.frames()] == [60]
+    assert "/second: no transform from 'left' to 'velo_link'" in source.notes[0]
+    assert "going on without the second LiDAR" in source.notes[0]
+    for wrong in ("/third", POINTS):
+        with pytest.raises(UsageError, match=rf"second_points_topic: no other point clouds on {wrong}; topics: "):
+            BagSource(bag, InputSettings(points_topic=POINTS, second_points_topic=wrong))
+
+
 # --- camera
 
 

@@ -88,7 +88,7 @@ def laid_out(name: str) -> Any:
 def thickness(message: Any, settings: InputSettings | None = None) -> tuple[float, str]:
     """How thick the wall is after de-skewing, m, and what was said of the times."""
     builder = FrameBuilder(settings or InputSettings(), Calibration("/points"), pytest.fail)
-    frame = builder.frame(STAMP, message, None, 0)
+    frame = builder.frame(STAMP, message, 0)
     assert len(frame.points) == 2000
     points = Preprocessor(PreprocessSettings()).measured(frame, TWIST)
     return float(np.abs(points[:, 0] - 20).max()), builder.time_problem

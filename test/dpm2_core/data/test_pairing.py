@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dpm2_core.data.pairing import BUFFER, JUMP, LATE, Images, RawMessage, clouds_after_others
+from dpm2_core.data.pairing import BUFFER, JUMP, LATE, Beside, RawMessage, clouds_after_others
 
 MS = 1_000_000
 START = 1_700_000_000_000
@@ -31,14 +31,14 @@ def record(clouds: list[tuple[int, int]], images: list[tuple[int, int]]) -> list
 
 def paired(messages: list[RawMessage], tolerance: float = 0.05, offset: int = 0) -> dict[int, int | None]:
     """The stamp of each cloud to that of its image, ms after START."""
-    images, out = Images(tolerance), {}
+    images, out = Beside(tolerance), {}
     for topic, _, data in clouds_after_others(messages, ["/cloud"], {"/image": offset * MS}):
         second, ns = struct.unpack_from("<iI", data, 4)
         stamp = second * 1000 + ns // MS - START
         if topic == "/image":
             images.add((stamp + offset) * MS, stamp)
         else:
-            out[stamp] = images.nearest(stamp * MS)
+            _, out[stamp] = images.nearest(stamp * MS) or (0, None)
             images.forget(stamp * MS)
     return out
 
@@ -78,11 +78,11 @@ def test_one_stamp_far_off_costs_its_image_alone(stray: int) -> None:
 
 
 def test_when_time_goes_back_the_images_of_before_are_not_used() -> None:
-    images = Images(0.05)
+    images = Beside(0.05)
     for turn in range(2):
         for n in range(20):
             images.add(n * 100 * MS, (turn, n))
-            assert images.nearest(n * 100 * MS) == (turn, n)
+            assert images.nearest(n * 100 * MS) == (n * 100 * MS, (turn, n))
             images.forget(n * 100 * MS)
 
 
@@ -93,7 +93,7 @@ def test_without_a_camera_nothing_is_held_back() -> None:
 
 def test_memory_is_bounded() -> None:
     """Whatever the stamps of images are; and clouds wait no longer than half a second for a camera that is silent."""
-    images = Images(0.05)
+    images = Beside(0.05)
     for n in range(10 * BUFFER):
         images.add(n * JUMP, n)
     assert images.nearest(0) is None
