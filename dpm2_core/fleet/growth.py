@@ -17,6 +17,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order
 
+from dpm2_core.errors import Dpm2Error
 from dpm2_core.fleet.joins import ENOUGH
 from dpm2_core.fleet.regions import Join
 from dpm2_core.fleet.search import affirmed, component
@@ -184,9 +185,21 @@ def _solved(there: Standing, maps: Mapping[str, MapData], joins: Sequence[Join])
 
 
 class _Region:
-    """Drives of a map file that are solved for; the nodes of others to which their loops lead are held."""
+    """Drives of a map file that are solved for; the nodes of others to which their loops lead are held.
+
+    Raises:
+        Dpm2Error: the file is damaged.
+    """
 
     def __init__(self, store: MapStore, spans: Sequence[range], settings: PoseGraphSettings) -> None:
+        try:
+            self._read(store, spans, settings)
+        except KeyError as error:
+            raise Dpm2Error(f"{store.path}: keyframe {error} is missing; see dpm2 map check") from None
+        except ValueError as error:
+            raise Dpm2Error(f"{store.path}: {error}; see dpm2 map check") from None
+
+    def _read(self, store: MapStore, spans: Sequence[range], settings: PoseGraphSettings) -> None:
         own = [node for span in spans for node in span]
         edges = store.rows("edges", where=_within(spans, "from_node", "to_node"))
         read = [(int(row[0]), edge_of(row)) for row in edges]

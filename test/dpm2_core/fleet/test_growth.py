@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dpm2_core.errors import Dpm2Error
 from dpm2_core.evaluation.metrics import ape_rmse
 from dpm2_core.fleet.growth import Growth, Standing, add_drives, grown, joins_of
 from dpm2_core.fleet.regions import LARGEST, Join, solve
@@ -118,6 +119,21 @@ def _killed(path: Path, inside: Mapping[str, int], data: MapData, joins: Sequenc
         add_drives(store, inside, growth)
         assert store.size == 180
         os.kill(os.getpid(), signal.SIGKILL)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    ["UPDATE poses SET T_map_kf = zeroblob(128) WHERE node = 3", "DELETE FROM poses WHERE node = 3",
+     "UPDATE edges SET T_from_to = zeroblob(128) WHERE id = 1"],
+)  # fmt: skip
+def test_a_damaged_map_is_an_error_that_names_it(tmp_path: Path, damage: str) -> None:
+    _, maps, joins = fleet_maps(3)
+    names, path = list(maps), tmp_path / "town.dpm2map"
+    inside = _made(path, {name: maps[name] for name in names[:2]}, _of(joins, names[:2]))
+    with closing(sqlite3.connect(path)) as connection, connection:
+        connection.execute(damage)
+    with MapStore.open(path) as store, pytest.raises(Dpm2Error, match=r"town\.dpm2map: .*; see dpm2 map check"):
+        grown(_standing(store, inside), {names[2]: maps[names[2]]}, joins)
 
 
 def test_a_ring_that_closes_moves_what_it_must(tmp_path: Path) -> None:
