@@ -67,7 +67,7 @@ measure: setup  ## every record that stands on the weights, again, at a clean co
 	$(BIN)/python -m tools.measure $(ARGS)
 
 # On a machine that does nothing else OpenMP threads may spin while they wait: a fifth faster.
-train-data: setup  ## the synthetic worlds that train-small and ablation learn from (2 cores: 40 minutes, 1.5 GB)
+train-data: setup  ## the synthetic worlds that train-small and ablation learn from (2 cores: 60 minutes, 1.8 GB)
 	$(BIN)/python -m dpm2_core.cli train data out/train/lidar --set worlds=64
 	$(BIN)/python -m dpm2_core.cli train data out/train/camera --config config/worlds_camera.yaml
 	$(BIN)/python -m dpm2_core.cli train data out/train/traffic --set worlds=20 --set first_seed=6000 --set frames=32 --set traffic=20 \
@@ -75,14 +75,22 @@ train-data: setup  ## the synthetic worlds that train-small and ablation learn f
 	$(BIN)/python -m dpm2_core.cli train data out/train/val --set first_seed=900000 --set worlds=12 --set frames=30 --set images=true
 	$(BIN)/python -m dpm2_core.cli train data out/train/val_degenerate --set first_seed=900100 --set worlds=6 --set frames=30 \
 		--set images=true --set 'mixture={highway: 0.5, tunnel: 0.5}'
+	$(BIN)/python -m dpm2_core.cli train data out/train/real --set worlds=72 --set first_seed=20000 --set frames=40 --set real=0.85 \
+		--set others=0.3 --set 'mixture={city: 0.27, suburb: 0.27, rural: 0.26, highway: 0.1, tunnel: 0.1}'
+	$(BIN)/python -m dpm2_core.cli train data out/train/real_traffic --set worlds=10 --set first_seed=21000 --set frames=30 \
+		--set traffic=20 --set real=0.85 --set 'mixture={city: 0.35, suburb: 0.25, rural: 0.2, highway: 0.2}'
+	$(BIN)/python -m dpm2_core.cli train data out/train/real_camera --set worlds=16 --set first_seed=22000 --set frames=24 \
+		--set images=true --set real=0.85 --set 'mixture={city: 0.2, suburb: 0.2, rural: 0.2, highway: 0.2, tunnel: 0.2}'
+	$(BIN)/python -m dpm2_core.cli train data out/train/real_val --set worlds=8 --set first_seed=940000 --set frames=24 --set real=1
 
 TRAIN = OMP_WAIT_POLICY=active $(BIN)/python -m dpm2_core.cli train
 RESUMED = $(if $(wildcard out/$(1)/checkpoint.pt),--resume)
-train-small: train-data  ## train the weights that are shipped: registration, image branch, both, poses, overlap (2 cores: 3 hours; continues)
+train-small: train-data  ## train the weights that are shipped: registration, image branch, both, poses, overlap (2 cores: 4 hours; continues)
 	$(TRAIN) phase1 --config config/train_small.yaml --out out/phase1 $(call RESUMED,phase1)
 	$(TRAIN) image --config config/train_small_image.yaml --out out/image $(call RESUMED,image)
 	$(TRAIN) phase1 --config config/train_small_camera.yaml --out out/camera $(call RESUMED,camera)
 	$(TRAIN) phase1 --config config/train_small_pose.yaml --out out/pose $(call RESUMED,pose)
+	$(TRAIN) phase1 --config config/train_small_real.yaml --out out/real $(call RESUMED,real)
 	$(TRAIN) phase2 --config config/train_small_phase2.yaml --out out/phase2 $(call RESUMED,phase2)
 
 train-ground: setup  ## train the weights of slam.filter.kind=ground (2 cores: 10 minutes, 1.5 GB)
