@@ -35,6 +35,7 @@ def _bench(function: str, options: str) -> Bench:
 
 
 BENCHES: dict[str, Bench] = {
+    "beside": _bench("beside:bench_beside", "threads set"),
     "covariance": _bench("covariance:bench_covariance", "source kitti threads set weights pairs only"),
     "diffslam": _bench("diffslam:bench_diffslam", "repetitions threads set"),
     "finetune": _bench("finetune:bench_finetune", "repetitions threads set pairs only"),

@@ -17,8 +17,8 @@ def bench(
     names: Annotated[
         list[str] | None,
         typer.Argument(
-            help="covariance, diffslam, finetune, fleet, gaps, geometric (default), hard, imu, indoor, loop-cost, "
-            "map, memory, neural, pose-graph, relocalise, roads, sensor, tasks, tilt, traffic."
+            help="beside, covariance, diffslam, finetune, fleet, gaps, geometric (default), hard, imu, indoor, "
+            "loop-cost, map, memory, neural, paper, pose-graph, relocalise, roads, sensor, tasks, tilt, traffic."
         ),
     ] = None,
     source: Annotated[

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A robot with an odometry of its own, whose wheels slip and jump: the map with it, beside the map without."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from rich.console import Group
+from rich.progress import Progress
+
+from benchmarks.harness import Options, Report, settings_of
+from dpm2_core.evaluation.metrics import ape_rmse
+from dpm2_core.frame import Array, Frame, Guess
+from dpm2_core.geometry import se3
+from dpm2_core.sim.sensors import real_sensor
+from dpm2_core.sim.settings import LidarConfig, PresetName
+from dpm2_core.sim.simulated_drive import TurningRobot
+from dpm2_core.sim.world import build_world
+from dpm2_core.slam.build import make_slam
+from dpm2_core.slam.settings import SlamSettings
+from dpm2_core.tables import FigureTable
+
+WORLDS: dict[str, tuple[str, PresetName, int, float]] = {
+    "suburb": ("loop", "suburb", 920, 4.0),
+    "car park": ("loop", "car_park", 921, 2.0),
+    "building": ("loop", "indoor", 922, 1.2),
+    "tunnel": ("straight", "tunnel", 923, 8.0),
+}
+"""Road, kind of world, its seed, speed in m/s."""
+FRAMES = 300
+LIDAR = LidarConfig(beams=16, columns=1024, height=0.8, car_body=False, min_range=0.4)
+SLIP, JUMP = 0.02, 0.5
+"""Fraction of the way, and m, once in the middle."""
+WAYS: dict[str, tuple[float, float, int] | None] = {
+    "own": None,
+    "slip": (SLIP, 0.0, FRAMES),
+    "slip and jump": (SLIP, JUMP, FRAMES),
+    "slip, then stops": (SLIP, 0.0, FRAMES // 2),
+}
+"""Slip, jump, and frames with it; None: the SLAM is alone."""
+
+
+def bench_beside(options: Options) -> Report:
+    """Each world once, with map and loops; no IMU."""
+    settings, results = settings_of(options), dict[str, Any]()
+    with Progress(transient=True) as progress:
+        for name, (road, preset, seed, speed) in WORLDS.items():
+            robot = TurningRobot(build_world(road, preset, seed), FRAMES, speed, real_sensor(LIDAR))
+            frames = list(progress.track(robot.frames(), total=FRAMES, description=name))
+            results[name] = {way: _drive(_with(frames, robot.poses, wrong), robot.poses, settings)
+                             for way, wrong in WAYS.items()}  # fmt: skip
+            progress.console.print(f"{name}: {results[name]}", soft_wrap=True)
+    known = {"beams": LIDAR.beams, "frames": FRAMES, "slip": SLIP, "jump_m": JUMP}
+    return Report({**known, "worlds": results}, Group(_table(results)))
+
+
+def wheels(truth: Array, slip: float, jump: float) -> Array:
+    """Poses (N, 4, 4) of an odometry from an origin of its own: each step too long by `slip`, one by `jump` m more."""
+    out = [se3.exp([0.0, 0.0, 2.0, 50.0, -20.0, 0.0])]
+    for n, (before, now) in enumerate(pairwise(truth), 1):
+        step = se3.log(se3.inverse(before) @ now)
+        step[3:] *= 1 + slip
+        step[3] += jump * (n == len(truth) // 2)
+        out.append(out[-1] @ se3.exp(step))
+    return np.array(out)
+
+
+def _with(frames: Sequence[Frame], truth: Array, wrong: tuple[float, float, int] | None) -> Sequence[Frame]:
+    if wrong is None:
+        return frames
+    slip, jump, count = wrong
+    poses = wheels(truth, slip, jump)
+    return [replace(frame, guess=Guess(poses[frame.index])) if frame.index < count else frame for frame in frames]
+
+
+def _drive(frames: Sequence[Frame], truth: Array, settings: SlamSettings) -> dict[str, Any]:
+    slam, poses, failed, used = make_slam(settings), list[Array](), 0, 0
+    for frame in frames:
+        tracked = slam.process(frame).odometry
+        poses.append(tracked.T_odom_lidar)
+        failed += not tracked.registration.ok
+        used += tracked.comparison is not None and tracked.comparison.used
+    slam.finish()
+    mapper = slam.mapper
+    of = [keyframe.index for keyframe in mapper.keyframes]
+    return {
+        "failed_frames": failed,
+        "frames_led": used,
+        "ape_rmse_m": ape_rmse(truth, np.array(poses)),
+        "map_ape_rmse_m": ape_rmse(truth[of], np.array(mapper.poses)),
+        "keyframes": len(of),
+        "loops": sum(loop.ok for loop in mapper.loops),
+    }
+
+
+def _table(worlds: dict[str, Any]) -> FigureTable:
+    figures = [f"{figure}, {way}" for figure in ("map APE m", "frames led") for way in WAYS]
+    table = FigureTable(f"Beside an odometry with {100 * SLIP:g} % slip", names=["world"], figures=figures)
+    for name, r in worlds.items():
+        row = [f"{r[way]['map_ape_rmse_m']:.3f}" for way in WAYS] + [str(r[way]["frames_led"]) for way in WAYS]
+        table.add_row(name, *row)
+    return table
