@@ -119,11 +119,12 @@ def test_the_card_has_the_figures_of_the_odometry() -> None:
 
 
 def test_what_refined_adds_on_these_drives_is_said() -> None:
+    said = r"`refined` is the points: its errors (?:equal|are) those of `geometric` to ([\d.]+) %"
+    (within,) = {float(number) for path in ("README.md", CARD) for number in re.findall(said, text(path))}
+    assert within <= 0.5
     for methods in record("neural.json")["parts"]["odometry"]["drives"].values():
         for key in ("rpe_trans_m", "rpe_rot_deg", "ape_rmse_m", "final_drift_percent", "t_err_percent"):
-            assert abs(methods["refined"][key] / methods["geometric"][key] - 1) <= 0.002
-    for path in ("README.md", CARD):
-        assert re.search(r"`refined` is the points: its errors (equal|are) those of `geometric` to 0.2 %", text(path))
+            assert 100 * abs(methods["refined"][key] / methods["geometric"][key] - 1) <= within
 
 
 def test_what_the_camera_adds_to_the_descriptors_is_said() -> None:
