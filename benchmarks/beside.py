@@ -13,11 +13,12 @@ from rich.console import Group
 from rich.progress import Progress
 
 from benchmarks.harness import Options, Report, settings_of
+from benchmarks.imu import LIDAR
 from dpm2_core.evaluation.metrics import ape_rmse
 from dpm2_core.frame import Array, Frame, Guess
 from dpm2_core.geometry import se3
 from dpm2_core.sim.sensors import real_sensor
-from dpm2_core.sim.settings import LidarConfig, PresetName
+from dpm2_core.sim.settings import PresetName
 from dpm2_core.sim.simulated_drive import TurningRobot
 from dpm2_core.sim.world import build_world
 from dpm2_core.slam.build import make_slam
@@ -32,7 +33,6 @@ WORLDS: dict[str, tuple[str, PresetName, int, float]] = {
 }
 """Road, kind of world, its seed, speed in m/s."""
 FRAMES = 300
-LIDAR = LidarConfig(beams=16, columns=1024, height=0.8, car_body=False, min_range=0.4)
 SLIP, JUMP = 0.02, 0.5
 """Fraction of the way, and m, once in the middle."""
 WAYS: dict[str, tuple[float, float, int] | None] = {

@@ -157,19 +157,17 @@ class Synchronizer:
             self._settle(true=True)
         if not self._queue:
             return None
-        head, sensors = self._queue[0], [sensor for sensor in (self.camera, self.second) if sensor is not None]
-        missing = [sensor for sensor in sensors if sensor.messages.nearest(head.stamp) is None]
-        if now < head.arrival + self._timeout and any(sensor.waits(head.stamp) for sensor in missing):
+        head, sensors = self._queue[0], (self.camera, self.second)
+        found = [None if sensor is None else sensor.messages.nearest(head.stamp) for sensor in sensors]
+        wanted = [(sensor, message) for sensor, message in zip(sensors, found, strict=True) if sensor is not None]
+        if now < head.arrival + self._timeout and any(s.waits(head.stamp) for s, message in wanted if message is None):
             return None
-        for sensor in sensors:
-            sensor.matched += sensor not in missing
-            sensor.missed += sensor in missing
-        if self.camera is not None:
-            _, head.image = self.camera.messages.nearest(head.stamp) or (0, None)
-        if self.second is not None:
-            head.second = self.second.messages.nearest(head.stamp)
-        for sensor in sensors:
+        for sensor, message in wanted:
+            sensor.matched += message is not None
+            sensor.missed += message is None
             sensor.messages.forget(head.stamp)
+        image, head.second = found
+        head.image = None if image is None else image[1]
         self._queue.popleft()
         self._left = head.stamp, head.arrival
         return head

@@ -194,7 +194,7 @@ class BagSource:
         are in the buffer then."""
         second, tolerance = self._calibration.second_topic, self._settings.image_tolerance
         beside = {topic: Beside(tolerance) for topic in (self.image_topic if self.camera else "", second) if topic}
-        others = dict.fromkeys([*beside, *[self.imu_topic] * bool(self.imu_topic)], 0)
+        others = dict.fromkeys(filter(None, (*beside, self.imu_topic)), 0)
         if self.camera:
             others[self.image_topic] = round(self._settings.image_time_offset * 1e9)
         messages = self._bag.messages([self.points_topic, *others])
