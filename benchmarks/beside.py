@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -16,10 +15,9 @@ from benchmarks.harness import Options, Report, settings_of
 from benchmarks.imu import LIDAR
 from dpm2_core.evaluation.metrics import ape_rmse
 from dpm2_core.frame import Array, Frame, Guess
-from dpm2_core.geometry import se3
 from dpm2_core.sim.sensors import real_sensor
 from dpm2_core.sim.settings import PresetName
-from dpm2_core.sim.simulated_drive import TurningRobot
+from dpm2_core.sim.simulated_drive import TurningRobot, wheel_odometry
 from dpm2_core.sim.world import build_world
 from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.settings import SlamSettings
@@ -58,22 +56,11 @@ def bench_beside(options: Options) -> Report:
     return Report({**known, "worlds": results}, Group(_table(results)))
 
 
-def wheels(truth: Array, slip: float, jump: float) -> Array:
-    """Poses (N, 4, 4) of an odometry from an origin of its own: each step too long by `slip`, one by `jump` m more."""
-    out = [se3.exp([0.0, 0.0, 2.0, 50.0, -20.0, 0.0])]
-    for n, (before, now) in enumerate(pairwise(truth), 1):
-        step = se3.log(se3.inverse(before) @ now)
-        step[3:] *= 1 + slip
-        step[3] += jump * (n == len(truth) // 2)
-        out.append(out[-1] @ se3.exp(step))
-    return np.array(out)
-
-
 def _with(frames: Sequence[Frame], truth: Array, wrong: tuple[float, float, int] | None) -> Sequence[Frame]:
     if wrong is None:
         return frames
     slip, jump, count = wrong
-    poses = wheels(truth, slip, jump)
+    poses = wheel_odometry(truth, slip, jump)
     return [replace(frame, guess=Guess(poses[frame.index])) if frame.index < count else frame for frame in frames]
 
 

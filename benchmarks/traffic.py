@@ -136,7 +136,7 @@ def _figures(runs: list[dict[str, Any]]) -> dict[str, Any]:
     rpe, turn = [run["rpe_trans_m"] for run in runs], [run["rpe_rot_deg"] for run in runs]
     return {
         "drives": len(runs), "rpe_m": mean(rpe), "spread_m": pstdev(rpe), "median_rpe_m": median(rpe),
-        "rpe_deg": mean(turn), "median_rpe_deg": median(turn), "astray": sum(e > LOST for e in rpe),
+        "rpe_deg": mean(turn), "median_rpe_deg": median(turn), "diverged": sum(e > LOST for e in rpe),
         "cpu_ms": median(run["cpu_ms"] for run in runs),
     }  # fmt: skip
 
@@ -155,13 +155,13 @@ def _report(drives: dict[str, Any], options: Options) -> Report:
     summary = summarized(drives)
     results = {"recipe": _recipe(options), "summary": summary, "drives": drives, "torch": torch.__version__,
                "measured_at": git_commit()}  # fmt: skip
-    title, figures = "RPE in dense traffic, mean over drives (median)", ["RPE m", "RPE deg", "astray", "CPU ms"]
+    title, figures = "RPE in dense traffic, mean over drives (median)", ["RPE m", "RPE deg", "diverged", "CPU ms"]
     table = FigureTable(title, names=["registration", "filter"], figures=figures)
     for registration, methods in summary.items():
         for method, row in methods.items():
             table.add_row(
                 registration, method, f"{row['rpe_m']:.4f} ({row['median_rpe_m']:.4f})",
-                f"{row['rpe_deg']:.4f} ({row['median_rpe_deg']:.4f})", f"{row['astray']} of {row['drives']}",
+                f"{row['rpe_deg']:.4f} ({row['median_rpe_deg']:.4f})", f"{row['diverged']} of {row['drives']}",
                 f"{row['cpu_ms']:.0f}",
             )  # fmt: skip
         table.add_section()

@@ -60,7 +60,7 @@ class Finetuned(RegistrationTraining):
             found, diverged = window_trajectories(self.model.decoder, tokens, poses)
             reference = torch.linalg.inv(poses[:, :1]) @ poses
             loss = torch.stack([trajectory_loss(a, b) for a, b in zip(found, reference, strict=True)]).mean()
-            figures |= {"trajectory": loss, "astray": diverged}
+            figures |= {"trajectory": loss, "diverged": diverged}
             total = total + by_trajectory * loss
         figures["loss"] = total
         return total, {name: value.detach().float() for name, value in figures.items()}
@@ -70,8 +70,8 @@ def window_trajectories(decoder: Decoder, tokens: Tokens, poses: Tensor) -> tupl
     """Trajectories (G, F, 4, 4) T_first_scan by registering each scan to the one before; the fraction that diverged.
 
     Args:
-        tokens: descriptors of G * F scans, place by place. poses: (G, F, 4, 4) reference, float64; where the network is
-            diverged, its motion is taken. See `differentiable_poses` for the gradient.
+        tokens: descriptors of G * F scans, place by place. poses: (G, F, 4, 4) reference, float64; where the network
+            diverged, their motion is taken. See `differentiable_poses` for the gradient.
     """
     groups, frames = poses.shape[:2]
     number = torch.arange(groups * frames, device=poses.device).view(groups, frames)

@@ -68,7 +68,7 @@ def registration_loss(
     if settings.pose:
         truth = T_target_source.double()
         T, usable = differentiable_poses(decoder, source, target, correlated, truth)
-        figures |= {"pose": pose_loss(T, truth), "astray": 1 - usable.double().mean()}
+        figures |= {"pose": pose_loss(T, truth), "diverged": 1 - usable.double().mean()}
         total = total + settings.pose * figures["pose"]
     return total, {**figures, "right": matches_right(scores.detach(), labels, limit)}
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -172,3 +173,15 @@ def _robot_progress(road: Road, end: float, speed: float, swings: float, rng: np
             k += len(shape) + round(rng.uniform(0.2, 1.0) / _STEP)
         side = -side
     return replace(road, times=times, travelled=travelled, slip=np.cumsum(rate) * _STEP)
+
+
+def wheel_odometry(T_world_base: Array, slip: float = 0.0, jump: float = 0.0) -> Array:
+    """Poses (N, 4, 4) of an odometry from an origin of its own: each step too long by `slip`, that to the middle frame
+    by `jump` m more."""
+    poses = [se3.exp([0.0, 0.0, 2.0, 50.0, -20.0, 0.0])]
+    for n, (before, now) in enumerate(pairwise(T_world_base), 1):
+        step = se3.log(se3.inverse(before) @ now)
+        step[3:] *= 1 + slip
+        step[3] += jump * (n == len(T_world_base) // 2)
+        poses.append(poses[-1] @ se3.exp(step))
+    return np.array(poses)

@@ -48,8 +48,8 @@ def test_the_summary_is_of_means_and_medians_and_counts_drives_that_strayed() ->
         for i, (none, dynamic) in enumerate([(0.004, 0.002), (0.2, 0.003), (0.006, 0.004)])
     }
     found = traffic.summarized(drives)["refined"]
-    assert found["none"]["astray"] == 1
-    assert found["movers"]["astray"] == 0
+    assert found["none"]["diverged"] == 1
+    assert found["movers"]["diverged"] == 0
     assert found["none"]["rpe_m"] == pytest.approx(0.07)
     assert found["movers"]["ratio"]["rpe_m"] == pytest.approx(0.003 / 0.07)
     assert found["movers"]["ratio"]["median_rpe_m"] == pytest.approx(0.5)

@@ -88,6 +88,6 @@ def test_registration_trains_by_it(packed: Path) -> None:
     total, figures = module(batch.points, None, (plan._replace(T_target_source=beside),))
     total.backward()
     assert float(figures["pose"]) > 0.1
-    assert float(figures["astray"]) == 0
+    assert float(figures["diverged"]) == 0
     grads = [p.grad for p in module.model.encoder.points.parameters() if p.grad is not None]
     assert any(float(grad.abs().max()) > 0 for grad in grads)

@@ -5,20 +5,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from dpm2_core.frame import Array, Frame, Guess, OdometryResult, State
 from dpm2_core.geometry import se3
+from dpm2_core.sim.simulated_drive import wheel_odometry
 from dpm2_core.slam.build import make_odometry
 from dpm2_core.slam.settings import SlamSettings
 
 from ....helpers.drives import Drive
 
 pytestmark = pytest.mark.slow
-JUMP = 12  # frame
+JUMP = 15  # frame, in the middle
 
 
 def run(frames: list[Frame]) -> list[OdometryResult]:
@@ -31,22 +31,10 @@ def off(tracked: list[OdometryResult], truth: Array) -> Array:
     return np.linalg.norm((se3.inverse(truth) @ np.array([t.T_odom_lidar for t in tracked]))[:, :3, 3], axis=1)
 
 
-def wheels(truth: Array, slip: float = 0.0, jump: float = 0.0) -> list[Guess]:
-    """From an origin of their own, each step too long by `slip`, and once too far by `jump` m."""
-    T = se3.exp([0.0, 0.0, 2.0, 50.0, -20.0, 0.0])
-    guesses = [Guess(T)]
-    for n, (before, now) in enumerate(pairwise(truth), 1):
-        step = se3.log(se3.inverse(before) @ now)
-        step[3:] *= 1 + slip
-        step[3] += jump * (n == JUMP)
-        T = T @ se3.exp(step)
-        guesses.append(Guess(T))
-    return guesses
-
-
 def beside(drive: Drive, **wrong: float) -> list[Frame]:
     frames, truth = drive
-    return [replace(frame, guess=guess) for frame, guess in zip(frames, wheels(truth, **wrong), strict=True)]
+    poses = wheel_odometry(truth, **wrong)
+    return [replace(frame, guess=Guess(T)) for frame, T in zip(frames, poses, strict=True)]
 
 
 def test_in_a_tunnel_it_tells_the_way(tunnel_drive: Drive) -> None:
