@@ -100,6 +100,46 @@ class Inertial:
 
 
 @dataclass(frozen=True, eq=False)
+class Fix:
+    """A position by satellites (GNSS).
+
+    Attributes:
+        stamp: ns.
+        geodetic: (3,) WGS84: latitude and longitude, degrees, and altitude above the ellipsoid, m.
+        covariance: (3, 3) of the position, east, north, up, m^2.
+        antenna: (3,) m, where the antenna was at that time: in the LiDAR's frame, of a keyframe in the keyframe's.
+    """
+
+    stamp: int
+    geodetic: Array
+    covariance: Array
+    antenna: Array
+
+    def __post_init__(self) -> None:
+        shapes = (self.geodetic.shape, self.covariance.shape, self.antenna.shape)
+        if shapes != ((3,), (3, 3), (3,)) or not (np.abs(self.geodetic) <= (90, 360, 1e5)).all():  # NaN compares false
+            raise ValueError(f"fix: latitude, longitude, altitude {self.geodetic.tolist()} are no place on Earth")
+        if not np.abs(self.antenna).max() <= 1e3:
+            raise ValueError(f"fix: its antenna is at {self.antenna.tolist()} m")
+        C = self.covariance
+        if not np.abs(C).max() <= 1e12 or not np.allclose(C, C.T) or np.linalg.eigvalsh(C)[0] <= 0:
+            raise ValueError(f"fix: {C.ravel().tolist()} is no covariance")
+
+
+@dataclass(frozen=True, eq=False)
+class Georeference:
+    """Where on Earth a map is.
+
+    Attributes:
+        origin: (3,) WGS84 of the local frame east, north, up: latitude and longitude, degrees, and altitude, m.
+        T_enu_map: (4, 4).
+    """
+
+    origin: Array
+    T_enu_map: Array
+
+
+@dataclass(frozen=True, eq=False)
 class Frame:
     """What the sensors saw at one time.
 
@@ -112,6 +152,7 @@ class Frame:
         problem: why the scan could not be read; `points` is then empty and the frame counts as failed, not lost.
         guess: where another odometry has the LiDAR at that time; the search for the pose begins there.
         imu: samples since those of the frame before, up to the last point; None where there is no IMU.
+        fix: the last one before the stamp that no frame before had; None where there is none.
     """
 
     stamp: int
@@ -122,6 +163,7 @@ class Frame:
     problem: str | None = None
     guess: Guess | None = None
     imu: Inertial | None = None
+    fix: Fix | None = None
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 4:
@@ -194,6 +236,7 @@ class Keyframe:
         edge: registration of this keyframe to the one before, T_before_this; None for the first.
         descriptors: neural ones, in its own LiDAR frame; None where the registration makes none.
         thumbnail: JPEG for the map file, or None.
+        fix: the last one on the way here from the keyframe before, or None.
     """
 
     id: int
@@ -205,6 +248,7 @@ class Keyframe:
     robot: str = ""
     descriptors: Descriptors | None = None
     thumbnail: bytes | None = None
+    fix: Fix | None = None
 
 
 @dataclass(frozen=True, eq=False)

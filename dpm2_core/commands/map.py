@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
@@ -20,6 +20,7 @@ from dpm2_core.data.pcd import write_las, write_pcd
 from dpm2_core.data.ply import write_ply
 from dpm2_core.data.trajectory import write_kitti, write_tum
 from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.files import write_json
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.slam.mapping.restore import restore
@@ -27,6 +28,9 @@ from dpm2_core.slam.mapping.tiles import write_tiles
 from dpm2_core.slam.store.map_data import MapData, load_map, map_cloud, save_as, trajectory
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.tables import FigureTable
+
+if TYPE_CHECKING:
+    from dpm2_core.slam.graph.pose_graph import PoseGraph
 
 app = typer.Typer(help="Map files: info, export, merge, prune, check; pose graphs: optimize.", no_args_is_help=True)
 app.command()(optimize)
@@ -51,6 +55,7 @@ def info(path: MapFile, json_file: JsonFile = None) -> None:
         ("length", f"{f['length_m']:.1f} m"),
         ("extent", f"{extent} m, of the keyframes" if extent else "-"),
         ("loops", f"{f['loops_accepted']} accepted of {f['loops_tried']} tried"),
+        ("georeference", _georeference(f["georeference"])),
         ("size", f"{f['bytes'] / 1e6:.2f} MB, {f['bytes'] / max(f['keyframes'], 1) / 1e3:.1f} kB per keyframe"),
     )
     for row in rows:
@@ -74,6 +79,7 @@ def _figures(path: Path, data: MapData, with_descriptors: int) -> dict[str, Any]
         "extent_m": np.ptp(data.poses[:, :3, 3], axis=0).tolist() if len(data) else [],
         "loops_accepted": sum(edge.ok for edge in loops),
         "loops_tried": len(loops),
+        "georeference": _georeference_figures(data),
         "bytes": sum(file.stat().st_size for suffix in ("", "-wal") if (file := Path(f"{path}{suffix}")).exists()),
         "sessions": [
             {
@@ -88,12 +94,43 @@ def _figures(path: Path, data: MapData, with_descriptors: int) -> dict[str, Any]
     }
 
 
+def _georeference_figures(data: MapData) -> dict[str, Any] | None:
+    """Where on Earth the map is, with what certainty; None where that is not known."""
+    if data.georeference is None:
+        return None
+    graph = _graph(data)
+    covariance, (used, count) = graph.georeference_covariance(), graph.fixes
+    T, sigmas = data.georeference.T_enu_map, np.full(6, np.nan) if covariance is None else np.sqrt(np.diag(covariance))
+    return {
+        "origin": data.georeference.origin.tolist(),
+        "T_enu_map": T.tolist(),
+        "heading_deg": float(np.degrees(np.arctan2(T[1, 0], T[0, 0]))),
+        "heading_sigma_deg": float(np.degrees(sigmas[2])),
+        "position_sigma_m": sigmas[3:].tolist(),
+        "fixes_used": used,
+        "fixes": count,
+    }
+
+
+def _georeference(figures: dict[str, Any] | None) -> str:
+    if figures is None:
+        return "-"
+    latitude, longitude, altitude = figures["origin"]
+    east, north, up = figures["position_sigma_m"]
+    return (
+        f"origin {latitude:.8f}, {longitude:.8f}, {altitude:.2f} m; map's x axis {figures['heading_deg']:.2f} deg from "
+        f"east to north (sigma {figures['heading_sigma_deg']:.2f}); sigma {east:.2f}, {north:.2f}, {up:.2f} m; "
+        f"{figures['fixes_used']} of {figures['fixes']} fixes used"
+    )
+
+
 @app.command()
 def export(
     path: MapFile,
     out: Annotated[Path, typer.Argument(help="File to write; its ending says what, unless --format does.")],
     format: Annotated[
-        str, typer.Option(help="ply, pcd, las, html, occupancy (YAML and PGM for Nav2), tum, kitti or g2o.")
+        str,
+        typer.Option(help="ply, pcd, las, html, occupancy (YAML and PGM for Nav2), tum, kitti, geojson or g2o."),
     ] = "",
     voxel: Annotated[float | None, typer.Option(min=0.01, help="Spacing of the points of a cloud, m [0.3].")] = None,
     resolution: Annotated[float | None, typer.Option(min=0.01, help="Cell of the occupancy grid, m [0.1].")] = None,
@@ -229,12 +266,27 @@ def _length(data: MapData) -> float:
     return float(steps[same].sum()) if len(data) > 1 else 0.0
 
 
-def _export_g2o(data: MapData, out: Path) -> None:
+def _graph(data: MapData) -> PoseGraph:
     from dpm2_core.slam.graph.pose_graph import PoseGraph, PoseGraphSettings
 
     graph = PoseGraph(PoseGraphSettings())
     restore(graph, data)
-    graph.write_g2o(out)
+    return graph
+
+
+def _export_geojson(data: MapData, out: Path) -> None:
+    from dpm2_core.geometry import geodesy
+
+    if data.georeference is None:
+        raise UsageError(f"{out}: the map has no georeference; see input.gnss_topic")
+    T_ecef_map = geodesy.enu_frame(data.georeference.origin) @ data.georeference.T_enu_map
+    features = []
+    for robot, session in sorted({(k.robot, s) for k, s in zip(data.keyframes, data.session, strict=True)}):
+        places = geodesy.geodetic((T_ecef_map @ trajectory(data, robot, session)[1])[:, :3, 3])
+        line = [[round(lon, 9), round(lat, 9), round(up, 3)] for lat, lon, up in places.tolist()]
+        geometry = {"type": "LineString", "coordinates": line if len(line) > 1 else line * 2}
+        features.append({"type": "Feature", "properties": {"robot": robot, "session": session}, "geometry": geometry})
+    write_json(out, {"type": "FeatureCollection", "features": features})
 
 
 def _export_page(data: MapData, out: Path, voxel: float) -> None:
@@ -260,10 +312,11 @@ _EXPORTS: dict[str, tuple[Callable[[MapData, Path, float], None], str]] = {
     "occupancy": (_export_occupancy, "resolution"),
     "tum": (lambda data, out, _: write_tum(out, *trajectory(data)), ""),
     "kitti": (lambda data, out, _: write_kitti(out, trajectory(data)[1]), ""),
-    "g2o": (lambda data, out, _: _export_g2o(data, out), ""),
+    "geojson": (lambda data, out, _: _export_geojson(data, out), ""),
+    "g2o": (lambda data, out, _: _graph(data).write_g2o(out), ""),
 }
 """How each kind is written, and the option that is its spacing."""
 _ENDINGS = {
     ".ply": "ply", ".pcd": "pcd", ".las": "las", ".yaml": "occupancy", ".pgm": "occupancy", ".tum": "tum",
-    ".g2o": "g2o", ".html": "html",
+    ".g2o": "g2o", ".geojson": "geojson", ".html": "html",
 }  # fmt: skip

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from dpm2_core.data import topics
 from dpm2_core.data.bag_file import open_bag
 from dpm2_core.data.frames import Calibration, FrameBuilder
+from dpm2_core.data.gnss import FixBuffer
 from dpm2_core.data.imu import ImuBuffer
 from dpm2_core.data.kitti import checked_correction
 from dpm2_core.data.livox import LIVOX
@@ -32,6 +33,7 @@ CLOUD = "sensor_msgs/msg/PointCloud2"
 CLOUDS = (CLOUD, *LIVOX)
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 IMU = "sensor_msgs/msg/Imu"
+FIX = "sensor_msgs/msg/NavSatFix"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 _TRUTH = ("nav_msgs/msg/Odometry", "nav_msgs/msg/Path")
 _TRUTH_GAP = 1_000_000_000  # ns between two true poses beyond which nothing is known in between
@@ -64,9 +66,11 @@ class BagSource:
         if topics.GRAY_CAMERA in self.transforms.frames:
             self.T_cam_lidar = self.transforms.lookup(topics.GRAY_CAMERA, self.lidar_frame)
         self.imu_topic = self._calibration.imu_topic = self._choose_imu()
-        self._imu, self._unsound, self._why_unsound = ImuBuffer(), 0, ""
-        imu = self._imu if self.imu_topic else None
-        self._frames = FrameBuilder(self._settings, self._calibration, self.notes.append, self._bag.decode, imu)
+        self._calibration.gnss_topic = self._choose_gnss()
+        self._imu, self._gnss = ImuBuffer(), FixBuffer()
+        self._unsound: dict[str, tuple[int, str]] = {}  # messages left out by topic, and why the first one
+        imu, gnss = self._imu if self.imu_topic else None, self._gnss if self._calibration.gnss_topic else None
+        self._frames = FrameBuilder(self._settings, self._calibration, self.notes.append, self._bag.decode, imu, gnss)
         self.vertical_angle_correction_deg = self._frames.angle_correction_deg
         self.image_topic = self._calibration.image_topic = self._choose_image()
         self.camera = self._camera() if self.image_topic else None
@@ -78,7 +82,8 @@ class BagSource:
         """Frames start..stop-1 as recorded, also where their stamps repeat or go back; `notes` says so."""
         before, without, count = None, 0, 0
         self._imu.clear()
-        self._unsound = 0
+        self._gnss.clear()
+        self._unsound.clear()
         for index, (stamp, cloud, image, second) in enumerate(islice(self._pairs(), stop)):
             if index < start:
                 continue
@@ -89,8 +94,8 @@ class BagSource:
             if self._frames.time_problem:
                 self._note_once(f"{self.points_topic}: {self._frames.time_problem}", f"first at frame {index}")
             yield frame
-        if self._unsound:
-            self._note_once(f"{self.imu_topic}: {self._unsound} samples left out", f"the first: {self._why_unsound}")
+        for topic, (left_out, why) in self._unsound.items():
+            self._note_once(f"{topic}: {left_out} samples left out", f"the first: {why}")
         if self.camera and without:
             within = f"within {self._settings.image_tolerance} s"
             self._note_once(f"{without} of {count} frames have no image of {self.image_topic}", within)
@@ -154,6 +159,11 @@ class BagSource:
             return ""
         return self._one_of(self._bag.topics(IMU), self._settings.imu_topic, topics.IMU, "Imu", "Imu messages")
 
+    def _choose_gnss(self) -> str:
+        """The topic of fixes, empty for none."""
+        asked = self._settings.gnss_topic
+        return asked and self._one_of(self._bag.topics(FIX), asked, asked, "NavSatFix", "NavSatFix messages")
+
     def _one_of(self, found: Sequence[str], asked: str, usual: str, kind: str, messages: str) -> str:
         """The topic that is asked for, else the usual one, else the only one; empty where that leaves a choice."""
         if asked:
@@ -197,7 +207,8 @@ class BagSource:
         others = dict.fromkeys(filter(None, (*beside, self.imu_topic)), 0)
         if self.camera:
             others[self.image_topic] = round(self._settings.image_time_offset * 1e9)
-        messages = self._bag.messages([self.points_topic, *others])
+        gnss = self._calibration.gnss_topic  # nobody waits for fixes: a late one has its place on the way, too
+        messages = self._bag.messages([self.points_topic, *others, *([gnss] if gnss else [])])
         for topic, time, data in clouds_after_others(messages, [self.points_topic], others):
             stamp = serialized_stamp(data, time)
             if topic == self.points_topic:
@@ -206,17 +217,18 @@ class BagSource:
                 yield stamp, data, image, found.get(second)
                 for sensor in beside.values():
                     sensor.forget(stamp)
-            elif topic == self.imu_topic:
-                self._add_imu(stamp, data)
+            elif topic in (self.imu_topic, gnss):
+                self._add_sample(topic, stamp, data)
             else:
                 beside[topic].add(stamp + others[topic], data)
 
-    def _add_imu(self, stamp: int, data: bytes) -> None:
+    def _add_sample(self, topic: str, stamp: int, data: bytes) -> None:
+        buffer = self._imu if topic == self.imu_topic else self._gnss
         try:
-            self._imu.add(stamp, self._bag.decode(self.imu_topic, data))
+            buffer.add(stamp, self._bag.decode(topic, data))
         except MessageError as error:
-            self._why_unsound = str(error) if not self._unsound else self._why_unsound
-            self._unsound += 1
+            left_out, why = self._unsound.get(topic, (0, str(error)))
+            self._unsound[topic] = left_out + 1, why
 
     def _truth(self, topic: str) -> tuple[Stamps, Array]:
         """Stamps (M,) ns and T_world_lidar (M, 4, 4); of several Path messages the last, the most complete, counts."""

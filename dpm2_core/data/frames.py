@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from dpm2_core.data.gnss import FixBuffer
 from dpm2_core.data.image_messages import decode_camera, decode_image, is_fisheye, rectified
 from dpm2_core.data.imu import ImuBuffer
 from dpm2_core.data.messages import MessageError, decode_points, why_untimed
@@ -16,7 +17,7 @@ from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.transforms import TransformTree
 from dpm2_core.data.vertical_angle import HDL64_CORRECTION_DEG, correct_vertical_angle
 from dpm2_core.errors import UsageError, printable
-from dpm2_core.frame import Array, Camera, Frame, Image, Inertial, Points
+from dpm2_core.frame import Array, Camera, Fix, Frame, Image, Inertial, Points
 from dpm2_core.geometry import se3
 
 _MOST_REPORTED = 20  # damaged data may be damaged in endless ways
@@ -28,7 +29,7 @@ class Calibration:
     """What is known of the sensors: of a recording from the start, of topics as it comes in.
 
     Attributes:
-        points_topic, image_topic, imu_topic, second_topic: full names; empty where there is none.
+        points_topic, image_topic, imu_topic, second_topic, gnss_topic: full names; empty where there is none.
         camera_info: sensor_msgs/CameraInfo; None as long as there is none.
         transforms: of /tf_static.
         angle_correction_deg: what the recording says of its vertical angles; None if it says nothing.
@@ -38,6 +39,7 @@ class Calibration:
     image_topic: str = ""
     imu_topic: str = ""
     second_topic: str = ""
+    gnss_topic: str = ""
     camera_info: Any = None
     transforms: TransformTree = field(default_factory=TransformTree)
     angle_correction_deg: float | None = None
@@ -51,12 +53,13 @@ class FrameBuilder:
         calibration: looked at anew for each frame.
         complain: called once with each different problem.
         decode: makes a message of a topic's bytes, or raises MessageError; the default takes messages as they are.
-        imu: where its samples come in; None where none is wanted.
+        imu, gnss: where their messages come in; None where none are wanted.
 
     Attributes:
         up: see `Inertial`.
         imu_problem: why the last scan has no samples, or they cannot be used; empty if they can, or before the first.
         image_problem: why the last image could not be used; empty if it could, or if there was none.
+        gnss_problem: why the antenna's place is not known; empty if it is.
         second_problem: why the last cloud of a second LiDAR could not be used; empty likewise.
         time_problem: why the last cloud cannot be de-skewed; empty if it can, or needs not.
     """
@@ -68,11 +71,12 @@ class FrameBuilder:
         complain: Callable[[str], None],
         decode: Callable[[str, Any], Any] = lambda topic, message: message,
         imu: ImuBuffer | None = None,
+        gnss: FixBuffer | None = None,
     ) -> None:
         self._settings, self._calibration, self._complain, self._decode = settings, calibration, complain, decode
         self._told: set[str] = set()
         self.image_problem = self.second_problem = self.time_problem = self.imu_problem = ""
-        self._imu = imu
+        self._imu, self._gnss, self.gnss_problem = imu, gnss, ""
         self.up: tuple[float, float, float] | None = (0.0, 0.0, 1.0)
 
     def frame(
@@ -97,7 +101,8 @@ class FrameBuilder:
         if second is not None:
             points, offset = self._joined(points, offset, lidar_frame, (second[0] - stamp) * 1e-9, second[1])
         imu = None if self._imu is None else self._inertial(self._imu, lidar_frame, stamp, offset)
-        return Frame(stamp, points, offset, self._images(lidar_frame, image), index, imu=imu)
+        fix = None if self._gnss is None else self._fix(self._gnss, lidar_frame, stamp)
+        return Frame(stamp, points, offset, self._images(lidar_frame, image), index, imu=imu, fix=fix)
 
     def _points(self, cloud: Any) -> tuple[Points, Points | None]:
         """(N, 4), and (N,) s after the stamp, of a decoded message."""
@@ -177,6 +182,17 @@ class FrameBuilder:
             return self._calibration.transforms.lookup(lidar_frame, imu_frame)[:3, :3]
         except UsageError as error:
             raise UsageError(f"{error}; set input.q_lidar_imu, or publish it on /tf_static") from None
+
+    def _fix(self, buffer: FixBuffer, lidar_frame: str, stamp: int) -> Fix | None:
+        """The last fix before a scan, with the place of its antenna."""
+        fix, self.gnss_problem = buffer.take(stamp), ""
+        if fix is None or buffer.frame.lstrip("/") == lidar_frame.lstrip("/"):
+            return fix
+        try:
+            return replace(fix, antenna=self._calibration.transforms.lookup(lidar_frame, buffer.frame)[:3, 3])
+        except (UsageError, ValueError) as error:
+            self.gnss_problem = self._tell(self._calibration.gnss_topic, error, "; the antenna is taken for the LiDAR")
+            return fix
 
     def _images(self, lidar_frame: str, message: Any | None) -> tuple[Image, ...]:
         if message is None:

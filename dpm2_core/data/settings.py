@@ -72,6 +72,10 @@ class InputSettings(Settings):
     q_lidar_imu: Annotated[tuple[float, float, float, float], AfterValidator(_unit_quaternion)] | None = None
     """Rotation of the IMU's frame in the LiDAR's, [qx, qy, qz, qw]; null asks /tf_static."""
 
+    gnss_topic: str = ""
+    """NavSatFix topic, whose fixes hold the map in its place on Earth; /tf_static is asked for the antenna's; empty:
+    none."""
+
     time_field: str | None = None
     """PointCloud2 field with the time of each point; null looks for a usual name (t, time_offset_ns, ...), "": none."""
 

@@ -27,6 +27,7 @@ class GraphData:
         T_from_to: (E, 4, 4) of each loop.
         covariances: (E, 6, 6) of each loop.
         fixed: nodes that keep their pose; the first of each trajectory that nothing ties to another does anyway.
+        placed: nodes whose trajectory starts well where it is.
     """
 
     poses: Array
@@ -37,6 +38,7 @@ class GraphData:
     T_from_to: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
     covariances: Array = field(default_factory=lambda: np.zeros((0, 6, 6)))
     fixed: Index = field(default_factory=lambda: np.zeros(0, np.intp))
+    placed: Index = field(default_factory=lambda: np.zeros(0, np.intp))
 
     def __len__(self) -> int:
         return len(self.poses)

@@ -12,11 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.frame import Array, Edge
+from dpm2_core.frame import Array, Edge, Fix, Georeference
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph import robust
+from dpm2_core.slam.graph.fixes import Fixes
 from dpm2_core.slam.graph.g2o import G2o, write_g2o
-from dpm2_core.slam.graph.graph_data import GraphData
+from dpm2_core.slam.graph.graph_data import GraphData, loop_errors, mahalanobis
 from dpm2_core.slam.graph.robust import RobustSettings, Solution
 from dpm2_core.slam.graph.worker import GraphWorker
 
@@ -24,6 +25,8 @@ _log = logging.getLogger(__name__)
 SHORT = 50
 """Loops; fewer are solved in about 20 ms, sooner than they are sent to another process."""
 _TOGETHER = 40  # pairs of nodes whose covariances are asked for at once
+_FIXES = 10, 20
+"""Fixes that may wait for an optimization: so many, or of all that there are one in so many."""
 _ATTEMPTS = 2  # processes that may die over one graph
 
 
@@ -52,6 +55,7 @@ class PoseGraph:
         self._tied: list[int] | None = None  # `_parts`, until they change
         self._worker = GraphWorker()
         self._moved = False  # a part, since a graph was sent: its solution is of no use
+        self._fixes, self._sent_fixes = Fixes(), list[int]()
         self._sent = 0  # loops in the graph that is being solved
         self._failures = 0
         self.problem = ""
@@ -77,6 +81,21 @@ class PoseGraph:
     def loops(self) -> list[Edge]:
         """All in the order in which they were added; `ok` and `reason` by the last optimization."""
         return list(self._loops)
+
+    @property
+    def georeference(self) -> Georeference | None:
+        """Where on Earth the map is, by its fixes; None while that is not known."""
+        return self._fixes.georeference
+
+    @property
+    def fixes(self) -> tuple[int, int]:
+        """How many constrain the poses, and all."""
+        return self._fixes.used, len(self._fixes)
+
+    @property
+    def unsolved(self) -> bool:
+        """Whether fixes that count have come since the last optimization."""
+        return self._fixes.due > 0 and self._fixes.georeference is not None
 
     @property
     def busy(self) -> bool:
@@ -129,6 +148,25 @@ class PoseGraph:
             self._tied = None
         self._loops.append(loop)
 
+    def add_fix(self, node: int, fix: Fix) -> bool:
+        """A position by satellites at a node; returns whether so many have come that it is time to optimize."""
+        self._fixes.add(node, fix)
+        if self._fixes.georeference is None:
+            self._fixes.locate(self.poses, self._located())
+            return self._fixes.georeference is not None
+        least, share = _FIXES
+        return self._fixes.due >= max(least, len(self._fixes) // share)
+
+    def set_georeference(self, georeference: Georeference) -> None:
+        """Where on Earth a map is that was loaded."""
+        self._fixes.georeference = georeference
+        chosen, first = self._chosen(), len(self._loops)
+        if chosen:
+            data = self._data()
+            errors = loop_errors(data.poses, data.ends[first:], data.T_from_to[first:])
+            kept = mahalanobis(errors, data.covariances[first:]) <= self._settings.loop_sigmas**2
+            self._fixes.solved(chosen, data.poses[-1], kept)
+
     def place(self, node: int, T_map_kf: Array) -> None:
         """Put a node there (4, 4), for the next optimization to begin with."""
         _check("node", node, T_map_kf)
@@ -149,13 +187,13 @@ class PoseGraph:
         Raises:
             Dpm2Error: the graph cannot be solved.
         """
-        if self._settings.background and len(self._loops) >= SHORT:
+        if self._settings.background and len(self._loops) + len(self._fixes) >= SHORT:
             self.collect()
             if not self.busy:
                 self._submit()
             return
         try:
-            self._apply(robust.optimize(self._data(), self._settings), len(self._loops))
+            self._apply(robust.optimize(self._sending(), self._settings), self._sent)
             self.problem = ""
         except (RuntimeError, np.linalg.LinAlgError) as error:  # gtsam's or numpy's: the system is singular
             raise Dpm2Error(f"pose graph: {' '.join(str(error).split())}") from None
@@ -189,7 +227,7 @@ class PoseGraph:
                 continue
             self._apply(solution, self._sent)
             self.problem, self._failures, changed = "", 0, True
-            if len(self._loops) > self._sent:
+            if len(self._loops) > self._sent or (wait and self.unsolved):
                 self._submit()
         return changed
 
@@ -200,6 +238,13 @@ class PoseGraph:
     def covariance(self, node: int) -> Array:
         """(6, 6) [rotation rad, translation m] of xi in T_map_kf @ Exp(xi), relative to the node that is held fixed."""
         return self._joint([node])
+
+    def georeference_covariance(self) -> Array | None:
+        """(6, 6) of xi in T_map_enu @ Exp(xi), about and along east, north, up; None where there is none."""
+        if not self._chosen():
+            return None
+        data = self._data()
+        return robust.joint_covariance(data, data.poses, self._kept(), np.array([len(self)]))
 
     def relative_covariance(self, a: int, b: int) -> Array:
         """(6, 6) of xi in T_a_b @ Exp(xi) of two different nodes; small between neighbors, however far from the start.
@@ -229,16 +274,29 @@ class PoseGraph:
         return out
 
     def write_g2o(self, path: Path) -> None:
-        """All vertices, the odometry and the loops that are kept, in g2o's SE3:QUAT format at full precision."""
-        write_g2o(path, G2o(self._data(), self._order(), planar=False), self._kept())
+        """All vertices, the odometry and the loops that are kept, in g2o's SE3:QUAT format at full precision.
+
+        With fixes the frame east, north, up is the last vertex.
+        """
+        data = self._data()
+        ids = np.append(self._order(), np.arange(len(self), len(data)))
+        write_g2o(path, G2o(data, ids, planar=False), self._kept())
 
     def _joint(self, nodes: list[int]) -> Array:
         data = self._data()
         return robust.joint_covariance(data, data.poses, self._kept(), self._places()[nodes])
 
     def _kept(self) -> NDArray[np.bool_]:
-        """(E,) which loops constrain the poses."""
-        return np.array([loop.ok for loop in self._loops], np.bool_)
+        """(E,) which loops, and then which fixes, constrain the poses."""
+        return np.array([*(loop.ok for loop in self._loops), *self._fixes.kept(self._chosen())], np.bool_)
+
+    def _located(self) -> NDArray[np.bool_]:
+        """(N,) whether each node is in the part whose place on Earth the georeference is."""
+        return np.array(self._parts(), np.intp)[self._trajectory] == 0
+
+    def _chosen(self) -> list[int]:
+        """The fixes that count."""
+        return self._fixes.chosen(self._located()) if len(self._fixes) else []
 
     def _order(self) -> NDArray[np.intp]:
         """(N,) nodes as the solver has them: one trajectory after the other, so that each is a chain."""
@@ -251,7 +309,7 @@ class PoseGraph:
     def _data(self) -> GraphData:
         order, steps = self._order(), self._steps
         ends = np.array([(loop.from_node, loop.to_node) for loop in self._loops], np.intp).reshape(-1, 2)
-        return GraphData(
+        data = GraphData(
             self.poses[order],
             np.array([step is not None for step in steps], np.bool_)[order],
             np.array([np.eye(4) if step is None else step.T_from_to for step in steps]).reshape(-1, 4, 4)[order],
@@ -263,6 +321,14 @@ class PoseGraph:
             np.array([loop.covariance for loop in self._loops]).reshape(-1, 6, 6),
             self._places()[self._held],
         )
+        return self._fixes.joined(data, self._places(), self._chosen())
+
+    def _sending(self) -> GraphData:
+        """The graph that is about to be solved."""
+        self._fixes.locate(self.poses, self._located())
+        self._sent, self._sent_fixes = len(self._loops), self._chosen()
+        self._fixes.sent()
+        return self._data()
 
     def _parts(self) -> list[int]:
         """Of each trajectory, the oldest one that loops tie it to."""
@@ -284,13 +350,15 @@ class PoseGraph:
 
     def _submit(self) -> None:
         self._moved = False
-        self._sent = len(self._loops)
-        self._worker.submit(self._data(), self._settings)
+        self._worker.submit(self._sending(), self._settings)
 
     def _apply(self, solution: Solution, loops: int) -> None:
-        count = len(solution.poses)
+        fixes = self._sent_fixes
+        count = len(solution.poses) - bool(fixes)
         places = np.argsort(np.argsort(self._trajectory[:count], kind="stable"))
         old, self._poses[:count] = self._poses[:count], list(solution.poses[places])
+        if fixes:
+            self._fixes.solved(fixes, solution.poses[-1], solution.kept[loops:])
         last = dict(zip(self._trajectory[:count], range(count), strict=True))  # solved for, of each trajectory
         for node in range(count, len(self)):
             at = last.get(self._trajectory[node])

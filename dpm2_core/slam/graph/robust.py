@@ -34,6 +34,7 @@ from dpm2_core.slam.graph.graph_data import (
     trajectories,
 )
 
+_FIX_KERNEL = 1.0  # as `loop_kernel`: many fixes in a row may be wrong alike, and none may outvote the odometry
 _FIXED = 1e-6  # rad and m, standard deviation of a pose that stays
 
 
@@ -142,13 +143,15 @@ def _factors(
     """The gtsam graph of the chosen nodes; `ends` count among them, no kernel: plain least squares."""
     factors, gaussian = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.Gaussian.Covariance
     noise: gtsam.noiseModel.Base
+    by_satellite = np.asarray(np.isin(ends, np.searchsorted(condensed.nodes, graph.placed)).any(axis=1))
     for k in np.flatnonzero(condensed.tied):
         noise = gaussian(condensed.covariances[k])
         factors.add(gtsam.BetweenFactorPose3(int(k) - 1, int(k), gtsam.Pose3(condensed.T[k]), noise))
     for loop in np.flatnonzero(used):
         noise = gaussian(graph.covariances[loop])
         if kernel is not None:
-            noise = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(kernel), noise)
+            width = _FIX_KERNEL if by_satellite[loop] else kernel
+            noise = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(width), noise)
         a, b = ends[loop].tolist()
         factors.add(gtsam.BetweenFactorPose3(a, b, gtsam.Pose3(graph.T_from_to[loop]), noise))
     still = gtsam.noiseModel.Isotropic.Sigma(6, _FIXED)
@@ -196,7 +199,7 @@ def _aligned(graph: GraphData, poses: Array, used: NDArray[np.bool_], kernel: fl
     for this in range(1, number[-1] + 1):
         own = number == this
         ties = np.flatnonzero(used & (ends_number.max(1) == this) & (ends_number.min(1) < this))
-        if not len(ties) or own[graph.fixed].any():
+        if not len(ties) or own[graph.fixed].any() or own[graph.placed].any():
             continue
         ends, T = graph.ends[ties], graph.T_from_to[ties]
         swap = ends_number[ties, 0] == this

@@ -13,7 +13,7 @@ from pydantic import Field
 
 from dpm2_core.config import Settings
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.frame import Array, Edge, Keyframe, Points, Registration
+from dpm2_core.frame import Array, Edge, Georeference, Keyframe, Points, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.loops.closure import LoopCloser
@@ -141,6 +141,11 @@ class Mapper:
         """Why the poses are not optimized, in words; empty since they were."""
         return self._graph.problem
 
+    @property
+    def georeference(self) -> Georeference | None:
+        """Where on Earth the map is, by the fixes of its keyframes; None while that is not known."""
+        return self._graph.georeference
+
     def start_session(self, T_map_odom: Array, covariance: Array | None = None) -> None:
         """Before the first keyframe of a session in a loaded map: where its odometry begins.
 
@@ -176,7 +181,7 @@ class Mapper:
         robot.last, robot.ids, robot.offset = node, keyframe.id + 1, offset
         before = len(self.loops)
         try:
-            self._close_loops()
+            self._close_loops(keyframe.fix is not None and self._graph.add_fix(node, keyframe.fix))
             self._lend(node, odometry, self.loops[before:])
             self._mark_moving(robot.window.add(node, cloud, self.poses))
         finally:
@@ -197,16 +202,17 @@ class Mapper:
             self._writer.add(node, self.keyframes[node], thumbnail)
             for edge in edges:
                 self._writer.add_edge(edge)
-            self._writer.sync(self.poses)
+            self._writer.sync(self.poses, self.georeference)
 
     def finish(self) -> None:
         """At the end of a drive: wait for the solver, find moving points in the last clouds, write the map file."""
+        self._optimize(changed=self._graph.unsolved)
         self._optimize(changed=False, wait=True)
         self._graph.close()
         for robot in self._robots.values():
             self._mark_moving(robot.window.finish(self.poses))
         if self._writer is not None:
-            self._writer.sync(self.poses)
+            self._writer.sync(self.poses, self.georeference)
 
     def cloud(self, voxel_size: float | None = None) -> Points:
         """The map (M, 4) float32 in the map frame, one point in each voxel of that size (default: settings)."""
@@ -266,11 +272,14 @@ class Mapper:
         self._graph.add_node(self._graph.pose(last) @ edge.T_from_to, edge)
         return [edge]
 
-    def _close_loops(self) -> None:
-        """Loops of the last keyframe: into the graph, unless they were rejected there or before."""
+    def _close_loops(self, due: bool) -> None:
+        """Loops of the last keyframe: into the graph, unless they were rejected there or before.
+
+        `due`: solve it in any case.
+        """
         tried = [self._tied(loop) for loop in self._closer.close(self.keyframes, self._clouds, self.poses)]
         self.loops += tried
-        self._optimize(any(loop.ok for loop in tried))
+        self._optimize(due or any(loop.ok for loop in tried))
 
     def _tied(self, loop: Edge) -> Edge:
         """A loop that was tried, in the graph if it was accepted; rejected if the graph does not take it."""

@@ -43,6 +43,7 @@ def merge_maps(a: MapData, b: MapData, T_a_b: Array, loops: Sequence[Edge] = ())
         CloudStore(lambda i: a.clouds.packed(i) if i < n else b.clouds.packed(i - n), moving, loans),
         lambda i: a.thumbnail(i) if i < n else b.thumbnail(i - n),
         lambda i: a.describe(i) if i < n else b.describe(i - n),
+        a.georeference,
     )
 
 
@@ -84,4 +85,4 @@ def optimized(data: MapData, graph: PoseGraph) -> MapData:
     """The map with the poses that its constraints ask for; `graph` is empty."""
     restore(graph, data)
     graph.optimize()
-    return replace(data, poses=graph.poses)
+    return replace(data, poses=graph.poses, georeference=graph.georeference)

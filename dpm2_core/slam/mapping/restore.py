@@ -18,6 +18,11 @@ def restore(graph: PoseGraph, data: MapData) -> None:
     for edge in data.constraints:
         if chain.get(edge.to_node) is not edge:
             graph.add_loop(shifted(edge, first))
+    for node, keyframe in enumerate(data.keyframes):
+        if keyframe.fix is not None:
+            graph.add_fix(first + node, keyframe.fix)
+    if data.georeference is not None and not first:
+        graph.set_georeference(data.georeference)
 
 
 def shifted(edge: Edge, first: int) -> Edge:

@@ -3,17 +3,20 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import replace
 
 import numpy as np
 from pydantic import Field
 
 from dpm2_core.config import Settings
-from dpm2_core.frame import Array, Frame, Keyframe, Registration
+from dpm2_core.frame import Array, Fix, Frame, Keyframe, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.spacing import Spacing
+
+_TRACE = 30  # frames that a fix may be older than the one that it comes with
 
 
 class KeyframeSettings(Settings):
@@ -48,11 +51,14 @@ class KeyframeSelector:
         self._last: Keyframe | None = None
         self._uncertainty = np.zeros((6, 6))
         self._requested = False
+        self._trace: deque[tuple[int, Array]] = deque(maxlen=_TRACE)  # of the frames before, without a break
+        self._fix: Fix | None = None  # the last one, its antenna in the odometry frame
         self._spacing = Spacing(self._settings.distance, self._settings.residual)
 
     def take_over(self, before: KeyframeSelector) -> None:
         """Go on after the keyframes of another one."""
         self._last, self._uncertainty, self._requested = before._last, before._uncertainty, before._requested
+        self._trace, self._fix = before._trace, before._fix
 
     def request(self) -> None:
         """Make a keyframe of the next registered scan at any distance: relocalization needs one even at standstill."""
@@ -65,7 +71,10 @@ class KeyframeSelector:
     def select(self, frame: Frame, scan: Scan, T_odom_lidar: Array, registration: Registration) -> Keyframe | None:
         """The keyframe that this scan makes, or None. A scan that was not registered never makes one."""
         if not registration.ok:
+            self._trace.clear()  # the way is not known
+            self._fix = None
             return None
+        self._follow(frame, T_odom_lidar)
         s, last, edge = self._settings, self._last, None
         if s.residual:
             self._spacing.registered(registration.rmse)
@@ -82,5 +91,25 @@ class KeyframeSelector:
         keyframe_id = 0 if last is None else last.id + 1
         known = scan.descriptors if scan.description is not None and scan.description.made else None
         keyframe = Keyframe(keyframe_id, frame.stamp, frame.index, T_odom_lidar, cloud, edge, self._robot, known)
-        self._last, self._uncertainty, self._requested = keyframe, np.zeros((6, 6)), False
+        if self._fix is not None:
+            keyframe = replace(keyframe, fix=_seen_from(se3.inverse(T_odom_lidar), self._fix))
+        self._last, self._uncertainty, self._requested, self._fix = keyframe, np.zeros((6, 6)), False, None
         return keyframe
+
+    def _follow(self, frame: Frame, T_odom_lidar: Array) -> None:
+        """Note the way, and where on it a fix was measured: it comes late, and between two scans."""
+        trace, fix = self._trace, frame.fix
+        if trace and frame.stamp <= trace[-1][0]:
+            trace.clear()
+        trace.append((frame.stamp, T_odom_lidar))
+        if fix is None or not trace[0][0] <= fix.stamp <= frame.stamp:
+            return
+        after = next(i for i, (stamp, _) in enumerate(trace) if stamp >= fix.stamp)
+        (t0, T0), (t1, T1) = trace[max(after - 1, 0)], trace[after]
+        part = (fix.stamp - t0) / (t1 - t0) if t1 > t0 else 0.0
+        self._fix = _seen_from(T0 @ se3.exp(part * se3.log(se3.inverse(T0) @ T1)), fix)
+
+
+def _seen_from(T_other_this: Array, fix: Fix) -> Fix:
+    """The fix with its antenna in another frame."""
+    return replace(fix, antenna=T_other_this[:3, :3] @ fix.antenna + T_other_this[:3, 3])

@@ -16,7 +16,7 @@ import numpy as np
 
 from dpm2_core.database import connect
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.frame import Array, Edge, Keyframe, Registration
+from dpm2_core.frame import Array, Edge, Georeference, Keyframe, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.slam.store import rows, schema
 from dpm2_core.slam.store.cloud_codec import pack_cloud, unpack_cloud, unpack_mask
@@ -124,6 +124,7 @@ class _Salvage:
                     moving[node] = mask
             except (ValueError, TypeError) as error:
                 self._problem(f"keyframe {node}: which points move is lost: {error}")
+        self._fixes(keyframes)
         edges = self._edges(new)
         edges = self._bridged(edges, [keyframes[node] for node in good], [session[node] for node in good])
         trail = self._trail(new)
@@ -139,6 +140,7 @@ class _Salvage:
             self._sessions(session),
             CloudStore(lambda node: self._payload(node)[0] or nothing, moving, loans),
             lambda node: self._payload(node)[2],
+            georeference=self._georeference(),
         )
         return subset(whole, good, edges, trail)
 
@@ -201,6 +203,23 @@ class _Salvage:
             poses[node] = T
             T_map_odom = T @ se3.inverse(keyframes[node].T_odom_kf)
         return poses
+
+    def _fixes(self, keyframes: dict[int, Keyframe]) -> None:
+        """Give those that are good to their keyframes."""
+        for row in self._rows("fixes"):
+            try:
+                node, fix = rows.fix_of(row)
+                keyframes[node] = replace(keyframes[node], fix=fix)
+            except (ValueError, KeyError) as error:
+                self._problem(f"keyframe {row[0]}: its fix is lost: {error}")
+
+    def _georeference(self) -> Georeference | None:
+        for row in self._rows("georeference"):
+            try:
+                return rows.georeference_of(row)
+            except ValueError as error:
+                self._problem(f"georeference: {error}")
+        return None
 
     def _edges(self, new: dict[int, int]) -> list[Edge]:
         edges = []

@@ -13,7 +13,7 @@ import numpy as np
 
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.frame import Array, Edge, Keyframe, Points
+from dpm2_core.frame import Array, Edge, Georeference, Keyframe, Points
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.slam.store.cloud_store import CloudStore, Loan
@@ -24,6 +24,8 @@ from dpm2_core.slam.store.rows import (
     Session,
     check_ends,
     edge_of,
+    fix_of,
+    georeference_of,
     keyframe_of,
     pose_of,
     removed_of,
@@ -46,6 +48,7 @@ class MapData:
         clouds: of each keyframe, read from the file when asked for.
         thumbnail: JPEG of a node, or None.
         describe: descriptors of a node that are in the file, where `keyframes` were read without; or None.
+        georeference: where on Earth it is; None where no fixes have told.
     """
 
     keyframes: list[Keyframe]
@@ -57,6 +60,7 @@ class MapData:
     clouds: CloudStore
     thumbnail: Thumbnail = field(default=lambda node: None)
     describe: Describe = field(default=lambda node: None)
+    georeference: Georeference | None = None
 
     def __len__(self) -> int:
         return len(self.keyframes)
@@ -92,6 +96,10 @@ def _load(store: MapStore, descriptors: bool) -> MapData:
     for node, edge in odometry_by_node(edges).items():
         if owner[edge.from_node] == owner[node]:
             keyframes[node] = replace(keyframes[node], edge=edge.registration)
+    for _, (node, fix) in _made(store, "fixes", fix_of):
+        if node not in nodes:
+            raise ValueError(f"a fix of keyframe {node}, which is not there")
+        keyframes[node] = replace(keyframes[node], fix=fix)
     poses = dict(_made(store, "poses", lambda row: pose_of(row[1])))
     if missing := set(nodes) - poses.keys():
         raise ValueError(f"keyframe {min(missing)} has no pose")
@@ -111,6 +119,7 @@ def _load(store: MapStore, descriptors: bool) -> MapData:
         CloudStore(store.cloud, [moving.get(node) for node in nodes], loans, str(store.path)),
         lambda node: store.payload(node, "thumbnail"),
         lambda node: None if (packed := store.payload(node, "descriptors")) is None else unpack_descriptors(packed),
+        next((made for _, made in _made(store, "georeference", georeference_of)), None),
     )
 
 
@@ -144,7 +153,7 @@ def _load_keyframes(store: MapStore, descriptors: bool) -> tuple[list[Keyframe],
 def _made(store: MapStore, table: str, make: Callable[[tuple[Any, ...]], _T]) -> Iterator[tuple[int, _T]]:
     """Number and noun of each row of a table; which row an error is about is added to it."""
     for row in store.rows(table):
-        with _of(table.removesuffix("s"), row[0]):
+        with _of("fix" if table == "fixes" else table.removesuffix("s"), row[0]):
             made = make(row)
         yield row[0], made
 
@@ -208,7 +217,7 @@ def append_map(store: MapStore, data: MapData) -> int:
         store.write(change, sessions)
     edges = [replace(edge, from_node=edge.from_node + first, to_node=edge.to_node + first) for edge in data.edges]
     trail = [replace(p, node=p.node + first, session=p.session + before) for p in data.trail]
-    store.write(Change(edges=edges, trail=trail))
+    store.write(Change(edges=edges, trail=trail, georeference=None if first else data.georeference))
     return first
 
 
@@ -234,6 +243,7 @@ def subset(data: MapData, nodes: Sequence[int], edges: list[Edge], trail: list[R
         clouds,
         lambda node: data.thumbnail(where[node]),
         lambda node: data.describe(where[node]),
+        data.georeference,
     )
 
 
@@ -248,10 +258,14 @@ def map_cloud(clouds: CloudStore, poses: Array, voxel: float) -> Points:
     return cloud
 
 
-def trajectory(data: MapData) -> tuple[list[int], Array]:
-    """Stamps (ns) and (K, 4, 4) T_map_kf of all keyframes that ever were, pruned ones too, by robot and time."""
+def trajectory(data: MapData, robot: str | None = None, session: int = 0) -> tuple[list[int], Array]:
+    """Stamps (ns) and (K, 4, 4) T_map_kf of all keyframes that ever were, pruned ones too, by robot and time.
+
+    `robot`: of that one in that `session` only; None: of all.
+    """
     rows = [(k.robot, s, k.stamp, T) for k, s, T in zip(data.keyframes, data.session, data.poses, strict=True)]
     rows += [(p.robot, p.session, p.stamp, data.poses[p.node] @ p.T_node_kf) for p in data.trail]
+    rows = [row for row in rows if robot is None or row[:2] == (robot, session)]
     rows.sort(key=lambda row: row[:3])
     return [row[2] for row in rows], np.array([row[3] for row in rows]).reshape(-1, 4, 4)
 

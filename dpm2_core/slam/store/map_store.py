@@ -21,7 +21,7 @@ from typing import Any
 from dpm2_core._version import __version__
 from dpm2_core.database import Connection, connect
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.frame import Array, Edge, Keyframe
+from dpm2_core.frame import Array, Edge, Georeference, Keyframe
 from dpm2_core.slam.store import schema
 from dpm2_core.slam.store.cloud_store import Loan
 from dpm2_core.slam.store.rows import (
@@ -29,6 +29,8 @@ from dpm2_core.slam.store.rows import (
     Session,
     array_bytes,
     edge_row,
+    fix_row,
+    georeference_row,
     keyframe_row,
     pack_descriptors,
     removed_row,
@@ -48,6 +50,7 @@ class Change:
         keyframes: node, keyframe (its cloud is not looked at), packed cloud or whose it borrows, JPEG or None.
         edges: in the order of the map; appended to those of the file.
         poses: T_map_kf (4, 4) by node. moving: packed mask by node. trail: what was pruned.
+        georeference: as it is from now on; None: as it was.
         judged: edges of the file by their number, as they are from now on.
     """
 
@@ -57,6 +60,7 @@ class Change:
     moving: dict[int, bytes] = field(default_factory=dict)
     trail: list[RemovedKeyframe] = field(default_factory=list)
     judged: dict[int, Edge] = field(default_factory=dict)
+    georeference: Georeference | None = None
 
 
 class MapStore:
@@ -146,6 +150,8 @@ class MapStore:
                 session = (sessions or {}).get(node, self.session)
                 loan = cloud if isinstance(cloud, Loan) else None
                 _insert(sql, "keyframes", [keyframe_row(node, keyframe, session, loan)])
+                if keyframe.fix is not None:
+                    _insert(sql, "fixes", [fix_row(node, keyframe.fix)])
                 if isinstance(cloud, bytes):
                     d = keyframe.descriptors
                     packed = None if d is None else pack_descriptors(d)
@@ -156,6 +162,8 @@ class MapStore:
             _insert(sql, "poses", [with_crc(node, array_bytes(T)) for node, T in change.poses.items()])
             _insert(sql, "moving", [with_crc(node, mask) for node, mask in change.moving.items()])
             _insert(sql, "trail", [removed_row(p) for p in change.trail])
+            if change.georeference is not None:
+                _insert(sql, "georeference", [georeference_row(change.georeference)])
 
     @property
     def size(self) -> int:

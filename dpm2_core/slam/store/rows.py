@@ -18,7 +18,7 @@ import numpy as np
 
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.frame import Array, Edge, Keyframe, Points, Registration
+from dpm2_core.frame import Array, Edge, Fix, Georeference, Keyframe, Points, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.slam.store.cloud_store import Loan
 from dpm2_core.slam.store.schema import row_crc
@@ -205,6 +205,47 @@ def removed_of(row: tuple[Any, ...]) -> RemovedKeyframe:
     id, robot, session, stamp, node, T_node_kf = row
     _check_types((id, session, stamp, node), robot)
     return RemovedKeyframe(id, robot, session, stamp, node, pose_of(T_node_kf))
+
+
+def fix_row(node: int, fix: Fix) -> tuple[Any, ...]:
+    """Of table `fixes`."""
+    return with_crc(node, fix.stamp, *fix.geodetic.tolist(), array_bytes(fix.covariance), *fix.antenna.tolist())
+
+
+def fix_of(row: tuple[Any, ...]) -> tuple[int, Fix]:
+    """Node and fix of a row of table `fixes`.
+
+    Raises:
+        ValueError: a value that no fix has; the node may be any.
+    """
+    node, stamp, *place, covariance, x, y, z = row
+    _check_types((node, stamp))
+    return node, Fix(stamp, _numbers(place), bytes_array(covariance, 3), _numbers([x, y, z]))
+
+
+def georeference_row(georeference: Georeference) -> tuple[Any, ...]:
+    """Of table `georeference`."""
+    return with_crc(0, *georeference.origin.tolist(), array_bytes(georeference.T_enu_map))
+
+
+def georeference_of(row: tuple[Any, ...]) -> Georeference:
+    """Of a row of table `georeference`.
+
+    Raises:
+        ValueError: a value that none has.
+    """
+    _, *place, T = row
+    origin = _numbers(place)
+    if not (np.abs(origin) <= (90, 360, 1e5)).all():
+        raise ValueError(f"latitude, longitude, altitude {origin.tolist()} are no place on Earth")
+    return Georeference(origin, pose_of(T))
+
+
+def _numbers(values: list[Any]) -> Array:
+    """Raises ValueError unless they are numbers with a fraction."""
+    if not all(isinstance(value, float) for value in values):
+        raise ValueError("something else where a number belongs")
+    return np.array(values)
 
 
 def session_of(row: tuple[Any, ...]) -> Session:

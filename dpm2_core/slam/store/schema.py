@@ -17,10 +17,10 @@ from dpm2_core.errors import UsageError
 
 APPLICATION_ID = 0x64706D32
 """The bytes `dpm2` at offset 68 of the file."""
-VERSION = 2
+VERSION = 3
 """Of the schema, in SQLite's user_version."""
 
-SCHEMA = """
+_SCHEMA_2 = """
 CREATE TABLE sessions (          -- every time that a program wrote to the map
   session  INTEGER PRIMARY KEY,  -- from 1
   program  TEXT NOT NULL,        -- version of dpm2
@@ -81,6 +81,29 @@ CREATE TABLE trail (             -- keyframes that were pruned: where they were,
   crc      INTEGER NOT NULL
 );
 """
+_ADDED_3 = """
+CREATE TABLE fixes (             -- of satellites (GNSS), WGS84
+  node     INTEGER PRIMARY KEY,  -- the keyframe that it was measured near
+  stamp    INTEGER NOT NULL,     -- ns
+  latitude REAL NOT NULL,        -- degrees
+  longitude REAL NOT NULL,
+  altitude REAL NOT NULL,        -- m above the ellipsoid
+  covariance BLOB NOT NULL,      -- 9 float64: m^2 east, north, up
+  antenna_x REAL NOT NULL,       -- m, where the antenna was then, in the keyframe's frame
+  antenna_y REAL NOT NULL,
+  antenna_z REAL NOT NULL,
+  crc      INTEGER NOT NULL
+);
+CREATE TABLE georeference (      -- one row, once it is known where on Earth the map is
+  id       INTEGER PRIMARY KEY,  -- 0
+  latitude REAL NOT NULL,        -- of the local frame east, north, up, as in fixes
+  longitude REAL NOT NULL,
+  altitude REAL NOT NULL,
+  T_enu_map BLOB NOT NULL,
+  crc      INTEGER NOT NULL
+);
+"""
+SCHEMA = _SCHEMA_2 + _ADDED_3
 
 CONTENT = {
     "keyframes": ("node", "id", "robot", "session", "stamp", "frame", "T_odom_kf", "lender", "T_kf_lender"),
@@ -91,6 +114,10 @@ CONTENT = {
         "id", "kind", "from_node", "to_node", "T_from_to", "covariance", "ok", "confidence", "rmse", "method", "reason",
     ),
     "trail": ("id", "robot", "session", "stamp", "node", "T_node_kf"),
+    "fixes": (
+        "node", "stamp", "latitude", "longitude", "altitude", "covariance", "antenna_x", "antenna_y", "antenna_z",
+    ),
+    "georeference": ("id", "latitude", "longitude", "altitude", "T_enu_map"),
 }  # fmt: skip
 """Columns of the tables with checksums, in the order in which the checksum takes them."""
 
@@ -162,11 +189,13 @@ def check(connection: sqlite3.Connection, version: int) -> None:
     Raises:
         sqlite3.DatabaseError: it has not, or cannot be read.
     """
-    check_schema(connection, statements(_SCHEMA_1 if version < 2 else SCHEMA))
+    check_schema(connection, statements({1: _SCHEMA_1, 2: _SCHEMA_2}.get(version, SCHEMA)))
 
 
 def migrate(connection: sqlite3.Connection, version: int) -> None:
-    """Bring an older map to `VERSION`, whole or not at all."""
+    """Bring an older map to `VERSION`; each step whole or not at all."""
     if version < 2:
         connection.create_function("row_crc", -1, row_crc, deterministic=True)
-        connection.executescript(f"BEGIN IMMEDIATE; {_TO_2.format(schema=SCHEMA)} PRAGMA user_version = 2; COMMIT;")
+        connection.executescript(f"BEGIN IMMEDIATE; {_TO_2.format(schema=_SCHEMA_2)} PRAGMA user_version = 2; COMMIT;")
+    if version < 3:
+        connection.executescript(f"BEGIN IMMEDIATE; {_ADDED_3} PRAGMA user_version = 3; COMMIT;")

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.frame import Array, Edge, Keyframe
+from dpm2_core.frame import Array, Edge, Georeference, Keyframe
 from dpm2_core.slam.store.cloud_store import CloudStore
 from dpm2_core.slam.store.map_store import Change, MapStore
 
@@ -26,6 +26,7 @@ class MapWriter:
         self.problem = ""
         self._store, self._clouds = store, clouds
         self._written = poses
+        self._georeference: Georeference | None = None
         self._keyframes: list[tuple[int, Keyframe, bytes | None]] = []
         self._edges: list[Edge] = []
         self._moving: set[int] = set()
@@ -42,8 +43,9 @@ class MapWriter:
         """The cloud store has a mask for that node."""
         self._moving.add(node)
 
-    def sync(self, poses: Array) -> None:
+    def sync(self, poses: Array, georeference: Georeference | None = None) -> None:
         """Write all that is new; (N, 4, 4) are the optimized poses. Never raises: see `problem`."""
+        self._georeference = georeference
         try:
             while len(self._keyframes) > _BATCH:
                 self._write(poses, self._keyframes[:_BATCH], last=False)
@@ -60,6 +62,7 @@ class MapWriter:
         change.edges = [edge for edge in self._edges if max(edge.from_node, edge.to_node) < ends]
         change.poses = self._moved(poses[:ends] if not last else poses)
         masks = {node: self._clouds.moving(node) for node in self._moving if node < ends}
+        change.georeference = self._georeference if last else None
         change.moving = {node: mask for node, mask in masks.items() if mask is not None}
         self._store.write(change)
         for node, *_ in keyframes:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dpm2_core.frame import Frame, Registration
+from dpm2_core.frame import Fix, Frame, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.slam.odometry.keyframe_selection import KeyframeSelector, KeyframeSettings
 from dpm2_core.slam.preprocess import Scan
@@ -32,3 +32,39 @@ def test_by_the_residual_the_spacing_settles(rmse: float, spacing: float) -> Non
     """At 2 (1 - rmse / 0.5)^2 of the distance, but no less than 1 m."""
     at = places(KeyframeSettings(distance=10, residual=0.5), rmse)
     assert np.diff(at)[-3:] == pytest.approx(spacing, abs=1.01)  # a scan per meter
+
+
+def fixes_on_the_way(fixes: dict[int, Fix], failed: int | None = None) -> dict[int, Fix]:
+    """Those of keyframes, by their frame; the robot goes 1 m a second forward, turned by 90 degrees to the left.
+
+    `fixes`: by the frame with which they come. `failed`: a frame that is not registered.
+    """
+    selector, scan, out = KeyframeSelector(KeyframeSettings(distance=5)), Scan(np.zeros((5, 4), np.float32)), {}
+    for second in range(13):
+        T = se3.make(se3.rotation(np.array([0, 0, np.pi / 2])), [0.0, float(second), 0.0])
+        frame = Frame(second * 10**9, scan.points, fix=fixes.get(second))
+        registration = Registration(T, np.eye(6) * 1e-4, ok=second != failed)
+        keyframe = selector.select(frame, scan, T, registration)
+        if keyframe is not None and keyframe.fix is not None:
+            out[second] = keyframe.fix
+    return out
+
+
+def measured(seconds: float) -> Fix:
+    return Fix(round(seconds * 1e9), np.array([49.0, 8.4, seconds]), np.eye(3), np.array([0.0, 0.0, 1.5]))
+
+
+def test_a_fix_travels_with_the_next_keyframe_as_seen_from_there() -> None:
+    """It comes late: the antenna is where it was when the fix was measured, between two scans."""
+    found = fixes_on_the_way({2: measured(0.5), 4: measured(3.25), 9: measured(9.0)})
+    assert list(found) == [5, 10]  # 5 m apart
+    assert found[5].stamp == 3_250_000_000  # the later of the two
+    np.testing.assert_allclose(found[5].antenna, [-1.75, 0, 1.5], atol=1e-9)  # behind, where it is looked back from
+    np.testing.assert_allclose(found[10].antenna, [-1.0, 0, 1.5], atol=1e-9)
+
+
+def test_a_fix_without_a_known_way_is_left_out() -> None:
+    assert fixes_on_the_way({2: measured(-0.5)}) == {}  # from before the drive
+    assert fixes_on_the_way({2: measured(2.5)}) == {}  # of the future
+    assert fixes_on_the_way({2: measured(1.5)}, failed=3) == {}
+    assert fixes_on_the_way({4: measured(1.5)}, failed=3) == {}

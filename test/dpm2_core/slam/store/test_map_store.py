@@ -12,6 +12,7 @@ import sys
 import tempfile
 import time
 from contextlib import closing, suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,8 @@ import pytest
 
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.frame import Keyframe
+from dpm2_core.frame import Fix, Georeference, Keyframe
+from dpm2_core.geometry import se3
 from dpm2_core.slam.mapping.merge import merge_maps
 from dpm2_core.slam.mapping.prune import prune
 from dpm2_core.slam.store import schema
@@ -271,6 +273,82 @@ def test_an_older_map_is_read_and_brought_up_to_date(tmp_path: Path, keyframes: 
             with sqlite3.connect(path) as sql:
                 assert sql.execute("PRAGMA user_version").fetchone() == (schema.VERSION,)
             sql.close()
+
+
+def test_a_map_without_tables_for_fixes_is_read_and_brought_up_to_date(map_file: Path) -> None:
+    """Version 2 is version 3 without them."""
+    with sqlite3.connect(map_file) as sql:
+        sql.executescript("DROP TABLE fixes; DROP TABLE georeference; PRAGMA user_version = 2; VACUUM;")
+    sql.close()
+    before = map_file.read_bytes()
+    for read_only in (True, False):
+        with MapStore.open(map_file, read_only=read_only) as store:
+            data = load_map(store)
+            assert len(data) == 12
+            assert data.georeference is None
+            if not read_only:
+                store.write(Change(georeference=GEOREFERENCE))
+        assert (map_file.read_bytes() == before) == read_only
+    with MapStore.open(map_file) as store:
+        assert load_map(store).georeference is not None
+
+
+GEOREFERENCE = Georeference(np.array([49.0, 8.4, 110.0]), se3.exp(np.array([0, 0, 1.0, 2, 3, 4])))
+FIX = Fix(5, np.array([49.0, 8.4, 110.5]), np.diag([4.0, 4, 16]), np.array([0.1, 0, 1.5]))
+
+
+def test_fixes_and_georeference_come_back(tmp_path: Path, keyframes: list[Keyframe]) -> None:
+    path, copy = tmp_path / "a.dpm2map", tmp_path / "b.dpm2map"
+    with MapStore.create(path) as store:
+        store.begin_session()
+        for node, keyframe in enumerate(keyframes):
+            keyframe = replace(keyframe, fix=FIX if node % 2 else None)
+            cloud = pack_cloud(keyframe.cloud)
+            store.write(Change([(node, keyframe, cloud, None)], poses={node: keyframe.T_odom_kf}))
+        store.write(Change(georeference=GEOREFERENCE))
+    with MapStore.open(path) as store:
+        save_as(load_map(store), copy)
+    for file in (path, copy):
+        with MapStore.open(file) as store:
+            data = load_map(store)
+        assert [k.fix is not None for k in data.keyframes] == [False, True] * 6
+        found, known = data.keyframes[3].fix, data.georeference
+        assert found is not None
+        assert known is not None
+        assert found.stamp == FIX.stamp
+        for name in ("geodetic", "covariance", "antenna"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(FIX, name))
+        np.testing.assert_array_equal(known.origin, GEOREFERENCE.origin)
+        np.testing.assert_array_equal(known.T_enu_map, GEOREFERENCE.T_enu_map)
+
+
+@pytest.mark.parametrize(
+    ("table", "row"),
+    [
+        ("fixes", (3, 5, 95.0, 8.4, 110.0, FIX.covariance.tobytes(), 0.0, 0.0, 0.0)),
+        ("fixes", (3, 5, 49.0, "8", 110.0, FIX.covariance.tobytes(), 0.0, 0.0, 0.0)),
+        ("fixes", (3, 5, 49.0, 8.4, 110.0, np.zeros(9).tobytes(), 0.0, 0.0, 0.0)),
+        ("fixes", (3, 5, 49.0, 8.4, 110.0, b"short", 0.0, 0.0, 0.0)),
+        ("fixes", (3, 5, 49.0, 8.4, 110.0, FIX.covariance.tobytes(), 1e9, 0.0, 0.0)),
+        ("fixes", (99, 5, 49.0, 8.4, 110.0, FIX.covariance.tobytes(), 0.0, 0.0, 0.0)),
+        ("georeference", (0, 49.0, 8.4, 1e9, np.eye(4).tobytes())),
+        ("georeference", (0, 49.0, 8.4, 110.0, np.zeros((4, 4)).tobytes())),
+    ],
+)
+def test_hostile_fixes_are_found_and_left_out(map_file: Path, tmp_path: Path, table: str, row: tuple) -> None:
+    with sqlite3.connect(map_file) as sql:
+        marks = ",".join("?" * (len(row) + 1))
+        sql.execute(f"INSERT INTO {table} VALUES ({marks})", (*row, schema.row_crc(*row)))
+    sql.close()
+    with MapStore.open(map_file) as store, pytest.raises(Dpm2Error, match="see dpm2 map check"):
+        load_map(store)
+    findings = check_map(map_file, tmp_path / "good.dpm2map")
+    assert len(findings.problems) == 1
+    assert findings.keyframes == 12
+    with MapStore.open(tmp_path / "good.dpm2map") as store:
+        data = load_map(store)
+    assert data.georeference is None
+    assert all(keyframe.fix is None for keyframe in data.keyframes)
 
 
 def test_what_is_no_map_is_rejected_in_one_line(tmp_path: Path, map_file: Path) -> None:

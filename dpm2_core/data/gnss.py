@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Positions by satellites (sensor_msgs/NavSatFix) as they come in, until a scan is there."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from typing import Any
+
+import numpy as np
+
+from dpm2_core.data.messages import MessageError
+from dpm2_core.data.pairing import JUMP
+from dpm2_core.frame import Fix
+
+_MOST = 100  # fixes kept; bounds memory where no cloud comes
+_LEAST = 0.01  # m, added to every standard deviation: no antenna's place and no clock is known better
+_ASSUMED = (5.0, 5.0, 10.0)  # m east, north, up where the receiver states none: that of a plain one under open sky
+_UNKNOWN = 1e4  # m, of an altitude that is not known
+
+
+def decode_fix(message: Any, stamp: int) -> Fix | None:
+    """The position that a sensor_msgs/NavSatFix with that stamp (ns) states, its antenna at the LiDAR; None: no fix.
+
+    A covariance that is unknown, or all zero, is taken to be that of a plain receiver; an altitude of NaN is unknown,
+    as the message's definition has it.
+
+    Raises:
+        MessageError: no place on Earth, or no covariance.
+    """
+    if message.status.status < 0:
+        return None
+    place = np.array([message.latitude, message.longitude, message.altitude], np.float64)
+    if not place[:2].any():
+        raise MessageError("latitude and longitude 0, which receivers send before they know")
+    covariance = np.array(message.position_covariance, np.float64).reshape(3, 3)
+    if message.position_covariance_type == 0 or not covariance.any():
+        covariance = np.diag(_ASSUMED) ** 2
+    if np.isnan(place[2]):
+        place[2], covariance[2], covariance[:, 2] = 0.0, 0.0, 0.0
+        covariance[2, 2] = _UNKNOWN**2
+    try:
+        return Fix(stamp, place, covariance + _LEAST**2 * np.eye(3), np.zeros(3))
+    except ValueError as error:
+        raise MessageError(str(error)) from None
+
+
+class FixBuffer:
+    """The latest fixes; any thread may add or take.
+
+    Attributes:
+        frame: of the antenna, as the last message names it.
+    """
+
+    def __init__(self) -> None:
+        self.frame = ""
+        self._lock = threading.Lock()
+        self._fixes: deque[Fix] = deque(maxlen=_MOST)
+
+    def clear(self) -> None:
+        """Forget everything."""
+        with self._lock:
+            self._fixes.clear()
+
+    def add(self, stamp: int, message: Any) -> None:
+        """Take a sensor_msgs/NavSatFix with its stamp (ns).
+
+        Raises:
+            MessageError: see `decode_fix`.
+        """
+        if (fix := decode_fix(message, stamp)) is not None:
+            with self._lock:
+                self.frame = message.header.frame_id
+                self._fixes.append(fix)
+
+    def take(self, stamp: int) -> Fix | None:
+        """The latest of those up to a scan's stamp (ns) that were not taken before; None if there is none."""
+        with self._lock:
+            found = max((fix for fix in self._fixes if fix.stamp <= stamp), key=lambda fix: fix.stamp, default=None)
+            later = [fix for fix in self._fixes if stamp < fix.stamp < stamp + JUMP]
+            self._fixes.clear()
+            self._fixes.extend(later)
+        return found

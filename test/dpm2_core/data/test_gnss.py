@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fixes of bags and hostile publishers: to the scan they precede, with covariance and antenna, or out, counted."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dpm2_core.data.bags import BagSource
+from dpm2_core.data.gnss import FixBuffer, decode_fix
+from dpm2_core.data.messages import MessageError
+from dpm2_core.data.settings import InputSettings
+from dpm2_core.data.topics import POINTS
+from dpm2_core.errors import UsageError
+
+SECOND = 10**9
+NAN, INF = float("nan"), float("inf")
+COVARIANCE = (4.0, 0, 0, 0, 4, 0, 0, 0, 16)
+
+
+def nav(bags: Any, stamp: float, place: tuple = (49.0, 8.4, 110.0), **other: Any) -> Any:
+    """A message; `other`: status, covariance, kind, frame."""
+    return bags.new(
+        "sensor_msgs/NavSatFix",
+        header=bags.header(stamp, other.get("frame", "gnss")),
+        status=bags.new("sensor_msgs/NavSatStatus", status=other.get("status", 0), service=1),
+        latitude=float(place[0]),
+        longitude=float(place[1]),
+        altitude=float(place[2]),
+        position_covariance=np.array(other.get("covariance", COVARIANCE), np.float64),
+        position_covariance_type=other.get("kind", 3),
+    )
+
+
+def drive(bags: Any, **other: Any) -> list[tuple[float, str, Any]]:
+    """Clouds at 1.0 to 1.9 s; fixes at 1.05 and 1.35 s, which come 0.12 s late."""
+    clouds = [(1 + 0.1 * i, POINTS, bags.cloud(1 + 0.1 * i)) for i in range(10)]
+    fixes = [(t + 0.12, "/fix", nav(bags, t, (49.0, 8.4 + t, 110.0), **other)) for t in (1.05, 1.35)]
+    return sorted([*clouds, *fixes], key=lambda m: m[0])
+
+
+def test_a_cloud_has_the_fix_that_came_before_it(bags: Any, tmp_path: Path) -> None:
+    place = (0.5, "/tf_static", bags.transform("velo_link", "gnss", (0.3, 0.2, 1.0)))
+    path = bags.write(tmp_path / "b", [place, *drive(bags)])
+    source = BagSource(path, InputSettings(gnss_topic="/fix"))
+    fixes = {frame.index: frame.fix for frame in source.frames() if frame.fix is not None}
+    assert source.notes == []
+    assert list(fixes) == [2, 5]
+    assert fixes[2].stamp == round(1.05 * SECOND)
+    np.testing.assert_allclose(fixes[2].geodetic, [49.0, 9.45, 110.0])
+    np.testing.assert_allclose(fixes[2].antenna, [0.3, 0.2, 1.0])
+    np.testing.assert_allclose(np.diag(fixes[2].covariance), [4, 4, 16], atol=1e-3)
+    assert [frame.fix is not None for frame in source.frames()].count(True) == 2  # read again
+    assert all(frame.fix is None for frame in BagSource(path).frames())  # off
+
+
+def test_an_antenna_without_a_place_is_at_the_lidar_and_said(bags: Any, tmp_path: Path) -> None:
+    source = BagSource(bags.write(tmp_path / "b", drive(bags)), InputSettings(gnss_topic="/fix"))
+    fixes = [frame.fix for frame in source.frames() if frame.fix is not None]
+    assert len(fixes) == 2
+    assert not fixes[0].antenna.any()
+    (note,) = source.notes
+    assert note.startswith("/fix: no transform from 'gnss' to 'velo_link'")
+    assert note.endswith("; the antenna is taken for the LiDAR")
+    own = BagSource(bags.write(tmp_path / "own", drive(bags, frame="velo_link")), InputSettings(gnss_topic="/fix"))
+    assert sum(frame.fix is not None for frame in own.frames()) == 2
+    assert own.notes == []
+
+
+def test_a_topic_that_is_not_there(bags: Any, tmp_path: Path) -> None:
+    path = bags.write(tmp_path / "b", drive(bags))
+    for topic in ("/none", POINTS):
+        with pytest.raises(UsageError, match=f"no NavSatFix messages on {topic}; topics: .*/fix"):
+            BagSource(path, InputSettings(gnss_topic=topic))
+
+
+def test_what_is_not_known(bags: Any) -> None:
+    """No fix is none; without a covariance that of a plain receiver; without an altitude the height says nothing."""
+    assert decode_fix(nav(bags, 1.0, (NAN, NAN, NAN), status=-1), SECOND) is None
+    for assumed in ({"kind": 0}, {"covariance": np.zeros(9)}):
+        fix = decode_fix(nav(bags, 1.0, **assumed), SECOND)
+        assert fix is not None
+        np.testing.assert_allclose(np.diag(fix.covariance), [25, 25, 100], atol=1e-3)
+    flat = decode_fix(nav(bags, 1.0, (49.0, 8.4, NAN), covariance=(4, 0, 1, 0, 4, 0, 1, 0, NAN)), SECOND)
+    assert flat is not None
+    np.testing.assert_allclose(flat.covariance, np.diag([4, 4, 1e8]), atol=1e-3)
+    np.testing.assert_array_equal(flat.geodetic, [49.0, 8.4, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("wrong", "reason"),
+    [
+        ({"place": (NAN, 8.4, 110)}, "no place on Earth"),
+        ({"place": (91.0, 8.4, 110)}, "no place on Earth"),
+        ({"place": (49.0, 1e300, 110)}, "no place on Earth"),
+        ({"place": (49.0, 8.4, INF)}, "no place on Earth"),
+        ({"place": (0.0, 0.0, 0.0)}, "before they know"),
+        ({"covariance": (NAN, *COVARIANCE[1:])}, "no covariance"),
+        ({"covariance": (-4.0, *COVARIANCE[1:])}, "no covariance"),
+        ({"covariance": (4.0, 3, *COVARIANCE[2:])}, "no covariance"),
+        ({"covariance": (1e300, *COVARIANCE[1:])}, "no covariance"),
+    ],
+)
+def test_what_cannot_be_is_left_out_and_counted(bags: Any, tmp_path: Path, wrong: dict, reason: str) -> None:
+    with pytest.raises(MessageError, match=reason):
+        decode_fix(nav(bags, 1.0, **wrong), SECOND)
+    messages = drive(bags, frame="velo_link")
+    messages[4:4] = [(messages[4][0], "/fix", nav(bags, 1.2, frame="velo_link", **wrong))] * 3
+    source = BagSource(bags.write(tmp_path / "b", messages), InputSettings(gnss_topic="/fix"))
+    assert sum(frame.fix is not None for frame in source.frames()) == 2
+    (note,) = source.notes
+    assert note.startswith("/fix: 3 samples left out (the first: ")
+    assert reason in note
+
+
+def test_a_flood_and_stamps_of_the_future_do_no_harm(bags: Any) -> None:
+    buffer = FixBuffer()
+    buffer.add(10**18, nav(bags, 1.0))
+    message = nav(bags, 1.0)
+    for k in range(500):
+        buffer.add(SECOND + k, message)
+    fix = buffer.take(2 * SECOND)
+    assert fix is not None
+    assert fix.stamp == SECOND + 499
+    assert buffer.take(2 * SECOND) is None
+    buffer.add(5 * SECOND // 2, message)
+    assert buffer.take(2 * SECOND) is None  # not of this scan yet
+    assert buffer.take(3 * SECOND) is not None

@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fixes in the real graph: they straighten a drive that drifts, and those that are wrong bend none."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+
+from dpm2_core.frame import Array, Edge, Fix, Georeference, Registration
+from dpm2_core.geometry import geodesy, se3
+from dpm2_core.slam.graph.pose_graph import PoseGraph, PoseGraphSettings
+
+START = np.array([49.0, 8.4, 110.0])
+ANTENNA = np.array([0.5, 0.2, 1.0])
+SIGMA = 2.0
+STEP = np.diag([np.radians(0.15)] * 3 + [0.05] * 3) ** 2  # of an odometry with that sigma a step of 5 m
+Wrong = Callable[[int], Array]
+
+
+def road(count: int) -> Array:
+    """(count, 4, 4) T_enu_kf: 5 m apart on a winding road that begins north-east and climbs."""
+    heading = 0.7 + 0.8 * np.sin(np.arange(count) / 40)
+    steps = 5 * np.column_stack([np.cos(heading), np.sin(heading), np.full(count, 0.02)])
+    at = np.cumsum(steps, axis=0) - steps[0]
+    return np.array([se3.make(se3.rotation(np.array([0, 0, h])), p) for h, p in zip(heading, at, strict=True)])
+
+
+def fix_at(number: int, T: Array, error: Array, sigma: float = SIGMA) -> Fix:
+    """Where the antenna was, and an error (3,) m."""
+    ecef = geodesy.enu_frame(START) @ np.append(T[:3, :3] @ ANTENNA + T[:3, 3] + error, 1)
+    covariance = np.diag([sigma, sigma, 2 * sigma]) ** 2
+    return Fix(number * 10**9, geodesy.geodetic(ecef[:3]), covariance, ANTENNA)
+
+
+def driven(
+    count: int, wrong: Wrong | None = None, drift_deg: float = 0.0, fixes: bool = True, background: bool = False
+) -> tuple[PoseGraph, Array]:
+    """A drive as the mapper feeds it, and its odometry alone (count, 4, 4); `drift_deg`: a step."""
+    rng, true = np.random.default_rng(1), road(count)
+    graph, odometry = PoseGraph(PoseGraphSettings(background=background)), [np.eye(4)]
+    graph.add_node(np.eye(4))
+    for node in range(count):
+        error, noise = rng.normal(size=3) * [SIGMA, SIGMA, 2 * SIGMA], rng.normal(size=6) * 2e-4
+        if node:
+            drift = se3.exp(np.array([0, 0, np.radians(drift_deg), 0, 0, 0]) + noise)
+            step = se3.inverse(true[node - 1]) @ true[node] @ drift
+            odometry.append(odometry[-1] @ step)
+            edge = Edge("odometry", node - 1, node, Registration(step, STEP))
+            graph.add_node(graph.pose(node - 1) @ step, edge)
+        graph.collect()
+        error = error if wrong is None else error + wrong(node)
+        if fixes and graph.add_fix(node, fix_at(node, true[node], error)):
+            graph.optimize()
+    if graph.unsolved:
+        graph.optimize()
+    graph.collect(wait=True)
+    graph.close()
+    return graph, np.array(odometry)
+
+
+def enu_of(graph: PoseGraph, poses: Array) -> Array:
+    """(N, 3) east, north, up about the start of the road, by the graph's georeference."""
+    known = graph.georeference
+    assert known is not None
+    T = se3.inverse(geodesy.enu_frame(START)) @ geodesy.enu_frame(known.origin) @ known.T_enu_map
+    return (T @ poses)[:, :3, 3]
+
+
+def errors(graph: PoseGraph) -> Array:
+    poses = graph.poses
+    return np.linalg.norm(enu_of(graph, poses) - road(len(poses))[:, :3, 3], axis=1)
+
+
+def bend(graph: PoseGraph) -> float:
+    """Largest error, m, of the way over 10 nodes, 50 m, as its length and direction at its start."""
+    true, poses = road(len(graph)), graph.poses
+    ways = se3.inverse(se3.inverse(true[:-10]) @ true[10:]) @ se3.inverse(poses[:-10]) @ poses[10:]
+    return float(np.linalg.norm(ways[:, :3, 3], axis=1).max())
+
+
+@pytest.fixture(scope="module")
+def clean() -> PoseGraph:
+    return driven(120)[0]
+
+
+@pytest.mark.slow
+def test_a_drive_that_drifts_is_straightened() -> None:
+    graph, odometry = driven(150, drift_deg=0.05)
+    true = road(150)
+    alone = se3.inverse(true[:1]) @ true
+    assert np.linalg.norm((odometry - alone)[:, :3, 3], axis=1).max() > 20  # m
+    assert errors(graph).max() < SIGMA
+    assert graph.fixes == (150, 150)
+
+
+def test_where_the_map_is_comes_with_its_certainty(clean: PoseGraph) -> None:
+    known, covariance = clean.georeference, clean.georeference_covariance()
+    assert known is not None
+    assert covariance is not None
+    heading, sigma = np.arctan2(known.T_enu_map[1, 0], known.T_enu_map[0, 0]), np.sqrt(covariance[2, 2])
+    assert abs(heading - 0.7) < 3 * sigma  # the road begins at 0.7 rad, and the map along it
+    assert sigma < np.radians(1.5)
+    assert np.sqrt(np.diag(covariance)[3:]).max() < 1.5
+    assert errors(clean).max() < SIGMA
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("wrong", "off"),
+    [
+        (lambda n: np.array([40.0, -30, 10]) * (n == 60), 1),  # a jump
+        (lambda n: np.array([40.0, -30, 10]) * (50 <= n < 75), 25),  # a street between high houses
+        (lambda n: np.array([12.0, -9, 0]) * (50 <= n < 75), None),  # multipath of not quite as much
+        (lambda n: np.array([40.0, -30, 10]) * (n >= 90), 30),  # to the end
+        (lambda n: np.array([4e6, 1e5, -1.5e6]) * (n < 3), 3),  # before the receiver knows
+    ],
+)
+def test_fixes_that_are_wrong_bend_no_map(clean: PoseGraph, wrong: Wrong, off: int | None) -> None:
+    graph, _ = driven(120, wrong)
+    assert bend(graph) < bend(clean) + 0.3  # m
+    assert errors(graph).max() < 1.5 * SIGMA
+    used, count = graph.fixes
+    assert count == 120
+    assert off is None or used == 120 - off
+
+
+def test_the_heading_must_be_observable_first() -> None:
+    """A robot that stands, and one that has gone 15 m with a receiver of 2 m."""
+    standing = PoseGraph(PoseGraphSettings())
+    standing.add_node(np.eye(4))
+    rng = np.random.default_rng(0)
+    assert not any(standing.add_fix(0, fix_at(k, np.eye(4), rng.normal(size=3) * SIGMA)) for k in range(50))
+    short, _ = driven(4)
+    for graph in (standing, short):
+        assert graph.georeference is None
+        assert graph.georeference_covariance() is None
+        assert graph.fixes[0] == 0
+
+
+def test_without_fixes_nothing_changes() -> None:
+    """To the bit: the graph that is written and solved is the same."""
+    with_fixes, odometry = driven(4)  # too few to tell where the map is
+    without, _ = driven(4, fixes=False)
+    np.testing.assert_array_equal(with_fixes.poses, without.poses)
+    without.optimize()
+    with_fixes.optimize()
+    np.testing.assert_array_equal(with_fixes.poses, without.poses)
+    np.testing.assert_allclose(without.poses, odometry, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_another_process_solves_the_same(clean: PoseGraph) -> None:
+    graph, _ = driven(120, background=True)
+    assert errors(graph).max() < SIGMA
+    np.testing.assert_allclose(enu_of(graph, graph.poses), enu_of(clean, clean.poses), atol=0.5)
+
+
+def test_in_a_file_the_local_frame_is_one_more_vertex(clean: PoseGraph, tmp_path: Path) -> None:
+    clean.write_g2o(tmp_path / "graph.g2o")
+    factors, values = gtsam.readG2o(str(tmp_path / "graph.g2o"), True)
+    assert (values.size(), factors.size()) == (121, 119 + 120 + 1)
+    known = clean.georeference
+    assert known is not None
+    np.testing.assert_allclose(values.atPose3(120).matrix(), se3.inverse(known.T_enu_map), atol=1e-6)
+
+
+def test_robots_that_no_loop_ties_keep_their_fixes_to_themselves(clean: PoseGraph) -> None:
+    """A second one's place in the map is not known: its fixes wait for a loop."""
+    graph, _ = driven(40)
+    before, first = graph.poses, len(graph)
+    graph.add_node(np.eye(4))
+    for k in range(30):
+        graph.add_fix(first, fix_at(k, road(40)[20], np.zeros(3)))
+    graph.optimize()
+    np.testing.assert_allclose(graph.poses[:first], before, atol=0.05)
+    np.testing.assert_array_equal(graph.pose(first), np.eye(4))
+    assert graph.fixes[0] == 40 + 30  # of them 40 are in the graph; the others have not been judged
+
+
+def test_a_georeference_that_most_fixes_deny_is_found_anew() -> None:
+    graph, _ = driven(40)
+    known = graph.georeference
+    assert known is not None
+    graph.set_georeference(Georeference(known.origin, se3.exp(np.array([0, 0, 2.0, 500, 0, 0])) @ known.T_enu_map))
+    graph.optimize()
+    assert errors(graph).max() < 1.5 * SIGMA
