@@ -25,7 +25,7 @@ class Camera:
         T_lidar_cam: (4, 4) float64, camera (x right, y down, z forward) to LiDAR frame, m.
         size: (width, height) of the image, pixels.
         distortion: plumb-bob coefficients k1, k2, p1, p2[, k3]; empty for a rectified image.
-        name: what messages call it.
+        name: what messages call it; of topics, that of its images. It tells the cameras of a drive apart.
     """
 
     K: Array

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from dpm2_core.data.livox import cloud_of_custom
 from dpm2_core.data.messages import MessageError, check_cloud
 from dpm2_core.data.transforms import TransformTree, transform_matrix
 from dpm2_core.errors import UsageError
@@ -31,13 +32,22 @@ def check_size(message: Any, points: int = 0) -> None:
         raise RejectedError("size", f"{len(message.data)} bytes, {points} points")
 
 
-def unreadable(message: Any) -> str:
-    """Why a PointCloud2 cannot be read; empty if it can."""
+def checked_cloud(message: Any) -> tuple[Any, str]:
+    """A PointCloud2, made of a Livox' CustomMsg where it is one, serialized; and why its points cannot be read, empty
+    if they can.
+
+    Raises:
+        RejectedError, MessageError: it is no cloud of any sensor.
+    """
+    if isinstance(message, bytes):
+        message = cloud_of_custom(message)
+    check_header(message.header)
+    check_size(message, message.width * message.height)
     try:
         check_cloud(message)
     except (MessageError, ValueError, TypeError, OverflowError) as error:
-        return str(error)
-    return ""
+        return message, str(error)
+    return message, ""
 
 
 def extended(tree: TransformTree, message: Any) -> tuple[TransformTree, str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import array
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -96,20 +96,26 @@ def grid_to_msg(grid: Grid, stamp: int, frame_id: str) -> OccupancyGrid:
 
 
 class Projection:
-    """The cloud painted into its image, for checking an extrinsic; made only while there is a subscriber."""
+    """The cloud painted into its images, for checking an extrinsic; made only while there is a subscriber."""
 
-    def __init__(self, node: Node) -> None:
-        self._publisher = node.create_publisher(Image, "dpm2/projection", 1)
+    def __init__(self, node: Node, second: bool) -> None:
+        """`second`: whether there is a second camera, which has a topic of its own."""
+        names = ["dpm2/projection", *["dpm2/second_projection"] * second]
+        self._publishers = [node.create_publisher(Image, name, 1) for name in names]
 
-    def show(self, frame: Frame, frame_id: str) -> None:
-        """Of a frame with an image, which was in that frame."""
-        if not frame.images or not self._publisher.get_subscription_count():
-            return
-        pixels = painted(frame.images[0], frame.points)
-        height, width = pixels.shape[:2]
-        message = Image(header=header(frame.stamp, frame_id), height=height, width=width, encoding="rgb8")
-        message.step, message.data = 3 * width, bytes_to_array(pixels.tobytes())
-        self._publisher.publish(message)
+    def show(self, frame: Frame, cameras: Sequence[str], beside: Mapping[str, tuple[int, Any]]) -> None:
+        """Each image of a frame; by the topics of the cameras, and the messages of these topics."""
+        for image in frame.images:
+            topic = image.camera.name
+            publisher = self._publishers[cameras.index(topic)]
+            if not publisher.get_subscription_count():
+                continue
+            pixels = painted(image, frame.points)
+            height, width = pixels.shape[:2]
+            at = header(frame.stamp, beside[topic][1].header.frame_id)
+            message = Image(header=at, height=height, width=width, encoding="rgb8")
+            message.step, message.data = 3 * width, bytes_to_array(pixels.tobytes())
+            publisher.publish(message)
 
 
 class Display:

@@ -7,7 +7,6 @@ import threading
 import time
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass
 from datetime import UTC, datetime
 
 import numpy as np
@@ -22,7 +21,7 @@ from dpm2_ros.mapping import MapperThread
 from dpm2_ros.other_odometry import OtherOdometry
 from dpm2_ros.state import SILENT
 from dpm2_ros.subscriptions import Inputs
-from dpm2_ros.synchronizer import SensorState, StampCheck
+from dpm2_ros.synchronizer import StampCheck
 
 OTHER_CLOCK = 1.0
 """Seconds between a cloud's stamp and the node's clock beyond which they are not of the same clock."""
@@ -121,13 +120,13 @@ class Diagnostics:
 
     def _statuses(self) -> list[DiagnosticStatus]:
         out = [self._odometry()]
-        synchronizer, known, frames = self._inputs.synchronizer, self._inputs.calibration, self._frames
-        if camera := synchronizer.camera:
-            images = _Beside("camera", "image", known.image_topic, frames.image_problem, "LiDAR only")
-            out.append(self._beside(camera, images))
-        if second := synchronizer.second:
-            clouds = _Beside("second lidar", "cloud", known.second_topic, frames.second_problem, "going on without")
-            out.append(self._beside(second, clouds))
+        known = self._inputs.calibration
+        if known.camera is not None:
+            out.append(self._beside("camera", "image", known.camera.topic))
+        if known.second_camera is not None:
+            out.append(self._beside("second camera", "image", known.second_camera.topic))
+        if known.second_topic:
+            out.append(self._beside("second lidar", "cloud", known.second_topic))
         if self._inputs.imu_received:
             out.append(self._imu())
         if self.other is not None:
@@ -245,42 +244,33 @@ class Diagnostics:
         return self._status("other odometry", WARN if verdict else OK, text, figures)
 
     def _imu(self) -> DiagnosticStatus:
-        inputs, last = self._inputs, self._health.last
-        problem = self._frames.imu_problem
+        inputs, last, topic = self._inputs, self._health.last, self._inputs.calibration.imu_topic
+        problem = self._frames.problems.get(topic, "")
         if not problem and last is not None and last.imu:
-            problem, topic = last.imu, inputs.calibration.imu_topic
+            problem = last.imu
             self._node.get_logger().warning(f"{topic}: {problem}; going on without the IMU", once=True)
         text = f"{problem}; going on without" if problem else "in use"
         return self._status("imu", WARN if problem else OK, text, {"received": inputs.imu_received})
 
-    def _beside(self, sensor: SensorState, what: _Beside) -> DiagnosticStatus:
+    def _beside(self, part: str, what: str, topic: str) -> DiagnosticStatus:
+        """Of a sensor beside the LiDAR and its messages, in words, and their topic."""
+        sensor = self._inputs.synchronizer.sensors[topic]
         figures = {"received": sensor.received, "used": sensor.matched, "late": sensor.late}
         silence = _silence(sensor.last_arrival)
         if silence is None:
-            level, text = WARN, f"no {what.message} on {what.topic} yet"
+            level, text = WARN, f"no {what} on {topic} yet"
         elif silence > SILENT:
-            level, text = WARN, f"no {what.message} on {what.topic} for {silence:.0f} s"
-        elif what.problem:
-            level, text = ERROR, what.problem
+            level, text = WARN, f"no {what} on {topic} for {silence:.0f} s"
+        elif problem := self._frames.problems.get(topic):
+            level, text = ERROR, problem
         elif not sensor.awaited:
-            level, text = WARN, f"{what.message}s come too late or have stamps of another clock"
+            level, text = WARN, f"{what}s come too late or have stamps of another clock"
         else:
-            return self._status(what.part, OK, "in use", figures)
-        return self._status(what.part, level, f"{text}; {what.without}", figures)
+            return self._status(part, OK, "in use", figures)
+        return self._status(part, level, f"{text}; going on without", figures)
 
     def _status(self, part: str, level: bytes, text: str, figures: Mapping[str, object]) -> DiagnosticStatus:
         return status(self._node, part, level, text, figures)
-
-
-@dataclass(frozen=True)
-class _Beside:
-    """A sensor beside the LiDAR, in words: of /diagnostics, its messages and their topic, why they are not used."""
-
-    part: str
-    message: str
-    topic: str
-    problem: str
-    without: str
 
 
 def _date(stamp: int) -> str:

@@ -22,8 +22,8 @@ from dpm2_core.slam.mapping.admission import RejectedError, check_covariance, ch
 from dpm2_ros.checks import check_header
 from dpm2_ros.conversions import check_frame, covariance_from_ros
 from dpm2_ros.guard import GuardedNode
+from dpm2_ros.matched_subscription import MatchedSubscription
 from dpm2_ros.settings import RosSettings
-from dpm2_ros.subscriptions import MatchedSubscription
 from dpm2_ros.tf import TFMessage
 from dpm2_ros.transform_history import TransformHistory
 

@@ -82,7 +82,8 @@ class SlamNode(GuardedNode):
         weights = weights_identity(self._config.slam)
         self._sender = KeyframeSender(self, self._robot, ros, weights)
         self._odom = self.create_publisher(Odometry, "dpm2/odom", 10)
-        self._state, self._projection = StatePublisher(self), Projection(self)
+        self._state = StatePublisher(self)
+        self._projection = Projection(self, second=bool(self._config.input.second_image_topic))
         # Idle with the mapper, which has its own.
         self._line = ThreadPoolExecutor(1, thread_name_prefix="keyframes", initializer=yield_to_odometry)
         sends = ros.publish_tf_odom and (not self._beside or ros.invert_odom_tf or not ros.embed_mapper)
@@ -209,9 +210,9 @@ class SlamNode(GuardedNode):
         self._look_for_base(bundle.cloud.header.frame_id or "lidar")
         x, y, z = self._base.T_start_lidar[2, :3].tolist()
         self._frames.up = (x, y, z) if self._base.name else None  # what is up for the base is to be up in odom
-        frame = self._frames.frame(bundle.stamp, bundle.cloud, self._index, bundle.image, bundle.second)
+        frame = self._frames.frame(bundle.stamp, bundle.cloud, self._index, bundle.beside)
         tracked = self._tracked(frame)
-        self._projection.show(frame, "" if bundle.image is None else bundle.image.header.frame_id)
+        self._projection.show(frame, [camera.topic for camera in self.calibration.cameras], bundle.beside)
         self._index += 1
         self._held.append(tracked)
         if self._base.name:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Subscriptions that suit their publishers, and what comes in through them."""
+"""What comes in: clouds, images, an IMU and calibration."""
 
 from __future__ import annotations
 
@@ -7,107 +7,40 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, PointCloud2
 from std_msgs.msg import Float64
 
 from dpm2_core.data import topics
-from dpm2_core.data.frames import Calibration
+from dpm2_core.data.frames import Calibration, CameraTopic
 from dpm2_core.data.image_messages import decode_camera
 from dpm2_core.data.imu import ImuBuffer
 from dpm2_core.data.kitti import checked_correction
-from dpm2_core.data.livox import LIVOX, cloud_of_custom
+from dpm2_core.data.livox import LIVOX
 from dpm2_core.data.messages import stamp_ns
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.errors import UsageError
 from dpm2_core.slam.mapping.admission import RejectedError
-from dpm2_ros.checks import check_header, check_size, extended, unreadable
+from dpm2_ros.checks import check_header, check_size, checked_cloud, extended
 from dpm2_ros.losses import Losses
-from dpm2_ros.message_types import message_type
+from dpm2_ros.matched_subscription import MatchedSubscription
 from dpm2_ros.settings import RosSettings
-from dpm2_ros.synchronizer import Bundle, SensorState, StampCheck, Synchronizer
+from dpm2_ros.synchronizer import Bundle, StampCheck, Synchronizer
 from dpm2_ros.tf import TFMessage
 
-_IMU_DEPTH = 1000  # samples that may wait: those of a second
 _OTHER_FRAME = 2.0  # s without a cloud after which one in another frame begins another drive
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 """For timers that must go on when /clock stops at the end of a bag."""
 
 LAST_ONE = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 LATCHED = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-
-
-class MatchedSubscription:
-    """A subscription with the reliability that the publishers offer.
-
-    A reliable subscriber never connects to a best-effort publisher, and a best-effort one loses data that a reliable
-    publisher would have sent again. So it starts reliable, and `refresh`, called often, follows the publishers. It also
-    follows one of PointCloud2 that finds a Livox' CustomMsg on its topic, whose messages come serialized.
-
-    Attributes:
-        topic: its full name, after remapping.
-        problem: why nothing comes although there is a publisher; else empty.
-    """
-
-    def __init__(self, node: Node, kind: type, topic: str, callback: Callable[..., None], ros: RosSettings) -> None:
-        self._node, self._kind, self._wanted, self._callback = node, kind, kind, callback
-        self._setting, self._depth = ros.reliability, _IMU_DEPTH if kind is Imu else ros.queue_depth
-        self._given, self.topic = topic, node.resolve_topic_name(topic)
-        self.reliability = ReliabilityPolicy.RELIABLE
-        self._subscription: Any = None
-        self._raw, self.problem = False, ""
-        self.refresh()
-
-    def take(self) -> None:
-        """Call back, in the executor's thread, with all that has arrived; it would take one of each topic in turn."""
-        handle = self._subscription.handle
-        with handle:  # not to be destroyed meanwhile
-            for _ in range(self._depth):
-                if (taken := handle.take_message(self._kind, self._raw)) is None:
-                    return
-                self._subscription.callback(taken[0])
-
-    def refresh(self) -> None:
-        """Follow the publishers of this moment."""
-        requested, offered = self.reliability, self._node.get_publishers_info_by_topic(self.topic)
-        if self._setting != "auto":
-            requested = ReliabilityPolicy[self._setting.upper()]
-        elif offered:
-            reliable = all(info.qos_profile.reliability != ReliabilityPolicy.BEST_EFFORT for info in offered)
-            requested = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
-        kind = self._kind_of({info.topic_type for info in offered})
-        if self._subscription is not None and (requested, kind) == (self.reliability, self._kind):
-            return
-        before, other_type = self._subscription, kind is not self._kind
-        self.reliability, self._kind, self._raw = requested, kind, kind is not self._wanted
-        if before is not None and other_type:  # DDS allows one type a topic
-            self._node.destroy_subscription(before)
-        qos = QoSProfile(depth=self._depth, history=HistoryPolicy.KEEP_LAST, reliability=requested)
-        self._subscription = self._node.create_subscription(kind, self._given, self._callback, qos, raw=self._raw)
-        if before is not None:
-            if not other_type:
-                self._node.destroy_subscription(before)
-            self._node.get_logger().info(f"{self.topic}: {requested.name.lower()} {kind.__name__}, as its publisher")
-
-    def _kind_of(self, offered: set[str]) -> type:
-        """What to subscribe to, given the types of the publishers."""
-        self.problem, custom = "", sorted(offered.intersection(LIVOX))
-        if self._wanted is not PointCloud2 or not custom or "sensor_msgs/msg/PointCloud2" in offered:
-            return self._wanted
-        found = message_type(custom[0])
-        if found is None:
-            self.problem = (
-                f"{self.topic} is a {custom[0]}, whose package is not installed here: install it, or let the driver "
-                f"send PointCloud2 (xfer_format: 0)"
-            )
-            self._node.get_logger().error(self.problem, once=True)
-        return found or self._wanted
 
 
 class Inputs:
@@ -119,59 +52,61 @@ class Inputs:
     """
 
     def __init__(self, node: Node, settings: InputSettings, ros: RosSettings, known: Calibration | None = None) -> None:
-        """`known`: what an earlier one has learned."""
-        self._node = node
-        points_topic, image_topic = settings.points_topic or topics.POINTS, settings.image_topic or topics.IMAGE
-        image_name = node.resolve_topic_name(image_topic) if settings.images else ""
-        imu_topic = settings.imu_topic or topics.IMU.lstrip("/")
-        imu_name = node.resolve_topic_name(imu_topic) if settings.imu else ""
-        second_topic = settings.second_points_topic
-        second_name = node.resolve_topic_name(second_topic) if second_topic else ""
-        points_name = node.resolve_topic_name(points_topic)
-        if second_name == points_name:
-            raise UsageError(f"input.second_points_topic: {second_name} is that of the first LiDAR")
-        self.calibration = known or Calibration(points_name, image_name, imu_name, second_name)
+        """`known`: what an earlier one has learned.
+
+        Raises:
+            UsageError: a second sensor with the topic of the first.
+        """
+        self._node, self._ros = node, ros
+        given = _with_defaults(settings)
+        self.calibration = known or _named(node, given)
         self.imu = ImuBuffer() if settings.imu else None
         self.imu_received = 0
         self._image_shift = round(settings.image_time_offset * 1e9)
         self._arrived = threading.Condition()
-        self.synchronizer = Synchronizer(
-            camera=settings.images,
-            depth=ros.queue_depth,
-            timeout=ros.sync_timeout,
-            tolerance=settings.image_tolerance,
-            second=bool(second_topic),
-        )
+        beside = [camera.topic for camera in self.calibration.cameras]
+        beside += filter(None, [self.calibration.second_topic])
+        self.synchronizer = Synchronizer(beside, ros.queue_depth, ros.sync_timeout, settings.image_tolerance)
         self.losses = Losses()
         """Clouds that were sent, and never arrived."""
-        self._calibrated = False  # by a CameraInfo
+        self._calibrated: set[str] = set()  # image topics of cameras that have a CameraInfo of use
         self._frame: str | None = None  # of the clouds
         self._times: deque[tuple[int, int]] = deque(maxlen=5)
-        beside: list[MatchedSubscription] = []
-        if settings.images:
-            image_type = CompressedImage if image_name.endswith("/compressed") else Image
-            info_topic = settings.camera_info_topic or _camera_info_beside(node, image_topic)
-            beside = [
-                MatchedSubscription(node, image_type, image_topic, self._on_image, ros),
-                MatchedSubscription(node, CameraInfo, info_topic, self._on_camera_info, ros),
-            ]
-        self._awaited: list[tuple[SensorState, MatchedSubscription]] = []
-        if self.synchronizer.camera is not None:
-            self._awaited.append((self.synchronizer.camera, beside[0]))
-        if second_topic:
-            beside.append(MatchedSubscription(node, PointCloud2, second_topic, self._on_second, ros))
-            assert self.synchronizer.second is not None
-            self._awaited.append((self.synchronizer.second, beside[-1]))
-        if settings.imu:
-            beside.append(MatchedSubscription(node, Imu, imu_topic, self._on_imu, ros))
+        others = self._others(given)
         self._static_topic, self._static_messages = node.resolve_topic_name(topics.TF_STATIC), 0
         if TFMessage is not None:  # else extrinsics come from parameters alone
             node.create_subscription(TFMessage, topics.TF_STATIC, self._on_static, LATCHED)
         self._correction_topic = node.resolve_topic_name(topics.VERTICAL_ANGLE_CORRECTION)
         node.create_subscription(Float64, topics.VERTICAL_ANGLE_CORRECTION, self._on_correction, LATCHED)
         # The last to be announced: who waits for it has found the others.
-        self.subscriptions = [MatchedSubscription(node, PointCloud2, points_topic, self._on_cloud, ros), *beside]
+        self.subscriptions = [self._subscribed(PointCloud2, given.points_topic, self._on_cloud), *others]
         node.create_timer(0.1, self._refresh, clock=STEADY)
+
+    def _others(self, given: InputSettings) -> list[MatchedSubscription]:
+        """The subscriptions to all but the clouds, of the topics that are given, before remapping."""
+        known, out = self.calibration, list[MatchedSubscription]()
+        if known.camera is not None:
+            out += self._images(known.camera, given.image_topic, given.camera_info_topic)
+        if known.second_camera is not None:
+            out += self._images(known.second_camera, given.second_image_topic, "")
+        if given.second_points_topic:
+            out.append(self._subscribed(PointCloud2, given.second_points_topic, self._on_second))
+        if given.imu:
+            out.append(self._subscribed(Imu, given.imu_topic, self._on_imu))
+        return out
+
+    def _images(self, camera: CameraTopic, topic: str, info_topic: str) -> list[MatchedSubscription]:
+        """The subscriptions to a camera's images and CameraInfo."""
+        kind = CompressedImage if camera.topic.endswith("/compressed") else Image
+        return [
+            self._subscribed(kind, topic, partial(self._on_image, camera)),
+            self._subscribed(
+                CameraInfo, info_topic or _camera_info_beside(self._node, topic), partial(self._on_camera_info, camera)
+            ),
+        ]
+
+    def _subscribed(self, kind: type, topic: str, callback: Callable[..., None]) -> MatchedSubscription:
+        return MatchedSubscription(self._node, kind, topic, callback, self._ros)
 
     def take(self, timeout: float) -> Bundle | None:
         """The next cloud that is ready, with its images; None after `timeout` s without one."""
@@ -212,38 +147,34 @@ class Inputs:
             if wanted.intersection(kinds) and topic not in own and self._node.count_publishers(topic)
         )
 
-    def _check_cloud(self, message: PointCloud2) -> None:
+    def _of_the_drive(self, message: PointCloud2 | bytes) -> PointCloud2:
         """An unreadable cloud counts as a failed scan where one was due; any other is not of this drive."""
-        now, frame = time.monotonic(), message.header.frame_id
-        check_header(message.header)
-        check_size(message, message.width * message.height)
-        last = self.synchronizer.last_arrival
+        cloud, problem = checked_cloud(message)
+        now, frame, last = time.monotonic(), cloud.header.frame_id, self.synchronizer.last_arrival
         if self._frame not in (None, frame) and last is not None and now - last < _OTHER_FRAME:
             raise RejectedError("another frame", f"a cloud in frame {frame[:80]!r}; the drive's is {self._frame!r}")
-        problem, stamp = unreadable(message), stamp_ns(message.header)
-        if problem and not (frame == self._frame and self.synchronizer.due(stamp, now)):
+        if problem and not (frame == self._frame and self.synchronizer.due(stamp_ns(cloud.header), now)):
             raise RejectedError("unreadable", problem)
         self._frame = frame
+        return cloud
 
     def _on_cloud(self, message: PointCloud2 | bytes, info: Mapping[str, Any]) -> None:
-        if isinstance(message, bytes):
-            message = cloud_of_custom(message)
         cloud, *others = self.subscriptions
         for other in reversed(others):  # what was sent before the cloud is to be there before it; calibration first
             other.take()
         # Several publishers count each for themselves.
         number = info.get("publication_sequence_number") if self._node.count_publishers(cloud.topic) < 2 else None
         try:
-            self._check_cloud(message)
-        except RejectedError:
+            message = self._of_the_drive(message)
+        except UsageError:
             self.losses.skip(number)
             raise
         if stamped := stamp_ns(message.header):
             self._times.append((stamped, self._node.get_clock().now().nanoseconds))
         stamp = self._stamp(message)
         with self._arrived:
-            for sensor, subscription in self._awaited:
-                sensor.present = bool(self._node.count_publishers(subscription.topic))
+            for topic, sensor in self.synchronizer.sensors.items():
+                sensor.present = bool(self._node.count_publishers(topic))
             lost = self.losses.add(stamp, number)
             check = self.synchronizer.add_cloud(stamp, message, time.monotonic())
             self._arrived.notify()
@@ -256,23 +187,20 @@ class Inputs:
                 f"cloud at {stamp_ns(message.header) / 1e9:.3f} s: {check}", throttle_duration_sec=5
             )
 
-    def _on_image(self, message: Any) -> None:
+    def _on_image(self, camera: CameraTopic, message: Any) -> None:
         check_header(message.header)
         check_size(message)
-        with self._arrived:
-            stamp = self._stamp(message) + self._image_shift
-            self.synchronizer.add_image(stamp, message, time.monotonic())
-            self._arrived.notify()
+        self._add(camera.topic, self._stamp(message) + self._image_shift, message)
 
     def _on_second(self, message: PointCloud2 | bytes) -> None:
-        if isinstance(message, bytes):
-            message = cloud_of_custom(message)
-        check_header(message.header)
-        check_size(message, message.width * message.height)
-        if problem := unreadable(message):
+        cloud, problem = checked_cloud(message)
+        if problem:
             raise RejectedError("unreadable", problem)
+        self._add(self.calibration.second_topic, self._stamp(cloud), cloud)
+
+    def _add(self, topic: str, stamp: int, message: Any) -> None:
         with self._arrived:
-            self.synchronizer.add_second(self._stamp(message), message, time.monotonic())
+            self.synchronizer.add(topic, stamp, message, time.monotonic())
             self._arrived.notify()
 
     def _on_imu(self, message: Imu) -> None:
@@ -285,16 +213,16 @@ class Inputs:
         """ns; drivers that leave the stamp at 0 get the time of arrival."""
         return stamp_ns(message.header) or self._node.get_clock().now().nanoseconds
 
-    def _on_camera_info(self, message: CameraInfo) -> None:
+    def _on_camera_info(self, camera: CameraTopic, message: CameraInfo) -> None:
         check_header(message.header)
         try:
             decode_camera(message, np.eye(4), "camera")
         except UsageError:
-            if self._calibrated:
+            if camera.topic in self._calibrated:
                 raise  # what is known stays
         else:
-            self._calibrated = True
-        self.calibration.camera_info = message
+            self._calibrated.add(camera.topic)
+        camera.info = message
 
     def _on_static(self, message: Any) -> None:
         self._static_messages += 1
@@ -309,6 +237,30 @@ class Inputs:
     def _refresh(self) -> None:
         for subscription in self.subscriptions:
             subscription.refresh()
+
+
+def _with_defaults(settings: InputSettings) -> InputSettings:
+    """The settings with every topic that is wanted."""
+    usual = {"points_topic": topics.POINTS, "image_topic": topics.IMAGE, "imu_topic": topics.IMU.lstrip("/")}
+    return settings.model_copy(update={key: getattr(settings, key) or topic for key, topic in usual.items()})
+
+
+def _named(node: Node, given: InputSettings) -> Calibration:
+    """What is to come in, by full names, after remapping; nothing is known of it yet."""
+    known = Calibration(node.resolve_topic_name(given.points_topic))
+    if given.second_points_topic:
+        known.second_topic = node.resolve_topic_name(given.second_points_topic)
+        if known.second_topic == known.points_topic:
+            raise UsageError(f"input.second_points_topic: {known.points_topic} is that of the first LiDAR")
+    if given.imu:
+        known.imu_topic = node.resolve_topic_name(given.imu_topic)
+    if given.images:
+        known.camera = CameraTopic(node.resolve_topic_name(given.image_topic))
+    if given.images and given.second_image_topic:
+        known.second_camera = CameraTopic(node.resolve_topic_name(given.second_image_topic))
+        if known.second_camera.topic == known.cameras[0].topic:
+            raise UsageError(f"input.second_image_topic: {known.second_camera.topic} is that of the first camera")
+    return known
 
 
 def _camera_info_beside(node: Node, image_topic: str) -> str:

@@ -2,7 +2,7 @@
 """Which clouds are accepted, and when one has waited long enough for what goes with it. Pure: no ROS, no clock, no
 thread.
 
-An image goes with it, and the cloud of a second LiDAR.
+Images of one or two cameras go with it, and the cloud of a second LiDAR.
 
 Every accepted cloud leaves exactly once, in order, with these by the rules of `dpm2_core.data.pairing`. It leaves as
 soon as there is one of each within the tolerance: a nearer one that may be on its way is not worth the wait.
@@ -11,7 +11,8 @@ soon as there is one of each within the tolerance: a nearer one that may be on i
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
@@ -47,9 +48,8 @@ class Bundle:
     cloud: Any
     arrival: float
     restarted: bool
-    image: Any = None
-    second: tuple[int, Any] | None = None
-    """Stamp (ns) and cloud of a second LiDAR."""
+    beside: dict[str, tuple[int, Any]] = field(default_factory=dict)
+    """Topic of each other sensor that has one to stamp (ns) and message."""
 
 
 @dataclass(eq=False)
@@ -81,18 +81,17 @@ class Synchronizer:
     """A bounded queue of clouds, each waiting for what goes with it.
 
     Args:
-        camera: whether images are wanted. second: whether clouds of a second LiDAR are. Without, nothing waits.
+        beside: topics of the other sensors. Without any, nothing waits.
         depth: clouds that may wait; when full, the oldest is dropped.
         timeout: longest wait of a cloud, s.
         tolerance: greatest difference of stamps that belong together, s.
 
     Attributes:
-        camera, second: None where it is not wanted.
+        sensors: those, by topic.
     """
 
-    def __init__(self, camera: bool, depth: int, timeout: float, tolerance: float, second: bool = False) -> None:
-        self.camera = SensorState(Beside(tolerance)) if camera else None
-        self.second = SensorState(Beside(tolerance)) if second else None
+    def __init__(self, beside: Iterable[str], depth: int, timeout: float, tolerance: float) -> None:
+        self.sensors = {topic: SensorState(Beside(tolerance)) for topic in beside}
         self.counts: dict[StampCheck, int] = dict.fromkeys(StampCheck, 0)
         self.dropped = 0
         self.last_arrival: float | None = None
@@ -131,18 +130,10 @@ class Synchronizer:
         """Whether a cloud of that stamp (ns) would be accepted as the next one of the drive."""
         return self._newest is not None and self._check(stamp, now) is StampCheck.ACCEPTED
 
-    def add_image(self, stamp: int, image: Any, now: float) -> None:
-        """Take an image with its stamp (ns); there must be a camera."""
-        assert self.camera is not None
-        self._add(self.camera, stamp, image, now)
-
-    def add_second(self, stamp: int, cloud: Any, now: float) -> None:
-        """Take a cloud of the second LiDAR, which there must be, with its stamp (ns)."""
-        assert self.second is not None
-        self._add(self.second, stamp, cloud, now)
-
-    def _add(self, sensor: SensorState, stamp: int, message: Any, now: float) -> None:
-        tolerance, (left, arrival) = sensor.messages.tolerance, self._left
+    def add(self, topic: str, stamp: int, message: Any, now: float) -> None:
+        """Take a message of another sensor with its stamp (ns)."""
+        sensor, (left, arrival) = self.sensors[topic], self._left
+        tolerance = sensor.messages.tolerance
         sensor.received += 1
         sensor.last_arrival = now
         late = -JUMP < stamp - left <= (tolerance if sensor.missed else -tolerance)
@@ -157,17 +148,16 @@ class Synchronizer:
             self._settle(true=True)
         if not self._queue:
             return None
-        head, sensors = self._queue[0], (self.camera, self.second)
-        found = [None if sensor is None else sensor.messages.nearest(head.stamp) for sensor in sensors]
-        wanted = [(sensor, message) for sensor, message in zip(sensors, found, strict=True) if sensor is not None]
-        if now < head.arrival + self._timeout and any(s.waits(head.stamp) for s, message in wanted if message is None):
+        head, sensors = self._queue[0], self.sensors
+        found = {topic: sensor.messages.nearest(head.stamp) for topic, sensor in sensors.items()}
+        missing = [sensors[topic] for topic, message in found.items() if message is None]
+        if now < head.arrival + self._timeout and any(sensor.waits(head.stamp) for sensor in missing):
             return None
-        for sensor, message in wanted:
-            sensor.matched += message is not None
-            sensor.missed += message is None
+        for topic, sensor in sensors.items():
+            sensor.matched += found[topic] is not None
+            sensor.missed += found[topic] is None
             sensor.messages.forget(head.stamp)
-        image, head.second = found
-        head.image = None if image is None else image[1]
+        head.beside = {topic: message for topic, message in found.items() if message is not None}
         self._queue.popleft()
         self._left = head.stamp, head.arrival
         return head

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from itertools import islice
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from dpm2_core.data import topics
 from dpm2_core.data.bag_file import open_bag
-from dpm2_core.data.frames import Calibration, FrameBuilder
+from dpm2_core.data.frames import Calibration, CameraTopic, FrameBuilder
 from dpm2_core.data.gnss import FixBuffer
 from dpm2_core.data.imu import ImuBuffer
 from dpm2_core.data.kitti import checked_correction
@@ -56,7 +57,7 @@ class BagSource:
         self.points_topic = self._choose_points()
         first = self._bag.first(self.points_topic)
         self.lidar_frame: str = first.header.frame_id if first else ""
-        second = self._choose_second()
+        second = self._second_topic("second_points_topic", self.points_topic, CLOUDS, "point clouds")
         correction = self._recorded_correction()
         self._calibration = Calibration(self.points_topic, second_topic=second, angle_correction_deg=correction)
         self.transforms = self._calibration.transforms
@@ -72,33 +73,34 @@ class BagSource:
         imu, gnss = self._imu if self.imu_topic else None, self._gnss if self._calibration.gnss_topic else None
         self._frames = FrameBuilder(self._settings, self._calibration, self.notes.append, self._bag.decode, imu, gnss)
         self.vertical_angle_correction_deg = self._frames.angle_correction_deg
-        self.image_topic = self._calibration.image_topic = self._choose_image()
-        self.camera = self._camera() if self.image_topic else None
+        self.camera = self._choose_cameras() if self._settings.images else None
 
     def __len__(self) -> int:
         return self._bag.counts[self.points_topic]
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
         """Frames start..stop-1 as recorded, also where their stamps repeat or go back; `notes` says so."""
-        before, without, count = None, 0, 0
+        before, count, cameras = None, 0, [camera.topic for camera in self._calibration.cameras]
+        images: Counter[str] = Counter()
         self._imu.clear()
         self._gnss.clear()
         self._unsound.clear()
-        for index, (stamp, cloud, image, second) in enumerate(islice(self._pairs(), stop)):
+        for index, (stamp, cloud, beside) in enumerate(islice(self._pairs(), stop)):
             if index < start:
                 continue
             if before is not None and stamp <= before:
                 self._note_once("time stamps do not increase", f"at frame {index}: {(stamp - before) * 1e-9:+.3f} s")
-            frame = self._frames.frame(stamp, cloud, index, image, second)
-            before, without, count = stamp, without + (not frame.images), count + 1
+            frame = self._frames.frame(stamp, cloud, index, beside)
+            before, count = stamp, count + 1
+            images.update(image.camera.name for image in frame.images)
             if self._frames.time_problem:
                 self._note_once(f"{self.points_topic}: {self._frames.time_problem}", f"first at frame {index}")
             yield frame
         for topic, (left_out, why) in self._unsound.items():
             self._note_once(f"{topic}: {left_out} samples left out", f"the first: {why}")
-        if self.camera and without:
+        for topic in (topic for topic in cameras if images[topic] < count):
             within = f"within {self._settings.image_tolerance} s"
-            self._note_once(f"{without} of {count} frames have no image of {self.image_topic}", within)
+            self._note_once(f"{count - images[topic]} of {count} frames have no image of {topic}", within)
 
     @cached_property
     def stamps(self) -> Stamps:
@@ -134,21 +136,29 @@ class BagSource:
             return topics.POINTS
         return found[0]
 
-    def _choose_second(self) -> str:
-        """The topic of a second LiDAR, empty for none."""
-        asked = self._settings.second_points_topic
-        if asked and (asked == self.points_topic or asked not in self._bag.topics(*CLOUDS)):
-            raise UsageError(
-                f"{self.path}: input.second_points_topic: no other point clouds on {asked}; {self._contents()}"
-            )
+    def _second_topic(self, key: str, first: str, kinds: Sequence[str], messages: str) -> str:
+        """The topic of a second sensor that a setting names, empty for none."""
+        asked: str = getattr(self._settings, key)
+        if asked and (asked == first or asked not in self._bag.topics(*kinds)):
+            raise UsageError(f"{self.path}: input.{key}: no other {messages} on {asked}; {self._contents()}")
         return asked
 
-    def _choose_image(self) -> str:
-        """An image topic, empty for none."""
-        asked, found = self._settings.image_topic, self._bag.topics(*IMAGES)
-        if not self._settings.images:
-            return ""
-        silent = [topic for topic, kind in self._bag.types.items() if kind in IMAGES and topic not in found]
+    def _choose_cameras(self) -> Camera | None:
+        """Find the cameras; returns the first one, None if there is none."""
+        settings, known = self._settings, self._calibration
+        second = self._second_topic("second_image_topic", settings.image_topic, IMAGES, "images")
+        if topic := self._choose_image(second):
+            asked = bool(settings.image_topic or settings.camera_info_topic)
+            known.camera = self._camera_topic(topic, settings.camera_info_topic, asked)
+        if second:
+            known.second_camera = self._camera_topic(second, "", asked=True)
+        cameras = [self._camera(camera) for camera in known.cameras]
+        return None if known.camera is None else cameras[0]
+
+    def _choose_image(self, second: str) -> str:
+        """The image topic of the first camera, which is not the second one's; empty for none."""
+        asked, found = self._settings.image_topic, [topic for topic in self._bag.topics(*IMAGES) if topic != second]
+        silent = [topic for topic, kind in self._bag.types.items() if kind in IMAGES and topic not in (*found, second)]
         if silent and not asked:
             self.notes.append(f"no message on the image topic {', '.join(silent)}")
         return self._one_of(found, asked, topics.IMAGE, "image", "images")
@@ -176,45 +186,44 @@ class BagSource:
             return ""
         return usual if usual in found else "".join(found)
 
-    def _camera(self) -> Camera | None:
-        namespace = self.image_topic.removesuffix("/compressed").rpartition("/")[0]
-        info_topic = self._settings.camera_info_topic or f"{namespace}/camera_info"
+    def _camera_topic(self, topic: str, info_topic: str, asked: bool) -> CameraTopic | None:
+        """The camera of an image topic with its CameraInfo; None without, which is an error where it is asked for."""
+        info_topic = info_topic or f"{topic.removesuffix('/compressed').rpartition('/')[0]}/camera_info"
         info = self._bag.first(info_topic) if self._bag.types.get(info_topic) == CAMERA_INFO else None
-        if info is None:
-            if self._settings.image_topic or self._settings.camera_info_topic:
-                raise UsageError(
-                    f"{self.path}: no CameraInfo on {info_topic} for {self.image_topic}; {self._contents()}"
-                )
-            self.notes.append(f"images of {self.image_topic} are left out: no CameraInfo on {info_topic}")
-            return None
-        self._calibration.camera_info = info
-        image = None if info.header.frame_id else self._bag.first(self.image_topic)
+        if info is not None:
+            return CameraTopic(topic, info)
+        if asked:
+            raise UsageError(f"{self.path}: no CameraInfo on {info_topic} for {topic}; {self._contents()}")
+        self.notes.append(f"images of {topic} are left out: no CameraInfo on {info_topic}")
+        return None
+
+    def _camera(self, camera: CameraTopic) -> Camera:
+        image = None if camera.info.header.frame_id else self._bag.first(camera.topic)
         try:
-            return self._frames.camera(self.lidar_frame, image.header.frame_id if image else "")
+            return self._frames.camera(camera, self.lidar_frame, image.header.frame_id if image else "")
         except UsageError as error:
-            raise UsageError(f"{self.path}: camera {self.image_topic}: {error}") from None
+            problem = str(error).removeprefix(f"{camera.topic}: ")
+            raise UsageError(f"{self.path}: camera {camera.topic}: {problem}") from None
 
     def _recorded_correction(self) -> float | None:
         topic, wanted = topics.VERTICAL_ANGLE_CORRECTION, self._settings.vertical_angle_correction_deg == "auto"
         message = self._bag.first(topic) if wanted else None
         return None if message is None else checked_correction(float(message.data), f"{self.path}: {topic}")
 
-    def _pairs(self) -> Iterator[tuple[int, bytes, bytes | None, tuple[int, bytes] | None]]:
-        """(stamp, cloud, image or None, second cloud with its stamp or None), serialized; the IMU's samples before it
-        are in the buffer then."""
-        second, tolerance = self._calibration.second_topic, self._settings.image_tolerance
-        beside = {topic: Beside(tolerance) for topic in (self.image_topic if self.camera else "", second) if topic}
-        others = dict.fromkeys(filter(None, (*beside, self.imu_topic)), 0)
-        if self.camera:
-            others[self.image_topic] = round(self._settings.image_time_offset * 1e9)
-        gnss = self._calibration.gnss_topic  # nobody waits for fixes: a late one has its place on the way, too
+    def _pairs(self) -> Iterator[tuple[int, bytes, dict[str, tuple[int, bytes]]]]:
+        """(stamp, cloud, what goes with it: topic to stamp and message), serialized; the IMU's samples before it are in
+        the buffer then."""
+        known, offset = self._calibration, round(self._settings.image_time_offset * 1e9)
+        others = dict.fromkeys((camera.topic for camera in known.cameras), offset)
+        others |= dict.fromkeys(filter(None, (known.second_topic, self.imu_topic)), 0)
+        beside = {topic: Beside(self._settings.image_tolerance) for topic in others if topic != self.imu_topic}
+        gnss = known.gnss_topic  # nobody waits for fixes: a late one has its place on the way, too
         messages = self._bag.messages([self.points_topic, *others, *([gnss] if gnss else [])])
         for topic, time, data in clouds_after_others(messages, [self.points_topic], others):
             stamp = serialized_stamp(data, time)
             if topic == self.points_topic:
-                found = {other: sensor.nearest(stamp) for other, sensor in beside.items()}
-                _, image = found.get(self.image_topic) or (0, None)
-                yield stamp, data, image, found.get(second)
+                found = ((other, sensor.nearest(stamp)) for other, sensor in beside.items())
+                yield stamp, data, {other: message for other, message in found if message is not None}
                 for sensor in beside.values():
                     sensor.forget(stamp)
             elif topic in (self.imu_topic, gnss):

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -25,24 +25,37 @@ _LENGTH = 300  # characters of a problem, whatever is in the message
 
 
 @dataclass(eq=False)
+class CameraTopic:
+    """A camera by its messages: the full topic of its images, and its CameraInfo, None as long as there is none."""
+
+    topic: str
+    info: Any = None
+
+
+@dataclass(eq=False)
 class Calibration:
     """What is known of the sensors: of a recording from the start, of topics as it comes in.
 
     Attributes:
-        points_topic, image_topic, imu_topic, second_topic, gnss_topic: full names; empty where there is none.
-        camera_info: sensor_msgs/CameraInfo; None as long as there is none.
+        points_topic, second_topic, imu_topic, gnss_topic: full names; empty where there is none.
+        camera, second_camera: None where there is none, or none is wanted.
         transforms: of /tf_static.
         angle_correction_deg: what the recording says of its vertical angles; None if it says nothing.
     """
 
     points_topic: str
-    image_topic: str = ""
-    imu_topic: str = ""
     second_topic: str = ""
+    imu_topic: str = ""
     gnss_topic: str = ""
-    camera_info: Any = None
+    camera: CameraTopic | None = None
+    second_camera: CameraTopic | None = None
     transforms: TransformTree = field(default_factory=TransformTree)
     angle_correction_deg: float | None = None
+
+    @property
+    def cameras(self) -> list[CameraTopic]:
+        """Those that there are, the first one first."""
+        return [camera for camera in (self.camera, self.second_camera) if camera is not None]
 
 
 class FrameBuilder:
@@ -57,10 +70,8 @@ class FrameBuilder:
 
     Attributes:
         up: see `Inertial`.
-        imu_problem: why the last scan has no samples, or they cannot be used; empty if they can, or before the first.
-        image_problem: why the last image could not be used; empty if it could, or if there was none.
+        problems: topic of a sensor beside the LiDAR to why its last message could not be used; only where that is so.
         gnss_problem: why the antenna's place is not known; empty if it is.
-        second_problem: why the last cloud of a second LiDAR could not be used; empty likewise.
         time_problem: why the last cloud cannot be de-skewed; empty if it can, or needs not.
     """
 
@@ -75,19 +86,18 @@ class FrameBuilder:
     ) -> None:
         self._settings, self._calibration, self._complain, self._decode = settings, calibration, complain, decode
         self._told: set[str] = set()
-        self.image_problem = self.second_problem = self.time_problem = self.imu_problem = ""
+        self.problems: dict[str, str] = {}
+        self.time_problem = ""
         self._imu, self._gnss, self.gnss_problem = imu, gnss, ""
         self.up: tuple[float, float, float] | None = (0.0, 0.0, 1.0)
 
-    def frame(
-        self, stamp: int, cloud: Any, index: int, image: Any = None, second: tuple[int, Any] | None = None
-    ) -> Frame:
+    def frame(self, stamp: int, cloud: Any, index: int, beside: Mapping[str, tuple[int, Any]] | None = None) -> Frame:
         """A cloud with its stamp (ns), and what goes with it; an unreadable cloud comes with `problem` set.
 
         Args:
-            image: a message. second: stamp (ns) and message of a second LiDAR.
+            beside: stamp (ns) and message of each camera, and of a second LiDAR, by its topic; where there is one.
         """
-        topic = self._calibration.points_topic
+        beside, topic = beside or {}, self._calibration.points_topic
         try:
             cloud = self._decode(topic, cloud)
             points, offset = self._points(cloud)
@@ -98,11 +108,14 @@ class FrameBuilder:
         self.time_problem = f"{why_untimed(cloud)}: not de-skewed" if offset is None and expected else ""
         points = correct_vertical_angle(points, self.angle_correction_deg)
         lidar_frame = cloud.header.frame_id
-        if second is not None:
+        if (second := beside.get(self._calibration.second_topic)) is not None:
             points, offset = self._joined(points, offset, lidar_frame, (second[0] - stamp) * 1e-9, second[1])
         imu = None if self._imu is None else self._inertial(self._imu, lidar_frame, stamp, offset)
         fix = None if self._gnss is None else self._fix(self._gnss, lidar_frame, stamp)
-        return Frame(stamp, points, offset, self._images(lidar_frame, image), index, imu=imu, fix=fix)
+        taken = [(camera, beside[camera.topic][1]) for camera in self._calibration.cameras if camera.topic in beside]
+        found = (self._image(lidar_frame, camera, message) for camera, message in taken)
+        images = tuple(image for image in found if image is not None)
+        return Frame(stamp, points, offset, images, index, imu=imu, fix=fix)
 
     def _points(self, cloud: Any) -> tuple[Points, Points | None]:
         """(N, 4), and (N,) s after the stamp, of a decoded message."""
@@ -119,32 +132,36 @@ class FrameBuilder:
             others, other_offset = self._points(second)
             T = self._calibration.transforms.lookup(lidar_frame, second.header.frame_id)
         except (MessageError, UsageError) as error:
-            self.second_problem = self._tell(topic, error, "; going on without the second LiDAR")
+            self.problems[topic] = self._tell(topic, error, "; going on without the second LiDAR")
             return points, offset
-        self.second_problem = ""
+        self.problems.pop(topic, None)
         if offset is not None or other_offset is not None or late:
             first = np.zeros(len(points), np.float32) if offset is None else offset
             then = np.zeros(len(others), np.float32) if other_offset is None else other_offset
             offset = np.concatenate([first, then + np.float32(late)])
         return np.concatenate([points, se3.transform(T, others)]), offset
 
-    def camera(self, lidar_frame: str, image_frame: str) -> Camera:
-        """The camera by what is known now; `image_frame` counts where its CameraInfo names no frame.
+    def camera(self, camera: CameraTopic, lidar_frame: str, image_frame: str) -> Camera:
+        """A camera by what is known now, named by its topic; `image_frame` counts where its CameraInfo names no frame.
 
         Raises:
             UsageError: CameraInfo or extrinsics are missing, or cannot be used.
         """
-        info, T_lidar_cam = self._calibration.camera_info, self._settings.extrinsic()
-        if info is None:
+        first, T_lidar_cam = self._calibration.camera, None
+        if camera.info is None:
             raise UsageError("no CameraInfo yet")
-        frame = info.header.frame_id or image_frame
+        frame, hint = camera.info.header.frame_id or image_frame, "publish it on /tf_static"
+        if camera is first:
+            T_lidar_cam = self._settings.extrinsic()
+            hint = "set input.T_lidar_cam, publish it on /tf_static, or leave images out with input.images=false"
+        elif first is not None and first.info is not None and frame == first.info.header.frame_id:
+            raise UsageError(f"its frame {frame!r} is that of {first.topic}: two cameras are not in one place")
         if T_lidar_cam is None:
             try:
                 T_lidar_cam = self._calibration.transforms.lookup(lidar_frame, frame)
             except UsageError as error:
-                hint = "set input.T_lidar_cam, publish it on /tf_static, or leave images out with input.images=false"
                 raise UsageError(f"{error}; {hint}") from None
-        return decode_camera(info, T_lidar_cam, frame or self._calibration.image_topic)
+        return decode_camera(camera.info, T_lidar_cam, camera.topic)
 
     @property
     def angle_correction_deg(self) -> float:
@@ -166,9 +183,9 @@ class FrameBuilder:
                 raise UsageError("no samples at the time of the scan")
             R = self._imu_rotation(lidar_frame, buffer.frame)
         except UsageError as error:
-            self.imu_problem = self._tell(topic, error, "; going on without the IMU")
+            self.problems[topic] = self._tell(topic, error, "; going on without the IMU")
             return None
-        self.imu_problem = ""
+        self.problems.pop(topic, None)
         return replace(found, rates=found.rates @ R.T, forces=found.forces @ R.T, up=self.up)
 
     def _imu_rotation(self, lidar_frame: str, imu_frame: str) -> Array:
@@ -194,22 +211,20 @@ class FrameBuilder:
             self.gnss_problem = self._tell(self._calibration.gnss_topic, error, "; the antenna is taken for the LiDAR")
             return fix
 
-    def _images(self, lidar_frame: str, message: Any | None) -> tuple[Image, ...]:
-        if message is None:
-            return ()
-        topic = self._calibration.image_topic
+    def _image(self, lidar_frame: str, taken_by: CameraTopic, message: Any) -> Image | None:
+        topic = taken_by.topic
         try:
             message = self._decode(topic, message)
-            camera = self.camera(lidar_frame, message.header.frame_id)
-            pixels, info = decode_image(message, camera.size), self._calibration.camera_info
-            if is_fisheye(info) and pixels.shape[1::-1] == camera.size:
-                pixels = rectified(pixels, info)
-            images = (Image(pixels, camera),)
+            camera = self.camera(taken_by, lidar_frame, message.header.frame_id)
+            pixels = decode_image(message, camera.size)
+            if is_fisheye(taken_by.info) and pixels.shape[1::-1] == camera.size:
+                pixels = rectified(pixels, taken_by.info)
+            image = Image(pixels, camera)
         except (UsageError, ValueError) as error:
-            self.image_problem = self._tell(topic, error, "; images are left out")
-            return ()
-        self.image_problem = ""
-        return images
+            self.problems[topic] = self._tell(topic, error, "; images are left out")
+            return None
+        self.problems.pop(topic, None)
+        return image
 
     def _tell(self, topic: str, error: Exception, more: str = "") -> str:
         """Complain unless it is known already; returns the problem as one line."""

@@ -57,8 +57,12 @@ class InputSettings(Settings):
     T_lidar_cam: Annotated[Place, AfterValidator(_unit_quaternion)] | None = None
     """Pose of the camera's optical frame in the LiDAR frame, [x, y, z (m), qx, qy, qz, qw]; null asks /tf_static."""
 
+    second_image_topic: str = ""
+    """Image or CompressedImage topic of a second camera, with a camera_info beside it, whose place /tf_static knows;
+    empty: none."""
+
     image_tolerance: Annotated[float, Field(gt=0, le=10)] = 0.05
-    """Largest difference of time between a cloud and its image, or that of a second LiDAR, s."""
+    """Largest difference of time between a cloud and what goes with it: images, the cloud of a second LiDAR, s."""
 
     image_time_offset: Annotated[float, Field(ge=-10, le=10)] = 0.0
     """Added to the stamps of images before they are compared with those of clouds, s."""

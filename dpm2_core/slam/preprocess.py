@@ -52,14 +52,14 @@ class Scan:
         cloud: (M, 4) float32, those for the local map. source: (N, 3) float64, those to register. Both are empty where
             the registration works on descriptors alone.
         description: neural descriptors, made when they are needed; None where the registration uses none.
-        image: the image that was taken with it, where the registration asks for one.
+        images: those that were taken with it, where the registration asks for them.
     """
 
     points: Points
     cloud: Points = field(default_factory=lambda: np.zeros((0, 4), np.float32))
     source: Array = field(default_factory=lambda: np.zeros((0, 3)))
     description: LazyDescriptors | None = None
-    image: Image | None = None
+    images: tuple[Image, ...] = ()
 
     @property
     def descriptors(self) -> Descriptors | None:

@@ -14,7 +14,7 @@ from std_msgs.msg import Header
 
 from dpm2_core.data.transforms import TransformTree
 from dpm2_core.slam.mapping.admission import RejectedError
-from dpm2_ros.checks import check_header, check_size, extended, unreadable
+from dpm2_ros.checks import check_header, check_size, checked_cloud, extended
 from dpm2_ros.conversions import cloud_to_msg
 from dpm2_ros.guard import one_line
 
@@ -64,17 +64,20 @@ def test_headers_that_cannot_be_true(sec: int, nanosec: int, frame: str) -> None
 
 def test_layouts_that_cannot_be_read() -> None:
     good = cloud_to_msg(np.zeros((10, 4), np.float32), 1, "lidar")
-    assert unreadable(good) == ""
-    for field, value in {
-        "point_step": 2**32 - 1, "width": 2**32 - 1, "height": 2**32 - 1, "data": b"", "fields": [],
-    }.items():  # fmt: skip
+    assert checked_cloud(good)[1] == ""
+    for field, value in {"point_step": 2**32 - 1, "width": 11, "height": 2, "data": b"", "fields": []}.items():
         cloud = cloud_to_msg(np.zeros((10, 4), np.float32), 1, "lidar")
         setattr(cloud, field, value)
-        assert unreadable(cloud), field
+        assert checked_cloud(cloud)[1], field
+    for field in ("width", "height"):
+        cloud = cloud_to_msg(np.zeros((10, 4), np.float32), 1, "lidar")
+        setattr(cloud, field, 2**32 - 1)
+        with pytest.raises(RejectedError, match=r"429496729\d+ points"):
+            checked_cloud(cloud)
     good.fields = [PointField(name=name, offset=0, datatype=7, count=2**32 - 1) for name in ("x", "y", "z")]
-    assert unreadable(good)
+    assert checked_cloud(good)[1]
     good.fields = [PointField(name="x" * 100_000, offset=0, datatype=7, count=1)] * 100
-    assert len(unreadable(good)) < 400
+    assert len(checked_cloud(good)[1]) < 400
     with pytest.raises(RejectedError, match="points"):
         check_size(good, 10**9)
 

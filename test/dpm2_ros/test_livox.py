@@ -18,9 +18,10 @@ from sensor_msgs.msg import PointCloud2
 from dpm2_core.data.frames import FrameBuilder
 from dpm2_core.data.settings import InputSettings
 from dpm2_ros.conversions import cloud_to_msg
+from dpm2_ros.matched_subscription import MatchedSubscription
 from dpm2_ros.message_types import message_type
 from dpm2_ros.settings import RosSettings
-from dpm2_ros.subscriptions import Inputs, MatchedSubscription
+from dpm2_ros.subscriptions import Inputs
 from test.dpm2_ros.test_subscriptions import node  # noqa: F401
 from test.helpers.livox import custom_message
 

@@ -228,7 +228,7 @@ class Listener(GuardedNode):
     def _work(self) -> None:
         while not self._ended.is_set():
             if (bundle := self._inputs.take(0.1)) is not None:
-                self.frames.append(self._builder.frame(bundle.stamp, bundle.cloud, len(self.frames), bundle.image))
+                self.frames.append(self._builder.frame(bundle.stamp, bundle.cloud, len(self.frames), bundle.beside))
                 self._odometry.publish(Odometry(header=bundle.cloud.header))
 
     def close(self) -> None:

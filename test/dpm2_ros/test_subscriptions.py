@@ -17,6 +17,7 @@ from std_msgs.msg import Float64
 
 from dpm2_core.data.frames import FrameBuilder
 from dpm2_core.data.settings import InputSettings
+from dpm2_core.errors import UsageError
 from dpm2_core.frame import Points
 from dpm2_ros.conversions import cloud_to_msg
 from dpm2_ros.guard import GuardedNode
@@ -100,9 +101,23 @@ def test_image_type_and_calibration_follow_the_remapped_topic(
     kind = CompressedImage if image.endswith("/compressed") else Image
     n = node(*remappings, namespace=namespace)
     made = inputs(n, **settings)
-    assert made.calibration.image_topic == image
+    assert [camera.topic for camera in made.calibration.cameras] == [image]
     listening = {(s.topic_name, s.msg_type) for s in n.subscriptions}
     assert {(image, kind), (info, CameraInfo)} <= listening
+
+
+def test_a_second_camera_is_found_as_the_first_one_is(node: Callable[..., Node]) -> None:
+    """Its CameraInfo beside where its images really come from, whatever is set for the first one's."""
+    n = node("/rear/image:=/back/image/compressed", namespace="/red")
+    made = inputs(n, image_topic="cam/image", camera_info_topic="/info", second_image_topic="/rear/image")
+    assert [camera.topic for camera in made.calibration.cameras] == ["/red/cam/image", "/back/image/compressed"]
+    assert list(made.synchronizer.sensors) == ["/red/cam/image", "/back/image/compressed"]
+    listening = {(s.topic_name, s.msg_type) for s in n.subscriptions}
+    assert {("/back/image/compressed", CompressedImage), ("/back/camera_info", CameraInfo)} <= listening
+    assert {("/red/cam/image", Image), ("/info", CameraInfo)} <= listening
+    assert inputs(n, images=False, second_image_topic="/rear/image").calibration.cameras == []
+    with pytest.raises(UsageError, match=r"^input\.second_image_topic: /red/x is that of the first camera$"):
+        inputs(n, image_topic="x", second_image_topic="/red/x")
 
 
 def test_a_remapping_is_applied_once(node: Callable[..., Node]) -> None:

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -13,12 +15,16 @@ MS = 1_000_000
 
 
 def make(camera: bool = True, depth: int = 10, timeout: float = 0.03, tolerance: float = 0.05) -> Synchronizer:
-    return Synchronizer(camera, depth, timeout, tolerance)
+    return Synchronizer(["/image"] * camera, depth, timeout, tolerance)
 
 
 def camera_of(synchronizer: Synchronizer) -> SensorState:
-    assert synchronizer.camera is not None
-    return synchronizer.camera
+    return synchronizer.sensors["/image"]
+
+
+def image_of(bundle: Bundle) -> Any:
+    """The message alone; None without one."""
+    return bundle.beside.get("/image", (0, None))[1]
 
 
 def drain(synchronizer: Synchronizer, now: float) -> list[Bundle]:
@@ -31,27 +37,33 @@ def test_without_a_camera_nothing_waits() -> None:
     assert [bundle.cloud for bundle in drain(synchronizer, 0.0)] == ["a"]
 
 
-def test_a_cloud_waits_for_image_and_second_lidar_alike() -> None:
-    """Each with patience of its own: one that is silent does not cost the other."""
-    synchronizer = Synchronizer(camera=True, depth=10, timeout=0.03, tolerance=0.05, second=True)
+def test_a_cloud_waits_for_all_other_sensors_alike() -> None:
+    """Each with patience of its own: one that is silent does not cost the others."""
+    topics = ("/image", "/second_image", "/lidar")
+    synchronizer = Synchronizer(topics, depth=10, timeout=0.03, tolerance=0.05)
     synchronizer.add_cloud(100 * MS, "a", now=0.0)
-    synchronizer.add_image(110 * MS, "image", now=0.01)
+    synchronizer.add("/image", 110 * MS, "image", now=0.01)
+    synchronizer.add("/second_image", 140 * MS, "other", now=0.01)
     assert not drain(synchronizer, 0.01)
-    synchronizer.add_second(60 * MS, "second", now=0.02)
+    synchronizer.add("/lidar", 60 * MS, "second", now=0.02)
     (bundle,) = drain(synchronizer, 0.02)
-    assert (bundle.image, bundle.second) == ("image", (60 * MS, "second"))
-    for n in range(2, 2 + PATIENCE):  # the camera stops
-        synchronizer.add_second(100 * n * MS, n, now=0.1 * n)
+    assert bundle.beside == {
+        "/image": (110 * MS, "image"), "/second_image": (140 * MS, "other"), "/lidar": (60 * MS, "second")
+    }  # fmt: skip
+    for n in range(2, 2 + PATIENCE):  # the first camera stops
+        for topic in topics[1:]:
+            synchronizer.add(topic, 100 * n * MS, n, now=0.1 * n)
         synchronizer.add_cloud(100 * n * MS, n, now=0.1 * n)
         assert not drain(synchronizer, 0.1 * n)
         (bundle,) = drain(synchronizer, 0.1 * n + 0.03)
-        assert (bundle.image, bundle.second) == (None, (100 * n * MS, n))
+        assert bundle.beside == dict.fromkeys(topics[1:], (100 * n * MS, n))
     synchronizer.add_cloud(2000 * MS, "last", now=2.0)
-    assert not drain(synchronizer, 2.0)
-    synchronizer.add_second(2000 * MS, "second", now=2.01)
-    assert [bundle.cloud for bundle in drain(synchronizer, 2.01)] == ["last"]  # nobody waits for the camera any more
-    assert synchronizer.second is not None
-    assert (synchronizer.second.matched, synchronizer.second.missed) == (PATIENCE + 2, 0)
+    synchronizer.add("/lidar", 2000 * MS, "second", now=2.01)
+    assert not drain(synchronizer, 2.01)
+    synchronizer.add("/second_image", 2000 * MS, "other", now=2.02)
+    assert [bundle.cloud for bundle in drain(synchronizer, 2.02)] == ["last"]  # nobody waits for the first any more
+    counts = [(synchronizer.sensors[topic].matched, synchronizer.sensors[topic].missed) for topic in topics]
+    assert counts == [(1, PATIENCE + 1), (PATIENCE + 2, 0), (PATIENCE + 2, 0)]
 
 
 def test_a_camera_that_nobody_publishes_is_not_waited_for() -> None:
@@ -60,9 +72,9 @@ def test_a_camera_that_nobody_publishes_is_not_waited_for() -> None:
     camera_of(synchronizer).present = False
     synchronizer.add_cloud(100 * MS, "a", now=0.0)
     assert [bundle.cloud for bundle in drain(synchronizer, 0.0)] == ["a"]
-    synchronizer.add_image(200 * MS, "image", now=0.1)
+    synchronizer.add("/image", 200 * MS, "image", now=0.1)
     synchronizer.add_cloud(200 * MS, "b", now=0.1)
-    assert [bundle.image for bundle in drain(synchronizer, 0.1)] == ["image"]
+    assert [image_of(bundle) for bundle in drain(synchronizer, 0.1)] == ["image"]
 
 
 @pytest.mark.parametrize(
@@ -79,9 +91,9 @@ def test_an_image_joins_within_timeout_and_tolerance(image_stamp_ms: int, arrive
     synchronizer = make()
     synchronizer.add_cloud(100 * MS, "cloud", now=0.0)
     if arrives_s < 0.03:
-        synchronizer.add_image(image_stamp_ms * MS, "image", now=arrives_s)
+        synchronizer.add("/image", image_stamp_ms * MS, "image", now=arrives_s)
     (bundle,) = drain(synchronizer, now=0.03)
-    assert bundle.image == ("image" if joins else None)
+    assert image_of(bundle) == ("image" if joins else None)
 
 
 def test_a_cloud_waits_for_its_image_and_no_longer() -> None:
@@ -96,26 +108,26 @@ def test_a_later_image_ends_the_wait() -> None:
     """Once the camera is beyond the cloud, its image will not come any more."""
     synchronizer = make()
     synchronizer.add_cloud(100 * MS, "cloud", now=0.0)
-    synchronizer.add_image(200 * MS, "next", now=0.0)
+    synchronizer.add("/image", 200 * MS, "next", now=0.0)
     assert synchronizer.pop(0.0) is not None
 
 
 def test_the_nearest_of_several_images_is_taken() -> None:
     synchronizer = make()
     for stamp in (60, 97, 140):
-        synchronizer.add_image(stamp * MS, stamp, now=0.0)
+        synchronizer.add("/image", stamp * MS, stamp, now=0.0)
     synchronizer.add_cloud(100 * MS, "cloud", now=0.0)
-    assert drain(synchronizer, 0.0)[0].image == 97
+    assert image_of(drain(synchronizer, 0.0)[0]) == 97
 
 
 def test_an_image_that_came_too_late_for_one_cloud_may_be_the_next_ones() -> None:
     """It is in the tolerance of both; that the first did not wait for it says nothing of the second."""
     synchronizer = make()
     synchronizer.add_cloud(100 * MS, "a", now=0.0)
-    assert [bundle.image for bundle in drain(synchronizer, 0.03)] == [None]
-    synchronizer.add_image(140 * MS, "image", now=0.04)
+    assert [image_of(bundle) for bundle in drain(synchronizer, 0.03)] == [None]
+    synchronizer.add("/image", 140 * MS, "image", now=0.04)
     synchronizer.add_cloud(160 * MS, "b", now=0.06)
-    assert [bundle.image for bundle in drain(synchronizer, 0.06)] == ["image"]
+    assert [image_of(bundle) for bundle in drain(synchronizer, 0.06)] == ["image"]
     assert camera_of(synchronizer).late == 1
 
 
@@ -139,9 +151,9 @@ def test_a_camera_that_comes_late_in_the_drive_is_used_from_then_on() -> None:
         synchronizer.add_cloud((100 + 100 * n) * MS, n, arrival)
         taken = drain(synchronizer, arrival)
         if n >= 2 * PATIENCE:
-            synchronizer.add_image((100 + 100 * n) * MS, n, arrival + 0.01)
+            synchronizer.add("/image", (100 + 100 * n) * MS, n, arrival + 0.01)
         taken += drain(synchronizer, arrival + 0.05)
-        joined += [bundle.image is not None for bundle in taken]
+        joined += [image_of(bundle) is not None for bundle in taken]
     assert joined == [False] * (2 * PATIENCE + 1) + [True] * (PATIENCE - 1)
 
 
@@ -152,7 +164,7 @@ def test_a_camera_that_is_always_too_late_costs_no_latency() -> None:
         waits = synchronizer.pop(0.1 * n) is None
         assert waits == (n < PATIENCE)
         drain(synchronizer, 0.1 * n + 0.03)
-        synchronizer.add_image((100 + 100 * n) * MS, n, 0.1 * n + 0.07)
+        synchronizer.add("/image", (100 + 100 * n) * MS, n, 0.1 * n + 0.07)
     assert camera_of(synchronizer).late == 20
 
 
@@ -160,7 +172,7 @@ def test_a_camera_that_stops_is_given_up_after_some_frames() -> None:
     synchronizer = make()
     for n in range(20):
         if n < 5:
-            synchronizer.add_image((100 + 100 * n) * MS, n, 0.1 * n)
+            synchronizer.add("/image", (100 + 100 * n) * MS, n, 0.1 * n)
         synchronizer.add_cloud((100 + 100 * n) * MS, n, 0.1 * n)
         waits = synchronizer.pop(0.1 * n) is None
         assert waits == (5 <= n < 5 + PATIENCE)
@@ -264,9 +276,9 @@ def test_images_join_again_after_a_restart() -> None:
     synchronizer = make()
     joined = []
     for n, stamp in enumerate((10_000, 10_100, 1_000, 1_100)):
-        synchronizer.add_image(stamp * MS, stamp, now=0.1 * n)
+        synchronizer.add("/image", stamp * MS, stamp, now=0.1 * n)
         synchronizer.add_cloud(stamp * MS, stamp, now=0.1 * n)
-        joined += [bundle.image for bundle in drain(synchronizer, 0.1 * n)]
+        joined += [image_of(bundle) for bundle in drain(synchronizer, 0.1 * n)]
     assert joined == [10_000, 10_100, 1_000, 1_100]
 
 
@@ -285,7 +297,7 @@ def test_every_cloud_leaves_once_or_is_counted(events: list[tuple[str, int, floa
             synchronizer.add_cloud(stamp * 50 * MS, stamp * 50 * MS, now)
             given_in.append(stamp * 50 * MS)
         else:
-            synchronizer.add_image(stamp * 50 * MS, stamp * 50 * MS, now)
+            synchronizer.add("/image", stamp * 50 * MS, stamp * 50 * MS, now)
         out += drain(synchronizer, now)
     out += drain(synchronizer, now + 1)
     assert len(synchronizer) == 0
@@ -294,4 +306,4 @@ def test_every_cloud_leaves_once_or_is_counted(events: list[tuple[str, int, floa
     assert len(out) + synchronizer.dropped == counts[StampCheck.ACCEPTED] + counts[StampCheck.RESTARTED]
     remaining = iter(given_in)
     assert all(bundle.cloud in remaining for bundle in out)  # a subsequence: same order, none twice
-    assert all(abs(bundle.image - bundle.stamp) <= 50 * MS for bundle in out if bundle.image is not None)
+    assert all(abs(image_of(bundle) - bundle.stamp) <= 50 * MS for bundle in out if image_of(bundle) is not None)

@@ -7,7 +7,10 @@ from dpm2_core.frame import Frame
 
 
 def thumbnail(frame: Frame, width: int) -> bytes | None:
-    """JPEG of the frame's first image, `width` pixels wide; None without an image, or for a width of 0."""
+    """JPEG of the frame's first image, `width` pixels wide; None without an image, or for a width of 0.
+
+    It is a second camera's where the first one has none.
+    """
     if not frame.images or not width:
         return None
     import cv2

@@ -5,6 +5,9 @@ Points and descriptors leave a direction open there: along it, every pose fits a
 a brightness in the image that was taken with it, and the same points are looked for in the image of this scan. One
 number is unknown, the way along the open direction; it is the one at which the two brightnesses correlate best. In town
 no direction is open, and no image is ever touched.
+
+Both images are of one camera. One is enough for one number, so that of two cameras the second is asked only where the
+earlier scan has no image of the first.
 """
 
 from __future__ import annotations
@@ -27,7 +30,7 @@ class VisualSettings(Settings):
     """How far along, by the image."""
 
     enabled: bool = True
-    """Ask the first camera where scans leave a direction open."""
+    """Ask a camera where scans leave a direction open: the first one; a second one only where that has no image."""
     sigma: float = Field(0.08, gt=0)
     """Standard deviation of the position in its worst direction above which it counts as open, m."""
     reach: float = Field(6.0, gt=0)
@@ -93,7 +96,7 @@ class VisualScanRegistration:
     def __init__(self, settings: VisualSettings, registration: ScanRegistration) -> None:
         self._settings = settings
         self._registration = registration
-        self._last: tuple[Scan, Array] | None = None  # a scan with an image and where it was taken
+        self._last: tuple[Scan, Array] | None = None  # a scan with images and where it was taken
         self._reference: _Reference | None = None  # made of it when first needed
 
     uses_images = True
@@ -109,20 +112,21 @@ class VisualScanRegistration:
         return VisualScanRegistration(self._settings, self._registration.fresh())
 
     def prepare(self, frame: Frame, twist: Array) -> Scan:
-        scan = self._registration.prepare(frame, twist)
-        return replace(scan, image=frame.images[0]) if frame.images else scan
+        return replace(self._registration.prepare(frame, twist), images=frame.images)
 
     def rejection(self, scan: Scan) -> str:
         return self._registration.rejection(scan)
 
     def register(self, scan: Scan, prediction: Prediction) -> Registration:
         result = self._registration.register(scan, prediction)
-        if not result.ok or scan.image is None or self._last is None or result.worst_sigma <= self._settings.sigma:
+        if not result.ok or self._last is None or result.worst_sigma <= self._settings.sigma:
             return result
-        return self._along(result, scan.image, prediction.information)
+        earlier = self._last[0].images[0].camera.name
+        image = next((image for image in scan.images if image.camera.name == earlier), None)
+        return result if image is None else self._along(result, image, prediction.information)
 
     def update(self, scan: Scan, T_odom_lidar: Array) -> bool:
-        if scan.image is not None and self._wants(T_odom_lidar):
+        if scan.images and self._wants(T_odom_lidar):
             self._last, self._reference = (scan, T_odom_lidar), None
         return self._registration.update(scan, T_odom_lidar)
 
@@ -152,8 +156,7 @@ class VisualScanRegistration:
         return replace(result, T_target_source=T, covariance=(covariance + covariance.T) / 2, method="visual")
 
     def _made(self, scan: Scan, T_odom_lidar: Array) -> _Reference:
-        assert scan.image is not None
-        image = _textured(scan.image, self._settings.width)
+        image = _textured(scan.images[0], self._settings.width)
         points = _ahead(scan.points, image, self._settings.points)
         return _Reference(image, points, T_odom_lidar)
 

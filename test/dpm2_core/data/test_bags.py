@@ -126,6 +126,82 @@ def test_a_second_lidar_without_a_place_is_left_out(bags: Any, tmp_path: Path) -
             BagSource(bag, InputSettings(points_topic=POINTS, second_points_topic=wrong))
 
 
+# --- a second camera
+
+REAR, REAR_INFO = "/rear/image_raw", "/rear/camera_info"
+
+
+def of_frame(message: Any, frame: str) -> Any:
+    message.header.frame_id = frame
+    return message
+
+
+def rear(bags: Any, times: list[float]) -> list[Message]:
+    """A camera 1 m behind the LiDAR; its values are 100 and up."""
+    images = [(t, REAR, of_frame(bags.image(t, 100 + n), "rear")) for n, t in enumerate(times)]
+    info, place = of_frame(bags.info(1), "rear"), bags.transform("velo_link", "rear", (-1, 0, 0))
+    return [(1, REAR_INFO, info), (1, "/tf_static", place), *images]
+
+
+def all_seen(source: BagSource) -> list[list[int]]:
+    """The gray values of each frame's images."""
+    return [[int(image.pixels[0, 0, 0]) for image in frame.images] for frame in source.frames()]
+
+
+TWO = InputSettings(second_image_topic=REAR)
+
+
+def test_images_of_two_cameras_each_join_the_nearest_cloud(bags: Any, tmp_path: Path) -> None:
+    """Out of phase; each misses some clouds, which costs the other nothing. The second alone is one more camera."""
+    times = [1.0, 1.1, 1.2, 1.3, 1.4]
+    ahead = [(t, IMAGE, bags.image(t, n)) for n, t in enumerate((1.01, 1.11, 1.41))]
+    recorded = [*clouds(bags, times), *rig(bags), *ahead, *rear(bags, [0.97, 1.17, 1.27, 1.37])]
+    bag = bags.write(tmp_path / "b", by_time(recorded))
+    source = BagSource(bag, TWO)
+    frames = list(source.frames())
+    assert all_seen(source) == [[0, 100], [1], [101], [102], [2, 103]]
+    assert [image.camera.T_lidar_cam[0, 3] for image in frames[0].images] == [0.2, -1]
+    assert [image.camera.name for image in frames[0].images] == [IMAGE, REAR]
+    assert source.camera is not None
+    assert source.camera.T_lidar_cam[0, 3] == 0.2
+    assert f"2 of 5 frames have no image of {IMAGE} (within 0.05 s)" in source.notes
+    assert f"1 of 5 frames have no image of {REAR} (within 0.05 s)" in source.notes
+    assert all_seen(BagSource(bag, InputSettings(image_topic=IMAGE))) == [[0], [1], [], [], [2]]
+    assert all_seen(BagSource(bag, InputSettings(image_topic=REAR))) == [[100], [], [101], [102], [103]]
+    placed = InputSettings(second_image_topic=REAR, T_lidar_cam=(0.5, 0, 0, 0, 0, 0, 1))  # of the first one alone
+    (first, *_) = BagSource(bag, placed).frames()
+    assert [image.camera.T_lidar_cam[0, 3] for image in first.images] == [0.5, -1]
+    alone = bags.write(tmp_path / "alone", by_time([*clouds(bags, times), *rear(bags, times)]))
+    assert all_seen(BagSource(alone, TWO)) == [[100 + n] for n in range(5)]
+
+
+def test_a_second_camera_that_cannot_be_used_is_named(bags: Any, tmp_path: Path) -> None:
+    """It was asked for: an error, as of a camera that is; images that cannot be read cost themselves."""
+    first = [*clouds(bags, [1, 2]), *rig(bags), (1, IMAGE, bags.image(1, 7)), (2, IMAGE, bags.image(2, 8))]
+    second = rear(bags, [1, 2])
+    cases: list[tuple[list[Message], str]] = [
+        ([], f"input.second_image_topic: no other images on {REAR}; topics: "),
+        (second[1:], f"no CameraInfo on {REAR_INFO} for {REAR}"),
+        ([second[0], *second[2:]], f"camera {REAR}: no transform from 'rear' to 'velo_link'; .*; publish it on /tf_st"),
+        (
+            [(1, REAR_INFO, bags.info(1)), *second[1:]],
+            f"camera {REAR}: its frame 'cam' is that of {IMAGE}: two cameras",
+        ),
+    ]
+    for n, (messages, problem) in enumerate(cases):
+        bag = bags.write(tmp_path / str(n), by_time([*first, *messages]))
+        with pytest.raises(UsageError, match=problem):
+            BagSource(bag, TWO)
+        assert len(BagSource(bag, InputSettings(image_topic=IMAGE))) == 2
+    with pytest.raises(UsageError, match=rf"second_image_topic: no other images on {IMAGE}"):
+        BagSource(tmp_path / "0", InputSettings(image_topic=IMAGE, second_image_topic=IMAGE))
+    assert all_seen(BagSource(tmp_path / "0", InputSettings(images=False, second_image_topic=REAR))) == [[], []]
+    odd = of_frame(bags.image(1, 9, encoding="yuv411"), "rear")
+    source = BagSource(bags.write(tmp_path / "odd", by_time([*first, *second[:2], (1, REAR, odd), second[3]])), TWO)
+    assert all_seen(source) == [[7], [8, 101]]
+    assert any(note.startswith(f"{REAR}: image encoding 'yuv411' is not supported") for note in source.notes)
+
+
 # --- camera
 
 

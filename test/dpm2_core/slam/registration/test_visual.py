@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -51,17 +52,22 @@ def hits(rays: Array, x: float) -> Array:
     return np.clip(way, 0, 80)[:, None] * rays + [x, 0, 0]
 
 
+def seen(x: float, paint: Paint, camera: Camera, gain: float = 1.0) -> Image:
+    """What a camera sees from `x` m along the corridor; `gain` is the exposure."""
+    u, v = np.meshgrid(np.arange(640), np.arange(240))
+    rays = np.c_[u.ravel(), v.ravel(), np.ones(u.size)] @ np.linalg.inv(camera.K).T @ camera.T_lidar_cam[:3, :3].T
+    gray = np.clip(gain * paint(hits(rays, x)).reshape(u.shape), 0, 255).astype(np.uint8)
+    return Image(np.repeat(gray[..., None], 3, 2), camera)
+
+
 def frame(x: float, paint: Paint, index: int = 0, gain: float = 1.0) -> Frame:
-    """What is seen from `x` m along the corridor; `gain` is the exposure."""
+    """Scan and image from `x` m along the corridor; `gain` is the exposure."""
     noise = np.random.default_rng(index)
     azimuth, elevation = noise.uniform(-np.pi, np.pi, 20_000), noise.uniform(-0.4, 0.4, 20_000)
     rays = np.c_[np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
     points = hits(rays, x) - [x, 0, 0] + noise.normal(0, 0.01, rays.shape)
-    u, v = np.meshgrid(np.arange(640), np.arange(240))
-    rays = np.c_[u.ravel(), v.ravel(), np.ones(u.size)] @ np.linalg.inv(CAMERA.K).T @ T_LIDAR_CAM[:3, :3].T
-    gray = np.clip(gain * paint(hits(rays, x)).reshape(u.shape), 0, 255).astype(np.uint8)
-    image = Image(np.repeat(gray[..., None], 3, 2), CAMERA)
-    return Frame(index * 10**8, np.c_[points, np.ones(len(points))].astype(np.float32), images=(image,), index=index)
+    points = np.c_[points, np.ones(len(points))].astype(np.float32)
+    return Frame(index * 10**8, points, images=(seen(x, paint, CAMERA, gain),), index=index)
 
 
 def registered(first: Frame, second: Frame, **visual: object) -> tuple[Array, Array, str, str]:
@@ -111,6 +117,24 @@ def test_without_images_nothing_changes() -> None:
     first, second = (Frame(f.stamp, f.points, index=f.index) for f in (frame(0.0, paint), frame(0.2, paint, 1)))
     for one, other in zip(registered(first, second), registered(first, second, enabled=False), strict=True):
         assert np.array_equal(one, other)
+
+
+@pytest.mark.slow
+def test_of_two_cameras_the_first_is_asked_and_the_second_where_it_has_no_image() -> None:
+    """Never one camera's image with the other's: they show different walls, or none in common."""
+    paint, back = random_paint(), np.diag([-1.0, -1, 1, 1])
+    rear = replace(CAMERA, T_lidar_cam=back @ T_LIDAR_CAM, name="rear")
+    two = [replace(f, images=(*f.images, seen(x, paint, rear))) for x, f in
+           ((0.0, frame(0.0, paint)), (1.7, frame(1.7, paint, 1)))]  # fmt: skip
+    first, second = ([replace(f, images=(f.images[n],)) for f in two] for n in (0, 1))
+    for one, other in zip(registered(*two), registered(two[0], first[1]), strict=True):
+        assert np.array_equal(one, other)
+    T, _, method, _ = registered(second[0], two[1])
+    assert method == "visual"
+    assert T[0, 3] == pytest.approx(1.7, abs=0.03)
+    _, _, method, reason = registered(two[0], second[1])
+    assert method == "geometric"
+    assert "image" not in reason
 
 
 @pytest.mark.slow

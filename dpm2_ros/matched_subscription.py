@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A subscription that suits its publishers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Imu, PointCloud2
+
+from dpm2_core.data.livox import LIVOX
+from dpm2_ros.message_types import message_type
+from dpm2_ros.settings import RosSettings
+
+_IMU_DEPTH = 1000  # samples that may wait: those of a second
+
+
+class MatchedSubscription:
+    """A subscription with the reliability that the publishers offer.
+
+    A reliable subscriber never connects to a best-effort publisher, and a best-effort one loses data that a reliable
+    publisher would have sent again. So it starts reliable, and `refresh`, called often, follows the publishers. It also
+    follows one of PointCloud2 that finds a Livox' CustomMsg on its topic, whose messages come serialized.
+
+    Attributes:
+        topic: its full name, after remapping.
+        problem: why nothing comes although there is a publisher; else empty.
+    """
+
+    def __init__(self, node: Node, kind: type, topic: str, callback: Callable[..., None], ros: RosSettings) -> None:
+        self._node, self._kind, self._wanted, self._callback = node, kind, kind, callback
+        self._setting, self._depth = ros.reliability, _IMU_DEPTH if kind is Imu else ros.queue_depth
+        self._given, self.topic = topic, node.resolve_topic_name(topic)
+        self.reliability = ReliabilityPolicy.RELIABLE
+        self._subscription: Any = None
+        self._raw, self.problem = False, ""
+        self.refresh()
+
+    def take(self) -> None:
+        """Call back, in the executor's thread, with all that has arrived; it would take one of each topic in turn."""
+        handle = self._subscription.handle
+        with handle:  # not to be destroyed meanwhile
+            for _ in range(self._depth):
+                if (taken := handle.take_message(self._kind, self._raw)) is None:
+                    return
+                self._subscription.callback(taken[0])
+
+    def refresh(self) -> None:
+        """Follow the publishers of this moment."""
+        requested, offered = self.reliability, self._node.get_publishers_info_by_topic(self.topic)
+        if self._setting != "auto":
+            requested = ReliabilityPolicy[self._setting.upper()]
+        elif offered:
+            reliable = all(info.qos_profile.reliability != ReliabilityPolicy.BEST_EFFORT for info in offered)
+            requested = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+        kind = self._kind_of({info.topic_type for info in offered})
+        if self._subscription is not None and (requested, kind) == (self.reliability, self._kind):
+            return
+        before, other_type = self._subscription, kind is not self._kind
+        self.reliability, self._kind, self._raw = requested, kind, kind is not self._wanted
+        if before is not None and other_type:  # DDS allows one type a topic
+            self._node.destroy_subscription(before)
+        qos = QoSProfile(depth=self._depth, history=HistoryPolicy.KEEP_LAST, reliability=requested)
+        self._subscription = self._node.create_subscription(kind, self._given, self._callback, qos, raw=self._raw)
+        if before is not None:
+            if not other_type:
+                self._node.destroy_subscription(before)
+            self._node.get_logger().info(f"{self.topic}: {requested.name.lower()} {kind.__name__}, as its publisher")
+
+    def _kind_of(self, offered: set[str]) -> type:
+        """What to subscribe to, given the types of the publishers."""
+        self.problem, custom = "", sorted(offered.intersection(LIVOX))
+        if self._wanted is not PointCloud2 or not custom or "sensor_msgs/msg/PointCloud2" in offered:
+            return self._wanted
+        found = message_type(custom[0])
+        if found is None:
+            self.problem = (
+                f"{self.topic} is a {custom[0]}, whose package is not installed here: install it, or let the driver "
+                f"send PointCloud2 (xfer_format: 0)"
+            )
+            self._node.get_logger().error(self.problem, once=True)
+        return found or self._wanted
