@@ -62,20 +62,19 @@ def ray_bias(points: Tensor, views: Views, uv: Tensor, alphas: tuple[float, ...]
         points: (B, N, 3), m. uv: (T, 2), pixels, the same in every view. alphas: 1/m, one or one a head.
 
     Returns:
-        The z-score over the V * T tokens of M exp(-alpha distance), (B, len(alphas), N, V * T), M being 0 for points
-        behind the camera; and `seen` (B, N, V), True where the point projects into an image that is present.
+        The z-score over the T tokens of each view of M exp(-alpha distance), (B, len(alphas), N, V * T), M being 0 for
+        points behind the camera: another camera changes nothing of what this one says; and `seen` (B, N, V), True where
+        the point projects into an image that is present.
     """
-    distances, fronts, seen = [], [], []
+    alpha = torch.tensor(alphas, device=points.device).view(1, -1, 1, 1)
+    biases, seen = [], []
     for view in range(views.pixels.shape[1]):
         K, T_lidar_cam = views.K[:, view].float(), views.T_lidar_cam[:, view].float()
         distance, front = point_ray_distance(points, *pixel_rays(uv, K, T_lidar_cam))
-        distances.append(distance)
-        fronts.append(front)
+        near = torch.exp(-alpha * distance[:, None]) * front[:, None]
+        biases.append(_compact(zscore(near, views.present[:, view, None, None, None])))
         seen.append(seen_from(points, views, view))
-    distance, front = torch.cat(distances, -1)[:, None], torch.cat(fronts, -1)[:, None]
-    alpha = torch.tensor(alphas, device=points.device).view(1, -1, 1, 1)
-    readable = views.present.repeat_interleave(len(uv), 1)[:, None, None]
-    return _compact(zscore(torch.exp(-alpha * distance) * front, readable)), torch.stack(seen, -1)
+    return torch.cat(biases, -1), torch.stack(seen, -1)
 
 
 def seen_from(points: Tensor, views: Views, view: int) -> Tensor:

@@ -156,6 +156,23 @@ def test_several_cameras(model: DeepPointMap2, noise: np.random.Generator) -> No
     torch.testing.assert_close(one, other, atol=1e-5, rtol=0)
 
 
+def test_two_cameras_do_not_disturb_each_other(model: DeepPointMap2, noise: np.random.Generator) -> None:
+    """With one fusion layer: what one shows is described as by that one alone, the rest as by the LiDAR alone."""
+    points = collate([build_pyramid(boxes(noise), model.settings)])
+    ahead, other = make_image(noise), make_image(noise)
+    turned = np.diag([-1.0, -1, 1, 1]) @ other.camera.T_lidar_cam
+    back = replace(other, camera=replace(other.camera, T_lidar_cam=turned))
+    views = views_of(model, [ahead, back])
+    tokens = model.encoder(points, views).tokens
+    seen = [seen_from(tokens.xyz, views, view)[0] for view in (0, 1)]
+    assert not (seen[0] & seen[1]).any()
+    alone = [model.encoder(points, views_of(model, [image])).tokens.features[0] for image in (ahead, back)]
+    alone.append(model.encoder(points).tokens.features[0])
+    for mask, features in zip((*seen, ~seen[0] & ~seen[1]), alone, strict=True):
+        assert mask.sum() >= 3
+        torch.testing.assert_close(tokens.features[0][mask], features[mask], atol=1e-4, rtol=0)
+
+
 @pytest.mark.parametrize(
     "kind", ["biased", "point_painting", "roi_pooling", "scale_dot", "without_learnable", "without_spatial"]
 )

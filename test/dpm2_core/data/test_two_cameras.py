@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A simulated drive with a camera that looks ahead and one that looks back, as a bag, through the whole SLAM."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from dpm2_core.data.bags import BagSource
+from dpm2_core.data.messages import cloud_fields, point_columns
+from dpm2_core.data.settings import InputSettings
+from dpm2_core.frame import Array, Camera
+from dpm2_core.geometry import se3
+from dpm2_core.sim.camera import calibration, render
+from dpm2_core.sim.lidar import Lidar
+from dpm2_core.sim.settings import CameraConfig, LidarConfig
+from dpm2_core.sim.world import build_world
+from dpm2_core.slam.build import make_slam
+from dpm2_core.slam.mapping.mapper import MapSettings
+from dpm2_core.slam.odometry.keyframe_selection import KeyframeSettings
+from dpm2_core.slam.settings import SlamSettings
+
+FRAMES, WIDTH, HEIGHT = 7, 208, 64
+CONFIG = CameraConfig(width=WIDTH, height=HEIGHT, focal=120.0, shadows=False)
+AHEAD = calibration(CONFIG)
+BACK = replace(AHEAD, T_lidar_cam=np.diag([-1.0, -1, 1, 1]) @ AHEAD.T_lidar_cam)
+CAMERAS = {"front": AHEAD, "rear": BACK}
+
+
+@pytest.fixture(scope="module")
+def drive(bags: Any, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Array]:
+    """The bag, whose fourth cloud has no image behind, and T_first_lidar (FRAMES, 4, 4)."""
+    world, lidar = build_world("straight", "suburb", seed=3, length=150.0), Lidar(LidarConfig(columns=900))
+    rng = np.random.default_rng(0)
+    poses = [world.drive_pose(3.0 + 0.1 * n) for n in range(FRAMES)]
+    messages: list[tuple[float, str, Any]] = []
+    for name, camera in CAMERAS.items():
+        messages.append((1, "/tf_static", placed(bags, name, camera)))
+        messages.append((1, f"/{name}/camera_info", info(bags, name, camera)))
+    for n, T in enumerate(poses):
+        stamp = 1 + 0.1 * n
+        points = lidar.scan(world, T, 3.0 + 0.1 * n, rng).points
+        fields = cloud_fields(point_columns(points), bags.store.types["sensor_msgs/msg/PointField"])
+        messages.append((stamp, "/points", bags.new("sensor_msgs/PointCloud2", header=bags.header(stamp), **fields)))
+        for name, camera in CAMERAS.items():
+            if (n, name) != (3, "rear"):
+                pixels = render(world, CONFIG, T @ camera.T_lidar_cam, 3.0 + 0.1 * n, rng)
+                message = bags.new("sensor_msgs/Image", header=bags.header(stamp + 0.01, name), height=HEIGHT,
+                                   width=WIDTH, encoding="rgb8", is_bigendian=0, step=3 * WIDTH,
+                                   data=pixels.reshape(-1))  # fmt: skip
+                messages.append((stamp + 0.01, f"/{name}/image", message))
+    bag = bags.write(tmp_path_factory.mktemp("two") / "bag", sorted(messages, key=lambda message: message[0]))
+    return bag, se3.inverse(poses[0]) @ np.array(poses)
+
+
+def placed(bags: Any, name: str, camera: Camera) -> Any:
+    message = bags.transform("velo_link", name, tuple(camera.T_lidar_cam[:3, 3].tolist()))
+    rotation = message.transforms[0].transform.rotation
+    rotation.x, rotation.y, rotation.z, rotation.w = se3.quaternion(camera.T_lidar_cam).tolist()
+    return message
+
+
+def info(bags: Any, name: str, camera: Camera) -> Any:
+    message = bags.info(1)
+    message.header.frame_id, message.width, message.height = name, WIDTH, HEIGHT
+    message.k = camera.K.reshape(-1)
+    return message
+
+
+@pytest.mark.slow
+def test_frames_with_two_images_are_described_registered_and_mapped(drive: tuple[Path, Array]) -> None:
+    """By the shipped network alone; the map shows what the first camera saw, and where one image is missing, nothing
+    else is."""
+    bag, T_first_lidar = drive
+    source = BagSource(bag, InputSettings(image_topic="/front/image", second_image_topic="/rear/image"))
+    frames = list(source.frames())
+    assert [len(frame.images) for frame in frames] == [2, 2, 2, 1, 2, 2, 2]
+    np.testing.assert_allclose(frames[0].images[1].camera.T_lidar_cam, BACK.T_lidar_cam, atol=1e-9)
+    settings = SlamSettings(
+        registration="neural", keyframes=KeyframeSettings(distance=1.0), map=MapSettings(thumbnail=64)
+    )
+    slam = make_slam(settings)
+    results = [slam.process(frame).odometry for frame in frames]
+    assert all(result.registration.ok for result in results)
+    for result, T in zip(results, T_first_lidar, strict=True):
+        assert np.linalg.norm(result.T_odom_lidar[:3, 3] - T[:3, 3]) < 0.15
+    keyframes = [(frame, result.keyframe) for frame, result in zip(frames, results, strict=True) if result.keyframe]
+    assert len(keyframes) >= 3
+    alone = make_slam(settings).process(replace(frames[0], images=frames[0].images[:1])).odometry.keyframe
+    assert alone is not None
+    assert alone.descriptors is not None
+    described = keyframes[0][1].descriptors
+    assert described is not None
+    assert not np.array_equal(described.features, alone.descriptors.features)
+    np.testing.assert_array_equal(described.xyz, alone.descriptors.xyz)
+    for frame, keyframe in keyframes:
+        assert keyframe.thumbnail is not None
+        shown = cv2.imdecode(np.frombuffer(keyframe.thumbnail, np.uint8), cv2.IMREAD_COLOR)[:, :, ::-1]
+        small = [cv2.resize(image.pixels, shown.shape[1::-1], interpolation=cv2.INTER_AREA) for image in frame.images]
+        apart = [np.abs(shown.astype(float) - image).mean() for image in small]
+        assert apart[0] < 12
+        assert apart[0] == min(apart)
