@@ -11,6 +11,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from dpm2_core.database import check_schema, connect, statements
+from dpm2_core.slam.store.cloud_store import SpillFile
 
 _SUFFIX = ".unsent"
 _TABLES = """
@@ -22,42 +23,42 @@ _LARGEST = 200_000  # bytes of a message: twice what a keyframe may have
 class KeyframeFile:
     """The messages of a drive's keyframes, those of number 0 first, each added whole or not at all.
 
-    A disk that is full or not there is no reason to lose a keyframe: it then stays in memory.
+    Where the file is full or not wanted, keyframes go into a `SpillFile`, and end with the process.
 
     Raises:
         sqlite3.Error, OSError: the file cannot be made, is no such file, is damaged, or another process has it.
     """
 
     def __init__(self, path: Path | None = None) -> None:
-        """`path`: made where there is none; None: a temporary file without a name, gone when the process is."""
+        """`path`: made where there is none; None: nothing of it is to outlive the process."""
         self.path = path
-        if path is None:
-            self._connection: sqlite3.Connection = sqlite3.connect("", isolation_level=None, check_same_thread=False)
-        else:
+        self._stored = 0  # in the file
+        self._others: list[list[int]] = []  # after those: their numbers in the other one
+        self._spill = SpillFile()
+        if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._connection = connect(path, "rwc", timeout=0.0)
-        try:
-            # One process alone: a second one of the same name in the same folder takes a file of its own.
-            self._connection.execute("PRAGMA locking_mode = EXCLUSIVE")
-            self._connection.execute("PRAGMA journal_mode = WAL")
-            self._connection.execute("PRAGMA synchronous = NORMAL")
-            self._connection.execute("BEGIN EXCLUSIVE")
-            if not self._connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]:
-                self._connection.execute(_TABLES)
-            self._connection.execute("COMMIT")
-            check_schema(self._connection, statements(_TABLES))
-            self._count = self._checked()
-        except BaseException:
-            self._connection.close()
-            raise
-        self._in_memory: dict[int, tuple[bytes, ...]] = {}
+            try:
+                self._stored = self._opened()
+            except BaseException:
+                self._connection.close()
+                raise
 
-    def _checked(self) -> int:
-        """How many there are.
+    def _opened(self) -> int:
+        """How many there are in the file.
 
         Raises:
             sqlite3.DatabaseError: what is there is not the keyframes of a drive.
         """
+        # One process alone: a second one of the same name in the same folder takes a file of its own.
+        self._connection.execute("PRAGMA locking_mode = EXCLUSIVE")
+        self._connection.execute("PRAGMA journal_mode = WAL")
+        self._connection.execute("PRAGMA synchronous = NORMAL")
+        self._connection.execute("BEGIN EXCLUSIVE")
+        if not self._connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]:
+            self._connection.execute(_TABLES)
+        self._connection.execute("COMMIT")
+        check_schema(self._connection, statements(_TABLES))
         query = "SELECT count(*), max(id), max(max(length(pose), length(descriptors), length(cloud))) FROM keyframe"
         count, last, largest = self._connection.execute(query).fetchone()
         if count and (last != count - 1 or largest > _LARGEST):
@@ -65,17 +66,16 @@ class KeyframeFile:
         return int(count)
 
     def __len__(self) -> int:
-        return self._count
+        return self._stored + len(self._others)
 
     def append(self, parts: Sequence[bytes]) -> None:
         """The next keyframe: its pose, its descriptors, its cloud, each serialized."""
-        id, self._count = self._count, self._count + 1
-        try:
-            if self._in_memory:  # those after it follow it, so that a file has no gap
-                raise sqlite3.OperationalError("disk full before")
-            self._connection.execute("INSERT INTO keyframe VALUES (?, ?, ?, ?)", (id, *parts))
-        except sqlite3.Error:
-            self._in_memory[id] = tuple(parts)
+        if self.path is not None and not self._others:  # those after one of these follow it: a file has no gap
+            with suppress(sqlite3.Error):
+                self._connection.execute("INSERT INTO keyframe VALUES (?, ?, ?, ?)", (self._stored, *parts))
+                self._stored += 1
+                return
+        self._others.append([self._spill.append(part) for part in parts])
 
     def read(self, id: int) -> list[bytes]:
         """The three messages of a keyframe.
@@ -83,8 +83,8 @@ class KeyframeFile:
         Raises:
             sqlite3.DatabaseError: it is damaged.
         """
-        if id in self._in_memory:
-            return list(self._in_memory[id])
+        if id >= self._stored:
+            return [self._spill.read(number) for number in self._others[id - self._stored]]
         query = "SELECT pose, descriptors, cloud FROM keyframe WHERE id = ?"
         parts: tuple[object, ...] | None = self._connection.execute(query, (id,)).fetchone()
         found = [part for part in parts or () if isinstance(part, bytes)]
@@ -94,9 +94,11 @@ class KeyframeFile:
 
     def close(self, keep: bool) -> None:
         """`keep`: leave the file for the next start; else it is deleted."""
+        if self.path is None:
+            return
         with suppress(sqlite3.Error):
             self._connection.close()
-        if self.path is not None and not keep:
+        if not keep:
             for path in (self.path, Path(f"{self.path}-wal")):
                 path.unlink(missing_ok=True)
             with suppress(OSError):  # it is not empty

@@ -40,7 +40,7 @@ class SpillFile:
         self._end = 0
         self._file: BinaryIO | None = None
         with suppress(OSError):
-            self._file = tempfile.TemporaryFile(prefix="dpm2_clouds_", buffering=0)  # noqa: SIM115
+            self._file = tempfile.TemporaryFile(prefix="dpm2_", buffering=0)  # noqa: SIM115
 
     def append(self, data: bytes) -> int:
         """Keep a piece; returns its number."""
