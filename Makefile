@@ -8,7 +8,8 @@ PYTHON ?= $(firstword $(shell for p in python3.11 python3.12 python3; do \
 BIN := .venv/bin
 READY := .venv/.ready
 EXTRAS ?= plot,sim,test,docs,view,fleet
-JOBS ?= -n 2 --dist worksteal
+# One more than two processors: it fills the pauses in which the tests of ROS wait.
+JOBS ?= -n 3 --dist worksteal
 
 # The environment is self-contained: a sourced ROS 2, another environment's bootstrap or its libraries must not leak in.
 unexport PYTHONPATH PYTHONHOME VIRTUAL_ENV AMENT_PREFIX_PATH ROS_DISTRO LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
@@ -17,11 +18,12 @@ unexport PYTHONPATH PYTHONHOME VIRTUAL_ENV AMENT_PREFIX_PATH ROS_DISTRO LD_LIBRA
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:[^#]*##/\t/' | expand -t 16
 
+# --no-compile: the first import of a module compiles it; of torch most are never imported.
 setup: $(READY)  ## create .venv with everything in it
 $(READY): setup.py pyproject.toml
 	@test -n "$(PYTHON)" || { echo "no Python 3.11 or 3.12 on PATH; set PYTHON=/path/to/python3.11" >&2; exit 2; }
 	@test -x $(BIN)/python || $(PYTHON) -m venv .venv || { rm -rf .venv; echo "the venv module is missing (Debian, Ubuntu: apt install python3-venv)" >&2; exit 1; }
-	$(BIN)/python -m pip install -qq --disable-pip-version-check -e '.[$(EXTRAS)]'
+	$(BIN)/python -m pip install -qq --disable-pip-version-check --no-compile -e '.[$(EXTRAS)]'
 	@$(BIN)/python -m dpm2_ros.build_tf2_msgs || echo "continuing without /tf" >&2
 	@touch $@
 
