@@ -9,10 +9,13 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Sequence
 from importlib.util import find_spec
+from typing import Any
 
 from dpm2_core.errors import UsageError, exit_code
 from dpm2_core.openmp import wait_passively
 from dpm2_ros.runtime import catch_signals, spin_node
+
+_MANAGED = "--lifecycle"
 
 
 def slam_node(arguments: Sequence[str] | None = None) -> int:
@@ -21,22 +24,18 @@ def slam_node(arguments: Sequence[str] | None = None) -> int:
     def work(arguments: Sequence[str]) -> int:
         from dpm2_ros.slam_node import SlamNode
 
-        if "--lifecycle" in arguments:
-            from dpm2_ros.lifecycle import ManagedSlamNode
-
-            return spin_node(ManagedSlamNode, [text for text in arguments if text != "--lifecycle"])
-        return spin_node(SlamNode, arguments)
+        return _spin(SlamNode, arguments)
 
     return _run(work, arguments)
 
 
 def mapper_node(arguments: Sequence[str] | None = None) -> int:
-    """The map apart."""
+    """The map apart; `--lifecycle` likewise."""
 
     def work(arguments: Sequence[str]) -> int:
         from dpm2_ros.mapper_node import MapperNode
 
-        return spin_node(MapperNode, arguments)
+        return _spin(MapperNode, arguments)
 
     return _run(work, arguments)
 
@@ -50,6 +49,10 @@ def bag_player(arguments: Sequence[str] | None = None) -> int:
         return main(arguments)
 
     return _run(work, arguments)
+
+
+def _spin(kind: Callable[[bool], Any], arguments: Sequence[str]) -> int:
+    return spin_node(lambda: kind(_MANAGED in arguments), [text for text in arguments if text != _MANAGED])
 
 
 def _run(work: Callable[[Sequence[str]], int], arguments: Sequence[str] | None) -> int:

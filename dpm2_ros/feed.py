@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -51,20 +52,27 @@ class Feed:
 
     def __init__(self, node: GuardedNode, mapper: MapperThread, namespace: str, weights: str) -> None:
         """`weights`: the identity of the mapper's network."""
-        self._node, self._mapper, self._robot, self._weights = node, mapper, namespace.strip("/"), weights
-        self.made = time.monotonic()
+        self._node, self._mapper, self._namespace, self._weights = node, mapper, namespace, weights
+        self._robot = namespace.strip("/")
+        self.opened = -float("inf")
         self._streams: dict[str, Stream] = {}  # by session, the one that was heard last at the end
         self._main: Stream | None = None
         self._acks = 0
         self._cloud_topic, self._seen_topic = f"{namespace}/dpm2/keyframe_cloud", f"{namespace}/dpm2/keyframe"
         self._pose_topic = namespace + ODOM
+        self._subscriptions: list[Any] = []
+        self._received: Any = None
+
+    def open(self) -> None:
+        """Listen, from now on or again: what is known of the drives has stayed."""
+        node, self.opened = self._node, time.monotonic()
         self._subscriptions = [
             node.create_subscription(Odometry, self._pose_topic, self._on_pose, WIRE),
             node.create_subscription(PointCloud2, self._seen_topic, self._on_seen, WIRE),
             node.create_subscription(UInt8MultiArray, self._cloud_topic, self._on_cloud, WIRE),
-            node.create_subscription(Odometry, f"{namespace}/dpm2/odom", self._on_odom, 10),
+            node.create_subscription(Odometry, f"{self._namespace}/dpm2/odom", self._on_odom, 10),
         ]
-        self._received = node.create_publisher(UInt32MultiArray, f"{namespace}/dpm2/keyframes_received", 10)
+        self._received = node.create_publisher(UInt32MultiArray, f"{self._namespace}/dpm2/keyframes_received", 10)
 
     @property
     def robots(self) -> dict[str, Stream]:
@@ -99,7 +107,9 @@ class Feed:
             stream.last = None
 
     def close(self) -> None:
-        """Listen no more."""
+        """Listen no more. What was acknowledged goes to the map, however much waits there already."""
+        for stream in self.robots.values():
+            self._hand_on(stream, time.monotonic(), math.inf)
         for subscription in self._subscriptions:
             self._node.destroy_subscription(subscription)
         self._node.destroy_publisher(self._received)
@@ -196,9 +206,9 @@ class Feed:
             self._streams[session].drop()
             total -= size
 
-    def _hand_on(self, stream: Stream, now: float) -> None:
-        """To the mapper: what is complete up to the first gap, once it is known whose it is."""
-        while self._mapper.waiting < _BACKLOG and (stream.robot is not None or self._place(stream, now)):
+    def _hand_on(self, stream: Stream, now: float, most: float = _BACKLOG) -> None:
+        """To the mapper, where so many may wait: what is complete up to the first gap, once it is known whose it is."""
+        while self._mapper.waiting < most and (stream.robot is not None or self._place(stream, now)):
             taken = stream.take()
             if taken is None:
                 return

@@ -1,28 +1,125 @@
 # SPDX-License-Identifier: Apache-2.0
-"""slam_node as a managed node, for Nav2's lifecycle manager and the like: the same node, step by step.
+"""What slam_node and mapper_node have in common: two steps, configure and activate, with their ways back.
 
-configure loads the network and opens the map; activate takes clouds; deactivate stops that, and keeps the map; cleanup
-saves it. What each step creates, its way back destroys.
+A plain node takes both as soon as it is made. A managed one (`--lifecycle`) leaves them to Nav2's lifecycle manager or
+the like, over the services of rclpy's `LifecycleNodeMixin`. What a step has made, its way back ends.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import ExitStack
 from typing import Any
 
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 
 from dpm2_core.errors import Dpm2Error
-from dpm2_ros.slam_node import SlamNode
+from dpm2_ros.guard import GuardedNode
+from dpm2_ros.mapping import MapperThread, robot_name
+from dpm2_ros.parameters import follow_changes, load_parameters
+from dpm2_ros.settings import NodeConfig
+
+_Snapshot = tuple[set[int], set[str]]
+"""Which entities of ROS, by their id(), and which attributes a node has had."""
 
 
-class ManagedSlamNode(LifecycleNodeMixin, SlamNode):
-    """See rclpy's `LifecycleNodeMixin` for the services."""
+class ManagedNode(LifecycleNodeMixin, GuardedNode):
+    """A node with the settings of all nodes, and perhaps a map.
 
-    def __init__(self) -> None:
-        SlamNode.__init__(self, managed=True)
+    Its class has `configure` and `activate`, and calls `start` when the rest of it is made.
+
+    Raises:
+        UsageError: a parameter that is not allowed.
+    """
+
+    _mapper: MapperThread | None = None  # once configured
+
+    def __init__(self, name: str) -> None:
+        GuardedNode.__init__(self, name, automatically_declare_parameters_from_overrides=True)
+        self._config, self._robot = load_parameters(self, NodeConfig), robot_name(self)
+        self._taken: list[tuple[_Snapshot, ExitStack]] = []  # steps: what was there before each, and its way back
+        follow_changes(self, self._config, self._apply)
+
+    def configure(self, back: ExitStack) -> None:
+        """Load the network, open the map, announce what will be published.
+
+        Args:
+            back: gets what is to be done at the cleanup, also where this fails half-way; topics, services and timers
+                go without.
+
+        Raises:
+            UsageError, Dpm2Error: this cannot be done.
+        """
+        raise NotImplementedError
+
+    def activate(self, back: ExitStack) -> None:
+        """Listen from now on.
+
+        Args:
+            back: gets what is to be done when it is deactivated, likewise.
+
+        Raises:
+            UsageError, Dpm2Error: this cannot be done.
+        """
+        raise NotImplementedError
+
+    def start(self, managed: bool) -> None:
+        """Take both steps; `managed`: wait to be told."""
+        if managed:
+            self._serve()
+        else:
+            self._take(self.configure)
+            self._take(self.activate)
+
+    def close(self) -> None:
+        """End everything, whatever is under way; the map is saved.
+
+        Raises:
+            Dpm2Error: the map could not be written.
+        """
+        taken, self._taken = self._taken, []
+        with ExitStack() as ways:
+            for _, back in taken:
+                ways.push(back)
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Unconfigured to inactive."""
+        return self._go(self.configure)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Inactive to active."""
+        return self._go(self.activate)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Active to inactive: the map stays."""
+        return self._return(1)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Inactive to unconfigured: the map is saved."""
+        return self._return(0)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """From anywhere to the end."""
+        return self._return(0)
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """After a bug in a step: to unconfigured."""
+        return self._return(0)
+
+    def _open_map(self, back: ExitStack) -> MapperThread:
+        """The map of this node, until the cleanup."""
+        self._mapper = mapper = MapperThread(self, self._config, self._robot)
+        back.callback(mapper.close)
+        return mapper
+
+    def _apply(self, config: NodeConfig) -> None:
+        """Parameters that have changed while the node runs."""
+        self._config = config
+        if self._mapper is not None:
+            self._mapper.apply(config)
+
+    def _serve(self) -> None:
         LifecycleNodeMixin.__init__(self)
-        self._made_before: dict[str, list[Any]] = {}
         change = self._service_change_state.callback
 
         def guarded(request: Any, response: Any) -> Any:
@@ -35,49 +132,46 @@ class ManagedSlamNode(LifecycleNodeMixin, SlamNode):
 
         self._service_change_state.callback = guarded
 
-    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Unconfigured to inactive."""
-        return self._go("configure", self.configure)
+    def _take(self, step: Callable[[ExitStack], None]) -> None:
+        before = self._snapshot()
+        with ExitStack() as back:
+            step(back)
+            self._taken.append((before, back.pop_all()))
 
-    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Inactive to active."""
-        return self._go("activate", self.activate)
-
-    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Active to inactive."""
-        return self._back("activate", self.deactivate)
-
-    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Inactive to unconfigured."""
-        return self._back("configure", self.cleanup)
-
-    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """From anywhere to the end."""
-        return self._back("configure", self.close)
-
-    def _go(self, step: str, work: Callable[[], None]) -> TransitionCallbackReturn:
-        before = self._made_before[step] = self._entities()
+    def _go(self, step: Callable[[ExitStack], None]) -> TransitionCallbackReturn:
+        before = self._snapshot()
         try:
-            work()
+            self._take(step)
         except Dpm2Error as error:
-            self.get_logger().error(f"{step}: {error}")
-            self._destroy_since(before)
+            self.get_logger().error(f"{step.__name__}: {error}")
+            self._drop_since(before)
             return TransitionCallbackReturn.FAILURE
+        except Exception as error:
+            self.fail(step.__name__, error)
+            self._drop_since(before)
+            return TransitionCallbackReturn.ERROR
         return TransitionCallbackReturn.SUCCESS
 
-    def _back(self, step: str, work: Callable[[], None]) -> TransitionCallbackReturn:
-        try:
-            work()
-        except Dpm2Error as error:  # the map file has what could not be saved besides
-            self.get_logger().error(f"{error}")
-        self._destroy_since(self._made_before.get(step, self._entities()))
+    def _return(self, steps: int) -> TransitionCallbackReturn:
+        """Undo all steps but so many."""
+        while len(self._taken) > steps:
+            before, back = self._taken.pop()
+            try:
+                back.close()
+            except Dpm2Error as error:  # the map file has what could not be saved besides
+                self.get_logger().error(f"{error}")
+            except Exception as error:
+                self.fail("transition", error)
+            self._drop_since(before)
         return TransitionCallbackReturn.SUCCESS
 
-    def _entities(self) -> list[Any]:
-        return [*self.publishers, *self.subscriptions, *self.services, *self.clients, *self.timers]
+    def _snapshot(self) -> _Snapshot:
+        entities = (*self.publishers, *self.subscriptions, *self.services, *self.clients, *self.timers)
+        return {id(entity) for entity in entities}, set(vars(self))
 
-    def _destroy_since(self, before: list[Any]) -> None:
-        kept = {id(entity) for entity in before}
+    def _drop_since(self, before: _Snapshot) -> None:
+        """Destroy the publishers and the like that were made since, and let go of the attributes: a map is large."""
+        kept, names = before
         ways = (
             (self.timers, self.destroy_timer),
             (self.subscriptions, self.destroy_subscription),
@@ -89,3 +183,5 @@ class ManagedSlamNode(LifecycleNodeMixin, SlamNode):
             for entity in list(entities):
                 if id(entity) not in kept:
                     destroy(entity)
+        for name in vars(self).keys() - names:
+            delattr(self, name)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import ExitStack
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from std_srvs.srv import Trigger
@@ -12,11 +13,9 @@ from dpm2_core.errors import UsageError
 from dpm2_core.slam.system import Slam
 from dpm2_ros.diagnostics import OK, WARN, DiagnosticsPublisher, mapper_status, message_status, status
 from dpm2_ros.feed import ODOM, Feed
-from dpm2_ros.guard import GuardedNode
 from dpm2_ros.keyframes import weights_identity
-from dpm2_ros.mapping import MapperThread, robot_name
-from dpm2_ros.parameters import follow_changes, load_parameters
-from dpm2_ros.settings import NodeConfig
+from dpm2_ros.lifecycle import ManagedNode
+from dpm2_ros.mapping import MapperThread
 from dpm2_ros.subscriptions import STEADY
 
 _MOST_ROBOTS = 64
@@ -24,40 +23,49 @@ PATIENCE = 10.0
 """s that a topic has to bring a keyframe before another may take its place."""
 
 
-class MapperNode(GuardedNode):
+class MapperNode(ManagedNode):
     """Listens to every robot in its namespace and below, also to those that come later, and makes one map of all.
 
     map -> odom of each goes out for the odometry frame that the robot itself names.
     """
 
-    def __init__(self) -> None:
-        super().__init__("mapper_node", automatically_declare_parameters_from_overrides=True)
-        config = load_parameters(self, NodeConfig)
-        if config.ros.localization_mode:
+    def __init__(self, managed: bool = False) -> None:
+        super().__init__("mapper_node")
+        if self._config.ros.localization_mode:
             raise UsageError("ros.localization_mode: is for slam_node")
-        self._weights = weights_identity(config.slam)
-        self._mapper = MapperThread(self, config, robot_name(self))
-        follow_changes(self, config, self._mapper.apply)
-        self._feeds: dict[str, Feed] = {}
         self._own = self.get_namespace().rstrip("/")
+        self.start(managed)
+
+    def configure(self, back: ExitStack) -> None:
+        """As of `ManagedNode`."""
+        self._weights = weights_identity(self._config.slam)
+        self._open_map(back)
+        self._feeds: dict[str, Feed] = {}
+        self.create_service(Trigger, "~/reset", self._on_reset)
+        self._diagnostics = DiagnosticsPublisher(self, self._statuses)
+
+    def activate(self, back: ExitStack) -> None:
+        """Listen from now on, in the same map. What was sent meanwhile was not acknowledged, and is sent again."""
+        for feed in self._feeds.values():
+            feed.open()
+        back.callback(self._pause)
         self._discover()
         self.create_timer(0.5, self._discover, clock=STEADY)
         self.create_timer(0.5, self._tick, clock=STEADY)
-        self.create_service(Trigger, "~/reset", self._on_reset)
-        self._diagnostics = DiagnosticsPublisher(self, self._statuses)
 
     @property
     def slam(self) -> Slam:
         """What works on the map."""
-        return self._mapper.slam
+        return self._map.slam
 
-    def close(self) -> None:
-        """Save the map.
+    @property
+    def _map(self) -> MapperThread:
+        assert self._mapper is not None
+        return self._mapper
 
-        Raises:
-            Dpm2Error: the map could not be written.
-        """
-        self._mapper.close()
+    def _pause(self) -> None:
+        for feed in self._feeds.values():
+            feed.close()
 
     def _discover(self) -> None:
         """Listen to the robots that are there, and to the one of this very namespace in any case."""
@@ -68,14 +76,15 @@ class MapperNode(GuardedNode):
             if len(self._feeds) >= _MOST_ROBOTS and not self._make_room():
                 self.reject(ODOM, "too many robots", f"{namespace}: not listened to, {_MOST_ROBOTS} others are")
                 return
-            self._feeds[namespace] = Feed(self, self._mapper, namespace, self._weights)
+            feed = self._feeds[namespace] = Feed(self, self._map, namespace, self._weights)
+            feed.open()
         for namespace, feed in list(self._feeds.items()):
             if self._idle(namespace, feed) and not self.count_publishers(namespace + ODOM):
                 self._feeds.pop(namespace).close()
 
     def _idle(self, namespace: str, feed: Feed) -> bool:
         """Whether nothing is lost without that feed."""
-        return namespace != self._own and not feed.proven and time.monotonic() - feed.made > PATIENCE
+        return namespace != self._own and not feed.proven and time.monotonic() - feed.opened > PATIENCE
 
     def _make_room(self) -> bool:
         oldest = next((namespace for namespace, feed in self._feeds.items() if self._idle(namespace, feed)), None)
@@ -88,7 +97,7 @@ class MapperNode(GuardedNode):
             feed.tick()
 
     def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self._mapper.reset()
+        self._map.reset()
         for feed in self._feeds.values():
             feed.forget()
         response.success, response.message = True, "the map is saved, and begins again empty"
@@ -104,4 +113,4 @@ class MapperNode(GuardedNode):
         if beside:
             text += f"; two in one namespace: {', '.join(beside)} kept apart"
         robots = status(self, "robots", WARN if beside else OK, text, figures)
-        return [mapper_status(self, self._mapper), robots, message_status(self)]
+        return [mapper_status(self, self._map), robots, message_status(self)]

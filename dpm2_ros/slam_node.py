@@ -7,6 +7,7 @@ import threading
 import time
 import traceback
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 
@@ -27,13 +28,11 @@ from dpm2_core.slam.system import Slam
 from dpm2_ros.base_frame import BaseFrame
 from dpm2_ros.conversions import BodyMotion, keyframe_to_base, odometry_to_msg
 from dpm2_ros.display import Projection
-from dpm2_ros.guard import GuardedNode
 from dpm2_ros.health import Diagnostics, Health
 from dpm2_ros.keyframes import KeyframeSender, weights_identity
-from dpm2_ros.mapping import MapperThread, respond, robot_name, yield_to_odometry
+from dpm2_ros.lifecycle import ManagedNode
+from dpm2_ros.mapping import respond, yield_to_odometry
 from dpm2_ros.other_odometry import OtherOdometry
-from dpm2_ros.parameters import follow_changes, load_parameters
-from dpm2_ros.settings import NodeConfig
 from dpm2_ros.state import StatePublisher
 from dpm2_ros.subscriptions import Inputs
 from dpm2_ros.synchronizer import Bundle
@@ -44,7 +43,7 @@ HELD = 300
 """Poses kept while the base frame is not known."""
 
 
-class SlamNode(GuardedNode):
+class SlamNode(ManagedNode):
     """The executor's thread only fills a queue; a worker empties it; the mapper has a thread of its own.
 
     Raises:
@@ -52,40 +51,28 @@ class SlamNode(GuardedNode):
     """
 
     def __init__(self, managed: bool = False) -> None:
-        """`managed`: wait for `configure` and `activate`; see `lifecycle.py`."""
-        super().__init__("slam_node", automatically_declare_parameters_from_overrides=True)
-        self._config = load_parameters(self, NodeConfig)
-        ros, self._robot = self._config.ros, robot_name(self)
+        super().__init__("slam_node")
+        ros = self._config.ros
         self._beside = ros.odom_source != "own"
         if ros.localization_mode and not ros.embed_mapper:
             raise UsageError("ros.localization_mode: needs ros.embed_mapper")
         if self._beside and ros.invert_odom_tf and not ros.embed_mapper:
             raise UsageError("ros.invert_odom_tf: needs ros.embed_mapper where ros.odom_source is another's")
-        follow_changes(self, self._config, self._apply)
-        self._mapper: MapperThread | None = None
-        self._configured = False
-        self._worker: threading.Thread | None = None  # set while active
-        if not managed:
-            self.configure()
-            self.activate()
+        self.start(managed)
 
-    def configure(self) -> None:
-        """Load the network, open the map, announce what will be published.
-
-        Raises:
-            UsageError, Dpm2Error: the map in which to find oneself cannot be used.
-        """
-        ros = self._config.ros
-        self._mapper = MapperThread(self, self._config, self._robot) if ros.embed_mapper else None
-        self._slam = make_slam(self._config.slam, self._robot) if self._mapper is None else self._mapper.slam
+    def configure(self, back: ExitStack) -> None:
+        """As of `ManagedNode`."""
+        ros, weights = self._config.ros, weights_identity(self._config.slam)
+        self._slam = self._open_map(back).slam if ros.embed_mapper else make_slam(self._config.slam, self._robot)
         self._health = Health()
-        weights = weights_identity(self._config.slam)
         self._sender = KeyframeSender(self, self._robot, ros, weights)
+        back.callback(self._sender.close)
         self._odom = self.create_publisher(Odometry, "dpm2/odom", 10)
         self._state = StatePublisher(self)
         self._projection = Projection(self, second=bool(self._config.input.second_image_topic))
         # Idle with the mapper, which has its own.
         self._line = ThreadPoolExecutor(1, thread_name_prefix="keyframes", initializer=yield_to_odometry)
+        back.callback(self._line.shutdown)
         sends = ros.publish_tf_odom and (not self._beside or ros.invert_odom_tf or not ros.embed_mapper)
         self._tf = TransformBroadcaster(self, ros.own_frame, sends, ros.invert_odom_tf)
         self.create_service(Trigger, "~/reset", self._on_reset)
@@ -99,9 +86,10 @@ class SlamNode(GuardedNode):
         warm_up(self._config.slam)
         self._known: Calibration | None = None
         self._begin()
-        self._index, self._configured = 0, True
+        back.callback(self._give_up)
+        self._index = 0
 
-    def activate(self) -> None:
+    def activate(self, back: ExitStack) -> None:
         """Take clouds from now on; the drive goes on, if there was one."""
         ros, self._waited = self._config.ros, False
         self._stopping.clear()
@@ -115,8 +103,9 @@ class SlamNode(GuardedNode):
         self._frames = FrameBuilder(reading, self._known, self.get_logger().error, imu=self._inputs.imu)
         self._diagnostics = Diagnostics(self, self._inputs, self._frames, self._health, self._mapper, self._sender)
         self._diagnostics.other = self._other
-        self._worker = threading.Thread(target=self._work, name="worker")
-        self._worker.start()
+        worker = threading.Thread(target=self._work, name="worker")
+        worker.start()
+        back.callback(self._end, worker)
         self.get_logger().info(f"waiting for clouds on {self._inputs.subscriptions[0].topic}")
 
     @property
@@ -129,44 +118,11 @@ class SlamNode(GuardedNode):
         """What is known of the sensors so far."""
         return self._inputs.calibration
 
-    def deactivate(self) -> None:
-        """End the worker after the frame it is at: no more clouds; the map stays."""
-        if self._worker is not None:
-            self._stopping.set()
-            self._worker.join()
-            self._worker = None
-            self.get_logger().info(self._diagnostics.account())
-
-    def cleanup(self) -> None:
-        """End the mapper, which saves the map.
-
-        Raises:
-            Dpm2Error: the map could not be written.
-        """
-        if not self._configured:
-            return
-        self._configured = False
-        self._give_up()
-        self._line.shutdown(wait=True)
-        self._sender.close()
-        mapper, self._mapper = self._mapper, None
-        if mapper is not None:
-            mapper.close()
-
-    def close(self) -> None:
-        """End everything, whatever is under way.
-
-        Raises:
-            Dpm2Error: the map could not be written.
-        """
-        self.deactivate()
-        self.cleanup()
-
-    def _apply(self, config: NodeConfig) -> None:
-        """Parameters that have changed while the node runs."""
-        self._config = config
-        if self._mapper is not None:
-            self._mapper.apply(config)
+    def _end(self, worker: threading.Thread) -> None:
+        """No more clouds, after the one that the worker is at."""
+        self._stopping.set()
+        worker.join()
+        self.get_logger().info(self._diagnostics.account())
 
     def _begin(self) -> None:
         """The state of a drive at its start."""

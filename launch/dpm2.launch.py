@@ -31,7 +31,7 @@ ARGUMENTS = {
     "localization_mode": ("", "true: slam_node finds itself in map_file"),
     "namespace": ("", "of all nodes: one a robot"),
     "robots": ("", "red,blue,green: a slam_node for each, in that namespace, and one mapper_node; empty: one robot"),
-    "lifecycle": ("false", "true: slam_node waits for a lifecycle manager"),
+    "lifecycle": ("false", "true: slam_node and mapper_node wait for a lifecycle manager"),
     "rviz": ("true", "show the map in RViz, if it is installed"),
     "use_sim_time": ("auto", "follow /clock; auto: with a bag"),
 }
@@ -88,6 +88,19 @@ def robots(value: dict[str, str]) -> list[tuple[str, dict[str, str]]]:
     return found
 
 
+def nodes(value: dict[str, str]) -> list[tuple[str, str, dict[str, str]]]:
+    """Executable, namespace and arguments' values of each node of dpm2."""
+    found = [("slam_node", *robot) for robot in robots(value)]
+    if value["embed_mapper"] == "false" or value["robots"]:
+        found.append(("mapper_node", value["namespace"], value))
+    return found
+
+
+def ending(value: dict[str, str]) -> str:
+    """The executable whose end is that of the launch; one of several robots may come back."""
+    return "mapper_node" if value["robots"] else "slam_node"
+
+
 def parameter_files(value: dict[str, str]) -> list[str]:
     """That of the user, if any; launch_ros itself only warns of one that is missing."""
     file = value["params_file"]
@@ -114,22 +127,19 @@ def _typed(given: dict[str, bool | str]) -> list[dict[str, bool | ParameterValue
 
 def _actions(context) -> list:
     value = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
-    given, common = parameters(value), {"package": "dpm2_ros", "output": "screen"}
-    managed = {"arguments": ["--lifecycle"]} if value["lifecycle"] == "true" else {}
-    last = {} if value["robots"] else {"on_exit": Shutdown()}  # one of several may come back
-    actions = []
-    for namespace, own in robots(value):
+    common = {"package": "dpm2_ros", "output": "screen"}
+    if value["lifecycle"] == "true":
+        common["arguments"] = ["--lifecycle"]
+    actions, last = [], ending(value)
+    for executable, namespace, own in nodes(value):
         files = [*parameter_files(value), *_typed(parameters(own))]
-        actions.append(Node(executable="slam_node", namespace=namespace, parameters=files, **last, **managed, **common))
-    if value["embed_mapper"] == "false" or value["robots"]:
-        files = [*parameter_files(value), *_typed(given)]
-        ends = {"on_exit": Shutdown()} if value["robots"] else {}
-        actions.append(Node(executable="mapper_node", namespace=value["namespace"], parameters=files, **ends, **common))
+        ends = Shutdown() if executable == last else None
+        actions.append(Node(executable=executable, namespace=namespace, parameters=files, on_exit=ends, **common))
     if value["bag"]:
         options = [value["bag"], "--rate", value["rate"], "--wait", "30"]
         actions.append(Node(package="dpm2_ros", executable="bag_player", output="screen", arguments=options))
     if value["rviz"] == "true":
-        actions.append(_rviz(value, bool(given.get("use_sim_time"))))
+        actions.append(_rviz(value, bool(parameters(value).get("use_sim_time"))))
     return actions
 
 
@@ -149,8 +159,7 @@ def _rviz(value: dict[str, str], sim_time: bool) -> Node | LogInfo:
 
 
 def generate_launch_description() -> LaunchDescription:
-    """slam_node, and as asked for: mapper_node, bag_player, RViz. It ends when slam_node does; of several robots, when
-    their mapper_node does."""
+    """slam_node, and as asked for: mapper_node, bag_player, RViz."""
     declared = [
         DeclareLaunchArgument(name, default_value=default, description=text, choices=CHOICES.get(name))
         for name, (default, text) in ARGUMENTS.items()

@@ -23,6 +23,7 @@ import rclpy
 import yaml
 
 from dpm2_core.config import flat_fields
+from dpm2_ros import executables
 from dpm2_ros.parameters import CONFIG_FILE, load_parameters
 from dpm2_ros.runtime import ros_context
 from dpm2_ros.settings import NodeConfig
@@ -178,11 +179,28 @@ def test_rviz_shows_the_topics_of_the_robot(launch_file: ModuleType) -> None:
 
 def test_it_starts_executables_that_exist(launch_file: ModuleType) -> None:
     code = (ROOT / "launch" / "dpm2.launch.py").read_text()
-    assert set(re.findall(r'executable="(\w+)"', code)) == {"slam_node", "mapper_node", "bag_player", "rviz2"}
+    assert set(re.findall(r'executable="(\w+)"', code)) == {"bag_player", "rviz2"}
     assert set(launch_file.CHOICES) <= set(launch_file.ARGUMENTS)
     assert all(launch_file.ARGUMENTS[name][0] in choices for name, choices in launch_file.CHOICES.items())
     assert "--rate" in code
     assert "--wait" in code
+
+
+@pytest.mark.parametrize(
+    ("given", "nodes", "last"),
+    [
+        ({}, ["slam_node"], "slam_node"),
+        ({"embed_mapper": "false"}, ["slam_node", "mapper_node"], "slam_node"),
+        ({"robots": "red,blue"}, ["slam_node", "slam_node", "mapper_node"], "mapper_node"),
+    ],
+)
+def test_the_launch_ends_with_the_node_that_all_depend_on(
+    launch_file: ModuleType, given: dict[str, str], nodes: list[str], last: str
+) -> None:
+    value = defaults(launch_file) | given
+    found = [executable for executable, _, _ in launch_file.nodes(value)]
+    assert (found, launch_file.ending(value), found.count(last)) == (nodes, last, 1)
+    assert set(found) <= set(executables.__dict__)
 
 
 def of(config: NodeConfig, name: str) -> Any:

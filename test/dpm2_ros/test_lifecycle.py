@@ -1,40 +1,53 @@
 # SPDX-License-Identifier: Apache-2.0
-"""slam_node as a managed node, over its lifecycle services: round and round, every map kept and nothing left over."""
+"""slam_node and mapper_node as managed nodes, over their lifecycle services: round and round, every map and every
+keyframe kept, and nothing left over."""
 
 from __future__ import annotations
 
 import gc
 import os
+import signal
 import threading
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import UInt8MultiArray
 
 from dpm2_core.data.topics import POINTS
+from dpm2_core.frame import Keyframe
+from dpm2_core.geometry import se3
 from dpm2_core.slam.store.check import check_map
-from dpm2_ros.lifecycle import ManagedSlamNode
+from dpm2_core.slam.store.map_data import load_map
+from dpm2_core.slam.store.map_store import MapStore
+from dpm2_ros.conversions import edge_to_msg, keyframe_name
+from dpm2_ros.keyframes import WIRE, payload_to_msgs
+from dpm2_ros.mapper_node import MapperNode
+from dpm2_ros.slam_node import SlamNode
+from tools.replay import ros_environment, start
 
 CONFIGURE, CLEANUP = Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_CLEANUP
 ACTIVATE, DEACTIVATE = Transition.TRANSITION_ACTIVATE, Transition.TRANSITION_DEACTIVATE
+FAST = ("input.images:=false", "slam.loops.descriptors:=false", "slam.registration:=geometric")
+ACKS = "/dpm2/keyframes_received"
+ROUNDS = int(os.environ.get("DPM2_ROUNDS", "6"))
 
 
 class Managed:
-    """The node, its manager and its LiDAR."""
+    """A node and its manager."""
 
-    def __init__(self, ros: Callable[..., Any], drive: Any, *parameters: str) -> None:
-        fast = ("input.images:=false", "slam.loops.descriptors:=false", "slam.registration:=geometric")
-        self.harness, self.drive = ros(*fast, *parameters), drive
-        self.lidar = self.harness.publisher(PointCloud2, POINTS)
-        self.odom = self.harness.hear(Odometry, "/dpm2/odom")
-        self.node: ManagedSlamNode = self.harness.add(ManagedSlamNode())
-        self._change = self.harness.node.create_client(ChangeState, "/slam_node/change_state")
-        self._state = self.harness.node.create_client(GetState, "/slam_node/get_state")
+    def __init__(self, harness: Any, kind: type[SlamNode] | type[MapperNode]) -> None:
+        self.harness, self.node = harness, harness.add(kind(managed=True))
+        name = self.node.get_name()
+        self._change = harness.node.create_client(ChangeState, f"/{name}/change_state")
+        self._state = harness.node.create_client(GetState, f"/{name}/get_state")
 
     def _call(self, client: Any, request: Any) -> Any:
         assert client.wait_for_service(timeout_sec=10)
@@ -42,19 +55,57 @@ class Managed:
         self.harness.wait(future.done, client.srv_name)
         return future.result()
 
-    def change(self, transition: int) -> bool:
-        return bool(self._call(self._change, ChangeState.Request(transition=Transition(id=transition))).success)
+    def change(self, *transitions: int) -> bool:
+        """Whether all of them were made."""
+        requests = (ChangeState.Request(transition=Transition(id=transition)) for transition in transitions)
+        return all(bool(self._call(self._change, request).success) for request in requests)
 
     @property
     def state(self) -> str:
         return str(self._call(self._state, GetState.Request()).current_state.label)
 
+    @property
+    def entities(self) -> int:
+        return len([*self.node.publishers, *self.node.subscriptions, *self.node.services, *self.node.timers])
+
+    @property
+    def keyframes(self) -> int:
+        """In the map."""
+        return len(self.node.slam.mapper.keyframes)
+
+
+class Lidar:
+    """Of a robot."""
+
+    def __init__(self, harness: Any, drive: Any) -> None:
+        self.harness, self.drive = harness, drive
+        self.clouds, self.odom = harness.publisher(PointCloud2, POINTS), harness.hear(Odometry, "/dpm2/odom")
+
     def send(self, *numbers: int) -> None:
-        self.harness.wait(self.lidar.get_subscription_count, "the subscription to the clouds")
+        self.harness.wait(self.clouds.get_subscription_count, "the subscription to the clouds")
         for n in numbers:
             before = len(self.odom)
-            self.lidar.publish(self.drive.cloud(n))
+            self.clouds.publish(self.drive.cloud(n))
             self.harness.wait(lambda before=before: len(self.odom) > before, f"the odometry of cloud {n}")
+
+
+class Robot:
+    """Its keyframes as messages."""
+
+    def __init__(self, harness: Any) -> None:
+        kinds = ((Odometry, "keyframe_odom"), (PointCloud2, "keyframe"), (UInt8MultiArray, "keyframe_cloud"))
+        self.harness = harness
+        self.wires = [harness.node.create_publisher(kind, f"/dpm2/{topic}", WIRE) for kind, topic in kinds]
+
+    def send(self, *ids: int) -> None:
+        self.harness.wait(lambda: all(wire.get_subscription_count() for wire in self.wires), "the mapper's ears")
+        for id in ids:
+            T, name = se3.exp([0, 0, 0, 5.0 * id, 0, 0]), keyframe_name("", id)
+            points = np.random.default_rng(id).uniform(0, 20, (500, 4)).astype(np.float32)
+            pose = edge_to_msg(T, np.eye(6) * 1e-4, 1000 + id, "odom", name)
+            parts = (pose, *payload_to_msgs(Keyframe(id, 1000 + id, id, T, points), name))
+            for wire, part in zip(self.wires, parts, strict=True):
+                wire.publish(part)
 
 
 def held() -> tuple[int, int]:
@@ -63,18 +114,29 @@ def held() -> tuple[int, int]:
     return threading.active_count(), len(os.listdir("/proc/self/fd"))
 
 
+def ids(path: Path) -> list[int]:
+    """Of the keyframes in a map file."""
+    with MapStore.open(path) as store:
+        return [keyframe.id for keyframe in load_map(store).keyframes]
+
+
 @pytest.mark.slow
-def test_rounds_keep_every_map_and_leave_nothing(ros: Callable[..., Any], drive: Any, tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", [SlamNode, MapperNode])
+def test_rounds_keep_every_map_and_leave_nothing(
+    ros: Callable[..., Any], drive: Any, tmp_path: Path, kind: type[SlamNode] | type[MapperNode]
+) -> None:
     """Six of them; DPM2_ROUNDS=20 for more."""
-    m = Managed(ros, drive, f"ros.map_directory:={tmp_path}")
-    after = []
-    for round in range(int(os.environ.get("DPM2_ROUNDS", "6"))):
-        assert all(m.change(transition) for transition in (CONFIGURE, ACTIVATE))
-        m.send(0, 1, 2)
-        assert m.change(DEACTIVATE)
-        assert m.change(CLEANUP)
-        entities = [*m.node.publishers, *m.node.subscriptions, *m.node.services, *m.node.timers]
-        after.append((*held(), len(entities)))
+    m = Managed(ros(*FAST, f"ros.map_directory:={tmp_path}"), kind)
+    source: Any = Lidar(m.harness, drive) if kind is SlamNode else Robot(m.harness)
+    after, maps = [], weakref.WeakSet[Any]()
+    for round in range(ROUNDS):
+        assert m.change(CONFIGURE, ACTIVATE)
+        maps.add(m.node.slam)
+        source.send(0, 1, 2)
+        m.harness.wait(lambda: m.keyframes, "a keyframe")
+        assert m.change(DEACTIVATE, CLEANUP)
+        after.append((*held(), m.entities))
+        assert not maps  # their memory is free
         name = "drive" if not round else f"drive-{round + 1}"
         result = check_map(tmp_path / f"{name}.dpm2map")
         assert (result.problems, result.keyframes >= 1) == ([], True)
@@ -86,31 +148,106 @@ def test_rounds_keep_every_map_and_leave_nothing(ros: Callable[..., Any], drive:
 @pytest.mark.slow
 def test_inactive_it_takes_no_cloud_and_keeps_the_map(ros: Callable[..., Any], drive: Any, tmp_path: Path) -> None:
     """And goes on where it was."""
-    m = Managed(ros, drive, f"ros.map_directory:={tmp_path}")
+    m = Managed(ros(*FAST, f"ros.map_directory:={tmp_path}"), SlamNode)
+    lidar = Lidar(m.harness, drive)
     assert m.state == "unconfigured"
     assert not m.change(ACTIVATE)
     assert m.change(CONFIGURE)
-    assert not m.lidar.get_subscription_count()
+    assert not lidar.clouds.get_subscription_count()
     assert m.change(ACTIVATE)
-    m.send(*range(4))
-    m.harness.wait(lambda: m.node.slam.mapper.keyframes, "the first keyframe")
-    keyframes = len(m.node.slam.mapper.keyframes)
+    lidar.send(*range(4))
+    m.harness.wait(lambda: m.keyframes, "the first keyframe")
+    keyframes = m.keyframes
     assert m.change(DEACTIVATE)
-    m.harness.wait(lambda: not m.lidar.get_subscription_count(), "the end of the subscription")
+    m.harness.wait(lambda: not lidar.clouds.get_subscription_count(), "the end of the subscription")
     assert m.state == "inactive"
     assert m.change(ACTIVATE)
-    m.send(*range(4, 10))
-    m.harness.wait(lambda: len(m.node.slam.mapper.keyframes) > keyframes, "a keyframe more")
-    last = m.odom[-1].pose.pose.position.x
+    lidar.send(*range(4, 10))
+    m.harness.wait(lambda: m.keyframes > keyframes, "a keyframe more")
+    last = lidar.odom[-1].pose.pose.position.x
     assert last == pytest.approx(drive.pose(9)[0, 3], abs=0.1)
     assert m.change(Transition.TRANSITION_ACTIVE_SHUTDOWN)
     assert m.state == "finalized"
     assert check_map(tmp_path / "drive.dpm2map").problems == []
 
 
-def test_what_cannot_be_configured_stays_unconfigured(ros: Callable[..., Any], drive: Any, tmp_path: Path) -> None:
-    m = Managed(ros, drive, "ros.localization_mode:=true", f"ros.map_file:={tmp_path / 'none.dpm2map'}")
-    before = held()[0]
+@pytest.mark.slow
+def test_a_robot_keeps_what_it_makes_while_its_mapper_is_inactive(
+    ros: Callable[..., Any], drive: Any, tmp_path: Path
+) -> None:
+    """Its keyframes are in the same map once the mapper is active again, each once; a new map gets the whole drive."""
+    apart = ("ros.embed_mapper:=false", "slam.keyframes.distance:=1.0", f"ros.map_directory:={tmp_path}")
+    harness = ros(*FAST, *apart)
+    m, lidar = Managed(harness, MapperNode), Lidar(harness, drive)
+    sent = harness.hear(Odometry, "/dpm2/keyframe_odom")
+    made = lambda: len({pose.child_frame_id for pose in sent})  # noqa: E731
+    harness.add(SlamNode())
+    assert m.change(CONFIGURE, ACTIVATE)
+    lidar.send(*range(5))
+    harness.wait(lambda: m.keyframes == made() >= 2, "the first keyframes")
+    assert m.change(DEACTIVATE)
+    others = lambda: (harness.node.count_subscribers("/dpm2/keyframe_odom"), harness.node.count_publishers(ACKS))  # noqa: E731
+    harness.wait(lambda: others() == (1, 0), "the end of its subscriptions and acknowledgments")
+    before = made()
+    lidar.send(*range(5, 16))
+    harness.wait(lambda: made() >= before + 4, "keyframes of the robot")
+    assert m.keyframes <= before
+    assert m.change(ACTIVATE)
+    harness.wait(lambda: m.keyframes >= made(), "what was made meanwhile")
+    assert m.change(DEACTIVATE, CLEANUP)
+    assert ids(tmp_path / "drive.dpm2map") == list(range(made()))
+    assert m.change(CONFIGURE, ACTIVATE)
+    harness.wait(lambda: m.keyframes >= made(), "the whole drive")
+    assert m.change(DEACTIVATE, CLEANUP)
+    assert ids(tmp_path / "drive-2.dpm2map") == list(range(made()))
+
+
+@pytest.mark.parametrize(
+    ("kind", "wrong"),
+    [
+        (SlamNode, "slam.neural.weights:=none.safetensors"),
+        (MapperNode, "slam.neural.weights:=none.safetensors"),
+        (SlamNode, "ros.localization_mode:=true"),
+    ],
+)
+def test_what_cannot_be_configured_stays_unconfigured(
+    ros: Callable[..., Any], tmp_path: Path, kind: type[SlamNode] | type[MapperNode], wrong: str
+) -> None:
+    """And leaves nothing: no thread, no topic, no empty map."""
+    m = Managed(ros(wrong, "input.images:=false", f"ros.map_directory:={tmp_path / 'maps'}"), kind)
+    before, entities = held()[0], m.entities
     assert not m.change(CONFIGURE)
     assert m.state == "unconfigured"
-    assert held()[0] == before
+    assert (held()[0], m.entities) == (before, entities)
+    assert not (tmp_path / "maps").exists()
+
+
+def test_what_cannot_be_activated_stays_inactive(ros: Callable[..., Any], tmp_path: Path) -> None:
+    m = Managed(ros(*FAST, f"input.second_points_topic:={POINTS}"), SlamNode)
+    assert m.change(CONFIGURE)
+    entities = m.entities
+    assert not m.change(ACTIVATE)
+    assert (m.state, m.entities) == ("inactive", entities)
+    assert m.change(CLEANUP)
+    assert m.state == "unconfigured"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["slam_node", "mapper_node"])
+def test_the_executable_waits_and_a_signal_ends_it(ros: Callable[..., Any], tmp_path: Path, name: str) -> None:
+    """Without a map, which it has not begun."""
+    harness = ros()
+    options = ["--lifecycle", "--ros-args", "-p", f"ros.map_directory:={tmp_path / 'maps'}"]
+    process = start(name, options, ros_environment(harness.node.context.get_domain_id()), tmp_path / "log")
+    try:
+        client = harness.node.create_client(GetState, f"/{name}/get_state")
+        harness.wait(client.service_is_ready, f"{name}'s lifecycle services")
+        future = client.call_async(GetState.Request())
+        harness.wait(future.done, "its state")
+        assert future.result().current_state.label == "unconfigured"
+        process.send_signal(signal.SIGINT)
+        assert process.wait(60) == 0, (tmp_path / "log").read_text()
+        assert not (tmp_path / "maps").exists()
+    finally:
+        process.kill()
+        process.wait()

@@ -49,26 +49,36 @@ def done(harness: Any, node: str, missing: Callable[[Graph], bool]) -> Graph:
 
 
 EMBEDDED = {"subscriber": {"/clock", "/dpm2/keyframes_received"}}
+LIFECYCLE = ("change_state", "get_available_states", "get_available_transitions", "get_state", "get_transition_graph")
+PLAIN = {
+    "publisher": {"/slam_node/transition_event"},
+    "service": {f"/slam_node/{name}" for name in LIFECYCLE},
+}
+OF_THE_MAP = ("grid", "loop_candidates", "loop_closure", "map", "path", "pose_graph")
 APART = {
-    "publisher": {f"/dpm2/{name}" for name in ("grid", "loop_candidates", "loop_closure", "map", "path", "pose_graph")},
-    "service": {"/slam_node/save_map"},
+    "publisher": {f"/dpm2/{name}" for name in OF_THE_MAP} | PLAIN["publisher"],
+    "service": {"/slam_node/save_map"} | PLAIN["service"],
 }
 
 
 @pytest.mark.parametrize(
-    ("make", "parameters", "without"),
+    ("make", "managed", "parameters", "without"),
     [
-        (SlamNode, (), EMBEDDED),
-        (SlamNode, ("ros.embed_mapper:=false", "use_sim_time:=true"), APART),
-        (MapperNode, ("use_sim_time:=true",), {}),
+        (SlamNode, True, (), EMBEDDED),
+        (SlamNode, False, ("ros.embed_mapper:=false", "use_sim_time:=true"), APART),
+        (MapperNode, True, ("use_sim_time:=true",), {}),
     ],
 )
 def test_nodes_do_what_the_policy_allows(
-    ros: Callable[..., Any], make: Any, parameters: tuple[str, ...], without: Graph
+    ros: Callable[..., Any], make: Any, managed: bool, parameters: tuple[str, ...], without: Graph
 ) -> None:
     """All of it and nothing else, but for what one way of running them does without."""
-    harness = ros("slam.loops.descriptors:=false", *parameters)
-    node = harness.add(make()).get_name()
+    harness = ros("slam.loops.descriptors:=false", "slam.registration:=geometric", *parameters)
+    made = make(managed)
+    if managed:
+        made.trigger_configure()
+        made.trigger_activate()
+    node = harness.add(made).get_name()
     expected = {kind: names - without.get(kind, set()) for kind, names in allowed(node).items()}
     assert done(harness, node, lambda graph: any(expected[kind] - graph[kind] for kind in graph)) == expected
 
