@@ -3,9 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from contextlib import suppress
-from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +17,10 @@ from dpm2_core.slam.mapping.tiles import TiledMap
 from dpm2_core.slam.output import save_map
 from dpm2_core.slam.session import open_for_localization, open_session
 from dpm2_core.slam.store.map_store import MapStore
+from dpm2_ros.map_folder import MapFolder, file_beside
 from dpm2_ros.settings import NodeConfig
 
 AUTO = "auto"
-_NAME = "drive"
-_SUFFIX = ".dpm2map"
 
 
 class ActiveMap:
@@ -41,7 +38,7 @@ class ActiveMap:
         """`robot`: whose node it is; `log`: a ROS logger."""
         self._config, self._robot, self._log = config, robot, log
         ros = config.ros
-        self._directory = Path(ros.map_directory) if ros.map_directory else None
+        self._maps = MapFolder(Path(ros.map_directory) if ros.map_directory else None, robot)
         self._path = Path(ros.map_file) if ros.map_file not in ("", AUTO) else None  # written, or to be found in
         self._folders: dict[str, Path] = {}  # of this drive, by the name under which it was saved
         self.located: LocalizationResult | None = None
@@ -88,7 +85,7 @@ class ActiveMap:
         Raises:
             UsageError, Dpm2Error: there is no file that would serve; what was before goes on.
         """
-        if name and (path := self._named_file(name)) != self._path:
+        if name and (path := self._maps.file(name)) != self._path:
             self._exchange(path)
             return self._looking()
         growing = self.localizer is None
@@ -106,11 +103,6 @@ class ActiveMap:
 
     def _looking(self) -> str:
         return f"looking for the robot in {self._path}, {len(self.mapper.keyframes)} keyframes"
-
-    def _named_file(self, name: str) -> Path:
-        if self._directory is None:
-            raise UsageError("ros.map_name: ros.map_directory is empty")
-        return self._directory / f"{name.removesuffix(_SUFFIX)}{_SUFFIX}"
 
     def _exchange(self, path: Path) -> None:
         """Another map, to find oneself in; the one that was is complete in its file, if it has one."""
@@ -159,7 +151,7 @@ class ActiveMap:
         self.finish()
         if self.mapper.store_problem:
             raise Dpm2Error(f"no reset: {self.mapper.store_problem}")
-        info = self.save() if self.mapper.keyframes and self._directory is not None else ""
+        info = self.save() if self.mapper.keyframes and self._maps.folder is not None else ""
         self.close()
         self._begin()
         return info
@@ -167,7 +159,7 @@ class ActiveMap:
     @property
     def saves(self) -> bool:
         """Whether `save` has a folder to write into."""
-        return self._directory is not None and self.localizer is None
+        return self._maps.folder is not None and self.localizer is None
 
     def save(self, name: str = "") -> str:
         """Cloud, trajectory and pose graph into the drive's own folder; says so in words.
@@ -178,36 +170,23 @@ class ActiveMap:
         Raises:
             UsageError: there is nothing to save. Dpm2Error: it cannot be written.
         """
-        if self._directory is None:
+        if (folder := self._maps.folder) is None:
             raise UsageError("no map is saved: ros.map_directory is empty")
         if self.localizer is not None:
             raise UsageError("no map is saved: in localization_mode the map stays as it is, in its file")
         if not self.mapper.keyframes:
             raise UsageError("no map is saved: there is no keyframe yet")
-        folder = self._directory
         try:
-            folder = self._folders[name] = self._folders.get(name) or self._claimed(self._directory, name)
+            folder = self._folders[name] = self._folders.get(name) or self._maps.claimed(name, self._path)
             save_map(self.mapper, folder)
         except OSError as error:
             raise Dpm2Error(f"{folder}: no map saved: {error.strerror}") from None
         path = self._path
         if name and self._store is not None:
-            path = folder.with_name(f"{folder.name}{_SUFFIX}")
+            path = file_beside(folder)
             self._store.copy_to(path)
         file = f", and as {path.resolve()}" if self._store is not None and path is not None else ""
         return f"map of {len(self.mapper.keyframes)} keyframes saved in {folder.resolve()}{file}"
-
-    def _claimed(self, directory: Path, name: str) -> Path:
-        """A new folder of that name, or of the drive's: the same again for each save of the same drive, never
-        another's."""
-        own = self._path.stem if self._path is not None else _named(_NAME, self._robot)
-        for folder in _numbered(directory / (name.removesuffix(_SUFFIX) or own)):
-            if name and folder.with_name(f"{folder.name}{_SUFFIX}").exists():
-                continue  # another drive's map
-            with suppress(FileExistsError):
-                folder.mkdir(parents=True)
-                return folder
-        raise AssertionError
 
     def finish(self) -> None:
         """Do what still waits; the file stays open."""
@@ -233,9 +212,7 @@ class ActiveMap:
     def _new_file(self) -> MapStore | None:
         """A map file, if there is to be one. A file that cannot be made is no reason not to map."""
         ros, self._folders = self._config.ros, {}
-        requested = Path(ros.map_file)
-        if ros.map_file == AUTO:
-            requested = self._directory / f"{_NAME}{_SUFFIX}" if self._directory is not None else Path()
+        requested = self._maps.usual if ros.map_file == AUTO else Path(ros.map_file)
         if requested.name:
             try:
                 self._path, store = self._created(requested)
@@ -248,9 +225,7 @@ class ActiveMap:
 
     def _created(self, requested: Path) -> tuple[Path, MapStore]:
         """A new map file with a name, and a folder for its clouds, that do not exist yet."""
-        for path in _numbered(requested.with_name(_named(requested.stem, self._robot) + requested.suffix)):
-            if path.exists() or (self._directory is not None and (self._directory / path.stem).exists()):
-                continue
+        for path in self._maps.free(requested):
             try:
                 return path, open_session(path, self._config.slam, dump_settings(self._config), resume=False)
             except UsageError:
@@ -275,13 +250,8 @@ class ActiveMap:
     def _opened(self) -> MapStore | TiledMap:
         """The file or folder of tiles, open for reading only."""
         if self._path is None:
-            raise UsageError("no map to find oneself in: ros.map_file does not name one" + self._hint())
+            raise UsageError("no map to find oneself in: ros.map_file does not name one" + self._maps.hint())
         return open_for_localization(self._path, self._config.slam)
-
-    def _hint(self) -> str:
-        """The youngest map in the folder."""
-        found = sorted(self._directory.glob(f"*{_SUFFIX}"), key=_age) if self._directory is not None else []
-        return f"; the youngest in {self._directory} is {found[-1]}" if found else ""
 
     def _resume(self) -> None:
         """Go on with the file."""
@@ -300,17 +270,3 @@ class ActiveMap:
             self._log.info(f"{kind} at ({x:.1f}, {y:.1f}, {z:.1f}) m of {self._config.ros.map_frame}")
         elif located.state in (State.LOST, State.DEGRADED):
             self._log.warning(f"{located.state}: {located.registration.reason}")
-
-
-def _age(path: Path) -> float:
-    return path.stat().st_mtime
-
-
-def _named(stem: str, robot: str) -> str:
-    return f"{stem}_{robot.replace('/', '_')}" if robot else stem
-
-
-def _numbered(path: Path) -> Iterator[Path]:
-    """The path, and without end the same with -2, -3, ... before its suffix."""
-    yield path
-    yield from (path.with_name(f"{path.stem}-{n}{path.suffix}") for n in count(2))

@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Names in the folder of maps: NAME.dpm2map and beside it a folder NAME. Nothing is overwritten."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import suppress
+from itertools import count
+from pathlib import Path
+
+from dpm2_core.errors import UsageError
+
+_NAME = "drive"
+_SUFFIX = ".dpm2map"
+
+
+class MapFolder:
+    """The maps of one robot, in a folder that others may use as well.
+
+    Attributes:
+        folder: None where nothing is saved.
+    """
+
+    def __init__(self, folder: Path | None, robot: str) -> None:
+        self.folder, self._robot = folder, robot
+
+    @property
+    def usual(self) -> Path:
+        """The file of a drive without a name of its own, as it is asked of `free`; without a name where nothing is
+        saved."""
+        return Path() if self.folder is None else self.folder / f"{_NAME}{_SUFFIX}"
+
+    def file(self, name: str) -> Path:
+        """The map of that name.
+
+        Raises:
+            UsageError: there is no folder.
+        """
+        if self.folder is None:
+            raise UsageError("ros.map_name: ros.map_directory is empty")
+        return self.folder / f"{name.removesuffix(_SUFFIX)}{_SUFFIX}"
+
+    def free(self, requested: Path) -> Iterator[Path]:
+        """Paths of that name, the robot's and a number that do not exist yet, nor a folder for their clouds."""
+        for path in _numbered(requested.with_name(self._of_robot(requested.stem) + requested.suffix)):
+            if not path.exists() and (self.folder is None or not (self.folder / path.stem).exists()):
+                yield path
+
+    def claimed(self, name: str, file: Path | None) -> Path:
+        """A new folder of that name, or of the drive's map file, if it has one: never another drive's.
+
+        Raises:
+            OSError: it cannot be made.
+        """
+        assert self.folder is not None
+        own = file.stem if file is not None else self._of_robot(_NAME)
+        for folder in _numbered(self.folder / (name.removesuffix(_SUFFIX) or own)):
+            if name and file_beside(folder).exists():
+                continue  # another drive's map
+            with suppress(FileExistsError):
+                folder.mkdir(parents=True)
+                return folder
+        raise AssertionError
+
+    def hint(self) -> str:
+        """Which map is the youngest, in words; empty where there is none."""
+        found = sorted(self.folder.glob(f"*{_SUFFIX}"), key=_age) if self.folder is not None else []
+        return f"; the youngest in {self.folder} is {found[-1]}" if found else ""
+
+    def _of_robot(self, stem: str) -> str:
+        return f"{stem}_{self._robot.replace('/', '_')}" if self._robot else stem
+
+
+def file_beside(folder: Path) -> Path:
+    """The map file that belongs to a folder of clouds."""
+    return folder.with_name(f"{folder.name}{_SUFFIX}")
+
+
+def _age(path: Path) -> float:
+    return path.stat().st_mtime
+
+
+def _numbered(path: Path) -> Iterator[Path]:
+    """The path, and without end the same with -2, -3, ... before its suffix."""
+    yield path
+    yield from (path.with_name(f"{path.stem}-{n}{path.suffix}") for n in count(2))
