@@ -186,13 +186,17 @@ def edge_to_msg(T: Array, covariance: Array, stamp: int, parent: str, child: str
 
 
 def keyframe_to_base(keyframe: Keyframe, T_base_lidar: Array) -> Keyframe:
-    """The same place seen from the base: its pose, cloud, descriptors and edge."""
+    """The same place seen from the base: its pose, cloud, descriptors, edge and fix."""
     edge, A = keyframe.edge, se3.adjoint(T_base_lidar)
     if edge is not None:
         T_before_this = T_base_lidar @ edge.T_target_source @ se3.inverse(T_base_lidar)
         edge = replace(edge, T_target_source=T_before_this, covariance=A @ edge.covariance @ A.T)
+    fix = keyframe.fix
+    if fix is not None:
+        fix = replace(fix, antenna=T_base_lidar[:3, :3] @ fix.antenna + T_base_lidar[:3, 3])
     return replace(
         keyframe,
+        fix=fix,
         T_odom_kf=T_base_lidar @ keyframe.T_odom_kf @ se3.inverse(T_base_lidar),
         cloud=se3.transform(T_base_lidar, keyframe.cloud).astype(np.float32),
         edge=edge,

@@ -25,7 +25,7 @@ from dpm2_core.slam.store.cloud_codec import CodecError, unpack_cloud
 from dpm2_core.slam.store.map_data import NO_POINTS
 from dpm2_ros.conversions import EARLIER, check_frame, covariance_from_ros, parse_keyframe_name
 from dpm2_ros.guard import GuardedNode
-from dpm2_ros.keyframes import BUDGET, WIRE, descriptors_from_msg, received_to_msg
+from dpm2_ros.keyframes import BUDGET, WIRE, cloud_from_msg, descriptors_from_msg, received_to_msg
 from dpm2_ros.mapping import MapperThread
 from dpm2_ros.streams import Parts, Stream
 
@@ -143,12 +143,12 @@ class Feed:
             with _noted(stream, id):
                 if len(message.data) > BUDGET:
                     raise RejectedError("size", f"keyframe {id}: {len(message.data)} bytes; at most {BUDGET} are sent")
-                packed = bytes(message.data)
+                packed, fix = cloud_from_msg(message)
                 try:
                     unpack_cloud(packed)
                 except CodecError as error:
                     raise RejectedError("cloud", f"keyframe {id}: {error}") from None
-            self._put(stream, id, "cloud", packed)
+            self._put(stream, id, "cloud", (packed, fix))
 
     def _on_seen(self, message: PointCloud2) -> None:
         stream, id = self._hear(message.header.frame_id)
@@ -238,9 +238,9 @@ class Feed:
         keyframe = keyframe_from(parts.pose, NO_POINTS, stream.robot, id, stream.last, parts.descriptors)
         stream.last, stream.odom_frame = replace(keyframe, descriptors=None), parts.pose.header.frame_id
         stream.taken += 1
-        packed = parts.cloud
-        assert packed is not None
-        self._mapper.add(lambda: replace(keyframe, cloud=unpack_cloud(packed)))
+        assert parts.cloud is not None
+        packed, fix = parts.cloud
+        self._mapper.add(lambda: replace(keyframe, cloud=unpack_cloud(packed), fix=fix))
 
     def _acknowledge(self, stream: Stream, now: float) -> None:
         if stream.session:

@@ -129,6 +129,8 @@ class Diagnostics:
             out.append(self._beside("second lidar", "cloud", known.second_topic))
         if self._inputs.imu_received:
             out.append(self._imu())
+        if self._inputs.gnss is not None:
+            out.append(self._gnss())
         if self.other is not None:
             out.append(self._other_odometry(self.other))
         if self._mapper is None:
@@ -251,6 +253,15 @@ class Diagnostics:
             self._node.get_logger().warning(f"{topic}: {problem}; going on without the IMU", once=True)
         text = f"{problem}; going on without" if problem else "in use"
         return self._status("imu", WARN if problem else OK, text, {"received": inputs.imu_received})
+
+    def _gnss(self) -> DiagnosticStatus:
+        inputs, problem, located = self._inputs, self._frames.gnss_problem, None
+        if not problem and not inputs.gnss_received:
+            problem = f"no fix on {inputs.calibration.gnss_topic} yet"
+        if self._mapper is not None:
+            located = self._mapper.slam.mapper.georeference
+        text = "in use" if located is not None else "the map's place on Earth is not known yet"
+        return self._status("gnss", WARN if problem else OK, problem or text, {"received": inputs.gnss_received})
 
     def _beside(self, part: str, what: str, topic: str) -> DiagnosticStatus:
         """Of a sensor beside the LiDAR and its messages, in words, and their topic."""

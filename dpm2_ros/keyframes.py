@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import secrets
 import sqlite3
+import struct
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -26,7 +27,7 @@ from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import MultiArrayDimension, MultiArrayLayout, UInt8MultiArray, UInt32MultiArray
 
 from dpm2_core.descriptors import Descriptors
-from dpm2_core.frame import Keyframe
+from dpm2_core.frame import Fix, Keyframe
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.network.pretrained import weights_path
 from dpm2_core.slam.mapping.admission import RejectedError
@@ -46,6 +47,7 @@ BUDGET = 99_000
 BEHIND = 10
 """Keyframes that the mapper may lack before /diagnostics warns; a few are always on their way."""
 
+_FIX = struct.Struct("<q15d")  # stamp, ns; place, covariance, antenna, as in `Fix`
 _FEATURE = "feature"
 _MOST_CHANNELS = 4096
 _MOST_ACKED = 1001  # numbers in an acknowledgment
@@ -222,16 +224,42 @@ def received_to_msg(session: str, below: int, above: Sequence[int]) -> UInt32Mul
 
 
 def payload_to_msgs(keyframe: Keyframe, name: str, weights: str = "") -> tuple[PointCloud2, UInt8MultiArray]:
-    """Descriptors and packed cloud of a keyframe, the cloud downsampled until both are within `BUDGET`."""
-    d = keyframe.descriptors
+    """Descriptors and packed cloud of a keyframe, the cloud downsampled until both are within `BUDGET`.
+
+    Behind the cloud is its fix, if it has one, as a second dimension.
+    """
+    d, fix = keyframe.descriptors, keyframe.fix
     descriptors = descriptors_to_msg(d, keyframe.stamp, name, weights)
-    room = BUDGET - len(descriptors.data)
+    room = BUDGET - len(descriptors.data) - _FIX.size
     cloud, voxel = keyframe.cloud, 0.3
     while len(packed := pack_cloud(cloud)) > room:
         voxel *= 1.15
         cloud = keyframe.cloud[voxel_first(keyframe.cloud, voxel)]
-    dimension = MultiArrayDimension(label=name, size=len(packed), stride=len(packed))
-    return descriptors, UInt8MultiArray(layout=MultiArrayLayout(dim=[dimension]), data=bytes_to_array(packed))
+    dimensions = [MultiArrayDimension(label=name, size=len(packed), stride=len(packed))]
+    if fix is not None:
+        dimensions.append(MultiArrayDimension(label="fix", size=_FIX.size, stride=_FIX.size))
+        packed += _FIX.pack(fix.stamp, *fix.geodetic, *fix.covariance.ravel(), *fix.antenna)
+    return descriptors, UInt8MultiArray(layout=MultiArrayLayout(dim=dimensions), data=bytes_to_array(packed))
+
+
+def cloud_from_msg(message: UInt8MultiArray) -> tuple[bytes, Fix | None]:
+    """The packed cloud of a keyframe, not unpacked yet, and its fix.
+
+    Raises:
+        RejectedError: the fix is invalid.
+    """
+    data = bytes(message.data)
+    if len(message.layout.dim) < 2:
+        return data, None
+    packed, rest = data[: -_FIX.size], data[-_FIX.size :]
+    if len(rest) != _FIX.size:
+        raise RejectedError("fix", f"a fix of {len(rest)} bytes")
+    stamp, *numbers = _FIX.unpack(rest)
+    values = np.array(numbers)
+    try:
+        return packed, Fix(stamp, values[:3], values[3:12].reshape(3, 3), values[12:])
+    except ValueError as error:
+        raise RejectedError("fix", str(error)) from None
 
 
 def descriptors_to_msg(d: Descriptors | None, stamp: int, name: str, weights: str = "") -> PointCloud2:

@@ -100,7 +100,9 @@ class SlamNode(ManagedNode):
         reading = self._config.input.model_copy(update={"images": self._config.input.images and self._slam.uses_images})
         self._inputs = Inputs(self, reading, ros, self._known)
         self._known = self._inputs.calibration
-        self._frames = FrameBuilder(reading, self._known, self.get_logger().error, imu=self._inputs.imu)
+        self._frames = FrameBuilder(
+            reading, self._known, self.get_logger().error, imu=self._inputs.imu, gnss=self._inputs.gnss
+        )
         self._diagnostics = Diagnostics(self, self._inputs, self._frames, self._health, self._mapper, self._sender)
         self._diagnostics.other = self._other
         worker = threading.Thread(target=self._work, name="worker")

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from dpm2_core.descriptors import Descriptors
-from dpm2_core.frame import Keyframe
+from dpm2_core.frame import Fix, Keyframe
 
 AHEAD = 64
 """Keyframes that may wait for one before them; those beyond are sent again."""
@@ -19,10 +19,10 @@ _TIMES = 3
 
 @dataclass(eq=False)
 class Parts:
-    """What has come of a keyframe, each part checked: its pose, its packed cloud, its descriptors."""
+    """What has come of a keyframe, each part checked: its pose, its packed cloud with its fix, its descriptors."""
 
     pose: Any = None
-    cloud: bytes | None = None
+    cloud: tuple[bytes, Fix | None] | None = None
     seen: bool = False
     descriptors: Descriptors | None = None
 
@@ -34,7 +34,11 @@ class Parts:
     @property
     def nbytes(self) -> int:
         """Roughly."""
-        return 2000 + len(self.cloud or b"") + (0 if self.descriptors is None else self.descriptors.nbytes)
+        return (
+            2000
+            + (0 if self.cloud is None else len(self.cloud[0]))
+            + (0 if self.descriptors is None else self.descriptors.nbytes)
+        )
 
 
 class Stream:

@@ -15,11 +15,12 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, PointCloud2
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, NavSatFix, PointCloud2
 from std_msgs.msg import Float64
 
 from dpm2_core.data import topics
 from dpm2_core.data.frames import Calibration, CameraTopic
+from dpm2_core.data.gnss import FixBuffer
 from dpm2_core.data.image_messages import decode_camera
 from dpm2_core.data.imu import ImuBuffer
 from dpm2_core.data.kitti import checked_correction
@@ -44,10 +45,11 @@ LATCHED = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE, durabili
 
 
 class Inputs:
-    """Clouds, images, an IMU and calibration as they come in. The callbacks only put them into queues.
+    """Clouds, images, an IMU, a GNSS receiver and calibration as they come in. The callbacks only put them into queues.
 
     Attributes:
         imu: its samples; None where none is wanted. imu_received: messages so far.
+        gnss: its fixes; None where none are wanted. gnss_received: messages so far.
         calibration: what is known by now; its topics are full names, after remapping.
     """
 
@@ -62,6 +64,7 @@ class Inputs:
         self.calibration = known or _named(node, given)
         self.imu = ImuBuffer() if settings.imu else None
         self.imu_received = 0
+        self.gnss, self.gnss_received = FixBuffer() if settings.gnss_topic else None, 0
         self._image_shift = round(settings.image_time_offset * 1e9)
         self._arrived = threading.Condition()
         beside = [camera.topic for camera in self.calibration.cameras]
@@ -93,6 +96,8 @@ class Inputs:
             out.append(self._subscribed(PointCloud2, given.second_points_topic, self._on_second))
         if given.imu:
             out.append(self._subscribed(Imu, given.imu_topic, self._on_imu))
+        if given.gnss_topic:
+            out.append(self._subscribed(NavSatFix, given.gnss_topic, self._on_fix))
         return out
 
     def _images(self, camera: CameraTopic, topic: str, info_topic: str) -> list[MatchedSubscription]:
@@ -209,6 +214,12 @@ class Inputs:
             self.imu.add(self._stamp(message), message)
             self.imu_received += 1
 
+    def _on_fix(self, message: NavSatFix) -> None:
+        check_header(message.header)
+        if self.gnss is not None:
+            self.gnss.add(self._stamp(message), message)
+            self.gnss_received += 1
+
     def _stamp(self, message: Any) -> int:
         """ns; drivers that leave the stamp at 0 get the time of arrival."""
         return stamp_ns(message.header) or self._node.get_clock().now().nanoseconds
@@ -254,6 +265,8 @@ def _named(node: Node, given: InputSettings) -> Calibration:
             raise UsageError(f"input.second_points_topic: {known.points_topic} is that of the first LiDAR")
     if given.imu:
         known.imu_topic = node.resolve_topic_name(given.imu_topic)
+    if given.gnss_topic:
+        known.gnss_topic = node.resolve_topic_name(given.gnss_topic)
     if given.images:
         known.camera = CameraTopic(node.resolve_topic_name(given.image_topic))
     if given.images and given.second_image_topic:

@@ -13,6 +13,7 @@ from dpm2_core.data.messages import MessageError
 from dpm2_core.data.pairing import JUMP
 from dpm2_core.frame import Fix
 
+_NO_FIX = -1  # -2, Jazzy's default, says that the driver sets no status at all
 _MOST = 100  # fixes kept; bounds memory where no cloud comes
 _LEAST = 0.01  # m, added to every standard deviation: no antenna's place and no clock is known better
 _ASSUMED = (5.0, 5.0, 10.0)  # m east, north, up where the receiver states none: that of a plain one under open sky
@@ -28,7 +29,7 @@ def decode_fix(message: Any, stamp: int) -> Fix | None:
     Raises:
         MessageError: no place on Earth, or no covariance.
     """
-    if message.status.status < 0:
+    if message.status.status == _NO_FIX:
         return None
     place = np.array([message.latitude, message.longitude, message.altitude], np.float64)
     if not place[:2].any():

@@ -14,7 +14,7 @@ from hypothesis.extra import numpy as hnp
 from dpm2_core.data.messages import decode_points, stamp_ns
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.errors import UsageError
-from dpm2_core.frame import Array, Keyframe, Registration
+from dpm2_core.frame import Array, Fix, Keyframe, Registration
 from dpm2_core.geometry import se3
 from dpm2_ros import conversions
 
@@ -132,7 +132,8 @@ def test_motion_of_the_base(xi: np.ndarray, mount: np.ndarray) -> None:
     T_base_lidar, T_odom_lidar = se3.exp(mount), se3.exp(xi)
     cloud = np.array([[1, 2, 3, 0.5]], np.float32)
     edge = Registration(T_odom_lidar, spd(4), 1.0, 0.0, "geometric")
-    keyframe = Keyframe(1, 5, 0, T_odom_lidar, cloud, edge)
+    fix = Fix(5, np.array([49.0, 8.4, 110.0]), np.eye(3), np.array([1.0, 2.0, 3.0]))  # where that point is
+    keyframe = Keyframe(1, 5, 0, T_odom_lidar, cloud, edge, fix=fix)
     base = motion(T_odom_lidar).of_base(T_base_lidar)
     start = motion(np.eye(4)).of_base(T_base_lidar)
     np.testing.assert_allclose(start.T_odom_body, np.eye(4), atol=EXACT)
@@ -140,6 +141,8 @@ def test_motion_of_the_base(xi: np.ndarray, mount: np.ndarray) -> None:
     np.testing.assert_allclose(base.T_odom_body @ T_base_lidar, T_base_lidar @ T_odom_lidar, atol=EXACT)
     seen = conversions.keyframe_to_base(keyframe, T_base_lidar)
     assert seen.edge is not None
+    assert seen.fix is not None
+    np.testing.assert_allclose(seen.fix.antenna, seen.cloud[0, :3], atol=1e-5)
     in_odom = seen.T_odom_kf @ np.append(seen.cloud[0, :3].astype(float), 1)
     expected = T_base_lidar @ T_odom_lidar @ np.append(cloud[0, :3].astype(float), 1)
     np.testing.assert_allclose(in_odom, expected, atol=1e-5)  # the cloud is float32

@@ -23,7 +23,7 @@ from std_srvs.srv import Trigger
 from dpm2_core.data.trajectory import read_trajectory
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.descriptors import Descriptors
-from dpm2_core.frame import Keyframe
+from dpm2_core.frame import Fix, Keyframe
 from dpm2_core.geometry import se3
 from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.store.map_data import load_map
@@ -71,6 +71,28 @@ def keyframes(mapper: Any) -> int:
 
 def points(seed: int) -> np.ndarray:
     return np.random.default_rng(seed).uniform(0, 1, (500, 4)).astype(np.float32) * [20, 20, 5, 1]
+
+
+def test_a_fix_travels_with_its_keyframe_and_a_forged_one_does_not(mapper: Any) -> None:
+    fix = Fix(7, np.array([49.0, 8.4, 110.0]), np.diag([4.0, 4, 16]), np.array([0.1, -0.2, 1.5]))
+    keyframe = Keyframe(0, 1000, 0, np.eye(4), points(0).astype(np.float32), fix=fix)
+    name = keyframe_name("", 0)
+    seen, cloud = payload_to_msgs(keyframe, name)
+    forged, cut = copy.deepcopy(cloud), copy.deepcopy(cloud)
+    forged.data[-8:] = type(cloud.data)("B", struct.pack("<d", float("nan")))
+    cut.data = cloud.data[:20]
+    wires = mapper.wires
+    for wrong in (forged, cut):
+        wires[2].publish(wrong)
+    mapper.wait(lambda: mapper.mapper.rejections.get("/dpm2/keyframe_cloud: fix", 0) >= 2, "rejections")
+    for wire, message in zip(wires, (edge_to_msg(np.eye(4), np.eye(6), 1000, "odom", name), seen, cloud), strict=True):
+        wire.publish(message)
+    mapper.wait(lambda: keyframes(mapper) == 1, "the keyframe")
+    found = core(mapper).keyframes[0].fix
+    assert found is not None
+    assert found.stamp == fix.stamp
+    for part in ("geodetic", "covariance", "antenna"):
+        np.testing.assert_array_equal(getattr(found, part), getattr(fix, part))
 
 
 @pytest.mark.parametrize("cloud_first", [False, True])

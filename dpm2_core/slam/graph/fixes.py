@@ -20,6 +20,7 @@ from dpm2_core.slam.graph.graph_data import GraphData, Index
 _FEWEST = 5
 _HEADING = np.radians(2.0)  # standard deviation from which on the heading counts as known
 _KERNEL = 3.0  # standard deviations beyond which a fix hardly counts for the start
+_SLACK, _DRIFT = 0.05, 0.02  # m, and m per m from the middle: the odometry errs, too
 _TRIALS = 100  # headings
 _NEAR = 10_000.0  # m from the median of all: farther fixes are wrong, and none of them is the origin
 _TILT = np.radians(5.0)  # standard deviation of the map's level: a drive may begin on a hill
@@ -76,6 +77,8 @@ class Fixes:
         here = np.array([poses[node] @ np.append(fix.antenna, 1) for node, fix in known])[:, :3]
         there = geodesy.ecef([fix.geodetic for _, fix in known])
         sigmas = np.array([np.sqrt(np.trace(fix.covariance[:2, :2]) / 2) for _, fix in known])
+        middle = np.linalg.norm(here - np.median(here, axis=0), axis=1)
+        sigmas = np.hypot(sigmas, _SLACK + _DRIFT * middle)
         near = np.linalg.norm(there - np.median(there, axis=0), axis=1) < _NEAR
         origin = known[int(np.argmax(near))][1].geodetic
         if self.georeference is not None:

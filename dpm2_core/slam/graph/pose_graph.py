@@ -160,6 +160,7 @@ class PoseGraph:
     def set_georeference(self, georeference: Georeference) -> None:
         """Where on Earth a map is that was loaded."""
         self._fixes.georeference = georeference
+        self._fixes.sent()
         chosen, first = self._chosen(), len(self._loops)
         if chosen:
             data = self._data()

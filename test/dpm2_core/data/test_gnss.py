@@ -80,6 +80,7 @@ def test_a_topic_that_is_not_there(bags: Any, tmp_path: Path) -> None:
 def test_what_is_not_known(bags: Any) -> None:
     """No fix is none; without a covariance that of a plain receiver; without an altitude the height says nothing."""
     assert decode_fix(nav(bags, 1.0, (NAN, NAN, NAN), status=-1), SECOND) is None
+    assert decode_fix(nav(bags, 1.0, status=-2), SECOND) is not None  # a driver that sets no status
     for assumed in ({"kind": 0}, {"covariance": np.zeros(9)}):
         fix = decode_fix(nav(bags, 1.0, **assumed), SECOND)
         assert fix is not None

@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""slam_node with a GNSS receiver, over real DDS: fixes that come late place the map, hostile ones are counted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import NavSatFix, PointCloud2
+
+from dpm2_core.data.topics import POINTS
+from dpm2_core.frame import Array
+from dpm2_core.geometry import geodesy, se3
+from dpm2_ros.conversions import header, transform_to_msg
+from dpm2_ros.slam_node import SlamNode
+from dpm2_ros.tf import TFMessage
+
+T_BASE_LIDAR = se3.exp([0.0, 0.0, 0.3, 0.8, 0.0, 1.2])
+T_LIDAR_ANTENNA = se3.exp([0.0, 0.0, 0.0, -0.5, 0.2, 0.4])
+T_ECEF_START = geodesy.enu_frame([49.0, 8.4, 110.0]) @ se3.exp([0, 0, 0.6, 0, 0, 0])
+"""Of the LiDAR's first pose."""
+SIGMA = 0.02
+
+
+def nav(stamp: int, place: Array) -> NavSatFix:
+    message = NavSatFix(header=header(stamp, "gnss"), position_covariance_type=NavSatFix.COVARIANCE_TYPE_KNOWN)
+    message.latitude, message.longitude, message.altitude = place.tolist()
+    message.position_covariance = (SIGMA**2 * np.eye(3)).ravel()
+    return message
+
+
+@pytest.mark.slow
+def test_fixes_place_the_map_on_earth(ros: Callable[..., Any], drive: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("dpm2_ros.diagnostics.PERIOD", 0.1)
+    harness = ros(
+        "input.images:=false", "ros.base_frame:=base_link", "input.gnss_topic:=fix", "slam.keyframes.distance:=1.0"
+    )
+    lidar = harness.publisher(PointCloud2, POINTS)
+    receiver = harness.publisher(NavSatFix, "/fix", reliable=False)
+    static = harness.publisher(TFMessage, "/tf_static", latched=True)
+    places = [("base_link", "lidar", T_BASE_LIDAR), ("lidar", "gnss", T_LIDAR_ANTENNA)]
+    static.publish(TFMessage(transforms=[transform_to_msg(T, 0, parent, child) for parent, child, T in places]))
+    odom, diagnostics = harness.hear(Odometry, "/dpm2/odom"), harness.hear(DiagnosticArray, "/diagnostics")
+    node: SlamNode = harness.add(SlamNode())
+    harness.wait(lambda: lidar.get_subscription_count() and receiver.get_subscription_count(), "subscriptions")
+    harness.wait(lambda: "gnss" in node.calibration.transforms.frames, "/tf_static")
+
+    def status() -> list[DiagnosticStatus]:
+        found = diagnostics[-1].status if diagnostics else []
+        return [s for s in found if s.name.endswith(": gnss")]
+
+    harness.wait(lambda: status() and status()[0].message == "no fix on /fix yet", "a warning without fixes")
+    rng = np.random.default_rng(0)
+    for n in range(drive.frames):
+        if n:  # of the scan before, as a receiver that takes a tenth of a second has it
+            ecef = T_ECEF_START @ drive.pose(n - 1) @ T_LIDAR_ANTENNA[:, 3]
+            place = geodesy.geodetic(ecef[:3] + SIGMA * rng.normal(size=3))
+            receiver.publish(nav(drive.stamp(n - 1), place))
+            for wrong in ([np.nan, 8.4, 110.0], [91.0, 8.4, 110.0], [0.0, 0.0, 0.0]):
+                receiver.publish(nav(drive.stamp(n - 1) + 1, np.array(wrong)))
+        before = len(odom)
+        lidar.publish(drive.cloud(n))
+        harness.wait(lambda before=before: len(odom) > before, f"the odometry of cloud {n}")
+    mapper = node.slam.mapper
+    harness.wait(lambda: mapper.georeference is not None, "the map's place on Earth")
+    harness.wait(lambda: status() and status()[0].message == "in use", "a status in use")
+    assert sum(node.rejections.values()) >= 3 * (drive.frames - 1)
+    # map is the frame of the base's first pose, `base` over the ground
+    known, T_start_map = mapper.georeference, se3.inverse(T_BASE_LIDAR)
+    found = geodesy.enu_frame(known.origin) @ known.T_enu_map
+    way = se3.inverse(found) @ T_ECEF_START @ T_start_map
+    assert np.linalg.norm(way[:3, 3]) < 0.2
+    assert np.degrees(np.abs(se3.log(way)[2])) < 1.0
