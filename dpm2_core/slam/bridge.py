@@ -9,6 +9,7 @@ of each other, move as the stretch does, when no direction is left open, and whe
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,10 +22,12 @@ from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration, a
 
 _TIES = 3
 """So many results must agree, and most of all that there are: two meet by chance."""
-_MOVED = 1.0
-"""They are evidence only when the robot has moved in between, m..."""
+_MOVED = 0.5
+"""They are evidence only when the robot has moved so far from one to the next, m..."""
 _AS_WELL = 0.9
 """...or when the scan fits the map before at least this much as well as its own stretch: one stands where one stood."""
+_NEAR = 1.0  # m, added to what a vehicle can do
+_DRIVES = 1.0  # m/s: no slower
 _BRAKES = 0.35  # m/s2: the way is searched so far around that of an even change of the motion, times seconds squared
 _STEERS = 0.06  # rad/s2: the same for the heading
 _PARTS = (0.75, 0.5, 0.25, 0.0)  # of that way, that are searched too if the robot, braking by
@@ -104,12 +107,14 @@ class Bridge:
                 `own` is how it was registered there.
         """
         self.tries += 1
-        if self._after is None:
+        if self._after is None and twist is not None:
             self._after = twist
-        T_begin_this = se3.inverse(self._T_begin) @ T_stretch
-        starts = self._beginnings() @ T_begin_this
-        result = self.registration.register(scan, Prediction(list(starts), unique=True))
-        problem = self._problem(result, result.T_target_source @ se3.inverse(T_begin_this))
+            self._ties = [tie for tie in self._ties if not self._impossible(self._began(tie))]
+        T_this_begin = se3.inverse(T_stretch) @ self._T_begin
+        starts = self._beginnings() @ se3.inverse(T_this_begin)
+        search = Prediction(list(starts), unique=True, possible=lambda T: not self._impossible(T @ T_this_begin))
+        result = self.registration.register(scan, search)
+        problem = self._problem(result, result.T_target_source @ T_this_begin)
         if problem:
             return replace(result, ok=False, reason=problem), False
         self._ties.append(_Tie(result, T_stretch))
@@ -155,14 +160,29 @@ class Bridge:
             return result.reason
         if (sigma := result.worst_sigma) > self._limits.sigma:
             return f"after a pause: position uncertain by {sigma:.2f} m"
+        return self._impossible(T_begin)
+
+    def _began(self, tie: _Tie) -> Array:
+        """Where the stretch began (4, 4), by one result."""
+        return tie.before.T_target_source @ se3.inverse(tie.T_stretch) @ self._T_begin
+
+    def _impossible(self, T_begin: Array) -> str:
+        """Why a vehicle cannot have come to T_begin (4, 4) in the pause; empty if it can."""
         if self._after is None or self.twist is None:
             return ""
         # Between two known velocities, with a bounded acceleration, nothing is farther from their mean times the time.
         T_before_begin = se3.inverse(self._T) @ T_begin
-        mean = (self.twist[3:] + T_before_begin[:3, :3] @ self._after[3:]) / 2
-        off = float(np.linalg.norm(T_before_begin[:3, 3] - self._seconds * mean))
-        if off > _MOVED + self._limits.acceleration * self._seconds**2 / 4:
+        before, after = self.twist[3:], T_before_begin[:3, :3] @ self._after[3:]
+        way, mean = T_before_begin[:3, 3], (before + after) / 2
+        off = float(np.linalg.norm(way - self._seconds * mean))
+        if off > _NEAR + self._limits.acceleration * self._seconds**2 / 4:
             return f"after a pause: {off:.0f} m from where the motion before and after leads"
+        if min(np.linalg.norm(before), np.linalg.norm(after)) > _DRIVES and before @ after > 0:
+            # It did not reverse: it has come at least as far as it needs to stop, and to be as fast again.
+            ahead = mean / np.linalg.norm(mean)
+            stops = sum(float(np.linalg.norm(v) * (v @ ahead)) for v in (before, after)) / 2 / self._limits.acceleration
+            if way @ ahead < stops - _NEAR:
+                return f"after a pause: {way @ ahead:.0f} m on, but it needs {stops:.0f} m to stop and start again"
         return ""
 
     def _together(self, fits: bool) -> bool:
@@ -176,7 +196,16 @@ class Bridge:
         ]
         if len(agreeing) < _TIES or 2 * len(agreeing) <= len(self._ties):
             return False
-        return fits or max(agreeing) >= _MOVED
+        return fits or _apart(agreeing) >= _TIES
+
+
+def _apart(distances: Sequence[float]) -> int:
+    """How many of them are far enough from one another to be evidence."""
+    count, reached = 0, -np.inf
+    for distance in sorted(distances):
+        if distance >= reached + _MOVED:
+            count, reached = count + 1, distance
+    return count
 
 
 def _direction(before: Array, after: Array) -> Array:

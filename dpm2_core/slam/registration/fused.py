@@ -74,6 +74,8 @@ class FusedScanRegistration:
             if _sure(points):
                 return points
         neural = self._neural.register(scan, prediction) if len(self._neural) else None
+        if neural is not None and neural.ok and not prediction.possible(neural.T_target_source):
+            neural = replace(neural, ok=False, reason="found where no vehicle can have come")
         if neural is not None and neural.ok and prediction.information is None:
             prediction = replace(prediction, starts=[neural.T_target_source, *prediction.starts])
         points = points or self._geometric.register(scan, prediction)

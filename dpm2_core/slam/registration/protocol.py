@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol, Self
 
@@ -39,12 +39,14 @@ class Prediction:
         information: (6, 6) [rotation rad, translation m] of the first; None: nothing to go by.
         unique: the starts are a search for a place: a result needs fewer points that fit, since a scan from afar shows
             much that the map does not have, but no other start may lead to a place that fits nearly as well.
+        possible: whether the robot can be at a pose (4, 4); asked of what is found without a start.
     """
 
     starts: Sequence[Array]
     widen: float = 1.0
     information: Array | None = None
     unique: bool = False
+    possible: Callable[[Array], bool] = lambda _: True
 
     @property
     def sigma(self) -> float:
