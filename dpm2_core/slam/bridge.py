@@ -114,11 +114,14 @@ class Bridge:
         starts = self._beginnings() @ se3.inverse(T_this_begin)
         search = Prediction(list(starts), unique=True, possible=lambda T: not self._impossible(T @ T_this_begin))
         result = self.registration.register(scan, search)
-        problem = self._problem(result, result.T_target_source @ T_this_begin)
+        fits = result.confidence >= _AS_WELL * own.confidence
+        problem = self._problem(result)
+        if not problem and not fits:  # else it stands where it stood, whatever the clock says
+            problem = self._impossible(result.T_target_source @ T_this_begin)
         if problem:
             return replace(result, ok=False, reason=problem), False
         self._ties.append(_Tie(result, T_stretch))
-        return result, self._together(result.confidence >= _AS_WELL * own.confidence)
+        return result, self._together(fits)
 
     def _beginnings(self) -> Array:
         """Where the stretch may begin (P, 4, 4), the most likely first."""
@@ -154,13 +157,13 @@ class Bridge:
     def _speed(self) -> float:
         return float(np.linalg.norm(self._motion[3:]))
 
-    def _problem(self, result: Registration, T_begin: Array) -> str:
-        """Why a result, by which the stretch begins at T_begin (4, 4), cannot be right."""
+    def _problem(self, result: Registration) -> str:
+        """Why a result says nothing."""
         if not result.ok:
             return result.reason
         if (sigma := result.worst_sigma) > self._limits.sigma:
             return f"after a pause: position uncertain by {sigma:.2f} m"
-        return self._impossible(T_begin)
+        return ""
 
     def _began(self, tie: _Tie) -> Array:
         """Where the stretch began (4, 4), by one result."""
@@ -177,12 +180,13 @@ class Bridge:
         off = float(np.linalg.norm(way - self._seconds * mean))
         if off > _NEAR + self._limits.acceleration * self._seconds**2 / 4:
             return f"after a pause: {off:.0f} m from where the motion before and after leads"
-        if min(np.linalg.norm(before), np.linalg.norm(after)) > _DRIVES and before @ after > 0:
+        speeds, most = np.linalg.norm([before, after], axis=1), self._limits.acceleration
+        if speeds.min() > _DRIVES and before @ after > 0 and speeds.sum() < most * self._seconds:
             # It did not reverse: it has come at least as far as it needs to stop, and to be as fast again.
             ahead = mean / np.linalg.norm(mean)
-            stops = sum(float(np.linalg.norm(v) * (v @ ahead)) for v in (before, after)) / 2 / self._limits.acceleration
-            if way @ ahead < stops - _NEAR:
-                return f"after a pause: {way @ ahead:.0f} m on, but it needs {stops:.0f} m to stop and start again"
+            least, came = float(speeds @ [before @ ahead, after @ ahead]) / (2 * most), float(way @ ahead)
+            if came < least - _NEAR:
+                return f"after a pause: {came:.0f} m on, but it needs {least:.0f} m to stop and start again"
         return ""
 
     def _together(self, fits: bool) -> bool:

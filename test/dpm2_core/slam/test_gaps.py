@@ -143,6 +143,19 @@ def test_real_gaps(kitti_root: object) -> None:
     assert off(tracked[14:], source.poses[kept[14:]]).max() < 0.5
 
 
+@pytest.mark.weights
+def test_a_place_that_looks_alike_is_not_one_that_the_robot_can_have_reached(kitti_root: object) -> None:
+    """Five seconds of KITTI 00 missing: to the network the scans after them look like a place 37 m back."""
+    source = open_source(f"{kitti_root}/sequences/00")
+    assert source.poses is not None
+    kept = [*range(23, 37), *range(85, 99)]
+    frames = list(source.frames(kept[0], kept[-1] + 1))
+    tracked = run([frames[i - kept[0]] for i in kept])
+    wrong = off(tracked[13:], source.poses[kept[13:]]) > 0.5
+    assert wrong.any()
+    assert not [t.state for t, far in zip(tracked[13:], wrong, strict=True) if far and t.state == State.TRACKING]
+
+
 @pytest.mark.slow
 def test_bench_places_gaps_and_counts_what_is_wrong(world: World) -> None:
     assert [(g.first, g.stop) for g in gaps([10**8 * i for i in range(31)])] == [(10, 20), (11, 21)]
