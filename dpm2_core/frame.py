@@ -117,7 +117,7 @@ class Fix:
 
     def __post_init__(self) -> None:
         shapes = (self.geodetic.shape, self.covariance.shape, self.antenna.shape)
-        if shapes != ((3,), (3, 3), (3,)) or not (np.abs(self.geodetic) <= (90, 360, 1e5)).all():  # NaN compares false
+        if shapes != ((3,), (3, 3), (3,)) or not _on_earth(self.geodetic):
             raise ValueError(f"fix: latitude, longitude, altitude {self.geodetic.tolist()} are no place on Earth")
         if not np.abs(self.antenna).max() <= 1e3:
             raise ValueError(f"fix: its antenna is at {self.antenna.tolist()} m")
@@ -137,6 +137,15 @@ class Georeference:
 
     origin: Array
     T_enu_map: Array
+
+    def __post_init__(self) -> None:
+        """Raises ValueError if the origin is not a place on Earth."""
+        if not _on_earth(self.origin):
+            raise ValueError(f"latitude, longitude, altitude {self.origin.tolist()} are no place on Earth")
+
+
+def _on_earth(geodetic: Array) -> bool:
+    return bool((np.abs(geodetic) <= (90, 360, 1e5)).all())  # NaN compares false
 
 
 @dataclass(frozen=True, eq=False)
