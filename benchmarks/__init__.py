@@ -57,6 +57,7 @@ BENCHES: dict[str, Bench] = {
     "tasks": _bench("tasks:bench_tasks", "repetitions threads set only"),
     "tilt": _bench("tilt:bench_tilt", "source kitti threads set weights pairs"),
     "traffic": _bench("traffic:bench_traffic", "repetitions threads set weights only"),
+    "views": _bench("views:bench_views", "source kitti threads set"),
 }
 """By the name that `dpm2 bench NAME` and `benchmarks/NAME.json` share."""
 

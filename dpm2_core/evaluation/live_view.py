@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 _SCAN = 6000  # points of a scan that are shown; all of a keyframe are, in the map
 _COLORS = {State.TRACKING: (90, 200, 120), State.DEGRADED: (240, 180, 60), State.LOST: (230, 80, 70)}
 _ACCEPTED, _REJECTED, _WAY = (90, 160, 255), (230, 90, 80), (240, 210, 90)
-_WIDTH = 640  # pixels of an image that is shown
+_WIDTH = 640  # pixels of an image that is shown, at most: to encode a larger one took longer than all the rest
 
 
 class LiveView:
@@ -77,7 +77,7 @@ class LiveView:
         self._show_figures(tracked)
         if frame.images:
             pixels = frame.images[0].pixels
-            step = max(1, pixels.shape[1] // _WIDTH)
+            step = -(-pixels.shape[1] // _WIDTH)
             jpeg = cv2.imencode(".jpg", pixels[::step, ::step, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 70])[1].tobytes()
             self._stream.log("image", self._rr.EncodedImage(contents=jpeg, media_type="image/jpeg"))
         if tracked.keyframe is not None:

@@ -58,6 +58,9 @@ EXPERIMENTS: dict[str, Listed] = {
     "ae-lidar": Listed(
         "Differentiable SLAM, table 4", "scans as short codes by AE_lidar, likewise", "task_tables:ae_lidar"
     ),
+    "ae-lidar-slam": Listed(
+        "Differentiable SLAM, beside table 4", "odometry on what AE_lidar makes, likewise", "task_tables:ae_lidar_slam"
+    ),
 }
 
 

@@ -219,5 +219,15 @@ AE_LIDAR = TaskTable(
     test=_CARLA_TEST,
     defaults=("slam.gamma=30", "slam.begin=29", "slam.every=3", "slam_loss.points=1024"),
 )
-TABLES = {"gndnet": GNDNET, "dslr": DSLR, "dslr-slam": DSLR_SLAM, "ae-lidar": AE_LIDAR}
-gndnet, dslr, dslr_slam, ae_lidar = (table.experiment() for table in TABLES.values())
+AE_LIDAR_SLAM = replace(
+    AE_LIDAR,
+    title="Odometry on what AE_lidar makes",
+    measured=SLAM,
+    figures=dict.fromkeys(("output_ate_m", "output_rpe_m", "output_rpe_deg"), ".4g"),
+    paper={},
+    notes=("the paper has no such table; the SLAM loss asks for this",),
+)
+TABLES = {
+    "gndnet": GNDNET, "dslr": DSLR, "dslr-slam": DSLR_SLAM, "ae-lidar": AE_LIDAR, "ae-lidar-slam": AE_LIDAR_SLAM,
+}  # fmt: skip
+gndnet, dslr, dslr_slam, ae_lidar, ae_lidar_slam = (table.experiment() for table in TABLES.values())

@@ -18,7 +18,7 @@ def open_scans(path: Path | str, needs: Sequence[RequiredData] = (), sequences: 
     A gap in the numbers of the scans ends a sequence: what lies across it is no motion from one scan to the next.
 
     Args:
-        sequences: names of their folders, such as 05, or numbers of pairs; empty: all there are.
+        sequences: names of their folders, such as 05, or of folders above; or numbers of pairs; empty: all there are.
 
     Raises:
         UsageError: no scans, something needed is missing, or a file of the wrong length; it names file and reason.
@@ -37,8 +37,15 @@ def open_scans(path: Path | str, needs: Sequence[RequiredData] = (), sequences: 
 
 
 def folders_of(path: Path, sequences: Sequence[str] = ()) -> list[Path]:
-    """The sequence folders below `path` of these names; all of them if none is named."""
-    return [folder for folder in sequence_folders(path) if not sequences or folder.name in sequences]
+    """The sequence folders below `path` that have one of these names, or are below one; all of them if none is named."""
+    return [
+        folder for folder in sequence_folders(path) if not sequences or set(sequences) & set(names_of(folder, path))
+    ]
+
+
+def names_of(folder: Path, path: Path) -> list[str]:
+    """The names that a sequence folder below `path` can be chosen by: those of the folders on the way, its own last."""
+    return [name for name in folder.relative_to(path).parts if name != "sequences"] or [folder.resolve().name]
 
 
 def is_among(number: int, sequences: Sequence[str]) -> bool:
@@ -47,7 +54,7 @@ def is_among(number: int, sequences: Sequence[str]) -> bool:
 
 
 def _check_found(path: Path, sequences: Sequence[str], found: Sequence[ScanSequence]) -> None:
-    folders = {folder.name for folder in sequence_folders(path)}
+    folders = {name for folder in sequence_folders(path) for name in names_of(folder, path)}
     pairs = {pair.number for pair in found if isinstance(pair, ArrayPair)}
     missing = [name for name in sequences if name not in folders and not (name.isdecimal() and int(name) in pairs)]
     if missing:

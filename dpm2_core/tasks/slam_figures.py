@@ -16,7 +16,7 @@ from dpm2_core.evaluation.metrics import evaluate
 from dpm2_core.frame import Array, Frame
 from dpm2_core.slam.build import make_odometry
 from dpm2_core.slam.settings import SlamSettings
-from dpm2_core.tasks.open import folders_of, is_among, open_scans
+from dpm2_core.tasks.open import folders_of, is_among, names_of, open_scans
 from dpm2_core.tasks.pairs import open_pairs
 from dpm2_core.tasks.scan import TaskScans
 from dpm2_core.tasks.task import Task
@@ -91,7 +91,7 @@ def _with_poses(task: Task, path: Path, sequences: Sequence[str]) -> Iterator[tu
         truth, scans = open_source(folder).poses, open_scans(folder, task.needs)
         if truth is None or len(truth) != len(scans):
             raise UsageError(f"{folder}: no true poses of its {len(scans)} scans; the SLAM cannot be evaluated")
-        yield folder.name, truth, scans
+        yield "/".join(names_of(folder, path)), truth, scans
 
 
 def _odometry(clouds: list[np.ndarray]) -> Array:

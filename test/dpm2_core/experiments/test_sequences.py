@@ -137,6 +137,6 @@ def test_the_list_has_every_experiment() -> None:
     assert done.returncode == 0
     assert list(json.loads(done.stdout)) == [
         "kitti", "kitti360", "robustness", "reference-points", "fusion", "attention", "gndnet", "dslr", "dslr-slam",
-        "ae-lidar",
+        "ae-lidar", "ae-lidar-slam",
     ]  # fmt: skip
     assert "Differentiable SLAM, table 4" in dpm2("experiment", "--list").stdout

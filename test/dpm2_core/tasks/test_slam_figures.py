@@ -15,6 +15,7 @@ from dpm2_core.sim.settings import DriveConfig, LidarConfig
 from dpm2_core.tasks.ae_lidar import AeLidarImage, AeLidarSettings
 from dpm2_core.tasks.ae_lidar_task import AeLidarTask, AeLidarTraining
 from dpm2_core.tasks.ground_task import GroundTask, GroundTraining
+from dpm2_core.tasks.open import folders_of, names_of, open_scans
 from dpm2_core.tasks.slam_figures import slam_figures
 
 
@@ -38,6 +39,14 @@ def task() -> AeLidarTask:
     return AeLidarTask(AeLidarTraining(network=AeLidarSettings(image=image, channels=4, latent=8))).eval()
 
 
+def test_a_folder_above_sequences_chooses_them(drives: Path) -> None:
+    """What is learned from and what is tested on may be two folders of drives whose sequences are all called 00."""
+    assert len(open_scans(drives)) == 2 * len(open_scans(drives, sequences=["1"])) == 8
+    assert [names_of(folder, drives) for folder in folders_of(drives, ["00"])] == [["0", "00"], ["1", "00"]]
+    with pytest.raises(UsageError, match="no sequence 2; there are 0, 00, 1"):
+        open_scans(drives, sequences=["2"])
+
+
 @pytest.mark.slow
 def test_a_perfect_network_is_as_good_as_its_input(
     drives: Path, task: AeLidarTask, monkeypatch: pytest.MonkeyPatch
@@ -54,7 +63,7 @@ def test_a_perfect_network_is_as_good_as_its_input(
     assert found["input_ate_m"] < 0.1
     assert found["input_rpe_m"] < 0.1
     assert untrained["output_ate_m"] > 10 * found["output_ate_m"]
-    alone = [untrained["input_ate_m"], slam_figures(task, drives / "1")["input_ate_m"]]
+    alone = [untrained["input_ate_m"], slam_figures(task, drives, ["1"])["input_ate_m"]]
     assert found["input_ate_m"] == pytest.approx(sum(alone) / 2)  # each drive is evaluated by its own scans
 
 
