@@ -37,10 +37,9 @@ def open_scans(path: Path | str, needs: Sequence[RequiredData] = (), sequences: 
 
 
 def folders_of(path: Path, sequences: Sequence[str] = ()) -> list[Path]:
-    """The sequence folders below `path` that have one of these names, or are below one; all of them if none is named."""
-    return [
-        folder for folder in sequence_folders(path) if not sequences or set(sequences) & set(names_of(folder, path))
-    ]
+    """The sequence folders below `path` that have one of these names, or are below one; all if none is named."""
+    chosen = set(sequences)
+    return [folder for folder in sequence_folders(path) if not chosen or chosen & set(names_of(folder, path))]
 
 
 def names_of(folder: Path, path: Path) -> list[str]:
