@@ -23,7 +23,7 @@ import numpy as np
 from rich.console import Group
 
 from benchmarks.fleet_drives import STEP, chained, odometry_of, poses_of, write_drive
-from benchmarks.fleet_growth import bench_growth
+from benchmarks.fleet_growth import bench_growth, bench_whole
 from benchmarks.harness import Options, Report, requested
 from benchmarks.roads import FIRST_SEED, road_files
 from dpm2_core.errors import Dpm2Error, UsageError
@@ -57,10 +57,10 @@ _FAST = ("slam.registration=geometric", "slam.loops.descriptors=false", "slam.th
 
 
 def bench_fleet(options: Options) -> Report:
-    """The parts of the issue's table, or the one that `--only` names: town, index, kills, workers, growth."""
+    """The parts of the issue's table, or the one that `--only` names: town, index, kills, workers, growth, whole."""
     parts: dict[str, Callable[[Path, Options], dict[str, Any]]] = {
         "town": bench_town, "index": bench_index, "kills": bench_kills, "workers": bench_workers,
-        "growth": lambda folder, _: bench_growth(folder),
+        "growth": lambda folder, _: bench_growth(folder), "whole": lambda folder, _: bench_whole(folder),
     }  # fmt: skip
     results: dict[str, Any] = {}
     file = options.out / "fleet.json"

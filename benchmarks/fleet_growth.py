@@ -1,9 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a drive more costs a map that grows: its place in the index, in the graph and in the file."""
+"""What a drive more costs a map that grows: its place in the index, in the graph and in the file; and the memory that a
+map of 20,000 keyframes takes when it is made at once.
+"""
 
 from __future__ import annotations
 
 import time
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack
+from dataclasses import replace
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -11,19 +17,21 @@ import numpy as np
 
 from dpm2_core.fleet.growth import Growth, Standing, add_drives, grown
 from dpm2_core.fleet.places import FleetIndex
-from dpm2_core.fleet.regions import LARGEST, Join
+from dpm2_core.fleet.regions import LARGEST, Join, solve
 from dpm2_core.frame import Array, Edge, Keyframe, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.pose_graph import PoseGraphSettings
 from dpm2_core.slam.loops.retrieval import WIDTH
 from dpm2_core.slam.store.cloud_codec import pack_cloud
 from dpm2_core.slam.store.cloud_store import CloudStore
-from dpm2_core.slam.store.map_data import NO_POINTS, MapData
+from dpm2_core.slam.store.map_data import NO_POINTS, MapData, load_map, save_as
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.slam.store.rows import Session
 
 DRIVES, KEYFRAMES, SHARED = 52, 100, 20
 """Drives; keyframes of each, 5 m apart; those that it has in common with the next."""
+AT_ONCE = 200
+"""Drives of the map that is made at once: 20,000 keyframes."""
 _NOISE = np.diag([1e-3] * 3 + [0.02] * 3) ** 2
 _POINTS = 5000  # of a cloud
 _WINDOW = 5  # additions whose median is taken
@@ -37,7 +45,7 @@ def bench_growth(folder: Path) -> dict[str, Any]:
     """
     rng = np.random.default_rng(0)
     count = (KEYFRAMES - SHARED) * DRIVES + SHARED
-    way = se3.exp(np.arange(count)[:, None] * np.array([0, 0, 0.01, 5.0, 0, 0]))
+    way = _way(count)
     looks = rng.normal(size=(count, WIDTH)).astype(np.float32)
     index, sizes, rows = FleetIndex(folder), dict[str, int](), []
     with MapStore.create(folder / "town.dpm2map") as store:
@@ -55,6 +63,52 @@ def bench_growth(folder: Path) -> dict[str, Any]:
         "cpu_ms_at_50_drives": many,
         "ratio": {part: many[part] / few[part] for part in few},
     }
+
+
+def bench_whole(folder: Path) -> dict[str, Any]:
+    """Drives as those of `bench_growth`, 20,000 keyframes, into a new map, in a process of its own: its memory."""
+    rng = np.random.default_rng(1)
+    way = _way((KEYFRAMES - SHARED) * AT_ONCE + SHARED)
+    joins: list[Join] = []
+    for number in range(AT_ONCE):
+        at = np.arange(KEYFRAMES) + number * (KEYFRAMES - SHARED)
+        save_as(_drive(way[at], rng), folder / f"d{number:03d}.dpm2map")
+        if number:
+            joins += _joins(f"d{number - 1:03d}", f"d{number:03d}", way, at)
+    with ProcessPoolExecutor(1, get_context("spawn")) as process:  # a forked one would count this one's memory
+        return process.submit(_at_once, folder, joins).result()
+
+
+def _at_once(folder: Path, joins: list[Join]) -> dict[str, Any]:
+    """As `merge` does it: the graph of all drives, then their maps into one file."""
+    start, began = _peak_mb(), time.process_time()
+    with ExitStack() as stack:
+        stores = [(path.stem, stack.enter_context(MapStore.open(path))) for path in sorted(folder.glob("d*.dpm2map"))]
+        maps = {name: load_map(store, descriptors=False) for name, store in stores}
+        region = solve(maps, joins, PoseGraphSettings(), LARGEST)
+        solved = time.process_time()
+        moved = {name: replace(data, poses=region.poses[name]) for name, data in maps.items()}
+        with MapStore.create(folder / "town.dpm2map") as store:
+            add_drives(store, {}, Growth(moved, region.joins))
+    return {
+        "keyframes": sum(map(len, maps.values())),
+        "joins_accepted": sum(join.loop.ok for join in region.joins),
+        "joins": len(joins),
+        "cpu_s": {"graph": solved - began, "file": time.process_time() - solved},
+        "file_mb": round((folder / "town.dpm2map").stat().st_size / 2**20),
+        "memory_mb": {"start": start, "peak": _peak_mb()},
+    }
+
+
+def _peak_mb() -> int:
+    """Largest resident set of this process since its start, MB."""
+    lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) // 1024
+
+
+def _way(count: int) -> Array:
+    """(N, 4, 4) true poses, 5 m apart, in a wide circle."""
+    return np.asarray(se3.exp(np.arange(count)[:, None] * np.array([0, 0, 0.01, 5.0, 0, 0])))
 
 
 def _added(store: MapStore, index: FleetIndex, sizes: dict[str, int], drive: tuple[str, MapData, Any],
