@@ -27,9 +27,6 @@ REQUIREMENTS = [
     "rosbags>=0.11,<0.12",  # bags without ROS; 0.x releases change the interface
     "mcap>=1.2,<2",  # salvages bags whose recording was cut off
     "opencv-python-headless>=4.9,<6",  # image decoding; headless: no Qt beside RViz
-    # Farthest point sampling at native speed. For aarch64 0.3.3 is the last with wheels; it gives the same indices.
-    "fpsample>=1.0,<2; platform_machine != 'aarch64'",
-    "fpsample==0.3.3; platform_machine == 'aarch64'",
 ]
 ROS = [  # wheels for x86_64 alone; elsewhere ROS 2 itself must be installed
     "ros-jazzy-rclpy>=7.1,<8; platform_machine == 'x86_64'",  # ROS 2 Jazzy itself

@@ -121,7 +121,7 @@ def test_what_is_declared_for_the_base_install_is_imported(declared: dict[str, l
 
 @pytest.mark.parametrize("machine", ["x86_64", "aarch64"])
 def test_a_machine_is_asked_only_for_what_exists_for_it(declared: dict[str, list[Requirement]], machine: str) -> None:
-    """Looked up in the package index: embreex, ros-rclpy and fpsample from 1.0 on have no wheels for aarch64."""
+    """Looked up in the package index: embreex and ros-rclpy have no wheels for aarch64."""
     environment = {"platform_machine": machine, "python_version": "3.12", "sys_platform": "linux"}
     requested = {
         _normal(r.name): str(r.specifier)
@@ -130,7 +130,6 @@ def test_a_machine_is_asked_only_for_what_exists_for_it(declared: dict[str, list
         if r.marker is None or r.marker.evaluate(environment)
     }
     assert ("embreex" in requested) is ("ros-rclpy" in requested) is (machine == "x86_64")
-    assert requested["fpsample"] == ("==0.3.3" if machine == "aarch64" else "<2,>=1.0")
 
 
 def test_what_make_demo_and_make_test_install_has_their_extras() -> None:

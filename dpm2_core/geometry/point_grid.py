@@ -166,14 +166,16 @@ def _within(query: Array, reach: float, grid: _Grid, squared: Array, index: Inde
             off_xy = off_x + _outside(y, cy * edge, edge)
             if off_xy > limit:
                 continue
-            for cz in range(z_first, z_last + 1):
-                at = block[cx // cells, cy // cells, cz // cells]
-                if at < 0 or off_xy + _outside(z, cz * edge, edge) > limit:
+            row = ((cx % _SIDE) * _SIDE + cy % _SIDE) * _SIDE
+            for bz in range(z_first // cells, z_last // cells + 1):
+                at = block[cx // cells, cy // cells, bz]
+                if at < 0:
                     continue
-                c = at * _VOLUME
-                if side == 1:
-                    c += ((cx % _SIDE) * _SIDE + cy % _SIDE) * _SIDE + cz % _SIDE
-                for i in range(start[c], start[c + side**3]):
+                c, end = at * _VOLUME, (at + 1) * _VOLUME
+                if side == 1:  # the cells of a row, whose points follow one another
+                    end = c + row + min(z_last - bz * _SIDE, _SIDE - 1) + 1
+                    c += row + max(z_first - bz * _SIDE, 0)
+                for i in range(start[c], start[end]):
                     dx, dy, dz = points[i, 0] - query[0], points[i, 1] - query[1], points[i, 2] - query[2]
                     squared[found], index[found] = dx * dx + dy * dy + dz * dz, i
                     found += squared[found] <= limit

@@ -3,27 +3,116 @@
 
 from __future__ import annotations
 
-import fpsample
 import numpy as np
 from numpy.typing import NDArray
 
+from dpm2_core.geometry.compiled import compiled
 from dpm2_core.geometry.point_grid import PointGrid
 
 Points = NDArray[np.float32]
 Index = NDArray[np.int64]
 
+_CHUNK = 128  # points that are updated together: 64 and 256 are slower for scans
+_HALVINGS = 5  # of the cloud, to where the sampling starts
 
-def farthest_points(points: Points, count: int) -> Index:
+
+def farthest_points(points: Points, count: int, grid: PointGrid | None = None) -> Index:
     """Farthest point sampling of (N, 3) points: min(N, count) indices, in sampling order.
 
-    The start is the same for the same cloud; which point it is follows from the tree, not from `start_idx` alone.
-    A prefix of the result is the farthest point sampling of that length: one call serves all levels of a pyramid.
+    The same cloud is sampled alike. A prefix of the result is the farthest point sampling of that length: one call
+    serves all levels of a pyramid.
+
+    Args:
+        grid: of these points, if there is one already.
     """
     count = min(count, len(points))
     if count <= 1:
         return np.arange(count)
-    height = min(5, len(points).bit_length() - 1)  # of the bucket tree; 5 is fastest around 15,000 points
-    return fpsample.bucket_fps_kdline_sampling(points, count, h=height, start_idx=0).astype(np.int64)
+    order = (grid or PointGrid(points.astype(np.float64), 1.5)).order
+    start = _in_the_corner(points.copy(), np.arange(len(points)))
+    return order[_farthest(points[order], int(np.flatnonzero(order == start)[0]), count)].astype(np.int64)
+
+
+@compiled("i8(f4[:, ::1], i8[::1])")
+def _in_the_corner(points: Points, index: Index) -> int:
+    """The first point of the lowest cell, when a cloud is halved at the mean of its widest axis again and again.
+
+    This is where the samplings of training started. Both arrays are reordered.
+    """
+    count = len(points)
+    for _ in range(_HALVINGS):
+        axis, widest, total = 0, np.float32(0), np.float32(0)
+        for a in range(3):
+            width = points[:count, a].max() - points[:count, a].min()
+            if width > widest:
+                axis, widest = a, width
+        for i in range(count):
+            total += points[i, axis]
+        middle, i, j = total / np.float32(count), 0, count - 1
+        while i <= j:
+            if points[i, axis] < middle:
+                i += 1
+            elif points[j, axis] >= middle:
+                j -= 1
+            else:
+                for a in range(3):
+                    points[i, a], points[j, a] = points[j, a], points[i, a]
+                index[i], index[j] = index[j], index[i]
+                i, j = i + 1, j - 1
+        count = max(i, 1)
+    return index[0]
+
+
+@compiled("void(f4, f4, f4, f4[:, ::1], f4[:, ::1], f4[::1])")
+def _from_boxes(x: float, y: float, z: float, low: Points, high: Points, squared: NDArray[np.float32]) -> None:
+    """Squared distances (M,) of a point from boxes, given by their corners (3, M)."""
+    low_x, low_y, low_z, high_x, high_y, high_z = low[0], low[1], low[2], high[0], high[1], high[2]
+    zero = np.float32(0)
+    for c in range(len(squared)):
+        dx = max(max(low_x[c] - x, x - high_x[c]), zero)
+        dy = max(max(low_y[c] - y, y - high_y[c]), zero)
+        dz = max(max(low_z[c] - z, z - high_z[c]), zero)
+        squared[c] = dx * dx + dy * dy + dz * dz
+
+
+@compiled("i8[::1](f4[:, ::1], i8, i8)")
+def _farthest(points: Points, start: int, count: int) -> Index:
+    """`farthest_points`, from a start, of points of which those that follow each other are near each other.
+
+    Chunks of them whose farthest point is nearer to the points so far than to the new one need no update. Distances are
+    compared as the integers of their bits, which are in the same order: these the compiler does many at a time.
+    """
+    n, chunks = len(points), (len(points) + _CHUNK - 1) // _CHUNK
+    xyz = np.empty((chunks, 3, _CHUNK), np.float32)
+    low, high = np.full((3, chunks), np.float32(np.inf)), np.full((3, chunks), np.float32(-np.inf))
+    for c in range(chunks):
+        for a in range(3):
+            for i in range(_CHUNK):
+                value = points[min(c * _CHUNK + i, n - 1), a]  # the last chunk is filled up with the last point
+                xyz[c, a, i] = value
+                low[a, c], high[a, c] = min(low[a, c], value), max(high[a, c], value)
+    squared, farthest = np.full((chunks, _CHUNK), np.float32(np.inf)), np.full(chunks, np.float32(np.inf))
+    bits, farthest_bits = squared.view(np.int32), farthest.view(np.int32)
+    bound, chosen, at = np.empty(chunks, np.float32), np.empty(count, np.int64), start
+    for sample in range(count):
+        chosen[sample] = at
+        x, y, z = points[at, 0], points[at, 1], points[at, 2]
+        _from_boxes(x, y, z, low, high, bound)
+        for c in range(chunks):
+            if bound[c] < farthest[c]:
+                of_chunk, its_bits, xs, ys, zs = squared[c], bits[c], xyz[c, 0], xyz[c, 1], xyz[c, 2]
+                for i in range(_CHUNK):
+                    dx, dy, dz = xs[i] - x, ys[i] - y, zs[i] - z
+                    s = dx * dx + dy * dy + dz * dz
+                    of_chunk[i] = s if s < of_chunk[i] else of_chunk[i]
+                farthest_bits[c] = its_bits.max()
+        most, c, at = farthest_bits.max(), 0, 0
+        while farthest_bits[c] != most:
+            c += 1
+        while bits[c, at] != most:
+            at += 1
+        at = min(c * _CHUNK + at, n - 1)
+    return chosen
 
 
 def interleaved(points: Points, special: Points, first: int) -> Points:

@@ -70,8 +70,8 @@ def build_pyramid(cloud: NDArray[np.float32], network: NetworkSettings) -> Pyram
         raise Dpm2Error(f"scan has {len(cloud)} points within {settings.near}-{settings.far} m, want {MIN_POINTS}")
     stages = settings.stages
     first = stages[0]
-    grid = _grid(cloud, first.radius)
-    xyz = cloud[farthest_points(cloud, first.points)]
+    grid = _grid(cloud, first.radius / 1.5)  # most neighborhoods are full before the radius
+    xyz = cloud[farthest_points(cloud, first.points, grid)]
     if fusion.reference == "salient":
         edges = vertical_edges(cloud, grid, int(fusion.edges * min(fusion.points, len(xyz))))
         xyz = interleaved(xyz, edges, fusion.points)

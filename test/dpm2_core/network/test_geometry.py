@@ -28,6 +28,18 @@ def test_farthest_points_are_greedy(noise: np.random.Generator, n: int) -> None:
         nearest = np.minimum(nearest, np.linalg.norm(points - points[before], axis=1))
         assert nearest[chosen] == pytest.approx(nearest.max(), rel=1e-5)  # float32 ties
     assert (farthest_points(points, 20) == order[:20]).all()
+    assert (farthest_points(points, 40, PointGrid(points.astype(float), 9.0)) == order).all()
+
+
+def test_the_sampling_starts_where_that_of_the_training_did(noise: np.random.Generator) -> None:
+    """By a k-d tree of five levels, in plain numpy."""
+    points = noise.uniform(-30, 30, (3000, 3)).astype(np.float32)
+    cell = points
+    for _ in range(5):
+        axis = np.ptp(cell, axis=0).argmax()
+        low = cell[:, axis] < cell[:, axis].mean()
+        cell = cell[low]
+    assert points[farthest_points(points, 2)[0]] in cell
 
 
 def test_neighbors_beyond_the_radius_repeat_the_nearest(noise: np.random.Generator) -> None:
