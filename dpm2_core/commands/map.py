@@ -6,14 +6,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import typer
 from scipy.spatial.transform import Rotation
 
 from dpm2_core.commands.map_graph import optimize
-from dpm2_core.commands.options import ConfigFile, JsonFile, Overrides, show
+from dpm2_core.commands.map_info import MapFile, graph_of, info
+from dpm2_core.commands.options import ConfigFile, Overrides
 from dpm2_core.config import load_settings
 from dpm2_core.console import Console
 from dpm2_core.data.pcd import write_las, write_pcd
@@ -23,105 +24,13 @@ from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.files import write_json
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
-from dpm2_core.slam.mapping.restore import restore
 from dpm2_core.slam.mapping.tiles import write_tiles
 from dpm2_core.slam.store.map_data import MapData, load_map, map_cloud, save_as, trajectory
 from dpm2_core.slam.store.map_store import MapStore
-from dpm2_core.tables import FigureTable
-
-if TYPE_CHECKING:
-    from dpm2_core.slam.graph.pose_graph import PoseGraph
 
 app = typer.Typer(help="Map files: info, export, merge, prune, check; pose graphs: optimize.", no_args_is_help=True)
+app.command()(info)
 app.command()(optimize)
-
-MapFile = Annotated[Path, typer.Argument(metavar="MAP", help="Map file, as `dpm2 run --map` writes it.")]
-
-
-@app.command()
-def info(path: MapFile, json_file: JsonFile = None) -> None:
-    """What is in a map."""
-    with MapStore.open(path) as store:
-        data = load_map(store, descriptors=False)
-        figures = _figures(path, data, sum(row[0] or 0 for row in store.rows("payloads", "descriptors IS NOT NULL")))
-    f = figures
-    table = FigureTable(str(path), names=["what"], text=["value"], header=False)
-    own = f"{f['own_clouds']} of them with their own cloud, {f['with_descriptors']} with descriptors"
-    extent = " x ".join(f"{size:.1f}" for size in f["extent_m"])
-    rows = (
-        ("keyframes", f"{f['keyframes']}, {own}"),
-        ("pruned", str(f["pruned"])),
-        ("robots", ", ".join(robot or "(one)" for robot in f["robots"]) or "-"),
-        ("length", f"{f['length_m']:.1f} m"),
-        ("extent", f"{extent} m, of the keyframes" if extent else "-"),
-        ("loops", f"{f['loops_accepted']} accepted of {f['loops_tried']} tried"),
-        ("georeference", _georeference(f["georeference"])),
-        ("size", f"{f['bytes'] / 1e6:.2f} MB, {f['bytes'] / max(f['keyframes'], 1) / 1e3:.1f} kB per keyframe"),
-    )
-    for row in rows:
-        table.add_row(*row)
-    for s in figures["sessions"]:
-        info = f"{s['keyframes']} keyframes, {s['started']}, dpm2 {s['program']}, weights {s['weights'] or 'none'}"
-        table.add_row(f"session {s['session']}", info)
-    show(table, figures, json_file)
-
-
-def _figures(path: Path, data: MapData, with_descriptors: int) -> dict[str, Any]:
-    loops = [edge for edge in data.edges if edge.kind == "loop"]
-    return {
-        "map": str(path),
-        "keyframes": len(data),
-        "own_clouds": sum(data.clouds.loan(node) is None for node in range(len(data))),
-        "with_descriptors": with_descriptors,
-        "pruned": len(data.trail),
-        "robots": sorted({keyframe.robot for keyframe in data.keyframes}),
-        "length_m": _length(data),
-        "extent_m": np.ptp(data.poses[:, :3, 3], axis=0).tolist() if len(data) else [],
-        "loops_accepted": sum(edge.ok for edge in loops),
-        "loops_tried": len(loops),
-        "georeference": _georeference_figures(data),
-        "bytes": sum(file.stat().st_size for suffix in ("", "-wal") if (file := Path(f"{path}{suffix}")).exists()),
-        "sessions": [
-            {
-                "session": s.number,
-                "keyframes": data.session.count(s.number),
-                "started": s.started,
-                "program": s.program,
-                "weights": s.weights,
-            }
-            for s in data.sessions
-        ],
-    }
-
-
-def _georeference_figures(data: MapData) -> dict[str, Any] | None:
-    """Where on Earth the map is, with what certainty; None where that is not known."""
-    if data.georeference is None:
-        return None
-    graph = _graph(data)
-    covariance, (used, count) = graph.georeference_covariance(), graph.fixes
-    T, sigmas = data.georeference.T_enu_map, np.full(6, np.nan) if covariance is None else np.sqrt(np.diag(covariance))
-    return {
-        "origin": data.georeference.origin.tolist(),
-        "T_enu_map": T.tolist(),
-        "heading_deg": float(np.degrees(np.arctan2(T[1, 0], T[0, 0]))),
-        "heading_sigma_deg": float(np.degrees(sigmas[2])),
-        "position_sigma_m": sigmas[3:].tolist(),
-        "fixes_used": used,
-        "fixes": count,
-    }
-
-
-def _georeference(figures: dict[str, Any] | None) -> str:
-    if figures is None:
-        return "-"
-    latitude, longitude, altitude = figures["origin"]
-    east, north, up = figures["position_sigma_m"]
-    return (
-        f"origin {latitude:.8f}, {longitude:.8f}, {altitude:.2f} m; map's x axis {figures['heading_deg']:.2f} deg from "
-        f"east to north (sigma {figures['heading_sigma_deg']:.2f}); sigma {east:.2f}, {north:.2f}, {up:.2f} m; "
-        f"{figures['fixes_used']} of {figures['fixes']} fixes used"
-    )
 
 
 @app.command()
@@ -259,21 +168,6 @@ def parse_transform(text: str) -> Array:
     return se3.make(R.as_matrix(), numbers[:3])
 
 
-def _length(data: MapData) -> float:
-    """Of the way through all keyframes, session by session, m."""
-    steps = np.linalg.norm(np.diff(data.poses[:, :3, 3], axis=0), axis=1)
-    same = np.diff(data.session) == 0
-    return float(steps[same].sum()) if len(data) > 1 else 0.0
-
-
-def _graph(data: MapData) -> PoseGraph:
-    from dpm2_core.slam.graph.pose_graph import PoseGraph, PoseGraphSettings
-
-    graph = PoseGraph(PoseGraphSettings())
-    restore(graph, data)
-    return graph
-
-
 def _export_geojson(data: MapData, out: Path) -> None:
     from dpm2_core.geometry import geodesy
 
@@ -313,7 +207,7 @@ _EXPORTS: dict[str, tuple[Callable[[MapData, Path, float], None], str]] = {
     "tum": (lambda data, out, _: write_tum(out, *trajectory(data)), ""),
     "kitti": (lambda data, out, _: write_kitti(out, trajectory(data)[1]), ""),
     "geojson": (lambda data, out, _: _export_geojson(data, out), ""),
-    "g2o": (lambda data, out, _: _graph(data).write_g2o(out), ""),
+    "g2o": (lambda data, out, _: graph_of(data).write_g2o(out), ""),
 }
 """How each kind is written, and the option that is its spacing."""
 _ENDINGS = {

@@ -87,7 +87,7 @@ def solve(maps: Mapping[str, MapData], joins: Sequence[Join], settings: PoseGrap
 
 
 def side_by_side(maps: Mapping[str, MapData], joins: Sequence[Join]) -> MapData:
-    """The drives in one map, each with the poses that it has, and their joins as loops."""
+    """The drives in one map, each with the poses that it has, and their joins as loops; its frame that of the first."""
     first = first_nodes(maps)
     loops = [
         replace(
@@ -95,8 +95,9 @@ def side_by_side(maps: Mapping[str, MapData], joins: Sequence[Join]) -> MapData:
         )
         for join in joins
     ]
-    both = _halved(list(maps.values()))
-    return replace(both, edges=[*both.edges, *loops])
+    drives = list(maps.values())
+    both = _halved(drives)
+    return replace(both, edges=[*both.edges, *loops], georeference=drives[0].georeference)
 
 
 def first_nodes(maps: Mapping[str, MapData]) -> dict[str, int]:

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.frame import Array, Edge, Points
+from dpm2_core.frame import Array, Edge, Georeference, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.loops.closure import LoopCloser
@@ -22,7 +22,8 @@ FindLoops = Callable[[MapData, MapData], list[Edge]]
 
 
 def merge_maps(a: MapData, b: MapData, T_a_b: Array, loops: Sequence[Edge] = ()) -> MapData:
-    """One map in the frame of `a`. Nodes and sessions of `b` count on after those of `a`.
+    """One map in the frame of `a`, its place on Earth that of `a`, else that of `b`. Nodes and sessions of `b` count on
+    after those of `a`.
 
     Args:
         T_a_b: (4, 4). loops: as `FindLoops` gives them.
@@ -43,8 +44,13 @@ def merge_maps(a: MapData, b: MapData, T_a_b: Array, loops: Sequence[Edge] = ())
         CloudStore(lambda i: a.clouds.packed(i) if i < n else b.clouds.packed(i - n), moving, loans),
         lambda i: a.thumbnail(i) if i < n else b.thumbnail(i - n),
         lambda i: a.describe(i) if i < n else b.describe(i - n),
-        a.georeference,
+        a.georeference or _seen_from(T_a_b, b.georeference),
     )
+
+
+def _seen_from(T_a_b: Array, known: Georeference | None) -> Georeference | None:
+    """The georeference of b as one of a."""
+    return None if known is None else replace(known, T_enu_map=known.T_enu_map @ se3.inverse(T_a_b))
 
 
 def align(a: MapData, b: MapData, find_loops: FindLoops) -> tuple[Array, list[Edge]]:

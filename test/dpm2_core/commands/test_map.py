@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import subprocess
 import sys
 import time
@@ -14,12 +15,12 @@ import pytest
 
 from dpm2_core.data.trajectory import read_trajectory
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.frame import Array, Keyframe
+from dpm2_core.frame import Array, Georeference, Keyframe
 from dpm2_core.geometry import se3
 from dpm2_core.sim.drive import simulate
 from dpm2_core.sim.settings import DriveConfig, LidarConfig
 from dpm2_core.slam.store.map_data import MapData, load_map
-from dpm2_core.slam.store.map_store import MapStore
+from dpm2_core.slam.store.map_store import Change, MapStore
 
 from ...helpers.command import dpm2
 
@@ -100,6 +101,26 @@ def test_merge_by_transform(tmp_path: Path, map_file: Path) -> None:
     done = dpm2("map", "merge", map_file, map_file, "--out", out, "--transform", "0 0 0 0")
     assert done.returncode == 2
     assert "a file already" in done.stderr
+
+
+def test_merge_by_transform_keeps_the_place_on_earth_of_either_map(tmp_path: Path, map_file: Path) -> None:
+    plain, out = tmp_path / "plain.dpm2map", tmp_path / "both.dpm2map"
+    plain.write_bytes(map_file.read_bytes())
+    known = Georeference(np.array([49.0, 8.4, 110.0]), se3.exp(np.array([0, 0, 1.0, 2, 3, 4])))
+    with MapStore.open(map_file, read_only=False) as store:
+        store.write(Change(georeference=known))
+    for first, second, place in ((plain, map_file, slice(12, None)), (map_file, plain, slice(0, 12))):
+        out.unlink(missing_ok=True)
+        assert dpm2("map", "merge", first, second, "--out", out, "--transform", "10 0 0 90").returncode == 0
+        both = loaded(out)
+        assert both.georeference is not None
+        np.testing.assert_array_equal(both.georeference.origin, known.origin)
+        where = known.T_enu_map @ loaded(map_file).poses
+        np.testing.assert_allclose(both.georeference.T_enu_map @ both.poses[place], where, atol=1e-9)
+    info = dpm2("map", "info", out, "--json", tmp_path / "info.json")
+    assert "how certain is not known" in " ".join(info.stdout.split())
+    figures = json.loads((tmp_path / "info.json").read_text(), parse_constant=pytest.fail)["georeference"]
+    assert (figures["heading_sigma_deg"], figures["position_sigma_m"], figures["fixes"]) == (None, None, 0)
 
 
 def test_check_and_recover(tmp_path: Path, map_file: Path) -> None:

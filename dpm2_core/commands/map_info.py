@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`dpm2 map info`: what is in a map."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import typer
+
+from dpm2_core.commands.options import JsonFile, show
+from dpm2_core.slam.mapping.restore import restore
+from dpm2_core.slam.store.map_data import MapData, load_map
+from dpm2_core.slam.store.map_store import MapStore
+from dpm2_core.tables import FigureTable
+
+if TYPE_CHECKING:
+    from dpm2_core.slam.graph.pose_graph import PoseGraph
+
+MapFile = Annotated[Path, typer.Argument(metavar="MAP", help="Map file, as `dpm2 run --map` writes it.")]
+
+
+def info(path: MapFile, json_file: JsonFile = None) -> None:
+    """What is in a map."""
+    with MapStore.open(path) as store:
+        data = load_map(store, descriptors=False)
+        figures = _figures(path, data, sum(row[0] or 0 for row in store.rows("payloads", "descriptors IS NOT NULL")))
+    f = figures
+    table = FigureTable(str(path), names=["what"], text=["value"], header=False)
+    own = f"{f['own_clouds']} of them with their own cloud, {f['with_descriptors']} with descriptors"
+    extent = " x ".join(f"{size:.1f}" for size in f["extent_m"])
+    rows = (
+        ("keyframes", f"{f['keyframes']}, {own}"),
+        ("pruned", str(f["pruned"])),
+        ("robots", ", ".join(robot or "(one)" for robot in f["robots"]) or "-"),
+        ("length", f"{f['length_m']:.1f} m"),
+        ("extent", f"{extent} m, of the keyframes" if extent else "-"),
+        ("loops", f"{f['loops_accepted']} accepted of {f['loops_tried']} tried"),
+        ("georeference", _georeference(f["georeference"])),
+        ("size", f"{f['bytes'] / 1e6:.2f} MB, {f['bytes'] / max(f['keyframes'], 1) / 1e3:.1f} kB per keyframe"),
+    )
+    for row in rows:
+        table.add_row(*row)
+    for s in figures["sessions"]:
+        info = f"{s['keyframes']} keyframes, {s['started']}, dpm2 {s['program']}, weights {s['weights'] or 'none'}"
+        table.add_row(f"session {s['session']}", info)
+    show(table, figures, json_file)
+
+
+def _figures(path: Path, data: MapData, with_descriptors: int) -> dict[str, Any]:
+    loops = [edge for edge in data.edges if edge.kind == "loop"]
+    return {
+        "map": str(path),
+        "keyframes": len(data),
+        "own_clouds": sum(data.clouds.loan(node) is None for node in range(len(data))),
+        "with_descriptors": with_descriptors,
+        "pruned": len(data.trail),
+        "robots": sorted({keyframe.robot for keyframe in data.keyframes}),
+        "length_m": _length(data),
+        "extent_m": np.ptp(data.poses[:, :3, 3], axis=0).tolist() if len(data) else [],
+        "loops_accepted": sum(edge.ok for edge in loops),
+        "loops_tried": len(loops),
+        "georeference": _georeference_figures(data),
+        "bytes": sum(file.stat().st_size for suffix in ("", "-wal") if (file := Path(f"{path}{suffix}")).exists()),
+        "sessions": [
+            {
+                "session": s.number,
+                "keyframes": data.session.count(s.number),
+                "started": s.started,
+                "program": s.program,
+                "weights": s.weights,
+            }
+            for s in data.sessions
+        ],
+    }
+
+
+def _georeference_figures(data: MapData) -> dict[str, Any] | None:
+    """Where on Earth the map is, with what certainty; None where that is not known.
+
+    The certainty is that of the whole graph, which is built for it: 0.8 s for 2,000 keyframes with a fix each. A file
+    that had it would have to have it anew with every keyframe.
+    """
+    if data.georeference is None:
+        return None
+    graph = graph_of(data)
+    covariance, (used, count) = graph.georeference_covariance(), graph.fixes
+    T, sigmas = data.georeference.T_enu_map, None if covariance is None else np.sqrt(np.diag(covariance))
+    return {
+        "origin": data.georeference.origin.tolist(),
+        "T_enu_map": T.tolist(),
+        "heading_deg": float(np.degrees(np.arctan2(T[1, 0], T[0, 0]))),
+        "heading_sigma_deg": None if sigmas is None else float(np.degrees(sigmas[2])),
+        "position_sigma_m": None if sigmas is None else sigmas[3:].tolist(),
+        "fixes_used": used,
+        "fixes": count,
+    }
+
+
+def _georeference(figures: dict[str, Any] | None) -> str:
+    if figures is None:
+        return "-"
+    latitude, longitude, altitude = figures["origin"]
+    where = (
+        f"origin {latitude:.8f}, {longitude:.8f}, {altitude:.2f} m; map's x axis {figures['heading_deg']:.2f} deg from "
+    )
+    if figures["position_sigma_m"] is None:
+        return f"{where}east to north; how certain is not known: no fix is tied to the first keyframe"
+    east, north, up = figures["position_sigma_m"]
+    return (
+        f"{where} (sigma {figures['heading_sigma_deg']:.2f}); sigma {east:.2f}, {north:.2f}, {up:.2f} m; "
+        f"{figures['fixes_used']} of {figures['fixes']} fixes used"
+    )
+
+
+def _length(data: MapData) -> float:
+    """Of the way through all keyframes, session by session, m."""
+    steps = np.linalg.norm(np.diff(data.poses[:, :3, 3], axis=0), axis=1)
+    same = np.diff(data.session) == 0
+    return float(steps[same].sum()) if len(data) > 1 else 0.0
+
+
+def graph_of(data: MapData) -> PoseGraph:
+    """The pose graph of a map."""
+    from dpm2_core.slam.graph.pose_graph import PoseGraph, PoseGraphSettings
+
+    graph = PoseGraph(PoseGraphSettings())
+    restore(graph, data)
+    return graph
