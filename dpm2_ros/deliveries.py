@@ -35,20 +35,25 @@ class Delivery:
         self._announced = sent or self._announced
 
     @property
-    def delivered(self) -> int:
-        """How many the mapper has."""
+    def arrived(self) -> int:
+        """How many the mapper has, in its map file or still in memory."""
         below, above = self._acks.agreed
         return below + len(above)
 
+    @property
+    def delivered(self) -> int:
+        """How many are in the mapper's map file, as far as there is no gap."""
+        return self._acks.agreed[0]
+
     def acknowledge(self, below: int, above: Set[int], now: float) -> None:
-        """The mapper has all ids below a number, and some above."""
+        """All ids below a number are in the map file; some above have arrived, too."""
         made = len(self.file)
         self._acks.add(min(below, made), {id for id in above if below <= id < made}, now)
         whole = self.delivered == made
         self._whole_since = None if not whole else self._whole_since or now
 
     def certain(self, now: float) -> bool:
-        """Whether all have arrived, by more than one acknowledgment; of a drive without keyframes too."""
+        """Whether all are delivered, by more than one acknowledgment; of a drive without keyframes too."""
         if not len(self.file):
             return True
         return self.delivered == len(self.file) and self._whole_since is not None and now - self._whole_since > _CERTAIN

@@ -25,7 +25,7 @@ from dpm2_core.slam.store.cloud_codec import CodecError, unpack_cloud
 from dpm2_core.slam.store.map_data import NO_POINTS
 from dpm2_ros.conversions import EARLIER, check_frame, covariance_from_ros, parse_keyframe_name
 from dpm2_ros.guard import GuardedNode
-from dpm2_ros.keyframes import BUDGET, WIRE, cloud_from_msg, descriptors_from_msg, received_to_msg
+from dpm2_ros.keyframe_messages import BUDGET, WIRE, cloud_from_msg, descriptors_from_msg, received_to_msg
 from dpm2_ros.mapping import MapperThread
 from dpm2_ros.streams import Parts, Stream
 
@@ -45,6 +45,7 @@ _BACKLOG = 32  # keyframes that may wait for the mapper
 class Feed:
     """One namespace: joins messages to keyframes, hands them to the mapper, and acknowledges those that have arrived.
 
+    What is not in the map file yet is acknowledged as what waits: so its robot keeps it, and does not send it again.
     A new session is that of the robot that was started again, once the old one has been silent for `SILENT` s. If both
     are heard they are two robots, and the second gets a name of its own, `robot.session`. So no session ends another.
     The robot itself says which drives are over: those it sends first, and its odometry is of none of them.
@@ -107,7 +108,10 @@ class Feed:
             stream.last = None
 
     def close(self) -> None:
-        """Listen no more. What was acknowledged goes to the map, however much waits there already."""
+        """Listen no more. What has arrived goes to the map, however much waits there already.
+
+        Not so the keyframes of a drive whose place is not decided: their robot sends them again.
+        """
         for stream in self.robots.values():
             self._hand_on(stream, time.monotonic(), math.inf)
         for subscription in self._subscriptions:
@@ -240,12 +244,12 @@ class Feed:
         stream.taken += 1
         assert parts.cloud is not None
         packed, fix = parts.cloud
-        self._mapper.add(lambda: replace(keyframe, cloud=unpack_cloud(packed), fix=fix))
+        stream.given(id, self._mapper.add(lambda: replace(keyframe, cloud=unpack_cloud(packed), fix=fix)))
 
     def _acknowledge(self, stream: Stream, now: float) -> None:
         if stream.session:
             stream.acknowledged = now
-            self._received.publish(received_to_msg(stream.session, stream.next, stream.above))
+            self._received.publish(received_to_msg(stream.session, *stream.arrived(self._mapper.written)))
 
 
 @contextmanager

@@ -134,10 +134,10 @@ class Diagnostics:
         if self.other is not None:
             out.append(self._other_odometry(self.other))
         if self._mapper is None:
-            delivered, made = self._sender.delivered
-            text = f"{delivered} of {made} keyframes have arrived at the mapper"
-            level = WARN if made - delivered > BEHIND else OK
-            out.append(self._status("mapper", level, text, {"keyframes": made, "delivered": delivered}))
+            arrived, made = self._sender.arrived
+            text = f"{arrived} of {made} keyframes have arrived at the mapper"
+            level = WARN if made - arrived > BEHIND else OK
+            out.append(self._status("mapper", level, text, {"keyframes": made, "delivered": arrived}))
         elif self._mapper.localizing:
             out.append(self._localization(self._mapper))
         else:

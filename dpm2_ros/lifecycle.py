@@ -12,10 +12,11 @@ from contextlib import ExitStack
 from typing import Any
 
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
+from rclpy.node import Node
 
 from dpm2_core.errors import Dpm2Error
 from dpm2_ros.guard import GuardedNode
-from dpm2_ros.mapping import MapperThread, robot_name
+from dpm2_ros.mapping import MapperThread
 from dpm2_ros.parameters import follow_changes, load_parameters
 from dpm2_ros.settings import NodeConfig
 
@@ -185,3 +186,8 @@ class ManagedNode(LifecycleNodeMixin, GuardedNode):
                     destroy(entity)
         for name in vars(self).keys() - names:
             delattr(self, name)
+
+
+def robot_name(node: Node) -> str:
+    """The namespace without slashes at its ends: what keyframes and folders are called after."""
+    return node.get_namespace().strip("/")

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import os
-import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -14,7 +12,6 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import OccupancyGrid, Odometry
 from nav_msgs.msg import Path as PathMsg
-from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
@@ -30,13 +27,13 @@ from dpm2_ros.active_map import ActiveMap
 from dpm2_ros.conversions import cloud_to_msg, edge_to_msg, keyframe_name
 from dpm2_ros.display import Display, grid_to_msg, loop_to_msg, path_to_msg, pose_graph_to_msg
 from dpm2_ros.guard import GuardedNode
+from dpm2_ros.runtime import yield_to_odometry
 from dpm2_ros.settings import NodeConfig
 from dpm2_ros.subscriptions import LAST_ONE, STEADY
 from dpm2_ros.tf import TransformBroadcaster
 
 KEEP_ALL = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
 _GRID_PERIOD, _GRID_WORK = 0.5, 0.3  # s between two grids, and at most of work at one
-_NICER = 10  # steps of niceness: a tenth of the fraction of the odometry where both want a processor
 
 
 class MapperThread:
@@ -53,7 +50,8 @@ class MapperThread:
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="mapper", initializer=yield_to_odometry)
         self._stamp = 0  # of the last keyframe, ns
         self._restarted: Future[None] | None = None  # since when the odometry's start is known here
-        self._lock, self._waiting = threading.Lock(), 0
+        self._lock = threading.Lock()
+        self._added = self._taken = self._written = 0  # keyframes
         self._changes = self.keyframes
         ros = config.ros
         self._tf = TransformBroadcaster(
@@ -93,7 +91,12 @@ class MapperThread:
     @property
     def waiting(self) -> int:
         """Keyframes that are not in the map yet."""
-        return self._waiting
+        return self._added - self._taken
+
+    @property
+    def written(self) -> int:
+        """So many keyframes, of all that were ever added, are in the map file (without one: in the map) or rejected."""
+        return self._written
 
     @property
     def channels(self) -> int | None:
@@ -132,11 +135,12 @@ class MapperThread:
             T = T_map_odom if T_own_odom is None else T_map_odom @ T_own_odom
             self._tf.send(T, stamp + self._config.ros.ahead, odom_frame)
 
-    def add(self, make: Callable[[], Keyframe]) -> None:
-        """Take in the keyframe that `make`, called in this thread, returns."""
+    def add(self, make: Callable[[], Keyframe]) -> int:
+        """Take in the keyframe that `make`, called in this thread, returns; how many came before it."""
         with self._lock:
-            self._waiting += 1
-        self._submit(lambda: self._take_in(make))
+            number, self._added = self._added, self._added + 1
+            self._submit(lambda: self._take_in(make))
+        return number
 
     def hint(self, T_map_base: Array) -> str:
         """Prior for the robot's pose (4, 4), for example from RViz; returns why it cannot be used, or an empty text."""
@@ -213,8 +217,9 @@ class MapperThread:
         try:
             self._add(make())
         finally:
-            with self._lock:
-                self._waiting -= 1
+            self._taken += 1
+            if not self.store_problem:
+                self._written = self._taken
 
     def _add(self, keyframe: Keyframe) -> None:
         loops = self._active.add(keyframe)
@@ -270,13 +275,6 @@ class MapperThread:
         return cloud_to_msg(points, self._stamp, self._config.ros.map_frame)
 
 
-def yield_to_odometry() -> None:
-    """Give this thread, and those that it starts, a low priority: a map may wait, the next scan may not."""
-    if sys.platform == "linux":  # elsewhere a thread has no number of its own for this
-        thread = threading.get_native_id()
-        os.setpriority(os.PRIO_PROCESS, thread, os.getpriority(os.PRIO_PROCESS, thread) + _NICER)
-
-
 async def respond(work: Future[str], response: Any) -> None:
     """Fill the response of a service with the result of work in another thread: success, or why not."""
     while not work.done():
@@ -292,8 +290,3 @@ class _OtherCallbacks:
 
     def __await__(self) -> Any:
         yield
-
-
-def robot_name(node: Node) -> str:
-    """The namespace without slashes at its ends: what keyframes and folders are called after."""
-    return node.get_namespace().strip("/")

@@ -12,18 +12,14 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
-from std_srvs.srv import SetBool, Trigger
 
 from dpm2_core.data.frames import Calibration, FrameBuilder
-from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Frame, Keyframe, OdometryResult, State
 from dpm2_core.geometry import se3
 from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.loops.localizer import LOST
-from dpm2_core.slam.mapping.admission import check_pose
 from dpm2_core.slam.system import Slam
 from dpm2_ros.base_frame import BaseFrame
 from dpm2_ros.conversions import BodyMotion, keyframe_to_base, odometry_to_msg
@@ -31,8 +27,9 @@ from dpm2_ros.display import Projection
 from dpm2_ros.health import Diagnostics, Health
 from dpm2_ros.keyframes import KeyframeSender, weights_identity
 from dpm2_ros.lifecycle import ManagedNode
-from dpm2_ros.mapping import respond, yield_to_odometry
 from dpm2_ros.other_odometry import OtherOdometry
+from dpm2_ros.requests import Requests
+from dpm2_ros.runtime import yield_to_odometry
 from dpm2_ros.state import StatePublisher
 from dpm2_ros.subscriptions import Inputs
 from dpm2_ros.synchronizer import Bundle
@@ -75,13 +72,9 @@ class SlamNode(ManagedNode):
         back.callback(self._line.shutdown)
         sends = ros.publish_tf_odom and (not self._beside or ros.invert_odom_tf or not ros.embed_mapper)
         self._tf = TransformBroadcaster(self, ros.own_frame, sends, ros.invert_odom_tf)
-        self.create_service(Trigger, "~/reset", self._on_reset)
-        self.create_service(Trigger, "~/load_map", self._on_load_map)
-        self.create_service(SetBool, "~/localization_mode", self._on_localization_mode)
-        self.create_subscription(PoseWithCovarianceStamped, "initialpose", self._on_initial_pose, 10)
-        self._reset_wanted = threading.Event()
         self._stopping = threading.Event()
         self._base = BaseFrame(ros.base_frame, (ros.odom_frame, ros.own_frame, ros.map_frame))
+        self._requests = Requests(self, self._mapper, self._base, ros.map_frame)
         self._waited = False  # for the base frame
         warm_up(self._config.slam)
         self._known: Calibration | None = None
@@ -137,8 +130,8 @@ class SlamNode(ManagedNode):
     def _work(self) -> None:
         while not self._stopping.is_set():
             bundle = self._inputs.take(timeout=0.1)
-            if self._reset_wanted.is_set():
-                self._reset_wanted.clear()
+            if self._requests.reset.is_set():
+                self._requests.reset.clear()
                 self._restart()
             if bundle is None:
                 continue
@@ -277,40 +270,3 @@ class SlamNode(ManagedNode):
         if (error := done.exception()) is not None:
             self._health.errors += 1
             self.get_logger().error(f"keyframe: {''.join(traceback.format_exception(error))}")
-
-    def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self._reset_wanted.set()
-        response.success = True
-        response.message = "the map is saved; odometry and map start again with the next cloud"
-        if self._mapper is None:
-            response.message = (
-                "odometry starts again with the next cloud, and its keyframes as a new session of the mapper's map"
-            )
-        return response
-
-    async def _on_load_map(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        if self._mapper is None:
-            response.success, response.message = False, "the mapper is another node's: ros.embed_mapper is off"
-            return response
-        try:
-            await respond(self._mapper.load(), response)
-        except UsageError as error:
-            response.success, response.message = False, str(error)
-        return response
-
-    async def _on_localization_mode(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        if self._mapper is None:
-            response.success, response.message = False, "the mapper is another node's: ros.embed_mapper is off"
-        else:
-            await respond(self._mapper.localise() if request.data else self._mapper.extend(), response)
-        return response
-
-    def _on_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
-        frame, requested = message.header.frame_id.lstrip("/"), self._config.ros.map_frame
-        if frame != requested:
-            raise UsageError(f"initialpose not used: want it in frame {requested}, not in {frame[:80]!r}")
-        T_map_base = transform_matrix(message.pose.pose)
-        check_pose(T_map_base)
-        T_map_start = T_map_base @ self._base.T_base_start
-        if problem := "no map here" if self._mapper is None else self._mapper.hint(T_map_start):
-            raise UsageError(f"initialpose not used: {problem}")

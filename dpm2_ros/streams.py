@@ -12,6 +12,7 @@ from dpm2_core.frame import Fix, Keyframe
 
 AHEAD = 64
 """Keyframes that may wait for one before them; those beyond are sent again."""
+_MOST_WAITING = 1000  # of which a robot is told at once
 _HALVES = 64  # keyframes of which some messages are missing; also sent again
 _STUCK = 6.0  # s in which a robot sends a keyframe four times
 _TIMES = 3
@@ -45,7 +46,7 @@ class Stream:
     """One drive, known by its session; without a session nothing is sent again, and order is arrival.
 
     Attributes:
-        next: all ids below have gone on to the map, or were given up.
+        next: all ids below have gone on to the mapper, or were given up.
         heard: when the last message came, s. since: when the first one came, since another drive took its place.
         robot: what the map calls it; None while that is not decided.
         last: its keyframe that went on last, without the cloud.
@@ -64,13 +65,19 @@ class Stream:
         self.odom_frame = ""
         self._parts: OrderedDict[int, Parts] = OrderedDict()
         self._above: dict[int, Parts] = {}
+        self._given: deque[tuple[int, int]] = deque()  # ids that have gone on, and the mapper's numbers for them
         self._queue: deque[tuple[int, Parts]] = deque(maxlen=AHEAD)  # without a session
         self._bad: tuple[float, int] | None = None  # since when, and how often, messages of the next one were rejected
 
-    @property
-    def above(self) -> list[int]:
-        """Ids that are complete, and wait for one before them."""
-        return sorted(self._above)
+    def arrived(self, written: int) -> tuple[int, list[int]]:
+        """Ids that have come: all below a number, which are in the map file, and some above, which wait in memory.
+
+        `written`: of the mapper's numbers, how many are in its file.
+        """
+        while self._given and self._given[0][1] < written:
+            self._given.popleft()
+        below = self._given[0][0] if self._given else self.next
+        return below, [*range(below, self.next), *sorted(self._above)][:_MOST_WAITING]
 
     @property
     def holds(self) -> int:
@@ -115,6 +122,11 @@ class Stream:
             return self._queue.popleft()
         id, self.next, self._bad = self.next, self.next + 1, None
         return id, self._above.pop(id)
+
+    def given(self, id: int, number: int) -> None:
+        """The mapper has been handed a keyframe, and calls it by that number."""
+        if self.session:
+            self._given.append((id, number))
 
     def reject(self, id: int, now: float) -> None:
         """A message of a keyframe was not sound."""

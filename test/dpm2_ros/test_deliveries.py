@@ -27,7 +27,7 @@ def test_what_is_not_acknowledged_is_sent_again_after_a_while() -> None:
     assert drive.due(2.1, 8) == list(range(8, 16))
     drive.acknowledge(12, {14}, 2.5)
     assert drive.due(4.0, 8) == [12, 13, 15, 16, 17, 18, 19]
-    assert drive.delivered == 13
+    assert (drive.arrived, drive.delivered) == (13, 12)
 
 
 def test_a_keyframe_that_had_to_wait_for_an_earlier_drive_is_due_at_once() -> None:
@@ -57,6 +57,15 @@ def test_one_acknowledgment_does_not_end_a_drive() -> None:
     for n in range(10):
         drive.acknowledge(3, set(), 13 + 0.5 * n)
     assert drive.certain(17.6)
+
+
+def test_what_the_mapper_has_in_memory_alone_does_not_end_a_drive() -> None:
+    """It is not sent again, either."""
+    drive = delivery(3)
+    for n in range(20):
+        drive.acknowledge(1, {1, 2}, 0.5 * n)
+    assert (drive.arrived, drive.delivered, drive.due(10.0, 8)) == (3, 1, [])
+    assert not drive.certain(10.0)
 
 
 def test_a_drive_without_keyframes_is_over_at_once() -> None:

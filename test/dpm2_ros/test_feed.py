@@ -1,27 +1,34 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a feed has acknowledged reaches the map, whatever ends first."""
+"""What a feed has acknowledged for good is in the map file; what waits reaches it, or stays with its robot."""
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import UInt8MultiArray, UInt32MultiArray
 
 from dpm2_core.frame import Keyframe
 from dpm2_core.slam.settings import SlamSettings
+from dpm2_core.slam.store.map_data import load_map
+from dpm2_core.slam.store.map_store import MapStore
 from dpm2_ros.conversions import edge_to_msg, keyframe_name
+from dpm2_ros.deliveries import Delivery
 from dpm2_ros.feed import Feed
 from dpm2_ros.guard import GuardedNode
-from dpm2_ros.keyframes import WIRE, payload_to_msgs
+from dpm2_ros.keyframe_messages import WIRE, payload_to_msgs
 from dpm2_ros.mapping import MapperThread
 from dpm2_ros.settings import NodeConfig, RosSettings
+from dpm2_ros.unsent import KeyframeFile
 
 COUNT = 45  # more than may wait for the mapper
+DRIVE, NEXT = "0123abcd", "89ab0123"  # sessions
 
 
 def keyframe(id: int) -> Keyframe:
@@ -32,10 +39,11 @@ def keyframe(id: int) -> Keyframe:
 class Node(GuardedNode):
     """A map, and the keyframes of one robot."""
 
-    def __init__(self) -> None:
+    def __init__(self, folder: Path) -> None:
         super().__init__("mapper")
         slam = SlamSettings.model_validate({"registration": "geometric", "loops": {"descriptors": False}})
-        self.mapper = MapperThread(self, NodeConfig(slam=slam, ros=RosSettings(map_directory="")), "robot")
+        ros = RosSettings(map_directory=str(folder))
+        self.mapper = MapperThread(self, NodeConfig(slam=slam, ros=ros), "robot")
         self.feed = Feed(self, self.mapper, "/robot", "")
         self.feed.open()
         self.create_timer(0.1, self.feed.tick)
@@ -53,22 +61,79 @@ class Node(GuardedNode):
         self.mapper.close()
 
 
-def test_what_it_has_acknowledged_reaches_the_map(ros: Callable[..., Any]) -> None:
-    """Also where it is closed while keyframes come faster than the mapper works: their robot may be gone."""
-    harness = ros()
-    kinds = ((Odometry, "keyframe_odom"), (PointCloud2, "keyframe"), (UInt8MultiArray, "keyframe_cloud"))
-    wires = [harness.node.create_publisher(kind, f"/robot/dpm2/{topic}", WIRE) for kind, topic in kinds]
-    acknowledged = harness.hear(UInt32MultiArray, "/robot/dpm2/keyframes_received")
-    node = harness.add(Node())
-    node.mapper.add(node.wait)
-    harness.wait(lambda: all(wire.get_subscription_count() for wire in wires), "the feed")
-    for id in range(COUNT):
-        name = keyframe_name("robot", id, "0123abcd")
-        pose = edge_to_msg(np.eye(4), np.eye(6) * 1e-4, 1000 + id, "odom", name)
-        for wire, part in zip(wires, (pose, *payload_to_msgs(keyframe(id), name)), strict=True):
-            wire.publish(part)
-    count = lambda: acknowledged[-1].data[0] + len(acknowledged[-1].data) - 1 if acknowledged else 0  # noqa: E731
-    harness.wait(lambda: count() == COUNT, "the acknowledgment of all")
-    assert acknowledged[-1].data[0] < COUNT
-    harness.remove(node)
-    assert len(node.mapper.slam.mapper.keyframes) == COUNT + 1
+class Robot:
+    """Sends the keyframes of its drives, and hears what the mapper has."""
+
+    def __init__(self, ros: Callable[..., Any], folder: Path) -> None:
+        self.harness, self.folder = ros(), folder
+        kinds = ((Odometry, "keyframe_odom"), (PointCloud2, "keyframe"), (UInt8MultiArray, "keyframe_cloud"))
+        self.wires = [self.harness.node.create_publisher(kind, f"/robot/dpm2/{topic}", WIRE) for kind, topic in kinds]
+        self.heard = self.harness.hear(UInt32MultiArray, "/robot/dpm2/keyframes_received")
+        self.node = self.harness.add(Node(folder))
+        self.harness.wait(lambda: all(wire.get_subscription_count() for wire in self.wires), "the feed")
+
+    def send(self, count: int, session: str) -> None:
+        for id in range(count):
+            name = keyframe_name("robot", id, session)
+            pose = edge_to_msg(np.eye(4), np.eye(6) * 1e-4, 1000 + id, "odom", name)
+            for wire, part in zip(self.wires, (pose, *payload_to_msgs(keyframe(id), name)), strict=True):
+                wire.publish(part)
+
+    def acknowledged(self, session: str) -> tuple[int, int]:
+        """All below that, and how many above, by the last answer."""
+        answers = [answer.data for answer in self.heard if answer.layout.dim[0].label == session]
+        return (answers[-1][0], len(answers[-1]) - 1) if answers else (0, 0)
+
+    def wait(self, session: str, arrived: int) -> None:
+        self.harness.wait(lambda: sum(self.acknowledged(session)) == arrived, f"the answer for {arrived}")
+
+    @property
+    def stored(self) -> int:
+        """Keyframes in the map file: what a mapper that is killed now leaves."""
+        (path,) = self.folder.glob("*.dpm2map")
+        with MapStore.open(path) as store:
+            return len(load_map(store))
+
+
+@pytest.fixture
+def robot(ros: Callable[..., Any], tmp_path: Path) -> Robot:
+    return Robot(ros, tmp_path)
+
+
+def test_what_has_arrived_reaches_the_map(robot: Robot) -> None:
+    """Also where the feed is closed while keyframes come faster than the mapper works: their robot may be gone."""
+    robot.node.mapper.add(robot.node.wait)
+    robot.send(COUNT, DRIVE)
+    robot.wait(DRIVE, COUNT)
+    robot.harness.remove(robot.node)
+    assert robot.stored == COUNT + 1
+
+
+def test_what_is_acknowledged_for_good_is_in_the_map_file(robot: Robot) -> None:
+    """A mapper that is killed loses what waits in its memory; its robot has that, and sends it to the next one."""
+    robot.node.mapper.add(robot.node.wait)
+    robot.send(COUNT, DRIVE)
+    robot.wait(DRIVE, COUNT)
+    assert robot.acknowledged(DRIVE) == (0, COUNT)
+    assert robot.stored == 0
+    robot.node.busy.set()
+    robot.harness.wait(lambda: robot.acknowledged(DRIVE) == (COUNT, 0), "all of them in the file")
+    assert robot.stored == COUNT + 1
+
+
+def test_a_drive_whose_place_is_not_decided_stays_with_its_robot(robot: Robot) -> None:
+    """It is not in the map when the mapper ends, however soon after the drive before it began."""
+    robot.node.busy.set()
+    robot.send(1, DRIVE)
+    robot.harness.wait(lambda: robot.acknowledged(DRIVE) == (1, 0), "the drive before")
+    robot.send(3, NEXT)
+    robot.wait(NEXT, 3)
+    kept = Delivery(NEXT, KeyframeFile(), False, 0.0)
+    for _ in range(3):
+        kept.append([b"pose", b"descriptors", b"cloud"], 0.0)
+    below, above = robot.acknowledged(NEXT)
+    robot.harness.remove(robot.node)
+    assert robot.stored == 1
+    for tick in range(10):
+        kept.acknowledge(below, set(range(below, below + above)), 0.5 * tick)
+    assert not kept.certain(5.0)

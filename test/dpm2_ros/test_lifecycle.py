@@ -28,7 +28,7 @@ from dpm2_core.slam.store.check import check_map
 from dpm2_core.slam.store.map_data import load_map
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_ros.conversions import edge_to_msg, keyframe_name
-from dpm2_ros.keyframes import WIRE, payload_to_msgs
+from dpm2_ros.keyframe_messages import WIRE, payload_to_msgs
 from dpm2_ros.mapper_node import MapperNode
 from dpm2_ros.slam_node import SlamNode
 from tools.replay import ros_environment, start

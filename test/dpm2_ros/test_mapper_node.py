@@ -31,7 +31,7 @@ from dpm2_core.slam.store.map_store import MapStore
 from dpm2_ros import feed, mapper_node
 from dpm2_ros.conversions import EARLIER, edge_to_msg, keyframe_name
 from dpm2_ros.feed import keyframe_from
-from dpm2_ros.keyframes import descriptors_to_msg, payload_to_msgs
+from dpm2_ros.keyframe_messages import descriptors_to_msg, payload_to_msgs
 from dpm2_ros.mapper_node import MapperNode
 from dpm2_ros.mapping import KEEP_ALL
 from dpm2_ros.tf import TFMessage

@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from dpm2_ros.mapping import yield_to_odometry
+from dpm2_ros.runtime import yield_to_odometry
 
 
 def niceness() -> int:

@@ -27,7 +27,7 @@ from dpm2_core.data.topics import CAMERA_INFO, IMAGE, POINTS
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.geometry import se3
 from dpm2_ros.conversions import cloud_to_msg, stamp_to_msg, transform_to_msg
-from dpm2_ros.keyframes import received_to_msg
+from dpm2_ros.keyframe_messages import received_to_msg
 from dpm2_ros.slam_node import SlamNode
 from dpm2_ros.tf import TFMessage
 

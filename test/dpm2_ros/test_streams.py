@@ -43,9 +43,23 @@ def test_ids_far_ahead_cost_no_memory() -> None:
         put(stream, id)
         stream.put(id % AHEAD, "cloud", CLOUD)
     assert stream.holds < 3 * AHEAD * len(CLOUD[0])
-    assert len(stream.above) < AHEAD  # what the robot learns: it sends the rest again
+    below, waiting = stream.arrived(written=0)
+    assert (below, len(waiting)) < (1, AHEAD)  # what the robot learns: it sends the rest again
     put(stream, 0)
     assert taken(stream) == list(range(AHEAD))
+
+
+def test_what_is_not_in_the_map_file_counts_as_waiting() -> None:
+    stream = Stream("5f3a9c01", 0.0)
+    for id in (0, 1, 2, 4):
+        put(stream, id)
+    for number, id in zip((7, 9, 10), taken(stream), strict=True):  # of the mapper; others have the rest
+        stream.given(id, number)
+    assert stream.arrived(written=0) == (0, [0, 1, 2, 4])
+    assert stream.arrived(written=9) == (1, [1, 2, 4])
+    assert stream.arrived(written=10) == (2, [2, 4])
+    stream.replaced()
+    assert stream.arrived(written=11) == (3, [])
 
 
 def test_a_keyframe_that_is_never_sound_holds_up_the_others_for_seconds_only() -> None:

@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A keyframe as three messages: pose, descriptors, packed cloud with its fix; and what the mapper answers."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+
+import numpy as np
+from nav_msgs.msg import Odometry
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message, serialize_message
+from sensor_msgs.msg import PointCloud2, PointField
+from std_msgs.msg import MultiArrayDimension, MultiArrayLayout, UInt8MultiArray, UInt32MultiArray
+
+from dpm2_core.descriptors import Descriptors
+from dpm2_core.frame import Fix, Keyframe
+from dpm2_core.geometry.voxel import voxel_first
+from dpm2_core.slam.mapping.admission import RejectedError
+from dpm2_core.slam.store.cloud_codec import pack_cloud
+from dpm2_ros.conversions import EARLIER, bytes_to_array, header
+
+WIRE = QoSProfile(depth=64, reliability=ReliabilityPolicy.RELIABLE)
+"""Of keyframes; what falls out of the queue is sent again."""
+BUDGET = 99_000
+"""Bytes of a keyframe's cloud and descriptors on the wire; its pose and the protocol's own have the rest of 100 kB."""
+
+_FIX = struct.Struct("<q15d")  # stamp, ns; place, covariance, antenna, as in `Fix`
+_FEATURE = "feature"
+_MOST_CHANNELS = 4096
+
+
+def of_earlier_drive(parts: Sequence[bytes]) -> list[bytes]:
+    """The serialized messages of a keyframe with a name that says that its drive is over.
+
+    Raises:
+        RuntimeError: they are no such messages.
+    """
+    kinds = (Odometry, PointCloud2, UInt8MultiArray)
+    pose, descriptors, cloud = (deserialize_message(part, kind) for part, kind in zip(parts, kinds, strict=True))
+    if not cloud.layout.dim:
+        raise RuntimeError("a cloud without the name of its keyframe")
+    name = pose.child_frame_id + EARLIER
+    pose.child_frame_id = descriptors.header.frame_id = cloud.layout.dim[0].label = name
+    return [bytes(serialize_message(part)) for part in (pose, descriptors, cloud)]
+
+
+def received_to_msg(session: str, below: int, above: Sequence[int]) -> UInt32MultiArray:
+    """What a mapper has of a session: all ids below one, in its map file, and some above."""
+    dimension = MultiArrayDimension(label=session, size=1 + len(above), stride=1 + len(above))
+    return UInt32MultiArray(layout=MultiArrayLayout(dim=[dimension]), data=[below, *above])
+
+
+def payload_to_msgs(keyframe: Keyframe, name: str, weights: str = "") -> tuple[PointCloud2, UInt8MultiArray]:
+    """Descriptors and packed cloud of a keyframe, the cloud downsampled until both are within `BUDGET`.
+
+    Behind the cloud is its fix, if it has one, as a second dimension.
+    """
+    d, fix = keyframe.descriptors, keyframe.fix
+    descriptors = descriptors_to_msg(d, keyframe.stamp, name, weights)
+    room = BUDGET - len(descriptors.data) - _FIX.size
+    cloud, voxel = keyframe.cloud, 0.3
+    while len(packed := pack_cloud(cloud)) > room:
+        voxel *= 1.15
+        cloud = keyframe.cloud[voxel_first(keyframe.cloud, voxel)]
+    dimensions = [MultiArrayDimension(label=name, size=len(packed), stride=len(packed))]
+    if fix is not None:
+        dimensions.append(MultiArrayDimension(label="fix", size=_FIX.size, stride=_FIX.size))
+        packed += _FIX.pack(fix.stamp, *fix.geodetic, *fix.covariance.ravel(), *fix.antenna)
+    return descriptors, UInt8MultiArray(layout=MultiArrayLayout(dim=dimensions), data=bytes_to_array(packed))
+
+
+def cloud_from_msg(message: UInt8MultiArray) -> tuple[bytes, Fix | None]:
+    """The packed cloud of a keyframe, not unpacked yet, and its fix.
+
+    Raises:
+        RejectedError: the fix is invalid.
+    """
+    data = bytes(message.data)
+    if len(message.layout.dim) < 2:
+        return data, None
+    packed, rest = data[: -_FIX.size], data[-_FIX.size :]
+    if len(rest) != _FIX.size:
+        raise RejectedError("fix", f"a fix of {len(rest)} bytes")
+    stamp, *numbers = _FIX.unpack(rest)
+    values = np.array(numbers)
+    try:
+        return packed, Fix(stamp, values[:3], values[3:12].reshape(3, 3), values[12:])
+    except ValueError as error:
+        raise RejectedError("fix", str(error)) from None
+
+
+def descriptors_to_msg(d: Descriptors | None, stamp: int, name: str, weights: str = "") -> PointCloud2:
+    """A cloud of points x, y, z, axis_x, axis_y and the bits of 128 half floats `feature:WEIGHTS`; empty for None.
+
+    Those of a tilted LiDAR whose base is not known are not sent: the receiver makes its own of the cloud.
+    """
+    d = None if d is not None and d.up is not None else d
+    channels = 0 if d is None else d.features.shape[1]
+    dtype = _row(max(channels, 1))
+    rows = np.zeros(0 if d is None else len(d), dtype)
+    if d is not None:
+        rows["xyz"], rows["axis"], rows["feature"] = d.xyz, d.axes, d.features
+    names = ("x", "y", "z", "axis_x", "axis_y")
+    fields = [PointField(name=n, offset=4 * i, datatype=PointField.FLOAT32, count=1) for i, n in enumerate(names)]
+    feature = f"{_FEATURE}:{weights}" if weights else _FEATURE
+    fields.append(PointField(name=feature, offset=20, datatype=PointField.UINT16, count=max(channels, 1)))
+    return PointCloud2(
+        header=header(stamp, name),
+        height=1,
+        width=len(rows),
+        fields=fields,
+        point_step=dtype.itemsize,
+        row_step=dtype.itemsize * len(rows),
+        data=bytes_to_array(rows.tobytes()),
+        is_dense=True,
+    )
+
+
+def descriptors_from_msg(message: PointCloud2) -> tuple[Descriptors | None, str]:
+    """The inverse of `descriptors_to_msg`: descriptors, and the identity of the weights that made them.
+
+    Raises:
+        RejectedError: it is something else.
+    """
+    if not message.width:
+        return None, ""
+    feature = next((f for f in message.fields if f.name.partition(":")[0] == _FEATURE), None)
+    channels = 0 if feature is None else feature.count
+    if not 0 < channels <= _MOST_CHANNELS:
+        raise RejectedError("descriptors", f"a cloud that holds descriptors of {channels} channels")
+    dtype = _row(channels)
+    if message.point_step != dtype.itemsize or len(message.data) != dtype.itemsize * message.width:
+        raise RejectedError(
+            "descriptors", f"{len(message.data)} bytes for {message.width} descriptors of {channels} channels"
+        )
+    rows = np.frombuffer(message.data, dtype)
+    xyz, features, axis = (np.ascontiguousarray(rows[name]) for name in ("xyz", "feature", "axis"))
+    return Descriptors(xyz, features, axis), "" if feature is None else feature.name.partition(":")[2][:64]
+
+
+def _row(channels: int) -> np.dtype[np.void]:
+    return np.dtype([("xyz", "<f4", 3), ("axis", "<f4", 2), ("feature", "<f2", channels)])

@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is asked of slam_node by services and from RViz: a new start, another map, a pose to begin with."""
+
+from __future__ import annotations
+
+import threading
+
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from rclpy.node import Node
+from std_srvs.srv import SetBool, Trigger
+
+from dpm2_core.data.transforms import transform_matrix
+from dpm2_core.errors import UsageError
+from dpm2_core.slam.mapping.admission import check_pose
+from dpm2_ros.base_frame import BaseFrame
+from dpm2_ros.mapping import MapperThread, respond
+
+
+class Requests:
+    """The services of slam_node, and `initialpose`.
+
+    Attributes:
+        reset: set once a new start is asked for.
+    """
+
+    def __init__(self, node: Node, mapper: MapperThread | None, base: BaseFrame, map_frame: str) -> None:
+        """`mapper`: None where it is another node's."""
+        self._mapper, self._base, self._map_frame = mapper, base, map_frame
+        self.reset = threading.Event()
+        node.create_service(Trigger, "~/reset", self._on_reset)
+        node.create_service(Trigger, "~/load_map", self._on_load_map)
+        node.create_service(SetBool, "~/localization_mode", self._on_localization_mode)
+        node.create_subscription(PoseWithCovarianceStamped, "initialpose", self._on_initial_pose, 10)
+
+    def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self.reset.set()
+        response.success = True
+        response.message = "the map is saved; odometry and map start again with the next cloud"
+        if self._mapper is None:
+            response.message = (
+                "odometry starts again with the next cloud, and its keyframes as a new session of the mapper's map"
+            )
+        return response
+
+    async def _on_load_map(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if self._mapper is None:
+            response.success, response.message = False, "the mapper is another node's: ros.embed_mapper is off"
+            return response
+        try:
+            await respond(self._mapper.load(), response)
+        except UsageError as error:
+            response.success, response.message = False, str(error)
+        return response
+
+    async def _on_localization_mode(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        if self._mapper is None:
+            response.success, response.message = False, "the mapper is another node's: ros.embed_mapper is off"
+        else:
+            await respond(self._mapper.localise() if request.data else self._mapper.extend(), response)
+        return response
+
+    def _on_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
+        frame, requested = message.header.frame_id.lstrip("/"), self._map_frame
+        if frame != requested:
+            raise UsageError(f"initialpose not used: want it in frame {requested}, not in {frame[:80]!r}")
+        T_map_base = transform_matrix(message.pose.pose)
+        check_pose(T_map_base)
+        T_map_start = T_map_base @ self._base.T_base_start
+        if problem := "no map here" if self._mapper is None else self._mapper.hint(T_map_start):
+            raise UsageError(f"initialpose not used: {problem}")
