@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -41,14 +41,16 @@ def sim(
     imu: Annotated[
         bool, typer.Option("--imu", help="With imu.txt, of an IMU at 100 Hz that errs as real ones.")
     ] = False,
+    gnss: Annotated[bool, typer.Option("--gnss", help="With gnss.txt, fixes of a plain receiver at 5 Hz.")] = False,
     workers: Annotated[int, typer.Option(min=1, help="Threads; they do not change the result.")] = 2,
 ) -> None:
     """Simulate a drive: scans, images, poses, point labels, scans without moving objects, and a map of the ground."""
     from dpm2_core.sim.drive import simulate  # embree and the rest are slow to import for the other commands
 
     lidar = {"pattern": pattern, "beams": beams, "height": height, "range": reach}
-    tree = {"frames": frames, "seed": seed, "road": road, "preset": preset, "images": images, "traffic": traffic}
-    drive = settings_from(DriveConfig, {**tree, "lidar": lidar, "imu": {} if imu else None}, default="dpm2 sim")
+    tree: dict[str, Any] = {"frames": frames, "seed": seed, "road": road, "preset": preset, "images": images}
+    tree |= {"traffic": traffic, "lidar": lidar, "imu": {} if imu else None, "gnss": {} if gnss else None}
+    drive = settings_from(DriveConfig, tree, default="dpm2 sim")
     if sensor == "real":
         drive = drive.model_copy(update={"lidar": real_sensor(drive.lidar)})
     console = Console(stderr=True)

@@ -23,7 +23,7 @@ from dpm2_core.data.messages import cloud_fields, point_columns
 from dpm2_core.data.prefetch import prefetch
 from dpm2_core.data.source import Span
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.frame import Array, Camera, Frame
+from dpm2_core.frame import Array, Camera, Fix, Frame
 from dpm2_core.geometry import se3
 
 EPOCH_NS = 1_316_995_200_000_000_000
@@ -100,13 +100,16 @@ class _KittiBag:
             self._put(topics.PATH, first, path, latched=True)
 
     def write(self, frame: Frame) -> None:
-        """IMU and image first: who waits for the cloud then has them already."""
+        """IMU, fix and image first: who waits for the cloud then has them already."""
         stamp = EPOCH_NS + frame.stamp
         if frame.imu is not None:
             R = self.source.R_lidar_imu  # back along its own axes
             samples = zip(frame.imu.stamps.tolist(), frame.imu.rates @ R, frame.imu.forces @ R, strict=True)
             for time, rates, forces in samples:
                 self._put(topics.IMU, EPOCH_NS + time, _imu(EPOCH_NS + time, rates, forces))
+        if frame.fix is not None:
+            time = EPOCH_NS + frame.fix.stamp
+            self._put(topics.FIX, time, _fix(time, frame.fix))
         if frame.problem:
             self.source.notes.append(f"{frame.problem}: written as an empty cloud")
         for image in frame.images:
@@ -163,6 +166,8 @@ def _static_frames(source: KittiSource) -> list[tuple[str, str, Array]]:
         frames.append((topics.LIDAR, topics.COLOR_CAMERA, source.camera.T_lidar_cam))
     if source.imu is not None:
         frames.append((topics.LIDAR, topics.IMU_LINK, se3.make(source.R_lidar_imu, np.zeros(3))))
+    if source.fixes:
+        frames.append((topics.LIDAR, topics.GNSS_LINK, se3.make(np.eye(3), source.fixes[0].antenna)))
     return frames
 
 
@@ -222,6 +227,15 @@ def _imu(stamp: int, rates: Array, forces: Array) -> Any:
         orientation_covariance=no_orientation, angular_velocity=vector(*rates.tolist()),
         angular_velocity_covariance=unknown, linear_acceleration=vector(*forces.tolist()),
         linear_acceleration_covariance=unknown,
+    )  # fmt: skip
+
+
+def _fix(stamp: int, fix: Fix) -> Any:
+    latitude, longitude, altitude = fix.geodetic.tolist()
+    return _TYPES["sensor_msgs/msg/NavSatFix"](
+        header=_header(stamp, topics.GNSS_LINK), status=_TYPES["sensor_msgs/msg/NavSatStatus"](status=0, service=1),
+        latitude=latitude, longitude=longitude, altitude=altitude, position_covariance=fix.covariance.ravel(),
+        position_covariance_type=2,  # of the diagonal
     )  # fmt: skip
 
 

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The KITTI odometry layout: sequences/NN/{velodyne,image_2,calib.txt,times.txt} and poses/NN.txt; with an IMU beside
-it imu.txt (a line for each sample: s, then rad/s and m/s2 along its axes) and Tr_imu_to_velo in calib.txt.
+it imu.txt (a line for each sample: s, then rad/s and m/s2 along its axes) and Tr_imu_to_velo in calib.txt; with fixes
+of satellites gnss.txt (s, latitude and longitude, deg, altitude, m, standard deviations to the east, north, up, m) and
+Tr_gnss_to_velo, of the antenna.
 
 A. Geiger, P. Lenz, R. Urtasun, "Are we ready for autonomous driving?", CVPR 2012.
 """
@@ -8,6 +10,7 @@ A. Geiger, P. Lenz, R. Urtasun, "Are we ready for autonomous driving?", CVPR 201
 from __future__ import annotations
 
 import json
+from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,7 +23,7 @@ from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.text import parse_row, read_lines, read_numbers
 from dpm2_core.data.vertical_angle import HDL64_CORRECTION_DEG, correct_vertical_angle
 from dpm2_core.errors import UsageError
-from dpm2_core.frame import Array, Camera, Frame, Inertial
+from dpm2_core.frame import Array, Camera, Fix, Frame, Inertial
 from dpm2_core.geometry import se3
 
 _MAX_CORRECTION_DEG = 5.0
@@ -68,15 +71,19 @@ class KittiSource:
         self.poses: Array | None = self._poses()
         self.camera = self._camera(calib)
         self.imu, self.R_lidar_imu = self._imu(calib)
+        self.fixes = self._fixes(calib)
 
     def __len__(self) -> int:
         return len(self._scans)
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
         """Frames start..stop-1 by position; `Frame.index` is the number in the file name."""
-        before = None
+        before, fixes = None, deque(self.fixes)
         for scan, stamp in list(zip(self._scans, self.stamps, strict=True))[start:stop]:
             imu, before = self._samples(before, int(stamp)), int(stamp)
+            fix = None
+            while fixes and fixes[0].stamp <= stamp:
+                fix = fixes.popleft()
             points, problem = read_scan(scan)
             points = scale_intensity(points, self._settings.intensity_max)  # KITTI's are in 0..1, not everyone's are
             yield Frame(
@@ -86,6 +93,7 @@ class KittiSource:
                 index=int(scan.stem),
                 problem=problem,
                 imu=imu,
+                fix=fix,
             )
 
     def _imu(self, calib: dict[str, Array]) -> tuple[Inertial | None, Array]:
@@ -110,6 +118,19 @@ class KittiSource:
         since = stamp - 10**9 if before is None else max(before, stamp - 10**9)
         first, last = np.searchsorted(s.stamps, [since, stamp], "right")
         return Inertial(s.stamps[first:last], s.rates[first:last] @ R.T, s.forces[first:last] @ R.T)
+
+    def _fixes(self, calib: dict[str, Array]) -> list[Fix]:
+        path, antenna = self.path / "gnss.txt", calib.get("Tr_gnss_to_velo", np.eye(4))[:3, 3]
+        rows, found = read_numbers(path, 7), []
+        for line, (time, *numbers) in enumerate(rows.tolist(), 1):
+            try:
+                covariance = np.diag(np.square(numbers[3:]))
+                found.append(Fix(round(time * 1e9), np.array(numbers[:3]), covariance, antenna))
+            except ValueError as error:
+                raise UsageError(f"{path}:{line}: {error}") from None
+        if rows.size and "Tr_gnss_to_velo" not in calib:
+            self.notes.append(f"{path}: the antenna is taken for the LiDAR: no Tr_gnss_to_velo in calib.txt")
+        return sorted(found, key=lambda fix: fix.stamp)
 
     def _correction(self) -> float:
         requested = self._settings.vertical_angle_correction_deg
@@ -201,8 +222,8 @@ class KittiSource:
 
 
 def read_calib(path: Path) -> dict[str, Array]:
-    """P0..P3 (3, 4), Tr (4, 4, LiDAR to left gray camera) and Tr_imu_to_velo (4, 4), those that a calib.txt has;
-    nothing if there is none.
+    """P0..P3 (3, 4), Tr (4, 4, LiDAR to left gray camera), Tr_imu_to_velo and Tr_gnss_to_velo (4, 4), those that a
+    calib.txt has; nothing if there is none.
 
     Raises:
         UsageError: a line is damaged; the message names it.
@@ -210,7 +231,7 @@ def read_calib(path: Path) -> dict[str, Array]:
     calib: dict[str, Array] = {}
     for number, line in enumerate(read_lines(path), 1):
         key, colon, text = line.partition(":")
-        if not colon or key.strip() not in ("P0", "P1", "P2", "P3", "Tr", "Tr_imu_to_velo"):
+        if not colon or key.strip() not in ("P0", "P1", "P2", "P3", "Tr", "Tr_imu_to_velo", "Tr_gnss_to_velo"):
             continue  # raw and object calibrations have many more
         row, name = parse_row(text, 12, f"{path}:{number}: {key}"), key.strip()
         matrix = row.reshape(3, 4)

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.geometry import se3
 from dpm2_core.sim.camera import calibration, render
+from dpm2_core.sim.gnss import Receiver
 from dpm2_core.sim.imu import Imu
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.road import FRAME_PERIOD, ROAD_KINDS, make_road, read_drive
@@ -33,7 +34,7 @@ OVERLAP = 16.0
 """How far a closed drive goes on beyond its start, m."""
 LONGEST_LAP = 800.0
 """A longer drive goes round again, m."""
-_LIDAR_STREAM, _CAMERA_STREAM, _IMU_STREAM = 10, 11, 14
+_LIDAR_STREAM, _CAMERA_STREAM, _IMU_STREAM, _GNSS_STREAM = 10, 11, 14, 15
 
 
 def simulate(
@@ -107,8 +108,9 @@ def _recipe(drive: DriveConfig) -> dict[str, Any]:
             del recipe["camera"][name]
     if drive.traffic == 1:
         del recipe["traffic"]
-    if drive.imu is None:
-        del recipe["imu"]
+    for name in ("imu", "gnss"):
+        if recipe[name] is None:
+            del recipe[name]
     return recipe
 
 
@@ -165,6 +167,8 @@ class _Drive:
     def __init__(self, world: World, drive: DriveConfig) -> None:
         self.world, self.lidar, self.camera = world, Lidar(drive.lidar), drive.camera if drive.images else None
         self.imu = None if drive.imu is None else Imu(drive.imu, np.random.default_rng([world.seed, _IMU_STREAM]))
+        rng = np.random.default_rng([world.seed, _GNSS_STREAM])
+        self.gnss = None if drive.gnss is None else Receiver(drive.gnss, rng)
         self.times = np.arange(_frames(drive)) * FRAME_PERIOD
         height, sway = drive.lidar.height, drive.lidar.real.sway
         self.T_world_level = np.stack([world.drive_pose(t, height, sway) for t in self.times])
@@ -186,6 +190,8 @@ class _Drive:
         self._write_ground(sequence / "ground.npz")
         if self.imu is not None:
             self._write_imu(self.imu, sequence / "imu.txt")
+        if self.gnss is not None:
+            self._write_fixes(self.gnss, sequence / "gnss.txt")
         pool = ThreadPoolExecutor(max(1, workers))
         try:
             for done, _ in enumerate(pool.map(lambda i: self._write_frame(sequence, i), range(len(self.times))), 1):
@@ -219,21 +225,30 @@ class _Drive:
             P = np.concatenate([self.K, self.K @ [[left], [0], [0]]], 1)
             calib.write(f"P{k}: " + " ".join(f"{v:.12e}" for v in P.ravel()) + "\n")
         calib.write("Tr: " + " ".join(f"{v:.12e}" for v in se3.inverse(self.T_lidar_cam0)[:3].ravel()) + "\n")
+        beside = {}
         if self.imu is not None:
-            T_lidar_imu = se3.make(self.imu.R_lidar_imu, np.zeros(3))
-            calib.write("Tr_imu_to_velo: " + " ".join(f"{v:.12e}" for v in T_lidar_imu[:3].ravel()) + "\n")
+            beside["imu"] = se3.make(self.imu.R_lidar_imu, np.zeros(3))
+        if self.gnss is not None:
+            beside["gnss"] = se3.make(np.eye(3), self.gnss.antenna)
+        for name, T_lidar_sensor in beside.items():
+            calib.write(f"Tr_{name}_to_velo: " + " ".join(f"{v:.12e}" for v in T_lidar_sensor[:3].ravel()) + "\n")
         (sequence / "calib.txt").write_text(calib.getvalue(), encoding="utf-8")
 
     def _write_imu(self, imu: Imu, path: Path) -> None:
         """A line for each sample, from before the first scan to after the last: s, then rad/s and m/s2 of its axes."""
-        world, lidar = self.world, self.lidar
-        height, sway = lidar.config.height, lidar.config.real.sway
-
-        def poses(times: Array) -> Array:
-            return np.stack([world.drive_pose(float(t), height, sway) for t in times]) @ lidar.T_level_lidar
-
         times = imu.times(-FRAME_PERIOD, self.times[-1] + FRAME_PERIOD)
-        np.savetxt(path, np.column_stack([times, *imu.measure(times, poses)]), "%.9e")
+        np.savetxt(path, np.column_stack([times, *imu.measure(times, self._poses)]), "%.9e")
+
+    def _write_fixes(self, gnss: Receiver, path: Path) -> None:
+        """A line for each: s, latitude and longitude, deg, altitude, m, standard deviations east, north, up, m."""
+        times = gnss.times(self.times[-1])
+        sigmas = np.tile(gnss.sigmas, (len(times), 1))
+        np.savetxt(path, np.column_stack([times, gnss.measure(self._poses(times)), sigmas]), "%.12e")
+
+    def _poses(self, times: Array) -> Array:
+        """T_world_lidar (K, 4, 4) at times (K,) s."""
+        height, sway = self.lidar.config.height, self.lidar.config.real.sway
+        return np.stack([self.world.drive_pose(float(t), height, sway) for t in times]) @ self.lidar.T_level_lidar
 
     def _write_ground(self, path: Path) -> None:
         """Height of the ground, kerbs included, NaN where unknown; T_grid_cam0 is the first pose in its frame."""

@@ -111,6 +111,23 @@ class ImuConfig(Settings):
     """Of the mount, deg to the left."""
 
 
+class GnssConfig(Settings):
+    """A receiver of satellites, by default a plain one. Errors are standard deviations, twice as large in height."""
+
+    rate: float = Field(default=5.0, gt=0, le=10)
+    """Fixes per second."""
+    noise: float = Field(default=0.3, ge=0)
+    """Of each fix, m."""
+    wander: float = Field(default=1.5, ge=0)
+    """Of an error that stays for a while, m."""
+    wander_time: float = Field(default=60.0, gt=0)
+    """s in which it becomes another one."""
+    antenna: tuple[float, float, float] = (-0.4, 0.0, 0.2)
+    """In the LiDAR's frame, m."""
+    origin: tuple[float, float, float] = (49.0, 8.4, 110.0)
+    """Of the world: latitude and longitude, deg, altitude above the ellipsoid, m. Its x axis points east."""
+
+
 class CameraConfig(Settings):
     """A forward-looking rectified color camera, 0.27 m ahead of and 0.08 m below the LiDAR."""
 
@@ -150,6 +167,8 @@ class DriveConfig(Settings):
     camera: CameraConfig = CameraConfig()
     imu: ImuConfig | None = None
     """None: there is none."""
+    gnss: GnssConfig | None = None
+    """Likewise."""
 
 
 class Preset(Settings):

@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 
 from dpm2_core.data.bags import BagSource
+from dpm2_core.data.convert import EPOCH_NS, convert_kitti
 from dpm2_core.data.gnss import FixBuffer, decode_fix
+from dpm2_core.data.kitti import KittiSource
 from dpm2_core.data.messages import MessageError
 from dpm2_core.data.settings import InputSettings
-from dpm2_core.data.topics import POINTS
+from dpm2_core.data.topics import FIX, POINTS
 from dpm2_core.errors import UsageError
 
 SECOND = 10**9
@@ -130,3 +132,41 @@ def test_a_flood_and_stamps_of_the_future_do_no_harm(bags: Any) -> None:
     buffer.add(5 * SECOND // 2, message)
     assert buffer.take(2 * SECOND) is None  # not of this scan yet
     assert buffer.take(3 * SECOND) is not None
+
+
+def test_a_folder_becomes_a_bag_with_the_same_fixes(kitti_folder: Any, tmp_path: Path) -> None:
+    folder = kitti_folder()
+    rows = [(t, 49 + t, 8.4, 110.0, 1.0, 2.0, 3.0) for t in (0.05, 0.12, 0.18, 0.33)]  # two of them before one scan
+    np.savetxt(folder / "gnss.txt", rows, "%.12e")
+    assert "gnss.txt: the antenna is taken for the LiDAR" in KittiSource(folder).notes[-1]
+    with (folder / "calib.txt").open("a") as file:
+        file.write("Tr_gnss_to_velo: 1 0 0 0.3 0 1 0 0.2 0 0 1 1\n")
+    source = KittiSource(folder)
+    assert source.notes == []
+    convert_kitti(source, tmp_path / "bag")
+    bag = BagSource(tmp_path / "bag", InputSettings(gnss_topic=FIX))
+    taken = {}
+    for ours, theirs in zip(bag.frames(), source.frames(), strict=True):
+        assert (ours.fix is None) == (theirs.fix is None)
+        if ours.fix is not None and theirs.fix is not None:
+            taken[ours.index] = theirs.fix.geodetic[0]
+            assert ours.fix.stamp == theirs.fix.stamp + EPOCH_NS
+            np.testing.assert_array_equal(ours.fix.geodetic, theirs.fix.geodetic)
+            np.testing.assert_array_equal(ours.fix.antenna, [0.3, 0.2, 1.0])
+            np.testing.assert_allclose(ours.fix.covariance, np.diag([1.0, 4, 9]), atol=1e-3)
+    assert taken == {1: 49.05, 2: 49.18, 4: 49.33}
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("0 49 8\n", "gnss.txt:1: 3 numbers, want 7"),
+        ("0 49 8 0 1 1 1\n1 99 8 0 1 1 1\n", "gnss.txt:2: fix: .* no place on Earth"),
+        ("0 49 8 0 1 1 0\n", "gnss.txt:1: fix: .* no covariance"),
+    ],
+)
+def test_a_damaged_file_is_named(kitti_folder: Any, text: str, problem: str) -> None:
+    folder = kitti_folder()
+    (folder / "gnss.txt").write_text(text)
+    with pytest.raises(UsageError, match=problem):
+        KittiSource(folder)

@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A receiver of satellites that is moved along poses: positions with the errors of a real one."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dpm2_core.geometry import geodesy, se3
+from dpm2_core.sim.settings import GnssConfig
+
+Array = se3.Array
+_OFFSET = 0.03  # s after the first scan: a fix comes between two scans
+
+
+class Receiver:
+    """Where its world is on Earth, and its antenna on the LiDAR.
+
+    Attributes:
+        T_ecef_world: (4, 4): x is east, y north, z up at the origin. antenna: (3,) m, in the LiDAR's frame.
+    """
+
+    def __init__(self, config: GnssConfig, rng: np.random.Generator) -> None:
+        """`rng` draws its noise."""
+        self.config, self._rng = config, rng
+        self.T_ecef_world: Array = geodesy.enu_frame(config.origin)
+        self.antenna = np.array(config.antenna, np.float64)
+        self.sigmas = np.hypot(config.noise, config.wander) * np.array([1.0, 1.0, 2.0])
+
+    def times(self, end: float) -> Array:
+        """(K,) s up to the end, at its rate."""
+        return np.arange(_OFFSET, end, 1 / self.config.rate)
+
+    def measure(self, T_world_lidar: Array) -> Array:
+        """(K, 3) latitude and longitude, deg, and altitude, m, by (K, 4, 4) poses at its times."""
+        c, count = self.config, len(T_world_lidar)
+        noise, wander = self._rng.standard_normal((2, count, 3)) * [1.0, 1.0, 2.0]
+        stays = np.exp(-1 / (c.rate * c.wander_time))
+        for k in range(1, count):  # Gauss-Markov: as wide at all times
+            wander[k] = stays * wander[k - 1] + np.sqrt(1 - stays**2) * wander[k]
+        local = (T_world_lidar @ np.append(self.antenna, 1))[:, :3] + c.noise * noise + c.wander * wander
+        return geodesy.geodetic(se3.transform(self.T_ecef_world, local))
