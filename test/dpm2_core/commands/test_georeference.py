@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A simulated drive with fixes through `dpm2 convert` and `dpm2 run` into a map, and from there onto other people's maps:
-near the truth, also where a receiver errs for a while."""
+"""A simulated drive with fixes through `dpm2 convert` and `dpm2 run` into a map, and onto other people's maps: near the
+truth, also where a receiver errs for a while."""
 
 from __future__ import annotations
 
