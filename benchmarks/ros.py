@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`make bench-ros`: the KITTI excerpt through bag, bag_player and slam_node at 10 Hz, with the node's own defaults."""
+"""`make bench-ros`: the KITTI excerpt through bag, bag_player and slam_node at 10 Hz, with the node's own defaults:
+alone, and with an IMU, where the drive has one, and a subscriber for everything.
+"""
 
 from __future__ import annotations
 
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -15,37 +18,43 @@ from rich.console import Group
 from benchmarks.harness import Options, Report, drives, write_report
 from dpm2_core.commands.options import run_command
 from dpm2_core.console import Console
-from dpm2_core.data import topics
 from dpm2_core.data.bags import BagSource
 from dpm2_core.data.convert import convert_kitti
 from dpm2_core.data.kitti import KittiSource
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.tables import FigureTable
-from tools.demo import evaluate_replay
+from tools.demo import Outcome, evaluate_replay
 from tools.replay import replay
 
+WITH: dict[str, tuple[dict[str, object], bool]] = {
+    "": ({"input.imu_topic": "/none"}, False),
+    ", IMU and all topics": ({}, True),
+}
+"""Parameters of the node, and whether all that it publishes has a subscriber, as with RViz and Nav2."""
 FIGURES = ("frames_in", "frames_out", "dropped", "latency_p50_ms", "latency_p95_ms", "ape_rmse_m", "rpe_trans_m")
 
 
 def bench(
-    source: Annotated[list[Path] | None, typer.Option(help="KITTI sequences instead of the excerpt.")] = None,
+    sources: Annotated[list[Path] | None, typer.Option("--source", help="KITTI sequences, not the excerpt.")] = None,
     out: Annotated[Path, typer.Option(help="Folder for ros.json.")] = Path("benchmarks"),
     repetitions: Annotated[int, typer.Option(min=1, help="Replays of every drive.")] = 3,
 ) -> int:
     """Replay every drive at its own speed and evaluate the poses; medians, and the worst of what must not happen."""
-    options = Options(sources=source or (), repetitions=repetitions)
+    options = Options(sources=sources or (), repetitions=repetitions)
     results: dict[str, dict[str, float | int | None]] = {}
-    with drives(options) as sources, tempfile.TemporaryDirectory(prefix="dpm2_bench_ros_") as folder:
-        for drive in sources:
+    with drives(options) as found, tempfile.TemporaryDirectory(prefix="dpm2_bench_ros_") as folder:
+        for drive in found:
             assert isinstance(drive, KittiSource)
             bag, work = Path(folder) / f"bag_{drive.name}", Path(folder) / drive.name
             work.mkdir()
             convert_kitti(KittiSource(drive.path), bag)
-            played = BagSource(bag, InputSettings(images=False))
-            runs = [evaluate_replay(played, replay(bag, topics.POINTS, work), work) for _ in range(repetitions)]
-            results[drive.name] = {
-                name: _median([run.summary[name] for run in runs], worst=name == "dropped") for name in FIGURES
-            } | {"failed_checks": sum(not holds for run in runs for holds in run.checks.values())}
+            source = BagSource(bag, InputSettings(images=False))
+            runs: dict[str, list[Outcome]] = {name: [] for name in WITH}
+            for _ in range(repetitions):
+                for name, (parameters, watched) in WITH.items():
+                    played = replay(source, work, parameters=parameters, watched=watched)
+                    runs[name].append(evaluate_replay(source, played, work))
+            results |= {f"{drive.name}{name}": _figures(of) for name, of in runs.items()}
     title = "Bag -> bag_player -> slam_node -> /dpm2/odom"
     table = FigureTable(title, names=["drive"], figures=[*FIGURES, "failed checks"])
     for name, row in results.items():
@@ -55,6 +64,11 @@ def bench(
     )
     Console().print(table)
     return 1 if any(row["failed_checks"] for row in results.values()) else 0
+
+
+def _figures(runs: Sequence[Outcome]) -> dict[str, float | int | None]:
+    medians = {name: _median([run.summary[name] for run in runs], worst=name == "dropped") for name in FIGURES}
+    return medians | {"failed_checks": sum(not holds for run in runs for holds in run.checks.values())}
 
 
 def _median(values: list[float | int | None], worst: bool) -> float | None:

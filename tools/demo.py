@@ -62,9 +62,7 @@ def demo(
     with Progress(*columns, console=console) as progress:
         task = progress.add_task("bag_player -> slam_node -> /dpm2/odom", total=len(source))
         parameters = {"ros.queue_depth": QUEUE, "ros.map_period": 2.0}
-        result = replay(
-            bag, source.points_topic, out, rate, parameters, lambda done: progress.update(task, completed=done)
-        )
+        result = replay(source, out, rate, parameters, lambda done: progress.update(task, completed=done))
     outcome = evaluate_replay(source, result, out)
     with atomic_write(out / "summary.json") as file:
         file.write(json.dumps(outcome.summary, indent=2) + "\n")

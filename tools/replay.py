@@ -13,12 +13,14 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dpm2_core.data.bags import BagSource
 from dpm2_core.data.messages import decode_points, stamp_ns
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.errors import Dpm2Error
@@ -87,27 +89,28 @@ def stop(process: subprocess.Popen[bytes], timeout: float = 60.0) -> int:
 
 
 def replay(
-    bag: Path,
-    points_topic: str,
+    source: BagSource,
     out: Path,
     rate: float = 1.0,
     parameters: Mapping[str, object] | None = None,
     progress: Callable[[int], None] = lambda frames: None,
+    watched: bool = False,
 ) -> Replay:
     """Play the bag into slam_node; returns when both processes have ended. Logs and the map go to `out`.
 
     Args:
-        points_topic: of the clouds in the bag.
+        source: the bag.
         rate: speed of playing.
         parameters: of slam_node.
         progress: called with the number of frames that have come out, now and then.
+        watched: everything that slam_node publishes has a subscriber, so that everything is made.
 
     Raises:
         Dpm2Error: a process ended before its time; the message gives the end of its log.
     """
     environment = ros_environment()
     os.environ.update(environment)  # the subscriber in this process reads it when rclpy starts
-    given = {"use_sim_time": True, "input.points_topic": points_topic, "ros.map_directory": str(out / "map")}
+    given = {"use_sim_time": True, "input.points_topic": source.points_topic, "ros.map_directory": str(out / "map")}
     pairs = [f"{name}:={_yaml(value)}" for name, value in (given | dict(parameters or {})).items()]
     arguments = ["--ros-args", *(part for pair in pairs for part in ("-p", pair))]
     times = out / "published.csv"
@@ -120,7 +123,9 @@ def replay(
             while not listener.connected():  # or the first poses would be sent before there is a subscriber
                 alive()
                 listener.spin(0.1)
-            playing = [str(bag), "--rate", str(rate), "--wait", "60", "--log", str(times)]
+            if watched:
+                listener.watch_all()
+            playing = [str(source.path), "--rate", str(rate), "--wait", "60", "--log", str(times)]
             player = start("bag_player", playing, environment, out / "bag_player.log")
             while player.poll() is None:
                 alive()
@@ -128,7 +133,7 @@ def replay(
                 progress(len(result.poses))
             if player.returncode:
                 raise Dpm2Error(f"bag_player ended with {player.returncode}: {_tail(out / 'bag_player.log')}")
-            result.published = _published(times, points_topic)
+            result.published = _published(times, source.points_topic)
             _drain(listener, result)
             progress(len(result.poses))
     finally:
@@ -198,6 +203,19 @@ class _Listener:
         self._executor.shutdown()
         self._node.destroy_node()
         rclpy.try_shutdown()
+
+    def watch_all(self) -> None:
+        """Subscribe to the other topics of slam_node, too, and leave their messages as the bytes that they came as."""
+        from rclpy.qos import QoSProfile, ReliabilityPolicy
+
+        profile = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+        heard = {subscription.topic_name for subscription in self._node.subscriptions}
+        for topic, (kind, *_) in self._node.get_publisher_names_and_types_by_node("slam_node", "/"):
+            if topic in heard:
+                continue
+            package, _, name = kind.split("/")
+            message = getattr(import_module(f"{package}.msg"), name)
+            self._node.create_subscription(message, topic, lambda _: None, profile, raw=True)
 
     def connected(self) -> bool:
         """Whether slam_node is heard, and its other topics have been found too."""

@@ -158,10 +158,9 @@ def test_a_drive_through_player_slam_node_and_mapper_node(
 def test_replay_is_checked_by_what_arrived(bag: Path, drive: Any, tmp_path: Path) -> None:
     """What `make demo` does: all checks hold; and without one pose, or in a wrong order of events, they do not."""
     parameters = {"ros.map_period": 0.5, "slam.keyframes.distance": 2.0}
-    result = replay(
-        bag, topics.POINTS, tmp_path, 0.25, parameters
-    )  # slowly: on a busy machine, too, nothing is dropped
     source = BagSource(bag, InputSettings(images=False))
+    # Slowly: on a busy machine, too, nothing is dropped.
+    result = replay(source, tmp_path, 0.25, parameters)
     outcome = evaluate_replay(source, result, tmp_path)
     assert all(outcome.checks.values()), outcome.checks
     summary = outcome.summary
