@@ -9,6 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from dpm2_core.network.pooling import as_machine_code, largest_sums, places_in_view
 from dpm2_core.network.pyramid import PointBatch
 from dpm2_core.network.settings import PointsSettings, StageSettings
 
@@ -92,12 +93,12 @@ def pool_neighbors(own: Tensor | None, index: Tensor | None, relative: Tensor, w
 
     own (B, m, C) and index (B, n, k), or None for places alone; places (B, n, k, P), weight (C, P): (B, n, C).
     """
+    if as_machine_code(relative):
+        return largest_sums(own, index, relative, weight)
     with torch.no_grad():
         sums = nn.functional.linear(relative, weight)
         if own is not None and index is not None:
             sums = gather(own, index).add_(sums)
-        if torch.is_inference_mode_enabled():
-            return max_neighbor(sums)
         best = argmax_neighbor(sums)
     n_places = relative.shape[-1]
     chosen = relative.gather(2, best[..., None].expand(*best.shape, n_places))
@@ -105,14 +106,6 @@ def pool_neighbors(own: Tensor | None, index: Tensor | None, relative: Tensor, w
     if own is not None and index is not None:
         out = out + own.gather(1, index.gather(2, best))
     return out
-
-
-def max_neighbor(sums: Tensor) -> Tensor:
-    """Maximum (B, n, C) of (B, n, k, C) over k, by halves: `amax` over an inner one is slow in bf16 on the CPU."""
-    while (k := sums.shape[2]) > 1:
-        half = (k + 1) // 2
-        sums = torch.maximum(sums[:, :, :half], sums[:, :, k - half :])
-    return sums[:, :, 0]
 
 
 def argmax_neighbor(sums: Tensor) -> Tensor:
@@ -135,7 +128,9 @@ class Aggregation(nn.Module):
         self.pooled = Pooled(channels_in, 5 if settings.view_aligned else 3, channels_out, settings.pool_first)
 
     def forward(self, xyz: Tensor, centers: Tensor, features: Tensor, index: Tensor) -> Tensor:
-        """xyz (B, m, 3), centers (B, n, 3), features (B, m, C), index (B, n, k) into m: (B, n, channels_out)."""
+        """xyz (B, m, 3) that begins with centers (B, n, 3), features (B, m, C), index (B, n, k) into m: (B, n, out)."""
+        if self.view_aligned and as_machine_code(xyz):
+            return self.pooled(features, index, places_in_view(xyz, view_axes(xyz), index, self.radius))
         delta = (gather(xyz, index) - centers[:, :, None]) / self.radius
         if not self.view_aligned:
             return self.pooled(features, index, delta)
