@@ -16,7 +16,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.network.decoder import Decoder, Prepared
 from dpm2_core.network.encoder import Encoder
 from dpm2_core.network.matching import correspond, match_scores
-from dpm2_core.network.pose_solver import Solver, register_batch
+from dpm2_core.network.pose_solver import Solver, agreement, register_batch
 from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.network.tokens import Tokens, to_tokens
 
@@ -77,6 +77,17 @@ class DeepPointMap2(nn.Module):
             correlated = self.decoder(source, target)
             level = register_batch(self.decoder, source, target, correlated, self.solver)
         return [_tilted(*row) for row in zip(level, sources, targets, strict=True)]
+
+    @torch.inference_mode()
+    def agreement(self, source: Descriptors, targets: Sequence[Descriptors]) -> list[float]:
+        """0..1, how far a set and each of the others agree on a motion as they are: see `pose_solver.agreement`."""
+        s, found = self.settings.decoder, list[float]()
+        device, view_aligned = next(self.parameters()).device, self.decoder.view_aligned
+        x = to_tokens([source.level()], view_aligned, device)
+        for target in targets:
+            y = to_tokens([target.level()], view_aligned, device)
+            found.append(float(agreement(x, y, s.temperature, s.pair_ratio)))
+        return found
 
     def overlap(self, sources: Sequence[Descriptors], targets: Sequence[Descriptors]) -> list[float]:
         """Probability 0..1 that each pair was seen from within 20 m; NaN while the overlap head is untrained."""

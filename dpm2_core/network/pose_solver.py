@@ -20,7 +20,16 @@ from dpm2_core.geometry.kabsch import transform, weighted_kabsch
 from dpm2_core.network.consensus import TOLERANCE, consensus
 from dpm2_core.network.decoder import Correlated, Decoder
 from dpm2_core.network.gauss_newton import solve_pose
-from dpm2_core.network.matching import Correspondences, correspond, guided_scores, match_scores
+from dpm2_core.network.losses import cosine
+from dpm2_core.network.matching import (
+    Correspondences,
+    best_pairs,
+    correspond,
+    guided_scores,
+    match_scores,
+    softmax_both,
+    take,
+)
 from dpm2_core.network.tokens import Tokens
 
 MIN_INLIERS = 30
@@ -39,6 +48,19 @@ def first_pose(pairs: Correspondences) -> Tensor:
     """The pose (B, 4, 4) that most pairs support, however many are wrong."""
     half = pairs.source.shape[1] // 2  # the other half are the same pairs, seen from the target
     return consensus(pairs.source[:, :half], pairs.target[:, :half], pairs.weight[:, :half])
+
+
+def agreement(source: Tokens, target: Tokens, temperature: float, ratio: float) -> Tensor:
+    """How far two sets, matched as they are before either has seen the other, agree on a motion: the part (B,) of the
+    best pairs that one pose brings together. Of two views of a place it is large, of two places small, and it takes a
+    tenth of the time of a registration."""
+    scores = cosine(source.features, target.features) / temperature
+    weight, i, j = best_pairs(softmax_both(scores, source.mask, target.mask), ratio)
+    if weight.shape[1] == 0:
+        return weight.new_zeros(len(weight))
+    at_source, at_target = take(source.xyz, i), take(target.xyz, j)
+    error = (transform(consensus(at_source, at_target, weight), at_source) - at_target).norm(dim=-1)
+    return ((error <= TOLERANCE) & (weight > 0)).float().mean(1)
 
 
 def supporting(pairs: Correspondences, T: Tensor) -> Tensor:

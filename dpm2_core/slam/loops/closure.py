@@ -163,7 +163,9 @@ class LoopCloser:
         source = keyframes[node].descriptors
         targets = [keyframes[c].descriptors for c in candidates]
         assert source is not None
-        results = self._places.register(source, [t for t in targets if t is not None])
+        known = [t for t in targets if t is not None]
+        by_head = self._settings.decided_by == "overlap"  # whose opinion of each is asked for, as in the paper
+        results = self._places.register(source, known, 0.0) if by_head else self._places.register(source, known)
         return [Edge("loop", c, node, result) for c, result in zip(candidates, results, strict=True)]
 
     def _nearest(self, since: Array, poses: Array) -> int | None:

@@ -235,6 +235,24 @@ def test_every_pose_is_rigid_to_float64(model: DeepPointMap2, noise: np.random.G
             assert np.linalg.det(R) > 0
 
 
+def test_descriptors_of_one_place_agree_on_a_motion_and_others_do_not(
+    model: DeepPointMap2, noise: np.random.Generator
+) -> None:
+    """Before the decoder has seen them: also where half of them are others; sets of one descriptor agree on nothing."""
+    here, elsewhere, one = described(model, noise, 60), described(model, noise, 60), described(model, noise, 1)
+    moved = here.moved(se3.exp([0, 0, 2.0, 9, -4, 0.2]))
+    half = Descriptors(
+        np.concatenate([moved.xyz[:30], elsewhere.xyz[:30]]),
+        np.concatenate([moved.features[:30], elsewhere.features[:30]]),
+    )
+    same, partly, other = model.agreement(here, [moved, half, elsewhere])
+    assert same == 1
+    assert partly >= 0.9  # the pairs are half as many as the descriptors, the best first
+    assert other < 0.3
+    assert model.agreement(one, [one]) == [0]
+    assert model.agreement(here, []) == []
+
+
 def test_too_few_descriptors_are_no_registration(model: DeepPointMap2, noise: np.random.Generator) -> None:
     """Not ok, with a reason, and no exception."""
     result = model.register(described(model, noise, 1), described(model, noise, 1))

@@ -22,6 +22,7 @@ from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import LidarConfig
 from dpm2_core.sim.world import World, build_world
 from dpm2_core.slam.loops.closure import LoopCloser, LoopSettings
+from dpm2_core.slam.loops.place_recognition import PlaceRecognition
 from dpm2_core.slam.loops.verification import Verifier
 from dpm2_core.slam.registration.icp import GeometricSettings
 
@@ -95,6 +96,24 @@ def test_a_revisit_is_found_whatever_the_drift_and_heading(heading: float) -> No
     assert max(errors(accepted, truth)) < 0.1
     waited = [loop for loop in loops if "waits" in loop.registration.reason]
     assert len(waited) <= 1  # the first, for the second
+
+
+@pytest.mark.slow
+@pytest.mark.weights
+def test_places_that_agree_on_no_motion_are_not_correlated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """That takes seven times as long, and nearly every candidate is another place."""
+    places = PlaceRecognition(load_network("small", 1))
+    here, near, far = (described(*place) for place in ((40.0, 0.0, 0.0), (44.0, 2.0, np.pi), (104.0, 0.0, 0.0)))
+    assert here is not None
+    assert near is not None
+    assert far is not None
+    found, other = places.register(here, [near, far])
+    assert found.ok
+    assert found.confidence > 0.3
+    assert not other.ok
+    assert "another place" in other.reason
+    monkeypatch.setattr(DeepPointMap2, "register", lambda *_: pytest.fail("the network was asked"))
+    assert not places.register(here, [far])[0].ok
 
 
 @pytest.mark.slow
