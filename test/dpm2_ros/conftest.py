@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import fcntl
+import importlib.util
 import os
 import subprocess
 import sys
@@ -13,11 +14,15 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from itertools import count
 from pathlib import Path
+from types import ModuleType
 from typing import Any
+from unittest.mock import MagicMock, patch
 
 import numpy as np
 import pytest
 import rclpy
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -136,6 +141,31 @@ def bag(sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+class Manager:
+    """What a lifecycle manager does with a node, over its services."""
+
+    def __init__(self, harness: Harness, name: str) -> None:
+        self._harness = harness
+        self._change = harness.node.create_client(ChangeState, f"{name}/change_state")
+        self._state = harness.node.create_client(GetState, f"{name}/get_state")
+
+    def _call(self, client: Any, request: Any) -> Any:
+        self._harness.wait(client.service_is_ready, client.srv_name)
+        future = client.call_async(request)
+        self._harness.wait(future.done, client.srv_name)
+        return future.result()
+
+    def change(self, *transitions: int) -> bool:
+        """Whether all of them were made."""
+        requests = (ChangeState.Request(transition=Transition(id=transition)) for transition in transitions)
+        return all(bool(self._call(self._change, request).success) for request in requests)
+
+    @property
+    def state(self) -> str:
+        """Its label."""
+        return str(self._call(self._state, GetState.Request()).current_state.label)
+
+
 class Harness:
     """Nodes under test and a tester's node, spun by one thread."""
 
@@ -237,6 +267,23 @@ def run() -> Callable[..., subprocess.CompletedProcess[str]]:
 def domain() -> int:
     """A ROS domain of this test's own."""
     return new_domain()
+
+
+@pytest.fixture(scope="session")
+def launch_file() -> ModuleType:
+    """The launch file, with mocks in place of launch and launch_ros, which have no wheels."""
+    path = Path(__file__).resolve().parents[2] / "launch" / "dpm2.launch.py"
+    spec = importlib.util.spec_from_file_location("dpm2_launch", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    missing = ("ament_index_python", "launch", "launch_ros")
+    lines = path.read_text().splitlines()
+    imported = {line.split()[1] for line in lines if line.startswith("from ") and line[5:].startswith(missing)}
+    packages = {name.split(".")[0] for name in imported}
+    with patch.dict(sys.modules, {name: MagicMock() for name in imported | packages}):
+        spec.loader.exec_module(module)
+    return module
 
 
 @pytest.fixture

@@ -2,27 +2,29 @@
 """What the launch file gives to the nodes starts them.
 
 launch and launch_ros are in no package registry. What is computed here is the launch file's own, plain Python; the
-rest of it, which hands that to launch_ros, needs an installation of ROS.
+processes are started here as launch_ros starts them, with what the file hands to it.
 """
 
 from __future__ import annotations
 
 import functools
-import importlib.util
 import re
 import signal
-import sys
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
-from unittest.mock import MagicMock, patch
 
 import pytest
 import rclpy
 import yaml
+from lifecycle_msgs.msg import Transition
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import UInt32MultiArray
 
 from dpm2_core.config import flat_fields
+from dpm2_core.slam.store.check import check_map
 from dpm2_ros import executables
 from dpm2_ros.parameters import CONFIG_FILE, load_parameters
 from dpm2_ros.runtime import ros_context
@@ -30,24 +32,10 @@ from dpm2_ros.settings import NodeConfig
 from dpm2_ros.share import share_directory
 from tools.replay import ros_environment, start
 
+from .conftest import Manager
+
 ROOT = Path(__file__).resolve().parents[2]
 DEFAULTS = {name: info.get_default(call_default_factory=True) for name, info in flat_fields(NodeConfig)}
-MISSING = ("ament_index_python", "launch", "launch_ros")
-
-
-@pytest.fixture(scope="module")
-def launch_file() -> ModuleType:
-    path = ROOT / "launch" / "dpm2.launch.py"
-    spec = importlib.util.spec_from_file_location("dpm2_launch", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    lines = path.read_text().splitlines()
-    imported = {line.split()[1] for line in lines if line.startswith("from ") and line[5:].startswith(MISSING)}
-    packages = {name.split(".")[0] for name in imported}
-    with patch.dict(sys.modules, {name: MagicMock() for name in imported | packages}):
-        spec.loader.exec_module(module)
-    return module
 
 
 def defaults(launch_file: ModuleType) -> dict[str, str]:
@@ -205,3 +193,66 @@ def test_the_launch_ends_with_the_node_that_all_depend_on(
 
 def of(config: NodeConfig, name: str) -> Any:
     return functools.reduce(getattr, name.split("."), config)
+
+
+def commands(launch_file: ModuleType, value: dict[str, str], folder: Path) -> list[tuple[str, list[str]]]:
+    """Executable and arguments of each process, as launch_ros makes them of what the file hands to it."""
+    launch_file.Node.reset_mock()
+    launch_file.LaunchConfiguration.side_effect = lambda name: SimpleNamespace(perform=lambda context: context[name])
+    launch_file.ParameterValue.side_effect = lambda text, value_type: value_type(text)
+    launch_file.generate_launch_description()
+    launch_file.OpaqueFunction.call_args.kwargs["function"](value)
+    found = []
+    for number, node in enumerate(call.kwargs for call in launch_file.Node.call_args_list):
+        files = [
+            given if isinstance(given, str) else str(write(given, folder / f"{number}_{k}.yaml"))
+            for k, given in enumerate(node["parameters"])
+        ]
+        remap = ["-r", f"__ns:=/{node['namespace']}"] if node["namespace"] else []
+        ros = ["--ros-args", *remap, *(word for file in files for word in ("--params-file", file))]
+        found.append((node["executable"], [*node.get("arguments", ()), *ros]))
+    return found
+
+
+@pytest.mark.slow
+def test_what_it_starts_with_lifecycle_is_managed_over_the_services(
+    launch_file: ModuleType, ros: Callable[..., Any], drive: Any, tmp_path: Path
+) -> None:
+    """A robot's slam_node and the mapper_node beside it, from nothing to a map file and back, and to their end."""
+    fast = {"input.images": False, "slam.loops.descriptors": False, "slam.registration": "geometric"}
+    file, maps = write(fast | {"slam.keyframes.distance": 1.0}, tmp_path / "fast.yaml"), tmp_path / "maps"
+    value = defaults(launch_file) | {"lifecycle": "true", "embed_mapper": "false", "namespace": "red", "rviz": "false"}
+    value |= {"params_file": str(file), "map_directory": str(maps), "points_topic": "points"}
+    harness = ros()
+    environment = ros_environment(harness.node.context.get_domain_id())
+    clouds, odom = harness.publisher(PointCloud2, "/red/points"), harness.hear(Odometry, "/red/dpm2/odom")
+    received = harness.hear(UInt32MultiArray, "/red/dpm2/keyframes_received")
+    running = {name: start(name, words, environment, tmp_path / name)
+               for name, words in commands(launch_file, value, tmp_path)}  # fmt: skip
+    try:
+        slam, mapper = managers = [Manager(harness, f"/red/{name}") for name in ("slam_node", "mapper_node")]
+        assert [manager.state for manager in managers] == ["unconfigured"] * 2
+        assert not maps.exists()
+        assert all(manager.change(Transition.TRANSITION_CONFIGURE) for manager in managers)
+        assert not clouds.get_subscription_count()
+        assert all(manager.change(Transition.TRANSITION_ACTIVATE) for manager in (mapper, slam))
+        harness.wait(clouds.get_subscription_count, "the subscription to the clouds")
+        for n in range(6):
+            clouds.publish(drive.cloud(n))
+            harness.wait(lambda n=n: len(odom) > n, f"the odometry of cloud {n}")
+        harness.wait(lambda: received and received[-1].data[0] >= 3, "keyframes in the map file")
+        assert all(manager.change(Transition.TRANSITION_DEACTIVATE) for manager in managers)
+        harness.wait(lambda: not clouds.get_subscription_count(), "the end of the subscription")
+        assert [manager.state for manager in managers] == ["inactive"] * 2
+        assert all(manager.change(Transition.TRANSITION_CLEANUP) for manager in managers)
+        assert [manager.state for manager in managers] == ["unconfigured"] * 2
+        (path,) = maps.glob("*.dpm2map")
+        result = check_map(path)
+        assert (result.problems, result.keyframes >= 3) == ([], True)
+        for process in running.values():
+            process.send_signal(signal.SIGINT)
+        assert {name: process.wait(60) for name, process in running.items()} == {"slam_node": 0, "mapper_node": 0}
+    finally:
+        for process in running.values():
+            process.kill()
+            process.wait()

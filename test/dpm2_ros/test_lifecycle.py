@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 import pytest
 from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import UInt8MultiArray
@@ -33,6 +32,8 @@ from dpm2_ros.mapper_node import MapperNode
 from dpm2_ros.slam_node import SlamNode
 from tools.replay import ros_environment, start
 
+from .conftest import Manager
+
 CONFIGURE, CLEANUP = Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_CLEANUP
 ACTIVATE, DEACTIVATE = Transition.TRANSITION_ACTIVATE, Transition.TRANSITION_DEACTIVATE
 FAST = ("input.images:=false", "slam.loops.descriptors:=false", "slam.registration:=geometric")
@@ -45,24 +46,12 @@ class Managed:
 
     def __init__(self, harness: Any, kind: type[SlamNode] | type[MapperNode]) -> None:
         self.harness, self.node = harness, harness.add(kind(managed=True))
-        name = self.node.get_name()
-        self._change = harness.node.create_client(ChangeState, f"/{name}/change_state")
-        self._state = harness.node.create_client(GetState, f"/{name}/get_state")
-
-    def _call(self, client: Any, request: Any) -> Any:
-        assert client.wait_for_service(timeout_sec=10)
-        future = client.call_async(request)
-        self.harness.wait(future.done, client.srv_name)
-        return future.result()
-
-    def change(self, *transitions: int) -> bool:
-        """Whether all of them were made."""
-        requests = (ChangeState.Request(transition=Transition(id=transition)) for transition in transitions)
-        return all(bool(self._call(self._change, request).success) for request in requests)
+        self.manager = Manager(harness, f"/{self.node.get_name()}")
+        self.change = self.manager.change
 
     @property
     def state(self) -> str:
-        return str(self._call(self._state, GetState.Request()).current_state.label)
+        return self.manager.state
 
     @property
     def entities(self) -> int:
@@ -240,11 +229,7 @@ def test_the_executable_waits_and_a_signal_ends_it(ros: Callable[..., Any], tmp_
     options = ["--lifecycle", "--ros-args", "-p", f"ros.map_directory:={tmp_path / 'maps'}"]
     process = start(name, options, ros_environment(harness.node.context.get_domain_id()), tmp_path / "log")
     try:
-        client = harness.node.create_client(GetState, f"/{name}/get_state")
-        harness.wait(client.service_is_ready, f"{name}'s lifecycle services")
-        future = client.call_async(GetState.Request())
-        harness.wait(future.done, "its state")
-        assert future.result().current_state.label == "unconfigured"
+        assert Manager(harness, f"/{name}").state == "unconfigured"
         process.send_signal(signal.SIGINT)
         assert process.wait(60) == 0, (tmp_path / "log").read_text()
         assert not (tmp_path / "maps").exists()
