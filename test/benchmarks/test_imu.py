@@ -1,0 +1,31 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The benchmark of the IMU on a few scans of a robot that turns fast: each way has its row, and what it was given."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from benchmarks import imu
+from benchmarks.harness import Options
+from dpm2_core.sim.settings import LidarConfig
+
+
+@pytest.mark.slow
+def test_each_way_is_given_the_samples_that_its_name_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(imu, "WORLDS", {"suburb": ("suburb", 912, 2.0, 90.0)})
+    monkeypatch.setattr(imu, "FRAMES", 44)
+    monkeypatch.setattr(imu, "LENGTHS", (1.0,))
+    monkeypatch.setattr(imu, "LIDAR", LidarConfig(beams=16, columns=360, height=0.8, car_body=False, min_range=0.4))
+    results = imu.bench_imu(Options(threads=1, out=tmp_path)).results
+    row = results["worlds"]["suburb"]
+    assert row["frames"] == 44
+    assert row["fastest_turn_deg_s"] > 80  # it stands for 1.5 s, and turns a second later
+    assert row["frames_above_50_deg_s"] >= 5
+    given = [row[way]["frames_with_imu"] for way in ("without", "stops", "with")]
+    assert given[0] == 0
+    assert 0 < given[1] < 30 < given[2]  # it stops at the 22nd scan
+    assert row["with"]["ape_rmse_m"] < 0.1  # m, of a way of 5 m
+    assert row["ratio"] == row["with"]["ape_rmse_m"] / row["without"]["ape_rmse_m"]
+    assert row["with"]["worst_tilt_deg"] < 3
