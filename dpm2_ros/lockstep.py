@@ -1,17 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """A recording into the graph exactly: a cloud goes out when the one before has its odometry, and never ahead of its
-images. So nothing depends on how long anything takes, and slam_node sees what `dpm2 run` sees.
+images, nor of the cloud of a second LiDAR. So nothing depends on how long anything takes, and slam_node sees what
+`dpm2 run` sees.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Iterator, Mapping
-from itertools import islice
+from itertools import combinations, islice
 from typing import Any
 
 from nav_msgs.msg import Odometry
+from rcl_interfaces.srv import GetParameters
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.expand_topic_name import expand_topic_name
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from dpm2_core.data.bag_file import Bag
@@ -25,6 +28,7 @@ ODOMETRY = "dpm2/odom"
 """Topic, in the namespace of the player."""
 TIMEOUT = 10.0
 """Seconds that a cloud waits for its odometry. A node rejects one whose stamp repeats; then the next goes out."""
+_SECOND = "input.second_points_topic"
 
 
 class Lockstep:
@@ -43,8 +47,9 @@ class Lockstep:
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(node)
         self._clouds: list[str] = []  # topics that get an odometry
+        self._joining: list[str] = []  # of second LiDARs, whose clouds join those
         self._awaited: int | None = None  # stamp of the cloud whose odometry is awaited, ns; 0: it has no stamp
-        self._images: dict[str, int] = {}  # stamp of the last one, by topic
+        self._beside: dict[str, int] = {}  # stamp of the last image or joining cloud, by topic
         self._sent = self._missing = 0
 
     def find(self, end: float) -> None:
@@ -56,23 +61,45 @@ class Lockstep:
         topic, clouds = self._odometry.topic_name, [t for t in self._publishers if self._bag.types[t] == CLOUD]
         while not STOP.wait(0.02):
             nodes = {_node(info) for info in self._node.get_publishers_info_by_topic(topic)}
-            self._clouds = [
-                cloud
+            takers = {
+                cloud: nodes & {_node(info) for info in self._node.get_subscriptions_info_by_topic(cloud)}
                 for cloud in clouds
-                if any(_node(info) in nodes for info in self._node.get_subscriptions_info_by_topic(cloud))
-                and self._publishers[cloud].get_subscription_count()
-            ]
-            if self._clouds and self._odometry.get_publisher_count():
-                self._check_alone()
-                return
+                if self._publishers[cloud].get_subscription_count()
+            }
+            taken = [cloud for cloud, found in takers.items() if found]
+            if taken and self._odometry.get_publisher_count():
+                # Two LiDARs of one node make one odometry, that of the first: which is the second one the node says.
+                among = nodes if len(clouds) > 1 else set()
+                self._joining = [second for node in sorted(among) if (second := self._second_of(*node)) in taken]
+                self._clouds = [cloud for cloud in taken if cloud not in self._joining]
+                if self._clouds:
+                    self._check_alone(takers)
+                    return
             if time.monotonic() >= end:
                 raise Dpm2Error(f"lockstep: no node turns {' or '.join(clouds) or 'clouds'} into {topic}")
 
-    def _check_alone(self) -> None:
-        """Two LiDARs of one node make one odometry: which clouds get one is not known here."""
-        takers = [_node(info) for cloud in self._clouds for info in self._node.get_subscriptions_info_by_topic(cloud)]
-        if len(set(takers)) < len(takers):
-            raise Dpm2Error(f"lockstep: a node takes clouds of {' and '.join(self._clouds)}; replay without lockstep")
+    def _check_alone(self, takers: Mapping[str, set[tuple[str, str]]]) -> None:
+        """Whether each node makes its odometry of one of the clouds."""
+        for one, other in combinations(self._clouds, 2):
+            if common := takers[one] & takers[other]:
+                raise Dpm2Error(
+                    f"lockstep: {min(common)[1]} takes clouds of {one} and {other}, and its {_SECOND} is neither: "
+                    "which of them get an odometry is not known; replay without lockstep"
+                )
+
+    def _second_of(self, namespace: str, name: str) -> str:
+        """The topic of a node's second LiDAR by its parameters; empty if it does not answer, or has none."""
+        client = self._node.create_client(GetParameters, f"{namespace.rstrip('/')}/{name}/get_parameters")
+        try:
+            if not client.wait_for_service(TIMEOUT):
+                return ""
+            future = client.call_async(GetParameters.Request(names=[_SECOND]))
+            self._executor.spin_until_future_complete(future, TIMEOUT)
+            values = future.result().values if future.done() else []
+            topic: str = values[0].string_value if values else ""
+            return topic and expand_topic_name(topic, name, namespace)
+        finally:
+            self._node.destroy_client(client)
 
     def begin(self) -> None:
         """Before the first message: the calibration of each camera, which `dpm2 run` has from the start."""
@@ -82,25 +109,28 @@ class Lockstep:
                     publisher.publish(bytes(data))
 
     def order(self, messages: Iterable[RawMessage]) -> Iterator[RawMessage]:
-        """The same messages as `dpm2 run` takes them: a cloud after images and IMU, if they have a subscriber."""
+        """The same messages as `dpm2 run` takes them: a cloud after images, IMU and what joins it, of those that have a
+        subscriber.
+        """
         listened = [topic for topic, publisher in self._publishers.items() if publisher.get_subscription_count()]
-        others = dict.fromkeys((t for t in listened if self._bag.types[t] in (*IMAGES, IMU)), 0)
+        others = dict.fromkeys((t for t in listened if self._bag.types[t] in (*IMAGES, IMU) or t in self._joining), 0)
         return clouds_after_others(messages, self._clouds, others)
 
     def turn(self, topic: str, data: bytes) -> None:
         """Before a message is published: wait, if it is a cloud, for the odometry of the one before.
 
-        Its images went out before the wait, and so have arrived when it ends. An image that may be nearer to the cloud
-        before than those that went out ahead of it came too late for it, and waits as well.
+        What goes with it, images and the cloud that joins it, went out before the wait, and so has arrived when it
+        ends. One that may be nearer to the cloud before than those that went out ahead of it came too late for it, and
+        waits as well.
 
         Raises:
             Dpm2Error: the node is gone.
         """
-        if self._bag.types[topic] in IMAGES:
-            before, stamp = self._images.get(topic, 0), serialized_stamp(data, 0)
+        if self._bag.types[topic] in IMAGES or topic in self._joining:
+            before, stamp = self._beside.get(topic, 0), serialized_stamp(data, 0)
             if self._awaited is not None and not (passed(before, self._awaited) and before <= stamp):
                 self._await_odometry()
-            self._images[topic] = stamp
+            self._beside[topic] = stamp
         if topic in self._clouds:
             self._await_odometry()
             self._awaited = serialized_stamp(data, 0)

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import fcntl
-import importlib.util
 import os
 import subprocess
 import sys
@@ -14,9 +13,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from itertools import count
 from pathlib import Path
-from types import ModuleType
 from typing import Any
-from unittest.mock import MagicMock, patch
 
 import numpy as np
 import pytest
@@ -264,26 +261,19 @@ def run() -> Callable[..., subprocess.CompletedProcess[str]]:
 
 
 @pytest.fixture
+def processes() -> Iterator[list[subprocess.Popen[bytes]]]:
+    """To be killed at the end."""
+    started: list[subprocess.Popen[bytes]] = []
+    yield started
+    for process in started:
+        process.kill()
+        process.wait()
+
+
+@pytest.fixture
 def domain() -> int:
     """A ROS domain of this test's own."""
     return new_domain()
-
-
-@pytest.fixture(scope="session")
-def launch_file() -> ModuleType:
-    """The launch file, with mocks in place of launch and launch_ros, which have no wheels."""
-    path = Path(__file__).resolve().parents[2] / "launch" / "dpm2.launch.py"
-    spec = importlib.util.spec_from_file_location("dpm2_launch", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    missing = ("ament_index_python", "launch", "launch_ros")
-    lines = path.read_text().splitlines()
-    imported = {line.split()[1] for line in lines if line.startswith("from ") and line[5:].startswith(missing)}
-    packages = {name.split(".")[0] for name in imported}
-    with patch.dict(sys.modules, {name: MagicMock() for name in imported | packages}):
-        spec.loader.exec_module(module)
-    return module
 
 
 @pytest.fixture

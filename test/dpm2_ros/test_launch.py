@@ -8,12 +8,15 @@ processes are started here as launch_ros starts them, with what the file hands t
 from __future__ import annotations
 
 import functools
+import importlib.util
 import re
 import signal
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock, patch
 
 import pytest
 import rclpy
@@ -36,6 +39,23 @@ from .conftest import Manager
 
 ROOT = Path(__file__).resolve().parents[2]
 DEFAULTS = {name: info.get_default(call_default_factory=True) for name, info in flat_fields(NodeConfig)}
+
+
+@pytest.fixture(scope="module")
+def launch_file() -> ModuleType:
+    """The launch file, with mocks in place of launch and launch_ros, which have no wheels."""
+    path = ROOT / "launch" / "dpm2.launch.py"
+    spec = importlib.util.spec_from_file_location("dpm2_launch", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    missing = ("ament_index_python", "launch", "launch_ros")
+    lines = path.read_text().splitlines()
+    imported = {line.split()[1] for line in lines if line.startswith("from ") and line[5:].startswith(missing)}
+    packages = {name.split(".")[0] for name in imported}
+    with patch.dict(sys.modules, {name: MagicMock() for name in imported | packages}):
+        spec.loader.exec_module(module)
+    return module
 
 
 def defaults(launch_file: ModuleType) -> dict[str, str]:
