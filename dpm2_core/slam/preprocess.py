@@ -8,11 +8,13 @@ from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import model_validator
 
 from dpm2_core.config import Settings
 from dpm2_core.descriptors import Descriptors, LazyDescriptors
 from dpm2_core.frame import Array, Frame, Image, Points
+from dpm2_core.geometry.compiled import compiled
 from dpm2_core.geometry.deskew import deskew
 from dpm2_core.geometry.turning import turned
 from dpm2_core.geometry.voxel import voxel_first
@@ -80,9 +82,7 @@ class Preprocessor:
         NaN, inf and zero points are dropped, those out of range, and what the filter leaves out.
         """
         s = self._settings
-        squared = np.einsum("ij,ij->i", frame.points[:, :3], frame.points[:, :3])
-        used = (squared >= s.min_range**2) & (squared <= s.max_range**2) & (squared > 0)  # False for NaN
-        points = frame.points[used]
+        points, used = _in_range(np.ascontiguousarray(frame.points), s.min_range**2, s.max_range**2)
         if s.deskew and frame.time_offset is not None:
             points = deskew(points, frame.time_offset[used], twist, _turn(frame))
         return points if self._filter is None else self._filter(points)
@@ -93,6 +93,19 @@ class Preprocessor:
         cloud = points[voxel_first(points, self._settings.map_voxel)]
         source = cloud[voxel_first(cloud, self._settings.source_voxel), :3].astype(np.float64)
         return Scan(points, cloud, source)
+
+
+@compiled("Tuple((f4[:, ::1], i8[::1]))(f4[:, ::1], f8, f8)")
+def _in_range(points: Points, least: float, most: float) -> tuple[Points, NDArray[np.int64]]:
+    """The (P, 4) of (N, 4) points at a squared distance from `least` to `most`, m2, and which they are; none at 0."""
+    used, index, count = np.empty_like(points), np.empty(len(points), np.int64), 0
+    for i in range(len(points)):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        squared = x * x + y * y + z * z
+        used[count] = points[i]
+        index[count] = i
+        count += squared >= least and squared <= most and squared > 0  # False for NaN
+    return used[:count], index[:count]
 
 
 def _turn(frame: Frame) -> Callable[[Array], Array | None] | None:

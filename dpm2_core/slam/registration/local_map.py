@@ -116,9 +116,10 @@ class LocalMap:
 
     def _fit_planes(self, index: NDArray[np.int32]) -> None:
         """Where there are none yet."""
-        requested = index[np.isnan(self._variances[index])]
+        asked = np.zeros(len(self.points), bool)
+        asked[index] = True
+        requested = np.flatnonzero(asked & np.isnan(self._variances))
         if len(requested):
-            requested = np.unique(requested)
             k = min(self._settings.plane_neighbours, len(self.points))
             around = self._grid.neighbors(self.points[requested], k)
             self._normals[requested], self._variances[requested] = fit_planes(self.points[around])
