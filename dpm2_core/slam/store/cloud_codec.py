@@ -51,7 +51,7 @@ def pack_cloud(points: Points) -> bytes:
     delta = np.diff(steps, axis=0, prepend=0).astype("<i2")
     planes = np.ascontiguousarray(delta.T).view(np.uint8).reshape(3, -1, 2).transpose(0, 2, 1)  # low bytes, high bytes
     intensity = np.rint(np.clip(points[:, 3], 0, 1) * 255).astype(np.uint8)
-    return _HEADER.pack(len(points), quantum) + zlib.compress(planes.tobytes() + intensity.tobytes(), 6)
+    return _HEADER.pack(len(points), quantum) + zlib.compress(planes.tobytes() + intensity.tobytes(), 4)
 
 
 def unpack_cloud(data: bytes) -> Points:
