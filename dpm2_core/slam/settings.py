@@ -17,7 +17,7 @@ from dpm2_core.slam.loops.closure import LoopSettings
 from dpm2_core.slam.loops.relocalization import RelocalizationSettings
 from dpm2_core.slam.mapping.mapper import MapSettings
 from dpm2_core.slam.odometry.keyframe_selection import KeyframeSettings
-from dpm2_core.slam.odometry.odometry import OdometrySettings
+from dpm2_core.slam.odometry.settings import OdometrySettings
 from dpm2_core.slam.preprocess import PreprocessSettings
 from dpm2_core.slam.registration.icp import GeometricSettings
 from dpm2_core.slam.registration.local_map import LocalMapSettings

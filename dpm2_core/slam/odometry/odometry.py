@@ -3,14 +3,11 @@
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import replace
 from time import perf_counter
 
 import numpy as np
-from pydantic import Field
 
-from dpm2_core.config import Settings
 from dpm2_core.frame import Array, Frame, OdometryResult, Registration, State
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.motion import OPEN, combined, covariance, predicted, spread
@@ -18,45 +15,13 @@ from dpm2_core.slam.bridge import Bridge, Limits
 from dpm2_core.slam.odometry.inertial import InertialMotion
 from dpm2_core.slam.odometry.keyframe_selection import KeyframeSelector
 from dpm2_core.slam.odometry.other import OtherMotion, Step
+from dpm2_core.slam.odometry.settings import OdometrySettings
+from dpm2_core.slam.odometry.starts import FITS_WELL, starts_from_rest, turned_starts
+from dpm2_core.slam.odometry.stream_clock import StreamClock
 from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration
 
-
-class OdometrySettings(Settings):
-    """When to accept a registration, and what to do when there is none."""
-
-    max_acceleration: float = 40.0
-    """A registration that differs from the prediction by more than this allows is rejected, m/s2 (0.5 m are free)."""
-    max_turn: float = 200.0
-    """The same for rotation, deg/s of difference from the predicted rate (3 deg are free)."""
-    turns: float = Field(0.0, ge=0, le=180)
-    """A scan that does not fit is looked for at other headings as well, up to so many degrees to both sides: robots
-    that turn on the spot; 0: not."""
-    steadiness: float = 10.0
-    """Standard deviation of the acceleration, m/s2 (and, in rad/s2, of the angular one): how far the prediction is
-    trusted where the points do not constrain the pose, as along a tunnel. Elsewhere they outweigh it."""
-    degraded_sigma: float = 0.08
-    """Standard deviation of the position in its worst direction above which the state is `degraded`, m."""
-    lost_after: int = 5
-    """Frames without a registration until the state is `lost`; `degraded` before."""
-    restart_after: int = 10
-    """Frames after a pause that are registered to the map before it, until the odometry counts as broken: a new stretch
-    then goes on from the predicted pose, with the uncertainty that the pause deserves."""
-    pause: float = 0.65
-    """Seconds without a registration after which one scan alone is no longer accepted; in a stream of fewer frames
-    per second 1.5 of its periods."""
-
-
-_PERIOD = 0.1  # s, assumed between two stamps that do not advance
-# Motions [m along x, deg of yaw] tried while the velocity is unknown: up to 110 km/h and 100 deg/s at 10 Hz. In a curve
-# only if none of those straight ahead fits well: in a town a right one has a confidence of 0.74 and more.
-_AHEAD = ((0.0, 0), (1.0, 0), (2.0, 0), (3.0, 0), (-1.0, 0))
-_CURVES = tuple((x, yaw) for yaw in (4, -4, 8, -8) for x in (0.5, 1.5, 2.5))
-_FITS_WELL = 0.7
-_HEADINGS = 3  # to each side
-_SLOWEST = 2.0  # s: no stream has a longer period
 _KNOWN = 0.5  # m and rad, standard deviation of the second pose, still skewed: where the points find it alone
-_RHYTHM = 9  # periods: their median is that of the stream
 _ANY_VELOCITY = 15.0**2 * np.eye(3)  # covariance, m/s: so much until two scans are registered
 
 
@@ -87,14 +52,12 @@ class Odometry:
         self._twist: Array | None = None  # unknown until two scans are registered
         self._of_velocity = _ANY_VELOCITY
         self._covariance = np.zeros((6, 6))
-        self._stamp: int | None = None
+        self._clock = StreamClock()
         self._registered = np.eye(4), 0.0  # the last registered pose, and the seconds since
         self._failures = 0
         self._first: Frame | None = None
-        self._periods: deque[float] = deque(maxlen=_RHYTHM)
-        self._clock = 0.0  # s since the first frame
         self._bridge: Bridge | None = None
-        self._left = 0.0  # `_clock` at the last pose before the pause that is being bridged
+        self._left = 0.0  # the time of the last pose before the pause that is being bridged
         self._breaks = 0
         self._other: OtherMotion | None = None  # since a frame came with a guess
         self._led = False  # by another odometry to the pose of this frame
@@ -106,10 +69,8 @@ class Odometry:
         """Go on where another one has just registered a frame: its pose and motion, and a map of that scan alone."""
         self.reset()
         self._T, self._twist, self._of_velocity = before._T, before._twist, before._of_velocity
-        self._covariance, self._stamp, self._registered = before._covariance, before._stamp, before._registered
-        self._clock, self._breaks, self._other = before._clock, before._breaks, before._other
-        self._inertial = before._inertial
-        self._periods.extend(before._periods)
+        self._covariance, self._clock, self._registered = before._covariance, before._clock, before._registered
+        self._breaks, self._other, self._inertial = before._breaks, before._other, before._inertial
         self._keyframes.take_over(before._keyframes)
         twist = np.zeros(6) if self._twist is None else self._twist
         self._registration.update(self._registration.prepare(frame, twist), self._T)
@@ -117,7 +78,7 @@ class Odometry:
     def process(self, frame: Frame) -> OdometryResult:
         """Pose of one frame; never raises for what a sensor may deliver, and always gives a finite pose."""
         clock = [perf_counter()]
-        dt = self._elapsed(frame.stamp)
+        dt = self._clock.advance(frame.stamp)
         twist = np.zeros(6) if self._twist is None else self._twist
         seconds = self._registered[1] + dt
         if frame.imu is not None and self._inertial is None:
@@ -176,24 +137,9 @@ class Odometry:
             return predicted(self._T, twist, dt)
         return predicted(self._registered[0], twist, self._registered[1] + dt)
 
-    def _elapsed(self, stamp: int) -> float:
-        """Seconds since the frame before; stamps that repeat or jump back count as one nominal period."""
-        dt = _PERIOD if self._stamp is None or stamp <= self._stamp else (stamp - self._stamp) * 1e-9
-        if self._stamp is not None:
-            self._periods.append(dt)
-        self._stamp = stamp
-        self._clock += dt
-        return dt
-
     def _pauses(self, dt: float) -> bool:
         """Whether so much time has passed since the last registered scan that another one alone is not accepted."""
-        if not len(self._registration):
-            return False
-        if len(self._periods) > 1:
-            limit = max(self._settings.pause, 1.5 * sorted(self._periods)[(len(self._periods) - 1) // 2])
-        else:
-            limit = _SLOWEST  # whether that is a pause or the rhythm of the stream is not known yet
-        return self._registered[1] + dt > limit
+        return len(self._registration) > 0 and self._registered[1] + dt > self._clock.pause(self._settings.pause)
 
     def _begin_stretch(self, dt: float) -> Array:
         """After a pause: the scan begins a map of its own, at the predicted pose (4, 4), which it returns."""
@@ -201,11 +147,11 @@ class Odometry:
         if self._bridge is None:
             limits = Limits(self._settings.steadiness, self._settings.degraded_sigma)
             self._bridge = Bridge(self._registration, T_registered, self._twist, self._of_velocity, limits)
-            self._left = self._clock - seconds - dt
+            self._left = self._clock.now - seconds - dt
         self._registration, self._twist, self._first = self._registration.fresh(), None, None
         self._of_velocity = _ANY_VELOCITY
         step = self._step_of_other()
-        self._T = self._bridge.begin(self._clock - self._left, None if step is None else T_registered @ step.T)
+        self._T = self._bridge.begin(self._clock.now - self._left, None if step is None else T_registered @ step.T)
         return self._T
 
     def _cross(self, bridge: Bridge, scan: Scan, own: Registration) -> Registration:
@@ -250,18 +196,13 @@ class Odometry:
             result = steady if steady.ok else result
         if result.ok or not self._settings.turns:
             return result
-        starts = [T_predicted @ se3.exp([0, 0, yaw, 0, 0, 0]) for yaw in self._headings()]
+        starts = turned_starts(T_predicted, self._settings.turns)
         turned = self._gated(self._registration.register(scan, Prediction(starts, widen)), T_predicted, dt)
         return turned if turned.ok else result
 
     def _step_of_other(self) -> Step | None:
         """What another odometry says of the way since the last registered frame."""
         return None if self._other is None else self._other.step
-
-    def _headings(self) -> list[float]:
-        """Turns on the spot that are tried, rad."""
-        most = float(np.radians(self._settings.turns))
-        return [side * most * (i + 1) / _HEADINGS for i in range(_HEADINGS) for side in (1, -1)] if most else []
 
     def _register_by_other(self, scan: Scan, dt: float) -> Registration | None:
         """From where another odometry leads; None without one, or where the scan does not confirm it."""
@@ -278,13 +219,11 @@ class Odometry:
         """While the velocity is unknown: the best of many starts; after a pause first as before it."""
         if self._bridge is not None and self._bridge.twist is not None:
             result = self._registration.register(scan, self._bridge.expected(T, dt))
-            if result.ok and result.confidence >= _FITS_WELL:
+            if result.ok and result.confidence >= FITS_WELL:
                 return result
-        turning = tuple((0.0, float(np.degrees(yaw))) for yaw in self._headings())
-        for motions in (_AHEAD, _AHEAD + _CURVES + turning):
-            starts = [T @ se3.exp([0, 0, np.radians(yaw), x, 0, 0]) for x, yaw in motions]
+        for starts in starts_from_rest(T, self._settings.turns):
             result = self._registration.register(scan, Prediction(starts, widen=2.0))
-            if result.ok and result.confidence >= _FITS_WELL:
+            if result.ok and result.confidence >= FITS_WELL:
                 break
         return result
 
@@ -336,8 +275,8 @@ class Odometry:
     def _follow(self, scan: Scan, registration: Registration, twist: Array | None) -> None:
         """Go on from a registered pose; `twist` (6,): the motion that led there, None where none did."""
         T_before, self._T = self._registered[0], registration.T_target_source
-        if self._inertial is not None and self._stamp is not None:
-            self._inertial.registered(T_before, self._T, self._stamp, twist)
+        if self._inertial is not None and self._clock.stamp is not None:
+            self._inertial.registered(T_before, self._T, self._clock.stamp, twist)
         self._registered = self._T, 0.0
         if self._other is not None:
             self._other.keep()

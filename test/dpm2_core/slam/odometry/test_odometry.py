@@ -15,7 +15,7 @@ from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import LidarConfig
 from dpm2_core.sim.world import build_world
 from dpm2_core.slam.build import make_odometry
-from dpm2_core.slam.odometry.odometry import OdometrySettings
+from dpm2_core.slam.odometry.settings import OdometrySettings
 from dpm2_core.slam.settings import SlamSettings
 
 from ....helpers.drives import Drive, make_drive

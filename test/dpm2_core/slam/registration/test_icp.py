@@ -8,7 +8,7 @@ import pytest
 
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
-from dpm2_core.slam.odometry.odometry import OdometrySettings
+from dpm2_core.slam.odometry.settings import OdometrySettings
 from dpm2_core.slam.preprocess import Preprocessor, PreprocessSettings, Scan
 from dpm2_core.slam.registration.icp import GeometricRegistration, GeometricSettings
 from dpm2_core.slam.registration.local_map import LocalMap, LocalMapSettings

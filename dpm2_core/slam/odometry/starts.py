@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the next scan may be while no motion is known, and where a robot may be that turned on the spot."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from dpm2_core.frame import Array
+from dpm2_core.geometry import se3
+
+FITS_WELL = 0.7
+"""Confidence from which no other starts are tried: in a town a right one has 0.74 and more."""
+# Motions [m along x, deg of yaw]: up to 110 km/h and 100 deg/s at 10 Hz.
+_AHEAD = ((0.0, 0), (1.0, 0), (2.0, 0), (3.0, 0), (-1.0, 0))
+_CURVES = tuple((x, yaw) for yaw in (4, -4, 8, -8) for x in (0.5, 1.5, 2.5))
+_HEADINGS = 3  # to each side
+
+
+def starts_from_rest(T: Array, turns: float) -> Iterator[list[Array]]:
+    """Poses (4, 4) from which the scan after the one at `T` is looked for: straight ahead; then, needed only if none of
+    these fits well, in a curve and turned as well.
+
+    Args:
+        turns: see `OdometrySettings.turns`.
+    """
+    turning = tuple((0.0, yaw) for yaw in _headings(turns))
+    for motions in (_AHEAD, _AHEAD + _CURVES + turning):
+        yield [T @ se3.exp([0, 0, np.radians(yaw), x, 0, 0]) for x, yaw in motions]
+
+
+def turned_starts(T: Array, turns: float) -> Sequence[Array]:
+    """Poses (4, 4) at the place of `T` with other headings."""
+    return [T @ se3.exp([0, 0, np.radians(yaw), 0, 0, 0]) for yaw in _headings(turns)]
+
+
+def _headings(most: float) -> list[float]:
+    """Turns on the spot that are tried, deg."""
+    return [side * most * (i + 1) / _HEADINGS for i in range(_HEADINGS) for side in (1, -1)] if most else []

@@ -1,0 +1,38 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The time of a stream of frames, by their stamps: how long ago the last one was, and which silence is a pause."""
+
+from __future__ import annotations
+
+from collections import deque
+
+_PERIOD = 0.1  # s, assumed between two stamps that do not advance
+_SLOWEST = 2.0  # s: no stream has a longer period
+_RHYTHM = 9  # periods: their median is that of the stream
+
+
+class StreamClock:
+    """Goes on with every frame.
+
+    Attributes:
+        stamp: of the last frame, ns; None before the first. now: s since the first frame.
+    """
+
+    def __init__(self) -> None:
+        self.stamp: int | None = None
+        self.now = 0.0
+        self._periods: deque[float] = deque(maxlen=_RHYTHM)
+
+    def advance(self, stamp: int) -> float:
+        """Seconds since the frame before; stamps that repeat or jump back count as one nominal period."""
+        dt = _PERIOD if self.stamp is None or stamp <= self.stamp else (stamp - self.stamp) * 1e-9
+        if self.stamp is not None:
+            self._periods.append(dt)
+        self.stamp = stamp
+        self.now += dt
+        return dt
+
+    def pause(self, least: float) -> float:
+        """Seconds without a registration that are a pause: `least`, or 1.5 periods where the stream is slow."""
+        if len(self._periods) > 1:
+            return max(least, 1.5 * sorted(self._periods)[(len(self._periods) - 1) // 2])
+        return _SLOWEST  # whether that is a pause or the rhythm of the stream is not known yet
