@@ -19,6 +19,7 @@ from dpm2_core.slam.graph.fixes import Fixes
 from dpm2_core.slam.graph.g2o import G2o, write_g2o
 from dpm2_core.slam.graph.graph_data import GraphData, loop_errors, mahalanobis
 from dpm2_core.slam.graph.robust import RobustSettings, Solution
+from dpm2_core.slam.graph.trajectories import Trajectories
 from dpm2_core.slam.graph.worker import GraphWorker
 
 _log = logging.getLogger(__name__)
@@ -48,11 +49,9 @@ class PoseGraph:
         self._settings = settings
         self._poses: list[Array] = []
         self._steps: list[Edge | None] = []  # the odometry to each node; None where a trajectory begins
-        self._trajectory: list[int] = []  # number of each node's
-        self._ends: list[int] = []  # last node of each trajectory
+        self._trajectories = Trajectories()
         self._loops: list[Edge] = []
         self._held: list[int] = []
-        self._tied: list[int] | None = None  # `_parts`, until they change
         self._worker = GraphWorker()
         self._moved = False  # a part, since a graph was sent: its solution is of no use
         self._fixes, self._sent_fixes = Fixes(), list[int]()
@@ -114,18 +113,12 @@ class PoseGraph:
         node = len(self)
         _check("node", node, T_map_kf)
         if odometry is None:
-            self._trajectory.append(len(self._ends))
-            self._ends.append(node)
-            self._tied = None
+            self._trajectories.begin()
         else:
             _check("edge to node", node, odometry.T_from_to, odometry.covariance)
             if odometry.to_node != node:
                 raise ValueError(f"the edge leads to node {odometry.to_node}, not to {node}")
-            number = self._trajectory[odometry.from_node]
-            if self._ends[number] != odometry.from_node:
-                raise ValueError(f"node {odometry.from_node} is not the last of its trajectory")
-            self._trajectory.append(number)
-            self._ends[number] = node
+            self._trajectories.extend(odometry.from_node)
         self._poses.append(T_map_kf)
         self._steps.append(odometry)
 
@@ -139,13 +132,12 @@ class PoseGraph:
             Dpm2Error: the loop is not sound; nothing was added.
         """
         _check("loop to node", loop.to_node, loop.T_from_to, loop.covariance)
-        parts = self._parts()
-        a, b = parts[self._trajectory[loop.from_node]], parts[self._trajectory[loop.to_node]]
+        a, b = self.part(loop.from_node), self.part(loop.to_node)
         if a != b:
             T_to = self._poses[loop.from_node] @ loop.T_from_to  # where the loop has that node
             T = T_to @ se3.inverse(self._poses[loop.to_node])
-            self._move(max(a, b), T if b > a else se3.inverse(T), parts)
-            self._tied = None
+            self._move(max(a, b), T if b > a else se3.inverse(T))
+            self._trajectories.loops_changed()
         self._loops.append(loop)
 
     def add_fix(self, node: int, fix: Fix) -> bool:
@@ -180,7 +172,7 @@ class PoseGraph:
 
     def part(self, node: int) -> int:
         """Number of the part of the graph that a node is in: nodes of two parts have nothing to do with each other."""
-        return self._parts()[self._trajectory[node]]
+        return self._trajectories.part(node, self._loops)
 
     def optimize(self) -> None:
         """Move the poses to the optimum and check the loops: here and now, or (`background`) in another process.
@@ -280,12 +272,12 @@ class PoseGraph:
         With fixes the frame east, north, up is the last vertex.
         """
         data = self._data()
-        ids = np.append(self._order(), np.arange(len(self), len(data)))
+        ids = np.append(self._trajectories.order(), np.arange(len(self), len(data)))
         write_g2o(path, G2o(data, ids, planar=False), self._kept())
 
     def _joint(self, nodes: list[int]) -> Array:
         data = self._data()
-        return robust.joint_covariance(data, data.poses, self._kept(), self._places()[nodes])
+        return robust.joint_covariance(data, data.poses, self._kept(), self._trajectories.places()[nodes])
 
     def _kept(self) -> NDArray[np.bool_]:
         """(E,) which loops, and then which fixes, constrain the poses."""
@@ -293,22 +285,14 @@ class PoseGraph:
 
     def _located(self) -> NDArray[np.bool_]:
         """(N,) whether each node is in the part whose place on Earth the georeference is."""
-        return np.array(self._parts(), np.intp)[self._trajectory] == 0
+        return self._trajectories.in_part(0, self._loops)
 
     def _chosen(self) -> list[int]:
         """The fixes that count."""
         return self._fixes.chosen(self._located()) if len(self._fixes) else []
 
-    def _order(self) -> NDArray[np.intp]:
-        """(N,) nodes as the solver has them: one trajectory after the other, so that each is a chain."""
-        return np.argsort(self._trajectory, kind="stable")
-
-    def _places(self) -> NDArray[np.intp]:
-        """(N,) place of each node in that order."""
-        return np.argsort(self._order())
-
     def _data(self) -> GraphData:
-        order, steps = self._order(), self._steps
+        order, places, steps = self._trajectories.order(), self._trajectories.places(), self._steps
         ends = np.array([(loop.from_node, loop.to_node) for loop in self._loops], np.intp).reshape(-1, 2)
         data = GraphData(
             self.poses[order],
@@ -317,12 +301,12 @@ class PoseGraph:
             np.array([np.zeros((6, 6)) if step is None else step.covariance for step in steps]).reshape(-1, 6, 6)[
                 order
             ],
-            self._places()[ends],
+            places[ends],
             np.array([loop.T_from_to for loop in self._loops]).reshape(-1, 4, 4),
             np.array([loop.covariance for loop in self._loops]).reshape(-1, 6, 6),
-            self._places()[self._held],
+            places[self._held],
         )
-        return self._fixes.joined(data, self._places(), self._chosen())
+        return self._fixes.joined(data, places, self._chosen())
 
     def _sending(self) -> GraphData:
         """The graph that is about to be solved."""
@@ -331,22 +315,10 @@ class PoseGraph:
         self._fixes.sent()
         return self._data()
 
-    def _parts(self) -> list[int]:
-        """Of each trajectory, the oldest one that loops tie it to."""
-        if self._tied is None:
-            parts = list(range(len(self._ends)))
-            for loop in self._loops:
-                one, other = sorted(parts[self._trajectory[node]] for node in (loop.from_node, loop.to_node))
-                if loop.ok and one != other:
-                    parts = [one if part == other else part for part in parts]
-            self._tied = parts
-        return self._tied
-
-    def _move(self, part: int, T: Array, parts: list[int]) -> None:
+    def _move(self, part: int, T: Array) -> None:
         """All of a part to T @ T_map_kf."""
-        for node, number in enumerate(self._trajectory):
-            if parts[number] == part:
-                self._poses[node] = T @ self._poses[node]
+        for node in np.flatnonzero(self._trajectories.in_part(part, self._loops)):
+            self._poses[node] = T @ self._poses[node]
         self._moved = True
 
     def _submit(self) -> None:
@@ -356,19 +328,18 @@ class PoseGraph:
     def _apply(self, solution: Solution, loops: int) -> None:
         fixes = self._sent_fixes
         count = len(solution.poses) - bool(fixes)
-        places = np.argsort(np.argsort(self._trajectory[:count], kind="stable"))
-        old, self._poses[:count] = self._poses[:count], list(solution.poses[places])
+        old, self._poses[:count] = self._poses[:count], list(solution.poses[self._trajectories.places(count)])
         if fixes:
             self._fixes.solved(fixes, solution.poses[-1], solution.kept[loops:])
-        last = dict(zip(self._trajectory[:count], range(count), strict=True))  # solved for, of each trajectory
+        last = dict(zip(self._trajectories.of[:count], range(count), strict=True))  # solved for, of each trajectory
         for node in range(count, len(self)):
-            at = last.get(self._trajectory[node])
+            at = last.get(self._trajectories.of[node])
             if at is not None:  # else another trajectory: nothing ties it to what moved
                 self._poses[node] = self._poses[at] @ se3.inverse(old[at]) @ self._poses[node]
         for number, loop in enumerate(self._loops[:loops]):
             checked = replace(loop.registration, ok=bool(solution.kept[number]), reason=solution.reason(number))
             self._loops[number] = replace(loop, registration=checked)
-        self._tied = None
+        self._trajectories.loops_changed()
 
 
 def _check(what: str, node: int, T: Array, covariance: Array | None = None) -> None:
