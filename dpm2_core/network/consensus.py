@@ -3,20 +3,25 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from dpm2_core.geometry.kabsch import weighted_kabsch
+from dpm2_core.geometry.compiled import compiled
+
+Array = NDArray[np.floating]
 
 STRETCH = 0.6  # m, change of the distance between two matches at which they no longer support each other
 TOLERANCE = 1.0  # m, residual of a match that supports a pose
 HYPOTHESES = 12
 MEMBERS = 12  # matches that make up a hypothesis
 ROUNDS = 2  # of refitting each hypothesis to all that support it
+_POWER = 10  # iterations
 
 
 def consensus(source: Tensor, target: Tensor, weight: Tensor) -> Tensor:
-    """The pose that most matches support, by second-order spatial compatibility.
+    """The pose that most matches support, by second-order spatial compatibility; without a gradient.
 
     A rigid motion keeps distances: two right matches agree on theirs, and on a third that agrees with both; wrong ones
     agree by chance alone. The matches with most support each head a hypothesis. (The idea is that of SC2-PCR,
@@ -28,35 +33,94 @@ def consensus(source: Tensor, target: Tensor, weight: Tensor) -> Tensor:
     Returns:
         T_target_source (B, 4, 4) float64.
     """
-    source, target, weight = source.float(), target.float(), weight.float()
-    batch, k, _ = source.shape
-    change = torch.cdist(source, source) - torch.cdist(target, target)
-    agree = (1 - (change / STRETCH) ** 2).clamp(min=0) * (weight > 0)[:, None]
-    support = agree * ((agree * weight[:, None]) @ agree.mT)
-    leading = weight
-    for _ in range(10):  # power iteration
-        leading = torch.nn.functional.normalize((support @ leading[..., None])[..., 0], dim=-1)
-    heads = leading.topk(min(HYPOTHESES, k))[1]
-    rows = support.gather(1, heads[..., None].expand(-1, -1, k))
-    score, members = rows.topk(min(MEMBERS, k))
-    hypotheses = heads.shape[1]
-
-    def fit(source: Tensor, target: Tensor, weight: Tensor) -> Tensor:
-        flat = (tensor.flatten(0, 1) for tensor in (source, target, weight))
-        return weighted_kabsch(*flat).unflatten(0, (batch, hypotheses))
-
-    every = (batch, hypotheses, k, 3)
-    sources, targets = source[:, None].expand(every), target[:, None].expand(every)
-    at = members[..., None].expand(*members.shape, 3)
-    T = fit(sources.gather(2, at), targets.gather(2, at), score)
-    for _ in range(ROUNDS):
-        T = fit(sources, targets, _supporting(T, sources, targets, weight))
-    best = _supporting(T, sources, targets, weight).sum(-1).argmax(1)
-    return T[torch.arange(batch, device=T.device), best]
+    fields = (tensor.detach().float().cpu().numpy() for tensor in (source, target, weight))
+    poses = [_consensus(*map(np.ascontiguousarray, row)) for row in zip(*fields, strict=True)]
+    return torch.from_numpy(np.stack(poses)).to(source.device)
 
 
-def _supporting(T: Tensor, sources: Tensor, targets: Tensor, weight: Tensor) -> Tensor:
-    """Weights (B, H, K) of the matches that a pose (B, H, 4, 4) brings together."""
-    moved = sources @ T[..., :3, :3].float().mT + T[..., None, :3, 3].float()
-    squared = (moved - targets).square().sum(-1)
-    return (1 - squared / TOLERANCE**2).clamp(min=0) * weight[:, None]
+@compiled("f4[:, ::1](f4[:, ::1], f4[:, ::1], f4[::1])")
+def _support(source: Array, target: Array, weight: Array) -> Array:
+    """(K, K), column i: how far each match agrees with match i, times what they agree with both of them."""
+    k = len(weight)
+    agree, support, both = np.empty((k, k), np.float32), np.empty((k, k), np.float32), np.empty(k, np.float32)
+    for i in range(k):
+        for j in range(k):
+            there = here = np.float32(0)
+            for a in range(3):
+                there += (target[i, a] - target[j, a]) ** 2
+                here += (source[i, a] - source[j, a]) ** 2
+            change = (np.sqrt(here) - np.sqrt(there)) / np.float32(STRETCH)
+            agree[i, j] = max(1 - change * change, 0)
+    for i in range(k):
+        both[:] = 0
+        for j in range(k):
+            shared = agree[i, j] * weight[j]
+            if shared > 0:
+                for other in range(k):
+                    both[other] += shared * agree[j, other]
+        for j in range(k):
+            support[j, i] = agree[i, j] * both[j] if weight[j] > 0 else 0
+    return support
+
+
+@compiled("f8[:, ::1](f4[:, ::1], f4[:, ::1], f4[::1])")
+def _fitted(source: Array, target: Array, weight: Array) -> Array:
+    """`kabsch.weighted_kabsch` of one set of matches."""
+    total, here, there, C = 0.0, np.zeros(3), np.zeros(3), np.zeros((3, 3))
+    for n in range(len(weight)):
+        total += weight[n]
+        for a in range(3):
+            here[a] += weight[n] * source[n, a]
+            there[a] += weight[n] * target[n, a]
+    here, there = here / max(total, 1e-12), there / max(total, 1e-12)
+    for n in range(len(weight)):
+        if weight[n] > 0:
+            for a in range(3):
+                for b in range(3):
+                    C[a, b] += weight[n] * (target[n, a] - there[a]) * (source[n, b] - here[b])
+    U, _, Vt = np.linalg.svd(C)
+    U[:, 2] *= np.sign(np.linalg.det(U) * np.linalg.det(Vt))
+    T = np.eye(4)
+    for a in range(3):
+        T[a, 3] = there[a]
+        for b in range(3):
+            T[a, b] = U[a, 0] * Vt[0, b] + U[a, 1] * Vt[1, b] + U[a, 2] * Vt[2, b]
+            T[a, 3] -= T[a, b] * here[b]
+    return T
+
+
+@compiled("void(f8[:, ::1], f4[:, ::1], f4[:, ::1], f4[::1], f4[::1])")
+def _supporting(T: Array, source: Array, target: Array, weight: Array, out: Array) -> None:
+    """Weights (K,) of the matches that a pose (4, 4) brings together."""
+    for n in range(len(weight)):
+        squared = 0.0
+        for a in range(3):
+            moved = T[a, 0] * source[n, 0] + T[a, 1] * source[n, 1] + T[a, 2] * source[n, 2] + T[a, 3]
+            squared += (moved - target[n, a]) ** 2
+        out[n] = max(1 - squared / TOLERANCE**2, 0.0) * weight[n]
+
+
+@compiled("f8[:, ::1](f4[:, ::1], f4[:, ::1], f4[::1])")
+def _consensus(source: Array, target: Array, weight: Array) -> Array:
+    support = _support(source, target, weight)
+    k, leading = len(weight), weight.copy()
+    for _ in range(_POWER):
+        product = np.zeros(k, np.float32)
+        for j in range(k):
+            for i in range(k):
+                product[i] += support[j, i] * leading[j]
+        leading[:] = product / max(np.sqrt((product * product).sum()), 1e-12)
+    best: Array = np.eye(4)
+    most, score = -1.0, np.empty(k, np.float32)
+    for head in np.argsort(-leading)[:HYPOTHESES]:
+        score[:] = 0
+        for member in np.argsort(-support[:, head])[:MEMBERS]:
+            score[member] = support[member, head]
+        T = _fitted(source, target, score)
+        for _ in range(ROUNDS):
+            _supporting(T, source, target, weight, score)
+            T = _fitted(source, target, score)
+        _supporting(T, source, target, weight, score)
+        if score.sum() > most:
+            best, most = T, score.sum()
+    return best

@@ -67,15 +67,14 @@ def correspond(
     weight, i, j = best_pairs(probability, settings.pair_ratio)
     x, y = take(source.xyz, i), take(target.xyz, j)
     a, b = take(correlated.source, i), take(correlated.target, j)
-    there, L_there = decoder.offset(a, b)
-    back, L_back = decoder.offset(b, a)
-    there, L_there = into_set_frame(there, L_there, take(source.axis, i))
-    back, L_back = into_set_frame(back, L_back, take(target.axis, j))
-    short = [offset.norm(dim=-1) <= settings.offset_limit for offset in (there, back)]
+    axis = torch.cat([take(source.axis, i), take(target.axis, j)])
+    offset, L = decoder.offset(torch.cat([a, b]), torch.cat([b, a]))  # both directions at once
+    (there, back), (L_there, L_back) = (part.chunk(2) for part in into_set_frame(offset, L, axis))
+    weights = weight * (offset.norm(dim=-1) <= settings.offset_limit).unflatten(0, (2, -1))
     return Correspondences(
         torch.cat([x + there, x], 1),
         torch.cat([y, y + back], 1),
-        torch.cat([weight * short[0], weight * short[1]], 1),
+        weights.transpose(0, 1).flatten(1),
         torch.cat([L_there, L_back], 1),
     )
 
