@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from dpm2_core.network.model import DeepPointMap2
 
+os.environ.setdefault("GOMP_SPINCOUNT", "0")  # beside each other they would spin for a third of all processor time
 wait_passively()  # as the programs do, before a test imports numpy
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # where a test does not ask for more: its arrays are small
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # some hundred processes are started: compile their modules once
