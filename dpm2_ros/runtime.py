@@ -68,12 +68,14 @@ def ros_context(arguments: Sequence[str], domain: int | None = None) -> None:
 
 
 def spin_node(make: Callable[[], Any], arguments: Sequence[str]) -> int:
-    """Make a node, spin it until a signal comes, close it.
+    """Make a node, spin it until a signal comes, close it; nothing of that if one came before.
 
     Args:
         make: returns a `GuardedNode` with `close()`, which saves what must be saved and may raise Dpm2Error.
         arguments: those of the process, without its name.
     """
+    if STOP.is_set():  # while it was imported: no map is opened, no network loaded
+        return 0
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
 

@@ -25,8 +25,9 @@ from dpm2_ros.mapping import KEEP_ALL, LAST_ONE
 from tools.demo import evaluate_replay, map_poses
 from tools.replay import replay, ros_environment, start
 
-GEOMETRIC = ["-p", "input.images:=false", "-p", "slam.loops.descriptors:=false", "-p", "slam.registration:=geometric"]
+QUICK = {"input.images": False, "slam.loops.descriptors": False, "slam.registration": "geometric"}
 """Neither camera nor network: it starts in half the time."""
+GEOMETRIC = [part for name, value in QUICK.items() for part in ("-p", f"{name}:={str(value).lower()}")]
 SAVED = ["map.ply", "pose_graph.g2o", "trajectory.tum"]
 
 
@@ -61,13 +62,23 @@ def test_slam_node_saves_its_map_when_stopped(
     assert sorted(path.name for path in (tmp_path / "map" / "drive").iterdir()) == SAVED
 
 
-@pytest.mark.parametrize("delay", [0.0, 0.6])
-def test_stopped_while_it_starts(tmp_path: Path, domain: int, delay: float) -> None:
-    """From the moment Python runs the entry point, also during imports."""
-    process = start("slam_node", [], ros_environment(domain), tmp_path / "log")
+def test_stopped_while_it_imports(tmp_path: Path, domain: int) -> None:
+    """From the moment Python runs the entry point; then no map is begun."""
+    saving = ["--ros-args", "-p", f"ros.map_directory:={tmp_path / 'map'}"]
+    process = start("slam_node", saving, ros_environment(domain), tmp_path / "log")
     while not _handles_sigint(process) and process.poll() is None:
         time.sleep(0.01)
-    time.sleep(delay)
+    process.send_signal(signal.SIGINT)
+    assert process.wait(60) == 0
+    assert (tmp_path / "log").read_text() == ""
+    assert not (tmp_path / "map").exists()
+
+
+def test_stopped_while_it_loads_the_network(ros: Callable[..., Any], tmp_path: Path) -> None:
+    """Its node is there, and does not listen yet."""
+    harness = ros()
+    process = start("slam_node", [], ros_environment(harness.node.context.get_domain_id()), tmp_path / "log")
+    harness.wait(lambda: "slam_node" in harness.node.get_node_names(), "the node")
     process.send_signal(signal.SIGINT)
     assert process.wait(60) == 0
     assert "Traceback" not in (tmp_path / "log").read_text()
@@ -157,7 +168,7 @@ def test_a_drive_through_player_slam_node_and_mapper_node(
 
 def test_replay_is_checked_by_what_arrived(bag: Path, drive: Any, tmp_path: Path) -> None:
     """What `make demo` does: all checks hold; and without one pose, or in a wrong order of events, they do not."""
-    parameters = {"ros.map_period": 0.5, "slam.keyframes.distance": 2.0}
+    parameters = {"ros.map_period": 0.5, "slam.keyframes.distance": 2.0, **QUICK}
     source = BagSource(bag, InputSettings(images=False))
     # Slowly: on a busy machine, too, nothing is dropped.
     result = replay(source, tmp_path, 0.25, parameters)
