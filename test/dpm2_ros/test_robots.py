@@ -6,7 +6,7 @@ from __future__ import annotations
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -33,14 +33,16 @@ from dpm2_ros.keyframe_messages import descriptors_from_msg, descriptors_to_msg,
 from dpm2_ros.tf import TFMessage
 from tools.replay import ros_environment, start
 
-pytestmark = pytest.mark.weights
+GEOMETRIC = ("-p", "slam.registration:=geometric", "-p", "slam.loops.descriptors:=false")
+"""Without the network, where it does not matter what a keyframe is made of: a node starts in half the time."""
 
 
 class Fleet:
     """Processes of robots and of their mapper; scans for each."""
 
-    def __init__(self, harness: Any, recording: Path, folder: Path) -> None:
-        self.harness, self.folder = harness, folder
+    def __init__(self, harness: Any, recording: Path, folder: Path, parameters: Sequence[str] = ()) -> None:
+        """`parameters`: of all nodes."""
+        self.harness, self.folder, self._parameters = harness, folder, parameters
         self.source = open_source(recording, InputSettings(images=False))
         self.environment = ros_environment(harness.node.context.get_domain_id())
         self.tf = harness.hear(TFMessage, "/tf")
@@ -50,7 +52,7 @@ class Fleet:
         self._stamp = 0
 
     def _start(self, name: str, log: str, *arguments: str) -> subprocess.Popen[bytes]:
-        process = start(name, ["--ros-args", *arguments], self.environment, self.folder / log)
+        process = start(name, ["--ros-args", *arguments, *self._parameters], self.environment, self.folder / log)
         self.processes.append(process)
         return process
 
@@ -124,12 +126,14 @@ class Fleet:
 
 
 @pytest.fixture
-def fleet(ros: Callable[..., Any], recording: Path, tmp_path: Path) -> Iterator[Fleet]:
-    made = Fleet(ros(), recording, tmp_path)
+def fleet(request: pytest.FixtureRequest, ros: Callable[..., Any], recording: Path, tmp_path: Path) -> Iterator[Fleet]:
+    made = Fleet(ros(), recording, tmp_path, getattr(request, "param", GEOMETRIC))
     yield made
     made.close()
 
 
+@pytest.mark.weights
+@pytest.mark.parametrize("fleet", [GEOMETRIC[:2]], ids=["descriptors"], indirect=True)
 def test_two_robots_one_map_each_with_its_own_correction(fleet: Fleet) -> None:
     """The second joins late, in the middle of what the first has seen, and learns where it is in the map."""
     fleet.mapper()
@@ -181,24 +185,9 @@ def test_an_outage_costs_nothing(fleet: Fleet) -> None:
 
 
 def test_a_robot_that_is_killed_and_comes_back(fleet: Fleet) -> None:
-    """Its new drive is a session of its own in the same map: ids count on, no odometry leads from one to the other."""
-    fleet.mapper()
-    red = fleet.robot("red")
-    fleet.drive("red", *range(9))
-    wait = fleet.harness.wait
-    wait(lambda: len(fleet.ids("red")) == 3, "the keyframes of the first drive")
-    red.kill()
-    red.wait()
-    fleet.robot("red")
-    fleet.drive("red", *range(4, 13))
-    fleet.received("red", 6)
-    odometry = [(e.from_node, e.to_node) for e in fleet.map().constraints if e.kind == "odometry"]
-    assert odometry == [(0, 1), (1, 2), (3, 4), (4, 5)]
-
-
-def test_a_robot_that_is_killed_out_of_reach_loses_no_keyframe(fleet: Fleet) -> None:
-    """It was killed while the mapper stood still: its next start sends them first, then those of the drive that goes
-    on. What has arrived is deleted from its disk."""
+    """While the mapper stood still: no keyframe is lost, its next start sends them first, then those of the drive that
+    goes on. While the mapper listens: what has arrived is deleted from its disk. Each start is a session of its own in
+    the same map: ids count on, no odometry leads from one to the other."""
     mapper = fleet.mapper()
     red = fleet.robot("red")
     fleet.drive("red", *range(5))
@@ -215,15 +204,21 @@ def test_a_robot_that_is_killed_out_of_reach_loses_no_keyframe(fleet: Fleet) -> 
     red = fleet.robot("red")
     fleet.drive("red", *range(6, 13))
     mapper.send_signal(signal.SIGCONT)
-    fleet.received("red", 7)
-    odometry = [(e.from_node, e.to_node) for e in fleet.map().constraints if e.kind == "odometry"]
-    assert odometry == [(0, 1), (1, 2), (2, 3), (3, 4), (5, 6)]
+    fleet.received("red", 8)
     fleet.harness.wait(lambda: len(list(left.glob("*.unsent"))) == 1, "the first drive's file deleted")
+    red.kill()
+    red.wait()
+    red = fleet.robot("red")
+    fleet.drive("red", *range(4, 9))
+    fleet.received("red", 10)
+    odometry = [(e.from_node, e.to_node) for e in fleet.map().constraints if e.kind == "odometry"]
+    assert odometry == [(0, 1), (1, 2), (2, 3), (3, 4), (5, 6), (6, 7), (8, 9)]
     red.send_signal(signal.SIGINT)
     red.wait(30)
     assert not left.exists()
 
 
+@pytest.mark.weights
 def test_a_keyframe_is_at_most_100_kB_on_the_wire(recording: Path) -> None:
     """Descriptors come out as they went in; a cloud too large is downsampled until it fits, a small one is not
     touched."""

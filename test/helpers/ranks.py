@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gradients of one training step on two places; under torchrun each process has one of them.
+"""Gradients of one training step on two places; of two processes each has one of them.
 
-ranks.py OUT PACKED NETWORK: file to write, folder of packed drives, settings of the network as JSON.
+ranks.py PACKED NETWORK: folder of packed drives, settings of the network as JSON.
 """
 
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -40,12 +39,10 @@ def gradients(packed: str, network: NetworkSettings, rank: int = 0, world: int =
     return {name: p.grad for name, p in module.named_parameters() if p.grad is not None}
 
 
-def main(out: str, packed: str, network: str) -> None:
-    """Write them, from the first rank."""
+def main(packed: str, network: str) -> dict[str, Tensor]:
+    """Those of all processes, in each of them."""
     with process_group() as (rank, world, _):
-        found = gradients(packed, NetworkSettings.model_validate_json(network), rank, world)
-        if rank == 0:
-            torch.save(found, Path(out))
+        return gradients(packed, NetworkSettings.model_validate_json(network), rank, world)
 
 
 if __name__ == "__main__":

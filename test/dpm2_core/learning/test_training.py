@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -262,22 +263,29 @@ def test_overlap_keeps_what_the_weights_say_of_registration(
     assert {**before, "phase": "2"} == after
 
 
-TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[3]), "OMP_NUM_THREADS": "1"}
 
 
 @pytest.mark.slow
-def test_two_processes_give_the_gradients_of_one(tmp_path: Path, packed: Path) -> None:
-    """gloo on the CPU, started by torchrun: each rank its part of the places, the mean of the losses."""
-    command = [*TORCHRUN, ranks.__file__, tmp_path / "two", packed, tiny().model_dump_json()]
-    done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == 0, done.stderr[-3000:]
-    one, two = ranks.gradients(str(packed), tiny()), torch.load(tmp_path / "two", weights_only=True)
+def test_two_processes_give_the_gradients_of_one(packed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """gloo on the CPU, this process and another: each its part of the places, the mean of the losses."""
+    one = ranks.gradients(str(packed), tiny())
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    group = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "WORLD_SIZE": "2"}
+    for name, value in {**group, "RANK": "0"}.items():
+        monkeypatch.setenv(name, value)
+    arguments = (str(packed), tiny().model_dump_json())
+    environment = {**ENVIRONMENT, **group, "RANK": "1"}
+    with subprocess.Popen([sys.executable, ranks.__file__, *arguments], env=environment) as other:
+        two = ranks.main(*arguments)
+    assert other.returncode == 0
     assert len(one) > 50
     for name, gradient in one.items():
         torch.testing.assert_close(two[name], gradient, atol=1e-6, rtol=1e-4, msg=name)
 
 
+TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
 LOOP = """
 import sys
 from pathlib import Path
