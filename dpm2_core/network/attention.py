@@ -9,12 +9,21 @@ import torch
 from torch import Tensor, nn
 
 
+def hiding(mask: Tensor | None) -> Tensor | None:
+    """The mask, or None where it hides nothing, as in one frame: passes less; a GPU would have to wait to know."""
+    return None if mask is not None and mask.device.type == "cpu" and bool(mask.all()) else mask
+
+
 def zscore(values: Tensor, mask: Tensor | None = None) -> Tensor:
     """Rows (..., T) to zero mean and unit deviation over the True tokens of the mask (..., T).
 
     A constant row, or one without any token, becomes zeros.
     """
-    weight = torch.ones_like(values) if mask is None else mask.to(values.dtype).expand_as(values)
+    mask = hiding(mask)
+    if mask is None:
+        deviation, mean = torch.std_mean(values, -1, correction=0, keepdim=True)
+        return (values - mean) / deviation.clamp(min=1e-4)
+    weight = mask.to(values.dtype).expand_as(values)
     count = weight.sum(-1, keepdim=True).clamp(min=1)
     mean = (values * weight).sum(-1, keepdim=True) / count
     centered = (values - mean) * weight
@@ -85,8 +94,7 @@ class Attention(nn.Module):
             mask: True where a token may be read, broadcastable to (B, heads, N, T), or None.
         """
         batch, n, width = x.shape
-        if mask is not None and mask.device.type == "cpu" and bool(mask.all()):
-            mask = None  # nothing to hide, as in one frame: a pass over the scores less; a GPU would have to wait
+        mask = hiding(mask)
         value = self._split(self.value(tokens))
         query = key = None
         if self.query is not None and self.key is not None:
@@ -111,4 +119,4 @@ class Attention(nn.Module):
         return torch.where(readable, out, torch.zeros_like(out))
 
     def _split(self, x: Tensor) -> Tensor:
-        return x.view(*x.shape[:2], self.heads, -1).transpose(1, 2)
+        return x.view(*x.shape[:2], self.heads, x.shape[2] // self.heads).transpose(1, 2)

@@ -276,3 +276,23 @@ def test_inference_gives_what_training_gives(noise: np.random.Generator, pool_fi
     for one, other in zip(trained.scales, inferred.scales, strict=True):
         torch.testing.assert_close(one.features, other.features, atol=1e-5, rtol=1e-5)
     torch.testing.assert_close(trained.tokens.features, inferred.tokens.features, atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize("cameras", [1, 2])
+@pytest.mark.parametrize("image_mask", ["view", "front"])
+def test_only_what_an_image_shows_is_asked_about_it(noise: np.random.Generator, cameras: int, image_mask: str) -> None:
+    """At inference; the descriptors are those of asking all, also where no point is seen."""
+    torch.manual_seed(0)
+    model = DeepPointMap2(tiny(fusion={"image_mask": image_mask})).eval()
+    points = collate([build_pyramid(boxes(noise), model.settings)])
+    image = make_image(noise)
+    up = np.array([[0, 0, -1, 0], [0, 1, 0, 0], [1, 0, 0, 90], [0, 0, 0, 1.0]]) @ image.camera.T_lidar_cam
+    sky = replace(image, camera=replace(image.camera, T_lidar_cam=up))
+    for images in ([image, make_image(noise)][:cameras], [sky] * cameras):
+        views = views_of(model, images)
+        with torch.no_grad():
+            trained, xyz = model.encoder(points, views).tokens.features, model.encoder(points).tokens.xyz
+        assert bool(seen_from(xyz, views, 0).any()) is (images[0] is image)
+        with torch.inference_mode():
+            inferred = model.encoder(points, views).tokens.features
+        torch.testing.assert_close(trained, inferred, atol=1e-4, rtol=1e-4)
