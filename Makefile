@@ -37,8 +37,9 @@ ros:  # of all targets the demo alone is nothing without it
 test: setup  ## all tests, and which of them took longest
 	$(BIN)/python -m pytest $(JOBS) --durations=15 $(ARGS)
 
+# As many processes as processors: nothing in these tests waits.
 test-fast: setup  ## all but the tests marked slow or ros
-	$(BIN)/python -m pytest $(JOBS) -m "not slow and not ros" $(ARGS)
+	$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow" --ignore test/dpm2_ros $(ARGS)
 
 fuzz: setup  ## a minute of random messages, a thousand per second, on all that the nodes listen to, beside a drive
 	DPM2_FUZZ_SECONDS=60 DPM2_FUZZ_RATE=1000 $(BIN)/python -m pytest -s test/dpm2_ros/test_fuzz.py $(ARGS)

@@ -164,6 +164,7 @@ def test_ctrl_c_ends_a_command_without_a_traceback_and_at_once(tmp_path: Path) -
     assert time.monotonic() - began < 10
 
 
+@pytest.mark.slow
 def test_a_reader_that_stops_early_is_no_error() -> None:
     command = f"{sys.executable} -m dpm2_core.cli config dump | head -1"
     done = subprocess.run(["sh", "-c", command], capture_output=True, text=True, check=False, timeout=60)

@@ -78,6 +78,7 @@ inners = st.builds(
         switch=st.booleans(),
     )
 )
+@pytest.mark.slow
 def test_what_is_dumped_loads_back_equal(tmp_path_factory: pytest.TempPathFactory, settings: Outer) -> None:
     path = tmp_path_factory.getbasetemp() / "dumped.yaml"
     path.write_bytes(dump_settings(settings).encode())

@@ -32,6 +32,8 @@ from ...helpers.drives import first_scans
 pytestmark = pytest.mark.slow
 
 FRAMES = 12
+QUICK = ("--set", "slam.registration=geometric", "--set", "slam.loops.descriptors=false")
+"""Without the network."""
 RESULTS = {
     "trajectory_kitti.txt", "trajectory.tum", "map.ply", "trajectory.png", "timing.json", "config.yaml",
     "metrics.json", "pose_graph.g2o", "frames.csv", "loops.csv", "ground_truth.tum",
@@ -103,7 +105,7 @@ def test_writes_everything_and_is_right(recording: Path, tmp_path: Path) -> None
 def test_a_bag_gives_the_same(recording: Path, tmp_path: Path) -> None:
     convert_kitti(KittiSource(recording), tmp_path / "bag")
     for source, out in ((recording, "folder"), (tmp_path / "bag", "bag_out")):
-        done = dpm2("run", source, "--out", tmp_path / out, "--frames", "2:9")
+        done = dpm2("run", source, "--out", tmp_path / out, "--frames", "2:9", *QUICK)
         assert done.returncode == 0, done.stderr
     # The bag's stamps are absolute, so intervals differ in the last digits of a float: not equal to the bit.
     folder, bag = (read_trajectory(tmp_path / out / "trajectory_kitti.txt").poses for out in ("folder", "bag_out"))
@@ -188,14 +190,14 @@ def test_given_ground_truth(recording: Path, sequence: Path, tmp_path: Path) -> 
 
 def test_full_disk_keeps_the_old_map(recording: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    assert dpm2("run", recording, "--out", out, "--frames", ":4").returncode == 0
+    assert dpm2("run", recording, "--out", out, "--frames", ":4", *QUICK).returncode == 0
     before = (out / "map.ply").read_bytes()
 
     def limit() -> None:  # no file may grow beyond 50 kB: writing the map fails as on a full disk
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000))
 
-    done = dpm2_process("run", recording, "--out", out, preexec_fn=limit)
+    done = dpm2_process("run", recording, "--out", out, *QUICK, preexec_fn=limit)
     assert done.returncode == 1
     assert "map.ply" in done.stderr
     assert (out / "map.ply").read_bytes() == before
@@ -208,7 +210,8 @@ def test_interrupted_run_writes_what_there_is(sequence: Path, tmp_path: Path) ->
     (sequence / "times.txt").write_text("".join(f"{0.1 * i:.1f}\n" for i in range(2000)))
     (sequence / "poses.txt").unlink(missing_ok=True)
     out, path = tmp_path / "out", tmp_path / "drive.dpm2map"
-    command = [sys.executable, "-m", "dpm2_core.cli", "run", str(sequence), "--out", str(out), "--map", str(path)]
+    run = ("run", str(sequence), "--out", str(out), "--map", str(path), *QUICK)
+    command = [sys.executable, "-m", "dpm2_core.cli", *run]
     listen = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # a test in the background may have it ignored
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, preexec_fn=listen)
     while not _keyframes(path):

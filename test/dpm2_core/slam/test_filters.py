@@ -52,6 +52,7 @@ def test_dynamic_objects_are_left_out_but_never_more_than_the_limit(points: np.n
     assert len(without_dynamic_objects(_High(0), 0.5, 0.7, points[:0])) == 0  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_ground_is_left_out(points: np.ndarray) -> None:
     """A network that says zero everywhere: the ground is where the sensor's height puts it."""
     net = GroundNet(GroundSettings(cells=32, channels=4)).eval()

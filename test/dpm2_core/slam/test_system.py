@@ -38,6 +38,7 @@ class Frames:
         yield from self._frames[start:stop]
 
 
+@pytest.mark.slow
 def test_the_steps_in_turn_are_the_whole(suburb_drive: tuple[list[Frame], Array]) -> None:
     """As the ROS node runs them in two threads: pose for pose and keyframe for keyframe the same."""
     frames = suburb_drive[0][:15]

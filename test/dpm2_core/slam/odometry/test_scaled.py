@@ -28,6 +28,7 @@ def away(preset: str, drive: list[Frame], poses: np.ndarray) -> tuple[np.ndarray
     return np.linalg.norm(T[:, :3, 3] - want[:, :3, 3], axis=1), [r.registration.ok for r in results], odometry.scale
 
 
+@pytest.mark.slow
 def test_a_small_room_with_16_beams_works_unasked() -> None:
     """5 x 4 m, furnished: every scan registered, to 3 cm; the settings for streets register none of them."""
     poses = walk(40)

@@ -196,6 +196,7 @@ def test_reading_leaves_no_trace(map_file: Path) -> None:
     assert state() == before
 
 
+@pytest.mark.slow
 def test_a_folder_that_cannot_be_written(map_file: Path) -> None:
     """Reading works, also of a map whose writer was killed; writing is an error that says so."""
     program = f"""
