@@ -47,7 +47,7 @@ RATE = float(os.environ.get("DPM2_FUZZ_RATE", "400"))
 LONG = SECONDS >= 30
 GROWTH = 20_000_000  # bytes
 START = 1_700_000_000_000_000_000
-SETTINGS = {"keyframes": {"distance": 2.0}}
+SETTINGS = {"keyframes": {"distance": 2.0}, "registration": "geometric"}  # keyframes are described by the network
 
 
 FLOATS = (0.0, -0.0, 1.0, -1.0, np.nan, np.inf, -np.inf, 1e308, -1e308, 5e-324, 1e-9, 12345.678)
@@ -230,6 +230,7 @@ class Nodes:
         environment = ros_environment(harness.node.context.get_domain_id())
         common = ("-p", "ros.map_directory:=''")
         robot = ["input.points_topic:=points", "ros.embed_mapper:=false", "slam.keyframes.distance:=2.0",
+                 "slam.registration:=geometric",
                  "input.vertical_angle_correction_deg:='0.0'"]  # fmt: skip
         pairs = [part for pair in robot for part in ("-p", pair)]
         mapper = ("-p", f"ros.map_file:={self.file}")
