@@ -18,18 +18,18 @@ from typing import Any
 import numpy as np
 import pytest
 import rclpy
-from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState, GetState
+from nav_msgs.msg import Odometry
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import UInt8MultiArray
 
 from dpm2_core.data.convert import convert_kitti
 from dpm2_core.data.kitti import KittiSource
-from dpm2_core.frame import Array, Points
+from dpm2_core.frame import Array, Keyframe, Points
 from dpm2_core.geometry import se3
-from dpm2_ros.conversions import cloud_to_msg
+from dpm2_ros.conversions import cloud_to_msg, edge_to_msg, keyframe_name
 from dpm2_ros.runtime import ros_context
 from tools.replay import ros_environment
 
@@ -138,31 +138,6 @@ def bag(sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-class Manager:
-    """What a lifecycle manager does with a node, over its services."""
-
-    def __init__(self, harness: Harness, name: str) -> None:
-        self._harness = harness
-        self._change = harness.node.create_client(ChangeState, f"{name}/change_state")
-        self._state = harness.node.create_client(GetState, f"{name}/get_state")
-
-    def _call(self, client: Any, request: Any) -> Any:
-        self._harness.wait(client.service_is_ready, client.srv_name)
-        future = client.call_async(request)
-        self._harness.wait(future.done, client.srv_name)
-        return future.result()
-
-    def change(self, *transitions: int) -> bool:
-        """Whether all of them were made."""
-        requests = (ChangeState.Request(transition=Transition(id=transition)) for transition in transitions)
-        return all(bool(self._call(self._change, request).success) for request in requests)
-
-    @property
-    def state(self) -> str:
-        """Its label."""
-        return str(self._call(self._state, GetState.Request()).current_state.label)
-
-
 class Harness:
     """Nodes under test and a tester's node, spun by one thread."""
 
@@ -250,6 +225,32 @@ def ros() -> Iterator[Callable[..., Harness]]:
     yield make
     for harness in made:
         harness.close()
+
+
+@pytest.fixture
+def mapper(ros: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Harness with a mapper_node that saves to tmp_path/map, and `send(name, T, cloud)` for keyframes."""
+    from dpm2_ros.keyframe_messages import payload_to_msgs  # these import the whole SLAM
+    from dpm2_ros.mapper_node import MapperNode
+    from dpm2_ros.mapping import KEEP_ALL
+
+    monkeypatch.setattr("dpm2_ros.diagnostics.PERIOD", 0.1)
+    harness = ros(f"ros.map_directory:={tmp_path / 'map'}")
+    harness.mapper = harness.add(MapperNode())
+    kinds = ((Odometry, "odom"), (PointCloud2, ""), (UInt8MultiArray, "cloud"))
+    wires = [harness.node.create_publisher(kind, f"/dpm2/keyframe_{end}".rstrip("_"), KEEP_ALL) for kind, end in kinds]
+    harness.wait(lambda: all(wire.get_subscription_count() for wire in wires), "the mapper's subscriptions")
+
+    def send(id: int, T: np.ndarray, points: np.ndarray, cloud_first: bool = False, name: str = "") -> None:
+        name = name or keyframe_name("", id)
+        pose = edge_to_msg(T, np.eye(6) * 1e-4, 1000 + id, "odom", name)
+        keyframe = Keyframe(id, 1000 + id, id, T, points.astype(np.float32))
+        messages = list(zip(wires, (pose, *payload_to_msgs(keyframe, name)), strict=True))
+        for publisher, message in reversed(messages) if cloud_first else messages:
+            publisher.publish(message)
+
+    harness.send, harness.wires = send, wires
+    return harness
 
 
 @pytest.fixture

@@ -15,12 +15,13 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import UInt8MultiArray, UInt32MultiArray
 
 from dpm2_core.frame import Keyframe
+from dpm2_core.geometry import se3
 from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.slam.store.map_data import load_map
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_ros.conversions import edge_to_msg, keyframe_name
 from dpm2_ros.deliveries import Delivery
-from dpm2_ros.feed import Feed
+from dpm2_ros.feed import Feed, keyframe_from
 from dpm2_ros.guard import GuardedNode
 from dpm2_ros.keyframe_messages import WIRE, payload_to_msgs
 from dpm2_ros.mapping import MapperThread
@@ -137,3 +138,20 @@ def test_a_drive_whose_place_is_not_decided_stays_with_its_robot(robot: Robot) -
     for tick in range(10):
         kept.acknowledge(below, set(range(below, below + above)), 0.5 * tick)
     assert not kept.certain(5.0)
+
+
+def test_the_edge_leads_to_the_last_keyframe_that_arrived() -> None:
+    before = Keyframe(3, 0, 0, se3.exp([0, 0, 0, 5, 0, 0]), np.zeros((0, 4), np.float32))
+    T, covariance = se3.exp([0, 0, 0.5, 12, 1, 0]), np.diag([1.0, 2, 3, 4, 5, 6])
+    pose = edge_to_msg(T, covariance, 9, "odom", "kf_5")
+    keyframe = keyframe_from(pose, np.zeros((0, 4), np.float32), "", 5, before)
+    assert keyframe.edge is not None
+    np.testing.assert_allclose(before.T_odom_kf @ keyframe.edge.T_target_source, T, atol=1e-9)
+    np.testing.assert_allclose(keyframe.edge.covariance, covariance, atol=1e-9)
+
+
+@pytest.mark.parametrize("before", [None, 5, 7])
+def test_the_first_keyframe_and_one_that_goes_back_have_no_edge(before: int | None) -> None:
+    last = None if before is None else Keyframe(before, 0, 0, np.eye(4), np.zeros((0, 4), np.float32))
+    pose = edge_to_msg(np.eye(4), np.eye(6), 9, "odom", "kf_5")
+    assert keyframe_from(pose, np.zeros((0, 4), np.float32), "", 5, last).edge is None

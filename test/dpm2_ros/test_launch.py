@@ -35,7 +35,7 @@ from dpm2_ros.settings import NodeConfig
 from dpm2_ros.share import share_directory
 from tools.replay import ros_environment, start
 
-from .conftest import Manager
+from ..helpers.lifecycle import Manager
 
 ROOT = Path(__file__).resolve().parents[2]
 DEFAULTS = {name: info.get_default(call_default_factory=True) for name, info in flat_fields(NodeConfig)}

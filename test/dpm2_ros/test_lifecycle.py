@@ -32,7 +32,7 @@ from dpm2_ros.mapper_node import MapperNode
 from dpm2_ros.slam_node import SlamNode
 from tools.replay import ros_environment, start
 
-from .conftest import Manager
+from ..helpers.lifecycle import Manager
 
 CONFIGURE, CLEANUP = Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_CLEANUP
 ACTIVATE, DEACTIVATE = Transition.TRANSITION_ACTIVATE, Transition.TRANSITION_DEACTIVATE

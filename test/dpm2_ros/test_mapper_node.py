@@ -5,9 +5,7 @@ from __future__ import annotations
 
 import copy
 import struct
-import time
 import zlib
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -25,52 +23,14 @@ from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.frame import Fix, Keyframe
 from dpm2_core.geometry import se3
-from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.store.map_data import load_map
 from dpm2_core.slam.store.map_store import MapStore
-from dpm2_ros import feed, mapper_node
-from dpm2_ros.conversions import EARLIER, edge_to_msg, keyframe_name
-from dpm2_ros.feed import keyframe_from
+from dpm2_ros import mapper_node
+from dpm2_ros.conversions import edge_to_msg, keyframe_name
 from dpm2_ros.keyframe_messages import descriptors_to_msg, payload_to_msgs
-from dpm2_ros.mapper_node import MapperNode
-from dpm2_ros.mapping import KEEP_ALL
 from dpm2_ros.tf import TFMessage
 
-
-@pytest.fixture
-def mapper(ros: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Harness with a mapper_node that saves to tmp_path/map, and `send(name, T, cloud)` for keyframes."""
-    monkeypatch.setattr("dpm2_ros.diagnostics.PERIOD", 0.1)
-    harness = ros(f"ros.map_directory:={tmp_path / 'map'}")
-    harness.mapper = harness.add(MapperNode())
-    kinds = ((Odometry, "odom"), (PointCloud2, ""), (UInt8MultiArray, "cloud"))
-    wires = [harness.node.create_publisher(kind, f"/dpm2/keyframe_{end}".rstrip("_"), KEEP_ALL) for kind, end in kinds]
-    harness.wait(lambda: all(wire.get_subscription_count() for wire in wires), "the mapper's subscriptions")
-
-    def send(id: int, T: np.ndarray, points: np.ndarray, cloud_first: bool = False, name: str = "") -> None:
-        name = name or keyframe_name("", id)
-        pose = edge_to_msg(T, np.eye(6) * 1e-4, 1000 + id, "odom", name)
-        keyframe = Keyframe(id, 1000 + id, id, T, points.astype(np.float32))
-        messages = list(zip(wires, (pose, *payload_to_msgs(keyframe, name)), strict=True))
-        for publisher, message in reversed(messages) if cloud_first else messages:
-            publisher.publish(message)
-
-    harness.send, harness.wires = send, wires
-    return harness
-
-
-def core(mapper: Any) -> Mapper:
-    """What makes the map in the node."""
-    return mapper.mapper.slam.mapper
-
-
-def keyframes(mapper: Any) -> int:
-    """In the map so far."""
-    return len(core(mapper).keyframes)
-
-
-def points(seed: int) -> np.ndarray:
-    return np.random.default_rng(seed).uniform(0, 1, (500, 4)).astype(np.float32) * [20, 20, 5, 1]
+from ..helpers.mapping import S, core, keyframes, points, rejections, send_all
 
 
 def test_a_fix_travels_with_its_keyframe_and_a_forged_one_does_not(mapper: Any) -> None:
@@ -162,41 +122,6 @@ def test_map_to_odom_goes_out_with_every_odometry(mapper: Any) -> None:
     np.testing.assert_array_equal(transform_matrix(transform.transform), np.eye(4))
 
 
-def test_the_edge_leads_to_the_last_keyframe_that_arrived() -> None:
-    before = Keyframe(3, 0, 0, se3.exp([0, 0, 0, 5, 0, 0]), np.zeros((0, 4), np.float32))
-    T, covariance = se3.exp([0, 0, 0.5, 12, 1, 0]), np.diag([1.0, 2, 3, 4, 5, 6])
-    pose = edge_to_msg(T, covariance, 9, "odom", "kf_5")
-    keyframe = keyframe_from(pose, np.zeros((0, 4), np.float32), "", 5, before)
-    assert keyframe.edge is not None
-    np.testing.assert_allclose(before.T_odom_kf @ keyframe.edge.T_target_source, T, atol=1e-9)
-    np.testing.assert_allclose(keyframe.edge.covariance, covariance, atol=1e-9)
-
-
-@pytest.mark.parametrize("before", [None, 5, 7])
-def test_the_first_keyframe_and_one_that_goes_back_have_no_edge(before: int | None) -> None:
-    last = None if before is None else Keyframe(before, 0, 0, np.eye(4), np.zeros((0, 4), np.float32))
-    pose = edge_to_msg(np.eye(4), np.eye(6), 9, "odom", "kf_5")
-    assert keyframe_from(pose, np.zeros((0, 4), np.float32), "", 5, last).edge is None
-
-
-S, OTHER = "5f3a9c01", "00000bad"  # sessions
-
-
-def send_all(mapper: Any, *ids: int, session: str = S, shift: float = 0.0) -> None:
-    for id in ids:
-        T = se3.exp([0, 0, 0, 5.0 * id + shift, 0, 0])
-        mapper.send(id, T, points(id), name=keyframe_name("", id, session))
-
-
-def rejections(mapper: Any) -> dict[str, int]:
-    """As they are published."""
-    for message in reversed(mapper.received["/diagnostics"]):
-        for status in message.status:
-            if status.name == "mapper_node: messages":
-                return {value.key: int(value.value) for value in status.values if value.value != "0"}
-    return {}
-
-
 def hostile_parts(id: int) -> list[Any]:
     """Messages under the name of a keyframe that a robot is about to send, each unsound in its way."""
     name, T = keyframe_name("", id, S), np.eye(4)
@@ -264,75 +189,6 @@ def test_descriptors_of_other_weights_are_made_anew(mapper: Any) -> None:
     assert mapper.mapper.rejections == {"/dpm2/keyframe: descriptors of other weights": 1}
     own = core(mapper).keyframes[0].descriptors
     assert own is None or not np.array_equal(own.features, foreign.features)
-
-
-@pytest.fixture
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Drives count as over after a second."""
-    monkeypatch.setattr(feed, "SILENT", 1.0)
-    monkeypatch.setattr(feed, "BESIDE", 0.3)
-
-
-def test_two_drives_in_one_namespace_are_kept_apart(mapper: Any) -> None:
-    """A forged session, or a second robot by accident: it is reported, and each gets on as if alone."""
-    mapper.hear(DiagnosticArray, "/diagnostics")
-    send_all(mapper, 0, 1)
-    mapper.wait(lambda: keyframes(mapper) == 2, "the drive")
-    send_all(mapper, 0, 1, session=OTHER, shift=100.0)
-
-    def apart() -> bool:
-        send_all(mapper, 2)  # again and again, as a robot does
-        time.sleep(0.1)
-        return keyframes(mapper) == 5
-
-    mapper.wait(apart, "both drives")
-    send_all(mapper, 2, session=OTHER, shift=100.0)
-    send_all(mapper, 3)
-    mapper.wait(lambda: keyframes(mapper) == 7, "both go on")
-    drives = {name: [k.id for k in core(mapper).keyframes if k.robot == name] for name in core(mapper).robots}
-    assert drives == {"": [0, 1, 2, 3], f".{OTHER}": [0, 1, 2]}
-    assert len(core(mapper).edges) == 5  # none between the two
-
-    def reported() -> bool:
-        send_all(mapper, 2, session=OTHER)
-        time.sleep(0.1)
-        heard = [status for m in mapper.received["/diagnostics"] for status in m.status]
-        return any(f"two in one namespace: .{OTHER} kept apart" in status.message for status in heard)
-
-    mapper.wait(reported, "the diagnostics")
-
-
-def test_what_is_left_of_an_earlier_drive_comes_before_the_next_one(mapper: Any) -> None:
-    """The robot was killed: until all of that drive is there, nobody knows where its odometry of now is in the map."""
-    odometry, heard = mapper.publisher(Odometry, "/dpm2/odom"), mapper.hear(TFMessage, "/tf")
-    mapper.wait(lambda: odometry.get_subscription_count() and mapper.mapper.count_subscribers("/tf"), "connections")
-    send_all(mapper, 0, 1)
-    mapper.wait(lambda: keyframes(mapper) == 2, "the drive")
-    send_all(mapper, 2, 3, session=f"{S}{EARLIER}")
-    mapper.wait(lambda: keyframes(mapper) == 4, "the rest of it")
-    for stamp in range(5):
-        odometry.publish(edge_to_msg(np.eye(4), np.eye(6), stamp, "odom", "base"))
-    time.sleep(1.0)
-    send_all(mapper, 0, 1, session=OTHER, shift=100.0)  # at once, without a silence
-    mapper.wait(lambda: keyframes(mapper) == 6, "the next drive")
-    odometry.publish(edge_to_msg(np.eye(4), np.eye(6), 77, "odom", "base"))
-    time.sleep(1.0)
-    assert not heard  # it is not placed yet, either
-    assert [k.robot for k in core(mapper).keyframes] == [""] * 6
-    assert [k.id for k in core(mapper).keyframes] == [0, 1, 2, 3, 4, 5]
-    assert [(e.from_node, e.to_node) for e in core(mapper).edges] == [(0, 1), (1, 2), (2, 3), (4, 5)]
-
-
-@pytest.mark.usefixtures("quick")
-def test_a_drive_that_another_one_has_replaced_comes_back(mapper: Any) -> None:
-    """The robot was out of reach, a session in its name began meanwhile: nothing that it sends is lost."""
-    for session, ids in ((S, (0, 1)), (OTHER, (0,)), (S, (2, 3))):
-        time.sleep(1.2)
-        expected = keyframes(mapper) + len(ids)
-        send_all(mapper, *ids, session=session)
-        mapper.wait(lambda n=expected: keyframes(mapper) == n, f"{ids} of {session}")
-    assert [k.robot for k in core(mapper).keyframes] == [""] * 5
-    assert [(e.from_node, e.to_node) for e in core(mapper).edges] == [(0, 1), (3, 4)]
 
 
 def test_topics_that_bring_nothing_are_forgotten(mapper: Any, monkeypatch: pytest.MonkeyPatch) -> None:

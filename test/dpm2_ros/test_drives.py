@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The drives of one namespace in mapper_node: one after the other, at the same time, and back again."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from nav_msgs.msg import Odometry
+
+from dpm2_ros import feed
+from dpm2_ros.conversions import EARLIER, edge_to_msg
+from dpm2_ros.tf import TFMessage
+
+from ..helpers.mapping import OTHER, S, core, keyframes, send_all
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drives count as over after a second."""
+    monkeypatch.setattr(feed, "SILENT", 1.0)
+    monkeypatch.setattr(feed, "BESIDE", 0.3)
+
+
+def test_two_drives_in_one_namespace_are_kept_apart(mapper: Any) -> None:
+    """A forged session, or a second robot by accident: it is reported, and each gets on as if alone."""
+    mapper.hear(DiagnosticArray, "/diagnostics")
+    send_all(mapper, 0, 1)
+    mapper.wait(lambda: keyframes(mapper) == 2, "the drive")
+    send_all(mapper, 0, 1, session=OTHER, shift=100.0)
+
+    def apart() -> bool:
+        send_all(mapper, 2)  # again and again, as a robot does
+        time.sleep(0.1)
+        return keyframes(mapper) == 5
+
+    mapper.wait(apart, "both drives")
+    send_all(mapper, 2, session=OTHER, shift=100.0)
+    send_all(mapper, 3)
+    mapper.wait(lambda: keyframes(mapper) == 7, "both go on")
+    drives = {name: [k.id for k in core(mapper).keyframes if k.robot == name] for name in core(mapper).robots}
+    assert drives == {"": [0, 1, 2, 3], f".{OTHER}": [0, 1, 2]}
+    assert len(core(mapper).edges) == 5  # none between the two
+
+    def reported() -> bool:
+        send_all(mapper, 2, session=OTHER)
+        time.sleep(0.1)
+        heard = [status for m in mapper.received["/diagnostics"] for status in m.status]
+        return any(f"two in one namespace: .{OTHER} kept apart" in status.message for status in heard)
+
+    mapper.wait(reported, "the diagnostics")
+
+
+def test_what_is_left_of_an_earlier_drive_comes_before_the_next_one(mapper: Any) -> None:
+    """The robot was killed: until all of that drive is there, nobody knows where its odometry of now is in the map."""
+    odometry, heard = mapper.publisher(Odometry, "/dpm2/odom"), mapper.hear(TFMessage, "/tf")
+    mapper.wait(lambda: odometry.get_subscription_count() and mapper.mapper.count_subscribers("/tf"), "connections")
+    send_all(mapper, 0, 1)
+    mapper.wait(lambda: keyframes(mapper) == 2, "the drive")
+    send_all(mapper, 2, 3, session=f"{S}{EARLIER}")
+    mapper.wait(lambda: keyframes(mapper) == 4, "the rest of it")
+    for stamp in range(5):
+        odometry.publish(edge_to_msg(np.eye(4), np.eye(6), stamp, "odom", "base"))
+    time.sleep(1.0)
+    send_all(mapper, 0, 1, session=OTHER, shift=100.0)  # at once, without a silence
+    mapper.wait(lambda: keyframes(mapper) == 6, "the next drive")
+    odometry.publish(edge_to_msg(np.eye(4), np.eye(6), 77, "odom", "base"))
+    time.sleep(1.0)
+    assert not heard  # it is not placed yet, either
+    assert [k.robot for k in core(mapper).keyframes] == [""] * 6
+    assert [k.id for k in core(mapper).keyframes] == [0, 1, 2, 3, 4, 5]
+    assert [(e.from_node, e.to_node) for e in core(mapper).edges] == [(0, 1), (1, 2), (2, 3), (4, 5)]
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_drive_that_another_one_has_replaced_comes_back(mapper: Any) -> None:
+    """The robot was out of reach, a session in its name began meanwhile: nothing that it sends is lost."""
+    for session, ids in ((S, (0, 1)), (OTHER, (0,)), (S, (2, 3))):
+        time.sleep(1.2)
+        expected = keyframes(mapper) + len(ids)
+        send_all(mapper, *ids, session=session)
+        mapper.wait(lambda n=expected: keyframes(mapper) == n, f"{ids} of {session}")
+    assert [k.robot for k in core(mapper).keyframes] == [""] * 5
+    assert [(e.from_node, e.to_node) for e in core(mapper).edges] == [(0, 1), (3, 4)]
