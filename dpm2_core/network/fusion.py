@@ -183,7 +183,8 @@ class Fusion(nn.Module):
             bias = point_bias(refs.xyz, xyz, mask, self.settings.alpha_lidar)
         return Branch(features, bias, mask[:, None, None])
 
-    def _image(self, refs: Tokens, views: Views, maps: list[FeatureMap]) -> Branch:
+    def _image(self, refs: Tokens, views: Views, maps: list[FeatureMap]) -> Branch | None:
+        """None where no reference point is in an image."""
         batch, count = views.present.shape
         kind = self.settings.kind
         uv = token_pixels(maps)
@@ -196,6 +197,8 @@ class Fusion(nn.Module):
         ):
             visible = torch.stack([seen_from(xyz, views, view) for view in range(count)]).any(0)[0]
             rows = visible.nonzero()[:, 0]  # in one image a fourth of them
+            if not len(rows):
+                return None
             xyz = xyz[:, rows]
         bias, seen = ray_bias(xyz, views, uv, self.settings.alpha_image)
         if kind in SAMPLED:
