@@ -59,17 +59,18 @@ def test_the_entry_of_a_program_lets_idle_threads_sleep_before_numpy_is_there(en
         "assert 'numpy' not in sys.modules\n"
         "try: entry(arguments)\n"
         "except SystemExit: pass\n"
-        "print(os.environ['OMP_WAIT_POLICY'], os.environ['GOMP_SPINCOUNT'])"
+        "print(*(os.environ[name] for name in ('OMP_WAIT_POLICY', 'GOMP_SPINCOUNT', 'OPENBLAS_NUM_THREADS')))"
     )
-    assert "passive 20000" in output
+    assert "passive 20000 1" in output
 
 
 def test_what_the_user_chose_stays() -> None:
     output = python(
-        "import os; os.environ['OMP_WAIT_POLICY'] = 'active'\n"
-        "from dpm2_core.openmp import wait_passively; wait_passively(); print(os.environ['OMP_WAIT_POLICY'])"
+        "import os; os.environ['OMP_WAIT_POLICY'], os.environ['OPENBLAS_NUM_THREADS'] = 'active', '2'\n"
+        "from dpm2_core.openmp import wait_passively; wait_passively()\n"
+        "print(os.environ['OMP_WAIT_POLICY'], os.environ['OPENBLAS_NUM_THREADS'])"
     )
-    assert output == "active\n"
+    assert output == "active 2\n"
 
 
 @pytest.mark.slow
