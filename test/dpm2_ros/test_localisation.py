@@ -34,13 +34,15 @@ from tools.replay import ros_environment, start
 from ..helpers.command import dpm2
 
 pytestmark = pytest.mark.weights
+ODOMETRY = "slam.registration=geometric"
+"""Of scans one after the other: places are found by the network all the same."""
 
 
 @pytest.fixture(scope="module")
 def made(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Its map, as the command makes it."""
     folder = tmp_path_factory.mktemp("map")
-    done = dpm2("run", recording, "--out", folder / "out", "--map", folder / "drive.dpm2map")
+    done = dpm2("run", recording, "--out", folder / "out", "--map", folder / "drive.dpm2map", "--set", ODOMETRY)
     assert done.returncode == 0, done.stderr
     return folder / "drive.dpm2map"
 
@@ -59,7 +61,7 @@ class Robot:
         self.odom = harness.hear(Odometry, "/dpm2/odom")
         self.diagnostics = harness.hear(DiagnosticArray, "/diagnostics")
         self.tf = harness.hear(TFMessage, "/tf")
-        pairs = ["input.images:=false", "ros.map_directory:=''", *parameters]
+        pairs = ["input.images:=false", "ros.map_directory:=''", ODOMETRY.replace("=", ":="), *parameters]
         arguments = ["--ros-args", *(part for pair in pairs for part in ("-p", pair))]
         self.process = start("slam_node", arguments, ros_environment(harness.node.context.get_domain_id()), log)
         harness.wait(self._ready, "slam_node", timeout=60)
