@@ -9,9 +9,11 @@ from typing import TypeVar
 import numba
 
 F = TypeVar("F", bound=Callable[..., object])
+READ_F4, READ_F8 = (numba.types.Array(kind, 2, "C", readonly=True) for kind in (numba.float32, numba.float64))
+"""Arrays that may not be written to, as the points of messages are: `f4[:, ::1]` would not take them."""
 
 
-def compiled(signature: str | list[str]) -> Callable[[F], F]:
+def compiled(signature: object) -> Callable[[F], F]:
     """Decorator: compile for these types when the module is imported, in double precision as written, without the GIL.
 
     The machine code is kept in `__pycache__` beside the source, or in the user's cache folder, so that it is made once

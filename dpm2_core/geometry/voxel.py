@@ -4,9 +4,10 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import float32, float64, int64
 from numpy.typing import NDArray
 
-from dpm2_core.geometry.compiled import compiled
+from dpm2_core.geometry.compiled import READ_F4, READ_F8, compiled
 
 _HALF = 1 << 20  # cells per axis on either side of the origin: 21 bits each fit one int64 key
 
@@ -23,7 +24,7 @@ def voxel_first(points: NDArray[np.floating], size: float, near: float = 0.0, fa
     return _first_in_cells(np.ascontiguousarray(points), dtype(1 / size), dtype(near * near), dtype(far * far))
 
 
-@compiled(["i8[::1](f4[:, ::1], f4, f4, f4)", "i8[::1](f8[:, ::1], f8, f8, f8)"])
+@compiled([int64[::1](READ_F4, *[float32] * 3), int64[::1](READ_F8, *[float64] * 3)])
 def _first_in_cells(
     points: NDArray[np.floating], scale: np.floating, least: np.floating, most: np.floating
 ) -> NDArray[np.int64]:

@@ -8,13 +8,14 @@ from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
+from numba import float32, float64, int64, types
 from numpy.typing import NDArray
 from pydantic import model_validator
 
 from dpm2_core.config import Settings
 from dpm2_core.descriptors import Descriptors, LazyDescriptors
 from dpm2_core.frame import Array, Frame, Image, Points
-from dpm2_core.geometry.compiled import compiled
+from dpm2_core.geometry.compiled import READ_F4, compiled
 from dpm2_core.geometry.deskew import deskew
 from dpm2_core.geometry.turning import turned
 from dpm2_core.geometry.voxel import voxel_first
@@ -95,7 +96,7 @@ class Preprocessor:
         return Scan(points, cloud, source)
 
 
-@compiled("Tuple((f4[:, ::1], i8[::1]))(f4[:, ::1], f8, f8)")
+@compiled(types.Tuple((float32[:, ::1], int64[::1]))(READ_F4, float64, float64))
 def _in_range(points: Points, least: float, most: float) -> tuple[Points, NDArray[np.int64]]:
     """The (P, 4) of (N, 4) points at a squared distance from `least` to `most`, m2, and which they are; none at 0."""
     used, index, count = np.empty_like(points), np.empty(len(points), np.int64), 0

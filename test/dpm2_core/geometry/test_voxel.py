@@ -17,6 +17,7 @@ def test_first_of_every_cell(seed: int, count: int, size: float, dtype: type) ->
     seen: dict[tuple[int, ...], int] = {}
     for i, cell in enumerate(map(tuple, cells)):
         seen.setdefault(cell, i)
+    points.flags.writeable = False  # as those of messages
     assert voxel_first(points, size).tolist() == sorted(seen.values())
 
 

@@ -21,6 +21,7 @@ def test_keeps_only_measurements_within_range() -> None:
         [[x, 0, 0, 0.5] for x in (np.nan, np.inf, 0, 1, 5, 100, 1e30)],
         np.float32,
     )  # fmt: skip
+    points.flags.writeable = False  # as those of messages
     scan = Preprocessor(PreprocessSettings()).prepare(Frame(0, points), np.zeros(6))
     np.testing.assert_array_equal(scan.cloud, points[4:5])
     np.testing.assert_array_equal(scan.source, points[4:5, :3])
