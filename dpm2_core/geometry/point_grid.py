@@ -223,7 +223,7 @@ def _neighbors(queries: Array, k: int, radius: float, grid: _Grid) -> Index:
         reach = min(_FIRST * grid[1][3], radius)
         found = _within(queries[q], reach, grid, squared, index)
         while found == 0 or (found < wanted and reach < radius):
-            reach = 2 * reach if found == 0 else min(2 * reach, radius)
+            reach = 2 * reach if found == 0 else min(min(2.0, 1.2 * np.sqrt(wanted / found)) * reach, radius)
             found = _within(queries[q], reach, grid, squared, index)
         _select(squared, index, found, min(wanted, found))
         for j in range(k):
