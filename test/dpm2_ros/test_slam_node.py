@@ -540,7 +540,7 @@ def test_images_that_nothing_looks_at_are_not_received(rig: Callable[..., Rig]) 
 
 def test_keyframes_that_no_mapper_has_received_are_counted(rig: Callable[..., Rig], drive: Any) -> None:
     """Without a mapper all are missing, a warning; once one acknowledges some, they are not."""
-    r = rig("ros.embed_mapper:=false", "slam.keyframes.distance:=0.5")
+    r = rig("ros.embed_mapper:=false", "slam.keyframes.distance:=0.5", "slam.loops.descriptors:=false")
     received = r.harness.publisher(UInt32MultiArray, "/dpm2/keyframes_received")
     poses = r.harness.hear(Odometry, "/dpm2/keyframe_odom")
     r.wait(lambda: r.node.count_subscribers("/dpm2/keyframe_odom"), "the subscription")
