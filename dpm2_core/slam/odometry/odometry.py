@@ -8,6 +8,7 @@ from time import perf_counter
 
 import numpy as np
 
+from dpm2_core.data.stream_clock import StreamClock
 from dpm2_core.frame import Array, Frame, OdometryResult, Registration, State
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.motion import OPEN, combined, covariance, predicted, spread
@@ -17,7 +18,6 @@ from dpm2_core.slam.odometry.keyframe_selection import KeyframeSelector
 from dpm2_core.slam.odometry.other import OtherMotion, Step
 from dpm2_core.slam.odometry.settings import OdometrySettings
 from dpm2_core.slam.odometry.starts import FITS_WELL, starts_from_rest, turned_starts
-from dpm2_core.slam.odometry.stream_clock import StreamClock
 from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import pytest
 
-from dpm2_core.slam.odometry.stream_clock import StreamClock
+from dpm2_core.data.stream_clock import StreamClock
 
 
 def test_stamps_that_do_not_advance_count_as_a_period() -> None:
