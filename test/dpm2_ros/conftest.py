@@ -142,9 +142,9 @@ class Harness:
     """Nodes under test and a tester's node, spun by one thread."""
 
     def __init__(self, parameters: Sequence[str], domain: int, namespace: str) -> None:
-        # Scans are registered by points, which takes less time: how a node handles them is the same. Drives through
-        # nodes as they are by default are in test_replay.py and test_lockstep.py.
-        quick = ("ros.map_directory:=''", "slam.registration:=geometric")
+        # Without the network, which takes most of the time, unless a test says otherwise: how a node handles scans and
+        # keyframes is the same. Drives through nodes as they are by default: test_replay.py and test_lockstep.py.
+        quick = ("ros.map_directory:=''", "slam.registration:=geometric", "slam.loops.descriptors:=false")
         pairs = [part for pair in (*quick, *parameters) for part in ("-p", pair)]
         remap = ["-r", f"__ns:={namespace}"] if namespace else []
         ros_context(["--ros-args", *pairs, *remap], domain)
@@ -238,7 +238,7 @@ def mapper(ros: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPa
     from dpm2_ros.mapping import KEEP_ALL
 
     monkeypatch.setattr("dpm2_ros.diagnostics.PERIOD", 0.1)
-    harness = ros(f"ros.map_directory:={tmp_path / 'map'}")
+    harness = ros(f"ros.map_directory:={tmp_path / 'map'}", "slam.loops.descriptors:=true")
     harness.mapper = harness.add(MapperNode())
     kinds = ((Odometry, "odom"), (PointCloud2, ""), (UInt8MultiArray, "cloud"))
     wires = [harness.node.create_publisher(kind, f"/dpm2/keyframe_{end}".rstrip("_"), KEEP_ALL) for kind, end in kinds]

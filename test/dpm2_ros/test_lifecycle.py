@@ -36,7 +36,7 @@ from ..helpers.lifecycle import Manager
 
 CONFIGURE, CLEANUP = Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_CLEANUP
 ACTIVATE, DEACTIVATE = Transition.TRANSITION_ACTIVATE, Transition.TRANSITION_DEACTIVATE
-FAST = ("input.images:=false", "slam.loops.descriptors:=false", "slam.registration:=geometric")
+FAST = ("input.images:=false",)
 ACKS = "/dpm2/keyframes_received"
 ROUNDS = int(os.environ.get("DPM2_ROUNDS", "6"))
 
@@ -203,7 +203,8 @@ def test_what_cannot_be_configured_stays_unconfigured(
     ros: Callable[..., Any], tmp_path: Path, kind: type[SlamNode] | type[MapperNode], wrong: str
 ) -> None:
     """And leaves nothing: no thread, no topic, no empty map."""
-    m = Managed(ros(wrong, "input.images:=false", f"ros.map_directory:={tmp_path / 'maps'}"), kind)
+    given = (wrong, "slam.loops.descriptors:=true", "input.images:=false")
+    m = Managed(ros(*given, f"ros.map_directory:={tmp_path / 'maps'}"), kind)
     before, entities = held()[0], m.entities
     assert not m.change(CONFIGURE)
     assert m.state == "unconfigured"

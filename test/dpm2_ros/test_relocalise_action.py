@@ -40,7 +40,8 @@ def test_a_robot_that_is_lost_finds_itself(ros: Callable[..., Any], recording: P
     drive = first_scans(recording, 10, tmp_path / "drive")
     made = dpm2("run", drive, "--out", tmp_path / "out", "--map", tmp_path / "street.dpm2map")
     assert made.returncode == 0, made.stderr
-    harness = ros(f"ros.map_file:={tmp_path / 'street.dpm2map'}", "ros.localization_mode:=true", "input.images:=false")
+    finding = ("ros.localization_mode:=true", "slam.loops.descriptors:=true", "input.images:=false")
+    harness = ros(f"ros.map_file:={tmp_path / 'street.dpm2map'}", *finding)
     lidar = harness.publisher(PointCloud2, topics.POINTS)
     harness.add(SlamNode())
     harness.wait(lidar.get_subscription_count, "the subscription to the clouds")

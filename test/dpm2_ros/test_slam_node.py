@@ -124,7 +124,7 @@ def test_every_cloud_gives_its_pose(rig: Callable[..., Rig], drive: Any, reliabl
 
 
 def test_keyframes_map_path_and_tf(rig: Callable[..., Rig], drive: Any) -> None:
-    r = rig("ros.map_period:=0.1", "ros.path_period:=0.1")
+    r = rig("ros.map_period:=0.1", "ros.path_period:=0.1", "slam.loops.descriptors:=true")
     hear = r.harness.hear
     keyframes, poses = hear(PointCloud2, "/dpm2/keyframe"), hear(Odometry, "/dpm2/keyframe_odom")
     maps, paths = hear(PointCloud2, "/dpm2/map", LATCHED), hear(PathMsg, "/dpm2/path", LATCHED)
@@ -165,7 +165,7 @@ def test_the_map_is_bounded_and_built_only_for_listeners(rig: Callable[..., Rig]
 
 def test_the_grid_is_latched_bounded_and_soon_there(rig: Callable[..., Rig], drive: Any) -> None:
     """Built only for listeners; a late one gets it at once; house fronts occupied, the street free."""
-    r = rig("ros.grid.resolution:=0.25", "ros.grid_max_cells:=200000", "slam.loops.descriptors:=false")
+    r = rig("ros.grid.resolution:=0.25", "ros.grid_max_cells:=200000")
     r.send_and_wait(0, 1)
     grids = r.harness.hear(OccupancyGrid, "/dpm2/grid", LATCHED)
     r.wait(lambda: grids, "the grid, once there is a subscriber")
@@ -540,7 +540,7 @@ def test_images_that_nothing_looks_at_are_not_received(rig: Callable[..., Rig]) 
 
 def test_keyframes_that_no_mapper_has_received_are_counted(rig: Callable[..., Rig], drive: Any) -> None:
     """Without a mapper all are missing, a warning; once one acknowledges some, they are not."""
-    r = rig("ros.embed_mapper:=false", "slam.keyframes.distance:=0.5", "slam.loops.descriptors:=false")
+    r = rig("ros.embed_mapper:=false", "slam.keyframes.distance:=0.5")
     received = r.harness.publisher(UInt32MultiArray, "/dpm2/keyframes_received")
     poses = r.harness.hear(Odometry, "/dpm2/keyframe_odom")
     r.wait(lambda: r.node.count_subscribers("/dpm2/keyframe_odom"), "the subscription")
