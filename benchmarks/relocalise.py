@@ -35,6 +35,7 @@ LATERAL = (-1.2, 3.0)
 """m to the left of the drive: as far as cars at the kerb leave room, and into the other lane."""
 APART = 5000.0
 """Between the roads in the map, m: the one map of all of them."""
+_NO_LOOPS = 1e9  # m between two keyframes of a loop
 _EDGE = np.diag(np.repeat([np.radians(0.15), 0.05], 3) ** 2)
 
 
@@ -74,7 +75,7 @@ def bench_relocalise(options: Options) -> Report:
 
 def survey(options: Options, settings: SlamSettings, file: Path, progress: Progress) -> list[Road]:
     """Write the map of all roads, poses as they truly are: relocalization alone is measured."""
-    settings = settings.model_copy(update={"loops": settings.loops.model_copy(update={"gap": np.inf})})
+    settings = settings.model_copy(update={"loops": settings.loops.model_copy(update={"gap": _NO_LOOPS})})
     roads: list[Road] = []
     with MapStore.create(file) as store:
         store.begin_session()
