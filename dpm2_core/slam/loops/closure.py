@@ -20,7 +20,7 @@ from dpm2_core.frame import Array, Edge, Keyframe, Points, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.scale import is_room
 from dpm2_core.slam.loops.consistency import Consistency, ConsistencySettings, OdometryChain
-from dpm2_core.slam.loops.place_recognition import PlaceRecognition, merged
+from dpm2_core.slam.loops.place_recognition import AGREEING, PlaceRecognition, merged
 from dpm2_core.slam.loops.verification import VerificationSettings, Verifier
 from dpm2_core.slam.registration.icp import GeometricSettings
 
@@ -165,7 +165,7 @@ class LoopCloser:
         assert source is not None
         known = [t for t in targets if t is not None]
         by_head = self._settings.decided_by == "overlap"  # whose opinion of each is asked for, as in the paper
-        results = self._places.register(source, known, 0.0) if by_head else self._places.register(source, known)
+        results = self._places.register(source, known, 0.0 if by_head else AGREEING)
         return [Edge("loop", c, node, result) for c, result in zip(candidates, results, strict=True)]
 
     def _nearest(self, since: Array, poses: Array) -> int | None:

@@ -22,7 +22,7 @@ from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import LidarConfig
 from dpm2_core.sim.world import World, build_world
 from dpm2_core.slam.loops.closure import LoopCloser, LoopSettings
-from dpm2_core.slam.loops.place_recognition import PlaceRecognition
+from dpm2_core.slam.loops.place_recognition import AGREEING, PlaceRecognition
 from dpm2_core.slam.loops.verification import Verifier
 from dpm2_core.slam.registration.icp import GeometricSettings
 
@@ -107,13 +107,13 @@ def test_places_that_agree_on_no_motion_are_not_correlated(monkeypatch: pytest.M
     assert here is not None
     assert near is not None
     assert far is not None
-    found, other = places.register(here, [near, far])
+    found, other = places.register(here, [near, far], AGREEING)
     assert found.ok
     assert found.confidence > 0.3
     assert not other.ok
     assert "another place" in other.reason
     monkeypatch.setattr(DeepPointMap2, "register", lambda *_: pytest.fail("the network was asked"))
-    assert not places.register(here, [far])[0].ok
+    assert not places.register(here, [far], AGREEING)[0].ok
 
 
 @pytest.mark.slow
