@@ -50,7 +50,7 @@ class ImageAttention:
     heat: NDArray[np.float32]
 
 
-@torch.inference_mode()
+@torch.no_grad()  # in inference mode only the points that an image shows would be asked, under other numbers
 def image_attention(model: DeepPointMap2, frame: Frame, point: int | None = None) -> ImageAttention:
     """Attention of one reference point in the last layer; by default of the one nearest to the middle of the image.
 
