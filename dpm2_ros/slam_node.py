@@ -163,7 +163,6 @@ class SlamNode(ManagedNode):
         self._frames.up = (x, y, z) if self._base.name else None  # what is up for the base is to be up in odom
         frame = self._frames.frame(bundle.stamp, bundle.cloud, self._index, bundle.beside)
         tracked = self._tracked(frame)
-        self._projection.show(frame, [camera.topic for camera in self.calibration.cameras], bundle.beside)
         self._index += 1
         self._held.append(tracked)
         if self._base.name:
@@ -174,6 +173,7 @@ class SlamNode(ManagedNode):
             self._give_up()
             self._begin()
         self._health.add(tracked, time.monotonic() - bundle.arrival)
+        self._projection.show(frame, [camera.topic for camera in self.calibration.cameras], bundle.beside)
         if (scale := self._slam.odometry.scale) != self._health.scale:
             self.get_logger().info(f"slam.preset auto: {scale}, by what the scans show")
             self._health.scale = scale

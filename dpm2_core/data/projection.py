@@ -27,15 +27,13 @@ def painted(image: Image, points: Points) -> NDArray[np.uint8]:
     xyz = xyz[((straight > -margin) & (straight < margin + np.array([width, height]))).all(1)]
     if not len(xyz):
         return pixels
-    xyz = xyz[np.argsort(-xyz[:, 2])]
     uv, _ = cv2.projectPoints(xyz, np.zeros(3), np.zeros(3), camera.K, np.array(camera.distortion, np.float64))
-    at = np.round(uv[:, 0]).astype(np.int64)
-    depth = np.log(xyz[:, 2] / _NEAREST) / np.log(_FARTHEST / _NEAREST)
-    shades = cv2.applyColorMap((255 * (1 - depth)).astype(np.uint8)[:, None], cv2.COLORMAP_TURBO)[:, 0, ::-1]
-    half = max(0, round(width / 640) - 1) + (width >= 320)  # pixels to either side of a point
-    for dx in range(-half, half + 1):
-        for dy in range(-half, half + 1):
-            u, v = at[:, 0] + dx, at[:, 1] + dy
-            shown = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-            pixels[v[shown], u[shown]] = shades[shown]
-    return pixels
+    u, v = np.round(uv[:, 0]).astype(np.int64).T
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    depth = np.log(xyz[inside, 2] / _NEAREST) / np.log(_FARTHEST / _NEAREST)
+    near = np.zeros((height, width), np.uint8)  # 0: no point; the nearest has 255, and covers what is behind it
+    np.maximum.at(near, (v[inside], u[inside]), (255 * (1 - depth)).clip(1, 255).astype(np.uint8))
+    side = 2 * (max(0, round(width / 640) - 1) + (width >= 320)) + 1  # pixels of a point
+    near = np.asarray(cv2.dilate(near, np.ones((side, side), np.uint8)), np.uint8)
+    shades = cv2.cvtColor(cv2.applyColorMap(near, cv2.COLORMAP_TURBO), cv2.COLOR_BGR2RGB)
+    return np.asarray(cv2.copyTo(shades, near, pixels), np.uint8)
