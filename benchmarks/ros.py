@@ -15,7 +15,7 @@ import numpy as np
 import typer
 from rich.console import Group
 
-from benchmarks.harness import Options, Report, drives, write_report
+from benchmarks.harness import Options, Report, drives, unique_name, write_report
 from dpm2_core.commands.options import run_command
 from dpm2_core.console import Console
 from dpm2_core.data.bags import BagSource
@@ -45,7 +45,8 @@ def bench(
     with drives(options) as found, tempfile.TemporaryDirectory(prefix="dpm2_bench_ros_") as folder:
         for drive in found:
             assert isinstance(drive, KittiSource)
-            bag, work = Path(folder) / f"bag_{drive.name}", Path(folder) / drive.name
+            title = unique_name(drive, results)
+            bag, work = Path(folder) / f"bag_{title}", Path(folder) / title
             work.mkdir()
             convert_kitti(KittiSource(drive.path), bag)
             source = BagSource(bag, InputSettings(images=False))
@@ -54,9 +55,10 @@ def bench(
                 for name, (parameters, watched) in WITH.items():
                     played = replay(source, work, parameters=parameters, watched=watched)
                     runs[name].append(evaluate_replay(source, played, work))
-            results |= {f"{drive.name}{name}": _figures(of) for name, of in runs.items()}
-    title = "Bag -> bag_player -> slam_node -> /dpm2/odom"
-    table = FigureTable(title, names=["drive"], figures=[*FIGURES, "failed checks"])
+            results |= {f"{title}{name}": _figures(of) for name, of in runs.items()}
+    table = FigureTable(
+        "Bag -> bag_player -> slam_node -> /dpm2/odom", names=["drive"], figures=[*FIGURES, "failed checks"]
+    )
     for name, row in results.items():
         table.add_row(name, *("-" if value is None else f"{value:.4g}" for value in row.values()))
     write_report(
