@@ -47,6 +47,14 @@ class Trajectories:
 
     def part(self, node: int, loops: Sequence[Edge]) -> int:
         """The oldest trajectory that accepted loops tie a node's to: nodes of two parts have nothing in common."""
+        return self._tied(loops)[self.of[node]]
+
+    def in_part(self, part: int, loops: Sequence[Edge]) -> NDArray[np.bool_]:
+        """(N,) whether each node is in that part."""
+        return np.array(self._tied(loops), np.intp)[self.of] == part
+
+    def _tied(self, loops: Sequence[Edge]) -> list[int]:
+        """The part of each trajectory."""
         if self._parts is None:
             parts = list(range(len(self._ends)))
             for loop in loops:
@@ -54,11 +62,7 @@ class Trajectories:
                 if loop.ok and one != other:
                     parts = [one if part == other else part for part in parts]
             self._parts = parts
-        return self._parts[self.of[node]]
-
-    def in_part(self, part: int, loops: Sequence[Edge]) -> NDArray[np.bool_]:
-        """(N,) whether each node is in that part."""
-        return np.array([self.part(node, loops) == part for node in range(len(self.of))], np.bool_)
+        return self._parts
 
     def order(self, count: int | None = None) -> NDArray[np.intp]:
         """(N,) the nodes, or the first so many, one trajectory after the other, so that each is a chain."""
