@@ -4,6 +4,9 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from typing import Any
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.node import Node
@@ -43,20 +46,20 @@ class Requests:
         return response
 
     async def _on_load_map(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        return await self._ask(MapperThread.load, response)
+
+    async def _on_localization_mode(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        return await self._ask(MapperThread.localise if request.data else MapperThread.extend, response)
+
+    async def _ask(self, work: Callable[[MapperThread], Future[str]], response: Any) -> Any:
+        """The response, filled with what the mapper's thread makes of it."""
         if self._mapper is None:
             response.success, response.message = False, "the mapper is another node's: ros.embed_mapper is off"
             return response
         try:
-            await respond(self._mapper.load(), response)
+            await respond(work(self._mapper), response)
         except UsageError as error:
             response.success, response.message = False, str(error)
-        return response
-
-    async def _on_localization_mode(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        if self._mapper is None:
-            response.success, response.message = False, "the mapper is another node's: ros.embed_mapper is off"
-        else:
-            await respond(self._mapper.localise() if request.data else self._mapper.extend(), response)
         return response
 
     def _on_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
