@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import shutil
 import tempfile
 from pathlib import Path
 from time import perf_counter
@@ -27,6 +26,7 @@ from dpm2_core.slam.store.map_data import load_map
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.slam.system import SlamResult
 from dpm2_core.tables import FigureTable
+from tools.browser import SOFTWARE, chromium
 
 _VOXEL = 0.3
 """Of the page, m: the default of `dpm2 map export`."""
@@ -45,7 +45,6 @@ _TURNING = """async () => {
   return rate;
 }"""
 """The view is turned in each frame for 4 s; the page itself counts frames per second while it moves."""
-_SOFTWARE = ("--no-sandbox", "--enable-unsafe-swiftshader", "--use-gl=angle", "--use-angle=swiftshader")
 
 
 def bench_views(options: Options) -> Report:
@@ -102,13 +101,13 @@ def _recorded(source: Source, options: Options, place: Path) -> dict[str, Any]:
 
 def _looked_at(path: Path) -> dict[str, float]:
     """Seconds until points and until all of them are drawn, and frames per second while the map is turned."""
-    program = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    program = chromium()
     if program is None:
         raise Dpm2Error("no Chromium (Debian: apt install chromium)")
     with needs("test", "the browser"):
         from playwright.sync_api import sync_playwright
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=program, args=list(_SOFTWARE))
+        browser = playwright.chromium.launch(executable_path=program, args=list(SOFTWARE))
         try:
             page = browser.new_page(viewport={"width": 1280, "height": 720})
             page.set_default_timeout(120_000)

@@ -3,13 +3,13 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import pytest
 
 from benchmarks.harness import Options
 from benchmarks.views import bench_views
+from tools.browser import chromium
 
 
 @pytest.mark.slow
@@ -17,7 +17,7 @@ def test_both_are_measured(recording: Path) -> None:
     """Every figure of the table is of something that happened: a recording, a page that was drawn and turned."""
     pytest.importorskip("rerun")
     pytest.importorskip("playwright")
-    if not any(shutil.which(name) for name in ("chromium", "chromium-browser", "google-chrome")):
+    if chromium() is None:
         pytest.skip("no Chromium")
     (row,) = bench_views(Options(sources=[recording])).results["drives"].values()
     assert row["frames"] > 0

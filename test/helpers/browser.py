@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import shutil
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,18 +11,19 @@ from typing import Any
 
 import pytest
 
+from tools.browser import SOFTWARE, chromium
+
 
 @contextmanager
 def opened(path: Path, width: int = 800, height: int = 600) -> Iterator[tuple[Any, list[str]]]:
     """A page in headless Chromium without a network, and what its console says; skips where there is no browser."""
     api = pytest.importorskip("playwright.sync_api", reason="no playwright: pip install '.[test]'")
-    program = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    program = chromium()
     if program is None:
         pytest.skip("no Chromium (Debian: apt install chromium)")
     said: list[str] = []
     with api.sync_playwright() as playwright:
-        options = ["--no-sandbox", "--enable-unsafe-swiftshader", "--use-gl=angle", "--use-angle=swiftshader"]
-        browser = playwright.chromium.launch(executable_path=program, args=options)
+        browser = playwright.chromium.launch(executable_path=program, args=list(SOFTWARE))
         try:
             context = browser.new_context(viewport={"width": width, "height": height}, offline=True)
             page = context.new_page()
