@@ -20,10 +20,9 @@ from dpm2_core.slam.odometry.odometry import Odometry
 from dpm2_core.slam.odometry.scaled import ScaledOdometry
 from dpm2_core.slam.preprocess import Preprocessor
 from dpm2_core.slam.registration.fused import FusedScanRegistration
-from dpm2_core.slam.registration.icp import GeometricRegistration
+from dpm2_core.slam.registration.icp import GeometricRegistration, GeometricScanRegistration
 from dpm2_core.slam.registration.local_map import LocalMap
 from dpm2_core.slam.registration.neural import NeuralScanRegistration
-from dpm2_core.slam.registration.points import GeometricScanRegistration
 from dpm2_core.slam.registration.protocol import ScanRegistration
 from dpm2_core.slam.registration.visual import VisualScanRegistration
 from dpm2_core.slam.settings import SlamSettings

@@ -13,8 +13,8 @@ from dpm2_core.descriptors import LazyDescriptors
 from dpm2_core.frame import Array, Frame, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.slam.preprocess import Scan
+from dpm2_core.slam.registration.icp import GeometricScanRegistration
 from dpm2_core.slam.registration.neural import NeuralScanRegistration
-from dpm2_core.slam.registration.points import GeometricScanRegistration
 from dpm2_core.slam.registration.protocol import MAP_NOISE, Prediction, agree
 
 _LED = np.diag(np.repeat([np.radians(2), 0.5], 3) ** -2.0)

@@ -64,7 +64,7 @@ def test_without_corrections_the_map_is_the_odometry(suburb_drive: tuple[list[Fr
 
 
 @pytest.mark.weights
-@pytest.mark.parametrize(("registration", "most"), [("geometric", 9), ("adaptive", 10)])
+@pytest.mark.parametrize(("registration", "most"), [("geometric", 8), ("adaptive", 9)])
 def test_a_frame_passes_few_modules(suburb_drive: tuple[list[Frame], Array], registration: str, most: int) -> None:
     """Between the recording and the recorded pose; functions of `geometry` and nouns are no stops.
 

@@ -15,9 +15,8 @@ from dpm2_core.frame import Array, Frame, Image, Points, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.slam.preprocess import Preprocessor, PreprocessSettings, Scan
 from dpm2_core.slam.registration.fused import FusedScanRegistration
-from dpm2_core.slam.registration.icp import GeometricRegistration, GeometricSettings
+from dpm2_core.slam.registration.icp import GeometricRegistration, GeometricScanRegistration, GeometricSettings
 from dpm2_core.slam.registration.local_map import LocalMap, LocalMapSettings
-from dpm2_core.slam.registration.points import GeometricScanRegistration
 from dpm2_core.slam.registration.protocol import Prediction
 
 from ....helpers.drives import Drive
