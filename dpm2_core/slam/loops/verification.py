@@ -98,6 +98,8 @@ class Verifier:
         near = cloud[np.einsum("ij,ij->i", cloud[:, :3], cloud[:, :3]) < self._settings.range**2]
         source = near[voxel_first(near, self._settings.voxel), :3].astype(np.float64)
         result = self._registration.register(source, around, T_proposed, widen)
+        if result.ok and result.worst_sigma > self._settings.max_sigma:
+            result = self._registration.probed(source, around, result)
         if not result.ok:
             return VerificationResult(result)
         fits = self._fits(source, around, result.T_target_source)

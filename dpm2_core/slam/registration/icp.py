@@ -56,6 +56,9 @@ _FEW = 400  # points show which places of a search are likely;
 _PLACES = 6  # so many of them are registered to,
 _PART = 4  # by one point in so many; all points compare the best two
 _NEAR = (1.0, 5.0)  # m and degrees: results within are one place
+_PROBE = 1.0  # m either way along a direction that may be open
+_HELD = 1e7  # information, 1 / m2, that keeps a scan there: to less than a millimeter
+_CLOSED = 0.05  # m, standard deviation along a direction in which it fits clearly worse on either side
 
 
 class GeometricRegistration:
@@ -111,14 +114,48 @@ class GeometricRegistration:
         result = Registration(T, _covariance(H), ratio, rmse, "geometric", ok, reason)
         return with_calibration(result, target.from_nearest_scan(T))
 
+    def probed(self, source: Array, target: LocalMap, result: Registration) -> Registration:
+        """A result that leaves a direction open, after a look 1 m either way along it; unchanged if that is open.
+
+        The covariance takes the noise of normals off what they say: cautious where poles and trees are few, and needed
+        in a tunnel. A direction is closed where the scan fits clearly worse on either side, whatever else of its pose
+        may change there. Starts on either side find the better place where the first one was off.
+        """
+        b = np.concatenate([np.zeros(3), np.linalg.eigh(result.of_scene[3:, 3:])[1][:, -1]])
+        beside = [se3.exp(way * b) for way in (-_PROBE, _PROBE)]
+        found = [result, *(self.register(source, target, result.T_target_source @ T) for T in beside)]
+        best = self.likeliest(source, target, [_closed(r, b) for r in found])
+        held = _HELD * np.outer(b, b)
+        rivals = [self.register(source, target, best.T_target_source @ T, prior=held) for T in beside]
+        return best if all(self._clearly(source, target, best, rival) for rival in rivals) else result
+
+    def likeliest(self, source: Array, target: LocalMap, found: Sequence[Registration]) -> Registration:
+        """The best of several results, with the way to the farthest that is nearly as likely in its covariance."""
+        fit = [self.likelihood(source, target, r.T_target_source) for r in found]
+        ok = max(r.ok for r in found)
+        best = max(value for r, value in zip(found, fit, strict=True) if r.ok == ok)
+        # The first of equals: least motion, where a tunnel fits anywhere.
+        chosen = next(r for r, value in zip(found, fit, strict=True) if r.ok == ok and value >= best - _EQUAL)
+        likely = [r for r, value in zip(found, fit, strict=True) if r.ok == ok and value >= best - _DISTINCT]
+        return _with_spread(chosen, likely)
+
     def likelihood(self, source: Array, target: LocalMap, T: Array) -> float:
         """Mean log likelihood of the (N, 3) points at a pose T_target_source: the greater, the better a pose fits.
 
         Distances along the normals are Cauchy distributed; a point without a counterpart has a density of 1 per meter.
         """
+        return float(self._log_density(source, target, T).mean())
+
+    def _log_density(self, source: Array, target: LocalMap, T: Array) -> Array:
+        """Of each point (N,)."""
         residual, _, variance = self._matched(source, target, T, self._settings.final_gate)
-        log_density = -0.5 * np.log(variance) - np.log1p(residual * residual / variance)
-        return float(np.fmax(log_density, 0).sum() / len(source))
+        return np.fmax(-0.5 * np.log(variance) - np.log1p(residual * residual / variance), 0)
+
+    def _clearly(self, source: Array, target: LocalMap, better: Registration, worse: Registration) -> bool:
+        """Whether a result is more likely than another one by more than the points differ about it by chance."""
+        gain = self._log_density(source, target, better.T_target_source)
+        gain -= self._log_density(source, target, worse.T_target_source)
+        return bool(gain.mean() > max(_DISTINCT, 3 * gain.std() * np.sqrt(_CORRELATED / len(gain))))
 
     def _linearize(self, source: Array, target: LocalMap, T: Array, gate: float) -> tuple[Array, Array, int, float]:
         """Hessian (6, 6) and gradient (6,) for a step on the right of T, number of inliers, their rmse in m."""
@@ -162,15 +199,7 @@ class GeometricScanRegistration:
         if p.unique:
             return self._searched(scan.source, p)
         found = [self._registration.register(scan.source, self._local_map, T, p.widen, p.information) for T in p.starts]
-        if len(found) == 1:
-            return found[0]
-        fit = [self._registration.likelihood(scan.source, self._local_map, r.T_target_source) for r in found]
-        ok = max(r.ok for r in found)
-        best = max(value for r, value in zip(found, fit, strict=True) if r.ok == ok)
-        # The first of equals: least motion, where a tunnel fits anywhere.
-        chosen = next(r for r, value in zip(found, fit, strict=True) if r.ok == ok and value >= best - _EQUAL)
-        likely = [r for r, value in zip(found, fit, strict=True) if r.ok == ok and value >= best - _DISTINCT]
-        return _with_spread(chosen, likely)
+        return found[0] if len(found) == 1 else self._registration.likeliest(scan.source, self._local_map, found)
 
     def _searched(self, source: Array, prediction: Prediction) -> Registration:
         """The place that fits best, if no other one fits nearly as well."""
@@ -228,6 +257,13 @@ def _covariance(H: Array) -> Array:
 
 def _failed(T_guess: Array, reason: str) -> Registration:
     return Registration(T_guess, np.diag([0.1, 0.1, 0.1, 1.0, 1.0, 1.0]), 0.0, np.inf, "geometric", False, reason)
+
+
+def _closed(result: Registration, b: Array) -> Registration:
+    """With its position known to `_CLOSED` along a direction, b (6,)."""
+    C = result.of_scene
+    C_b = C @ b
+    return replace(result, covariance=result.covariance - np.outer(C_b, C_b) / (b @ C_b + _CLOSED**2))
 
 
 def _with_spread(chosen: Registration, likely: Sequence[Registration]) -> Registration:

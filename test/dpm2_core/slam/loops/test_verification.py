@@ -77,3 +77,14 @@ def test_along_a_tunnel_no_pose_is_accepted() -> None:
     for meters in (0.0, 1.0, 8.0):
         T = se3.inverse(poses[3]) @ poses[6] @ se3.exp(np.array([0, 0, 0, meters, 0, 0]))
         assert not v.verify(clouds[6], around, T).registration.ok
+
+
+def test_a_proposal_that_is_off_along_a_street_is_moved_to_its_place() -> None:
+    """It would stay a meter off, where the covariance leaves the street open; starts on either side of it return."""
+    clouds, poses = scans_along("city")
+    v = verifier()
+    others = [2, 3, 4, 6, 7, 8]
+    around = v.surroundings([clouds[i] for i in others], se3.inverse(poses[5]) @ poses[others])
+    found = v.verify(clouds[5], around, se3.exp(np.array([0, 0, 0, 1.5, 0, 0]))).registration
+    assert found.ok, found.reason
+    assert np.linalg.norm(found.T_target_source[:3, 3]) < 0.05  # twice the noise of the range
