@@ -65,7 +65,11 @@ class FusedScanRegistration:
         return replace(scan, description=LazyDescriptors(partial(self._neural.describe, scan.points, images)))
 
     def rejection(self, scan: Scan) -> str:
-        return self._geometric.rejection(scan)
+        reason = self._geometric.rejection(scan)
+        if not reason and scan.description is not None:
+            # The next scan, whose motion nobody knows, is registered to this one; its keyframe has them, too.
+            scan.description.get()
+        return reason
 
     def register(self, scan: Scan, prediction: Prediction) -> Registration:
         points = None
