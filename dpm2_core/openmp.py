@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How idle threads of OpenMP and OpenBLAS wait. Only the entry of a program sets it: no import changes it."""
+"""How many threads OpenMP may have, and how idle ones wait. Only the entry of a program sets it, no import."""
 
 from __future__ import annotations
 
@@ -17,3 +17,12 @@ def wait_passively() -> None:
     # some 50 us: a sleep between two small layers takes longer than both
     os.environ.setdefault("GOMP_SPINCOUNT", "20000")
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+
+def allowed(threads: int) -> int:
+    """So many threads, or as many as OMP_THREAD_LIMIT allows.
+
+    torch believes that it gets as many as it was told, and leaves the parts of the others of its results unwritten.
+    """
+    limit = os.environ.get("OMP_THREAD_LIMIT", "")
+    return min(threads, int(limit)) if limit.isdecimal() and int(limit) > 0 else threads

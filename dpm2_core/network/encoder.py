@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from dpm2_core.descriptors import Descriptors, is_level, levelling
+from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Frame, Image
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.tilt import up_of
@@ -82,7 +83,7 @@ class Encoder(nn.Module):
         """Descriptors of one frame, from its raw points and its images, if any; of a tilted sensor in level axes.
 
         Raises:
-            Dpm2Error: too few points in range.
+            Dpm2Error: too few points in range, or the result is not finite.
         """
         device = next(self.parameters()).device
         cloud, images = crop(frame.points, self.settings.points), frame.images
@@ -97,7 +98,10 @@ class Encoder(nn.Module):
         """Descriptors of a cropped (M, 3) cloud, in its own axes."""
         points = collate([build_pyramid(cloud, self.settings)])
         views = collate_views([images], self.settings.image) if self.image is not None else None
-        return self.encode_batch(points, views, device)[0]
+        made = self.encode_batch(points, views, device)[0]
+        if not np.isfinite(made.features).all():
+            raise Dpm2Error("the network's descriptors are not finite: damaged weights, or a library that fails here")
+        return made
 
     @torch.inference_mode()
     def encode_batch(self, points: PointBatch, views: Views | None, device: torch.device) -> list[Descriptors]:

@@ -42,7 +42,7 @@ class DeepPointMap2(nn.Module):
         """Descriptors of a frame's points and, if the network has an image branch, its images.
 
         Raises:
-            Dpm2Error: too few points.
+            Dpm2Error: too few points, or the result is not finite.
         """
         return self.encoder.encode(frame)
 

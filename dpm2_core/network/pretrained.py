@@ -10,6 +10,7 @@ from threading import Lock
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from dpm2_core.errors import UsageError
+from dpm2_core.openmp import allowed
 
 if TYPE_CHECKING:  # torch takes seconds to import, and the geometric SLAM does without
     from dpm2_core.network.model import DeepPointMap2
@@ -61,7 +62,7 @@ def load_once(path: Path, threads: int, load: Callable[[Path], M]) -> M:
     """
     import torch
 
-    torch.set_num_threads(threads)
+    torch.set_num_threads(allowed(threads))
     try:
         file = path.resolve(strict=True)
         stat = file.stat()

@@ -103,6 +103,15 @@ def test_padding_changes_nothing(model: DeepPointMap2, noise: np.random.Generato
     )
 
 
+def test_a_result_that_is_not_finite_is_an_error(noise: np.random.Generator) -> None:
+    """As of a library that leaves parts of its results unwritten, or of damaged weights."""
+    broken = DeepPointMap2(tiny()).eval()
+    with torch.no_grad():
+        next(broken.encoder.parameters()).fill_(torch.nan)
+    with pytest.raises(Dpm2Error, match="not finite"):
+        broken.describe(Frame(0, np.pad(boxes(noise), ((0, 0), (0, 1)))))
+
+
 @pytest.mark.parametrize("beams", [16, 32])
 def test_sparse_sensors(model: DeepPointMap2, noise: np.random.Generator, beams: int) -> None:
     """Few beams give finite descriptors."""
