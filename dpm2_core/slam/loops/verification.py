@@ -21,6 +21,7 @@ from dpm2_core.slam.registration.local_map import LocalMap, LocalMapSettings
 
 _CELL = 2.0  # m, of the grid whose lowest points are the ground
 _ABOVE = 0.5  # m over it: what stands there
+_WELL = 0.75  # fraction of that which fits where a pose is right; with less, a place beside it may fit better
 
 
 class VerificationSettings(Settings):
@@ -98,14 +99,16 @@ class Verifier:
         near = cloud[np.einsum("ij,ij->i", cloud[:, :3], cloud[:, :3]) < self._settings.range**2]
         source = near[voxel_first(near, self._settings.voxel), :3].astype(np.float64)
         result = self._registration.register(source, around, T_proposed, widen)
-        if result.ok and result.worst_sigma > self._settings.max_sigma:
-            result = self._registration.probed(source, around, result)
         if not result.ok:
             return VerificationResult(result)
-        fits = self._fits(source, around, result.T_target_source)
         standing = height_above_ground(source, _CELL, reach=0) > _ABOVE
         points = int(standing.sum())
+        fits = self._fits(source, around, result.T_target_source)
         structure = float(fits[standing].mean()) if points else 0.0
+        if result.worst_sigma > self._settings.max_sigma or structure < _WELL:
+            result = self._registration.probed(source, around, result)
+            fits = self._fits(source, around, result.T_target_source)
+            structure = float(fits[standing].mean()) if points else 0.0
         meters, degrees = se3.magnitude(se3.inverse(T_proposed) @ result.T_target_source)
         overlap_features = VerificationResult(
             replace(result, confidence=min(result.confidence, structure)), structure, points, meters, degrees
