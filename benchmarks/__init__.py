@@ -54,7 +54,6 @@ BENCHES: dict[str, Bench] = {
     "relocalise": _bench("relocalise:bench_relocalise", "source kitti threads set pairs"),
     "roads": _bench("roads:bench_roads", "source kitti threads set"),
     "sensor": _bench("sensor:bench_sensor", "source kitti"),
-    "tasks": _bench("tasks:bench_tasks", "repetitions threads set only"),
     "tilt": _bench("tilt:bench_tilt", "source kitti threads set weights pairs"),
     "traffic": _bench("traffic:bench_traffic", "repetitions threads set weights only"),
     "views": _bench("views:bench_views", "source kitti threads set"),

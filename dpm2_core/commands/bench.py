@@ -18,7 +18,7 @@ def bench(
         list[str] | None,
         typer.Argument(
             help="beside, covariance, diffslam, finetune, fleet, gaps, geometric (default), hard, imu, indoor, "
-            "loop-cost, map, memory, neural, paper, pose-graph, relocalise, roads, sensor, tasks, tilt, traffic."
+            "loop-cost, map, memory, neural, paper, pose-graph, relocalise, roads, sensor, tilt, traffic."
         ),
     ] = None,
     source: Annotated[
@@ -47,7 +47,7 @@ def bench(
     ] = None,
     only: Annotated[
         str | None,
-        typer.Option(help="finetune, fleet, neural, tasks, traffic: this part alone; else those that NAME.json lacks."),
+        typer.Option(help="finetune, fleet, neural, traffic: this part alone; else those that NAME.json lacks."),
     ] = None,
 ) -> None:
     """Measure accuracy and speed beside KISS-ICP on the same scans, memory over a long drive, or the network."""

@@ -182,7 +182,7 @@ def test_a_packed_excerpt_is_unpacked_for_as_long_as_the_run_lasts(sequence: Pat
 def test_what_cannot_be_measured_is_rejected(sequence: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"speed: no such benchmark; choose from .*geometric, .*neural"):
         bench(["geometric", "speed"])
-    for name, ignored in (("tasks", "source"), ("geometric", "weights"), ("pose-graph", "set"), ("map", "pairs")):
+    for name, ignored in (("diffslam", "source"), ("geometric", "weights"), ("pose-graph", "set"), ("map", "pairs")):
         argument = {"settings" if ignored == "set" else ignored: [sequence]}
         with pytest.raises(UsageError, match=f"--{ignored}: benchmark {name} has no use for it; it takes --"):
             bench([name], out=tmp_path, **argument)
