@@ -218,13 +218,13 @@ if os.getuid() == 0:
     os.setuid(65534)  # root may write anywhere
 with MapStore.open(path) as reader:
     data = load_map(reader)
-    print(len(data), len(data.sessions), len(data.clouds[0]))
+    print(len(data), len(data.sessions), len(data.clouds[0]), flush=True)
 attempts = (lambda: MapStore.open(path, read_only=False).begin_session(), lambda: MapStore.create(path.parent / "b"))
 for attempt in attempts:
     try:
         attempt()
     except Dpm2Error as error:
-        print(str(path.parent) in str(error), len(str(error).splitlines()))
+        print(str(path.parent) in str(error), len(str(error).splitlines()), flush=True)
 os._exit(0)
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
