@@ -262,7 +262,7 @@ def _failed(T_guess: Array, reason: str) -> Registration:
 def _closed(result: Registration, b: Array) -> Registration:
     """With its position known to `_CLOSED` along a direction, b (6,), or better, where it is already."""
     C_b = result.of_scene @ b
-    variance = b @ C_b
+    variance = float(b @ C_b)
     excess = max(variance - _CLOSED**2, 0.0) / variance**2
     return replace(result, covariance=result.covariance - excess * np.outer(C_b, C_b))
 
