@@ -24,6 +24,7 @@ from dpm2_core.data.source import Source
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.evaluation.record import REPOSITORY, write_record
 from dpm2_core.frame import Array, Frame
+from dpm2_core.openmp import allowed
 from dpm2_core.slam.settings import Config, SlamSettings
 
 
@@ -152,7 +153,7 @@ def torch_threads(number: int) -> Iterator[None]:
     import torch
 
     before = torch.get_num_threads()
-    torch.set_num_threads(number)
+    torch.set_num_threads(allowed(number))
     try:
         yield
     finally:

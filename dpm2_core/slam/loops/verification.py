@@ -103,25 +103,24 @@ class Verifier:
             return VerificationResult(result)
         standing = height_above_ground(source, _CELL, reach=0) > _ABOVE
         points = int(standing.sum())
-        fits = self._fits(source, around, result.T_target_source)
-        structure = float(fits[standing].mean()) if points else 0.0
+        share, structure = self._shares(source, around, result.T_target_source, standing)
         if result.worst_sigma > self._settings.max_sigma or structure < _WELL:
             result = self._registration.probed(source, around, result)
-            fits = self._fits(source, around, result.T_target_source)
-            structure = float(fits[standing].mean()) if points else 0.0
+            share, structure = self._shares(source, around, result.T_target_source, standing)
         meters, degrees = se3.magnitude(se3.inverse(T_proposed) @ result.T_target_source)
         overlap_features = VerificationResult(
             replace(result, confidence=min(result.confidence, structure)), structure, points, meters, degrees
         )
-        reason = self._objection(overlap_features, float(fits.mean()), widen)
+        reason = self._objection(overlap_features, share, widen)
         return replace(
             overlap_features, registration=replace(overlap_features.registration, ok=not reason, reason=reason)
         )
 
-    def _fits(self, source: Array, around: LocalMap, T: Array) -> NDArray[np.bool_]:
-        """Which points (N,) lie on a surface of the map."""
+    def _shares(self, source: Array, around: LocalMap, T: Array, standing: NDArray[np.bool_]) -> tuple[float, float]:
+        """Fractions that lie on a surface of the map: of the points (N, 3), and of those that stand above the ground."""
         residual, _, spread = around.match(source @ T[:3, :3].T + T[:3, 3], self._gate)
-        return residual**2 < 9 * (self._noise**2 + spread)  # False for NaN
+        fits = residual**2 < 9 * (self._noise**2 + spread)  # False for NaN
+        return float(fits.mean()), float(fits[standing].mean()) if standing.any() else 0.0
 
     def _objection(self, e: VerificationResult, share: float, widen: float) -> str:
         """Why it is not accepted; empty if it is."""

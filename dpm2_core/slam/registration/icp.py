@@ -127,7 +127,9 @@ class GeometricRegistration:
         best = self.likeliest(source, target, [_closed(r, b) for r in found])
         held = _HELD * np.outer(b, b)
         rivals = [self.register(source, target, best.T_target_source @ T, prior=held) for T in beside]
-        return best if all(self._clearly(source, target, best, rival) for rival in rivals) else result
+        density = self._log_density(source, target, best.T_target_source)
+        gains = [density - self._log_density(source, target, rival.T_target_source) for rival in rivals]
+        return best if all(_is_clear(gain) for gain in gains) else result
 
     def likeliest(self, source: Array, target: LocalMap, found: Sequence[Registration]) -> Registration:
         """The best of several results, with the way to the farthest that is nearly as likely in its covariance."""
@@ -150,12 +152,6 @@ class GeometricRegistration:
         """Of each point (N,)."""
         residual, _, variance = self._matched(source, target, T, self._settings.final_gate)
         return np.fmax(-0.5 * np.log(variance) - np.log1p(residual * residual / variance), 0)
-
-    def _clearly(self, source: Array, target: LocalMap, better: Registration, worse: Registration) -> bool:
-        """Whether a result is more likely than another one by more than the points differ about it by chance."""
-        gain = self._log_density(source, target, better.T_target_source)
-        gain -= self._log_density(source, target, worse.T_target_source)
-        return bool(gain.mean() > max(_DISTINCT, 3 * gain.std() * np.sqrt(_CORRELATED / len(gain))))
 
     def _linearize(self, source: Array, target: LocalMap, T: Array, gate: float) -> tuple[Array, Array, int, float]:
         """Hessian (6, 6) and gradient (6,) for a step on the right of T, number of inliers, their rmse in m."""
@@ -236,6 +232,11 @@ class GeometricScanRegistration:
         if wanted:
             self._local_map.insert(scan.cloud, T_odom_lidar)
         return wanted
+
+
+def _is_clear(gain: Array) -> bool:
+    """Whether log likelihoods of the points (N,) differ by more than by chance."""
+    return bool(gain.mean() > max(_DISTINCT, 3 * gain.std() * np.sqrt(_CORRELATED / len(gain))))
 
 
 def _close(T: Array, T_other: Array) -> bool:
