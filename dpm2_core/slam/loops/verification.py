@@ -117,7 +117,7 @@ class Verifier:
         )
 
     def _shares(self, source: Array, around: LocalMap, T: Array, standing: NDArray[np.bool_]) -> tuple[float, float]:
-        """Fractions that lie on a surface of the map: of the points (N, 3), and of those that stand above the ground."""
+        """Fractions that lie on a surface of the map: of the points (N, 3), and of those that stand."""
         residual, _, spread = around.match(source @ T[:3, :3].T + T[:3, 3], self._gate)
         fits = residual**2 < 9 * (self._noise**2 + spread)  # False for NaN
         return float(fits.mean()), float(fits[standing].mean()) if standing.any() else 0.0
