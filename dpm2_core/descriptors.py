@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dpm2_core.errors import Dpm2Error
+
 _LEVEL = np.cos(np.radians(5))  # a tilt that is smaller is that of the road
 
 
@@ -98,10 +100,11 @@ def _turned(axis: NDArray[np.float32], R: NDArray[np.float32]) -> NDArray[np.flo
 class LazyDescriptors:
     """Descriptors of a scan, made when they are first needed: that takes the network as long as all else together."""
 
-    def __init__(self, make: Callable[[], Descriptors | None]) -> None:
-        """`make`: gives None for a scan that has too few points."""
-        self._make: Callable[[], Descriptors | None] | None = make
+    def __init__(self, make: Callable[[], Descriptors]) -> None:
+        """`make`: raises Dpm2Error for a scan that has none, such as one of too few points."""
+        self._make: Callable[[], Descriptors] | None = make
         self._value: Descriptors | None = None
+        self._problem = ""
 
     @property
     def made(self) -> bool:
@@ -109,10 +112,19 @@ class LazyDescriptors:
         return self._make is None
 
     def get(self) -> Descriptors | None:
-        """The descriptors; None of a scan that has too few points."""
+        """The descriptors; None of a scan that has none, for the reason that `problem` gives."""
         if self._make is not None:
-            self._value, self._make = self._make(), None  # which held the scan's points
+            try:
+                self._value = self._make()
+            except Dpm2Error as error:
+                self._problem = str(error)
+            self._make = None  # which held the scan's points
         return self._value
+
+    @property
+    def problem(self) -> str:
+        """Why there are none; empty if there are some, or if they were not needed yet."""
+        return self._problem
 
 
 def merge(sets: Sequence[Descriptors]) -> Descriptors:

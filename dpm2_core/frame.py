@@ -217,6 +217,11 @@ class Registration:
         """Standard deviation of the position in the direction that the scene leaves most open, m."""
         return float(np.sqrt(max(np.linalg.eigvalsh(self.of_scene[3:, 3:])[-1], 0.0)))
 
+    @property
+    def open_direction(self) -> Array:
+        """(3,) unit vector in the source's axes: where the scene determines the position least."""
+        return np.linalg.eigh(self.of_scene[3:, 3:])[1][:, -1]
+
 
 class State(StrEnum):
     """Health of the odometry and of the localization in a map, as published in /diagnostics."""

@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dpm2_core.descriptors import Descriptors, levelling, merge
+from dpm2_core.descriptors import Descriptors, LazyDescriptors, levelling, merge
+from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 
@@ -74,3 +75,21 @@ def test_merged_sets_have_one_way_up(noise: np.random.Generator) -> None:
     low = np.abs(plain.xyz[:, 2]) < np.linalg.norm(plain.xyz[:, :2], axis=1)
     np.testing.assert_allclose(both.axes[30:][low], both.axes[:30][low], atol=0.05)  # twice the 0.02 rad at 45 degrees
     np.testing.assert_allclose(both.axes[:30], one.axes, atol=1e-5)
+
+
+def test_lazy_descriptors_are_made_once_and_say_why_there_are_none(noise: np.random.Generator) -> None:
+    asked = []
+
+    def fails() -> Descriptors:
+        asked.append(1)
+        raise Dpm2Error("scan has 3 points")
+
+    lazy = LazyDescriptors(fails)
+    assert (lazy.made, lazy.problem, asked) == (False, "", [])
+    assert lazy.get() is None
+    assert lazy.get() is None
+    assert (lazy.made, lazy.problem, asked) == (True, "scan has 3 points", [1])
+    some = level(noise)
+    found = LazyDescriptors(lambda: some)
+    assert found.get() is some
+    assert found.problem == ""

@@ -63,3 +63,14 @@ def test_nouns_cannot_be_changed() -> None:
     frame = Frame(stamp=0, points=np.zeros((1, 4), np.float32))
     with pytest.raises(AttributeError):
         frame.stamp = 1  # type: ignore[misc]
+
+
+def test_the_open_direction_is_that_of_the_largest_uncertainty_of_the_scene() -> None:
+    """The uncertainty that grew with the motion, equal in all directions, says nothing of the scene."""
+    axis = np.array([0.6, 0.8, 0.0])
+    scene = np.diag(np.full(6, 1e-4))
+    scene[3:, 3:] += 0.25 * np.outer(axis, axis)
+    floor = (0.01, 0.3)
+    result = Registration(np.eye(4), scene + np.diag(np.repeat(floor, 3) ** 2), floor=floor)
+    assert abs(result.open_direction @ axis) == pytest.approx(1.0)
+    assert result.worst_sigma == pytest.approx(np.sqrt(0.25 + 1e-4))

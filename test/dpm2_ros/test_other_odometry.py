@@ -140,7 +140,8 @@ def test_late_stopping_and_coming_back(robot: Callable[..., Robot], drive: Any) 
     for n in range(3):
         r.turn_wheels(n)  # too late
     r.send(*range(3, 7))
-    assert "too long" in r.status(lambda s: "going on without" not in s.message).message
+    known = r.status(lambda s: "too long" in s.message)  # only "in use" until the ways of a few clouds are known
+    assert "going on without" not in known.message
     r.send(7, 8, wheels=False)
     assert "ends 0." in r.status(lambda s: "going on without" in s.message).message
     for n in (7, 8):

@@ -16,6 +16,7 @@ import numpy as np
 from pydantic import Field
 
 from dpm2_core.config import Settings
+from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Array, Edge, Keyframe, Points, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.scale import is_room
@@ -85,10 +86,13 @@ class LoopCloser:
         return None if self._places is None else self._places.channels
 
     def described(self, keyframe: Keyframe) -> Keyframe:
-        """The keyframe with descriptors, of its cloud where its registration made none."""
+        """The keyframe with descriptors, of its cloud where its registration made none; as it is if that has none."""
         if keyframe.descriptors is not None or self._places is None:
             return keyframe
-        return replace(keyframe, descriptors=self._places.describe(keyframe.cloud))
+        try:
+            return replace(keyframe, descriptors=self._places.describe(keyframe.cloud))
+        except Dpm2Error:  # too few points: no loop begins there, and none ends there
+            return keyframe
 
     def close(self, keyframes: Sequence[Keyframe], clouds: Sequence[Points], poses: Array) -> list[Edge]:
         """Try to close loops with the last keyframe.

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpm2_core.descriptors import Descriptors, merge
-from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Array, Frame, Keyframe, Points, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.slam.loops.retrieval import PlaceIndex, pooled
@@ -39,15 +38,15 @@ class PlaceRecognition:
         """Width of the features that it makes."""
         return self._network.settings.channels
 
-    def describe(self, points: Points) -> Descriptors | None:
-        """Descriptors of a cloud (M, 4); None if it has too few points.
+    def describe(self, points: Points) -> Descriptors:
+        """Descriptors of a cloud (M, 4).
 
         A keyframe's cloud, downsampled as it is, gives descriptors that serve as well as those of the whole scan.
+
+        Raises:
+            Dpm2Error: it has none.
         """
-        try:
-            return self._network.describe(Frame(0, points))
-        except Dpm2Error:
-            return None
+        return self._network.describe(Frame(0, points))
 
     def update(self, keyframes: Sequence[Keyframe]) -> None:
         """Take in those that are new."""

@@ -16,6 +16,7 @@ from pydantic import Field
 
 from dpm2_core.config import Settings
 from dpm2_core.descriptors import Descriptors
+from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Array, Keyframe, Points, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.voxel import voxel_first
@@ -88,9 +89,10 @@ class Relocalizer:
             descriptors: of the cloud, if they are known already.
         """
         s = self._settings
-        descriptors = descriptors or self._places.describe(cloud)
-        if descriptors is None:
-            return nowhere(f"{len(cloud)} points: too few for descriptors")
+        try:
+            descriptors = descriptors or self._places.describe(cloud)
+        except Dpm2Error as error:
+            return nowhere(str(error))
         allowed = np.ones(len(self), bool)
         if hint is not None:  # as on a plan: who points at a map on a screen gives no height
             allowed = np.linalg.norm(self._poses[:, :2, 3] - hint[:2, 3], axis=1) <= s.hint_radius

@@ -198,9 +198,9 @@ class TiledRelocalizer:
         settings: RelocalizationSettings,
         tiles: TiledMap,
         make: Callable[[MapData], Relocalizer],
-        describe: Callable[[Points], Descriptors | None],
+        describe: Callable[[Points], Descriptors],
     ) -> None:
-        """`make`: for a map that is in memory. `describe`: descriptors of a cloud; None of too few points."""
+        """`make`: for a map that is in memory. `describe`: descriptors of a cloud; Dpm2Error where it has none."""
         self._settings, self._tiles, self._make, self._describe = settings, tiles, make, describe
         self._here: Relocalizer | None = None
 
@@ -210,9 +210,10 @@ class TiledRelocalizer:
         Raises:
             Dpm2Error: a square is missing or damaged.
         """
-        descriptors = descriptors or self._describe(cloud)
-        if descriptors is None:
-            return nowhere(f"{len(cloud)} points: too few for descriptors")
+        try:
+            descriptors = descriptors or self._describe(cloud)
+        except Dpm2Error as error:
+            return nowhere(str(error))
         if hint is None:
             tiles = self._tiles.like(pooled(descriptors), self._settings.candidates)
         else:

@@ -121,7 +121,7 @@ class GeometricRegistration:
         in a tunnel. A direction is closed where the scan fits clearly worse on either side, whatever else of its pose
         may change there. Starts on either side find the better place where the first one was off.
         """
-        b = np.concatenate([np.zeros(3), np.linalg.eigh(result.of_scene[3:, 3:])[1][:, -1]])
+        b = np.concatenate([np.zeros(3), result.open_direction])
         beside = [se3.exp(way * b) for way in (-_PROBE, _PROBE)]
         found = [result, *(self.register(source, target, result.T_target_source @ T) for T in beside)]
         best = self.likeliest(source, target, [_closed(r, b) for r in found])

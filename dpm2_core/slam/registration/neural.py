@@ -12,7 +12,6 @@ from pydantic import Field
 
 from dpm2_core.config import Settings
 from dpm2_core.descriptors import Descriptors, LazyDescriptors
-from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Array, Frame, Image, Points, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.voxel import voxel_first
@@ -80,15 +79,18 @@ class NeuralScanRegistration:
         images = frame.images if self.uses_images else ()
         return Scan(points, description=LazyDescriptors(partial(self.describe, points, images)))
 
-    def describe(self, points: Points, images: tuple[Image, ...] = ()) -> Descriptors | None:
-        """The descriptors of a prepared scan (P, 4); None of too few points."""
-        try:
-            return self._model.describe(Frame(0, points, images=images))
-        except Dpm2Error:
-            return None
+    def describe(self, points: Points, images: tuple[Image, ...] = ()) -> Descriptors:
+        """The descriptors of a prepared scan (P, 4).
+
+        Raises:
+            Dpm2Error: it has none.
+        """
+        return self._model.describe(Frame(0, points, images=images))
 
     def rejection(self, scan: Scan) -> str:
-        return "" if scan.descriptors is not None else f"{len(scan.points)} points: too few for descriptors"
+        if scan.description is None:
+            return "no descriptors"
+        return "" if scan.descriptors is not None else scan.description.problem
 
     def register(self, scan: Scan, prediction: Prediction) -> Registration:
         T_predicted = prediction.starts[0]

@@ -138,7 +138,7 @@ class VisualScanRegistration:
     def _along(self, result: Registration, image: Image, information: Array | None) -> Registration:
         """The result moved along its open direction to where the images agree; unchanged if they do not."""
         s = self._settings
-        axis = np.linalg.eigh(result.covariance[3:, 3:])[1][:, -1]
+        axis = result.open_direction
         b = np.concatenate([np.zeros(3), axis])
         reach = s.reach
         if information is not None:

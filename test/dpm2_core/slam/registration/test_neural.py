@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -12,7 +13,7 @@ import pytest
 import torch
 
 from dpm2_core.descriptors import Descriptors, LazyDescriptors
-from dpm2_core.errors import UsageError
+from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Frame, State
 from dpm2_core.geometry import se3
 from dpm2_core.network.model import DeepPointMap2
@@ -58,7 +59,12 @@ def descriptors(noise: np.random.Generator) -> Descriptors:
 
 
 def lazy(value: Descriptors | None) -> LazyDescriptors:
-    return LazyDescriptors(lambda: value)
+    def make() -> Descriptors:
+        if value is None:
+            raise Dpm2Error("too few points")
+        return value
+
+    return LazyDescriptors(make)
 
 
 def around(places: DescriptorMap, T: np.ndarray, frames: int = 2) -> tuple[np.ndarray, Descriptors]:
@@ -110,6 +116,16 @@ def test_frames_are_described_when_they_are_registered_to(noise: np.random.Gener
     empty = DescriptorMap(Spacing(3, 0), radius=20)
     empty.insert(lazy(None), np.eye(4))
     assert empty.around(np.eye(4), 2) is None
+
+
+def test_a_fault_of_the_network_reaches_the_user_in_its_own_words(noise: np.random.Generator) -> None:
+    broken = DeepPointMap2(tiny()).eval()
+    with torch.no_grad():
+        next(broken.encoder.parameters()).fill_(torch.nan)
+    registration = NeuralScanRegistration(NeuralSettings(), Preprocessor(PreprocessSettings()), broken)
+    scan = registration.prepare(Frame(0, cloud(boxes(noise))), np.zeros(6))
+    assert "not finite" in registration.rejection(scan)
+    assert "not finite" in registration.register(scan, Prediction([np.eye(4)])).reason
 
 
 def test_memory_is_bounded(noise: np.random.Generator) -> None:
@@ -164,7 +180,7 @@ def test_bad_frames_are_rejected_in_words_and_survived(weights: Path, noise: np.
     tracked = [slam.process(frame).odometry for frame in frames]
     for t in (tracked[0], *tracked[4:7]):
         assert not t.registration.ok
-        assert "too few for descriptors" in t.registration.reason
+        assert re.search(r"scan has \d+ points within .* m, want \d+", t.registration.reason)
     assert tracked[6].state == State.DEGRADED
     assert tracked[-1].registration.ok
     assert all(np.isfinite(t.T_odom_lidar).all() and np.isfinite(t.covariance).all() for t in tracked)
