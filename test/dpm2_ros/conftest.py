@@ -18,7 +18,9 @@ from typing import Any
 import numpy as np
 import pytest
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from nav_msgs.msg import Odometry
+from rcl_interfaces.srv import GetParameters
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -150,6 +152,7 @@ class Harness:
         ros_context(["--ros-args", *pairs, *remap], domain)
         self.node = rclpy.create_node("tester", use_global_arguments=False)
         self.received: dict[str, list[Any]] = {}
+        self._clients: dict[str, Any] = {}
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self.node)
         self._closing: list[Any] = []
@@ -189,6 +192,81 @@ class Harness:
         return self.node.create_publisher(
             kind, topic, QoSProfile(depth=50, reliability=reliability, durability=durability)
         )
+
+    def call(self, kind: type, name: str, **fields: Any) -> Any:
+        """The reply of a node's service, of which the request goes out once: it need not be one that may come twice.
+
+        Fast DDS drops a reply where the server has not found the client's reader within 0.1 s, as may be on a busy
+        machine, and does not tell the client. Readers are announced in the order in which they were made: once the node
+        has replied to one that was made later, it knows the first.
+        """
+        if name not in self._clients:
+            self._clients[name] = self.node.create_client(kind, name)
+            probe = self.node.create_client(GetParameters, f"{name.rpartition('/')[0]}/get_parameters")
+            self._reply(probe, GetParameters.Request(), again=3.0)
+        return self._reply(self._clients[name], kind.Request(**fields))
+
+    def _reply(self, client: Any, request: Any, again: float = float("inf")) -> Any:
+        """`again`: s without a reply after which the request is sent once more."""
+        self.wait(client.service_is_ready, client.srv_name)
+        sent, futures = 0.0, list[Any]()
+
+        def replies() -> list[Any]:
+            nonlocal sent
+            if not futures or time.monotonic() - sent > again:
+                sent = time.monotonic()
+                futures.append(client.call_async(request))
+            return [future.result() for future in futures if future.done()]
+
+        self.wait(replies, f"the reply of {client.srv_name}")
+        return replies()[0]
+
+    @property
+    def diagnostics(self) -> list[DiagnosticArray]:
+        """What has come of /diagnostics, since this was asked for first."""
+        topic = "/diagnostics"
+        return self.received[topic] if topic in self.received else self.hear(DiagnosticArray, topic)
+
+    def status(
+        self, part: str, condition: Callable[[DiagnosticStatus], Any] = bool, since: int | None = None
+    ) -> DiagnosticStatus:
+        """The first status for which something holds, once there is one.
+
+        A message may tell of the time before what a test has just done: the condition says what is waited for.
+
+        Args:
+            part: how its name ends. since: number of the first message that counts; None: the last that has come.
+        """
+        heard = self.diagnostics
+        begin = max(len(heard) - 1, 0) if since is None else since
+        last, found = "none", list[DiagnosticStatus]()
+
+        def look() -> bool:
+            nonlocal begin, last
+            for message in heard[begin:]:
+                begin += 1
+                statuses = [status for status in message.status if status.name.endswith(part)]
+                found.extend(filter(condition, statuses))
+                last = repr(statuses[-1]) if statuses else last
+            return bool(found)
+
+        try:
+            self.wait(look, f"a status of {part}")
+        except AssertionError as error:
+            raise AssertionError(f"{error}; the last: {last}") from None
+        return found[0]
+
+    def find(self, name: str) -> None:
+        """Until a node elsewhere has found all that is heard here; what it sends before that is lost.
+
+        A reader that was announced after the others has its diagnostics.
+        """
+        told: list[str] = []
+        add = lambda message: told.extend(status.name for status in message.status)  # noqa: E731
+        reader = self.node.create_subscription(DiagnosticArray, "/diagnostics", add, 10)
+        self._executor.wake()
+        self.wait(lambda: any(one.startswith(f"{name}: ") for one in told), f"the diagnostics of {name}")
+        self.node.destroy_subscription(reader)
 
     @staticmethod
     def wait(condition: Callable[[], Any], what: str, timeout: float = 90.0) -> None:
@@ -260,7 +338,7 @@ def mapper(ros: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def run() -> Callable[..., subprocess.CompletedProcess[str]]:
     """Runs one of the executables to its end: run("slam_node", *arguments)."""
 
-    def finish(name: str, *arguments: str, timeout: float = 60.0) -> subprocess.CompletedProcess[str]:
+    def finish(name: str, *arguments: str, timeout: float = 180.0) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-m", "dpm2_ros.executables", name, *arguments]
         environment = ros_environment(new_domain())
         return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=timeout, check=False)

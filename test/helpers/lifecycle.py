@@ -13,22 +13,17 @@ class Manager:
     """What a lifecycle manager does with a node, over its services."""
 
     def __init__(self, harness: Any, name: str) -> None:
-        self._harness = harness
-        self._change = harness.node.create_client(ChangeState, f"{name}/change_state")
-        self._state = harness.node.create_client(GetState, f"{name}/get_state")
-
-    def _call(self, client: Any, request: Any) -> Any:
-        self._harness.wait(client.service_is_ready, client.srv_name)
-        future = client.call_async(request)
-        self._harness.wait(future.done, client.srv_name)
-        return future.result()
+        self._harness, self._name = harness, name
 
     def change(self, *transitions: int) -> bool:
         """Whether all of them were made."""
-        requests = (ChangeState.Request(transition=Transition(id=transition)) for transition in transitions)
-        return all(bool(self._call(self._change, request).success) for request in requests)
+        made = (Transition(id=transition) for transition in transitions)
+        return all(self._call(ChangeState, "change_state", transition=one).success for one in made)
 
     @property
     def state(self) -> str:
         """Its label."""
-        return str(self._call(self._state, GetState.Request()).current_state.label)
+        return str(self._call(GetState, "get_state").current_state.label)
+
+    def _call(self, kind: type, service: str, **fields: Any) -> Any:
+        return self._harness.call(kind, f"{self._name}/{service}", **fields)

@@ -1,0 +1,24 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Conditions that a test waits for in /diagnostics."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from diagnostic_msgs.msg import DiagnosticStatus
+
+
+def figures(status: DiagnosticStatus) -> dict[str, str]:
+    """Its values by their keys."""
+    return {value.key: value.value for value in status.values}
+
+
+def having(**expected: object) -> Callable[[DiagnosticStatus], bool]:
+    """Whether a status has these figures."""
+    wanted = {key: str(value) for key, value in expected.items()}
+    return lambda status: wanted.items() <= figures(status).items()
+
+
+def saying(text: str) -> Callable[[DiagnosticStatus], bool]:
+    """Whether a status has that in its message."""
+    return lambda status: text in status.message
