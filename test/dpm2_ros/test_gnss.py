@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import NavSatFix, PointCloud2
 
@@ -18,6 +18,8 @@ from dpm2_core.geometry import geodesy, se3
 from dpm2_ros.conversions import header, transform_to_msg
 from dpm2_ros.slam_node import SlamNode
 from dpm2_ros.tf import TFMessage
+
+from ..helpers.diagnostics import having
 
 T_BASE_LIDAR = se3.exp([0.0, 0.0, 0.3, 0.8, 0.0, 1.2])
 T_LIDAR_ANTENNA = se3.exp([0.0, 0.0, 0.0, -0.5, 0.2, 0.4])
@@ -44,16 +46,11 @@ def test_fixes_place_the_map_on_earth(ros: Callable[..., Any], drive: Any, monke
     static = harness.publisher(TFMessage, "/tf_static", latched=True)
     places = [("base_link", "lidar", T_BASE_LIDAR), ("lidar", "gnss", T_LIDAR_ANTENNA)]
     static.publish(TFMessage(transforms=[transform_to_msg(T, 0, parent, child) for parent, child, T in places]))
-    odom, diagnostics = harness.hear(Odometry, "/dpm2/odom"), harness.hear(DiagnosticArray, "/diagnostics")
+    odom = harness.hear(Odometry, "/dpm2/odom")
     node: SlamNode = harness.add(SlamNode())
     harness.wait(lambda: lidar.get_subscription_count() and receiver.get_subscription_count(), "subscriptions")
     harness.wait(lambda: "gnss" in node.calibration.transforms.frames, "/tf_static")
-
-    def status() -> list[DiagnosticStatus]:
-        found = diagnostics[-1].status if diagnostics else []
-        return [s for s in found if s.name.endswith(": gnss")]
-
-    harness.wait(lambda: status() and status()[0].message == "no fix on /fix yet", "a warning without fixes")
+    assert harness.status(": gnss", lambda s: s.message == "no fix on /fix yet").level == DiagnosticStatus.WARN
     rng = np.random.default_rng(0)
     for n in range(drive.frames):
         if n:  # of the scan before, as a receiver that takes a tenth of a second has it
@@ -67,8 +64,9 @@ def test_fixes_place_the_map_on_earth(ros: Callable[..., Any], drive: Any, monke
         harness.wait(lambda before=before: len(odom) > before, f"the odometry of cloud {n}")
     mapper = node.slam.mapper
     harness.wait(lambda: mapper.georeference is not None, "the map's place on Earth")
-    harness.wait(lambda: status() and status()[0].message == "in use", "a status in use")
-    assert sum(node.rejections.values()) >= 3 * (drive.frames - 1)
+    harness.status(": mapper", having(keyframes=drive.frames // 2, waiting=0))  # 0.8 m a scan: every second one
+    harness.status(": gnss", lambda s: s.message == "in use")
+    harness.wait(lambda: sum(node.rejections.values()) >= 3 * (drive.frames - 1), "the rejections")
     # map is the frame of the base's first pose, `base` over the ground
     known, T_start_map = mapper.georeference, se3.inverse(T_BASE_LIDAR)
     found = geodesy.enu_frame(known.origin) @ known.T_enu_map

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import Imu, PointCloud2
 
@@ -18,6 +18,8 @@ from dpm2_core.geometry import se3
 from dpm2_ros.conversions import header, transform_to_msg, vector
 from dpm2_ros.slam_node import SlamNode
 from dpm2_ros.tf import TFMessage
+
+from ..helpers.diagnostics import saying
 
 PITCH = np.radians(10.0)  # the slope that the robot stands on, nose up
 T_BASE_LIDAR = se3.exp([0.0, 0.1, 0.3, 0.8, 0.0, 1.2])
@@ -39,7 +41,7 @@ class Robot:
         static = publisher(TFMessage, "/tf_static", latched=True)
         static.publish(TFMessage(transforms=[transform_to_msg(T, 0, "base_link", n) for n, T in frames.items()]))
         self.odom = self.harness.hear(Odometry, "/dpm2/odom")
-        self.diagnostics = self.harness.hear(DiagnosticArray, "/diagnostics")
+        self.diagnostics = self.harness.diagnostics
         self.node: SlamNode = self.harness.add(SlamNode())
         self.wait(lambda: self.lidar.get_subscription_count() and self.imu.get_subscription_count(), "subscriptions")
         self.wait(lambda: "lidar" in self.node.calibration.transforms.frames, "/tf_static")
@@ -61,15 +63,10 @@ class Robot:
             self.lidar.publish(cloud)
             self.wait(lambda before=before: len(self.odom) > before, f"the odometry of cloud {n}")
 
-    def status(self, condition: Callable[[DiagnosticStatus], bool]) -> DiagnosticStatus:
+    def status(self, condition: Callable[[DiagnosticStatus], Any]) -> DiagnosticStatus:
         """Of the IMU, once it is so."""
-
-        def last() -> list[DiagnosticStatus]:
-            statuses = self.diagnostics[-1].status if self.diagnostics else []
-            return [s for s in statuses if s.name.endswith(": imu") and condition(s)]
-
-        self.wait(last, "a status of the IMU")
-        return last()[0]
+        found: DiagnosticStatus = self.harness.status(": imu", condition)
+        return found
 
 
 @pytest.fixture
@@ -94,11 +91,9 @@ def test_a_start_on_a_slope_is_level_and_one_that_stops_is_missed(robot: Callabl
         r.sample(late + 10**6 * (k == 19) + k)
     r.wait(lambda: sum(r.node.rejections.values()) >= 22, "rejections")
     r.send(3, 4)
-    assert r.status(lambda s: "in use" in s.message)
+    assert r.status(saying("in use"))
     r.send(5, 6, samples=False)
-    assert (
-        "no samples at the time of the scan; going on" in r.status(lambda s: s.level == DiagnosticStatus.WARN).message
-    )
+    assert r.status(saying("no samples at the time of the scan; going on")).level == DiagnosticStatus.WARN
     r.send(7)
     assert r.status(lambda s: s.message == "in use")
     for message in r.odom:
@@ -109,7 +104,7 @@ def test_a_start_on_a_slope_is_level_and_one_that_stops_is_missed(robot: Callabl
 def test_without_its_place_it_is_left_out_and_said(robot: Callable[..., Robot]) -> None:
     r = robot(place=False)
     r.send(0, 1)
-    said = r.status(lambda s: s.level == DiagnosticStatus.WARN).message
-    assert said.startswith("no transform from 'imu_link' to 'lidar'")
-    assert "set input.q_lidar_imu" in said
+    said = r.status(saying("set input.q_lidar_imu"))
+    assert said.message.startswith("no transform from 'imu_link' to 'lidar'")
+    assert said.level == DiagnosticStatus.WARN
     np.testing.assert_allclose(transform_matrix(r.odom[0].pose.pose)[:3, :3], np.eye(3), atol=0.01)

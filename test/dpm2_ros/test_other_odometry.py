@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import PointCloud2
 
@@ -21,6 +21,8 @@ from dpm2_core.geometry import se3
 from dpm2_ros.conversions import edge_to_msg, transform_to_msg
 from dpm2_ros.slam_node import SlamNode
 from dpm2_ros.tf import TFMessage
+
+from ..helpers.diagnostics import figures, having, saying
 
 T_BASE_LIDAR = se3.exp([0.0, 0.0, 0.2, 0.8, 0.0, 1.2])
 JUMP, SLIP = 9, 0.02  # cloud before which the wheels jump by 0.5 m; fraction by which their ways are too long
@@ -42,7 +44,7 @@ class Robot:
         static.publish(TFMessage(transforms=[transform_to_msg(T_BASE_LIDAR, 0, "base_link", "lidar")]))
         self.heard = self.harness.hear(TFMessage, "/tf")
         self.odom = self.harness.hear(Odometry, "/dpm2/odom")
-        self.diagnostics = self.harness.hear(DiagnosticArray, "/diagnostics")
+        self.diagnostics = self.harness.diagnostics
         self.node: SlamNode = self.harness.add(SlamNode())
         wheels = self.topic or self.tf
         self.wait(lambda: self.lidar.get_subscription_count() and wheels.get_subscription_count(), "subscriptions")
@@ -89,15 +91,14 @@ class Robot:
                 link[stamp_ns(t.header)] = transform_matrix(t.transform)
         return out
 
-    def status(self, condition: Callable[[DiagnosticStatus], bool]) -> DiagnosticStatus:
+    def status(self, condition: Callable[[DiagnosticStatus], Any], **options: int) -> DiagnosticStatus:
         """Of the other odometry, once it is so."""
+        found: DiagnosticStatus = self.harness.status("other odometry", condition, **options)
+        return found
 
-        def last() -> list[DiagnosticStatus]:
-            statuses = self.diagnostics[-1].status if self.diagnostics else []
-            return [s for s in statuses if s.name.endswith("other odometry") and condition(s)]
-
-        self.wait(last, "a status of the other odometry")
-        return last()[0]
+    def processed(self, count: int) -> None:
+        """Until the node is done with so many clouds: their transforms come after their odometry."""
+        self.harness.status("slam_node: odometry", having(processed=count))
 
 
 @pytest.fixture
@@ -122,11 +123,10 @@ def test_slip_and_a_jump_of_half_a_meter(robot: Callable[..., Robot], drive: Any
         T_map_base = links["map", "odom"][stamp] @ r.wheels[stamp]
         np.testing.assert_allclose(T_map_base, transform_matrix(message.pose.pose), atol=1e-6)
         assert np.linalg.norm((T_map_base - r.base(n))[:3, 3]) < ACCURATE
-    whole = lambda s: s.values[0].value == str(drive.frames)  # noqa: E731
-    said = r.status(lambda s: "outweighed" in s.message and whole(s))
+    said = r.status(saying("outweighed"), since=0)  # for a while after the jump
     assert said.level == DiagnosticStatus.WARN
     assert float(said.message.split()[1]) == pytest.approx(0.5, abs=0.05)
-    values = {value.key: value.value for value in said.values}
+    values = figures(r.status(having(**{"clouds with it": drive.frames, "without": 0})))
     assert float(values["its ways too long by (%)"]) == pytest.approx(100 * SLIP, abs=0.3)
     assert (values["clouds with it"], values["outweighed"]) == (str(drive.frames), "1")
 
@@ -136,14 +136,16 @@ def test_late_stopping_and_coming_back(robot: Callable[..., Robot], drive: Any) 
     """The drive goes on without it, /diagnostics says so, and map -> odom is sent where it is known alone."""
     r = robot("tf")
     r.send(0, 1, 2, wheels=False)
-    assert "no transform from 'base_link' to 'odom'" in r.status(lambda s: "going on without" in s.message).message
+    missing = "no transform from 'base_link' to 'odom'"
+    assert "going on without" in r.status(saying(missing)).message
+    r.processed(3)
     for n in range(3):
         r.turn_wheels(n)  # too late
     r.send(*range(3, 7))
-    known = r.status(lambda s: "too long" in s.message)  # only "in use" until the ways of a few clouds are known
-    assert "going on without" not in known.message
+    assert "going on without" not in r.status(saying("too long")).message
     r.send(7, 8, wheels=False)
-    assert "ends 0." in r.status(lambda s: "going on without" in s.message).message
+    assert "going on without" in r.status(saying("ends 0.")).message
+    r.processed(9)
     for n in (7, 8):
         r.turn_wheels(n)
     r.send(*range(9, 12))
