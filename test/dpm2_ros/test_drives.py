@@ -8,14 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Odometry
 
 from dpm2_ros import feed
 from dpm2_ros.conversions import EARLIER, edge_to_msg
 from dpm2_ros.tf import TFMessage
 
-from ..helpers.mapping import OTHER, S, core, keyframes, send_all
+from ..helpers.mapping import OTHER, S, core, keyframes, mapped, send_all
 
 
 @pytest.fixture
@@ -27,7 +26,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_two_drives_in_one_namespace_are_kept_apart(mapper: Any) -> None:
     """A forged session, or a second robot by accident: it is reported, and each gets on as if alone."""
-    mapper.hear(DiagnosticArray, "/diagnostics")
+    diagnostics = mapper.diagnostics
     send_all(mapper, 0, 1)
     mapper.wait(lambda: keyframes(mapper) == 2, "the drive")
     send_all(mapper, 0, 1, session=OTHER, shift=100.0)
@@ -40,7 +39,7 @@ def test_two_drives_in_one_namespace_are_kept_apart(mapper: Any) -> None:
     mapper.wait(apart, "both drives")
     send_all(mapper, 2, session=OTHER, shift=100.0)
     send_all(mapper, 3)
-    mapper.wait(lambda: keyframes(mapper) == 7, "both go on")
+    mapped(mapper, 7)
     drives = {name: [k.id for k in core(mapper).keyframes if k.robot == name] for name in core(mapper).robots}
     assert drives == {"": [0, 1, 2, 3], f".{OTHER}": [0, 1, 2]}
     assert len(core(mapper).edges) == 5  # none between the two
@@ -48,7 +47,7 @@ def test_two_drives_in_one_namespace_are_kept_apart(mapper: Any) -> None:
     def reported() -> bool:
         send_all(mapper, 2, session=OTHER)
         time.sleep(0.1)
-        heard = [status for m in mapper.received["/diagnostics"] for status in m.status]
+        heard = [status for m in diagnostics for status in m.status]
         return any(f"two in one namespace: .{OTHER} kept apart" in status.message for status in heard)
 
     mapper.wait(reported, "the diagnostics")
@@ -66,7 +65,7 @@ def test_what_is_left_of_an_earlier_drive_comes_before_the_next_one(mapper: Any)
         odometry.publish(edge_to_msg(np.eye(4), np.eye(6), stamp, "odom", "base"))
     time.sleep(1.0)
     send_all(mapper, 0, 1, session=OTHER, shift=100.0)  # at once, without a silence
-    mapper.wait(lambda: keyframes(mapper) == 6, "the next drive")
+    mapped(mapper, 6)
     odometry.publish(edge_to_msg(np.eye(4), np.eye(6), 77, "odom", "base"))
     time.sleep(1.0)
     assert not heard  # it is not placed yet, either
@@ -82,6 +81,6 @@ def test_a_drive_that_another_one_has_replaced_comes_back(mapper: Any) -> None:
         time.sleep(1.2)
         expected = keyframes(mapper) + len(ids)
         send_all(mapper, *ids, session=session)
-        mapper.wait(lambda n=expected: keyframes(mapper) == n, f"{ids} of {session}")
+        mapped(mapper, expected)
     assert [k.robot for k in core(mapper).keyframes] == [""] * 5
     assert [(e.from_node, e.to_node) for e in core(mapper).edges] == [(0, 1), (3, 4)]

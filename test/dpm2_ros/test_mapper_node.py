@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import MultiArrayDimension, MultiArrayLayout, UInt8MultiArray
@@ -30,7 +29,7 @@ from dpm2_ros.conversions import edge_to_msg, keyframe_name
 from dpm2_ros.keyframe_messages import descriptors_to_msg, payload_to_msgs
 from dpm2_ros.tf import TFMessage
 
-from ..helpers.mapping import S, core, keyframes, points, rejections, send_all
+from ..helpers.mapping import S, core, keyframes, mapped, points, rejections, send_all
 
 
 def test_a_fix_travels_with_its_keyframe_and_a_forged_one_does_not(mapper: Any) -> None:
@@ -80,11 +79,7 @@ def test_a_map_file_is_written_as_the_drive_goes_on(mapper: Any, tmp_path: Path)
         mapper.send(id, se3.exp([0, 0, 0, 5.0 * id, 0, 0]), points(id))
         mapper.wait(lambda expected=id + 1: keyframes(mapper) == expected, "the keyframe")
     mapper.wait(lambda: stored("drive.dpm2map") == 3, "all of them in the file")
-    client = mapper.node.create_client(Trigger, "/mapper_node/reset")
-    assert client.wait_for_service(10)
-    result = client.call_async(Trigger.Request())
-    mapper.wait(result.done, "the reset")
-    assert result.result().success
+    assert mapper.call(Trigger, "/mapper_node/reset").success
     mapper.wait(lambda: keyframes(mapper) == 0, "the empty map")  # which comes after the save
     assert read_trajectory(tmp_path / "map" / "drive" / "trajectory.tum").keys.tolist() == [1000, 1001, 1002]
     mapper.send(0, np.eye(4), points(0))
@@ -104,7 +99,7 @@ def test_a_restarted_odometry_goes_on_in_the_same_map(mapper: Any) -> None:
     """As a trajectory of its own, which nothing ties to the first; ids count on."""
     for id in (0, 1, 2, 0):
         mapper.send(id, se3.exp([0, 0, 0, 5.0 * id, 0, 0]), points(id))
-    mapper.wait(lambda: keyframes(mapper) == 4, "all four")
+    mapped(mapper, 4)
     assert [keyframe.id for keyframe in core(mapper).keyframes] == [0, 1, 2, 3]
     assert [(e.from_node, e.to_node) for e in core(mapper).edges] == [(0, 1), (1, 2)]
     assert core(mapper).T_map_odom_of("") is None
@@ -153,7 +148,6 @@ def hostile_parts(id: int) -> list[Any]:
 
 def test_nothing_under_the_name_of_a_keyframe_displaces_it(mapper: Any) -> None:
     """Unsound messages are rejected one by one, and counted by their reason; the robot's own then make its map."""
-    mapper.hear(DiagnosticArray, "/diagnostics")
     wires = dict(zip((Odometry, PointCloud2, UInt8MultiArray), mapper.wires, strict=True))
     bad = hostile_parts(1)
     for message in bad:
@@ -185,7 +179,7 @@ def test_descriptors_of_other_weights_are_made_anew(mapper: Any) -> None:
     seen, packed = payload_to_msgs(Keyframe(0, 9, 0, np.eye(4), cloud, descriptors=foreign), name, "0123456789abcdef")
     for publisher, message in zip(wire, (pose, seen, packed), strict=True):
         publisher.publish(message)
-    mapper.wait(lambda: keyframes(mapper) == 1, "the keyframe", timeout=60)
+    mapper.wait(lambda: keyframes(mapper) == 1, "the keyframe")
     assert mapper.mapper.rejections == {"/dpm2/keyframe: descriptors of other weights": 1}
     own = core(mapper).keyframes[0].descriptors
     assert own is None or not np.array_equal(own.features, foreign.features)

@@ -11,6 +11,8 @@ from dpm2_core.geometry import se3
 from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_ros.conversions import keyframe_name
 
+from .diagnostics import having
+
 S, OTHER = "5f3a9c01", "00000bad"  # sessions
 
 
@@ -22,6 +24,11 @@ def core(mapper: Any) -> Mapper:
 def keyframes(mapper: Any) -> int:
     """In the map so far."""
     return len(core(mapper).keyframes)
+
+
+def mapped(mapper: Any, count: int) -> None:
+    """Until so many keyframes are in the map, and all that has to do with them is done."""
+    mapper.status("mapper_node: mapper", having(keyframes=count, waiting=0))
 
 
 def points(seed: int) -> np.ndarray:
@@ -36,7 +43,7 @@ def send_all(mapper: Any, *ids: int, session: str = S, shift: float = 0.0) -> No
 
 def rejections(mapper: Any) -> dict[str, int]:
     """As they are published."""
-    for message in reversed(mapper.received["/diagnostics"]):
+    for message in reversed(mapper.diagnostics):
         for status in message.status:
             if status.name == "mapper_node: messages":
                 return {value.key: int(value.value) for value in status.values if value.value != "0"}
