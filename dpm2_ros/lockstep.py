@@ -29,6 +29,9 @@ ODOMETRY = "dpm2/odom"
 TIMEOUT = 10.0
 """Seconds that a cloud waits for its odometry. A node rejects one whose stamp repeats; then the next goes out."""
 _SECOND = "input.second_points_topic"
+_AGAIN = 2.0
+"""Seconds without an answer after which a node is asked once more: Fast DDS drops an answer where the node has not
+found who asks within 0.1 s, and does not say so here."""
 
 
 class Lockstep:
@@ -93,9 +96,12 @@ class Lockstep:
         try:
             if not client.wait_for_service(TIMEOUT):
                 return ""
-            future = client.call_async(GetParameters.Request(names=[_SECOND]))
-            self._executor.spin_until_future_complete(future, TIMEOUT)
-            values = future.result().values if future.done() else []
+            end, asked, answers = time.monotonic() + TIMEOUT, list[Any](), list[Any]()
+            while not answers and not STOP.is_set() and (left := end - time.monotonic()) > 0:
+                asked.append(client.call_async(GetParameters.Request(names=[_SECOND])))
+                self._executor.spin_until_future_complete(asked[-1], min(left, _AGAIN))
+                answers = [future.result() for future in asked if future.done()]
+            values = answers[0].values if answers else []
             topic: str = values[0].string_value if values else ""
             return topic and expand_topic_name(topic, name, namespace)
         finally:

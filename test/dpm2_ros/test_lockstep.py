@@ -14,8 +14,10 @@ import cv2
 import numpy as np
 import pytest
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Odometry
+from rcl_interfaces.srv import GetParameters
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.task import Future
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import PointCloud2
@@ -92,16 +94,15 @@ def test_lockstep_gives_the_trajectory_of_dpm2_run(
     settings = ["slam.visual.sigma=0.0001", "slam.visual.min_correlation=0.0", "slam.visual.distinct=0.0"]
     settings.append("slam.loops.descriptors=false")  # for which the network would be loaded
     harness = ros()
-    odometry, diagnostics = harness.hear(Odometry, "/dpm2/odom"), harness.hear(DiagnosticArray, "/diagnostics")
+    odometry = harness.hear(Odometry, "/dpm2/odom")
     environment = ros_environment(harness.node.context.get_domain_id())
     given = [*(text.replace("=", ":=") for text in settings), "ros.base_frame:=velo_link", "ros.map_directory:=''"]
     arguments = ["--ros-args", *(part for one in given for part in ("-p", one))]
     processes.append(start("slam_node", arguments, environment, tmp_path / "node"))
-    # the diagnostics say that the node knows this listener: its odometry of the first clouds would be lost otherwise
-    harness.wait(lambda: diagnostics, "the diagnostics")
+    harness.find("slam_node")  # its odometry of the first clouds would be lost otherwise
     player = start("bag_player", [str(fast_camera), "--lockstep"], environment, tmp_path / "player")
     processes.append(player)
-    assert player.wait(60) == 0, (tmp_path / "player").read_text()
+    assert player.wait(180) == 0, (tmp_path / "player").read_text()
     assert f"each of {drive.frames} clouds had its odometry" in (tmp_path / "player").read_text()
     harness.wait(lambda: len(odometry) == drive.frames, "the odometry")
 
@@ -132,8 +133,8 @@ def play(bag: Path) -> None:
 class Listener(GuardedNode):
     """Makes frames as slam_node does, and publishes an odometry for each."""
 
-    def __init__(self, second: str = "") -> None:
-        super().__init__("listener")
+    def __init__(self, second: str = "", **options: Any) -> None:
+        super().__init__("listener", **options)
         self.frames: list[Frame] = []
         settings = InputSettings(points_topic=topics.POINTS, second_points_topic=second)
         self.declare_parameter("input.second_points_topic", second)
@@ -241,6 +242,27 @@ def test_lockstep_joins_the_clouds_of_two_lidars_as_dpm2_run_does(
     assert [contents(frame) for frame in node.frames] == [contents(frame) for frame in expected]
 
 
+def test_a_node_whose_answer_is_lost_is_asked_again(ros: Callable[..., Any], bag: Path, tmp_path: Path) -> None:
+    """Which of the clouds is that of its second LiDAR."""
+    recording, asked, never = with_second(bag, tmp_path / "two", 0), [], Future()
+    node = ros().add(Listener(SECOND, start_parameter_services=False))
+
+    async def answer(request: GetParameters.Request, response: GetParameters.Response) -> GetParameters.Response:
+        asked.append(request.names)
+        if len(asked) == 1:
+            await never
+        response.values = [parameter.get_parameter_value() for parameter in node.get_parameters(request.names)]
+        return response
+
+    node.create_service(GetParameters, "~/get_parameters", answer, callback_group=ReentrantCallbackGroup())
+    try:
+        play(recording)
+    finally:
+        never.set_result(None)
+    assert asked == [["input.second_points_topic"]] * 2
+    assert [frame.stamp for frame in node.frames] == BagSource(bag).stamps.tolist()
+
+
 def test_two_lidars_of_a_node_that_does_not_say_which_is_the_second_end_it(
     ros: Callable[..., Any], bag: Path, tmp_path: Path
 ) -> None:
@@ -269,13 +291,13 @@ class Responder:
 def test_a_cloud_without_odometry_is_reported_and_the_next_goes_out(
     ros: Callable[..., Any], bag: Path, drive: Any, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(lockstep, "TIMEOUT", 0.5)
+    monkeypatch.setattr(lockstep, "TIMEOUT", 3.0)  # the odometry of the others comes within that, however busy it is
     node = Responder(ros(), lambda n: n != 5)
     with pytest.raises(Dpm2Error, match=f"1 of {drive.frames} clouds had no odometry"):
         play(bag)
     stamps = BagSource(bag).stamps.tolist()
     assert node.stamps == stamps
-    assert f"no odometry within 0.5 s for the cloud at {stamps[4] * 1e-9:.3f} s" in capfd.readouterr().err
+    assert f"no odometry within 3 s for the cloud at {stamps[4] * 1e-9:.3f} s" in capfd.readouterr().err
 
 
 def test_a_node_that_goes_away_ends_it(ros: Callable[..., Any], bag: Path) -> None:
