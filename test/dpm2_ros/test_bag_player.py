@@ -7,7 +7,6 @@ import csv
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -67,25 +66,28 @@ def listener(ros: Callable[..., Any], tmp_path: Path) -> Iterator[Listener]:
 
 
 def test_everything_arrives_as_recorded_and_in_time(listener: Listener, bag: Path, drive: Any, tmp_path: Path) -> None:
-    player = listener.play(str(bag), "--wait", "20", "--rate", "2", "--log", str(tmp_path / "times.csv"))
-    assert player.wait(60) == 0, listener.output()
-    listener.harness.wait(lambda: len(listener.clouds) == len(listener.images) == drive.frames, "every cloud and image")
+    player = listener.play(str(bag), "--wait", "90", "--rate", "2", "--log", str(tmp_path / "times.csv"))
+    assert player.wait(180) == 0, listener.output()
+    wait = listener.harness.wait
+    wait(lambda: len(listener.clouds) == len(listener.images) == drive.frames, "every cloud and image")
+    wait(lambda: len(listener.infos) == drive.frames and listener.static, "the calibration")
     source = BagSource(bag, InputSettings(vertical_angle_correction_deg=0.0))
     for message, image, frame in zip(listener.clouds, listener.images, source.frames(), strict=True):
         assert stamp_ns(message.header) == frame.stamp
         np.testing.assert_array_equal(decode_points(message)[0], frame.points)
         np.testing.assert_array_equal(decode_image(image), frame.images[0].pixels)
-    assert len(listener.infos) == drive.frames
     assert {t.child_frame_id for t in listener.static[0].transforms} >= {"velo_link", "camera_color_left"}
     with (tmp_path / "times.csv").open() as file:
-        rows = [row for row in csv.DictReader(file) if row["topic"] == topics.POINTS]
-    published = np.array([int(row["published_ns"]) for row in rows])
+        rows = list(csv.DictReader(file))
+    published = np.array([int(row["published_ns"]) for row in rows if row["topic"] == topics.POINTS])
     assert len(published) == drive.frames
-    # 0.1 s at twice the speed; on a busy machine single ones may be late, but none early
-    seconds = (published - published[0]) * 1e-9
-    assert (seconds > 0.05 * np.arange(drive.frames) - 0.02).all()
-    assert np.median(seconds - 0.05 * np.arange(drive.frames)) < 0.3
-    now = np.array([message.clock.sec * 10**9 + message.clock.nanosec for message in listener.clock])
+    # 0.1 s at twice the speed, from the first message on; on a busy machine single ones may be late, but none early
+    late = (published - int(rows[0]["published_ns"])) * 1e-9 - 0.05 * np.arange(drive.frames)
+    assert (late > -0.04).all()  # not by a period; the first one may have been late by less
+    assert np.median(late) < 0.3
+    ticks = lambda: [message.clock.sec * 10**9 + message.clock.nanosec for message in listener.clock]  # noqa: E731
+    wait(lambda: ticks()[-1:] == [source.stamps[-1]], "the last of /clock")
+    now = np.array(ticks())
     assert len(now) > 50
     assert (np.diff(now) >= -20_000_000).all()  # while it waits the clock is measured, and may be ahead by a moment
     assert now[0] >= source.stamps[0] - 20_000_000
@@ -94,20 +96,20 @@ def test_everything_arrives_as_recorded_and_in_time(listener: Listener, bag: Pat
 
 def test_start_duration_and_topics(listener: Listener, bag: Path, drive: Any) -> None:
     arguments = ["--start", "0.45", "--duration", "0.4", "--topics", topics.POINTS, "--topics", topics.TF_STATIC]
-    assert listener.play(str(bag), "--wait", "20", *arguments).wait(60) == 0, listener.output()
+    assert listener.play(str(bag), "--wait", "90", *arguments).wait(180) == 0, listener.output()
     listener.harness.wait(lambda: len(listener.clouds) >= 4, "four clouds")
+    listener.harness.wait(lambda: listener.static, "the calibration")  # it comes from wherever one starts
     stamps = BagSource(bag, InputSettings(images=False)).stamps.tolist()
     assert [stamp_ns(message.header) for message in listener.clouds] == stamps[5:9]
     assert listener.images == []
-    assert listener.static  # calibration comes from wherever one starts
 
 
 def test_it_loops_until_it_is_stopped(listener: Listener, bag: Path, drive: Any) -> None:
-    player = listener.play(str(bag), "--wait", "20", "--loop", "--rate", "8")
+    player = listener.play(str(bag), "--wait", "90", "--loop", "--rate", "8")
     listener.harness.wait(lambda: len(listener.clouds) > 2 * drive.frames, "a third round")
     player.send_signal(signal.SIGINT)
     player.send_signal(signal.SIGINT)
-    assert player.wait(10) == 0
+    assert player.wait(60) == 0
     assert "Traceback" not in listener.output()
     stamps = [stamp_ns(message.header) for message in listener.clouds]
     assert stamps[drive.frames : 2 * drive.frames] == stamps[: drive.frames]
@@ -117,12 +119,11 @@ def test_it_waits_for_subscribers(ros: Callable[..., Any], bag: Path, tmp_path: 
     """Nothing is lost to a subscriber that comes later than the player."""
     harness = ros()
     environment = ros_environment(harness.node.context.get_domain_id())
-    player = start("bag_player", [str(bag), "--wait", "30", "--rate", "4"], environment, tmp_path / "log")
+    player = start("bag_player", [str(bag), "--wait", "90", "--rate", "4"], environment, tmp_path / "log")
     try:
-        harness.wait(lambda: harness.node.count_publishers(topics.POINTS), "the player")
-        time.sleep(0.3)
+        harness.wait(lambda: "waiting 90 s" in (tmp_path / "log").read_text(), "the player")
         clouds = harness.hear(PointCloud2, topics.POINTS)
-        assert player.wait(60) == 0
+        assert player.wait(180) == 0
         harness.wait(lambda: len(clouds) == drive.frames, "every cloud")
     finally:
         player.kill()
@@ -133,7 +134,10 @@ def play_here(*arguments: str) -> int:
     return exit_code(lambda: main(arguments))
 
 
-def test_without_a_subscriber_it_says_so_and_plays(bag: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_without_a_subscriber_it_says_so_and_plays(
+    bag: Path, domain: int, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))  # where nobody listens
     assert play_here(str(bag), "--wait", "0.3", "--duration", "0.1") == 0
     assert f"playing without a subscriber to {topics.POINTS} yet" in capfd.readouterr().err
 
@@ -161,9 +165,9 @@ def test_a_truncated_bag_plays_what_is_left(listener: Listener, bag: Path, tmp_p
     (whole,) = bag.glob("*.mcap")
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(whole.read_bytes()[: whole.stat().st_size * 6 // 10])
-    assert listener.play(str(cut), "--wait", "20", "--rate", "4").wait(60) == 0, listener.output()
-    time.sleep(0.5)
-    assert 0 < len(listener.clouds) < drive.frames
+    assert listener.play(str(cut), "--wait", "90", "--rate", "4").wait(180) == 0, listener.output()
+    listener.harness.wait(lambda: listener.clouds, "what is left")
+    assert len(listener.clouds) < drive.frames
     assert "truncated" in listener.output()
 
 

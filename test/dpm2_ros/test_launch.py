@@ -86,7 +86,7 @@ def test_a_node_starts_from_a_file_of_defaults_and_empty_texts(
     try:
         harness.wait(lambda: name in harness.node.get_node_names() or process.poll() is not None, f"{name} to be there")
         process.send_signal(signal.SIGINT)
-        assert process.wait(60) == 0, (tmp_path / "log").read_text()
+        assert process.wait(180) == 0, (tmp_path / "log").read_text()
     finally:
         process.kill()
         process.wait()
@@ -271,7 +271,7 @@ def test_what_it_starts_with_lifecycle_is_managed_over_the_services(
         assert (result.problems, result.keyframes >= 3) == ([], True)
         for process in running.values():
             process.send_signal(signal.SIGINT)
-        assert {name: process.wait(60) for name, process in running.items()} == {"slam_node": 0, "mapper_node": 0}
+        assert {name: process.wait(180) for name, process in running.items()} == {"slam_node": 0, "mapper_node": 0}
     finally:
         for process in running.values():
             process.kill()

@@ -125,13 +125,13 @@ def test_rounds_keep_every_map_and_leave_nothing(
         m.harness.wait(lambda: m.keyframes, "a keyframe")
         assert m.change(DEACTIVATE, CLEANUP)
         after.append((*held(), m.entities))
-        assert not maps  # their memory is free
+        m.harness.wait(lambda: (gc.collect(), not maps)[1], "their memory to be free")
         name = "drive" if not round else f"drive-{round + 1}"
         result = check_map(tmp_path / f"{name}.dpm2map")
         assert (result.problems, result.keyframes >= 1) == ([], True)
         assert (tmp_path / name / "map.ply").is_file()
     assert m.state == "unconfigured"
-    assert after[-1] == after[2]  # not the first: what is loaded once stays
+    m.harness.wait(lambda: (*held(), m.entities) == after[2], f"no more than {after[2]}, as of {after}")
 
 
 @pytest.mark.slow
@@ -172,15 +172,14 @@ def test_a_robot_keeps_what_it_makes_while_its_mapper_is_inactive(
     made = lambda: len({pose.child_frame_id for pose in sent})  # noqa: E731
     harness.add(SlamNode())
     assert m.change(CONFIGURE, ACTIVATE)
-    lidar.send(*range(5))
-    harness.wait(lambda: m.keyframes == made() >= 2, "the first keyframes")
+    lidar.send(*range(5))  # 0.8 m apart: every second one is a keyframe
+    harness.wait(lambda: m.keyframes == made() == 3, "the first keyframes")
     assert m.change(DEACTIVATE)
     others = lambda: (harness.node.count_subscribers("/dpm2/keyframe_odom"), harness.node.count_publishers(ACKS))  # noqa: E731
     harness.wait(lambda: others() == (1, 0), "the end of its subscriptions and acknowledgments")
-    before = made()
     lidar.send(*range(5, 16))
-    harness.wait(lambda: made() >= before + 4, "keyframes of the robot")
-    assert m.keyframes <= before
+    harness.wait(lambda: made() == 8, "keyframes of the robot")
+    assert m.keyframes <= 3
     assert m.change(ACTIVATE)
     harness.wait(lambda: m.keyframes >= made(), "what was made meanwhile")
     assert m.change(DEACTIVATE, CLEANUP)
@@ -232,7 +231,7 @@ def test_the_executable_waits_and_a_signal_ends_it(ros: Callable[..., Any], tmp_
     try:
         assert Manager(harness, f"/{name}").state == "unconfigured"
         process.send_signal(signal.SIGINT)
-        assert process.wait(60) == 0, (tmp_path / "log").read_text()
+        assert process.wait(180) == 0, (tmp_path / "log").read_text()
         assert not (tmp_path / "maps").exists()
     finally:
         process.kill()

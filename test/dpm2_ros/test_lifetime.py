@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMsg
 from sensor_msgs.msg import PointCloud2
@@ -42,17 +41,15 @@ def test_slam_node_saves_its_map_when_stopped(
     environment = ros_environment(harness.node.context.get_domain_id())
     process = start("slam_node", ["--ros-args", *parameters], environment, tmp_path / "log")
     try:
-        harness.wait(
-            lambda: lidar.get_subscription_count() and harness.node.count_publishers("/dpm2/odom"), "slam_node"
-        )
-        time.sleep(0.2)
+        harness.wait(lidar.get_subscription_count, "slam_node")
+        harness.find("slam_node")
         for n in range(8):
             lidar.publish(drive.cloud(n))
         harness.wait(lambda: odometry, "odometry")
         for _ in range(times):
             process.send_signal(getattr(signal, name))
             time.sleep(0.02)
-        assert process.wait(60) == 0
+        assert process.wait(180) == 0
     finally:
         process.kill()
     output = (tmp_path / "log").read_text()
@@ -69,7 +66,7 @@ def test_stopped_while_it_imports(tmp_path: Path, domain: int) -> None:
     while not _handles_sigint(process) and process.poll() is None:
         time.sleep(0.01)
     process.send_signal(signal.SIGINT)
-    assert process.wait(60) == 0
+    assert process.wait(180) == 0
     assert (tmp_path / "log").read_text() == ""
     assert not (tmp_path / "map").exists()
 
@@ -80,7 +77,7 @@ def test_stopped_while_it_loads_the_network(ros: Callable[..., Any], tmp_path: P
     process = start("slam_node", [], ros_environment(harness.node.context.get_domain_id()), tmp_path / "log")
     harness.wait(lambda: "slam_node" in harness.node.get_node_names(), "the node")
     process.send_signal(signal.SIGINT)
-    assert process.wait(60) == 0
+    assert process.wait(180) == 0
     assert "Traceback" not in (tmp_path / "log").read_text()
 
 
@@ -102,14 +99,12 @@ def test_a_map_that_cannot_be_saved_at_the_end_is_exit_code_1(
     environment = ros_environment(harness.node.context.get_domain_id())
     process = start("slam_node", ["--ros-args", *parameters], environment, tmp_path / "log")
     try:
-        harness.wait(
-            lambda: lidar.get_subscription_count() and harness.node.count_publishers("/dpm2/odom"), "slam_node"
-        )
-        time.sleep(0.2)
+        harness.wait(lidar.get_subscription_count, "slam_node")
+        harness.find("slam_node")
         lidar.publish(drive.cloud(0))
         harness.wait(lambda: odometry, "odometry")
         process.send_signal(signal.SIGINT)
-        assert process.wait(60) == 1
+        assert process.wait(180) == 1
     finally:
         process.kill()
     output = (tmp_path / "log").read_text()
@@ -124,7 +119,7 @@ def test_a_drive_through_player_slam_node_and_mapper_node(
     """Three processes, the mapper apart: every cloud comes out, and the mapper saves the map of all keyframes."""
     harness = ros()
     odometry, keyframes = harness.hear(Odometry, "/dpm2/odom"), harness.hear(Odometry, "/dpm2/keyframe_odom", KEEP_ALL)
-    diagnostics, paths = harness.hear(DiagnosticArray, "/diagnostics"), harness.hear(PathMsg, "/dpm2/path", LAST_ONE)
+    paths = harness.hear(PathMsg, "/dpm2/path", LAST_ONE)
 
     def made() -> int:
         """Keyframes; one that the mapper has not acknowledged yet is sent again."""
@@ -139,24 +134,17 @@ def test_a_drive_through_player_slam_node_and_mapper_node(
     }
     try:
         harness.wait(lambda: harness.node.count_subscribers("/dpm2/keyframe") == 1, "the mapper")
-        # What is published before the two have found each other is lost, as always in DDS: wait until one is heard.
-        harness.wait(
-            lambda: (
-                any("slam_node" in status.name for message in diagnostics for status in message.status)
-                and harness.node.count_publishers("/dpm2/odom") == 1
-            ),
-            "slam_node",
-        )
-        slowly = ["--wait", "20", "--rate", "0.25"]  # on a busy machine, too, nothing is dropped
+        harness.find("slam_node")
+        slowly = ["--wait", "90", "--rate", "0.25"]  # on a busy machine, too, nothing is dropped
         player = start("bag_player", [str(bag), *slowly], environment, tmp_path / "player.log")
         processes["player"] = player
-        assert player.wait(60) == 0
+        assert player.wait(180) == 0
         harness.wait(lambda: len(odometry) == drive.frames, "every pose")
         processes["slam_node"].send_signal(signal.SIGINT)
-        assert processes["slam_node"].wait(60) == 0
+        assert processes["slam_node"].wait(180) == 0
         harness.wait(lambda: paths and len(paths[-1].poses) == made(), "the last keyframe in the map")
         processes["mapper_node"].send_signal(signal.SIGINT)
-        assert processes["mapper_node"].wait(60) == 0
+        assert processes["mapper_node"].wait(180) == 0
     finally:
         for process in processes.values():
             process.kill()
@@ -166,10 +154,15 @@ def test_a_drive_through_player_slam_node_and_mapper_node(
     assert made() >= 3
 
 
-def test_replay_is_checked_by_what_arrived(bag: Path, drive: Any, tmp_path: Path) -> None:
+def test_replay_is_checked_by_what_arrived(
+    bag: Path, drive: Any, domain: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """What `make demo` does: all checks hold; and without one pose, or in a wrong order of events, they do not."""
     parameters = {"ros.map_period": 0.5, "slam.keyframes.distance": 2.0, **QUICK}
     source = BagSource(bag, InputSettings(images=False))
+    for name, value in ros_environment(domain).items():  # it draws a domain, which may be that of another test
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr("tools.replay.ros_environment", lambda: ros_environment(domain))
     # Slowly: on a busy machine, too, nothing is dropped.
     result = replay(source, tmp_path, 0.25, parameters)
     outcome = evaluate_replay(source, result, tmp_path)

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
@@ -59,12 +58,13 @@ class Robot:
         self._source = open_source(recording, InputSettings(images=False))
         self.lidar = harness.publisher(PointCloud2, topics.POINTS)
         self.odom = harness.hear(Odometry, "/dpm2/odom")
-        self.diagnostics = harness.hear(DiagnosticArray, "/diagnostics")
         self.tf = harness.hear(TFMessage, "/tf")
+        self.diagnostics = harness.diagnostics
         pairs = ["input.images:=false", "ros.map_directory:=''", ODOMETRY.replace("=", ":="), *parameters]
         arguments = ["--ros-args", *(part for pair in pairs for part in ("-p", pair))]
         self.process = start("slam_node", arguments, ros_environment(harness.node.context.get_domain_id()), log)
-        harness.wait(self._ready, "slam_node", timeout=60)
+        harness.wait(self._ready, "slam_node")
+        harness.find("slam_node")
 
     def _ready(self) -> bool:
         assert self.process.poll() is None, self.log.read_text()
@@ -90,7 +90,7 @@ class Robot:
             self.send(frame)
             return condition()
 
-        self.harness.wait(again, what, timeout=40)
+        self.harness.wait(again, what, timeout=120)
 
     def message(self, part: str) -> str:
         """The last status of a part."""
@@ -104,13 +104,6 @@ class Robot:
             return np.inf
         return float(np.linalg.norm((last["odom"] @ last["lidar"] - T_map_lidar)[:3, 3]))
 
-    def call(self, kind: type, name: str, **fields: Any) -> Any:
-        client = self.harness.node.create_client(kind, name)
-        assert client.wait_for_service(timeout_sec=10)
-        future = client.call_async(kind.Request(**fields))
-        self.harness.wait(future.done, name)
-        return future.result()
-
     def point(self, T_map_lidar: Array, frame: str) -> None:
         """As RViz does."""
         message = PoseWithCovarianceStamped(header=header(0, frame))
@@ -122,7 +115,7 @@ class Robot:
     def close(self) -> int:
         self.process.send_signal(signal.SIGINT)
         try:
-            return self.process.wait(60)
+            return self.process.wait(180)
         finally:
             self.process.kill()
 
@@ -156,9 +149,7 @@ def test_finds_itself_tracks_and_notices_being_carried_off(
     r = robot(f"ros.map_file:={made}", "ros.localization_mode:=true", "slam.keyframes.distance:=2.0")
     assert "relocalising" in r.message("slam_node: localisation")
     r.send(*range(8, 17))
-    r.harness.wait(
-        lambda: r.message("slam_node: localisation").startswith(("relocalised", "tracking")), "a result", timeout=30
-    )
+    r.harness.wait(lambda: r.message("slam_node: localisation").startswith(("relocalised", "tracking")), "a result")
     r.send(17, 18)
     r.harness.wait(lambda: r.off(place(recording, 18)) < 0.1, "its place in the map")
     r.harness.wait(lambda: r.message("slam_node: localisation").startswith("tracking"), "the second result")
@@ -185,17 +176,17 @@ def test_hints_and_services_give_reasons(
     r.stand(0, lambda: r.off(np.eye(4)) < 0.2, "map -> odom")
     r.point(np.eye(4), "odom")
     r.harness.wait(lambda: "want it in frame map, not in 'odom'" in r.log.read_text(), "the warning")
-    saved = r.call(Trigger, "/slam_node/save_map")
+    saved = r.harness.call(Trigger, "/slam_node/save_map")
     assert not saved.success
     # the file goes: it cannot be loaded again, and the robot keeps what it has
     made_elsewhere = made.rename(made.with_name("gone.dpm2map"))
     try:
-        result = r.call(Trigger, "/slam_node/load_map")
+        result = r.harness.call(Trigger, "/slam_node/load_map")
         assert not result.success
         assert "no such map file" in result.message
     finally:
         made_elsewhere.rename(made)
-    loaded = r.call(Trigger, "/slam_node/load_map")
+    loaded = r.harness.call(Trigger, "/slam_node/load_map")
     assert loaded.success, loaded.message
     r.harness.wait(lambda: "relocalising" in r.message("slam_node: localisation"), "the new search")
     r.point(np.eye(4), "map")
@@ -212,22 +203,22 @@ def test_from_mapping_to_localizing_and_back(robot: Callable[..., Robot], tmp_pa
     """One node makes a map, finds itself in it, and lets it grow by a session; each response has a message."""
     path = tmp_path / "own.dpm2map"
     r = robot(f"ros.map_file:={path}", "slam.keyframes.distance:=2.0")
-    assert not r.call(Trigger, "/slam_node/load_map").success
-    growing = r.call(SetBool, "/slam_node/localization_mode", data=False)
+    assert not r.harness.call(Trigger, "/slam_node/load_map").success
+    growing = r.harness.call(SetBool, "/slam_node/localization_mode", data=False)
     assert growing.success
     assert "already" in growing.message
     r.send(*range(8))
-    localizing = r.call(SetBool, "/slam_node/localization_mode", data=True)
+    localizing = r.harness.call(SetBool, "/slam_node/localization_mode", data=True)
     assert localizing.success, localizing.message
     before = digest(path)
-    early = r.call(SetBool, "/slam_node/localization_mode", data=False)
+    early = r.harness.call(SetBool, "/slam_node/localization_mode", data=False)
     assert not early.success
     assert "relocalising" in early.message
 
     def extended() -> bool:
         r.send(8, 9)
         assert digest(path) == before
-        return r.call(SetBool, "/slam_node/localization_mode", data=False).success
+        return r.harness.call(SetBool, "/slam_node/localization_mode", data=False).success
 
     r.harness.wait(extended, "the robot in its map")
     r.send(*range(10, 20))
@@ -254,20 +245,20 @@ def test_another_map_by_its_name_while_the_node_runs(
     def named(name: str) -> Any:
         value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=name)
         request = [Parameter(name="ros.map_name", value=value)]
-        return r.call(SetParameters, "/slam_node/set_parameters", parameters=request).results[0]
+        return r.harness.call(SetParameters, "/slam_node/set_parameters", parameters=request).results[0]
 
     refused = named("../town")
     assert not refused.successful
     assert "map_name" in refused.reason
-    assert not r.call(Trigger, "/slam_node/load_map").success  # nothing is named
+    assert not r.harness.call(Trigger, "/slam_node/load_map").success  # nothing is named
     assert named("nowhere").successful
-    lost = r.call(Trigger, "/slam_node/load_map")
+    lost = r.harness.call(Trigger, "/slam_node/load_map")
     assert (lost.success, "no such map file" in lost.message) == (False, True)
     assert named("start").successful
-    assert "start.dpm2map" in r.call(Trigger, "/slam_node/save_map").message
+    assert "start.dpm2map" in r.harness.call(Trigger, "/slam_node/save_map").message
     assert named("town").successful
     before = digest(maps / "town.dpm2map")
-    loaded = r.call(Trigger, "/slam_node/load_map")
+    loaded = r.harness.call(Trigger, "/slam_node/load_map")
     assert loaded.success, loaded.message
     r.stand(12, lambda: r.off(place(recording, 12)) < 0.2, "the robot in the other map")
     assert r.close() == 0

@@ -157,12 +157,12 @@ def test_the_rviz_layout_shows_topics_that_exist() -> None:
     assert all(f'"{topic[1:]}"' in code for topic in ours)
 
 
-def test_tf2_msgs_built_here_talks_to_those_of_ros(tmp_path: Path) -> None:
+def test_tf2_msgs_built_here_talks_to_those_of_ros(domain: int) -> None:
     """The type hash is what DDS compares; this is the one that ROS 2 Jazzy's own package announces."""
     import rclpy
     from tf2_msgs.msg import TFMessage
 
-    rclpy.init(args=[], domain_id=99)
+    rclpy.init(args=[], domain_id=domain)
     try:
         node: Node = rclpy.create_node("hash")
         node.create_publisher(TFMessage, "/tf", 1)

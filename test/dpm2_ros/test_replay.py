@@ -13,8 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import pytest
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import PointCloud2
 
@@ -23,40 +22,39 @@ from dpm2_core.data.messages import stamp_ns
 from dpm2_ros.slam_node import SlamNode
 from tools.replay import ros_environment, start, stop
 
+from ..helpers.diagnostics import figures
+
 PROFILE, SEGMENT = "FASTRTPS_DEFAULT_PROFILES_FILE", 32 * 2**20
 
 
-def wait_until_idle(process: subprocess.Popen[bytes]) -> None:
-    """Until a node takes less than 0.2 s of processor time in a second; a cloud takes more, also on a busy machine."""
-    before = 0.0
-    for _ in range(60):
-        fields = Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()
-        used = (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-        if used - before < 0.2:
-            return
-        before = used
-        time.sleep(1.0)
-    pytest.fail("the node is not idle after a minute")
+def all_gone(sent: int) -> Callable[[DiagnosticStatus], bool]:
+    """Whether each of so many clouds has been processed, dropped, rejected or lost."""
+    ends = ("processed", "dropped", "rejected", "lost on the way")
+    return lambda status: sum(int(n) for what, n in figures(status).items() if what.startswith(ends)) == sent
 
 
 def test_started_at_the_same_moment_nothing_is_lost(
-    processes: list[Any], bag: Path, drive: Any, domain: int, tmp_path: Path
+    ros: Callable[..., Any], processes: list[Any], bag: Path, drive: Any, tmp_path: Path
 ) -> None:
     """The node subscribes when it is ready; no cloud waits for an import. Then too fast: what is dropped is counted."""
+    harness = ros()
+    diagnostics = harness.diagnostics
     imports = {"PYTHONPROFILEIMPORTTIME": "1"}  # each is a line of the log
-    arguments, environment = ["--ros-args", "-p", "ros.map_directory:=''"], ros_environment(domain)
+    arguments = ["--ros-args", "-p", "ros.map_directory:=''"]
+    environment = ros_environment(harness.node.context.get_domain_id())
     node = start("slam_node", arguments, environment | imports, tmp_path / "node")
     processes.append(node)
     for rate, name in (("1", "in time"), ("20", "too fast")):
-        processes.append(start("bag_player", [str(bag), "--rate", rate], environment, tmp_path / name))
-        assert processes[-1].wait(60) == 0
+        processes.append(start("bag_player", [str(bag), "--wait", "90", "--rate", rate], environment, tmp_path / name))
+        assert processes[-1].wait(180) == 0
         assert f"{drive.frames} of them clouds" in (tmp_path / name).read_text()
         if rate == "1":
             ready, _, driving = (tmp_path / "node").read_text().partition("waiting for clouds")
     assert "import time:" in ready
     assert "import time:" not in driving
-    wait_until_idle(node)  # the last clouds are on their way through it
-    assert stop(node) == 0
+    # the last clouds are on their way through it
+    harness.status("slam_node: odometry", all_gone(2 * drive.frames), since=len(diagnostics))
+    assert stop(node, 180) == 0
     account = re.search(r"(\d+) clouds sent: (\d+) processed, (.*)", (tmp_path / "node").read_text())
     assert account is not None
     parts = [int(number) for number in re.findall(r"\d+", account[3])]
@@ -69,22 +67,22 @@ def test_losses_are_in_diagnostics(ros: Callable[..., Any], drive: Any) -> None:
     """Real ones: while the executor is held up, DDS keeps as many clouds as the queue may hold, and no more."""
     harness = ros("input.images:=false", "ros.queue_depth:=2")
     lidar, odometry = harness.publisher(PointCloud2, topics.POINTS), harness.hear(Odometry, "/dpm2/odom")
-    diagnostics = harness.hear(DiagnosticArray, "/diagnostics")
+    diagnostics = harness.diagnostics
     node = harness.add(SlamNode())
     harness.wait(lambda: lidar.get_subscription_count() and node.count_subscribers("/dpm2/odom"), "the node")
     lidar.publish(drive.cloud(0))
     harness.wait(lambda: odometry, "the first")
-    holding = threading.Event()
-    harness.node.create_timer(0.05, lambda: holding.is_set() or (holding.set(), time.sleep(1.0)))
+    holding, going_on = threading.Event(), threading.Event()
+    harness.node.create_timer(0.05, lambda: holding.is_set() or (holding.set(), going_on.wait(120)))
     harness.wait(holding.is_set, "the executor to be held up")
-    for n in range(1, drive.frames):
-        lidar.publish(drive.cloud(n))
-        time.sleep(0.02)
+    try:
+        for n in range(1, drive.frames):
+            lidar.publish(drive.cloud(n))
+        time.sleep(0.5)  # until DDS has delivered them
+    finally:
+        going_on.set()
     harness.wait(lambda: stamp_ns(odometry[-1].header) == drive.stamp(drive.frames - 1), "the last")
-    seen = len(diagnostics)
-    harness.wait(lambda: len(diagnostics) > seen + 1, "diagnostics of the end")
-    (status,) = [one for one in diagnostics[-1].status if one.name.endswith("odometry")]
-    values = {value.key: value.value for value in status.values}
+    values = figures(harness.status("slam_node: odometry", all_gone(drive.frames)))
     dropped, lost = int(values["dropped (queue full)"]), int(values["lost on the way"])
     assert int(values["processed"]) + dropped + lost == int(values["received"]) + lost == drive.frames
     assert lost >= 5
@@ -116,10 +114,12 @@ def test_the_dds_profile_is_used_unless_the_user_has_one(
     }
     for n, (name, more) in enumerate(environments.items()):
         alone = {"ROS_DOMAIN_ID": str(1 + (domain + n) % 100)}  # each sees the memory of those in its domain
-        processes.append(start("bag_player", [str(bag)], inherited | alone | more, tmp_path / name))
+        given = [str(bag), "--wait", "120"]
+        processes.append(start("bag_player", given, inherited | alone | more, tmp_path / name))
     for name, process in zip(environments, processes, strict=True):
-        end = time.monotonic() + 30
-        while "waiting 30 s" not in (tmp_path / name).read_text() and time.monotonic() < end:
+        end = time.monotonic() + 90
+        while "waiting 120 s" not in (tmp_path / name).read_text():
+            assert time.monotonic() < end, (tmp_path / name).read_text()
             time.sleep(0.05)
         found[name] = segments(process)
         process.send_signal(signal.SIGINT)

@@ -87,7 +87,7 @@ def test_the_player_does_what_the_policy_allows(ros: Callable[..., Any], bag: Pa
     """With a bag of `dpm2 convert kitti`."""
     harness = ros()
     environment = ros_environment(harness.node.context.get_domain_id())
-    player = start("bag_player", [str(bag), "--wait", "60", "--lockstep"], environment, tmp_path / "log")
+    player = start("bag_player", [str(bag), "--wait", "180", "--lockstep"], environment, tmp_path / "log")
     expected = allowed("bag_player")
     expected["publisher"].discard("/imu")  # this bag has none
     try:
