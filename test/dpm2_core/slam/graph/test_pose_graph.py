@@ -155,7 +155,7 @@ def test_no_process_outlives_a_killed_program() -> None:
         assert parent.stdout.readline() == "solved\n"
         (pid,) = solvers(parent.pid)
         parent.kill()
-    for _ in range(100):
+    for _ in range(600):
         try:
             with open(f"/proc/{pid}/stat") as file:
                 if file.read().rpartition(")")[2].split()[0] == "Z":  # ended, its status is not read yet
