@@ -9,6 +9,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from dpm2_core.errors import UsageError
+
 Array = NDArray[np.float64]
 RoomKind = Literal["room", "corridor", "hall", "stairs", "deck"]
 _NARROW = 2.4
@@ -16,6 +18,7 @@ _NARROW = 2.4
 AISLE = 6.2
 """Width of the lanes of a car park, m; the rows of cars between them are `ROW` deep."""
 ROW = 10.0
+_TRIES = 50  # plans of a building, of which one is more than a single hall
 
 
 @dataclass(frozen=True)
@@ -71,10 +74,19 @@ class FloorPlan:
 
 
 def office(length: float, rng: np.random.Generator) -> FloorPlan:
-    """A floor of rooms, corridors, halls and a staircase, with a way of very roughly `length` m through it."""
+    """A floor of rooms, corridors, halls and a staircase, with a way of very roughly `length` m through it.
+
+    Raises:
+        UsageError: too short for two rooms.
+    """
     area, aspect = 1.8 * length, rng.uniform(0.8, 1.8)
     size = np.sqrt([area * aspect, area / aspect])
-    rooms = _split((0.0, 0.0), (float(size[0]), float(size[1])), rng)
+    for _ in range(_TRIES):
+        rooms = _split((0.0, 0.0), (float(size[0]), float(size[1])), rng)
+        if len(rooms) > 1:  # one hall has no door, and so no way
+            break
+    else:
+        raise UsageError(f"a building for a way of {length:g} m has a single room; want a longer way")
     kinds = [
         k for k, room in enumerate(rooms) if room.kind == "room" and room.size.min() > 3.2 and room.size.max() > 4.5
     ]

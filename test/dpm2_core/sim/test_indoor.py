@@ -95,6 +95,18 @@ def test_places_to_train_on_lie_on_the_way(inside: World) -> None:
     assert np.ptp(at[:, :2], axis=0).max() > 5
 
 
+@pytest.mark.parametrize("length", [20.0, 48.0, 150.0])
+def test_every_seed_gives_a_building_with_a_way(length: float) -> None:
+    """A single hall has no door to go through."""
+    for seed in range(100):
+        assert len(office(length, np.random.default_rng(seed)).way) > 1, seed
+
+
+def test_a_building_too_short_for_two_rooms_is_rejected() -> None:
+    with pytest.raises(UsageError, match="a way of 1 m has a single room"):
+        office(1.0, np.random.default_rng(0))
+
+
 def test_a_car_park_grows_with_the_way_asked_for() -> None:
     short, long = (car_park(length, np.random.default_rng(0)) for length in (80.0, 400.0))
     assert long.rooms[0].size.prod() > 2 * short.rooms[0].size.prod()
