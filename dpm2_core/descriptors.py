@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,12 +25,15 @@ class Descriptors:
             single frame, where they follow from `xyz`.
         up: (3,) float32 unit vector, in the frame of the set, where the sensor was tilted and the features are those
             of its scan in level axes; None: the frame of the set counts as level.
+        scale: the features are those of the scan enlarged by this factor: see `geometry.scale.scale_of`. Sets of
+            different scales cannot be compared.
     """
 
     xyz: NDArray[np.float32]
     features: NDArray[np.float16]
     axis: NDArray[np.float32] | None = None
     up: NDArray[np.float32] | None = None
+    scale: float = 1.0
 
     def __post_init__(self) -> None:
         n = len(self.xyz)
@@ -50,7 +53,7 @@ class Descriptors:
         """(N, 2) `axis`, computed for a single frame."""
         if self.axis is not None:
             return self.axis
-        xy = self.level().xyz[:, :2]
+        xy = self.as_encoded().xyz[:, :2]
         length = np.linalg.norm(xy, axis=1, keepdims=True)
         unit = xy / np.maximum(length, 1e-3)
         return np.where(length > 1e-3, unit, (1.0, 0.0)).astype(np.float32)
@@ -63,18 +66,19 @@ class Descriptors:
         turn = turn if up is None else levelling(up) @ turn
         axis = _turned(self.axes, turn.astype(np.float32))
         xyz = self.xyz @ R.T + T[:3, 3].astype(np.float32)
-        return Descriptors(xyz, self.features, axis, up)
+        return replace(self, xyz=xyz, axis=axis, up=up)
 
     @property
     def R_level_set(self) -> NDArray[np.float32]:
         """(3, 3) turns the frame of the set into the level axes nearest to it."""
         return np.eye(3, dtype=np.float32) if self.up is None else levelling(self.up)
 
-    def level(self) -> Descriptors:
-        """The same in level axes, `R_level_set`; itself where the frame of the set counts as level."""
-        if self.up is None:
+    def as_encoded(self) -> Descriptors:
+        """The same as the network saw it: in level axes, `R_level_set`, and enlarged by `scale`."""
+        if self.up is None and self.scale == 1:
             return self
-        return Descriptors(self.xyz @ self.R_level_set.T, self.features, self.axis)
+        xyz = self.xyz @ self.R_level_set.T * np.float32(self.scale)
+        return Descriptors(xyz, self.features, self.axis)
 
 
 def is_level(up: NDArray[np.floating]) -> bool:
@@ -128,17 +132,17 @@ class LazyDescriptors:
 
 
 def merge(sets: Sequence[Descriptors]) -> Descriptors:
-    """One set of several that are already in the same frame.
+    """One set of several that are already in the same frame; those of another scale than the first are left out.
 
     Raises:
         ValueError: no set given.
     """
     if not sets:
         raise ValueError("merge: want at least one set of descriptors")
+    sets = [s for s in sets if s.scale == sets[0].scale]
     up = next((s.up for s in sets if s.up is not None), None)
     axes = [s.axes for s in sets]
     if up is not None:  # each estimated its own
         axes = [_turned(axis, levelling(up) @ s.R_level_set.T) for axis, s in zip(axes, sets, strict=True)]
-    return Descriptors(
-        np.concatenate([s.xyz for s in sets]), np.concatenate([s.features for s in sets]), np.concatenate(axes), up
-    )
+    xyz, features = np.concatenate([s.xyz for s in sets]), np.concatenate([s.features for s in sets])
+    return Descriptors(xyz, features, np.concatenate(axes), up, sets[0].scale)

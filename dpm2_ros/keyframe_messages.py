@@ -93,9 +93,10 @@ def cloud_from_msg(message: UInt8MultiArray) -> tuple[bytes, Fix | None]:
 def descriptors_to_msg(d: Descriptors | None, stamp: int, name: str, weights: str = "") -> PointCloud2:
     """A cloud of points x, y, z, axis_x, axis_y and the bits of 128 half floats `feature:WEIGHTS`; empty for None.
 
-    Those of a tilted LiDAR whose base is not known are not sent: the receiver makes its own of the cloud.
+    Those of a tilted LiDAR whose base is not known, and those of a room, are not sent: the receiver makes its own of
+    the cloud.
     """
-    d = None if d is not None and d.up is not None else d
+    d = None if d is not None and (d.up is not None or d.scale != 1) else d
     channels = 0 if d is None else d.features.shape[1]
     dtype = _row(max(channels, 1))
     rows = np.zeros(0 if d is None else len(d), dtype)

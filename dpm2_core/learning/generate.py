@@ -15,10 +15,11 @@ from dpm2_core.config import Settings
 from dpm2_core.data.packed import PackedWriter, Sample, write_packed
 from dpm2_core.data.source import Source
 from dpm2_core.errors import UsageError
-from dpm2_core.frame import Array, Camera, Frame, Image
+from dpm2_core.frame import Array, Camera, Frame, Image, Points
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.deskew import deskew
-from dpm2_core.network.encoder import resize
+from dpm2_core.geometry.scale import ROOM_SCALE, scale_of
+from dpm2_core.network.encoder import in_encoded_axes, resize
 from dpm2_core.network.pyramid import crop
 from dpm2_core.network.settings import NetworkSettings, preset
 from dpm2_core.sim.camera import calibration, render
@@ -82,7 +83,7 @@ def generate_world(folder: Path, seed: int, settings: GenerateSettings) -> None:
     weather = np.random.default_rng([seed, 81])
     if weather.random() < settings.wet:
         camera = camera.model_copy(update={"wet": float(weather.uniform(0.02, 0.3)), "lens": seed})
-    samples = []
+    samples, scale = list[Sample](), ROOM_SCALE if PRESETS[kind].indoor == "rooms" else 1.0
     for _ in range(settings.frames):
         T, time = world.sample_pose(noise, height=height, sway=sway)
         scan = lidar.drive_scan(world, T, time, noise, world.drive_twist(time, height, sway))
@@ -93,7 +94,7 @@ def generate_world(folder: Path, seed: int, settings: GenerateSettings) -> None:
             hours = float(weather.uniform(-0.5, 0.5)) * settings.hours
             pixels = render(world, camera, T @ view.T_lidar_cam, time, noise, hours)
             images = (small_image(Image(pixels, view), network),)
-        samples.append(Sample(crop(points, network.points), T, images))
+        samples.append(_sample(points, T, images, network, scale))
     sensor = lidar.config.model_dump(mode="json", exclude_defaults=True)
     write_packed(folder, samples, {"source": "synthetic city", "preset": kind, "seed": seed, "sensor": sensor})
 
@@ -138,8 +139,8 @@ def pack(
 ) -> int:
     """Pack the frames of a source that have a pose, one after the other; returns how many.
 
-    Points with time offsets are moved to where they are seen from at the stamp, by the true motion. `frames`: positions
-    to look at; `advance` is called after each.
+    Points with time offsets are moved to where they are seen from at the stamp, by the true motion. A drive that begins
+    in a room is enlarged, as the network sees it. `frames`: positions to look at; `advance` is called after each.
 
     Raises:
         UsageError: the source has no poses, or its frames do not all have as many images of one size.
@@ -149,29 +150,40 @@ def pack(
     chosen = frames or range(len(source))
     with PackedWriter(folder) as writer:
         before: tuple[Frame, Array] | None = None  # a motion needs the next pose, so each frame waits for it
-        twist = np.zeros(6)
+        twist, scale = np.zeros(6), 0.0
         for position, frame in enumerate(source.frames(chosen.start, chosen.stop), chosen.start):
             advance()
             pose = source.poses[position]
             if position not in chosen or frame.problem is not None or not np.isfinite(pose).all():
                 continue
+            scale = scale or scale_of(frame.points)
             if before is not None:
                 twist = _twist(before, (frame, pose))
-                writer.add(_sample(*before, twist, network))
+                writer.add(_packed(*before, twist, network, scale))
             before = frame, pose
         if before is None:
             raise UsageError(f"{source.name}: no readable frame with a pose")
-        writer.add(_sample(*before, twist, network))
-        writer.finish({"source": source.name})
+        writer.add(_packed(*before, twist, network, scale))
+        writer.finish({"source": source.name, "scale": scale})
     return len(writer)
 
 
-def _sample(frame: Frame, pose: Array, twist: Array, network: NetworkSettings) -> Sample:
+def _packed(frame: Frame, pose: Array, twist: Array, network: NetworkSettings, scale: float) -> Sample:
     points = frame.points
     if frame.time_offset is not None:
         points = deskew(points, frame.time_offset, twist)
     images = tuple(small_image(image, network) for image in frame.images)
-    return Sample(crop(points, network.points), pose, images)
+    return _sample(points, pose, images, network, scale)
+
+
+def _sample(points: Points, pose: Array, images: tuple[Image, ...], network: NetworkSettings, scale: float) -> Sample:
+    """A frame of a world that is enlarged by `scale`."""
+    if scale == 1:
+        return Sample(crop(points, network.points), pose, images)
+    T = pose.copy()
+    T[:3, 3] *= scale
+    cloud = crop(points[:, :3] * np.float32(scale), network.points)
+    return Sample(cloud, T, tuple(in_encoded_axes(image, np.eye(3, dtype=np.float32), scale) for image in images))
 
 
 def _twist(before: tuple[Frame, Array], after: tuple[Frame, Array]) -> Array:

@@ -17,6 +17,7 @@ from dpm2_core.descriptors import Descriptors, is_level, levelling
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Frame, Image
 from dpm2_core.geometry import se3
+from dpm2_core.geometry.scale import scale_of
 from dpm2_core.geometry.tilt import up_of
 from dpm2_core.network.convnext import FeatureMap
 from dpm2_core.network.fusion import Fusion
@@ -80,19 +81,26 @@ class Encoder(nn.Module):
 
     @torch.inference_mode()
     def encode(self, frame: Frame) -> Descriptors:
-        """Descriptors of one frame, from its raw points and its images, if any; of a tilted sensor in level axes.
+        """Descriptors of one frame, from its raw points and its images, if any.
+
+        Those of a tilted sensor are made in level axes, those of a room as if it had the size of a street.
 
         Raises:
             Dpm2Error: too few points in range, or the result is not finite.
         """
         device = next(self.parameters()).device
-        cloud, images = crop(frame.points, self.settings.points), frame.images
+        cloud, images, scale = crop(frame.points, self.settings.points), frame.images, scale_of(frame.points)
         up = up_of(cloud)
-        if up is None or is_level(up):  # no ground to tell by, or as the network was trained
+        if up is not None and is_level(up):  # as the network was trained; None: no ground to tell by
+            up = None
+        if scale != 1:
+            cloud = crop(frame.points[:, :3] * np.float32(scale), self.settings.points)
+        if up is None and scale == 1:
             return self._encode(cloud, images, device)
-        R = levelling(up)
-        made = self._encode(np.ascontiguousarray(cloud @ R.T), [_turned(image, R) for image in images], device)
-        return replace(made, xyz=made.xyz @ R, up=up)
+        R = np.eye(3, dtype=np.float32) if up is None else levelling(up)
+        views = [in_encoded_axes(image, R, scale) for image in images]
+        made = self._encode(np.ascontiguousarray(cloud @ R.T), views, device)
+        return replace(made, xyz=made.xyz @ R / np.float32(scale), up=up, scale=scale)
 
     def _encode(self, cloud: NDArray[np.float32], images: Sequence[Image], device: torch.device) -> Descriptors:
         """Descriptors of a cropped (M, 3) cloud, in its own axes."""
@@ -112,9 +120,11 @@ class Encoder(nn.Module):
         return [Descriptors(x[m].numpy(), f[m].numpy()) for x, f, m in zip(xyz, features, mask, strict=True)]
 
 
-def _turned(image: Image, R: NDArray[np.float32]) -> Image:
-    """An image whose camera stands in other axes: R (3, 3) turns the LiDAR's into those."""
+def in_encoded_axes(image: Image, R: NDArray[np.float32], scale: float) -> Image:
+    """An image whose camera stands in other axes, into which R (3, 3) turns the LiDAR's, in a scene that is enlarged by
+    `scale`."""
     T_lidar_cam = se3.make(R, np.zeros(3)) @ image.camera.T_lidar_cam
+    T_lidar_cam[:3, 3] *= scale
     return replace(image, camera=replace(image.camera, T_lidar_cam=T_lidar_cam))
 
 

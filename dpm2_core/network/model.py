@@ -55,13 +55,13 @@ class DeepPointMap2(nn.Module):
         with torch.autocast(next(self.parameters()).device.type, torch.bfloat16):
             (y, prepared_target), (x, prepared_source) = self._prepare(target), self._prepare(source)
             correlated = self.decoder.correlate(prepared_source, prepared_target)
-            return _tilted(register_batch(self.decoder, x, y, correlated, self.solver)[0], source, target)
+            return _of_sets(register_batch(self.decoder, x, y, correlated, self.solver)[0], source, target)
 
     def _prepare(self, descriptors: Descriptors) -> tuple[Tokens, Prepared]:
         """A set for the decoder, made or kept."""
         entry = next((kept for kept in self._prepared if kept[0] is descriptors), None)
         if entry is None:
-            tokens = to_tokens([descriptors.level()], self.decoder.view_aligned, next(self.parameters()).device)
+            tokens = to_tokens([descriptors.as_encoded()], self.decoder.view_aligned, next(self.parameters()).device)
             entry = descriptors, tokens, self.decoder.prepare(tokens)
         others = tuple(kept for kept in self._prepared if kept[0] is not descriptors)
         self._prepared = (entry, *others)[:_KEPT]  # a new tuple: the SLAM's threads have shallow copies of the network
@@ -71,21 +71,24 @@ class DeepPointMap2(nn.Module):
     def register_many(self, sources: list[Descriptors], targets: list[Descriptors]) -> list[Registration]:
         """`register` for a batch of pairs; nothing is kept."""
         device = next(self.parameters()).device
-        source = to_tokens([s.level() for s in sources], self.decoder.view_aligned, device)
-        target = to_tokens([t.level() for t in targets], self.decoder.view_aligned, device)
+        source = to_tokens([s.as_encoded() for s in sources], self.decoder.view_aligned, device)
+        target = to_tokens([t.as_encoded() for t in targets], self.decoder.view_aligned, device)
         with torch.autocast(device.type, torch.bfloat16):
             correlated = self.decoder(source, target)
-            level = register_batch(self.decoder, source, target, correlated, self.solver)
-        return [_tilted(*row) for row in zip(level, sources, targets, strict=True)]
+            found = register_batch(self.decoder, source, target, correlated, self.solver)
+        return [_of_sets(*row) for row in zip(found, sources, targets, strict=True)]
 
     @torch.inference_mode()
     def agreement(self, source: Descriptors, targets: Sequence[Descriptors]) -> list[float]:
         """0..1, how far a set and each of the others agree on a motion as they are: see `pose_solver.agreement`."""
         s, found = self.settings.decoder, list[float]()
         device, view_aligned = next(self.parameters()).device, self.decoder.view_aligned
-        x = to_tokens([source.level()], view_aligned, device)
+        x = to_tokens([source.as_encoded()], view_aligned, device)
         for target in targets:
-            y = to_tokens([target.level()], view_aligned, device)
+            if target.scale != source.scale:
+                found.append(0.0)
+                continue
+            y = to_tokens([target.as_encoded()], view_aligned, device)
             found.append(float(agreement(x, y, s.temperature, s.pair_ratio)))
         return found
 
@@ -97,21 +100,33 @@ class DeepPointMap2(nn.Module):
     def matches(self, source: Descriptors, target: Descriptors) -> tuple[Array, Array, Array]:
         """The descriptors that `register` pairs: positions (K, 3) in each frame, m, and confidence (K,) 0..1."""
         device = next(self.parameters()).device
-        x, y = (to_tokens([d.level()], self.decoder.view_aligned, device) for d in (source, target))
+        x, y = (to_tokens([d.as_encoded()], self.decoder.view_aligned, device) for d in (source, target))
         with torch.autocast(device.type, torch.bfloat16):
             correlated = self.decoder(x, y)
             pairs = correspond(self.decoder, x, y, correlated, match_scores(self.decoder, correlated))
         half = pairs.weight.shape[1] // 2  # then the same pairs again, in the other direction
-        at_source, at_target = pairs.source[0, half:].double().cpu(), pairs.target[0, :half].double().cpu()
+        at_source = pairs.source[0, half:].double().cpu().numpy() / source.scale
+        at_target = pairs.target[0, :half].double().cpu().numpy() / target.scale
         weight = pairs.weight[0, :half].double().cpu().numpy()
-        return at_source.numpy() @ source.R_level_set, at_target.numpy() @ target.R_level_set, weight
+        return at_source @ source.R_level_set, at_target @ target.R_level_set, weight
 
 
-def _tilted(level: Registration, source: Descriptors, target: Descriptors) -> Registration:
-    """A registration of sets in level axes as one of the sets themselves."""
+def _of_sets(encoded: Registration, source: Descriptors, target: Descriptors) -> Registration:
+    """A registration of sets as the network saw them, in level axes and enlarged, as one of the sets themselves."""
+    if source.scale != target.scale:
+        return replace(encoded, ok=False, confidence=0.0, overlap=0.0, reason="one is a room, the other is not")
+    if source.scale != 1:
+        encoded = _reduced(encoded, source.scale)
     if source.up is None and target.up is None:
-        return level
+        return encoded
     at_source, at_target = (se3.make(d.R_level_set, np.zeros(3)) for d in (source, target))
-    T = se3.orthonormalized(se3.inverse(at_target) @ level.T_target_source @ at_source)
+    T = se3.orthonormalized(se3.inverse(at_target) @ encoded.T_target_source @ at_source)
     A = se3.adjoint(se3.inverse(at_source))
-    return replace(level, T_target_source=T, covariance=A @ level.covariance @ A.T)
+    return replace(encoded, T_target_source=T, covariance=A @ encoded.covariance @ A.T)
+
+
+def _reduced(result: Registration, scale: float) -> Registration:
+    """A registration of a scene that was enlarged by `scale`."""
+    T, S = result.T_target_source.copy(), np.repeat([1.0, 1 / scale], 3)
+    T[:3, 3] /= scale
+    return replace(result, T_target_source=T, covariance=result.covariance * np.outer(S, S), rmse=result.rmse / scale)

@@ -36,9 +36,9 @@ def test_levelling_is_the_smallest_turn_that_brings_up_to_z(up: list[float]) -> 
 
 def test_the_heights_of_a_tilted_set_are_those_of_a_level_one(noise: np.random.Generator) -> None:
     plain = level(noise)
-    again = leaning(plain, LEAN[:3, :3]).level()
+    again = leaning(plain, LEAN[:3, :3]).as_encoded()
     np.testing.assert_allclose(again.xyz[:, 2], plain.xyz[:, 2], atol=1e-5)
-    assert plain.level() is plain
+    assert plain.as_encoded() is plain
 
 
 def test_axes_point_to_the_descriptors_after_any_move(noise: np.random.Generator) -> None:
@@ -47,7 +47,7 @@ def test_axes_point_to_the_descriptors_after_any_move(noise: np.random.Generator
     moved = leaning(plain, LEAN[:3, :3]).moved(LEAN @ T @ se3.inverse(LEAN))
     at = moved.R_level_set.astype(float)
     origin = at @ LEAN[:3, :3] @ T[:3, 3]  # where the sensor was that saw them
-    seen = moved.level().xyz[:, :2] - origin[:2]
+    seen = moved.as_encoded().xyz[:, :2] - origin[:2]
     seen /= np.linalg.norm(seen, axis=1, keepdims=True)
     np.testing.assert_allclose(np.linalg.norm(moved.axes, axis=1), 1, atol=1e-5)
     # T leans by 4 degrees itself: what is high up is seen beside where it stands.
@@ -93,3 +93,22 @@ def test_lazy_descriptors_are_made_once_and_say_why_there_are_none(noise: np.ran
     found = LazyDescriptors(lambda: some)
     assert found.get() is some
     assert found.problem == ""
+
+
+def test_a_room_is_enlarged_for_the_network_alone(noise: np.random.Generator) -> None:
+    """Where the descriptors lie is always in meters; the scale goes with them wherever they are moved."""
+    room = replace(level(noise), scale=5.0)
+    np.testing.assert_allclose(room.as_encoded().xyz, 5 * room.xyz, rtol=1e-6)
+    np.testing.assert_allclose(room.axes, replace(room, scale=1.0).axes, atol=1e-6)
+    moved = room.moved(LEAN)
+    assert moved.scale == 5
+    np.testing.assert_allclose(moved.xyz, se3.transform(LEAN, room.xyz), atol=1e-5)
+    both = merge([room, moved])
+    assert (len(both), both.scale) == (60, 5)
+
+
+def test_what_was_enlarged_by_another_factor_is_not_merged(noise: np.random.Generator) -> None:
+    room, street = replace(level(noise), scale=5.0), level(noise)
+    for first, other in ((room, street), (street, room)):
+        merged = merge([first, other, first])
+        assert (len(merged), merged.scale) == (60, first.scale)

@@ -236,6 +236,8 @@ def test_a_keyframe_is_at_most_100_kB_on_the_wire(recording: Path) -> None:
     assert descriptors is not None
     tilted = replace(descriptors, up=np.array([0.6, 0, 0.8], np.float32))  # no base says what level is: not sent
     assert descriptors_from_msg(descriptors_to_msg(tilted, 5, "red/kf_1.00000000")) == (None, "")
+    room = replace(descriptors, scale=5.0)
+    assert descriptors_from_msg(descriptors_to_msg(room, 5, "red/kf_1.00000000")) == (None, "")
     for cloud in (points, points[::50]):
         keyframe = Keyframe(1, 2, 3, np.eye(4), cloud, None, "", descriptors)
         seen, packed = payload_to_msgs(keyframe, "red/kf_1.00000000", "0123456789abcdef")

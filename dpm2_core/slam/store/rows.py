@@ -27,7 +27,7 @@ NO_POINTS: Points = np.zeros((0, 4), np.float32)
 FARTHEST = 1e7
 """m from the origin: from there on float32 clouds are meters off. No pose of a map lies beyond."""
 _LONGEST_NAME = 255
-_DESCRIPTORS = struct.Struct("<IIB")  # number, channels, 1 with axes + 2 with the direction up
+_DESCRIPTORS = struct.Struct("<IIB")  # number, channels, 1 with axes + 2 with the direction up + 4 with a scale
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,11 +96,13 @@ def pose_of(data: Any) -> Array:
 
 
 def pack_descriptors(d: Descriptors) -> bytes:
-    """xyz float32, features float16, axes and up float32 if there are any."""
-    head = _DESCRIPTORS.pack(len(d), d.features.shape[1], (d.axis is not None) + 2 * (d.up is not None))
-    axis = b"".join(np.ascontiguousarray(part, "<f4").tobytes() for part in (d.axis, d.up) if part is not None)
+    """xyz float32, features float16; axes, up, and a scale other than 1, float32, if there are any."""
+    scale = None if d.scale == 1 else np.array([d.scale])
+    present = [part is not None for part in (d.axis, d.up, scale)]
+    head = _DESCRIPTORS.pack(len(d), d.features.shape[1], sum(bit << i for i, bit in enumerate(present)))
+    rest = b"".join(np.ascontiguousarray(part, "<f4").tobytes() for part in (d.axis, d.up, scale) if part is not None)
     xyz, features = np.ascontiguousarray(d.xyz, "<f4"), np.ascontiguousarray(d.features, "<f2")
-    return head + xyz.tobytes() + features.tobytes() + axis
+    return head + xyz.tobytes() + features.tobytes() + rest
 
 
 def unpack_descriptors(data: bytes) -> Descriptors:
@@ -112,19 +114,23 @@ def unpack_descriptors(data: bytes) -> Descriptors:
     if len(data) < _DESCRIPTORS.size:
         raise ValueError("no descriptors: too few bytes")
     n, channels, parts = _DESCRIPTORS.unpack_from(data)
-    axes, tilted = parts & 1, parts >> 1
-    end = list(accumulate((_DESCRIPTORS.size, 12 * n, 2 * n * channels, 8 * n * axes, 12 * bool(tilted))))
-    if len(data) != end[-1] or not n or not channels:
+    axes, tilted, scaled = (parts >> i & 1 for i in range(3))
+    sizes = 12 * n, 2 * n * channels, 8 * n * axes, 12 * tilted, 4 * scaled
+    end = list(accumulate(sizes, initial=_DESCRIPTORS.size))
+    if len(data) != end[-1] or not n or not channels or parts > 7:
         raise ValueError(f"no descriptors: {len(data)} bytes for {n} of {channels}")
     xyz = np.frombuffer(data, "<f4", 3 * n, end[0]).reshape(n, 3).copy()
     features = np.frombuffer(data, "<f2", n * channels, end[1]).reshape(n, channels).copy()
     axis = np.frombuffer(data, "<f4", 2 * n, end[2]).reshape(n, 2).copy() if axes else None
     up = np.frombuffer(data, "<f4", 3, end[3]).copy() if tilted else None
+    scale = float(np.frombuffer(data, "<f4", 1, end[4])[0]) if scaled else 1.0
+    if not 1e-2 < scale < 1e2:  # False for NaN
+        raise ValueError(f"no descriptors: a scale of {scale:g}")
     if not all(np.isfinite(part).all() for part in (xyz, features, axis, up) if part is not None):
         raise ValueError("no descriptors: values that are not finite")
     if up is not None and not (abs(np.linalg.norm(up) - 1) < 1e-3 and up[2] > 0):
         raise ValueError("no descriptors: what should point up does not")
-    return Descriptors(xyz, features, axis, up)
+    return Descriptors(xyz, features, axis, up, scale)
 
 
 def with_crc(*values: Any) -> tuple[Any, ...]:

@@ -11,7 +11,7 @@ import pytest
 from dpm2_core.data.kitti import KittiSource
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.geometry import se3
-from dpm2_core.geometry.scale import is_room
+from dpm2_core.geometry.scale import ROOM_SCALE, is_room, scale_of
 from dpm2_core.geometry.voxel import voxel_first
 from test.helpers.rooms import frames, walk
 
@@ -26,6 +26,7 @@ def test_a_room_and_a_street(voxel: float) -> None:
         room, street = room[voxel_first(room, voxel)], street[voxel_first(street, voxel)]
     assert is_room(room) is True
     assert is_room(street) is False
+    assert (scale_of(room), scale_of(street)) == (ROOM_SCALE, 1)
 
 
 def test_too_little_says_nothing() -> None:

@@ -17,9 +17,11 @@ from dpm2_core.data.packed import PackedDrive, Sample, open_packed, write_packed
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
+from dpm2_core.geometry.scale import ROOM_SCALE
 from dpm2_core.learning.dataset import DataSettings, GroupDataset, Mixture
 from dpm2_core.learning.generate import pack
 
+from ...helpers import rooms
 from ...helpers.networks import tiny
 from ...helpers.scenes import boxes, make_image
 
@@ -50,6 +52,37 @@ class Sweeps:
             images = (make_image(np.random.default_rng(n)),) if self.images or n == 3 else ()
             points = np.c_[seen, np.ones(len(seen))].astype(np.float32)
             yield Frame(n * 10**8, points, offsets, images, index=n)
+
+
+class Walk:
+    """Five scans of a walk in a room."""
+
+    name, T_cam_lidar = "walk", None
+
+    def __init__(self) -> None:
+        self.notes: list[str] = []
+        self.poses: Array | None = rooms.walk(5)
+
+    def __len__(self) -> int:
+        return 5
+
+    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
+        assert self.poses is not None
+        yield from rooms.frames(self.poses)[start:stop]
+
+
+def test_a_room_is_packed_as_the_network_sees_it(tmp_path: Path) -> None:
+    """Enlarged, way and all."""
+    source = Walk()
+    pack(source, tmp_path / "d", tiny())
+    drive = PackedDrive(tmp_path / "d")
+    assert drive.about["scale"] == ROOM_SCALE
+    assert source.poses is not None
+    for n, frame in enumerate(source.frames()):
+        np.testing.assert_allclose(drive[n].pose[:3, 3], ROOM_SCALE * source.poses[n, :3, 3])
+        np.testing.assert_array_equal(drive[n].pose[:3, :3], source.poses[n, :3, :3])
+        reach = np.abs(frame.points[:, :3]).max(0)
+        np.testing.assert_allclose(np.abs(drive[n].cloud).max(0), ROOM_SCALE * reach, rtol=0.1)
 
 
 @pytest.mark.slow

@@ -110,6 +110,30 @@ def test_descriptors_of_a_tilted_lidar_come_back_with_where_up_is(noise: np.rand
             unpack_descriptors(packed[:-4])
 
 
+@pytest.mark.parametrize("tilted", [False, True])
+def test_descriptors_of_a_room_come_back_with_their_scale(noise: np.random.Generator, tilted: bool) -> None:
+    xyz, features = noise.normal(size=(9, 3)).astype("f4"), noise.normal(size=(9, 8)).astype("f2")
+    up = np.array([0.6, 0, 0.8], "f4") if tilted else None
+    packed = pack_descriptors(Descriptors(xyz, features, None, up, 5.0))
+    back = unpack_descriptors(packed)
+    assert back.scale == 5
+    assert (back.up is None) == (not tilted)
+    np.testing.assert_array_equal(back.xyz, xyz)
+    for wrong in (np.nan, np.inf, 0.0, -5.0, 1e9):
+        with pytest.raises(ValueError, match="no descriptors: a scale of"):
+            unpack_descriptors(packed[:-4] + np.array(wrong, "f4").tobytes())
+    with pytest.raises(ValueError, match="bytes for 9 of 8"):
+        unpack_descriptors(packed[:-4])
+
+
+@pytest.mark.parametrize("parts", [8, 12, 255])
+def test_descriptors_with_parts_that_nobody_knows_are_rejected(noise: np.random.Generator, parts: int) -> None:
+    packed = bytearray(pack_descriptors(Descriptors(noise.normal(size=(9, 3)).astype("f4"), np.ones((9, 8), "f2"))))
+    packed[8] = parts
+    with pytest.raises(ValueError, match="no descriptors"):
+        unpack_descriptors(bytes(packed))
+
+
 def test_a_loan_and_a_thumbnail_come_back(map_file: Path, keyframes: list[Keyframe]) -> None:
     T = np.eye(4)
     T[0, 3] = 2.0
