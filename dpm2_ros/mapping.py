@@ -12,6 +12,8 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import OccupancyGrid, Odometry
 from nav_msgs.msg import Path as PathMsg
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
@@ -70,7 +72,7 @@ class MapperThread:
         ]
         self._drawn: tuple[object, OccupancyMap] | None = None  # what the grid is of, and the grid
         node.create_timer(0.1, self._show, clock=STEADY)
-        node.create_service(Trigger, "~/save_map", self._on_save)
+        slow_service(node, Trigger, "~/save_map", self._on_save)
 
     @property
     def slam(self) -> Slam:
@@ -273,6 +275,11 @@ class MapperThread:
         if len(points) > most:
             points = points[np.linspace(0, len(points) - 1, most).astype(np.intp)]
         return cloud_to_msg(points, self._stamp, self._config.ros.map_frame)
+
+
+def slow_service(node: Node, kind: type, name: str, callback: Callable[..., Any]) -> None:
+    """A service whose callback awaits: in a group of its own, for the others of a group wait until it ends."""
+    node.create_service(kind, name, callback, callback_group=MutuallyExclusiveCallbackGroup())
 
 
 async def respond(work: Future[str], response: Any) -> None:

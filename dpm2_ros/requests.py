@@ -16,7 +16,7 @@ from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.errors import UsageError
 from dpm2_core.slam.mapping.admission import check_pose
 from dpm2_ros.base_frame import BaseFrame
-from dpm2_ros.mapping import MapperThread, respond
+from dpm2_ros.mapping import MapperThread, respond, slow_service
 
 
 class Requests:
@@ -31,8 +31,8 @@ class Requests:
         self._mapper, self._base, self._map_frame = mapper, base, map_frame
         self.reset = threading.Event()
         node.create_service(Trigger, "~/reset", self._on_reset)
-        node.create_service(Trigger, "~/load_map", self._on_load_map)
-        node.create_service(SetBool, "~/localization_mode", self._on_localization_mode)
+        slow_service(node, Trigger, "~/load_map", self._on_load_map)
+        slow_service(node, SetBool, "~/localization_mode", self._on_localization_mode)
         node.create_subscription(PoseWithCovarianceStamped, "initialpose", self._on_initial_pose, 10)
 
     def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:

@@ -27,6 +27,7 @@ from dpm2_core.data.messages import decode_points, stamp_ns
 from dpm2_core.data.topics import CAMERA_INFO, IMAGE, POINTS
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.geometry import se3
+from dpm2_ros.active_map import ActiveMap
 from dpm2_ros.conversions import cloud_to_msg, stamp_to_msg, transform_to_msg
 from dpm2_ros.keyframe_messages import received_to_msg
 from dpm2_ros.slam_node import SlamNode
@@ -715,6 +716,33 @@ def test_save_map_says_what_it_did(rig: Callable[..., Rig], drive: Any, tmp_path
         "pose_graph.g2o",
         "trajectory.tum",
     ]
+
+
+def test_clouds_are_processed_while_a_map_is_saved(
+    rig: Callable[..., Rig], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A large map takes seconds."""
+    begun, may_end, save = threading.Event(), threading.Event(), ActiveMap.save
+
+    def slow(self: ActiveMap, name: str = "") -> str:
+        begun.set()
+        assert may_end.wait(60)
+        return save(self, name)
+
+    monkeypatch.setattr(ActiveMap, "save", slow)
+    r = rig(f"ros.map_directory:={tmp_path / 'map'}")
+    r.send_and_wait(0)
+    results: list[Any] = []
+    caller = threading.Thread(target=lambda: results.append(r.harness.call(Trigger, "/slam_node/save_map")))
+    caller.start()
+    try:
+        assert begun.wait(60)
+        r.send_and_wait(1, 2, 3)
+        assert not results
+    finally:
+        may_end.set()
+        caller.join()
+    assert results[0].success
 
 
 def test_a_map_that_cannot_be_saved_is_a_response(rig: Callable[..., Rig], drive: Any, tmp_path: Path) -> None:
