@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where in a map am I? From one cloud, without any prior, from anywhere and whatever the heading.
 
-The descriptors find the keyframes that look alike and a pose in each; the points decide. Two places that both convince
-are no answer: it is better not to know than to be sure of the wrong one.
+The descriptors find the keyframes that look alike and a pose in each; the points decide. Where the second best place
+fits nearly as well there is no answer: it is better not to know than to be sure of the wrong one.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ if TYPE_CHECKING:  # torch takes seconds to import
     from dpm2_core.network.model import DeepPointMap2
 
 _SAME_PLACE = 5.0  # m, candidates whose poses are nearer are one place
+_CLEARLY = 0.5  # of what does not fit at the second best place, at most so much does not fit at the best
 
 
 class RelocalizationSettings(Settings):
@@ -36,8 +37,6 @@ class RelocalizationSettings(Settings):
     """So many keyframes that look like the scan are registered by the network..."""
     verified: int = Field(3, ge=1)
     """...and so many of the resulting places are verified by the points, the most confident first."""
-    min_confidence: float = Field(0.15, ge=0, le=1)
-    """Of the network's registration, below which the points are not asked."""
     surroundings: float = Field(22.0, gt=0)
     """Keyframes so near to a candidate make up the map to register to, m..."""
     keyframes: int = Field(9, ge=1)
@@ -97,18 +96,17 @@ class Relocalizer:
         if hint is not None:  # as on a plan: who points at a map on a screen gives no height
             allowed = np.linalg.norm(self._poses[:, :2, 3] - hint[:2, 3], axis=1) <= s.hint_radius
         nodes = self._places.similar(descriptors, allowed, s.candidates)
-        proposals = [p for p in self._proposals(descriptors, nodes) if p.confidence >= s.min_confidence]
-        rejections = [f"no keyframe of {int(allowed.sum())} matches the descriptors"] if not proposals else []
-        result: Registration | None = None
-        for proposal in proposals[: s.verified]:
-            outcome = self.verify(cloud, proposal.T_target_source)
-            if not outcome.ok:
-                rejections.append(outcome.reason)
-            elif result is None:
-                result = outcome
-            elif _meters(result.T_target_source, outcome.T_target_source) > _SAME_PLACE:
-                return nowhere("two places of the map fit alike")
-        return nowhere("; ".join(rejections)) if result is None else result
+        proposals = self._proposals(descriptors, nodes)[: s.verified]
+        if not proposals:
+            return nowhere(f"no keyframe of {int(allowed.sum())} matches the descriptors")
+        places = [self.verify(cloud, proposal.T_target_source) for proposal in proposals]
+        best = max(places, key=lambda place: (place.ok, place.confidence))
+        if not best.ok:
+            return nowhere("; ".join(place.reason for place in places))
+        second = max((place.confidence for place in places if _meters(place, best) > _SAME_PLACE), default=0.0)
+        if 1 - best.confidence > _CLEARLY * (1 - second):
+            return nowhere(f"two places of the map fit alike: {best.confidence:.0%} and {second:.0%} of the points")
+        return best
 
     def verify(self, cloud: Points, T_map_lidar: Array, widen: float = 1.0) -> Registration:
         """Verifies a pose in the map by the points: T_map_lidar, `ok` or not; `widen` as in `Verifier.verify`."""
@@ -135,8 +133,7 @@ class Relocalizer:
             if result.ok
         ]
         for proposal in sorted(in_map, key=lambda r: -r.confidence):
-            T = proposal.T_target_source
-            if all(_meters(T, other.T_target_source) > _SAME_PLACE for other in proposals):
+            if all(_meters(proposal, other) > _SAME_PLACE for other in proposals):
                 proposals.append(proposal)
         return proposals
 
@@ -155,5 +152,5 @@ def nowhere(reason: str) -> Registration:
     return Registration(np.eye(4), np.eye(6) * 1e6, 0.0, np.inf, "relocalisation", False, reason)
 
 
-def _meters(a: Array, b: Array) -> float:
-    return float(np.linalg.norm(a[:3, 3] - b[:3, 3]))
+def _meters(a: Registration, b: Registration) -> float:
+    return float(np.linalg.norm(a.T_target_source[:3, 3] - b.T_target_source[:3, 3]))

@@ -40,11 +40,13 @@ def seen(s: float, lateral: float = 0.0, heading: float = 0.0, time: float = 0.0
 @pytest.fixture(scope="module")
 def relocalizer() -> Relocalizer:
     """A map of 60 m of a street."""
+    at = np.arange(50.0, 111.0, 5.0)
+    return made([seen(s) for s in at], np.array([world().pose_at(s) for s in at]))
+
+
+def made(clouds: list[Points], poses: Array) -> Relocalizer:
     network = load_network("small", 2)
     describe = PlaceRecognition(network).describe
-    at = np.arange(50.0, 111.0, 5.0)
-    poses = np.array([world().pose_at(s) for s in at])
-    clouds = [seen(s) for s in at]
     keyframes = [Keyframe(i, i, i, poses[i], cloud[:0], None, "", describe(cloud)) for i, cloud in enumerate(clouds)]
     settings = RelocalizationSettings()
     verifier = Verifier(settings.verification, GeometricSettings())
@@ -78,6 +80,21 @@ def test_another_street_is_not_found_and_a_wrong_hint_finds_nothing(relocalizer:
     cloud = seen(63.0)
     assert relocalizer.find(cloud, hint=world().pose_at(70.0)).ok
     assert not relocalizer.find(cloud, hint=world().pose_at(70.0) @ se3.make(np.eye(3), np.array([500.0, 0, 0]))).ok
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kept", "found"), [(1.0, False), (0.5, True)], ids=["alike", "clearly better"])
+def test_a_place_is_found_only_where_it_fits_clearly_better_than_another_one(kept: float, found: bool) -> None:
+    """The street stands twice in the map: as it is, and 500 m away with a share of the directions kept."""
+    at, far = np.arange(55.0, 71.0, 5.0), se3.make(np.eye(3), np.array([0, 500.0, 0]))
+    poses, clouds = np.array([world().pose_at(s) for s in at]), [seen(s) for s in at]
+    partly = [cloud[np.sin(8 * np.arctan2(cloud[:, 1], cloud[:, 0])) <= 2 * kept - 1] for cloud in clouds]
+    result = made(clouds + partly, np.concatenate([poses, far @ poses])).find(seen(63.0, 0.5, time=7.0))
+    assert result.ok == found, result.reason
+    if found:
+        assert off(result, world().pose_at(63.0, 0.5))[0] < 0.1
+    else:
+        assert re.match(r"two places of the map fit alike: \d+% and \d+%", result.reason)
 
 
 @pytest.mark.slow
