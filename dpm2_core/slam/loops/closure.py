@@ -3,7 +3,8 @@
 
 A candidate must convince four times: the network, which finds it and registers it without any start; the points of the
 new keyframe, which must fit the map around it; the odometry, whose drift has limits; and, where the correction is
-large, a second loop that says the same. Whatever fails is kept with the reason.
+large, a second loop that says the same. There it must also fit clearly better than any other place. Whatever fails is
+kept with the reason.
 """
 
 from __future__ import annotations
@@ -22,7 +23,12 @@ from dpm2_core.geometry import se3
 from dpm2_core.geometry.scale import is_room
 from dpm2_core.slam.loops.consistency import Consistency, ConsistencySettings, OdometryChain
 from dpm2_core.slam.loops.place_recognition import AGREEING, PlaceRecognition, merged
-from dpm2_core.slam.loops.verification import VerificationSettings, Verifier
+from dpm2_core.slam.loops.verification import (
+    SAME_PLACE,
+    VerificationSettings,
+    Verifier,
+    objection_of_others,
+)
 from dpm2_core.slam.registration.icp import GeometricSettings
 
 if TYPE_CHECKING:  # torch takes seconds to import
@@ -115,21 +121,30 @@ class LoopCloser:
             self._settings, self._verifier = self._room if is_room(clouds[node]) else self._usual
         since = self._path.since(node)
         tried, proposals = self._proposals(node, since, keyframes, poses)
-        for number, proposal in enumerate(proposals):
-            if number >= self._settings.verified:
-                tried.append(proposal.rejected("others are more likely"))
-                continue
-            if self._settings.decided_by == "overlap":
-                tried.append(proposal)
-                break
+        if self._settings.decided_by == "overlap":
+            return tried + proposals[:1]
+        most, failed = self._settings.verified, list[Edge]()
+        for number, proposal in enumerate(proposals[:most]):
             loop = self._verified(proposal, keyframes, clouds, poses)
             if not loop.ok:
-                tried.append(loop)
+                failed.append(loop)
                 continue
             T_expected = se3.inverse(poses[loop.from_node]) @ poses[node]
-            tried += self._consistency.check(loop, T_expected, self._settings.consistency)
-            break
-        return tried
+            if not self._consistency.expected(loop, T_expected, self._settings.consistency):
+                unseen = [p for p in proposals[number + 1 :] if self._elsewhere(p, loop)][:most]
+                others = [f for f in failed if self._elsewhere(f, loop)]
+                others += [self._verified(p, keyframes, clouds, poses) for p in unseen]
+                if objection := objection_of_others(loop.registration, [o.registration for o in others]):
+                    return [*tried, *failed, loop.rejected(objection)]
+            return tried + failed + self._consistency.check(loop, T_expected, self._settings.consistency)
+        return tried + failed + [proposal.rejected("others are more likely") for proposal in proposals[most:]]
+
+    def _elsewhere(self, one: Edge, other: Edge) -> bool:
+        """Whether the new keyframe is at another place by one loop than by the other, if that is known."""
+        if not np.isfinite(self._path.between(one.from_node, other.from_node)):
+            return False
+        T_from_to = self._path.T(other.from_node, one.from_node) @ one.T_from_to
+        return se3.magnitude(se3.inverse(other.T_from_to) @ T_from_to)[0] > SAME_PLACE
 
     def _proposals(
         self, node: int, since: Array, keyframes: Sequence[Keyframe], poses: Array

@@ -21,13 +21,15 @@ from dpm2_core.frame import Array, Keyframe, Points, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.slam.loops.place_recognition import PlaceRecognition
-from dpm2_core.slam.loops.verification import VerificationSettings, Verifier
+from dpm2_core.slam.loops.verification import (
+    SAME_PLACE,
+    VerificationSettings,
+    Verifier,
+    objection_of_others,
+)
 
 if TYPE_CHECKING:  # torch takes seconds to import
     from dpm2_core.network.model import DeepPointMap2
-
-_SAME_PLACE = 5.0  # m, candidates whose poses are nearer are one place
-_CLEARLY = 0.5  # of what does not fit at the second best place, at most so much does not fit at the best
 
 
 class RelocalizationSettings(Settings):
@@ -103,10 +105,8 @@ class Relocalizer:
         best = max(places, key=lambda place: (place.ok, place.confidence))
         if not best.ok:
             return nowhere("; ".join(place.reason for place in places))
-        second = max((place.confidence for place in places if _meters(place, best) > _SAME_PLACE), default=0.0)
-        if 1 - best.confidence > _CLEARLY * (1 - second):
-            return nowhere(f"two places of the map fit alike: {best.confidence:.0%} and {second:.0%} of the points")
-        return best
+        objection = objection_of_others(best, [place for place in places if _meters(place, best) > SAME_PLACE])
+        return nowhere(objection) if objection else best
 
     def verify(self, cloud: Points, T_map_lidar: Array, widen: float = 1.0) -> Registration:
         """Verifies a pose in the map by the points: T_map_lidar, `ok` or not; `widen` as in `Verifier.verify`."""
@@ -133,7 +133,7 @@ class Relocalizer:
             if result.ok
         ]
         for proposal in sorted(in_map, key=lambda r: -r.confidence):
-            if all(_meters(proposal, other) > _SAME_PLACE for other in proposals):
+            if all(_meters(proposal, other) > SAME_PLACE for other in proposals):
                 proposals.append(proposal)
         return proposals
 

@@ -22,6 +22,9 @@ from dpm2_core.slam.registration.local_map import LocalMap, LocalMapSettings
 _CELL = 2.0  # m, of the grid whose lowest points are the ground
 _ABOVE = 0.5  # m over it: what stands there
 _WELL = 0.75  # fraction of that which fits where a pose is right; with less, a place beside it may fit better
+_CLEARLY = 0.5  # of what does not fit at the second best place, at most so much does not fit at the best
+_ELSEWHERE = 0.7  # fit that another place is assumed to have where none was tried: in car parks they have 0.5 to 0.8
+SAME_PLACE = 5.0  # m, poses nearer to each other than this are of one place
 
 
 class VerificationSettings(Settings):
@@ -64,6 +67,23 @@ class VerificationResult:
     points: int = 0
     moved: float = 0.0
     turned: float = 0.0
+
+
+def objection_of_others(best: Registration, others: Sequence[Registration]) -> str:
+    """Why a verified pose is not believed without a prior: another place fits nearly as well; empty if none does.
+
+    As the ratio test of D. Lowe, "Distinctive Image Features from Scale-Invariant Keypoints", IJCV 2004, with what does
+    not fit as the distance.
+
+    Args:
+        others: verifications at other places, also those that were not accepted.
+    """
+    second = max((other.confidence for other in others), default=_ELSEWHERE)
+    if 1 - best.confidence <= _CLEARLY * (1 - second):
+        return ""
+    if not others:
+        return f"{best.confidence:.0%} of the points fit: too few without another place to compare with"
+    return f"two places of the map fit alike: {best.confidence:.0%} and {second:.0%} of the points"
 
 
 class Verifier:

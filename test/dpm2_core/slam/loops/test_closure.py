@@ -19,10 +19,12 @@ from dpm2_core.network.pose_solver import Solved
 from dpm2_core.network.pretrained import load_network
 from dpm2_core.network.tokens import Tokens
 from dpm2_core.sim.lidar import Lidar
+from dpm2_core.sim.sensors import real_sensor
 from dpm2_core.sim.settings import LidarConfig
 from dpm2_core.sim.world import World, build_world
 from dpm2_core.slam.loops.closure import LoopCloser, LoopSettings
 from dpm2_core.slam.loops.place_recognition import AGREEING, PlaceRecognition
+from dpm2_core.slam.loops.relocalization import downsampled
 from dpm2_core.slam.loops.verification import Verifier
 from dpm2_core.slam.registration.icp import GeometricSettings
 
@@ -204,3 +206,36 @@ def test_the_overlap_head_alone_accepts_the_best_candidate(monkeypatch: pytest.M
     loops, _ = drive(places, jump, gap=30.0, decided_by="overlap", min_overlap=0.7)
     assert not any(loop.registration.ok for loop in loops)
     assert "the overlap head of these weights is not trained" in {loop.registration.reason for loop in loops}
+
+
+def joined(*parts: tuple[float, float]) -> tuple[list[Edge], Array]:
+    """Loops between two robots in a car park that looks alike everywhere, each of which drives a part of one way, m."""
+    world = build_world("loop", "car_park", seed=902, length=120.0)
+    lidar = Lidar(real_sensor(LidarConfig(beams=16, height=0.8)))
+    search, keyframes, clouds, truth, loops = closer(), list[Keyframe](), list[Points](), list[Array](), list[Edge]()
+    for robot, (start, stop) in zip("ab", parts, strict=True):
+        for s in np.arange(start, stop, 4.0):
+            truth.append(world.pose_at(s, height=0.8))
+            points = lidar.scan(world, truth[-1], 0.5 * s, np.random.default_rng(int(s))).points
+            clouds.append(downsampled(points, 0.3, 40.0))
+            edge = Registration(np.eye(4), FIRM, 1.0, 0.1, "test") if s > start else None
+            keyframes.append(search.described(Keyframe(len(truth), 0, 0, truth[-1], clouds[-1], edge, robot)))
+            loops += search.close(keyframes, clouds, np.array(truth))
+    return loops, np.array(truth)
+
+
+@pytest.mark.slow
+@pytest.mark.weights
+def test_robots_in_different_parts_of_a_place_that_looks_alike_are_not_joined() -> None:
+    loops, _ = joined((0.0, 40.0), (44.0, 80.0))
+    assert any("fit alike" in loop.registration.reason for loop in loops)
+    assert not any(loop.ok for loop in loops)
+
+
+@pytest.mark.slow
+@pytest.mark.weights
+def test_robots_that_meet_in_a_place_that_looks_alike_are_joined_where_they_do() -> None:
+    loops, truth = joined((0.0, 40.0), (18.0, 40.0))
+    accepted = [loop for loop in loops if loop.ok]
+    assert len(accepted) >= 2
+    assert max(errors(accepted, truth)) < 0.2

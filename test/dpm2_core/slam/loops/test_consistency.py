@@ -112,3 +112,16 @@ def test_between_robots_it_always_takes_two() -> None:
     (first,) = checked_by(consistency, loop(3, 23, T), np.eye(4))
     assert not first.ok
     assert len(checked_by(consistency, loop(4, 24, T), np.eye(4))) == 2
+
+
+def test_what_is_expected_needs_no_other_loop_and_nothing_is_expected_between_robots_before_the_first() -> None:
+    path, settings, T = straight(), ConsistencySettings(), pose(0.5)
+    consistency, there = Consistency(path), expected(path, 10, 40)
+    assert consistency.expected(loop(10, 40, there), there, settings)
+    assert not consistency.expected(loop(10, 40, pose(3.0) @ there), there, settings)
+    for node in range(101, 121):
+        path.append(keyframe(node, pose(5.0 * (node - 101)), None if node == 101 else FIRM, "b"))
+    assert not consistency.expected(loop(3, 104, T), T, settings)
+    consistency.check(loop(3, 104, T), np.eye(4), settings)
+    consistency.check(loop(4, 105, T), np.eye(4), settings)
+    assert consistency.expected(loop(5, 106, T), np.eye(4), settings)

@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Places in buildings: found from one scan in a map, and drives joined to one map, or honestly not."""
+
+from __future__ import annotations
+
+import tempfile
+from collections import Counter
+from dataclasses import dataclass
+from itertools import permutations
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from benchmarks.relocalise import success_rates
+from dpm2_core.data.kitti import KittiSource
+from dpm2_core.data.settings import InputSettings
+from dpm2_core.frame import Array, Edge, Frame, Keyframe
+from dpm2_core.geometry import se3
+from dpm2_core.pipeline import Config, OfflineRun
+from dpm2_core.sim.drive import fitting_length
+from dpm2_core.sim.lidar import Lidar
+from dpm2_core.sim.settings import DriveConfig
+from dpm2_core.sim.world import build_world
+from dpm2_core.slam.build import make_localizer
+from dpm2_core.slam.loops.relocalization import downsampled
+from dpm2_core.slam.mapping.mapper import Mapper
+from dpm2_core.slam.preprocess import Preprocessor
+from dpm2_core.slam.settings import SlamSettings
+from dpm2_core.tables import FigureTable
+
+HEIGHT = 0.8
+"""Of the LiDAR above the floor, m."""
+VISITS, VISITS_SEED = 60, 5
+"""Random places and headings in each world."""
+WRONG_M, WRONG_DEG = 0.5, 5.0
+"""A loop that is off by more than either is wrong: the next room."""
+
+
+@dataclass(frozen=True)
+class Visit:
+    """A scan as the SLAM keeps it, and T_map_lidar (4, 4) in the map of its own world."""
+
+    keyframe: Keyframe
+    truth: Array
+
+
+def visits_to(config: DriveConfig, settings: SlamSettings) -> list[Visit]:
+    """Random visits to the world of a drive, whose map begins where the drive does."""
+    world = build_world(config.road, config.preset, config.seed, fitting_length(config))
+    lidar, rng = Lidar(config.lidar), np.random.default_rng(VISITS_SEED)
+    T_map_world, visits = se3.inverse(world.drive_pose(0.0, HEIGHT)), list[Visit]()
+    for i in range(VISITS):
+        T, time = world.sample_pose(rng, height=HEIGHT, sway=config.lidar.real.sway)
+        T = T @ se3.exp(np.array([0, 0, rng.uniform(-np.pi, np.pi), 0, 0, 0]))
+        frame = Frame(0, lidar.scan(world, T, time, rng).points)
+        points = Preprocessor(settings.preprocess).measured(frame, np.zeros(6))
+        cloud = downsampled(points, settings.keyframes.voxel, settings.keyframes.range)
+        visits.append(Visit(Keyframe(i, 0, i, np.eye(4), cloud), T_map_world @ T))
+    return visits
+
+
+def relocalised(settings: SlamSettings, mapper: Mapper, visits: dict[str, list[Visit]], home: str) -> dict[str, Any]:
+    """Visits to the world of the map, and how many of those to the other worlds it takes for its own."""
+    rows, mistaken = [], 0
+    for name, of_world in visits.items():
+        for visit in of_world:
+            localizer, started = make_localizer(settings, mapper), perf_counter()
+            found = localizer.add(visit.keyframe).registration
+            if name == home:
+                off = se3.magnitude(se3.inverse(found.T_target_source) @ visit.truth)
+                rows.append((found.ok, *off, perf_counter() - started))
+            else:
+                mistaken += found.ok
+    return {**success_rates(rows), "other_worlds": VISITS * (len(visits) - 1), "mistaken": mistaken}
+
+
+def joins(drive: Path, settings: SlamSettings) -> dict[str, int]:
+    """Each two thirds of a drive in one map: how many pairs are joined rightly, wrongly, or stay apart."""
+    source = KittiSource(drive, InputSettings(images=False))
+    config = Config(input=InputSettings(images=False), slam=settings)
+    assert source.poses is not None
+    third, found = len(source) // 3, Counter[str]()
+    for first, second in permutations([(0, third), (third, 2 * third), (2 * third, 3 * third)], 2):
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "map.dpm2map"
+            with OfflineRun(drive, config, frames=first, map_file=file) as run:
+                run.run()
+            with OfflineRun(drive, config, frames=second, map_file=file, map_mode="extend") as run:
+                run.run()
+                found[_joined(run.slam.mapper, source.poses)] += 1
+    return {kind: found[kind] for kind in ("right", "apart", "wrong")}
+
+
+def _joined(mapper: Mapper, truth: Array) -> str:
+    start = mapper.session_start
+    truth = truth[[keyframe.index for keyframe in mapper.keyframes]]
+    between = [loop for loop in mapper.loops if loop.ok and (loop.from_node < start) != (loop.to_node < start)]
+    if not between:
+        return "apart"
+    return "wrong" if any(is_wrong(truth, loop) for loop in between) else "right"
+
+
+def is_wrong(truth: Array, loop: Edge) -> bool:
+    """Whether a loop between keyframes at `truth` (N, 4, 4) leads to another place: the next room."""
+    meters, degrees = error_of(truth, loop)
+    return meters > WRONG_M or degrees > WRONG_DEG
+
+
+def error_of(truth: Array, loop: Edge) -> tuple[float, float]:
+    """How far a loop is off, m and degrees."""
+    a, b = truth[loop.from_node], truth[loop.to_node]
+    return se3.magnitude(se3.inverse(se3.inverse(a) @ b) @ loop.T_from_to)
+
+
+def relocalise_table(worlds: dict[str, Any]) -> FigureTable:
+    """What `relocalised` found."""
+    figures = ("right %", "no answer", "wrong", "median m", "other worlds' taken for it", "p95 s")
+    table = FigureTable("relocalization from one scan, without a prior", names=["world"], figures=figures)
+    for name, world in worlds.items():
+        r = world["relocalisation"]
+        median = "-" if r["median_error_m"] is None else f"{r['median_error_m']:.3f}"
+        table.add_row(name, f"{100 * r['right']:.0f}", f"{r['no_answer']} of {r['visits']}", str(r["wrong"]), median,
+                      f"{r['mistaken']} of {r['other_worlds']}", f"{r['seconds']['p95']:.2f}")  # fmt: skip
+    return table
+
+
+def join_table(worlds: dict[str, Any]) -> FigureTable:
+    """What `joins` found."""
+    table = FigureTable("two thirds of a drive in one map", names=["world"], figures=("right", "apart", "wrong"))
+    for name, world in worlds.items():
+        table.add_row(name, *(str(world["joins"][kind]) for kind in ("right", "apart", "wrong")))
+    return table
