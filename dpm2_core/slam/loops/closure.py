@@ -3,8 +3,8 @@
 
 A candidate must convince four times: the network, which finds it and registers it without any start; the points of the
 new keyframe, which must fit the map around it; the odometry, whose drift has limits; and, where the correction is
-large, a second loop that says the same. There it must also fit clearly better than any other place. Whatever fails is
-kept with the reason.
+large, a second loop that says the same. Where no odometry leads from one end to the other, as between two drives, it
+must also fit clearly better than any other place. Whatever fails is kept with the reason.
 """
 
 from __future__ import annotations
@@ -129,13 +129,13 @@ class LoopCloser:
             if not loop.ok:
                 failed.append(loop)
                 continue
-            T_expected = se3.inverse(poses[loop.from_node]) @ poses[node]
-            if not self._consistency.expected(loop, T_expected, self._settings.consistency):
+            if self._consistency.is_first(loop, self._settings.consistency):
                 unseen = [p for p in proposals[number + 1 :] if self._elsewhere(p, loop)][:most]
                 others = [f for f in failed if self._elsewhere(f, loop)]
                 others += [self._verified(p, keyframes, clouds, poses) for p in unseen]
                 if objection := objection_of_others(loop.registration, [o.registration for o in others]):
                     return [*tried, *failed, loop.rejected(objection)]
+            T_expected = se3.inverse(poses[loop.from_node]) @ poses[node]
             return tried + failed + self._consistency.check(loop, T_expected, self._settings.consistency)
         return tried + failed + [proposal.rejected("others are more likely") for proposal in proposals[most:]]
 

@@ -83,13 +83,10 @@ class Consistency:
         self._accepted: list[Edge] = []
         self._waiting: list[Edge] = []
 
-    def expected(self, loop: Edge, T_expected: Array, settings: ConsistencySettings) -> bool:
-        """Whether the odometry or an accepted loop says the same as this one; arguments as `check`."""
-        if np.isfinite(self._path.between(loop.from_node, loop.to_node)):
-            meters, degrees = se3.magnitude(se3.inverse(T_expected) @ loop.T_from_to)
-            if max(meters, degrees) <= settings.certain:
-                return True
-        return any(self._agree(loop, accepted, settings) for accepted in self._accepted[-200:])
+    def is_first(self, loop: Edge, settings: ConsistencySettings) -> bool:
+        """Whether nothing else says where its ends are to each other: no odometry, and no accepted loop."""
+        known = np.isfinite(self._path.between(loop.from_node, loop.to_node))
+        return not known and not self._agrees_with_accepted(loop, settings)
 
     def check(self, loop: Edge, T_expected: Array, settings: ConsistencySettings) -> list[Edge]:
         """Check a loop that the points have verified.
@@ -103,13 +100,19 @@ class Consistency:
         s = settings
         since = self._path.between(loop.from_node, loop.to_node)
         meters, degrees = se3.magnitude(se3.inverse(T_expected) @ loop.T_from_to)
-        if np.isfinite(since) and (meters > 1 + s.drift * since or degrees > 3 + s.drift_turn * since):
-            return [loop.rejected(f"{meters:.1f} m, {degrees:.1f} deg from the odometry")]
         confirmed = [w for w in self._waiting if self._agree(loop, w, s)]
-        if confirmed or self.expected(loop, T_expected, s):
+        if np.isfinite(since):
+            if meters > 1 + s.drift * since or degrees > 3 + s.drift_turn * since:
+                return [loop.rejected(f"{meters:.1f} m, {degrees:.1f} deg from the odometry")]
+            if meters <= s.certain and degrees <= s.certain:
+                return self._accept([loop, *confirmed])
+        if confirmed or self._agrees_with_accepted(loop, s):
             return self._accept([loop, *confirmed])
         self._waiting.append(loop)
         return [loop.rejected(f"{meters:.1f} m from the odometry: waits for a second loop that agrees")]
+
+    def _agrees_with_accepted(self, loop: Edge, s: ConsistencySettings) -> bool:
+        return any(self._agree(loop, accepted, s) for accepted in self._accepted[-200:])
 
     def _accept(self, loops: Sequence[Edge]) -> list[Edge]:
         self._accepted += loops

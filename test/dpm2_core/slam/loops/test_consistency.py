@@ -114,14 +114,15 @@ def test_between_robots_it_always_takes_two() -> None:
     assert len(checked_by(consistency, loop(4, 24, T), np.eye(4))) == 2
 
 
-def test_what_is_expected_needs_no_other_loop_and_nothing_is_expected_between_robots_before_the_first() -> None:
+def test_a_loop_is_the_first_where_neither_odometry_nor_another_loop_ties_its_ends() -> None:
     path, settings, T = straight(), ConsistencySettings(), pose(0.5)
-    consistency, there = Consistency(path), expected(path, 10, 40)
-    assert consistency.expected(loop(10, 40, there), there, settings)
-    assert not consistency.expected(loop(10, 40, pose(3.0) @ there), there, settings)
+    consistency = Consistency(path)
+    assert not consistency.is_first(loop(10, 40, pose(3.0) @ expected(path, 10, 40)), settings)
     for node in range(101, 121):
         path.append(keyframe(node, pose(5.0 * (node - 101)), None if node == 101 else FIRM, "b"))
-    assert not consistency.expected(loop(3, 104, T), T, settings)
+    assert consistency.is_first(loop(3, 104, T), settings)
     consistency.check(loop(3, 104, T), np.eye(4), settings)
+    assert consistency.is_first(loop(4, 105, T), settings)  # the other one still waits
     consistency.check(loop(4, 105, T), np.eye(4), settings)
-    assert consistency.expected(loop(5, 106, T), np.eye(4), settings)
+    assert not consistency.is_first(loop(5, 106, T), settings)
+    assert consistency.is_first(loop(5, 106, pose(9.0)), settings)
