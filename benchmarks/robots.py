@@ -2,7 +2,7 @@
 """`make bench-robots`: three slam_nodes on overlapping parts of a real road, and one mapper_node behind a bad network.
 
 The mapper has a network of its own, joined to the robots' by one link that loses packets and is gone for 30 s
-(`bench_network`). The robots drive at the same time, along KITTI's sequence 07 in the synthetic city.
+(`lossy_link`). The robots drive at the same time, along KITTI's sequence 07 in the synthetic city.
 """
 
 from __future__ import annotations

@@ -16,9 +16,9 @@ from dpm2_core.errors import UsageError
 LINK = """
 import socket, sys, time
 from pathlib import Path
-from dpm2_ros import bench_network
-bench_network.LOSS = 0.2
-link = bench_network.Link()
+from benchmarks import lossy_link
+lossy_link.LOSS = 0.2
+link = lossy_link.Link()
 echo = link.start_mapper([], {"PATH": sys.argv[2]}, Path(sys.argv[1]))
 s = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 s.bind(("10.73.0.1", 7400)); s.settimeout(0.2)
