@@ -363,6 +363,12 @@ def domain() -> int:
 
 
 @pytest.fixture
+def domains() -> Iterator[int]:
+    """More of them, for a test whose processes must not meet."""
+    return _domains
+
+
+@pytest.fixture
 def drive() -> Drive:
     """The drive, scan by scan."""
     return Drive()

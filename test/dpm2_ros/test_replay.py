@@ -9,7 +9,7 @@ import signal
 import subprocess
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -98,13 +98,13 @@ def segments(process: subprocess.Popen[bytes]) -> list[int]:
 
 
 def test_the_dds_profile_is_used_unless_the_user_has_one(
-    processes: list[Any], bag: Path, domain: int, tmp_path: Path
+    processes: list[Any], bag: Path, domains: Iterator[int], tmp_path: Path
 ) -> None:
     """The user's may be named by either variable, or Fast DDS be configured by another."""
     shipped = Path(__file__).parents[2] / "config" / "fastdds.xml"
     own = tmp_path / "own.xml"
     own.write_text(shipped.read_text().replace(str(SEGMENT), str(SEGMENT // 2)))
-    inherited = {name: value for name, value in ros_environment(domain).items() if name != PROFILE}
+    inherited = {name: value for name, value in ros_environment().items() if name != PROFILE}
     found: dict[str, list[int]] = {}
     environments: dict[str, dict[str, str]] = {
         "none": {},
@@ -112,8 +112,8 @@ def test_the_dds_profile_is_used_unless_the_user_has_one(
         "newer name": {"FASTDDS_DEFAULT_PROFILES_FILE": str(own)},
         "transports": {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"},
     }
-    for n, (name, more) in enumerate(environments.items()):
-        alone = {"ROS_DOMAIN_ID": str(1 + (domain + n) % 100)}  # each sees the memory of those in its domain
+    for name, more in environments.items():
+        alone = {"ROS_DOMAIN_ID": str(next(domains))}  # each sees the memory of those in its domain
         given = [str(bag), "--wait", "120"]
         processes.append(start("bag_player", given, inherited | alone | more, tmp_path / name))
     for name, process in zip(environments, processes, strict=True):
