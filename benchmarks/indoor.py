@@ -19,7 +19,6 @@ from benchmarks.harness import Options, Report, settings_of
 from benchmarks.indoor_places import (
     HEIGHT,
     Visit,
-    error_of,
     is_wrong,
     join_table,
     joins,
@@ -27,6 +26,7 @@ from benchmarks.indoor_places import (
     relocalised,
     visits_to,
 )
+from benchmarks.loops import error_of
 from dpm2_core.data.kitti import KittiSource
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.evaluation.metrics import evaluate
@@ -96,7 +96,7 @@ def _drive(path: Path, settings: SlamSettings, progress: Progress, name: str) ->
         "keyframes": len(mapper.keyframes),
         "loops": len(loops),
         "wrong_loops": sum(is_wrong(truth, loop) for loop in loops),
-        "worst_loop_m": max((error_of(truth, loop)[0] for loop in loops), default=None),
+        "worst_loop_m": max((error_of(loop, truth)[0] for loop in loops), default=None),
     }, mapper
 
 

@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.relocalise import success_rates
+from benchmarks.loops import error_of
+from benchmarks.relocalise import measured, row_of, success_rates
 from dpm2_core.data.kitti import KittiSource
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.frame import Array, Edge, Frame, Keyframe
@@ -26,7 +27,6 @@ from dpm2_core.sim.world import build_world
 from dpm2_core.slam.build import make_localizer
 from dpm2_core.slam.loops.relocalization import downsampled
 from dpm2_core.slam.mapping.mapper import Mapper
-from dpm2_core.slam.preprocess import Preprocessor
 from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.tables import FigureTable
 
@@ -55,22 +55,21 @@ def visits_to(config: DriveConfig, settings: SlamSettings) -> list[Visit]:
         T, time = world.sample_pose(rng, height=HEIGHT, sway=config.lidar.real.sway)
         T = T @ se3.exp(np.array([0, 0, rng.uniform(-np.pi, np.pi), 0, 0, 0]))
         frame = Frame(0, lidar.scan(world, T, time, rng).points)
-        points = Preprocessor(settings.preprocess).measured(frame, np.zeros(6))
-        cloud = downsampled(points, settings.keyframes.voxel, settings.keyframes.range)
+        cloud = downsampled(measured(frame, settings), settings.keyframes.voxel, settings.keyframes.range)
         visits.append(Visit(Keyframe(i, 0, i, np.eye(4), cloud), T_map_world @ T))
     return visits
 
 
 def relocalised(settings: SlamSettings, mapper: Mapper, visits: dict[str, list[Visit]], home: str) -> dict[str, Any]:
     """Visits to the world of the map, and how many of those to the other worlds it takes for its own."""
-    rows, mistaken = [], 0
+    localizer, rows, mistaken = make_localizer(settings, mapper), [], 0
     for name, of_world in visits.items():
         for visit in of_world:
-            localizer, started = make_localizer(settings, mapper), perf_counter()
+            localizer.restart()
+            started = perf_counter()
             found = localizer.add(visit.keyframe).registration
             if name == home:
-                off = se3.magnitude(se3.inverse(found.T_target_source) @ visit.truth)
-                rows.append((found.ok, *off, perf_counter() - started))
+                rows.append(row_of(found, visit.truth, perf_counter() - started))
             else:
                 mistaken += found.ok
     return {**success_rates(rows), "other_worlds": VISITS * (len(visits) - 1), "mistaken": mistaken}
@@ -104,14 +103,8 @@ def _joined(mapper: Mapper, truth: Array) -> str:
 
 def is_wrong(truth: Array, loop: Edge) -> bool:
     """Whether a loop between keyframes at `truth` (N, 4, 4) leads to another place: the next room."""
-    meters, degrees = error_of(truth, loop)
+    meters, degrees = error_of(loop, truth)
     return meters > WRONG_M or degrees > WRONG_DEG
-
-
-def error_of(truth: Array, loop: Edge) -> tuple[float, float]:
-    """How far a loop is off, m and degrees."""
-    a, b = truth[loop.from_node], truth[loop.to_node]
-    return se3.magnitude(se3.inverse(se3.inverse(a) @ b) @ loop.T_from_to)
 
 
 def relocalise_table(worlds: dict[str, Any]) -> FigureTable:

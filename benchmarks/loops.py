@@ -33,8 +33,7 @@ def check_loops(loops: Sequence[Edge], truth: Array) -> dict[str, Any]:
     found: set[int] = set()
     errors, wrong, rejections = [], 0, Counter[str]()
     for loop in loops:
-        true = se3.inverse(truth[loop.from_node]) @ truth[loop.to_node]
-        meters, degrees = se3.magnitude(se3.inverse(true) @ loop.T_from_to)
+        meters, degrees = error_of(loop, truth)
         if not loop.ok:
             words = loop.registration.reason.split()
             rejections[" ".join(word for word in words if not any(c.isdigit() for c in word))] += 1
@@ -54,6 +53,12 @@ def check_loops(loops: Sequence[Edge], truth: Array) -> dict[str, Any]:
     for kind, nodes in revisits(truth).items():
         result[kind] = {"revisits": len(nodes), "found": len(nodes & found)}
     return result
+
+
+def error_of(loop: Edge, truth: Array) -> tuple[float, float]:
+    """How far a loop is off, m and degrees; (N, 4, 4) true poses of the keyframes."""
+    T_from_to = se3.inverse(truth[loop.from_node]) @ truth[loop.to_node]
+    return se3.magnitude(se3.inverse(T_from_to) @ loop.T_from_to)
 
 
 def revisits(truth: Array) -> dict[str, set[int]]:

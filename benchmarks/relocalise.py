@@ -67,7 +67,7 @@ def bench_relocalise(options: Options) -> Report:
             for cloud, truth in visits(roads, settings, options.pairs):
                 started = perf_counter()
                 found = relocalizer.find(cloud)
-                rows.append(_row(found, truth, perf_counter() - started))
+                rows.append(row_of(found, truth, perf_counter() - started))
                 progress.advance(task)
             results = {"keyframes": len(data), "lateral_m": LATERAL, **success_rates(rows)}
     return Report(results, Group(*(f"{name}: {value}" for name, value in results.items())))
@@ -88,7 +88,7 @@ def survey(options: Options, settings: SlamSettings, file: Path, progress: Progr
             task = progress.add_task(f"map of {drive.name}", total=len(frames))
             for i in frames:
                 cloud = downsampled(
-                    _measured(drive.frame(i), settings), settings.keyframes.voxel, settings.keyframes.range
+                    measured(drive.frame(i), settings), settings.keyframes.voxel, settings.keyframes.range
                 )
                 edge = Registration(np.eye(4), _EDGE, 1.0, 0.1, "survey") if mapper.keyframes else None
                 T = road.T_map_world @ drive.poses[i]
@@ -108,7 +108,7 @@ def visits(roads: list[Road], settings: SlamSettings, count: int) -> Iterator[tu
         s = rng.uniform(5, world.road.drive.length - 5)
         T = world.pose_at(s, rng.uniform(*LATERAL), rng.uniform(-np.pi, np.pi))
         scan = lidar.scan(world, T, rng.uniform(0, world.road.times[-1]), rng)
-        points = _measured(Frame(0, scan.points), settings)
+        points = measured(Frame(0, scan.points), settings)
         yield downsampled(points, settings.keyframes.voxel, settings.keyframes.range), road.T_map_world @ T
 
 
@@ -133,9 +133,11 @@ def success_rates(rows: list[tuple[bool, float, float, float]]) -> dict[str, Any
     }
 
 
-def _row(result: Registration, truth: Array, seconds: float) -> tuple[bool, float, float, float]:
+def row_of(result: Registration, truth: Array, seconds: float) -> tuple[bool, float, float, float]:
+    """A result for `success_rates`; `truth` T_map_lidar (4, 4)."""
     return result.ok, *se3.magnitude(se3.inverse(result.T_target_source) @ truth), seconds
 
 
-def _measured(frame: Frame, settings: SlamSettings) -> Points:
+def measured(frame: Frame, settings: SlamSettings) -> Points:
+    """The points (N, 4) of a frame at rest, as the SLAM prepares them."""
     return Preprocessor(settings.preprocess).measured(frame, np.zeros(6))
