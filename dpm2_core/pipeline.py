@@ -38,6 +38,7 @@ from dpm2_core.evaluation.run_folder import (
 from dpm2_core.extras import MissingPackageError
 from dpm2_core.files import atomic_write, write_json
 from dpm2_core.frame import Array, Frame, OdometryResult
+from dpm2_core.interrupt import interrupt_deferred
 from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.output import TrajectoryRecorder
@@ -117,7 +118,7 @@ class OfflineRun:
         progress: Callable[[SlamResult], None] = lambda result: None,
         watch: Watch | None = None,
     ) -> Result:
-        """All frames through the SLAM, once; Ctrl-C ends it early, and the result is of the frames until then.
+        """All frames through the SLAM, once; Ctrl-C ends it after a frame, and the result is of the frames until then.
 
         Args:
             progress: called after each frame. watch: the same, with the frame and the map as they are then.
@@ -125,12 +126,15 @@ class OfflineRun:
         result = Result(self.source, self._config, self.slam.mapper, self._truth, self._truth_name)
         began = perf_counter()
         try:
-            for frame in prefetch(self.source.frames(self._start, self._stop)):
-                step = self.slam.process(frame)
-                result.add(step.odometry)
-                if watch is not None:
-                    watch(frame, step, self.slam.mapper)
-                progress(step)
+            with interrupt_deferred() as interrupted:
+                for frame in prefetch(self.source.frames(self._start, self._stop)):
+                    step = self.slam.process(frame)
+                    result.add(step.odometry)
+                    if watch is not None:
+                        watch(frame, step, self.slam.mapper)
+                    progress(step)
+                    if interrupted():
+                        raise KeyboardInterrupt
         except KeyboardInterrupt:
             result.interrupted = True
         result.wall_s = perf_counter() - began
