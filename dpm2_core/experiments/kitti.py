@@ -38,6 +38,7 @@ PAPER: Cells = {
     sequence: {"t_err_percent": t, "r_err_deg_per_100m": r} for sequence, t, r in zip(TESTED, _T, _R, strict=True)
 }
 """DeepPointMap2's row of table 1."""
+_SPEED = {"ape_rmse_m": ".3f", "fps": ".0f"}
 _APE = {"ape_mean_m": ".2f", "ape_rmse_m": ".2f", **SHOWN}
 
 
@@ -60,15 +61,19 @@ def _kitti_outcome(request: Request, figures: Mapping[str, Figures]) -> Outcome:
     title = "KITTI odometry: t_err % / r_err deg per 100 m"
     caption = "KITTI metric of the left camera's poses, mean over all segments; mean: over the sequences."
     table = ResultTable(title, [*sequences, MEAN], SHOWN, caption)
+    speed = ResultTable("APE rmse m / frames per s", [*sequences, MEAN], _SPEED,
+                        "APE: positions after SE(3) alignment; frames per second: processing alone, of each of"
+                        f" {request.workers} parts at a time.")  # fmt: skip
     names = [name for name, _ in registrations(request)] + peer_names(request)
     for name in names:
-        table.add(name, cells(name, sequences, figures, list(SHOWN)))
+        for rows in (table, speed):
+            rows.add(name, cells(name, sequences, figures, list(rows.figures)))
     table.add("DeepPointMap2", {s: PAPER[s] for s in sequences if s in PAPER}, "the paper")
     notes = missing_note(sequences, TESTED)
     if not all(sequence in PAPER for sequence in sequences) or request.frames or request.lengths:
         notes.append("other sequences, frames or lengths than the paper's: its row is no comparison")
     runs = run_folders(names, sequences, request.out)
-    return Outcome([table], notes, runs, _pictures(runs, sequences, request.out, notes))
+    return Outcome([table, speed], notes, runs, _pictures(runs, sequences, request.out, notes))
 
 
 def _kitti360_parts(request: Request) -> Sequence[Sequence[Part]]:
