@@ -8,10 +8,15 @@ from numpy.typing import NDArray
 from scipy.ndimage import grey_opening, minimum_filter
 
 _OPENING = 7  # cells
+_BESIDE = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], bool)
 
 
 def height_above_ground(points: NDArray[np.floating], cell: float = 1.0, reach: int = 2) -> NDArray[np.floating]:
-    """(M,) m of (M, 3+) points above the lowest one within `reach` cells of `cell` m around them."""
+    """(M,) m of (M, 3+) points above the lowest one within `reach` cells of `cell` m around them.
+
+    A cell that lies deeper than all that touch it by more than its own edge is not ground: what is mirrored in a window
+    or a puddle appears below it. One such point in a real scan lifts everything within 5 m by 10 m.
+    """
     if not len(points):
         return np.zeros(0, points.dtype)
     x, y = (np.floor(points[:, axis] / cell).astype(np.int64) for axis in (0, 1))
@@ -20,6 +25,9 @@ def height_above_ground(points: NDArray[np.floating], cell: float = 1.0, reach: 
     at = x * shape[1] + y  # one index is twice as fast as two
     lowest = np.full(shape, np.inf, points.dtype)
     np.minimum.at(lowest.reshape(-1), at, z)
+    beside = minimum_filter(lowest, footprint=_BESIDE, mode="constant", cval=np.inf)
+    pit = np.isfinite(beside) & (lowest < beside - cell)
+    lowest[pit] = beside[pit]
     around = minimum_filter(lowest, 2 * reach + 1, mode="constant", cval=np.inf)
     return z - around.reshape(-1)[at]
 

@@ -21,6 +21,17 @@ def test_a_wall_stands_and_a_slope_does_not(dtype: type) -> None:
     assert len(height_above_ground(np.zeros((0, 3), dtype))) == 0
 
 
+@pytest.mark.parametrize("reach", [0, 2])
+def test_a_point_mirrored_below_the_ground_lifts_nothing(reach: int) -> None:
+    """A bank of 2 m, steeper than a street and longer than a cell, remains ground to either side."""
+    x, y = np.meshgrid(np.arange(-10, 10, 0.25), np.arange(-10, 10, 0.25))
+    ground = np.stack([x.ravel(), y.ravel(), np.where(x < 3, 0.0, -2.0).ravel()], -1)
+    mirrored = np.array([[-5.0, 1.0, -9.0], [-4.9, 1.1, -8.0]])
+    height = height_above_ground(np.concatenate([ground, mirrored]), 1.0, reach)
+    assert (height[len(ground) :] < 0).all()
+    np.testing.assert_array_equal(height[: len(ground)], height_above_ground(ground, 1.0, reach))
+
+
 def test_the_ground_below_a_roof_is_not_the_roof() -> None:
     """A roof of 5 by 5 m over ground that is seen around it alone: shorter than the opening of 7 cells of 1 m."""
     x, y = np.meshgrid(np.arange(-15, 15, 0.25), np.arange(-15, 15, 0.25))
