@@ -70,7 +70,7 @@ measure: setup  ## every record that stands on the weights, again, at a clean co
 	$(BIN)/python -m tools.measure $(ARGS)
 
 # On a machine that does nothing else OpenMP threads may spin while they wait: a fifth faster.
-train-data: setup  ## the synthetic worlds that train-small and ablation learn from (2 cores: 60 minutes, 1.8 GB)
+train-data: setup  ## the synthetic worlds that train-small and ablation learn from (2 cores: 60 minutes, 2.3 GB)
 	$(BIN)/python -m dpm2_core.cli train data out/train/lidar --set worlds=64
 	$(BIN)/python -m dpm2_core.cli train data out/train/camera --config config/worlds_camera.yaml
 	$(BIN)/python -m dpm2_core.cli train data out/train/traffic --set worlds=20 --set first_seed=6000 --set frames=32 --set traffic=20 \
@@ -78,22 +78,27 @@ train-data: setup  ## the synthetic worlds that train-small and ablation learn f
 	$(BIN)/python -m dpm2_core.cli train data out/train/val --set first_seed=900000 --set worlds=12 --set frames=30 --set images=true
 	$(BIN)/python -m dpm2_core.cli train data out/train/val_degenerate --set first_seed=900100 --set worlds=6 --set frames=30 \
 		--set images=true --set 'mixture={highway: 0.5, tunnel: 0.5}'
-	$(BIN)/python -m dpm2_core.cli train data out/train/real --set worlds=72 --set first_seed=20000 --set frames=40 --set real=0.85 \
+	$(BIN)/python -m dpm2_core.cli train data out/train/real --set worlds=112 --set first_seed=20000 --set frames=40 --set real=0.85 \
 		--set others=0.3 --set 'mixture={city: 0.27, suburb: 0.27, rural: 0.26, highway: 0.1, tunnel: 0.1}'
 	$(BIN)/python -m dpm2_core.cli train data out/train/real_traffic --set worlds=10 --set first_seed=21000 --set frames=30 \
 		--set traffic=20 --set real=0.85 --set 'mixture={city: 0.35, suburb: 0.25, rural: 0.2, highway: 0.2}'
-	$(BIN)/python -m dpm2_core.cli train data out/train/real_camera --set worlds=16 --set first_seed=22000 --set frames=24 \
+	$(BIN)/python -m dpm2_core.cli train data out/train/real_camera --set worlds=30 --set first_seed=22000 --set frames=24 \
 		--set images=true --set real=0.85 --set 'mixture={city: 0.2, suburb: 0.2, rural: 0.2, highway: 0.2, tunnel: 0.2}'
 	$(BIN)/python -m dpm2_core.cli train data out/train/real_val --set worlds=8 --set first_seed=940000 --set frames=24 --set real=1
+	$(BIN)/python -m dpm2_core.cli train data out/train/rooms --set worlds=120 --set first_seed=23000 --set frames=40 --set beams=16 \
+		--set real=0.85 --set others=0.5 --set 'mixture={indoor: 0.8, car_park: 0.2}'
+	$(BIN)/python -m dpm2_core.cli train data out/train/rooms_val --set worlds=8 --set first_seed=941000 --set frames=30 --set beams=16 \
+		--set real=1 --set others=0.5 --set 'mixture={indoor: 1}'
 
 TRAIN = OMP_WAIT_POLICY=active $(BIN)/python -m dpm2_core.cli train
 RESUMED = $(if $(wildcard out/$(1)/checkpoint.pt),--resume)
-train-small: train-data  ## train the weights that are shipped: registration, image branch, both, poses, overlap (2 cores: 4 hours; continues)
+train-small: train-data  ## train the weights that are shipped: registration, image branch, both, poses, rooms, overlap (2 cores: 5 hours; continues)
 	$(TRAIN) phase1 --config config/train_small.yaml --out out/phase1 $(call RESUMED,phase1)
 	$(TRAIN) image --config config/train_small_image.yaml --out out/image $(call RESUMED,image)
 	$(TRAIN) phase1 --config config/train_small_camera.yaml --out out/camera $(call RESUMED,camera)
 	$(TRAIN) phase1 --config config/train_small_pose.yaml --out out/pose $(call RESUMED,pose)
 	$(TRAIN) phase1 --config config/train_small_real.yaml --out out/real $(call RESUMED,real)
+	$(TRAIN) phase1 --config config/train_small_rooms.yaml --out out/rooms $(call RESUMED,rooms)
 	$(TRAIN) phase2 --config config/train_small_phase2.yaml --out out/phase2 $(call RESUMED,phase2)
 
 train-ground: setup  ## train the weights of slam.filter.kind=ground (2 cores: 10 minutes, 1.5 GB)
@@ -103,16 +108,16 @@ train-ground: setup  ## train the weights of slam.filter.kind=ground (2 cores: 1
 	$(BIN)/python -m dpm2_core.cli train gndnet out/ground/train --val out/ground/val --out out/ground/run --set network.channels=16 \
 		--set epochs=8 --set rate=2e-3 --set lift=0.3 --set gaps=0.1 $(call RESUMED,ground/run)
 
-# Dense traffic and the usual one with 64 beams, and 32 beams higher up; the task learns from all of them.
-MOVERS = $(BIN)/python -m dpm2_core.cli train tasks-data out/movers/$(1) --set 'presets=[city, suburb, rural, highway]' \
-	--set train_frames=12 --set val=4 --set val_frames=6
-train-movers: setup  ## train the weights of slam.filter.kind=movers (2 cores: 15 minutes, 1.5 GB)
-	$(call MOVERS,dense) --set traffic=30 --set lidar.columns=1400 --set train=20 --set first_seed=7300
-	$(call MOVERS,usual) --set traffic=1 --set lidar.columns=2000 --set train=12 --set first_seed=7400
-	$(call MOVERS,sparse) --set traffic=15 --set lidar.beams=32 --set lidar.height=2.1 --set lidar.columns=1024 --set train=12 --set first_seed=7500
-	for part in train val; do mkdir -p out/movers/$$part; for set in dense usual sparse; do for drive in out/movers/$$set/$$part/*; do \
+# The usual traffic and a dense one with 64 beams, and 32 beams higher up; the task learns from all of them.
+MOVERS = $(BIN)/python -m dpm2_core.cli train tasks-data out/movers/$(1) --config config/movers_drives.yaml
+train-movers: setup  ## train the weights of slam.filter.kind=movers (2 cores: 25 minutes, 5 GB)
+	$(call MOVERS,usual)
+	$(call MOVERS,dense) --set train=24 --set train_frames=8 --set first_seed=18000 --set traffic=25 \
+		--set 'presets=[city, suburb, rural, highway]'
+	$(call MOVERS,sparse) --set train=40 --set first_seed=19000 --set lidar.beams=32 --set lidar.height=2 --set lidar.columns=1810
+	for part in train val; do mkdir -p out/movers/$$part; for set in usual dense sparse; do for drive in out/movers/$$set/$$part/*; do \
 		ln -sfn ../$$set/$$part/$$(basename $$drive) out/movers/$$part/$$set-$$(basename $$drive); done; done; done
-	$(BIN)/python -m dpm2_core.cli train movers out/movers/train --val out/movers/val --out out/movers/run \
+	$(BIN)/python -m dpm2_core.cli train movers out/movers/train --val out/movers/val --out out/movers/run --set every=3 \
 		$(call RESUMED,movers/run)
 
 ablation: train-data  ## Table 4: every fusion trained alike at a small budget

@@ -24,6 +24,12 @@ MOVABLE = (10, 11, 13, 15, 16, 18, 20, 30, 31, 32)
 """Cars, bicycles, buses, motorcycles, on rails, trucks, other vehicles, people, riders: SemanticKITTI's classes."""
 FIRST_MOVING = 252
 """The same while they move have this number and higher ones."""
+_STRETCH = 0.2
+_SLOPE = 0.07  # standard deviation along and across
+
+Voxels = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]
+"""(V,) numbers of the occupied voxels of a scan, ascending, the fraction of their points that can move, and how many
+there are."""
 
 
 class DynamicObjectTraining(TaskTraining):
@@ -38,6 +44,9 @@ class DynamicObjectTraining(TaskTraining):
     rate: float = Field(default=3e-3, gt=0)
     drop: float = Field(default=0.7, ge=0, lt=1)
     """At most this fraction of a scan's points is left out, another one each time: sparser sensors."""
+    paste: float = Field(default=0.5, ge=0, le=1)
+    """Chance that the dynamic objects of another scan are put into a scan, turned about the sensor: to where the
+    simulator has none, before a hedge or in a yard."""
 
 
 class DynamicObjectTask(Task):
@@ -53,21 +62,27 @@ class DynamicObjectTask(Task):
         self.net = DynamicObjectNet(settings.network)
 
     def losses(self, window: list[TaskScan]) -> tuple[Tensor, Callable[[], Tensor] | None]:
-        """Cross-entropy over the occupied voxels, each by the root of how many points it has; turned and mirrored."""
-        network, chosen, targets, weights = self.settings.network, [], [], []
-        for scan in window:
-            points, movable, counted = _arrays(scan)
-            keep = counted & (torch.rand(len(points)).numpy() >= self.settings.drop * float(torch.rand(())))
-            voxel, inside = voxels(_turned(points[keep]), network)
-            where, back, count = np.unique(voxel[inside], return_inverse=True, return_counts=True)
-            chosen.append(where)
-            targets.append(np.bincount(back, movable[keep][inside], len(where)) / count)
-            weights.append(np.sqrt(count))
+        """Cross-entropy over the occupied voxels, each by the root of how many points it has."""
+        network, scans = self.settings.network, [self._voxels(scan) for scan in window]
+        drawn = [
+            _pasted(own, others) if torch.rand(()) < self.settings.paste else own
+            for own, others in zip(scans, scans[1:] + scans[:1], strict=True)
+        ]
+        chosen = [where for where, _, _ in drawn]
         logits = self.net(occupancy(chosen, network).to(self.device)).flatten(1)
         found = torch.cat([row[torch.from_numpy(w)] for row, w in zip(logits, chosen, strict=True)])
-        target, weight = (torch.from_numpy(np.concatenate(v)).to(found) for v in (targets, weights))
+        target = torch.from_numpy(np.concatenate([movable for _, movable, _ in drawn])).to(found)
+        weight = torch.from_numpy(np.sqrt(np.concatenate([count for _, _, count in drawn]))).to(found)
         loss = functional.binary_cross_entropy_with_logits(found, target, weight, reduction="sum")
         return loss / weight.sum().clamp(min=1), None
+
+    def _voxels(self, scan: TaskScan) -> Voxels:
+        """Of some of the points of a scan, varied at random."""
+        points, movable, counted = _arrays(scan)
+        keep = counted & (torch.rand(len(points)).numpy() >= self.settings.drop * float(torch.rand(())))
+        voxel, inside = voxels(_varied(points[keep]), self.settings.network)
+        where, back, count = np.unique(voxel[inside], return_inverse=True, return_counts=True)
+        return where, np.bincount(back, movable[keep][inside], len(where)) / count, count
 
     def evaluate(self, scans: TaskScans) -> dict[str, float]:
         """Over all points of all scans: IoU, precision and recall of what can move, and recall of what does."""
@@ -96,6 +111,17 @@ class DynamicObjectTask(Task):
         dynamic_objects_png(path, points[counted], self.net.probability(points)[counted] > 0.5, movable[counted])
 
 
+def _pasted(voxels: Voxels, others: Voxels) -> Voxels:
+    """With the dynamic objects among the others, each voxel once."""
+    objects = others[1] > 0.5
+    where = np.concatenate([voxels[0], others[0][objects]])
+    unique, back = np.unique(where, return_inverse=True)
+    movable, count = np.zeros(len(unique)), np.zeros(len(unique), np.int64)
+    np.maximum.at(movable, back, np.concatenate([voxels[1], others[1][objects]]))
+    np.add.at(count, back, np.concatenate([voxels[2], others[2][objects]]))
+    return unique, movable, count
+
+
 def _arrays(scan: TaskScan) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]:
     """Finite points (N, 4), which of them can move, and which have a class at all.
 
@@ -110,11 +136,16 @@ def _arrays(scan: TaskScan) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDA
     return points, np.isin(labels, MOVABLE) | (labels >= FIRST_MOVING), finite & ~np.isin(labels, UNCOUNTED)
 
 
-def _turned(points: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The points (N, 4) turned about z by a random angle, and half of the times mirrored."""
+def _varied(points: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The points (N, 4) turned about z by a random angle, half of the times mirrored, stretched by up to 20 % and
+    tilted: on a slope cars stand higher above the lowest point around them, and a network that has never seen that
+    finds none there."""
     angle, side = float(torch.rand(())) * 2 * math.pi, 1 if torch.rand(()) < 0.5 else -1
-    turn = np.array([[math.cos(angle), -side * math.sin(angle)], [math.sin(angle), side * math.cos(angle)]], np.float32)
-    return np.concatenate([points[:, :2] @ turn.T, points[:, 2:]], 1)
+    stretch = 1 + _STRETCH * (2 * torch.rand(3).numpy() - 1)
+    slope = _SLOPE * torch.randn(2).numpy()
+    c, s = math.cos(angle), math.sin(angle)
+    M = np.array([[c, -side * s, 0], [s, side * c, 0], [*slope, 1]]) * stretch
+    return np.concatenate([points[:, :3] @ M.T.astype(np.float32), points[:, 3:]], 1)
 
 
 def _ratio(part: float, whole: float) -> float:

@@ -105,6 +105,22 @@ def test_scans_without_classes_and_weights_of_others_are_errors_of_use(tmp_path:
         load(Path(__file__))
 
 
+def test_dynamic_objects_of_one_scan_are_put_into_another() -> None:
+    """A network that takes everything for dynamic: the more of it there is, the lower its loss."""
+    cars = Drive(3)[0]
+    assert cars.labels is not None
+    empty = TaskScan(cars.points, torch.full_like(cars.labels, 50), None, "drive", 1)
+    loss = []
+    for paste in (0.0, 1.0):
+        torch.manual_seed(0)
+        task = DynamicObjectTask(SMALL.model_copy(update={"paste": paste, "drop": 0.0}))
+        with torch.no_grad():
+            task.net.head.weight.zero_()
+            task.net.head.bias.fill_(9.0)
+            loss.append(float(task.losses([empty, cars])[0]))
+    assert loss[1] < 0.98 * loss[0]
+
+
 def test_points_that_are_not_finite_teach_nothing() -> None:
     torch.manual_seed(0)
     scan = Drive(2)[0]
