@@ -14,10 +14,12 @@ from dpm2_core.learning.train_image import ImageTrainingSettings
 from dpm2_core.learning.train_overlap import OverlapTrainingSettings
 from dpm2_core.learning.train_registration import RegistrationTrainingSettings
 from dpm2_core.network.settings import preset
+from dpm2_core.tasks.drives import TaskDriveSettings
 
 CONFIG = Path(__file__).parents[3] / "config"
 READ_BY: dict[str, type[Settings]] = {
     "ablation": AblationSettings,
+    "movers_drives": TaskDriveSettings,
     "train_paper_overlap": OverlapTrainingSettings,
     "train_paper_registration": RegistrationTrainingSettings,
     "train_small": RegistrationTrainingSettings,
@@ -26,6 +28,7 @@ READ_BY: dict[str, type[Settings]] = {
     "train_small_phase2": OverlapTrainingSettings,
     "train_small_pose": RegistrationTrainingSettings,
     "train_small_real": RegistrationTrainingSettings,
+    "train_small_rooms": RegistrationTrainingSettings,
     "worlds_camera": GenerateSettings,
 }
 
