@@ -34,7 +34,7 @@ from dpm2_core.slam.registration.icp import GeometricSettings
 if TYPE_CHECKING:  # torch takes seconds to import
     from dpm2_core.network.model import DeepPointMap2
 
-_MERGED = 6.0  # m, path around a keyframe whose descriptors are merged with its own
+_MERGED = 6.0  # m, path around a keyframe whose descriptors are merged with its own; rooms are enlarged
 
 
 class LoopSettings(Settings):
@@ -214,9 +214,12 @@ class LoopCloser:
         """T_from_to by the descriptors of the keyframes around both."""
         assert self._places is not None
         a, b = proposal.from_node, proposal.to_node
-        before = np.flatnonzero(self._path.since(b) <= _MERGED)
+        own = keyframes[b].descriptors
+        assert own is not None
+        reach = _MERGED / own.scale
+        before = np.flatnonzero(self._path.since(b) <= reach)
         source = merged(keyframes, poses, before.tolist(), b)
-        target = merged(keyframes, poses, self._around(a, b, _MERGED), a)
+        target = merged(keyframes, poses, self._around(a, b, reach), a)
         return self._places.register(source, [target])[0]
 
     def _around(self, candidate: int, node: int, reach: float) -> list[int]:
