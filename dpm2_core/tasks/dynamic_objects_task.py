@@ -24,8 +24,8 @@ MOVABLE = (10, 11, 13, 15, 16, 18, 20, 30, 31, 32)
 """Cars, bicycles, buses, motorcycles, on rails, trucks, other vehicles, people, riders: SemanticKITTI's classes."""
 FIRST_MOVING = 252
 """The same while they move have this number and higher ones."""
-_STRETCH = 0.2
-_SLOPE = 0.07  # standard deviation along and across
+_STRETCH = 0.15
+_SLOPE = 0.05  # standard deviation along and across
 
 Voxels = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]
 """(V,) numbers of the occupied voxels of a scan, ascending, the fraction of their points that can move, and how many
@@ -137,7 +137,7 @@ def _arrays(scan: TaskScan) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDA
 
 
 def _varied(points: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The points (N, 4) turned about z by a random angle, half of the times mirrored, stretched by up to 20 % and
+    """The points (N, 4) turned about z by a random angle, half of the times mirrored, stretched by up to 15 % and
     tilted: on a slope cars stand higher above the lowest point around them, and a network that has never seen that
     finds none there."""
     angle, side = float(torch.rand(())) * 2 * math.pi, 1 if torch.rand(()) < 0.5 else -1
