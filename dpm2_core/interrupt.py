@@ -14,8 +14,8 @@ def interrupt_deferred() -> Iterator[Callable[[], bool]]:
     """Inside, the first Ctrl-C raises nothing: the function that this yields returns True from then on.
 
     KeyboardInterrupt at any other place would leave a frame half processed, and out of compiled code it comes as
-    SystemError. The second Ctrl-C raises it: the work hangs. A handler other than Python's own stays as it is, and so
-    does that of a process that ignores Ctrl-C; outside of the main thread none is ever called.
+    SystemError. The second Ctrl-C raises it, for work that hangs. A handler other than Python's own stays as it is,
+    and so does that of a process that ignores Ctrl-C; outside of the main thread none is ever called.
     """
     requested = False
 

@@ -111,14 +111,14 @@ class DynamicObjectTask(Task):
         dynamic_objects_png(path, points[counted], self.net.probability(points)[counted] > 0.5, movable[counted])
 
 
-def _pasted(voxels: Voxels, others: Voxels) -> Voxels:
-    """With the dynamic objects among the others, each voxel once."""
+def _pasted(own: Voxels, others: Voxels) -> Voxels:
+    """A scan's own voxels with the dynamic objects among the others, each voxel once."""
     objects = others[1] > 0.5
-    where = np.concatenate([voxels[0], others[0][objects]])
+    where = np.concatenate([own[0], others[0][objects]])
     unique, back = np.unique(where, return_inverse=True)
     movable, count = np.zeros(len(unique)), np.zeros(len(unique), np.int64)
-    np.maximum.at(movable, back, np.concatenate([voxels[1], others[1][objects]]))
-    np.add.at(count, back, np.concatenate([voxels[2], others[2][objects]]))
+    np.maximum.at(movable, back, np.concatenate([own[1], others[1][objects]]))
+    np.add.at(count, back, np.concatenate([own[2], others[2][objects]]))
     return unique, movable, count
 
 

@@ -14,6 +14,7 @@ from dpm2_core.learning.train_image import ImageTrainingSettings
 from dpm2_core.learning.train_overlap import OverlapTrainingSettings
 from dpm2_core.learning.train_registration import RegistrationTrainingSettings
 from dpm2_core.network.settings import preset
+from dpm2_core.sim.settings import HDL64E
 from dpm2_core.tasks.drives import TaskDriveSettings
 
 CONFIG = Path(__file__).parents[3] / "config"
@@ -40,6 +41,11 @@ def test_every_key_of_a_recipe_is_a_setting(name: str) -> None:
 
 def test_no_recipe_of_the_network_is_forgotten_here() -> None:
     assert {path.stem for path in CONFIG.glob("train_*.yaml")} <= set(READ_BY)
+
+
+def test_the_sensor_of_the_dynamic_objects_drives_is_the_simulators_own() -> None:
+    """YAML cannot name it, so it stands there again."""
+    assert load_settings(TaskDriveSettings, CONFIG / "movers_drives.yaml").lidar == HDL64E
 
 
 def test_the_recipes_of_the_paper_are_of_its_network_and_fit_each_other() -> None:
