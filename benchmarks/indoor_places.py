@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.loops import error_of
-from benchmarks.relocalise import measured, row_of, success_rates
+from benchmarks.relocalise_visits import measured, row_of, success_rates
 from dpm2_core.data.kitti import KittiSource
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.frame import Array, Edge, Frame, Keyframe

@@ -8,13 +8,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 from rich.console import Group
 from rich.progress import Progress
 
 from benchmarks.harness import Options, Report, processors, settings_of
+from benchmarks.relocalise_open import open_roads
+from benchmarks.relocalise_visits import measured, row_of, success_rates
 from benchmarks.roads import open_road, road_files
 from dpm2_core.frame import Array, Frame, Keyframe, Points, Registration
 from dpm2_core.geometry import se3
@@ -24,13 +25,10 @@ from dpm2_core.sim.simulated_drive import SimulatedDrive
 from dpm2_core.slam.build import make_mapper
 from dpm2_core.slam.loops.relocalization import Relocalizer, downsampled
 from dpm2_core.slam.loops.verification import Verifier
-from dpm2_core.slam.preprocess import Preprocessor
 from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.slam.store.map_data import load_map
 from dpm2_core.slam.store.map_store import MapStore
 
-RIGHT_M, RIGHT_DEG = 0.3, 1.0
-"""A result no farther off is right."""
 LATERAL = (-1.2, 3.0)
 """m to the left of the drive: as far as cars at the kerb leave room, and into the other lane."""
 APART = 5000.0
@@ -49,6 +47,8 @@ class Road:
 
 def bench_relocalise(options: Options) -> Report:
     """Survey the roads at a keyframe each 5 m, save the map, load it, and look for `pairs` random scans in it.
+
+    Without `--source` also on a highway and in a tunnel, where the geometry looks alike everywhere.
 
     Raises:
         UsageError: there are no pose files.
@@ -70,6 +70,8 @@ def bench_relocalise(options: Options) -> Report:
                 rows.append(row_of(found, truth, perf_counter() - started))
                 progress.advance(task)
             results = {"keyframes": len(data), "lateral_m": LATERAL, **success_rates(rows)}
+        if not options.sources:
+            results["open_roads"] = open_roads(settings, network, progress)
     return Report(results, Group(*(f"{name}: {value}" for name, value in results.items())))
 
 
@@ -116,28 +118,3 @@ def spaced(drive: SimulatedDrive, meters: float) -> list[int]:
     """Frames of a drive that are so far apart along it."""
     driven = drive.world.road.distance(drive.times)
     return sorted({int(np.searchsorted(driven, s)) for s in np.arange(0, driven[-1], meters)})
-
-
-def success_rates(rows: list[tuple[bool, float, float, float]]) -> dict[str, Any]:
-    """Figures of results: found or not, m and degrees off, seconds."""
-    ok, meters, degrees, seconds = (np.array(column) for column in zip(*rows, strict=True))
-    right = ok & (meters <= RIGHT_M) & (degrees <= RIGHT_DEG)
-    given = meters[ok.astype(bool)]
-    return {
-        "visits": len(rows),
-        "right": round(float(right.mean()), 4),
-        "no_answer": int((~ok.astype(bool)).sum()),
-        "wrong": int((ok & ~right).sum()),
-        "median_error_m": round(float(np.median(given)), 4) if len(given) else None,
-        "seconds": {f"p{q}": round(float(np.percentile(seconds, q)), 3) for q in (50, 95)},
-    }
-
-
-def row_of(result: Registration, truth: Array, seconds: float) -> tuple[bool, float, float, float]:
-    """A result for `success_rates`; `truth` T_map_lidar (4, 4)."""
-    return result.ok, *se3.magnitude(se3.inverse(result.T_target_source) @ truth), seconds
-
-
-def measured(frame: Frame, settings: SlamSettings) -> Points:
-    """The points (N, 4) of a frame at rest, as the SLAM prepares them."""
-    return Preprocessor(settings.preprocess).measured(frame, np.zeros(6))

@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks.harness import Options
 from benchmarks.loops import check_loops, revisits
-from benchmarks.relocalise import success_rates
+from benchmarks.relocalise_visits import success_rates
 from benchmarks.roads import road_files
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Edge, Registration

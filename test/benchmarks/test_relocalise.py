@@ -7,11 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.progress import Progress
 
 from benchmarks.harness import Options
 from benchmarks.relocalise import bench_relocalise
+from benchmarks.relocalise_open import open_roads
 from dpm2_core.data.trajectory import write_kitti
 from dpm2_core.geometry import se3
+from dpm2_core.network.pretrained import load_network
+from dpm2_core.slam.settings import SlamSettings
 
 
 @pytest.mark.slow
@@ -23,3 +27,17 @@ def test_a_scan_finds_itself_on_a_short_road(tmp_path: Path) -> None:
     assert results["keyframes"] >= 5
     assert results["wrong"] == 0
     assert results["right"] == 1
+
+
+@pytest.mark.slow
+@pytest.mark.weights
+def test_where_every_place_looks_alike_there_is_no_answer_rather_than_a_wrong_one() -> None:
+    """A highway and a tunnel: what the geometry leaves open is not answered, with images or without."""
+    with Progress(disable=True) as progress:
+        found = open_roads(SlamSettings(), load_network("small", 1), progress, spacing=100, visits=2)
+    assert set(found) == {"highway", "tunnel"}
+    for road in found.values():
+        assert road["keyframes"] >= 8
+        for kind in ("without images", "with images"):
+            assert road[kind]["wrong"] == 0
+            assert road[kind]["visits"] == 2

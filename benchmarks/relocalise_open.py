@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Relocalization where the geometry looks alike everywhere: one scan on a highway and in a tunnel of a kilometer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from rich.progress import Progress
+
+from benchmarks.relocalise_visits import measured, row_of, success_rates
+from dpm2_core.frame import Array, Frame, Image, Keyframe
+from dpm2_core.network.model import DeepPointMap2
+from dpm2_core.sim.camera import calibration, render
+from dpm2_core.sim.lidar import Lidar
+from dpm2_core.sim.settings import CameraConfig, PresetName
+from dpm2_core.sim.world import World, build_world
+from dpm2_core.slam.loops.relocalization import Relocalizer, downsampled
+from dpm2_core.slam.loops.verification import Verifier
+from dpm2_core.slam.settings import SlamSettings
+
+WORLDS: dict[PresetName, int] = {"highway": 951, "tunnel": 952}
+"""And their seeds."""
+LENGTH = 1000.0
+"""Of each road, m, to which curves are added."""
+_CAMERA = CameraConfig(width=620, height=188, focal=360.0)
+_AHEAD = 0.1
+"""Headings differ by at most so much from those of the map, rad: a camera that looks back sees another picture."""
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """A place on the road, and the scan and the image from there."""
+
+    T_map_lidar: Array
+    frame: Frame
+
+
+def open_roads(
+    settings: SlamSettings, network: DeepPointMap2, progress: Progress, spacing: float = 5.0, visits: int = 40
+) -> dict[str, Any]:
+    """Random visits to each road, in other traffic, looked for in its map; without images, and with those of both.
+
+    Args:
+        spacing: of the keyframes of the map along the road, m.
+    """
+    out: dict[str, Any] = {}
+    for preset, seed in WORLDS.items():
+        world, rng = build_world("random", preset, seed, LENGTH), np.random.default_rng(seed)
+        stops = np.arange(spacing, world.road.drive.length - spacing, spacing)
+        road = [(world.pose_at(s), _when(world, s)) for s in stops]
+        there = [world.sample_pose(rng, heading=_AHEAD) for _ in range(visits)]
+        task = progress.add_task(preset, total=len(road) + len(there))
+        seen = [_Seen(T, _frame(world, T, time, rng)) for T, time in progress.track(road + there, task_id=task)]
+        known, visited = seen[: len(road)], seen[len(road) :]
+        out[preset] = {"keyframes": len(road)} | {
+            word: _relocalised(settings, network, known, visited, images)
+            for word, images in (("without images", False), ("with images", True))
+        }
+    return out
+
+
+def _when(world: World, s: float) -> float:
+    """The time at which the drive passes arc length `s`."""
+    return float(np.interp(s, world.road.distance(world.road.times), world.road.times))
+
+
+def _frame(world: World, T: Array, time: float, rng: np.random.Generator) -> Frame:
+    view = calibration(_CAMERA)
+    pixels = render(world, _CAMERA, T @ view.T_lidar_cam, time, rng)
+    return Frame(0, Lidar().scan(world, T, time, rng).points, images=(Image(pixels, view),))
+
+
+def _relocalised(
+    settings: SlamSettings, network: DeepPointMap2, known: Sequence[_Seen], visited: Sequence[_Seen], images: bool
+) -> dict[str, Any]:
+    def keyframe(frame: Frame) -> Keyframe:
+        points = measured(frame, settings)
+        cloud = downsampled(points, settings.keyframes.voxel, settings.keyframes.range)
+        described = network.describe(Frame(0, points, images=frame.images if images else ()))
+        return Keyframe(0, 0, 0, np.eye(4), cloud, descriptors=described)
+
+    keyframes = [keyframe(place.frame) for place in known]
+    poses = np.stack([place.T_map_lidar for place in known])
+    verifier = Verifier(settings.relocalise.verification, settings.geometric)
+    in_map = Relocalizer(
+        settings.relocalise, verifier, network, keyframes, [keyframe.cloud for keyframe in keyframes], poses
+    )
+    rows = []
+    for place in visited:
+        visit, started = keyframe(place.frame), perf_counter()
+        found = in_map.find(visit.cloud, descriptors=visit.descriptors)
+        rows.append(row_of(found, place.T_map_lidar, perf_counter() - started))
+    return success_rates(rows)

@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One visit to a saved map, and the figures of many."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from dpm2_core.frame import Array, Frame, Points, Registration
+from dpm2_core.geometry import se3
+from dpm2_core.slam.preprocess import Preprocessor
+from dpm2_core.slam.settings import SlamSettings
+
+RIGHT_M, RIGHT_DEG = 0.3, 1.0
+"""A result no farther off is right."""
+
+
+def success_rates(rows: list[tuple[bool, float, float, float]]) -> dict[str, Any]:
+    """Figures of results: found or not, m and degrees off, seconds."""
+    ok, meters, degrees, seconds = (np.array(column) for column in zip(*rows, strict=True))
+    right = ok & (meters <= RIGHT_M) & (degrees <= RIGHT_DEG)
+    given = meters[ok.astype(bool)]
+    return {
+        "visits": len(rows),
+        "right": round(float(right.mean()), 4),
+        "no_answer": int((~ok.astype(bool)).sum()),
+        "wrong": int((ok & ~right).sum()),
+        "median_error_m": round(float(np.median(given)), 4) if len(given) else None,
+        "seconds": {f"p{q}": round(float(np.percentile(seconds, q)), 3) for q in (50, 95)},
+    }
+
+
+def row_of(result: Registration, truth: Array, seconds: float) -> tuple[bool, float, float, float]:
+    """A result for `success_rates`; `truth` T_map_lidar (4, 4)."""
+    return result.ok, *se3.magnitude(se3.inverse(result.T_target_source) @ truth), seconds
+
+
+def measured(frame: Frame, settings: SlamSettings) -> Points:
+    """The points (N, 4) of a frame at rest, as the SLAM prepares them."""
+    return Preprocessor(settings.preprocess).measured(frame, np.zeros(6))
