@@ -18,7 +18,7 @@ from pydantic import Field
 from dpm2_core.config import Settings
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Points
-from dpm2_core.network.pretrained import PERCEPTION_WEIGHTS, PRETRAINED_DIR, load_once
+from dpm2_core.network.pretrained import DYNAMIC, PERCEPTION_WEIGHTS, PRETRAINED_DIR, load_once
 
 if TYPE_CHECKING:  # torch takes seconds to import, and the geometric SLAM does without
     from dpm2_core.network.perception.dslr import Dslr
@@ -36,7 +36,7 @@ class FilterSettings(Settings):
     in front of DSLR's translation of the scan into one without traffic."""
     weights: Path | None = None
     """Path of a .safetensors file; unset: those that come with dpm2."""
-    threshold: float = Field(0.5, gt=0, lt=1)
+    threshold: float = Field(DYNAMIC, gt=0, lt=1)
     """movers: probability from which a point is left out."""
     most: float = Field(0.7, ge=0, le=1)
     """movers: at most this fraction of a scan is left out, the most likely ones."""

@@ -16,6 +16,7 @@ from torch.nn import functional
 
 from dpm2_core.errors import UsageError
 from dpm2_core.network.perception.dynamic_objects import DynamicObjectNet, DynamicObjectNetSettings, occupancy, voxels
+from dpm2_core.network.pretrained import DYNAMIC
 from dpm2_core.tasks.ground_task import UNCOUNTED
 from dpm2_core.tasks.scan import TaskScan, TaskScans
 from dpm2_core.tasks.task import Task, TaskTraining
@@ -24,8 +25,8 @@ MOVABLE = (10, 11, 13, 15, 16, 18, 20, 30, 31, 32)
 """Cars, bicycles, buses, motorcycles, on rails, trucks, other vehicles, people, riders: SemanticKITTI's classes."""
 FIRST_MOVING = 252
 """The same while they move have this number and higher ones."""
-_STRETCH = 0.15
-_SLOPE = 0.05  # standard deviation along and across
+_STRETCH = 0.2
+_SLOPE = 0.07  # standard deviation along and across
 
 Voxels = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]
 """(V,) numbers of the occupied voxels of a scan, ascending, the fraction of their points that can move, and how many
@@ -90,7 +91,7 @@ class DynamicObjectTask(Task):
         for i in range(len(scans)):
             scan = scans[i]
             points, movable, counted = _arrays(scan)
-            found = (self.net.probability(points) > 0.5) & counted
+            found = (self.net.probability(points) > DYNAMIC) & counted
             assert scan.labels is not None
             moving = (scan.labels >= FIRST_MOVING).cpu().numpy()
             counts += [(found & movable).sum(), (found & ~movable).sum(), (~found & movable & counted).sum(),
@@ -108,7 +109,7 @@ class DynamicObjectTask(Task):
         from dpm2_core.tasks.dynamic_objects_figure import dynamic_objects_png  # matplotlib is slow to import
 
         points, movable, counted = _arrays(scan)
-        dynamic_objects_png(path, points[counted], self.net.probability(points)[counted] > 0.5, movable[counted])
+        dynamic_objects_png(path, points[counted], self.net.probability(points)[counted] > DYNAMIC, movable[counted])
 
 
 def _pasted(own: Voxels, others: Voxels) -> Voxels:
@@ -137,7 +138,7 @@ def _arrays(scan: TaskScan) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDA
 
 
 def _varied(points: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The points (N, 4) turned about z by a random angle, half of the times mirrored, stretched by up to 15 % and
+    """The points (N, 4) turned about z by a random angle, half of the times mirrored, stretched by up to 20 % and
     tilted: on a slope cars stand higher above the lowest point around them, and a network that has never seen that
     finds none there."""
     angle, side = float(torch.rand(())) * 2 * math.pi, 1 if torch.rand(()) < 0.5 else -1
