@@ -17,9 +17,9 @@ from dpm2_core.evaluation.record import REPOSITORY, git_commit
 
 RECORDS = REPOSITORY / "benchmarks"
 COMMANDS: dict[str, Sequence[str]] = {
-    "geometric": (), "neural": (), "hard": (), "paper": (), "gaps": ("--only", "adaptive"),
-    "covariance": ("--threads", "1"), "tilt": (), "sensor": (), "relocalise": (), "roads": (), "indoor": (),
-    "finetune": (),
+    "geometric": (), "neural": (), "hard": (), "paper": (), "gaps": (),
+    "covariance": ("--threads", "1"), "tilt": (), "sensor": (), "relocalise": ("--pairs", "200"),
+    "roads": (), "indoor": (), "finetune": (),
 }  # fmt: skip
 """Benchmarks and their options, the quick ones first."""
 _CODE = ("dpm2_core", "benchmarks/*.py")
