@@ -31,6 +31,7 @@ from benchmarks.neural_view import view
 from benchmarks.pairs import PairMethod, all_pairs, by_registration, gicp_from_identity, kiss_from_identity
 from benchmarks.repeated import repeated
 from benchmarks.unseen import corruption, image_matters, overlap, synthetic
+from benchmarks.unseen_sensors import other_sensors
 from dpm2_core.evaluation.figures import success_png
 from dpm2_core.evaluation.record import git_commit
 from dpm2_core.frame import Array, Frame
@@ -183,6 +184,7 @@ PARTS: Mapping[str, Part] = {
     "odometry": _of_drives(odometry),
     "corruption": corruption,
     "image": image_matters,
+    "sensors": other_sensors,
     "overlap": overlap,
     "reference": repeated,
     "speed": _of_drives(speed),

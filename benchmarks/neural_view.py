@@ -18,6 +18,7 @@ def view(parts: Mapping[str, Any]) -> Group:
         ("synthetic", "Unseen synthetic worlds"),
         ("corruption", "Failing sensors"),
         ("image", "Where the image must matter"),
+        ("sensors", "Other LiDARs in unseen synthetic worlds"),
     ):
         if name in parts:
             shown.append(_pair_table(title, parts[name]["pairs"]))

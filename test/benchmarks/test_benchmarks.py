@@ -224,7 +224,9 @@ def test_the_neural_benchmark_measures_pairs_odometry_and_stages(
     record = json.loads(path.read_text())
     assert (record["weights"]["preset"], record["weights"]["steps"]) == ("tiny", "0")
     parts = record["parts"]
-    assert list(parts) == ["synthetic", "real", "odometry", "corruption", "image", "overlap", "reference", "speed"]
+    assert list(parts) == [
+        "synthetic", "real", "odometry", "corruption", "image", "sensors", "overlap", "reference", "speed"
+    ]  # fmt: skip
     assert parts["synthetic"]["pairs"]["up to 20 m, any yaw"]["neural"]["pairs"] > 0
     ours = parts["real"]["drives"][sequence.name]
     assert list(ours["consecutive"]) == ["neural"]
@@ -235,6 +237,8 @@ def test_the_neural_benchmark_measures_pairs_odometry_and_stages(
     assert set(parts["corruption"]["error_ratio"]) == {"LiDAR obstruction 100 %", "camera failure 100 %"}
     assert {"neural with camera", "neural without camera"} <= set(parts["image"]["pairs"]["tunnel, up to 5 m"])
     assert (tmp_path / "neural_image.png").read_bytes().startswith(b"\x89PNG")
+    assert parts["sensors"]["pairs"]["16 beams, up to 12 m"]["neural"]["pairs"] > 0
+    assert "rosette, up to 12 m, any yaw" not in parts["sensors"]["pairs"]  # it looks ahead alone
     assert 0 <= parts["overlap"]["average_precision"] <= 1
     speed = parts["speed"]["drives"][sequence.name]
     assert speed["stages_ms"]["total"]["median"] > 0

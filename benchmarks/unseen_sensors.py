@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The network on scans of other LiDARs than most of those that it has learned from, in worlds that it has not seen."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.harness import Options
+from benchmarks.pairs import summarized
+from dpm2_core.data.packed import Sample, write_packed
+from dpm2_core.evaluation.pair_set import PairSet
+from dpm2_core.geometry import se3
+from dpm2_core.network.model import DeepPointMap2
+from dpm2_core.network.pyramid import crop
+from dpm2_core.network.settings import NetworkSettings
+from dpm2_core.sim.lidar import Lidar
+from dpm2_core.sim.sensors import real_sensor
+from dpm2_core.sim.settings import LidarConfig, PresetName
+from dpm2_core.sim.world import build_world
+
+SENSORS = {
+    "16 beams": LidarConfig(beams=16),
+    "32 beams": LidarConfig(beams=32),
+    "64 beams": LidarConfig(beams=64),
+    "128 beams": LidarConfig(beams=128, columns=1024),
+    "rosette": LidarConfig(beams=16, columns=1500, pattern="rosette"),
+}
+"""With a real one's errors; the rosette sees 70 degrees ahead and never repeats."""
+FIRST_SEED = 960_000
+PLACES: tuple[PresetName, ...] = ("city", "suburb", "rural", "suburb")
+FARTHEST = 12.0
+"""Between the scans of a pair, m."""
+
+
+def other_sensors(network: DeepPointMap2, options: Options) -> dict[str, Any]:
+    """Pairs up to 12 m apart by each sensor, without a prior; those of all-round ones turned at random, too."""
+    out: dict[str, Any] = {}
+    for name, clean in SENSORS.items():
+        folder = sensor_drives(name, network, options)
+        rows = PairSet(folder, 2 * options.pairs, network.settings, images=False).errors(network)
+        near, turned = rows[:, 0] <= FARTHEST, rows[:, 1] > 0
+        out[f"{name}, up to {FARTHEST:g} m"] = {"neural": summarized(rows[near & ~turned, 2:4])}
+        if clean.pattern == "spinning":
+            out[f"{name}, up to {FARTHEST:g} m, any yaw"] = {"neural": summarized(rows[near & turned, 2:4])}
+    return {"pairs": out}
+
+
+def sensor_drives(name: str, network: DeepPointMap2, options: Options) -> Path:
+    """Folder of packed drives: those that were given, or new ones by this sensor, which a later run finds again."""
+    if options.unseen is not None:
+        return options.unseen
+    root = options.cache / f"{network.settings.preset}_sensors" / name.replace(" ", "_")
+    for i, place in enumerate(PLACES):
+        folder = root / str(i)
+        if not folder.exists():
+            drive(folder, place, FIRST_SEED + i, SENSORS[name], network.settings)
+    return root
+
+
+def drive(
+    folder: Path, place: PresetName, seed: int, clean: LidarConfig, network: NetworkSettings, scans: int = 24
+) -> None:
+    """Pack scans of one world; each sensor sees the same places."""
+    world, noise = build_world("random", place, seed), np.random.default_rng(seed)
+    lidar = Lidar(real_sensor(clean))
+    height, sway = lidar.config.height, lidar.config.real.sway
+    samples = list[Sample]()
+    for _ in range(scans):
+        T, time = world.sample_pose(noise, height=height, sway=sway)
+        own = np.random.default_rng([seed, len(samples)])
+        scan = lidar.drive_scan(world, T, time, own, world.drive_twist(time, height, sway))
+        level = se3.transform(lidar.T_level_lidar, scan.points).astype(np.float32)
+        samples.append(Sample(crop(level, network.points), T, ()))
+    write_packed(folder, samples, {"source": "synthetic city", "preset": place, "seed": seed})
