@@ -35,7 +35,7 @@ FIRST_SEED = 900_001
 FRAMES = 60
 LIDAR = LidarConfig(columns=1024)
 """64 beams, about 60 thousand points."""
-REGISTRATIONS = ("geometric", "neural", "refined")
+REGISTRATIONS = ("adaptive", "geometric", "neural", "refined")
 ORACLE = "true dynamic objects left out"
 _ERRORS = ("rpe_trans_m", "rpe_rot_deg", "ape_rmse_m")
 LOST = 0.1

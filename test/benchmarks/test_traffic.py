@@ -56,5 +56,5 @@ def test_the_summary_is_of_means_and_medians_and_counts_drives_that_strayed() ->
 
 
 def test_an_unknown_registration_is_an_error_of_use() -> None:
-    with pytest.raises(UsageError, match="geometric, neural, refined"):
+    with pytest.raises(UsageError, match="adaptive, geometric, neural, refined"):
         traffic.bench_traffic(Options(only="visual"))
