@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`make bench-ros`: the KITTI excerpt through bag, bag_player and slam_node at 10 Hz, with the node's own defaults:
-alone, and with an IMU, where the drive has one, and a subscriber for everything.
+alone, and with an IMU, where the drive has one, and a subscriber for everything; then with the network for each scan.
 """
 
 from __future__ import annotations
@@ -29,6 +29,8 @@ from tools.replay import replay
 WITH: dict[str, tuple[dict[str, object], bool]] = {
     "": ({"input.imu_topic": "/none"}, False),
     ", IMU and all topics": ({}, True),
+    ", neural": ({"input.imu_topic": "/none", "slam.registration": "neural"}, False),
+    ", refined": ({"input.imu_topic": "/none", "slam.registration": "refined"}, False),
 }
 """Parameters of the node, and whether all that it publishes has a subscriber, as with RViz and Nav2."""
 FIGURES = ("frames_in", "frames_out", "dropped", "latency_p50_ms", "latency_p95_ms", "ape_rmse_m", "rpe_trans_m")
