@@ -109,7 +109,7 @@ def _drive(request: Request, settings: Sequence[str]) -> dict[str, Any]:
 
 def _input(overrides: Sequence[str]) -> list[str]:
     """Those that say how frames are read: other programs have no use for the rest."""
-    return [text for text in overrides if text.startswith(("input.", "slam.threads"))]
+    return [text for text in overrides if text.startswith("input.")]
 
 
 def _folder(name: str) -> str:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from time import perf_counter
@@ -73,7 +74,7 @@ def own(folder: Path, advance: Advance, drive: Drive, corrupt: str | None = None
 
 
 def peer(folder: Path, advance: Advance, drive: Drive, name: str) -> Figures:
-    """Another program on the same frames, read one at a time.
+    """Another program on the same frames, read one at a time, on all processors.
 
     Raises:
         UsageError: it is not installed, or as `own`. Dpm2Error: it gave another number of poses than frames.
@@ -84,7 +85,7 @@ def peer(folder: Path, advance: Advance, drive: Drive, name: str) -> Figures:
     program, stamps, index, seconds = None, list[int](), list[int](), list[float]()
     for frame in prefetch(source.frames(start, stop)):
         if program is None:
-            program = make_peer(name, config.slam.threads, frame.time_offset is not None)
+            program = make_peer(name, os.cpu_count() or 1, frame.time_offset is not None)
         began = perf_counter()
         program.add(frame)
         seconds.append(perf_counter() - began)

@@ -36,8 +36,8 @@ class SlamSettings(Settings):
     """How a scan finds its pose: by points, by neural descriptors, by both (refined), or by points that ask the network
     where they do not know (adaptive): at the start, after a pause, at few frames per second, along a tunnel. Adaptive
     describes the scans of the LiDAR alone."""
-    threads: int = Field(2, ge=1)
-    """Threads of the network."""
+    threads: int = Field(1, ge=1)
+    """Threads of the network. More are faster where processors are idle; on busy ones they wait for each other."""
     filter: FilterSettings = FilterSettings()
     preprocess: PreprocessSettings = PreprocessSettings()
     geometric: GeometricSettings = GeometricSettings()

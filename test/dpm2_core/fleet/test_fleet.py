@@ -199,14 +199,14 @@ def test_what_kills_every_worker_ends_with_a_reason(cluster: Cluster) -> None:
 def test_drives_of_a_manifest_have_names_and_settings_of_their_own(tmp_path: Path) -> None:
     manifest = tmp_path / "fleet.yaml"
     manifest.write_text(
-        "drives: [{path: a/00}, {path: b/00, name: b00, frames: '5:9', gt: true.txt, set: [slam.threads=1]}]"
+        "drives: [{path: a/00}, {path: b/00, name: b00, frames: '5:9', gt: true.txt, set: [slam.threads=3]}]"
     )
     parts = parts_of(read_drives([manifest]), None, ["slam.registration=geometric"])
     assert [part.name for part in parts] == ["00", "b00"]
     assert parts[1].arguments["path"] == str(tmp_path / "b" / "00")
     assert parts[1].arguments["gt"] == str(tmp_path / "true.txt")
     assert parts[1].arguments["frames"] == (5, 9)
-    assert [part.cores for part in parts] == [2, 1]
+    assert [part.cores for part in parts] == [1, 3]
     assert parts[0].arguments["config"]["slam"]["registration"] == "geometric"
 
 
