@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.loops import error_of
-from benchmarks.relocalise_visits import measured, row_of, success_rates
+from benchmarks.relocalise_visits import kept, measured, row_of, success_rates
 from dpm2_core.data.kitti import KittiSource
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.frame import Array, Edge, Frame, Keyframe
@@ -25,7 +25,6 @@ from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import DriveConfig
 from dpm2_core.sim.world import build_world
 from dpm2_core.slam.build import make_localizer
-from dpm2_core.slam.loops.relocalization import downsampled
 from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.tables import FigureTable
@@ -55,7 +54,7 @@ def visits_to(config: DriveConfig, settings: SlamSettings) -> list[Visit]:
         T, time = world.sample_pose(rng, height=HEIGHT, sway=config.lidar.real.sway)
         T = T @ se3.exp(np.array([0, 0, rng.uniform(-np.pi, np.pi), 0, 0, 0]))
         frame = Frame(0, lidar.scan(world, T, time, rng).points)
-        cloud = downsampled(measured(frame, settings), settings.keyframes.voxel, settings.keyframes.range)
+        cloud = kept(measured(frame, settings), settings)
         visits.append(Visit(Keyframe(i, 0, i, np.eye(4), cloud), T_map_world @ T))
     return visits
 

@@ -15,7 +15,7 @@ from rich.progress import Progress
 
 from benchmarks.harness import Options, Report, processors, settings_of
 from benchmarks.relocalise_open import open_roads
-from benchmarks.relocalise_visits import measured, row_of, success_rates
+from benchmarks.relocalise_visits import kept, measured, row_of, success_rates
 from benchmarks.roads import open_road, road_files
 from dpm2_core.frame import Array, Frame, Keyframe, Points, Registration
 from dpm2_core.geometry import se3
@@ -23,7 +23,7 @@ from dpm2_core.network.pretrained import load_network
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.simulated_drive import SimulatedDrive
 from dpm2_core.slam.build import make_mapper
-from dpm2_core.slam.loops.relocalization import Relocalizer, downsampled
+from dpm2_core.slam.loops.relocalization import Relocalizer
 from dpm2_core.slam.loops.verification import Verifier
 from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.slam.store.map_data import load_map
@@ -89,9 +89,7 @@ def survey(options: Options, settings: SlamSettings, file: Path, progress: Progr
             frames = spaced(drive, 5.0)
             task = progress.add_task(f"map of {drive.name}", total=len(frames))
             for i in frames:
-                cloud = downsampled(
-                    measured(drive.frame(i), settings), settings.keyframes.voxel, settings.keyframes.range
-                )
+                cloud = kept(measured(drive.frame(i), settings), settings)
                 edge = Registration(np.eye(4), _EDGE, 1.0, 0.1, "survey") if mapper.keyframes else None
                 T = road.T_map_world @ drive.poses[i]
                 mapper.add(Keyframe(len(mapper.keyframes), i, i, T, cloud, edge))
@@ -111,7 +109,7 @@ def visits(roads: list[Road], settings: SlamSettings, count: int) -> Iterator[tu
         T = world.pose_at(s, rng.uniform(*LATERAL), rng.uniform(-np.pi, np.pi))
         scan = lidar.scan(world, T, rng.uniform(0, world.road.times[-1]), rng)
         points = measured(Frame(0, scan.points), settings)
-        yield downsampled(points, settings.keyframes.voxel, settings.keyframes.range), road.T_map_world @ T
+        yield kept(points, settings), road.T_map_world @ T
 
 
 def spaced(drive: SimulatedDrive, meters: float) -> list[int]:

@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 from rich.progress import Progress
 
-from benchmarks.relocalise_visits import measured, row_of, success_rates
+from benchmarks.relocalise_visits import kept, measured, row_of, success_rates
 from dpm2_core.frame import Array, Frame, Image, Keyframe
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.sim.camera import calibration, render
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import CameraConfig, PresetName
 from dpm2_core.sim.world import World, build_world
-from dpm2_core.slam.loops.relocalization import Relocalizer, downsampled
+from dpm2_core.slam.loops.relocalization import Relocalizer
 from dpm2_core.slam.loops.verification import Verifier
 from dpm2_core.slam.settings import SlamSettings
 
@@ -79,9 +79,8 @@ def _relocalised(
 ) -> dict[str, Any]:
     def keyframe(frame: Frame) -> Keyframe:
         points = measured(frame, settings)
-        cloud = downsampled(points, settings.keyframes.voxel, settings.keyframes.range)
         described = network.describe(Frame(0, points, images=frame.images if images else ()))
-        return Keyframe(0, 0, 0, np.eye(4), cloud, descriptors=described)
+        return Keyframe(0, 0, 0, np.eye(4), kept(points, settings), descriptors=described)
 
     keyframes = [keyframe(place.frame) for place in known]
     poses = np.stack([place.T_map_lidar for place in known])

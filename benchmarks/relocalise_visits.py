@@ -9,6 +9,7 @@ import numpy as np
 
 from dpm2_core.frame import Array, Frame, Points, Registration
 from dpm2_core.geometry import se3
+from dpm2_core.slam.loops.relocalization import downsampled
 from dpm2_core.slam.preprocess import Preprocessor
 from dpm2_core.slam.settings import SlamSettings
 
@@ -39,3 +40,8 @@ def row_of(result: Registration, truth: Array, seconds: float) -> tuple[bool, fl
 def measured(frame: Frame, settings: SlamSettings) -> Points:
     """The points (N, 4) of a frame at rest, as the SLAM prepares them."""
     return Preprocessor(settings.preprocess).measured(frame, np.zeros(6))
+
+
+def kept(points: Points, settings: SlamSettings) -> Points:
+    """Of such points those (M, 4) that a keyframe keeps."""
+    return downsampled(points, settings.keyframes.voxel, settings.keyframes.range)
