@@ -17,12 +17,16 @@ from torch.utils.data import DataLoader, Dataset
 
 from dpm2_core.config import Settings
 from dpm2_core.data.packed import PackedDrive, Sample, open_packed
+from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Array
 from dpm2_core.learning.augment import AugmentSettings, augment
 from dpm2_core.network.encoder import collate_views
-from dpm2_core.network.pyramid import PointBatch, Pyramid, build_pyramid, collate
+from dpm2_core.network.pyramid import MIN_POINTS, PointBatch, Pyramid, build_pyramid, collate
 from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.network.spatial import Views
+
+_LEAST = 8 * MIN_POINTS  # points of a scan that is learnt from
+_PLACES = 100  # that are tried
 
 
 class PackedSettings(Settings):
@@ -137,15 +141,26 @@ class GroupDataset(Dataset[Batch]):
         images = []
         poses = []
         for _ in range(settings.groups):
-            drive = self.drives.choose(noise)
-            for index in self.draw(drive.poses, noise):
-                sample: Sample = augment(drive[index], settings.augment, noise)
+            for sample in self._place(noise):
                 pyramids.append(build_pyramid(sample.cloud, self.network))
                 images.append(sample.images if settings.images else ())
                 poses.append(sample.pose)
         views = collate_views(images, self.network.image) if settings.images else None
         shaped = torch.from_numpy(np.stack(poses)).view(settings.groups, -1, 4, 4)
         return Batch(collate(pyramids), views, shaped)
+
+    def _place(self, noise: np.random.Generator) -> list[Sample]:
+        """Frames of a place, changed; another place where one of them shows nothing, as beside a truck.
+
+        Raises:
+            Dpm2Error: none is found.
+        """
+        for _ in range(_PLACES):
+            drive = self.drives.choose(noise)
+            found = [drive[index] for index in self.draw(drive.poses, noise)]
+            if min(len(sample.cloud) for sample in found) >= _LEAST:
+                return [augment(sample, self.settings.augment, noise) for sample in found]
+        raise Dpm2Error(f"of {_PLACES} places of the packed drives, each has a scan of fewer than {_LEAST} points")
 
     def batches(self, start: int, rank: int) -> Iterator[Batch]:
         """Batches from step `start` on, in order, prepared ahead by worker processes."""

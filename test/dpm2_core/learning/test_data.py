@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from dpm2_core.data.packed import QUANTUM, PackedDrive, Sample, open_packed, write_packed
 from dpm2_core.descriptors import Descriptors, merge
-from dpm2_core.errors import UsageError
+from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.geometry import se3
 from dpm2_core.learning.augment import AugmentSettings, augment
 from dpm2_core.learning.dataset import DataSettings, GroupDataset, draw_group
@@ -147,6 +147,21 @@ def test_batches_depend_on_their_number_alone(packed: Path) -> None:
         assert torch.equal(again.points.xyz, batch.points.xyz)
         assert torch.equal(again.poses, batch.poses)
     assert not torch.equal(data[0, 0].points.xyz, data[1, 0].points.xyz)
+
+
+@pytest.mark.parametrize("every", [False, True])
+def test_a_scan_that_shows_nothing_does_not_end_a_training(samples: list[Sample], tmp_path: Path, every: bool) -> None:
+    """As beside a truck: another place is drawn; an error only where there is no other one."""
+    nothing = [sample._replace(cloud=sample.cloud[:3]) for sample in samples]
+    write_packed(tmp_path / "world", nothing if every else [*samples, nothing[0]], {})
+    settings = DataSettings(packed={str(tmp_path): 1.0}, groups=1, frames=2)
+    data = GroupDataset(settings, tiny(), settings.draw, seed=0)
+    if every:
+        with pytest.raises(Dpm2Error, match="each has a scan of fewer than 256 points"):
+            data[0, 0]
+        return
+    for step in range(20):
+        assert torch.isfinite(data[step, 0].poses).all()
 
 
 @pytest.mark.parametrize("sides", [(1, 1), (1, 3), (2, 2)])
