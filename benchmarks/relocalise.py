@@ -23,6 +23,7 @@ from dpm2_core.network.pretrained import load_network
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.simulated_drive import SimulatedDrive
 from dpm2_core.slam.build import make_mapper
+from dpm2_core.slam.loops.pictures import KnownMap
 from dpm2_core.slam.loops.relocalization import Relocalizer
 from dpm2_core.slam.loops.verification import Verifier
 from dpm2_core.slam.settings import SlamSettings
@@ -61,7 +62,8 @@ def bench_relocalise(options: Options) -> Report:
             data = load_map(store)
             network = load_network(settings.neural.weights, settings.threads, settings.neural.preset)
             verifier = Verifier(settings.relocalise.verification, settings.geometric)
-            relocalizer = Relocalizer(settings.relocalise, verifier, network, data.keyframes, data.clouds, data.poses)
+            known = KnownMap(data.keyframes, data.clouds, data.poses)
+            relocalizer = Relocalizer(settings.relocalise, settings.visual, verifier, network, known)
             task = progress.add_task("relocalise", total=options.pairs)
             rows = []
             for cloud, truth in visits(roads, settings, options.pairs):

@@ -12,12 +12,14 @@ import numpy as np
 from rich.progress import Progress
 
 from benchmarks.relocalise_visits import kept, measured, row_of, success_rates
+from dpm2_core.data.thumbnail import image_of, thumbnail
 from dpm2_core.frame import Array, Frame, Image, Keyframe
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.sim.camera import calibration, render
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import CameraConfig, PresetName
 from dpm2_core.sim.world import World, build_world
+from dpm2_core.slam.loops.pictures import KnownMap
 from dpm2_core.slam.loops.relocalization import Relocalizer
 from dpm2_core.slam.loops.verification import Verifier
 from dpm2_core.slam.settings import SlamSettings
@@ -27,6 +29,8 @@ WORLDS: dict[PresetName, int] = {"highway": 951, "tunnel": 952}
 LENGTH = 1000.0
 """Of each road, m, to which curves are added."""
 _CAMERA = CameraConfig(width=620, height=188, focal=360.0)
+WIDTH = 320
+"""Of the picture of a keyframe, pixels."""
 _AHEAD = 0.1
 """Headings differ by at most so much from those of the map, rad: a camera that looks back sees another picture."""
 
@@ -80,17 +84,19 @@ def _relocalised(
     def keyframe(frame: Frame) -> Keyframe:
         points = measured(frame, settings)
         described = network.describe(Frame(0, points, images=frame.images if images else ()))
-        return Keyframe(0, 0, 0, np.eye(4), kept(points, settings), descriptors=described)
+        picture = thumbnail(frame.images[0], WIDTH) if images else None
+        return Keyframe(0, 0, 0, np.eye(4), kept(points, settings), descriptors=described, thumbnail=picture)
 
     keyframes = [keyframe(place.frame) for place in known]
     poses = np.stack([place.T_map_lidar for place in known])
+    clouds = [keyframe.cloud for keyframe in keyframes]
+    in_map = KnownMap(keyframes, clouds, poses, lambda node: keyframes[node].thumbnail)
     verifier = Verifier(settings.relocalise.verification, settings.geometric)
-    in_map = Relocalizer(
-        settings.relocalise, verifier, network, keyframes, [keyframe.cloud for keyframe in keyframes], poses
-    )
+    relocalizer = Relocalizer(settings.relocalise, settings.visual, verifier, network, in_map)
     rows = []
     for place in visited:
         visit, started = keyframe(place.frame), perf_counter()
-        found = in_map.find(visit.cloud, descriptors=visit.descriptors)
+        picture = None if visit.thumbnail is None else image_of(visit.thumbnail)
+        found = relocalizer.find(visit.cloud, descriptors=visit.descriptors, picture=picture)
         rows.append(row_of(found, place.T_map_lidar, perf_counter() - started))
     return success_rates(rows)

@@ -10,6 +10,7 @@ from dpm2_core.slam.filters import make_filter
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.loops.closure import LoopCloser
 from dpm2_core.slam.loops.localizer import Localizer
+from dpm2_core.slam.loops.pictures import KnownMap
 from dpm2_core.slam.loops.place_recognition import PlaceRecognition
 from dpm2_core.slam.loops.relocalization import Relocalizer
 from dpm2_core.slam.loops.verification import Verifier
@@ -47,7 +48,7 @@ def make_slam(settings: SlamSettings | None = None, robot: str = "", store: MapS
         UsageError: a network has no weights to run with.
     """
     s = settings or SlamSettings()
-    return Slam(make_odometry(s, robot), *make_map(s, store), s.map.thumbnail)
+    return Slam(make_odometry(s, robot), *make_map(s, store), s.map.thumbnail, s.visual)
 
 
 def make_map(s: SlamSettings, store: MapStore | TiledMap | None = None) -> tuple[Mapper, Localizer | None]:
@@ -104,9 +105,8 @@ def make_localizer(s: SlamSettings, mapper: Mapper) -> Localizer:
     Raises:
         UsageError: the network has no weights to run with.
     """
-    relocalizer = Relocalizer(
-        s.relocalise, _verifier(s), _network(s), mapper.keyframes, mapper.clouds, mapper.poses
-    )  # fmt: skip
+    known = KnownMap(mapper.keyframes, mapper.clouds, mapper.poses, mapper.thumbnail)
+    relocalizer = Relocalizer(s.relocalise, s.visual, _verifier(s), _network(s), known)
     return Localizer(relocalizer, s.relocalise.max_failures)
 
 
@@ -119,7 +119,8 @@ def make_tiled_localizer(s: SlamSettings, tiles: TiledMap) -> Localizer:
     verifier, network = _verifier(s), _network(s)
 
     def around(data: MapData) -> Relocalizer:
-        return Relocalizer(s.relocalise, verifier, network, data.keyframes, data.clouds, data.poses)
+        known = KnownMap(data.keyframes, data.clouds, data.poses, data.thumbnail)
+        return Relocalizer(s.relocalise, s.visual, verifier, network, known)
 
     relocalizer = TiledRelocalizer(s.relocalise, tiles, around, PlaceRecognition(network).describe)
     return Localizer(relocalizer, s.relocalise.max_failures)

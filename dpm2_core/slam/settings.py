@@ -22,7 +22,7 @@ from dpm2_core.slam.preprocess import PreprocessSettings
 from dpm2_core.slam.registration.icp import GeometricSettings
 from dpm2_core.slam.registration.local_map import LocalMapSettings
 from dpm2_core.slam.registration.neural import NeuralSettings
-from dpm2_core.slam.registration.visual import VisualSettings
+from dpm2_core.slam.registration.texture import VisualSettings
 
 
 class SlamSettings(Settings):

@@ -11,13 +11,15 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from time import perf_counter
 
+from dpm2_core.data.thumbnail import thumbnail
 from dpm2_core.frame import Array, Edge, Frame, Keyframe, OdometryResult, State
 from dpm2_core.slam.loops.localizer import LocalizationResult, Localizer
 from dpm2_core.slam.mapping.mapper import Mapper
-from dpm2_core.slam.mapping.thumbnail import thumbnail
 from dpm2_core.slam.odometry.odometry import Odometry
 from dpm2_core.slam.odometry.scaled import ScaledOdometry
+from dpm2_core.slam.registration.texture import VisualSettings
 
+_WIDTH = 320  # pixels, of a picture by which a place is found: 6 kB
 _LOST_ON_THE_WAY = 10_000_000_000  # ns after which a keyframe that has not come to the map will not come any more
 
 
@@ -71,10 +73,17 @@ class Slam:
         mapper: Mapper,
         localizer: Localizer | None = None,
         thumbnail_width: int = 0,
+        visual: VisualSettings | None = None,
     ) -> None:
-        """`thumbnail_width`: of the image that a keyframe carries into a map file, pixels; 0: none."""
+        """Put the parts together.
+
+        Args:
+            thumbnail_width: of the image that every keyframe carries into a map file, pixels; 0: none.
+            visual: which keyframes carry one by which their place is found again; None: none.
+        """
         self.odometry, self.mapper, self.localizer = odometry, mapper, localizer
         self._thumbnail_width = thumbnail_width
+        self._visual = visual if visual is not None and visual.enabled else None
         self._T_map_odom: Array | None = None  # of the map that grows, until the next keyframe
         self._underway: int | None = None  # stamp of the keyframe that has not come to the map yet
 
@@ -106,8 +115,19 @@ class Slam:
         if result.keyframe is None:
             return result
         self._underway = frame.stamp
-        image = thumbnail(frame, self._thumbnail_width)
-        return result if image is None else replace(result, keyframe=replace(result.keyframe, thumbnail=image))
+        width = max(self._thumbnail_width, _WIDTH if self._asks_pictures(result) else 0)
+        if not frame.images or not width:
+            return result
+        return replace(result, keyframe=replace(result.keyframe, thumbnail=thumbnail(frame.images[0], width)))
+
+    def _asks_pictures(self, result: OdometryResult) -> bool:
+        """Whether the place of a keyframe is looked for by its picture, now or later: its points leave it open."""
+        registration = result.registration
+        return self._visual is not None and (
+            self.localizer is not None
+            or registration.method in ("first", "visual")
+            or registration.worst_sigma > self._visual.sigma
+        )
 
     def map_step(self, keyframe: Keyframe) -> MapResult:
         """Take a keyframe into the map, or find it there.

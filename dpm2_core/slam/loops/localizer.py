@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dpm2_core.frame import Array, Keyframe, Registration, State
+from dpm2_core.data.thumbnail import image_of
+from dpm2_core.frame import Array, Image, Keyframe, Registration, State
 from dpm2_core.geometry import se3
 from dpm2_core.slam.loops.consistency import BROKEN
 from dpm2_core.slam.loops.relocalization import FindsPlaces, nowhere
@@ -76,22 +77,23 @@ class Localizer:
         if self._T_last is not None:
             self._distrust += float(np.linalg.norm(keyframe.T_odom_kf[:3, 3] - self._T_last[:3, 3]))
         self._T_last = keyframe.T_odom_kf
+        picture = None if keyframe.thumbnail is None else image_of(keyframe.thumbnail)
         if self.state.located:
-            return self._track(keyframe)
-        return self._find(keyframe, nowhere("lost"))
+            return self._track(keyframe, picture)
+        return self._find(keyframe, picture, nowhere("lost"))
 
-    def _track(self, keyframe: Keyframe) -> LocalizationResult:
+    def _track(self, keyframe: Keyframe, picture: Image | None) -> LocalizationResult:
         """Where the odometry says, if the points agree; else look everywhere."""
         T_predicted = self.T_map_odom @ keyframe.T_odom_kf
-        result = self._relocalizer.verify(keyframe.cloud, T_predicted)
+        result = self._relocalizer.verify(keyframe.cloud, T_predicted, picture=picture)
         if result.ok:
             return self._located(keyframe, result, jumped=False)
         self._failures += 1
-        return self._find(keyframe, result)
+        return self._find(keyframe, picture, result)
 
-    def _find(self, keyframe: Keyframe, rejected: Registration) -> LocalizationResult:
+    def _find(self, keyframe: Keyframe, picture: Image | None, rejected: Registration) -> LocalizationResult:
         """Look in the whole map, or around the hint; while tracking, a far-off result must be repeated."""
-        result = self._relocalizer.find(keyframe.cloud, self._hint, keyframe.descriptors)
+        result = self._relocalizer.find(keyframe.cloud, self._hint, keyframe.descriptors, picture)
         self._hint = None
         tracking = self.state.located
         T_predicted = self.T_map_odom @ keyframe.T_odom_kf

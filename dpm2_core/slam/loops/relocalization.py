@@ -2,34 +2,43 @@
 """Where in a map am I? From one cloud, without any prior, from anywhere and whatever the heading.
 
 The descriptors find the keyframes that look alike and a pose in each; the points decide. Where the second best place
-fits nearly as well there is no answer: it is better not to know than to be sure of the wrong one.
+fits nearly as well there is no answer: it is better not to know than to be sure of the wrong one. Where the points do
+not know how far along a road one is, a picture may: see `pictures`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from dpm2_core.config import Settings
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.frame import Array, Keyframe, Points, Registration
+from dpm2_core.frame import Array, Image, Points, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.voxel import voxel_first
+from dpm2_core.slam.loops.pictures import KnownMap, PicturedPlaces
 from dpm2_core.slam.loops.place_recognition import PlaceRecognition
 from dpm2_core.slam.loops.verification import (
     SAME_PLACE,
+    Along,
     VerificationSettings,
     Verifier,
     objection_of_others,
 )
+from dpm2_core.slam.registration.texture import VisualSettings
 
 if TYPE_CHECKING:  # torch takes seconds to import
     from dpm2_core.network.model import DeepPointMap2
+
+
+_REACH = 1.0  # m, along the road around a place that a picture has found
 
 
 class RelocalizationSettings(Settings):
@@ -39,6 +48,9 @@ class RelocalizationSettings(Settings):
     """So many keyframes that look like the scan are registered by the network..."""
     verified: int = Field(3, ge=1)
     """...and so many of the resulting places are verified by the points, the most confident first."""
+    pictured: int = Field(150, ge=0)
+    """Where they do not say how far along a road one is: so many keyframes, no two of them next to each other, are
+    compared by their pictures."""
     surroundings: float = Field(22.0, gt=0)
     """Keyframes so near to a candidate make up the map to register to, m..."""
     keyframes: int = Field(9, ge=1)
@@ -53,10 +65,18 @@ class RelocalizationSettings(Settings):
 class FindsPlaces(Protocol):
     """What a `Localizer` asks: see `Relocalizer`."""
 
-    def find(self, cloud: Points, hint: Array | None = None, descriptors: Descriptors | None = None) -> Registration:
+    def find(
+        self,
+        cloud: Points,
+        hint: Array | None = None,
+        descriptors: Descriptors | None = None,
+        picture: Image | None = None,
+    ) -> Registration:
         """T_map_lidar of a cloud (M, 4), or why it is not known."""
 
-    def verify(self, cloud: Points, T_map_lidar: Array, widen: float = 1.0) -> Registration:
+    def verify(
+        self, cloud: Points, T_map_lidar: Array, widen: float = 1.0, picture: Image | None = None
+    ) -> Registration:
         """Verifies a pose in the map by the points."""
 
 
@@ -66,61 +86,108 @@ class Relocalizer:
     def __init__(
         self,
         settings: RelocalizationSettings,
+        visual: VisualSettings,
         verifier: Verifier,
         network: DeepPointMap2,
-        keyframes: Sequence[Keyframe],
-        clouds: Sequence[Points],
-        poses: Array,
+        known: KnownMap,
     ) -> None:
-        """`keyframes` with descriptors, their `clouds` (M, 4), and `poses` (N, 4, 4) T_map_kf."""
-        self._settings = settings
-        self._keyframes, self._clouds, self._poses = keyframes, clouds, poses
+        self._settings, self._visual = settings, visual
+        self._keyframes, self._clouds, self._poses = known.keyframes, known.clouds, known.poses
         self._places = PlaceRecognition(network)
-        self._places.update(keyframes)
+        self._places.update(self._keyframes)
+        self._pictures = PicturedPlaces(visual, known)
         self._verifier = verifier
 
     def __len__(self) -> int:
         return len(self._keyframes)
 
-    def find(self, cloud: Points, hint: Array | None = None, descriptors: Descriptors | None = None) -> Registration:
+    def find(
+        self,
+        cloud: Points,
+        hint: Array | None = None,
+        descriptors: Descriptors | None = None,
+        picture: Image | None = None,
+    ) -> Registration:
         """T_map_lidar of a cloud (M, 4), or why it is not known.
 
         Args:
             hint: T_map_lidar (4, 4) to look around; its heading does not matter.
             descriptors: of the cloud, if they are known already.
+            picture: taken with the cloud, for where the points do not say how far along a road it was.
         """
-        s = self._settings
         try:
             descriptors = descriptors or self._places.describe(cloud)
         except Dpm2Error as error:
             return nowhere(str(error))
         allowed = np.ones(len(self), bool)
         if hint is not None:  # as on a plan: who points at a map on a screen gives no height
-            allowed = np.linalg.norm(self._poses[:, :2, 3] - hint[:2, 3], axis=1) <= s.hint_radius
-        nodes = self._places.similar(descriptors, allowed, s.candidates)
-        proposals = self._proposals(descriptors, nodes)[: s.verified]
-        if not proposals:
-            return nowhere(f"no keyframe of {int(allowed.sum())} matches the descriptors")
-        places = [self.verify(cloud, proposal.T_target_source) for proposal in proposals]
-        best = max(places, key=lambda place: (place.ok, place.confidence))
-        if not best.ok:
-            return nowhere("; ".join(place.reason for place in places))
-        objection = objection_of_others(best, [place for place in places if _meters(place, best) > SAME_PLACE])
-        return nowhere(objection) if objection else best
+            allowed = np.linalg.norm(self._poses[:, :2, 3] - hint[:2, 3], axis=1) <= self._settings.hint_radius
+        places = self._by_points(cloud, descriptors, allowed)
+        found = _unique(places) if places else nowhere(f"no keyframe of {int(allowed.sum())} matches the descriptors")
+        texture = self._pictures.texture(picture)
+        if found.ok or texture is None:
+            return found
+        nodes = self._places.similar(descriptors, allowed, self._settings.pictured)
+        verifier, T_across = self._verifier.suited_to(cloud), self._across(places)
+        place = self._pictures.find(cloud, texture, nodes, verifier, T_across)
+        if place is None:
+            return found
+        if not place.ok:
+            return nowhere(place.reason)
+        return self._verified(cloud, place.T_target_source, along=partial(self._pictures.along, texture, _REACH))
 
-    def verify(self, cloud: Points, T_map_lidar: Array, widen: float = 1.0) -> Registration:
-        """Verifies a pose in the map by the points: T_map_lidar, `ok` or not; `widen` as in `Verifier.verify`."""
+    def verify(
+        self, cloud: Points, T_map_lidar: Array, widen: float = 1.0, picture: Image | None = None
+    ) -> Registration:
+        """Verifies a pose in the map by the points: T_map_lidar, `ok` or not; `widen` as in `Verifier.verify`.
+
+        Args:
+            picture: taken with the cloud, for where the points leave a direction open.
+        """
+        texture = self._pictures.texture(picture)
+        along = None if texture is None else partial(self._pictures.along, texture, self._visual.reach)
+        return self._verified(cloud, T_map_lidar, widen, along)
+
+    def _verified(
+        self,
+        cloud: Points,
+        T_map_lidar: Array,
+        widen: float = 1.0,
+        along: Callable[[Sequence[int]], Along] | None = None,
+    ) -> Registration:
         distance = self._distance(T_map_lidar)
         near = np.flatnonzero(distance <= self._settings.surroundings)
         if not len(near):
             return nowhere("outside the map")
-        nodes = near[np.argsort(distance[near])[: self._settings.keyframes]]
+        nodes = near[np.argsort(distance[near])[: self._settings.keyframes]].tolist()
         T_at_map = se3.inverse(self._poses[nodes[0]])
         verifier = self._verifier.suited_to(cloud)
-        around = verifier.surroundings([self._clouds[n] for n in nodes.tolist()], T_at_map @ self._poses[nodes])
-        result = verifier.verify(cloud, around, T_at_map @ T_map_lidar, widen).registration
+        around = verifier.surroundings([self._clouds[n] for n in nodes], T_at_map @ self._poses[nodes])
+        open_way = None if along is None else along(nodes)
+        result = verifier.verify(cloud, around, T_at_map @ T_map_lidar, widen, open_way).registration
         T = se3.orthonormalized(self._poses[nodes[0]] @ result.T_target_source)
         return replace(result, T_target_source=T, method="relocalisation")
+
+    def _by_points(self, cloud: Points, descriptors: Descriptors, allowed: NDArray[np.bool_]) -> list[Registration]:
+        """The places that the descriptors propose among `allowed` (N,) keyframes, `ok` if the points confirm them."""
+        s = self._settings
+        nodes = self._places.similar(descriptors, allowed, s.candidates)
+        proposals = self._proposals(descriptors, nodes)[: s.verified]
+        return [self._verified(cloud, proposal.T_target_source) for proposal in proposals]
+
+    def _across(self, places: Sequence[Registration]) -> Array:
+        """Where across the road, seen from a keyframe beside it that looks the same way, and with which heading."""
+        seen = [(place, self._seen_from_nearest(place.T_target_source)) for place in places]
+        ahead = [(place, T) for place, T in seen if place.confidence > 0 and T[0, 0] > 0]
+        if not ahead:
+            return np.eye(4)
+        place, T = max(ahead, key=lambda one: one[0].confidence)
+        way = T[:3, :3] @ place.open_direction
+        return se3.make(T[:3, :3], T[:3, 3] - way * (way @ T[:3, 3]))
+
+    def _seen_from_nearest(self, T_map_lidar: Array) -> Array:
+        """T_kf_lidar (4, 4) of the nearest keyframe."""
+        return se3.inverse(self._poses[int(self._distance(T_map_lidar).argmin())]) @ T_map_lidar
 
     def _proposals(self, descriptors: Descriptors, nodes: Sequence[int]) -> list[Registration]:
         """T_map_lidar by each keyframe, the most confident first, one for each place."""
@@ -139,6 +206,15 @@ class Relocalizer:
 
     def _distance(self, T_map_lidar: Array) -> Array:
         return np.linalg.norm(self._poses[:, :3, 3] - T_map_lidar[:3, 3], axis=1)
+
+
+def _unique(places: Sequence[Registration]) -> Registration:
+    """The best of several verified places, if no other one fits nearly as well; else why not."""
+    best = max(places, key=lambda place: (place.ok, place.confidence))
+    if not best.ok:
+        return nowhere("; ".join(place.reason for place in places))
+    objection = objection_of_others(best, [place for place in places if _meters(place, best) > SAME_PLACE])
+    return nowhere(objection) if objection else best
 
 
 def downsampled(points: Points, voxel: float, reach: float) -> Points:

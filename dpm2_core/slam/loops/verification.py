@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,6 +25,10 @@ _WELL = 0.75  # fraction of that which fits where a pose is right; with less, a 
 _CLEARLY = 0.5  # of what does not fit at the second best place, at most so much does not fit at the best
 _ELSEWHERE = 0.7  # fit that a place which was not tried is assumed to have: in car parks they have 0.5 to 0.8
 SAME_PLACE = 5.0  # m, poses nearer to each other than this are of one place
+
+
+Along = Callable[[Registration], Registration]
+"""Finds the way along the direction that the points leave open; the result itself where it cannot."""
 
 
 class VerificationSettings(Settings):
@@ -69,7 +73,7 @@ class VerificationResult:
     turned: float = 0.0
 
 
-def objection_of_others(best: Registration, others: Sequence[Registration]) -> str:
+def objection_of_others(best: Registration, others: Sequence[Registration], by: str = "points") -> str:
     """Why a verified pose is not believed without a prior: another place fits nearly as well; empty if none does.
 
     As the ratio test of D. Lowe, "Distinctive Image Features from Scale-Invariant Keypoints", IJCV 2004, with what does
@@ -77,13 +81,14 @@ def objection_of_others(best: Registration, others: Sequence[Registration]) -> s
 
     Args:
         others: verifications at other places, also those that were not accepted.
+        by: what the confidences are of, for the message.
     """
     second = max([_ELSEWHERE, *(other.confidence for other in others)])
     if 1 - best.confidence <= _CLEARLY * (1 - second):
         return ""
     if second == _ELSEWHERE:
-        return f"{best.confidence:.0%} of the points fit: no more than at a place that looks alike"
-    return f"two places of the map fit alike: {best.confidence:.0%} and {second:.0%} of the points"
+        return f"{best.confidence:.0%} of the {by} fit: no more than at a place that looks alike"
+    return f"two places of the map fit alike: {best.confidence:.0%} and {second:.0%} of the {by}"
 
 
 class Verifier:
@@ -110,14 +115,25 @@ class Verifier:
         local_map.insert(np.concatenate(parts), np.eye(4), poses)
         return local_map
 
-    def verify(self, cloud: Points, around: LocalMap, T_proposed: Array, widen: float = 1.0) -> VerificationResult:
+    def source(self, cloud: Points) -> Array:
+        """Those points (N, 3) of a cloud (M, 4) that are registered."""
+        near = cloud[np.einsum("ij,ij->i", cloud[:, :3], cloud[:, :3]) < self._settings.range**2]
+        return near[voxel_first(near, self._settings.voxel), :3].astype(np.float64)
+
+    def register(self, source: Array, around: LocalMap, T_proposed: Array, widen: float) -> Registration:
+        """Points (N, 3) of `source` in a map, not verified."""
+        return self._registration.register(source, around, T_proposed, widen)
+
+    def verify(
+        self, cloud: Points, around: LocalMap, T_proposed: Array, widen: float = 1.0, along: Along | None = None
+    ) -> VerificationResult:
         """Verify a pose of a cloud (M, 4) in a map.
 
         Args:
             widen: factor on how far from the proposed pose the points may look for theirs.
+            along: asked where the points leave a direction open.
         """
-        near = cloud[np.einsum("ij,ij->i", cloud[:, :3], cloud[:, :3]) < self._settings.range**2]
-        source = near[voxel_first(near, self._settings.voxel), :3].astype(np.float64)
+        source = self.source(cloud)
         result = self._registration.register(source, around, T_proposed, widen)
         if not result.ok:
             return VerificationResult(result)
@@ -126,6 +142,8 @@ class Verifier:
         share, structure = self._shares(source, around, result.T_target_source, standing)
         if result.worst_sigma > self._settings.max_sigma or structure < _WELL:
             result = self._registration.probed(source, around, result)
+            if along is not None and result.worst_sigma > self._settings.max_sigma:
+                result = along(result)
             share, structure = self._shares(source, around, result.T_target_source, standing)
         meters, degrees = se3.magnitude(se3.inverse(T_proposed) @ result.T_target_source)
         overlap_features = VerificationResult(

@@ -24,7 +24,7 @@ from dpm2_core.slam.mapping.redundancy import RedundancySettings, lender
 from dpm2_core.slam.mapping.restore import restore
 from dpm2_core.slam.store.cloud_codec import pack_cloud
 from dpm2_core.slam.store.cloud_store import CloudStore
-from dpm2_core.slam.store.map_data import NO_POINTS, borrowing, load_map, map_cloud
+from dpm2_core.slam.store.map_data import NO_POINTS, Thumbnail, borrowing, load_map, map_cloud
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.slam.store.writer import MapWriter
 
@@ -37,7 +37,8 @@ class MapSettings(Settings):
     voxel: float = 0.3
     """Spacing of its points, m."""
     thumbnail: int = Field(0, ge=0, le=1024)
-    """Width of the image that a map file keeps of each keyframe, pixels; 0: none."""
+    """Width of the image that a map file keeps of each keyframe, pixels. 0: only of those by whose picture one can say
+    how far along a tunnel or a highway one is, see `slam.visual`: 6 kB each."""
     moving: MovingSettings = MovingSettings()
     redundancy: RedundancySettings = RedundancySettings()
 
@@ -67,6 +68,7 @@ class Mapper:
         keyframes: all, without their clouds; a node is a position among them. ids count on over a robot's sessions.
         session_start: node of the first keyframe of this session: those before are of a map that was loaded.
         loops: tried in this session, accepted or rejected.
+        thumbnail: JPEG of a node of a map that was loaded, or None.
     """
 
     def __init__(
@@ -78,6 +80,7 @@ class Mapper:
         self._closer = loops
         self.keyframes: list[Keyframe] = []
         self.loops: list[Edge] = []
+        self.thumbnail: Thumbnail = lambda node: None
         self._clouds = CloudStore()
         self._writer: MapWriter | None = None
         self._robots: dict[str, _Robot] = {}
@@ -234,7 +237,7 @@ class Mapper:
             if d is not None and channels is not None and d.features.shape[1] != channels:
                 width = d.features.shape[1]
                 raise UsageError(f"{store.path}: descriptors of {width} channels, the network makes {channels}")
-        self.keyframes, self._clouds = data.keyframes, data.clouds
+        self.keyframes, self._clouds, self.thumbnail = data.keyframes, data.clouds, data.thumbnail
         try:
             restore(self._graph, data)
             for node, T_map_kf in enumerate(data.poses):  # joined, parts have moved by the errors of their first loops

@@ -20,7 +20,7 @@ import numpy as np
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.files import write_json
-from dpm2_core.frame import Array, Points, Registration
+from dpm2_core.frame import Array, Image, Points, Registration
 from dpm2_core.slam.loops.relocalization import RelocalizationSettings, Relocalizer, nowhere
 from dpm2_core.slam.loops.retrieval import WIDTH, Vector, centered, pooled
 from dpm2_core.slam.mapping.merge import merge_maps
@@ -204,7 +204,13 @@ class TiledRelocalizer:
         self._settings, self._tiles, self._make, self._describe = settings, tiles, make, describe
         self._here: Relocalizer | None = None
 
-    def find(self, cloud: Points, hint: Array | None = None, descriptors: Descriptors | None = None) -> Registration:
+    def find(
+        self,
+        cloud: Points,
+        hint: Array | None = None,
+        descriptors: Descriptors | None = None,
+        picture: Image | None = None,
+    ) -> Registration:
         """As `Relocalizer.find`: around a hint, or else in the squares that look like the cloud.
 
         Raises:
@@ -219,9 +225,11 @@ class TiledRelocalizer:
         else:
             tiles = self._tiles.around(hint[:2, 3], self._settings.hint_radius)
         here = self._at(tiles)
-        return nowhere("outside the map") if here is None else here.find(cloud, hint, descriptors)
+        return nowhere("outside the map") if here is None else here.find(cloud, hint, descriptors, picture)
 
-    def verify(self, cloud: Points, T_map_lidar: Array, widen: float = 1.0) -> Registration:
+    def verify(
+        self, cloud: Points, T_map_lidar: Array, widen: float = 1.0, picture: Image | None = None
+    ) -> Registration:
         """As `Relocalizer.verify`.
 
         Raises:
@@ -230,7 +238,8 @@ class TiledRelocalizer:
         xy, reach = T_map_lidar[:2, 3], self._settings.surroundings
         if not self._tiles.open or not set(self._tiles.around(xy, reach)) <= self._tiles.open:
             self._at(self._tiles.around(xy, max(self._tiles.size, reach)))  # more: not again in the next moment
-        return nowhere("outside the map") if self._here is None else self._here.verify(cloud, T_map_lidar, widen)
+        here = self._here
+        return nowhere("outside the map") if here is None else here.verify(cloud, T_map_lidar, widen, picture)
 
     def _at(self, tiles: Collection[Tile]) -> Relocalizer | None:
         self._here = self._make(self._tiles.read(tiles)) if tiles else None

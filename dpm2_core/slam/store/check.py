@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from dpm2_core.data.thumbnail import image_of
 from dpm2_core.database import connect
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Array, Edge, Georeference, Keyframe, Registration
@@ -181,11 +182,21 @@ class _Salvage:
             unpack_cloud(row[1])
             if row[2] is not None:
                 rows.unpack_descriptors(row[2])
-            return row[1], row[2], row[3]
+            return row[1], row[2], self._thumbnail(node, row[3], complain)
         except (ValueError, TypeError) as error:
             if complain:
                 self._problem(f"keyframe {node}: its payload is lost: {error}")
             return None, None, None
+
+    def _thumbnail(self, node: int, jpeg: bytes | None, complain: bool) -> bytes | None:
+        try:
+            if jpeg is not None:
+                image_of(jpeg)
+        except ValueError as error:
+            if complain:
+                self._problem(f"keyframe {node}: {error}")
+            return None
+        return jpeg
 
     def _poses(self, keyframes: dict[int, Keyframe]) -> dict[int, Array]:
         """T_map_kf by node; one that is lost follows from the keyframe before, by odometry."""

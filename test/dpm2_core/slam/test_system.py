@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 
@@ -18,6 +19,7 @@ from dpm2_core.slam.loops.localizer import LocalizationResult
 from dpm2_core.slam.session import open_for_localization, open_session
 from dpm2_core.slam.settings import Config, SlamSettings
 
+from ...helpers import corridor
 from ...helpers.scenes import make_image
 
 GEOMETRIC = SlamSettings.model_validate({"registration": "geometric", "threads": 1, "loops": {"descriptors": False}})
@@ -138,3 +140,41 @@ def test_a_keyframe_carries_its_thumbnail_into_the_map_file(
     assert jpeg is not None
     assert jpeg.startswith(b"\xff\xd8")
     assert slam.mapper.keyframes[0].thumbnail is None  # in the file, not in memory
+
+
+@pytest.mark.slow
+@pytest.mark.weights
+def test_in_a_corridor_keyframes_keep_a_picture_by_which_the_robot_finds_itself(tmp_path: Path) -> None:
+    """The whole way: images with the scans, a map file, and a later drive that begins somewhere along it."""
+    paint, settings = corridor.random_paint(3), SlamSettings(threads=1)
+    path = tmp_path / "corridor.dpm2map"
+    with open_session(path, settings, "", resume=False) as store:
+        slam = make_slam(settings, store=store)
+        for n in range(26):
+            slam.process(corridor.frame(1.0 * n, paint, n))
+        slam.finish()
+        pictured = [store.payload(node, "thumbnail") is not None for node in range(len(slam.mapper.keyframes))]
+    assert len(pictured) >= 5
+    assert all(pictured)
+    with open_for_localization(path, settings) as store:
+        slam = make_slam(settings, store=store)
+        located = [slam.process(corridor.frame(11.7 + 0.8 * n, paint, 500 + n, gain=0.7)).T_map_lidar for n in range(8)]
+    assert located[0] is not None
+    assert located[0][0, 3] == pytest.approx(11.7, abs=0.1)
+    assert located[-1] is not None
+    assert located[-1][0, 3] == pytest.approx(11.7 + 0.8 * 7, abs=0.1)
+
+
+def test_in_a_street_keyframes_keep_no_picture(
+    suburb_drive: tuple[list[Frame], Array], noise: np.random.Generator, tmp_path: Path
+) -> None:
+    """But the first, of which nothing is known yet: a map stays small."""
+    image = make_image(noise)
+    with open_session(tmp_path / "a.dpm2map", GEOMETRIC, "", resume=False) as store:
+        slam = make_slam(GEOMETRIC, store=store)
+        for f in suburb_drive[0][:15]:
+            slam.process(replace(f, images=(image,)))
+        slam.finish()
+        pictured = [store.payload(node, "thumbnail") is not None for node in range(len(slam.mapper.keyframes))]
+    assert len(pictured) >= 2
+    assert pictured == [True] + [False] * (len(pictured) - 1)

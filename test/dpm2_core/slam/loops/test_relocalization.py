@@ -16,10 +16,12 @@ from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import LidarConfig
 from dpm2_core.sim.world import World, build_world
 from dpm2_core.slam.loops.localizer import Localizer
+from dpm2_core.slam.loops.pictures import KnownMap
 from dpm2_core.slam.loops.place_recognition import PlaceRecognition
 from dpm2_core.slam.loops.relocalization import RelocalizationSettings, Relocalizer
 from dpm2_core.slam.loops.verification import Verifier
 from dpm2_core.slam.registration.icp import GeometricSettings
+from dpm2_core.slam.registration.texture import VisualSettings
 
 pytestmark = pytest.mark.weights
 
@@ -50,7 +52,7 @@ def made(clouds: list[Points], poses: Array) -> Relocalizer:
     keyframes = [Keyframe(i, i, i, poses[i], cloud[:0], None, "", describe(cloud)) for i, cloud in enumerate(clouds)]
     settings = RelocalizationSettings()
     verifier = Verifier(settings.verification, GeometricSettings())
-    return Relocalizer(settings, verifier, network, keyframes, clouds, poses)
+    return Relocalizer(settings, VisualSettings(), verifier, network, KnownMap(keyframes, clouds, poses))
 
 
 def off(found: Registration, truth: Array) -> tuple[float, float]:

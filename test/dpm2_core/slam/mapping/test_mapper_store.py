@@ -199,27 +199,6 @@ def test_memory_of_a_keyframe_is_that_of_its_descriptors(tmp_path: Path) -> None
     assert used / (2 * LAP) < 8000
 
 
-@pytest.mark.parametrize("width", [0, 64])
-def test_thumbnails(tmp_path: Path, width: int) -> None:
-    import cv2
-
-    from dpm2_core.frame import Camera, Frame, Image
-    from dpm2_core.slam.mapping.thumbnail import thumbnail
-
-    pixels = np.zeros((100, 200, 3), np.uint8)
-    pixels[..., 0] = 255  # red
-    frame = Frame(0, np.zeros((0, 4), np.float32), images=(Image(pixels, Camera(np.eye(3), np.eye(4), (200, 100))),))
-    jpeg = thumbnail(frame, width)
-    if not width:
-        assert jpeg is None
-        return
-    assert jpeg is not None
-    back = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
-    assert back.shape == (32, 64, 3)
-    assert back[10, 10, 2] > 240  # BGR
-    assert back[10, 10, 0] < 20
-
-
 def test_descriptors_that_the_network_cannot_compare_are_told(map_file: Path) -> None:
     """Of 16 channels, whatever weights the file names; every search for loops would fail with them."""
 

@@ -12,12 +12,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dpm2_core.data.thumbnail import thumbnail
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Keyframe
 from dpm2_core.slam.store.check import check_map
 from dpm2_core.slam.store.map_data import MapData, load_map
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.slam.store.rows import with_crc
+
+from ....helpers.scenes import make_image
 
 
 def execute(path: Path, *statements: tuple[str, tuple[object, ...]]) -> None:
@@ -95,6 +98,26 @@ def test_damaged_pages_cost_only_what_is_on_them(map_file: Path, seed: int) -> N
     assert check_map(map_file).problems
     data = recovered(map_file)
     assert len(data) >= 8  # each page holds a few keyframes or less
+
+
+def test_an_invalid_picture_costs_nothing_but_itself(map_file: Path, noise: np.random.Generator) -> None:
+    """Its checksum is right: who wrote it did not know better, or wishes harm."""
+    jpeg = thumbnail(make_image(noise), 32).replace(b'"K": [[', b'"K": [["')
+    with closing(sqlite3.connect(map_file)) as sql:
+        row = sql.execute("SELECT node, cloud, descriptors, ? FROM payloads WHERE node = 3", (jpeg,)).fetchone()
+    execute(map_file, ("UPDATE payloads SET thumbnail = ?, crc = ? WHERE node = 3", with_crc(*row)[3:]))
+    assert check_map(map_file).problems == []  # that is no camera at all: a foreign JPEG
+    jpeg = thumbnail(make_image(noise), 32).replace(b'"size": [32,', b'"size": [-2,')
+    row = (*row[:3], jpeg)
+    execute(map_file, ("UPDATE payloads SET thumbnail = ?, crc = ? WHERE node = 3", with_crc(*row)[3:]))
+    result = check_map(map_file)
+    assert result.problems == ["keyframe 3: thumbnail: its camera is invalid: size of [-2.0, 16.0] pixels"]
+    assert (result.lost, result.lost_clouds) == (0, 0)
+    assert len(recovered(map_file)) == 12
+    with MapStore.open(map_file.with_name("recovered.dpm2map")) as store:
+        data = load_map(store)
+        assert data.thumbnail(3) is None
+        assert len(data.clouds[3])
 
 
 def test_a_destroyed_header(map_file: Path, keyframes: list[Keyframe]) -> None:

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A small image of a keyframe: a JPEG that anybody can show, with its camera in the JPEG's comment."""
+
+from __future__ import annotations
+
+import json
+import struct
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from dpm2_core.data.compressed import decode_compressed
+from dpm2_core.frame import Array, Camera, Image
+from dpm2_core.geometry import se3
+
+_START, _COMMENT = b"\xff\xd8", b"\xff\xfe"
+_QUALITY = 80
+_KEYS = {"K", "T_lidar_cam", "size", "distortion", "name"}
+_DISTORTIONS = (0, 4, 5, 8, 12, 14)  # coefficients that OpenCV takes
+_LARGEST = 4096  # pixels of width and height
+
+
+def thumbnail(image: Image, width: int) -> bytes:
+    """JPEG of an image, `width` pixels wide."""
+    height = max(1, round(width * image.pixels.shape[0] / image.pixels.shape[1]))
+    small = cv2.resize(image.pixels, (width, height), interpolation=cv2.INTER_AREA)
+    jpeg = cv2.imencode(".jpg", cv2.cvtColor(small, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
+    scale = np.diag([width / image.camera.size[0], height / image.camera.size[1], 1.0])
+    camera = replace(image.camera, K=scale @ image.camera.K, size=(width, height))
+    fields = {key: np.asarray(value).tolist() for key, value in vars(camera).items()}
+    comment = json.dumps(fields).encode()
+    return _START + _COMMENT + struct.pack(">H", len(comment) + 2) + comment + bytes(jpeg)[2:]
+
+
+def image_of(jpeg: bytes) -> Image | None:
+    """The image of such a JPEG; None for one without a camera.
+
+    Raises:
+        ValueError: it is damaged, or what it says is no camera.
+    """
+    if jpeg[:4] != _START + _COMMENT or len(jpeg) < 6:
+        return None
+    (length,) = struct.unpack_from(">H", jpeg, 4)
+    try:
+        fields = json.loads(jpeg[6 : 4 + length])
+    except ValueError:
+        return None
+    if not isinstance(fields, dict) or fields.keys() != _KEYS:
+        return None
+    try:
+        camera = _camera(fields)
+    except (ValueError, TypeError, OverflowError, RecursionError) as error:
+        raise ValueError(f"thumbnail: its camera is invalid: {error}") from None
+    return Image(decode_compressed(jpeg, camera.size), camera)
+
+
+def _camera(fields: dict[str, object]) -> Camera:
+    K, T, size = _numbers(fields, "K", (3, 3)), _numbers(fields, "T_lidar_cam", (4, 4)), _numbers(fields, "size", (2,))
+    if min(K[0, 0], K[1, 1]) <= 0 or (K[2] != (0, 0, 1)).any():
+        raise ValueError("K is not one of a pinhole")
+    if not se3.is_rigid(T):
+        raise ValueError("T_lidar_cam is not a rigid transform")
+    if not ((size >= 1) & (size <= _LARGEST)).all():
+        raise ValueError(f"size of {size.tolist()} pixels")
+    distortion = np.asarray(fields["distortion"], np.float64)
+    if distortion.ndim != 1 or len(distortion) not in _DISTORTIONS or not np.isfinite(distortion).all():
+        raise ValueError("distortion is not 4, 5, 8, 12 or 14 finite numbers")
+    return Camera(K, T, (int(size[0]), int(size[1])), tuple(distortion.tolist()), str(fields["name"]))
+
+
+def _numbers(fields: dict[str, object], key: str, shape: tuple[int, ...]) -> Array:
+    found = np.asarray(fields[key], np.float64)
+    if found.shape != shape or not np.isfinite(found).all():
+        raise ValueError(f"{key} is not {shape} finite numbers")
+    return found

@@ -1,0 +1,229 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Texture where the geometry is silent: how far along a tunnel or a highway.
+
+Points and descriptors leave a direction open there: along it, every pose fits alike. The points of one scan have a
+brightness in the image that was taken with it, and the same points are looked for in the image of another scan. One
+number is unknown, the way along the open direction; it is the one at which the two brightnesses correlate best.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from dpm2_core.config import Settings
+from dpm2_core.frame import Array, Image, Points, Registration
+from dpm2_core.geometry import se3
+
+
+class VisualSettings(Settings):
+    """How far along, by the image."""
+
+    enabled: bool = True
+    """Ask a camera where scans leave a direction open: the first one; a second one only where that has no image."""
+    sigma: float = Field(0.08, gt=0)
+    """Standard deviation of the position in its worst direction above which it counts as open, m."""
+    reach: float = Field(6.0, gt=0)
+    """Farthest that is looked to either side, m; less where the motion so far says more."""
+    baseline: float = Field(3.0, gt=0)
+    """Way after which another image is the one to compare with, m."""
+    points: int = Field(1500, gt=0)
+    """So many points are compared."""
+    width: int = Field(640, gt=0)
+    """Images are reduced to this width, pixels."""
+    min_correlation: float = Field(0.3, ge=0, le=1)
+    """Minimum correlation; lower values are discarded."""
+    distinct: float = Field(0.1, ge=0, le=1)
+    """Minimum margin over the second-best correlation peak; rejects repetitive structure such as lane markings."""
+
+
+_NEAR, _FAR = 2.0, 50.0  # m ahead of the camera: the compared points
+_STEPS = (0.1, 0.02)  # m, between the places tried: everywhere, then around the best
+_GLANCE, _FEW = 0.2, 3  # m, between the places at a glance, by each third point
+_BLUR = (2.5, 1.0)  # pixels: so that nothing is missed between two of them
+_LOCAL = 12.0  # pixels: light that changes more slowly is no texture
+_LEAST = 100  # points that both images must show
+_CORRELATED = 100  # pixels next to each other, and the points between them, say the same
+_COARSE_MARGIN = 0.3  # candidates within it of the best coarse correlation are refined at the fine level
+_APART = 0.6  # m: other places, not the slope of the best one
+
+
+@dataclass(frozen=True, eq=False)
+class Texture:
+    """Brightness of an image without its slow changes.
+
+    Attributes:
+        levels: (h, w) float32, blurred by each of `_BLUR`.
+        K: (3, 3) of the reduced image. T_cam_lidar: (4, 4).
+    """
+
+    levels: tuple[NDArray[np.float32], ...]
+    K: Array
+    T_cam_lidar: Array
+
+    def project(self, points: Array) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Pixels (..., N, 2) of points (..., N, 3) of the camera frame, m, and which of them the image shows."""
+        ahead = points[..., 2] > _NEAR / 2
+        image = points @ self.K.T
+        uv = np.asarray(image[..., :2] / np.where(ahead, points[..., 2], 1.0)[..., None], np.float32)
+        height, width = self.levels[0].shape
+        shown: NDArray[np.bool_] = ahead & (uv >= 0).all(-1) & (uv[..., 0] <= width - 1) & (uv[..., 1] <= height - 1)
+        return uv, shown
+
+    def sample(self, points: Array, level: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Texture (S, N) at points (S, N, 3) of the camera frame, m, and which of them the image shows."""
+        uv, shown = self.project(points)
+        found = cv2.remap(self.levels[level], uv[..., 0], uv[..., 1], cv2.INTER_LINEAR)
+        return np.asarray(found, np.float32), shown
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """Points (N, 3) of a scan in its LiDAR frame, float32, and their texture (N,) at each of `_BLUR`."""
+
+    points: Points
+    texture: tuple[NDArray[np.float32], ...]
+
+
+@dataclass(frozen=True)
+class Peak:
+    """A way along the open direction at which two images agree: m, its standard deviation, m, and the correlation."""
+
+    offset: float
+    sigma: float
+    correlation: float
+
+
+def textured(image: Image, width: int) -> Texture:
+    """Brightness without its slow changes, over its local contrast, undistorted."""
+    camera, gray = image.camera, cv2.cvtColor(image.pixels, cv2.COLOR_RGB2GRAY)
+    if camera.distortion:
+        gray = cv2.undistort(gray, camera.K, np.array(camera.distortion))
+    scale = min(1.0, width / camera.size[0])
+    size = (round(camera.size[0] * scale), round(camera.size[1] * scale))
+    gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    detail = gray - cv2.GaussianBlur(gray, (0, 0), _LOCAL)
+    detail /= np.sqrt(cv2.GaussianBlur(detail * detail, (0, 0), 2 * _LOCAL)) + 2.0  # gray levels: less is noise
+    K = np.diag([size[0] / camera.size[0], size[1] / camera.size[1], 1.0]) @ camera.K
+    return Texture(tuple(cv2.GaussianBlur(detail, (0, 0), blur) for blur in _BLUR), K, se3.inverse(camera.T_lidar_cam))
+
+
+def reference(points: Points, image: Texture, count: int) -> Reference:
+    """At most `count` of the points (P, 4) that the image shows, spread evenly over the scan."""
+    in_camera = _moved(image.T_cam_lidar, points[:, :3].astype(np.float64))
+    kept = np.flatnonzero(image.project(in_camera)[1] & (in_camera[:, 2] > _NEAR) & (in_camera[:, 2] < _FAR))
+    kept = kept[:: max(1, len(kept) // count)]
+    texture = [image.sample(in_camera[kept][None], level)[0][0] for level in range(len(_BLUR))]
+    return Reference(points[kept, :3], tuple(texture))
+
+
+def along(
+    s: VisualSettings, result: Registration, known: Reference, image: Texture, T_ref_target: Array, reach: float
+) -> Registration:
+    """A registration, moved along its open direction to where the images agree; unchanged, and why, if they do not.
+
+    Args:
+        known: what is looked for in the image of the source. T_ref_target: (4, 4) from the target to its scan.
+        reach: the farthest that is looked to either side, m.
+    """
+    found = _search(s, known, image, T_ref_target @ result.T_target_source, result.open_direction, reach)
+    if isinstance(found, str):
+        return replace(result, reason="; ".join(part for part in (result.reason, found) if part))
+    b = np.concatenate([np.zeros(3), result.open_direction])
+    gain = result.covariance @ b / (b @ result.covariance @ b + found.sigma**2)
+    T = se3.orthonormalized(result.T_target_source @ se3.exp(gain * found.offset))
+    covariance = result.covariance - np.outer(gain, b @ result.covariance)
+    return replace(result, T_target_source=T, covariance=(covariance + covariance.T) / 2, method="visual")
+
+
+def _search(
+    s: VisualSettings, known: Reference, image: Texture, T_ref_lidar: Array, axis: Array, reach: float
+) -> Peak | str:
+    """The way along `axis` of the LiDAR frame, or why it is not known."""
+    if len(known.points) < _LEAST:
+        return f"image: only {len(known.points)} points in it"
+    best, *others = peaks(s, known, image, T_ref_lidar, axis, reach) or [Peak(0.0, np.inf, 0.0)]
+    if best.correlation < s.min_correlation:
+        return f"image: no place correlates by {s.min_correlation:.2f}"
+    if any(p.correlation > best.correlation - s.distinct and abs(p.offset - best.offset) > _APART for p in others):
+        return "image: several places are alike"
+    return best
+
+
+def peaks(
+    s: VisualSettings, known: Reference, image: Texture, T_ref_lidar: Array, axis: Array, reach: float
+) -> list[Peak]:
+    """Where along `axis` (3,) of the LiDAR frame the texture of a reference is found in an image, the best first.
+
+    Args:
+        T_ref_lidar: (4, 4) from the LiDAR frame of the image to that of the reference, but for the way along the axis.
+        reach: the farthest that is looked to either side, m.
+    """
+    offsets = np.arange(-reach, reach + _STEPS[0] / 2, _STEPS[0])
+    correlation = _correlated(known, image, T_ref_lidar, axis, offsets, 0)
+    candidates = _maxima(correlation, max(s.min_correlation / 2, float(correlation.max()) - _COARSE_MARGIN))
+    around = np.arange(-_STEPS[0], _STEPS[0] + _STEPS[1] / 2, _STEPS[1])
+    found = []
+    for middle in offsets[candidates]:
+        fine = _correlated(known, image, T_ref_lidar, axis, middle + around, 1)
+        found.append(_peak(middle + around, fine, len(known.points)))
+    return sorted(found, key=lambda peak: -peak.correlation)
+
+
+def glance(known: Reference, image: Texture, T_ref_lidar: Array, axis: Array, reach: float) -> Peak:
+    """As the best of `peaks`, by fewer points and coarser steps: a tenth of the time."""
+    few = Reference(known.points[::_FEW], tuple(level[::_FEW] for level in known.texture))
+    offsets = np.arange(-reach, reach + _GLANCE / 2, _GLANCE)
+    correlation = _correlated(few, image, T_ref_lidar, axis, offsets, 0)
+    best = int(correlation.argmax())
+    return Peak(float(offsets[best]), _GLANCE, float(correlation[best]))
+
+
+def _correlated(
+    known: Reference, image: Texture, T_ref_lidar: Array, axis: Array, offsets: Array, level: int
+) -> NDArray[np.float32]:
+    """Correlation (S,) of the texture with that of the image for the LiDAR at each of the offsets (S,), m."""
+    there = _moved(image.T_cam_lidar @ se3.inverse(T_ref_lidar), known.points.astype(np.float64))
+    step = image.T_cam_lidar[:3, :3] @ axis
+    return _correlations(known.texture[level], *image.sample(there - offsets[:, None, None] * step, level))
+
+
+def _maxima(correlation: NDArray[np.float32], least: float) -> NDArray[np.intp]:
+    """Interior local maxima of the correlation above `least`."""
+    inner = correlation[1:-1]
+    return 1 + np.flatnonzero((inner >= correlation[:-2]) & (inner > correlation[2:]) & (inner > least))
+
+
+def _moved(T: Array, points: Array) -> Array:
+    return points @ T[:3, :3].T + T[:3, 3]
+
+
+def _correlations(
+    values: NDArray[np.float32], found: NDArray[np.float32], shown: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    """Correlation (S,) of values (N,) with each row of found (S, N) over what is shown; 0 where that is too little."""
+    weight = shown.astype(np.float32)
+    count = weight.sum(1)
+    x = (values - (weight @ values / np.maximum(count, 1))[:, None]) * weight
+    y = (found - ((found * weight).sum(1) / np.maximum(count, 1))[:, None]) * weight
+    spread = np.sqrt((x * x).sum(1) * (y * y).sum(1))
+    return np.where(count >= _LEAST, (x * y).sum(1) / np.maximum(spread, 1e-6), 0.0)
+
+
+def _peak(offsets: Array, correlation: NDArray[np.float32], points: int) -> Peak:
+    """Maximum of a parabola through the top.
+
+    The information of a shift in y = x(shift) + noise is n (dx/dshift)^2 / var(noise); both follow from the correlation
+    r and its second derivative: -n r'' r / (1 - r^2).
+    """
+    i = int(np.clip(correlation.argmax(), 1, len(offsets) - 2))
+    before, top, after = correlation[i - 1 : i + 2].astype(float)
+    step = offsets[1] - offsets[0]
+    bend = max((2 * top - before - after) / step**2, 1e-3)
+    offset = offsets[i] + float(np.clip((after - before) / (2 * bend * step), -step, step))
+    information = points / _CORRELATED * bend * top / max(1 - top * top, 1e-3)
+    return Peak(offset, float(max(0.01, information**-0.5)), float(correlation.max()))

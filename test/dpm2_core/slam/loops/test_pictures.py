@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the points fit everywhere, a picture finds the place; where it fits nowhere or twice, there is no answer."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dpm2_core.data.thumbnail import image_of, thumbnail
+from dpm2_core.frame import Array, Image, Keyframe
+from dpm2_core.geometry import se3
+from dpm2_core.network.pretrained import load_network
+from dpm2_core.slam.loops.localizer import Localizer
+from dpm2_core.slam.loops.pictures import KnownMap
+from dpm2_core.slam.loops.place_recognition import PlaceRecognition
+from dpm2_core.slam.loops.relocalization import RelocalizationSettings, Relocalizer
+from dpm2_core.slam.loops.verification import VerificationSettings, Verifier
+from dpm2_core.slam.registration.icp import GeometricSettings
+from dpm2_core.slam.registration.texture import VisualSettings
+
+from ....helpers.corridor import Paint, frame, random_paint, stripes
+
+pytestmark = pytest.mark.weights
+
+AT = np.arange(0.0, 41.0, 5.0)
+PAINT = random_paint()
+
+
+def keyframe(x: float, paint: Paint, index: int, pictured: bool = True) -> Keyframe:
+    seen = frame(x, paint, index, gain=0.8)
+    picture = thumbnail(seen.images[0], 320) if pictured else None
+    describe = PlaceRecognition(load_network("small", 1)).describe
+    return Keyframe(index, index * 10**9, index, place(x), seen.points, None, "", describe(seen.points), picture)
+
+
+def place(x: float) -> Array:
+    return se3.make(np.eye(3), np.array([x, 0, 0]))
+
+
+def in_map(keyframes: list[Keyframe]) -> KnownMap:
+    """Keyframes at each of `AT`."""
+    poses = np.array([place(x) for x in AT])
+    return KnownMap(keyframes, [k.cloud for k in keyframes], poses, lambda node: keyframes[node].thumbnail)
+
+
+def relocalizer(paint: Paint, pictured: bool = True, visual: VisualSettings | None = None) -> Relocalizer:
+    keyframes = [keyframe(x, paint, n, pictured) for n, x in enumerate(AT)]
+    known = in_map(keyframes)
+    verifier = Verifier(VerificationSettings(), GeometricSettings())
+    settings = visual or VisualSettings()
+    return Relocalizer(RelocalizationSettings(), settings, verifier, load_network("small", 1), known)
+
+
+def picture_of(keyframe: Keyframe) -> Image | None:
+    return None if keyframe.thumbnail is None else image_of(keyframe.thumbnail)
+
+
+@pytest.mark.slow
+def test_a_place_in_a_corridor_is_found_by_its_picture_alone() -> None:
+    """To 5 cm, two steps of the fine search at half the resolution; without the picture or the map's, not at all."""
+    visit = keyframe(18.3, PAINT, 77)
+    found = relocalizer(PAINT).find(visit.cloud, None, visit.descriptors, picture_of(visit))
+    assert found.ok, found.reason
+    assert found.T_target_source[0, 3] == pytest.approx(18.3, abs=0.05)
+    np.testing.assert_allclose(found.T_target_source[1:3, 3], 0, atol=0.03)
+    assert found.worst_sigma < 0.1
+    blind = relocalizer(PAINT).find(visit.cloud, None, visit.descriptors)
+    assert not blind.ok
+    for without in (relocalizer(PAINT, pictured=False), relocalizer(PAINT, visual=VisualSettings(enabled=False))):
+        assert not without.find(visit.cloud, None, visit.descriptors, picture_of(visit)).ok
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("paint", "seen", "why"),
+    [(PAINT, random_paint(5), "position uncertain by 1.00 m"), (stripes, stripes, "fit alike: .* of the pictures")],
+    ids=["elsewhere", "repetitive"],
+)
+def test_a_picture_that_fits_nowhere_or_everywhere_is_no_place(paint: Paint, seen: Paint, why: str) -> None:
+    visit = keyframe(18.3, seen, 77)
+    found = relocalizer(paint).find(visit.cloud, None, visit.descriptors, picture_of(visit))
+    assert not found.ok
+    assert re.search(why, found.reason), found.reason
+
+
+@pytest.mark.slow
+def test_localization_goes_on_along_a_corridor() -> None:
+    """Found, then confirmed at each keyframe, with an odometry that runs 4 % too far; blind, it is lost."""
+    for pictured in (True, False):
+        localizer = Localizer(relocalizer(PAINT))
+        states = []
+        for n, x in enumerate((7.0, 12.0, 17.0, 22.0, 27.0)):
+            now = replace(keyframe(x, PAINT, 100 + n, pictured), T_odom_kf=place(1.04 * (x - 7.0)))
+            located = localizer.add(now)
+            states.append(str(located.state))
+            if pictured:
+                assert located.T_map_kf[0, 3] == pytest.approx(x, abs=0.06)
+        assert states == (["relocalised"] + ["tracking"] * 4 if pictured else ["relocalising"] * 5)
+
+
+@pytest.mark.slow
+def test_a_damaged_picture_in_a_map_is_no_picture() -> None:
+    """Its neighbor shows the place, too."""
+    visit = keyframe(18.3, PAINT, 77)
+    keyframes = [keyframe(x, PAINT, n) for n, x in enumerate(AT)]
+    jpeg = keyframes[4].thumbnail
+    assert jpeg is not None
+    keyframes[4] = replace(keyframes[4], thumbnail=jpeg[:1000])
+    known = in_map(keyframes)
+    verifier = Verifier(VerificationSettings(), GeometricSettings())
+    where = Relocalizer(RelocalizationSettings(), VisualSettings(), verifier, load_network("small", 1), known)
+    found = where.find(visit.cloud, None, visit.descriptors, picture_of(visit))
+    assert found.ok, found.reason
+    assert found.T_target_source[0, 3] == pytest.approx(18.3, abs=0.1)
