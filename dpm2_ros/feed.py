@@ -25,7 +25,7 @@ from dpm2_core.slam.store.cloud_codec import CodecError, unpack_cloud
 from dpm2_core.slam.store.map_data import NO_POINTS
 from dpm2_ros.conversions import EARLIER, check_frame, covariance_from_ros, parse_keyframe_name
 from dpm2_ros.guard import GuardedNode
-from dpm2_ros.keyframe_messages import BUDGET, WIRE, cloud_from_msg, descriptors_from_msg, received_to_msg
+from dpm2_ros.keyframe_messages import BUDGET, WIRE, descriptors_from_msg, payload_from_msg, received_to_msg
 from dpm2_ros.mapping import MapperThread
 from dpm2_ros.streams import Parts, Stream
 
@@ -147,12 +147,12 @@ class Feed:
             with _noted(stream, id):
                 if len(message.data) > BUDGET:
                     raise RejectedError("size", f"keyframe {id}: {len(message.data)} bytes; at most {BUDGET} are sent")
-                packed, fix = cloud_from_msg(message)
+                payload = payload_from_msg(message)
                 try:
-                    unpack_cloud(packed)
+                    unpack_cloud(payload.cloud)
                 except CodecError as error:
                     raise RejectedError("cloud", f"keyframe {id}: {error}") from None
-            self._put(stream, id, "cloud", (packed, fix))
+            self._put(stream, id, "cloud", payload)
 
     def _on_seen(self, message: PointCloud2) -> None:
         stream, id = self._hear(message.header.frame_id)
@@ -243,8 +243,11 @@ class Feed:
         stream.last, stream.odom_frame = replace(keyframe, descriptors=None), parts.pose.header.frame_id
         stream.taken += 1
         assert parts.cloud is not None
-        packed, fix = parts.cloud
-        stream.given(id, self._mapper.add(lambda: replace(keyframe, cloud=unpack_cloud(packed), fix=fix)))
+        packed, fix, thumbnail = parts.cloud
+        stream.given(
+            id,
+            self._mapper.add(lambda: replace(keyframe, cloud=unpack_cloud(packed), fix=fix, thumbnail=thumbnail)),
+        )
 
     def _acknowledge(self, stream: Stream, now: float) -> None:
         if stream.session:

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A keyframe as three messages: pose, descriptors, packed cloud with its fix; and what the mapper answers."""
+"""A keyframe as three messages: pose, descriptors, packed cloud with fix and thumbnail; and what the mapper answers."""
 
 from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from nav_msgs.msg import Odometry
@@ -13,6 +14,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import MultiArrayDimension, MultiArrayLayout, UInt8MultiArray, UInt32MultiArray
 
+from dpm2_core.data.thumbnail import image_of
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.frame import Fix, Keyframe
 from dpm2_core.geometry.voxel import voxel_first
@@ -23,9 +25,11 @@ from dpm2_ros.conversions import EARLIER, bytes_to_array, header
 WIRE = QoSProfile(depth=64, reliability=ReliabilityPolicy.RELIABLE)
 """Of keyframes; what falls out of the queue is sent again."""
 BUDGET = 99_000
-"""Bytes of a keyframe's cloud and descriptors on the wire; its pose and the protocol's own have the rest of 100 kB."""
+"""Bytes of a keyframe's payload and descriptors on the wire; pose and protocol have the rest of 100 kB."""
 
 _FIX = struct.Struct("<q15d")  # stamp, ns; place, covariance, antenna, as in `Fix`
+_OF_FIX, _OF_THUMBNAIL = "fix", "thumbnail"
+_LARGEST_THUMBNAIL = 20_000  # bytes: one of 320 pixels has 6000; a larger one would cost the cloud its points
 _FEATURE = "feature"
 _MOST_CHANNELS = 4096
 
@@ -51,41 +55,66 @@ def received_to_msg(session: str, below: int, above: Sequence[int]) -> UInt32Mul
     return UInt32MultiArray(layout=MultiArrayLayout(dim=[dimension]), data=[below, *above])
 
 
-def payload_to_msgs(keyframe: Keyframe, name: str, weights: str = "") -> tuple[PointCloud2, UInt8MultiArray]:
-    """Descriptors and packed cloud of a keyframe, the cloud downsampled until both are within `BUDGET`.
+class Payload(NamedTuple):
+    """What comes with a keyframe's cloud, which is packed: its fix and its thumbnail, if it has them."""
 
-    Behind the cloud is its fix, if it has one, as a second dimension.
+    cloud: bytes
+    fix: Fix | None = None
+    thumbnail: bytes | None = None
+
+
+def payload_to_msgs(keyframe: Keyframe, name: str, weights: str = "") -> tuple[PointCloud2, UInt8MultiArray]:
+    """Descriptors and payload of a keyframe, the cloud downsampled until both are within `BUDGET`.
+
+    Behind the cloud are its fix and its thumbnail, if it has them, as dimensions more.
     """
-    d, fix = keyframe.descriptors, keyframe.fix
+    d, fix, thumbnail = keyframe.descriptors, keyframe.fix, keyframe.thumbnail
     descriptors = descriptors_to_msg(d, keyframe.stamp, name, weights)
-    room = BUDGET - len(descriptors.data) - _FIX.size
+    behind = {}
+    if fix is not None:
+        behind[_OF_FIX] = _FIX.pack(fix.stamp, *fix.geodetic, *fix.covariance.ravel(), *fix.antenna)
+    if thumbnail is not None and len(thumbnail) <= _LARGEST_THUMBNAIL:
+        behind[_OF_THUMBNAIL] = thumbnail
+    room = BUDGET - len(descriptors.data) - sum(map(len, behind.values()))
     cloud, voxel = keyframe.cloud, 0.3
     while len(packed := pack_cloud(cloud)) > room:
         voxel *= 1.15
         cloud = keyframe.cloud[voxel_first(keyframe.cloud, voxel)]
-    dimensions = [MultiArrayDimension(label=name, size=len(packed), stride=len(packed))]
-    if fix is not None:
-        dimensions.append(MultiArrayDimension(label="fix", size=_FIX.size, stride=_FIX.size))
-        packed += _FIX.pack(fix.stamp, *fix.geodetic, *fix.covariance.ravel(), *fix.antenna)
-    return descriptors, UInt8MultiArray(layout=MultiArrayLayout(dim=dimensions), data=bytes_to_array(packed))
+    parts = {name: packed, **behind}
+    dimensions = [MultiArrayDimension(label=key, size=len(part), stride=len(part)) for key, part in parts.items()]
+    data = bytes_to_array(b"".join(parts.values()))
+    return descriptors, UInt8MultiArray(layout=MultiArrayLayout(dim=dimensions), data=data)
 
 
-def cloud_from_msg(message: UInt8MultiArray) -> tuple[bytes, Fix | None]:
-    """The packed cloud of a keyframe, not unpacked yet, and its fix.
+def payload_from_msg(message: UInt8MultiArray) -> Payload:
+    """The payload of a keyframe, its cloud not unpacked yet.
 
     Raises:
-        RejectedError: the fix is invalid.
+        RejectedError: the parts are not as long as it says, or the fix or the thumbnail is invalid.
     """
-    data = bytes(message.data)
-    if len(message.layout.dim) < 2:
-        return data, None
-    packed, rest = data[: -_FIX.size], data[-_FIX.size :]
-    if len(rest) != _FIX.size:
-        raise RejectedError("fix", f"a fix of {len(rest)} bytes")
-    stamp, *numbers = _FIX.unpack(rest)
+    data, dimensions = bytes(message.data), message.layout.dim
+    if len(dimensions) < 2:
+        return Payload(data)
+    ends = np.cumsum([dimension.size for dimension in dimensions]).tolist()
+    if ends[-1] != len(data):
+        raise RejectedError("size", f"{len(data)} bytes for parts of {ends[-1]}")
+    behind = {d.label: data[end - d.size : end] for d, end in zip(dimensions[1:], ends[1:], strict=True)}
+    fix, thumbnail = behind.get(_OF_FIX), behind.get(_OF_THUMBNAIL)
+    try:
+        if thumbnail is not None:
+            image_of(thumbnail)
+    except ValueError as error:
+        raise RejectedError("thumbnail", str(error)) from None
+    return Payload(data[: ends[0]], None if fix is None else _fix_from(fix), thumbnail)
+
+
+def _fix_from(data: bytes) -> Fix:
+    if len(data) != _FIX.size:
+        raise RejectedError("fix", f"a fix of {len(data)} bytes")
+    stamp, *numbers = _FIX.unpack(data)
     values = np.array(numbers)
     try:
-        return packed, Fix(stamp, values[:3], values[3:12].reshape(3, 3), values[12:])
+        return Fix(stamp, values[:3], values[3:12].reshape(3, 3), values[12:])
     except ValueError as error:
         raise RejectedError("fix", str(error)) from None
 

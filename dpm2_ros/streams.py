@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from dpm2_core.descriptors import Descriptors
-from dpm2_core.frame import Fix, Keyframe
+from dpm2_core.frame import Keyframe
+from dpm2_ros.keyframe_messages import Payload
 
 AHEAD = 64
 """Keyframes that may wait for one before them; those beyond are sent again."""
@@ -20,10 +21,10 @@ _TIMES = 3
 
 @dataclass(eq=False)
 class Parts:
-    """What has come of a keyframe, each part checked: its pose, its packed cloud with its fix, its descriptors."""
+    """What has come of a keyframe, each part checked: its pose, its payload, its descriptors."""
 
     pose: Any = None
-    cloud: tuple[bytes, Fix | None] | None = None
+    cloud: Payload | None = None
     seen: bool = False
     descriptors: Descriptors | None = None
 
@@ -37,7 +38,7 @@ class Parts:
         """Roughly."""
         return (
             2000
-            + (0 if self.cloud is None else len(self.cloud[0]))
+            + (0 if self.cloud is None else len(self.cloud.cloud) + len(self.cloud.thumbnail or b""))
             + (0 if self.descriptors is None else self.descriptors.nbytes)
         )
 

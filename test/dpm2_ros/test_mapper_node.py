@@ -43,7 +43,8 @@ def test_a_fix_travels_with_its_keyframe_and_a_forged_one_does_not(mapper: Any) 
     wires = mapper.wires
     for wrong in (forged, cut):
         wires[2].publish(wrong)
-    mapper.wait(lambda: mapper.mapper.rejections.get("/dpm2/keyframe_cloud: fix", 0) >= 2, "rejections")
+    for why in ("fix", "size"):
+        mapper.wait(lambda of=why: mapper.mapper.rejections.get(f"/dpm2/keyframe_cloud: {of}", 0), f"rejected: {why}")
     for wire, message in zip(wires, (edge_to_msg(np.eye(4), np.eye(6), 1000, "odom", name), seen, cloud), strict=True):
         wire.publish(message)
     mapper.wait(lambda: keyframes(mapper) == 1, "the keyframe")

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from dpm2_ros.deliveries import Acks
+from dpm2_ros.keyframe_messages import Payload
 from dpm2_ros.streams import AHEAD, Stream
 
-CLOUD = bytes(100_000), None  # and no fix
+CLOUD = Payload(bytes(100_000))
 
 
 def put(stream: Stream, id: int) -> None:

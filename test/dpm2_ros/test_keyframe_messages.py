@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A keyframe's payload comes out of its messages as it went in, and what does not add up is rejected by name."""
+
+from __future__ import annotations
+
+from array import array
+
+import numpy as np
+import pytest
+
+from dpm2_core.data.thumbnail import thumbnail
+from dpm2_core.frame import Fix, Keyframe
+from dpm2_core.slam.mapping.admission import RejectedError
+from dpm2_core.slam.store.cloud_codec import unpack_cloud
+from dpm2_ros.keyframe_messages import BUDGET, payload_from_msg, payload_to_msgs
+
+from ..helpers.scenes import make_image
+
+FIX = Fix(7, np.array([49.0, 8.4, 116.0]), np.diag([1.0, 2.0, 3.0]), np.array([0.1, 0.2, 0.3]))
+
+
+def keyframe(noise: np.random.Generator, fix: Fix | None, picture: bytes | None, points: int = 500) -> Keyframe:
+    cloud = noise.uniform(-20, 20, (points, 4)).astype(np.float32)
+    return Keyframe(3, 5, 3, np.eye(4), cloud, None, "", None, picture, fix)
+
+
+@pytest.mark.parametrize("fixed", [True, False])
+@pytest.mark.parametrize("pictured", [True, False])
+def test_fix_and_thumbnail_travel_with_the_cloud(noise: np.random.Generator, fixed: bool, pictured: bool) -> None:
+    """Within the budget, whatever of them there is: the cloud gives way."""
+    picture = thumbnail(make_image(noise), 200) if pictured else None
+    sent = keyframe(noise, FIX if fixed else None, picture, 100_000)
+    payload = payload_from_msg(payload_to_msgs(sent, "a/3")[1])
+    assert payload.thumbnail == picture
+    assert (payload.fix is None) == (not fixed)
+    if payload.fix is not None:
+        assert payload.fix.stamp == 7
+        for name in ("geodetic", "covariance", "antenna"):
+            np.testing.assert_array_equal(getattr(payload.fix, name), getattr(FIX, name))
+    assert 1000 < len(unpack_cloud(payload.cloud)) < 100_000
+    assert len(payload.cloud) + len(picture or b"") < BUDGET
+
+
+def test_a_picture_that_would_cost_the_cloud_its_points_stays_at_home(noise: np.random.Generator) -> None:
+    picture = thumbnail(make_image(noise, (1024, 768)), 1024)
+    assert len(picture) > 20_000
+    payload = payload_from_msg(payload_to_msgs(keyframe(noise, FIX, picture), "a/3")[1])
+    assert payload.thumbnail is None
+    assert payload.fix is not None
+
+
+def test_parts_that_do_not_add_up_are_rejected(noise: np.random.Generator) -> None:
+    picture = thumbnail(make_image(noise), 32)
+    message = payload_to_msgs(keyframe(noise, FIX, picture), "a/3")[1]
+    message.layout.dim[1].size = 2**32 - 1
+    with pytest.raises(RejectedError, match="bytes for parts of"):
+        payload_from_msg(message)
+    message = payload_to_msgs(keyframe(noise, FIX, picture), "a/3")[1]
+    message.layout.dim[0].size += 8
+    message.layout.dim[1].size -= 8
+    with pytest.raises(RejectedError, match="a fix of 120 bytes"):
+        payload_from_msg(message)
+    message = payload_to_msgs(keyframe(noise, None, picture), "a/3")[1]
+    message.data = array("B", bytes(message.data).replace(b'"size": [32', b'"size": [99'))
+    with pytest.raises(RejectedError, match="the camera has 99 x"):
+        payload_from_msg(message)
