@@ -73,7 +73,7 @@ class VerificationResult:
     turned: float = 0.0
 
 
-def objection_of_others(best: Registration, others: Sequence[Registration], by: str = "points") -> str:
+def objection_of_others(best: Registration, others: Sequence[Registration]) -> str:
     """Why a verified pose is not believed without a prior: another place fits nearly as well; empty if none does.
 
     As the ratio test of D. Lowe, "Distinctive Image Features from Scale-Invariant Keypoints", IJCV 2004, with what does
@@ -81,14 +81,13 @@ def objection_of_others(best: Registration, others: Sequence[Registration], by: 
 
     Args:
         others: verifications at other places, also those that were not accepted.
-        by: what the confidences are of, for the message.
     """
     second = max([_ELSEWHERE, *(other.confidence for other in others)])
     if 1 - best.confidence <= _CLEARLY * (1 - second):
         return ""
     if second == _ELSEWHERE:
-        return f"{best.confidence:.0%} of the {by} fit: no more than at a place that looks alike"
-    return f"two places of the map fit alike: {best.confidence:.0%} and {second:.0%} of the {by}"
+        return f"{best.confidence:.0%} of the points fit: no more than at a place that looks alike"
+    return f"two places of the map fit alike: {best.confidence:.0%} and {second:.0%} of the points"
 
 
 class Verifier:

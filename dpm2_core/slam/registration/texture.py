@@ -3,7 +3,7 @@
 
 Points and descriptors leave a direction open there: along it, every pose fits alike. The points of one scan have a
 brightness in the image that was taken with it, and the same points are looked for in the image of another scan. One
-number is unknown, the way along the open direction; it is the one at which the two brightnesses correlate best.
+number is unknown, the way along the open direction; it is the one at which the two correlate best.
 """
 
 from __future__ import annotations
@@ -45,6 +45,7 @@ _NEAR, _FAR = 2.0, 50.0  # m ahead of the camera: the compared points
 _STEPS = (0.1, 0.02)  # m, between the places tried: everywhere, then around the best
 _GLANCE, _FEW = 0.2, 3  # m, between the places at a glance, by each third point
 _BLUR = (2.5, 1.0)  # pixels: so that nothing is missed between two of them
+_BESIDE = 1.0  # m, before and behind: what is the same there says nothing
 _LOCAL = 12.0  # pixels: light that changes more slowly is no texture
 _LEAST = 100  # points that both images must show
 _CORRELATED = 100  # pixels next to each other, and the points between them, say the same
@@ -83,7 +84,7 @@ class Texture:
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """Points (N, 3) of a scan in its LiDAR frame, float32, and their texture (N,) at each of `_BLUR`."""
+    """Points (N, 3) of a scan in its LiDAR frame, float32, and how their texture (N,) changes, at each of `_BLUR`."""
 
     points: Points
     texture: tuple[NDArray[np.float32], ...]
@@ -112,13 +113,19 @@ def textured(image: Image, width: int) -> Texture:
     return Texture(tuple(cv2.GaussianBlur(detail, (0, 0), blur) for blur in _BLUR), K, se3.inverse(camera.T_lidar_cam))
 
 
-def reference(points: Points, image: Texture, count: int) -> Reference:
-    """At most `count` of the points (P, 4) that the image shows, spread evenly over the scan."""
+def reference(points: Points, image: Texture, count: int, axis: Array) -> Reference:
+    """At most `count` of the points (P, 4) that the image shows, spread evenly over the scan.
+
+    Args:
+        axis: (3,) in the LiDAR frame, the direction that is open; either sign.
+    """
     in_camera = _moved(image.T_cam_lidar, points[:, :3].astype(np.float64))
     kept = np.flatnonzero(image.project(in_camera)[1] & (in_camera[:, 2] > _NEAR) & (in_camera[:, 2] < _FAR))
     kept = kept[:: max(1, len(kept) // count)]
-    texture = [image.sample(in_camera[kept][None], level)[0][0] for level in range(len(_BLUR))]
-    return Reference(points[kept, :3], tuple(texture))
+    step = image.T_cam_lidar[:3, :3] @ axis
+    here = [_changes(image, in_camera[kept], step, np.zeros(1), level) for level in range(len(_BLUR))]
+    shown = here[0][1][0]
+    return Reference(points[kept[shown], :3], tuple(texture[0, shown] for texture, _ in here))
 
 
 def along(
@@ -189,7 +196,28 @@ def _correlated(
     """Correlation (S,) of the texture with that of the image for the LiDAR at each of the offsets (S,), m."""
     there = _moved(image.T_cam_lidar @ se3.inverse(T_ref_lidar), known.points.astype(np.float64))
     step = image.T_cam_lidar[:3, :3] @ axis
-    return _correlations(known.texture[level], *image.sample(there - offsets[:, None, None] * step, level))
+    return _correlations(known.texture[level], *_changes(image, there, step, offsets, level))
+
+
+def _changes(
+    image: Texture, points: Array, step: Array, offsets: Array, level: int
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Texture (S, N) at points (N, 3) less `offsets` (S,) times `step` (3,), but only what changes along that.
+
+    Rails, the edges of a road and of its walls, and what drives ahead look the same everywhere along it: the texture is
+    taken relative to that at the points `_BESIDE` m before and behind, which lie on the same surfaces.
+    """
+    every = float(offsets[1] - offsets[0]) if len(offsets) > 1 else _BESIDE
+    k = round(_BESIDE / every)
+    if len(offsets) > 2 * k:  # the places beside are among the offsets
+        wide = offsets[0] + every * np.arange(-k, len(offsets) + k)
+        found, shown = image.sample(points - wide[:, None, None] * step, level)
+        parts = [(found[a : a + len(offsets)], shown[a : a + len(offsets)]) for a in (0, k, 2 * k)]
+    else:
+        parts = [image.sample(points - (offsets + a)[:, None, None] * step, level) for a in (-_BESIDE, 0.0, _BESIDE)]
+    (before, in_before), (here, in_here), (behind, in_behind) = parts
+    changes = np.asarray(here - (before + behind) / 2, np.float32)
+    return changes, in_before & in_here & in_behind
 
 
 def _maxima(correlation: NDArray[np.float32], least: float) -> NDArray[np.intp]:
@@ -225,5 +253,5 @@ def _peak(offsets: Array, correlation: NDArray[np.float32], points: int) -> Peak
     step = offsets[1] - offsets[0]
     bend = max((2 * top - before - after) / step**2, 1e-3)
     offset = offsets[i] + float(np.clip((after - before) / (2 * bend * step), -step, step))
-    information = points / _CORRELATED * bend * top / max(1 - top * top, 1e-3)
+    information = points / _CORRELATED * bend * max(top, 1e-6) / max(1 - top * top, 1e-3)
     return Peak(offset, float(max(0.01, information**-0.5)), float(correlation.max()))

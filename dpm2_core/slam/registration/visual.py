@@ -75,6 +75,7 @@ class VisualScanRegistration:
         assert self._last is not None
         scan, T_odom_ref = self._last
         if self._reference is None:
-            self._reference = reference(scan.points, textured(scan.images[0], s.width), s.points)
+            axis = T_odom_ref[:3, :3].T @ result.T_target_source[:3, :3] @ result.open_direction
+            self._reference = reference(scan.points, textured(scan.images[0], s.width), s.points, axis)
         image_now = textured(image, s.width)
         return along(s, result, self._reference, image_now, se3.inverse(T_odom_ref), reach)
