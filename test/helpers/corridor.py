@@ -12,6 +12,7 @@ from scipy.ndimage import map_coordinates
 from dpm2_core.frame import Array, Camera, Frame, Image
 
 HALF, HEIGHT = 4.0, 1.8  # m: from the sensor to the walls, and to floor and ceiling
+AHEAD = 14.0  # m, the truck
 T_LIDAR_CAM = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
 CAMERA = Camera(np.array([[300, 0, 319.5], [0, 300, 119.5], [0, 0, 1.0]]), T_LIDAR_CAM, (640, 240))
 Paint = Callable[[Array], Array]
@@ -35,26 +36,34 @@ def stripes(points: Array) -> Array:
     return 128 + 100 * np.sign(np.sin(np.pi * points[:, 0]))
 
 
-def hits(rays: Array, x: float) -> Array:
-    """Where rays (N, 3) from (x, 0, 0) meet walls, floor or ceiling, (N, 3) in the corridor."""
+def with_truck(paint: Paint, x: float) -> Paint:
+    """The paint, and the white back of a truck `AHEAD` m ahead of `x`."""
+    return lambda points: np.where(np.abs(points[:, 0] - x - AHEAD) < 1e-6, 250.0, paint(points))
+
+
+def hits(rays: Array, x: float, truck: bool) -> Array:
+    """Where rays (N, 3) from (x, 0, 0) meet walls, floor or ceiling, or the truck, (N, 3) in the corridor."""
     with np.errstate(divide="ignore"):
         way = np.minimum(HALF / np.abs(rays[:, 1]), HEIGHT / np.abs(rays[:, 2]))
-    return np.clip(way, 0, 80)[:, None] * rays + [x, 0, 0]
+        back = AHEAD / rays[:, 0]
+    on_truck = truck & (rays[:, 0] > 0) & (back < way) & (np.abs(back * rays[:, 1]) < HALF / 2)
+    return np.clip(np.where(on_truck, back, way), 0, 80)[:, None] * rays + [x, 0, 0]
 
 
-def seen(x: float, paint: Paint, camera: Camera, gain: float = 1.0) -> Image:
+def seen(x: float, paint: Paint, camera: Camera, gain: float = 1.0, truck: bool = False) -> Image:
     """What a camera sees from `x` m along the corridor; `gain` is the exposure."""
     u, v = np.meshgrid(np.arange(640), np.arange(240))
     rays = np.c_[u.ravel(), v.ravel(), np.ones(u.size)] @ np.linalg.inv(camera.K).T @ camera.T_lidar_cam[:3, :3].T
-    gray = np.clip(gain * paint(hits(rays, x)).reshape(u.shape), 0, 255).astype(np.uint8)
+    painted = with_truck(paint, x) if truck else paint
+    gray = np.clip(gain * painted(hits(rays, x, truck)).reshape(u.shape), 0, 255).astype(np.uint8)
     return Image(np.repeat(gray[..., None], 3, 2), camera)
 
 
-def frame(x: float, paint: Paint, index: int = 0, gain: float = 1.0) -> Frame:
-    """Scan and image from `x` m along the corridor; `gain` is the exposure."""
+def frame(x: float, paint: Paint, index: int = 0, gain: float = 1.0, truck: bool = False) -> Frame:
+    """Scan and image from `x` m along the corridor; `gain` is the exposure; with a truck that drives ahead, or not."""
     noise = np.random.default_rng(index)
     azimuth, elevation = noise.uniform(-np.pi, np.pi, 20_000), noise.uniform(-0.4, 0.4, 20_000)
     rays = np.c_[np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
-    points = hits(rays, x) - [x, 0, 0] + noise.normal(0, 0.01, rays.shape)
+    points = hits(rays, x, truck) - [x, 0, 0] + noise.normal(0, 0.01, rays.shape)
     points = np.c_[points, np.ones(len(points))].astype(np.float32)
-    return Frame(index * 10**8, points, images=(seen(x, paint, CAMERA, gain),), index=index)
+    return Frame(index * 10**8, points, images=(seen(x, paint, CAMERA, gain, truck),), index=index)
