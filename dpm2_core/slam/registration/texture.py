@@ -48,7 +48,6 @@ _BLUR = (2.5, 1.0)  # pixels: so that nothing is missed between two of them
 _BESIDE = 1.0  # m, before and behind: what is the same there says nothing
 _LOCAL = 12.0  # pixels: light that changes more slowly is no texture
 _LEAST = 100  # points that both images must show
-_SECTORS = 8  # from left to right
 _CORRELATED = 100  # pixels next to each other, and the points between them, say the same
 _COARSE_MARGIN = 0.3  # candidates within it of the best coarse correlation are refined at the fine level
 _APART = 0.6  # m: other places, not the slope of the best one
@@ -123,7 +122,6 @@ def reference(points: Points, image: Texture, count: int, axis: Array) -> Refere
     in_camera = _moved(image.T_cam_lidar, points[:, :3].astype(np.float64))
     kept = np.flatnonzero(image.project(in_camera)[1] & (in_camera[:, 2] > _NEAR) & (in_camera[:, 2] < _FAR))
     kept = kept[:: max(1, len(kept) // count)]
-    kept = kept[np.argsort(in_camera[kept, 0] / in_camera[kept, 2])]  # from left to right: see `_correlations`
     step = image.T_cam_lidar[:3, :3] @ axis
     here = [_changes(image, in_camera[kept], step, np.zeros(1), level) for level in range(len(_BLUR))]
     shown = here[0][1][0]
@@ -235,21 +233,13 @@ def _moved(T: Array, points: Array) -> Array:
 def _correlations(
     values: NDArray[np.float32], found: NDArray[np.float32], shown: NDArray[np.bool_]
 ) -> NDArray[np.float32]:
-    """Correlation (S,) of values (N,) with each row of found (S, N) over what is shown; 0 where that is too little.
-
-    The mean of those of the sectors: what drives ahead looks the same everywhere, and has no more than its share.
-    """
-    each = len(values) // _SECTORS
-    x, y, w = (a[..., : each * _SECTORS].reshape(*a.shape[:-1], _SECTORS, each) for a in (values, found, shown))
-    weight = w.astype(np.float32)
-    count = weight.sum(-1)
-    x = (x - ((x * weight).sum(-1) / np.maximum(count, 1))[..., None]) * weight
-    y = (y - ((y * weight).sum(-1) / np.maximum(count, 1))[..., None]) * weight
-    spread = np.sqrt((x * x).sum(-1) * (y * y).sum(-1))
-    enough = count >= _LEAST / _SECTORS
-    of_sectors = np.where(enough, (x * y).sum(-1) / np.maximum(spread, 1e-6), 0.0)
-    usable = enough.sum(-1)
-    return np.where(2 * usable > _SECTORS, of_sectors.sum(-1) / np.maximum(usable, 1), 0.0).astype(np.float32)
+    """Correlation (S,) of values (N,) with each row of found (S, N) over what is shown; 0 where that is too little."""
+    weight = shown.astype(np.float32)
+    count = weight.sum(1)
+    x = (values - (weight @ values / np.maximum(count, 1))[:, None]) * weight
+    y = (found - ((found * weight).sum(1) / np.maximum(count, 1))[:, None]) * weight
+    spread = np.sqrt((x * x).sum(1) * (y * y).sum(1))
+    return np.where(count >= _LEAST, (x * y).sum(1) / np.maximum(spread, 1e-6), 0.0)
 
 
 def _peak(offsets: Array, correlation: NDArray[np.float32], points: int) -> Peak:
