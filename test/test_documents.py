@@ -79,6 +79,23 @@ def test_the_figures_at_few_frames_per_second_are_those_of_the_record() -> None:
     assert all(rate["adaptive"]["failed_frames"] == 0 for rate in rates)
 
 
+def test_where_the_geometry_is_silent_the_figures_are_those_of_the_records() -> None:
+    pairs, seen = record("neural.json")["parts"]["image"]["pairs"], []
+    for cells in rows("README.md", "| | without camera | with | KISS-ICP |"):
+        of = pairs[f"{cells[0]}, up to 5 m"]
+        for cell, method in zip(cells[1:], ("refined without camera", "refined with camera", "kiss-icp"), strict=True):
+            assert equals(cell.strip("* m"), of[method]["median_m"]), (cells[0], method)
+        seen.append(cells[0])
+    assert len(seen) == len(pairs)
+    roads = record("relocalise.json")["open_roads"]
+    found = re.findall(
+        r"with a picture (\d+) of (\d+) in the tunnel and (\d+) of (\d+) on the highway", text("README.md")
+    )
+    of = [roads[road]["with images"] for road in ("tunnel", "highway")]
+    assert [int(n) for n in found[0]] == [n for r in of for n in (round(r["right"] * r["visits"]), r["visits"])]
+    assert [case["wrong"] for road in roads.values() for case in road.values() if isinstance(case, dict)] == [0] * 4
+
+
 def test_bold_is_what_is_best() -> None:
     """Of each drive and figure, and nothing else: the reader looks at what is bold."""
     heading = "| drive | method | RPE m | RPE deg | ATE m | t_err % | drift % | frames/s | CPU ms per frame |"

@@ -133,7 +133,7 @@ class Relocalizer:
         if place is None:
             return found
         if not place.ok:
-            return nowhere(place.reason)
+            return nowhere(f"{found.reason}; {place.reason}")
         return self._verified(cloud, place.T_target_source, along=partial(self._pictures.along, texture, _REACH))
 
     def verify(
@@ -155,6 +155,7 @@ class Relocalizer:
         widen: float = 1.0,
         along: Callable[[Sequence[int]], Along] | None = None,
     ) -> Registration:
+        """As `verify`; `along` gives, of the keyframes around, what finds the way along an open direction."""
         distance = self._distance(T_map_lidar)
         near = np.flatnonzero(distance <= self._settings.surroundings)
         if not len(near):
