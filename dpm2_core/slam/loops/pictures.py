@@ -16,7 +16,7 @@ import numpy as np
 from dpm2_core.data.thumbnail import image_of
 from dpm2_core.frame import Array, Image, Keyframe, Points, Registration
 from dpm2_core.geometry import se3
-from dpm2_core.slam.loops.verification import Along, Verifier
+from dpm2_core.slam.loops.verification import Along, Verifier, meters_apart
 from dpm2_core.slam.registration.texture import (
     Reference,
     Texture,
@@ -111,7 +111,7 @@ class PicturedPlaces:
         if not places:
             return None
         best = max(places, key=lambda place: place.confidence)
-        others = [place for place in places if _meters(place, best) > _APART]
+        others = [place for place in places if meters_apart(place, best) > _APART]
         return replace(best, ok=not (why := _objection(best, others)), reason=why)
 
     def _seen(self, node: int, view: _View, closely: bool = False) -> list[Registration]:
@@ -161,7 +161,3 @@ def _objection(best: Registration, others: Sequence[Registration]) -> str:
     if second == _ELSEWHERE:
         return f"the picture correlates by {best.confidence:.2f}: no more than with a place that looks alike"
     return f"the pictures of two places are alike: correlations of {best.confidence:.2f} and {second:.2f}"
-
-
-def _meters(a: Registration, b: Registration) -> float:
-    return float(np.linalg.norm(a.T_target_source[:3, 3] - b.T_target_source[:3, 3]))

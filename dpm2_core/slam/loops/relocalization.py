@@ -30,6 +30,7 @@ from dpm2_core.slam.loops.verification import (
     Along,
     VerificationSettings,
     Verifier,
+    meters_apart,
     objection_of_others,
 )
 from dpm2_core.slam.registration.texture import VisualSettings
@@ -201,7 +202,7 @@ class Relocalizer:
             if result.ok
         ]
         for proposal in sorted(in_map, key=lambda r: -r.confidence):
-            if all(_meters(proposal, other) > SAME_PLACE for other in proposals):
+            if all(meters_apart(proposal, other) > SAME_PLACE for other in proposals):
                 proposals.append(proposal)
         return proposals
 
@@ -214,7 +215,7 @@ def _unique(places: Sequence[Registration]) -> Registration:
     best = max(places, key=lambda place: (place.ok, place.confidence))
     if not best.ok:
         return nowhere("; ".join(place.reason for place in places))
-    objection = objection_of_others(best, [place for place in places if _meters(place, best) > SAME_PLACE])
+    objection = objection_of_others(best, [place for place in places if meters_apart(place, best) > SAME_PLACE])
     return nowhere(objection) if objection else best
 
 
@@ -227,7 +228,3 @@ def downsampled(points: Points, voxel: float, reach: float) -> Points:
 def nowhere(reason: str) -> Registration:
     """No pose, and why."""
     return Registration(np.eye(4), np.eye(6) * 1e6, 0.0, np.inf, "relocalisation", False, reason)
-
-
-def _meters(a: Registration, b: Registration) -> float:
-    return float(np.linalg.norm(a.T_target_source[:3, 3] - b.T_target_source[:3, 3]))
