@@ -12,7 +12,7 @@ import numpy as np
 from rich.progress import Progress
 
 from benchmarks.relocalise_visits import kept, measured, row_of, success_rates
-from dpm2_core.data.thumbnail import image_of, thumbnail
+from dpm2_core.data.thumbnail import PLACE_WIDTH, thumbnail, usable_image
 from dpm2_core.frame import Array, Frame, Image, Keyframe
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.sim.camera import calibration, render
@@ -29,8 +29,6 @@ WORLDS: dict[PresetName, int] = {"highway": 951, "tunnel": 952}
 LENGTH = 1000.0
 """Of each road, m, to which curves are added."""
 _CAMERA = CameraConfig(width=620, height=188, focal=360.0)
-WIDTH = 320
-"""Of the picture of a keyframe, pixels."""
 _AHEAD = 0.1
 """Headings differ by at most so much from those of the map, rad: a camera that looks back sees another picture."""
 
@@ -84,7 +82,7 @@ def _relocalised(
     def keyframe(frame: Frame) -> Keyframe:
         points = measured(frame, settings)
         described = network.describe(Frame(0, points, images=frame.images if images else ()))
-        picture = thumbnail(frame.images[0], WIDTH) if images else None
+        picture = thumbnail(frame.images[0], PLACE_WIDTH) if images else None
         return Keyframe(0, 0, 0, np.eye(4), kept(points, settings), descriptors=described, thumbnail=picture)
 
     keyframes = [keyframe(place.frame) for place in known]
@@ -96,7 +94,7 @@ def _relocalised(
     rows = []
     for place in visited:
         visit, started = keyframe(place.frame), perf_counter()
-        picture = None if visit.thumbnail is None else image_of(visit.thumbnail)
+        picture = usable_image(visit.thumbnail)
         found = relocalizer.find(visit.cloud, descriptors=visit.descriptors, picture=picture)
         rows.append(row_of(found, place.T_map_lidar, perf_counter() - started))
     return success_rates(rows)

@@ -14,6 +14,8 @@ from dpm2_core.data.compressed import decode_compressed
 from dpm2_core.frame import Array, Camera, Image
 from dpm2_core.geometry import se3
 
+PLACE_WIDTH = 320
+"""Of a picture by which a place is found, pixels: 6 kB."""
 _START, _COMMENT = b"\xff\xd8", b"\xff\xfe"
 _QUALITY = 80
 _KEYS = {"K", "T_lidar_cam", "size", "distortion", "name"}
@@ -53,6 +55,14 @@ def image_of(jpeg: bytes) -> Image | None:
     except (ValueError, TypeError, OverflowError, RecursionError) as error:
         raise ValueError(f"thumbnail: its camera is invalid: {error}") from None
     return Image(decode_compressed(jpeg, camera.size), camera)
+
+
+def usable_image(jpeg: bytes | None) -> Image | None:
+    """As `image_of`; None also without a JPEG, and for a damaged one."""
+    try:
+        return None if jpeg is None else image_of(jpeg)
+    except ValueError:
+        return None
 
 
 def _camera(fields: dict[str, object]) -> Camera:

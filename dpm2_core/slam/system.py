@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from time import perf_counter
 
-from dpm2_core.data.thumbnail import thumbnail
+from dpm2_core.data.thumbnail import PLACE_WIDTH, thumbnail
 from dpm2_core.frame import Array, Edge, Frame, Keyframe, OdometryResult, State
 from dpm2_core.slam.loops.localizer import LocalizationResult, Localizer
 from dpm2_core.slam.mapping.mapper import Mapper
@@ -19,7 +19,6 @@ from dpm2_core.slam.odometry.odometry import Odometry
 from dpm2_core.slam.odometry.scaled import ScaledOdometry
 from dpm2_core.slam.registration.texture import VisualSettings
 
-_WIDTH = 320  # pixels, of a picture by which a place is found: 6 kB
 _LOST_ON_THE_WAY = 10_000_000_000  # ns after which a keyframe that has not come to the map will not come any more
 
 
@@ -115,7 +114,7 @@ class Slam:
         if result.keyframe is None:
             return result
         self._underway = frame.stamp
-        width = max(self._thumbnail_width, _WIDTH if self._asks_pictures(result) else 0)
+        width = max(self._thumbnail_width, PLACE_WIDTH if self._asks_pictures(result) else 0)
         if not frame.images or not width:
             return result
         return replace(result, keyframe=replace(result.keyframe, thumbnail=thumbnail(frame.images[0], width)))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dpm2_core.data.thumbnail import image_of
+from dpm2_core.data.thumbnail import usable_image
 from dpm2_core.frame import Array, Image, Keyframe, Registration, State
 from dpm2_core.geometry import se3
 from dpm2_core.slam.loops.consistency import BROKEN
@@ -77,7 +77,7 @@ class Localizer:
         if self._T_last is not None:
             self._distrust += float(np.linalg.norm(keyframe.T_odom_kf[:3, 3] - self._T_last[:3, 3]))
         self._T_last = keyframe.T_odom_kf
-        picture = None if keyframe.thumbnail is None else image_of(keyframe.thumbnail)
+        picture = usable_image(keyframe.thumbnail)
         if self.state.located:
             return self._track(keyframe, picture)
         return self._find(keyframe, picture, nowhere("lost"))

@@ -8,12 +8,11 @@ on three simulated highways and in a tunnel of 1 km, by 0.49 to 0.90 on KITTI 04
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from dpm2_core.data.thumbnail import image_of
+from dpm2_core.data.thumbnail import usable_image
 from dpm2_core.frame import Array, Image, Keyframe, Points, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.slam.loops.verification import Along, Verifier, meters_apart
@@ -55,12 +54,17 @@ class KnownMap:
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """What is looked for: points (N, 3) to be registered, a picture, and T_kf_lidar but for the way along the road."""
+    """What is looked for: points (N, 3) to be registered, a picture, and T_kf_lidar but for the way along the road.
+
+    Attributes:
+        registered: to the keyframes so far, by node; None to one that has no picture.
+    """
 
     source: Array
     picture: Texture
     verifier: Verifier
     T_across: Array
+    registered: dict[int, Registration | None] = field(default_factory=dict)
 
 
 class PicturedPlaces:
@@ -116,12 +120,10 @@ class PicturedPlaces:
 
     def _seen(self, node: int, view: _View, closely: bool = False) -> list[Registration]:
         """Places T_map_lidar at which a keyframe shows what the picture does; their confidence is the correlation."""
-        s = self._settings
-        if self._known.thumbnail(node) is None:
+        s, result = self._settings, self._registered(node, view)
+        if result is None or not result.ok:
             return []
-        around = view.verifier.surroundings([self._known.clouds[node]], np.eye(4)[None])
-        result = view.verifier.register(view.source, around, view.T_across, _WIDEN)
-        known = self._reference(node, result.T_target_source, result.open_direction) if result.ok else None
+        known = self._reference(node, result.T_target_source, result.open_direction)
         if known is None:
             return []
         T, axis, picture = result.T_target_source, result.open_direction, view.picture
@@ -131,6 +133,16 @@ class PicturedPlaces:
             replace(result, T_target_source=self._poses[node] @ T_kf_lidar, confidence=max(peak.correlation, 0.0))
             for T_kf_lidar, peak in zip(moved, found, strict=True)
         ]
+
+    def _registered(self, node: int, view: _View) -> Registration | None:
+        """The points of the view to those of a keyframe; None where it has no picture."""
+        if node not in view.registered:
+            result = None
+            if self._known.thumbnail(node) is not None:
+                around = view.verifier.surroundings([self._known.clouds[node]], np.eye(4)[None])
+                result = view.verifier.register(view.source, around, view.T_across, _WIDEN)
+            view.registered[node] = result
+        return view.registered[node]
 
     def _reference(self, node: int, T_ref_lidar: Array, axis: Array) -> Reference | None:
         """What a keyframe's picture shows along `axis` (3,) of another LiDAR; None where it has none that can be used.
@@ -144,13 +156,10 @@ class PicturedPlaces:
         return self._references[node]
 
     def _made(self, node: int, axis: Array) -> Reference | None:
-        jpeg = self._known.thumbnail(node)
-        with suppress(ValueError):  # a damaged picture is no picture
-            image = None if jpeg is None else image_of(jpeg)
-            if image is not None:
-                s = self._settings
-                return reference(self._known.clouds[node], textured(image, s.width), s.points, axis)
-        return None
+        image, s = usable_image(self._known.thumbnail(node)), self._settings
+        if image is None:
+            return None
+        return reference(self._known.clouds[node], textured(image, s.width), s.points, axis)
 
 
 def _objection(best: Registration, others: Sequence[Registration]) -> str:

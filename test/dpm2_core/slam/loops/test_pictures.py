@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dpm2_core.data.thumbnail import image_of, thumbnail
+from dpm2_core.data.thumbnail import PLACE_WIDTH, thumbnail, usable_image
 from dpm2_core.frame import Array, Image, Keyframe
 from dpm2_core.geometry import se3
 from dpm2_core.network.pretrained import load_network
@@ -31,7 +31,7 @@ PAINT = random_paint()
 
 def keyframe(x: float, paint: Paint, index: int, pictured: bool = True) -> Keyframe:
     seen = frame(x, paint, index, gain=0.8)
-    picture = thumbnail(seen.images[0], 320) if pictured else None
+    picture = thumbnail(seen.images[0], PLACE_WIDTH) if pictured else None
     describe = PlaceRecognition(load_network("small", 1)).describe
     return Keyframe(index, index * 10**9, index, place(x), seen.points, None, "", describe(seen.points), picture)
 
@@ -55,7 +55,7 @@ def relocalizer(paint: Paint, pictured: bool = True, visual: VisualSettings | No
 
 
 def picture_of(keyframe: Keyframe) -> Image | None:
-    return None if keyframe.thumbnail is None else image_of(keyframe.thumbnail)
+    return usable_image(keyframe.thumbnail)
 
 
 @pytest.mark.slow
