@@ -24,10 +24,11 @@ from dpm2_core.evaluation.canvas import new_figure, save_png
 from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry.rays import project
 from dpm2_core.network.attention import Attention
-from dpm2_core.network.encoder import collate_views, to_device
+from dpm2_core.network.encoder import to_device
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pyramid import build_pyramid, collate, crop
 from dpm2_core.network.spatial import seen_from
+from dpm2_core.network.views import collate_views
 
 _INK, _CHOSEN = "#c9d1d9", "#ff9f1c"
 
@@ -65,7 +66,8 @@ def image_attention(model: DeepPointMap2, frame: Frame, point: int | None = None
     views = collate_views([frame.images[:1]], encoder.settings.image)
     if views is None:
         raise UsageError(f"frame {frame.index} has no image")
-    points = collate([build_pyramid(crop(frame.points, encoder.settings.points), encoder.settings)])
+    cloud = crop(frame.points, encoder.settings.points)
+    points = collate([build_pyramid(cloud, encoder.settings, frame.images[:1])])
     given: list[Any] = []
     hook = attention.register_forward_pre_hook(lambda module, arguments: given.append(arguments))
     device = next(model.parameters()).device

@@ -11,10 +11,10 @@ import torch
 from dpm2_core.data.packed import open_packed
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.geometry import se3
-from dpm2_core.network.encoder import collate_views
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pyramid import build_pyramid, collate
 from dpm2_core.network.settings import NetworkSettings
+from dpm2_core.network.views import collate_views
 
 NEAR, FAR = 5.0, 20.0  # m, between the frames of a pair
 SUCCESS = (0.6, 1.5)  # m, deg
@@ -58,12 +58,12 @@ class PairSet:
             for drive, index, yaw in keys[begin : begin + 8]:
                 sample = self.drives[drive][index]
                 turn = se3.exp([0, 0, yaw, 0, 0, 0])
-                pyramids.append(build_pyramid(se3.transform(turn, sample.cloud), self.network))
                 turned = [
                     type(i)(i.pixels, type(i.camera)(i.camera.K, turn @ i.camera.T_lidar_cam, i.camera.size))
                     for i in sample.images
                 ]
                 images.append(turned if self.images else [])
+                pyramids.append(build_pyramid(se3.transform(turn, sample.cloud), self.network, images[-1]))
             out += model.encoder.encode_batch(collate(pyramids), collate_views(images, self.network.image), device)
         return out
 

@@ -20,10 +20,9 @@ from dpm2_core.data.packed import PackedDrive, Sample, open_packed
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Array
 from dpm2_core.learning.augment import AugmentSettings, augment
-from dpm2_core.network.encoder import collate_views
 from dpm2_core.network.pyramid import MIN_POINTS, PointBatch, Pyramid, build_pyramid, collate
 from dpm2_core.network.settings import NetworkSettings
-from dpm2_core.network.spatial import Views
+from dpm2_core.network.views import Views, collate_views
 
 _LEAST = 8 * MIN_POINTS  # points of a scan that is learnt from
 _PLACES = 100  # that are tried
@@ -142,8 +141,8 @@ class GroupDataset(Dataset[Batch]):
         poses = []
         for _ in range(settings.groups):
             for sample in self._place(noise):
-                pyramids.append(build_pyramid(sample.cloud, self.network))
                 images.append(sample.images if settings.images else ())
+                pyramids.append(build_pyramid(sample.cloud, self.network, images[-1]))
                 poses.append(sample.pose)
         views = collate_views(images, self.network.image) if settings.images else None
         shaped = torch.from_numpy(np.stack(poses)).view(settings.groups, -1, 4, 4)

@@ -19,9 +19,9 @@ from dpm2_core.frame import Array, Camera, Frame, Image, Points
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.deskew import deskew
 from dpm2_core.geometry.scale import ROOM_SCALE, scale_of
-from dpm2_core.network.encoder import in_encoded_axes, resize
 from dpm2_core.network.pyramid import crop
 from dpm2_core.network.settings import NetworkSettings, preset
+from dpm2_core.network.views import in_encoded_axes, resize
 from dpm2_core.sim.camera import calibration, render
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.sensors import drawn_sensor
@@ -79,7 +79,7 @@ def generate_world(folder: Path, seed: int, settings: GenerateSettings) -> None:
         config = config.model_copy(update={"height": noise.uniform(0.3, 1.6), "car_body": False, "min_range": 0.4})
     lidar = Lidar(drawn_sensor(config, settings.real, settings.others, np.random.default_rng([seed, 79])))
     height, sway = lidar.config.height, lidar.config.real.sway
-    camera = _camera(network)
+    camera = training_camera(network)
     weather = np.random.default_rng([seed, 81])
     if weather.random() < settings.wet:
         camera = camera.model_copy(update={"wet": float(weather.uniform(0.02, 0.3)), "lens": seed})
@@ -99,7 +99,7 @@ def generate_world(folder: Path, seed: int, settings: GenerateSettings) -> None:
     write_packed(folder, samples, {"source": "synthetic city", "preset": kind, "seed": seed, "sensor": sensor})
 
 
-def _camera(network: NetworkSettings) -> CameraConfig:
+def training_camera(network: NetworkSettings) -> CameraConfig:
     """KITTI's field of view at twice the network's image size: averaged down, it is free of aliasing."""
     height, width = network.image.size
     return CameraConfig(width=2 * width, height=2 * height, focal=720.0 * 2 * width / 1241)

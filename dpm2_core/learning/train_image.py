@@ -25,11 +25,11 @@ from dpm2_core.geometry import se3
 from dpm2_core.learning.augment import augment_image
 from dpm2_core.learning.dataset import Mixture, PackedSettings, draw_group
 from dpm2_core.learning.trainer import OptimizerSettings, Trainer
-from dpm2_core.network.encoder import collate_views
 from dpm2_core.network.losses import cosine, info_nce, label_distances
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.settings import NetworkSettings, preset
-from dpm2_core.network.spatial import Views, image_features
+from dpm2_core.network.spatial import image_features
+from dpm2_core.network.views import Views, collate_views
 from dpm2_core.network.weights import load_weights, save_weights
 
 NEUTRAL = 1.5  # m, within which a point's neighbors are neither right nor wrong

@@ -24,8 +24,8 @@ from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pose_solver import overlap_features, solve_batch
 from dpm2_core.network.pyramid import PointBatch
 from dpm2_core.network.settings import NetworkSettings
-from dpm2_core.network.spatial import Views
 from dpm2_core.network.tokens import Tokens
+from dpm2_core.network.views import Views
 from dpm2_core.network.weights import load_weights, network_settings, save_weights
 
 OVERLAP = 20.0  # m: nearer pairs are positive

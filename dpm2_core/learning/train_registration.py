@@ -23,8 +23,9 @@ from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pointnext import Scale
 from dpm2_core.network.pyramid import PointBatch
 from dpm2_core.network.settings import NetworkSettings, preset
-from dpm2_core.network.spatial import Views, image_features
+from dpm2_core.network.spatial import image_features
 from dpm2_core.network.tokens import Tokens
+from dpm2_core.network.views import Views
 from dpm2_core.network.weights import load_fitting, load_weights, save_weights
 
 

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -16,7 +15,6 @@ from torch import Tensor, nn
 from dpm2_core.descriptors import Descriptors, is_level, levelling
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Frame, Image
-from dpm2_core.geometry import se3
 from dpm2_core.geometry.scale import scale_of
 from dpm2_core.geometry.tilt import up_of
 from dpm2_core.network.convnext import FeatureMap
@@ -24,9 +22,10 @@ from dpm2_core.network.fusion import Fusion
 from dpm2_core.network.pointnext import Scale, view_axes
 from dpm2_core.network.pyramid import PointBatch, build_pyramid, collate, crop
 from dpm2_core.network.registry import image_backbone, point_backbone
-from dpm2_core.network.settings import ImageSettings, NetworkSettings
-from dpm2_core.network.spatial import Views, paint
+from dpm2_core.network.settings import NetworkSettings
+from dpm2_core.network.spatial import paint
 from dpm2_core.network.tokens import Tokens
+from dpm2_core.network.views import Views, collate_views, in_encoded_axes
 
 
 class Encoded(NamedTuple):
@@ -69,7 +68,7 @@ class Encoder(nn.Module):
             views = None
         if views is not None and self.image is not None:
             maps = self.image(views.pixels.flatten(0, 1))
-        return Encoded(self.fusion(scales, views, maps), scales, maps)
+        return Encoded(self.fusion(scales, views, maps, points.texture), scales, maps)
 
     @staticmethod
     def _colors(points: PointBatch, views: Views | None) -> Tensor | None:
@@ -104,7 +103,7 @@ class Encoder(nn.Module):
 
     def _encode(self, cloud: NDArray[np.float32], images: Sequence[Image], device: torch.device) -> Descriptors:
         """Descriptors of a cropped (M, 3) cloud, in its own axes."""
-        points = collate([build_pyramid(cloud, self.settings)])
+        points = collate([build_pyramid(cloud, self.settings, images if self.image is not None else ())])
         views = collate_views([images], self.settings.image) if self.image is not None else None
         made = self.encode_batch(points, views, device)[0]
         if not np.isfinite(made.features).all():
@@ -118,42 +117,6 @@ class Encoder(nn.Module):
             tokens = self(*to_device((points, views), device)).tokens
         xyz, features, mask = (field.cpu() for field in (tokens.xyz, tokens.features.half(), tokens.mask))
         return [Descriptors(x[m].numpy(), f[m].numpy()) for x, f, m in zip(xyz, features, mask, strict=True)]
-
-
-def in_encoded_axes(image: Image, R: NDArray[np.float32], scale: float) -> Image:
-    """An image whose camera stands in other axes, into which R (3, 3) turns the LiDAR's, in a scene that is enlarged by
-    `scale`."""
-    T_lidar_cam = se3.make(R, np.zeros(3)) @ image.camera.T_lidar_cam
-    T_lidar_cam[:3, 3] *= scale
-    return replace(image, camera=replace(image.camera, T_lidar_cam=T_lidar_cam))
-
-
-def collate_views(images: Sequence[Sequence[Image]], settings: ImageSettings) -> Views | None:
-    """Resize and stack the images of each frame; absent ones are masked, None if no frame has any."""
-    most = max((len(frame) for frame in images), default=0)
-    if most == 0:
-        return None
-    height, width = settings.size
-    pixels = np.zeros((len(images), most, 3, height, width), np.uint8)
-    K = np.tile(np.eye(3, dtype=np.float32), (len(images), most, 1, 1))
-    T = np.tile(np.eye(4, dtype=np.float32), (len(images), most, 1, 1))
-    present = np.zeros((len(images), most), bool)
-    for b, frame in enumerate(images):
-        for v, image in enumerate(frame):
-            pixels[b, v], K[b, v] = resize(image.pixels, image.camera.K, settings.size)
-            T[b, v] = image.camera.T_lidar_cam
-            present[b, v] = True
-    return Views(*(torch.from_numpy(array) for array in (pixels, K, T, present)))
-
-
-def resize(pixels: np.ndarray, K: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Resize (H, W, 3) to (3, *size) and scale the intrinsics, pixel centers being at integers."""
-    height, width = pixels.shape[:2]
-    out = cv2.resize(pixels, size[::-1], interpolation=cv2.INTER_AREA)
-    scale = np.diag([size[1] / width, size[0] / height, 1.0])
-    shift = np.eye(3)
-    shift[:2, 2] = 0.5
-    return out.transpose(2, 0, 1), np.linalg.inv(shift) @ scale @ shift @ K
 
 
 def to_device(batch: Any, device: torch.device | str) -> Any:

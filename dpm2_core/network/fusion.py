@@ -6,12 +6,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from dpm2_core.geometry.corners import TEXTURE
 from dpm2_core.network.attention import Attention, RelativeBias, sine_code
 from dpm2_core.network.convnext import FeatureMap
 from dpm2_core.network.pointnext import Scale, to_view, view_axes
 from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.network.spatial import (
-    Views,
     image_features,
     point_bias,
     ray_bias,
@@ -20,6 +20,7 @@ from dpm2_core.network.spatial import (
     token_pixels,
 )
 from dpm2_core.network.tokens import Tokens
+from dpm2_core.network.views import Views
 
 SAMPLED = {"roi_pooling": 3}  # side of the window that replaces the image attention
 
@@ -147,13 +148,18 @@ class Fusion(nn.Module):
             self.pixel = nn.Linear(settings.image.pyramid, settings.channels)
             self.pixel_in = nn.Linear(settings.channels, settings.channels, bias=False)
             nn.init.zeros_(self.pixel_in.weight)  # begins as the network without
+        self.texture = None
+        if fusion.corners and fusion.reference == "salient":
+            self.texture = nn.Linear(TEXTURE, settings.channels, bias=False)
+            nn.init.orthogonal_(self.texture.weight, 4.0)  # half of a descriptor's length: patches alike, so are they
         self.lidar_norm = nn.LayerNorm(width)
         self.layers = nn.ModuleList(FusionLayer(settings) for _ in range(fusion.layers))
         self.relative = RelativeBias(fusion.layers, fusion.heads) if fusion.relative else None
         self.out = nn.Linear(width, settings.channels)
 
-    def forward(self, scales: list[Scale], views: Views | None, maps: list[FeatureMap]) -> Tokens:
-        """scales of the point backbone; views with the feature maps (B * V, C, h, w) of their images, or None."""
+    def forward(self, scales: list[Scale], views: Views | None, maps: list[FeatureMap], texture: Tensor) -> Tokens:
+        """scales of the point backbone; views with the feature maps (B * V, C, h, w) of their images, or None; texture
+        (B, N, TEXTURE) of the reference points that are image corners, zeros for the others."""
         refs = self.references(scales)
         chosen = [scales[i] for i in self.settings.levels]
         lidar = self._lidar(refs, chosen)
@@ -168,8 +174,10 @@ class Fusion(nn.Module):
         x = self.out(x)
         if self.pixel is not None and views is not None:
             features, seen = image_features(refs.xyz, views, maps)
-            texture = nn.functional.normalize(self.pixel(features).float(), dim=-1).to(x.dtype)
-            x = x + self.pixel_in(texture) * seen[..., None]
+            own = nn.functional.normalize(self.pixel(features).float(), dim=-1).to(x.dtype)
+            x = x + self.pixel_in(own) * seen[..., None]
+        if self.texture is not None:
+            x = x + self.texture(texture.to(x.dtype))
         return refs._replace(features=x)
 
     def _lidar(self, refs: Tokens, scales: list[Scale]) -> Branch:

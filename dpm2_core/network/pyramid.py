@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -12,11 +13,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dpm2_core.errors import Dpm2Error
+from dpm2_core.frame import Image
+from dpm2_core.geometry.corners import TEXTURE, Corners, image_corners, no_corners
 from dpm2_core.geometry.edges import vertical_edges
 from dpm2_core.geometry.point_grid import PointGrid
 from dpm2_core.geometry.sampling import farthest_points, interleaved, neighbours
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.network.settings import NetworkSettings, PointsSettings
+from dpm2_core.network.views import resize
 
 MIN_POINTS = 32  # below this a scan says nothing about the pose
 
@@ -31,6 +35,7 @@ class Pyramid:
         patches: (n_0, k_0, 3) float16 m, input points around each first-level point, relative to it.
         groups: per further level (n_i, k_i) int16, neighbors in the level before.
         locals: per level, per residual block (n_i, k) int16, neighbors in the level itself.
+        texture: (n, TEXTURE) float16 of the reference points that are image corners, zeros for the others.
         ups: per feature propagation, coarse to fine, (n_fine, 3) int16, the nearest points of the coarser level.
     """
 
@@ -40,6 +45,7 @@ class Pyramid:
     groups: tuple[NDArray[np.int16], ...]
     locals: tuple[tuple[NDArray[np.int16], ...], ...]
     ups: tuple[NDArray[np.int16], ...]
+    texture: NDArray[np.float16]
 
 
 class PointBatch(NamedTuple):
@@ -51,6 +57,7 @@ class PointBatch(NamedTuple):
     groups: tuple[Tensor, ...]
     locals: tuple[tuple[Tensor, ...], ...]
     ups: tuple[Tensor, ...]
+    texture: Tensor
 
 
 def crop(points: NDArray[np.float32], settings: PointsSettings) -> NDArray[np.float32]:
@@ -59,8 +66,8 @@ def crop(points: NDArray[np.float32], settings: PointsSettings) -> NDArray[np.fl
     return xyz[np.argsort(xyz[:, 0])]
 
 
-def build_pyramid(cloud: NDArray[np.float32], network: NetworkSettings) -> Pyramid:
-    """The pyramid of a cropped (M, 3) cloud.
+def build_pyramid(cloud: NDArray[np.float32], network: NetworkSettings, images: Sequence[Image] = ()) -> Pyramid:
+    """The pyramid of a cropped (M, 3) cloud, and of its images where reference points may be corners of them.
 
     Raises:
         Dpm2Error: fewer than `MIN_POINTS` points.
@@ -72,9 +79,13 @@ def build_pyramid(cloud: NDArray[np.float32], network: NetworkSettings) -> Pyram
     first = stages[0]
     grid = _grid(cloud, first.radius / 1.5)  # most neighborhoods are full before the radius
     xyz = cloud[farthest_points(cloud, first.points, grid)]
+    texture = np.zeros((len(xyz), TEXTURE), np.float32)
     if fusion.reference == "salient":
-        edges = vertical_edges(cloud, grid, int(fusion.edges * min(fusion.points, len(xyz))))
-        xyz = interleaved(xyz, edges, fusion.points)
+        references = min(fusion.points, len(xyz))
+        corners = _corners(cloud, images, network, int(fusion.corners * references))
+        others = references - len(corners.xyz)
+        xyz = interleaved(xyz, vertical_edges(cloud, grid, int(fusion.edges * others)), others)
+        xyz, texture = (interleaved(a, b, references) for a, b in zip((xyz, texture), corners, strict=True))
     count = len(xyz)
     index = neighbours(grid, xyz, first.neighbours, first.radius)
     patches = np.zeros((first.points, first.neighbours, 3), np.float16)
@@ -99,7 +110,20 @@ def build_pyramid(cloud: NDArray[np.float32], network: NetworkSettings) -> Pyram
     )
     full = np.zeros((first.points, 3), np.float32)
     full[:count] = xyz
-    return Pyramid(full, count, patches, groups, locals_, ups)
+    textures = np.zeros((fusion.points, TEXTURE), np.float16)
+    textures[: min(count, fusion.points)] = texture[: fusion.points]
+    return Pyramid(full, count, patches, groups, locals_, ups, textures)
+
+
+def _corners(cloud: NDArray[np.float32], images: Sequence[Image], network: NetworkSettings, most: int) -> Corners:
+    """Corners of all images, as many of each; none for a network without a camera."""
+    if network.image.backbone == "none" or not images or most < len(images):
+        return no_corners()
+    found = []
+    for image in images:
+        pixels, K = resize(image.pixels, image.camera.K, network.image.size)
+        found.append(image_corners(pixels.transpose(1, 2, 0), K, image.camera.T_lidar_cam, cloud, most // len(images)))
+    return Corners(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
 
 
 def _grid(points: NDArray[np.float32], radius: float) -> PointGrid:
@@ -128,4 +152,5 @@ def collate(pyramids: list[Pyramid]) -> PointBatch:
             for levels in zip(*(p.locals for p in pyramids), strict=True)
         ),
         tuple(index(list(level)) for level in zip(*(p.ups for p in pyramids), strict=True)),
+        torch.from_numpy(np.stack([p.texture for p in pyramids])).float(),
     )

@@ -90,10 +90,14 @@ class FusionSettings(Settings):
     The others than biased are the alternatives of the paper's Table 4; point_painting gives every point of the cloud
     the color of its pixel before the point backbone, and has no image backbone."""
     reference: Literal["salient", "fps", "uniform", "normal"] = "salient"
-    """How reference points are chosen: vertical edges and poles of the cloud among its farthest points, farthest points
-    alone, or random positions. The last three are those of the paper's Table 3."""
+    """How reference points are chosen: image corners, vertical edges and poles of the cloud among its farthest points,
+    farthest points alone, or random positions. The last three are those of the paper's Table 3."""
     edges: float = Field(0.5, ge=0, le=1)
-    """Ratio of the reference points that `salient` puts on vertical edges; fewer where a scan shows fewer."""
+    """Ratio of the reference points but for image corners that `salient` puts on vertical edges; fewer where a scan
+    shows fewer."""
+    corners: float = Field(0, ge=0, le=1)
+    """Ratio of the reference points that `salient` puts on image corners with the depth of the scan, each with the
+    texture around it in its descriptor; fewer where the images show fewer, none without an image."""
     points: int = Field(256, gt=0)
     """Number of reference points."""
     reference_features: bool = True

@@ -3,30 +3,13 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
 from dpm2_core.geometry.rays import pixel_rays, point_ray_distance, project
 from dpm2_core.network.attention import zscore
 from dpm2_core.network.convnext import FeatureMap
-
-
-class Views(NamedTuple):
-    """The images of a batch, resized.
-
-    Attributes:
-        pixels: (B, V, 3, H, W) uint8.
-        K: (B, V, 3, 3) intrinsics of the resized image, pixels.
-        T_lidar_cam: (B, V, 4, 4).
-        present: (B, V) False where an image is missing.
-    """
-
-    pixels: Tensor
-    K: Tensor
-    T_lidar_cam: Tensor
-    present: Tensor
+from dpm2_core.network.views import Views
 
 
 def point_bias(points: Tensor, tokens: Tensor, token_mask: Tensor, alpha: float) -> Tensor:

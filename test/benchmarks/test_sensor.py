@@ -8,6 +8,7 @@ import pytest
 
 from benchmarks.repeated import shares
 from benchmarks.scan_statistics import RANGES, rings_of, statistics
+from dpm2_core.frame import Frame
 from dpm2_core.geometry import se3
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import Imperfections, LidarConfig
@@ -53,11 +54,11 @@ def test_rings_are_told_apart_where_azimuth_starts_again() -> None:
 @pytest.mark.slow
 def test_reference_points_of_the_same_scan_meet_and_of_another_place_do_not(street: World) -> None:
     """Twice the same cloud: all; 20 m apart with a wrong motion: hardly any."""
-    cloud = _scans(street)[0]
+    frame = Frame(0, _scans(street)[0])
     poses = np.stack([np.eye(4)] * 10)
-    same = shares([cloud] * 10, poses, tiny(), 5)
+    same = shares([frame] * 10, poses, tiny(), 5)
     assert {row["1 apart"]["0.2 m"] for row in same.values()} == {1.0}
     poses[:, 0, 3] = 20.0 * np.arange(10)
-    moved = shares([cloud] * 10, poses, tiny(), 5)
+    moved = shares([frame] * 10, poses, tiny(), 5)
     assert all(row["1 apart"]["0.2 m"] < 0.2 for row in moved.values())
     assert se3.inverse(poses[1])[0, 3] == -20.0

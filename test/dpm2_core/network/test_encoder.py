@@ -13,13 +13,14 @@ from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Frame, Image
 from dpm2_core.geometry import se3
 from dpm2_core.network.convnext import FeatureMap
-from dpm2_core.network.encoder import Encoder, collate_views, resize
+from dpm2_core.network.encoder import Encoder
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pointnext import argmax_neighbor
 from dpm2_core.network.pretrained import weights_path
 from dpm2_core.network.pyramid import build_pyramid, collate, crop
 from dpm2_core.network.settings import PRESETS, preset
-from dpm2_core.network.spatial import Views, image_features, paint, seen_from
+from dpm2_core.network.spatial import image_features, paint, seen_from
+from dpm2_core.network.views import Views, collate_views, resize
 from dpm2_core.network.weights import network_settings
 
 from ...helpers.networks import tiny
@@ -97,7 +98,7 @@ def test_padding_changes_nothing(model: DeepPointMap2, noise: np.random.Generato
     torch.testing.assert_close(together.features[1], alone.features[0], atol=1e-5, rtol=0)
     poisoned = sparse.xyz.copy()
     poisoned[sparse.count :] = 1e3  # the values of padding are not read either
-    changed = type(sparse)(poisoned, sparse.count, sparse.patches, sparse.groups, sparse.locals, sparse.ups)
+    changed = replace(sparse, xyz=poisoned)
     torch.testing.assert_close(
         model.encoder(collate([changed])).tokens.features[0, :40], alone.features[0, :40], atol=1e-5, rtol=0
     )
