@@ -80,7 +80,7 @@ def window_trajectories(decoder: Decoder, tokens: Tokens, poses: Tensor) -> tupl
     )
     truth = (torch.linalg.inv(poses[:, :-1]) @ poses[:, 1:]).flatten(0, 1)
     T, usable = differentiable_poses(decoder, source, target, decoder(source, target), truth)
-    steps = T.unflatten(0, (groups, frames - 1))
+    steps = torch.where(usable[:, None, None], T, truth).unflatten(0, (groups, frames - 1))
     chain = [torch.eye(4, dtype=steps.dtype, device=steps.device).expand(groups, 4, 4)]
     for i in range(frames - 1):
         chain.append(chain[-1] @ steps[:, i])

@@ -17,7 +17,8 @@ from dpm2_core.network.pose_solver import solve_batch, weighted_gauss_newton
 from dpm2_core.network.tokens import Tokens
 
 DIVERGED = 1.0
-"""A registration that is wrong by more than this has no gradient that leads back, m."""
+"""A registration that is wrong by more than this has no gradient that leads back, m: what counts then is what pulls
+its pairs away from the truth, and the less the farther."""
 ROTATION = 25.0
 """What the square of an angle counts for beside that of a distance, m2 / rad2: as at a distance of 5 m."""
 FINE = 0.05
@@ -27,31 +28,33 @@ FINE = 0.05
 def differentiable_poses(
     decoder: Decoder, source: Tokens, target: Tokens, correlated: Correlated, truth: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Poses (B, 4, 4) T_target_source float64 with gradients, and which of them (B,) have not diverged.
+    """Poses (B, 4, 4) T_target_source float64 with gradients, and which of them (B,) the network found itself.
 
     Matches, offsets and their precisions have a gradient; the pose has it through the last steps of its least squares,
     which start at the solution: as the implicit function theorem gives it, and without that of a decomposition, which
     is infinite where singular values meet.
 
     Args:
-        truth: (B, 4, 4) float64; where the network is `DIVERGED`, it is the pose.
+        truth: (B, 4, 4) float64; where the network is `DIVERGED`, the steps start there.
     """
     with torch.no_grad():
         solved = solve_batch(decoder, source, target, correlated)
     if solved is None:
         return truth, torch.zeros(len(truth), dtype=torch.bool, device=truth.device)
     off = (solved.T[:, :3, 3] - truth[:, :3, 3]).norm(dim=-1)
-    usable = off < DIVERGED  # False for NaN
-    start = torch.where(usable[:, None, None], solved.T, truth)
+    found = off < DIVERGED  # False for NaN
+    start = torch.where(found[:, None, None], solved.T, truth)
     scores = guided_scores(match_scores(decoder, correlated), start, source, target)
     T, _ = weighted_gauss_newton(start, correspond(decoder, source, target, correlated, scores), rounds=2)
-    usable = usable & T.detach().flatten(1).isfinite().all(1)
-    return torch.where(usable[:, None, None], T, truth), usable
+    finite = T.detach().flatten(1).isfinite().all(1)
+    return torch.where(finite[:, None, None], T, truth), found & finite
 
 
 def pose_loss(T: Tensor, truth: Tensor) -> Tensor:
-    """Mean over poses (B, 4, 4) of sqrt(|t|^2 + ROTATION |r|^2 + FINE^2) - FINE of their errors, m."""
+    """Mean over poses (B, 4, 4) of their errors, m: of d / (1 + d / DIVERGED), which never exceeds `DIVERGED`, with
+    d = sqrt(|t|^2 + ROTATION |r|^2 + FINE^2) - FINE."""
     t = T[:, :3, 3] - truth[:, :3, 3]
     r = se3_torch.log_rotation(truth[:, :3, :3].mT @ T[:, :3, :3])
     squared = t.square().sum(-1) + ROTATION * r.square().sum(-1)
-    return ((squared + FINE**2).sqrt() - FINE).mean()
+    distance = (squared + FINE**2).sqrt() - FINE
+    return (distance / (1 + distance / DIVERGED)).mean()

@@ -91,7 +91,7 @@ def solve_pose(
     Args:
         T: (4, 4) start; it becomes the result. source, target: (N, 3), m; weight: (N,); L: (N, 3, 3): see
             `Correspondences`.
-        how: degrees of freedom of the Student weights, and how many steps.
+        how: squared residual from which the weights fall, and how many steps.
 
     Returns:
         Information matrix (6, 6) of xi in T exp(xi) at the last step, and the squared residuals (N,) after it.
@@ -105,7 +105,7 @@ def solve_pose(
         information[:], gradient[:] = _DAMPING * np.eye(6), 0.0
         for n in range(n_pairs):
             s = residual[n, 0] ** 2 + residual[n, 1] ** 2 + residual[n, 2] ** 2
-            w = weight[n] * (soft + 3) / (soft + s)
+            w = weight[n] * ((soft + 3) / (soft + s)) ** 2
             for axis in range(3):
                 for i in range(6):
                     weighted = w * jacobian[n, axis, i]

@@ -36,7 +36,7 @@ MIN_INLIERS = 30
 CONFIDENT = 30  # pairs whose mean confidence is that of the registration
 CHI2 = 11.3  # 99 % quantile with 3 degrees of freedom: inliers of the precision-weighted solve
 ROUNDS = 8  # of the precision-weighted solve
-SOFT = 3.0  # degrees of freedom of the Student weights in the precision-weighted solve
+SOFT = 3.0  # squared residual from which the weights of the precision-weighted solve fall
 MOST_CONFIDENT, SURE = 64, 0.5  # the solver `confident` starts from so many pairs, and from those that are so probable
 
 Solver = Literal["consensus", "confident"]
@@ -122,6 +122,9 @@ def whitened_residuals(T: Tensor, pairs: Correspondences) -> tuple[Tensor, Tenso
 def weighted_gauss_newton(T: Tensor, pairs: Correspondences, rounds: int = ROUNDS) -> tuple[Tensor, Tensor]:
     """Iteratively reweighted Gauss-Newton on the residuals weighed with their predicted precision.
 
+    The weights are those of Geman and McClure: in a tunnel the points of a scan claim together, each unsure, that
+    nothing moved; what a few corners of an image say otherwise stands, if it is where the steps start.
+
     Args:
         T: (B, 4, 4) start. pairs: the correspondences.
 
@@ -133,7 +136,7 @@ def weighted_gauss_newton(T: Tensor, pairs: Correspondences, rounds: int = ROUND
     for _ in range(rounds):
         residual, jacobian = whitened_residuals(T, pairs)
         squared = (residual * residual).sum(-1)
-        weight = pairs.weight * (SOFT + 3) / (SOFT + squared)
+        weight = pairs.weight * ((SOFT + 3) / (SOFT + squared)) ** 2
         weighted = jacobian * weight[..., None, None]
         information = (weighted.flatten(1, 2).transpose(1, 2) @ jacobian.flatten(1, 2)) + damping
         gradient = weighted.flatten(1, 2).transpose(1, 2) @ residual.flatten(1, 2)[..., None]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The loss on the pose: what an error costs, that it trains the network, and that what has diverged does not."""
+"""The loss on the pose: what an error costs, and that it trains the network, from the truth where that has diverged."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import torch
 from dpm2_core.geometry import se3
 from dpm2_core.learning.dataset import DataSettings, GroupDataset
 from dpm2_core.learning.pair_sampling import merge_tokens
-from dpm2_core.learning.pose_loss import FINE, differentiable_poses, pose_loss
+from dpm2_core.learning.pose_loss import DIVERGED, FINE, differentiable_poses, pose_loss
 from dpm2_core.learning.registration_loss import LossSettings
 from dpm2_core.learning.train_registration import RegistrationTraining, RegistrationTrainingSettings, set_pairs_of
 from dpm2_core.network.model import DeepPointMap2
@@ -23,11 +23,22 @@ from ...helpers.networks import tiny
 TRUTH = torch.from_numpy(se3.exp([0.01, -0.02, 1.0, 3.0, 0.5, 0.1]))[None]
 
 
-@pytest.mark.parametrize("xi", [[0, 0, 0, 3, 4, 0], [0, 1, 0, 0, 0, 0]])
-def test_a_large_error_costs_what_it_is_and_five_meters_a_radian(xi: list[float]) -> None:
-    """Both are 5 m; the smooth part takes at most `FINE` off."""
-    loss = float(pose_loss(TRUTH @ torch.from_numpy(se3.exp(xi)), TRUTH))
-    assert 5 - FINE <= loss <= 5
+@pytest.mark.parametrize("size", [0.1, 0.5])
+def test_five_meters_count_as_much_as_a_radian(size: float) -> None:
+    """Of both the loss is that of the distance, less than `FINE` for the smooth part off."""
+    costs = [
+        float(pose_loss(TRUTH @ torch.from_numpy(se3.exp(xi)), TRUTH))
+        for xi in ([0, 0, 0, 0.6 * size, 0.8 * size, 0], [0, size / 5, 0, 0, 0, 0])
+    ]
+    assert costs[0] == pytest.approx(costs[1])
+    assert (size - FINE) / (1 + size) < costs[0] < size / (1 + size)
+
+
+def test_farther_errors_cost_more_but_never_more_than_the_limit() -> None:
+    """A pair that shows nothing of its motion does not rule the others."""
+    costs = [float(pose_loss(TRUTH @ torch.from_numpy(se3.exp([0, 0, 0, x, 0, 0])), TRUTH)) for x in (1, 3, 30, 300)]
+    assert costs == sorted(costs)
+    assert costs[-1] < DIVERGED
 
 
 def test_no_error_costs_nothing_and_has_a_finite_gradient() -> None:
@@ -49,23 +60,36 @@ def places(count: int, channels: int) -> tuple[Tokens, Tokens]:
     return Tokens(xyz, features, axes[0], mask), Tokens(moved, features, axes[1], mask)
 
 
-def test_what_has_diverged_takes_the_truth_and_has_no_gradient() -> None:
-    """The same pair is compared with a truth that it is near, and with one 3 m beside."""
+def test_what_has_diverged_starts_at_the_truth_and_learns_what_pulls_it_away() -> None:
+    """The same pair is compared with a truth that it is near, and with one 3 m beside, towards which it would go."""
     torch.manual_seed(0)
     model = DeepPointMap2(tiny()).eval()
     source, target = places(60, model.settings.channels)
     source = source._replace(features=source.features.clone().requires_grad_(True))
     with torch.no_grad():
-        near, usable = differentiable_poses(model.decoder, source, target, model.decoder(source, target), TRUTH)
+        near, found = differentiable_poses(model.decoder, source, target, model.decoder(source, target), TRUTH)
     beside = near.clone()
     beside[:, 0, 3] += 3.0
     T, kept = differentiable_poses(model.decoder, source, target, model.decoder(source, target), beside)
-    assert bool(usable.all())
+    assert bool(found.all())
     assert not bool(kept.any())
-    torch.testing.assert_close(T, beside)
-    T.sum().backward()
+    assert float((T.detach() - beside)[:, :3, 3].norm()) > 0.1
+    assert float((T.detach() - near)[:, :3, 3].norm()) < 3.0
+    pose_loss(T, beside).backward()
     assert source.features.grad is not None
-    assert float(source.features.grad.abs().max()) == 0.0
+    assert float(source.features.grad.abs().max()) > 0
+
+
+def test_features_that_are_not_finite_take_the_truth() -> None:
+    """A step without a pose has no gradient instead of one that is not a number."""
+    torch.manual_seed(0)
+    model = DeepPointMap2(tiny()).eval()
+    source, target = places(60, model.settings.channels)
+    source = source._replace(features=torch.full_like(source.features, torch.nan))
+    with torch.no_grad():
+        T, kept = differentiable_poses(model.decoder, source, target, model.decoder(source, target), TRUTH)
+    assert not bool(kept.any())
+    torch.testing.assert_close(T, TRUTH)
 
 
 def test_registration_trains_by_it(packed: Path) -> None:
