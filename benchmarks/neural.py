@@ -35,10 +35,10 @@ from benchmarks.unseen_sensors import other_sensors
 from dpm2_core.evaluation.figures import success_png
 from dpm2_core.evaluation.record import git_commit
 from dpm2_core.frame import Array, Frame
-from dpm2_core.network.encoder import collate_views
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pretrained import load_network, weights_path
 from dpm2_core.network.pyramid import build_pyramid, collate, crop
+from dpm2_core.network.views import collate_views
 from dpm2_core.network.weights import read_metadata
 from dpm2_core.slam.build import make_registration
 
@@ -102,17 +102,17 @@ def _of_drives(one: Callable[[Array, list[Frame], DeepPointMap2, Options], Any])
 
 
 def real_pairs(poses: Array, frames: list[Frame], network: DeepPointMap2, options: Options) -> dict[str, Any]:
-    """Near pairs by the network alone; those 10-20 m apart by every method, none with a prior."""
+    """Near pairs by the network, and refined by the points; those 10-20 m apart by every method; none with a prior."""
     methods: dict[str, PairMethod] = {
         name: by_registration(make_registration(settings_of(options, f"slam.registration={name}")))
         for name in ("neural", "refined", "geometric")
     }
-    neural = {"neural": methods["neural"]}
+    near = {name: methods[name] for name in ("neural", "refined")}
     if (gicp := gicp_from_identity(options.threads)) is not None:
         methods["small_gicp"] = gicp
     if (config := kiss_config(options)) is not None:
         methods[BASELINE] = kiss_from_identity(config)
-    kinds = {"consecutive": neural, "8 apart": neural, "10-20 m": methods}
+    kinds = {"consecutive": near, "8 apart": near, "10-20 m": methods}
     return all_pairs(kinds, frames, poses, options.pairs)
 
 
@@ -162,7 +162,7 @@ def stage_times(network: DeepPointMap2, frames: Sequence[Frame]) -> dict[str, An
         clock = [perf_counter()]
         cloud = crop(frame.points, points)
         clock.append(perf_counter())
-        pyramid = build_pyramid(cloud, network.settings)
+        pyramid = build_pyramid(cloud, network.settings, frame.images if encoder.image is not None else ())
         clock.append(perf_counter())
         views = collate_views([frame.images], network.settings.image) if encoder.image is not None else None
         clock.append(perf_counter())

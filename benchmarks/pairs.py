@@ -22,6 +22,8 @@ PairMethod = Callable[[Frame, Frame], Array | None]
 """T_first_second (4, 4) of two frames; None: no result."""
 
 Pairs = Sequence[tuple[int, int]]
+_DIFFERENCE = "neural from refined"
+"""How far network and points are from each other: where they are nearer than either is to the truth, the truth errs."""
 
 
 def pairs_of(poses: Array, most: int) -> dict[str, list[tuple[int, int]]]:
@@ -100,13 +102,17 @@ def kiss_from_identity(config: Any) -> PairMethod:
     return register
 
 
-def pair_errors(method: PairMethod, frames: Sequence[Frame], poses: Array, pairs: Pairs) -> Array:
-    """(len(pairs), 2) translation error, m, and rotation error, deg; inf where there was no result."""
-    errors = np.full((len(pairs), 2), np.inf)
-    for row, (a, b) in zip(errors, pairs, strict=True):
-        T = method(frames[a], frames[b])
-        if T is not None:
-            row[:] = se3.magnitude(se3.inverse(se3.inverse(poses[a]) @ poses[b]) @ T)
+def pair_poses(method: PairMethod, frames: Sequence[Frame], pairs: Pairs) -> list[Array | None]:
+    """T_first_second (4, 4) of each pair; None where there was no result."""
+    return [method(frames[a], frames[b]) for a, b in pairs]
+
+
+def pair_errors(found: Sequence[Array | None], truth: Sequence[Array | None]) -> Array:
+    """(len(found), 2) distance, m, and angle, deg, of poses from others; inf where there is none."""
+    errors = np.full((len(found), 2), np.inf)
+    for row, T, other in zip(errors, found, truth, strict=True):
+        if T is not None and other is not None:
+            row[:] = se3.magnitude(se3.inverse(other) @ T)
     return errors
 
 
@@ -123,9 +129,12 @@ def summarized(errors: Array) -> dict[str, float | int | None]:
 def all_pairs(
     kinds: Mapping[str, Mapping[str, PairMethod]], frames: Sequence[Frame], poses: Array, most: int
 ) -> dict[str, dict[str, Any]]:
-    """Each kind of pair, at most so many of it, by its methods."""
-    pairs = pairs_of(poses, most)
-    return {
-        kind: {name: summarized(pair_errors(method, frames, poses, pairs[kind])) for name, method in methods.items()}
-        for kind, methods in kinds.items()
-    }
+    """Each kind of pair, at most so many of it, by its methods; and how far `neural` is from `refined`."""
+    out: dict[str, dict[str, Any]] = {}
+    for kind, pairs in pairs_of(poses, most).items():
+        truth = [se3.inverse(poses[a]) @ poses[b] for a, b in pairs]
+        found = {name: pair_poses(method, frames, pairs) for name, method in kinds[kind].items()}
+        out[kind] = {name: summarized(pair_errors(T, truth)) for name, T in found.items()}
+        if {"neural", "refined"} <= found.keys():
+            out[kind][_DIFFERENCE] = summarized(pair_errors(found["neural"], found["refined"]))
+    return out
