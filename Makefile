@@ -84,6 +84,12 @@ train-data: setup  ## the synthetic worlds that train-small and ablation learn f
 		--set traffic=20 --set real=0.85 --set 'mixture={city: 0.35, suburb: 0.25, rural: 0.2, highway: 0.2}'
 	$(BIN)/python -m dpm2_core.cli train data out/train/real_camera --set worlds=30 --set first_seed=22000 --set frames=24 \
 		--set images=true --set real=0.85 --set 'mixture={city: 0.2, suburb: 0.2, rural: 0.2, highway: 0.2, tunnel: 0.2}'
+	$(BIN)/python -m dpm2_core.cli train data out/train/corners --set worlds=90 --set first_seed=24000 --set frames=30 --set images=true \
+		--set real=0.85 --set 'mixture={city: 0.14, suburb: 0.13, rural: 0.13, highway: 0.3, tunnel: 0.3}'
+	$(BIN)/python -m dpm2_core.cli train data out/train/corners_val --set worlds=8 --set first_seed=942000 --set frames=24 --set images=true \
+		--set real=1 --set 'mixture={highway: 0.5, tunnel: 0.5}'
+	$(BIN)/python -m dpm2_core.cli train data out/train/corners_val --set worlds=8 --set first_seed=943000 --set frames=24 --set images=true \
+		--set real=1 --set 'mixture={city: 0.34, suburb: 0.33, rural: 0.33}'
 	$(BIN)/python -m dpm2_core.cli train data out/train/real_val --set worlds=8 --set first_seed=940000 --set frames=24 --set real=1
 	$(BIN)/python -m dpm2_core.cli train data out/train/rooms --set worlds=120 --set first_seed=23000 --set frames=40 --set beams=16 \
 		--set real=0.85 --set others=0.5 --set 'mixture={indoor: 0.8, car_park: 0.2}'
@@ -92,13 +98,14 @@ train-data: setup  ## the synthetic worlds that train-small and ablation learn f
 
 TRAIN = OMP_WAIT_POLICY=active $(BIN)/python -m dpm2_core.cli train
 RESUMED = $(if $(wildcard out/$(1)/checkpoint.pt),--resume)
-train-small: train-data  ## train the weights that are shipped: registration, image branch, both, poses, rooms, overlap (2 cores: 5 hours; continues)
+train-small: train-data  ## train the weights that are shipped: registration, image branch, both, poses, rooms, image corners, overlap (2 cores: 6 hours; continues)
 	$(TRAIN) phase1 --config config/train_small.yaml --out out/phase1 $(call RESUMED,phase1)
 	$(TRAIN) image --config config/train_small_image.yaml --out out/image $(call RESUMED,image)
 	$(TRAIN) phase1 --config config/train_small_camera.yaml --out out/camera $(call RESUMED,camera)
 	$(TRAIN) phase1 --config config/train_small_pose.yaml --out out/pose $(call RESUMED,pose)
 	$(TRAIN) phase1 --config config/train_small_real.yaml --out out/real $(call RESUMED,real)
 	$(TRAIN) phase1 --config config/train_small_rooms.yaml --out out/rooms $(call RESUMED,rooms)
+	$(TRAIN) phase1 --config config/train_small_corners.yaml --out out/corners $(call RESUMED,corners)
 	$(TRAIN) phase2 --config config/train_small_phase2.yaml --out out/phase2 $(call RESUMED,phase2)
 
 train-ground: setup  ## train the weights of slam.filter.kind=ground (2 cores: 10 minutes, 1.5 GB)
