@@ -27,6 +27,7 @@ _SURE_SIGMA = 0.08  # m, standard deviation of a position with no direction left
 _AT_MOST = 25.0
 """Times the information of the points. Where they leave a direction open, as on a highway, most of what a scan shows
 looks alike all along it: the network then matches what moves with the sensor, and is sure of standing still."""
+_TOGETHER = 0.5  # m, least deviation of what it finds there by the images: most of its matches err together
 
 
 class FusedScanRegistration:
@@ -114,15 +115,17 @@ class FusedScanRegistration:
         """Both by their information, along the directions that the network claims to know better than the points.
 
         Elsewhere its errors would count for more than it adds: its covariance is too small and that of the points too
-        large. Without images, what it claims to know and the points leave open altogether counts for nothing. The
-        information of the prediction, prior (6, 6), holds the points but is no part of the uncertainty.
+        large. What it claims to know and the points leave open altogether counts for nothing without images, and for
+        `_TOGETHER` with them. The information of the prediction, prior (6, 6), holds the points but is no part of the
+        uncertainty.
         """
         of_points, of_network = np.linalg.inv(points.of_scene), np.linalg.inv(neural.of_scene + MAP_NOISE)
         held = of_points if prior is None else of_points + prior
         ratio, axes = eigh(of_network, of_points)
         dual = of_points @ axes
-        most = np.inf if self.uses_images else _AT_MOST
-        of_network = (dual * np.where((ratio < 1) | (ratio > most), 0, ratio)) @ dual.T
+        known = np.minimum(ratio, (axes[3:] ** 2).sum(0) / _TOGETHER**2) if self.uses_images else 0 * ratio
+        ratio = np.where(ratio > _AT_MOST, known, ratio)
+        of_network = (dual * np.where(ratio < 1, 0, ratio)) @ dual.T
         step = np.linalg.solve(held + of_network, of_network @ _difference(points, neural))
         T = se3.orthonormalized(points.T_target_source @ se3.exp(step))
         covariance = np.linalg.inv(of_points + of_network) + points.covariance - points.of_scene

@@ -78,7 +78,8 @@ def test_reference_points(kitti: Path, weights: Path, tmp_path: Path, monkeypatc
     record = json.loads((tmp_path / "reference-points.json").read_text())
     rows = record["tables"][0]["rows"]
     assert [row["name"] for row in rows if row["origin"] == "this run"] == [
-        "FPS 128", "FPS 256", "FPS 512", "uniform 256", "uniform 4096", "normal 256", "normal 4096"
+        "FPS 128", "FPS 256", "FPS 512", "FPS and edges 256", "FPS, edges and image corners 256",
+        "uniform 256", "uniform 4096", "normal 256", "normal 4096",
     ]  # fmt: skip
     paper = {row["name"]: row["cells"] for row in rows if row["origin"] == "the paper"}
     assert paper["FPS 256"]["06"] == {"t_err_percent": 0.47}

@@ -176,12 +176,14 @@ def test_the_network_is_asked_only_where_the_points_do_not_know(suburb_drive: Dr
 
 
 def test_along_a_tunnel_the_network_has_it_by_its_images(tunnel_drive: Drive) -> None:
-    """There the points know every direction but one."""
+    """There the points know every direction but one; along that the network counts for half a metre, however sure it
+    is: its matches err together, and the image is asked where a deviation is above 0.08 m."""
     case = Case(tunnel_drive, images=True)
     result, _ = case.register([0, 0, 0, 0.02, 0.03, 0])
     assert (result.ok, result.method) == (True, "refined")
     off = se3.log(se3.inverse(case.truth) @ result.T_target_source)
-    assert abs(off[3] - 0.02) < 0.02  # the network's own error along; points alone: decimetres
+    assert abs(off[3] - 0.02) < 0.05  # the network's own error along; points alone: decimetres
+    assert 0.08 < result.worst_sigma < 0.5
     assert abs(off[4]) < 0.02  # the network was off by 3 cm across
 
 
