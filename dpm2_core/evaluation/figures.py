@@ -158,19 +158,19 @@ def bars_png(path: Path | str, groups: Mapping[str, Mapping[str, float]], title:
     """Groups of bars, a color a name.
 
     Args:
-        groups: name of a group, name of a bar, and its length; the same bars in all groups.
+        groups: name of a group, name of a bar, and its length; a group need not have every bar.
 
     Raises:
         Dpm2Error: the file could not be written.
     """
-    names = list(next(iter(groups.values())))
+    names = list(dict.fromkeys(name for row in groups.values() for name in row))
     figure = new_figure(figsize=(9, 0.4 * len(groups) * len(names) / 2 + 1.6), dpi=100)
     axes = figure.add_subplot()
     for k, name in enumerate(names):
         at = np.arange(len(groups)) + (k - (len(names) - 1) / 2) * 0.8 / len(names)
-        lengths = [row[name] for row in groups.values()]
-        axes.barh(at, lengths, 0.8 / len(names), label=name)
-        for y, length in zip(at, lengths, strict=True):
+        known = {y: row[name] for y, row in zip(at, groups.values(), strict=True) if name in row}
+        axes.barh(list(known), list(known.values()), 0.8 / len(names), label=name)
+        for y, length in known.items():
             axes.text(length, y, f" {length:.2f}", va="center", fontsize=8)
     axes.set_yticks(range(len(groups)), list(groups))
     axes.invert_yaxis()

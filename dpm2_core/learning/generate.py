@@ -15,13 +15,13 @@ from dpm2_core.config import Settings
 from dpm2_core.data.packed import PackedWriter, Sample, write_packed
 from dpm2_core.data.source import Source
 from dpm2_core.errors import UsageError
-from dpm2_core.frame import Array, Camera, Frame, Image, Points
+from dpm2_core.frame import Array, Frame, Image, Points
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.deskew import deskew
 from dpm2_core.geometry.scale import ROOM_SCALE, scale_of
 from dpm2_core.network.pyramid import crop
 from dpm2_core.network.settings import NetworkSettings, preset
-from dpm2_core.network.views import in_encoded_axes, resize
+from dpm2_core.network.views import in_encoded_axes, small_image
 from dpm2_core.sim.camera import calibration, render
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.sensors import drawn_sensor
@@ -93,7 +93,7 @@ def generate_world(folder: Path, seed: int, settings: GenerateSettings) -> None:
             view = calibration(camera)
             hours = float(weather.uniform(-0.5, 0.5)) * settings.hours
             pixels = render(world, camera, T @ view.T_lidar_cam, time, noise, hours)
-            images = (small_image(Image(pixels, view), network),)
+            images = (small_image(Image(pixels, view), network.image),)
         samples.append(_sample(points, T, images, network, scale))
     sensor = lidar.config.model_dump(mode="json", exclude_defaults=True)
     write_packed(folder, samples, {"source": "synthetic city", "preset": kind, "seed": seed, "sensor": sensor})
@@ -103,14 +103,6 @@ def training_camera(network: NetworkSettings) -> CameraConfig:
     """KITTI's field of view at twice the network's image size: averaged down, it is free of aliasing."""
     height, width = network.image.size
     return CameraConfig(width=2 * width, height=2 * height, focal=720.0 * 2 * width / 1241)
-
-
-def small_image(image: Image, network: NetworkSettings) -> Image:
-    """The image at the network's size."""
-    pixels, K = resize(image.pixels, image.camera.K, network.image.size)
-    height, width = network.image.size
-    camera = Camera(K, image.camera.T_lidar_cam, (width, height), image.camera.distortion, image.camera.name)
-    return Image(np.ascontiguousarray(pixels.transpose(1, 2, 0)), camera)
 
 
 def generate(
@@ -172,7 +164,7 @@ def _packed(frame: Frame, pose: Array, twist: Array, network: NetworkSettings, s
     points = frame.points
     if frame.time_offset is not None:
         points = deskew(points, frame.time_offset, twist)
-    images = tuple(small_image(image, network) for image in frame.images)
+    images = tuple(small_image(image, network.image) for image in frame.images)
     return _sample(points, pose, images, network, scale)
 
 

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dpm2_core.frame import Image
+from dpm2_core.frame import Camera, Image
 from dpm2_core.geometry import se3
 from dpm2_core.network.settings import ImageSettings
 
@@ -58,6 +58,14 @@ def collate_views(images: Sequence[Sequence[Image]], settings: ImageSettings) ->
             T[b, v] = image.camera.T_lidar_cam
             present[b, v] = True
     return Views(*(torch.from_numpy(array) for array in (pixels, K, T, present)))
+
+
+def small_image(image: Image, settings: ImageSettings) -> Image:
+    """The image at the network's size, which the network reads as it reads the image itself."""
+    pixels, K = resize(image.pixels, image.camera.K, settings.size)
+    height, width = settings.size
+    camera = Camera(K, image.camera.T_lidar_cam, (width, height), image.camera.distortion, image.camera.name)
+    return Image(np.ascontiguousarray(pixels.transpose(1, 2, 0)), camera)
 
 
 def resize(pixels: np.ndarray, K: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:

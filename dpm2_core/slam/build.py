@@ -85,7 +85,7 @@ def make_registration(s: SlamSettings) -> ScanRegistration:
     geometric = GeometricScanRegistration(preprocessor, GeometricRegistration(s.geometric), LocalMap(s.local_map))
     chosen: ScanRegistration = geometric
     if s.registration != "geometric":
-        neural = NeuralScanRegistration(s.neural, preprocessor, _network(s), s.registration != "adaptive")
+        neural = NeuralScanRegistration(s.neural, preprocessor, _network(s))
         chosen = (
             neural
             if s.registration == "neural"

@@ -63,7 +63,8 @@ class FusedScanRegistration:
     def prepare(self, frame: Frame, twist: Array) -> Scan:
         scan = self._geometric.prepare(frame, twist)
         images = frame.images if self.uses_images else ()
-        return replace(scan, description=LazyDescriptors(partial(self._neural.describe, scan.points, images)))
+        description = LazyDescriptors(partial(self._neural.describe, scan.points, images))
+        return replace(scan, description=description, images=images)
 
     def rejection(self, scan: Scan) -> str:
         reason = self._geometric.rejection(scan)
@@ -94,11 +95,11 @@ class FusedScanRegistration:
             starts = [points.T_target_source, neural.T_target_source]
             likelier = self._geometric.register(scan, replace(prediction, starts=starts))
             if likelier.ok and agree(likelier, neural):
-                return self._mean(likelier, neural, None)
+                return self._fused(scan, likelier, neural, None)
             return _because(points, f"neural and points {_apart(points, neural)} apart")
         if not self._always and _sure(points):
             return points  # all that they needed was the start
-        return self._mean(points, neural, prediction.information)
+        return self._fused(scan, points, neural, prediction.information)
 
     def _led(self, scan: Scan, neural: Registration) -> Registration:
         """The points from the pose of the network, when the motion so far did not lead them to a result."""
@@ -106,36 +107,40 @@ class FusedScanRegistration:
         if not points.ok:
             return replace(neural, reason=f"not refined: {points.reason}")
         if agree(points, neural):
-            return self._mean(points, neural, None)
+            return self._fused(scan, points, neural, None)
         xi = _difference(points, neural)
         why = f"neural and points {_apart(points, neural)} apart"
         return replace(neural, covariance=neural.covariance + np.outer(xi, xi), reason=why)
 
-    def _mean(self, points: Registration, neural: Registration, prior: Array | None) -> Registration:
-        """Both by their information, along the directions that the network claims to know better than the points.
-
-        Elsewhere its errors would count for more than it adds: its covariance is too small and that of the points too
-        large. What it claims to know and the points leave open altogether counts for nothing without images, and for
-        `_TOGETHER` with them. The information of the prediction, prior (6, 6), holds the points but is no part of the
-        uncertainty.
-        """
-        of_points, of_network = np.linalg.inv(points.of_scene), np.linalg.inv(neural.of_scene + MAP_NOISE)
-        held = of_points if prior is None else of_points + prior
-        ratio, axes = eigh(of_network, of_points)
-        dual = of_points @ axes
-        known = np.minimum(ratio, (axes[3:] ** 2).sum(0) / _TOGETHER**2) if self.uses_images else 0 * ratio
-        ratio = np.where(ratio > _AT_MOST, known, ratio)
-        of_network = (dual * np.where(ratio < 1, 0, ratio)) @ dual.T
-        step = np.linalg.solve(held + of_network, of_network @ _difference(points, neural))
-        T = se3.orthonormalized(points.T_target_source @ se3.exp(step))
-        covariance = np.linalg.inv(of_points + of_network) + points.covariance - points.of_scene
-        return replace(points, T_target_source=T, covariance=covariance, method="refined")
+    def _fused(self, scan: Scan, points: Registration, neural: Registration, prior: Array | None) -> Registration:
+        return _mean(points, neural, prior, self.uses_images and bool(scan.images))
 
     def update(self, scan: Scan, T_odom_lidar: Array) -> bool:
         kept = self._geometric.update(scan, T_odom_lidar)
         if kept:  # both remember the same scans, and the network's part is not passed on every frame
             self._neural.keep(scan, T_odom_lidar)
         return kept
+
+
+def _mean(points: Registration, neural: Registration, prior: Array | None, seen: bool) -> Registration:
+    """Both by their information, along the directions that the network claims to know better than the points.
+
+    Elsewhere its errors would count for more than it adds: its covariance is too small and that of the points too
+    large. What it claims to know and the points leave open altogether counts for nothing unless it has `seen` an
+    image, and for `_TOGETHER` then. The information of the prediction, prior (6, 6), holds the points but is no part of
+    the uncertainty.
+    """
+    of_points, of_network = np.linalg.inv(points.of_scene), np.linalg.inv(neural.of_scene + MAP_NOISE)
+    held = of_points if prior is None else of_points + prior
+    ratio, axes = eigh(of_network, of_points)
+    dual = of_points @ axes
+    known = np.minimum(ratio, (axes[3:] ** 2).sum(0) / _TOGETHER**2) if seen else 0 * ratio
+    ratio = np.where(ratio > _AT_MOST, known, ratio)
+    of_network = (dual * np.where(ratio < 1, 0, ratio)) @ dual.T
+    step = np.linalg.solve(held + of_network, of_network @ _difference(points, neural))
+    T = se3.orthonormalized(points.T_target_source @ se3.exp(step))
+    covariance = np.linalg.inv(of_points + of_network) + points.covariance - points.of_scene
+    return replace(points, T_target_source=T, covariance=covariance, method="refined")
 
 
 def _sure(points: Registration) -> bool:

@@ -15,6 +15,7 @@ from dpm2_core.descriptors import Descriptors, LazyDescriptors
 from dpm2_core.frame import Array, Frame, Image, Points, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.voxel import voxel_first
+from dpm2_core.network.views import small_image
 from dpm2_core.slam.preprocess import Preprocessor, Scan
 from dpm2_core.slam.registration.descriptor_map import DescriptorMap
 from dpm2_core.slam.registration.protocol import Prediction, agree
@@ -54,11 +55,8 @@ class NeuralSettings(Settings):
 class NeuralScanRegistration:
     """Descriptors to the descriptors of earlier frames. The prediction only chooses which those are."""
 
-    def __init__(
-        self, settings: NeuralSettings, preprocessor: Preprocessor, model: DeepPointMap2, images: bool = True
-    ) -> None:
-        """`images` False: by the LiDAR alone."""
-        self.uses_images = images and model.encoder.image is not None
+    def __init__(self, settings: NeuralSettings, preprocessor: Preprocessor, model: DeepPointMap2) -> None:
+        self.uses_images = model.encoder.image is not None
         self._settings = settings
         self._preprocessor = preprocessor
         self._model = model
@@ -72,12 +70,12 @@ class NeuralScanRegistration:
         self._map.clear()
 
     def fresh(self) -> NeuralScanRegistration:
-        return NeuralScanRegistration(self._settings, self._preprocessor, self._model, self.uses_images)
+        return NeuralScanRegistration(self._settings, self._preprocessor, self._model)
 
     def prepare(self, frame: Frame, twist: Array) -> Scan:
         points = self._preprocessor.measured(frame, twist)
         images = frame.images if self.uses_images else ()
-        return Scan(points, description=LazyDescriptors(partial(self.describe, points, images)))
+        return Scan(points, description=LazyDescriptors(partial(self.describe, points, images)), images=images)
 
     def describe(self, points: Points, images: tuple[Image, ...] = ()) -> Descriptors:
         """The descriptors of a prepared scan (P, 4).
@@ -135,9 +133,12 @@ class NeuralScanRegistration:
         if scan.description is None:
             return
         description = scan.description
-        if not description.made and not self.uses_images:  # a whole scan, which may never be needed, takes megabytes
-            few = scan.points[voxel_first(scan.points, self._model.settings.points.voxel)]
-            description = LazyDescriptors(partial(self.describe, few))
+        if not description.made:  # a whole scan with its images, which may never be needed, takes megabytes
+            network = self._model.settings
+            few = scan.points[voxel_first(scan.points, network.points.voxel)]
+            images = scan.images if self.uses_images else ()
+            small = tuple(small_image(image, network.image) for image in images)
+            description = LazyDescriptors(partial(self.describe, few, small))
         self._map.insert(description, T_odom_lidar)
 
 

@@ -20,6 +20,7 @@ from dpm2_core.slam.registration.local_map import LocalMap, LocalMapSettings
 from dpm2_core.slam.registration.protocol import Prediction
 
 from ....helpers.drives import Drive
+from ....helpers.scenes import make_image
 
 SIGMA = np.repeat([0.001, 0.04], 3)  # rad, m, that the network claims
 
@@ -57,6 +58,8 @@ class Case:
 
     def __init__(self, drive: Drive, always: bool = True, images: bool = False) -> None:
         frames, truth = drive
+        if images:
+            frames = [replace(frame, images=(make_image(np.random.default_rng(0)),)) for frame in frames]
         self.oracle = Oracle()
         self.oracle.uses_images = images
         geometric = GeometricScanRegistration(
@@ -187,9 +190,12 @@ def test_along_a_tunnel_the_network_has_it_by_its_images(tunnel_drive: Drive) ->
     assert abs(off[4]) < 0.02  # the network was off by 3 cm across
 
 
-def test_along_a_tunnel_a_network_without_images_is_not_believed(tunnel_drive: Drive) -> None:
-    """It claims to know what the points leave open, and is a meter off: the uncertainty stays that of the points."""
+@pytest.mark.parametrize("camera", [False, True])
+def test_along_a_tunnel_a_network_without_images_is_not_believed(tunnel_drive: Drive, camera: bool) -> None:
+    """It claims to know what the points leave open, and is a meter off: the uncertainty stays that of the points; also
+    of a network that has a camera, where a scan comes without its image."""
     case = Case(tunnel_drive)
+    case.registration.uses_images = camera
     result, _ = case.register([0, 0, 0, 1.0, 0, 0])
     assert result.ok
     assert result.worst_sigma > 0.5

@@ -212,6 +212,24 @@ def test_images_are_asked_for_and_used_where_the_network_has_a_camera(noise: np.
         assert np.array_equal(with_image.features, without.features) is not requested
 
 
+def test_what_is_remembered_of_a_scan_gives_its_descriptors(noise: np.random.Generator) -> None:
+    """A kept scan, thinned out and with a small image, is described as the whole one would have been."""
+    torch.manual_seed(0)
+    model = DeepPointMap2(tiny()).eval().requires_grad_(False)
+    registration = NeuralScanRegistration(NeuralSettings(), Preprocessor(PreprocessSettings()), model)
+    first, second = (
+        registration.prepare(Frame(0, cloud(boxes(noise)), images=(make_image(noise),)), np.zeros(6)) for _ in range(2)
+    )
+    results = []
+    for described in (False, True):
+        registration.clear()
+        if described:
+            assert first.descriptors is not None
+        registration.keep(first, np.eye(4))
+        results.append(registration.register(second, Prediction([np.eye(4)])))
+    np.testing.assert_allclose(results[0].T_target_source, results[1].T_target_source, atol=1e-9)
+
+
 def test_descriptors_of_a_keyframe_take_70_kb(noise: np.random.Generator) -> None:
     torch.manual_seed(0)
     model = DeepPointMap2(preset("small")).eval().requires_grad_(False)
