@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
+from dpm2_core.geometry.contrast import local_contrast
 from dpm2_core.geometry.edges import spaced
 from dpm2_core.geometry.point_grid import PointGrid
 
@@ -22,7 +23,7 @@ _SPACING = 0.5  # m between two corners
 _NEAR, _FAR = 2.0, 35.0  # m of depth: farther away, a pixel is as wide as the spacing of corners
 _CANDIDATES = 600
 _BORDER = 4  # pixels without a corner
-_CONTRAST, _DARK = 8.0, 2.0  # pixels over which light changes slowly; gray levels: less is noise
+_LOCAL = 8.0  # pixels: light that changes more slowly is no texture
 _NEIGHBORS, _WITHIN = 12, 10.0  # points of the scan that give the depth, pixels
 _BELL = 4.0  # pixels, the deviation of their weights
 _ROUNDS = (0.2, 0.05, 0.05)  # relative residuals that count half in the fits of a plane: rain and what lies behind
@@ -50,7 +51,7 @@ def image_corners(pixels: NDArray[np.uint8], K: Array, T_lidar_cam: Array, cloud
     Args:
         K: (3, 3) of the image, without distortion. T_lidar_cam: (4, 4). cloud: (N, 3) m.
     """
-    detail = _detail(pixels)
+    detail = local_contrast(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), _LOCAL)
     uv, score = _corners(cv2.GaussianBlur(detail, (0, 0), _BLURS[0]))
     in_camera = se3.transform(se3.inverse(T_lidar_cam), cloud[:, :3].astype(np.float64))
     depth, share = _depth(uv, in_camera, K, detail.shape)
@@ -60,14 +61,6 @@ def image_corners(pixels: NDArray[np.uint8], K: Array, T_lidar_cam: Array, cloud
     xyz = se3.transform(T_lidar_cam, at).astype(np.float32)
     kept = spaced(xyz, _SPACING, most)
     return Corners(xyz[kept], _patches(detail, uv[kept], K[0, 0] * _SIZE / depth[kept]))
-
-
-def _detail(pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Brightness without its slow changes, over its local contrast."""
-    gray = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    gray -= cv2.GaussianBlur(gray, (0, 0), _CONTRAST)
-    gray /= np.sqrt(cv2.GaussianBlur(gray * gray, (0, 0), 2 * _CONTRAST)) + _DARK
-    return gray
 
 
 def _corners(image: NDArray[np.float32]) -> tuple[Array, NDArray[np.float32]]:

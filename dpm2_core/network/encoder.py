@@ -25,7 +25,7 @@ from dpm2_core.network.registry import image_backbone, point_backbone
 from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.network.spatial import paint
 from dpm2_core.network.tokens import Tokens
-from dpm2_core.network.views import Views, collate_views, in_encoded_axes
+from dpm2_core.network.views import Views, collate_views, in_encoded_axes, small_image
 
 
 class Encoded(NamedTuple):
@@ -88,7 +88,8 @@ class Encoder(nn.Module):
             Dpm2Error: too few points in range, or the result is not finite.
         """
         device = next(self.parameters()).device
-        cloud, images, scale = crop(frame.points, self.settings.points), frame.images, scale_of(frame.points)
+        cloud, scale = crop(frame.points, self.settings.points), scale_of(frame.points)
+        images = [small_image(image, self.settings.image) for image in frame.images] if self.image is not None else []
         up = up_of(cloud)
         if up is not None and is_level(up):  # as the network was trained; None: no ground to tell by
             up = None
@@ -103,8 +104,8 @@ class Encoder(nn.Module):
 
     def _encode(self, cloud: NDArray[np.float32], images: Sequence[Image], device: torch.device) -> Descriptors:
         """Descriptors of a cropped (M, 3) cloud, in its own axes."""
-        points = collate([build_pyramid(cloud, self.settings, images if self.image is not None else ())])
-        views = collate_views([images], self.settings.image) if self.image is not None else None
+        points = collate([build_pyramid(cloud, self.settings, images)])
+        views = collate_views([images], self.settings.image)
         made = self.encode_batch(points, views, device)[0]
         if not np.isfinite(made.features).all():
             raise Dpm2Error("the network's descriptors are not finite: damaged weights, or a library that fails here")

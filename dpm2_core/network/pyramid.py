@@ -20,7 +20,7 @@ from dpm2_core.geometry.point_grid import PointGrid
 from dpm2_core.geometry.sampling import farthest_points, interleaved, neighbours
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.network.settings import NetworkSettings, PointsSettings
-from dpm2_core.network.views import resize
+from dpm2_core.network.views import small_image
 
 MIN_POINTS = 32  # below this a scan says nothing about the pose
 
@@ -72,20 +72,13 @@ def build_pyramid(cloud: NDArray[np.float32], network: NetworkSettings, images: 
     Raises:
         Dpm2Error: fewer than `MIN_POINTS` points.
     """
-    settings, fusion = network.points, network.fusion
+    settings = network.points
     if len(cloud) < MIN_POINTS:
         raise Dpm2Error(f"scan has {len(cloud)} points within {settings.near}-{settings.far} m, want {MIN_POINTS}")
     stages = settings.stages
     first = stages[0]
     grid = _grid(cloud, first.radius / 1.5)  # most neighborhoods are full before the radius
-    xyz = cloud[farthest_points(cloud, first.points, grid)]
-    texture = np.zeros((len(xyz), TEXTURE), np.float32)
-    if fusion.reference == "salient":
-        references = min(fusion.points, len(xyz))
-        corners = _corners(cloud, images, network, int(fusion.corners * references))
-        others = references - len(corners.xyz)
-        xyz = interleaved(xyz, vertical_edges(cloud, grid, int(fusion.edges * others)), others)
-        xyz, texture = (interleaved(a, b, references) for a, b in zip((xyz, texture), corners, strict=True))
+    xyz, texture = _sampled(cloud, grid, network, images)
     count = len(xyz)
     index = neighbours(grid, xyz, first.neighbours, first.radius)
     patches = np.zeros((first.points, first.neighbours, 3), np.float16)
@@ -110,9 +103,24 @@ def build_pyramid(cloud: NDArray[np.float32], network: NetworkSettings, images: 
     )
     full = np.zeros((first.points, 3), np.float32)
     full[:count] = xyz
-    textures = np.zeros((fusion.points, TEXTURE), np.float16)
-    textures[: min(count, fusion.points)] = texture[: fusion.points]
-    return Pyramid(full, count, patches, groups, locals_, ups, textures)
+    return Pyramid(full, count, patches, groups, locals_, ups, texture.astype(np.float16))
+
+
+def _sampled(
+    cloud: NDArray[np.float32], grid: PointGrid, network: NetworkSettings, images: Sequence[Image]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """The points (N, 3) of the first level, the reference points first, and the texture of these."""
+    fusion = network.fusion
+    xyz = cloud[farthest_points(cloud, network.points.stages[0].points, grid)]
+    texture = np.zeros((max(len(xyz), fusion.points), TEXTURE), np.float32)
+    if fusion.reference == "salient":
+        references = min(fusion.points, len(xyz))
+        corners = _corners(cloud, images, network, int(fusion.corners * references))
+        others = references - len(corners.xyz)
+        xyz = interleaved(xyz, vertical_edges(cloud, grid, int(fusion.edges * others)), others)
+        xyz = interleaved(xyz, corners.xyz, references)
+        texture[: len(xyz)] = interleaved(texture[: len(xyz)], corners.texture, references)
+    return xyz, texture[: fusion.points]
 
 
 def _corners(cloud: NDArray[np.float32], images: Sequence[Image], network: NetworkSettings, most: int) -> Corners:
@@ -121,8 +129,8 @@ def _corners(cloud: NDArray[np.float32], images: Sequence[Image], network: Netwo
         return no_corners()
     found = []
     for image in images:
-        pixels, K = resize(image.pixels, image.camera.K, network.image.size)
-        found.append(image_corners(pixels.transpose(1, 2, 0), K, image.camera.T_lidar_cam, cloud, most // len(images)))
+        small = small_image(image, network.image)
+        found.append(image_corners(small.pixels, small.camera.K, small.camera.T_lidar_cam, cloud, most // len(images)))
     return Corners(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
 
 

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dpm2_core.frame import Camera, Image
+from dpm2_core.frame import Image
 from dpm2_core.geometry import se3
 from dpm2_core.network.settings import ImageSettings
 
@@ -54,18 +54,22 @@ def collate_views(images: Sequence[Sequence[Image]], settings: ImageSettings) ->
     present = np.zeros((len(images), most), bool)
     for b, frame in enumerate(images):
         for v, image in enumerate(frame):
-            pixels[b, v], K[b, v] = resize(image.pixels, image.camera.K, settings.size)
+            small = small_image(image, settings)
+            pixels[b, v], K[b, v] = small.pixels.transpose(2, 0, 1), small.camera.K
             T[b, v] = image.camera.T_lidar_cam
             present[b, v] = True
     return Views(*(torch.from_numpy(array) for array in (pixels, K, T, present)))
 
 
 def small_image(image: Image, settings: ImageSettings) -> Image:
-    """The image at the network's size, which the network reads as it reads the image itself."""
-    pixels, K = resize(image.pixels, image.camera.K, settings.size)
-    height, width = settings.size
-    camera = Camera(K, image.camera.T_lidar_cam, (width, height), image.camera.distortion, image.camera.name)
-    return Image(np.ascontiguousarray(pixels.transpose(1, 2, 0)), camera)
+    """The image as the network reads it: at its size, without distortion; itself, if it is so."""
+    camera, pixels, size = image.camera, image.pixels, settings.size[::-1]
+    if not camera.distortion and camera.size == size:
+        return image
+    if camera.distortion:
+        pixels = np.asarray(cv2.undistort(pixels, camera.K, np.array(camera.distortion)), np.uint8)
+    small, K = resize(pixels, camera.K, settings.size)
+    return Image(np.ascontiguousarray(small.transpose(1, 2, 0)), replace(camera, K=K, size=size, distortion=()))
 
 
 def resize(pixels: np.ndarray, K: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:

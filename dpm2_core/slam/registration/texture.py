@@ -18,6 +18,7 @@ from pydantic import Field
 from dpm2_core.config import Settings
 from dpm2_core.frame import Array, Image, Points, Registration
 from dpm2_core.geometry import se3
+from dpm2_core.geometry.contrast import local_contrast
 
 
 class VisualSettings(Settings):
@@ -106,9 +107,7 @@ def textured(image: Image, width: int) -> Texture:
         gray = cv2.undistort(gray, camera.K, np.array(camera.distortion))
     scale = min(1.0, width / camera.size[0])
     size = (round(camera.size[0] * scale), round(camera.size[1] * scale))
-    gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA).astype(np.float32)
-    detail = gray - cv2.GaussianBlur(gray, (0, 0), _LOCAL)
-    detail /= np.sqrt(cv2.GaussianBlur(detail * detail, (0, 0), 2 * _LOCAL)) + 2.0  # gray levels: less is noise
+    detail = local_contrast(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), _LOCAL)
     K = np.diag([size[0] / camera.size[0], size[1] / camera.size[1], 1.0]) @ camera.K
     return Texture(tuple(cv2.GaussianBlur(detail, (0, 0), blur) for blur in _BLUR), K, se3.inverse(camera.T_lidar_cam))
 
