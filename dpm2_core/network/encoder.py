@@ -19,13 +19,14 @@ from dpm2_core.geometry.scale import scale_of
 from dpm2_core.geometry.tilt import up_of
 from dpm2_core.network.convnext import FeatureMap
 from dpm2_core.network.fusion import Fusion
+from dpm2_core.network.images import in_encoded_axes, small_image
 from dpm2_core.network.pointnext import Scale, view_axes
 from dpm2_core.network.pyramid import PointBatch, build_pyramid, collate, crop
 from dpm2_core.network.registry import image_backbone, point_backbone
 from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.network.spatial import paint
 from dpm2_core.network.tokens import Tokens
-from dpm2_core.network.views import Views, collate_views, in_encoded_axes, small_image
+from dpm2_core.network.views import Views, collate_views
 
 
 class Encoded(NamedTuple):

@@ -19,8 +19,8 @@ from dpm2_core.geometry.edges import vertical_edges
 from dpm2_core.geometry.point_grid import PointGrid
 from dpm2_core.geometry.sampling import farthest_points, interleaved, neighbours
 from dpm2_core.geometry.voxel import voxel_first
+from dpm2_core.network.images import small_image
 from dpm2_core.network.settings import NetworkSettings, PointsSettings
-from dpm2_core.network.views import small_image
 
 MIN_POINTS = 32  # below this a scan says nothing about the pose
 

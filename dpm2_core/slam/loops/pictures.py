@@ -27,6 +27,7 @@ from dpm2_core.slam.registration.texture import (
     textured,
 )
 
+BETWEEN = 6.0  # m to either side of a keyframe: where the next one is nearer
 _CLEARLY = 0.6  # of what does not correlate at the second best place, at most so much does not at the best
 _ELSEWHERE = 0.45  # correlation that a place which is not in the map is assumed to have
 _CORRELATED = 1 - _CLEARLY * (1 - _ELSEWHERE)  # at least, at the right place
@@ -127,7 +128,7 @@ class PicturedPlaces:
         if known is None:
             return []
         T, axis, picture = result.T_target_source, result.open_direction, view.picture
-        found = peaks(s, known, picture, T, axis, s.reach) if closely else [glance(known, picture, T, axis, s.reach)]
+        found = peaks(s, known, picture, T, axis, BETWEEN) if closely else [glance(known, picture, T, axis, BETWEEN)]
         moved = [T @ se3.make(np.eye(3), peak.offset * axis) for peak in found]
         return [
             replace(result, T_target_source=self._poses[node] @ T_kf_lidar, confidence=max(peak.correlation, 0.0))

@@ -23,7 +23,7 @@ from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Array, Image, Points, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.voxel import voxel_first
-from dpm2_core.slam.loops.pictures import KnownMap, PicturedPlaces
+from dpm2_core.slam.loops.pictures import BETWEEN, KnownMap, PicturedPlaces
 from dpm2_core.slam.loops.place_recognition import PlaceRecognition
 from dpm2_core.slam.loops.verification import (
     SAME_PLACE,
@@ -146,7 +146,7 @@ class Relocalizer:
             picture: taken with the cloud, for where the points leave a direction open.
         """
         texture = self._pictures.texture(picture)
-        along = None if texture is None else partial(self._pictures.along, texture, self._visual.reach)
+        along = None if texture is None else partial(self._pictures.along, texture, BETWEEN)
         return self._verified(cloud, T_map_lidar, widen, along)
 
     def _verified(

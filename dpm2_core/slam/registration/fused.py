@@ -27,7 +27,7 @@ _SURE_SIGMA = 0.08  # m, standard deviation of a position with no direction left
 _AT_MOST = 25.0
 """Times the information of the points. Where they leave a direction open, as on a highway, most of what a scan shows
 looks alike all along it: the network then matches what moves with the sensor, and is sure of standing still."""
-_TOGETHER = 0.5  # m, least deviation of what it finds there by the images: most of its matches err together
+_TOGETHER = 3.0  # m, least deviation of what it finds there by the images: most of its matches err together
 
 
 class FusedScanRegistration:
@@ -92,6 +92,8 @@ class FusedScanRegistration:
         if not points.ok:
             return self._led(scan, neural)
         if not agree(points, neural):
+            if prediction.sigma > _SURE_MOTION and points.worst_sigma > _SURE_SIGMA and self._seen(scan):
+                return self._led(scan, neural)  # where points fit anywhere, they fit best where nothing has moved
             starts = [points.T_target_source, neural.T_target_source]
             likelier = self._geometric.register(scan, replace(prediction, starts=starts))
             if likelier.ok and agree(likelier, neural):
@@ -113,7 +115,10 @@ class FusedScanRegistration:
         return replace(neural, covariance=neural.covariance + np.outer(xi, xi), reason=why)
 
     def _fused(self, scan: Scan, points: Registration, neural: Registration, prior: Array | None) -> Registration:
-        return _mean(points, neural, prior, self.uses_images and bool(scan.images))
+        return _mean(points, neural, prior, self._seen(scan))
+
+    def _seen(self, scan: Scan) -> bool:
+        return self.uses_images and bool(scan.images)
 
     def update(self, scan: Scan, T_odom_lidar: Array) -> bool:
         kept = self._geometric.update(scan, T_odom_lidar)

@@ -15,7 +15,7 @@ from dpm2_core.descriptors import Descriptors, LazyDescriptors
 from dpm2_core.frame import Array, Frame, Image, Points, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.voxel import voxel_first
-from dpm2_core.network.views import small_image
+from dpm2_core.network.images import small_image
 from dpm2_core.slam.preprocess import Preprocessor, Scan
 from dpm2_core.slam.registration.descriptor_map import DescriptorMap
 from dpm2_core.slam.registration.protocol import Prediction, agree

@@ -28,7 +28,7 @@ class VisualSettings(Settings):
     """Ask a camera where scans leave a direction open: the first one; a second one only where that has no image."""
     sigma: float = Field(0.08, gt=0)
     """Standard deviation of the position in its worst direction above which it counts as open, m."""
-    reach: float = Field(6.0, gt=0)
+    reach: float = Field(20.0, gt=0)
     """Farthest that is looked to either side, m; less where the motion so far says more."""
     baseline: float = Field(3.0, gt=0)
     """Way after which another image is the one to compare with, m."""

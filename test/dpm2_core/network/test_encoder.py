@@ -14,13 +14,14 @@ from dpm2_core.frame import Frame, Image
 from dpm2_core.geometry import se3
 from dpm2_core.network.convnext import FeatureMap
 from dpm2_core.network.encoder import Encoder
+from dpm2_core.network.images import resize
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pointnext import argmax_neighbor
 from dpm2_core.network.pretrained import weights_path
 from dpm2_core.network.pyramid import build_pyramid, collate, crop
 from dpm2_core.network.settings import PRESETS, preset
 from dpm2_core.network.spatial import image_features, paint, seen_from
-from dpm2_core.network.views import Views, collate_views, resize
+from dpm2_core.network.views import Views, collate_views
 from dpm2_core.network.weights import network_settings
 
 from ...helpers.networks import tiny

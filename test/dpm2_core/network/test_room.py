@@ -11,9 +11,9 @@ import pytest
 from dpm2_core.frame import Camera, Frame, Image
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.scale import ROOM_SCALE, is_room
+from dpm2_core.network.images import in_encoded_axes
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pretrained import load_network
-from dpm2_core.network.views import in_encoded_axes
 from test.helpers.rooms import frames
 
 FIRST = se3.make(np.eye(3), [-0.5, 0.2, 0.6])

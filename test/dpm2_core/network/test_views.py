@@ -9,8 +9,9 @@ import cv2
 import numpy as np
 
 from dpm2_core.frame import Camera, Image
+from dpm2_core.network.images import small_image
 from dpm2_core.network.settings import ImageSettings
-from dpm2_core.network.views import collate_views, small_image
+from dpm2_core.network.views import collate_views
 
 from ...helpers.scenes import make_image
 

@@ -178,16 +178,26 @@ def test_the_network_is_asked_only_where_the_points_do_not_know(suburb_drive: Dr
     assert tunnel.oracle.asked == 1
 
 
-def test_along_a_tunnel_the_network_has_it_by_its_images(tunnel_drive: Drive) -> None:
-    """There the points know every direction but one; along that the network counts for half a metre, however sure it
-    is: its matches err together, and the image is asked where a deviation is above 0.08 m."""
+def test_along_a_tunnel_the_network_by_its_images_counts_little_where_the_motion_is_known(tunnel_drive: Drive) -> None:
+    """It is a metre off along: its matches err together. The result stays with the motion, and the image is asked, as
+    it is where a deviation is above 0.08 m; across, where the points know, nothing moves."""
     case = Case(tunnel_drive, images=True)
-    result, _ = case.register([0, 0, 0, 0.02, 0.03, 0])
+    result, _ = case.register([0, 0, 0, 1.0, 0.03, 0])
     assert (result.ok, result.method) == (True, "refined")
     off = se3.log(se3.inverse(case.truth) @ result.T_target_source)
-    assert abs(off[3] - 0.02) < 0.05  # the network's own error along; points alone: decimetres
-    assert 0.08 < result.worst_sigma < 0.5
-    assert abs(off[4]) < 0.02  # the network was off by 3 cm across
+    assert abs(off[3]) < 0.3
+    assert abs(off[4]) < 0.02
+    assert result.worst_sigma > 0.5
+
+
+def test_along_a_tunnel_the_network_by_its_images_leads_where_the_motion_is_not_known(tunnel_drive: Drive) -> None:
+    """The points fit everywhere, best where nothing has moved: 8 m behind."""
+    case = Case(tunnel_drive, images=True)
+    case.prediction = Prediction([case.truth @ se3.exp([0, 0, 0, -8, 0, 0])], widen=2.0)
+    result, error = case.register([0, 0, 0, 0.2, 0.03, 0])
+    assert result.ok
+    assert error < 0.5
+    assert result.worst_sigma > 0.08
 
 
 @pytest.mark.parametrize("camera", [False, True])

@@ -23,7 +23,8 @@ from ....helpers.corridor import CAMERA, T_LIDAR_CAM, Paint, frame, random_paint
 
 def registered(first: Frame, second: Frame, **visual: object) -> tuple[Array, Array, str, str]:
     """Pose and covariance of the second in the frame of the first, method and reason."""
-    registration = make_registration(SlamSettings(visual=VisualSettings.model_validate(visual)))
+    settings = VisualSettings.model_validate(visual)
+    registration = make_registration(SlamSettings(registration="geometric", visual=settings))
     registration.update(registration.prepare(first, np.zeros(6)), np.eye(4))
     result = registration.register(registration.prepare(second, np.zeros(6)), Prediction([np.eye(4)]))
     assert result.ok
