@@ -229,7 +229,7 @@ def test_the_neural_benchmark_measures_pairs_odometry_and_stages(
     ]  # fmt: skip
     assert parts["synthetic"]["pairs"]["up to 20 m, any yaw"]["neural"]["pairs"] > 0
     ours = parts["real"]["drives"][sequence.name]
-    assert list(ours["consecutive"]) == ["neural"]
+    assert list(ours["consecutive"]) == ["neural", "refined", "neural from refined"]
     assert set(ours["10-20 m"]) >= {"neural", "refined", "geometric"}
     assert ("small_gicp" in ours["10-20 m"]) == (find_spec("small_gicp") is not None)  # of the extra bench
     assert ours["8 apart"]["neural"]["pairs"] == 0  # six frames

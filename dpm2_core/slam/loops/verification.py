@@ -23,7 +23,7 @@ _CELL = 2.0  # m, of the grid whose lowest points are the ground
 _ABOVE = 0.5  # m over it: what stands there
 _WELL = 0.75  # fraction of that which fits where a pose is right; with less, a place beside it may fit better
 _CLEARLY = 0.5  # of what does not fit at the second best place, at most so much does not fit at the best
-_ELSEWHERE = 0.7  # fit that a place which was not tried is assumed to have: in car parks they have 0.5 to 0.8
+_ELSEWHERE = 0.8  # fit that a place which was not tried is assumed to have: in car parks they have 0.5 to 0.89
 SAME_PLACE = 5.0  # m, poses nearer to each other than this are of one place
 
 
