@@ -25,6 +25,7 @@ from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry.rays import project
 from dpm2_core.network.attention import Attention
 from dpm2_core.network.encoder import to_device
+from dpm2_core.network.images import small_image
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pyramid import build_pyramid, collate, crop
 from dpm2_core.network.spatial import seen_from
@@ -63,11 +64,12 @@ def image_attention(model: DeepPointMap2, frame: Frame, point: int | None = None
     attention = None if encoder.fusion is None else encoder.fusion.layers[-1].image
     if encoder.image is None or not isinstance(attention, Attention):
         raise UsageError("these weights have no camera branch with attention, so there is none to show")
-    views = collate_views([frame.images[:1]], encoder.settings.image)
+    images = [small_image(image, encoder.settings.image) for image in frame.images[:1]]
+    views = collate_views([images], encoder.settings.image)
     if views is None:
         raise UsageError(f"frame {frame.index} has no image")
     cloud = crop(frame.points, encoder.settings.points)
-    points = collate([build_pyramid(cloud, encoder.settings, frame.images[:1])])
+    points = collate([build_pyramid(cloud, encoder.settings, images)])
     given: list[Any] = []
     hook = attention.register_forward_pre_hook(lambda module, arguments: given.append(arguments))
     device = next(model.parameters()).device

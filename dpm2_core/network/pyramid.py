@@ -35,8 +35,8 @@ class Pyramid:
         patches: (n_0, k_0, 3) float16 m, input points around each first-level point, relative to it.
         groups: per further level (n_i, k_i) int16, neighbors in the level before.
         locals: per level, per residual block (n_i, k) int16, neighbors in the level itself.
-        texture: (n, TEXTURE) float16 of the reference points that are image corners, zeros for the others.
         ups: per feature propagation, coarse to fine, (n_fine, 3) int16, the nearest points of the coarser level.
+        texture: (n, TEXTURE) float16 of the reference points that are image corners, zeros for the others.
     """
 
     xyz: NDArray[np.float32]
