@@ -136,23 +136,20 @@ def ablation(
     out: OutOption = Path("out/ablation"),
     report: Annotated[Path, typer.Option("--json", help="Table to write.")] = Path("benchmarks/ablation.json"),
 ) -> None:
-    """The paper's Table 4: alternatives of the fusion, trained alike; continues where it was stopped."""
+    """The paper's tables 3 and 4: alternatives of the fusion and of its reference points, trained alike; continues."""
     from dpm2_core.evaluation.record import write_record
-    from dpm2_core.experiments.ablation import AblationSettings
+    from dpm2_core.experiments.ablation import AblationSettings, ablation_tables, gains
     from dpm2_core.experiments.ablation import ablation as compare
-    from dpm2_core.tables import FigureTable
 
     chosen = load_settings(AblationSettings, config, settings or [])
     if not chosen.measure:
         raise UsageError("measure: want the folders of packed drives to measure on, such as {unseen: out/train/val}")
     found = compare(chosen, out)
-    columns = [f"{drives}: {what}" for drives in chosen.measure for what in ("near m", "success", "far")]
-    table = FigureTable("Fusions trained alike", names=["fusion"], figures=columns)
-    for name, rows in found.items():
-        cells = [f"{r['near_m']:.3f} {r['near_success']:.0%} {r['far_success']:.0%}".split() for r in rows.values()]
-        table.add_row(name, *(cell for row in cells for cell in row))
-    write_record(report, "ablation", {"settings": chosen.model_dump(mode="json"), "variants": found})
-    Console().print(table, f"written to {report}")
+    results = {"settings": chosen.model_dump(mode="json"), "variants": found, "gains": gains(found)}
+    write_record(report, "ablation", results)
+    for table in ablation_tables(found):
+        Console().print(table)
+    Console().print(f"written to {report}")
 
 
 def reject_overwriting(out: Path, resume: bool) -> None:

@@ -1,21 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's Table 4: alternatives of the fusion, trained alike and measured on the same unseen pairs."""
+"""The paper's tables 3 and 4: alternatives of the fusion and of its reference points, trained alike with several seeds
+and measured on the same unseen pairs."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
 from pathlib import Path
+from statistics import mean
 from typing import Any
 
 from pydantic import Field
 
 from dpm2_core.config import Settings, merged
 from dpm2_core.evaluation.pair_set import PairSet
+from dpm2_core.experiments.paired import Gain, paired_gain
+from dpm2_core.files import atomic_write
 from dpm2_core.learning.train_registration import RegistrationTrainingSettings, train_registration
 from dpm2_core.network.weights import load_model
+from dpm2_core.tables import FigureTable
 
+FIRST = "biased attention"
+"""The variant that the others are compared with."""
 TABLE_4: dict[str, dict[str, Any]] = {
-    "biased attention": {},
+    FIRST: {},
     "PointPainting": {"fusion": {"kind": "point_painting"}},
     "RoI pooling 3x3": {"fusion": {"kind": "roi_pooling"}},
     "scale-dot attention": {"fusion": {"kind": "scale_dot"}},
@@ -24,6 +33,12 @@ TABLE_4: dict[str, dict[str, Any]] = {
     "biased attention, own pixel": {"fusion": {"pixel": True}},
     "no camera": {"image": {"backbone": "none"}},
 }
+MIXTURES: dict[str, dict[str, Any]] = {
+    "farthest points": {"fusion": {"reference": "fps"}},
+    "farthest points, edges": {"fusion": {"reference": "salient", "corners": 0}},
+    "farthest points, edges, twice the corners": {"fusion": {"reference": "salient", "corners": 0.5}},
+}
+"""Reference points other than those of the presets."""
 
 
 class AblationSettings(Settings):
@@ -31,34 +46,93 @@ class AblationSettings(Settings):
 
     training: RegistrationTrainingSettings = RegistrationTrainingSettings()
     """Of every variant; each changes its network."""
-    variants: dict[str, dict[str, Any]] = TABLE_4
-    """Name and change to the network of each."""
+    variants: dict[str, dict[str, Any]] = Field({**TABLE_4, **MIXTURES}, min_length=1)
+    """Name and change to the network of each; the others are compared with the first."""
+    seeds: int = Field(1, gt=0)
+    """Trainings of each: weights and data from seed 0, 1, ... on."""
     measure: dict[str, str] = Field({})
     """Name and folder of the packed drives that all are measured on."""
     pairs: int = Field(300, gt=0)
     """Frame pairs of each."""
 
 
-def ablation(
-    settings: AblationSettings, out: Path, progress: Callable[[str, dict[str, Any]], None] = lambda name, row: None
-) -> dict[str, dict[str, Any]]:
-    """Train and measure every variant; one that was trained before, in `out`, is only measured.
+COMPARED = ("near_m", "near_success", "far_success", "turned_success")
+"""Figures of which the gain is stated."""
+Table = dict[str, dict[str, dict[str, list[float]]]]
+"""Figures of `PairSet.measure` by variant and drives: one of each seed."""
 
-    Returns:
-        Figures of `PairSet.measure` by variant and by drives.
+
+def ablation(
+    settings: AblationSettings,
+    out: Path,
+    progress: Callable[[str, int, dict[str, Any]], None] = lambda name, seed, row: None,
+) -> Table:
+    """Train and measure every variant; what was trained or measured before, in `out`, is not done again.
+
+    All variants of a seed are trained before the next seed, so that what is stopped has compared something.
     """
-    table: dict[str, dict[str, Any]] = {}
-    for name, change in settings.variants.items():
-        training = settings.training.model_copy(update={"network": merged(settings.training.network, change)})
-        folder = out / name.replace(" ", "_")
-        weights = folder / "weights.safetensors"
-        if not weights.exists():
-            train_registration(training, folder, resume=(folder / "checkpoint.pt").exists())
-        model = load_model(weights)
-        images = training.data.images and model.encoder.image is not None
-        table[name] = {
-            drives: PairSet(Path(folder_of), settings.pairs, model.settings, images).measure(model)
-            for drives, folder_of in settings.measure.items()
-        }
-        progress(name, table[name])
+    table: Table = {name: {drives: {} for drives in settings.measure} for name in settings.variants}
+    for seed in range(settings.seeds):
+        for name in settings.variants:
+            measured = _measured(settings, name, seed, out)
+            for drives, figures in measured.items():
+                for figure, value in figures.items():
+                    table[name][drives].setdefault(figure, []).append(value)
+            progress(name, seed, measured)
     return table
+
+
+def _measured(settings: AblationSettings, name: str, seed: int, out: Path) -> dict[str, dict[str, float]]:
+    """Figures by drives of one training."""
+    network = merged(settings.training.network, settings.variants[name])
+    optimiser = settings.training.optimiser.model_copy(update={"seed": seed})
+    training = settings.training.model_copy(update={"network": network, "optimiser": optimiser})
+    folder = out / name.replace(" ", "_") / str(seed)
+    weights, known = folder / "weights.safetensors", folder / "figures.json"
+    asked = {"measure": settings.measure, "pairs": settings.pairs}
+    if weights.exists() and known.exists() and (stored := json.loads(known.read_text()))["asked"] == asked:
+        return dict(stored["figures"])
+    if not weights.exists():
+        train_registration(training, folder, resume=(folder / "checkpoint.pt").exists())
+    model = load_model(weights)
+    images = training.data.images and model.encoder.image is not None
+    figures = {
+        drives: PairSet(Path(folder_of), settings.pairs, model.settings, images).measure(model)
+        for drives, folder_of in settings.measure.items()
+    }
+    with atomic_write(known) as file:
+        file.write(json.dumps({"asked": asked, "figures": figures}))
+    return figures
+
+
+def gains(table: Table) -> dict[str, dict[str, dict[str, Any]]]:
+    """What each variant gains over the first one, paired by seed: `Gain` by variant, drives and figure."""
+    first, *others = table
+    found: dict[str, dict[str, dict[str, Any]]] = {}
+    for name in others:
+        for drives, figures in table[name].items():
+            for figure in (key for key in COMPARED if key in figures):
+                gain = paired_gain(table[first][drives][figure], figures[figure], not figure.endswith("success"))
+                if gain is not None:
+                    found.setdefault(name, {}).setdefault(drives, {})[figure] = asdict(gain)
+    return found
+
+
+def ablation_tables(table: Table) -> Iterator[FigureTable]:
+    """A table for people of each set of drives: means over the seeds, and the gain over the first variant."""
+    first, *_ = table
+    found = gains(table)
+    for drives in table[first]:
+        columns = ["near m", "near", "far", "turned"]
+        shown = FigureTable(drives, names=["variant"], figures=columns, text=[f"right near pairs beside {first}"])
+        for name, rows in table.items():
+            row = {figure: mean(values) for figure, values in rows[drives].items()}
+            gain = found.get(name, {}).get(drives, {}).get("near_success")
+            shown.add_row(name, *(_cell(row, figure) for figure in COMPARED), "" if gain is None else str(Gain(**gain)))
+        yield shown
+
+
+def _cell(row: dict[str, float], figure: str) -> str:
+    if figure not in row:
+        return ""
+    return f"{row[figure]:.3f}" if figure.endswith("_m") else f"{row[figure]:.0%}"

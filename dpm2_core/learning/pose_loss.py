@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The error of the pose that the network finds, with a gradient: what losses on descriptors and offsets never see.
 
-Beyond the paper, whose the registration training stops at the matches. It is eq. 3 of "Differentiable SLAM Helps Deep
+Beyond the paper, whose registration training stops at the matches. It is eq. 3 of "Differentiable SLAM Helps Deep
 Learning-based LiDAR Perception Tasks" for single pairs.
 """
 

@@ -43,7 +43,7 @@ class OverlapOptimiserSettings(OptimizerSettings):
 
 
 class OverlapTrainingSettings(Settings):
-    """A training of the overlap training; the network is that of the registration training, with all its settings."""
+    """The overlap training; the network is that of the registration training, with all its settings."""
 
     start: str
     """Weights of the registration training (safetensors)."""

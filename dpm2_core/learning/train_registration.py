@@ -95,7 +95,7 @@ class RegistrationTraining(nn.Module):
 
 
 class RegistrationTrainingSettings(Settings):
-    """A training of the registration training."""
+    """The registration training."""
 
     preset: str = "small"
     """Network preset."""

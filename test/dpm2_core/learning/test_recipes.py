@@ -20,6 +20,7 @@ from dpm2_core.tasks.drives import TaskDriveSettings
 CONFIG = Path(__file__).parents[3] / "config"
 READ_BY: dict[str, type[Settings]] = {
     "ablation": AblationSettings,
+    "ablation_start": RegistrationTrainingSettings,
     "movers_drives": TaskDriveSettings,
     "train_paper_overlap": OverlapTrainingSettings,
     "train_paper_registration": RegistrationTrainingSettings,
