@@ -27,6 +27,7 @@ from benchmarks.fleet_growth import bench_growth, bench_whole
 from benchmarks.harness import Options, Report, requested
 from benchmarks.roads import FIRST_SEED, road_files
 from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.evaluation.machine import processors
 from dpm2_core.evaluation.metrics import ape_rmse
 from dpm2_core.fleet.cluster import Cluster, Status
 from dpm2_core.fleet.drives import MAP, parts_of, read_drives
@@ -260,7 +261,7 @@ def bench_workers(folder: Path, options: Options) -> dict[str, Any]:
     """Wall time of four equal drives with one worker and with two, a thread each; what is not the drives' own time."""
     parts = _drives(folder, 1, 200)
     four = [Part(f"{n}", part.work, part.arguments, part.inputs, True, 1) for part in parts for n in range(4)]
-    out: dict[str, Any] = {"processors": len(os.sched_getaffinity(0))}
+    out: dict[str, Any] = {"processors": processors()}
     for workers in (1, 2):
         with Cluster(workers=workers) as cluster:
             cluster.start()

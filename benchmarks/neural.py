@@ -35,6 +35,7 @@ from benchmarks.unseen_sensors import other_sensors
 from dpm2_core.evaluation.figures import success_png
 from dpm2_core.evaluation.record import git_commit
 from dpm2_core.frame import Array, Frame
+from dpm2_core.network.images import small_image
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pretrained import load_network, weights_path
 from dpm2_core.network.pyramid import build_pyramid, collate, crop
@@ -162,9 +163,10 @@ def stage_times(network: DeepPointMap2, frames: Sequence[Frame]) -> dict[str, An
         clock = [perf_counter()]
         cloud = crop(frame.points, points)
         clock.append(perf_counter())
-        pyramid = build_pyramid(cloud, network.settings, frame.images if encoder.image is not None else ())
+        images = [small_image(image, network.settings.image) for image in frame.images if encoder.image is not None]
+        views = collate_views([images], network.settings.image)
         clock.append(perf_counter())
-        views = collate_views([frame.images], network.settings.image) if encoder.image is not None else None
+        pyramid = build_pyramid(cloud, network.settings, images)
         clock.append(perf_counter())
         descriptors = encoder.encode_batch(collate([pyramid]), views, next(network.parameters()).device)[0]
         clock.append(perf_counter())
@@ -173,7 +175,7 @@ def stage_times(network: DeepPointMap2, frames: Sequence[Frame]) -> dict[str, An
         clocks.append([b - a for a, b in pairwise(clock)])
         before, size = descriptors, descriptors.nbytes
     times = np.array(clocks)[1:]  # the first call allocates
-    names = ("crop and voxels", "sampling and neighbors", "pictures", "encoder", "decoder and pose")
+    names = ("crop and voxels", "pictures", "sampling and neighbors", "encoder", "decoder and pose")
     stages = {name: quantiles_ms(column) for name, column in zip(names, times.T, strict=True)}
     return {"stages_ms": {**stages, "total": quantiles_ms(times.sum(1))}, "descriptor_bytes": size}
 

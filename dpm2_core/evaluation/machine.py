@@ -84,12 +84,18 @@ def extras() -> Finding:
     return Finding("extras", "ok" if not missing else "note", found)
 
 
-def processor() -> Finding:
-    """Cores that this process may use, and the instructions that the network gains from."""
+def processors() -> int:
+    """How many this process may use, by its affinity and the quota of a container."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     quota = _read("/sys/fs/cgroup/cpu.max").split()
     if len(quota) == 2 and quota[0].isdecimal():
         cores = max(1, min(cores, int(quota[0]) // int(quota[1])))
+    return cores
+
+
+def processor() -> Finding:
+    """Cores that this process may use, and the instructions that the network gains from."""
+    cores = processors()
     text = _read("/proc/cpuinfo")
     model = re.search(r"model name\s*: (.+)", text)
     flags = set(re.findall(r"\w+", " ".join(re.findall(r"^(?:flags|Features)\s*: (.+)", text, re.MULTILINE)[:1])))

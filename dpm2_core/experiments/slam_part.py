@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from time import perf_counter
@@ -20,6 +19,7 @@ from dpm2_core.data.trajectory import Trajectory, matched, read_trajectory, writ
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.evaluation.ground_truth import in_other_frame, read_ground_truth
 from dpm2_core.evaluation.kitti_metric import known
+from dpm2_core.evaluation.machine import processors
 from dpm2_core.evaluation.metrics import Metrics, evaluate
 from dpm2_core.evaluation.run_folder import METRICS, TIMING, TRAJECTORY, TRUTH, write_frames, write_truth
 from dpm2_core.experiments.peers import make_peer
@@ -85,7 +85,7 @@ def peer(folder: Path, advance: Advance, drive: Drive, name: str) -> Figures:
     program, stamps, index, seconds = None, list[int](), list[int](), list[float]()
     for frame in prefetch(source.frames(start, stop)):
         if program is None:
-            program = make_peer(name, os.cpu_count() or 1, frame.time_offset is not None)
+            program = make_peer(name, processors(), frame.time_offset is not None)
         began = perf_counter()
         program.add(frame)
         seconds.append(perf_counter() - began)

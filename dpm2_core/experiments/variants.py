@@ -34,7 +34,7 @@ TABLE_3: dict[str, dict[str, Any]] = {
     "FPS 256": {"fusion": {"points": 256}},
     "FPS 512": {"fusion": {"points": 512}},
     "FPS and edges 256": {"fusion": {"reference": "salient", "corners": 0}},
-    "FPS, edges and image corners 256": {"fusion": {"reference": "salient", "corners": 0.375}},
+    "FPS, edges and image corners 256": {"fusion": {"reference": "salient", "corners": 0.25}},
     "uniform 256": {"fusion": {"reference": "uniform", "points": 256}},
     "uniform 4096": {"fusion": {"reference": "uniform", "points": 4096}},
     "normal 256": {"fusion": {"reference": "normal", "points": 256}},

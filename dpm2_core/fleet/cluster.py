@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 
 from dpm2_core._version import __version__
 from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.evaluation.machine import processors
 from dpm2_core.extras import needs
 
 ATTEMPTS = 3
@@ -126,7 +127,7 @@ class Cluster:
             return
         temporary = tempfile.gettempdir()
         self._folder = Path(tempfile.mkdtemp(prefix="ray_", dir=temporary if len(temporary) < _LONGEST else "/tmp"))
-        workers = self._workers or max(len(os.sched_getaffinity(0)) // self._cores, 1)
+        workers = self._workers or max(processors() // self._cores, 1)
         ray.init(
             "local", num_cpus=workers * self._cores, include_dashboard=False, object_store_memory=_STORE,
             _temp_dir=str(self._folder), **quiet,
