@@ -12,8 +12,9 @@ from torch import Tensor
 
 from dpm2_core.geometry import se3_torch
 from dpm2_core.network.decoder import Correlated, Decoder
+from dpm2_core.network.gauss_newton import weighted_gauss_newton
 from dpm2_core.network.matching import correspond, guided_scores, match_scores
-from dpm2_core.network.pose_solver import solve_batch, weighted_gauss_newton
+from dpm2_core.network.pose_solver import solve_batch
 from dpm2_core.network.tokens import Tokens
 
 DIVERGED = 1.0

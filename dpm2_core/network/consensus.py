@@ -17,6 +17,8 @@ TOLERANCE = 1.0  # m, residual of a match that supports a pose
 HYPOTHESES = 12
 MEMBERS = 12  # matches that make up a hypothesis
 ROUNDS = 2  # of refitting each hypothesis to all that support it
+HEADS = 32  # matches that head the hypotheses of `alternatives`; none that an earlier one brings together
+APART_M, APART_DEG = 2.0, 10.0  # poses nearer than this are one: they lead to the same solution
 _POWER = 10  # iterations
 
 
@@ -36,6 +38,22 @@ def consensus(source: Tensor, target: Tensor, weight: Tensor) -> Tensor:
     fields = (tensor.detach().float().cpu().numpy() for tensor in (source, target, weight))
     poses = [_consensus(*map(np.ascontiguousarray, row)) for row in zip(*fields, strict=True)]
     return torch.from_numpy(np.stack(poses)).to(source.device)
+
+
+def alternatives(source: Tensor, target: Tensor, weight: Tensor, known: Tensor, most: int) -> Tensor:
+    """Other poses (B, most, 4, 4) float64 than those known (B, 4, 4), and than each other: those that bring most
+    matches together, whatever the confidence of these. Where there are fewer, the known pose again.
+
+    Of two places that look alike from afar the wrong one can have the more confident matches, but hardly more of them.
+    `source`, `target` and `weight` are those of `consensus`.
+    """
+    fields = (tensor.detach().float().cpu().numpy() for tensor in (source, target, weight))
+    rows = (map(np.ascontiguousarray, row) for row in zip(*fields, strict=True))
+    other = [
+        _alternatives(x, y, w, T, most)
+        for (x, y, w), T in zip(rows, known.double().cpu().contiguous().numpy(), strict=True)
+    ]
+    return torch.from_numpy(np.stack(other)).to(source.device)
 
 
 @compiled("f4[:, ::1](f4[:, ::1], f4[:, ::1], f4[::1])")
@@ -100,6 +118,21 @@ def _supporting(T: Array, source: Array, target: Array, weight: Array, out: Arra
         out[n] = max(1 - squared / TOLERANCE**2, 0.0) * weight[n]
 
 
+@compiled("f8[:, ::1](f4[::1], f4[:, ::1], f4[:, ::1], f4[::1], f4[::1])")
+def _hypothesis(support: Array, source: Array, target: Array, weight: Array, score: Array) -> Array:
+    """The pose (4, 4) of the matches that agree most with one, by its `support` (K,), refitted to all that support it;
+    `score` (K,) becomes the weights of these."""
+    score[:] = 0
+    for member in np.argsort(-support)[:MEMBERS]:
+        score[member] = support[member]
+    T = _fitted(source, target, score)
+    for _ in range(ROUNDS):
+        _supporting(T, source, target, weight, score)
+        T = _fitted(source, target, score)
+    _supporting(T, source, target, weight, score)
+    return T
+
+
 @compiled("f8[:, ::1](f4[:, ::1], f4[:, ::1], f4[::1])")
 def _consensus(source: Array, target: Array, weight: Array) -> Array:
     support = _support(source, target, weight)
@@ -113,14 +146,47 @@ def _consensus(source: Array, target: Array, weight: Array) -> Array:
     best: Array = np.eye(4)
     most, score = -1.0, np.empty(k, np.float32)
     for head in np.argsort(-leading)[:HYPOTHESES]:
-        score[:] = 0
-        for member in np.argsort(-support[:, head])[:MEMBERS]:
-            score[member] = support[member, head]
-        T = _fitted(source, target, score)
-        for _ in range(ROUNDS):
-            _supporting(T, source, target, weight, score)
-            T = _fitted(source, target, score)
-        _supporting(T, source, target, weight, score)
+        T = _hypothesis(support[:, head].copy(), source, target, weight, score)
         if score.sum() > most:
             best, most = T, score.sum()
     return best
+
+
+@compiled("b1(f8[:, ::1], f8[:, ::1])")
+def _same(one: Array, other: Array) -> bool:
+    """Whether two poses (4, 4) lead to the same solution."""
+    squared, trace = 0.0, 0.0
+    for a in range(3):
+        squared += (one[a, 3] - other[a, 3]) ** 2
+        for b in range(3):
+            trace += one[a, b] * other[a, b]
+    return squared < APART_M**2 and trace > 1 + 2 * np.cos(np.radians(APART_DEG))
+
+
+@compiled("f8[:, :, ::1](f4[:, ::1], f4[:, ::1], f4[::1], f8[:, ::1], i8)")
+def _alternatives(source: Array, target: Array, weight: Array, known: Array, most: int) -> Array:
+    support = _support(source, target, weight)
+    k, tried = len(weight), 0
+    poses, together = np.empty((HEADS, 4, 4)), np.full(HEADS, -1)
+    explained, score = weight <= 0, np.empty(k, np.float32)
+    for head in np.argsort(-support.sum(0)):
+        if tried == HEADS:
+            break
+        if not explained[head]:
+            poses[tried] = _hypothesis(support[:, head].copy(), source, target, weight, score)
+            together[tried] = (score > 0).sum()
+            explained |= score > 0
+            explained[head] = True
+            tried += 1
+    chosen, number = np.empty((most + 1, 4, 4)), 1
+    chosen[:] = known
+    for i in np.argsort(-together)[:tried]:
+        if number > most:
+            break
+        new = True
+        for j in range(number):
+            new &= not _same(chosen[j], poses[i])
+        if new:
+            chosen[number] = poses[i]
+            number += 1
+    return chosen[1:].copy()

@@ -1,15 +1,74 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The precision-weighted solve of `pose_solver` as machine code, for inference: the same steps without gradients."""
+"""The precision-weighted solve: with gradients, and as machine code for inference, the same steps without them."""
 
 from __future__ import annotations
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from dpm2_core.geometry.compiled import compiled
+from dpm2_core.network.matching import Correspondences
 
 Array = NDArray[np.float64]
+ROUNDS = 8  # steps
+SOFT = 3.0  # squared residual from which the weights fall
 _DAMPING = 1e-6
+
+
+def whitened_residuals(T: Tensor, pairs: Correspondences) -> tuple[Tensor, Tensor]:
+    """Residuals in units of their deviation (B, 2K, 3) and their Jacobian (B, 2K, 3, 6) for T exp(xi)."""
+    half = pairs.source.shape[1] // 2
+    R, t = T[:, None, :3, :3], T[:, None, :3, 3]
+    source, target, L = pairs.source.double(), pairs.target.double(), pairs.L.double()
+    moved_back = ((target - t)[..., None, :] @ R)[..., 0, :]  # R^T (y - t)
+    L = torch.cat([L[:, :half], R.transpose(-1, -2) @ L[:, half:]], 1)  # all in the source frame
+    # In the source frame the step turns the target's point, in the target frame the source's.
+    lever_arm = torch.cat([moved_back[:, :half], source[:, half:]], 1)
+    zero = torch.zeros_like(lever_arm[..., 0])
+    x, y, z = lever_arm.unbind(-1)
+    minus_hat = torch.stack([zero, z, -y, -z, zero, x, y, -x, zero], -1).unflatten(-1, (3, 3))
+    eye = torch.eye(3, dtype=source.dtype, device=source.device).expand_as(minus_hat)
+    jacobian = L.transpose(-1, -2) @ torch.cat([minus_hat, eye], -1)
+    residual = (L.transpose(-1, -2) @ (source - moved_back)[..., None])[..., 0]
+    return residual, jacobian
+
+
+def weighted_gauss_newton(T: Tensor, pairs: Correspondences, rounds: int = ROUNDS) -> tuple[Tensor, Tensor]:
+    """Iteratively reweighted Gauss-Newton on the residuals weighed with their predicted precision.
+
+    The weights are those of Geman and McClure: in a tunnel the points of a scan claim together, each unsure, that
+    nothing moved; what a few corners of an image say otherwise stands, if it is where the steps start.
+
+    Args:
+        T: (B, 4, 4) start. pairs: the correspondences.
+
+    Returns:
+        T (B, 4, 4) and the information matrix (B, 6, 6) of xi in T exp(xi), rotation first.
+    """
+    information = T.new_zeros(len(T), 6, 6)
+    damping = torch.eye(6, dtype=T.dtype, device=T.device) * _DAMPING
+    for _ in range(rounds):
+        residual, jacobian = whitened_residuals(T, pairs)
+        squared = (residual * residual).sum(-1)
+        weight = pairs.weight * ((SOFT + 3) / (SOFT + squared)) ** 2
+        weighted = jacobian * weight[..., None, None]
+        information = (weighted.flatten(1, 2).transpose(1, 2) @ jacobian.flatten(1, 2)) + damping
+        gradient = weighted.flatten(1, 2).transpose(1, 2) @ residual.flatten(1, 2)[..., None]
+        T = T @ exp(-torch.linalg.solve(information, gradient)[..., 0])
+    return T, information
+
+
+def exp(xi: Tensor) -> Tensor:
+    """SE(3) exponential of (B, 6) [rotation, translation]."""
+    w, v = xi[:, :3], xi[:, 3:]
+    zero = torch.zeros_like(w[:, 0])
+    x, y, z = w.unbind(-1)
+    generator = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
+    out = xi.new_zeros(len(xi), 4, 4)
+    out[:, :3, :3], out[:, :3, 3] = generator, v
+    return torch.linalg.matrix_exp(out)
 
 
 @compiled("void(f8[:, ::1], f8[::1], f8[::1])")
@@ -86,7 +145,7 @@ def _whiten(T: Array, source: Array, target: Array, L: Array, residual: Array, j
 def solve_pose(
     T: Array, source: Array, target: Array, weight: Array, L: Array, how: tuple[float, float]
 ) -> tuple[Array, Array]:
-    """`pose_solver.weighted_gauss_newton` of one set of pairs.
+    """`weighted_gauss_newton` of one set of pairs.
 
     Args:
         T: (4, 4) start; it becomes the result. source, target: (N, 3), m; weight: (N,); L: (N, 3, 3): see

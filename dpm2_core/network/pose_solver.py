@@ -2,12 +2,13 @@
 """Pairs of points to a pose: consensus, precision-weighted solve or robust SVD, and its overlap probability.
 
 Beyond the paper: the first pose is a consensus of pairs that keep each other's distances, and with it the descriptors
-are matched again, each to what lies near it. The paper's own way is the solver `confident`.
+are matched again, each to what lies near it; where little fits, other poses are tried. The paper's own way is the
+solver `confident`.
 """
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -17,9 +18,9 @@ from dpm2_core.frame import Registration
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.calibration import with_calibration
 from dpm2_core.geometry.kabsch import transform, weighted_kabsch
-from dpm2_core.network.consensus import TOLERANCE, consensus
+from dpm2_core.network.consensus import TOLERANCE, alternatives, consensus
 from dpm2_core.network.decoder import Correlated, Decoder
-from dpm2_core.network.gauss_newton import solve_pose
+from dpm2_core.network.gauss_newton import ROUNDS, SOFT, solve_pose, weighted_gauss_newton, whitened_residuals
 from dpm2_core.network.losses import cosine
 from dpm2_core.network.matching import (
     Correspondences,
@@ -35,8 +36,9 @@ from dpm2_core.network.tokens import Tokens
 MIN_INLIERS = 30
 CONFIDENT = 30  # pairs whose mean confidence is that of the registration
 CHI2 = 11.3  # 99 % quantile with 3 degrees of freedom: inliers of the precision-weighted solve
-ROUNDS = 8  # of the precision-weighted solve
-SOFT = 3.0  # squared residual from which the weights of the precision-weighted solve fall
+FEW = 0.5  # of the pairs: where no more of them fit, other poses are tried, too
+LEAST = 0.4  # of the pairs: fewer fit at wrong poses alone
+TRIED, CLEARLY = 4, 1.25  # so many, of which the best counts if so many times as many pairs fit there
 MOST_CONFIDENT, SURE = 64, 0.5  # the solver `confident` starts from so many pairs, and from those that are so probable
 
 Solver = Literal["consensus", "confident"]
@@ -101,60 +103,6 @@ def robust_kabsch(pairs: Correspondences, inliers: Tensor, rounds: int = 3) -> t
     return T, inliers
 
 
-def whitened_residuals(T: Tensor, pairs: Correspondences) -> tuple[Tensor, Tensor]:
-    """Residuals in units of their deviation (B, 2K, 3) and their Jacobian (B, 2K, 3, 6) for T exp(xi)."""
-    half = pairs.source.shape[1] // 2
-    R, t = T[:, None, :3, :3], T[:, None, :3, 3]
-    source, target, L = pairs.source.double(), pairs.target.double(), pairs.L.double()
-    moved_back = ((target - t)[..., None, :] @ R)[..., 0, :]  # R^T (y - t)
-    L = torch.cat([L[:, :half], R.transpose(-1, -2) @ L[:, half:]], 1)  # all in the source frame
-    # In the source frame the step turns the target's point, in the target frame the source's.
-    lever_arm = torch.cat([moved_back[:, :half], source[:, half:]], 1)
-    zero = torch.zeros_like(lever_arm[..., 0])
-    x, y, z = lever_arm.unbind(-1)
-    minus_hat = torch.stack([zero, z, -y, -z, zero, x, y, -x, zero], -1).unflatten(-1, (3, 3))
-    eye = torch.eye(3, dtype=source.dtype, device=source.device).expand_as(minus_hat)
-    jacobian = L.transpose(-1, -2) @ torch.cat([minus_hat, eye], -1)
-    residual = (L.transpose(-1, -2) @ (source - moved_back)[..., None])[..., 0]
-    return residual, jacobian
-
-
-def weighted_gauss_newton(T: Tensor, pairs: Correspondences, rounds: int = ROUNDS) -> tuple[Tensor, Tensor]:
-    """Iteratively reweighted Gauss-Newton on the residuals weighed with their predicted precision.
-
-    The weights are those of Geman and McClure: in a tunnel the points of a scan claim together, each unsure, that
-    nothing moved; what a few corners of an image say otherwise stands, if it is where the steps start.
-
-    Args:
-        T: (B, 4, 4) start. pairs: the correspondences.
-
-    Returns:
-        T (B, 4, 4) and the information matrix (B, 6, 6) of xi in T exp(xi), rotation first.
-    """
-    information = T.new_zeros(len(T), 6, 6)
-    damping = torch.eye(6, dtype=T.dtype, device=T.device) * 1e-6
-    for _ in range(rounds):
-        residual, jacobian = whitened_residuals(T, pairs)
-        squared = (residual * residual).sum(-1)
-        weight = pairs.weight * ((SOFT + 3) / (SOFT + squared)) ** 2
-        weighted = jacobian * weight[..., None, None]
-        information = (weighted.flatten(1, 2).transpose(1, 2) @ jacobian.flatten(1, 2)) + damping
-        gradient = weighted.flatten(1, 2).transpose(1, 2) @ residual.flatten(1, 2)[..., None]
-        T = T @ exp(-torch.linalg.solve(information, gradient)[..., 0])
-    return T, information
-
-
-def exp(xi: Tensor) -> Tensor:
-    """SE(3) exponential of (B, 6) [rotation, translation]."""
-    w, v = xi[:, :3], xi[:, 3:]
-    zero = torch.zeros_like(w[:, 0])
-    x, y, z = w.unbind(-1)
-    generator = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
-    out = xi.new_zeros(len(xi), 4, 4)
-    out[:, :3, :3], out[:, :3, 3] = generator, v
-    return torch.linalg.matrix_exp(out)
-
-
 class Solved(NamedTuple):
     """Poses of a batch.
 
@@ -170,24 +118,75 @@ class Solved(NamedTuple):
     confidence: Tensor
 
 
+class Matched(NamedTuple):
+    """A batch of set pairs that the decoder has correlated, with the scores (B, N, M) of their matches, and the pairs
+    of these that are chosen without knowing a pose."""
+
+    source: Tokens
+    target: Tokens
+    correlated: Correlated
+    scores: Tensor
+    unguided: Correspondences
+
+
 def solve_batch(
     decoder: Decoder, source: Tokens, target: Tokens, correlated: Correlated, solver: Solver = "consensus"
 ) -> Solved | None:
     """Match and solve; None where there is nothing to match."""
     scores = match_scores(decoder, correlated)
-    unguided = pairs = correspond(decoder, source, target, correlated, scores)
-    if pairs.weight.shape[1] == 0:
+    unguided = correspond(decoder, source, target, correlated, scores)
+    if unguided.weight.shape[1] == 0:
         return None
     if solver == "confident":
-        T, information, inliers = _solve_svd(pairs, most_confident(pairs))
-        return Solved(T, information, pairs, inliers, _confidence(pairs, T))
-    T = first_pose(pairs)
+        T, information, inliers = _solve_svd(unguided, most_confident(unguided))
+        return Solved(T, information, unguided, inliers, _confidence(unguided, T))
+    matched = Matched(source, target, correlated, scores, unguided)
+    return _reconsidered(decoder, matched, _solved_from(decoder, matched, first_pose(unguided)))
+
+
+def _solved_from(decoder: Decoder, matched: Matched, T: Tensor) -> Solved:
+    """From rough poses (B, 4, 4): solved, matched again to what lies near under the pose at hand, solved again."""
+    source, target, correlated, scores, pairs = matched
     solve = _solve_precise if decoder.settings.precision else _solve_svd_near
     T, information, inliers = solve(pairs, T)
     for _ in range(decoder.settings.guided):
         pairs = correspond(decoder, source, target, correlated, guided_scores(scores, T, source, target))
         T, information, inliers = solve(pairs, T)
-    return Solved(T, information, pairs, inliers, _confidence(unguided, T))
+    return Solved(T, information, pairs, inliers, _confidence(matched.unguided, T))
+
+
+def _reconsidered(decoder: Decoder, matched: Matched, solved: Solved) -> Solved:
+    """The same, but where few pairs fit, as on both sides of a corner, and clearly more of them at another pose."""
+    fit = solved.inliers.sum(1)
+    rows = (fit < FEW * _size(decoder, matched.source, matched.target)).nonzero()[:, 0]
+    if len(rows) == 0:
+        return solved
+    matched = _rows(matched, rows)
+    half = matched.unguided.source.shape[1] // 2
+    source, target, weight = (field[:, :half] for field in matched.unguided[:3])
+    starts = alternatives(source, target, weight, solved.T[rows], TRIED)
+    own = torch.arange(len(rows), device=rows.device)
+    others = _solved_from(decoder, _rows(matched, own.repeat_interleave(TRIED)), starts.flatten(0, 1))
+    most, best = others.inliers.sum(1).view(-1, TRIED).max(1)
+    clear = most > CLEARLY * fit[rows]
+    return _with_rows(solved, rows[clear], _rows(others, (own * TRIED + best)[clear]))
+
+
+def _size(decoder: Decoder, source: Tokens, target: Tokens) -> Tensor:
+    """Of how many pairs (B,) `inliers` are a part, in both directions, without what padding adds."""
+    return (source.mask.sum(1) + target.mask.sum(1)) * decoder.settings.pair_ratio
+
+
+def _rows(batch: Any, index: Tensor) -> Any:
+    """Some members of a batch: tensors in named tuples, nested at will."""
+    return batch[index] if isinstance(batch, Tensor) else type(batch)(*(_rows(field, index) for field in batch))
+
+
+def _with_rows(batch: Any, index: Tensor, others: Any) -> Any:
+    """The batch with others in the place of its members `index`."""
+    if isinstance(batch, Tensor):
+        return batch.index_copy(0, index, others)
+    return type(batch)(*(_with_rows(*fields) for fields in zip(batch, [index] * len(batch), others, strict=True)))
 
 
 def overlap_features(solved: Solved) -> Tensor:
@@ -215,11 +214,12 @@ def register_batch(
     T, inliers = solved.T, solved.inliers
     error = (transform(T, solved.pairs.source.double()) - solved.pairs.target).norm(dim=-1)
     count = inliers.sum(1)
+    objections = map(_objection, count.tolist(), _size(decoder, source, target).tolist())
     rmse = ((error**2 * inliers).sum(1) / count.clamp(min=1)).sqrt()
     covariance = decoder.settings.covariance_scale * torch.linalg.inv(solved.information)
     overlap = overlap_probability(decoder, source, target, correlated, solved)
-    figures = (field.tolist() for field in (solved.confidence, rmse, count, overlap))
-    return [_registration(*row) for row in zip(T.cpu(), covariance.cpu(), *figures, strict=True)]
+    figures = (field.tolist() for field in (solved.confidence, rmse, overlap))
+    return [_registration(*row) for row in zip(T.cpu(), covariance.cpu(), *figures, objections, strict=True)]
 
 
 def _solve_precise(pairs: Correspondences, T: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -268,16 +268,21 @@ def _confidence(unguided: Correspondences, T: Tensor) -> Tensor:
     return weight.topk(min(CONFIDENT, weight.shape[1]))[0].mean(1)
 
 
+def _objection(count: int, size: float) -> str:
+    """Why a motion that brings so many of the pairs together is no result; empty where it is one."""
+    if count < 3:
+        return f"{count} matching descriptors, want 3"
+    return "" if count >= LEAST * size else f"only {count / size:.0%} of the matched descriptors fit one motion"
+
+
 def _registration(
-    T: Tensor, covariance: Tensor, confidence: float, rmse: float, count: int, overlap: float
+    T: Tensor, covariance: Tensor, confidence: float, rmse: float, overlap: float, objection: str
 ) -> Registration:
     if not bool(T.isfinite().all() and covariance.isfinite().all()):
         return _nothing("no finite pose")
-    if count < 3:
-        return _nothing(f"{count} matching descriptors, want 3")
     # Rigid to float64: the solver composes many steps, and an exponential of a large one leaves 1 + 2e-15 behind.
     rigid = se3.orthonormalized(T.double().numpy())
-    result = Registration(rigid, covariance.numpy(), confidence, rmse, "neural", overlap=overlap)
+    result = Registration(rigid, covariance.numpy(), confidence, rmse, "neural", not objection, objection, overlap)
     return with_calibration(result, rigid)
 
 

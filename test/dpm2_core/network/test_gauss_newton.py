@@ -8,9 +8,8 @@ import torch
 
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.kabsch import transform
-from dpm2_core.network.gauss_newton import solve_pose
+from dpm2_core.network.gauss_newton import ROUNDS, SOFT, solve_pose, weighted_gauss_newton, whitened_residuals
 from dpm2_core.network.matching import Correspondences
-from dpm2_core.network.pose_solver import ROUNDS, SOFT, weighted_gauss_newton, whitened_residuals
 
 PAIRS = 120
 

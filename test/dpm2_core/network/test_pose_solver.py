@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 import torch
@@ -10,6 +12,8 @@ import torch
 from dpm2_core.descriptors import Descriptors, merge
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.kabsch import transform
+from dpm2_core.network.consensus import alternatives, consensus
+from dpm2_core.network.gauss_newton import weighted_gauss_newton, whitened_residuals
 from dpm2_core.network.heads import OffsetHead, into_set_frame
 from dpm2_core.network.matching import Correspondences, best_pairs, guided_scores, softmax_both
 from dpm2_core.network.model import DeepPointMap2
@@ -19,8 +23,6 @@ from dpm2_core.network.pose_solver import (
     most_confident,
     robust_kabsch,
     supporting,
-    weighted_gauss_newton,
-    whitened_residuals,
 )
 from dpm2_core.network.tokens import Tokens, to_tokens
 
@@ -91,6 +93,30 @@ def test_consensus_survives_a_majority_of_wrong_matches(noise: np.random.Generat
         error = se3.log(se3.inverse(truth) @ estimate)
         assert np.linalg.norm(error[3:]) < 0.3  # 0.1 m of noise a point, some thirty right matches
         assert np.linalg.norm(error[:3]) < 0.03
+
+
+def test_alternatives_are_other_poses_with_the_most_matches_first(noise: np.random.Generator) -> None:
+    """Of two motions that agree, the one of the fewer and more confident matches is the consensus, the other one the
+    first alternative; none is given twice, and where no other motion is agreed on for long, the known one fills up."""
+    pairs, T = perfect(noise, pairs=100)
+    other = torch.from_numpy(se3.exp([0, 0, 2.5, 12, -7, 0.4]))
+    source, target, weight = pairs.source[:, :100].clone(), pairs.target[:, :100].clone(), torch.full((2, 100), 0.1)
+    target[:, :30], weight[:, :30] = transform(other.expand(2, 4, 4), source[:, :30]), 0.9
+    known = consensus(source, target, weight)
+    torch.testing.assert_close(known, other.expand(2, 4, 4), atol=1e-3, rtol=0)
+    found = alternatives(source, target, weight, known, 4)
+    torch.testing.assert_close(found[:, 0], T, atol=1e-3, rtol=0)
+    few = alternatives(source[:, :30], target[:, :30], weight[:, :30], known, 3)
+    torch.testing.assert_close(few, known[:, None].expand(2, 3, 4, 4), atol=0, rtol=0)
+    for poses in torch.cat([known[:, None], found], 1).numpy():
+        apart = [se3.magnitude(se3.inverse(a) @ b) for i, a in enumerate(poses) for b in poses[:i]]
+        assert all(m > 2 or deg > 10 or m + deg == 0 for m, deg in apart)
+
+
+def test_alternatives_of_matches_without_weight_are_the_known_pose(noise: np.random.Generator) -> None:
+    pairs, T = perfect(noise, pairs=5)
+    found = alternatives(pairs.source, pairs.target, torch.zeros_like(pairs.weight), T, 2)
+    torch.testing.assert_close(found, T[:, None].expand(2, 2, 4, 4), atol=0, rtol=0)
 
 
 def test_guidance_leaves_what_the_pose_brings_together() -> None:
@@ -268,6 +294,20 @@ def test_descriptors_of_one_place_agree_on_a_motion_and_others_do_not(
     assert other < 0.3
     assert model.agreement(one, [one]) == [0]
     assert model.agreement(here, []) == []
+
+
+def test_other_places_are_no_registration_and_the_same_place_is_one(
+    model: DeepPointMap2, noise: np.random.Generator
+) -> None:
+    """By how many of the matched descriptors fit one motion; the pose that fits best is given in any case."""
+    here = described(model, noise, 60)
+    T = se3.exp([0, 0, 2.0, 9, -4, 0.2])
+    same, other = model.register_many([here, here], [here.moved(T), described(model, noise, 60)])
+    assert same.ok
+    np.testing.assert_allclose(same.T_target_source, T, atol=0.05)  # bf16
+    assert not other.ok
+    assert re.fullmatch(r"only \d+% of the matched descriptors fit one motion", other.reason)
+    assert np.isfinite(other.T_target_source).all()
 
 
 def test_too_few_descriptors_are_no_registration(model: DeepPointMap2, noise: np.random.Generator) -> None:

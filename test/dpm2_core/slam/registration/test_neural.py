@@ -187,13 +187,17 @@ def test_bad_frames_are_rejected_in_words_and_survived(weights: Path, noise: np.
 
 
 def test_unsure_matches_are_no_answer(weights: Path, noise: np.random.Generator) -> None:
+    """Nor those of another place, of which few fit one motion, however sure each of them is."""
     s = SlamSettings(registration="neural", neural=NeuralSettings(weights=str(weights), min_confidence=1))
     registration = make_registration(s)
-    first, other = (registration.prepare(Frame(0, cloud(boxes(noise))), np.zeros(6)) for _ in range(2))
+    here, elsewhere = (cloud(boxes(noise)) for _ in range(2))
+    again = here + noise.normal(0, 0.02, here.shape).astype(np.float32)
+    first, second, other = (registration.prepare(Frame(0, points), np.zeros(6)) for points in (here, again, elsewhere))
     registration.update(first, np.eye(4))
-    result = registration.register(other, Prediction([np.eye(4)]))
-    assert not result.ok
-    assert "confidence of only" in result.reason
+    for scan, reason in ((second, "confidence of only"), (other, "of the matched descriptors fit one motion")):
+        result = registration.register(scan, Prediction([np.eye(4)]))
+        assert not result.ok
+        assert reason in result.reason
 
 
 def test_images_are_asked_for_and_used_where_the_network_has_a_camera(noise: np.random.Generator) -> None:
