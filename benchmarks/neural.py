@@ -103,7 +103,8 @@ def _of_drives(one: Callable[[Array, list[Frame], DeepPointMap2, Options], Any])
 
 
 def real_pairs(poses: Array, frames: list[Frame], network: DeepPointMap2, options: Options) -> dict[str, Any]:
-    """Near pairs by the network, and refined by the points; those 10-20 m apart by every method; none with a prior."""
+    """Near pairs by the network, and refined by the points; those 10-20 m apart by every method; none with a prior.
+    The network's errors are also stated against poses that the points have fitted."""
     methods: dict[str, PairMethod] = {
         name: by_registration(make_registration(settings_of(options, f"slam.registration={name}")))
         for name in ("neural", "refined", "geometric")
@@ -114,7 +115,8 @@ def real_pairs(poses: Array, frames: list[Frame], network: DeepPointMap2, option
     if (config := kiss_config(options)) is not None:
         methods[BASELINE] = kiss_from_identity(config)
     kinds = {"consecutive": near, "8 apart": near, "10-20 m": methods}
-    return all_pairs(kinds, frames, poses, options.pairs)
+    points = make_registration(settings_of(options, "slam.registration=geometric"))
+    return all_pairs(kinds, frames, poses, options.pairs, points)
 
 
 def odometry(poses: Array, frames: list[Frame], network: DeepPointMap2, options: Options) -> dict[str, Any]:
