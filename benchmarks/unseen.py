@@ -12,7 +12,7 @@ import numpy as np
 
 from benchmarks.geometric import BASELINE, kiss_config
 from benchmarks.harness import Options, settings_of
-from benchmarks.pairs import PairMethod, by_registration, kiss_from_identity, summarized
+from benchmarks.pairs import MANY, PairMethod, by_registration, kiss_from_identity, summarized
 from dpm2_core.data.corrupt import hidden_by, random_box
 from dpm2_core.data.packed import PackedDrive, Sample
 from dpm2_core.errors import UsageError
@@ -172,7 +172,7 @@ def overlap(network: DeepPointMap2, options: Options) -> dict[str, Any]:
         raise UsageError("overlap: the head of these weights is untrained; dpm2 train phase2 trains it")
     pairs = _pairs(network, options, "mixed", 1)
     noise = np.random.default_rng(3)
-    groups = max(1, options.pairs // (FRAMES - 1))
+    groups = max(1, MANY * options.pairs // (FRAMES - 1))
     pairs.frames, chosen, distances = {}, [], []
     for g in range(groups):
         d = g % len(pairs.drives)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.harness import Options
-from benchmarks.pairs import summarized
+from benchmarks.pairs import MANY, summarized
 from dpm2_core.data.packed import Sample, write_packed
 from dpm2_core.evaluation.pair_set import PairSet
 from dpm2_core.geometry import se3
@@ -40,7 +40,7 @@ def other_sensors(network: DeepPointMap2, options: Options) -> dict[str, Any]:
     out: dict[str, Any] = {}
     for name, clean in SENSORS.items():
         folder = sensor_drives(name, network, options)
-        rows = PairSet(folder, 2 * options.pairs, network.settings, images=False).errors(network)
+        rows = PairSet(folder, MANY * options.pairs, network.settings, images=False).errors(network)
         near, turned = rows[:, 0] <= FARTHEST, rows[:, 1] > 0
         out[f"{name}, up to {FARTHEST:g} m"] = {"neural": summarized(rows[near & ~turned, 2:4])}
         if clean.pattern == "spinning":
