@@ -51,7 +51,7 @@ def alternatives(source: Tensor, target: Tensor, weight: Tensor, known: Tensor, 
     rows = (map(np.ascontiguousarray, row) for row in zip(*fields, strict=True))
     other = [
         _alternatives(x, y, w, T, most)
-        for (x, y, w), T in zip(rows, known.double().cpu().contiguous().numpy(), strict=True)
+        for (x, y, w), T in zip(rows, known.detach().double().cpu().contiguous().numpy(), strict=True)
     ]
     return torch.from_numpy(np.stack(other)).to(source.device)
 

@@ -141,7 +141,8 @@ def solve_batch(
         T, information, inliers = _solve_svd(unguided, most_confident(unguided))
         return Solved(T, information, unguided, inliers, _confidence(unguided, T))
     matched = Matched(source, target, correlated, scores, unguided)
-    return _reconsidered(decoder, matched, _solved_from(decoder, matched, first_pose(unguided)))
+    solved = _solved_from(decoder, matched, first_pose(unguided))
+    return _reconsidered(decoder, matched, solved) if decoder.settings.precision else solved
 
 
 def _solved_from(decoder: Decoder, matched: Matched, T: Tensor) -> Solved:
@@ -214,7 +215,9 @@ def register_batch(
     T, inliers = solved.T, solved.inliers
     error = (transform(T, solved.pairs.source.double()) - solved.pairs.target).norm(dim=-1)
     count = inliers.sum(1)
-    objections = map(_objection, count.tolist(), _size(decoder, source, target).tolist())
+    by_precision = decoder.settings.precision and solver == "consensus"  # `LEAST` is of such inliers
+    size = _size(decoder, source, target) * by_precision
+    objections = map(_objection, count.tolist(), size.tolist())
     rmse = ((error**2 * inliers).sum(1) / count.clamp(min=1)).sqrt()
     covariance = decoder.settings.covariance_scale * torch.linalg.inv(solved.information)
     overlap = overlap_probability(decoder, source, target, correlated, solved)
