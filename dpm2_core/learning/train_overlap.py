@@ -19,6 +19,7 @@ from dpm2_core.frame import Array
 from dpm2_core.learning.dataset import GroupDataset, GroupSettings
 from dpm2_core.learning.trainer import OptimizerSettings, Trainer
 from dpm2_core.network.encoder import to_device
+from dpm2_core.network.heads import POSE_FEATURES
 from dpm2_core.network.losses import overlap_loss
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pose_solver import overlap_features, solve_batch
@@ -99,7 +100,8 @@ class OverlapTraining(nn.Module):
             target = Tokens(*(field[number[:, 1:].flatten()] for field in tokens))
             correlated = self.model.decoder(source, target)
             solved = solve_batch(self.model.decoder, source, target, correlated)
-            posed = overlap_features(solved) if solved is not None else source.xyz.new_zeros(len(source.xyz), 2)
+            nothing = source.xyz.new_zeros(len(source.xyz), POSE_FEATURES)
+            posed = nothing if solved is None else overlap_features(solved)
         return self.model.decoder.overlap(*correlated, source.mask, target.mask, posed)
 
 

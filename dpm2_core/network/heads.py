@@ -60,6 +60,9 @@ class OffsetHead(nn.Module):
         return offset, L.unflatten(-1, (3, 3))
 
 
+POSE_FEATURES = 2  # of `pose_solver.overlap_features`
+
+
 class OverlapHead(nn.Module):
     """Probability that two frames are within 20 m: point-wise layers, mean over the valid points, classifier.
 
@@ -71,12 +74,14 @@ class OverlapHead(nn.Module):
         super().__init__()
         self.points = PointMLP(width)
         self.pose = pose
-        self.classify = nn.Sequential(nn.Linear(2 * width + 2 * pose, 2 * width), nn.ReLU(), nn.Linear(2 * width, 1))
+        given = 2 * width + POSE_FEATURES * pose
+        self.classify = nn.Sequential(nn.Linear(given, 2 * width), nn.ReLU(), nn.Linear(2 * width, 1))
 
     def forward(
         self, source: Tensor, target: Tensor, source_mask: Tensor, target_mask: Tensor, overlap_features: Tensor
     ) -> Tensor:
-        """source (B, N, C), target (B, M, C) with masks (B, N), (B, M), `registration.evidence` (B, 2): logits (B,)."""
+        """source (B, N, C), target (B, M, C) with masks (B, N), (B, M), features of the pose
+        (B, POSE_FEATURES), see `pose_solver.overlap_features`: logits (B,)."""
         pooled = []
         for features, mask in ((source, source_mask), (target, target_mask)):
             weight = mask[..., None].to(features.dtype)

@@ -39,11 +39,21 @@ def softmax_both(scores: Tensor, source_mask: Tensor, target_mask: Tensor) -> Te
     return scores.softmax(2) * scores.softmax(1) * valid
 
 
-def best_pairs(probability: Tensor, ratio: float) -> tuple[Tensor, Tensor, Tensor]:
-    """The floor(ratio (N + M)) // 2 most probable pairs of (B, N, M): probability, row and column (B, K)."""
+def pairs_wanted(source_mask: Tensor, target_mask: Tensor, ratio: float) -> Tensor:
+    """Of how many pairs (B,) the pose of sets with masks (B, N) and (B, M) is made: floor(ratio (n + m)) // 2 of their
+    n and m descriptors."""
+    return (ratio * (source_mask.sum(1) + target_mask.sum(1))).long() // 2
+
+
+def best_pairs(
+    probability: Tensor, source_mask: Tensor, target_mask: Tensor, ratio: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The `pairs_wanted` most probable pairs of (B, N, M): probability, row and column (B, K); after those of a set
+    that is smaller than others of the batch, pairs of probability 0."""
     _, n, m = probability.shape
-    k = min(int(ratio * (n + m)) // 2, n * m)
-    value, flat = probability.flatten(1).topk(k)
+    wanted = pairs_wanted(source_mask, target_mask, ratio)
+    value, flat = probability.flatten(1).topk(min(int(ratio * (n + m)) // 2, n * m))
+    value = value * (torch.arange(value.shape[1], device=value.device) < wanted[:, None])
     return value, flat // m, flat % m
 
 
@@ -64,7 +74,7 @@ def correspond(
     """Choose pairs by their scores (B, N, M) and predict, for each, the offsets in both directions."""
     settings = decoder.settings
     probability = softmax_both(scores, source.mask, target.mask)
-    weight, i, j = best_pairs(probability, settings.pair_ratio)
+    weight, i, j = best_pairs(probability, source.mask, target.mask, settings.pair_ratio)
     x, y = take(source.xyz, i), take(target.xyz, j)
     a, b = take(correlated.source, i), take(correlated.target, j)
     axis = torch.cat([take(source.axis, i), take(target.axis, j)])

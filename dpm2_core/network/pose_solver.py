@@ -28,6 +28,7 @@ from dpm2_core.network.matching import (
     correspond,
     guided_scores,
     match_scores,
+    pairs_wanted,
     softmax_both,
     take,
 )
@@ -57,7 +58,7 @@ def agreement(source: Tokens, target: Tokens, temperature: float, ratio: float) 
     best pairs that one pose brings together. Of two views of a place it is large, of two places small, and it takes a
     tenth of the time of a registration."""
     scores = cosine(source.features, target.features) / temperature
-    weight, i, j = best_pairs(softmax_both(scores, source.mask, target.mask), ratio)
+    weight, i, j = best_pairs(softmax_both(scores, source.mask, target.mask), source.mask, target.mask, ratio)
     if weight.shape[1] == 0:
         return weight.new_zeros(len(weight))
     at_source, at_target = take(source.xyz, i), take(target.xyz, j)
@@ -108,7 +109,7 @@ class Solved(NamedTuple):
 
     Attributes:
         T: (B, 4, 4) float64. information: (B, 6, 6) of xi in T exp(xi). inliers: (B, 2K) of `pairs`.
-        confidence: (B,) 0..1.
+        confidence: (B,) 0..1. share: (B,) 0..1, of the pairs that are inliers.
     """
 
     T: Tensor
@@ -116,6 +117,7 @@ class Solved(NamedTuple):
     pairs: Correspondences
     inliers: Tensor
     confidence: Tensor
+    share: Tensor
 
 
 class Matched(NamedTuple):
@@ -139,7 +141,8 @@ def solve_batch(
         return None
     if solver == "confident":
         T, information, inliers = _solve_svd(unguided, most_confident(unguided))
-        return Solved(T, information, unguided, inliers, _confidence(unguided, T))
+        share = _share(decoder, source, target, inliers)
+        return Solved(T, information, unguided, inliers, _confidence(unguided, T), share)
     matched = Matched(source, target, correlated, scores, unguided)
     solved = _solved_from(decoder, matched, first_pose(unguided))
     return _reconsidered(decoder, matched, solved) if decoder.settings.precision else solved
@@ -153,13 +156,13 @@ def _solved_from(decoder: Decoder, matched: Matched, T: Tensor) -> Solved:
     for _ in range(decoder.settings.guided):
         pairs = correspond(decoder, source, target, correlated, guided_scores(scores, T, source, target))
         T, information, inliers = solve(pairs, T)
-    return Solved(T, information, pairs, inliers, _confidence(matched.unguided, T))
+    share = _share(decoder, source, target, inliers)
+    return Solved(T, information, pairs, inliers, _confidence(matched.unguided, T), share)
 
 
 def _reconsidered(decoder: Decoder, matched: Matched, solved: Solved) -> Solved:
     """The same, but where few pairs fit, as on both sides of a corner, and clearly more of them at another pose."""
-    fit = solved.inliers.sum(1)
-    rows = (fit < FEW * _size(decoder, matched.source, matched.target)).nonzero()[:, 0]
+    rows = (solved.share < FEW).nonzero()[:, 0]
     if len(rows) == 0:
         return solved
     matched = _rows(matched, rows)
@@ -168,14 +171,14 @@ def _reconsidered(decoder: Decoder, matched: Matched, solved: Solved) -> Solved:
     starts = alternatives(source, target, weight, solved.T[rows], TRIED)
     own = torch.arange(len(rows), device=rows.device)
     others = _solved_from(decoder, _rows(matched, own.repeat_interleave(TRIED)), starts.flatten(0, 1))
-    most, best = others.inliers.sum(1).view(-1, TRIED).max(1)
-    clear = most > CLEARLY * fit[rows]
+    most, best = others.share.view(-1, TRIED).max(1)
+    clear = most > CLEARLY * solved.share[rows]
     return _with_rows(solved, rows[clear], _rows(others, (own * TRIED + best)[clear]))
 
 
-def _size(decoder: Decoder, source: Tokens, target: Tokens) -> Tensor:
-    """Of how many pairs (B,) `inliers` are a part, in both directions, without what padding adds."""
-    return (source.mask.sum(1) + target.mask.sum(1)) * decoder.settings.pair_ratio
+def _share(decoder: Decoder, source: Tokens, target: Tokens, inliers: Tensor) -> Tensor:
+    """Which part (B,) of the pairs, in both directions, inliers (B, 2K) are."""
+    return inliers.sum(1) / (2 * pairs_wanted(source.mask, target.mask, decoder.settings.pair_ratio)).clamp(min=1)
 
 
 def _rows(batch: Any, index: Tensor) -> Any:
@@ -191,9 +194,10 @@ def _with_rows(batch: Any, index: Tensor, others: Any) -> Any:
 
 
 def overlap_features(solved: Solved) -> Tensor:
-    """What the pose of a pair says about its overlap (B, 2): its confidence, and the distance in units of 20 m."""
+    """What the pose of a pair says about its overlap (B, `POSE_FEATURES`): its confidence, and the distance in units of
+    20 m."""
     distance = (solved.T[:, :3, 3].norm(dim=-1) / 20).clamp(max=3).nan_to_num(3.0)
-    return torch.stack([solved.confidence.nan_to_num(0.0), distance.to(solved.confidence.dtype)], -1).float()
+    return torch.stack([solved.confidence.nan_to_num(0.0).to(distance.dtype), distance], -1).float()
 
 
 def overlap_probability(
@@ -216,8 +220,8 @@ def register_batch(
     error = (transform(T, solved.pairs.source.double()) - solved.pairs.target).norm(dim=-1)
     count = inliers.sum(1)
     by_precision = decoder.settings.precision and solver == "consensus"  # `LEAST` is of such inliers
-    size = _size(decoder, source, target) * by_precision
-    objections = map(_objection, count.tolist(), size.tolist())
+    least = LEAST if by_precision else 0.0
+    objections = [_objection(*row, least) for row in zip(count.tolist(), solved.share.tolist(), strict=True)]
     rmse = ((error**2 * inliers).sum(1) / count.clamp(min=1)).sqrt()
     covariance = decoder.settings.covariance_scale * torch.linalg.inv(solved.information)
     overlap = overlap_probability(decoder, source, target, correlated, solved)
@@ -271,11 +275,11 @@ def _confidence(unguided: Correspondences, T: Tensor) -> Tensor:
     return weight.topk(min(CONFIDENT, weight.shape[1]))[0].mean(1)
 
 
-def _objection(count: int, size: float) -> str:
+def _objection(count: int, share: float, least: float) -> str:
     """Why a motion that brings so many of the pairs together is no result; empty where it is one."""
     if count < 3:
         return f"{count} matching descriptors, want 3"
-    return "" if count >= LEAST * size else f"only {count / size:.0%} of the matched descriptors fit one motion"
+    return "" if share >= least else f"only {share:.0%} of the matched descriptors fit one motion"
 
 
 def _registration(

@@ -150,13 +150,11 @@ class Verifier:
                 result = along(result)
             share, structure = self._shares(source, around, result.T_target_source, standing)
         meters, degrees = se3.magnitude(se3.inverse(T_proposed) @ result.T_target_source)
-        overlap_features = VerificationResult(
+        found = VerificationResult(
             replace(result, confidence=min(result.confidence, structure)), structure, points, meters, degrees
         )
-        reason = self._objection(overlap_features, share, widen)
-        return replace(
-            overlap_features, registration=replace(overlap_features.registration, ok=not reason, reason=reason)
-        )
+        reason = self._objection(found, share, widen)
+        return replace(found, registration=replace(found.registration, ok=not reason, reason=reason))
 
     def _shares(self, source: Array, around: LocalMap, T: Array, standing: NDArray[np.bool_]) -> tuple[float, float]:
         """Fractions that lie on a surface of the map: of the points (N, 3), and of those that stand."""

@@ -21,7 +21,9 @@ from dpm2_core.network.pointnext import from_view, to_view
 from dpm2_core.network.pose_solver import (
     first_pose,
     most_confident,
+    overlap_features,
     robust_kabsch,
+    solve_batch,
     supporting,
 )
 from dpm2_core.network.tokens import Tokens, to_tokens
@@ -200,12 +202,19 @@ def test_moving_both_clouds_moves_the_answer(noise: np.random.Generator) -> None
 
 @pytest.mark.parametrize(("n", "m", "k"), [(256, 256, 128), (256, 512, 192), (3, 2, 1), (1, 1, 0)])
 def test_number_of_pairs(n: int, m: int, k: int) -> None:
-    """floor(0.5 (M + N)) // 2 of the most probable, in descending order."""
-    probability = torch.rand(2, n, m)
-    value, row, column = best_pairs(probability, 0.5)
+    """floor(0.5 (M + N)) // 2 of the most probable, in descending order; beside a larger set as many as alone."""
+    probability, masks = torch.rand(2, n, m), (torch.ones(2, n, dtype=torch.bool), torch.ones(2, m, dtype=torch.bool))
+    value, row, column = best_pairs(probability, *masks, 0.5)
     assert value.shape == (2, k)
     assert torch.equal(value, probability[torch.arange(2)[:, None], row, column])
     assert (value.diff() <= 0).all()
+    masks[0][1, n // 2 :] = False
+    probability = probability * masks[0][:, :, None]
+    beside = best_pairs(probability, *masks, 0.5)
+    alone = best_pairs(probability[1:, : n // 2], masks[0][1:, : n // 2], masks[1][1:], 0.5)
+    number = alone[0].shape[1]
+    assert torch.equal(beside[0][1, :number], alone[0][0])
+    assert (beside[0][1, number:] == 0).all()
 
 
 def test_dual_softmax_at_padding_is_zero() -> None:
@@ -262,7 +271,7 @@ def test_registration_of_sets_of_different_sizes(model: DeepPointMap2, noise: np
         assert 0 <= result.confidence <= 1
         assert result.method == "neural"
         alone = model.register(source, target)
-        # padding adds columns to bf16 products, and more pairs are kept in the larger batch
+        # padding adds columns to bf16 products
         assert alone.confidence == pytest.approx(result.confidence, abs=0.05)
 
 
@@ -308,6 +317,26 @@ def test_other_places_are_no_registration_and_the_same_place_is_one(
     assert not other.ok
     assert re.fullmatch(r"only \d+% of the matched descriptors fit one motion", other.reason)
     assert np.isfinite(other.T_target_source).all()
+
+
+def test_how_much_of_a_pair_fits(model: DeepPointMap2, noise: np.random.Generator) -> None:
+    """All of a set and itself 10 m away, less than half of two others; as much in a batch with a larger set."""
+    here, larger = described(model, noise, 60), described(model, noise, 90)
+    away = here.moved(se3.exp([0, 0, 0.4, 10, 0, 0]))
+    sources, targets = [here, here, larger], [away, described(model, noise, 60), larger]
+    with torch.inference_mode():
+        given = []
+        for row in (slice(0, 2), slice(0, 3)):
+            source, target = to_tokens(sources[row], True), to_tokens(targets[row], True)
+            solved = solve_batch(model.decoder, source, target, model.decoder(source, target))
+            assert solved is not None
+            given.append(torch.cat([overlap_features(solved), solved.share[:, None]], -1))
+    confidence, distance, share = given[0].T
+    assert (share[0], share[1]) == (1, pytest.approx(0.2, abs=0.25))
+    assert distance[0] == pytest.approx(0.5, abs=0.01)  # units of 20 m
+    assert confidence[0] > confidence[1]
+    torch.testing.assert_close(given[1][0], given[0][0], atol=0.02, rtol=0)
+    assert given[1][2, 2] == 1
 
 
 def test_too_few_descriptors_are_no_registration(model: DeepPointMap2, noise: np.random.Generator) -> None:
