@@ -70,7 +70,7 @@ measure: setup  ## every record that stands on the weights, again, at a clean co
 	$(BIN)/python -m tools.measure $(ARGS)
 
 # On a machine that does nothing else OpenMP threads may spin while they wait: a fifth faster.
-train-data: setup  ## the synthetic worlds that train-small and ablation learn from (2 cores: 60 minutes, 2.3 GB)
+train-data: setup  ## the synthetic worlds that train-small and ablation learn from (2 cores: 65 minutes, 2.4 GB)
 	$(BIN)/python -m dpm2_core.cli train data out/train/lidar --set worlds=64
 	$(BIN)/python -m dpm2_core.cli train data out/train/camera --config config/worlds_camera.yaml
 	$(BIN)/python -m dpm2_core.cli train data out/train/traffic --set worlds=20 --set first_seed=6000 --set frames=32 --set traffic=20 \
@@ -86,6 +86,8 @@ train-data: setup  ## the synthetic worlds that train-small and ablation learn f
 		--set images=true --set real=0.85 --set 'mixture={city: 0.2, suburb: 0.2, rural: 0.2, highway: 0.2, tunnel: 0.2}'
 	$(BIN)/python -m dpm2_core.cli train data out/train/corners --set worlds=90 --set first_seed=24000 --set frames=30 --set images=true \
 		--set real=0.85 --set 'mixture={city: 0.14, suburb: 0.13, rural: 0.13, highway: 0.3, tunnel: 0.3}'
+	$(BIN)/python -m dpm2_core.cli train data out/train/light --set worlds=60 --set first_seed=25000 --set frames=30 --set images=true \
+		--set real=0.85 --set hours=1.5 --set wet=0.3 --set 'mixture={city: 0.14, suburb: 0.13, rural: 0.13, highway: 0.3, tunnel: 0.3}'
 	$(BIN)/python -m dpm2_core.cli train data out/train/corners_val/open --set worlds=8 --set first_seed=942000 --set frames=24 --set images=true \
 		--set real=1 --set 'mixture={highway: 0.5, tunnel: 0.5}'
 	$(BIN)/python -m dpm2_core.cli train data out/train/corners_val/towns --set worlds=8 --set first_seed=943000 --set frames=24 --set images=true \
@@ -98,7 +100,7 @@ train-data: setup  ## the synthetic worlds that train-small and ablation learn f
 
 TRAIN = OMP_WAIT_POLICY=active $(BIN)/python -m dpm2_core.cli train
 RESUMED = $(if $(wildcard out/$(1)/checkpoint.pt),--resume)
-train-small: train-data  ## train the weights that are shipped: registration, image branch, both, poses, rooms, image corners, overlap (2 cores: 6 hours; continues)
+train-small: train-data  ## train the weights that are shipped: registration, image branch, both, poses, rooms, image corners, light, overlap (2 cores: 7 hours; continues)
 	$(TRAIN) phase1 --config config/train_small.yaml --out out/phase1 $(call RESUMED,phase1)
 	$(TRAIN) image --config config/train_small_image.yaml --out out/image $(call RESUMED,image)
 	$(TRAIN) phase1 --config config/train_small_camera.yaml --out out/camera $(call RESUMED,camera)
@@ -106,6 +108,7 @@ train-small: train-data  ## train the weights that are shipped: registration, im
 	$(TRAIN) phase1 --config config/train_small_real.yaml --out out/real $(call RESUMED,real)
 	$(TRAIN) phase1 --config config/train_small_rooms.yaml --out out/rooms $(call RESUMED,rooms)
 	$(TRAIN) phase1 --config config/train_small_corners.yaml --out out/corners $(call RESUMED,corners)
+	$(TRAIN) phase1 --config config/train_small_light.yaml --out out/light $(call RESUMED,light)
 	$(TRAIN) phase2 --config config/train_small_phase2.yaml --out out/phase2 $(call RESUMED,phase2)
 
 train-ground: setup  ## train the weights of slam.filter.kind=ground (2 cores: 10 minutes, 1.5 GB)

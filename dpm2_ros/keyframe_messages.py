@@ -24,6 +24,8 @@ from dpm2_ros.conversions import EARLIER, bytes_to_array, header
 
 WIRE = QoSProfile(depth=64, reliability=ReliabilityPolicy.RELIABLE)
 """Of keyframes; what falls out of the queue is sent again."""
+MOST_DESCRIPTORS = 256
+"""Of a keyframe on the wire: beside more of them its cloud would have too few points to be verified by."""
 BUDGET = 99_000
 """Bytes of a keyframe's payload and descriptors on the wire; pose and protocol have the rest of 100 kB."""
 
@@ -122,15 +124,17 @@ def _fix_from(data: bytes) -> Fix:
 def descriptors_to_msg(d: Descriptors | None, stamp: int, name: str, weights: str = "") -> PointCloud2:
     """A cloud of points x, y, z, axis_x, axis_y and the bits of 128 half floats `feature:WEIGHTS`; empty for None.
 
+    At most `MOST_DESCRIPTORS`, the first: any number of the first is as evenly spread as all.
     Those of a tilted LiDAR whose base is not known, and those of a room, are not sent: the receiver makes its own of
     the cloud.
     """
     d = None if d is not None and (d.up is not None or d.scale != 1) else d
     channels = 0 if d is None else d.features.shape[1]
     dtype = _row(max(channels, 1))
-    rows = np.zeros(0 if d is None else len(d), dtype)
+    rows = np.zeros(0 if d is None else min(len(d), MOST_DESCRIPTORS), dtype)
     if d is not None:
-        rows["xyz"], rows["axis"], rows["feature"] = d.xyz, d.axes, d.features
+        sent = slice(len(rows))
+        rows["xyz"], rows["axis"], rows["feature"] = d.xyz[sent], d.axes[sent], d.features[sent]
     names = ("x", "y", "z", "axis_x", "axis_y")
     fields = [PointField(name=n, offset=4 * i, datatype=PointField.FLOAT32, count=1) for i, n in enumerate(names)]
     feature = f"{_FEATURE}:{weights}" if weights else _FEATURE

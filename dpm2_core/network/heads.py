@@ -60,14 +60,15 @@ class OffsetHead(nn.Module):
         return offset, L.unflatten(-1, (3, 3))
 
 
-POSE_FEATURES = 2  # of `pose_solver.overlap_features`
+POSE_FEATURES = 3  # of `pose_solver.overlap_features`
 
 
 class OverlapHead(nn.Module):
     """Probability that two frames are within 20 m: point-wise layers, mean over the valid points, classifier.
 
-    `pose`: the classifier also takes how confident the registration of the pair is and how far apart it puts them.
-    Means over the points alone know little of either, and the paper's head, trained alike, hardly got off the ground.
+    `pose`: the classifier also takes how much of the pair fits its registration, how confident that is and how far
+    apart it puts them. Means over the points alone know little of all this, and the paper's head, trained alike, hardly
+    got off the ground.
     """
 
     def __init__(self, width: int, pose: bool) -> None:

@@ -194,10 +194,10 @@ def _with_rows(batch: Any, index: Tensor, others: Any) -> Any:
 
 
 def overlap_features(solved: Solved) -> Tensor:
-    """What the pose of a pair says about its overlap (B, `POSE_FEATURES`): its confidence, and the distance in units of
-    20 m."""
+    """What the pose of a pair says about its overlap (B, `POSE_FEATURES`): its confidence, the distance in units of
+    20 m, and the share of the pairs that fit, which tells places apart that look alike."""
     distance = (solved.T[:, :3, 3].norm(dim=-1) / 20).clamp(max=3).nan_to_num(3.0)
-    return torch.stack([solved.confidence.nan_to_num(0.0).to(distance.dtype), distance], -1).float()
+    return torch.stack([solved.confidence.nan_to_num(0.0).to(distance.dtype), distance, solved.share], -1).float()
 
 
 def overlap_probability(

@@ -4,15 +4,23 @@
 from __future__ import annotations
 
 from array import array
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from dpm2_core.data.thumbnail import thumbnail
+from dpm2_core.descriptors import Descriptors
 from dpm2_core.frame import Fix, Keyframe
 from dpm2_core.slam.mapping.admission import RejectedError
 from dpm2_core.slam.store.cloud_codec import unpack_cloud
-from dpm2_ros.keyframe_messages import BUDGET, payload_from_msg, payload_to_msgs
+from dpm2_ros.keyframe_messages import (
+    BUDGET,
+    MOST_DESCRIPTORS,
+    descriptors_from_msg,
+    payload_from_msg,
+    payload_to_msgs,
+)
 
 from ..helpers.scenes import make_image
 
@@ -47,6 +55,22 @@ def test_a_picture_that_would_cost_the_cloud_its_points_stays_at_home(noise: np.
     payload = payload_from_msg(payload_to_msgs(keyframe(noise, FIX, picture), "a/3")[1])
     assert payload.thumbnail is None
     assert payload.fix is not None
+
+
+def test_the_first_256_descriptors_travel(noise: np.random.Generator) -> None:
+    """Any number of the first is as evenly spread as all; fewer travel as they are."""
+    for count in (320, 200):
+        made = Descriptors(noise.normal(0, 15, (count, 3)).astype("f4"), noise.normal(0, 1, (count, 128)).astype("f2"))
+        sent = replace(keyframe(noise, FIX, None, 100_000), descriptors=made)
+        message, payload = payload_to_msgs(sent, "a/3", "0123456789abcdef")
+        got, weights = descriptors_from_msg(message)
+        assert weights == "0123456789abcdef"
+        assert got is not None
+        most = min(count, MOST_DESCRIPTORS)
+        np.testing.assert_array_equal(got.xyz, made.xyz[:most])
+        np.testing.assert_array_equal(got.axes, made.axes[:most])
+        np.testing.assert_array_equal(got.features, made.features[:most])
+        assert len(message.data) + len(payload.data) <= BUDGET
 
 
 def test_parts_that_do_not_add_up_are_rejected(noise: np.random.Generator) -> None:

@@ -319,7 +319,7 @@ def test_other_places_are_no_registration_and_the_same_place_is_one(
     assert np.isfinite(other.T_target_source).all()
 
 
-def test_how_much_of_a_pair_fits(model: DeepPointMap2, noise: np.random.Generator) -> None:
+def test_the_overlap_head_is_told_how_much_of_a_pair_fits(model: DeepPointMap2, noise: np.random.Generator) -> None:
     """All of a set and itself 10 m away, less than half of two others; as much in a batch with a larger set."""
     here, larger = described(model, noise, 60), described(model, noise, 90)
     away = here.moved(se3.exp([0, 0, 0.4, 10, 0, 0]))
@@ -330,7 +330,7 @@ def test_how_much_of_a_pair_fits(model: DeepPointMap2, noise: np.random.Generato
             source, target = to_tokens(sources[row], True), to_tokens(targets[row], True)
             solved = solve_batch(model.decoder, source, target, model.decoder(source, target))
             assert solved is not None
-            given.append(torch.cat([overlap_features(solved), solved.share[:, None]], -1))
+            given.append(overlap_features(solved))
     confidence, distance, share = given[0].T
     assert (share[0], share[1]) == (1, pytest.approx(0.2, abs=0.25))
     assert distance[0] == pytest.approx(0.5, abs=0.01)  # units of 20 m
