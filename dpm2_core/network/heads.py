@@ -61,21 +61,22 @@ class OffsetHead(nn.Module):
 
 
 POSE_FEATURES = 3  # of `pose_solver.overlap_features`
+_MIDDLE, _SPREAD = (0.3, 1.0, 0.5), (0.15, 0.5, 0.15)  # of these, about where near and far pairs part
 
 
 class OverlapHead(nn.Module):
-    """Probability that two frames are within 20 m: point-wise layers, mean over the valid points, classifier.
+    """Probability that two frames are within 20 m.
 
-    `pose`: the classifier also takes how much of the pair fits its registration, how confident that is and how far
-    apart it puts them. Means over the points alone know little of all this, and the paper's head, trained alike, hardly
-    got off the ground.
+    `pose`: by what their registration says: how confident it is, how far apart it puts them, and how much of the pair
+    fits. False: by the descriptors, as in the paper: point-wise layers, mean over the valid points, classifier. That
+    head, trained alike, hardly got off the ground; one on both was worse than the pose alone in worlds with another
+    sensor, with an average precision of 0.96 instead of 0.99.
     """
 
     def __init__(self, width: int, pose: bool) -> None:
         super().__init__()
-        self.points = PointMLP(width)
-        self.pose = pose
-        given = 2 * width + POSE_FEATURES * pose
+        self.points = None if pose else PointMLP(width)
+        given = POSE_FEATURES if pose else 2 * width
         self.classify = nn.Sequential(nn.Linear(given, 2 * width), nn.ReLU(), nn.Linear(2 * width, 1))
 
     def forward(
@@ -83,12 +84,13 @@ class OverlapHead(nn.Module):
     ) -> Tensor:
         """source (B, N, C), target (B, M, C) with masks (B, N), (B, M), features of the pose
         (B, POSE_FEATURES), see `pose_solver.overlap_features`: logits (B,)."""
+        if self.points is None:
+            middle, spread = (overlap_features.new_tensor(values) for values in (_MIDDLE, _SPREAD))
+            return self.classify((overlap_features - middle) / spread)[..., 0].float()
         pooled = []
         for features, mask in ((source, source_mask), (target, target_mask)):
             weight = mask[..., None].to(features.dtype)
             pooled.append((self.points(features) * weight).sum(1) / weight.sum(1).clamp(min=1))
-        if self.pose:
-            pooled.append(overlap_features.to(pooled[0].dtype))
         return self.classify(torch.cat(pooled, -1))[..., 0].float()
 
 

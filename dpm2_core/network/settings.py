@@ -147,8 +147,8 @@ class DecoderSettings(Settings):
     guided: int = Field(2, ge=0, le=64)
     """Times that descriptors are matched anew with the pose at hand. 0: the paper's single matching."""
     overlap_pose: bool = True
-    """Give the overlap head how much of a pair fits its registration, how certain that is and how far apart it puts
-    them. False: the paper's."""
+    """The overlap head asks how much of a pair fits its registration, how certain that is and how far apart it puts
+    them. False: the paper's, which asks the descriptors."""
     covariance_scale: float = Field(4.0, gt=0)
     """Factor on the covariance of the pose: both directions of a pair and neighboring pairs err alike."""
 
