@@ -153,6 +153,6 @@ def test_the_notebook(recording: Path, tmp_path: Path, monkeypatch: pytest.Monke
     nbclient.NotebookClient(notebook, timeout=200, resources={"metadata": {"path": str(tmp_path)}}).execute()
     printed = "".join(output.get("text", "") for cell in notebook.cells for output in cell.get("outputs", ()))
     assert "tracking confidence" in printed
-    assert "(256, 3) (256, 128)" in printed
+    assert "(320, 3) (320, 128)" in printed
     assert (tmp_path / "trajectory.png").read_bytes().startswith(b"\x89PNG")
     assert any("image/png" in output.get("data", {}) for output in notebook.cells[-1].outputs)
