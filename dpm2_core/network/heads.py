@@ -69,8 +69,8 @@ class OverlapHead(nn.Module):
 
     `pose`: by what their registration says: how confident it is, how far apart it puts them, and how much of the pair
     fits. False: by the descriptors, as in the paper: point-wise layers, mean over the valid points, classifier. That
-    head, trained alike, hardly got off the ground; one on both was worse than the pose alone in worlds with another
-    sensor, with an average precision of 0.96 instead of 0.99.
+    head, trained alike, hardly got off the ground. One that asked both had an average precision of 0.961 where the
+    sensor was without errors, unlike in training; the registration alone has 0.996 there.
     """
 
     def __init__(self, width: int, pose: bool) -> None:
@@ -82,8 +82,8 @@ class OverlapHead(nn.Module):
     def forward(
         self, source: Tensor, target: Tensor, source_mask: Tensor, target_mask: Tensor, overlap_features: Tensor
     ) -> Tensor:
-        """source (B, N, C), target (B, M, C) with masks (B, N), (B, M), features of the pose
-        (B, POSE_FEATURES), see `pose_solver.overlap_features`: logits (B,)."""
+        """Logits (B,) of source (B, N, C) and target (B, M, C) with masks (B, N) and (B, M), and
+        `pose_solver.overlap_features` (B, POSE_FEATURES); each mode reads what it asks alone."""
         if self.points is None:
             middle, spread = (overlap_features.new_tensor(values) for values in (_MIDDLE, _SPREAD))
             return self.classify((overlap_features - middle) / spread)[..., 0].float()

@@ -47,7 +47,7 @@ def test_parameters_are_those_of_deep_point_map() -> None:
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_presets_give_descriptors_of_128_channels(name: str, noise: np.random.Generator) -> None:
-    """256 of them or, where image corners come on top, 320: 69 or 86 kB per frame."""
+    """320 in `small`, 256 in the others: 86 or 69 kB per frame."""
     torch.manual_seed(0)
     out = Encoder(preset(name)).eval().encode(frame(boxes(noise, 6000)))
     count = 320 if name == "small" else 256
