@@ -46,6 +46,7 @@ class NeuralSettings(Settings):
     refined: int = Field(0, ge=0, le=64)
     """Register a frame that enters the map once more, to so many frames merged, and take the more certain pose: the
     paper's refinement from scan to map. 0: not."""
+    # Of 39 validation pairs with a confidence of 0.08 to 0.1 three are right, of 123 from there to 0.15 a quarter
     min_confidence: float = Field(0.1, ge=0, le=1)
     """Mean probability of the best matches below which there is no result."""
     max_sigma: float = Field(0.6, gt=0)

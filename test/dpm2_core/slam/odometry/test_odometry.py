@@ -222,8 +222,8 @@ def test_a_drive_may_begin_in_a_column() -> None:
     assert np.mean([scan.moving.mean() for scan in scans]) > 0.45
     tracked = run([Frame(i * 10**8, scan.points) for i, scan in enumerate(scans)])
     assert all(t.registration.ok for t in tracked)
-    # The column moves by 1.6 m per frame against the road, what little of that stands holds the car: to a tenth of
-    # such a step between, to a few centimeters at the end
+    # The column moves by 1.6 m per frame against the road. What little of that stands holds the car to less than a
+    # tenth of such a step in every scan, and to a few centimeters at the end
     off = errors(tracked, se3.inverse(truth[0]) @ truth)[:, 0]
     assert off.max() < 0.15
     assert off[-1] < 0.05
