@@ -100,7 +100,7 @@ train-data: setup  ## the synthetic worlds that train-small and ablation learn f
 
 TRAIN = OMP_WAIT_POLICY=active $(BIN)/python -m dpm2_core.cli train
 RESUMED = $(if $(wildcard out/$(1)/checkpoint.pt),--resume)
-train-small: train-data  ## train the weights that are shipped: registration, image branch, both, poses, rooms, image corners, light, overlap (2 cores: 7 hours; continues)
+train-small: train-data  ## train the weights that are shipped: registration, image branch, both, poses, rooms, image corners, light, heights, overlap (2 cores: 8 hours; continues)
 	$(TRAIN) phase1 --config config/train_small.yaml --out out/phase1 $(call RESUMED,phase1)
 	$(TRAIN) image --config config/train_small_image.yaml --out out/image $(call RESUMED,image)
 	$(TRAIN) phase1 --config config/train_small_camera.yaml --out out/camera $(call RESUMED,camera)
@@ -109,6 +109,7 @@ train-small: train-data  ## train the weights that are shipped: registration, im
 	$(TRAIN) phase1 --config config/train_small_rooms.yaml --out out/rooms $(call RESUMED,rooms)
 	$(TRAIN) phase1 --config config/train_small_corners.yaml --out out/corners $(call RESUMED,corners)
 	$(TRAIN) phase1 --config config/train_small_light.yaml --out out/light $(call RESUMED,light)
+	$(TRAIN) phase1 --config config/train_small_heights.yaml --out out/heights $(call RESUMED,heights)
 	$(TRAIN) phase2 --config config/train_small_phase2.yaml --out out/phase2 $(call RESUMED,phase2)
 
 train-ground: setup  ## train the weights of slam.filter.kind=ground (2 cores: 10 minutes, 1.5 GB)

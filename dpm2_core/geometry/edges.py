@@ -11,7 +11,8 @@ from dpm2_core.geometry.point_grid import PointGrid
 from dpm2_core.geometry.sampling import Index, Points, neighbours
 from dpm2_core.geometry.voxel import voxel_first
 
-SPACING = 1.5  # m between two edges
+SPACING = 0.9  # m between two edges: those of one pole are HEIGHT apart
+HEIGHT = 1.0  # m, and an edge lies at a multiple of it: at heights of their own two scans' places on a pole do not meet
 _NEIGHBOURS, _RADIUS = 16, 1.5  # m
 _LENGTH = 1.0  # m that the neighborhood of an edge spans vertically, at least
 _GAP = 0.5  # m between heights seen of an edge, at most: between sparser beams it is a guess where an edge is
@@ -23,8 +24,9 @@ _KEPT = 16  # best candidates for each edge wanted: more than are within the spa
 def vertical_edges(cloud: Points, grid: PointGrid, most: int) -> Points:
     """Up to `most` (k, 3) places on vertical edges and poles, the clearest first, `SPACING` m apart.
 
-    A place is the mean of 16 neighbors whose extent is linear and vertical. Sparse beams, and places without vertical
-    structure, give fewer or none: each must have been seen at heights no farther apart than 0.5 m, over 1 m.
+    A place is the mean of 16 neighbors whose extent is linear and vertical, moved along it to the nearest multiple of
+    `HEIGHT` above the origin. Sparse beams, and places without vertical structure, give fewer or none: each must have
+    been seen at heights no farther apart than 0.5 m, over 1 m.
 
     Args:
         cloud: (N, 3) m, of one point a voxel of about 0.3 m. grid: of the cloud.
@@ -38,11 +40,22 @@ def vertical_edges(cloud: Points, grid: PointGrid, most: int) -> Points:
     known = (height[:, -1] - height[:, 0] >= _LENGTH) & (np.diff(height, axis=1).max(1) <= _GAP)
     around = cloud[index[known]] - candidates[known, None]
     mean = around.mean(1)
-    score = verticality(around - mean[:, None])
+    around -= mean[:, None]
+    score = verticality(around)
     order = np.argsort(-score, kind="stable")[: _KEPT * most]
     order = order[score[order] >= _SCORE]
-    at = (candidates[known] + mean)[order]
+    at = _at_multiples_of_height((candidates[known] + mean)[order], around[order])
     return at[spaced(at, SPACING, most)]
+
+
+def _at_multiples_of_height(mean: Points, centered: NDArray[np.floating]) -> Points:
+    """The (N, 3) means of (N, k, 3) neighborhoods, moved to a multiple of `HEIGHT` along the line that the heights fit.
+
+    Half of a height at most, which is what a neighborhood of `_LENGTH` spans to each side."""
+    height = centered[..., 2:]
+    per_height = (centered[..., :2] * height).sum(1) / (height * height).sum(1)
+    z = np.round(mean[:, 2:] / HEIGHT) * HEIGHT
+    return np.hstack([mean[:, :2] + per_height * (z - mean[:, 2:]), z]).astype(np.float32)
 
 
 def verticality(centered: NDArray[np.floating]) -> NDArray[np.float64]:
