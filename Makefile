@@ -111,7 +111,7 @@ train-small: train-data  ## train the weights that are shipped: registration, im
 	$(TRAIN) phase1 --config config/train_small_light.yaml --out out/light $(call RESUMED,light)
 	$(TRAIN) phase1 --config config/train_small_heights.yaml --out out/heights $(call RESUMED,heights)
 	$(TRAIN) phase1 --config config/train_small_heights.yaml --out out/settled --set start=out/heights/weights.safetensors \
-		--set network={} --set optimiser.steps=400 --set optimiser.rate=3e-4 $(call RESUMED,settled)
+		--set optimiser.steps=400 --set optimiser.rate=3e-4 $(call RESUMED,settled)
 	$(BIN)/python -m tools.average_weights out/average/weights.safetensors $(foreach stage,light heights settled,out/$(stage)/weights.safetensors)
 	$(TRAIN) phase2 --config config/train_small_phase2.yaml --out out/phase2 $(call RESUMED,phase2)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The mean of several weights: of what all have in the same shape; the rest, and the settings, are the last one's."""
+"""The mean of several weights: of what fits in all; the rest is the last one's, the settings are the preset's."""
 
 from __future__ import annotations
 
@@ -7,36 +7,34 @@ from pathlib import Path
 
 import pytest
 import torch
-from safetensors.torch import save_file
 
 from dpm2_core.errors import UsageError
-from tools.average_weights import average, main
+from dpm2_core.network.model import DeepPointMap2
+from dpm2_core.network.settings import preset
+from dpm2_core.network.weights import load_model, read_metadata, save_weights
+from tools.average_weights import main
 
 
-def written(path: Path, head: int, value: float) -> Path:
-    tensors = {
-        "layer": torch.full((2, 3), value), "head": torch.full((head,), value), "steps": torch.tensor(int(value)),
-    }  # fmt: skip
-    save_file(tensors, path, {"network": f"of {value}"})
-    return path
-
-
-def test_what_all_have_is_averaged_and_the_last_decides_the_rest(tmp_path: Path) -> None:
-    files = [written(tmp_path / f"{i}.safetensors", 4 if i else 5, value) for i, value in enumerate((1.0, 2.0, 6.0))]
-    tensors, about = average(files)
-    torch.testing.assert_close(tensors["layer"], torch.full((2, 3), 3.0))
-    torch.testing.assert_close(tensors["head"], torch.full((4,), 6.0))
-    assert tensors["steps"] == 6
-    assert about == {"network": "of 6.0"}
+def test_the_mean_is_a_network_of_the_preset(tmp_path: Path) -> None:
+    files, networks = [], []
+    for steps, edges in ((10, 0.5), (20, 0.65)):
+        torch.manual_seed(steps)
+        networks.append(DeepPointMap2(preset("small", {"fusion": {"edges": edges}})))
+        files.append(tmp_path / f"{steps}.safetensors")
+        save_weights(networks[-1], files[-1], {"phase": "1", "steps": str(steps)})
     main([str(tmp_path / "new" / "mean.safetensors"), *map(str, files)])
-    again, _ = average([tmp_path / "new" / "mean.safetensors"])
-    assert all(torch.equal(again[name], tensor) for name, tensor in tensors.items())
+    mean = load_model(tmp_path / "new" / "mean.safetensors")
+    assert mean.settings == preset("small")
+    assert read_metadata(tmp_path / "new" / "mean.safetensors")["steps"] == "20"
+    one, other = (network.state_dict() for network in networks)
+    for name, tensor in mean.state_dict().items():
+        torch.testing.assert_close(tensor, (one[name] + other[name]) / 2, rtol=2e-3, atol=1e-3)  # stored in fp16
 
 
 def test_what_cannot_be_averaged_is_named(tmp_path: Path) -> None:
     (tmp_path / "text.safetensors").write_text("no weights")
-    for files in ([tmp_path / "missing.safetensors"], [tmp_path / "text.safetensors"]):
-        with pytest.raises(UsageError, match=files[0].name):
-            average(files)
+    for file in (tmp_path / "missing.safetensors", tmp_path / "text.safetensors"):
+        with pytest.raises(UsageError, match=file.name):
+            main([str(tmp_path / "out"), str(file)])
     with pytest.raises(UsageError, match="want OUT IN"):
         main([str(tmp_path / "out")])
