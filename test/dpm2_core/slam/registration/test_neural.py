@@ -14,7 +14,7 @@ import torch
 
 from dpm2_core.descriptors import Descriptors, LazyDescriptors
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.frame import Frame, State
+from dpm2_core.frame import Frame, Registration, State
 from dpm2_core.geometry import se3
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pretrained import load_network
@@ -198,6 +198,22 @@ def test_unsure_matches_are_no_answer(weights: Path, noise: np.random.Generator)
         result = registration.register(scan, Prediction([np.eye(4)]))
         assert not result.ok
         assert reason in result.reason
+
+
+def test_where_no_motion_is_known_a_match_must_be_twice_as_sure(weights: Path, noise: np.random.Generator) -> None:
+    """Nothing else would contradict a place that looks alike."""
+    here = cloud(boxes(noise))
+
+    def register(least: float, information: np.ndarray | None) -> Registration:
+        settings = NeuralSettings(weights=str(weights), min_confidence=least)
+        registration = make_registration(SlamSettings(registration="neural", neural=settings))
+        scan = registration.prepare(Frame(0, here), np.zeros(6))
+        registration.update(scan, np.eye(4))
+        return registration.register(scan, Prediction([np.eye(4)], information=information))
+
+    least = 0.7 * register(0, None).confidence
+    assert register(least, np.eye(6)).ok
+    assert "confidence of only" in register(least, None).reason
 
 
 def test_images_are_asked_for_and_used_where_the_network_has_a_camera(noise: np.random.Generator) -> None:
