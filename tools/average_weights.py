@@ -16,7 +16,7 @@ import torch
 from dpm2_core.errors import UsageError, exit_code
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.settings import preset
-from dpm2_core.network.weights import load_fitting, read_metadata, save_weights
+from dpm2_core.network.weights import load_fitting, network_settings, read_metadata, save_weights
 
 
 def average(files: Sequence[Path]) -> DeepPointMap2:
@@ -25,7 +25,7 @@ def average(files: Sequence[Path]) -> DeepPointMap2:
     Raises:
         UsageError: one is not readable weights, or none of it fits.
     """
-    model = DeepPointMap2(preset(read_metadata(files[-1])["preset"]))
+    model = DeepPointMap2(preset(network_settings(files[-1]).preset))
     states, partly = [], set[str]()
     for file in files:
         partly.update(load_fitting(model, file))
@@ -44,9 +44,8 @@ def main(arguments: Sequence[str]) -> None:
     if len(arguments) < 2:
         raise UsageError("want OUT IN...")
     out, *files = map(Path, arguments)
-    kept = {key: value for key, value in read_metadata(files[-1]).items() if key not in ("preset", "network")}
     out.parent.mkdir(parents=True, exist_ok=True)
-    save_weights(average(files), out, kept)
+    save_weights(average(files), out, read_metadata(files[-1]))
 
 
 if __name__ == "__main__":

@@ -118,7 +118,7 @@ def finetune(
 
     def save(averaged: nn.Module) -> None:
         assert isinstance(averaged, Finetuned)
-        about = {k: v for k, v in read_metadata(start_from).items() if k not in ("preset", "network")}
+        about = read_metadata(start_from)
         about |= {"finetuned_from": start_from.stem, "finetuned_steps": str(optimizer.steps)}
         save_weights(averaged.model, weights, about)
 

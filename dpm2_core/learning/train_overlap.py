@@ -134,8 +134,7 @@ def train_overlap(settings: OverlapTrainingSettings, out: Path, resume: bool = F
 
     def save(averaged: nn.Module) -> None:
         assert isinstance(averaged, OverlapTraining)
-        kept = {key: value for key, value in about.items() if key not in ("preset", "network")}
-        save_weights(averaged.model, weights, {**kept, "phase": "2"})
+        save_weights(averaged.model, weights, {**about, "phase": "2"})
 
     validate = validator(settings, network) if settings.validation else None
     Trainer(module, batches, optimizer, out, save, validate).run(resume)

@@ -28,7 +28,8 @@ _TIMM = re.compile(r"timm:[\w.]+")  # a network that timm itself builds; other n
 
 
 def save_weights(model: DeepPointMap2, path: Path, about: dict[str, str], half: bool = True) -> None:
-    """Write all parameters with the network's settings; `half` stores fp16, half the size."""
+    """Write all parameters with the network's settings, which replace those in `about`; `half` stores fp16, half the
+    size."""
     metadata = {**about, "preset": model.settings.preset, "network": model.settings.model_dump_json()}
     write_tensors(model.state_dict(), path, metadata, half)
 

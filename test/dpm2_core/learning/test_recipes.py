@@ -27,7 +27,6 @@ READ_BY: dict[str, type[Settings]] = {
     "train_small": RegistrationTrainingSettings,
     "train_small_camera": RegistrationTrainingSettings,
     "train_small_corners": RegistrationTrainingSettings,
-    "train_small_heights": RegistrationTrainingSettings,
     "train_small_image": ImageTrainingSettings,
     "train_small_light": RegistrationTrainingSettings,
     "train_small_phase2": OverlapTrainingSettings,
