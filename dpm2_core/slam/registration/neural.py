@@ -48,15 +48,14 @@ class NeuralSettings(Settings):
     paper's refinement from scan to map. 0: not."""
     # Of 130 validation pairs with a confidence of 0.1 to 0.15 a quarter is right, of those above 0.3 99.6 %
     min_confidence: float = Field(0.1, ge=0, le=1)
-    """Mean probability of the best matches below which there is no result; thrice that where no motion is known."""
+    """Mean probability of the best matches below which there is no result; twice that in a search for a place."""
     max_sigma: float = Field(0.6, gt=0)
     """Largest standard deviation of the position in its worst direction, m."""
 
 
-_UNCONFIRMED = 3.0
-"""Times the least confidence where no motion is known that would contradict a wrong pose. Such poses agree with each
-other: after a gap of 5 s in KITTI 00 three had 0.11 to 0.13, at a place that looks alike 32 m off. Of validation pairs
-with 0.2 to 0.25 43 % are wrong, by 13 m; their covariance, that of the fit, does not say so."""
+_PLACE = 2.0
+"""Times the least confidence in a search for a place, as after a pause: nothing contradicts a wrong pose there, and
+wrong ones agree with each other. After a gap of 5 s in KITTI 00 three had 0.11 to 0.13, at its like 32 m off."""
 
 
 class NeuralScanRegistration:
@@ -107,7 +106,7 @@ class NeuralScanRegistration:
             second = self._registered(scan, result.T_target_source, self._settings.refined)
             if second.ok and second.worst_sigma < result.worst_sigma:
                 result = second
-        least = self._settings.min_confidence * (1 if prediction.information is not None else _UNCONFIRMED)
+        least = self._settings.min_confidence * (_PLACE if prediction.unique else 1)
         if result.confidence < least:
             return replace(result, ok=False, reason=f"matches with a confidence of only {result.confidence:.2f}")
         if (sigma := result.worst_sigma) > self._settings.max_sigma:

@@ -200,21 +200,21 @@ def test_unsure_matches_are_no_answer(weights: Path, noise: np.random.Generator)
         assert reason in result.reason
 
 
-def test_where_no_motion_is_known_a_match_must_be_thrice_as_sure(weights: Path, noise: np.random.Generator) -> None:
+def test_in_a_search_for_a_place_a_match_must_be_twice_as_sure(weights: Path, noise: np.random.Generator) -> None:
     """Nothing else would contradict a place that looks alike."""
     here = cloud(boxes(noise))
 
-    def register(least: float, information: np.ndarray | None) -> Registration:
+    def register(least: float, unique: bool) -> Registration:
         settings = NeuralSettings(weights=str(weights), min_confidence=least)
         registration = make_registration(SlamSettings(registration="neural", neural=settings))
         scan = registration.prepare(Frame(0, here), np.zeros(6))
         registration.update(scan, np.eye(4))
-        return registration.register(scan, Prediction([np.eye(4)], information=information))
+        return registration.register(scan, Prediction([np.eye(4)], unique=unique))
 
-    found = register(0, None).confidence
-    assert register(0.3 * found, None).ok
-    assert register(0.4 * found, np.eye(6)).ok
-    assert "confidence of only" in register(0.4 * found, None).reason
+    found = register(0, True).confidence
+    assert register(0.4 * found, True).ok
+    assert register(0.7 * found, False).ok
+    assert "confidence of only" in register(0.7 * found, True).reason
 
 
 def test_images_are_asked_for_and_used_where_the_network_has_a_camera(noise: np.random.Generator) -> None:
