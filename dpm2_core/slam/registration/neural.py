@@ -55,7 +55,8 @@ class NeuralSettings(Settings):
 
 _PLACE = 2.0
 """Times the least confidence in a search for a place, as after a pause: nothing contradicts a wrong pose there, and
-wrong ones agree with each other. After a gap of 5 s in KITTI 00 three had 0.11 to 0.13, at its like 32 m off."""
+wrong ones agree with each other. After a gap of 5 s in KITTI 00 three had 0.11 to 0.13, 32 m off, where it looks
+alike."""
 
 
 class NeuralScanRegistration:

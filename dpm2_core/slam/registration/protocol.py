@@ -38,7 +38,8 @@ class Prediction:
         widen: factor on how far from them the pose is searched.
         information: (6, 6) [rotation rad, translation m] of the first; None: nothing to go by.
         unique: the starts are a search for a place: a result needs fewer points that fit, since a scan from afar shows
-            much that the map does not have, but no other start may lead to a place that fits nearly as well.
+            much that the map does not have, but no other start may lead to a place that fits nearly as well. The
+            network must be surer of its matches.
         possible: whether the robot can be at a pose (4, 4); asked of what is found without a start.
     """
 
