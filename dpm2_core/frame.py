@@ -188,7 +188,8 @@ class Registration:
     Attributes:
         T_target_source: (4, 4) float64.
         covariance: (6, 6) [rotation rad, translation m] of xi in T = T_target_source @ Exp(xi), if the pose is right.
-        confidence: 0..1, 0 for a guess; each method's own measure. The network's card says how often it is right.
+        confidence: 0..1, 0 for a guess; of the network the probability that the pose is right, of the points the share
+            of them that fit.
         rmse: root mean square residual of the inliers, m.
         method: how it was found.
         ok: False: do not use it; `reason` says why in words.

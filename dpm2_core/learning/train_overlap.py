@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The overlap training: the overlap head alone, on the frozen network of the registration training, half of the pairs
-near, half hard or far."""
+"""The overlap training: the heads that judge a pose alone, on the frozen network of the registration training, half of
+the pairs near, half hard or far. Beside the paper's overlap head that is the confidence of a pose."""
 
 from __future__ import annotations
 
@@ -16,15 +16,17 @@ from torch import Tensor, nn
 
 from dpm2_core.config import Settings
 from dpm2_core.frame import Array
+from dpm2_core.geometry import se3_torch
 from dpm2_core.learning.dataset import GroupDataset, GroupSettings
 from dpm2_core.learning.trainer import OptimizerSettings, Trainer
 from dpm2_core.network.encoder import to_device
 from dpm2_core.network.heads import POSE_FEATURES
-from dpm2_core.network.losses import overlap_loss
+from dpm2_core.network.losses import confidence_loss, overlap_loss
 from dpm2_core.network.model import DeepPointMap2
-from dpm2_core.network.pose_solver import overlap_features, solve_batch
+from dpm2_core.network.pose_solver import solve_batch
 from dpm2_core.network.pyramid import PointBatch
 from dpm2_core.network.settings import NetworkSettings
+from dpm2_core.network.solved import Solved, confidence_of, overlap_features
 from dpm2_core.network.tokens import Tokens
 from dpm2_core.network.views import Views
 from dpm2_core.network.weights import load_weights, network_settings, save_weights
@@ -78,21 +80,30 @@ def draw_overlap(poses: Array, noise: np.random.Generator) -> NDArray[np.intp]:
 
 
 class OverlapTraining(nn.Module):
-    """The frozen network with a trained overlap head, and its loss."""
+    """The frozen network with the heads that are trained, and their loss."""
 
     def __init__(self, network: NetworkSettings) -> None:
         super().__init__()
         self.model = DeepPointMap2(network)
         self.model.requires_grad_(False)
         self.model.decoder.overlap.requires_grad_(True)
+        self.model.decoder.confidence.requires_grad_(network.decoder.precision)  # else it is not asked
 
-    def forward(self, points: PointBatch, views: Views | None, distance: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """Loss of places whose frames are `distance` (G * 4,) m from the first."""
-        loss = overlap_loss(self.logits(points, views), distance, OVERLAP)
-        return loss, {"loss": loss.detach()}
+    def forward(
+        self, points: PointBatch, views: Views | None, distance: Tensor, T_target_source: Tensor
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Loss of places whose frames are `distance` (G * 4,) m from the first, which lies at T_target_source
+        (G * 4, 4, 4) in each of them."""
+        logits, solved = self.logits(points, views)
+        parts = {"overlap": overlap_loss(logits, distance, OVERLAP)}
+        decoder = self.model.decoder
+        if solved is not None and decoder.settings.precision:
+            parts["confidence"] = confidence_loss(confidence_of(decoder, solved), solved.T, T_target_source)
+        loss = torch.stack(list(parts.values())).sum()
+        return loss, {"loss": loss.detach(), **{name: part.detach() for name, part in parts.items()}}
 
-    def logits(self, points: PointBatch, views: Views | None) -> Tensor:
-        """(G * 4,) of each place's first frame with its others."""
+    def logits(self, points: PointBatch, views: Views | None) -> tuple[Tensor, Solved | None]:
+        """Overlap (G * 4,) of each place's first frame with its others, and its poses in them."""
         with torch.no_grad():
             tokens = self.model.encoder(points, views).tokens
             number = torch.arange(len(tokens.xyz), device=tokens.xyz.device).view(-1, FRAMES)
@@ -102,13 +113,18 @@ class OverlapTraining(nn.Module):
             solved = solve_batch(self.model.decoder, source, target, correlated)
             nothing = source.xyz.new_zeros(len(source.xyz), POSE_FEATURES)
             posed = nothing if solved is None else overlap_features(solved)
-        return self.model.decoder.overlap(*correlated, source.mask, target.mask, posed)
+        return self.model.decoder.overlap(*correlated, source.mask, target.mask, posed), solved
 
 
 def pair_distances(poses: Tensor) -> Tensor:
     """(G * 4,) m between the first frame of each place and the others, of poses (G, FRAMES, 4, 4)."""
     t = poses[:, :, :3, 3]
     return (t[:, 1:] - t[:, :1]).norm(dim=-1).flatten().float()
+
+
+def pair_poses(poses: Tensor) -> Tensor:
+    """T_target_source (G * 4, 4, 4) of the first frame of each place in the others, of poses (G, FRAMES, 4, 4)."""
+    return (se3_torch.inverse(poses[:, 1:]) @ poses[:, :1]).flatten(0, 1)
 
 
 def average_precision(scores: np.ndarray, positive: np.ndarray) -> float:
@@ -120,7 +136,7 @@ def average_precision(scores: np.ndarray, positive: np.ndarray) -> float:
 
 
 def train_overlap(settings: OverlapTrainingSettings, out: Path, resume: bool = False) -> Path:
-    """Train; writes checkpoint, log and `weights.safetensors`, the registration training's with the new head, to
+    """Train; writes checkpoint, log and `weights.safetensors`, the registration training's with the new heads, to
     `out`."""
     optimizer, weights = settings.optimiser, out / "weights.safetensors"
     torch.manual_seed(optimizer.seed)
@@ -129,8 +145,9 @@ def train_overlap(settings: OverlapTrainingSettings, out: Path, resume: bool = F
     about = load_weights(module.model, Path(settings.start))
     data = GroupDataset(settings.data, network, draw_overlap, optimizer.seed)
 
-    def batches(start: int, rank: int) -> Iterator[tuple[PointBatch, Views | None, Tensor]]:
-        return ((batch.points, batch.views, pair_distances(batch.poses)) for batch in data.batches(start, rank))
+    def batches(start: int, rank: int) -> Iterator[tuple[PointBatch, Views | None, Tensor, Tensor]]:
+        found = data.batches(start, rank)
+        return ((b.points, b.views, pair_distances(b.poses), pair_poses(b.poses)) for b in found)
 
     def save(averaged: nn.Module) -> None:
         assert isinstance(averaged, OverlapTraining)
@@ -154,7 +171,7 @@ def validator(settings: OverlapTrainingSettings, network: NetworkSettings) -> Ca
         scores, distances = [], []
         for points, views, poses in map(batch, range(settings.validation_batches)):
             with torch.autocast(device.type, torch.bfloat16):
-                logits = module.logits(*to_device((points, views), device))
+                logits, _ = module.logits(*to_device((points, views), device))
             scores.append(logits.cpu().numpy())
             distances.append(pair_distances(poses).numpy())
         positive = np.concatenate(distances) <= OVERLAP

@@ -9,7 +9,7 @@ from typing import NamedTuple
 from torch import Tensor, nn
 
 from dpm2_core.network.attention import Attention, RelativeBias, sine_code
-from dpm2_core.network.heads import OffsetHead, OverlapHead, PointMLP
+from dpm2_core.network.heads import ConfidenceHead, OffsetHead, OverlapHead, PointMLP
 from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.network.tokens import Tokens
 
@@ -66,6 +66,7 @@ class Decoder(nn.Module):
         self.relative = RelativeBias(decoder.layers, decoder.heads) if decoder.position == "relative" else None
         self.similarity = PointMLP(width)
         self.offset = OffsetHead(width, decoder.precision)
+        self.confidence = ConfidenceHead()
         self.overlap = OverlapHead(width, decoder.overlap_pose)
         self.overlap_trained = False  # until the overlap training has trained the head
         self.coarse = PointMLP(settings.channels)

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Heads on (correlated) descriptors: similarity, offset with precision, overlap, and the coarse pairing of training."""
+"""Heads on (correlated) descriptors: similarity, offset with precision, and the coarse pairing of training; and on the
+poses that they lead to: confidence and overlap."""
 
 from __future__ import annotations
 
@@ -60,7 +61,26 @@ class OffsetHead(nn.Module):
         return offset, L.unflatten(-1, (3, 3))
 
 
-POSE_FEATURES = 3  # of `pose_solver.overlap_features`
+CONFIDENCE_FEATURES = 5  # of `solved.confidence_features`
+
+
+class ConfidenceHead(nn.Linear):
+    """Logits (B,) of `solved.confidence_features` (B, CONFIDENCE_FEATURES): is the pose right?
+
+    It begins as what the shipped weights have learned, for a network that has had no overlap training.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(CONFIDENCE_FEATURES, 1)
+        with torch.no_grad():
+            self.weight.copy_(torch.tensor([[1.4, 13.2, -1.5, -8.3, 3.4]]))
+            self.bias.fill_(-5.4)
+
+    def forward(self, features: Tensor) -> Tensor:
+        return super().forward(features)[..., 0].float()
+
+
+POSE_FEATURES = 3  # of `solved.overlap_features`
 _MIDDLE, _SPREAD = (0.3, 1.0, 0.5), (0.15, 0.5, 0.15)  # of these, about where near and far pairs part
 
 
@@ -83,7 +103,7 @@ class OverlapHead(nn.Module):
         self, source: Tensor, target: Tensor, source_mask: Tensor, target_mask: Tensor, overlap_features: Tensor
     ) -> Tensor:
         """Logits (B,) of source (B, N, C) and target (B, M, C) with masks (B, N) and (B, M), and
-        `pose_solver.overlap_features` (B, POSE_FEATURES); each mode reads what it asks alone."""
+        `solved.overlap_features` (B, POSE_FEATURES); each mode reads what it asks alone."""
         if self.points is None:
             middle, spread = (overlap_features.new_tensor(values) for values in (_MIDDLE, _SPREAD))
             return self.classify((overlap_features - middle) / spread)[..., 0].float()

@@ -3,13 +3,16 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
+from dpm2_core.geometry import se3_torch
 from dpm2_core.geometry.kabsch import transform
 
+RIGHT_M, RIGHT_DEG = 1.0, 3.0  # errors of a pose that is right; few lie between these and meters
 SOFT = 3.0  # degrees of freedom of the Student distribution of offset residuals
 
 
@@ -101,3 +104,11 @@ def student_offset(residual: Tensor, L: Tensor, weight: Tensor) -> Tensor:
 def overlap_loss(logits: Tensor, distance: Tensor, limit: float = 20.0) -> Tensor:
     """Binary cross entropy of overlap logits (B,) against `distance` (B,) <= limit, m."""
     return nn.functional.binary_cross_entropy_with_logits(logits, (distance <= limit).float())
+
+
+def confidence_loss(logits: Tensor, T: Tensor, true: Tensor) -> Tensor:
+    """Binary cross entropy of the logits (B,) that poses (B, 4, 4) are right, against whether they are: within
+    `RIGHT_M` and `RIGHT_DEG` of the true ones."""
+    difference = se3_torch.log(se3_torch.inverse(true.double()) @ T.double())
+    right = (difference[:, 3:].norm(dim=-1) < RIGHT_M) & (difference[:, :3].norm(dim=-1) < math.radians(RIGHT_DEG))
+    return nn.functional.binary_cross_entropy_with_logits(logits, right.to(logits.dtype))

@@ -16,7 +16,8 @@ from dpm2_core.geometry import se3
 from dpm2_core.network.decoder import Decoder, Prepared
 from dpm2_core.network.encoder import Encoder
 from dpm2_core.network.matching import correspond, match_scores
-from dpm2_core.network.pose_solver import Solver, agreement, register_batch
+from dpm2_core.network.pose_solver import Solver, agreement
+from dpm2_core.network.registrations import register_batch
 from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.network.tokens import Tokens, to_tokens
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pairs of points to a pose: consensus, precision-weighted solve or robust SVD, and its overlap probability.
+"""Pairs of points to a pose: consensus, precision-weighted solve or robust SVD.
 
 Beyond the paper: the first pose is a consensus of pairs that keep each other's distances, and with it the descriptors
 are matched again, each to what lies near it; where little fits, other poses are tried. The paper's own way is the
@@ -14,9 +14,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dpm2_core.frame import Registration
-from dpm2_core.geometry import se3
-from dpm2_core.geometry.calibration import with_calibration
 from dpm2_core.geometry.kabsch import transform, weighted_kabsch
 from dpm2_core.network.consensus import TOLERANCE, alternatives, consensus
 from dpm2_core.network.decoder import Correlated, Decoder
@@ -32,14 +29,17 @@ from dpm2_core.network.matching import (
     softmax_both,
     take,
 )
+from dpm2_core.network.solved import Solved, confidence_of
 from dpm2_core.network.tokens import Tokens
 
 MIN_INLIERS = 30
-CONFIDENT = 30  # pairs whose mean confidence is that of the registration
+BEST = 30  # pairs whose mean probability says how well a pose is borne out
 CHI2 = 11.3  # 99 % quantile with 3 degrees of freedom: inliers of the precision-weighted solve
 FEW = 0.5  # of the pairs: where no more of them fit, other poses are tried, too
-LEAST = 0.4  # of the pairs: fewer fit at wrong poses alone
-TRIED, CLEARLY = 4, 1.25  # so many, of which the best counts if so many times as many pairs fit there
+TRIED, CLEARLY = (
+    8,
+    1.0,
+)  # so many, of which the surest counts if the odds that it is right are e times those of the first
 MOST_CONFIDENT, SURE = 64, 0.5  # the solver `confident` starts from so many pairs, and from those that are so probable
 
 Solver = Literal["consensus", "confident"]
@@ -104,22 +104,6 @@ def robust_kabsch(pairs: Correspondences, inliers: Tensor, rounds: int = 3) -> t
     return T, inliers
 
 
-class Solved(NamedTuple):
-    """Poses of a batch.
-
-    Attributes:
-        T: (B, 4, 4) float64. information: (B, 6, 6) of xi in T exp(xi). inliers: (B, 2K) of `pairs`.
-        confidence: (B,) 0..1. share: (B,) 0..1, of the pairs that are inliers.
-    """
-
-    T: Tensor
-    information: Tensor
-    pairs: Correspondences
-    inliers: Tensor
-    confidence: Tensor
-    share: Tensor
-
-
 class Matched(NamedTuple):
     """A batch of set pairs that the decoder has correlated, with the scores (B, N, M) of their matches, and the pairs
     of these that are chosen without knowing a pose."""
@@ -142,7 +126,7 @@ def solve_batch(
     if solver == "confident":
         T, information, inliers = _solve_svd(unguided, most_confident(unguided))
         share = _share(decoder, source, target, inliers)
-        return Solved(T, information, unguided, inliers, _confidence(unguided, T), share)
+        return Solved(T, information, unguided, inliers, _borne_out(unguided, T), share)
     matched = Matched(source, target, correlated, scores, unguided)
     solved = _solved_from(decoder, matched, first_pose(unguided))
     return _reconsidered(decoder, matched, solved) if decoder.settings.precision else solved
@@ -157,11 +141,11 @@ def _solved_from(decoder: Decoder, matched: Matched, T: Tensor) -> Solved:
         pairs = correspond(decoder, source, target, correlated, guided_scores(scores, T, source, target))
         T, information, inliers = solve(pairs, T)
     share = _share(decoder, source, target, inliers)
-    return Solved(T, information, pairs, inliers, _confidence(matched.unguided, T), share)
+    return Solved(T, information, pairs, inliers, _borne_out(matched.unguided, T), share)
 
 
 def _reconsidered(decoder: Decoder, matched: Matched, solved: Solved) -> Solved:
-    """The same, but where few pairs fit, as on both sides of a corner, and clearly more of them at another pose."""
+    """The same, but where few pairs fit, as on both sides of a corner, and another pose is clearly more probable."""
     rows = (solved.share < FEW).nonzero()[:, 0]
     if len(rows) == 0:
         return solved
@@ -171,8 +155,8 @@ def _reconsidered(decoder: Decoder, matched: Matched, solved: Solved) -> Solved:
     starts = alternatives(source, target, weight, solved.T[rows], TRIED)
     own = torch.arange(len(rows), device=rows.device)
     others = _solved_from(decoder, _rows(matched, own.repeat_interleave(TRIED)), starts.flatten(0, 1))
-    most, best = others.share.view(-1, TRIED).max(1)
-    clear = most > CLEARLY * solved.share[rows]
+    most, best = confidence_of(decoder, others).view(-1, TRIED).max(1)
+    clear = most > confidence_of(decoder, solved)[rows] + CLEARLY
     return _with_rows(solved, rows[clear], _rows(others, (own * TRIED + best)[clear]))
 
 
@@ -191,42 +175,6 @@ def _with_rows(batch: Any, index: Tensor, others: Any) -> Any:
     if isinstance(batch, Tensor):
         return batch.index_copy(0, index, others)
     return type(batch)(*(_with_rows(*fields) for fields in zip(batch, [index] * len(batch), others, strict=True)))
-
-
-def overlap_features(solved: Solved) -> Tensor:
-    """What the pose of a pair says about its overlap (B, `POSE_FEATURES`): its confidence, the distance in units of
-    20 m, and the share of the pairs that fit, which tells places apart that look alike."""
-    distance = (solved.T[:, :3, 3].norm(dim=-1) / 20).clamp(max=3).nan_to_num(3.0)
-    return torch.stack([solved.confidence.nan_to_num(0.0).to(distance.dtype), distance, solved.share], -1).float()
-
-
-def overlap_probability(
-    decoder: Decoder, source: Tokens, target: Tokens, correlated: Correlated, solved: Solved
-) -> Tensor:
-    """Probability (B,) that each pair was seen from within 20 m; NaN while the head is untrained."""
-    if not decoder.overlap_trained:
-        return torch.full(source.mask.shape[:1], torch.nan)
-    return decoder.overlap(*correlated, source.mask, target.mask, overlap_features(solved)).sigmoid()
-
-
-def register_batch(
-    decoder: Decoder, source: Tokens, target: Tokens, correlated: Correlated, solver: Solver = "consensus"
-) -> list[Registration]:
-    """The registrations of a batch, T_target_source each."""
-    solved = solve_batch(decoder, source, target, correlated, solver)
-    if solved is None:
-        return [_nothing("0 matching descriptors, want 3")] * len(source.xyz)
-    T, inliers = solved.T, solved.inliers
-    error = (transform(T, solved.pairs.source.double()) - solved.pairs.target).norm(dim=-1)
-    count = inliers.sum(1)
-    by_precision = decoder.settings.precision and solver == "consensus"  # `LEAST` is of such inliers
-    least = LEAST if by_precision else 0.0
-    objections = [_objection(*row, least) for row in zip(count.tolist(), solved.share.tolist(), strict=True)]
-    rmse = ((error**2 * inliers).sum(1) / count.clamp(min=1)).sqrt()
-    covariance = decoder.settings.covariance_scale * torch.linalg.inv(solved.information)
-    overlap = overlap_probability(decoder, source, target, correlated, solved)
-    figures = (field.tolist() for field in (solved.confidence, rmse, overlap))
-    return [_registration(*row) for row in zip(T.cpu(), covariance.cpu(), *figures, objections, strict=True)]
 
 
 def _solve_precise(pairs: Correspondences, T: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -268,30 +216,8 @@ def _solve_svd(pairs: Correspondences, inliers: Tensor) -> tuple[Tensor, Tensor,
     return T, jacobian.transpose(1, 2) @ jacobian + 1e-6 * torch.eye(6, device=T.device), inliers
 
 
-def _confidence(unguided: Correspondences, T: Tensor) -> Tensor:
-    """Mean probability of the best pairs that the pose bears out, as matched without knowing it."""
+def _borne_out(unguided: Correspondences, T: Tensor) -> Tensor:
+    """Mean probability (B,) of the best pairs, as matched without the poses, that these bring together."""
     error = (transform(T, unguided.source.double()) - unguided.target).norm(dim=-1)
     weight = unguided.weight * (error <= TOLERANCE)
-    return weight.topk(min(CONFIDENT, weight.shape[1]))[0].mean(1)
-
-
-def _objection(count: int, share: float, least: float) -> str:
-    """Why a motion that brings so many of the pairs together is no result; empty where it is one."""
-    if count < 3:
-        return f"{count} matching descriptors, want 3"
-    return "" if share >= least else f"only {share:.0%} of the matched descriptors fit one motion"
-
-
-def _registration(
-    T: Tensor, covariance: Tensor, confidence: float, rmse: float, overlap: float, objection: str
-) -> Registration:
-    if not bool(T.isfinite().all() and covariance.isfinite().all()):
-        return _nothing("no finite pose")
-    # Rigid to float64: the solver composes many steps, and an exponential of a large one leaves 1 + 2e-15 behind.
-    rigid = se3.orthonormalized(T.double().numpy())
-    result = Registration(rigid, covariance.numpy(), confidence, rmse, "neural", not objection, objection, overlap)
-    return with_calibration(result, rigid)
-
-
-def _nothing(reason: str) -> Registration:
-    return Registration(np.eye(4), np.eye(6) * 1e6, 0.0, np.inf, "neural", False, reason)
+    return weight.topk(min(BEST, weight.shape[1]))[0].mean(1)

@@ -51,8 +51,8 @@ class LoopSettings(Settings):
     """So many keyframes that look like the new one are registered by the network..."""
     verified: int = 2
     """...and so many of them, the most confident first, by their points."""
-    min_confidence: float = 0.15
-    """Of the network's registration, below which the points are not asked."""
+    min_confidence: float = Field(0.1, ge=0, le=1)
+    """Probability that the network's registration is right, below which the points are not asked."""
     min_overlap: float = Field(0.2, ge=0, le=1)
     """Probability of the network's overlap head, below which the points are not asked either."""
     decided_by: Literal["points", "overlap"] = "points"
@@ -163,7 +163,7 @@ class LoopCloser:
                 if not r.ok:
                     rejections.append(loop)
                 elif r.confidence < s.min_confidence:
-                    rejections.append(loop.rejected(f"descriptors match with a confidence of only {r.confidence:.2f}"))
+                    rejections.append(loop.rejected(f"right with a probability of only {r.confidence:.0%}"))
                 elif s.decided_by == "overlap" and np.isnan(r.overlap):
                     rejections.append(loop.rejected("the overlap head of these weights is not trained"))
                 elif r.overlap < s.min_overlap:  # NaN of an untrained head rejects nothing

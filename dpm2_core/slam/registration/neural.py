@@ -46,17 +46,16 @@ class NeuralSettings(Settings):
     refined: int = Field(0, ge=0, le=64)
     """Register a frame that enters the map once more, to so many frames merged, and take the more certain pose: the
     paper's refinement from scan to map. 0: not."""
-    # Of 130 validation pairs with a confidence of 0.1 to 0.15 a quarter is right, of those above 0.3 99.6 %
     min_confidence: float = Field(0.1, ge=0, le=1)
-    """Mean probability of the best matches below which there is no result; twice that in a search for a place."""
+    """Probability that a pose is right, below which there is no result: here the motion so far can contradict it. In a
+    search for a place, where nothing does, at least 0.6."""
     max_sigma: float = Field(0.6, gt=0)
     """Largest standard deviation of the position in its worst direction, m."""
 
 
-_PLACE = 2.0
-"""Times the least confidence in a search for a place, as after a pause: nothing contradicts a wrong pose there, and
-wrong ones agree with each other. After a gap of 5 s in KITTI 00 three had 0.11 to 0.13, 32 m off, where it looks
-alike."""
+_PLACE = 0.6
+"""Least confidence in a search for a place, as after a pause: nothing contradicts a wrong pose there, and wrong ones
+agree with each other."""
 
 
 class NeuralScanRegistration:
@@ -107,9 +106,9 @@ class NeuralScanRegistration:
             second = self._registered(scan, result.T_target_source, self._settings.refined)
             if second.ok and second.worst_sigma < result.worst_sigma:
                 result = second
-        least = self._settings.min_confidence * (_PLACE if prediction.unique else 1)
-        if result.confidence < least:
-            return replace(result, ok=False, reason=f"matches with a confidence of only {result.confidence:.2f}")
+        least = self._settings.min_confidence
+        if result.confidence < (max(least, _PLACE) if prediction.unique else least):
+            return replace(result, ok=False, reason=f"right with a probability of only {result.confidence:.0%}")
         if (sigma := result.worst_sigma) > self._settings.max_sigma:
             return replace(result, ok=False, reason=f"position uncertain by {sigma:.2f} m")
         if prediction.information is not None:

@@ -181,7 +181,7 @@ def test_places_that_hardly_overlap_are_left_to_no_one(monkeypatch: pytest.Monke
 
     reasons = []
     for value in (0.1, float("nan")):
-        monkeypatch.setattr("dpm2_core.network.pose_solver.overlap_probability", probability(value))
+        monkeypatch.setattr("dpm2_core.network.registrations.overlap_probability", probability(value))
         loops, _ = drive(places, jump, gap=30.0, consistency={"drift": 0.5})
         reasons.append([loop.registration.reason for loop in loops])
     assert any("overlap with a probability of only 0.10" in reason for reason in reasons[0])
@@ -200,7 +200,7 @@ def test_the_overlap_head_alone_accepts_the_best_candidate(monkeypatch: pytest.M
     assert accepted[0].registration.overlap == max(loop.registration.overlap for loop in loops)
     assert errors(accepted, truth)[0] < 0.5  # as the network registers
     monkeypatch.setattr(
-        "dpm2_core.network.pose_solver.overlap_probability",
+        "dpm2_core.network.registrations.overlap_probability",
         lambda decoder, source, *_: torch.full(source.mask.shape[:1], torch.nan),
     )
     loops, _ = drive(places, jump, gap=30.0, decided_by="overlap", min_overlap=0.7)

@@ -186,35 +186,38 @@ def test_bad_frames_are_rejected_in_words_and_survived(weights: Path, noise: np.
     assert all(np.isfinite(t.T_odom_lidar).all() and np.isfinite(t.covariance).all() for t in tracked)
 
 
-def test_unsure_matches_are_no_answer(weights: Path, noise: np.random.Generator) -> None:
-    """Nor those of another place, of which few fit one motion, however sure each of them is."""
-    s = SlamSettings(registration="neural", neural=NeuralSettings(weights=str(weights), min_confidence=1))
+def test_another_place_is_no_answer(weights: Path, noise: np.random.Generator) -> None:
+    """The same one is, by another scan."""
+    s = SlamSettings(registration="neural", neural=NeuralSettings(weights=str(weights)))
     registration = make_registration(s)
     here, elsewhere = (cloud(boxes(noise)) for _ in range(2))
     again = here + noise.normal(0, 0.02, here.shape).astype(np.float32)
     first, second, other = (registration.prepare(Frame(0, points), np.zeros(6)) for points in (here, again, elsewhere))
     registration.update(first, np.eye(4))
-    for scan, reason in ((second, "confidence of only"), (other, "of the matched descriptors fit one motion")):
-        result = registration.register(scan, Prediction([np.eye(4)]))
-        assert not result.ok
-        assert reason in result.reason
+    assert registration.register(second, Prediction([np.eye(4)])).ok
+    result = registration.register(other, Prediction([np.eye(4)]))
+    assert not result.ok
+    assert "of the matched descriptors fit one motion" in result.reason
 
 
-def test_in_a_search_for_a_place_a_match_must_be_twice_as_sure(weights: Path, noise: np.random.Generator) -> None:
-    """Nothing else would contradict a place that looks alike."""
-    here = cloud(boxes(noise))
+def test_in_a_search_for_a_place_a_pose_must_be_probable(noise: np.random.Generator) -> None:
+    """Nothing else would contradict a place that looks alike; where the motion is known it can."""
+    torch.manual_seed(0)
+    network, here = DeepPointMap2(tiny()).eval(), cloud(boxes(noise))
 
-    def register(least: float, unique: bool) -> Registration:
-        settings = NeuralSettings(weights=str(weights), min_confidence=least)
-        registration = make_registration(SlamSettings(registration="neural", neural=settings))
+    def register(probability: float, unique: bool) -> Registration:
+        with torch.no_grad():
+            network.decoder.confidence.weight.zero_()
+            network.decoder.confidence.bias.fill_(float(np.log(probability / (1 - probability))))
+        registration = NeuralScanRegistration(NeuralSettings(), Preprocessor(PreprocessSettings()), network)
         scan = registration.prepare(Frame(0, here), np.zeros(6))
         registration.update(scan, np.eye(4))
         return registration.register(scan, Prediction([np.eye(4)], unique=unique))
 
-    found = register(0, True).confidence
-    assert register(0.4 * found, True).ok
-    assert register(0.7 * found, False).ok
-    assert "confidence of only" in register(0.7 * found, True).reason
+    assert register(0.7, True).ok
+    assert register(0.3, False).ok
+    assert register(0.3, True).reason == "right with a probability of only 30%"
+    assert not register(0.05, False).ok
 
 
 def test_images_are_asked_for_and_used_where_the_network_has_a_camera(noise: np.random.Generator) -> None:

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Solved poses to registrations: how probable it is that a pose is right, and that both sets saw the same place."""
+
+from __future__ import annotations
+
+from itertools import repeat
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dpm2_core.frame import Registration
+from dpm2_core.geometry import se3
+from dpm2_core.geometry.calibration import with_calibration
+from dpm2_core.network.decoder import Correlated, Decoder
+from dpm2_core.network.pose_solver import Solver, solve_batch
+from dpm2_core.network.solved import Solved, confidence_of, covariance_of, overlap_features, residual
+from dpm2_core.network.tokens import Tokens
+
+LEAST = 0.1  # confidence: below it a pose is no result
+LEAST_SHARE = 0.4  # of the pairs: fewer fit at wrong poses alone
+
+
+def register_batch(
+    decoder: Decoder, source: Tokens, target: Tokens, correlated: Correlated, solver: Solver = "consensus"
+) -> list[Registration]:
+    """The registrations of a batch, T_target_source each."""
+    solved = solve_batch(decoder, source, target, correlated, solver)
+    if solved is None:
+        return [_nothing("0 matching descriptors, want 3")] * len(source.xyz)
+    count, rmse, covariance = solved.inliers.sum(1), residual(solved), covariance_of(decoder, solved)
+    if decoder.settings.precision and solver == "consensus":  # whose figures the head has learned from
+        confidence = confidence_of(decoder, solved).sigmoid()
+        rows = zip(count.tolist(), solved.share.tolist(), confidence.tolist(), strict=True)
+    else:
+        confidence = solved.borne_out
+        rows = zip(count.tolist(), repeat(1.0), repeat(1.0), strict=False)
+    objections = [_objection(*row) for row in rows]
+    overlap = overlap_probability(decoder, source, target, correlated, solved)
+    figures = (field.tolist() for field in (confidence, rmse, overlap))
+    return [_registration(*row) for row in zip(solved.T.cpu(), covariance.cpu(), *figures, objections, strict=True)]
+
+
+def overlap_probability(
+    decoder: Decoder, source: Tokens, target: Tokens, correlated: Correlated, solved: Solved
+) -> Tensor:
+    """Probability (B,) that each pair was seen from within 20 m; NaN while the head is untrained."""
+    if not decoder.overlap_trained:
+        return torch.full(source.mask.shape[:1], torch.nan)
+    return decoder.overlap(*correlated, source.mask, target.mask, overlap_features(solved)).sigmoid()
+
+
+def _objection(count: int, share: float, confidence: float) -> str:
+    """Why a pose that brings so many pairs together, such a share of all, is no result; empty where it is one."""
+    if count < 3:
+        return f"{count} matching descriptors, want 3"
+    if share < LEAST_SHARE:
+        return f"only {share:.0%} of the matched descriptors fit one motion"
+    return "" if confidence >= LEAST else f"right with a probability of only {confidence:.0%}"
+
+
+def _registration(
+    T: Tensor, covariance: Tensor, confidence: float, rmse: float, overlap: float, objection: str
+) -> Registration:
+    if not bool(T.isfinite().all() and covariance.isfinite().all()):
+        return _nothing("no finite pose")
+    # Rigid to float64: the solver composes many steps, and an exponential of a large one leaves 1 + 2e-15 behind.
+    rigid = se3.orthonormalized(T.double().numpy())
+    result = Registration(rigid, covariance.numpy(), confidence, rmse, "neural", not objection, objection, overlap)
+    return with_calibration(result, rigid)
+
+
+def _nothing(reason: str) -> Registration:
+    return Registration(np.eye(4), np.eye(6) * 1e6, 0.0, np.inf, "neural", False, reason)

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Poses that were solved for: how close their pairs come, and how probably they are right."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from dpm2_core.geometry.kabsch import transform
+from dpm2_core.network.decoder import Decoder
+from dpm2_core.network.matching import Correspondences
+
+_BORNE_OUT, _SIGMA, _RMSE = 0.01, 0.02, 0.8  # less of these tells no more: 99 % of right poses have more
+
+
+class Solved(NamedTuple):
+    """Poses of a batch.
+
+    Attributes:
+        T: (B, 4, 4) float64. information: (B, 6, 6) of xi in T exp(xi). inliers: (B, 2K) of `pairs`.
+        borne_out: (B,) 0..1, mean probability of the best pairs, as matched without the pose, that it brings together.
+        share: (B,) 0..1, of the pairs that are inliers.
+    """
+
+    T: Tensor
+    information: Tensor
+    pairs: Correspondences
+    inliers: Tensor
+    borne_out: Tensor
+    share: Tensor
+
+
+def residual(solved: Solved) -> Tensor:
+    """Root mean square distance (B,) between the points of the inliers, m."""
+    error = (transform(solved.T, solved.pairs.source.double()) - solved.pairs.target).norm(dim=-1)
+    return ((error**2 * solved.inliers).sum(1) / solved.inliers.sum(1).clamp(min=1)).sqrt()
+
+
+def covariance_of(decoder: Decoder, solved: Solved) -> Tensor:
+    """(B, 6, 6) [rad, m] of xi in T exp(xi); not finite where the pairs leave a pose open."""
+    return decoder.settings.covariance_scale * torch.linalg.inv_ex(solved.information)[0]
+
+
+def confidence_of(decoder: Decoder, solved: Solved) -> Tensor:
+    """Logit (B,) of each pose being right, by the head of the decoder."""
+    logits: Tensor = decoder.confidence(confidence_features(decoder, solved))
+    return logits
+
+
+def confidence_features(decoder: Decoder, solved: Solved) -> Tensor:
+    """What tells a right pose from a wrong one (B, `CONFIDENCE_FEATURES`): logarithm of how well the matches bear it
+    out, share of the pairs that fit, logarithms of the largest standard deviation of the position and of the residual,
+    and the distance in units of 20 m, at most 1.
+
+    A wrong pose brings fewer pairs together, and less closely. Of views far apart less is to be expected: what a wrong
+    pose in a tunnel puts at the same place would match better if it were there.
+    """
+    variance = torch.linalg.eigvalsh(covariance_of(decoder, solved)[:, 3:, 3:].nan_to_num(1e6, 1e6, -1e6))[:, -1]
+    figures = (solved.borne_out, _BORNE_OUT), (variance.clamp(min=0).sqrt(), _SIGMA), (residual(solved), _RMSE)
+    borne_out, sigma, rmse = (figure.double().nan_to_num(0.0).clamp(least, 1e3).log() for figure, least in figures)
+    distance = _distance(solved).clamp(max=1)
+    return torch.stack([borne_out, solved.share.double(), sigma, rmse, distance.double()], -1).float()
+
+
+def overlap_features(solved: Solved) -> Tensor:
+    """What the pose of a pair says about its overlap (B, `POSE_FEATURES`): how well the matches bear it out, the
+    distance in units of 20 m, and the share of the pairs that fit, which tells places apart that look alike."""
+    distance = _distance(solved)
+    return torch.stack([solved.borne_out.nan_to_num(0.0).to(distance.dtype), distance, solved.share], -1).float()
+
+
+def _distance(solved: Solved) -> Tensor:
+    """(B,) between the frames of each pair by its pose, in units of 20 m, at most 3."""
+    return (solved.T[:, :3, 3].norm(dim=-1) / 20).clamp(max=3).nan_to_num(3.0)
