@@ -51,10 +51,8 @@ class LoopSettings(Settings):
     """So many keyframes that look like the new one are registered by the network..."""
     verified: int = 2
     """...and so many of them, the most confident first, by their points."""
-    min_confidence: float = Field(0.1, ge=0, le=1)
-    """Probability that the network's registration is right, below which the points are not asked."""
     min_overlap: float = Field(0.2, ge=0, le=1)
-    """Probability of the network's overlap head, below which the points are not asked either."""
+    """Probability of the network's overlap head, below which the points are not asked."""
     decided_by: Literal["points", "overlap"] = "points"
     """What accepts a candidate of the network: the points and a second loop; or, as in the paper, its overlap head
     alone, which then also chooses the best of the candidates."""
@@ -162,8 +160,6 @@ class LoopCloser:
                 r = loop.registration
                 if not r.ok:
                     rejections.append(loop)
-                elif r.confidence < s.min_confidence:
-                    rejections.append(loop.rejected(f"right with a probability of only {r.confidence:.0%}"))
                 elif s.decided_by == "overlap" and np.isnan(r.overlap):
                     rejections.append(loop.rejected("the overlap head of these weights is not trained"))
                 elif r.overlap < s.min_overlap:  # NaN of an untrained head rejects nothing

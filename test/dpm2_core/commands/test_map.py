@@ -186,7 +186,7 @@ def test_run_writes_a_map_and_goes_on_with_it(tmp_path: Path, recording: Path) -
 def test_a_drive_that_is_killed_leaves_a_sound_map(tmp_path: Path, recording: Path) -> None:
     """kill -9 of a real drive, after the network has tried loops and had them rejected."""
     path = tmp_path / "a.dpm2map"
-    rejecting = ("--set", "slam.loops.gap=3", "--set", "slam.loops.min_confidence=2", "--set", "slam.loops.radius=0")
+    rejecting = ("--set", "slam.loops.gap=3", "--set", "slam.loops.min_overlap=1", "--set", "slam.loops.radius=0")
     command = ["run", str(recording), "--out", str(tmp_path / "out"), "--map", str(path), *rejecting]
     child = subprocess.Popen([sys.executable, "-m", "dpm2_core.cli", *command], stderr=subprocess.DEVNULL)
     try:
