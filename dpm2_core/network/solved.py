@@ -13,6 +13,7 @@ from dpm2_core.network.decoder import Decoder
 from dpm2_core.network.matching import Correspondences
 
 _BORNE_OUT, _SIGMA, _RMSE = 0.01, 0.02, 0.8  # less of these tells no more: 99 % of right poses have more
+_WORST = 1e3  # m
 
 
 class Solved(NamedTuple):
@@ -57,9 +58,10 @@ def confidence_features(decoder: Decoder, solved: Solved) -> Tensor:
     A wrong pose brings fewer pairs together, and less closely. Of views far apart less is to be expected: what a wrong
     pose in a tunnel puts at the same place would match better if it were there.
     """
-    variance = torch.linalg.eigvalsh(covariance_of(decoder, solved)[:, 3:, 3:].nan_to_num(1e6, 1e6, -1e6))[:, -1]
-    figures = (solved.borne_out, _BORNE_OUT), (variance.clamp(min=0).sqrt(), _SIGMA), (residual(solved), _RMSE)
-    borne_out, sigma, rmse = (figure.double().nan_to_num(0.0).clamp(least, 1e3).log() for figure, least in figures)
+    variance = torch.linalg.eigvalsh(covariance_of(decoder, solved)[:, 3:, 3:].nan_to_num(_WORST**2, _WORST**2))[:, -1]
+    borne_out = solved.borne_out.double().nan_to_num(0.0).clamp(min=_BORNE_OUT).log()
+    sigma = variance.clamp(_SIGMA**2, _WORST**2).sqrt().log()
+    rmse = residual(solved).nan_to_num(_WORST).clamp(_RMSE, _WORST).log()
     distance = _distance(solved).clamp(max=1)
     return torch.stack([borne_out, solved.share.double(), sigma, rmse, distance.double()], -1).float()
 
