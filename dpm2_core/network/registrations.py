@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from itertools import repeat
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -19,6 +17,7 @@ from dpm2_core.network.tokens import Tokens
 
 LEAST = 0.1  # confidence: below it a pose is no result
 LEAST_SHARE = 0.4  # of the pairs: fewer fit at wrong poses alone
+LEAST_MATCHED = 0.15  # mean probability of the best pairs, where no head knows more: of the solver `confident`
 
 
 def register_batch(
@@ -28,14 +27,15 @@ def register_batch(
     solved = solve_batch(decoder, source, target, correlated, solver)
     if solved is None:
         return [_nothing("0 matching descriptors, want 3")] * len(source.xyz)
-    count, rmse, covariance = solved.inliers.sum(1), residual(solved), covariance_of(decoder, solved)
+    rmse, covariance = residual(solved), covariance_of(decoder, solved)
     if decoder.settings.precision and solver == "consensus":  # whose figures the head has learned from
         confidence = confidence_of(decoder, solved).sigmoid()
-        rows = zip(count.tolist(), solved.share.tolist(), confidence.tolist(), strict=True)
+        improbable = [_improbable(*row) for row in zip(solved.share.tolist(), confidence.tolist(), strict=True)]
     else:
         confidence = solved.borne_out
-        rows = zip(count.tolist(), repeat(1.0), repeat(1.0), strict=False)
-    objections = [_objection(*row) for row in rows]
+        improbable = [_unmatched(value) for value in confidence.tolist()]
+    few = [_few(count) for count in solved.inliers.sum(1).tolist()]
+    objections = [first or second for first, second in zip(few, improbable, strict=True)]
     overlap = overlap_probability(decoder, source, target, correlated, solved)
     figures = (field.tolist() for field in (confidence, rmse, overlap))
     return [_registration(*row) for row in zip(solved.T.cpu(), covariance.cpu(), *figures, objections, strict=True)]
@@ -50,13 +50,21 @@ def overlap_probability(
     return decoder.overlap(*correlated, source.mask, target.mask, overlap_features(solved)).sigmoid()
 
 
-def _objection(count: int, share: float, confidence: float) -> str:
-    """Why a pose that brings so many pairs together, such a share of all, is no result; empty where it is one."""
-    if count < 3:
-        return f"{count} matching descriptors, want 3"
+def _few(count: int) -> str:
+    """Why so many pairs make no pose; empty where they do."""
+    return f"{count} matching descriptors, want 3" if count < 3 else ""
+
+
+def _improbable(share: float, confidence: float) -> str:
+    """Why a pose that brings such a share of the pairs together is no result; empty where it is one."""
     if share < LEAST_SHARE:
         return f"only {share:.0%} of the matched descriptors fit one motion"
     return "" if confidence >= LEAST else f"right with a probability of only {confidence:.0%}"
+
+
+def _unmatched(borne_out: float) -> str:
+    """The same of a pose that is borne out by matches of such a mean probability alone."""
+    return "" if borne_out >= LEAST_MATCHED else f"descriptors match with a confidence of only {borne_out:.2f}"
 
 
 def _registration(

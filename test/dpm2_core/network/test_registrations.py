@@ -82,6 +82,16 @@ def test_an_improbable_pose_is_no_registration(model: DeepPointMap2, noise: np.r
     assert re.fullmatch(r"right with a probability of only \d+%", result.reason)
 
 
+def test_the_papers_solver_wants_probable_matches(model: DeepPointMap2, noise: np.random.Generator) -> None:
+    """Its robust SVD makes most pairs fit, whatever they are: how many do says nothing."""
+    model.solver = "confident"
+    here = described(model, noise, 60)
+    same, other = model.register_many([here, here], [here, described(model, noise, 60)])
+    assert same.ok
+    assert not other.ok
+    assert re.fullmatch(r"descriptors match with a confidence of only 0\.\d\d", other.reason)
+
+
 def test_the_overlap_head_is_told_how_much_of_a_pair_fits(model: DeepPointMap2, noise: np.random.Generator) -> None:
     """All of a set and itself 10 m away, less than half of two others; as much in a batch with a larger set."""
     here, larger = described(model, noise, 60), described(model, noise, 90)
