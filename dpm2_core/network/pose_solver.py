@@ -36,10 +36,8 @@ MIN_INLIERS = 30
 BEST = 30  # pairs whose mean probability says how well a pose is borne out
 CHI2 = 11.3  # 99 % quantile with 3 degrees of freedom: inliers of the precision-weighted solve
 FEW = 0.5  # of the pairs: where no more of them fit, other poses are tried, too
-TRIED, CLEARLY = (
-    8,
-    1.0,
-)  # so many, of which the surest counts if the odds that it is right are e times those of the first
+TRIED = 8  # so many
+CLEARLY = 1.0  # logit: of these the surest counts, if it is surer than the first pose by so much
 MOST_CONFIDENT, SURE = 64, 0.5  # the solver `confident` starts from so many pairs, and from those that are so probable
 
 Solver = Literal["consensus", "confident"]
@@ -123,11 +121,10 @@ def solve_batch(
     unguided = correspond(decoder, source, target, correlated, scores)
     if unguided.weight.shape[1] == 0:
         return None
+    matched = Matched(source, target, correlated, scores, unguided)
     if solver == "confident":
         T, information, inliers = _solve_svd(unguided, most_confident(unguided))
-        share = _share(decoder, source, target, inliers)
-        return Solved(T, information, unguided, inliers, _borne_out(unguided, T), share)
-    matched = Matched(source, target, correlated, scores, unguided)
+        return _judged(decoder, matched, unguided, (T, information, inliers))
     solved = _solved_from(decoder, matched, first_pose(unguided))
     return _reconsidered(decoder, matched, solved) if decoder.settings.precision else solved
 
@@ -140,8 +137,20 @@ def _solved_from(decoder: Decoder, matched: Matched, T: Tensor) -> Solved:
     for _ in range(decoder.settings.guided):
         pairs = correspond(decoder, source, target, correlated, guided_scores(scores, T, source, target))
         T, information, inliers = solve(pairs, T)
-    share = _share(decoder, source, target, inliers)
-    return Solved(T, information, pairs, inliers, _borne_out(matched.unguided, T), share)
+    return _judged(decoder, matched, pairs, (T, information, inliers))
+
+
+def _judged(
+    decoder: Decoder, matched: Matched, pairs: Correspondences, solution: tuple[Tensor, Tensor, Tensor]
+) -> Solved:
+    """Poses (B, 4, 4), information (B, 6, 6) and inliers (B, 2K) of pairs, with what tells how good they are."""
+    T, information, inliers = solution
+    covariance = decoder.settings.covariance_scale * torch.linalg.inv_ex(information)[0]
+    error = (transform(T, pairs.source.double()) - pairs.target).norm(dim=-1)
+    count = inliers.sum(1)
+    residual = ((error**2 * inliers).sum(1) / count.clamp(min=1)).sqrt()
+    wanted = pairs_wanted(matched.source.mask, matched.target.mask, decoder.settings.pair_ratio)
+    return Solved(T, covariance, residual, count, _borne_out(matched.unguided, T), count / (2 * wanted).clamp(min=1))
 
 
 def _reconsidered(decoder: Decoder, matched: Matched, solved: Solved) -> Solved:
@@ -158,11 +167,6 @@ def _reconsidered(decoder: Decoder, matched: Matched, solved: Solved) -> Solved:
     most, best = confidence_of(decoder, others).view(-1, TRIED).max(1)
     clear = most > confidence_of(decoder, solved)[rows] + CLEARLY
     return _with_rows(solved, rows[clear], _rows(others, (own * TRIED + best)[clear]))
-
-
-def _share(decoder: Decoder, source: Tokens, target: Tokens, inliers: Tensor) -> Tensor:
-    """Which part (B,) of the pairs, in both directions, inliers (B, 2K) are."""
-    return inliers.sum(1) / (2 * pairs_wanted(source.mask, target.mask, decoder.settings.pair_ratio)).clamp(min=1)
 
 
 def _rows(batch: Any, index: Tensor) -> Any:

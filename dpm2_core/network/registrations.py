@@ -12,7 +12,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.geometry.calibration import with_calibration
 from dpm2_core.network.decoder import Correlated, Decoder
 from dpm2_core.network.pose_solver import Solver, solve_batch
-from dpm2_core.network.solved import Solved, confidence_of, covariance_of, overlap_features, residual
+from dpm2_core.network.solved import Solved, confidence_of, overlap_features
 from dpm2_core.network.tokens import Tokens
 
 LEAST = 0.1  # confidence: below it a pose is no result
@@ -27,18 +27,19 @@ def register_batch(
     solved = solve_batch(decoder, source, target, correlated, solver)
     if solved is None:
         return [_nothing("0 matching descriptors, want 3")] * len(source.xyz)
-    rmse, covariance = residual(solved), covariance_of(decoder, solved)
     if decoder.settings.precision and solver == "consensus":  # whose figures the head has learned from
         confidence = confidence_of(decoder, solved).sigmoid()
         improbable = [_improbable(*row) for row in zip(solved.share.tolist(), confidence.tolist(), strict=True)]
     else:
         confidence = solved.borne_out
         improbable = [_unmatched(value) for value in confidence.tolist()]
-    few = [_few(count) for count in solved.inliers.sum(1).tolist()]
+    few = [_few(count) for count in solved.inliers.tolist()]
     objections = [first or second for first, second in zip(few, improbable, strict=True)]
     overlap = overlap_probability(decoder, source, target, correlated, solved)
-    figures = (field.tolist() for field in (confidence, rmse, overlap))
-    return [_registration(*row) for row in zip(solved.T.cpu(), covariance.cpu(), *figures, objections, strict=True)]
+    figures = (field.tolist() for field in (confidence, solved.residual, overlap))
+    return [
+        _registration(*row) for row in zip(solved.T.cpu(), solved.covariance.cpu(), *figures, objections, strict=True)
+    ]
 
 
 def overlap_probability(

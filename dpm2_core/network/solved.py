@@ -8,9 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dpm2_core.geometry.kabsch import transform
 from dpm2_core.network.decoder import Decoder
-from dpm2_core.network.matching import Correspondences
 
 _BORNE_OUT, _SIGMA, _RMSE = 0.01, 0.02, 0.8  # less of these tells no more: 99 % of right poses have more
 _WORST = 1e3  # m
@@ -20,37 +18,29 @@ class Solved(NamedTuple):
     """Poses of a batch.
 
     Attributes:
-        T: (B, 4, 4) float64. information: (B, 6, 6) of xi in T exp(xi). inliers: (B, 2K) of `pairs`.
+        T: (B, 4, 4) float64.
+        covariance: (B, 6, 6) [rad, m] of xi in T exp(xi); not finite where the pairs leave a pose open.
+        residual: (B,) m, root mean square distance between the points of the inliers.
+        inliers: (B,) pairs that fit, in both directions.
         borne_out: (B,) 0..1, mean probability of the best pairs, as matched without the pose, that it brings together.
         share: (B,) 0..1, of the pairs that are inliers.
     """
 
     T: Tensor
-    information: Tensor
-    pairs: Correspondences
+    covariance: Tensor
+    residual: Tensor
     inliers: Tensor
     borne_out: Tensor
     share: Tensor
 
 
-def residual(solved: Solved) -> Tensor:
-    """Root mean square distance (B,) between the points of the inliers, m."""
-    error = (transform(solved.T, solved.pairs.source.double()) - solved.pairs.target).norm(dim=-1)
-    return ((error**2 * solved.inliers).sum(1) / solved.inliers.sum(1).clamp(min=1)).sqrt()
-
-
-def covariance_of(decoder: Decoder, solved: Solved) -> Tensor:
-    """(B, 6, 6) [rad, m] of xi in T exp(xi); not finite where the pairs leave a pose open."""
-    return decoder.settings.covariance_scale * torch.linalg.inv_ex(solved.information)[0]
-
-
 def confidence_of(decoder: Decoder, solved: Solved) -> Tensor:
     """Logit (B,) of each pose being right, by the head of the decoder."""
-    logits: Tensor = decoder.confidence(confidence_features(decoder, solved))
+    logits: Tensor = decoder.confidence(confidence_features(solved))
     return logits
 
 
-def confidence_features(decoder: Decoder, solved: Solved) -> Tensor:
+def confidence_features(solved: Solved) -> Tensor:
     """What tells a right pose from a wrong one (B, `CONFIDENCE_FEATURES`): logarithm of how well the matches bear it
     out, share of the pairs that fit, logarithms of the largest standard deviation of the position and of the residual,
     and the distance in units of 20 m, at most 1.
@@ -58,10 +48,10 @@ def confidence_features(decoder: Decoder, solved: Solved) -> Tensor:
     A wrong pose brings fewer pairs together, and less closely. Of views far apart less is to be expected: what a wrong
     pose in a tunnel puts at the same place would match better if it were there.
     """
-    variance = torch.linalg.eigvalsh(covariance_of(decoder, solved)[:, 3:, 3:].nan_to_num(_WORST**2, _WORST**2))[:, -1]
+    variance = torch.linalg.eigvalsh(solved.covariance[:, 3:, 3:].nan_to_num(_WORST**2, _WORST**2))[:, -1]
     borne_out = solved.borne_out.double().nan_to_num(0.0).clamp(min=_BORNE_OUT).log()
     sigma = variance.clamp(_SIGMA**2, _WORST**2).sqrt().log()
-    rmse = residual(solved).nan_to_num(_WORST).clamp(_RMSE, _WORST).log()
+    rmse = solved.residual.nan_to_num(_WORST).clamp(_RMSE, _WORST).log()
     distance = _distance(solved).clamp(max=1)
     return torch.stack([borne_out, solved.share.double(), sigma, rmse, distance.double()], -1).float()
 

@@ -11,8 +11,6 @@ import torch
 
 from dpm2_core.descriptors import Descriptors, merge
 from dpm2_core.geometry import se3
-from dpm2_core.geometry.kabsch import transform
-from dpm2_core.network.matching import Correspondences
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pose_solver import solve_batch
 from dpm2_core.network.registrations import LEAST
@@ -120,25 +118,20 @@ def test_too_few_descriptors_are_no_registration(model: DeepPointMap2, noise: np
     assert "matching descriptors" in result.reason
 
 
-def test_a_pose_is_the_surer_the_better_its_pairs_fit(noise: np.random.Generator) -> None:
+def test_a_pose_is_the_surer_the_better_its_pairs_fit() -> None:
     """Each of these alone makes it less probable: a larger residual, less probable pairs, fewer that fit, a smaller
     distance, a larger deviation; a pose that is not finite is improbable."""
     decoder = DeepPointMap2(tiny()).decoder.requires_grad_(False)
-    source, scatter = (torch.from_numpy(noise.normal(0, 1, (1, 120, 3))) for _ in range(2))
 
     def confidence(rmse: float = 0.4, weight: float = 0.3, fit: float = 0.6, far: float = 8.0, L: float = 5.0) -> float:
         T = torch.from_numpy(se3.exp([0, 0, 0.3, far, 0, 0]))[None]
-        target = transform(T, 15 * source) + rmse * scatter
-        pairs = Correspondences(
-            15 * source, target, torch.full((1, 120), weight), L * torch.eye(3).expand(1, 120, 3, 3)
-        )
-        information, inliers = 20 * L**2 * torch.eye(6, dtype=torch.float64)[None], torch.ones(1, 120, dtype=torch.bool)
-        solved = Solved(T, information, pairs, inliers, torch.tensor([weight]), torch.tensor([fit]))
-        return float(confidence_of(decoder, solved))
+        covariance = torch.eye(6, dtype=torch.float64)[None] / (20 * L**2)
+        figures = (torch.tensor([value]) for value in (rmse, 120, weight, fit))
+        return float(confidence_of(decoder, Solved(T, covariance, *figures)))
 
     worse = confidence(rmse=1.0), confidence(weight=0.1), confidence(fit=0.4), confidence(far=0.5), confidence(L=1)
     assert max(worse) < confidence()
-    assert confidence(far=np.nan) < -10  # a logit
+    assert confidence(far=np.nan, rmse=np.nan) < -10  # a logit
 
 
 def test_sets_that_stay_give_the_same_answer_again(model: DeepPointMap2, noise: np.random.Generator) -> None:
