@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from pydantic import Field
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional
 
 from dpm2_core.errors import UsageError
@@ -27,6 +27,8 @@ FIRST_MOVING = 252
 """The same while they move have this number and higher ones."""
 _STRETCH = 0.2
 _SLOPE = 0.07  # standard deviation along and across
+_SHADOWS, _MISSING = 8, 0.15  # most of them in a scan; most of its voxels that have no points
+_SETTLED = 400  # scans that the statistics are of
 
 Voxels = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]
 """(V,) numbers of the occupied voxels of a scan, ascending, the fraction of their points that can move, and how many
@@ -43,7 +45,8 @@ class DynamicObjectTraining(TaskTraining):
     batch: int = Field(default=4, ge=1)
     every: int = Field(default=5, ge=1)
     rate: float = Field(default=3e-3, gt=0)
-    drop: float = Field(default=0.7, ge=0, lt=1)
+    average: float = Field(default=0.998, ge=0, lt=1)
+    thin: float = Field(default=0.7, ge=0, lt=1)
     """At most this fraction of a scan's points is left out, another one each time: sparser sensors."""
     paste: float = Field(default=0.5, ge=0, le=1)
     """Chance that the dynamic objects of another scan are put into a scan, turned about the sensor: to where the
@@ -78,12 +81,32 @@ class DynamicObjectTask(Task):
         return loss / weight.sum().clamp(min=1), None
 
     def _voxels(self, scan: TaskScan) -> Voxels:
-        """Of some of the points of a scan, varied at random."""
+        """Of some of the points of a scan, varied at random; in half of them others hide some, as what stands before a
+        thing does."""
         points, movable, counted = _arrays(scan)
-        keep = counted & (torch.rand(len(points)).numpy() >= self.settings.drop * float(torch.rand(())))
+        keep = counted & (torch.rand(len(points)).numpy() >= self.settings.thin * float(torch.rand(())))
+        if torch.rand(()) < 0.5:
+            keep &= ~_shadowed(points)
         voxel, inside = voxels(_varied(points[keep]), self.settings.network)
         where, back, count = np.unique(voxel[inside], return_inverse=True, return_counts=True)
-        return where, np.bincount(back, movable[keep][inside], len(where)) / count, count
+        fraction = np.bincount(back, movable[keep][inside], len(where)) / count
+        if torch.rand(()) < 0.5:
+            seen = torch.rand(len(where)).numpy() >= _MISSING * float(torch.rand(()))
+            where, fraction, count = where[seen], fraction[seen], count[seen]
+        return where, fraction, count
+
+    def settle(self, scans: TaskScans) -> None:
+        """The means and variances of the layers are made those of whole scans: the training has seen thinned and mixed
+        ones alone, and off its own kind of scan that costs as much as anything else."""
+        for layer in self.net.modules():
+            if isinstance(layer, nn.BatchNorm2d):
+                layer.reset_running_stats()
+                layer.momentum = None  # the mean over all of them
+                layer.train()
+        generator = torch.Generator().manual_seed(self.settings.seed)
+        for i in torch.randperm(len(scans), generator=generator)[:_SETTLED].tolist():
+            self.net.probability(_arrays(scans[i])[0])
+        self.eval()
 
     def evaluate(self, scans: TaskScans) -> dict[str, float]:
         """Over all points of all scans: IoU, precision and recall of what can move, and recall of what does."""
@@ -135,6 +158,17 @@ def _arrays(scan: TaskScan) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDA
     finite = np.isfinite(points).all(1)
     points = np.where(finite[:, None], points, np.float32(0))
     return points, np.isin(labels, MOVABLE) | (labels >= FIRST_MOVING), finite & ~np.isin(labels, UNCOUNTED)
+
+
+def _shadowed(points: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Which of the points (N, 4) lie in the shadows of things that are not there: sectors of up to 0.24 rad, each from
+    some distance on."""
+    azimuth, distance = np.arctan2(points[:, 1], points[:, 0]), np.hypot(points[:, 0], points[:, 1])
+    out = np.zeros(len(points), np.bool_)
+    for at, width, start in torch.rand(int(float(torch.rand(())) * _SHADOWS), 3).tolist():
+        off = np.abs((azimuth - (2 * at - 1) * math.pi + math.pi) % (2 * math.pi) - math.pi)
+        out |= (off < 0.02 + 0.1 * width) & (distance > 4 + 30 * start)
+    return out
 
 
 def _varied(points: NDArray[np.float32]) -> NDArray[np.float32]:

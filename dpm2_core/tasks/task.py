@@ -59,6 +59,8 @@ class TaskTraining(Settings):
     """Weight decay."""
     clip: float = Field(default=1.0, gt=0)
     """Largest norm of the gradient."""
+    average: float = Field(default=0, ge=0, lt=1)
+    """Decay of the average of the weights that is kept; 0: the last ones."""
     seed: int = 0
     """Of the weights, the order of the windows and everything random."""
     validate_every: int = Field(default=5, ge=1)
@@ -145,6 +147,9 @@ class Task(nn.Module, ABC):
 
     def start_epoch(self, epoch: int) -> None:
         """Get ready for an epoch, the first being 0: a task of several stages freezes what does not learn in this."""
+
+    def settle(self, scans: TaskScans) -> None:
+        """What is left to do after the last step, before the weights are stored; `scans` are those learned from."""
 
     def windows(self, scans: int) -> list[slice]:
         """Where each window is among so many scans."""

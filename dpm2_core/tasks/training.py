@@ -52,14 +52,16 @@ def train_task(
     optimizer = OptimizerSettings(
         kind=settings.optimizer, momentum=settings.momentum, drop_every=settings.drop_every * epoch,
         drop=settings.drop, steps=settings.epochs * epoch, rate=settings.rate, final_rate=settings.final_rate,
-        warmup=settings.warmup, decay=settings.decay, clip=settings.clip, ema=0.0, seed=settings.seed, compile=False,
-        bf16=False, save_every=epoch, validate_every=settings.validate_every * epoch,
+        warmup=settings.warmup, decay=settings.decay, clip=settings.clip, ema=settings.average, seed=settings.seed,
+        compile=False, bf16=False, save_every=epoch, validate_every=settings.validate_every * epoch,
     )  # fmt: skip
 
     def batches(start: int, rank: int) -> Iterator[tuple[list[TaskScan], int]]:
         return _batches(task, scans, windows, start)
 
     def save(averaged: nn.Module) -> None:
+        task.load_state_dict(averaged.state_dict())
+        task.settle(scans)
         save_task(task, out / WEIGHTS, {"epochs": str(settings.epochs if until is None else until)})
 
     validate = None if val is None else partial(measure, scans=val)

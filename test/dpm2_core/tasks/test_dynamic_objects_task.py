@@ -4,6 +4,7 @@ rejected."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from dpm2_core.tasks.scan import TaskScan, TaskScans
 from dpm2_core.tasks.training import new_task, save_task, train_task
 
 SMALL = DynamicObjectTraining(
-    network=DynamicObjectNetSettings(cells=32, cell=1.0, channels=8), epochs=12, every=1, batch=1, drop=0.3
+    network=DynamicObjectNetSettings(cells=32, cell=1.0, channels=8), epochs=24, every=1, batch=1, thin=0.3, average=0.9
 )
 
 
@@ -113,12 +114,49 @@ def test_dynamic_objects_of_one_scan_are_put_into_another() -> None:
     loss = []
     for paste in (0.0, 1.0):
         torch.manual_seed(0)
-        task = DynamicObjectTask(SMALL.model_copy(update={"paste": paste, "drop": 0.0}))
+        task = DynamicObjectTask(SMALL.model_copy(update={"paste": paste, "thin": 0.0}))
         with torch.no_grad():
             task.net.head.weight.zero_()
             task.net.head.bias.fill_(9.0)
             loss.append(float(task.losses([empty, cars])[0]))
     assert loss[1] < 0.98 * loss[0]
+
+
+def test_a_training_ends_with_the_statistics_of_whole_scans() -> None:
+    """Whatever they were before; what was learned stays, and the same scans give the same answer."""
+    scans = TaskScans([Drive(5)])
+    torch.manual_seed(0)
+    task = DynamicObjectTask(SMALL).eval()
+    learned = {name: value.clone() for name, value in task.named_parameters()}
+    answers = []
+    for factor in (1.0, 30.0):
+        for name, value in task.named_buffers():
+            if name.endswith("running_mean"):
+                value.add_(factor)
+        unsettled = task.net.probability(scans[0].points.numpy())
+        task.settle(scans)
+        answers.append(task.net.probability(scans[0].points.numpy()))
+        assert not np.array_equal(unsettled, answers[-1])
+    np.testing.assert_array_equal(*answers)
+    assert not any(layer.training for layer in task.modules())
+    for name, value in task.named_parameters():
+        torch.testing.assert_close(value, learned[name], rtol=0, atol=0)
+
+
+def test_the_average_of_the_weights_is_kept_where_one_is_asked_for(tmp_path: Path) -> None:
+    """The same training ends elsewhere, but nearer to its last weights than to its first."""
+    scans = TaskScans([Drive(5)])
+    few = SMALL.model_copy(update={"epochs": 4, "warmup": 1})
+    first = list(new_task("movers", few).parameters())
+    last, average = (
+        list(
+            train_task(
+                new_task("movers", few.model_copy(update={"average": decay})), scans, tmp_path / name
+            ).parameters()
+        )
+        for name, decay in (("last", 0.0), ("average", 0.9))
+    )
+    assert 0 < _distance(average, last) < 0.5 * _distance(first, last)
 
 
 def test_points_that_are_not_finite_teach_nothing() -> None:
@@ -137,3 +175,7 @@ class _One(Drive):
 
     def __init__(self, scan: TaskScan) -> None:
         self.scans = [scan]
+
+
+def _distance(a: Sequence[torch.Tensor], b: Sequence[torch.Tensor]) -> float:
+    return float(torch.stack([(x - y).detach().norm() for x, y in zip(a, b, strict=True)]).norm())
