@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from hashlib import sha256
 from statistics import mean, median, pstdev
 from time import process_time
 from typing import Any
@@ -48,7 +49,7 @@ Scans = list[tuple[Points, NDArray[np.bool_]]]
 def bench_traffic(options: Options) -> Report:
     """Every registration in every place, repetitions being worlds of each; `--only` names one registration.
 
-    Goes on where traffic.json ends, if it is of the same settings; it is written after each drive.
+    Goes on where traffic.json ends, if it is of the same settings and weights; it is written after each drive.
 
     Raises:
         UsageError: no such registration.
@@ -142,12 +143,16 @@ def _figures(runs: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _recipe(options: Options) -> dict[str, Any]:
+    """What the drives stand on: where it has changed, all are measured again."""
     return {
         "frames": FRAMES,
         "lidar": LIDAR.model_dump(),
         "first_seed": FIRST_SEED,
         "places": PLACES,
         "overrides": list(options.overrides),
+        "weights_sha256": {
+            path.stem: sha256(path.read_bytes()).hexdigest() for path in sorted(PRETRAINED_DIR.glob("*.safetensors"))
+        },
     }
 
 

@@ -34,9 +34,10 @@ def test_a_short_drive_is_evaluated_once(tmp_path: Path, monkeypatch: pytest.Mon
         traffic.bench_traffic(options).results["drives"]
         == json.loads((tmp_path / "traffic.json").read_text())["drives"]
     )
-    monkeypatch.setattr(traffic, "FRAMES", 7)  # of another recipe: begun anew
-    with pytest.raises(TypeError):
-        traffic.bench_traffic(options)
+    for name, other in (("FRAMES", 7), ("PRETRAINED_DIR", tmp_path)):  # another recipe, other weights: begun anew
+        with monkeypatch.context() as changed, pytest.raises(TypeError):
+            changed.setattr(traffic, name, other)
+            traffic.bench_traffic(options)
 
 
 def test_the_summary_is_of_means_and_medians_and_counts_drives_that_strayed() -> None:
