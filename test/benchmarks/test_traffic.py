@@ -35,9 +35,10 @@ def test_a_short_drive_is_evaluated_once(tmp_path: Path, monkeypatch: pytest.Mon
         == json.loads((tmp_path / "traffic.json").read_text())["drives"]
     )
     for name, other in (("FRAMES", 7), ("PRETRAINED_DIR", tmp_path)):  # another recipe, other weights: begun anew
-        with monkeypatch.context() as changed, pytest.raises(TypeError):
+        with monkeypatch.context() as changed:
             changed.setattr(traffic, name, other)
-            traffic.bench_traffic(options)
+            with pytest.raises(TypeError):
+                traffic.bench_traffic(options)
 
 
 def test_the_summary_is_of_means_and_medians_and_counts_drives_that_strayed() -> None:
