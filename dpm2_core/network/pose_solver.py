@@ -36,8 +36,8 @@ MIN_INLIERS = 30
 BEST = 30  # pairs whose mean probability says how well a pose is borne out
 CHI2 = 11.3  # 99 % quantile with 3 degrees of freedom: inliers of the precision-weighted solve
 FEW = 0.5  # of the pairs: where no more of them fit, other poses are tried, too
-TRIED = 8  # so many
-CLEARLY = 1.0  # logit: of these the surest counts, if it is surer than the first pose by so much
+TRIED = 8  # other poses, at most
+CLEARLY = 1.0  # logit by which the most probable of them must exceed that of the first pose to replace it
 MOST_CONFIDENT, SURE = 64, 0.5  # the solver `confident` starts from so many pairs, and from those that are so probable
 
 Solver = Literal["consensus", "confident"]
@@ -146,11 +146,10 @@ def _judged(
     """Poses (B, 4, 4), information (B, 6, 6) and inliers (B, 2K) of pairs, with what tells how good they are."""
     T, information, inliers = solution
     covariance = decoder.settings.covariance_scale * torch.linalg.inv_ex(information)[0]
-    error = (transform(T, pairs.source.double()) - pairs.target).norm(dim=-1)
     count = inliers.sum(1)
-    residual = ((error**2 * inliers).sum(1) / count.clamp(min=1)).sqrt()
     wanted = pairs_wanted(matched.source.mask, matched.target.mask, decoder.settings.pair_ratio)
-    return Solved(T, covariance, residual, count, _borne_out(matched.unguided, T), count / (2 * wanted).clamp(min=1))
+    share = count / (2 * wanted).clamp(min=1)
+    return Solved(T, covariance, _residual(pairs, T, inliers), count, _borne_out(matched.unguided, T), share)
 
 
 def _reconsidered(decoder: Decoder, matched: Matched, solved: Solved) -> Solved:
@@ -212,12 +211,16 @@ def _solve_svd_near(pairs: Correspondences, T: Tensor) -> tuple[Tensor, Tensor, 
 def _solve_svd(pairs: Correspondences, inliers: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Pose, information and inliers by the robust SVD: every offset counts as known like the others."""
     T, inliers = robust_kabsch(pairs, inliers)
-    error = (transform(T, pairs.source.double()) - pairs.target).norm(dim=-1)
-    rmse = ((error**2 * inliers).sum(1) / inliers.sum(1).clamp(min=1)).sqrt()
-    sigma = rmse.clamp(min=0.02)[:, None, None, None] / 3**0.5
+    sigma = _residual(pairs, T, inliers).clamp(min=0.02)[:, None, None, None] / 3**0.5
     _, jacobian = whitened_residuals(T, pairs._replace(L=torch.eye(3, device=T.device).expand_as(pairs.L)))
     jacobian = (jacobian * inliers[..., None, None] / sigma).flatten(1, 2)
     return T, jacobian.transpose(1, 2) @ jacobian + 1e-6 * torch.eye(6, device=T.device), inliers
+
+
+def _residual(pairs: Correspondences, T: Tensor, inliers: Tensor) -> Tensor:
+    """Root mean square distance (B,) between the points of the inliers (B, 2K), m."""
+    error = (transform(T, pairs.source.double()) - pairs.target).norm(dim=-1)
+    return ((error**2 * inliers).sum(1) / inliers.sum(1).clamp(min=1)).sqrt()
 
 
 def _borne_out(unguided: Correspondences, T: Tensor) -> Tensor:
