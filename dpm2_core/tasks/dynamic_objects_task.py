@@ -11,8 +11,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from pydantic import Field
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional
+from torch.optim.swa_utils import update_bn
 
 from dpm2_core.errors import UsageError
 from dpm2_core.network.perception.dynamic_objects import DynamicObjectNet, DynamicObjectNetSettings, occupancy, voxels
@@ -98,15 +99,12 @@ class DynamicObjectTask(Task):
     def settle(self, scans: TaskScans) -> None:
         """The means and variances of the layers are made those of whole scans: the training has seen thinned and mixed
         ones alone, and off its own kind of scan that costs as much as anything else."""
-        for layer in self.net.modules():
-            if isinstance(layer, nn.BatchNorm2d):
-                layer.reset_running_stats()
-                layer.momentum = None  # the mean over all of them
-                layer.train()
-        generator = torch.Generator().manual_seed(self.settings.seed)
-        for i in torch.randperm(len(scans), generator=generator)[:_SETTLED].tolist():
-            self.net.probability(_arrays(scans[i])[0])
-        self.eval()
+        network, generator = self.settings.network, torch.Generator().manual_seed(self.settings.seed)
+        chosen = torch.randperm(len(scans), generator=generator)[:_SETTLED].tolist()
+        scanned = (voxels(_arrays(scans[i])[0], network) for i in chosen)
+        grids = (occupancy([voxel[inside]], network).to(self.device) for voxel, inside in scanned)
+        with torch.autocast(self.device.type, torch.bfloat16):  # as `DynamicObjectNet.probability`
+            update_bn(grids, self.net)
 
     def evaluate(self, scans: TaskScans) -> dict[str, float]:
         """Over all points of all scans: IoU, precision and recall of what can move, and recall of what does."""
@@ -165,9 +163,8 @@ def _shadowed(points: NDArray[np.float32]) -> NDArray[np.bool_]:
     some distance on."""
     azimuth, distance = np.arctan2(points[:, 1], points[:, 0]), np.hypot(points[:, 0], points[:, 1])
     out = np.zeros(len(points), np.bool_)
-    for at, width, start in torch.rand(int(float(torch.rand(())) * _SHADOWS), 3).tolist():
-        off = np.abs((azimuth - (2 * at - 1) * math.pi + math.pi) % (2 * math.pi) - math.pi)
-        out |= (off < 0.02 + 0.1 * width) & (distance > 4 + 30 * start)
+    for start, width, beyond in torch.rand(int(float(torch.rand(())) * _SHADOWS), 3).tolist():
+        out |= ((azimuth - math.tau * start) % math.tau < 0.04 + 0.2 * width) & (distance > 4 + 30 * beyond)
     return out
 
 

@@ -146,16 +146,13 @@ def test_a_training_ends_with_the_statistics_of_whole_scans() -> None:
 def test_the_average_of_the_weights_is_kept_where_one_is_asked_for(tmp_path: Path) -> None:
     """The same training ends elsewhere, but nearer to its last weights than to its first."""
     scans = TaskScans([Drive(5)])
-    few = SMALL.model_copy(update={"epochs": 4, "warmup": 1})
-    first = list(new_task("movers", few).parameters())
-    last, average = (
-        list(
-            train_task(
-                new_task("movers", few.model_copy(update={"average": decay})), scans, tmp_path / name
-            ).parameters()
-        )
-        for name, decay in (("last", 0.0), ("average", 0.9))
-    )
+
+    def settings(average: float) -> DynamicObjectTraining:
+        return SMALL.model_copy(update={"epochs": 4, "warmup": 1, "average": average})
+
+    first = list(new_task("movers", settings(0)).parameters())
+    last = list(train_task(new_task("movers", settings(0)), scans, tmp_path / "last").parameters())
+    average = list(train_task(new_task("movers", settings(0.9)), scans, tmp_path / "average").parameters())
     assert 0 < _distance(average, last) < 0.5 * _distance(first, last)
 
 
