@@ -126,7 +126,7 @@ train-ground: setup  ## train the weights of slam.filter.kind=ground (2 cores: 1
 
 # The usual traffic and a dense one with 64 beams, and 32 beams higher up; the task learns from all of them.
 MOVERS = $(BIN)/python -m dpm2_core.cli train tasks-data out/movers/$(1) --config config/movers_drives.yaml
-train-movers: setup  ## train the weights of slam.filter.kind=movers (2 cores: 30 minutes, 10 GB)
+train-movers: setup  ## train the weights of slam.filter.kind=movers (one core: 45 minutes, 10 GB)
 	$(call MOVERS,usual)
 	$(call MOVERS,dense) --set train=24 --set train_frames=8 --set first_seed=18000 --set traffic=25 \
 		--set 'presets=[city, suburb, rural, highway]'

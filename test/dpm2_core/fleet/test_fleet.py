@@ -77,7 +77,7 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
 
 @pytest.fixture(scope="module")
 def drives(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Two drives of 12 scans, and a folder that is none."""
+    """Two drives of 12 scans, and a folder that is not a drive."""
     root = tmp_path_factory.mktemp("drives")
     (root / "nothing").mkdir()
     return [*(first_scans(recording, 12, root / name) for name in ("one", "two")), root / "nothing"]
