@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from dpm2_core.geometry.rays import pixel_rays, point_ray_distance, project
-from dpm2_core.network.attention import zscore
+from dpm2_core.network import compiled_bias
+from dpm2_core.network.attention import hiding, zscore
 from dpm2_core.network.convnext import FeatureMap
 from dpm2_core.network.views import Views
 
@@ -20,11 +21,19 @@ def point_bias(points: Tensor, tokens: Tensor, token_mask: Tensor, alpha: float)
         - 2 * points @ tokens.transpose(-1, -2)
     )
     distance = squared.clamp(min=1e-6).sqrt()
-    return _compact(zscore(torch.exp(-alpha * distance), token_mask[:, None])[:, None])
+    return _near_bias(distance, torch.ones_like(distance, dtype=torch.bool), token_mask[:, None], (alpha,))
 
 
-def _compact(bias: Tensor) -> Tensor:
-    """bf16 under autocast: the largest tensors of the network, read by every layer."""
+def _near_bias(distance: Tensor, counted: Tensor, mask: Tensor, alphas: tuple[float, ...]) -> Tensor:
+    """The z-scores (B, len(alphas), N, T) of M exp(-alpha distance) over the tokens that the mask shows, those of the
+    others being 0; M is 0 where a distance (B, N, T) is not counted. The mask is (B, 1, T or 1).
+
+    bf16 under autocast: the largest tensors of the network, read by every layer.
+    """
+    if compiled_bias.applies(distance) and hiding(mask) is None:
+        return compiled_bias.near_bias(distance, counted, alphas)
+    alpha = torch.tensor(alphas, device=distance.device).view(1, -1, 1, 1)
+    bias = zscore(torch.exp(-alpha * distance[:, None]) * counted[:, None], mask[:, None])
     return bias.bfloat16() if torch.is_autocast_enabled(bias.device.type) else bias
 
 
@@ -49,13 +58,11 @@ def ray_bias(points: Tensor, views: Views, uv: Tensor, alphas: tuple[float, ...]
         points behind the camera: another camera changes nothing of what this one says; and `seen` (B, N, V), True where
         the point projects into an image that is present.
     """
-    alpha = torch.tensor(alphas, device=points.device).view(1, -1, 1, 1)
     biases, seen = [], []
     for view in range(views.pixels.shape[1]):
         K, T_lidar_cam = views.K[:, view].float(), views.T_lidar_cam[:, view].float()
         distance, front = point_ray_distance(points, *pixel_rays(uv, K, T_lidar_cam))
-        near = torch.exp(-alpha * distance[:, None]) * front[:, None]
-        biases.append(_compact(zscore(near, views.present[:, view, None, None, None])))
+        biases.append(_near_bias(distance, front, views.present[:, view, None, None], alphas))
         seen.append(seen_from(points, views, view))
     return torch.cat(biases, -1), torch.stack(seen, -1)
 

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Biases as machine code are those of the tensors, rounded once."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dpm2_core.network import compiled_bias
+from dpm2_core.network.attention import RelativeBias, zscore
+
+HALF_ULP = 2**-8  # of bfloat16, relative
+
+
+def close(found: torch.Tensor, exact: torch.Tensor) -> None:
+    """Rounded to bfloat16, after an error of float32 that grows with the largest term of a sum."""
+    assert found.dtype == torch.bfloat16
+    torch.testing.assert_close(found.float(), exact.float(), rtol=HALF_ULP, atol=2e-5)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(1, 70), st.floats(0.01, 200), st.integers(0, 2**31))
+def test_relative_bias_is_that_of_the_tensors(n: int, spread: float, seed: int) -> None:
+    """Of any number of points, near or far, in a batch of two."""
+    torch.manual_seed(seed)
+    relative = RelativeBias(2, 3)
+    torch.nn.init.normal_(relative.weight)
+    xyz, axis = torch.randn(2, n, 3) * spread, torch.nn.functional.normalize(torch.randn(2, n, 2), dim=-1)
+    with torch.no_grad():
+        exact = relative(xyz, axis)
+        with torch.autocast("cpu", torch.bfloat16):
+            found = relative(xyz, axis)
+    for a, b in zip(found, exact, strict=True):
+        close(a, b)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(1, 70), st.floats(0.01, 300), st.floats(0, 1), st.integers(0, 2**31))
+def test_near_bias_is_the_zscore_of_the_decay(tokens: int, spread: float, hidden: float, seed: int) -> None:
+    """Also where nothing counts, or all lie so far away that the decay vanishes."""
+    torch.manual_seed(seed)
+    distance, counted = torch.rand(2, 4, tokens) * spread, torch.rand(2, 4, tokens) >= hidden
+    alphas = (0.1, 1.0, 6.0)
+    alpha = torch.tensor(alphas, dtype=torch.float64).view(1, -1, 1, 1)
+    exact = zscore(torch.exp(-alpha * distance[:, None]) * counted[:, None])
+    torch.testing.assert_close(
+        compiled_bias.near_bias(distance, counted, alphas).float(), exact.float(), rtol=HALF_ULP, atol=5e-3
+    )
+
+
+def test_training_and_other_devices_keep_to_tensors() -> None:
+    """A gradient is asked for, or full precision: the machine code has neither."""
+    x = torch.zeros(1)
+    assert not compiled_bias.applies(x)
+    with torch.autocast("cpu", torch.bfloat16):
+        assert not compiled_bias.applies(x)
+        with torch.no_grad():
+            assert compiled_bias.applies(x)
+            assert not compiled_bias.applies(torch.zeros(1, device="meta"))
+    with torch.no_grad():
+        assert not compiled_bias.applies(x)
+
+
+@pytest.mark.parametrize("at", [0.0, 1e-3, 0.7, 40.0, 1e4])
+def test_a_single_distance(at: float) -> None:
+    """The decay alone, by a bias whose only weight is that of one reach: exp(-d / 1 m)."""
+    weight = torch.zeros(1, compiled_bias.DIRECTIONS + compiled_bias.DISTANCES)
+    weight[0, compiled_bias.DIRECTIONS] = 1
+    xyz, axis = torch.tensor([[[0.0, 0, 0], [at, 0, 0]]]), torch.tensor([[[1.0, 0], [1, 0]]])
+    found = compiled_bias.relative_bias(xyz, axis, weight, (1.0, 2.5, 6.0, 15.0, 40.0))[0, 0]
+    exact = torch.exp(-torch.cdist(xyz[0], xyz[0]))
+    torch.testing.assert_close(found.float(), exact, rtol=HALF_ULP, atol=4e-5)  # sqrt(1e-9) of 0 m
