@@ -22,7 +22,8 @@ class RosSettings(Settings):
     """Of the subscriptions. auto follows the publishers: best effort as soon as one of them offers no more."""
 
     queue_depth: int = Field(default=10, ge=1, le=1000)
-    """Clouds that may wait for the worker; when full, the oldest is dropped, and counted in /diagnostics."""
+    """Clouds that may wait for the worker; when full, the oldest is dropped, and counted in /diagnostics. Where clouds
+    keep coming faster than they are processed fewer may wait, down to two, until it has caught up."""
 
     sync_timeout: float = Field(default=0.03, ge=0, le=5)
     """How long a cloud waits for its image before it goes on without, s."""

@@ -20,6 +20,8 @@ from dpm2_core.data.pairing import JUMP, Beside, passed
 
 HOLD = 0.5
 """Longest wait (s) for the next stamp, which confirms a jump."""
+FEW = 2
+"""Clouds that may wait at least where they come faster than they can be processed."""
 PATIENCE = 5
 """Clouds in a row that a sensor may miss before clouds no longer wait for it (until it delivers again)."""
 
@@ -82,7 +84,8 @@ class Synchronizer:
 
     Args:
         beside: topics of the other sensors. Without any, nothing waits.
-        depth: clouds that may wait; when full, the oldest is dropped.
+        depth: clouds that may wait; when full, the oldest is dropped. Where clouds keep coming faster than they go, one
+            fewer may wait each time, down to `FEW`: as many are lost, but those that go are not old.
         timeout: longest wait of a cloud, s.
         tolerance: greatest difference of stamps that belong together, s.
 
@@ -97,7 +100,8 @@ class Synchronizer:
         self.last_arrival: float | None = None
         self._timeout = timeout
         self._queue: deque[Bundle] = deque()
-        self._depth = depth
+        self._depth = self._room = depth  # what may wait in general, and now
+        self._moves = False  # whether a cloud has gone since the last was dropped: too slow, but not held up
         self._newest: int | None = None  # stamp of the last cloud accepted
         self._arrival = 0.0  # of that cloud
         self._jumped: Bundle | None = None
@@ -146,6 +150,15 @@ class Synchronizer:
         """The next cloud that has what goes with it or has waited long enough; None if there is none yet."""
         if self._jumped is not None and now >= self._jumped.arrival + HOLD:
             self._settle(true=True)
+        ready = self._ready(now)
+        if ready is None:  # who asks is not behind
+            self._room = self._depth
+        else:
+            self._left, self._moves = (ready.stamp, ready.arrival), True
+        return ready
+
+    def _ready(self, now: float) -> Bundle | None:
+        """Takes the next cloud from the queue, if it need not wait."""
         if not self._queue:
             return None
         head, sensors = self._queue[0], self.sensors
@@ -159,7 +172,6 @@ class Synchronizer:
             sensor.messages.forget(head.stamp)
         head.beside = {topic: message for topic, message in found.items() if message is not None}
         self._queue.popleft()
-        self._left = head.stamp, head.arrival
         return head
 
     def deadline(self) -> float | None:
@@ -193,7 +205,9 @@ class Synchronizer:
     def _accept(self, bundle: Bundle) -> None:
         self._newest, self._arrival = bundle.stamp, bundle.arrival
         self._queue.append(bundle)
-        if len(self._queue) > self._depth:
+        if len(self._queue) > self._room and self._moves:
+            self._room, self._moves = max(self._room - 1, min(FEW, self._depth)), False
+        while len(self._queue) > self._room:
             oldest = self._queue.popleft()
             self._queue[0].restarted |= oldest.restarted  # not lost with the cloud that announced it
             self.dropped += 1

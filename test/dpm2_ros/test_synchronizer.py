@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dpm2_ros.synchronizer import HOLD, PATIENCE, Bundle, SensorState, StampCheck, Synchronizer
+from dpm2_ros.synchronizer import FEW, HOLD, PATIENCE, Bundle, SensorState, StampCheck, Synchronizer
 
 MS = 1_000_000
 
@@ -186,6 +187,60 @@ def test_a_full_queue_drops_the_oldest_and_counts() -> None:
         synchronizer.add_cloud((100 + n) * MS, n, now=0.0)
     assert [bundle.cloud for bundle in drain(synchronizer, 1.0)] == [2, 3, 4]
     assert synchronizer.dropped == 2
+
+
+def driven(synchronizer: Synchronizer, takes: float, until: float, image_late: float | None = None) -> list[Bundle]:
+    """What a worker gets that needs so long (s) for each of the clouds that come at 10 Hz, arrival as they went."""
+    got, free, step = list[Bundle](), 0.0, 0.01
+    for tick in range(round(until / step)):
+        now = tick * step
+        if tick % 10 == 0:
+            synchronizer.add_cloud(tick * 10 * MS, tick, now)
+        if image_late is not None and (due := tick - round(image_late / step)) >= 0 and due % 10 == 0:
+            synchronizer.add("/image", due * 10 * MS, due, now)
+        if now >= free and (bundle := synchronizer.pop(now)) is not None:
+            bundle.arrival, free = now - bundle.arrival, now + takes
+            got.append(bundle)
+    return got
+
+
+def test_a_worker_that_is_too_slow_gets_clouds_that_are_not_old() -> None:
+    """Of 10 clouds 8 can be processed: two are lost whatever waits, but after a while they wait FEW periods, not 10,
+    and none of the gaps on the way there is longer than three periods."""
+    synchronizer = make(camera=False)
+    got = driven(synchronizer, takes=0.125, until=60)
+    assert max(bundle.arrival for bundle in got) <= 1.15  # 10 waiting, and the rest of the one before
+    assert max(bundle.arrival for bundle in got[len(got) // 2 :]) <= (FEW + 1) * 0.1
+    assert max(b.stamp - a.stamp for a, b in pairwise(got)) <= 300 * MS
+    assert len(got) == pytest.approx(60 / 0.125, rel=0.05)
+
+
+def test_a_worker_that_has_caught_up_may_fall_behind_again_without_loss() -> None:
+    """A second of too much work in an hour costs nothing, also after a time of too much work."""
+    synchronizer = make(camera=False)
+    driven(synchronizer, takes=0.125, until=60)
+    at, dropped = 60.0, synchronizer.dropped
+    drain(synchronizer, at)
+    for n in range(10):
+        synchronizer.add_cloud((60_000 + 100 * n) * MS, n, now=at + 0.1 * n)
+    assert synchronizer.dropped == dropped
+    assert len(drain(synchronizer, at + 1)) == 10
+
+
+def test_a_worker_that_is_held_up_loses_only_what_does_not_fit() -> None:
+    synchronizer = make(camera=False, depth=10)
+    drain(synchronizer, 0.0)
+    for n in range(15):  # while it is busy with something else
+        synchronizer.add_cloud(100 * n * MS, n, now=0.1 * n)
+    assert [bundle.cloud for bundle in drain(synchronizer, 1.5)] == list(range(5, 15))
+
+
+def test_images_that_come_late_starve_no_worker() -> None:
+    """Each 0.3 s after its cloud, longer than FEW clouds: who waits for them is not behind."""
+    synchronizer = make(timeout=1.0)
+    got = driven(synchronizer, takes=0.12, until=60, image_late=0.3)
+    assert len(got) > 0.9 * 60 / 0.12
+    assert sum(image_of(bundle) is not None for bundle in got) > 0.8 * len(got)
 
 
 @pytest.mark.parametrize(
