@@ -65,4 +65,4 @@ def _keyframe(node: int, T: Array, rng: np.random.Generator) -> Keyframe:
     features = rng.normal(size=(256, 16)) @ rng.normal(size=(16, 128))
     xyz = (rng.normal(size=(256, 3)) * (20, 20, 2)).astype(np.float32)
     return Keyframe(node, node, node, se3.make(np.eye(3), T[:3, 3]), NO_POINTS, _EDGE if node else None, "",
-                    Descriptors(xyz, features.astype(np.float16)))  # fmt: skip
+                    Descriptors.of(xyz, features))  # fmt: skip

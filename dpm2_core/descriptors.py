@@ -16,11 +16,12 @@ _LEVEL = np.cos(np.radians(5))  # a tilt that is smaller is that of the road
 
 @dataclass(frozen=True, eq=False)
 class Descriptors:
-    """What is kept of a frame: about 86 kB for 320 descriptors.
+    """What is kept of a frame: 46 kB for 320 descriptors.
 
     Attributes:
         xyz: (N, 3) float32 m, in the frame of the set.
-        features: (N, 128) float16.
+        features: (N, 128) int8, in units of `step`: with more bits no pose differs by more than chance.
+        step: (N,) float32, of each descriptor.
         axis: (N, 2) float32, horizontal unit vectors from the sensor to each descriptor, in level axes; None for a
             single frame, where they follow from `xyz`.
         up: (3,) float32 unit vector, in the frame of the set, where the sensor was tilted and the features are those
@@ -30,15 +31,22 @@ class Descriptors:
     """
 
     xyz: NDArray[np.float32]
-    features: NDArray[np.float16]
+    features: NDArray[np.int8]
+    step: NDArray[np.float32]
     axis: NDArray[np.float32] | None = None
     up: NDArray[np.float32] | None = None
     scale: float = 1.0
 
     def __post_init__(self) -> None:
         n = len(self.xyz)
-        if self.xyz.shape != (n, 3) or self.features.ndim != 2 or len(self.features) != n:
-            raise ValueError(f"descriptors: xyz {self.xyz.shape}, features {self.features.shape}; want (N, 3), (N, C)")
+        shapes = self.xyz.shape, self.features.shape, self.step.shape
+        if self.xyz.shape != (n, 3) or self.features.ndim != 2 or len(self.features) != n or self.step.shape != (n,):
+            raise ValueError("descriptors: xyz {}, features {}, step {}; want (N, 3), (N, C), (N,)".format(*shapes))
+
+    @classmethod
+    def of(cls, xyz: NDArray[np.float32], values: NDArray[np.floating]) -> Descriptors:
+        """Those of a single frame with positions (N, 3) and features (N, C)."""
+        return cls(xyz, *quantized(values))
 
     def __len__(self) -> int:
         return len(self.xyz)
@@ -46,7 +54,13 @@ class Descriptors:
     @property
     def nbytes(self) -> int:
         """Bytes of the arrays."""
-        return self.xyz.nbytes + self.features.nbytes + (0 if self.axis is None else self.axis.nbytes)
+        arrays = self.xyz, self.features, self.step, self.axis
+        return sum(array.nbytes for array in arrays if array is not None)
+
+    @property
+    def values(self) -> NDArray[np.float32]:
+        """(N, C) the features."""
+        return self.features * self.step[:, None]
 
     @property
     def axes(self) -> NDArray[np.float32]:
@@ -78,7 +92,17 @@ class Descriptors:
         if self.up is None and self.scale == 1:
             return self
         xyz = self.xyz @ self.R_level_set.T * np.float32(self.scale)
-        return Descriptors(xyz, self.features, self.axis)
+        return Descriptors(xyz, self.features, self.step, self.axis)
+
+
+def quantized(values: NDArray[np.floating]) -> tuple[NDArray[np.int8], NDArray[np.float32]]:
+    """Features (N, C) as int8 in units of a step (N,), of which the largest of each descriptor has 127.
+
+    A step is not finite where a feature is not.
+    """
+    step = np.abs(values).max(1).astype(np.float32) / np.float32(127)
+    with np.errstate(invalid="ignore"):
+        return np.rint(values / np.maximum(step, 1e-30)[:, None]).astype(np.int8), step
 
 
 def is_level(up: NDArray[np.floating]) -> bool:
@@ -144,5 +168,5 @@ def merge(sets: Sequence[Descriptors]) -> Descriptors:
     axes = [s.axes for s in sets]
     if up is not None:  # each estimated its own
         axes = [_turned(axis, levelling(up) @ s.R_level_set.T) for axis, s in zip(axes, sets, strict=True)]
-    xyz, features = np.concatenate([s.xyz for s in sets]), np.concatenate([s.features for s in sets])
-    return Descriptors(xyz, features, np.concatenate(axes), up, sets[0].scale)
+    xyz, features, step = (np.concatenate([getattr(s, name) for s in sets]) for name in ("xyz", "features", "step"))
+    return Descriptors(xyz, features, step, np.concatenate(axes), up, sets[0].scale)

@@ -24,10 +24,9 @@ from dpm2_ros.conversions import EARLIER, bytes_to_array, header
 
 WIRE = QoSProfile(depth=64, reliability=ReliabilityPolicy.RELIABLE)
 """Of keyframes; what falls out of the queue is sent again."""
-MOST_DESCRIPTORS = 256
-"""Of a keyframe on the wire: beside more of them its cloud would have too few points to be verified by."""
 BUDGET = 99_000
-"""Bytes of a keyframe's payload and descriptors on the wire; pose and protocol have the rest of 100 kB."""
+"""Bytes of a keyframe's payload and descriptors on the wire; pose and protocol have the rest of 100 kB. Descriptors may
+have half of it, 325 of 128 channels: beside more the cloud would have too few points to be verified by."""
 
 _FIX = struct.Struct("<q15d")  # stamp, ns; place, covariance, antenna, as in `Fix`
 _OF_FIX, _OF_THUMBNAIL = "fix", "thumbnail"
@@ -122,23 +121,23 @@ def _fix_from(data: bytes) -> Fix:
 
 
 def descriptors_to_msg(d: Descriptors | None, stamp: int, name: str, weights: str = "") -> PointCloud2:
-    """A cloud of points x, y, z, axis_x, axis_y and the bits of 128 half floats `feature:WEIGHTS`; empty for None.
+    """A cloud of points x, y, z, axis_x, axis_y, step and 128 int8 `feature:WEIGHTS`, in units of step; empty for None.
 
-    At most `MOST_DESCRIPTORS`, the first: any number of the first is as evenly spread as all.
+    The first, in half of `BUDGET`: any number of the first is as evenly spread as all.
     Those of a tilted LiDAR whose base is not known, and those of a room, are not sent: the receiver makes its own of
     the cloud.
     """
     d = None if d is not None and (d.up is not None or d.scale != 1) else d
     channels = 0 if d is None else d.features.shape[1]
     dtype = _row(max(channels, 1))
-    rows = np.zeros(0 if d is None else min(len(d), MOST_DESCRIPTORS), dtype)
+    rows = np.zeros(0 if d is None else min(len(d), BUDGET // 2 // dtype.itemsize), dtype)
     if d is not None:
-        sent = slice(len(rows))
-        rows["xyz"], rows["axis"], rows["feature"] = d.xyz[sent], d.axes[sent], d.features[sent]
-    names = ("x", "y", "z", "axis_x", "axis_y")
+        for column, part in (("xyz", d.xyz), ("axis", d.axes), ("step", d.step), ("feature", d.features)):
+            rows[column] = part[: len(rows)]
+    names = ("x", "y", "z", "axis_x", "axis_y", "step")
     fields = [PointField(name=n, offset=4 * i, datatype=PointField.FLOAT32, count=1) for i, n in enumerate(names)]
     feature = f"{_FEATURE}:{weights}" if weights else _FEATURE
-    fields.append(PointField(name=feature, offset=20, datatype=PointField.UINT16, count=max(channels, 1)))
+    fields.append(PointField(name=feature, offset=24, datatype=PointField.INT8, count=max(channels, 1)))
     return PointCloud2(
         header=header(stamp, name),
         height=1,
@@ -160,18 +159,20 @@ def descriptors_from_msg(message: PointCloud2) -> tuple[Descriptors | None, str]
     if not message.width:
         return None, ""
     feature = next((f for f in message.fields if f.name.partition(":")[0] == _FEATURE), None)
-    channels = 0 if feature is None else feature.count
+    if feature is not None and feature.datatype == PointField.UINT16:
+        return None, ""  # float16, of a robot with an earlier dpm2: the receiver makes its own of the cloud
+    channels = 0 if feature is None or feature.datatype != PointField.INT8 else feature.count
     if not 0 < channels <= _MOST_CHANNELS:
-        raise RejectedError("descriptors", f"a cloud that holds descriptors of {channels} channels")
+        raise RejectedError("descriptors", f"a cloud that holds descriptors of {channels} channels of int8")
     dtype = _row(channels)
     if message.point_step != dtype.itemsize or len(message.data) != dtype.itemsize * message.width:
         raise RejectedError(
             "descriptors", f"{len(message.data)} bytes for {message.width} descriptors of {channels} channels"
         )
     rows = np.frombuffer(message.data, dtype)
-    xyz, features, axis = (np.ascontiguousarray(rows[name]) for name in ("xyz", "feature", "axis"))
-    return Descriptors(xyz, features, axis), "" if feature is None else feature.name.partition(":")[2][:64]
+    xyz, features, step, axis = (np.ascontiguousarray(rows[name]) for name in ("xyz", "feature", "step", "axis"))
+    return Descriptors(xyz, features, step, axis), "" if feature is None else feature.name.partition(":")[2][:64]
 
 
 def _row(channels: int) -> np.dtype[np.void]:
-    return np.dtype([("xyz", "<f4", 3), ("axis", "<f4", 2), ("feature", "<f2", channels)])
+    return np.dtype([("xyz", "<f4", 3), ("axis", "<f4", 2), ("step", "<f4"), ("feature", "i1", channels)])

@@ -108,7 +108,7 @@ class Encoder(nn.Module):
         points = collate([build_pyramid(cloud, self.settings, images)])
         views = collate_views([images], self.settings.image)
         made = self.encode_batch(points, views, device)[0]
-        if not np.isfinite(made.features).all():
+        if not np.isfinite(made.step).all():
             raise Dpm2Error("the network's descriptors are not finite: damaged weights, or a library that fails here")
         return made
 
@@ -117,8 +117,8 @@ class Encoder(nn.Module):
         """Descriptors of a batch of prepared frames."""
         with torch.autocast(device.type, torch.bfloat16):
             tokens = self(*to_device((points, views), device)).tokens
-        xyz, features, mask = (field.cpu() for field in (tokens.xyz, tokens.features.half(), tokens.mask))
-        return [Descriptors(x[m].numpy(), f[m].numpy()) for x, f, m in zip(xyz, features, mask, strict=True)]
+        xyz, features, mask = (field.cpu() for field in (tokens.xyz, tokens.features.float(), tokens.mask))
+        return [Descriptors.of(x[m].numpy(), f[m].numpy()) for x, f, m in zip(xyz, features, mask, strict=True)]
 
 
 def to_device(batch: Any, device: torch.device | str) -> Any:

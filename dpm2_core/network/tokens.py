@@ -44,4 +44,4 @@ def to_tokens(sets: Sequence[Descriptors], view_aligned: bool, device: torch.dev
     if not view_aligned:
         axis[..., 0] = 1
     mask = torch.arange(longest, device=device) < torch.tensor([[len(s)] for s in sets], device=device)
-    return Tokens(padded([s.xyz for s in sets]), padded([s.features.astype(np.float32) for s in sets]), axis, mask)
+    return Tokens(padded([s.xyz for s in sets]), padded([s.values for s in sets]), axis, mask)

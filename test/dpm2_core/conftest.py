@@ -28,7 +28,7 @@ def keyframes(noise: np.random.Generator) -> list[Keyframe]:
     out = []
     for i, T in enumerate(poses):
         cloud = np.column_stack([noise.uniform(-40, 40, (300, 2)), noise.uniform(-2, 6, 300), noise.random(300)])
-        d = Descriptors(noise.normal(size=(8, 3)).astype(np.float32), noise.normal(size=(8, 16)).astype(np.float16))
+        d = Descriptors.of(noise.normal(size=(8, 3)).astype(np.float32), noise.normal(size=(8, 16)))
         covariance = np.diag(np.arange(1.0, 7.0)) * 1e-4
         edge = Registration(se3.inverse(poses[i - 1]) @ T, covariance, 0.9, 0.05, "test") if i else None
         out.append(Keyframe(i, 10**15 + i * 10**8 + 7, 3 * i, T, cloud.astype(np.float32), edge, "", d))

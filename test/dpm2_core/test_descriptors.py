@@ -7,6 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from numpy.typing import NDArray
 
 from dpm2_core.descriptors import Descriptors, LazyDescriptors, levelling, merge
 from dpm2_core.errors import Dpm2Error
@@ -18,7 +22,7 @@ LEAN = se3.exp([0.1, 0.5, 0, 0, 0, 0])  # 29 degrees
 
 def level(noise: np.random.Generator) -> Descriptors:
     """As a level sensor sees them."""
-    return Descriptors(noise.normal(size=(30, 3)).astype("f4") * 20, noise.normal(size=(30, 8)).astype("f2"))
+    return Descriptors.of(noise.normal(size=(30, 3)).astype("f4") * 20, noise.normal(size=(30, 8)))
 
 
 def leaning(d: Descriptors, R: Array) -> Descriptors:
@@ -75,6 +79,24 @@ def test_merged_sets_have_one_way_up(noise: np.random.Generator) -> None:
     low = np.abs(plain.xyz[:, 2]) < np.linalg.norm(plain.xyz[:, :2], axis=1)
     np.testing.assert_allclose(both.axes[30:][low], both.axes[:30][low], atol=0.05)  # twice the 0.02 rad at 45 degrees
     np.testing.assert_allclose(both.axes[:30], one.axes, atol=1e-5)
+
+
+@given(arrays(np.float32, (3, 5), elements=st.floats(-1e4, 1e4, width=32)))
+def test_features_are_rounded_to_a_254th_of_the_largest(values: NDArray[np.float32]) -> None:
+    """Of each descriptor by itself, and once: rounding what is rounded changes nothing."""
+    d = Descriptors.of(np.zeros((3, 3), np.float32), values)
+    largest = np.abs(values).max(1, keepdims=True)
+    assert (np.abs(d.values - values) <= largest / 254 * 1.001 + 1e-30).all()
+    np.testing.assert_array_equal(
+        Descriptors.of(d.xyz, d.values).features[largest[:, 0] > 1e-20], d.features[largest[:, 0] > 1e-20]
+    )
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_features_that_are_not_finite_have_a_step_that_is_not(value: float) -> None:
+    values = np.ones((3, 5), np.float32)
+    values[1, 2] = value
+    assert np.isfinite(Descriptors.of(np.zeros((3, 3), np.float32), values).step).tolist() == [True, False, True]
 
 
 def test_lazy_descriptors_are_made_once_and_say_why_there_are_none(noise: np.random.Generator) -> None:

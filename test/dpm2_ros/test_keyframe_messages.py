@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from sensor_msgs.msg import PointField
 
 from dpm2_core.data.thumbnail import thumbnail
 from dpm2_core.descriptors import Descriptors
@@ -16,8 +17,8 @@ from dpm2_core.slam.mapping.admission import RejectedError
 from dpm2_core.slam.store.cloud_codec import unpack_cloud
 from dpm2_ros.keyframe_messages import (
     BUDGET,
-    MOST_DESCRIPTORS,
     descriptors_from_msg,
+    descriptors_to_msg,
     payload_from_msg,
     payload_to_msgs,
 )
@@ -57,20 +58,30 @@ def test_a_picture_that_would_cost_the_cloud_its_points_stays_at_home(noise: np.
     assert payload.fix is not None
 
 
-def test_the_first_256_descriptors_travel(noise: np.random.Generator) -> None:
-    """Any number of the first is as evenly spread as all; fewer travel as they are."""
-    for count in (320, 200):
-        made = Descriptors(noise.normal(0, 15, (count, 3)).astype("f4"), noise.normal(0, 1, (count, 128)).astype("f2"))
+def test_descriptors_travel_in_half_of_the_budget(noise: np.random.Generator) -> None:
+    """All 320 of a frame do; of more the first, any number of which is as evenly spread as all."""
+    for count, most in ((600, 325), (320, 320)):
+        made = Descriptors.of(noise.normal(0, 15, (count, 3)).astype("f4"), noise.normal(0, 1, (count, 128)))
         sent = replace(keyframe(noise, FIX, None, 100_000), descriptors=made)
         message, payload = payload_to_msgs(sent, "a/3", "0123456789abcdef")
         got, weights = descriptors_from_msg(message)
         assert weights == "0123456789abcdef"
         assert got is not None
-        most = min(count, MOST_DESCRIPTORS)
         np.testing.assert_array_equal(got.xyz, made.xyz[:most])
         np.testing.assert_array_equal(got.axes, made.axes[:most])
-        np.testing.assert_array_equal(got.features, made.features[:most])
+        np.testing.assert_array_equal(got.values, made.values[:most])
         assert len(message.data) + len(payload.data) <= BUDGET
+
+
+def test_descriptors_of_an_earlier_robot_are_left_to_the_receiver(noise: np.random.Generator) -> None:
+    """It sent float16; what is neither is rejected."""
+    made = Descriptors.of(noise.normal(0, 15, (9, 3)).astype("f4"), noise.normal(0, 1, (9, 8)))
+    message = descriptors_to_msg(made, 5, "a/3", "0123456789abcdef")
+    message.fields[-1].datatype = PointField.UINT16
+    assert descriptors_from_msg(message) == (None, "")
+    message.fields[-1].datatype = PointField.FLOAT64
+    with pytest.raises(RejectedError, match="0 channels of int8"):
+        descriptors_from_msg(message)
 
 
 def test_parts_that_do_not_add_up_are_rejected(noise: np.random.Generator) -> None:

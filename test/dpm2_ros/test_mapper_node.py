@@ -141,7 +141,7 @@ def hostile_parts(id: int) -> list[Any]:
             bytes(200_000),
         )
     ]
-    seen = descriptors_to_msg(Descriptors(np.zeros((9, 3), "f4"), np.zeros((9, 8), "f2")), 5, name, "weights")
+    seen = descriptors_to_msg(Descriptors.of(np.zeros((9, 3), "f4"), np.zeros((9, 8))), 5, name, "weights")
     short, wide = copy.deepcopy(seen), copy.deepcopy(seen)
     short.width, wide.fields[-1].count = 2**32 - 1, 2**32 - 1
     return [*poses, *clouds, short, wide]
@@ -175,7 +175,7 @@ def test_no_name_ends_the_mapper(mapper: Any, name: str) -> None:
 def test_descriptors_of_other_weights_are_made_anew(mapper: Any) -> None:
     """The keyframe is used, and what is compared with others comes from the mapper's own network."""
     name, cloud = keyframe_name("", 0, S), points(0)
-    foreign = Descriptors(np.ones((256, 3), "f4"), np.ones((256, 128), "f2"))
+    foreign = Descriptors.of(np.ones((256, 3), "f4"), np.ones((256, 128)))
     pose, wire = edge_to_msg(np.eye(4), np.zeros((6, 6)), 9, "odom", name), mapper.wires
     seen, packed = payload_to_msgs(Keyframe(0, 9, 0, np.eye(4), cloud, descriptors=foreign), name, "0123456789abcdef")
     for publisher, message in zip(wire, (pose, seen, packed), strict=True):

@@ -29,7 +29,7 @@ def pooled(descriptors: Descriptors) -> Vector:
     rows, columns = np.triu_indices(CHANNELS)
     if len(descriptors) < _FEW:
         return np.zeros(len(rows), np.float32)
-    features = descriptors.features.astype(np.float32) @ _directions(descriptors.features.shape[1])
+    features = descriptors.values @ _directions(descriptors.features.shape[1])
     features -= features.mean(0)
     covariance = features.T @ features / len(features)
     eigenvalues, axes = np.linalg.eigh(covariance + 1e-3 * np.trace(covariance) / CHANNELS * np.eye(CHANNELS))

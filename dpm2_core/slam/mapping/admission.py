@@ -82,6 +82,6 @@ def check_descriptors(d: Descriptors, channels: int | None = None) -> None:
         raise RejectedError("descriptors", f"{count} descriptors of {width} channels; want 1 to {MAX_DESCRIPTORS}")
     if d.axis is not None and d.axis.shape != (count, 2):
         raise RejectedError("descriptors", f"its descriptors have axes of shape {d.axis.shape}; want ({count}, 2)")
-    parts = ((d.xyz, _REACH), (d.features, _LARGEST_FEATURE), (d.axes, 2.0))
+    parts = ((d.xyz, _REACH), (d.step, _LARGEST_FEATURE / 127), (d.axes, 2.0))
     if not all(np.abs(part).max() <= limit for part, limit in parts):  # NaN compares false
         raise RejectedError("descriptors", "its descriptors are not finite, or too large")

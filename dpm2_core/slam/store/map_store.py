@@ -111,7 +111,7 @@ class MapStore:
                 schema.check(store._connection, version)
                 if version < schema.VERSION and not read_only:
                     schema.migrate(store._connection, version)
-                elif version < schema.VERSION:
+                elif version < schema.TABLES:
                     store = _migrated_copy(store, version)
                 if not read_only:
                     _durable(store._connection)

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from dpm2_core.descriptors import Descriptors
+from dpm2_core.descriptors import Descriptors, quantized
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Array, Edge, Fix, Georeference, Keyframe, Points, Registration
 from dpm2_core.geometry import se3
@@ -27,7 +27,8 @@ NO_POINTS: Points = np.zeros((0, 4), np.float32)
 FARTHEST = 1e7
 """m from the origin: from there on float32 clouds are meters off. No pose of a map lies beyond."""
 _LONGEST_NAME = 255
-_DESCRIPTORS = struct.Struct("<IIB")  # number, channels, 1 with axes + 2 with the direction up + 4 with a scale
+_DESCRIPTORS = struct.Struct("<IIB")  # number, channels, the sum of what follows
+_AXES, _UP, _SCALE, _STEPS = 1, 2, 4, 8  # without steps, as in maps of version 3: features are float16
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,13 +97,14 @@ def pose_of(data: Any) -> Array:
 
 
 def pack_descriptors(d: Descriptors) -> bytes:
-    """xyz float32, features float16; axes, up, and a scale other than 1, float32, if there are any."""
+    """xyz float32, features int8, steps float32; axes, up, and a scale other than 1, float32, if there are any."""
     scale = None if d.scale == 1 else np.array([d.scale])
-    present = [part is not None for part in (d.axis, d.up, scale)]
-    head = _DESCRIPTORS.pack(len(d), d.features.shape[1], sum(bit << i for i, bit in enumerate(present)))
-    rest = b"".join(np.ascontiguousarray(part, "<f4").tobytes() for part in (d.axis, d.up, scale) if part is not None)
-    xyz, features = np.ascontiguousarray(d.xyz, "<f4"), np.ascontiguousarray(d.features, "<f2")
-    return head + xyz.tobytes() + features.tobytes() + rest
+    others = {_AXES: d.axis, _UP: d.up, _SCALE: scale}
+    parts = _STEPS + sum(bit for bit, part in others.items() if part is not None)
+    head = _DESCRIPTORS.pack(len(d), d.features.shape[1], parts)
+    rest = [np.ascontiguousarray(part, "<f4") for part in (d.step, *others.values()) if part is not None]
+    arrays = np.ascontiguousarray(d.xyz, "<f4"), np.ascontiguousarray(d.features, "i1"), *rest
+    return head + b"".join(array.tobytes() for array in arrays)
 
 
 def unpack_descriptors(data: bytes) -> Descriptors:
@@ -114,23 +116,27 @@ def unpack_descriptors(data: bytes) -> Descriptors:
     if len(data) < _DESCRIPTORS.size:
         raise ValueError("no descriptors: too few bytes")
     n, channels, parts = _DESCRIPTORS.unpack_from(data)
-    axes, tilted, scaled = (parts >> i & 1 for i in range(3))
-    sizes = 12 * n, 2 * n * channels, 8 * n * axes, 12 * tilted, 4 * scaled
+    axes, tilted, scaled, steps = (bool(parts & bit) for bit in (_AXES, _UP, _SCALE, _STEPS))
+    sizes = 12 * n, (2 - steps) * n * channels, 4 * n * steps, 8 * n * axes, 12 * tilted, 4 * scaled
     end = list(accumulate(sizes, initial=_DESCRIPTORS.size))
-    if len(data) != end[-1] or not n or not channels or parts > 7:
+    if len(data) != end[-1] or not n or not channels or parts > _AXES + _UP + _SCALE + _STEPS:
         raise ValueError(f"no descriptors: {len(data)} bytes for {n} of {channels}")
     xyz = np.frombuffer(data, "<f4", 3 * n, end[0]).reshape(n, 3).copy()
-    features = np.frombuffer(data, "<f2", n * channels, end[1]).reshape(n, channels).copy()
-    axis = np.frombuffer(data, "<f4", 2 * n, end[2]).reshape(n, 2).copy() if axes else None
-    up = np.frombuffer(data, "<f4", 3, end[3]).copy() if tilted else None
-    scale = float(np.frombuffer(data, "<f4", 1, end[4])[0]) if scaled else 1.0
+    features = np.frombuffer(data, "i1" if steps else "<f2", n * channels, end[1]).reshape(n, channels).copy()
+    if steps:
+        step = np.frombuffer(data, "<f4", n, end[2]).copy()
+    else:
+        features, step = quantized(features)
+    axis = np.frombuffer(data, "<f4", 2 * n, end[3]).reshape(n, 2).copy() if axes else None
+    up = np.frombuffer(data, "<f4", 3, end[4]).copy() if tilted else None
+    scale = float(np.frombuffer(data, "<f4", 1, end[5])[0]) if scaled else 1.0
     if not 1e-2 < scale < 1e2:  # False for NaN
         raise ValueError(f"no descriptors: a scale of {scale:g}")
-    if not all(np.isfinite(part).all() for part in (xyz, features, axis, up) if part is not None):
+    if not all(np.isfinite(part).all() for part in (xyz, step, axis, up) if part is not None):
         raise ValueError("no descriptors: values that are not finite")
     if up is not None and not (abs(np.linalg.norm(up) - 1) < 1e-3 and up[2] > 0):
         raise ValueError("no descriptors: what should point up does not")
-    return Descriptors(xyz, features, axis, up, scale)
+    return Descriptors(xyz, features, step, axis, up, scale)
 
 
 def with_crc(*values: Any) -> tuple[Any, ...]:

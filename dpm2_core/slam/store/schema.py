@@ -17,8 +17,10 @@ from dpm2_core.errors import UsageError
 
 APPLICATION_ID = 0x64706D32
 """The bytes `dpm2` at offset 68 of the file."""
-VERSION = 3
-"""Of the schema, in SQLite's user_version."""
+VERSION = 4
+"""In SQLite's user_version. Since 4 the features of descriptors are int8 (rows.py); the tables are those of 3."""
+TABLES = 3
+"""Version that introduced the tables as they are."""
 
 _SCHEMA_2 = """
 CREATE TABLE sessions (          -- every time that a program wrote to the map
@@ -199,3 +201,4 @@ def migrate(connection: sqlite3.Connection, version: int) -> None:
         connection.executescript(f"BEGIN IMMEDIATE; {_TO_2.format(schema=_SCHEMA_2)} PRAGMA user_version = 2; COMMIT;")
     if version < 3:
         connection.executescript(f"BEGIN IMMEDIATE; {_ADDED_3} PRAGMA user_version = 3; COMMIT;")
+    connection.execute(f"PRAGMA user_version = {VERSION}")

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -193,8 +194,8 @@ def test_merged_sets_have_the_same_axes_in_training_and_in_use(view_aligned: boo
     noise = np.random.default_rng(0)
     axes = noise.normal(size=(2, 5, 2))
     axes = (axes / np.linalg.norm(axes, axis=-1, keepdims=True)).astype(np.float32)
-    xyz, features = noise.normal(size=(2, 5, 3)).astype(np.float32), np.zeros((2, 5, 4), np.float16)
-    members = [Descriptors(*parts) for parts in zip(xyz, features, axes, strict=True)]
+    xyz, features = noise.normal(size=(2, 5, 3)).astype(np.float32), np.zeros((2, 5, 4), np.float32)
+    members = [replace(Descriptors.of(x, f), axis=a) for x, f, a in zip(xyz, features, axes, strict=True)]
     T = np.stack([np.eye(4), se3.exp([0, 0, 1.2, 3, -1, 0])])
     used = to_tokens([merge([m.moved(t) for m, t in zip(members, T, strict=True)])], view_aligned)
     tokens = to_tokens(members, view_aligned)

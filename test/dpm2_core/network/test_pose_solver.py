@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -251,8 +253,9 @@ def test_offset_head_starts_without_offset() -> None:
 
 def described(model: DeepPointMap2, noise: np.random.Generator, n: int) -> Descriptors:
     """Random descriptors."""
-    features = noise.normal(0, 1, (n, model.settings.channels)).astype(np.float16)
-    return Descriptors(noise.normal(0, 15, (n, 3)).astype(np.float32), features)
+    return Descriptors.of(
+        noise.normal(0, 15, (n, 3)).astype(np.float32), noise.normal(0, 1, (n, model.settings.channels))
+    )
 
 
 def test_descriptors_of_one_place_agree_on_a_motion_and_others_do_not(
@@ -261,9 +264,9 @@ def test_descriptors_of_one_place_agree_on_a_motion_and_others_do_not(
     """Before the decoder has seen them: also where half of them are others; sets of one descriptor agree on nothing."""
     here, elsewhere, one = described(model, noise, 60), described(model, noise, 60), described(model, noise, 1)
     moved = here.moved(se3.exp([0, 0, 2.0, 9, -4, 0.2]))
-    half = Descriptors(
+    half = Descriptors.of(
         np.concatenate([moved.xyz[:30], elsewhere.xyz[:30]]),
-        np.concatenate([moved.features[:30], elsewhere.features[:30]]),
+        np.concatenate([moved.values[:30], elsewhere.values[:30]]),
     )
     same, partly, other = model.agreement(here, [moved, half, elsewhere])
     assert same == 1
@@ -278,7 +281,7 @@ def test_swapping_the_heading_frame_of_a_set_changes_nothing(model: DeepPointMap
     a, b = described(model, noise, 48), described(model, noise, 48)
     moved = b.moved(se3.exp([0, 0, 2.5, 12, -7, 0.4]))
     tokens = to_tokens([a], True)
-    one = model.decoder(tokens, to_tokens([Descriptors(b.xyz, b.features, b.axes)], True))
+    one = model.decoder(tokens, to_tokens([replace(b, axis=b.axes)], True))
     other = model.decoder(tokens, to_tokens([moved], True))
     torch.testing.assert_close(one.source, other.source, atol=1e-4, rtol=0)
     torch.testing.assert_close(one.target, other.target, atol=1e-4, rtol=0)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -22,8 +23,9 @@ from ...helpers.networks import tiny
 
 def described(model: DeepPointMap2, noise: np.random.Generator, n: int) -> Descriptors:
     """Random descriptors."""
-    features = noise.normal(0, 1, (n, model.settings.channels)).astype(np.float16)
-    return Descriptors(noise.normal(0, 15, (n, 3)).astype(np.float32), features)
+    return Descriptors.of(
+        noise.normal(0, 15, (n, 3)).astype(np.float32), noise.normal(0, 1, (n, model.settings.channels))
+    )
 
 
 def test_registration_of_sets_of_different_sizes(model: DeepPointMap2, noise: np.random.Generator) -> None:
@@ -46,7 +48,7 @@ def test_every_pose_is_rigid_to_float64(model: DeepPointMap2, noise: np.random.G
     """Also where nothing fits and the solver has gone far diverged: a map keeps rejected loops, too."""
     for scale in (1, 10, 100):
         sets = [described(model, noise, 90) for _ in range(12)]
-        sets = [Descriptors(d.xyz * np.float32(scale), d.features) for d in sets]
+        sets = [replace(d, xyz=d.xyz * np.float32(scale)) for d in sets]
         for result in model.register_many(sets[:6], sets[6:]):
             assert (result.T_target_source[3] == [0, 0, 0, 1]).all()
             R = result.T_target_source[:3, :3]
@@ -139,7 +141,7 @@ def test_sets_that_stay_give_the_same_answer_again(model: DeepPointMap2, noise: 
 
     def some(n: int) -> Descriptors:
         features = noise.standard_normal((n, model.settings.channels))
-        return Descriptors(noise.uniform(-20, 20, (n, 3)).astype(np.float32), features.astype(np.float16))
+        return Descriptors.of(noise.uniform(-20, 20, (n, 3)).astype(np.float32), features)
 
     target, other, sources = some(40), some(40), [some(30), some(30)]
     together = model.register_many([sources[0], sources[1], sources[0]], [target, target, other])

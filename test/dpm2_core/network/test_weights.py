@@ -46,9 +46,7 @@ def test_round_trip(model: DeepPointMap2, saved: Path) -> None:
 def test_overlap_is_checked_after_overlap_alone(model: DeepPointMap2, saved: Path, tmp_path: Path) -> None:
     """An untrained head says NaN, never a figure that would pass a gate."""
     noise = np.random.default_rng(0)
-    descriptors = Descriptors(
-        noise.uniform(-9, 9, (40, 3)).astype(np.float32), noise.normal(size=(40, 32)).astype("f2")
-    )
+    descriptors = Descriptors.of(noise.uniform(-9, 9, (40, 3)).astype(np.float32), noise.normal(size=(40, 32)))
     save_weights(model, tmp_path / "two.safetensors", {"phase": "2"})
     untrained, trained = (
         load_model(path).register_many([descriptors], [descriptors])[0].overlap

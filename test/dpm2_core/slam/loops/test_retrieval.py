@@ -15,7 +15,7 @@ def place(seed: int, noise: float = 0.0, count: int = 256) -> Descriptors:
     kind, rng = np.random.default_rng(seed), np.random.default_rng([seed, int(1e6 * noise)])
     mixing = kind.normal(size=(16, 128))
     features = rng.normal(size=(count, 16)) @ mixing + noise * rng.normal(size=(count, 128))
-    return Descriptors(rng.normal(size=(count, 3)).astype(np.float32), features.astype(np.float16))
+    return Descriptors.of(rng.normal(size=(count, 3)).astype(np.float32), features)
 
 
 @pytest.mark.slow
@@ -31,7 +31,7 @@ def test_a_place_is_found_among_a_thousand() -> None:
 def test_the_order_of_the_descriptors_does_not_matter() -> None:
     one = place(3)
     shuffled = np.random.default_rng(0).permutation(len(one))
-    other = Descriptors(one.xyz[shuffled], one.features[shuffled])
+    other = Descriptors(one.xyz[shuffled], one.features[shuffled], one.step[shuffled])
     np.testing.assert_allclose(pooled(one), pooled(other), atol=1e-4)  # sums in float32
 
 

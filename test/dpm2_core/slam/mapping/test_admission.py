@@ -28,7 +28,7 @@ SETTINGS = SlamSettings.model_validate({"loops": {"descriptors": False}})
 
 def descriptors(channels: int = 128) -> Descriptors:
     rng = np.random.default_rng(0)
-    return Descriptors(rng.normal(size=(256, 3)).astype("f4"), rng.normal(size=(256, channels)).astype("f2"))
+    return Descriptors.of(rng.normal(size=(256, 3)).astype("f4"), rng.normal(size=(256, channels)))
 
 
 def keyframe(id: int) -> Keyframe:
@@ -57,7 +57,7 @@ def with_covariance(covariance: Array) -> Callable[[Keyframe], Keyframe]:
 def with_features(value: float) -> Callable[[Keyframe], Keyframe]:
     def change(k: Keyframe) -> Keyframe:
         d = descriptors()
-        d.features[7, 7] = value
+        d.step[7] = value / abs(int(d.features[7].max()))
         return replace(k, descriptors=d)
 
     return change

@@ -30,7 +30,7 @@ def data(noise: np.random.Generator) -> MapData:
     described = [
         replace(
             k,
-            descriptors=Descriptors(noise.normal(size=(80, 3)).astype("f4"), noise.normal(size=(80, 40)).astype("f2")),
+            descriptors=Descriptors.of(noise.normal(size=(80, 3)).astype("f4"), noise.normal(size=(80, 40))),
         )
         for k in made.keyframes
     ]

@@ -7,6 +7,7 @@ import hashlib
 import os
 import signal
 import sqlite3
+import struct
 import subprocess
 import sys
 import tempfile
@@ -47,7 +48,7 @@ store.begin_session()
 print("begun", flush=True)
 for node in range(int(sys.argv[2])):
     cloud = rng.uniform(0, 1, (2000, 4)).astype(np.float32)
-    d = Descriptors(np.zeros((64, 3), np.float32), np.zeros((64, 128), np.float16))
+    d = Descriptors.of(np.zeros((64, 3), np.float32), np.zeros((64, 128)))
     k = Keyframe(node, node, node, np.eye(4), cloud, None, "", d)
     edges = [Edge("odometry", node - 1, node, Registration(np.eye(4), np.eye(6)))] if node else []
     store.write(Change([(node, k, pack_cloud(cloud), None)], edges, {n: np.eye(4) for n in range(node + 1)}))
@@ -66,7 +67,7 @@ def whole_prefix(path: Path) -> int:
 
 
 def test_everything_comes_back(tmp_path: Path, map_file: Path, keyframes: list[Keyframe]) -> None:
-    """Poses and covariances to the last bit, clouds to half a centimeter, descriptors as the float16 they are."""
+    """Poses and covariances to the last bit, clouds to half a centimeter, descriptors as the bytes they are."""
     for path in (map_file, tmp_path / "again.dpm2map", tmp_path / "without.dpm2map"):
         if path != map_file:
             with MapStore.open(map_file) as store:
@@ -94,14 +95,14 @@ def test_everything_comes_back(tmp_path: Path, map_file: Path, keyframes: list[K
 
 
 def test_descriptors_of_a_tilted_lidar_come_back_with_where_up_is(noise: np.random.Generator) -> None:
-    xyz, features = noise.normal(size=(9, 3)).astype("f4"), noise.normal(size=(9, 8)).astype("f2")
+    made = Descriptors.of(noise.normal(size=(9, 3)).astype("f4"), noise.normal(size=(9, 8)))
     up = np.array([0.6, 0, 0.8], "f4")
     for axis in (None, noise.normal(size=(9, 2)).astype("f4")):
-        packed = pack_descriptors(Descriptors(xyz, features, axis, up))
+        packed = pack_descriptors(replace(made, axis=axis, up=up))
         back = unpack_descriptors(packed)
         assert back.up is not None
         np.testing.assert_array_equal(back.up, up)
-        np.testing.assert_array_equal(back.features, features)
+        np.testing.assert_array_equal(back.values, made.values)
         assert (back.axis is None) == (axis is None)
         for wrong in ([0.6, 0, -0.8], [0, 0, 2], [np.nan, 0, 1]):
             with pytest.raises(ValueError, match="no descriptors"):
@@ -112,13 +113,13 @@ def test_descriptors_of_a_tilted_lidar_come_back_with_where_up_is(noise: np.rand
 
 @pytest.mark.parametrize("tilted", [False, True])
 def test_descriptors_of_a_room_come_back_with_their_scale(noise: np.random.Generator, tilted: bool) -> None:
-    xyz, features = noise.normal(size=(9, 3)).astype("f4"), noise.normal(size=(9, 8)).astype("f2")
+    made = Descriptors.of(noise.normal(size=(9, 3)).astype("f4"), noise.normal(size=(9, 8)))
     up = np.array([0.6, 0, 0.8], "f4") if tilted else None
-    packed = pack_descriptors(Descriptors(xyz, features, None, up, 5.0))
+    packed = pack_descriptors(replace(made, up=up, scale=5.0))
     back = unpack_descriptors(packed)
     assert back.scale == 5
     assert (back.up is None) == (not tilted)
-    np.testing.assert_array_equal(back.xyz, xyz)
+    np.testing.assert_array_equal(back.xyz, made.xyz)
     for wrong in (np.nan, np.inf, 0.0, -5.0, 1e9):
         with pytest.raises(ValueError, match="no descriptors: a scale of"):
             unpack_descriptors(packed[:-4] + np.array(wrong, "f4").tobytes())
@@ -126,12 +127,23 @@ def test_descriptors_of_a_room_come_back_with_their_scale(noise: np.random.Gener
         unpack_descriptors(packed[:-4])
 
 
-@pytest.mark.parametrize("parts", [8, 12, 255])
+@pytest.mark.parametrize("parts", [0, 16, 24, 255])
 def test_descriptors_with_parts_that_nobody_knows_are_rejected(noise: np.random.Generator, parts: int) -> None:
-    packed = bytearray(pack_descriptors(Descriptors(noise.normal(size=(9, 3)).astype("f4"), np.ones((9, 8), "f2"))))
+    packed = bytearray(pack_descriptors(Descriptors.of(noise.normal(size=(9, 3)).astype("f4"), np.ones((9, 8)))))
     packed[8] = parts
     with pytest.raises(ValueError, match="no descriptors"):
         unpack_descriptors(bytes(packed))
+
+
+def test_descriptors_of_an_earlier_map_are_float16(noise: np.random.Generator) -> None:
+    """As `pack_descriptors` wrote them before version 4 of the map."""
+    xyz, features = noise.normal(size=(9, 3)).astype("<f4"), noise.normal(size=(9, 8)).astype("<f2")
+    back = unpack_descriptors(struct.pack("<IIB", 9, 8, 0) + xyz.tobytes() + features.tobytes())
+    np.testing.assert_array_equal(back.xyz, xyz)
+    np.testing.assert_allclose(back.values, features, atol=np.abs(features).max() / 254 + 1e-6)
+    features[3, 2] = np.nan
+    with pytest.raises(ValueError, match="not finite"):
+        unpack_descriptors(struct.pack("<IIB", 9, 8, 0) + xyz.tobytes() + features.tobytes())
 
 
 def test_a_loan_and_a_thumbnail_come_back(map_file: Path, keyframes: list[Keyframe]) -> None:
@@ -278,6 +290,19 @@ def version_1(path: Path, keyframes: list[Keyframe]) -> None:
                 edge = ("odometry", node - 1, node, k.edge.T_target_source.tobytes(), k.edge.covariance.tobytes())
                 sql.execute("INSERT INTO edges VALUES (?,?,?,?,?)", edge)
     sql.close()
+
+
+def test_a_map_of_version_3_has_the_same_tables(map_file: Path) -> None:
+    """It is read where it is, and written on after its number has been raised."""
+    with sqlite3.connect(map_file) as sql:
+        sql.execute("PRAGMA user_version = 3")
+    sql.close()
+    for read_only, version in ((True, 3), (False, schema.VERSION)):
+        with MapStore.open(map_file, read_only=read_only) as store:
+            assert len(load_map(store)) == 12
+        with sqlite3.connect(map_file) as sql:
+            assert sql.execute("PRAGMA user_version").fetchone() == (version,)
+        sql.close()
 
 
 def test_an_older_map_is_read_and_brought_up_to_date(tmp_path: Path, keyframes: list[Keyframe]) -> None:
