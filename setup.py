@@ -18,6 +18,7 @@ REQUIREMENTS = [
     "torch>=2.6,<2.14",  # the network; its CPU wheels serve, README.md
     "safetensors>=0.4,<1",  # weights: data that cannot execute code
     "numba>=0.61,<1",  # loops over points as machine code: scan registration, sampling
+    "llvmlite",  # what the processor has; of the version that numba asks for
     "gtsam>=4.3,<4.4",  # pose graph; the first with wheels for numpy 2
     "pydantic>=2.7,<3",  # typed configuration
     "annotated-types>=0.6,<1",  # the bounds of its fields, as ROS parameters

@@ -24,6 +24,7 @@ from dpm2_core.network.heads import POSE_FEATURES
 from dpm2_core.network.losses import confidence_loss, overlap_loss
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pose_solver import solve_batch
+from dpm2_core.network.precision import mixed_precision
 from dpm2_core.network.pyramid import PointBatch
 from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.network.solved import Solved, confidence_of, overlap_features
@@ -170,7 +171,7 @@ def validator(settings: OverlapTrainingSettings, network: NetworkSettings) -> Ca
         device = next(module.parameters()).device
         scores, distances = [], []
         for points, views, poses in map(batch, range(settings.validation_batches)):
-            with torch.autocast(device.type, torch.bfloat16):
+            with mixed_precision(device):
                 logits, _ = module.logits(*to_device((points, views), device))
             scores.append(logits.cpu().numpy())
             distances.append(pair_distances(poses).numpy())

@@ -23,6 +23,7 @@ from torch.nn.parallel import DistributedDataParallel
 from dpm2_core.config import Settings
 from dpm2_core.learning.checkpoint import Log, load_checkpoint, save_checkpoint
 from dpm2_core.network.encoder import to_device
+from dpm2_core.network.precision import mixed_precision
 
 
 class OptimizerSettings(Settings):
@@ -55,7 +56,7 @@ class OptimizerSettings(Settings):
     compile: bool = True
     """torch.compile: slower to start, about twice as fast."""
     bf16: bool = True
-    """bf16 autocast."""
+    """bf16 autocast, where the processor multiplies bf16."""
     save_every: int = Field(200, gt=0)
     """Steps between checkpoints."""
     validate_every: int = Field(400, gt=0)
@@ -197,7 +198,7 @@ class Trainer:
         torch.manual_seed(settings.seed * 1_000_003 + step)
         buffers = [value.clone() for value in module.buffers()]
         device = next(module.parameters()).device
-        with torch.autocast(device.type, torch.bfloat16, enabled=settings.bf16):
+        with mixed_precision(device, settings.bf16):
             loss, figures = wrapped(*batch)
         optimizer.zero_grad(set_to_none=True)
         loss.backward()

@@ -13,39 +13,50 @@ from torch import Tensor
 from dpm2_core.geometry.compiled import compiled
 
 Array = NDArray[np.float32]
-Bits = NDArray[np.int16]  # of bfloat16
+Bits = NDArray[np.int16]  # of bfloat16, or twice as many of float32
 
 DIRECTIONS, DISTANCES = 5, 5  # functions of where a point lies, and then of how far away it is
 
 
 def applies(x: Tensor) -> bool:
-    """Whether biases of such a tensor are made here: on a CPU, in bf16, without a gradient."""
-    return x.device.type == "cpu" and torch.is_autocast_enabled("cpu") and not torch.is_grad_enabled()
+    """Whether biases of such a tensor are made here: on a CPU, without a gradient."""
+    return x.device.type == "cpu" and not torch.is_grad_enabled()
 
 
 def relative_bias(xyz: Tensor, axis: Tensor, weight: Tensor, reach: tuple[float, ...]) -> Tensor:
-    """Weighted sums (B, M, N, N), bf16, of `attention.RelativeBias.basis` of xyz (B, N, 3) m with axes (B, N, 2).
+    """Weighted sums (B, M, N, N) of `attention.RelativeBias.basis` of xyz (B, N, 3) m with axes (B, N, 2); bf16 under
+    autocast.
 
     Args:
         weight: (M, DIRECTIONS + DISTANCES). reach: (DISTANCES,) m, of the functions of distance.
     """
-    out = np.empty((len(xyz), len(weight), xyz.shape[1], xyz.shape[1]), np.int16)
-    for points, axes, made in zip(xyz.float().numpy(), axis.float().numpy(), out, strict=True):
+    out = _biases(len(xyz), len(weight), xyz.shape[1], xyz.shape[1])
+    for points, axes, made in zip(xyz.float().numpy(), axis.float().numpy(), _bits(out), strict=True):
         fields = np.ascontiguousarray(points.T), np.ascontiguousarray(axes), weight.detach().numpy()
         _relative(*fields, _rates(tuple(1 / r for r in reach)), made)
-    return torch.from_numpy(out).view(torch.bfloat16)
+    return out
 
 
 def near_bias(distance: Tensor, counted: Tensor, alphas: tuple[float, ...]) -> Tensor:
-    """The z-scores (B, len(alphas), N, T), bf16, over the tokens of exp(-alpha distance), 0 where not counted.
+    """The z-scores (B, len(alphas), N, T) over the tokens of exp(-alpha distance), 0 where not counted; bf16 under
+    autocast.
 
     Args:
         distance: (B, N, T), m. counted: (B, N, T). alphas: 1/m.
     """
-    out = np.empty((len(distance), len(alphas), *distance.shape[1:]), np.int16)
-    for row in zip(distance.float().contiguous().numpy(), counted.contiguous().numpy(), out, strict=True):
+    out = _biases(len(distance), len(alphas), *distance.shape[1:])
+    for row in zip(distance.float().contiguous().numpy(), counted.contiguous().numpy(), _bits(out), strict=True):
         _near(row[0], row[1], _rates(alphas), row[2])
-    return torch.from_numpy(out).view(torch.bfloat16)
+    return out
+
+
+def _biases(*shape: int) -> Tensor:
+    return torch.empty(shape, dtype=torch.bfloat16 if torch.is_autocast_enabled("cpu") else torch.float32)
+
+
+def _bits(biases: Tensor) -> Bits:
+    bits: Bits = biases.view(torch.int16).numpy()
+    return bits
 
 
 def _rates(alphas: tuple[float, ...]) -> Array:
@@ -70,8 +81,11 @@ def _power_of_two(x: Array, rate: float, out: Array) -> None:
 
 
 @compiled("void(f4[::1], i2[::1])")
-def _rounded(values: Array, out: Bits) -> None:
-    """To the nearest bfloat16, of two the even one."""
+def _write(values: Array, out: Bits) -> None:
+    """As they are, or rounded to the nearest bfloat16, of two the even one, where there is room for no more."""
+    if len(out) > len(values):
+        out.view(np.float32)[:] = values
+        return
     bits = values.view(np.int32)
     for j in range(len(out)):
         out[j] = (bits[j] + np.int32(0x7FFF) + ((bits[j] >> np.int32(16)) & np.int32(1))) >> np.int32(16)
@@ -107,7 +121,7 @@ def _relative(xyz: Array, axis: Array, weight: Array, rates: Array, out: Bits) -
                 direction = w[0] * f[0, j] + w[1] * f[1, j] + w[2] * f[2, j] + w[3] * f[3, j] + w[4] * f[4, j]
                 near = w[5] * f[5, j] + w[6] * f[6, j] + w[7] * f[7, j] + w[8] * f[8, j] + w[9] * f[9, j]
                 total[j] = direction + near
-            _rounded(total, out[m, i])
+            _write(total, out[m, i])
 
 
 @compiled("void(f4[:, ::1], b1[:, ::1], f4[::1], i2[:, :, ::1])")
@@ -122,4 +136,4 @@ def _near(distance: Array, counted: NDArray[np.bool_], rates: Array, out: Bits) 
                 value[j] = value[j] if counted[i, j] else np.float32(0)
             value -= np.dot(value, one) / np.float32(size)
             value /= max(np.sqrt(np.dot(value, value) / np.float32(size)), np.float32(1e-4))
-            _rounded(value, out[r, i])
+            _write(value, out[r, i])

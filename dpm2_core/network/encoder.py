@@ -21,6 +21,7 @@ from dpm2_core.network.convnext import FeatureMap
 from dpm2_core.network.fusion import Fusion
 from dpm2_core.network.images import in_encoded_axes, small_image
 from dpm2_core.network.pointnext import Scale, view_axes
+from dpm2_core.network.precision import mixed_precision
 from dpm2_core.network.pyramid import PointBatch, build_pyramid, collate, crop
 from dpm2_core.network.registry import image_backbone, point_backbone
 from dpm2_core.network.settings import NetworkSettings
@@ -115,7 +116,7 @@ class Encoder(nn.Module):
     @torch.inference_mode()
     def encode_batch(self, points: PointBatch, views: Views | None, device: torch.device) -> list[Descriptors]:
         """Descriptors of a batch of prepared frames."""
-        with torch.autocast(device.type, torch.bfloat16):
+        with mixed_precision(device):
             tokens = self(*to_device((points, views), device)).tokens
         xyz, features, mask = (field.cpu() for field in (tokens.xyz, tokens.features.float(), tokens.mask))
         return [Descriptors.of(x[m].numpy(), f[m].numpy()) for x, f, m in zip(xyz, features, mask, strict=True)]

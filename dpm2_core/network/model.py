@@ -17,6 +17,7 @@ from dpm2_core.network.decoder import Decoder, Prepared
 from dpm2_core.network.encoder import Encoder
 from dpm2_core.network.matching import correspond, match_scores
 from dpm2_core.network.pose_solver import Solver, agreement
+from dpm2_core.network.precision import mixed_precision
 from dpm2_core.network.registrations import register_batch
 from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.network.tokens import Tokens, to_tokens
@@ -53,7 +54,7 @@ class DeepPointMap2(nn.Module):
 
         What is done for each set alone is kept for the next calls with the same object, such as the map of an odometry.
         """
-        with torch.autocast(next(self.parameters()).device.type, torch.bfloat16):
+        with mixed_precision(next(self.parameters()).device):
             (y, prepared_target), (x, prepared_source) = self._prepare(target), self._prepare(source)
             correlated = self.decoder.correlate(prepared_source, prepared_target)
             return _of_sets(register_batch(self.decoder, x, y, correlated, self.solver)[0], source, target)
@@ -74,7 +75,7 @@ class DeepPointMap2(nn.Module):
         device = next(self.parameters()).device
         source = to_tokens([s.as_encoded() for s in sources], self.decoder.view_aligned, device)
         target = to_tokens([t.as_encoded() for t in targets], self.decoder.view_aligned, device)
-        with torch.autocast(device.type, torch.bfloat16):
+        with mixed_precision(device):
             correlated = self.decoder(source, target)
             found = register_batch(self.decoder, source, target, correlated, self.solver)
         return [_of_sets(*row) for row in zip(found, sources, targets, strict=True)]
@@ -102,7 +103,7 @@ class DeepPointMap2(nn.Module):
         """The descriptors that `register` pairs: positions (K, 3) in each frame, m, and confidence (K,) 0..1."""
         device = next(self.parameters()).device
         x, y = (to_tokens([d.as_encoded()], self.decoder.view_aligned, device) for d in (source, target))
-        with torch.autocast(device.type, torch.bfloat16):
+        with mixed_precision(device):
             correlated = self.decoder(x, y)
             pairs = correspond(self.decoder, x, y, correlated, match_scores(self.decoder, correlated))
         half = pairs.weight.shape[1] // 2  # then the same pairs again, in the other direction

@@ -17,6 +17,7 @@ from torch.optim.swa_utils import update_bn
 
 from dpm2_core.errors import UsageError
 from dpm2_core.network.perception.dynamic_objects import DynamicObjectNet, DynamicObjectNetSettings, occupancy, voxels
+from dpm2_core.network.precision import mixed_precision
 from dpm2_core.network.pretrained import DYNAMIC
 from dpm2_core.tasks.ground_task import UNCOUNTED
 from dpm2_core.tasks.scan import TaskScan, TaskScans
@@ -103,7 +104,7 @@ class DynamicObjectTask(Task):
         chosen = torch.randperm(len(scans), generator=generator)[:_SETTLED].tolist()
         scanned = (voxels(_arrays(scans[i])[0], network) for i in chosen)
         grids = (occupancy([voxel[inside]], network).to(self.device) for voxel, inside in scanned)
-        with torch.autocast(self.device.type, torch.bfloat16):  # as `DynamicObjectNet.probability`
+        with mixed_precision(self.device):  # as `DynamicObjectNet.probability`
             update_bn(grids, self.net)
 
     def evaluate(self, scans: TaskScans) -> dict[str, float]:

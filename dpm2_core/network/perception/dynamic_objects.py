@@ -22,6 +22,7 @@ from torch.nn import functional
 from dpm2_core.config import Settings
 from dpm2_core.geometry.ground import height_above_ground
 from dpm2_core.network.perception.task_weights import load_network
+from dpm2_core.network.precision import mixed_precision
 
 LAYERS = (0.25, 0.75, 1.25, 1.75, 2.5, 4.0)
 """Bounds of the layers of height above the ground, m; one more layer below, one above."""
@@ -75,7 +76,7 @@ class DynamicObjectNet(nn.Module):
         """(N,) 0..1 of (N, 3+) points of one scan, m, in a frame whose z is about up; 0 off the grid."""
         voxel, inside = voxels(points, self.settings)
         occupied = occupancy([voxel[inside]], self.settings).to(self.range.device)
-        with torch.autocast(occupied.device.type, torch.bfloat16):
+        with mixed_precision(occupied.device):
             logits = self(occupied)
         out = np.zeros(len(points), np.float32)
         out[inside] = logits.flatten().sigmoid().float().cpu().numpy()[voxel[inside]]
