@@ -99,8 +99,9 @@ def processor() -> Finding:
     text = _read("/proc/cpuinfo")
     model = re.search(r"model name\s*: (.+)", text)
     flags = set(re.findall(r"\w+", " ".join(re.findall(r"^(?:flags|Features)\s*: (.+)", text, re.MULTILINE)[:1])))
-    known = {"avx2": "AVX2", "avx512f": "AVX-512", "amx_tile": "AMX", "asimd": "NEON"}
-    has = [name for flag, name in known.items() if flag in flags]
+    bf16 = dict.fromkeys(("avx512_bf16", "amx_bf16", "bf16"), "bf16")  # else float32, network/precision.py
+    known = {"avx2": "AVX2", "avx512f": "AVX-512", "amx_tile": "AMX", "asimd": "NEON", **bf16}
+    has = list(dict.fromkeys(name for flag, name in known.items() if flag in flags))
     found = f"{model[1] if model else 'unknown'}, {cores} cores, {', '.join(has) or 'no vector instructions known'}"
     if not has:
         return Finding("processor", "warning", found, "the network needs AVX2 or NEON to be quick")

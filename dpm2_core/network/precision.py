@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""bf16 where the processor multiplies it."""
+"""bf16 where the device multiplies it."""
 
 from __future__ import annotations
 
@@ -10,15 +10,20 @@ from llvmlite import binding
 
 
 def mixed_precision(device: torch.device, wanted: bool = True) -> torch.autocast:
-    """The network's context on this device: autocast to bf16 if it is wanted and as fast as float32, else float32."""
-    return torch.autocast(device.type, torch.bfloat16, enabled=wanted and (device.type != "cpu" or multiplies_bf16()))
+    """The context of the network on this device: autocast to bf16 where it is wanted and multiplied, else float32."""
+    return torch.autocast(device.type, torch.bfloat16, enabled=wanted and multiplies_bf16(device.type))
 
 
 @cache
-def multiplies_bf16() -> bool:
-    """Whether this processor has instructions for products of bf16 (AVX-512 BF16, AMX or those of ARM).
+def multiplies_bf16(kind: str) -> bool:
+    """Whether this kind of device ("cpu", "cuda", ...) has instructions for products of bf16.
 
-    One that has to emulate them takes six times as long as with float32, the whole network (AVX2, AMD Zen 3).
+    A processor has AVX-512 BF16, AMX or those of ARM, a GPU those of Ampere. One without them can emulate bf16: the
+    whole network then takes six times as long as in float32 (AMD Zen 3).
     """
+    if kind == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    if kind != "cpu":
+        return True
     features = binding.get_host_cpu_features()
     return any(features.get(name, False) for name in ("avx512bf16", "amx-bf16", "bf16"))
