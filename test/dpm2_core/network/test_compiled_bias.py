@@ -14,11 +14,10 @@ from dpm2_core.network.attention import RelativeBias, zscore
 HALF_ULP = 2**-8  # of bfloat16, relative
 
 
-def close(found: torch.Tensor, exact: torch.Tensor, atol: float) -> None:
-    """Rounded to bfloat16, if at all, after an error of float32 that grows with the largest term of a sum."""
-    torch.testing.assert_close(
-        found.float(), exact.float(), rtol=HALF_ULP if found.dtype == torch.bfloat16 else 1e-5, atol=atol
-    )
+def close(found: torch.Tensor, exact: torch.Tensor, bf16: bool, atol: float) -> None:
+    """Rounded to bfloat16, if asked to, after an error of float32 that grows with the largest term of a sum."""
+    assert found.dtype == (torch.bfloat16 if bf16 else torch.float32)
+    torch.testing.assert_close(found.float(), exact.float(), rtol=HALF_ULP if bf16 else 1e-5, atol=atol)
 
 
 @settings(max_examples=30, deadline=None)
@@ -33,8 +32,7 @@ def test_relative_bias_is_that_of_the_tensors(n: int, spread: float, seed: int, 
     with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=bf16):
         found = relative(xyz, axis)
     for a, b in zip(found, exact, strict=True):
-        assert a.dtype == (torch.bfloat16 if bf16 else torch.float32)
-        close(a, b, atol=2e-5)
+        close(a, b, bf16, atol=2e-5)
 
 
 @settings(max_examples=30, deadline=None)
@@ -47,7 +45,7 @@ def test_near_bias_is_the_zscore_of_the_decay(tokens: int, spread: float, hidden
     alpha = torch.tensor(alphas, dtype=torch.float64).view(1, -1, 1, 1)
     exact = zscore(torch.exp(-alpha * distance[:, None]) * counted[:, None])
     with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
-        close(compiled_bias.near_bias(distance, counted, alphas), exact, atol=5e-3)
+        close(compiled_bias.near_bias(distance, counted, alphas), exact, bf16, atol=5e-3)
 
 
 def test_training_and_other_devices_keep_to_tensors() -> None:
@@ -59,12 +57,14 @@ def test_training_and_other_devices_keep_to_tensors() -> None:
         assert not compiled_bias.applies(torch.zeros(1, device="meta"))
 
 
+@pytest.mark.parametrize("bf16", [True, False])
 @pytest.mark.parametrize("at", [0.0, 1e-3, 0.7, 40.0, 1e4])
-def test_a_single_distance(at: float) -> None:
+def test_a_single_distance(at: float, bf16: bool) -> None:
     """The decay alone, by a bias whose only weight is that of one reach: exp(-d / 1 m)."""
     weight = torch.zeros(1, compiled_bias.DIRECTIONS + compiled_bias.DISTANCES)
     weight[0, compiled_bias.DIRECTIONS] = 1
     xyz, axis = torch.tensor([[[0.0, 0, 0], [at, 0, 0]]]), torch.tensor([[[1.0, 0], [1, 0]]])
-    found = compiled_bias.relative_bias(xyz, axis, weight, (1.0, 2.5, 6.0, 15.0, 40.0))[0, 0]
+    with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
+        found = compiled_bias.relative_bias(xyz, axis, weight, (1.0, 2.5, 6.0, 15.0, 40.0))[0, 0]
     exact = torch.exp(-torch.cdist(xyz[0], xyz[0]))
-    torch.testing.assert_close(found.float(), exact, rtol=HALF_ULP, atol=4e-5)  # sqrt(1e-9) of 0 m
+    close(found, exact, bf16, atol=4e-5)  # sqrt(1e-9) of 0 m
