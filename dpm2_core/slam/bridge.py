@@ -24,7 +24,7 @@ _TIES = 3
 """So many results must agree, and most of all that there are: two meet by chance."""
 _MOVED = 0.5
 """They are evidence only when the robot has moved so far from one to the next, m..."""
-_AS_WELL = 0.9
+_AS_WELL = 0.85
 """...or when the scan fits the map before at least this much as well as its own stretch: one stands where one stood."""
 _NEAR = 1.0  # m, added to what a vehicle can do
 _DRIVES = 1.0  # m/s: no slower

@@ -52,9 +52,10 @@ _EQUAL = 0.02
 """Mean log likelihoods of the points that differ by less say nothing, such as along a tunnel."""
 _DISTINCT = 0.06
 """By so much must the mean log likelihood of a place exceed that of every other one that a search has found."""
-_FEW = 400  # points show which places of a search are likely;
+_FEW = 400  # points show which heading fits where the motion is not known, and which places of a search are likely;
 _PLACES = 6  # so many of them are registered to,
 _PART = 4  # by one point in so many; all points compare the best two
+_HEADINGS = np.array([se3.exp([0, 0, np.radians(yaw), 0, 0, 0]) for yaw in (0, 3, -3, 6, -6, 9, -9)])
 _NEAR = (1.0, 5.0)  # m and degrees: results within are one place
 _PROBE = 1.0  # m either way along a direction that may be open
 _HELD = 1e7  # information, 1 / m2, that keeps a scan there: to less than a millimeter
@@ -194,13 +195,23 @@ class GeometricScanRegistration:
         p = prediction
         if p.unique:
             return self._searched(scan.source, p)
-        found = [self._registration.register(scan.source, self._local_map, T, p.widen, p.information) for T in p.starts]
+        starts = p.starts if p.known or not len(scan.source) else [self._steered(scan.source, T) for T in p.starts]
+        found = [self._registration.register(scan.source, self._local_map, T, p.widen, p.information) for T in starts]
         return found[0] if len(found) == 1 else self._registration.likeliest(scan.source, self._local_map, found)
+
+    def _steered(self, source: Array, T: Array) -> Array:
+        """A start (4, 4) at the heading where the scan fits best: a curve may have begun or ended meanwhile.
+
+        Half a second after the last scan one in 40 settles beside its place otherwise, with 80 % of its points on the
+        map. It costs no time: a better start needs fewer steps.
+        """
+        poses = T @ _HEADINGS
+        return np.asarray(poses[self._local_map.fit(_few(source), poses).argmax()])
 
     def _searched(self, source: Array, prediction: Prediction) -> Registration:
         """The place that fits best, if no other one fits nearly as well."""
         poses = np.asarray(prediction.starts)
-        few = source[:: -(-len(source) // _FEW)]
+        few = _few(source)
         places: list[Array] = []
         for i in np.argsort(-self._local_map.fit(few, poses), kind="stable"):
             if all(_apart(poses[i], T) for T in places):
@@ -232,6 +243,11 @@ class GeometricScanRegistration:
         if wanted:
             self._local_map.insert(scan.cloud, T_odom_lidar)
         return wanted
+
+
+def _few(source: Array) -> Array:
+    """At most `_FEW` of the points (N, 3), N >= 1."""
+    return source[:: -(-len(source) // _FEW)]
 
 
 def _is_clear(gain: Array) -> bool:

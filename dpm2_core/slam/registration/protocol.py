@@ -50,11 +50,12 @@ class Prediction:
     possible: Callable[[Array], bool] = lambda _: True
 
     @property
-    def sigma(self) -> float:
-        """Standard deviation of the first position in its least certain direction, m; infinite if nothing is known."""
-        if self.information is None:
-            return float("inf")
-        return float(np.linalg.eigvalsh(self.information[3:, 3:])[0] ** -0.5)
+    def known(self) -> bool:
+        """Whether the motion so far leads to the place: to 1 m, standard deviation in the least certain direction.
+
+        At the default steadiness that lasts 0.3 s.
+        """
+        return self.information is not None and float(np.linalg.eigvalsh(self.information[3:, 3:])[0]) >= 1.0
 
 
 class ScanRegistration(Protocol):

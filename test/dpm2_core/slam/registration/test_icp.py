@@ -84,6 +84,27 @@ def test_the_most_likely_start_wins_whatever_its_place(suburb_drive: Drive) -> N
         assert error(result.T_target_source, truth) < 0.05
 
 
+@pytest.mark.parametrize("off", [[0, 0, 0.14, 1, 0.5, 0], [0, 0, -0.14, 1, 0, 0], [0, 0, 0.16, 2, 1, 0]])
+def test_the_heading_is_looked_for_where_the_motion_is_not_known(suburb_drive: Drive, off: list[float]) -> None:
+    """8 or 9 degrees off, as where a curve has ended. A motion that is known is followed, to a wrong place, too."""
+    registration, scan, truth = make_case(suburb_drive, 1.0)
+    start = truth @ se3.exp(off)
+    for information in (np.eye(6) / 2**2, None):
+        result = registration.register(scan, Prediction([start], information=information))
+        assert result.ok
+        assert error(result.T_target_source, truth) < 0.05
+    followed = registration.register(scan, Prediction([start], information=np.eye(6)))
+    assert not followed.ok or error(followed.T_target_source, truth) > 0.3, "else the case is none"
+
+
+@pytest.mark.parametrize("information", [np.eye(6), None])
+def test_a_scan_without_points_fails(suburb_drive: Drive, information: Array | None) -> None:
+    registration, scan, truth = make_case(suburb_drive, 1.0)
+    nothing = replace(scan, source=np.zeros((0, 3)))
+    result = registration.register(nothing, Prediction([truth], information=information))
+    assert (result.ok, result.reason[:17]) == (False, "0 points against ")
+
+
 def test_likelihood_is_greatest_at_the_truth(suburb_drive: Drive) -> None:
     frames, truth = suburb_drive
     scan = Preprocessor(PreprocessSettings()).prepare(frames[4], np.zeros(6))
