@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 from statistics import mean, pstdev
 from time import process_time
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 from rich.console import Group
 
-from benchmarks.harness import Options, Report, earlier, requested, torch_threads, write_report
+from benchmarks.harness import Options, Report, earlier, file_digest, requested, torch_threads, write_report
 from dpm2_core.config import load_settings
 from dpm2_core.data.open import open_source
 from dpm2_core.data.settings import InputSettings
@@ -65,7 +64,7 @@ def bench_finetune(options: Options) -> Report:
     with torch_threads(options.threads):
         chosen = load_settings(FinetuneSettings, None, [STEPS, *options.overrides])
         weights = weights_path(chosen.weights)
-        network, digest = load_model(weights), hashlib.sha256(weights.read_bytes()).hexdigest()
+        network, digest = load_model(weights), file_digest(weights)
         _prepare(folder, chosen, options)
         validations = {name: PairSet(folder / name, 2 * options.pairs, network.settings, False) for name in UNSEEN}
         same = {"settings": chosen.model_dump(mode="json"), "weights_sha256": digest}

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from hashlib import sha256
 from itertools import pairwise
 from time import perf_counter
 from typing import Any
@@ -19,6 +18,7 @@ from benchmarks.harness import (
     Report,
     drives,
     earlier,
+    file_digest,
     processors,
     quantiles_ms,
     requested,
@@ -81,7 +81,7 @@ def _weights(name: str) -> dict[str, Any]:
     path = weights_path(name)
     about = read_metadata(path)
     about.pop("network", None)
-    return {"name": name, "bytes": path.stat().st_size, "sha256": sha256(path.read_bytes()).hexdigest(), **about}
+    return {"name": name, "bytes": path.stat().st_size, "sha256": file_digest(path), **about}
 
 
 def _of_drives(one: Callable[[Array, list[Frame], DeepPointMap2, Options], Any]) -> Part:

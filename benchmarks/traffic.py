@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from hashlib import sha256
 from statistics import mean, median, pstdev
 from time import process_time
 from typing import Any
@@ -14,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from rich.console import Group
 
-from benchmarks.harness import Options, Report, earlier, requested, settings_of, write_report
+from benchmarks.harness import Options, Report, earlier, file_digest, requested, settings_of, write_report
 from dpm2_core.evaluation.metrics import evaluate
 from dpm2_core.evaluation.record import git_commit
 from dpm2_core.frame import Frame, Points
@@ -150,9 +149,7 @@ def _recipe(options: Options) -> dict[str, Any]:
         "first_seed": FIRST_SEED,
         "places": PLACES,
         "overrides": list(options.overrides),
-        "weights_sha256": {
-            path.stem: sha256(path.read_bytes()).hexdigest() for path in sorted(PRETRAINED_DIR.glob("*.safetensors"))
-        },
+        "weights_sha256": {path.stem: file_digest(path) for path in sorted(PRETRAINED_DIR.glob("*.safetensors"))},
     }
 
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from dpm2_core.network import compiled_bias
+from dpm2_core.network.precision import product_type
 
 
 def hiding(mask: Tensor | None) -> Tensor | None:
@@ -62,8 +63,7 @@ class RelativeBias(nn.Module):
         forward, left = (c * x + s * y) * inverse, (c * y - s * x) * inverse
         near = [torch.exp(distance * (-1 / reach)) for reach in self.REACH]
         functions = [forward, left, z * inverse, forward * forward, left * left, *near]
-        dtype = torch.bfloat16 if torch.is_autocast_enabled(xyz.device.type) else xyz.dtype
-        return torch.stack([f.to(dtype) for f in functions], 1)
+        return torch.stack([f.to(product_type(xyz)) for f in functions], 1)
 
     def forward(self, xyz: Tensor, axis: Tensor) -> tuple[Tensor, ...]:
         """Bias (B, heads, N, N) of each layer, for xyz (B, N, 3) m with axes (B, N, 2)."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dpm2_core.geometry.compiled import compiled
+from dpm2_core.network.precision import product_type
 
 Array = NDArray[np.float32]
 Bits = NDArray[np.int16]  # of bfloat16, or twice as many of float32
@@ -30,7 +31,7 @@ def relative_bias(xyz: Tensor, axis: Tensor, weight: Tensor, reach: tuple[float,
     Args:
         weight: (M, DIRECTIONS + DISTANCES). reach: (DISTANCES,) m, of the functions of distance.
     """
-    out = _biases(len(xyz), len(weight), xyz.shape[1], xyz.shape[1])
+    out = torch.empty(len(xyz), len(weight), xyz.shape[1], xyz.shape[1], dtype=product_type(xyz.float()))
     for points, axes, made in zip(xyz.float().numpy(), axis.float().numpy(), _bits(out), strict=True):
         fields = np.ascontiguousarray(points.T), np.ascontiguousarray(axes), weight.detach().numpy()
         _relative(*fields, _rates(tuple(1 / r for r in reach)), made)
@@ -44,14 +45,10 @@ def near_bias(distance: Tensor, counted: Tensor, alphas: tuple[float, ...]) -> T
     Args:
         distance: (B, N, T), m. counted: (B, N, T). alphas: 1/m.
     """
-    out = _biases(len(distance), len(alphas), *distance.shape[1:])
+    out = torch.empty(len(distance), len(alphas), *distance.shape[1:], dtype=product_type(distance.float()))
     for row in zip(distance.float().contiguous().numpy(), counted.contiguous().numpy(), _bits(out), strict=True):
         _near(row[0], row[1], _rates(alphas), row[2])
     return out
-
-
-def _biases(*shape: int) -> Tensor:
-    return torch.empty(shape, dtype=torch.bfloat16 if torch.is_autocast_enabled("cpu") else torch.float32)
 
 
 def _bits(biases: Tensor) -> Bits:

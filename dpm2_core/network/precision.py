@@ -7,11 +7,17 @@ from functools import cache
 
 import torch
 from llvmlite import binding
+from torch import Tensor
 
 
 def mixed_precision(device: torch.device, wanted: bool = True) -> torch.autocast:
     """The context of the network on this device: autocast to bf16 where it is wanted and multiplied, else float32."""
     return torch.autocast(device.type, torch.bfloat16, enabled=wanted and multiplies_bf16(device.type))
+
+
+def product_type(x: Tensor) -> torch.dtype:
+    """Of what is multiplied with a tensor: bf16 under autocast, else the tensor's own."""
+    return torch.bfloat16 if torch.is_autocast_enabled(x.device.type) else x.dtype
 
 
 @cache

@@ -10,6 +10,7 @@ from dpm2_core.geometry.rays import pixel_rays, point_ray_distance, project
 from dpm2_core.network import compiled_bias
 from dpm2_core.network.attention import hiding, zscore
 from dpm2_core.network.convnext import FeatureMap
+from dpm2_core.network.precision import product_type
 from dpm2_core.network.views import Views
 
 
@@ -34,7 +35,7 @@ def _near_bias(distance: Tensor, counted: Tensor, mask: Tensor, alphas: tuple[fl
         return compiled_bias.near_bias(distance, counted, alphas)
     alpha = torch.tensor(alphas, device=distance.device).view(1, -1, 1, 1)
     bias = zscore(torch.exp(-alpha * distance[:, None]) * counted[:, None], mask[:, None])
-    return bias.bfloat16() if torch.is_autocast_enabled(bias.device.type) else bias
+    return bias.to(product_type(bias))
 
 
 def token_pixels(maps: list[FeatureMap]) -> Tensor:

@@ -34,7 +34,7 @@ class SlamSettings(Settings):
     SLAM of DeepPointMap2 as published, by the network alone (docs/experiments.md)."""
     registration: Literal["geometric", "neural", "refined", "adaptive"] = "adaptive"
     """How a scan finds its pose: by points, by neural descriptors, by both (refined), or by points that ask the network
-    where they do not know (adaptive): at the start, after a pause, at few frames per second, along a tunnel."""
+    where they do not know (adaptive): where few of them fit, as at few frames per second, and along a tunnel."""
     threads: int = Field(1, ge=1)
     """Threads of the network. More are faster where processors are idle; on busy ones they wait for each other."""
     filter: FilterSettings = FilterSettings()

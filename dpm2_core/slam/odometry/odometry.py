@@ -17,9 +17,9 @@ from dpm2_core.slam.odometry.inertial import InertialMotion
 from dpm2_core.slam.odometry.keyframe_selection import KeyframeSelector
 from dpm2_core.slam.odometry.other import OtherMotion, Step
 from dpm2_core.slam.odometry.settings import OdometrySettings
-from dpm2_core.slam.odometry.starts import FITS_WELL, starts_from_rest, turned_starts
+from dpm2_core.slam.odometry.starts import starts_from_rest, turned_starts
 from dpm2_core.slam.preprocess import Scan
-from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration
+from dpm2_core.slam.registration.protocol import FITS_WELL, Prediction, ScanRegistration
 
 _KNOWN = 0.5  # m and rad, standard deviation of the second pose, still skewed: where the points find it alone
 _ANY_VELOCITY = 15.0**2 * np.eye(3)  # covariance, m/s: so much until two scans are registered

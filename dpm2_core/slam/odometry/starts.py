@@ -10,8 +10,6 @@ import numpy as np
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 
-FITS_WELL = 0.7
-"""Confidence from which no other starts are tried: in a town a right one has 0.74 and more."""
 # Motions [m along x, deg of yaw]: up to 110 km/h and 100 deg/s at 10 Hz.
 _AHEAD = ((0.0, 0), (1.0, 0), (2.0, 0), (3.0, 0), (-1.0, 0))
 _CURVES = tuple((x, yaw) for yaw in (4, -4, 8, -8) for x in (0.5, 1.5, 2.5))

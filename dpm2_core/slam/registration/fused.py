@@ -15,13 +15,12 @@ from dpm2_core.geometry import se3
 from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.icp import GeometricScanRegistration
 from dpm2_core.slam.registration.neural import NeuralScanRegistration
-from dpm2_core.slam.registration.protocol import MAP_NOISE, Prediction, agree
+from dpm2_core.slam.registration.protocol import FITS_WELL, MAP_NOISE, Prediction, agree
 
 _LED = np.diag(np.repeat([np.radians(2), 0.5], 3) ** -2.0)
 """Information of a network pose with a standard deviation of 2 degrees and 0.5 m: enough to initialize ICP."""
 
 
-_SURE_FIT = 0.75  # fraction of the points that fit: in rooms, where points lead to a wrong turn, fewer do
 _SURE_SIGMA = 0.08  # m, standard deviation of a position with no direction left open
 _AT_MOST = 25.0
 """Times the information of the points. Where they leave a direction open, as on a highway, most of what a scan shows
@@ -143,7 +142,7 @@ def _mean(points: Registration, neural: Registration, prior: Array | None, seen:
 
 def _sure(points: Registration) -> bool:
     """Whether they fit well, with no direction left open."""
-    return points.ok and points.confidence >= _SURE_FIT and points.worst_sigma <= _SURE_SIGMA
+    return points.ok and points.confidence >= FITS_WELL and points.worst_sigma <= _SURE_SIGMA
 
 
 def _difference(a: Registration, b: Registration) -> Array:
