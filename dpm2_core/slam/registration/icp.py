@@ -56,6 +56,7 @@ _FEW = 400  # points show which heading fits where the motion is not known, and 
 _PLACES = 6  # so many of them are registered to,
 _PART = 4  # by one point in so many; all points compare the best two
 _HEADINGS = np.array([se3.exp([0, 0, np.radians(yaw), 0, 0, 0]) for yaw in (0, 3, -3, 6, -6, 9, -9)])
+_BETTER = 0.06  # so much must another heading fit better (0 to 2): on a plain 0.05 is chance
 _NEAR = (1.0, 5.0)  # m and degrees: results within are one place
 _PROBE = 1.0  # m either way along a direction that may be open
 _HELD = 1e7  # information, 1 / m2, that keeps a scan there: to less than a millimeter
@@ -206,7 +207,8 @@ class GeometricScanRegistration:
         map. It costs no time: a better start needs fewer steps.
         """
         poses = T @ _HEADINGS
-        return np.asarray(poses[self._local_map.fit(_few(source), poses).argmax()])
+        fit = self._local_map.fit(_few(source), poses)
+        return np.asarray(poses[fit.argmax()]) if fit.max() > fit[0] + _BETTER else T
 
     def _searched(self, source: Array, prediction: Prediction) -> Registration:
         """The place that fits best, if no other one fits nearly as well."""
