@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 from rich.console import Group
 
-from benchmarks.harness import Options, Report, earlier, file_digest, requested, torch_threads, write_report
+from benchmarks.harness import Options, Report, earlier, requested, torch_threads, write_report
 from dpm2_core.config import load_settings
 from dpm2_core.data.open import open_source
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.evaluation.pair_set import NEAR, SUCCESS, PairSet
 from dpm2_core.evaluation.record import git_commit
+from dpm2_core.files import file_digest
 from dpm2_core.learning.finetune import finetune
 from dpm2_core.learning.finetune_data import prepare
 from dpm2_core.learning.finetune_settings import FinetuneSettings

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import subprocess
@@ -175,12 +174,6 @@ def earlier(path: Path, key: str, **same: Any) -> dict[str, Any]:
         return dict(record[key]) if all(record[name] == value for name, value in as_written.items()) else {}
     except (OSError, ValueError, KeyError, TypeError):
         return {}
-
-
-def file_digest(path: Path) -> str:
-    """SHA-256 of a file, which tells the weights of a record apart."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def rounded(x: float) -> float:

@@ -18,7 +18,6 @@ from benchmarks.harness import (
     Report,
     drives,
     earlier,
-    file_digest,
     processors,
     quantiles_ms,
     requested,
@@ -34,6 +33,7 @@ from benchmarks.unseen import corruption, image_matters, overlap, synthetic
 from benchmarks.unseen_sensors import other_sensors
 from dpm2_core.evaluation.figures import success_png
 from dpm2_core.evaluation.record import git_commit
+from dpm2_core.files import file_digest
 from dpm2_core.frame import Array, Frame
 from dpm2_core.network.images import small_image
 from dpm2_core.network.model import DeepPointMap2

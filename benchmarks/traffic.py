@@ -13,9 +13,10 @@ import torch
 from numpy.typing import NDArray
 from rich.console import Group
 
-from benchmarks.harness import Options, Report, earlier, file_digest, requested, settings_of, write_report
+from benchmarks.harness import Options, Report, earlier, requested, settings_of, write_report
 from dpm2_core.evaluation.metrics import evaluate
 from dpm2_core.evaluation.record import git_commit
+from dpm2_core.files import file_digest
 from dpm2_core.frame import Frame, Points
 from dpm2_core.network.pretrained import PERCEPTION_WEIGHTS, PRETRAINED_DIR
 from dpm2_core.sim.lidar import Lidar

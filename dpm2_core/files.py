@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Results reach the disk whole or not at all: a full disk or a kill leaves the file that was there before."""
+"""Results reach the disk whole or not at all: a full disk or a kill leaves the file that was there before. And what
+tells files apart."""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 from collections.abc import Iterator
@@ -52,3 +54,13 @@ def write_json(path: Path | str, content: object) -> None:
     """
     with atomic_write(path) as file:
         file.write(json.dumps(content, indent=2) + "\n")
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 of what a file holds.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import glob
-import hashlib
 import json
 import multiprocessing
 import resource
@@ -23,7 +22,7 @@ from typing import Any
 
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.evaluation.record import git_commit
-from dpm2_core.files import atomic_write
+from dpm2_core.files import atomic_write, file_digest
 
 DONE = "part.json"
 """In the folder of a part that ended: what it was asked for, and its figures."""
@@ -231,5 +230,4 @@ def _digest(path: Path) -> str | None:
 @lru_cache
 def _hashed(path: Path, mtime_ns: int, size: int) -> str:
     """SHA-256 of a file; many parts read the same weights. `mtime_ns` and `size`: as it is now."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    return file_digest(path)

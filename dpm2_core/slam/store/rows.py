@@ -6,7 +6,6 @@ A row may come from anyone, with a correct checksum: what is made of it is of th
 
 from __future__ import annotations
 
-import hashlib
 import struct
 from collections.abc import Container
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ import numpy as np
 
 from dpm2_core.descriptors import Descriptors, quantized
 from dpm2_core.errors import Dpm2Error
+from dpm2_core.files import file_digest
 from dpm2_core.frame import Array, Edge, Fix, Georeference, Keyframe, Points, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.slam.store.cloud_store import Loan
@@ -61,8 +61,7 @@ def weights_id(path: Path) -> str:
         Dpm2Error: the file cannot be read.
     """
     try:
-        with path.open("rb") as file:
-            return f"{path.stem} {hashlib.file_digest(file, 'sha256').hexdigest()[:16]}"
+        return f"{path.stem} {file_digest(path)[:16]}"
     except OSError as error:
         raise Dpm2Error(f"{path}: {error.strerror}") from None
 

@@ -22,15 +22,18 @@ PRIOR = np.eye(6) / 0.1**2  # information of a velocity known to 1 m/s, 10 Hz
 Case = tuple[GeometricScanRegistration, Scan, Array]
 
 
+def make_registration() -> GeometricScanRegistration:
+    """With the default settings, and an empty map."""
+    return GeometricScanRegistration(
+        Preprocessor(PreprocessSettings()), GeometricRegistration(GeometricSettings()), LocalMap(LocalMapSettings())
+    )
+
+
 def make_case(drive: Drive, seen: float) -> Case:
     """A map of one scan, of which something hides all but a fraction of the azimuth; the fourth scan after, its
     pose."""
-    frames, truth = drive
-    preprocessor = Preprocessor(PreprocessSettings())
-    registration = GeometricScanRegistration(
-        preprocessor, GeometricRegistration(GeometricSettings()), LocalMap(LocalMapSettings())
-    )
-    first, later = (preprocessor.prepare(frames[i], np.zeros(6)) for i in (0, 4))
+    (frames, truth), registration = drive, make_registration()
+    first, later = (registration.prepare(frames[i], np.zeros(6)) for i in (0, 4))
     azimuth = np.arctan2(first.cloud[:, 1], first.cloud[:, 0])
     visible = np.cos(azimuth * 2) > np.cos(np.pi * seen)  # two sectors, ahead and behind
     registration.update(Scan(first.points, first.cloud[visible], first.source), np.eye(4))
@@ -99,24 +102,23 @@ def test_the_heading_is_looked_for_where_the_motion_is_not_known(suburb_drive: D
 
 def test_on_a_plain_the_heading_stays_that_of_the_motion() -> None:
     """Rings on the ground fit at any heading: by chance another one seems to fit a little better."""
-    preprocessor, rng = Preprocessor(PreprocessSettings()), np.random.default_rng(0)
-    registration = GeometricScanRegistration(
-        preprocessor, GeometricRegistration(GeometricSettings()), LocalMap(LocalMapSettings())
-    )
+    registration, rng = make_registration(), np.random.default_rng(0)
     height, azimuth = 1.7, np.linspace(-np.pi, np.pi, 1024, endpoint=False)
     radius = np.repeat(height / np.tan(np.radians(np.linspace(1.5, 25, 40))), len(azimuth))
     ring = np.column_stack([radius * np.cos(np.tile(azimuth, 40)), radius * np.sin(np.tile(azimuth, 40))])
     plain = np.column_stack([ring, np.full(len(ring), -height), np.zeros(len(ring))])
     noise = np.array([0.02, 0.02, 0.02, 0])
+
+    def scan() -> Scan:
+        points = (plain + noise * rng.standard_normal(plain.shape)).astype(np.float32)
+        return registration.prepare(Frame(0, points), np.zeros(6))
+
     for x in (0.0, 1.0, 2.0):
-        frame = Frame(0, (plain + noise * rng.standard_normal(plain.shape)).astype(np.float32))
-        registration.update(registration.prepare(frame, np.zeros(6)), se3.make(np.eye(3), [x, 0, 0]))
+        registration.update(scan(), se3.make(np.eye(3), [x, 0, 0]))
     turns_little = np.diag(np.repeat([0.01, 2.0], 3) ** -2.0)  # so that the scan stays at the heading it starts from
     for x in (6.0, 7.1, 8.3, 9.2, 10.4):
-        frame = Frame(0, (plain + noise * rng.standard_normal(plain.shape)).astype(np.float32))
         start = se3.make(np.eye(3), [x, 0, 0])
-        prediction = Prediction([start], information=turns_little)
-        result = registration.register(registration.prepare(frame, np.zeros(6)), prediction)
+        result = registration.register(scan(), Prediction([start], information=turns_little))
         assert se3.magnitude(se3.inverse(start) @ result.T_target_source)[1] < 2
 
 
@@ -152,9 +154,7 @@ def test_along_a_tunnel_answers_agree_and_the_least_motion_is_kept(tunnel_drive:
 
 def mapped(drive: Drive) -> GeometricScanRegistration:
     """Five scans of a drive as a map."""
-    made = GeometricScanRegistration(
-        Preprocessor(PreprocessSettings()), GeometricRegistration(GeometricSettings()), LocalMap(LocalMapSettings())
-    )
+    made = make_registration()
     for frame, T in zip(*(part[:5] for part in drive), strict=True):
         made.update(made.prepare(frame, np.zeros(6)), T)
     return made
