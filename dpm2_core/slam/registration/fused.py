@@ -33,9 +33,10 @@ class FusedScanRegistration:
 
     If both agree (see `agree`), they are fused by their information: ICP dominates in structured scenes, the network
     along degenerate directions such as a tunnel. If they disagree, ICP starts from the network's pose as well, and the
-    more likely of its results is kept. Without a motion prediction, the network's pose is an additional start of ICP
-    at once. If ICP fails, it is tried again from the network's pose; if it fails there too, or converges elsewhere,
-    the network's pose is returned with its own covariance. `reason` says which of the two disagreed, and why.
+    more likely of its results is kept. Where little is known of the motion, it does so at once: a direction that seems
+    open from afar may be closed at the right place. If ICP fails, it is tried again from the network's pose; if it
+    fails there too, or converges elsewhere, the network's pose is returned with its own covariance. `reason` says which
+    of the two disagreed, and why.
     """
 
     def __init__(
@@ -74,8 +75,8 @@ class FusedScanRegistration:
         neural = self._neural.register(scan, prediction) if len(self._neural) else None
         if neural is not None and neural.ok and not prediction.possible(neural.T_target_source):
             neural = replace(neural, ok=False, reason="found where no vehicle can have come")
-        if neural is not None and neural.ok and prediction.information is None:
-            points, prediction = None, replace(prediction, starts=[neural.T_target_source, *prediction.starts])
+        if neural is not None and neural.ok and not prediction.known:
+            points, prediction = None, _also_from(neural, prediction)
         points = points or self._geometric.register(scan, prediction)
         if neural is None:
             return _because(points, "neural: no descriptors yet")
@@ -90,6 +91,7 @@ class FusedScanRegistration:
             likelier = self._geometric.register(scan, replace(prediction, starts=starts))
             if likelier.ok and agree(likelier, neural):
                 return self._fused(scan, likelier, neural, None)
+            points = likelier if likelier.ok else points
             return _because(points, f"neural and points {_apart(points, neural)} apart")
         if not self._always and _sure(points):
             return points  # all that they needed was the start
@@ -138,6 +140,12 @@ def _mean(points: Registration, neural: Registration, prior: Array | None, seen:
     T = se3.orthonormalized(points.T_target_source @ se3.exp(step))
     covariance = np.linalg.inv(of_points + of_network) + points.covariance - points.of_scene
     return replace(points, T_target_source=T, covariance=covariance, method="refined")
+
+
+def _also_from(neural: Registration, prediction: Prediction) -> Prediction:
+    """With the network's pose as one more start: the first of equals only where there is nothing else to go by."""
+    start, starts = neural.T_target_source, prediction.starts
+    return replace(prediction, starts=[start, *starts] if prediction.information is None else [*starts, start])
 
 
 def _sure(points: Registration) -> bool:

@@ -81,6 +81,23 @@ class Case:
         return result, float(np.linalg.norm(result.T_target_source[:3, 3] - self.truth[:3, 3]))
 
 
+def between_walls() -> Drive:
+    """Six scans, 0.2 m apart, of floor and walls that are smooth but for a niche 1 m deep and 1.5 m long."""
+    noise = np.random.default_rng(0)
+    truth = np.tile(np.eye(4), (6, 1, 1))
+    truth[:, 0, 3] = 0.2 * np.arange(6)
+    frames = []
+    for i, T in enumerate(truth):
+        x, side, height = noise.uniform(-20, 20, 12000), noise.choice([-3.0, 3.0], 12000), noise.uniform(-1, 2, 12000)
+        side[(np.abs(x - 5) < 0.75) & (side > 0)] += 1
+        ends = np.column_stack([noise.choice([4.25, 5.75], 600), noise.uniform(3, 4, 600), noise.uniform(-1, 2, 600)])
+        floor = np.column_stack([noise.uniform(-20, 20, 4000), noise.uniform(-3, 3, 4000), np.full(4000, -1.0)])
+        points = np.concatenate([np.column_stack([x, side, height]), ends, floor]) - T[:3, 3]
+        points += noise.normal(0, 0.01, points.shape)
+        frames.append(Frame(i * 10**8, np.pad(points, ((0, 0), (0, 1))).astype(np.float32), index=i))
+    return frames, truth
+
+
 @pytest.fixture
 def case(suburb_drive: Drive) -> Case:
     return Case(suburb_drive)
@@ -148,12 +165,30 @@ def test_while_no_motion_is_known_the_network_gives_one_more_start(case: Case) -
     assert error < 0.02
 
 
-def test_where_two_disagree_the_likelier_is_taken(case: Case) -> None:
-    """Of the motion so far little is known: points that start 12 m off fit somewhere, but not as well."""
-    case.prediction = Prediction([case.truth @ se3.exp([0, 0, 0, 12, 0, 0])], widen=2.0, information=np.eye(6) / 100)
-    result, error = case.register([0, 0, 0, 0.05, 0.02, 0])
-    assert (result.ok, result.method) == (True, "refined")
+@pytest.mark.parametrize(("off", "method"), [([0.05, 0.02], "refined"), ([0.6, 0.2], "geometric")])
+@pytest.mark.parametrize("known", [0.01, 4.0])
+def test_where_two_disagree_the_likelier_is_taken(case: Case, off: list[float], method: str, known: float) -> None:
+    """Points that start 12 m off fit somewhere, but not as well as from the network's pose; also where it is 0.6 m off
+    and sure of it, and whether the motion so far is thought to be known to 10 m or to 0.5 m."""
+    start = case.truth @ se3.exp([0, 0, 0, 12, 0, 0])
+    case.prediction = Prediction([start], widen=2.0, information=known * np.eye(6))
+    assert case.register([0, 0, 0, 0, 0, 0], size=0)[1] > 5
+    result, error = case.register([0, 0, 0, *off, 0], size=1)
+    assert (result.ok, result.method) == (True, method)
     assert error < 0.02
+
+
+def test_what_few_points_show_is_found_from_the_network() -> None:
+    """Two walls with a niche: points that start 4 m off leave the way along open, and do not contradict the network."""
+    case = Case(between_walls())
+    information = np.diag(np.repeat([1.0, 2.0], 3) ** -2.0)
+    case.prediction = Prediction([case.truth @ se3.exp([0, 0, 0, -4, 0, 0])], information=information)
+    alone, lost = case.register([0, 0, 0, 0, 0, 0], size=0)
+    assert lost > 2
+    assert alone.worst_sigma > 0.5
+    result, error = case.register([0, 0, 0, 0.05, 0.02, 0], size=1)
+    assert result.ok
+    assert error < 0.1
 
 
 def test_the_network_is_asked_only_where_the_points_do_not_know(suburb_drive: Drive, tunnel_drive: Drive) -> None:
