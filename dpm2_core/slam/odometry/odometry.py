@@ -19,7 +19,7 @@ from dpm2_core.slam.odometry.other import OtherMotion, Step
 from dpm2_core.slam.odometry.settings import OdometrySettings
 from dpm2_core.slam.odometry.starts import starts_from_rest, turned_starts
 from dpm2_core.slam.preprocess import Scan
-from dpm2_core.slam.registration.protocol import FITS_WELL, Prediction, ScanRegistration
+from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration
 
 _KNOWN = 0.5  # m and rad, standard deviation of the second pose, still skewed: where the points find it alone
 _ANY_VELOCITY = 15.0**2 * np.eye(3)  # covariance, m/s: so much until two scans are registered
@@ -218,12 +218,14 @@ class Odometry:
     def _registered_from_rest(self, scan: Scan, T: Array, dt: float) -> Registration:
         """While the velocity is unknown: the best of many starts; after a pause first as before it."""
         if self._bridge is not None and self._bridge.twist is not None:
-            result = self._registration.register(scan, self._bridge.expected(T, dt))
-            if result.ok and result.confidence >= FITS_WELL:
+            expected = self._bridge.expected(T, dt)
+            result = self._registration.register(scan, expected)
+            if result.ok and result.confidence >= expected.convincing:
                 return result
         for starts in starts_from_rest(T, self._settings.turns):
-            result = self._registration.register(scan, Prediction(starts, widen=2.0))
-            if result.ok and result.confidence >= FITS_WELL:
+            prediction = Prediction(starts, widen=2.0)
+            result = self._registration.register(scan, prediction)
+            if result.ok and result.confidence >= prediction.convincing:
                 break
         return result
 

@@ -15,7 +15,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.icp import GeometricScanRegistration
 from dpm2_core.slam.registration.neural import NeuralScanRegistration
-from dpm2_core.slam.registration.protocol import FITS_WELL, MAP_NOISE, Prediction, agree
+from dpm2_core.slam.registration.protocol import MAP_NOISE, Prediction, agree
 
 _LED = np.diag(np.repeat([np.radians(2), 0.5], 3) ** -2.0)
 """Information of a network pose with a standard deviation of 2 degrees and 0.5 m: enough to initialize ICP."""
@@ -70,7 +70,7 @@ class FusedScanRegistration:
 
     def register(self, scan: Scan, prediction: Prediction) -> Registration:
         points = None if self._always else self._geometric.register(scan, prediction)
-        if points is not None and _sure(points):
+        if points is not None and _sure(points, prediction):
             return points
         neural = self._neural.register(scan, prediction) if len(self._neural) else None
         if neural is not None and neural.ok and not prediction.possible(neural.T_target_source):
@@ -93,7 +93,7 @@ class FusedScanRegistration:
                 return self._fused(scan, likelier, neural, None)
             points = likelier if likelier.ok else points
             return _because(points, f"neural and points {_apart(points, neural)} apart")
-        if not self._always and _sure(points):
+        if not self._always and _sure(points, prediction):
             return points  # all that they needed was the start
         return self._fused(scan, points, neural, prediction.information)
 
@@ -148,9 +148,9 @@ def _also_from(neural: Registration, prediction: Prediction) -> Prediction:
     return replace(prediction, starts=[start, *starts] if prediction.information is None else [*starts, start])
 
 
-def _sure(points: Registration) -> bool:
+def _sure(points: Registration, prediction: Prediction) -> bool:
     """Whether they fit well, with no direction left open."""
-    return points.ok and points.confidence >= FITS_WELL and points.worst_sigma <= _SURE_SIGMA
+    return points.ok and points.confidence >= prediction.convincing and points.worst_sigma <= _SURE_SIGMA
 
 
 def _difference(a: Registration, b: Registration) -> Array:
