@@ -37,7 +37,7 @@ class Options:
         kitti: folder of the excerpt, packed (it holds unpack.py) or in KITTI layout; None looks for it.
         repetitions: of every method on every drive.
         threads: processors that every method may use.
-        overrides: `key=value` settings of the SLAM.
+        overrides: `key=value` settings of the SLAM, and of how drives are read.
         weights: of the network, a name or a path; None: those of the settings.
         unseen: packed drives of worlds that the network has not seen; None makes some.
         pairs: of frames of each kind.
@@ -65,8 +65,12 @@ class Options:
 
 def settings_of(options: Options, *more: str) -> SlamSettings:
     """Settings of the SLAM as asked for, with `more` of the kind `slam.registration=neural`."""
+    return _configuration(options, *more).slam
+
+
+def _configuration(options: Options, *more: str) -> Config:
     weights = [] if options.weights is None else [f"slam.neural.weights={options.weights}"]
-    return load_settings(Config, None, [f"slam.threads={options.threads}", *weights, *options.overrides, *more]).slam
+    return load_settings(Config, None, [f"slam.threads={options.threads}", *weights, *options.overrides, *more])
 
 
 def requested(options: Options, parts: Collection[str]) -> list[str]:
@@ -97,8 +101,9 @@ def drives(options: Options) -> Iterator[list[Source]]:
     Raises:
         UsageError: there is none.
     """
+    how = _configuration(options).input
     if options.sources:
-        yield [open_source(path) for path in options.sources]
+        yield [open_source(path, how) for path in options.sources]
         return
     kitti = options.excerpt
     if not kitti.is_dir():
@@ -113,7 +118,7 @@ def drives(options: Options) -> Iterator[list[Source]]:
         sequences = sorted(path for path in (root / "sequences").glob("*") if (path / "velodyne").is_dir())
         if not sequences:
             raise UsageError(f"{kitti}: neither unpack.py nor sequences/NN/velodyne in it")
-        yield [open_source(path) for path in sequences]
+        yield [open_source(path, how) for path in sequences]
 
 
 def truth_of(source: Source) -> Array:
