@@ -64,7 +64,7 @@ class Prediction:
         """Confidence of points from which their pose is not doubted, if it leaves no direction open.
 
         Where the motion is not known more must fit: of 54 poses between the two values 3 were wrong, of 1,047 above 4
-        (vehicles up to 0.9 s after the last scan, a LiDAR in the hand up to 2.5 s).
+        (vehicles up to 0.9 s after the last scan, one at walking pace up to 2.5 s).
         """
         return _KNOWN_FITS if self.known else _FITS
 

@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A public drive of another sensor as a KITTI sequence: python -m benchmarks.livox_drive FOLDER SEQUENCE.
+
+FOLDER is datas/benchmark_realworld of github.com/hku-mars/BALM (Liu et al., "Efficient and consistent bundle adjustment
+on LiDAR point clouds", T-RO 2023): 177 scans of a Livox Avia at walking pace, two a second. It needs the extra
+`datasets`.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from dpm2_core.data.cloud_folder import CloudFolder
+from dpm2_core.data.trajectory import write_kitti
+from dpm2_core.errors import UsageError, exit_code
+from dpm2_core.geometry import se3
+
+_T_CAM_LIDAR = se3.make([[0, -1, 0], [0, 0, -1], [1, 0, 0]], [0, 0, 0])  # of no camera: KITTI's poses are those of one
+_POSES = "alidarPose.csv"
+
+
+def write_sequence(folder: Path, out: Path) -> None:
+    """Scans, times and poses as KITTI's odometry has them.
+
+    Raises:
+        UsageError: there are not as many poses as scans.
+    """
+    scans = CloudFolder(folder)
+    lines = (folder / _POSES).read_text(encoding="utf-8").replace(",\n", "\n").split()
+    rows = np.array([[float(number) for number in line.split(",")] for line in lines])
+    if rows.shape != (4 * len(scans), 4):
+        raise UsageError(f"{folder / _POSES}: {len(rows)} rows for {len(scans)} scans; four rows of four each")
+    poses = rows.reshape(-1, 4, 4)
+    times = poses[:, 3, 3].copy()  # where others have a 1
+    poses[:, 3] = 0, 0, 0, 1
+    (out / "velodyne").mkdir(parents=True)
+    for frame in scans.frames():
+        if frame.problem is not None:
+            raise UsageError(frame.problem)
+        frame.points.astype("<f4").tofile(out / "velodyne" / f"{frame.index:06d}.bin")
+    np.savetxt(out / "times.txt", times - times[0], "%.6f")
+    (out / "calib.txt").write_text("Tr: " + " ".join(f"{number:g}" for number in _T_CAM_LIDAR[:3].ravel()) + "\n")
+    write_kitti(out / "poses.txt", _T_CAM_LIDAR @ se3.inverse(poses[0]) @ poses @ se3.inverse(_T_CAM_LIDAR))
+
+
+if __name__ == "__main__":
+    sys.exit(exit_code(lambda: write_sequence(Path(sys.argv[1]), Path(sys.argv[2]))))
