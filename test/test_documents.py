@@ -79,6 +79,20 @@ def test_the_figures_at_few_frames_per_second_are_those_of_the_record() -> None:
     assert all(rate["adaptive"]["failed_frames"] == 0 for rate in rates)
 
 
+def test_the_figures_of_the_livox_are_those_of_the_record() -> None:
+    methods = {"dpm2, `adaptive`": "adaptive", "dpm2, `neural`": "neural", "KISS-ICP": "kiss-icp"}
+    (cases,) = record("livox.json")["drives"].values()
+    found = rows("README.md", "| one scan every | 0.5 s | 1.5 s | 3 s | 5 s |")
+    assert [cells[0] for cells in found] == list(methods)
+    for cells in found:
+        for every, cell in zip((1, 3, 6, 10), cells[1:], strict=True):
+            assert equals(cell, cases[f"every {every}"][methods[cells[0]]]["rpe_trans_m"]), (cells[0], every)
+    assert [cases[f"every {every}"]["adaptive"]["failed_frames"] for every in (1, 3, 6, 10)] == [0, 0, 2, 2]
+    interrupted = [case["adaptive"] for name, case in cases.items() if name.startswith(("gap", "blind"))]
+    assert max(figures["error_m"] for figures in interrupted) < 0.045
+    assert cases["kidnapped"]["adaptive"]["verdict"] == "said"
+
+
 def test_where_the_geometry_is_silent_the_figures_are_those_of_the_records() -> None:
     pairs, seen = record("neural.json")["parts"]["image"]["pairs"], []
     for cells in rows("README.md", "| | without camera | with | KISS-ICP |"):
