@@ -9,6 +9,7 @@ on LiDAR point clouds", T-RO 2023): 177 scans of a Livox Avia at walking pace, t
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -26,13 +27,17 @@ def write_sequence(folder: Path, out: Path) -> None:
     """Scans, times and poses as KITTI's odometry has them.
 
     Raises:
-        UsageError: there are not as many poses as scans.
+        UsageError: scans cannot be read, there are not as many poses as scans, or `out` is there.
     """
     scans = CloudFolder(folder)
-    lines = (folder / _POSES).read_text(encoding="utf-8").replace(",\n", "\n").split()
-    rows = np.array([[float(number) for number in line.split(",")] for line in lines])
-    if rows.shape != (4 * len(scans), 4):
-        raise UsageError(f"{folder / _POSES}: {len(rows)} rows for {len(scans)} scans; four rows of four each")
+    try:
+        rows = np.loadtxt(folder / _POSES, delimiter=",", usecols=range(4), ndmin=2)
+    except (OSError, ValueError) as error:
+        raise UsageError(f"{folder / _POSES}: {error}") from None
+    if len(rows) != 4 * len(scans):
+        raise UsageError(f"{folder / _POSES}: {len(rows)} rows for {len(scans)} scans, want four each")
+    if out.exists():
+        raise UsageError(f"{out}: is there already")
     poses = rows.reshape(-1, 4, 4)
     times = poses[:, 3, 3].copy()  # where others have a 1
     poses[:, 3] = 0, 0, 0, 1
@@ -46,5 +51,12 @@ def write_sequence(folder: Path, out: Path) -> None:
     write_kitti(out / "poses.txt", _T_CAM_LIDAR @ se3.inverse(poses[0]) @ poses @ se3.inverse(_T_CAM_LIDAR))
 
 
+def main(arguments: Sequence[str]) -> None:
+    """Raises UsageError unless there are two arguments."""
+    if len(arguments) != 2:
+        raise UsageError("want two arguments: the folder of the scans, and of the sequence")
+    write_sequence(Path(arguments[0]), Path(arguments[1]))
+
+
 if __name__ == "__main__":
-    sys.exit(exit_code(lambda: write_sequence(Path(sys.argv[1]), Path(sys.argv[2]))))
+    sys.exit(exit_code(lambda: main(sys.argv[1:])))

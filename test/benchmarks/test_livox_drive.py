@@ -42,9 +42,15 @@ def test_a_drive_keeps_its_points_times_and_motion(folder: Path, tmp_path: Path)
     np.testing.assert_allclose(steps, se3.inverse(T_WORLD_LIDAR[:-1]) @ T_WORLD_LIDAR[1:], atol=1e-6)
 
 
-def test_poses_that_are_missing_are_an_error(folder: Path, tmp_path: Path) -> None:
+def test_what_is_missing_or_in_the_way_is_an_error(folder: Path, tmp_path: Path) -> None:
     poses = folder / "alidarPose.csv"
-    poses.write_text("".join(poses.read_text().splitlines(keepends=True)[:8]))
-    with pytest.raises(UsageError, match=r"alidarPose\.csv: 8 rows for 3 scans"):
-        write_sequence(folder, tmp_path / "00")
+    rows = poses.read_text().splitlines(keepends=True)
+    for text, words in (("".join(rows[:8]), "8 rows for 3 scans"), ("1,0,?,0,\n", "could not convert")):
+        poses.write_text(text)
+        with pytest.raises(UsageError, match=rf"alidarPose\.csv: .*{words}"):
+            write_sequence(folder, tmp_path / "00")
     assert not (tmp_path / "00").exists()
+    poses.write_text("".join(rows))
+    write_sequence(folder, tmp_path / "00")
+    with pytest.raises(UsageError, match="is there already"):
+        write_sequence(folder, tmp_path / "00")

@@ -16,8 +16,6 @@ from dpm2_core.slam.preprocess import Scan
 CHI2 = 22.46
 """99.9 % quantile of chi2 with 6 degrees of freedom: two poses that are farther apart contradict each other."""
 
-_KNOWN_FITS, _FITS = 0.7, 0.75  # confidence of points: see `Prediction.convincing`
-
 # What the covariances of two registrations leave out, rad and m: the poses of the frames that make up the maps.
 MAP_NOISE = np.diag(np.repeat([np.radians(0.1), 0.03], 3) ** 2)
 
@@ -66,7 +64,7 @@ class Prediction:
         Where the motion is not known more must fit: of 54 poses between the two values 3 were wrong, of 1,047 above 4
         (vehicles up to 0.9 s after the last scan, one at walking pace up to 2.5 s).
         """
-        return _KNOWN_FITS if self.known else _FITS
+        return 0.7 if self.known else 0.75
 
 
 class ScanRegistration(Protocol):
