@@ -17,9 +17,7 @@ import numpy as np
 from dpm2_core.data.cloud_folder import CloudFolder
 from dpm2_core.data.trajectory import write_kitti
 from dpm2_core.errors import UsageError, exit_code
-from dpm2_core.geometry import se3
 
-_T_CAM_LIDAR = se3.make([[0, -1, 0], [0, 0, -1], [1, 0, 0]], [0, 0, 0])  # of no camera: KITTI's poses are those of one
 _POSES = "alidarPose.csv"
 
 
@@ -47,8 +45,8 @@ def write_sequence(folder: Path, out: Path) -> None:
             raise UsageError(frame.problem)
         frame.points.astype("<f4").tofile(out / "velodyne" / f"{frame.index:06d}.bin")
     np.savetxt(out / "times.txt", times - times[0], "%.6f")
-    (out / "calib.txt").write_text("Tr: " + " ".join(f"{number:g}" for number in _T_CAM_LIDAR[:3].ravel()) + "\n")
-    write_kitti(out / "poses.txt", _T_CAM_LIDAR @ se3.inverse(poses[0]) @ poses @ se3.inverse(_T_CAM_LIDAR))
+    (out / "calib.txt").write_text("Tr: 1 0 0 0 0 1 0 0 0 0 1 0\n")  # the poses are the LiDAR's
+    write_kitti(out / "poses.txt", poses)
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
 import os
@@ -19,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.files import file_digest
 from dpm2_core.geometry import se3
 from dpm2_core.sim.camera import calibration, render
 from dpm2_core.sim.gnss import Receiver
@@ -102,7 +102,7 @@ def _recipe(drive: DriveConfig) -> dict[str, Any]:
             del recipe["lidar"][name]
     if drive.road not in ROAD_KINDS:
         path = Path(drive.road)
-        recipe["road"] = f"{path.name} sha256:{hashlib.sha256(path.read_bytes()).hexdigest()}"
+        recipe["road"] = f"{path.name} sha256:{file_digest(path)}"
     for name in ("wet", "lens"):  # and a dry one
         if recipe["camera"][name] == 0:
             del recipe["camera"][name]

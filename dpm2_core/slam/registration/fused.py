@@ -85,13 +85,14 @@ class FusedScanRegistration:
         if not points.ok:
             return self._led(scan, neural)
         if not agree(points, neural):
-            if not prediction.known and points.worst_sigma > _SURE_SIGMA and self._seen(scan):
+            if prediction.known:
+                starts = [points.T_target_source, neural.T_target_source]
+                likelier = self._geometric.register(scan, replace(prediction, starts=starts))
+                if likelier.ok and agree(likelier, neural):
+                    return self._fused(scan, likelier, neural, None)
+                points = likelier if likelier.ok else points
+            elif points.worst_sigma > _SURE_SIGMA and self._seen(scan):
                 return self._led(scan, neural)  # where points fit anywhere, they fit best where nothing has moved
-            starts = [points.T_target_source, neural.T_target_source]
-            likelier = self._geometric.register(scan, replace(prediction, starts=starts))
-            if likelier.ok and agree(likelier, neural):
-                return self._fused(scan, likelier, neural, None)
-            points = likelier if likelier.ok else points
             return _because(points, f"neural and points {_apart(points, neural)} apart")
         if not self._always and _sure(points, prediction):
             return points  # all that they needed was the start
