@@ -43,7 +43,7 @@ EXTRAS = {
     ],
     "test": [
         "import-linter>=2.1,<3",
-        "pytest>=8,<10",
+        "pytest>=9,<10",
         "pytest-timeout>=2.3,<3",
         "pytest-xdist>=3.6,<4",
         "filelock>=3.13,<4",

@@ -38,7 +38,7 @@ from dpm2_core.slam.store.map_data import MapData, load_map
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.tables import FigureTable
 from dpm2_ros.conversions import cloud_to_msg, parse_keyframe_name
-from dpm2_ros.runtime import ros_context
+from dpm2_ros.runtime import end_ros, ros_context
 from tools.replay import ros_environment, start, stop
 
 ROAD = "07"
@@ -95,11 +95,8 @@ class _Scans:
             self._executor.spin_once(timeout_sec=left)
 
     def close(self) -> None:
-        import rclpy
-
         self._executor.shutdown()
-        self._node.destroy_node()
-        rclpy.try_shutdown()
+        end_ros(self._node)
 
 
 def bench(

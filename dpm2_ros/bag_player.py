@@ -25,7 +25,7 @@ from dpm2_core.files import atomic_write
 from dpm2_ros.conversions import stamp_to_msg
 from dpm2_ros.lockstep import ODOMETRY, Lockstep
 from dpm2_ros.message_types import message_type
-from dpm2_ros.runtime import STOP, ros_context
+from dpm2_ros.runtime import STOP, end_ros, ros_context
 
 LATCHED = (topics.TF_STATIC, topics.VERTICAL_ANGLE_CORRECTION)
 CLOCK_PERIOD = 0.01
@@ -210,7 +210,7 @@ def main(arguments: Sequence[str]) -> int:
         own = remove_ros_args(["bag_player", *arguments])[1:]
         return int(app(args=own, standalone_mode=False, prog_name="bag_player") or 0)
     finally:
-        rclpy.try_shutdown()
+        end_ros()
 
 
 def _play(
@@ -238,5 +238,5 @@ def _play(
         )
         BagPlayer(node, options).play()
     finally:
-        node.destroy_node()
+        end_ros(node)
     return 0

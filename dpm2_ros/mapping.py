@@ -29,7 +29,7 @@ from dpm2_ros.active_map import ActiveMap
 from dpm2_ros.conversions import cloud_to_msg, edge_to_msg, keyframe_name
 from dpm2_ros.display import Display, grid_to_msg, loop_to_msg, path_to_msg, pose_graph_to_msg
 from dpm2_ros.guard import GuardedNode
-from dpm2_ros.runtime import yield_to_odometry
+from dpm2_ros.runtime import lower_priority
 from dpm2_ros.settings import NodeConfig
 from dpm2_ros.subscriptions import LAST_ONE, STEADY
 from dpm2_ros.tf import TransformBroadcaster
@@ -49,7 +49,7 @@ class MapperThread:
         config = config.model_copy(update={"slam": config.slam.model_copy(update={"pose_graph": graph})})
         self._node, self._config, self._robot = node, config, robot
         self._active = ActiveMap(config, robot, node.get_logger())
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="mapper", initializer=yield_to_odometry)
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="mapper", initializer=lower_priority)
         self._stamp = 0  # of the last keyframe, ns
         self._restarted: Future[None] | None = None  # since when the odometry's start is known here
         self._lock = threading.Lock()

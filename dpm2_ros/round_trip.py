@@ -14,7 +14,7 @@ import sys
 import time
 
 from dpm2_core.errors import Dpm2Error, exit_code
-from dpm2_ros.runtime import ros_context
+from dpm2_ros.runtime import end_ros, ros_context
 
 SIZE = 2_000_000
 """Bytes: 120,000 points."""
@@ -48,7 +48,7 @@ def receive(topic: str) -> dict[str, object]:
     finally:
         sender.terminate()
         sender.wait()
-        rclpy.try_shutdown()
+        end_ros(node)
     if not arrived:
         raise Dpm2Error(f"no message of {SIZE} bytes came from another process within {_PATIENCE:g} s")
     return {"rmw": rclpy.get_rmw_implementation_identifier(), "ms": min(arrived)}

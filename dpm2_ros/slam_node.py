@@ -29,7 +29,7 @@ from dpm2_ros.keyframes import KeyframeSender, weights_identity
 from dpm2_ros.lifecycle import ManagedNode
 from dpm2_ros.other_odometry import OtherOdometry
 from dpm2_ros.requests import Requests
-from dpm2_ros.runtime import yield_to_odometry
+from dpm2_ros.runtime import lower_priority
 from dpm2_ros.state import StatePublisher
 from dpm2_ros.subscriptions import Inputs
 from dpm2_ros.synchronizer import Bundle
@@ -68,7 +68,7 @@ class SlamNode(ManagedNode):
         self._state = StatePublisher(self)
         self._projection = Projection(self, second=bool(self._config.input.second_image_topic))
         # Idle with the mapper, which has its own.
-        self._line = ThreadPoolExecutor(1, thread_name_prefix="keyframes", initializer=yield_to_odometry)
+        self._line = ThreadPoolExecutor(1, thread_name_prefix="keyframes", initializer=lower_priority)
         back.callback(self._line.shutdown)
         sends = ros.publish_tf_odom and (not self._beside or ros.invert_odom_tf or not ros.embed_mapper)
         self._tf = TransformBroadcaster(self, ros.own_frame, sends, ros.invert_odom_tf)

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 from dpm2_core.errors import exit_code
-from dpm2_ros.runtime import ros_context
+from dpm2_ros.runtime import end_ros, ros_context
 
 _OF_RCLPY = ("/parameter_events", "/rosout", "/clock")
 _HEAD = """# Topics and services
@@ -78,14 +78,12 @@ def main() -> int:
     """Print the page."""
 
     def work() -> None:
-        import rclpy
-
         with tempfile.TemporaryDirectory() as folder:
             ros_context(["--ros-args", "-p", f"ros.map_directory:={folder}"])
             try:
                 sys.stdout.write(page(describe(node_makers())))
             finally:
-                rclpy.try_shutdown()
+                end_ros()
 
     return exit_code(work)
 

@@ -25,7 +25,7 @@ from dpm2_core.data.messages import decode_points, stamp_ns
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Array, Points
-from dpm2_ros.runtime import ros_context
+from dpm2_ros.runtime import end_ros, ros_context
 
 Nanoseconds = NDArray[np.int64]
 
@@ -198,11 +198,8 @@ class _Listener:
         return self
 
     def __exit__(self, *_: object) -> None:
-        import rclpy
-
         self._executor.shutdown()
-        self._node.destroy_node()
-        rclpy.try_shutdown()
+        end_ros(self._node)
 
     def watch_all(self) -> None:
         """Subscribe to the other topics of slam_node, too, and leave their messages as the bytes that they came as."""

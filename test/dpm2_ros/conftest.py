@@ -32,7 +32,7 @@ from dpm2_core.data.kitti import KittiSource
 from dpm2_core.frame import Array, Keyframe, Points
 from dpm2_core.geometry import se3
 from dpm2_ros.conversions import cloud_to_msg, edge_to_msg, keyframe_name
-from dpm2_ros.runtime import ros_context
+from dpm2_ros.runtime import end_ros, ros_context
 from tools.replay import ros_environment
 
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = ros_environment()["ROS_AUTOMATIC_DISCOVERY_RANGE"]
@@ -289,9 +289,7 @@ class Harness:
             self._ended.set()
             self._thread.join()
             self._executor.shutdown()
-            for node in (*self._closing, self.node):
-                node.destroy_node()
-            rclpy.try_shutdown()
+            end_ros(*self._closing, self.node)
 
 
 @pytest.fixture

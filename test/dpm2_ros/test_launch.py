@@ -30,7 +30,7 @@ from dpm2_core.config import flat_fields
 from dpm2_core.slam.store.check import check_map
 from dpm2_ros import executables
 from dpm2_ros.parameters import CONFIG_FILE, load_parameters
-from dpm2_ros.runtime import ros_context
+from dpm2_ros.runtime import end_ros, ros_context
 from dpm2_ros.settings import NodeConfig
 from dpm2_ros.share import share_directory
 from tools.replay import ros_environment, start
@@ -96,7 +96,7 @@ def test_arguments_left_alone_override_no_file(launch_file: ModuleType) -> None:
     assert launch_file.parameters(defaults(launch_file)) == {}
 
 
-def test_every_argument_is_a_parameter_that_is_taken(launch_file: ModuleType, tmp_path: Path) -> None:
+def test_every_argument_is_a_parameter_that_is_taken(launch_file: ModuleType, tmp_path: Path, domain: int) -> None:
     (tmp_path / "settings.yaml").write_text("{}")
     value = defaults(launch_file) | {
         "bag": "drive.mcap",
@@ -113,13 +113,13 @@ def test_every_argument_is_a_parameter_that_is_taken(launch_file: ModuleType, tm
         "localization_mode": "true",
     }
     file = write(launch_file.parameters(value), tmp_path / "p.yaml")
-    ros_context(["--ros-args", "--params-file", str(file)])
+    ros_context(["--ros-args", "--params-file", str(file)], domain)
+    node = rclpy.create_node("any", automatically_declare_parameters_from_overrides=True)
     try:
-        node = rclpy.create_node("any", automatically_declare_parameters_from_overrides=True)
         config = load_parameters(node, NodeConfig)
         assert node.get_parameter("use_sim_time").value is True  # by the bag
     finally:
-        rclpy.try_shutdown()
+        end_ros(node)
     changed = {name for name, default in DEFAULTS.items() if of(config, name) != default}
     assert changed == set(launch_file.PARAMETERS.values()) - {CONFIG_FILE}
     assert (config.ros.embed_mapper, config.ros.localization_mode, config.ros.map_file) == (False, True, "town.dpm2map")

@@ -3,14 +3,18 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
+import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+import rclpy
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMsg
 from sensor_msgs.msg import PointCloud2
@@ -21,6 +25,7 @@ from dpm2_core.data.messages import stamp_ns
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.evaluation.metrics import ape_rmse
 from dpm2_ros.mapping import KEEP_ALL, LAST_ONE
+from dpm2_ros.runtime import end_ros, ros_context
 from tools.demo import evaluate_replay, map_poses
 from tools.replay import replay, ros_environment, start
 
@@ -184,3 +189,35 @@ def test_replay_is_checked_by_what_arrived(
     assert (outcome.summary["frames_out"], outcome.summary["dropped"]) == (drive.frames - 1, 1)
     result.poses[12345] = lost
     assert not evaluate_replay(source, result, tmp_path).checks["no odometry without its cloud"]
+
+
+def test_ros_ends_in_time_or_the_process_does(domain: int) -> None:
+    """Also where what hangs holds Python's lock, so that neither a signal nor another thread is heard."""
+    stuck = "ctypes.PyDLL(None).sleep(120)"
+    code = f"""
+import ctypes
+from dpm2_ros.runtime import end_ros, ros_context
+class Stuck:
+    def destroy_node(self): {stuck}
+ros_context([], {domain})
+end_ros(Stuck(), within=1.0)
+"""
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    assert ended.returncode == 1
+    assert "in destroy_node" in ended.stderr
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="processors can be chosen on Linux alone")
+def test_after_the_end_of_ros_all_processors_are_used_again(domain: int) -> None:
+    before = os.sched_getaffinity(0), os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+    ros_context([], domain)
+    seen = list[set[int]]()
+
+    class Watched:
+        def destroy_node(self) -> None:
+            seen.append(os.sched_getaffinity(0))
+
+    end_ros(Watched())
+    assert [len(processors) for processors in seen] == [1]
+    assert (os.sched_getaffinity(0), os.getpriority(os.PRIO_PROCESS, threading.get_native_id())) == before
+    assert not rclpy.ok()

@@ -67,6 +67,7 @@ def test_points_of_a_custom_message_arrive(node: Callable[..., Node]) -> None:  
         publisher.publish(custom_message(10**9 + i * 10**8, POINTS, SECONDS))
         rclpy.spin_once(n, timeout_sec=0.1)
         bundle = inputs.take(0.0)
+    driver.destroy_node()
     rclpy.shutdown(context=other)
     assert bundle is not None
     frame = FrameBuilder(InputSettings(), inputs.calibration, pytest.fail).frame(bundle.stamp, bundle.cloud, 0)

@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from dpm2_ros.runtime import yield_to_odometry
+from dpm2_ros.runtime import lower_priority
 
 
 def niceness() -> int:
@@ -20,6 +20,6 @@ def niceness() -> int:
 @pytest.mark.skipif(sys.platform != "linux", reason="threads have a priority of their own on Linux alone")
 def test_only_the_thread_of_the_map_gives_way() -> None:
     before = niceness()
-    with ThreadPoolExecutor(1, initializer=yield_to_odometry) as pool:
+    with ThreadPoolExecutor(1, initializer=lower_priority) as pool:
         assert pool.submit(niceness).result() == min(before + 10, 19)
     assert niceness() == before

@@ -18,6 +18,7 @@ import yaml
 from rclpy.node import Node
 
 from dpm2_ros import build_tf2_msgs
+from dpm2_ros.runtime import end_ros, ros_context
 from dpm2_ros.share import share_directory
 from tools.replay import ros_environment
 
@@ -162,14 +163,14 @@ def test_tf2_msgs_built_here_talks_to_those_of_ros(domain: int) -> None:
     import rclpy
     from tf2_msgs.msg import TFMessage
 
-    rclpy.init(args=[], domain_id=domain)
+    ros_context([], domain)
+    node: Node = rclpy.create_node("hash")
     try:
-        node: Node = rclpy.create_node("hash")
         node.create_publisher(TFMessage, "/tf", 1)
         (info,) = node.get_publishers_info_by_topic("/tf")
         assert str(info.topic_type_hash) == build_tf2_msgs.TYPE_HASH
     finally:
-        rclpy.try_shutdown()
+        end_ros(node)
 
 
 def test_tf2_msgs_without_a_compiler_is_one_line(tmp_path: Path) -> None:

@@ -4,42 +4,45 @@
 from __future__ import annotations
 
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 import rclpy
 from rcl_interfaces.msg import ParameterType
+from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from dpm2_core.config import flat_fields
 from dpm2_core.errors import UsageError
 from dpm2_ros.parameters import follow_changes, load_parameters, page
-from dpm2_ros.runtime import ros_context
+from dpm2_ros.runtime import end_ros, ros_context
 from dpm2_ros.settings import CHANGEABLE, NodeConfig
 
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "parameters.md"
+Load = Callable[..., tuple[NodeConfig, Node]]
 
 
-def load(*parameters: str) -> tuple[NodeConfig, object]:
-    """Configuration and node, with parameters as on the command line."""
-    arguments = ["--ros-args", *(part for pair in parameters for part in ("-p", pair))] if parameters else []
-    rclpy.init(args=arguments)
-    node = rclpy.create_node("parameters", automatically_declare_parameters_from_overrides=True)
-    return load_parameters(node, NodeConfig), node
+@pytest.fixture
+def load(domain: int) -> Iterator[Load]:
+    """load(*parameters): configuration and node, with parameters as on the command line."""
+    nodes = list[Node]()
+
+    def make(*parameters: str) -> tuple[NodeConfig, Node]:
+        arguments = ["--ros-args", *(part for pair in parameters for part in ("-p", pair))] if parameters else []
+        ros_context(arguments, domain)
+        nodes.append(rclpy.create_node("parameters", automatically_declare_parameters_from_overrides=True))
+        return load_parameters(nodes[-1], NodeConfig), nodes[-1]
+
+    yield make
+    end_ros(*nodes)
 
 
-@pytest.fixture(autouse=True)
-def _shut_down():
-    yield
-    rclpy.try_shutdown()
-
-
-def test_defaults_are_those_of_the_settings() -> None:
+def test_defaults_are_those_of_the_settings(load: Load) -> None:
     assert load()[0] == NodeConfig()
 
 
-def test_every_setting_is_declared_described_and_read_only() -> None:
+def test_every_setting_is_declared_described_and_read_only(load: Load) -> None:
     _, node = load()
     for name, info in flat_fields(NodeConfig):
         descriptor = node.describe_parameter(name)
@@ -50,7 +53,7 @@ def test_every_setting_is_declared_described_and_read_only() -> None:
     assert dict(flat_fields(NodeConfig)).keys() >= CHANGEABLE
 
 
-def test_some_change_while_a_node_runs() -> None:
+def test_some_change_while_a_node_runs(load: Load) -> None:
     """One at a time or together, all or none; what is not allowed is refused with the reason, as at the start."""
     config, node = load("ros.map_period:=3.0")
     seen: list[NodeConfig] = []
@@ -75,7 +78,7 @@ def test_some_change_while_a_node_runs() -> None:
     assert node.get_parameter("ros.map_period").value == 3.0
 
 
-def test_types_and_ranges() -> None:
+def test_types_and_ranges(load: Load) -> None:
     _, node = load()
     queue = node.describe_parameter("ros.queue_depth")
     assert queue.type == ParameterType.PARAMETER_INTEGER
@@ -86,7 +89,7 @@ def test_types_and_ranges() -> None:
     assert "auto or reliable or best_effort" in node.describe_parameter("ros.reliability").additional_constraints
 
 
-def test_values_of_every_kind() -> None:
+def test_values_of_every_kind(load: Load) -> None:
     config, node = load(
         "ros.queue_depth:=3",
         "ros.sync_timeout:=1",  # ROS takes it for an integer
@@ -104,7 +107,7 @@ def test_values_of_every_kind() -> None:
     assert list(node.get_parameter("input.T_lidar_cam").value) == [0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
 
 
-def test_parameters_override_the_file(tmp_path: Path) -> None:
+def test_parameters_override_the_file(load: Load, tmp_path: Path) -> None:
     file = tmp_path / "settings.yaml"
     file.write_text("ros: {queue_depth: 5, odom_frame: drift}\nslam: {map: {voxel: 0.25}}\n")
     config, node = load(f"config_file:={file}", "ros.queue_depth:=7")
@@ -112,7 +115,7 @@ def test_parameters_override_the_file(tmp_path: Path) -> None:
     assert node.get_parameter("config_file").value == str(file)
 
 
-def test_empty_texts_are_defaults_where_the_default_is_empty() -> None:
+def test_empty_texts_are_defaults_where_the_default_is_empty(load: Load) -> None:
     """As a parameter file or a launch file gives them."""
     empty = [name for name, info in flat_fields(NodeConfig) if info.get_default(call_default_factory=True) == ""]
     config, node = load("config_file:=''", *(f"{name}:=''" for name in empty))
@@ -136,7 +139,7 @@ def test_empty_texts_are_defaults_where_the_default_is_empty() -> None:
         ("qos_overrides./points.subscription.depth:=3", "qos_overrides is not supported; ros.reliability"),
     ],
 )
-def test_mistakes_are_named(parameter: str, message: str) -> None:
+def test_mistakes_are_named(load: Load, parameter: str, message: str) -> None:
     with pytest.raises(UsageError, match=message) as error:
         load(parameter)
     assert "\n" not in str(error.value)
@@ -162,7 +165,7 @@ def test_the_page_of_parameters_is_up_to_date() -> None:
     assert DOCS.read_text() == page(NodeConfig), "run `make parameters`"
 
 
-def test_a_preset_changes_what_is_not_given_and_shows_in_the_parameters(tmp_path: Path) -> None:
+def test_a_preset_changes_what_is_not_given_and_shows_in_the_parameters(load: Load, tmp_path: Path) -> None:
     """Also above a file of settings: neither its defaults nor those of the node count as given."""
     file = tmp_path / "config.yaml"
     file.write_text("slam: {keyframes: {distance: 7.0}}")

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import rclpy
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import Float64
 
@@ -21,6 +20,7 @@ from dpm2_core.errors import UsageError
 from dpm2_core.frame import Points
 from dpm2_ros.conversions import cloud_to_msg
 from dpm2_ros.guard import GuardedNode
+from dpm2_ros.runtime import end_ros, ros_context
 from dpm2_ros.settings import RosSettings
 from dpm2_ros.subscriptions import LATCHED, Inputs
 
@@ -31,13 +31,15 @@ CLOUD: Points = np.array([[50, 0, 0, 0.5], [0, 30, 1, 0.5]], np.float32)
 def node(domain: int) -> Iterator[Callable[..., Node]]:
     """node(*remappings, namespace="")."""
 
+    nodes = list[Node]()
+
     def make(*remappings: str, namespace: str = "") -> Node:
-        arguments = [part for rule in remappings for part in ("-r", rule)]
-        rclpy.init(args=["--ros-args", *arguments], domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
-        return GuardedNode("listener", namespace=namespace)
+        ros_context(["--ros-args", *(part for rule in remappings for part in ("-r", rule))], domain)
+        nodes.append(GuardedNode("listener", namespace=namespace))
+        return nodes[-1]
 
     yield make
-    rclpy.try_shutdown()
+    end_ros(*nodes)
 
 
 def inputs(node: Node, **settings: Any) -> Inputs:
@@ -57,12 +59,14 @@ def test_a_remapped_lidar_has_not_the_error_of_kittis(node: Callable[..., Node])
     assert raised(made) == 0
 
 
-def test_kittis_own_topic_has_it(node: Callable[..., Node]) -> None:
-    assert raised(inputs(node())) == pytest.approx(0.205, abs=1e-3)
-    rclpy.try_shutdown()
-    assert raised(inputs(node("/points:=/kitti/velo/pointcloud"), points_topic="/points")) == pytest.approx(
-        0.205, abs=1e-3
-    )
+@pytest.mark.parametrize(
+    ("remappings", "settings"),
+    [((), {}), (("/points:=/kitti/velo/pointcloud",), {"points_topic": "/points"})],
+)
+def test_kittis_own_topic_has_it(
+    node: Callable[..., Node], remappings: tuple[str, ...], settings: dict[str, str]
+) -> None:
+    assert raised(inputs(node(*remappings), **settings)) == pytest.approx(0.205, abs=1e-3)
 
 
 @pytest.mark.parametrize(
