@@ -79,30 +79,35 @@ def spin_node(make: Callable[[], Any], arguments: Sequence[str]) -> int:
     """
     if STOP.is_set():  # while it was imported: no map is opened, no network loaded
         return 0
-    from rclpy.executors import SingleThreadedExecutor
-
     sys.setswitchinterval(_SWITCH)
     ros_context(arguments)
+    nodes = list[Any]()
     try:
-        node = make()
-        executor = SingleThreadedExecutor()
-        executor.add_node(node)
-        try:
-            while not STOP.is_set():
-                try:
-                    executor.spin_once(timeout_sec=0.1)
-                except Exception as error:  # of a service, or of rclpy itself; callbacks are guarded
-                    node.fail("executor", error)
-                    STOP.wait(0.01)  # what fails each time leaves the rest some time
-        finally:
-            try:
-                node.close()
-            finally:
-                executor.shutdown()
-                end_ros(node)
+        nodes.append(make())
+        _spin(nodes[0])
     finally:
-        end_ros()
+        end_ros(*nodes)
     return 0
+
+
+def _spin(node: Any) -> None:
+    """Until a signal comes; then close it."""
+    from rclpy.executors import SingleThreadedExecutor
+
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    try:
+        while not STOP.is_set():
+            try:
+                executor.spin_once(timeout_sec=0.1)
+            except Exception as error:  # of a service, or of rclpy itself; callbacks are guarded
+                node.fail("executor", error)
+                STOP.wait(0.01)  # what fails each time leaves the rest some time
+    finally:
+        try:
+            node.close()
+        finally:
+            executor.shutdown()
 
 
 def end_ros(*nodes: Any, within: float = 20.0) -> None:
