@@ -30,7 +30,6 @@ CLOUD: Points = np.array([[50, 0, 0, 0.5], [0, 30, 1, 0.5]], np.float32)
 @pytest.fixture
 def node(domain: int) -> Iterator[Callable[..., Node]]:
     """node(*remappings, namespace="")."""
-
     nodes = list[Node]()
 
     def make(*remappings: str, namespace: str = "") -> Node:
