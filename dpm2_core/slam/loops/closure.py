@@ -3,8 +3,8 @@
 
 A candidate must convince four times: the network, which finds it and registers it without any start; the points of the
 new keyframe, which must fit the map around it; the odometry, whose drift has limits; and, where the correction is
-large, a second loop that says the same. Where no odometry leads from one end to the other, as between two drives, it
-must also fit clearly better than any other place. Whatever fails is kept with the reason.
+large, a second loop that says the same. Where the odometry between its ends is not known, as of two drives or across a
+gap, it must also fit clearly better than any other place. Whatever fails is kept with the reason.
 """
 
 from __future__ import annotations

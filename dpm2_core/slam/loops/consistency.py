@@ -12,10 +12,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from dpm2_core.config import Settings
-from dpm2_core.frame import Array, Edge, Keyframe
+from dpm2_core.frame import Array, Edge, Keyframe, Registration
 from dpm2_core.geometry import se3
 
-BROKEN = 0.5  # m, standard deviation of an odometry edge that says that the odometry was lost
+UNCERTAIN = 0.5  # m, standard deviation of an odometry edge beyond drift: a direction was open, or nothing fitted
+_ANYWAY = (1.0, 0.02)  # m and degrees, and per meter of path: what odometry may be off by without such an edge
 
 
 class ConsistencySettings(Settings):
@@ -36,11 +37,17 @@ class ConsistencySettings(Settings):
 
 
 class OdometryChain:
-    """The odometry of all keyframes, in segments: one robot, one session, until the odometry was lost."""
+    """The odometry of all keyframes, in segments: one robot, one session.
+
+    Within one it is known where its uncertain edges add no more, with three standard deviations each, than it may drift
+    on the way anyway. So a stretch that leaves 1 m open does not part the two ends of a drive of 1 km, but does part
+    what lies on both sides of it.
+    """
 
     def __init__(self) -> None:
         self._segment = np.zeros(256, np.int64)
         self._meters = np.zeros(256)  # since the segment began
+        self._doubt = np.zeros(256)  # the same: three deviations of all uncertain edges, m or degrees, the larger
         self._T_odom_kf: list[Array] = []
         self._last: dict[str, int] = {}  # by robot
 
@@ -53,26 +60,40 @@ class OdometryChain:
         if node == len(self._segment):
             self._segment = np.concatenate([self._segment, np.zeros_like(self._segment)])
             self._meters = np.concatenate([self._meters, np.zeros_like(self._meters)])
+            self._doubt = np.concatenate([self._doubt, np.zeros_like(self._doubt)])
         self._last[keyframe.robot] = node
         self._T_odom_kf.append(keyframe.T_odom_kf)
-        if before is None or keyframe.edge is None or keyframe.edge.worst_sigma > BROKEN:
-            self._segment[node], self._meters[node] = node, 0.0
+        if before is None or keyframe.edge is None:
+            self._segment[node], self._meters[node], self._doubt[node] = node, 0.0, 0.0
             return
         step = np.linalg.norm(keyframe.T_odom_kf[:3, 3] - self._T_odom_kf[before][:3, 3])
         self._segment[node], self._meters[node] = self._segment[before], self._meters[before] + step
+        self._doubt[node] = self._doubt[before] + _doubt(keyframe.edge)
 
     def since(self, node: int) -> Array:
-        """(N,) meters of path between each node and this one; inf where there is no odometry between them."""
-        meters, same = self._meters[: len(self)], self._segment[: len(self)] == self._segment[node]
-        return np.where(same, np.abs(meters - meters[node]), np.inf)
+        """(N,) meters of path between each node and this one; inf where the odometry between them is not known."""
+        return self._path(slice(len(self)), node)
 
     def between(self, a: int, b: int) -> float:
         """The same for two nodes."""
-        return float(abs(self._meters[a] - self._meters[b])) if self._segment[a] == self._segment[b] else np.inf
+        return float(self._path(a, b))
+
+    def _path(self, nodes: int | slice, node: int) -> Array:
+        meters, doubt = (np.abs(sums[nodes] - sums[node]) for sums in (self._meters, self._doubt))
+        known = (self._segment[nodes] == self._segment[node]) & (doubt <= _ANYWAY[0] + _ANYWAY[1] * meters)
+        return np.where(known, meters, np.inf)
 
     def T(self, a: int, b: int) -> Array:
         """T_a_b (4, 4) by odometry, of two nodes of one segment."""
         return se3.inverse(self._T_odom_kf[a]) @ self._T_odom_kf[b]
+
+
+def _doubt(edge: Registration) -> float:
+    """Three standard deviations, m or degrees, the larger, of an edge that is uncertain; 0 for others."""
+    if edge.worst_sigma <= UNCERTAIN:
+        return 0.0
+    turn = np.degrees(np.sqrt(np.linalg.eigvalsh(edge.covariance[:3, :3])[-1]))
+    return 3 * max(edge.worst_sigma, float(turn))
 
 
 class Consistency:
@@ -84,7 +105,7 @@ class Consistency:
         self._waiting: list[Edge] = []
 
     def is_first(self, loop: Edge, settings: ConsistencySettings) -> bool:
-        """Whether nothing else says where its ends are to each other: no odometry, and no accepted loop."""
+        """Whether nothing else says where its ends are to each other: no known odometry, and no accepted loop."""
         known = np.isfinite(self._path.between(loop.from_node, loop.to_node))
         return not known and not self._agrees_with_accepted(loop, settings)
 

@@ -10,7 +10,7 @@ import numpy as np
 from dpm2_core.data.thumbnail import usable_image
 from dpm2_core.frame import Array, Image, Keyframe, Registration, State
 from dpm2_core.geometry import se3
-from dpm2_core.slam.loops.consistency import BROKEN
+from dpm2_core.slam.loops.consistency import UNCERTAIN
 from dpm2_core.slam.loops.relocalization import FindsPlaces, nowhere
 
 LOST = np.diag([1.0, 1.0, 1.0, 100.0, 100.0, 100.0]) ** 2
@@ -72,7 +72,7 @@ class Localizer:
     def add(self, keyframe: Keyframe) -> LocalizationResult:
         """Find a keyframe, which has its cloud, in the map."""
         self._stamp = keyframe.stamp
-        if keyframe.edge is not None and keyframe.edge.worst_sigma > BROKEN:
+        if keyframe.edge is not None and keyframe.edge.worst_sigma > UNCERTAIN:
             self.state = State.LOST  # the odometry was: it may be anywhere by now
         if self._T_last is not None:
             self._distrust += float(np.linalg.norm(keyframe.T_odom_kf[:3, 3] - self._T_last[:3, 3]))

@@ -53,6 +53,22 @@ def test_path_lengths_are_known_within_a_segment_alone() -> None:
     assert path.between(3, 5) == np.inf  # the odometry was lost between them
 
 
+@pytest.mark.parametrize(("sigma", "turn", "known"), [(1.0, 1e-3, True), (20.0, 1e-3, False), (1.0, 0.3, False)])
+def test_a_stretch_that_is_uncertain_by_less_than_the_drift_does_not_part_a_long_drive(
+    sigma: float, turn: float, known: bool
+) -> None:
+    # four keyframes whose scans leave the direction of the road open, in a drive of 1 km: 12 m of the 21 that may drift
+    path, uncertain = OdometryChain(), np.diag([turn**2] * 3 + [sigma**2, 1e-4, 1e-4])
+    for node in range(201):
+        path.append(keyframe(node, pose(5.0 * node), None if node == 0 else uncertain if 100 <= node < 104 else FIRM))
+    assert path.between(0, 200) == (1000 if known else np.inf)
+    assert path.since(200)[0] == path.between(0, 200)
+    assert path.between(90, 110) == np.inf  # 100 m of path may drift by 3 m: what lies on both sides is not known
+    assert path.between(0, 99) == 495
+    assert path.between(104, 200) == 480
+    assert Consistency(path).is_first(loop(0, 200, np.eye(4)), ConsistencySettings()) is not known
+
+
 def test_a_loop_that_agrees_with_the_odometry_needs_no_other() -> None:
     path = straight()
     T = expected(path, 0, 100)
