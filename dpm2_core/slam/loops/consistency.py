@@ -16,13 +16,13 @@ from dpm2_core.frame import Array, Edge, Keyframe, Registration
 from dpm2_core.geometry import se3
 
 UNCERTAIN = 0.5  # m, standard deviation of an odometry edge beyond drift: a direction was open, or nothing fitted
-_ANYWAY = (1.0, 0.02)  # m and degrees, and per meter of path: what odometry may be off by without such an edge
+_SLACK, _DRIFT = 1.0, 0.02  # m, and per meter of path: what odometry may be off by without such an edge
 
 
 class ConsistencySettings(Settings):
     """How far loops may differ from the odometry and from each other."""
 
-    drift: float = 0.02
+    drift: float = _DRIFT
     """Expected odometry drift per meter; a loop that corrects more than this times the path, plus 1 m, is rejected."""
     drift_turn: float = 0.02
     """The same for rotation, degrees per meter (and 3 degrees)."""
@@ -58,13 +58,12 @@ class OdometryChain:
         """Add the next node."""
         node, before = len(self), self._last.get(keyframe.robot)
         if node == len(self._segment):
-            self._segment = np.concatenate([self._segment, np.zeros_like(self._segment)])
-            self._meters = np.concatenate([self._meters, np.zeros_like(self._meters)])
-            self._doubt = np.concatenate([self._doubt, np.zeros_like(self._doubt)])
+            of_nodes = self._segment, self._meters, self._doubt
+            self._segment, self._meters, self._doubt = (np.concatenate([a, np.zeros_like(a)]) for a in of_nodes)
         self._last[keyframe.robot] = node
         self._T_odom_kf.append(keyframe.T_odom_kf)
         if before is None or keyframe.edge is None:
-            self._segment[node], self._meters[node], self._doubt[node] = node, 0.0, 0.0
+            self._segment[node] = node
             return
         step = np.linalg.norm(keyframe.T_odom_kf[:3, 3] - self._T_odom_kf[before][:3, 3])
         self._segment[node], self._meters[node] = self._segment[before], self._meters[before] + step
@@ -72,15 +71,15 @@ class OdometryChain:
 
     def since(self, node: int) -> Array:
         """(N,) meters of path between each node and this one; inf where the odometry between them is not known."""
-        return self._path(slice(len(self)), node)
+        return self._known_meters(slice(len(self)), node)
 
     def between(self, a: int, b: int) -> float:
         """The same for two nodes."""
-        return float(self._path(a, b))
+        return float(self._known_meters(a, b))
 
-    def _path(self, nodes: int | slice, node: int) -> Array:
+    def _known_meters(self, nodes: int | slice, node: int) -> Array:
         meters, doubt = (np.abs(sums[nodes] - sums[node]) for sums in (self._meters, self._doubt))
-        known = (self._segment[nodes] == self._segment[node]) & (doubt <= _ANYWAY[0] + _ANYWAY[1] * meters)
+        known = (self._segment[nodes] == self._segment[node]) & (doubt <= _SLACK + _DRIFT * meters)
         return np.where(known, meters, np.inf)
 
     def T(self, a: int, b: int) -> Array:
@@ -123,7 +122,7 @@ class Consistency:
         meters, degrees = se3.magnitude(se3.inverse(T_expected) @ loop.T_from_to)
         confirmed = [w for w in self._waiting if self._agree(loop, w, s)]
         if np.isfinite(since):
-            if meters > 1 + s.drift * since or degrees > 3 + s.drift_turn * since:
+            if meters > _SLACK + s.drift * since or degrees > 3 + s.drift_turn * since:
                 return [loop.rejected(f"{meters:.1f} m, {degrees:.1f} deg from the odometry")]
             if meters <= s.certain and degrees <= s.certain:
                 return self._accept([loop, *confirmed])

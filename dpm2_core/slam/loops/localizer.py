@@ -73,7 +73,7 @@ class Localizer:
         """Find a keyframe, which has its cloud, in the map."""
         self._stamp = keyframe.stamp
         if keyframe.edge is not None and keyframe.edge.worst_sigma > UNCERTAIN:
-            self.state = State.LOST  # the odometry was: it may be anywhere by now
+            self.state = State.LOST  # its odometry may have been
         if self._T_last is not None:
             self._distrust += float(np.linalg.norm(keyframe.T_odom_kf[:3, 3] - self._T_last[:3, 3]))
         self._T_last = keyframe.T_odom_kf
