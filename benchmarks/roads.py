@@ -5,14 +5,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
 import numpy as np
 from rich.console import Group
 from rich.progress import Progress
 
-from benchmarks.harness import Options, Report, quantiles_ms, settings_of
+from benchmarks.harness import Options, Report, settings_of
 from benchmarks.loops import check_loops
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.metrics import evaluate
@@ -59,15 +58,11 @@ def drive(path: Path, settings: SlamSettings, progress: Progress) -> dict[str, A
     source = open_road(path)
     slam, recorder = make_slam(settings), TrajectoryRecorder()
     task = progress.add_task(path.stem, total=len(source))
-    failed, odometry_s, map_s = 0, [], []
-    started = perf_counter()
+    failed = 0
     for frame in source.frames():
         tracked = slam.process(frame).odometry
         recorder.add(tracked)
         failed += not tracked.registration.ok
-        odometry_s.append(sum(tracked.seconds.values()) - tracked.seconds["map"])
-        if tracked.keyframe is not None:
-            map_s.append(tracked.seconds["map"])
         progress.advance(task)
     mapper = slam.mapper
     keyframes = np.array([k.index for k in mapper.keyframes])
@@ -81,9 +76,6 @@ def drive(path: Path, settings: SlamSettings, progress: Progress) -> dict[str, A
         "odometry": {name: getattr(alone, name) for name in _ERRORS},
         "slam": {name: getattr(corrected, name) for name in _ERRORS},
         "loops": check_loops(mapper.loops, source.poses[keyframes]),
-        "odometry_ms": quantiles_ms(odometry_s),
-        "keyframe_ms": quantiles_ms(map_s),
-        "wall_s": round(perf_counter() - started, 1),
     }
 
 

@@ -16,7 +16,7 @@ from dpm2_core.errors import UsageError
 train = typer.Typer(help="Make training data and train the network.", no_args_is_help=True)
 
 ConfigOption = Annotated[Path | None, typer.Option("--config", help="YAML; its defaults otherwise.")]
-SetOption = Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, such as optimizer.steps=2000.")]
+SetOption = Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, a key as in the YAML.")]
 OutOption = Annotated[Path, typer.Option("--out", help="Folder for checkpoint, log and weights.")]
 ResumeOption = Annotated[bool, typer.Option("--resume", help="Continue from the checkpoint in --out.")]
 

@@ -166,13 +166,18 @@ class PackedDrive:
         )
 
 
+def _is_unfinished(folder: Path) -> bool:
+    return any(name.endswith(".part") for name in folder.parts)
+
+
 def open_packed(root: Path) -> list[PackedDrive]:
     """Every packed drive below `root`, by name.
 
     Raises:
         UsageError: there is none.
     """
-    found = [PackedDrive(path.parent) for path in sorted(root.rglob("about.json")) if ".part" not in str(path)]
+    folders = (path.parent for path in sorted(root.rglob("about.json")))
+    found = [PackedDrive(folder) for folder in folders if not _is_unfinished(folder.relative_to(root))]
     if not found:
         raise UsageError(f"{root}: no packed drive below it; `dpm2 train pack` makes some")
     return found

@@ -69,10 +69,12 @@ def _downsampled(points: Tensor, weight: Tensor, count: int, voxel: float) -> Te
     index = weight.nonzero()[:, 0]
     if len(index) <= count:
         return index
+    # The order is one of all points: with one weight that is zero or not, the others are chosen as before.
     generator = torch.Generator().manual_seed(len(points))
-    index = index[torch.randperm(len(index), generator=generator).to(index.device)]
+    order = torch.randperm(len(points), generator=generator).to(index.device)
+    index = order[weight[order] != 0]
     cell = (points[index] / voxel).floor().long().clamp(-_CELLS // 2, _CELLS // 2 - 1) + _CELLS // 2
-    key, order = ((cell[:, 0] * _CELLS + cell[:, 1]) * _CELLS + cell[:, 2]).sort(stable=True)
+    key, by_cell = ((cell[:, 0] * _CELLS + cell[:, 1]) * _CELLS + cell[:, 2]).sort(stable=True)
     first = torch.ones_like(key, dtype=torch.bool)
     first[1:] = key[1:] != key[:-1]
-    return index[order[first].sort()[0][:count]].sort()[0]
+    return index[by_cell[first].sort()[0][:count]].sort()[0]

@@ -46,8 +46,8 @@ class SlamLossSettings(Settings):
     """Gradients do not pass beyond every so many scans of the trajectory: long windows do not explode. 0: they pass."""
 
     placebo: bool = False
-    """For experiments: a window is compared with the trajectory of the window before. The same loss and bound, without
-    what it has to say."""
+    """For experiments: a window is compared with the trajectory of the window before; the first, with its own, which
+    costs nothing. The same loss and bound, without what it has to say."""
 
 
 def trajectory_loss(poses: Tensor, reference: Tensor, rotation_weight: float = 25.0) -> Tensor:
@@ -137,10 +137,14 @@ class SlamLoss(torch.nn.Module):
         if frames is not None:
             check_contiguous(frames, len(pred_clouds))
         reference, guess = self._reference(target_clouds, target_weights, guess, frames)
-        if self.settings.placebo:
-            reference, self._before = reference if self._before is None else self._before, reference
         poses = odometry(pred_clouds, weights, guess, self.settings, "predicted clouds")
+        if self.settings.placebo:
+            reference, self._before = poses.detach() if self._before is None else self._before, reference
         return trajectory_loss(poses, reference.to(poses.device), self.settings.rotation_weight)
+
+    def restart(self) -> None:
+        """The next window has none before it: at the start of an epoch, so that a resumed training goes on alike."""
+        self._before = None
 
     @torch.no_grad()
     def _reference(self, clouds: Clouds, weights: Weights, guess: Tensor | None,

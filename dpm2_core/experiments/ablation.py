@@ -13,8 +13,9 @@ from typing import Any
 
 from pydantic import Field
 
-from dpm2_core.config import Settings, merged
+from dpm2_core.config import Settings, dump_settings, merged
 from dpm2_core.evaluation.pair_set import PairSet
+from dpm2_core.experiments.begun import begin_training
 from dpm2_core.experiments.paired import Gain, paired_gain
 from dpm2_core.files import atomic_write
 from dpm2_core.learning.train_registration import RegistrationTrainingSettings, train_registration
@@ -67,7 +68,7 @@ def ablation(
     out: Path,
     progress: Callable[[str, int, dict[str, Any]], None] = lambda name, seed, row: None,
 ) -> Table:
-    """Train and measure every variant; what was trained or measured before, in `out`, is not done again.
+    """Train and measure every variant; what was trained or measured alike before, in `out`, is not done again.
 
     All variants of a seed are trained before the next seed, so that what is stopped has compared something.
     """
@@ -90,10 +91,12 @@ def _measured(settings: AblationSettings, name: str, seed: int, out: Path) -> di
     folder = out / name.replace(" ", "_") / str(seed)
     weights, known = folder / "weights.safetensors", folder / "figures.json"
     asked = {"measure": settings.measure, "pairs": settings.pairs}
+    read = [Path(training.start)] if training.start else []
+    resume = begin_training(folder, dump_settings(training), weights.name, read)
     if weights.exists() and known.exists() and (stored := json.loads(known.read_text()))["asked"] == asked:
         return dict(stored["figures"])
     if not weights.exists():
-        train_registration(training, folder, resume=(folder / "checkpoint.pt").exists())
+        train_registration(training, folder, resume=resume)
     model = load_model(weights)
     images = training.data.images and model.encoder.image is not None
     figures = {

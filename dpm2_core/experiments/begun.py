@@ -4,22 +4,28 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
-from dpm2_core.files import atomic_write
+from dpm2_core.files import atomic_write, file_digest
 
 _BEGUN, _CHECKPOINT, LOG = "begun.yaml", "checkpoint.pt", "log.jsonl"
 
 
-def begin_training(folder: Path, text: str, weights: str, start: Path | None = None) -> bool:
+def begin_training(folder: Path, text: str, weights: str, read: Sequence[Path] = (), start: Path | None = None) -> bool:
     """Ready a folder for a training that is asked for by `text`; whether there is a checkpoint to go on from.
 
-    What a training asked for by another text has left there, the file `weights` among it, is removed.
+    What a training that was asked for by another text, or from other files, has left there is removed, the file
+    `weights` among it.
 
     Args:
+        read: files that the training begins with, such as weights.
         start: folder of a training whose checkpoint and log a new one goes on from.
     """
+    folder.mkdir(parents=True, exist_ok=True)
     begun = folder / _BEGUN
+    files = [*read, *([] if start is None else [start / _CHECKPOINT])]
+    text += "".join(f"# {path}: {file_digest(path) if path.is_file() else 'missing'}\n" for path in files)
     if not (begun.is_file() and begun.read_text(encoding="utf-8") == text):
         for old in (_CHECKPOINT, LOG, weights):
             (folder / old).unlink(missing_ok=True)

@@ -42,6 +42,11 @@ class Request:
     overrides: tuple[str, ...] = ()
     workers: int = 1
 
+    @property
+    def config_files(self) -> list[Path]:
+        """The YAML of the training, if any: the inputs of a part, which is done again when its content changes."""
+        return [] if self.config is None else [self.config]
+
 
 @dataclass
 class Outcome:

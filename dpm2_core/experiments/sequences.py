@@ -43,6 +43,12 @@ def missing_note(found: Sequence[str], paper: Sequence[str]) -> list[str]:
     return [f"not measured, since they are not there or were not asked for: {', '.join(missing)}"] if missing else []
 
 
+def learned_note(learned: Sequence[str], tested: Sequence[str]) -> list[str]:
+    """What is to be said where sequences that were learned from are tested on."""
+    both = [sequence for sequence in tested if sequence in learned]
+    return [f"tested on what was learned from: {', '.join(both)}"] if both else []
+
+
 def registrations(request: Request) -> list[tuple[str, list[str]]]:
     """Name and settings of each of our rows."""
     chosen = request.registrations or ("",)

@@ -72,11 +72,11 @@ def train(
     """
     settings = settings_of(training)
     kind = task_type(training["task"])
-    # All arms are to see the same scans, so what one can learn from decides for all.
-    needs = kind.learns_from(settings_of({**training, "arm": "with"}))
+    # All arms are to see the same scans, so the one that needs most decides for all: it has no SLAM loss to learn from.
+    needs = kind.learns_from(settings_of({**training, "arm": "without"}))
     scans = open_scans(training["data"], needs, training["learn"])
     text = dump_settings(settings) + json.dumps({"training": training, "until": until}) + "\n"
-    resume = begin_training(folder, text, WEIGHTS, None if start is None else Path(start))
+    resume = begin_training(folder, text, WEIGHTS, start=None if start is None else Path(start))
     task = new_task(training["task"], settings)
     train_task(task, scans, folder, resume, until=until)
     advance(1, 1)

@@ -14,6 +14,7 @@ from dpm2_core.evaluation.figures import trajectories_png
 from dpm2_core.experiments.kitti import aligned_ways
 from dpm2_core.experiments.paired import paired_gain
 from dpm2_core.experiments.request import Experiment, Outcome, Request
+from dpm2_core.experiments.sequences import learned_note
 from dpm2_core.experiments.table import Cells, ResultTable
 from dpm2_core.experiments.task_part import MEASURE, SLAM, TRAIN, Arm, Training, first_slam_epoch, settings_of
 from dpm2_core.extras import MissingPackageError
@@ -62,13 +63,15 @@ class TaskTable:
             start = None
             if common:
                 training = self._training(request, seed, "without")
-                shared.append(Part(self._name(seed, "shared"), TRAIN, {"training": training, "until": common}, ()))
+                shared.append(Part(self._name(seed, "shared"), TRAIN, {"training": training, "until": common},
+                                   request.config_files))  # fmt: skip
                 start = str(request.out / self._name(seed, "shared"))
             for arm in ARMS:
                 name = self._name(seed, arm)
                 training = self._training(request, seed, arm)
-                checkpoint = () if start is None else [Path(start) / "checkpoint.pt"]
-                arms.append(Part(name, TRAIN, {"training": training, "start": start}, checkpoint))
+                checkpoint = [] if start is None else [Path(start) / "checkpoint.pt"]
+                inputs = [*request.config_files, *checkpoint]
+                arms.append(Part(name, TRAIN, {"training": training, "start": start}, inputs))
                 weights = request.out / name / WEIGHTS
                 tested = {"task": self.task, "weights": str(weights), "drive": self._tested(request)}
                 measured.append(Part(self._measured(seed, arm), self.measured, tested, [weights]))
@@ -102,7 +105,7 @@ class TaskTable:
     def _warnings(
         self, request: Request, of: Mapping[str, Mapping[str, list[float]]], figures: Mapping[str, Figures]
     ) -> list[str]:
-        notes = []
+        notes = learned_note(request.learn or self.learn, request.sequences or self.test)
         settings = settings_of(self._training(request, 0, "with"))
         if settings.has_windows(settings.epochs - 1):
             notes.append(
@@ -206,8 +209,10 @@ DSLR_SLAM = replace(
         }.items()
         for arm, ate in zip(("", " with SLAM loss"), both, strict=True)
     },
-    test=("0", "1", "2", "3"),
-    notes=("true poses are read from posesN.txt beside the pairs, or from the drive",),
+    notes=(
+        "the paper's 0 to 3 are drives recorded for this table; --sequences names others than the pairs of Table 2",
+        "true poses are read from posesN.txt beside the pairs, or from the drive",
+    ),
 )  # fmt: skip
 AE_LIDAR = TaskTable(
     title="Table 4: AE_lidar, Chamfer distance of the reconstruction",

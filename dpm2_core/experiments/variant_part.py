@@ -10,6 +10,7 @@ from typing import Any
 
 from dpm2_core.config import dump_settings, load_settings, merged
 from dpm2_core.data.open import open_source
+from dpm2_core.data.packed import PackedDrive
 from dpm2_core.experiments.begun import LOG, begin_training
 from dpm2_core.fleet.part import Advance, Figures
 from dpm2_core.learning.generate import pack as write_packed_drive
@@ -21,6 +22,8 @@ from dpm2_core.slam.settings import Config
 PACK = "dpm2_core.experiments.variant_part:pack"
 TRAIN = "dpm2_core.experiments.variant_part:train"
 WEIGHTS = "weights.safetensors"
+DRIVE = "drive"
+"""In the folder of a part that packs."""
 
 
 def pack(folder: Path, advance: Advance, data: str, settings: Sequence[str], weights: str) -> Figures:
@@ -38,34 +41,40 @@ def pack(folder: Path, advance: Advance, data: str, settings: Sequence[str], wei
         advance(done, len(source))
 
     network = network_settings(weights_path(weights))
-    return {"frames": write_packed_drive(source, folder / "drive", network, None, count)}
+    return {"frames": write_packed_drive(source, folder / DRIVE, network, None, count)}
 
 
 def training_of(
-    config: str | None, settings: Sequence[str], start: str, network: dict[str, Any], packed: Path
+    config: str | None, settings: Sequence[str], start: str, network: dict[str, Any], packed: Sequence[Path]
 ) -> RegistrationTrainingSettings:
-    """The training of a variant, `network` being its changes to the network of the weights that it starts from."""
+    """The training of a variant on packed drives, each as often as it has frames.
+
+    `network`: its changes to the network of the weights that it starts from.
+    """
     chosen = load_settings(RegistrationTrainingSettings, None if config is None else Path(config), settings)
     path = weights_path(start)
     own = network_settings(path)
     tree = merged(merged(own.model_dump(mode="json"), chosen.network), network)
     data = chosen.data
     if not data.packed:
-        images = any(packed.rglob("pixels.npy"))
-        data = data.model_copy(update={"packed": {str(packed): 1.0}, "images": images})
+        images = any((drive / "pixels.npy").is_file() for drive in packed)
+        frames = {str(drive): float(len(PackedDrive(drive))) for drive in packed}
+        data = data.model_copy(update={"packed": frames, "images": images})
     # The changes say all there is to the network, its name included, so it does not matter to which preset.
     changes = {"preset": "small", "network": tree, "start": str(path), "partial": True, "data": data}
     return chosen.model_copy(update=changes)
 
 
-def train(folder: Path, advance: Advance, training: dict[str, Any], packed: str, network: dict[str, Any]) -> Figures:
+def train(
+    folder: Path, advance: Advance, training: dict[str, Any], packed: Sequence[str], network: dict[str, Any]
+) -> Figures:
     """Fine-tune a variant of a network from weights, as far as they fit; one that was stopped goes on.
 
     Raises:
         UsageError: no such weights, or no packed drive.
     """
-    chosen = training_of(training["config"], training["settings"], training["start"], network, Path(packed))
-    resume = begin_training(folder, dump_settings(chosen), WEIGHTS)
+    chosen = training_of(training["config"], training["settings"], training["start"], network, [*map(Path, packed)])
+    resume = begin_training(folder, dump_settings(chosen), WEIGHTS, [Path(chosen.start)])
     weights = train_registration(chosen, folder, resume=resume)
     steps = chosen.optimiser.steps
     advance(steps, steps)

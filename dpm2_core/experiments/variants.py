@@ -16,9 +16,9 @@ from dpm2_core.evaluation.image_attention import attention_png, image_attention
 from dpm2_core.experiments.ablation import TABLE_4 as TRAINED_ALIKE
 from dpm2_core.experiments.kitti import ORIGINAL_POSES, TESTED
 from dpm2_core.experiments.request import Experiment, Outcome, Request, drawn
-from dpm2_core.experiments.sequences import SHOWN, cells, missing_note, own_part, present, run_folders
+from dpm2_core.experiments.sequences import SHOWN, cells, learned_note, missing_note, own_part, present, run_folders
 from dpm2_core.experiments.table import MEAN, ResultTable
-from dpm2_core.experiments.variant_part import PACK, TRAIN, WEIGHTS
+from dpm2_core.experiments.variant_part import DRIVE, PACK, TRAIN, WEIGHTS
 from dpm2_core.fleet.part import Figures, Part
 from dpm2_core.network.pretrained import weights_path
 from dpm2_core.network.weights import load_model
@@ -81,9 +81,10 @@ class VariantTable:
             "settings": [text for text in request.overrides if not text.startswith(_FOR_SLAM)],
             "start": start,
         }
-        arguments = {"training": training, "packed": str(request.out / "packed")}
+        arguments = {"training": training, "packed": [str(request.out / pack.name / DRIVE) for pack in packs]}
+        inputs = [weights_path(start), *request.config_files]
         trained = [
-            Part(self._training(name), TRAIN, {**arguments, "network": _joined(change)}, [weights_path(start)])
+            Part(self._training(name), TRAIN, {**arguments, "network": _joined(change)}, inputs)
             for name, change in self.variants.items()
         ]
         stages: list[list[Part]] = [packs, trained]
@@ -94,7 +95,7 @@ class VariantTable:
     def outcome(self, request: Request, figures: Mapping[str, Figures]) -> Outcome:
         """The table, and the panel of attention maps."""
         sequences = present(request, TESTED, ORIGINAL_POSES)
-        notes: list[str] = []
+        notes = learned_note(_learned(request), sequences)
         tables = []
         if self.judged:
             table = ResultTable(self.title, [*sequences, MEAN], SHOWN, "t_err % / r_err deg per 100 m, network alone.")

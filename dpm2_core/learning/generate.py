@@ -14,11 +14,13 @@ from pydantic import Field
 from dpm2_core.config import Settings
 from dpm2_core.data.packed import PackedWriter, Sample, write_packed
 from dpm2_core.data.source import Source
+from dpm2_core.descriptors import is_level, levelling
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Frame, Image, Points
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.deskew import deskew
 from dpm2_core.geometry.scale import ROOM_SCALE, scale_of
+from dpm2_core.geometry.tilt import up_of
 from dpm2_core.network.images import in_encoded_axes, small_image
 from dpm2_core.network.pyramid import crop
 from dpm2_core.network.settings import NetworkSettings, preset
@@ -131,8 +133,10 @@ def pack(
 ) -> int:
     """Pack the frames of a source that have a pose, one after the other; returns how many.
 
-    Points with time offsets are moved to where they are seen from at the stamp, by the true motion. A drive that begins
-    in a room is enlarged, as the network sees it. `frames`: positions to look at; `advance` is called after each.
+    Points with time offsets are moved to where they are seen from at the stamp, by the true motion. All is as the
+    network sees it: scans of a tilted sensor in level axes, and a drive that begins in a room enlarged.
+
+    `frames`: positions to look at; `advance` is called after each.
 
     Raises:
         UsageError: the source has no poses, or its frames do not all have as many images of one size.
@@ -165,6 +169,11 @@ def _packed(frame: Frame, pose: Array, twist: Array, network: NetworkSettings, s
     if frame.time_offset is not None:
         points = deskew(points, frame.time_offset, twist)
     images = tuple(small_image(image, network.image) for image in frame.images)
+    up = up_of(crop(points, network.points))
+    if up is not None and not is_level(up):
+        R = levelling(up)
+        points, pose = points[:, :3] @ R.T, pose @ se3.make(R.T, np.zeros(3))
+        images = tuple(in_encoded_axes(image, R, 1.0) for image in images)
     return _sample(points, pose, images, network, scale)
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import torch
 from torch import nn
 
+from dpm2_core.diffslam.trajectory_loss import SlamLoss
 from dpm2_core.diffslam.windows import ContiguousWindows
 from dpm2_core.errors import UsageError
 from dpm2_core.learning.trainer import OptimizerSettings, Trainer
@@ -127,6 +128,9 @@ def _batches(
     while True:
         task.train()
         task.start_epoch(epoch)
+        for module in task.modules():
+            if isinstance(module, SlamLoss):
+                module.restart()
         if settings.has_windows(epoch):
             windows.set_epoch(epoch)
             order = [i for window in windows for i in window]

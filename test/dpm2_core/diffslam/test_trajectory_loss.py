@@ -220,6 +220,17 @@ def test_large_clouds_are_downsampled_alike(noise: np.random.Generator, scans: l
     assert all(0 < int((slope.abs().sum(1) > 0).sum()) <= 500 for slope in slopes)
 
 
+def test_a_weight_of_zero_changes_the_choice_of_that_point_alone(scans: list[Tensor]) -> None:
+    """Of more points than are kept, predicted and target scans keep the same ones where their weights differ little."""
+    big = [torch.cat([scan, scan + 0.01, scan - 0.01]) for scan in scans]
+    weights = [torch.ones(len(scan)) for scan in big]
+    for weight in weights:
+        weight[7] = 0
+    loss = SlamLoss(SlamLossSettings(points=500))(big, big, weights)
+    # One of 500 points of a voxel of 0.5 m; drawn independently, the loss of these scans is 100 times as large.
+    assert float(loss) < 1e-6
+
+
 def test_trajectory_loss_by_hand() -> None:
     """Eq. 3: one pose 3 m off, one 0.1 rad; no gradient into the reference; shapes are checked."""
     reference = torch.eye(4).double().repeat(3, 1, 1).requires_grad_()
@@ -237,10 +248,13 @@ def test_trajectory_loss_by_hand() -> None:
 
 
 def test_a_placebo_compares_with_the_window_before(scans: list[Tensor]) -> None:
-    """The first window has none before it and no loss; the next, which goes the other way, that of the first."""
+    """The first window has none before it and no loss, whatever was predicted; the next, which goes the other way, that
+    of the first; and so it is again after a new start."""
     loss = SlamLoss(SlamLossSettings(placebo=True, icp=CONVERGED.icp))
-    assert float(loss(scans, scans)) == 0
+    assert float(loss(scans[::-1], scans)) == 0
     backwards = scans[::-1]
     requested = trajectory_loss(odometry(backwards, settings=CONVERGED), odometry(scans, settings=CONVERGED))
     assert float(loss(backwards, backwards)) == pytest.approx(float(requested), rel=1e-6)
     assert float(requested) > 1
+    loss.restart()
+    assert float(loss(scans[::-1], scans)) == 0

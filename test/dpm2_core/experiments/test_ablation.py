@@ -60,6 +60,10 @@ def test_seeds_are_trainings_of_their_own(packed: Path, tmp_path: Path) -> None:
     assert len(weights) == 2
     ablation(settings.model_copy(update={"pairs": 4}), tmp_path)
     assert [path.stat().st_mtime_ns for path in weights] == times
+    optimiser = settings.training.optimiser.model_copy(update={"rate": 0.1})
+    other = settings.model_copy(update={"training": settings.training.model_copy(update={"optimiser": optimiser})})
+    (row,) = ablation(other, tmp_path).values()
+    assert not set(row["same"]["near_m"]) & {first, second}, "figures of the training before"
 
 
 def test_a_gain_is_of_the_same_seeds() -> None:

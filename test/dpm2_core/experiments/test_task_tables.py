@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -62,6 +63,12 @@ def test_gndnet_in_three_arms(tmp_path: Path) -> None:
     assert again.startswith("Table 1")
     assert done.stdout.endswith(again)  # after the bars of the trainings
     assert {path: path.stat().st_mtime_ns for path in before} == before
+    shutil.rmtree(data / "sequences" / "05" / "labels")
+    call = ("experiment", "gndnet", data, "--out", tmp_path / "new", "--learn", "00,05", "--sequences", "00", *small)
+    refused = dpm2(*call)
+    assert refused.returncode == 2  # although the arm with the SLAM loss could learn from it
+    assert "no labels" in refused.stderr
+    assert not [*(tmp_path / "new").rglob("checkpoint.pt")]
 
 
 @pytest.mark.slow

@@ -4,12 +4,17 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
-from dpm2_core.experiments.variants import TABLE_3
+from dpm2_core.experiments.request import Request
+from dpm2_core.experiments.variant_part import TRAIN
+from dpm2_core.experiments.variants import TABLE_3, fusion
+from dpm2_core.files import file_digest
+from dpm2_core.fleet.part import DONE, Part, figures_of
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.weights import save_weights
 
@@ -65,6 +70,28 @@ def test_fusion_then_its_attention_maps(kitti: Path, weights: Path, tmp_path: Pa
     assert done.returncode == 0, done.stderr
     assert {path: path.stat().st_mtime_ns for path in trained} == trained
     assert (tmp_path / "attention_06.png").stat().st_size > 20_000
+
+
+def trainings(request: Request) -> list[Part]:
+    """The parts that train."""
+    return [part for stage in fusion.parts(request) for part in stage if part.work == TRAIN]
+
+
+def test_what_is_learned_from_and_how_tells_trainings_apart(kitti: Path, weights: Path, tmp_path: Path) -> None:
+    """Of other sequences, or by a YAML file with other content under the same name, every variant is trained anew."""
+    config = tmp_path / "training.yaml"
+    config.write_text("pairs: 1\n")
+    request = Request(kitti, tmp_path / "out", learn=("00",), weights=str(weights), config=config)
+    for part in (one := trainings(request)):
+        (done := tmp_path / "out" / part.name).mkdir(parents=True)
+        record = {"arguments": dict(part.arguments), "files": {}, "figures": {}, "commit": "", "seconds": 0,
+                  "peak_memory_mb": 0, "inputs": {str(path): file_digest(path) for path in part.inputs}}  # fmt: skip
+        (done / DONE).write_text(json.dumps(record))
+    assert all(figures_of(part, tmp_path / "out") is not None for part in one)
+    both = trainings(replace(request, learn=("00", "06")))
+    assert not any(figures_of(part, tmp_path / "out") for part in both)
+    config.write_text("pairs: 2\n")
+    assert not any(figures_of(part, tmp_path / "out") for part in trainings(request))
 
 
 @pytest.mark.slow

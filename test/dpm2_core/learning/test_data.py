@@ -40,8 +40,8 @@ def test_packing_keeps_clouds_to_a_millimeter(packed: Path, samples: list[Sample
 
 
 def test_an_unfinished_drive_is_not_opened(packed: Path, samples: list[Sample], tmp_path: Path) -> None:
-    """What a killed run leaves has another name, and is replaced by the next."""
-    root = tmp_path / "root"
+    """What a killed run leaves has another name, and is replaced by the next; the name of the whole does not matter."""
+    root = tmp_path / "root.parts"
     shutil.copytree(packed / "world", root / "new.part")
     with pytest.raises(UsageError, match="no packed drive"):
         open_packed(root)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from typer.testing import CliRunner
 
 from dpm2_core.cli import app
@@ -83,6 +84,45 @@ def test_a_room_is_packed_as_the_network_sees_it(tmp_path: Path) -> None:
         np.testing.assert_array_equal(drive[n].pose[:3, :3], source.poses[n, :3, :3])
         reach = np.abs(frame.points[:, :3]).max(0)
         np.testing.assert_allclose(np.abs(drive[n].cloud).max(0), ROOM_SCALE * reach, rtol=0.1)
+
+
+class Leaning:
+    """Two scans of a street by a sensor that leans forward by 20 degrees, with images."""
+
+    name, T_cam_lidar = "leaning", None
+
+    def __init__(self) -> None:
+        self.notes: list[str] = []
+        self.T_level_lidar = se3.exp([0, np.radians(20), 0, 0, 0, 0])
+        level = np.stack([np.eye(4), se3.exp([0, 0, 0.1, 1, 0, 0])])
+        self.poses: Array | None = level @ self.T_level_lidar
+        world = boxes(np.random.default_rng(0), 20_000)
+        self.world = world[world[:, 2] >= -1.7]  # nothing beneath the ground
+
+    def __len__(self) -> int:
+        return 2
+
+    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
+        assert self.poses is not None
+        for n, pose in enumerate(self.poses[start:stop], start):
+            seen = np.c_[se3.transform(se3.inverse(pose), self.world), np.ones(len(self.world))].astype(np.float32)
+            yield Frame(n * 10**8, seen, None, (make_image(np.random.default_rng(n)),), index=n)
+
+
+def test_scans_of_a_sensor_that_leans_are_packed_in_level_axes(tmp_path: Path) -> None:
+    """As the network sees them; poses and cameras go with them."""
+    source = Leaning()
+    pack(source, tmp_path / "d", tiny())
+    drive = PackedDrive(tmp_path / "d")
+    for n, frame in enumerate(source.frames()):
+        sample = drive[n]
+        assert sample.pose[2, 2] > np.cos(np.radians(2))  # the street is level
+        there = se3.transform(sample.pose, sample.cloud.astype(np.float64))
+        gap = cKDTree(source.world).query(there)[0]
+        assert gap.max() < 0.01  # 2 mm of packing
+        assert source.poses is not None
+        of_camera = source.poses[n] @ frame.images[0].camera.T_lidar_cam
+        np.testing.assert_allclose(sample.pose @ sample.images[0].camera.T_lidar_cam, of_camera, atol=1e-6)
 
 
 @pytest.mark.slow
