@@ -175,8 +175,9 @@ class Frame:
     fix: Fix | None = None
 
     def __post_init__(self) -> None:
-        if self.points.ndim != 2 or self.points.shape[1] != 4:
-            raise ValueError(f"frame {self.index}: points are {self.points.shape}, want (N, 4)")
+        if self.points.ndim != 2 or self.points.shape[1] != 4 or self.points.dtype != np.float32:
+            found = f"{self.points.shape} {self.points.dtype}"
+            raise ValueError(f"frame {self.index}: points are {found}, want (N, 4) float32")
         if self.time_offset is not None and self.time_offset.shape != self.points.shape[:1]:
             raise ValueError(f"frame {self.index}: {len(self.time_offset)} time offsets for {len(self.points)} points")
 

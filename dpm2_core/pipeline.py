@@ -44,6 +44,7 @@ from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.output import TrajectoryRecorder
 from dpm2_core.slam.session import MapMode, open_map, resume_at
 from dpm2_core.slam.settings import Config
+from dpm2_core.slam.store.map_data import remove_map
 from dpm2_core.slam.system import SlamResult
 
 Watch = Callable[[Frame, SlamResult, Mapper], None]
@@ -80,6 +81,7 @@ class OfflineRun:
         self._config = config or Config()
         self._resources = ExitStack()
         self._truth: Array | Trajectory | None = None
+        made = None if map_file is None or map_file.exists() else map_file
         store = None if map_file is None else open_map(map_file, self._config, map_mode)
         if store is not None:
             self._resources.push(store)
@@ -96,6 +98,8 @@ class OfflineRun:
                 self._truth = read_ground_truth(self.source, ground_truth, self._start, self._stop)
         except BaseException:
             self.close()
+            if made is not None:  # or the same command, with its mistake corrected, would find a map there
+                remove_map(made)
             raise
         self._truth_name = self.source.truth if ground_truth is None else str(ground_truth)
 
@@ -200,8 +204,17 @@ class Result:
 
     @cached_property
     def poses(self) -> Array:
-        """(N, 4, 4) T_map_lidar of all frames after all corrections; read when the run has ended."""
-        return self.recorder.poses(self.mapper.poses[self.mapper.session_start :])
+        """(N, 4, 4) T_map_lidar of all frames after all corrections; read when the run has ended.
+
+        Raises:
+            UsageError: the run has localized, and made no map.
+        """
+        keyframes = self.mapper.poses[self.mapper.session_start :]
+        if len(keyframes) != self.recorder.keyframes:
+            raise UsageError(
+                "a run that localizes corrects no poses: look at T_map_lidar of each result, by `progress`"
+            )
+        return self.recorder.poses(keyframes)
 
     @property
     def sensor_poses(self) -> Array:

@@ -22,6 +22,8 @@ from dpm2_core.frame import Array, Frame
 
 SUFFIXES = (".pcd", ".ply")
 _PERIOD = 0.1  # s between scans whose names are no times
+_PAIR = re.compile(r"(?:.*\D)?(\d{9,10})[_-](\d{1,9})")
+"""Seconds and nanoseconds since 1970, as ROS has them."""
 _EPOCHS = ((1e8, 1e11, 1.0), (1e11, 1e14, 1e-3), (1e14, 1e17, 1e-6), (1e17, 1e20, 1e-9))
 """From, to, s: a number in a name that is a time since 1970 after 1973."""
 
@@ -44,13 +46,14 @@ class CloudFolder:
         folder = Path(path)
         self.name, self.notes = folder.resolve().name, list[str]()
         found = [file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES] if folder.is_dir() else []
-        self._files = sorted(found, key=lambda file: (_number(file) is None, _number(file) or 0.0, file.name))
-        if not self._files:
+        if not found:
             raise UsageError(f"{folder}: no .pcd or .ply file in this folder")
+        numbers = _numbers(found)
+        self._files = sorted(found, key=lambda file: (numbers[file] is None, numbers[file] or 0, file.name))
         if any(file.suffix.lower() == ".pcd" for file in self._files):
             _pcd_type()  # now, rather than at the first scan
         self._frames = FrameBuilder(settings or InputSettings(), Calibration(str(folder)), self.notes.append)
-        self.stamps = _stamps(self._files)
+        self.stamps = _stamps([numbers[file] for file in self._files])
 
     def __len__(self) -> int:
         return len(self._files)
@@ -95,15 +98,20 @@ def _pcd_type() -> Any:
     return PointCloud
 
 
-def _number(file: Path) -> float | None:
-    """The last number in a name: 12 of scan_012.pcd."""
-    found = re.findall(r"\d+(?:\.\d+)?", file.stem)
-    return float(found[-1]) if found else None
+def _numbers(files: list[Path]) -> dict[Path, float | None]:
+    """The last number in each name, 12 of scan_012.pcd; ns where all names end in seconds and nanoseconds."""
+    pairs = [match for file in files if (match := _PAIR.fullmatch(file.stem))]
+    if len(pairs) == len(files) and max(len(match[2]) for match in pairs) == 9:
+        return {file: int(match[1]) * 10**9 + int(match[2]) for file, match in zip(files, pairs, strict=True)}
+    found = {file: re.findall(r"\d+(?:\.\d+)?", file.stem) for file in files}
+    return {file: float(numbers[-1]) if numbers else None for file, numbers in found.items()}
 
 
-def _stamps(files: list[Path]) -> NDArray[np.int64]:
-    numbers = [_number(file) for file in files]
+def _stamps(numbers: list[float | None]) -> NDArray[np.int64]:
+    """ns, of the numbers in order."""
+    known = [number for number in numbers if number is not None]
     for low, high, scale in _EPOCHS:
-        if all(number is not None and low <= number < high for number in numbers) and len(set(numbers)) == len(files):
-            return np.array([round((number or 0.0) * scale * 1e9) for number in numbers], np.int64)
-    return np.round(np.arange(len(files)) * _PERIOD * 1e9).astype(np.int64)
+        if len(set(known)) == len(numbers) and low <= known[0] and known[-1] < high:
+            # Integers, which are ns, as they are: a float64 of this size is 256 ns off.
+            return np.array([n if isinstance(n, int) else round(n * scale * 1e9) for n in known], np.int64)
+    return np.round(np.arange(len(numbers)) * _PERIOD * 1e9).astype(np.int64)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -132,6 +133,16 @@ def decode_camera(info: Any, T_lidar_cam: Array, name: str) -> Camera:
         raise MessageError(f"{name}: CameraInfo has no image size, or one beyond {_WIDEST_IMAGE} pixels")
     kept = () if is_fisheye(info) else tuple(D.tolist())
     return Camera(K, T_lidar_cam, (int(info.width), int(info.height)), kept, name)
+
+
+def info_of(topic: str, info: Any) -> Any:
+    """The CameraInfo of a topic's images: of image_rect and the like, which image_proc publishes beside the CameraInfo
+    of the raw image, one without distortion, so that P counts."""
+    name = topic.removesuffix("/compressed").rpartition("/")[2]
+    if not name.startswith("image_rect") or not info.p[0]:
+        return info
+    return SimpleNamespace(header=info.header, width=info.width, height=info.height, k=info.k, p=info.p, d=[],
+                           distortion_model=info.distortion_model)  # fmt: skip
 
 
 def is_fisheye(info: Any) -> bool:

@@ -228,6 +228,8 @@ def _time_offset(time: NDArray[Any], points: Points, stamp: int, unit: TimeUnit)
     seen = np.isfinite(points[:, :3]).all(1) & points[:, :3].any(1)  # drivers often zero the time of a missing return
     value = _first(time).astype(np.float64)
     seen &= np.isfinite(value)
+    if _is_absolute(value[seen & (value != 0)]):
+        seen &= value != 0  # of a missing return, although its point may have been moved into another frame since
     if not seen.any():
         return None
     first, last = value[seen].min(), value[seen].max()
@@ -242,6 +244,11 @@ def _time_offset(time: NDArray[Any], points: Points, stamp: int, unit: TimeUnit)
     with np.errstate(invalid="ignore", over="ignore"):
         offset = (value - origin) * scale
     return np.where(seen & (np.abs(offset) <= _LONGEST_SCAN), offset, 0.0).astype(np.float32)  # else it means nothing
+
+
+def _is_absolute(times: NDArray[np.float64]) -> bool:
+    """Whether times (N,), none zero, are by a clock that began long before the scan."""
+    return len(times) > 0 and 0 < 10 * np.ptp(times) < times.min()
 
 
 def _time_scale(first: float, last: float, floating: bool) -> float:

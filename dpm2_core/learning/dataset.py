@@ -37,8 +37,6 @@ class PackedSettings(Settings):
     """Factor on the weight of drives of a preset of the synthetic city, such as {tunnel: 3}."""
     groups: int = Field(4, gt=0)
     """Places in a batch, per process."""
-    workers: int = Field(1, ge=0)
-    """Processes that load and sample; 0 loads in the training process."""
     augment: AugmentSettings = AugmentSettings()
 
 
@@ -47,6 +45,8 @@ class GroupSettings(PackedSettings):
 
     images: bool = False
     """Read the images."""
+    workers: int = Field(1, ge=0)
+    """Processes that load and sample; 0 loads in the training process."""
 
 
 class DataSettings(GroupSettings):

@@ -28,6 +28,11 @@ class TrajectoryRecorder:
     def __len__(self) -> int:
         return len(self.stamps)
 
+    @property
+    def keyframes(self) -> int:
+        """How many of the frames became keyframes."""
+        return len(self._keyframe)
+
     def add(self, tracked: OdometryResult) -> None:
         """Take in the result of the next frame."""
         if tracked.keyframe is not None:

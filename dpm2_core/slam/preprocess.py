@@ -104,6 +104,8 @@ def _in_range(points: Points, least: float, most: float) -> tuple[Points, NDArra
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         squared = x * x + y * y + z * z
         used[count] = points[i]
+        if not np.isfinite(points[i, 3]):
+            used[count, 3] = 0  # an intensity that is not known
         index[count] = i
         count += squared >= least and squared <= most and squared > 0  # False for NaN
     return used[:count], index[:count]

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal
@@ -98,9 +99,14 @@ def resume_at(mapper: Mapper, source: Source, start: int) -> int:
     if not mapper.keyframes:
         return start
     last = mapper.keyframes[-1]
-    first = next(iter(source.frames(0, 1)), None)
-    position = -1 if first is None else last.index - first.index
-    result = next(iter(source.frames(position, position + 1)), None) if 0 <= position < len(source) else None
+
+    def index_at(position: int) -> int:
+        return next(iter(source.frames(position, position + 1))).index
+
+    position = min(len(source) - 1, last.index - index_at(0))
+    if position > 0 and index_at(position) != last.index:  # some scans are missing
+        position = bisect_left(range(position), last.index, key=index_at)
+    result = None if position < 0 else next(iter(source.frames(position, position + 1)))
     if result is None or result.stamp != last.stamp:
         raise UsageError(f"--resume: frame {last.index}, where the map ends, is not in {source.name}")
     mapper.start_session(mapper.poses[-1], _SAME_FRAME)

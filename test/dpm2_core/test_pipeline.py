@@ -147,9 +147,35 @@ def test_a_run_goes_on_in_its_map_file(recording: Path, tmp_path: Path) -> None:
         OfflineRun(recording, CONFIG, map_file=path)
 
 
+def test_a_drive_with_missing_scans_goes_on(recording: Path, tmp_path: Path) -> None:
+    """Every second scan: the frame where the map ends is found by its number, not by its position."""
+    drive, path = tmp_path / "drive", tmp_path / "drive.dpm2map"
+    first_scans(recording, FRAMES, drive)
+    for scan in [*drive.rglob("velodyne/*.bin")]:
+        if int(scan.stem) % 2:
+            scan.unlink()
+    with OfflineRun(drive, CONFIG, (0, 4), map_file=path) as begun:
+        begun.run()
+    with OfflineRun(drive, CONFIG, map_file=path, map_mode="resume") as again:
+        assert again.run().recorder.index[-1] == FRAMES - 2
+
+
+def test_a_run_that_localizes_has_no_poses_of_its_own(recording: Path, tmp_path: Path) -> None:
+    path = tmp_path / "drive.dpm2map"
+    with OfflineRun(recording, Config(), (0, 8), map_file=path) as drive:
+        drive.run()
+    with (
+        OfflineRun(recording, Config(), (0, 8), map_file=path, map_mode="localize") as drive,
+        pytest.raises(UsageError, match="T_map_lidar of each result"),
+    ):
+        drive.run().save(tmp_path / "out")
+
+
 def test_errors_of_use_come_before_anything_runs(recording: Path, tmp_path: Path) -> None:
+    path = tmp_path / "drive.dpm2map"
     with pytest.raises(UsageError, match="no such file"):
-        OfflineRun(tmp_path / "nowhere", CONFIG)
+        OfflineRun(tmp_path / "nowhere", CONFIG, map_file=path)
+    assert not [*tmp_path.iterdir()], "a map file that the corrected command would be refused for"
     with pytest.raises(UsageError, match=f"--frames 50:60: 00 has {FRAMES} frames"):
         OfflineRun(recording, CONFIG, (50, 60))
     write_kitti(tmp_path / "short.txt", np.tile(np.eye(4), (3, 1, 1)))

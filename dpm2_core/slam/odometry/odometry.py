@@ -97,10 +97,10 @@ class Odometry:
         T_predicted = self._begin_stretch(dt) if pauses else self._predicted(twist, dt)
         registration = self._register(scan, T_predicted, dt, frame.problem)
         if self._first is not None and registration.ok:
-            scan, registration = self._begin_again(self._first, frame, registration, dt)
+            scan, registration = self._begin_again(self._first, frame, registration, seconds)
         clock.append(perf_counter())
         self._update(scan, registration, dt)
-        if registration.method == "first" and frame.time_offset is not None:
+        if registration.method == "first" and registration.ok and frame.time_offset is not None:
             self._first = frame
         T = self._T
         if self._bridge is not None and registration.ok:
@@ -241,11 +241,11 @@ class Odometry:
         return result
 
     def _begin_again(
-        self, first: Frame, frame: Frame, registration: Registration, dt: float
+        self, first: Frame, frame: Frame, registration: Registration, seconds: float
     ) -> tuple[Scan, Registration]:
-        """The second scan has shown the velocity: undo the motion in the first one too, and register anew."""
+        """The second scan has shown the velocity, `seconds` later: undo the motion in the first too; register anew."""
         self._first = None
-        twist = se3.log(se3.inverse(self._T) @ registration.T_target_source) / dt
+        twist = se3.log(se3.inverse(self._T) @ registration.T_target_source) / seconds
         self._registration.clear()
         self._registration.update(self._registration.prepare(first, twist), self._T)
         scan = self._registration.prepare(frame, twist)

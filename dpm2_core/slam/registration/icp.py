@@ -146,9 +146,10 @@ class GeometricRegistration:
     def likelihood(self, source: Array, target: LocalMap, T: Array) -> float:
         """Mean log likelihood of the (N, 3) points at a pose T_target_source: the greater, the better a pose fits.
 
-        Distances along the normals are Cauchy distributed; a point without a counterpart has a density of 1 per meter.
+        Distances along the normals are Cauchy distributed; a point without a counterpart has a density of 1 per meter,
+        and no points have it too.
         """
-        return float(self._log_density(source, target, T).mean())
+        return float(self._log_density(source, target, T).mean()) if len(source) else 0.0
 
     def _log_density(self, source: Array, target: LocalMap, T: Array) -> Array:
         """Of each point (N,)."""

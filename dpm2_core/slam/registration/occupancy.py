@@ -36,8 +36,8 @@ class Occupancy:
         """Mean value of the voxels that the points (N, 3) of a scan fall into at each of the poses (P, 4, 4)."""
         R, t = poses[:, :3, :3].astype(np.float32), (poses[:, :3, 3] - self._origin).astype(np.float32)
         moved = np.einsum("pij,nj->pni", R, source.astype(np.float32), optimize=True) + t[:, None]
+        inside = ((moved >= 0) & (moved < np.float32(_VOXEL) * np.array(self._value.shape, np.float32))).all(-1)
+        moved[~inside] = 0  # a corner, which is empty; what is beyond any integer may be outside
         cell = (moved / np.float32(_VOXEL)).astype(np.int32)
-        inside = ((moved >= 0) & (cell < self._value.shape)).all(-1)
-        cell[~inside] = 0  # a corner, which is empty
         value = self._value[cell[..., 0], cell[..., 1], cell[..., 2]]
         return np.asarray(value.mean(1))

@@ -57,6 +57,17 @@ def test_names_that_are_times(tmp_path: Path, scale: int) -> None:
     assert "no time field: not de-skewed" in source.notes[0]
 
 
+@pytest.mark.parametrize("name", ["cloud_{}_{}.ply", "{}-{}.ply"])
+def test_names_that_are_seconds_and_nanoseconds(tmp_path: Path, name: str) -> None:
+    """In the order of both; with fewer digits the nanoseconds have no zeros before them."""
+    stamps = [EPOCH * 10**9 + k * 10**8 + 82 for k in range(8, 13)]
+    for n, stamp in enumerate(stamps):
+        write_ply(tmp_path / name.format(*divmod(stamp, 10**9)), np.zeros((5, 4), np.float32) + n + 1)
+    frames = [*CloudFolder(tmp_path).frames()]
+    assert [frame.stamp for frame in frames] == stamps
+    assert [frame.points[0, 0] for frame in frames] == [1, 2, 3, 4, 5]
+
+
 def test_a_damaged_file_is_a_failed_frame(tmp_path: Path) -> None:
     for n in range(4):
         write_pcd(tmp_path / f"{n}.pcd", "binary", n)

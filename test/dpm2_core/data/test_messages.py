@@ -197,6 +197,16 @@ def test_missing_returns_do_not_spoil_the_times() -> None:
     np.testing.assert_allclose(time, [0, 0.05, 0, 0.1], atol=1e-6)
 
 
+@pytest.mark.parametrize("began", [5.0, STAMP * 1e-9])
+def test_a_time_of_zero_among_absolute_ones_means_nothing(began: float) -> None:
+    """As of a missing return whose point was moved into the vehicle's frame; by a clock of the sensor or by UTC."""
+    _, clean = messages.decode_points(cloud(xyz(4, timestamp=began + np.array([0, 0.05, 0.07, 0.1]))))
+    _, time = messages.decode_points(cloud(xyz(5, timestamp=np.append(began + np.array([0, 0.05, 0.07, 0.1]), 0.0))))
+    np.testing.assert_array_equal(time, np.append(clean, 0))
+    _, relative = messages.decode_points(cloud(xyz(4, time=np.array([0, 0.03, 0.06, 0.1], np.float32))))
+    np.testing.assert_allclose(relative, [0, 0.03, 0.06, 0.1])
+
+
 def test_odd_points_keep_their_place() -> None:
     columns = xyz(5)
     columns["x"][:] = [np.nan, np.inf, 0, -np.inf, 1]
@@ -362,6 +372,19 @@ def test_camera_of_a_rectified_image_has_the_rectified_intrinsics() -> None:
     assert (camera.size, camera.distortion, camera.name) == ((640, 480), (), "left")
     unrectified = image_messages.decode_camera(info(p=np.zeros(12), d=[]), np.eye(4), "left")
     assert unrectified.K[0, 0] == 500
+
+
+@pytest.mark.parametrize("model", ["plumb_bob", "equidistant"])
+def test_the_info_of_a_raw_image_beside_its_rectified_one(model: str) -> None:
+    """image_proc publishes image_rect beside the CameraInfo of the raw image: P counts, without distortion."""
+    raw = info(d=[0.1, 0.0, 0.0, 0.01], distortion_model=model, header=header())
+    for topic in ("/front/image_rect", "/front/image_rect_color/compressed"):
+        of_topic = image_messages.info_of(topic, raw)
+        camera = image_messages.decode_camera(of_topic, np.eye(4), "front")
+        assert (camera.K[0, 0], camera.distortion) == (480, ())
+        assert not image_messages.is_fisheye(of_topic)
+    for topic, of in (("/front/image_raw", raw), ("/front/image_rect", info(p=np.zeros(12), header=header()))):
+        assert image_messages.info_of(topic, of) is of
 
 
 def test_a_fisheye_becomes_a_pinhole_camera() -> None:

@@ -127,9 +127,12 @@ def test_some_nan_points_are_dropped(suburb_drive: Drive) -> None:
     for frame in frames[:6]:
         points = frame.points.copy()
         points[::10, 0] = np.nan
+        points[1::10, 3] = np.nan
         points[5::10] = 0
         dirty.append(replace(frame, points=points))
-    assert errors(run(dirty), truth[:6])[:, 0].max() < 0.05
+    tracked = run(dirty)
+    assert errors(tracked, truth[:6])[:, 0].max() < 0.05
+    assert all(np.isfinite(t.keyframe.cloud).all() for t in tracked if t.keyframe is not None)
 
 
 @pytest.mark.slow
@@ -140,6 +143,50 @@ def test_bad_frames_before_the_first_good_one(suburb_drive: Drive) -> None:
     assert tracked[0].state == State.INITIALIZING
     assert not tracked[0].registration.ok
     assert errors(tracked[1:], truth[:6])[:, 0].max() < 0.05
+
+
+@pytest.mark.slow
+def test_an_empty_second_scan_while_no_velocity_is_known(suburb_drive: Drive) -> None:
+    """At the start, and after a pause."""
+    frames, truth = suburb_drive
+    empty = [replace(frames[i], points=np.zeros((0, 4), np.float32)) for i in (1, 18)]
+    tracked = run([frames[0], empty[0], *frames[2:8], frames[17], empty[1], *frames[19:28]])
+    assert not tracked[1].registration.ok
+    assert not tracked[9].registration.ok
+    assert errors(tracked[2:8], truth[2:8])[:, 0].max() < 0.05
+    assert tracked[-1].state == State.TRACKING
+
+
+@pytest.mark.slow
+def test_the_beginning_of_a_sweep_that_is_refused_does_not_become_the_map() -> None:
+    """What many drivers send first, with the times of its points: the next scan is the first."""
+    frames, truth = make_drive("suburb", 12, deskewed=False)
+    first = frames[0]
+    assert first.time_offset is not None
+    part = replace(first, points=first.points[:60], time_offset=first.time_offset[:60])
+    tracked = run([part, *frames[1:]])
+    assert not tracked[0].registration.ok
+    assert tracked[-1].state == State.TRACKING
+    assert errors(tracked[1:], se3.inverse(truth[1]) @ truth[1:])[:, 0].max() < 0.05
+
+
+@pytest.mark.slow
+def test_skewed_scans_with_a_failed_one_at_the_start() -> None:
+    """The motion within the first scan is that of the time since, not of one period."""
+    frames, truth = make_drive("suburb", 8, deskewed=False)
+    tracked = run([frames[0], replace(frames[1], problem="cut off"), *frames[2:]])
+    assert errors(tracked[2:], truth[2:])[:, 0].max() < 0.05  # 0.1 m with twice the speed
+
+
+@pytest.mark.slow
+def test_a_clock_that_is_set_from_uptime_to_utc(suburb_drive: Drive) -> None:
+    """Half a century of motion is no place to look at; with the sensor in any orientation."""
+    frames, _ = suburb_drive
+    R = se3.exp([0, np.radians(-20), 0, 0, 0, 0])[:3, :3] @ se3.exp([0, 0, np.radians(45), 0, 0, 0])[:3, :3]
+    turned = [replace(f, points=np.c_[f.points[:, :3] @ R.T, f.points[:, 3]].astype(np.float32)) for f in frames]
+    late = [replace(f, stamp=f.stamp + 17 * 10**17) for f in turned[8:]]
+    tracked = run([*turned[:8], *late])
+    assert tracked[-1].state == State.TRACKING
 
 
 @pytest.mark.slow

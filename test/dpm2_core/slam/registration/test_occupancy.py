@@ -24,6 +24,7 @@ def test_the_pose_where_the_scan_was_taken_fits_best() -> None:
 
 
 def test_what_lies_outside_counts_nothing() -> None:
-    far = se3.exp([0, 0, 0, 500, 0, 0])
-    assert Occupancy(WORLD, np.zeros(3)).fit(SCAN, np.array([far, se3.inverse(far)])).tolist() == [0, 0]
+    for meters in (500.0, 1e12):  # what no integer can count
+        far = se3.exp([0, 0, 0, meters, meters, meters])
+        assert Occupancy(WORLD, np.zeros(3)).fit(SCAN, np.array([far, se3.inverse(far)])).tolist() == [0, 0]
     assert Occupancy(WORLD + 1000, np.zeros(3)).fit(SCAN, T[None]).tolist() == [0]
