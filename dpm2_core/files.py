@@ -56,6 +56,11 @@ def write_json(path: Path | str, content: object) -> None:
         file.write(json.dumps(content, indent=2) + "\n")
 
 
+def expanded(path: str) -> str:
+    """A path whose `~` is the home folder, as a shell has it: none reads what stands in a ROS parameter."""
+    return os.path.expanduser(path)
+
+
 def file_digest(path: Path) -> str:
     """SHA-256 of what a file holds.
 

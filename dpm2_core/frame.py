@@ -162,6 +162,7 @@ class Frame:
         guess: where another odometry has the LiDAR at that time; the search for the pose begins there.
         imu: samples since those of the frame before, up to the last point; None where there is no IMU.
         fix: the last one before the stamp that no frame before had; None where there is none.
+        dropped: scans since the frame before that came, but were left out for want of time.
     """
 
     stamp: int
@@ -173,6 +174,7 @@ class Frame:
     guess: Guess | None = None
     imu: Inertial | None = None
     fix: Fix | None = None
+    dropped: int = 0
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 4 or self.points.dtype != np.float32:

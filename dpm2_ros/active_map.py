@@ -29,6 +29,7 @@ class ActiveMap:
     Attributes:
         slam: what works on it; the map is exchanged there.
         located: what became of the last keyframe in a map that stays as it is.
+        file_problem: why the map has no file, in words; empty where it has, or is to have none.
 
     Raises:
         UsageError: `localization_mode` without a map that would serve.
@@ -42,6 +43,7 @@ class ActiveMap:
         self._path = Path(ros.map_file) if ros.map_file not in ("", AUTO) else None  # written, or to be found in
         self._folders: dict[str, Path] = {}  # of this drive, by the name under which it was saved
         self.located: LocalizationResult | None = None
+        self.file_problem = ""
         self._T_map_odom: dict[str, Array] | None = None  # by robot, while the map grows; None before any keyframe
         self._store: MapStore | TiledMap | None = self._opened() if ros.localization_mode else self._new_file()
         self.slam = make_slam(config.slam, robot, self._store)
@@ -211,12 +213,13 @@ class ActiveMap:
 
     def _new_file(self) -> MapStore | None:
         """A map file, if there is to be one. A file that cannot be made is no reason not to map."""
-        ros, self._folders = self._config.ros, {}
+        ros, self._folders, self.file_problem = self._config.ros, {}, ""
         requested = self._maps.usual if ros.map_file == AUTO else Path(ros.map_file)
         if requested.name:
             try:
                 self._path, store = self._created(requested)
             except Dpm2Error as error:
+                self.file_problem = str(error)
                 self._log.error(f"no map file: {error}")
             else:
                 self._log.info(f"map file: {self._path}")

@@ -18,7 +18,7 @@ from rosgraph_msgs.msg import Clock
 
 from dpm2_core.data import topics
 from dpm2_core.data.bag_file import Bag, open_bag
-from dpm2_core.data.bags import CLOUD
+from dpm2_core.data.bags import CAMERA_INFO, CLOUD
 from dpm2_core.data.prefetch import prefetch
 from dpm2_core.errors import UsageError, printable
 from dpm2_core.files import atomic_write
@@ -65,6 +65,9 @@ class BagPlayer:
         self._bag: Bag = open_bag(options.bag)
         if missing := [topic for topic in options.topics if topic not in self._bag.types]:
             raise UsageError(f"{options.bag}: no topic {', '.join(missing)}; topics: {', '.join(self._bag.types)}")
+        # A CameraInfo that was recorded once was latched.
+        once = [topic for topic in self._bag.topics(CAMERA_INFO) if self._bag.counts[topic] == 1]
+        self._latched = (*LATCHED, *once)
         self._publishers = self._make_publishers()
         self._clock = node.create_publisher(Clock, "/clock", 10) if options.clock else None
         self._lockstep = Lockstep(node, self._bag, self._publishers) if options.lockstep else None
@@ -101,7 +104,7 @@ class BagPlayer:
         """Latched topics first: a subscriber that has discovered a later one then has these."""
         requested = self._options.topics or tuple(self._bag.types)
         publishers = {}
-        for topic in sorted(requested, key=lambda topic: topic not in LATCHED):
+        for topic in sorted(requested, key=lambda topic: topic not in self._latched):
             if self._options.lockstep and topic == self._node.resolve_topic_name(ODOMETRY):
                 self._node.get_logger().warning(f"{topic} is left out: it comes from the node now")
                 continue
@@ -109,7 +112,7 @@ class BagPlayer:
             if (known := message_type(kind)) is None:
                 self._node.get_logger().warning(f"{printable(topic)} is left out: no message type {printable(kind)}")
                 continue
-            durability = DurabilityPolicy.TRANSIENT_LOCAL if topic in LATCHED else DurabilityPolicy.VOLATILE
+            durability = DurabilityPolicy.TRANSIENT_LOCAL if topic in self._latched else DurabilityPolicy.VOLATILE
             qos = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=durability)
             publishers[topic] = self._node.create_publisher(known, topic, qos)
         if not publishers:
@@ -118,7 +121,7 @@ class BagPlayer:
 
     def _publish_latched(self) -> None:
         """Every latched message at once: calibration is wanted before the first cloud, from wherever one starts."""
-        for topic, _, data in self._bag.messages([topic for topic in LATCHED if topic in self._publishers]):
+        for topic, _, data in self._bag.messages([topic for topic in self._latched if topic in self._publishers]):
             self._publishers[topic].publish(bytes(data))
 
     def _await_subscribers(self) -> None:
@@ -187,7 +190,7 @@ class BagPlayer:
     def _selected(self) -> Iterator[tuple[str, int, bytes]]:
         """The messages of the stretch that is asked for."""
         first = last = None
-        for topic, log_time, data in self._bag.messages([t for t in self._publishers if t not in LATCHED]):
+        for topic, log_time, data in self._bag.messages([t for t in self._publishers if t not in self._latched]):
             if first is None:
                 first = log_time + round(self._options.start * 1e9)
                 last = None if self._options.duration is None else first + round(self._options.duration * 1e9)

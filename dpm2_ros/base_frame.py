@@ -24,9 +24,12 @@ class BaseFrame:
         T_base_start: (4, 4) that frame in the one of `name`: identity, unless a parent came later.
     """
 
-    def __init__(self, wanted: str, own: tuple[str, ...]) -> None:
-        """`wanted`: the frame that was asked for, or empty; `own`: frames that this node is a parent with."""
-        self._wanted, self._own = wanted.lstrip("/"), own
+    def __init__(self, wanted: str, own: tuple[str, ...], is_child: bool) -> None:
+        """`wanted`: the frame that was asked for, or empty.
+
+        `own`: frames that this node is a parent with, `is_child`: of the frame itself.
+        """
+        self._wanted, self._own, self._is_child = wanted.lstrip("/"), own, is_child
         self._tree: TransformTree | None = None  # that of the last look
         self.name = self.problem = ""
         self.T_start_lidar = self.T_base_start = np.eye(4)
@@ -42,9 +45,18 @@ class BaseFrame:
 
     def look(self, tree: TransformTree, lidar_frame: str) -> bool:
         """Find the frame, or see whether it has changed; returns whether it has."""
-        if tree is self._tree or (self.name and self._wanted):
+        if tree is self._tree:
             return False
         self._tree = tree
+        top = tree.root(self._wanted, self._own) if self._wanted and self._is_child else self._wanted
+        if top != self._wanted:
+            self.problem = (
+                f"ros.base_frame: {self._wanted} has a parent in /tf_static, and no frame has two: name {top} instead, "
+                "or none, or set ros.publish_tf_odom to false"
+            )
+            return False
+        if self.name and self._wanted:
+            return False
         lidar_frame = lidar_frame.lstrip("/")
         name = self._wanted or tree.root(lidar_frame, self._own)
         if name == self.name:

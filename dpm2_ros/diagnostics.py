@@ -46,6 +46,8 @@ def mapper_status(node: Node, mapper: MapperThread) -> DiagnosticStatus:
     accepted, tried = mapper.loops
     figures = {"keyframes": mapper.keyframes, "loops accepted": accepted, "loops tried": tried}
     problems = []
+    if mapper.file_problem:
+        problems.append(f"no map file, the map is only in memory: {mapper.file_problem}")
     if mapper.store_problem:
         problems.append(f"map file incomplete: {mapper.store_problem}")
     if mapper.graph_problem:

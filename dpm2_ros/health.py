@@ -111,7 +111,7 @@ class Diagnostics:
         """Set while there is no pose of the frame that was asked for."""
         self.other: OtherOdometry | None = None
         """Another odometry, if there is one."""
-        self._lost_before = 0
+        self._lost_before = self._dropped_before = 0
         self._publisher = DiagnosticsPublisher(node, self._statuses)
 
     def publish(self) -> None:
@@ -194,11 +194,12 @@ class Diagnostics:
         if last.registration.reason:
             text += f": {last.registration.reason}"
         if last.breaks:
-            text += f"; the way across {last.breaks} pause(s) of the sensor is not known"
+            text += f"; the way across {last.breaks} pause(s) is not known"
         if self.frame_problem:
             level, text = ERROR, f"{text}; {self.frame_problem}"
-        if synchronizer.dropped and len(synchronizer):
+        if synchronizer.dropped > self._dropped_before:
             level, text = max(level, WARN), f"{text}; cannot keep up, {synchronizer.dropped} clouds dropped"
+        self._dropped_before = synchronizer.dropped
         if problem := self._frames.time_problem:
             self._node.get_logger().warning(f"{topic}: {problem}", once=True)
             text = f"{text}; {problem}"

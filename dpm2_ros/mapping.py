@@ -116,6 +116,11 @@ class MapperThread:
         return self._active.mapper.store_problem
 
     @property
+    def file_problem(self) -> str:
+        """Why there is no map file although there is to be one, in words; else empty."""
+        return self._active.file_problem
+
+    @property
     def localizing(self) -> bool:
         """Whether the map stays as it is."""
         return self._active.localizer is not None

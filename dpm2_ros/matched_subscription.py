@@ -7,8 +7,8 @@ from collections.abc import Callable
 from typing import Any
 
 from rclpy.node import Node
-from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import Imu, PointCloud2
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import CameraInfo, Imu, PointCloud2
 
 from dpm2_core.data.livox import LIVOX
 from dpm2_ros.message_types import message_type
@@ -18,7 +18,7 @@ _IMU_DEPTH = 1000  # samples that may wait: those of a second
 
 
 class MatchedSubscription:
-    """A subscription with the reliability that the publishers offer.
+    """A subscription with the reliability that the publishers offer, and of CameraInfo with their durability.
 
     A reliable subscriber never connects to a best-effort publisher, and a best-effort one loses data that a reliable
     publisher would have sent again. So it starts reliable, and `refresh`, called often, follows the publishers. It also
@@ -34,6 +34,7 @@ class MatchedSubscription:
         self._setting, self._depth = ros.reliability, _IMU_DEPTH if kind is Imu else ros.queue_depth
         self._given, self.topic = topic, node.resolve_topic_name(topic)
         self.reliability = ReliabilityPolicy.RELIABLE
+        self._qos = self.reliability, DurabilityPolicy.VOLATILE
         self._subscription: Any = None
         self._raw, self.problem = False, ""
         self.refresh()
@@ -55,14 +56,19 @@ class MatchedSubscription:
         elif offered:
             reliable = all(info.qos_profile.reliability != ReliabilityPolicy.BEST_EFFORT for info in offered)
             requested = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+        latched = DurabilityPolicy.TRANSIENT_LOCAL
+        keeps = self._wanted is CameraInfo and offered and all(i.qos_profile.durability == latched for i in offered)
+        durability = latched if keeps else DurabilityPolicy.VOLATILE  # one that has been sent once, long ago
         kind = self._kind_of({info.topic_type for info in offered})
-        if self._subscription is not None and (requested, kind) == (self.reliability, self._kind):
+        if self._subscription is not None and (requested, durability, kind) == (*self._qos, self._kind):
             return
         before, other_type = self._subscription, kind is not self._kind
-        self.reliability, self._kind, self._raw = requested, kind, kind is not self._wanted
+        self._qos = self.reliability, _ = requested, durability
+        self._kind, self._raw = kind, kind is not self._wanted
         if before is not None and other_type:  # DDS allows one type a topic
             self._node.destroy_subscription(before)
-        qos = QoSProfile(depth=self._depth, history=HistoryPolicy.KEEP_LAST, reliability=requested)
+        keep = HistoryPolicy.KEEP_LAST
+        qos = QoSProfile(depth=self._depth, history=keep, reliability=requested, durability=durability)
         self._subscription = self._node.create_subscription(kind, self._given, self._callback, qos, raw=self._raw)
         if before is not None:
             if not other_type:

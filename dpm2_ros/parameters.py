@@ -21,6 +21,7 @@ from pydantic.fields import FieldInfo
 
 from dpm2_core.config import Settings, flat_fields, load_settings, read_yaml, settings_from
 from dpm2_core.errors import UsageError
+from dpm2_core.files import expanded
 from dpm2_ros.settings import CHANGEABLE
 
 if TYPE_CHECKING:
@@ -48,7 +49,9 @@ def load_parameters(node: Node, kind: type[T]) -> T:
         for name, parameter in node.get_parameters_by_prefix("").items()
         if not name.startswith(_OF_RCLPY)
     }
-    given = {name: value for name, value in declared.items() if value is not None}
+    # `ros2 param dump` writes null for what is not set, which rcl reads as a text.
+    unset = {name for name, info in fields.items() if info.default is None}
+    given = {n: value for n, value in declared.items() if value is not None and not (value == "null" and n in unset)}
     file = given.pop(CONFIG_FILE, "")
     if not isinstance(file, str):
         raise UsageError(f"ROS parameter: {CONFIG_FILE}: want the path of a file, got {file!r}")
@@ -56,9 +59,10 @@ def load_parameters(node: Node, kind: type[T]) -> T:
         raise UsageError("qos_overrides is not supported; ros.reliability and ros.queue_depth are the inputs' QoS")
     if unknown := sorted(set(given) - set(fields)):
         raise UsageError(f"unknown parameter {', '.join(unknown)}; docs/parameters.md lists them")
-    load_settings(kind, Path(file) if file else None)  # its mistakes are its own
+    path = Path(expanded(file)) if file else None
+    load_settings(kind, path)  # its mistakes are its own
     # Only what is given: a preset may change the rest.
-    tree = _with(read_yaml(Path(file)) if file else {}, given)
+    tree = _with({} if path is None else read_yaml(path), given)
     config = settings_from(kind, tree, dict.fromkeys(given, "ROS parameter"))
     for name in declared:
         node.undeclare_parameter(name)

@@ -5,9 +5,10 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator, model_validator
 
 from dpm2_core.config import Settings
+from dpm2_core.files import expanded
 from dpm2_core.slam.mapping.occupancy_map import OccupancySettings
 from dpm2_core.slam.settings import Config
 
@@ -101,6 +102,20 @@ class RosSettings(Settings):
 
     localization_mode: bool = False
     """slam_node finds itself in `map_file`, which stays as it is, and makes no map of its own."""
+
+    @field_validator("map_directory", "map_file")
+    @classmethod
+    def _expanded(cls, path: str) -> str:
+        return expanded(path)
+
+    @model_validator(mode="after")
+    def _different(self) -> RosSettings:
+        frames = [self.map_frame, self.own_frame, self.base_frame.lstrip("/")]
+        if self.own_frame != self.odom_frame:
+            frames.append(self.odom_frame)
+        if len(set(frames)) < len(frames):
+            raise ValueError(f"want different frames for map, odom and base, got {', '.join(filter(None, frames))}")
+        return self
 
     @property
     def own_frame(self) -> str:

@@ -73,7 +73,8 @@ class SlamNode(ManagedNode):
         sends = ros.publish_tf_odom and (not self._beside or ros.invert_odom_tf or not ros.embed_mapper)
         self._tf = TransformBroadcaster(self, ros.own_frame, sends, ros.invert_odom_tf)
         self._stopping = threading.Event()
-        self._base = BaseFrame(ros.base_frame, (ros.odom_frame, ros.own_frame, ros.map_frame))
+        is_child = ros.publish_tf_odom and not self._beside and not ros.invert_odom_tf
+        self._base = BaseFrame(ros.base_frame, (ros.odom_frame, ros.own_frame, ros.map_frame), is_child)
         self._requests = Requests(self, self._mapper, self._base, ros.map_frame)
         self._waited = False  # for the base frame
         warm_up(self._config.slam)
@@ -85,6 +86,7 @@ class SlamNode(ManagedNode):
     def activate(self, back: ExitStack) -> None:
         """Take clouds from now on; the drive goes on, if there was one."""
         ros, self._waited = self._config.ros, False
+        self._health = Health()  # its counts are beside those of the inputs, which are new too
         self._stopping.clear()
         self._other = None
         if self._beside:
@@ -162,7 +164,7 @@ class SlamNode(ManagedNode):
         x, y, z = self._base.T_start_lidar[2, :3].tolist()
         self._frames.up = (x, y, z) if self._base.name else None  # what is up for the base is to be up in odom
         frame = self._frames.frame(bundle.stamp, bundle.cloud, self._index, bundle.beside)
-        tracked = self._tracked(frame)
+        tracked = self._tracked(replace(frame, dropped=bundle.dropped))
         self._index += 1
         self._held.append(tracked)
         if self._base.name:

@@ -21,7 +21,7 @@ from std_msgs.msg import Float64
 from dpm2_core.data import topics
 from dpm2_core.data.frames import Calibration, CameraTopic
 from dpm2_core.data.gnss import FixBuffer
-from dpm2_core.data.image_messages import decode_camera
+from dpm2_core.data.image_messages import decode_camera, info_of
 from dpm2_core.data.imu import ImuBuffer
 from dpm2_core.data.kitti import checked_correction
 from dpm2_core.data.livox import LIVOX
@@ -227,7 +227,7 @@ class Inputs:
     def _on_camera_info(self, camera: CameraTopic, message: CameraInfo) -> None:
         check_header(message.header)
         try:
-            decode_camera(message, np.eye(4), "camera")
+            decode_camera(info_of(camera.topic, message), np.eye(4), "camera")
         except UsageError:
             if camera.topic in self._calibrated:
                 raise  # what is known stays

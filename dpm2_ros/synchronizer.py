@@ -52,6 +52,8 @@ class Bundle:
     restarted: bool
     beside: dict[str, tuple[int, Any]] = field(default_factory=dict)
     """Topic of each other sensor that has one to stamp (ns) and message."""
+    dropped: int = 0
+    """Clouds right before it that were."""
 
 
 @dataclass(eq=False)
@@ -210,4 +212,5 @@ class Synchronizer:
         while len(self._queue) > self._room:
             oldest = self._queue.popleft()
             self._queue[0].restarted |= oldest.restarted  # not lost with the cloud that announced it
+            self._queue[0].dropped += oldest.dropped + 1
             self.dropped += 1

@@ -6,7 +6,8 @@ from __future__ import annotations
 from collections import deque
 
 _PERIOD = 0.1  # s, assumed between two stamps that do not advance
-_SLOWEST = 2.0  # s: no stream has a longer period
+SLOWEST = 2.0
+"""No stream has a longer period, s."""
 _RHYTHM = 9  # periods: their median is that of the stream
 
 
@@ -35,4 +36,4 @@ class StreamClock:
         """Seconds without a registration that are a pause: `least`, or 1.5 periods where the stream is slow."""
         if len(self._periods) > 1:
             return max(least, 1.5 * sorted(self._periods)[(len(self._periods) - 1) // 2])
-        return _SLOWEST  # whether that is a pause or the rhythm of the stream is not known yet
+        return SLOWEST  # whether that is a pause or the rhythm of the stream is not known yet

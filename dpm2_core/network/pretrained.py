@@ -10,6 +10,7 @@ from threading import Lock
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from dpm2_core.errors import UsageError
+from dpm2_core.files import expanded
 from dpm2_core.openmp import allowed
 
 if TYPE_CHECKING:  # torch takes seconds to import, and the geometric SLAM does without
@@ -41,10 +42,11 @@ def weights_path(weights: str) -> Path:
     """
     if weights in pretrained_names():
         return PRETRAINED_DIR / f"{weights}.safetensors"
-    if not Path(weights).is_file():
+    path = Path(expanded(weights))
+    if not path.is_file():
         names = ", ".join(pretrained_names()) or "none"
         raise UsageError(f"slam.neural.weights {weights}: no such file; weights that come with dpm2: {names}")
-    return Path(weights)
+    return path
 
 
 def load_once(path: Path, threads: int, load: Callable[[Path], M]) -> M:

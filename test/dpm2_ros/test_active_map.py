@@ -136,6 +136,20 @@ def test_an_empty_value_says_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert list(tmp_path.iterdir()) == [tmp_path / "town.dpm2map"]
 
 
+def test_a_file_that_cannot_be_made_is_known_until_there_is_one(tmp_path: Path) -> None:
+    """The map grows without it."""
+    directory = tmp_path / "maps"
+    directory.write_text("no folder")
+    active = ActiveMap(config(map_directory=str(directory)), "", LOG)
+    assert str(directory) in active.file_problem
+    active.add(keyframes(1)[0])
+    assert len(active.mapper.keyframes) == 1
+    directory.unlink()
+    active.reset()
+    assert active.file_problem == ""
+    active.close()
+
+
 def test_a_reset_saves_first(tmp_path: Path) -> None:
     active = ActiveMap(config(map_directory=str(tmp_path)), "", LOG)
     for keyframe in keyframes(3):

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import Transition
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import PointCloud2
@@ -97,6 +98,11 @@ class Robot:
                 wire.publish(part)
 
 
+def counts(message: DiagnosticArray) -> dict[str, str]:
+    """Figures of the odometry."""
+    return {value.key: value.value for value in message.status[0].values}
+
+
 def held() -> tuple[int, int]:
     """Threads of Python and open files of this process."""
     gc.collect()
@@ -138,7 +144,7 @@ def test_rounds_keep_every_map_and_leave_nothing(
 def test_inactive_it_takes_no_cloud_and_keeps_the_map(ros: Callable[..., Any], drive: Any, tmp_path: Path) -> None:
     """And goes on where it was."""
     m = Managed(ros(*FAST, f"ros.map_directory:={tmp_path}"), SlamNode)
-    lidar = Lidar(m.harness, drive)
+    lidar, diagnostics = Lidar(m.harness, drive), m.harness.hear(DiagnosticArray, "/diagnostics")
     assert m.state == "unconfigured"
     assert not m.change(ACTIVATE)
     assert m.change(CONFIGURE)
@@ -153,6 +159,8 @@ def test_inactive_it_takes_no_cloud_and_keeps_the_map(ros: Callable[..., Any], d
     assert m.change(ACTIVATE)
     lidar.send(*range(4, 10))
     m.harness.wait(lambda: m.keyframes > keyframes, "a keyframe more")
+    names = ("received", "processed")
+    m.harness.wait(lambda: diagnostics and [counts(diagnostics[-1])[n] for n in names] == ["6", "6"], "their number")
     last = lidar.odom[-1].pose.pose.position.x
     assert last == pytest.approx(drive.pose(9)[0, 3], abs=0.1)
     assert m.change(Transition.TRANSITION_ACTIVE_SHUTDOWN)

@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+import functools
 import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import rclpy
+import yaml
 from rcl_interfaces.msg import ParameterType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -28,8 +31,12 @@ def load(domain: int) -> Iterator[Load]:
     """load(*parameters): configuration and node, with parameters as on the command line."""
     nodes = list[Node]()
 
-    def make(*parameters: str) -> tuple[NodeConfig, Node]:
+    def make(*parameters: str, params_file: Path | None = None) -> tuple[NodeConfig, Node]:
         arguments = ["--ros-args", *(part for pair in parameters for part in ("-p", pair))] if parameters else []
+        if params_file is not None:
+            arguments = ["--ros-args", "--params-file", str(params_file)]
+        end_ros(*nodes)  # of the call before
+        nodes.clear()
         ros_context(arguments, domain)
         nodes.append(rclpy.create_node("parameters", automatically_declare_parameters_from_overrides=True))
         return load_parameters(nodes[-1], NodeConfig), nodes[-1]
@@ -123,9 +130,35 @@ def test_empty_texts_are_defaults_where_the_default_is_empty(load: Load) -> None
     assert node.get_parameter("config_file").value == ""
 
 
+def test_what_was_dumped_can_be_loaded(load: Load, tmp_path: Path) -> None:
+    """`ros2 param dump` writes null for what is not set, which the parser of ROS reads as a text."""
+    node = load()[1]
+    file = tmp_path / "dump.yaml"
+    dumped: dict[str, Any] = {}
+    for name, _ in flat_fields(NodeConfig):
+        value = node.get_parameter(name).value
+        *path, leaf = name.split(".")
+        functools.reduce(lambda tree, part: tree.setdefault(part, {}), path, dumped)[leaf] = (
+            value.tolist() if hasattr(value, "tolist") else value
+        )
+    assert dumped["input"]["time_field"] is None
+    file.write_text(yaml.dump({"/**": {"ros__parameters": dumped}}))
+    assert load(params_file=file)[0] == NodeConfig()
+
+
+def test_a_home_folder_is_meant_by_its_sign(load: Load, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No shell looks at parameters."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "settings.yaml").write_text("ros: {queue_depth: 5}\n")
+    ros = load("config_file:='~/settings.yaml'", "ros.map_directory:='~/maps'", "ros.map_file:='~/town.dpm2map'")[0].ros
+    assert (ros.queue_depth, ros.map_directory, ros.map_file) == (5, f"{tmp_path}/maps", f"{tmp_path}/town.dpm2map")
+
+
 @pytest.mark.parametrize(
     ("parameter", "message"),
     [
+        ("ros.map_frame:=odom", "want different frames for map, odom and base, got odom, odom"),
+        ("ros.base_frame:=/map", "want different frames for map, odom and base, got map, odom, map"),
         ("ros.queue_depht:=3", "unknown parameter ros.queue_depht; docs/parameters.md"),
         ("queue_depth:=3", "unknown parameter queue_depth"),
         ("ros.queue_depth:=0", "ROS parameter: ros.queue_depth: .*greater than or equal to 1, got 0"),

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -129,6 +130,18 @@ def test_a_remapping_is_applied_once(node: Callable[..., Node]) -> None:
     assert inputs(n, points_topic="/a", images=False).calibration.points_topic == "/b"
     assert "/b" in {s.topic_name for s in n.subscriptions}
     assert "/a" not in {s.topic_name for s in n.subscriptions}
+
+
+def test_a_camera_info_that_was_sent_once_arrives(node: Callable[..., Node]) -> None:
+    """Latched, long before anyone listens."""
+    n = node()
+    info = CameraInfo(height=6, width=8, k=[5.0, 0, 4, 0, 5, 3, 0, 0, 1], p=[5.0, 0, 4, 0, 0, 5, 3, 0, 0, 0, 1, 0])
+    n.create_publisher(CameraInfo, "/front/camera_info", LATCHED).publish(info)
+    made = inputs(n, image_topic="/front/image")
+    end = time.monotonic() + 20
+    while made.calibration.cameras[0].info is None and time.monotonic() < end:
+        rclpy.spin_once(n, timeout_sec=0.2)
+    assert made.calibration.cameras[0].info == info
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, 90.0, -5.1])

@@ -185,7 +185,7 @@ def test_a_full_queue_drops_the_oldest_and_counts() -> None:
     synchronizer = make(depth=3)
     for n in range(5):
         synchronizer.add_cloud((100 + n) * MS, n, now=0.0)
-    assert [bundle.cloud for bundle in drain(synchronizer, 1.0)] == [2, 3, 4]
+    assert [(bundle.cloud, bundle.dropped) for bundle in drain(synchronizer, 1.0)] == [(2, 2), (3, 0), (4, 0)]
     assert synchronizer.dropped == 2
 
 

@@ -8,7 +8,7 @@ from time import perf_counter
 
 import numpy as np
 
-from dpm2_core.data.stream_clock import StreamClock
+from dpm2_core.data.stream_clock import SLOWEST, StreamClock
 from dpm2_core.frame import Array, Frame, OdometryResult, Registration, State
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.motion import OPEN, combined, covariance, predicted, spread
@@ -93,7 +93,7 @@ class Odometry:
             self._other.look(frame.guess, known, seconds, self._of_prediction(seconds))
         scan = self._registration.prepare(frame, twist)
         clock.append(perf_counter())
-        pauses = frame.problem is None and self._pauses(dt) and not self._registration.rejection(scan)
+        pauses = self._pauses(frame, dt) and not self._registration.rejection(scan)
         T_predicted = self._begin_stretch(dt) if pauses else self._predicted(twist, dt)
         registration = self._register(scan, T_predicted, dt, frame.problem)
         if self._first is not None and registration.ok:
@@ -137,9 +137,14 @@ class Odometry:
             return predicted(self._T, twist, dt)
         return predicted(self._registered[0], twist, self._registered[1] + dt)
 
-    def _pauses(self, dt: float) -> bool:
-        """Whether so much time has passed since the last registered scan that another one alone is not accepted."""
-        return len(self._registration) > 0 and self._registered[1] + dt > self._clock.pause(self._settings.pause)
+    def _pauses(self, frame: Frame, dt: float) -> bool:
+        """Whether so much time has passed since the last registered scan that this one alone is not accepted.
+
+        Where scans were left out for want of time, the stream is a slow one: what a pause asks for takes more time yet.
+        """
+        least = SLOWEST if frame.dropped else self._settings.pause
+        known = len(self._registration) > 0 and frame.problem is None
+        return known and self._registered[1] + dt > self._clock.pause(least)
 
     def _begin_stretch(self, dt: float) -> Array:
         """After a pause: the scan begins a map of its own, at the predicted pose (4, 4), which it returns."""

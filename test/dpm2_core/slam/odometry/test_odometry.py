@@ -190,6 +190,18 @@ def test_a_clock_that_is_set_from_uptime_to_utc(suburb_drive: Drive) -> None:
 
 
 @pytest.mark.slow
+def test_scans_that_were_left_out_for_want_of_time_are_no_pause(suburb_drive: Drive) -> None:
+    """What a pause asks for takes more time yet, and more would be left out: up to 2 s the stream is a slow one."""
+    frames, truth = suburb_drive
+    late = [replace(frame, dropped=9) for frame in frames[18::10]]
+    tracked = run([*frames[:8], *late])
+    assert [t.state for t in tracked[8:]] == [State.TRACKING] * len(late)
+    assert errors(tracked[8:], truth[18::10])[:, 0].max() < 0.1
+    paused = run([*frames[:8], frames[18]])
+    assert "pause" in paused[-1].registration.reason
+
+
+@pytest.mark.slow
 def test_an_unreadable_scan_keeps_its_reason(suburb_drive: Drive) -> None:
     frames, _ = suburb_drive
     broken = Frame(6 * 10**8, np.zeros((0, 4), np.float32), problem="000006.bin: 13 bytes")
