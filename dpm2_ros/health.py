@@ -108,7 +108,7 @@ class Diagnostics:
         self._node, self._inputs, self._frames, self._health = node, inputs, frames, health
         self._mapper, self._sender = mapper, sender
         self.frame_problem = ""
-        """Set while there is no pose of the frame that was asked for."""
+        """What is wrong with the frame that was asked for, in words."""
         self.other: OtherOdometry | None = None
         """Another odometry, if there is one."""
         self._lost_before = self._dropped_before = 0

@@ -110,6 +110,35 @@ def test_where_the_geometry_is_silent_the_figures_are_those_of_the_records() -> 
     assert [case["wrong"] for road in roads.values() for case in road.values() if isinstance(case, dict)] == [0] * 4
 
 
+def test_the_times_of_a_relocalization_are_those_of_the_record() -> None:
+    found = record("relocalise.json")
+    (times,) = re.findall(r"without any prior in ([\d.]+) s \(p95 ([\d.]+)", text("README.md"))
+    assert all(equals(time, found["seconds"][key]) for time, key in zip(times, ("p50", "p95"), strict=True))
+    (times,) = re.findall(r"cm in ([\d.]+) and ([\d.]+) s; the others are said", text("README.md"))
+    of = [found["open_roads"][road]["with images"]["seconds"]["p50"] for road in ("tunnel", "highway")]
+    assert all(map(equals, times, of))
+
+
+def test_the_figures_of_loops_and_of_the_solver_are_those_of_the_records() -> None:
+    roads, graph = record("roads.json")["roads"].values(), record("pose-graph.json")
+    kinds = [road["loops"][kind] for road in roads for kind in ("same", "reverse", "cross")]
+    passed = r"(\d+) of the (\d+) places that are passed again are found, (\d+) of them"
+    (counts,) = re.findall(passed, text("README.md"))
+    reverse = sum(road["loops"]["reverse"]["found"] for road in roads)
+    assert [int(n) for n in counts] == [sum(k["found"] for k in kinds), sum(k["revisits"] for k in kinds), reverse]
+    assert sum(road["loops"]["wrong"] for road in roads) == 0
+    (shares,) = re.findall(r"error after loops is (\d+) to (\d+) % of that", text("README.md"))
+    left = [100 * road["slam"]["ape_rmse_m"] / road["odometry"]["ape_rmse_m"] for road in roads]
+    assert equals(shares[0], min(left))
+    assert equals(shares[1], max(left))
+    (written,) = re.findall(
+        r"in ([\d.]+) s: ATE ([\d.]+) m \(odometry ([\d.]+), plain least squares (\d+)\)", text("README.md")
+    )
+    most = graph["kitti_00"]["0.00"]
+    of = (most["seconds"], most["ate_m"], most["odometry_ate_m"], most["least_squares"]["ate_m"])
+    assert all(map(equals, written, of))
+
+
 def test_bold_is_what_is_best() -> None:
     """Of each drive and figure, and nothing else: the reader looks at what is bold."""
     heading = "| drive | method | RPE m | RPE deg | ATE m | t_err % | drift % | frames/s | CPU ms per frame |"

@@ -17,7 +17,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from dpm2_core.config import Settings
 from dpm2_core.data.packed import PackedDrive, Sample, open_packed
-from dpm2_core.errors import Dpm2Error
+from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Array
 from dpm2_core.learning.augment import AugmentSettings, augment
 from dpm2_core.network.pyramid import MIN_POINTS, PointBatch, Pyramid, build_pyramid, collate
@@ -116,6 +116,8 @@ class Mixture:
             drives += found
             factors = [settings.emphasis.get(str(drive.about.get("preset")), 1.0) for drive in found]
             chances += [weight * factor * len(drive) / frames for drive, factor in zip(found, factors, strict=True)]
+        if not drives:
+            raise UsageError("data.packed: want packed drives; `dpm2 train data` and `dpm2 train pack` make some")
         self.drives: Sequence[PackedDrive] = drives
         self.chances = np.array(chances) / sum(chances)
 

@@ -30,4 +30,4 @@ class OdometrySettings(Settings):
     then goes on from the predicted pose, with the uncertainty that the pause deserves."""
     pause: float = 0.65
     """Seconds without a registration after which one scan alone is no longer accepted; in a stream of fewer frames
-    per second 1.5 of its periods."""
+    per second 1.5 of its periods, and 2 s where a node has left clouds out for want of time."""

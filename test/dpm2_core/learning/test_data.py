@@ -17,7 +17,7 @@ from dpm2_core.descriptors import Descriptors, merge
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.geometry import se3
 from dpm2_core.learning.augment import AugmentSettings, augment
-from dpm2_core.learning.dataset import DataSettings, GroupDataset, draw_group
+from dpm2_core.learning.dataset import DataSettings, GroupDataset, Mixture, draw_group
 from dpm2_core.learning.pair_sampling import merge_tokens, sample_set_pairs
 from dpm2_core.learning.train_overlap import average_precision, draw_overlap
 from dpm2_core.network.model import DeepPointMap2
@@ -48,6 +48,11 @@ def test_an_unfinished_drive_is_not_opened(packed: Path, samples: list[Sample], 
     write_packed(root / "new", samples, {})
     assert [drive.name for drive in open_packed(root)] == ["new"]
     assert not (root / "new.part").exists()
+
+
+def test_without_a_drive_there_is_nothing_to_learn() -> None:
+    with pytest.raises(UsageError, match=r"data\.packed: want packed drives"):
+        Mixture(DataSettings())
 
 
 def test_foreign_folders_are_rejected(tmp_path: Path) -> None:
