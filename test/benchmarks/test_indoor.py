@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import indoor
+from benchmarks import indoor, indoor_places
 from benchmarks.harness import Options
 
 
@@ -15,6 +15,7 @@ from benchmarks.harness import Options
 def test_a_few_scans_of_a_building_are_evaluated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(indoor, "WORLDS", {"building": ("indoor", 900, 12)})
     monkeypatch.setattr(indoor, "LENGTHS", (0.5,))
+    monkeypatch.setattr(indoor_places, "VISITS", 4)
     options = Options(threads=1, out=tmp_path, overrides=["slam.loops.descriptors=false"])
     results = indoor.bench_indoor(options).results
     assert results["beams"] == indoor.BEAMS
@@ -22,5 +23,6 @@ def test_a_few_scans_of_a_building_are_evaluated(tmp_path: Path, monkeypatch: py
     assert (row["frames"], row["failed_frames"], row["breaks"]) == (12, 0, 0)
     assert row["keyframes"] >= 1
     assert row["loops"] >= row["wrong_loops"] == 0
+    assert (row["relocalisation"]["visits"], sum(row["joins"].values())) == (4, 6)
     for kind in ("odometry", "slam"):
         assert 0 < row[kind]["ape_rmse_m"] < 0.1  # m, in a room
