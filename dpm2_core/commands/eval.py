@@ -63,8 +63,11 @@ def _of_drive(path: Path, settings: list[str]) -> Trajectory:
     if source.poses is None:
         raise UsageError(f"{path}: the drive has no ground truth")
     T = np.eye(4) if source.T_cam_lidar is None else source.T_cam_lidar
-    numbers = getattr(source, "numbers", np.arange(len(source)))  # those in the file names
+    numbers = getattr(source, "numbers", None)  # those in the file names
+    numbers = np.arange(len(source)) if numbers is None else numbers
     known = np.isfinite(source.poses).all((1, 2))
+    if not known.any():
+        raise UsageError(f"{path}: no frame has a pose; {'; '.join(source.notes)}")
     return Trajectory(T @ source.poses[known] @ se3.inverse(T), numbers[known], "kitti-indexed")
 
 

@@ -37,6 +37,7 @@ IMU = "sensor_msgs/msg/Imu"
 FIX = "sensor_msgs/msg/NavSatFix"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 _TRUTH = ("nav_msgs/msg/Odometry", "nav_msgs/msg/Path")
+_SWEEP = 100_000_000  # ns: so far beyond its stamp may the last point of a cloud be, up to which the IMU is wanted
 _TRUTH_GAP = 1_000_000_000  # ns between two true poses beyond which nothing is known in between
 
 
@@ -112,7 +113,14 @@ class BagSource:
     @cached_property
     def poses(self) -> Array | None:
         """(len, 4, 4) T_world_lidar ground truth interpolated at the stamps, NaN where there is none; None without."""
-        return interpolate(*self._truth(self.truth), self.stamps) if self.truth else None
+        if not self.truth:
+            return None
+        stamps, T = self._truth(self.truth)
+        poses = interpolate(stamps, T, self.stamps)
+        if missing := int(np.isnan(poses[:, 0, 0]).sum()):
+            times = f"poses from {_span(stamps)}, clouds from {_span(self.stamps)}"
+            self._note_once(f"{self.truth}: {missing} of {len(poses)} frames have no pose", times)
+        return poses
 
     @cached_property
     def truth(self) -> str:
@@ -161,7 +169,8 @@ class BagSource:
         silent = [topic for topic, kind in self._bag.types.items() if kind in IMAGES and topic not in (*found, second)]
         if silent and not asked:
             self.notes.append(f"no message on the image topic {', '.join(silent)}")
-        return self._one_of(found, asked, topics.IMAGE, "image", "images")
+        usual = topics.IMAGE if topics.IMAGE in found else topics.IMAGE.removesuffix("_raw")  # two kinds of kitti2bag
+        return self._one_of(found, asked, usual, "image", "images")
 
     def _choose_imu(self) -> str:
         """An IMU's topic, empty for none."""
@@ -215,7 +224,8 @@ class BagSource:
         the buffer then."""
         known, offset = self._calibration, round(self._settings.image_time_offset * 1e9)
         others = dict.fromkeys((camera.topic for camera in known.cameras), offset)
-        others |= dict.fromkeys(filter(None, (known.second_topic, self.imu_topic)), 0)
+        others |= dict.fromkeys(filter(None, (known.second_topic,)), 0)
+        others |= dict.fromkeys(filter(None, (self.imu_topic,)), -_SWEEP)
         beside = {topic: Beside(self._settings.image_tolerance) for topic in others if topic != self.imu_topic}
         gnss = known.gnss_topic  # nobody waits for fixes: a late one has its place on the way, too
         messages = self._bag.messages([self.points_topic, *others, *([gnss] if gnss else [])])
@@ -241,10 +251,12 @@ class BagSource:
 
     def _truth(self, topic: str) -> tuple[Stamps, Array]:
         """Stamps (M,) ns and T_world_lidar (M, 4, 4); of several Path messages the last, the most complete, counts."""
-        decoded = [self._bag.decode(topic, data) for _, _, data in self._bag.messages([topic])]
+        raw = [(time, data) for _, time, data in self._bag.messages([topic])]
+        decoded = [self._bag.decode(topic, data) for _, data in raw]
         is_path = self._bag.types[topic] == _TRUTH[1]
         stamped: list[Any] = decoded[-1].poses if is_path else decoded
-        stamps = np.array([stamp_ns(item.header) for item in stamped], np.int64)
+        of_items = (stamp_ns(i.header) for i in stamped) if is_path else (serialized_stamp(d, t) for t, d in raw)
+        stamps = np.fromiter(of_items, np.int64)
         T = np.array([transform_matrix(item.pose if is_path else item.pose.pose) for item in stamped]).reshape(-1, 4, 4)
         child = "" if is_path or not decoded else decoded[0].child_frame_id
         if child and child != self.lidar_frame:
@@ -258,6 +270,10 @@ class BagSource:
     def _note_once(self, what: str, detail: str) -> None:
         if not any(note.startswith(what) for note in self.notes):
             self.notes.append(f"{what} ({detail})")
+
+
+def _span(stamps: Stamps) -> str:
+    return f"{stamps.min() * 1e-9:.3f} to {stamps.max() * 1e-9:.3f} s" if len(stamps) else "none"
 
 
 def interpolate(stamps: Stamps, poses: Array, at: Stamps) -> Array:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
+from decimal import Decimal
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -23,16 +24,17 @@ from dpm2_core.frame import Array, Frame
 SUFFIXES = (".pcd", ".ply")
 _PERIOD = 0.1  # s between scans whose names are no times
 _PAIR = re.compile(r"(?:.*\D)?(\d{9,10})[_-](\d{1,9})")
-"""Seconds and nanoseconds since 1970, as ROS has them."""
-_EPOCHS = ((1e8, 1e11, 1.0), (1e11, 1e14, 1e-3), (1e14, 1e17, 1e-6), (1e17, 1e20, 1e-9))
-"""From, to, s: a number in a name that is a time since 1970 after 1973."""
+"""Seconds since 1970 and their fraction, of 3, 6 or 9 digits; nanoseconds also without the zeros before them."""
+_EPOCHS = ((10**8, 10**11, 10**9), (10**11, 10**14, 10**6), (10**14, 10**17, 10**3), (10**17, 10**20, 1))
+"""From, to, ns: a number in a name that is a time since 1970 after 1973."""
 
 
 class CloudFolder:
     """Scans in the order of the numbers in their names. See `Source`; neither images nor ground truth.
 
     Fields are those of PointCloud2: intensity, and the time of each point, under their usual names. The stamp is the
-    number in the name where all of them are times since 1970 (s, ms, us or ns), else they are 0.1 s apart.
+    last number in the name where all of them are times since 1970 (s, ms, us or ns), or the last two, seconds and their
+    fraction; else they are 0.1 s apart.
 
     Raises:
         UsageError: no such file in the folder, or what reads PCD is not installed.
@@ -48,12 +50,16 @@ class CloudFolder:
         found = [file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES] if folder.is_dir() else []
         if not found:
             raise UsageError(f"{folder}: no .pcd or .ply file in this folder")
-        numbers = _numbers(found)
-        self._files = sorted(found, key=lambda file: (numbers[file] is None, numbers[file] or 0, file.name))
+        times = _times(found)
+        if times:
+            self._files = [found[i] for i in np.argsort(times)]
+            self.stamps = np.sort(np.array(times, np.int64))
+        else:
+            self._files = sorted(found, key=lambda file: (not _numbers(file), _numbers(file), file.name))
+            self.stamps = np.round(np.arange(len(found)) * _PERIOD * 1e9).astype(np.int64)
         if any(file.suffix.lower() == ".pcd" for file in self._files):
             _pcd_type()  # now, rather than at the first scan
         self._frames = FrameBuilder(settings or InputSettings(), Calibration(str(folder)), self.notes.append)
-        self.stamps = _stamps([numbers[file] for file in self._files])
 
     def __len__(self) -> int:
         return len(self._files)
@@ -98,20 +104,19 @@ def _pcd_type() -> Any:
     return PointCloud
 
 
-def _numbers(files: list[Path]) -> dict[Path, float | None]:
-    """The last number in each name, 12 of scan_012.pcd; ns where all names end in seconds and nanoseconds."""
+def _numbers(file: Path) -> list[Decimal]:
+    """All numbers in a name, the first first: of 2023-11-14_22-13-20_750 as of scan_012."""
+    return [Decimal(number) for number in re.findall(r"\d+(?:\.\d+)?", file.stem)]
+
+
+def _times(files: list[Path]) -> list[int]:
+    """ns of each file; empty where they are not all times since 1970, each another one."""
     pairs = [match for file in files if (match := _PAIR.fullmatch(file.stem))]
-    if len(pairs) == len(files) and max(len(match[2]) for match in pairs) == 9:
-        return {file: int(match[1]) * 10**9 + int(match[2]) for file, match in zip(files, pairs, strict=True)}
-    found = {file: re.findall(r"\d+(?:\.\d+)?", file.stem) for file in files}
-    return {file: float(numbers[-1]) if numbers else None for file, numbers in found.items()}
-
-
-def _stamps(numbers: list[float | None]) -> NDArray[np.int64]:
-    """ns, of the numbers in order."""
-    known = [number for number in numbers if number is not None]
-    for low, high, scale in _EPOCHS:
-        if len(set(known)) == len(numbers) and low <= known[0] and known[-1] < high:
-            # Integers, which are ns, as they are: a float64 of this size is 256 ns off.
-            return np.array([n if isinstance(n, int) else round(n * scale * 1e9) for n in known], np.int64)
-    return np.round(np.arange(len(numbers)) * _PERIOD * 1e9).astype(np.int64)
+    widths = {len(match[2]) for match in pairs}
+    if len(pairs) == len(files) and (max(widths) == 9 or widths in ({6}, {3})):
+        found = [int(match[1]) * 10**9 + int(match[2]) * 10 ** (9 - max(widths)) for match in pairs]
+    else:
+        last = [numbers[-1] for file in files if (numbers := _numbers(file))]
+        of = ((low, high, ns) for low, high, ns in _EPOCHS if all(low <= number < high for number in last))
+        found = [round(number * ns) for *_, ns in of for number in last]
+    return found if len(set(found)) == len(files) else []

@@ -136,10 +136,10 @@ def decode_camera(info: Any, T_lidar_cam: Array, name: str) -> Camera:
 
 
 def info_of(topic: str, info: Any) -> Any:
-    """The CameraInfo of a topic's images: of image_rect and the like, which image_proc publishes beside the CameraInfo
-    of the raw image, one without distortion, so that P counts."""
+    """The CameraInfo of a topic's images: without distortion, so that P counts, for image_rect and the like, which
+    image_proc publishes beside the CameraInfo of the raw image, and for KITTI's, as kitti2bag does."""
     name = topic.removesuffix("/compressed").rpartition("/")[2]
-    if not name.startswith("image_rect") or not info.p[0]:
+    if not (name.startswith("image_rect") or topic.startswith("/kitti/")) or not info.p[0]:
         return info
     return SimpleNamespace(header=info.header, width=info.width, height=info.height, k=info.k, p=info.p, d=[],
                            distortion_model=info.distortion_model)  # fmt: skip

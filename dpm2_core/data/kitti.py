@@ -186,12 +186,18 @@ class KittiSource:
         return se3.inverse(self.T_cam_lidar) @ T_world_cam @ self.T_cam_lidar
 
     def _of_each_scan(self, rows: Array) -> Array:
-        """The row of each scan: by frame number if there are enough, else counted from the first scan; NaN beyond."""
-        if len(rows) > self.numbers[-1]:
+        """The row of each scan, NaN where there is none.
+
+        By frame number where there are enough rows or the scans begin at 0, else one after the other where they are as
+        many. Of others nothing says which is whose.
+        """
+        out = np.full((len(self), rows.shape[1]), np.nan)
+        if len(rows) == len(self) <= self.numbers[-1]:
+            at = np.arange(len(self))
+        elif len(rows) > self.numbers[-1] or self.numbers[0] == 0:
             at = self.numbers
         else:
-            at = np.arange(len(self)) if len(rows) == len(self) else self.numbers - self.numbers[0]
-        out = np.full((len(self), rows.shape[1]), np.nan)
+            return out
         out[at < len(rows)] = rows[at[at < len(rows)]]
         return out
 

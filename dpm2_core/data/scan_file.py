@@ -23,7 +23,15 @@ def read_scan(path: Path) -> tuple[Points, str | None]:
         return nothing, f"{path}: {error.strerror}"
     if size % 16:
         return nothing, f"{path}: {size} bytes are no whole number of points (16 bytes each)"
+    if size % 20 == 0 and _are_rings(values[4::5]) and not _are_rings(values[::5]):
+        return nothing, f"{path}: 5 numbers a point, the last a ring, as nuScenes has them; want 4"
     return values.reshape(-1, 4), None
+
+
+def _are_rings(values: NDArray[np.float32]) -> bool:
+    """Whether all are whole numbers, not all the same, of so many beams as a LiDAR has."""
+    whole = (values >= 0) & (values < 256) & (values == np.floor(values))
+    return len(values) > 0 and bool(whole.all()) and bool(np.ptp(values) > 0)
 
 
 def read_image(path: Path) -> NDArray[np.uint8] | None:

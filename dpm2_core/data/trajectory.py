@@ -128,13 +128,16 @@ def _poses(rows: Array, columns: int) -> tuple[Array, NDArray[np.bool_]]:
 def matched(gt: Trajectory, est: Trajectory, tolerance: float = 0.01) -> tuple[Array, Array]:
     """Ground truth (N, 4, 4) and the estimate (N, 4, 4) of the same frames, NaN where it has none.
 
-    By stamp (nearest within `tolerance`, s) if both are TUM, by frame number if one carries it, else line by line.
+    By stamp (nearest within `tolerance`, s) if both are TUM, by frame number if one carries it and the other has a line
+    for each number, else line by line.
 
     Raises:
         UsageError: nothing says which pose belongs to which, or none belong together.
     """
     stamped = gt.kind == est.kind == "tum"
     numbered = "tum" not in (gt.kind, est.kind) and "kitti-indexed" in (gt.kind, est.kind)
+    if numbered and est.kind == "kitti" and len(est) <= gt.keys.max():  # of some frames: their lines are no numbers
+        numbered = False
     if not stamped and not numbered:
         if len(gt) == len(est):
             return gt.poses, est.poses
@@ -144,13 +147,15 @@ def matched(gt: Trajectory, est: Trajectory, tolerance: float = 0.01) -> tuple[A
         )
     gt_keys, order = np.unique(gt.keys, return_index=True)
     gt_poses = gt.poses[order]
-    rows, near = _nearest(gt_keys, est.keys, round(tolerance * 1e9) if stamped else 0)
-    if not near.any():
+    rows, apart = _nearest(gt_keys, est.keys)
+    near = np.flatnonzero(apart <= (round(tolerance * 1e9) if stamped else 0))
+    if not len(near):
         unit = "time stamp" if stamped else "frame number"
         raise UsageError(f"no {unit} of the estimate ({est.keys[0]}...) is one of the ground truth ({gt.keys[0]}...)")
-    rows, first = np.unique(rows[near], return_index=True)  # of several for one frame (a looped bag) the first
+    near = near[np.argsort(apart[near], kind="stable")]  # of several for one frame the nearest, or the first (a loop)
+    rows, first = np.unique(rows[near], return_index=True)
     est_poses = np.full_like(gt_poses, np.nan)
-    est_poses[rows] = est.poses[near][first]
+    est_poses[rows] = est.poses[near[first]]
     if stamped and _period(gt_keys) < 0.75 * _period(est.keys):
         # Ground truth of a faster clock (GNSS, motion capture): the frames are those of the estimate.
         return gt_poses[rows], est_poses[rows]
@@ -162,9 +167,9 @@ def _period(keys: Keys) -> float:
     return float(np.median(np.diff(keys))) if len(keys) > 1 else 0.0
 
 
-def _nearest(keys: Keys, requested: Keys, tolerance: int) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Row of the nearest of ascending `keys` for each wanted one, and whether it is within the tolerance."""
+def _nearest(keys: Keys, requested: Keys) -> tuple[NDArray[np.intp], Keys]:
+    """Row of the nearest of ascending `keys` for each wanted one, and how far it is."""
     right = np.clip(np.searchsorted(keys, requested), 0, len(keys) - 1)
     left = np.maximum(right - 1, 0)
     rows = np.where(np.abs(keys[left] - requested) <= np.abs(keys[right] - requested), left, right)
-    return rows, np.abs(keys[rows] - requested) <= tolerance
+    return rows, np.abs(keys[rows] - requested)

@@ -6,6 +6,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from dpm2_core.data.source import Source
 from dpm2_core.data.trajectory import Trajectory, read_trajectory
 from dpm2_core.errors import UsageError
@@ -27,10 +29,11 @@ def read_ground_truth(source: Source, path: Path | None, start: int, stop: int) 
     truth = read_trajectory(path)
     if truth.kind == "tum" or truth.kind == "kitti-indexed":
         return truth
-    if len(truth) < len(source):
+    numbers = getattr(source, "numbers", None)  # those in the file names; a bag has none
+    if len(truth) < len(source) or (len(truth) > len(source) and numbers is None):
         raise UsageError(f"{path}: {len(truth)} poses for {len(source)} frames of {source.name}")
-    if len(truth) > len(source):  # a file of the whole sequence beside an excerpt: KITTI's frame numbers say which
-        numbers = [frame.index for frame in source.frames(start, stop)]
+    if len(truth) > len(source):  # a file of the whole sequence beside an excerpt
+        numbers = np.asarray(numbers)[start:stop]
         if max(numbers) >= len(truth):
             raise UsageError(f"{path}: {len(truth)} poses, but {source.name} has frame {max(numbers)}")
         poses = truth.poses[numbers]

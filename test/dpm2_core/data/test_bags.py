@@ -378,6 +378,21 @@ def test_odometry_is_interpolated_at_the_clouds(bags: Any, tmp_path: Path, child
     assert np.isnan(poses[3]).all()
 
 
+def test_a_truth_of_another_time_is_said(bags: Any, tmp_path: Path) -> None:
+    """As by a clock that counts leap seconds; a stamp of zero is that of the recording."""
+    messages = [*clouds(bags, [1, 1.5]), *((t, "/truth", bags.odometry(t + 37, 0)) for t in (1, 1.5))]
+    messages += [(t, "/unstamped", bags.odometry(0, x)) for t, x in ((1, 10), (1.5, 20))]
+    bag = bags.write(tmp_path / "b", by_time(messages))
+    source = BagSource(bag, InputSettings(ground_truth_topic="/truth"))
+    assert source.poses is not None
+    assert np.isnan(source.poses).all()
+    (note,) = source.notes
+    assert note.startswith("/truth: 2 of 2 frames have no pose (poses from 38.000 to 38.500 s, clouds from 1.000")
+    unstamped = BagSource(bag, InputSettings(ground_truth_topic="/unstamped")).poses
+    assert unstamped is not None
+    np.testing.assert_allclose(unstamped[:, 0, 3], [10, 20])
+
+
 def test_a_path_is_ground_truth(bags: Any, tmp_path: Path) -> None:
     stamped = [bags.new("geometry_msgs/PoseStamped", header=o.header, pose=o.pose.pose)
                for o in (bags.odometry(1, 5.0), bags.odometry(2, 6.0))]  # fmt: skip

@@ -68,6 +68,24 @@ def test_names_that_are_seconds_and_nanoseconds(tmp_path: Path, name: str) -> No
     assert [frame.points[0, 0] for frame in frames] == [1, 2, 3, 4, 5]
 
 
+@pytest.mark.parametrize(
+    "names",
+    [
+        [f"{EPOCH + n // 10}_{n % 10}50000" for n in range(8, 13)],
+        [f"{EPOCH + n // 10}_{n % 10}50" for n in range(8, 13)],
+        [f"20231114_2213{59 + n // 10 * 41}_{n % 10}50" for n in range(8, 13)],
+        [f"2023-11-14-22-13-{n}" for n in (8, 9, 10, 58, 59)],
+        [f"run2_{n}" for n in (9, 10, 11, 100, 101)],
+    ],
+)
+def test_names_of_several_numbers_are_in_the_order_of_all(tmp_path: Path, names: list[str]) -> None:
+    for n, name in enumerate(names):
+        write_ply(tmp_path / f"{name}.ply", np.zeros((5, 4), np.float32) + n + 1)
+    frames = [*CloudFolder(tmp_path).frames()]
+    assert [frame.points[0, 0] for frame in frames] == [1, 2, 3, 4, 5]
+    assert np.diff([frame.stamp for frame in frames]).tolist() == [10**8] * 4
+
+
 def test_a_damaged_file_is_a_failed_frame(tmp_path: Path) -> None:
     for n in range(4):
         write_pcd(tmp_path / f"{n}.pcd", "binary", n)

@@ -229,6 +229,30 @@ def test_a_damaged_calibration_is_named(kitti_folder: MakeFolder, line: str, mes
         KittiSource(folder)
 
 
+def test_files_that_end_before_an_excerpt_does_are_not_shifted_to_its_start(kitti_folder: MakeFolder) -> None:
+    """Rows are neither one for each scan nor enough for their numbers: nobody knows whose they are."""
+    folder = kitti_folder(numbers=[20, 21, 23])
+    (folder / "times.txt").write_text("".join(f"{0.2 * n}\n" for n in range(22)))
+    (folder / "poses.txt").write_text("".join(f"1 0 0 0 0 1 0 0 0 0 1 {n}\n" for n in range(22)))
+    source = KittiSource(folder, InputSettings(kitti_poses="semantic_kitti"))
+    assert source.poses is not None
+    assert np.isnan(source.poses).all()
+    np.testing.assert_array_equal(source.stamps, [0, 100_000_000, 300_000_000])
+    assert any("3 of 3 frames have no pose" in note for note in source.notes)
+    assert any("0.1 s apart" in note for note in source.notes)
+
+
+def test_scans_with_a_ring_of_each_point_are_refused(kitti_folder: MakeFolder, noise: np.random.Generator) -> None:
+    """nuScenes' five numbers a point would be read as four, rings and intensities as coordinates."""
+    folder, count = kitti_folder(), 32 * 8
+    points = np.c_[noise.uniform(-40, 40, (count, 3)), noise.uniform(0, 255, count), np.arange(count) % 32]
+    points.astype("<f4").tofile(folder / "velodyne" / "000001.bin")
+    frames = [*KittiSource(folder).frames()]
+    assert frames[1].problem is not None
+    assert "5 numbers a point" in frames[1].problem
+    assert [frame.problem for frame in frames if frame.index != 1] == [None] * 4
+
+
 def test_times_that_end_early_continue_at_their_pace(kitti_folder: MakeFolder) -> None:
     folder = kitti_folder()
     (folder / "times.txt").write_text("0\n0.2\n0.4\n")

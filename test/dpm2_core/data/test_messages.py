@@ -378,7 +378,7 @@ def test_camera_of_a_rectified_image_has_the_rectified_intrinsics() -> None:
 def test_the_info_of_a_raw_image_beside_its_rectified_one(model: str) -> None:
     """image_proc publishes image_rect beside the CameraInfo of the raw image: P counts, without distortion."""
     raw = info(d=[0.1, 0.0, 0.0, 0.01], distortion_model=model, header=header())
-    for topic in ("/front/image_rect", "/front/image_rect_color/compressed"):
+    for topic in ("/front/image_rect", "/front/image_rect_color/compressed", "/kitti/camera_color_left/image_raw"):
         of_topic = image_messages.info_of(topic, raw)
         camera = image_messages.decode_camera(of_topic, np.eye(4), "front")
         assert (camera.K[0, 0], camera.distortion) == (480, ())

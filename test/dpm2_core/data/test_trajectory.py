@@ -104,6 +104,23 @@ def test_missing_frames_are_found_by_their_number() -> None:
     assert (_x(gt), _x(est)) == ([0, 1, 2, 3, 4], [None, 1, None, 3, None])
 
 
+def test_lines_are_numbers_only_where_there_is_one_for_each() -> None:
+    """Of an excerpt of frames 20 to 23: as many lines are its frames; enough for all numbers are those of the whole
+    drive; others nobody can place."""
+    gt = _trajectory([20, 21, 22, 23], "kitti-indexed")
+    assert _x(matched(gt, _trajectory([0, 1, 2, 3], "kitti"))[1]) == [0, 1, 2, 3]
+    assert _x(matched(gt, _trajectory(list(range(24)), "kitti"))[1]) == [20, 21, 22, 23]
+    with pytest.raises(UsageError, match=r"4 poses \(kitti-indexed\), the estimate 3 "):
+        matched(gt, _trajectory([0, 1, 2], "kitti"))
+
+
+def test_of_a_faster_estimate_the_nearest_counts() -> None:
+    """At 200 Hz, two samples lie within the tolerance on either side."""
+    ms = 10**6
+    gt = _trajectory([i * 100 * ms for i in range(11)], "tum")
+    assert _x(matched(gt, _trajectory([i * 5 * ms for i in range(201)], "tum"))[1]) == _x(gt.poses)
+
+
 def test_stamps_match_within_the_tolerance_and_in_any_order() -> None:
     s = 10**9
     gt = _trajectory([2 * s, 1 * s, 3 * s], "tum")
