@@ -27,6 +27,7 @@ from dpm2_ros.lockstep import ODOMETRY, Lockstep
 from dpm2_ros.message_types import message_type
 from dpm2_ros.runtime import STOP, end_ros, ros_context
 
+CLOCK = "/clock"
 LATCHED = (topics.TF_STATIC, topics.VERTICAL_ANGLE_CORRECTION)
 CLOCK_PERIOD = 0.01
 """Seconds between two /clock messages."""
@@ -69,7 +70,10 @@ class BagPlayer:
         once = [topic for topic in self._bag.topics(CAMERA_INFO) if self._bag.counts[topic] == 1]
         self._latched = (*LATCHED, *once)
         self._publishers = self._make_publishers()
-        self._clock = node.create_publisher(Clock, "/clock", 10) if options.clock else None
+        recorded = CLOCK in self._publishers
+        if recorded:
+            node.get_logger().info(f"{CLOCK} is that of the recording")
+        self._clock = node.create_publisher(Clock, CLOCK, 10) if options.clock and not recorded else None
         self._lockstep = Lockstep(node, self._bag, self._publishers) if options.lockstep else None
         self._published: list[str] = []  # lines of the log
         self._clouds = 0

@@ -91,6 +91,12 @@ class Feed:
         recent = time.monotonic() - SILENT
         return [name for name, s in self.robots.items() if name != self._robot and s.heard > recent]
 
+    @property
+    def odom_frames(self) -> set[str]:
+        """Of the odometries that are heard now."""
+        recent = time.monotonic() - SILENT
+        return {stream.odom_frame for stream in self.robots.values() if stream.live and stream.heard > recent}
+
     def tick(self) -> None:
         """Twice a second: decide what waits, and acknowledge what has arrived."""
         now = time.monotonic()
@@ -128,8 +134,13 @@ class Feed:
         main = [self._robot] if self._robot in known else []
         for robot in (*main, *reversed(known)):  # of two that use the same frame the first
             if known[robot].odom_frame == frame and known[robot].live:
-                self._mapper.broadcast(stamp_ns(message.header), robot, frame)
+                if not self._has_begun_anew(known[robot]):
+                    self._mapper.broadcast(stamp_ns(message.header), robot, frame)
                 return
+
+    def _has_begun_anew(self, drive: Stream) -> bool:
+        """Whether the robot of a drive has started again since it was heard: its odometry is that of another drive."""
+        return any(s.robot is None and s.live and drive.heard < s.since <= s.heard for s in self._streams.values())
 
     def _on_pose(self, message: Odometry) -> None:
         stream, id = self._hear(message.child_frame_id)

@@ -227,12 +227,15 @@ class Diagnostics:
         located, figures = mapper.located, {"keyframes of the map": str(mapper.keyframes)}
         if located is None:
             return self._status("localisation", WARN, f"{State.RELOCALIZING}: no keyframe yet", figures)
-        result, text = located.registration, str(located.state)
+        result, last, state = located.registration, self._health.last, located.state
+        if last is not None and last.state is State.LOST and state is not State.LOST:
+            return self._status("localisation", ERROR, f"{State.LOST}: the odometry is", figures)
+        text = str(state)
         if result.ok:
             figures |= {"confidence": f"{result.confidence:.2f}", "worst sigma (m)": f"{result.worst_sigma:.3f}"}
         else:
             text += f": {result.reason}"
-        return self._status("localisation", _LEVEL[located.state], text, figures)
+        return self._status("localisation", _LEVEL[state], text, figures)
 
     def _other_odometry(self, other: OtherOdometry) -> DiagnosticStatus:
         verdict = other.verdict
@@ -257,12 +260,22 @@ class Diagnostics:
 
     def _gnss(self) -> DiagnosticStatus:
         inputs, problem, located = self._inputs, self._frames.gnss_problem, None
-        if not problem and not inputs.gnss_received:
-            problem = f"no fix on {inputs.calibration.gnss_topic} yet"
+        problem = problem or self._fix_problem()
         if self._mapper is not None:
             located = self._mapper.slam.mapper.georeference
         text = "in use" if located is not None else "the map's place on Earth is not known yet"
         return self._status("gnss", WARN if problem else OK, problem or text, {"received": inputs.gnss_received})
+
+    def _fix_problem(self) -> str:
+        """Why no fix comes, or none is of use, in words; else empty."""
+        last, clouds, topic = self._inputs.gnss_last, self._inputs.times, self._inputs.calibration.gnss_topic
+        if last is None:
+            return f"no fix on {topic} yet"
+        stamp, arrival = last
+        if (silence := time.monotonic() - arrival) > SILENT:
+            return f"no fix on {topic} for {silence:.0f} s"
+        ahead = (stamp - clouds[0]) * 1e-9 if clouds else 0.0
+        return f"stamps of another clock, {ahead:+.0f} s from the clouds'" if abs(ahead) > OTHER_CLOCK + SILENT else ""
 
     def _beside(self, part: str, what: str, topic: str) -> DiagnosticStatus:
         """Of a sensor beside the LiDAR and its messages, in words, and their topic."""

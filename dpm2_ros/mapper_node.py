@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from contextlib import ExitStack
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -103,6 +104,11 @@ class MapperNode(ManagedNode):
         response.success, response.message = True, "the map is saved, and begins again empty"
         return response
 
+    def _shared_frames(self) -> list[str]:
+        """Odometry frames of robots in several namespaces that are heard now."""
+        counts = Counter(frame for feed in self._feeds.values() for frame in feed.odom_frames)
+        return sorted(frame for frame, count in counts.items() if count > 1)
+
     def _statuses(self) -> list[DiagnosticStatus]:
         now, figures = time.monotonic(), {}
         beside = [name for feed in self._feeds.values() for name in feed.beside]
@@ -112,5 +118,9 @@ class MapperNode(ManagedNode):
         text = f"{len(figures)} robots"
         if beside:
             text += f"; two in one namespace: {', '.join(beside)} kept apart"
-        robots = status(self, "robots", WARN if beside else OK, text, figures)
+        if shared := self._shared_frames():
+            text += f"; one odom_frame of two robots: {', '.join(shared)}; give each its own"
+            problem = f"map -> {shared[0]} jumps between two robots: give each its ros.odom_frame"
+            self.get_logger().error(problem, once=True)
+        robots = status(self, "robots", WARN if beside or shared else OK, text, figures)
         return [mapper_status(self, self._map), robots, message_status(self)]

@@ -182,7 +182,7 @@ class MapperThread:
 
     def reset(self) -> None:
         """Save the map and begin an empty one; where it cannot be saved, it goes on."""
-        self._submit(self._reset)
+        self._restarted = self._submit(self._reset)
 
     def close(self) -> None:
         """Finish what is waiting, save the map, end the thread.

@@ -245,7 +245,8 @@ class SlamNode(ManagedNode):
         self._odom.publish(odometry_to_msg(motion, covariance, seconds, ros.own_frame, self._base.name))
         if self._other is None or ros.invert_odom_tf:
             self._tf.send(motion.T_odom_body, motion.stamp, self._base.name)
-        self._send_map(motion)
+        if not (tracked.state is State.LOST and self._mapper is not None and self._mapper.localizing):
+            self._send_map(motion)  # where the map does not grow nobody is in it by an odometry that is lost
 
     def _send_map(self, motion: BodyMotion) -> None:
         """Where odom is: in the map, or, where the mapper is elsewhere, another's in our own."""

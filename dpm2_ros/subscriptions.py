@@ -49,7 +49,8 @@ class Inputs:
 
     Attributes:
         imu: its samples; None where none is wanted. imu_received: messages so far.
-        gnss: its fixes; None where none are wanted. gnss_received: messages so far.
+        gnss: its fixes; None where none are wanted. gnss_received: messages so far. gnss_last: stamp, ns, and arrival,
+            s, of the last.
         calibration: what is known by now; its topics are full names, after remapping.
     """
 
@@ -65,6 +66,7 @@ class Inputs:
         self.imu = ImuBuffer() if settings.imu else None
         self.imu_received = 0
         self.gnss, self.gnss_received = FixBuffer() if settings.gnss_topic else None, 0
+        self.gnss_last: tuple[int, float] | None = None
         self._image_shift = round(settings.image_time_offset * 1e9)
         self._arrived = threading.Condition()
         beside = [camera.topic for camera in self.calibration.cameras]
@@ -217,8 +219,9 @@ class Inputs:
     def _on_fix(self, message: NavSatFix) -> None:
         check_header(message.header)
         if self.gnss is not None:
-            self.gnss.add(self._stamp(message), message)
-            self.gnss_received += 1
+            stamp = self._stamp(message)
+            self.gnss.add(stamp, message)
+            self.gnss_received, self.gnss_last = self.gnss_received + 1, (stamp, time.monotonic())
 
     def _stamp(self, message: Any) -> int:
         """ns; drivers that leave the stamp at 0 get the time of arrival."""

@@ -43,6 +43,8 @@ class IsLocated(py_trees.behaviour.Behaviour):
 
     def update(self) -> Status:
         """As py_trees calls it."""
+        if self._localization.state == "unknown":  # before the first diagnostics
+            return Status.RUNNING
         return Status.SUCCESS if self._localization.state in LOCATED else Status.FAILURE
 
 

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
@@ -113,6 +114,21 @@ def test_it_loops_until_it_is_stopped(listener: Listener, bag: Path, drive: Any)
     assert "Traceback" not in listener.output()
     stamps = [stamp_ns(message.header) for message in listener.clouds]
     assert stamps[drive.frames : 2 * drive.frames] == stamps[: drive.frames]
+
+
+def test_a_recorded_clock_is_the_only_one(listener: Listener, tmp_path: Path) -> None:
+    """Of a simulation, whose time is not that of the recording."""
+    types = get_typestore(Stores.ROS2_JAZZY)
+    Time, RecordedClock = types.types["builtin_interfaces/msg/Time"], types.types["rosgraph_msgs/msg/Clock"]
+    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connection = writer.add_connection("/clock", RecordedClock.__msgtype__, typestore=types)
+        for n in range(5):
+            message = types.serialize_cdr(RecordedClock(Time(100 + n, 0)), RecordedClock.__msgtype__)
+            writer.write(connection, 10**18 + n * 10**8, message)
+    assert listener.play(str(tmp_path / "bag"), "--wait", "90").wait(180) == 0, listener.output()
+    listener.harness.wait(lambda: len(listener.clock) == 5, "the clock")
+    assert [message.clock.sec for message in listener.clock] == [100, 101, 102, 103, 104]
+    assert "/clock is that of the recording" in listener.output()
 
 
 def test_it_waits_for_subscribers(ros: Callable[..., Any], bag: Path, tmp_path: Path, drive: Any) -> None:

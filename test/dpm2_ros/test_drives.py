@@ -11,7 +11,7 @@ import pytest
 from nav_msgs.msg import Odometry
 
 from dpm2_ros import feed
-from dpm2_ros.conversions import EARLIER, edge_to_msg
+from dpm2_ros.conversions import EARLIER, edge_to_msg, keyframe_name
 from dpm2_ros.tf import TFMessage
 
 from ..helpers.mapping import OTHER, S, core, keyframes, mapped, send_all
@@ -73,6 +73,25 @@ def test_what_is_left_of_an_earlier_drive_comes_before_the_next_one(mapper: Any)
     assert [k.robot for k in core(mapper).keyframes] == [""] * 6
     assert [k.id for k in core(mapper).keyframes] == [0, 1, 2, 3, 4, 5]
     assert [(e.from_node, e.to_node) for e in core(mapper).edges] == [(0, 1), (1, 2), (2, 3), (4, 5)]
+
+
+def test_a_robot_that_starts_again_is_not_put_where_its_drive_before_was(mapper: Any) -> None:
+    """Its odometry begins at zero; until the place of its new drive is decided, nobody knows where that is."""
+    odometry, heard = mapper.publisher(Odometry, "/dpm2/odom"), mapper.hear(TFMessage, "/tf")
+    mapper.wait(lambda: odometry.get_subscription_count() and mapper.mapper.count_subscribers("/tf"), "connections")
+    send_all(mapper, 0, 1)
+    mapper.wait(lambda: keyframes(mapper) == 2, "the drive")
+    odometry.publish(edge_to_msg(np.eye(4), np.eye(6), 5, "odom", "base"))
+    mapper.wait(lambda: len(heard) == 1, "/tf")
+    mapper.wires[0].publish(edge_to_msg(np.eye(4), np.eye(6) * 1e-4, 1000, "odom", keyframe_name("", 0, OTHER)))
+    time.sleep(0.5)
+    odometry.publish(edge_to_msg(np.eye(4), np.eye(6), 6, "odom", "base"))
+    time.sleep(1.0)
+    assert len(heard) == 1
+    send_all(mapper, 2)  # the drive before goes on: it was another robot's
+    time.sleep(0.5)
+    odometry.publish(edge_to_msg(np.eye(4), np.eye(6), 7, "odom", "base"))
+    mapper.wait(lambda: len(heard) == 2, "/tf again")
 
 
 @pytest.mark.usefixtures("quick")

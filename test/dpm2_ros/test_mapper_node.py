@@ -26,7 +26,7 @@ from dpm2_core.slam.store.map_data import load_map
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_ros import mapper_node
 from dpm2_ros.conversions import edge_to_msg, keyframe_name
-from dpm2_ros.keyframe_messages import descriptors_to_msg, payload_to_msgs
+from dpm2_ros.keyframe_messages import WIRE, descriptors_to_msg, payload_to_msgs
 from dpm2_ros.tf import TFMessage
 
 from ..helpers.mapping import S, core, keyframes, mapped, points, rejections, send_all
@@ -116,6 +116,28 @@ def test_map_to_odom_goes_out_with_every_odometry(mapper: Any) -> None:
     assert (transform.header.frame_id, transform.child_frame_id) == ("map", "odom")
     assert transform.header.stamp.nanosec == 77 + 500_000_000  # valid until the next one
     np.testing.assert_array_equal(transform_matrix(transform.transform), np.eye(4))
+
+
+def test_robots_whose_odometry_frames_have_one_name_are_reported(mapper: Any) -> None:
+    """map -> odom would be that of the one and of the other in turn."""
+    for robot in ("red", "blue"):
+        kinds = ((Odometry, "odom"), (PointCloud2, ""), (UInt8MultiArray, "cloud"))
+        topics = [f"/{robot}/dpm2/keyframe_{end}".rstrip("_") for _, end in kinds]
+        wires = [
+            mapper.node.create_publisher(kind, topic, WIRE) for (kind, _), topic in zip(kinds, topics, strict=True)
+        ]
+        mapper.wait(lambda wires=wires: all(wire.get_subscription_count() for wire in wires), "the mapper's ears")
+        name, before = keyframe_name(robot, 0), keyframes(mapper)
+        pose = edge_to_msg(np.eye(4), np.eye(6) * 1e-4, 1000, "odom", name)
+        keyframe = Keyframe(0, 1000, 0, np.eye(4), points(0).astype(np.float32))
+        for wire, message in zip(wires, (pose, *payload_to_msgs(keyframe, name)), strict=True):
+            wire.publish(message)
+        mapper.wait(lambda before=before: keyframes(mapper) > before, "its keyframe")
+
+    def said() -> bool:
+        return any("one odom_frame of two robots: odom" in s.message for m in mapper.diagnostics for s in m.status)
+
+    mapper.wait(said, "the report")
 
 
 def hostile_parts(id: int) -> list[Any]:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -57,8 +57,9 @@ class Localizer:
         self.state = State.RELOCALIZING
 
     def wants(self, stamp: int) -> bool:
-        """Whether to ask for a keyframe now (ns): while lost one looks once a second, also at a halt."""
-        return not self.state.located and (self._stamp is None or stamp - self._stamp >= _PATIENCE)
+        """Whether to ask for a keyframe now (ns): once a second, also at a halt, unless the map confirms the place."""
+        confirmed = self.state.located and self.state is not State.DEGRADED
+        return not confirmed and (self._stamp is None or stamp - self._stamp >= _PATIENCE)
 
     def restart(self) -> None:
         """The odometry has begun anew: one may be anywhere."""
@@ -102,6 +103,7 @@ class Localizer:
             near = meters <= 2.0 + 0.02 * self._distrust
             if not tracking or near or self._failures >= self._max_failures:
                 return self._located(keyframe, result, jumped=not (tracking and near))
+            result = replace(result, ok=False, reason=f"found {meters:.1f} m away, not confirmed yet")
         elif tracking:
             result = rejected
         if tracking:

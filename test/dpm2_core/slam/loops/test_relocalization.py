@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -142,3 +143,13 @@ def test_localization_tracks_notices_kidnapping_and_admits_being_lost(relocalize
     assert sigmas[-1] >= 100.0**2 * 0.99
     # back again
     assert localizer.add(keyframe(7, 70.0, broken)).state is State.RELOCALIZED
+    # one scan from elsewhere is not believed at once; at a halt one looks again after a second
+    assert localizer.add(keyframe(8, 72.0, broken)).state is State.TRACKING
+    elsewhere = replace(keyframe(9, 74.0, broken), cloud=keyframe(9, 95.0, broken).cloud)
+    doubted = localizer.add(elsewhere)
+    assert doubted.state is State.DEGRADED
+    assert re.search(r"found \d+\.\d m away, not confirmed yet", doubted.registration.reason)
+    assert not doubted.registration.ok
+    assert (localizer.wants(9 + 10**9 - 1), localizer.wants(9 + 10**9)) == (False, True)
+    localizer.add(keyframe(10, 76.0, broken))
+    assert not localizer.wants(10 + 10**9)
