@@ -14,7 +14,7 @@ from dpm2_core.config import load_settings
 from dpm2_core.console import Console
 from dpm2_core.data.corrupt import CorruptedSource, parse_corruption
 from dpm2_core.data.source import Source
-from dpm2_core.errors import UsageError
+from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.evaluation.live_view import LiveView
 from dpm2_core.evaluation.report import metrics_table
 from dpm2_core.pipeline import OfflineRun, Result, Watch, open_recording, save_config
@@ -125,7 +125,11 @@ def _drive(drive: OfflineRun, watch: Watch | None) -> Result:
 
 
 def _report(result: Result, out: Path, json_file: Path | None) -> None:
-    """Write the files, and say what came out."""
+    """Write the files, and say what came out.
+
+    Raises:
+        Dpm2Error: the map file is not complete.
+    """
     console, source = Console(stderr=True), result.source
     if result.interrupted:
         console.print(f"interrupted after {len(result)} frames; writing what there is", style="yellow")
@@ -133,8 +137,6 @@ def _report(result: Result, out: Path, json_file: Path | None) -> None:
         console.print(note, style="yellow", soft_wrap=True)
     if not result.connected:
         console.print("no place of this drive was found in the map: it stands in a frame of its own", style="yellow")
-    if problem := result.mapper.store_problem:
-        console.print(f"map file incomplete: {problem}", style="red", soft_wrap=True)
     for missing in result.save(out):
         console.print(missing, soft_wrap=True)
     metrics, sensor = result.metrics, "LiDAR" if source.T_cam_lidar is None else "left camera"
@@ -143,3 +145,5 @@ def _report(result: Result, out: Path, json_file: Path | None) -> None:
     figures = {"source": source.name, **result.timing, "metrics": None if metrics is None else metrics.model_dump()}
     show(shown, figures, json_file)
     console.print(f"Results in {out}", soft_wrap=True)
+    if problem := result.mapper.store_problem:
+        raise Dpm2Error(f"map file incomplete: {problem}")

@@ -26,7 +26,7 @@ from dpm2_core.fleet.regions import LARGEST, Join, solve
 from dpm2_core.fleet.run import View
 from dpm2_core.fleet.search import Search, affirmed, component
 from dpm2_core.slam.settings import SlamSettings
-from dpm2_core.slam.store.map_data import MapData, load_map, remove_map
+from dpm2_core.slam.store.map_data import MapData, load_map, move_map, remove_map
 from dpm2_core.slam.store.map_store import MapStore
 
 
@@ -175,11 +175,12 @@ def _anew(out: Path, search: Search, sizes: Mapping[str, int], joins: Sequence[J
         moved = {name: replace(maps[name], poses=region.poses[name]) for name in together}
         fresh = out.with_name(f".{out.name}.new")
         remove_map(fresh)
-        with MapStore.create(fresh) as store:
-            add_drives(store, {}, Growth(moved, enough), refused)
-        for suffix in ("-wal", "-shm"):  # of the map before, and of no other
-            out.with_name(f"{out.name}{suffix}").unlink(missing_ok=True)
-        fresh.replace(out)
+        try:
+            with MapStore.create(fresh) as store:
+                add_drives(store, {}, Growth(moved, enough), refused)
+            move_map(fresh, out)
+        finally:
+            remove_map(fresh)
     return Merged({name: sizes[name] for name in together}, {}, _rows([*enough, *refused]))
 
 

@@ -53,7 +53,7 @@ def write_grid(path: Path, grid: Grid) -> Path:
         "origin": [*grid.origin, 0.0],
         "negate": 0,
         "occupied_thresh": 0.65,
-        "free_thresh": 0.25,
+        "free_thresh": 0.196,  # below (255 - 205) / 255, which is unknown: map_server has no rule for 205 itself
     }
     with atomic_write(about) as file:
         yaml.safe_dump(content, file, sort_keys=False)

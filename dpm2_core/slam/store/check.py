@@ -57,7 +57,7 @@ def check_map(path: Path, recover: Path | None = None) -> Findings:
         copy = Path(folder) / "map"  # opening replays FILE-wal, which would change the damaged file
         for suffix in ("", "-wal"):
             with suppress(FileNotFoundError):
-                shutil.copyfile(f"{path}{suffix}", f"{copy}{suffix}")
+                shutil.copyfile(f"{path.resolve()}{suffix}", f"{copy}{suffix}")
         with closing(_opened(copy, path, findings)) as sql:
             data = _Salvage(sql, copy.stat().st_size // _SMALLEST, findings).run()
             findings.keyframes = len(data)

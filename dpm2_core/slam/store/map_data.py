@@ -184,7 +184,7 @@ def save_as(data: MapData, path: Path) -> None:
     try:
         with MapStore.create(part) as store:
             append_map(store, data)
-        part.replace(path)
+        move_map(part, path)
     except BaseException:
         remove_map(path)
         raise
@@ -219,6 +219,20 @@ def append_map(store: MapStore, data: MapData) -> int:
     trail = [replace(p, node=p.node + first, session=p.session + before) for p in data.trail]
     store.write(Change(edges=edges, trail=trail, georeference=None if first else data.georeference))
     return first
+
+
+def move_map(source: Path, target: Path) -> None:
+    """Give a map that was closed another name; the map that had it goes, with what SQLite keeps beside it.
+
+    Raises:
+        Dpm2Error: not all of it is in that one file, since the disk was full; the map that was there stays.
+    """
+    wal = Path(f"{source}-wal")
+    if wal.exists() and wal.stat().st_size:  # see MapStore.close; renamed without it, the map would be damaged
+        raise Dpm2Error(f"{target}: not written: the map could not be made one file; is the disk full?")
+    for suffix in ("-wal", "-shm"):  # of the map before, and of no other
+        Path(f"{target}{suffix}").unlink(missing_ok=True)
+    source.replace(target)
 
 
 def remove_map(path: Path) -> None:

@@ -71,6 +71,7 @@ class MapStore:
         self.path = path
         self.read_only = read_only
         self.session = 0
+        self._newest = 0  # number of the last session that this program has written
         self._connection = connection
         self._together = False
         self._copy: tempfile.TemporaryDirectory[str] | None = None
@@ -130,7 +131,7 @@ class MapStore:
         with self._transaction() as sql:
             number = sql.execute("SELECT coalesce(max(session), 0) + 1 FROM sessions").fetchone()[0]
             sql.execute("INSERT INTO sessions VALUES (?,?,?,?,?)", (number, __version__, started, config, weights))
-        self.session = int(number)
+        self.session = self._newest = int(number)
         return self.session
 
     def add_sessions(self, sessions: Iterable[Session]) -> None:
@@ -138,6 +139,7 @@ class MapStore:
         with self._transaction() as sql:
             rows = [(s.number, s.program, s.started, s.config, s.weights) for s in sessions]
             sql.executemany("INSERT INTO sessions VALUES (?,?,?,?,?)", rows)
+        self._newest = max([self._newest, *(row[0] for row in rows)])
 
     def write(self, change: Change, sessions: dict[int, int] | None = None) -> None:
         """Take a change in, whole or not at all. `sessions`: of nodes that are not of the present one.
@@ -146,6 +148,7 @@ class MapStore:
             Dpm2Error: it could not be written: a full disk, a read-only file, another writer.
         """
         with self._transaction() as sql:
+            self._check_alone(sql)
             for node, keyframe, cloud, thumbnail in change.keyframes:
                 session = (sessions or {}).get(node, self.session)
                 loan = cloud if isinstance(cloud, Loan) else None
@@ -164,6 +167,12 @@ class MapStore:
             _insert(sql, "trail", [removed_row(p) for p in change.trail])
             if change.georeference is not None:
                 _insert(sql, "georeference", [georeference_row(change.georeference)])
+
+    def _check_alone(self, sql: sqlite3.Connection) -> None:
+        """Two programs that go on from the same last keyframe would give the same number to different ones."""
+        newest = sql.execute("SELECT coalesce(max(session), 0) FROM sessions").fetchone()[0]
+        if self.session and newest > self._newest:
+            raise Dpm2Error(f"{self.path}: another program has begun to write to it")
 
     @property
     def size(self) -> int:
@@ -289,7 +298,7 @@ def _insert(sql: sqlite3.Connection, table: str, rows: Sequence[tuple[Any, ...]]
 
 
 def _connect(path: Path, mode: str) -> Connection:
-    return connect(path, mode, BUSY)
+    return connect(path.resolve(), mode, BUSY)
 
 
 def _durable(connection: sqlite3.Connection) -> None:
@@ -299,7 +308,7 @@ def _durable(connection: sqlite3.Connection) -> None:
 
 def _open_read_only(path: Path) -> MapStore:
     """As it lies there where it is whole; with FILE-wal as a reader of that; from a copy where not even that can be."""
-    wal = Path(f"{path}-wal")
+    wal = Path(f"{path.resolve()}-wal")  # SQLite names it after the file, not after a link to it
     if not wal.exists() or not wal.stat().st_size:
         if _head(path)[18] == 1:  # closed, with a journal on rollback: a reader leaves no trace
             return MapStore(path, _connect(path, "ro"), True)
@@ -324,7 +333,7 @@ def _copied(path: Path) -> MapStore:
     copy = Path(folder.name) / "map"
     for suffix in ("", "-wal"):
         with suppress(FileNotFoundError):
-            shutil.copyfile(f"{path}{suffix}", f"{copy}{suffix}")
+            shutil.copyfile(f"{path.resolve()}{suffix}", f"{copy}{suffix}")
     store = MapStore(path, _connect(copy, "rw"), True)
     store._copy = folder
     return store

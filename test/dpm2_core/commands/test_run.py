@@ -204,7 +204,9 @@ def test_full_disk_keeps_the_old_map(recording: Path, tmp_path: Path) -> None:
     assert not [path for path in out.iterdir() if path.suffix == ".part"]
 
 
-def test_interrupted_run_writes_what_there_is(sequence: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("another", [False, True])
+def test_interrupted_run_writes_what_there_is(sequence: Path, tmp_path: Path, another: bool) -> None:
+    """All, or all but the map file, which is said, where another program has begun to write to that meanwhile."""
     for i in range(FRAMES, 2000):  # the car stands still at the end, for longer than the test
         (sequence / "velodyne" / f"{i:06d}.bin").symlink_to(sequence / "velodyne" / f"{FRAMES - 1:06d}.bin")
     (sequence / "times.txt").write_text("".join(f"{0.1 * i:.1f}\n" for i in range(2000)))
@@ -217,9 +219,13 @@ def test_interrupted_run_writes_what_there_is(sequence: Path, tmp_path: Path) ->
     while not _keyframes(path):
         assert process.poll() is None
         time.sleep(0.05)
+    if another:
+        with MapStore.open(path, read_only=False) as store:
+            store.begin_session("", "")
     process.send_signal(signal.SIGINT)
     _, stderr = process.communicate(timeout=60)
-    assert process.returncode == 0, stderr
+    assert process.returncode == another, stderr
+    assert (f"map file incomplete: {path}: another program has begun to write to it" in stderr) == another
     assert "interrupted after" in stderr
     assert 1 <= len(read_trajectory(out / "trajectory_kitti.txt")) < 2000
 

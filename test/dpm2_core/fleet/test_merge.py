@@ -3,26 +3,33 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+from collections.abc import Collection
+from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from benchmarks.fleet_drives import poses_of, write_drive
-from dpm2_core.errors import UsageError
+from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.evaluation.metrics import ape_rmse
 from dpm2_core.fleet.cluster import Cluster
 from dpm2_core.fleet.drives import MAP
 from dpm2_core.fleet.joins import ENOUGH, stretches
 from dpm2_core.fleet.merge import merge
-from dpm2_core.fleet.part import DONE
+from dpm2_core.fleet.part import DONE, Figures, Part
 from dpm2_core.fleet.places import WIDTH, FleetIndex
+from dpm2_core.fleet.regions import Join
 from dpm2_core.sim.world import build_world
 from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.slam.store.check import check_map
-from dpm2_core.slam.store.map_data import load_map
+from dpm2_core.slam.store.map_data import MapData, load_map, save_as
 from dpm2_core.slam.store.map_store import MapStore
+from test.helpers.fleets import fleet_maps
+from test.helpers.full_disk import CHECKPOINT, largest_file
 
 NOISE = np.diag([1e-3] * 3 + [0.02] * 3) ** 2
 
@@ -80,6 +87,50 @@ def test_a_file_that_is_no_merge_is_not_replaced(tmp_path: Path) -> None:
     assert (tmp_path / "mine").read_text() == "precious"
     with pytest.raises(UsageError, match="no drive that is whole"):
         merge(tmp_path, tmp_path / "out", SlamSettings(), Cluster())
+
+
+class Found:
+    """A search that knows what there is."""
+
+    version = 1
+
+    def __init__(self, folder: Path, maps: dict[str, MapData], joins: list[Join]) -> None:
+        self.folder, self.settings = folder, SlamSettings()
+        self._maps, self._joins = maps, joins
+
+    def drives(self, left_out: dict[str, str]) -> dict[str, Part]:
+        return {name: Part(name, "", {"version": self.version}) for name in self._maps}
+
+    def places(self, parts: dict[str, Part], left_out: dict[str, str]) -> dict[str, Figures]:
+        return {name: {"keyframes": len(data)} for name, data in self._maps.items()}
+
+    def index(self, parts: dict[str, Part]) -> None:
+        pass
+
+    def joins(self, parts: dict[str, Part], index: None, inside: Collection[str] = ()) -> list[Join]:
+        return self._joins
+
+
+def test_a_map_that_does_not_fit_on_the_disk_leaves_the_one_before(
+    tmp_path: Path, noise: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where only the last step fails, too: all of the new map is in FILE-wal then, but not in the file."""
+    _, maps, joins = fleet_maps(3)
+    for name, data in maps.items():
+        (tmp_path / name).mkdir()
+        save_as(replace(data, thumbnail=lambda node: noise.bytes(35_000)), tmp_path / name / MAP)
+    monkeypatch.setattr("dpm2_core.fleet.merge.Search", lambda *arguments: Found(tmp_path, maps, joins))
+    out = tmp_path / "out" / "town"
+    out.parent.mkdir()
+    merge(tmp_path, out, SlamSettings(), nullcontext())
+    before, size = check_map(out), out.stat().st_size
+    assert size > CHECKPOINT + 600_000  # else FILE-wal would be too large first, which is another error
+    monkeypatch.setattr(Found, "version", 2)  # all drives are others by now
+    with largest_file(size - 300_000), pytest.raises(Dpm2Error, match=r"town: not written: .*is the disk full"):
+        merge(tmp_path, out, SlamSettings(), nullcontext())
+    assert check_map(out) == before
+    assert (before.keyframes, before.problems) == (180, [])
+    assert sorted(os.listdir(out.parent)) == ["town", "town.json"]
 
 
 def test_places_are_found_again_in_an_index_that_was_kept(tmp_path: Path, noise: np.random.Generator) -> None:

@@ -13,7 +13,7 @@ from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.mapping.occupancy import occupancy_grid, write_grid
-from dpm2_core.slam.mapping.occupancy_map import OccupancySettings
+from dpm2_core.slam.mapping.occupancy_map import Grid, OccupancySettings
 
 SETTINGS = OccupancySettings(resolution=0.25, reach=20.0)
 
@@ -30,18 +30,23 @@ def room(slope: float = 0.0) -> Points:
 
 
 def read_back(path: Path) -> tuple[np.ndarray, dict[str, object]]:
-    """A map_server's view: what its trinary mode makes of YAML and PGM, by rows from the lowest y."""
+    """Nav2's view: what the trinary mode of nav2_map_server/src/map_io.cpp makes of both files, from the lowest y."""
     about = yaml.safe_load(path.read_text())
     magic, size, depth, pixels = (path.parent / about["image"]).read_bytes().split(b"\n", 3)
     assert (magic, depth) == (b"P5", b"255")
     columns, rows = map(int, size.split())
     gray = np.frombuffer(pixels, np.uint8).reshape(rows, columns)[::-1]
-    occupancy = (255 - gray.astype(float)) / 255
+    occupancy = 1.0 - gray / 255
     cells = np.full(gray.shape, -1)
-    cells[occupancy > about["occupied_thresh"]] = 100
     cells[occupancy < about["free_thresh"]] = 0
-    cells[gray == 205] = -1
+    cells[about["occupied_thresh"] < occupancy] = 100
     return cells, about
+
+
+def test_each_value_is_to_nav2_what_it_is_here(tmp_path: Path) -> None:
+    """Occupied, unknown, free: Nav2 knows no unknown but what lies between its two thresholds."""
+    path = write_grid(tmp_path / "grid.yaml", Grid(np.uint8([[0, 205, 254]]), (0.0, 0.0), 0.25))
+    assert read_back(path)[0].tolist() == [[100, -1, 0]]
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.08])

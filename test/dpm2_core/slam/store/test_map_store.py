@@ -32,6 +32,7 @@ from dpm2_core.slam.store.cloud_store import CloudStore, Loan
 from dpm2_core.slam.store.map_data import append_map, load_map, save_as
 from dpm2_core.slam.store.map_store import Change, MapStore
 from dpm2_core.slam.store.rows import pack_descriptors, unpack_descriptors
+from test.helpers.full_disk import CHECKPOINT, largest_file
 from test.helpers.maps import ring
 
 WRITER = """
@@ -425,6 +426,70 @@ def test_two_writers(map_file: Path, keyframes: list[Keyframe], monkeypatch: pyt
         one.execute("BEGIN IMMEDIATE")
         with pytest.raises(Dpm2Error, match="locked"):
             two.begin_session()
+
+
+def test_of_two_programs_that_go_on_with_a_map_only_the_later_one_writes(
+    map_file: Path, keyframes: list[Keyframe]
+) -> None:
+    """Both count on from its 12 keyframes: the one would replace what the other has written."""
+    cloud = pack_cloud(keyframes[0].cloud)
+
+    def change(robot: str, node: int) -> Change:
+        return Change([(node, replace(keyframes[0], robot=robot), cloud, None)], poses={node: np.eye(4)})
+
+    with MapStore.open(map_file, read_only=False) as one, MapStore.open(map_file, read_only=False) as two:
+        one.begin_session()
+        one.write(change("one", 12))
+        two.begin_session()
+        two.write(change("two", 13))
+        with pytest.raises(Dpm2Error, match="another program has begun to write to it") as caught:
+            one.write(change("one", 13))
+        assert str(map_file) in str(caught.value)
+        two.write(change("two", 14))
+    with MapStore.open(map_file) as store:
+        data = load_map(store)
+    assert [keyframe.robot for keyframe in data.keyframes[12:]] == ["one", "two", "two"]
+    assert data.session[12:] == [2, 3, 3]
+
+
+def test_a_program_that_takes_over_other_maps_goes_on_with_its_own_session(
+    tmp_path: Path, keyframes: list[Keyframe]
+) -> None:
+    with MapStore.create(tmp_path / "map") as store:
+        store.begin_session()
+        append_map(store, ring(3))
+        store.write(Change([(3, keyframes[0], pack_cloud(keyframes[0].cloud), None)], poses={3: np.eye(4)}))
+    with MapStore.open(tmp_path / "map") as store:
+        assert load_map(store).session == [2, 2, 2, 1]
+
+
+def test_a_copy_that_does_not_fit_on_the_disk_is_an_error(tmp_path: Path, noise: np.random.Generator) -> None:
+    """Also where only the last step fails: all of it is in FILE-wal then, but not in the file."""
+    data = replace(ring(13), thumbnail=lambda node: noise.bytes(500_000))
+    save_as(data, tmp_path / "map")
+    size = (tmp_path / "map").stat().st_size
+    with largest_file(size - 300_000), pytest.raises(Dpm2Error, match=r"copy: not written: .*is the disk full"):
+        save_as(data, tmp_path / "copy")
+    assert size > CHECKPOINT + 600_000  # else FILE-wal would have been too large first, which is another error
+    assert os.listdir(tmp_path) == ["map"]
+
+
+@pytest.mark.parametrize("read_only", [True, False])
+def test_a_link_to_a_map_that_is_being_written_shows_all_of_it(
+    tmp_path: Path, map_file: Path, keyframes: list[Keyframe], read_only: bool
+) -> None:
+    """FILE-wal lies beside the file, and not beside the link."""
+    link = tmp_path / "elsewhere" / "latest"
+    link.parent.mkdir()
+    link.symlink_to(map_file)
+    with MapStore.open(map_file, read_only=False) as writer:
+        writer.begin_session()
+        writer.write(Change([(12, keyframes[0], pack_cloud(keyframes[0].cloud), None)], poses={12: np.eye(4)}))
+        with MapStore.open(link, read_only=read_only) as store:
+            assert store.path == link
+            assert len(load_map(store)) == 13
+        assert check_map(link).keyframes == 13
+    assert os.listdir(link.parent) == [link.name]
 
 
 def test_an_unfinished_copy_leaves_nothing_behind(
