@@ -53,7 +53,7 @@ def export(
         if format or voxel is not None or resolution is not None:
             raise UsageError("--tiles: squares of the map as it is; --format, --voxel and --resolution do not apply")
         with MapStore.open(path) as store:
-            count = write_tiles(load_map(store, descriptors=False), out, tiles)
+            count = write_tiles(_loaded(store), out, tiles)
         Console(stderr=True).print(f"{out} written: {count} tiles", highlight=False, soft_wrap=True)
         return
     kind = format or _ENDINGS.get(out.suffix.lower(), "")
@@ -64,10 +64,7 @@ def export(
     if ignored := [name for name, value in spacing.items() if value is not None and name != requested]:
         raise UsageError(f"--{ignored[0]}: a map as {kind} has no use for it")
     with MapStore.open(path) as store:
-        data = load_map(store, descriptors=False)
-        if not len(data):
-            raise UsageError(f"{path}: no keyframe in it yet")
-        write(data, out, spacing.get(requested) or _SPACING[requested])
+        write(_loaded(store), out, spacing.get(requested) or _SPACING[requested])
     Console(stderr=True).print(f"{out} written", highlight=False, soft_wrap=True)
 
 
@@ -168,16 +165,38 @@ def parse_transform(text: str) -> Array:
     return se3.make(R.as_matrix(), numbers[:3])
 
 
+def _loaded(store: MapStore) -> MapData:
+    """The map without descriptors.
+
+    Raises:
+        UsageError: it is empty.
+    """
+    data = load_map(store, descriptors=False)
+    if not len(data):
+        raise UsageError(f"{store.path}: no keyframe in it yet")
+    return data
+
+
 def _export_geojson(data: MapData, out: Path) -> None:
     from dpm2_core.geometry import geodesy
+    from dpm2_core.slam.mapping.parts import placed_on_earth
 
     if data.georeference is None:
         raise UsageError(f"{out}: the map has no georeference; see input.gnss_topic")
-    T_ecef_map = geodesy.enu_frame(data.georeference.origin) @ data.georeference.T_enu_map
-    features = []
+    placed, features = placed_on_earth(data), []
     for robot, session in sorted({(k.robot, s) for k, s in zip(data.keyframes, data.session, strict=True)}):
-        places = geodesy.geodetic((T_ecef_map @ trajectory(data, robot, session)[1])[:, :3, 3])
-        line = [[round(lon, 9), round(lat, 9), round(up, 3)] for lat, lon, up in places.tolist()]
+        way = trajectory(placed, robot, session)[1][:, :3, 3]
+        known = np.isfinite(way).all(axis=1)
+        if not known.all():
+            drive = f"session {session} of {robot}" if robot else f"session {session}"
+            Console(stderr=True).print(
+                f"{out}: without {(~known).sum()} of the {len(way)} keyframes of {drive}: "
+                "no loop ties them to the first keyframe, and their own fixes are too few to tell where they are",
+                highlight=False, soft_wrap=True,
+            )  # fmt: skip
+        if not known.any():
+            continue
+        line = [[round(lon, 9), round(lat, 9), round(up, 3)] for lat, lon, up in geodesy.geodetic(way[known]).tolist()]
         geometry = {"type": "LineString", "coordinates": line if len(line) > 1 else line * 2}
         features.append({"type": "Feature", "properties": {"robot": robot, "session": session}, "geometry": geometry})
     write_json(out, {"type": "FeatureCollection", "features": features})

@@ -10,8 +10,8 @@ import numpy as np
 import typer
 
 from dpm2_core.commands.options import JsonFile, show
-from dpm2_core.slam.mapping.restore import restore
-from dpm2_core.slam.store.map_data import MapData, load_map
+from dpm2_core.slam.mapping.restore import restore_solved
+from dpm2_core.slam.store.map_data import MapData, load_map, trajectory
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.tables import FigureTable
 
@@ -62,7 +62,7 @@ def _figures(path: Path, data: MapData, with_descriptors: int) -> dict[str, Any]
         "loops_accepted": sum(edge.ok for edge in loops),
         "loops_tried": len(loops),
         "georeference": _georeference_figures(data),
-        "bytes": sum(file.stat().st_size for suffix in ("", "-wal") if (file := Path(f"{path}{suffix}")).exists()),
+        "bytes": _size(path),
         "sessions": [
             {
                 "session": s.number,
@@ -102,11 +102,10 @@ def _georeference(figures: dict[str, Any] | None) -> str:
     if figures is None:
         return "-"
     latitude, longitude, altitude = figures["origin"]
-    where = (
-        f"origin {latitude:.8f}, {longitude:.8f}, {altitude:.2f} m; map's x axis {figures['heading_deg']:.2f} deg from "
-    )
+    heading = f"{figures['heading_deg']:.2f} deg from east to north"
+    where = f"origin {latitude:.8f}, {longitude:.8f}, {altitude:.2f} m; map's x axis {heading}"
     if figures["position_sigma_m"] is None:
-        return f"{where}east to north; how certain is not known: no fix is tied to the first keyframe"
+        return f"{where}; how certain is not known: too few fixes are tied to the first keyframe"
     east, north, up = figures["position_sigma_m"]
     return (
         f"{where} (sigma {figures['heading_sigma_deg']:.2f}); sigma {east:.2f}, {north:.2f}, {up:.2f} m; "
@@ -114,17 +113,24 @@ def _georeference(figures: dict[str, Any] | None) -> str:
     )
 
 
+def _size(path: Path) -> int:
+    """Bytes of the file and of what SQLite keeps beside it, which lies beside the file that a link leads to."""
+    file = path.resolve()
+    return sum(part.stat().st_size for suffix in ("", "-wal") if (part := Path(f"{file}{suffix}")).exists())
+
+
 def _length(data: MapData) -> float:
-    """Of the way through all keyframes, session by session, m."""
-    steps = np.linalg.norm(np.diff(data.poses[:, :3, 3], axis=0), axis=1)
-    same = np.diff(data.session) == 0
-    return float(steps[same].sum()) if len(data) > 1 else 0.0
+    """Of the ways of each robot in each session through all keyframes that ever were, m."""
+    drives = {(keyframe.robot, session) for keyframe, session in zip(data.keyframes, data.session, strict=True)}
+    drives |= {(pruned.robot, pruned.session) for pruned in data.trail}
+    ways = (trajectory(data, robot, session)[1][:, :3, 3] for robot, session in sorted(drives))
+    return float(sum(np.linalg.norm(np.diff(way, axis=0), axis=1).sum() for way in ways))
 
 
 def graph_of(data: MapData) -> PoseGraph:
-    """The pose graph of a map."""
+    """The pose graph of a map, with the poses that it has."""
     from dpm2_core.slam.graph.pose_graph import PoseGraph, PoseGraphSettings
 
     graph = PoseGraph(PoseGraphSettings())
-    restore(graph, data)
+    restore_solved(graph, data)
     return graph

@@ -21,10 +21,11 @@ from dpm2_core.errors import Dpm2Error
 from dpm2_core.fleet.joins import ENOUGH
 from dpm2_core.fleet.regions import Join
 from dpm2_core.fleet.search import affirmed, component
-from dpm2_core.frame import Array, Edge
+from dpm2_core.frame import Array, Edge, Georeference
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.graph_data import loop_errors, mahalanobis
 from dpm2_core.slam.graph.pose_graph import PoseGraph, PoseGraphSettings
+from dpm2_core.slam.mapping.parts import located, parts_of
 from dpm2_core.slam.mapping.restore import restore
 from dpm2_core.slam.store.map_data import MapData, append_map, odometry_by_node
 from dpm2_core.slam.store.map_store import Change, MapStore
@@ -59,6 +60,8 @@ class Growth:
 def add_drives(store: MapStore, inside: Mapping[str, int], growth: Growth, refused: Iterable[Join] = ()) -> None:
     """Write them behind the drives in a file, each a robot by its name.
 
+    A file that does not know its place on Earth takes over that of the first of them that does.
+
     Args:
         refused: joins that were rejected; those of drives that are not there are left out.
 
@@ -70,7 +73,10 @@ def add_drives(store: MapStore, inside: Mapping[str, int], growth: Growth, refus
     spans = spans_of({**inside, **{name: len(data) for name, data in growth.maps.items()}})
     joins = [join for join in (*growth.joins, *refused) if join.one in spans and join.other in spans]
     loops = [_in_file(join, {end: spans[end].start for end in (join.one, join.other)}) for join in joins]
-    store.write(Change(edges=loops, judged=growth.judged, poses=growth.moved))
+    known = None
+    if next(store.rows("georeference"), None) is None:
+        known = next(filter(None, map(_georeference, growth.maps.values())), None)
+    store.write(Change(edges=loops, judged=growth.judged, poses=growth.moved, georeference=known))
 
 
 def joins_of(loops: Collection[Edge], inside: Mapping[str, int]) -> list[Join]:
@@ -82,6 +88,14 @@ def joins_of(loops: Collection[Edge], inside: Mapping[str, int]) -> list[Join]:
                                  to_node=loop.to_node - spans[other].start))
         for one, other, loop in zip(ones, others, loops, strict=True)
     ]  # fmt: skip
+
+
+def _georeference(data: MapData) -> Georeference | None:
+    """That of the map in which a drive has its poses, by the drive's fixes: its own is of the frame that it had."""
+    if data.georeference is None:
+        return None
+    parts = parts_of(data)
+    return located(data, parts == parts[0])
 
 
 def _renamed(name: str, data: MapData) -> MapData:

@@ -43,10 +43,9 @@ class Fixes:
     def __len__(self) -> int:
         return len(self._fixes)
 
-    @property
-    def used(self) -> int:
-        """How many constrain the poses, by the last optimization."""
-        return 0 if self.georeference is None else sum(self._used)
+    def used(self, chosen: Sequence[int]) -> int:
+        """How many of those chosen constrain the poses, by the last optimization."""
+        return sum(self._used[k] for k in chosen)
 
     @property
     def due(self) -> int:

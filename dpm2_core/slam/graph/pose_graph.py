@@ -89,7 +89,7 @@ class PoseGraph:
     @property
     def fixes(self) -> tuple[int, int]:
         """How many constrain the poses, and all."""
-        return self._fixes.used, len(self._fixes)
+        return self._fixes.used(self._chosen()), len(self._fixes)
 
     @property
     def unsolved(self) -> bool:
@@ -233,11 +233,14 @@ class PoseGraph:
         return self._joint([node])
 
     def georeference_covariance(self) -> Array | None:
-        """(6, 6) of xi in T_map_enu @ Exp(xi), about and along east, north, up; None where there is none."""
+        """(6, 6) of xi in T_map_enu @ Exp(xi), about and along east, north, up; None where too few fixes tell."""
         if not self._chosen():
             return None
         data = self._data()
-        return robust.joint_covariance(data, data.poses, self._kept(), np.array([len(self)]))
+        try:
+            return robust.joint_covariance(data, data.poses, self._kept(), np.array([len(self)]))
+        except RuntimeError:  # gtsam's: the system is singular, as with one fix, which says nothing of the heading
+            return None
 
     def relative_covariance(self, a: int, b: int) -> Array:
         """(6, 6) of xi in T_a_b @ Exp(xi) of two different nodes; small between neighbors, however far from the start.

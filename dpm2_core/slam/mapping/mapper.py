@@ -21,7 +21,7 @@ from dpm2_core.slam.mapping.admission import check_keyframe
 from dpm2_core.slam.mapping.moving import MovingSettings, MovingWindow
 from dpm2_core.slam.mapping.occupancy_map import OccupancyMap
 from dpm2_core.slam.mapping.redundancy import RedundancySettings, lender
-from dpm2_core.slam.mapping.restore import restore
+from dpm2_core.slam.mapping.restore import restore_solved
 from dpm2_core.slam.store.cloud_codec import pack_cloud
 from dpm2_core.slam.store.cloud_store import CloudStore
 from dpm2_core.slam.store.map_data import NO_POINTS, Thumbnail, borrowing, load_map, map_cloud
@@ -215,6 +215,7 @@ class Mapper:
         for robot in self._robots.values():
             self._mark_moving(robot.window.finish(self.poses))
         if self._writer is not None:
+            self._writer.judge(self._graph.loops)
             self._writer.sync(self.poses, self.georeference)
 
     def cloud(self, voxel_size: float | None = None) -> Points:
@@ -239,9 +240,7 @@ class Mapper:
                 raise UsageError(f"{store.path}: descriptors of {width} channels, the network makes {channels}")
         self.keyframes, self._clouds, self.thumbnail = data.keyframes, data.clouds, data.thumbnail
         try:
-            restore(self._graph, data)
-            for node, T_map_kf in enumerate(data.poses):  # joined, parts have moved by the errors of their first loops
-                self._graph.place(node, T_map_kf)
+            restore_solved(self._graph, data)
         except (ValueError, Dpm2Error) as error:
             raise Dpm2Error(f"{store.path}: {error}; see dpm2 map check") from None
         for keyframe in data.keyframes:

@@ -8,38 +8,46 @@ from dataclasses import replace
 from typing import Literal
 
 import numpy as np
+from scipy.spatial import KDTree
 
-from dpm2_core.frame import Edge
+from dpm2_core.frame import Edge, Fix, Keyframe
 from dpm2_core.geometry import se3
+from dpm2_core.slam.mapping.parts import parts_of
 from dpm2_core.slam.store.map_data import MapData, subset
 from dpm2_core.slam.store.rows import RemovedKeyframe
 
 _LAP = 10  # keyframes: neighbors along the drive are no revisit
+_LEVER = 20.0  # m: a fix farther from its keyframe would say more of that one's heading than of its place
 
 
 def redundant_nodes(data: MapData, distance: float, angle: float) -> list[int]:
     """Keyframes without a payload of their own, and those near an older one that stays; never the last.
 
+    Two keyframes that no accepted edges tie are not compared: where they are relative to each other is not known.
+
     Args:
         distance: m, at most; 0: only those without a payload. angle: degrees between their headings, at most.
     """
-    kept: list[int] = []
-    positions, last = data.poses[:, :3, 3], data.clouds.loan(len(data) - 1) if len(data) else None
-    given_up = []
+    if not len(data):
+        return []
+    positions, last = data.poses[:, :3, 3], data.clouds.loan(len(data) - 1)
+    parts, session, tree = parts_of(data), np.array(data.session), KDTree(positions)
+    stays = np.ones(len(data), np.bool_)
     for node in range(len(data)):
-        needed = node == len(data) - 1 or (last is not None and node == last.lender)
-        older = np.array([k for k in kept if node - k >= _LAP or data.session[k] != data.session[node]], np.intp)
-        near = older[np.linalg.norm(positions[older] - positions[node], axis=1) <= distance]
-        turned = se3.angle(se3.inverse(data.poses[near]) @ data.poses[node]) if distance and len(near) else np.inf
-        if not needed and (data.clouds.loan(node) is not None or np.min(turned) <= np.radians(angle)):
-            given_up.append(node)
-        else:
-            kept.append(node)
-    return given_up
+        if node == len(data) - 1 or (last is not None and node == last.lender):
+            continue
+        near = np.array(tree.query_ball_point(positions[node], distance) if distance else [], np.intp)
+        near = near[(near < node) & stays[near] & (parts[near] == parts[node])]
+        near = near[(node - near >= _LAP) | (session[near] != session[node])]
+        turned = se3.angle(se3.inverse(data.poses[near]) @ data.poses[node]) if len(near) else np.inf
+        stays[node] = data.clouds.loan(node) is None and np.min(turned) > np.radians(angle)
+    return np.flatnonzero(~stays).tolist()
 
 
 def prune(data: MapData, nodes: Collection[int]) -> MapData:
     """The map without those nodes. Where they were is kept as `trail`, what tied them together as composed edges.
+
+    A fix of one that goes is handed to the keyframe beside it, where that has none.
 
     Raises:
         ValueError: a node that stays borrows the cloud of one that goes.
@@ -71,7 +79,29 @@ def prune(data: MapData, nodes: Collection[int]) -> MapData:
         anchor = anchors.get(old.node, old.node)
         T_anchor_old = se3.inverse(data.poses[anchor]) @ data.poses[old.node]
         trail.append(replace(old, node=new[anchor], T_node_kf=T_anchor_old @ old.T_node_kf))
-    return subset(data, kept, edges, trail)
+    return subset(replace(data, keyframes=_with_fixes(data, sorted(gone), kept)), kept, edges, trail)
+
+
+def _with_fixes(data: MapData, gone: Sequence[int], kept: Sequence[int]) -> list[Keyframe]:
+    """The keyframes of all nodes, where those that stay have taken over fixes of those that go.
+
+    A fix goes to the nearest keyframe of its part that stays, which need not be the one that has its place on the
+    trail: where a whole drive goes, that is the end of the drive. Of several the surest is taken, then the nearest.
+    """
+    keyframes, parts, at = list(data.keyframes), parts_of(data), np.array(kept, np.intp)
+    offered: list[tuple[float, float, int, Fix]] = []
+    for node in gone:
+        fix, near = data.keyframes[node].fix, at[parts[at] == parts[node]]
+        if fix is None or not len(near):
+            continue
+        heir = int(near[np.argmin(np.linalg.norm(data.poses[near, :3, 3] - data.poses[node, :3, 3], axis=1))])
+        antenna = se3.transform(se3.inverse(data.poses[heir]) @ data.poses[node], fix.antenna[None])[0]
+        if (lever := float(np.linalg.norm(antenna))) <= _LEVER:
+            offered.append((float(np.trace(fix.covariance)), lever, heir, replace(fix, antenna=antenna)))
+    for _, _, heir, fix in sorted(offered, key=lambda offer: offer[:2]):
+        if keyframes[heir].fix is None:
+            keyframes[heir] = replace(keyframes[heir], fix=fix)
+    return keyframes
 
 
 def _anchor(data: MapData, node: int, kept: Sequence[int]) -> int:

@@ -25,6 +25,18 @@ def restore(graph: PoseGraph, data: MapData) -> None:
         graph.set_georeference(data.georeference)
 
 
+def restore_solved(graph: PoseGraph, data: MapData) -> None:
+    """Take a map into an empty pose graph with the poses that it has.
+
+    `restore` alone moves each part to where its first loop has it, which may be one that the optimization rejects.
+    """
+    restore(graph, data)
+    for node, T_map_kf in enumerate(data.poses):
+        graph.place(node, T_map_kf)
+    if data.georeference is not None:  # again: the poses say which fixes constrain them
+        graph.set_georeference(data.georeference)
+
+
 def shifted(edge: Edge, first: int) -> Edge:
     """The edge where its node 0 is number `first`."""
     return replace(edge, from_node=edge.from_node + first, to_node=edge.to_node + first)

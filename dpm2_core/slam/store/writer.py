@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Array, Edge, Georeference, Keyframe
 from dpm2_core.slam.store.cloud_store import CloudStore
 from dpm2_core.slam.store.map_store import Change, MapStore
+from dpm2_core.slam.store.rows import array_bytes, edge_of
 
 _BATCH = 20  # keyframes a transaction while catching up: memory is that of so many clouds
 _STILL = 1e-4  # m and rad: poses that move by less are not worth writing
@@ -30,6 +33,7 @@ class MapWriter:
         self._keyframes: list[tuple[int, Keyframe, bytes | None]] = []
         self._edges: list[Edge] = []
         self._moving: set[int] = set()
+        self._judged: list[Edge] = []
 
     def add(self, node: int, keyframe: Keyframe, thumbnail: bytes | None = None) -> None:
         """A keyframe; its cloud is in the cloud store."""
@@ -38,6 +42,10 @@ class MapWriter:
     def add_edge(self, edge: Edge) -> None:
         """An edge, after its keyframes."""
         self._edges.append(edge)
+
+    def judge(self, loops: Sequence[Edge]) -> None:
+        """Loops as they are now: with the next `sync` those of the file whose verdict is another one are rewritten."""
+        self._judged = list(loops)
 
     def set_moving(self, node: int) -> None:
         """The cloud store has a mask for that node."""
@@ -50,6 +58,7 @@ class MapWriter:
             while len(self._keyframes) > _BATCH:
                 self._write(poses, self._keyframes[:_BATCH], last=False)
             self._write(poses, self._keyframes, last=True)
+            self._rewrite()
             self.problem = ""
         except Dpm2Error as error:
             self.problem = f"{error}; {len(self._keyframes)} keyframes are in memory only"
@@ -75,8 +84,23 @@ class MapWriter:
         written[still] = self._written[still]  # small moves add up until they are worth writing
         self._written = written
 
+    def _rewrite(self) -> None:
+        """Bring the verdicts in the file up to date."""
+        # By the measurement, too: the search may have rejected another loop between the same two keyframes.
+        now = {_key(loop): loop for loop in self._judged if loop.kind == "loop"}
+        rows = self._store.rows("edges", where="kind = 'loop'") if now else ()
+        file = [(int(row[0]), edge_of(row)) for row in rows]
+        known = [(number, loop, now[_key(loop)]) for number, loop in file if _key(loop) in now]
+        if changed := {number: judged for number, loop, judged in known if judged.ok != loop.ok}:
+            self._store.write(Change(judged=changed))
+        self._judged = []
+
     def _moved(self, poses: Array) -> dict[int, Array]:
         """Poses that the file does not have, by node."""
         known = min(len(self._written), len(poses))
         moved = np.abs(poses[:known] - self._written[:known]).max((1, 2), initial=0.0) > _STILL
         return {int(node): poses[node] for node in (*np.flatnonzero(moved), *range(known, len(poses)))}
+
+
+def _key(loop: Edge) -> tuple[int, int, bytes]:
+    return loop.from_node, loop.to_node, array_bytes(loop.T_from_to)

@@ -5,6 +5,7 @@ truth, also where a receiver errs for a while."""
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,17 +14,20 @@ import pytest
 
 from dpm2_core.data.convert import EPOCH_NS
 from dpm2_core.data.kitti import KittiSource
-from dpm2_core.frame import Array
-from dpm2_core.geometry import geodesy
+from dpm2_core.frame import Array, Edge, Fix, Georeference, Registration
+from dpm2_core.geometry import geodesy, se3
 from dpm2_core.sim.drive import simulate
 from dpm2_core.sim.settings import DriveConfig, GnssConfig, LidarConfig
-from dpm2_core.slam.store.map_data import load_map
+from dpm2_core.slam.mapping.merge import merge_maps
+from dpm2_core.slam.store.map_data import MapData, load_map, save_as
 from dpm2_core.slam.store.map_store import MapStore
 
 from ...helpers.command import dpm2
 from ...helpers.drives import first_scans
+from ...helpers.maps import ring
 
 FRAMES, SIGMA = 40, 0.05
+ORIGIN = np.array([49.0, 8.4, 110.0])
 WRONG = slice(14, 24)  # of the fixes, a quarter
 GNSS = GnssConfig(rate=10, noise=SIGMA, wander=0)
 OPTIONS = ("slam.registration=geometric", "slam.loops.descriptors=false", "slam.keyframes.distance=1.5")
@@ -109,6 +113,66 @@ def test_fixes_that_are_50_m_off_for_a_while_bend_nothing(drive: Path, tmp_path:
     assert np.abs(found.off).max() < 3 * SIGMA
     wrong = found.info["fixes"] - found.info["fixes_used"]
     assert wrong >= 5  # of those that came with a keyframe
+
+
+FAR = np.array([300.0, 40.0, 5.0])  # m, between the two drives
+
+
+def two_drives(wrong_first: bool = False, tied: bool = False, fixes: bool = True) -> MapData:
+    """A ring of 40 keyframes with a fix each, and another one that begins on top of it in the map.
+
+    Args:
+        wrong_first: the first loop between the two is one that the optimization rejected.
+        tied: the second is the first again, and 20 loops say so; else it was FAR away. fixes: of the second one.
+    """
+    one = ring(40, points=10)
+    two = merge_maps(one, one, np.eye(4))
+    keyframes = []
+    for node, (keyframe, T) in enumerate(zip(two.keyframes, two.poses, strict=True)):
+        off = FAR if node >= 40 and not tied else np.zeros(3)
+        place = geodesy.geodetic((geodesy.enu_frame(ORIGIN) @ np.append(T[:3, 3] + off, 1))[:3])
+        fix = Fix(keyframe.stamp, place, np.eye(3) * 0.02**2, np.zeros(3))
+        keyframes.append(replace(keyframe, fix=fix if fixes or node < 40 else None))
+    loops = []
+    if tied:
+        T = se3.exp(np.array([0, 0, 0.3, 9.0, 0, 0])) if wrong_first else np.eye(4)
+        loops = [Edge("loop", 5, 45, Registration(T, np.eye(6) * 1e-4))]
+        loops += [Edge("loop", node, 40 + node, Registration(np.eye(4), np.eye(6) * 1e-4)) for node in range(6, 26)]
+    return replace(two, keyframes=keyframes, edges=[*two.edges, *loops], georeference=Georeference(ORIGIN, np.eye(4)))
+
+
+def lines_of(path: Path) -> dict[int, Array]:
+    """(K, 3) east, north, up about ORIGIN, m, of each session of a GeoJSON file."""
+    out = {}
+    for feature in json.loads(path.read_text())["features"]:
+        way = np.array(feature["geometry"]["coordinates"])[:, [1, 0, 2]]
+        out[feature["properties"]["session"]] = se3.transform(se3.inverse(geodesy.enu_frame(ORIGIN)), geodesy.ecef(way))
+    return out
+
+
+def test_a_drive_that_nothing_ties_to_the_map_is_written_where_its_own_fixes_are(tmp_path: Path) -> None:
+    data = two_drives()
+    save_as(data, tmp_path / "map")
+    assert dpm2("map", "export", tmp_path / "map", tmp_path / "a.geojson").returncode == 0
+    lines = lines_of(tmp_path / "a.geojson")
+    for session, off in ((1, np.zeros(3)), (2, FAR)):
+        np.testing.assert_allclose(lines[session], data.poses[:40, :3, 3] + off, atol=0.01)  # the file has mm
+
+
+def test_a_drive_that_nothing_places_is_left_out_and_named(tmp_path: Path) -> None:
+    save_as(two_drives(fixes=False), tmp_path / "map")
+    done = dpm2("map", "export", tmp_path / "map", tmp_path / "a.geojson")
+    assert done.returncode == 0
+    assert "without 40 of the 40 keyframes of session 2" in done.stderr
+    assert set(lines_of(tmp_path / "a.geojson")) == {1}
+
+
+def test_only_fixes_that_are_in_the_graph_count_as_used(tmp_path: Path) -> None:
+    for name, data, used in (("apart", two_drives(), 40), ("tied", two_drives(wrong_first=True, tied=True), 80)):
+        save_as(data, tmp_path / name)
+        done = dpm2("map", "info", tmp_path / name, "--json", tmp_path / "info.json")
+        assert f"{used} of 80 fixes used" in " ".join(done.stdout.split())
+        assert json.loads((tmp_path / "info.json").read_text())["georeference"]["fixes_used"] == used
 
 
 def test_a_map_without_one_says_so(map_file: Path, tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import json
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,14 +16,19 @@ import pytest
 
 from dpm2_core.data.trajectory import read_trajectory
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.frame import Array, Georeference, Keyframe
+from dpm2_core.fleet.regions import side_by_side, solve
+from dpm2_core.frame import Array, Edge, Georeference, Keyframe, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.sim.drive import simulate
 from dpm2_core.sim.settings import DriveConfig, LidarConfig
-from dpm2_core.slam.store.map_data import MapData, load_map
+from dpm2_core.slam.graph.pose_graph import PoseGraphSettings
+from dpm2_core.slam.mapping.prune import prune
+from dpm2_core.slam.store.map_data import MapData, load_map, save_as
 from dpm2_core.slam.store.map_store import Change, MapStore
 
 from ...helpers.command import dpm2
+from ...helpers.fleets import fleet_maps
+from ...helpers.maps import ring
 
 
 def loaded(path: Path) -> MapData:
@@ -86,6 +92,56 @@ def test_what_cannot_be_exported(tmp_path: Path, map_file: Path) -> None:
     assert done.returncode == 2
     assert "no keyframe" in done.stderr
     assert dpm2("map", "info", tmp_path / "empty.dpm2map").returncode == 0
+
+
+def test_an_empty_map_makes_no_tiles(tmp_path: Path) -> None:
+    with MapStore.create(tmp_path / "empty.dpm2map") as store:
+        store.begin_session()
+    done = dpm2("map", "export", tmp_path / "empty.dpm2map", tmp_path / "tiles", "--tiles", 50)
+    assert done.returncode == 2
+    assert done.stderr.strip().endswith("empty.dpm2map: no keyframe in it yet")
+    assert not (tmp_path / "tiles").exists()
+
+
+def test_the_graph_of_several_drives_lies_where_their_map_does(tmp_path: Path) -> None:
+    """Though the first loop between two of them is wrong, and the optimization has rejected it."""
+    import gtsam
+
+    _, maps, joins = fleet_maps(2)
+    joins.insert(0, joins.pop())  # the wrong one
+    poses = solve(maps, joins, PoseGraphSettings()).poses
+    data = replace(side_by_side(maps, joins), poses=np.concatenate(list(poses.values())))
+    save_as(data, tmp_path / "map")
+    assert dpm2("map", "export", tmp_path / "map", tmp_path / "a.g2o").returncode == 0
+    _, values = gtsam.readG2o(str(tmp_path / "a.g2o"), True)
+    written = np.array([values.atPose3(node).matrix() for node in range(len(data))])
+    np.testing.assert_allclose(written, data.poses, atol=1e-9)  # rounding
+
+
+def test_the_length_is_that_of_all_ways(tmp_path: Path) -> None:
+    """Of two robots whose keyframes take turns, also when keyframes are pruned; the file may be a link."""
+    steps = 10.0 * np.arange(12)
+    made = ring(24, points=10)
+    poses = np.array([se3.make(np.eye(3), [steps[node // 2], 100.0 * (node % 2), 0]) for node in range(24)])
+    robots = [replace(k, robot=("red", "blue")[k.id % 2]) for k in made.keyframes]
+    edges = [
+        Edge("odometry", node - 2, node, Registration(se3.inverse(poses[node - 2]) @ poses[node], np.eye(6) * 1e-4))
+        for node in range(2, 24)
+    ]
+    data = replace(made, poses=poses, keyframes=robots, edges=edges)
+    save_as(data, tmp_path / "whole")
+    save_as(prune(data, range(3, 20)), tmp_path / "less")
+    for name in ("whole", "less"):
+        (tmp_path / "link").unlink(missing_ok=True)
+        (tmp_path / "link").symlink_to(tmp_path / name)
+        with MapStore.open(tmp_path / name, read_only=False) as store:
+            store.begin_session()  # from now on there is a file beside it
+            info = dpm2("map", "info", tmp_path / "link", "--json", tmp_path / f"{name}.json")
+            assert info.returncode == 0
+            size = sum(path.stat().st_size for path in (tmp_path / name, tmp_path / f"{name}-wal"))
+        figures = json.loads((tmp_path / f"{name}.json").read_text())
+        assert figures["length_m"] == pytest.approx(2 * 110.0)
+        assert figures["bytes"] == size
 
 
 def test_merge_by_transform(tmp_path: Path, map_file: Path) -> None:

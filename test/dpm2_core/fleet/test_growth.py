@@ -8,6 +8,7 @@ import signal
 import sqlite3
 from collections.abc import Mapping, Sequence
 from contextlib import closing
+from dataclasses import replace
 from itertools import pairwise
 from multiprocessing import get_context
 from pathlib import Path
@@ -19,8 +20,8 @@ from dpm2_core.errors import Dpm2Error
 from dpm2_core.evaluation.metrics import ape_rmse
 from dpm2_core.fleet.growth import Growth, Standing, add_drives, grown, joins_of
 from dpm2_core.fleet.regions import LARGEST, Join, solve
-from dpm2_core.frame import Edge, Registration
-from dpm2_core.geometry import se3
+from dpm2_core.frame import Edge, Fix, Georeference, Registration
+from dpm2_core.geometry import geodesy, se3
 from dpm2_core.slam.graph.pose_graph import PoseGraphSettings
 from dpm2_core.slam.store.check import check_map
 from dpm2_core.slam.store.map_data import MapData, load_map
@@ -177,3 +178,39 @@ def test_what_is_too_large_to_be_solved_at_once_is_made_anew(tmp_path: Path) -> 
         assert grown(_standing(store, inside, 119), {"d2": maps["d2"]}, joins[11:]) is None
         with pytest.raises(KeyError):
             grown(_standing(store, inside), {"d2": maps["d2"]}, [Join("d9", "d2", joins[11].loop)])
+
+
+ORIGIN = np.array([49.0, 8.4, 110.0])
+
+
+def _with_fixes(data: MapData, true: np.ndarray) -> MapData:
+    """The map of a drive with a fix at each of its true places (N, 4, 4) about ORIGIN, which knows where it is."""
+    places = geodesy.geodetic((geodesy.enu_frame(ORIGIN) @ true)[:, :3, 3])
+    fixes = [Fix(i, place, np.eye(3) * 0.02**2, np.zeros(3)) for i, place in enumerate(places)]
+    keyframes = [replace(keyframe, fix=fix) for keyframe, fix in zip(data.keyframes, fixes, strict=True)]
+    return replace(data, keyframes=keyframes, georeference=Georeference(ORIGIN, true[0] @ se3.inverse(data.poses[0])))
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_a_map_takes_over_where_it_is_from_the_first_drive_that_knows(tmp_path: Path, late: bool) -> None:
+    """The first two of three do not; `late`: the third comes into a map that is there."""
+    truth, maps, joins = fleet_maps(3)
+    maps["d2"] = _with_fixes(maps["d2"], truth["d2"])
+    names, path = list(maps), tmp_path / "map"
+    first = names[:2] if late else names
+    region = solve({name: maps[name] for name in first}, _of(joins, first), SETTINGS)
+    solved = {name: replace(maps[name], poses=T) for name, T in region.poses.items()}
+    with MapStore.create(path) as store:
+        add_drives(store, {}, Growth(solved, region.joins))
+        if late:
+            inside = {name: len(maps[name]) for name in first}
+            growth = grown(_standing(store, inside), {"d2": maps["d2"]}, joins[11:])
+            assert growth is not None
+            add_drives(store, inside, growth)
+    with MapStore.open(path) as store:
+        data = load_map(store)
+    assert data.georeference is not None
+    T_ecef_map = geodesy.enu_frame(data.georeference.origin) @ data.georeference.T_enu_map
+    own = se3.inverse(geodesy.enu_frame(ORIGIN)) @ T_ecef_map @ data.poses[120:]
+    off = np.linalg.norm((own - truth["d2"])[:, :2, 3], axis=1)
+    assert off.max() < 1.0  # m: the odometry of 120 m has drifted, by 1 mrad a keyframe

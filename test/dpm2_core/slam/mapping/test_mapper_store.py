@@ -6,6 +6,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from dpm2_core.slam.store.map_store import MapStore
 
 SIGMA = np.diag([1e-3] * 3 + [0.02] * 3) ** 2
 LAP = 20
+WRONG = LAP + 4  # a node with a wrong loop
 
 
 class KnownLoops(LoopCloser):
@@ -78,6 +80,40 @@ def test_the_file_holds_what_the_mapper_holds(tmp_path: Path) -> None:
         assert len(again.keyframes) == again.session_start == 40
         for before, after in zip(clouds, again.clouds, strict=True):
             np.testing.assert_array_equal(after, before)
+
+
+class OneWrong(KnownLoops):
+    """One of its loops is far off, and is accepted all the same."""
+
+    def close(self, keyframes: Sequence[Keyframe], clouds: Sequence[Points], poses: Array) -> list[Edge]:
+        wrong = se3.exp([0, 0, 0.3, 9.0, 0, 0])
+        return [
+            replace(loop, registration=replace(loop.registration, T_target_source=loop.T_from_to @ wrong))
+            if loop.to_node == WRONG
+            else loop
+            for loop in super().close(keyframes, clouds, poses)
+        ]
+
+
+def test_the_file_has_the_verdicts_of_the_last_optimization(tmp_path: Path) -> None:
+    """A loop that was accepted, and that those after it contradict, holds nothing in the file either."""
+    path = tmp_path / "a.dpm2map"
+    with MapStore.create(path) as store:
+        store.begin_session()
+        mapper = Mapper(MapSettings(), PoseGraph(PoseGraphSettings()), OneWrong(), store)
+        for keyframe in laps(2):
+            mapper.add(keyframe)
+        mapper.finish()
+        assert mapper.store_problem == ""
+    assert [loop.ok for loop in mapper.loops if loop.to_node == WRONG] == [True]
+    with MapStore.open(path) as store:
+        data = load_map(store)
+    (wrong,) = (edge for edge in data.edges if (edge.kind, edge.to_node) == ("loop", WRONG))
+    assert not wrong.ok
+    assert "sigma" in wrong.registration.reason
+    ends = {(edge.from_node, edge.to_node) for edge in data.constraints}
+    assert ends == {(edge.from_node, edge.to_node) for edge in mapper.edges}
+    assert len(data.edges) == len(mapper.loops) + 2 * LAP - 1
 
 
 @pytest.mark.slow

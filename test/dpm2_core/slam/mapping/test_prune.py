@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.frame import Array, Edge, Keyframe, Registration
+from dpm2_core.frame import Array, Edge, Fix, Keyframe, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.pose_graph import PoseGraph, PoseGraphSettings
 from dpm2_core.slam.mapping.merge import align, merge_maps, optimized
@@ -90,6 +90,36 @@ def test_pruning_laps_leaves_one_with_all_constraints() -> None:
     again = prune(less, [5, 6, 40])  # what a pruned one was tied to can go, too
     np.testing.assert_allclose(trajectory(again)[1], data.poses, atol=1e-9)
     np.testing.assert_array_equal(again.clouds[5], less.clouds[7])
+
+
+def test_a_drive_that_nothing_ties_to_the_map_stays_where_it_seems_to_be_a_revisit() -> None:
+    """Without a place found, a second drive begins in the frame of the first, on top of it, wherever it was."""
+    data = laps(2, session=True)
+    assert redundant_nodes(data, 2.0, 20.0) == list(range(40, 79))
+    within = [edge for edge in data.edges if data.session[edge.from_node] == data.session[edge.to_node]]
+    refused = [edge.rejected("no") for edge in data.edges if edge not in within]
+    apart = replace(data, edges=[*within, *refused])
+    assert redundant_nodes(apart, 2.0, 20.0) == []
+
+
+def test_the_fixes_of_a_pruned_drive_stay_in_the_map() -> None:
+    """Where the antenna was is the same place of the map; a keyframe with a fix of its own keeps that."""
+    data, antenna = laps(2, session=True), np.array([0.5, 0.2, 1.0])
+    poses = np.concatenate([data.poses[:40], data.poses[40:] @ se3.exp([0, 0, 0.1, 0.5, 0.3, 0])])
+    fixes = {node: Fix(node, np.array([49.0, 8.4, node]), np.eye(3), antenna) for node in (3, *range(40, 79))}
+    keyframes = [replace(keyframe, fix=fixes.get(node)) for node, keyframe in enumerate(data.keyframes)]
+    data = replace(data, poses=poses, keyframes=keyframes)
+    less = prune(data, redundant_nodes(data, 2.0, 20.0))
+    assert len(less) == 41
+    for node, keyframe in enumerate(less.keyframes[:39]):
+        was = 3 if node == 3 else node + 40
+        assert keyframe.fix is not None
+        assert keyframe.fix.geodetic[2] == was
+        at, before = less.poses[node] @ np.append(keyframe.fix.antenna, 1), poses[was] @ np.append(antenna, 1)
+        np.testing.assert_allclose(at, before, atol=1e-9)  # rounding
+    (last,) = prune(data, range(79)).keyframes  # of all that go: the nearest, some would be 60 m off
+    assert last.fix is not None
+    assert last.fix.geodetic[2] == 78
 
 
 def test_the_optimum_stays_when_nodes_go() -> None:

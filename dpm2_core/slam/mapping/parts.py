@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which keyframes of a map hang together: where two parts are relative to each other is not known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from dpm2_core.frame import Georeference
+from dpm2_core.geometry import geodesy
+from dpm2_core.slam.graph.fixes import Fixes
+from dpm2_core.slam.store.map_data import MapData
+
+
+def parts_of(data: MapData) -> NDArray[np.int32]:
+    """(N,) number of the part that each node is in, by the accepted edges."""
+    ends = np.array([(edge.from_node, edge.to_node) for edge in data.constraints], np.intp).reshape(-1, 2)
+    graph = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), (len(data), len(data)))
+    return np.asarray(connected_components(graph, directed=False)[1], np.int32)
+
+
+def located(data: MapData, own: NDArray[np.bool_]) -> Georeference | None:
+    """Where on Earth the map is by the fixes of some of its nodes, (N,), alone; None where these do not tell."""
+    fixes = Fixes()
+    for node in np.flatnonzero(own).tolist():
+        if (fix := data.keyframes[node].fix) is not None:
+            fixes.add(node, fix)
+    fixes.locate(data.poses, own)
+    return fixes.georeference
+
+
+def placed_on_earth(data: MapData) -> MapData:
+    """The map with poses (N, 4, 4) T_ecef_kf.
+
+    The georeference is that of the first keyframe's part. Another part is placed by its own fixes; where these do not
+    tell, its poses are NaN.
+
+    Raises:
+        ValueError: the map has no georeference.
+    """
+    if data.georeference is None:
+        raise ValueError("the map has no georeference")
+    parts, poses = parts_of(data), np.full_like(data.poses, np.nan)
+    for part in np.unique(parts):
+        own = parts == part
+        known = data.georeference if own[0] else located(data, own)
+        if known is not None:
+            poses[own] = geodesy.enu_frame(known.origin) @ known.T_enu_map @ data.poses[own]
+    return replace(data, poses=poses)
