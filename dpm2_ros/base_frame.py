@@ -20,19 +20,25 @@ class BaseFrame:
     Attributes:
         name: whose pose it is; empty before it is known.
         problem: why it is not known, in words.
+        above: the root above the frame that was asked for; where that is another one, it has a parent in /tf_static.
         T_start_lidar: (4, 4) LiDAR in the frame with which the drive began: its first pose is the origin of odom.
         T_base_start: (4, 4) that frame in the one of `name`: identity, unless a parent came later.
     """
 
-    def __init__(self, wanted: str, own: tuple[str, ...], is_child: bool) -> None:
-        """`wanted`: the frame that was asked for, or empty.
-
-        `own`: frames that this node is a parent with, `is_child`: of the frame itself.
-        """
-        self._wanted, self._own, self._is_child = wanted.lstrip("/"), own, is_child
+    def __init__(self, wanted: str, own: tuple[str, ...]) -> None:
+        """`wanted`: the frame that was asked for, or empty; `own`: frames that this node is a parent with."""
+        self._wanted, self._own = wanted.lstrip("/"), own
         self._tree: TransformTree | None = None  # that of the last look
         self.name = self.problem = ""
+        self.above = self._wanted
         self.T_start_lidar = self.T_base_start = np.eye(4)
+
+    @property
+    def child_problem(self) -> str:
+        """Why it must not be a child on /tf, in words; empty where it may."""
+        if self.above == self._wanted:
+            return ""
+        return f"{self._wanted} has a parent in /tf_static, and no frame has two: name {self.above} as ros.base_frame"
 
     @property
     def optional(self) -> bool:
@@ -48,15 +54,10 @@ class BaseFrame:
         if tree is self._tree:
             return False
         self._tree = tree
-        top = tree.root(self._wanted, self._own) if self._wanted and self._is_child else self._wanted
-        if top != self._wanted:
-            self.problem = (
-                f"ros.base_frame: {self._wanted} has a parent in /tf_static, and no frame has two: name {top} instead, "
-                "or none, or set ros.publish_tf_odom to false"
-            )
-            return False
-        if self.name and self._wanted:
-            return False
+        if self._wanted:
+            self.above = tree.root(self._wanted, self._own)
+            if self.name:
+                return False
         lidar_frame = lidar_frame.lstrip("/")
         name = self._wanted or tree.root(lidar_frame, self._own)
         if name == self.name:

@@ -109,6 +109,8 @@ class Diagnostics:
         self._mapper, self._sender = mapper, sender
         self.frame_problem = ""
         """What is wrong with the frame that was asked for, in words."""
+        self.tf_problem = ""
+        """Why its pose is not on /tf, in words."""
         self.other: OtherOdometry | None = None
         """Another odometry, if there is one."""
         self._lost_before = self._dropped_before = 0
@@ -197,6 +199,8 @@ class Diagnostics:
             text += f"; the way across {last.breaks} pause(s) is not known"
         if self.frame_problem:
             level, text = ERROR, f"{text}; {self.frame_problem}"
+        if self.tf_problem:
+            level, text = max(level, WARN), f"{text}; {self.tf_problem}"
         if synchronizer.dropped > self._dropped_before:
             level, text = max(level, WARN), f"{text}; cannot keep up, {synchronizer.dropped} clouds dropped"
         self._dropped_before = synchronizer.dropped

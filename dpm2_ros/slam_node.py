@@ -73,8 +73,7 @@ class SlamNode(ManagedNode):
         sends = ros.publish_tf_odom and (not self._beside or ros.invert_odom_tf or not ros.embed_mapper)
         self._tf = TransformBroadcaster(self, ros.own_frame, sends, ros.invert_odom_tf)
         self._stopping = threading.Event()
-        is_child = ros.publish_tf_odom and not self._beside and not ros.invert_odom_tf
-        self._base = BaseFrame(ros.base_frame, (ros.odom_frame, ros.own_frame, ros.map_frame), is_child)
+        self._base = BaseFrame(ros.base_frame, (ros.odom_frame, ros.own_frame, ros.map_frame))
         self._requests = Requests(self, self._mapper, self._base, ros.map_frame)
         self._waited = False  # for the base frame
         warm_up(self._config.slam)
@@ -215,6 +214,9 @@ class SlamNode(ManagedNode):
         if base.problem:
             self.get_logger().error(base.problem, throttle_duration_sec=10)
         self._diagnostics.frame_problem = base.problem
+        if base.child_problem and ros.publish_tf_odom and not self._beside and not ros.invert_odom_tf:
+            self._diagnostics.tf_problem = f"no {ros.odom_frame} -> {base.name} on /tf: {base.child_problem}"
+            self.get_logger().warning(self._diagnostics.tf_problem, once=True)
 
     def _hand_on(self, tracked: OdometryResult) -> OdometryResult:
         """The keyframe to the map, pose and transforms published; returns what was published."""
@@ -243,7 +245,7 @@ class SlamNode(ManagedNode):
         A = se3.adjoint(self._base.T_base_start)
         motion, covariance = motion.of_other(self._base.T_base_start), A @ covariance @ A.T
         self._odom.publish(odometry_to_msg(motion, covariance, seconds, ros.own_frame, self._base.name))
-        if self._other is None or ros.invert_odom_tf:
+        if ros.invert_odom_tf or (self._other is None and not self._base.child_problem):
             self._tf.send(motion.T_odom_body, motion.stamp, self._base.name)
         if not (tracked.state is State.LOST and self._mapper is not None and self._mapper.localizing):
             self._send_map(motion)  # where the map does not grow nobody is in it by an odometry that is lost

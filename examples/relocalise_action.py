@@ -19,6 +19,8 @@ from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 LOCATED = ("tracking", "degraded", "relocalised")
+PATIENCE = 3.0
+"""Seconds until /diagnostics, which come once a second, must have said something."""
 
 
 class Localization:
@@ -39,11 +41,11 @@ class IsLocated(py_trees.behaviour.Behaviour):
 
     def __init__(self, localization: Localization) -> None:
         super().__init__("is located")
-        self._localization = localization
+        self._localization, self._began = localization, time.monotonic()
 
     def update(self) -> Status:
         """As py_trees calls it."""
-        if self._localization.state == "unknown":  # before the first diagnostics
+        if self._localization.state == "unknown" and time.monotonic() - self._began < PATIENCE:
             return Status.RUNNING
         return Status.SUCCESS if self._localization.state in LOCATED else Status.FAILURE
 
