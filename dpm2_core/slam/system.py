@@ -110,6 +110,8 @@ class Slam:
         arriving = underway is not None and abs(frame.stamp - underway) < _LOST_ON_THE_WAY
         if localizer is not None and not arriving and localizer.wants(frame.stamp):
             self.odometry.request_keyframe()
+        if localizer is not None and localizer.found is not None:
+            self.odometry.cross_breaks(localizer.found)
         result = self.odometry.process(frame)
         if result.keyframe is None:
             return result

@@ -43,6 +43,7 @@ class Localizer:
         T_map_odom: (4, 4), the last that was verified; it means nothing before `state.located`.
         state: RELOCALISING before the first result, which makes it RELOCALISED; the next one TRACKING; DEGRADED where
             the map does not confirm the odometry, LOST when that lasts or the odometry is broken.
+        found: stamp (ns) of the last keyframe that was found in the map; None before the first.
     """
 
     def __init__(self, relocalizer: FindsPlaces, max_failures: int = 3) -> None:
@@ -53,6 +54,7 @@ class Localizer:
         self._distrust = 0.0  # m, path since the map last confirmed the odometry
         self._T_last: Array | None = None
         self._stamp: int | None = None
+        self.found: int | None = None
         self.T_map_odom: Array = np.eye(4)
         self.state = State.RELOCALIZING
 
@@ -64,7 +66,7 @@ class Localizer:
     def restart(self) -> None:
         """The odometry has begun anew: one may be anywhere."""
         self.T_map_odom, self.state = np.eye(4), State.RELOCALIZING
-        self._failures, self._distrust, self._T_last, self._stamp = 0, 0.0, None, None
+        self._failures, self._distrust, self._T_last, self._stamp, self.found = 0, 0.0, None, None, None
 
     def hint(self, T_map_lidar: Array) -> None:
         """Prior for the pose of the next keyframe (4, 4), for example from RViz."""
@@ -114,5 +116,5 @@ class Localizer:
     def _located(self, keyframe: Keyframe, result: Registration, jumped: bool) -> LocalizationResult:
         self.T_map_odom = se3.orthonormalized(result.T_target_source @ se3.inverse(keyframe.T_odom_kf))
         self.state = State.RELOCALIZED if jumped else State.TRACKING
-        self._failures, self._distrust = 0, 0.0
+        self._failures, self._distrust, self.found = 0, 0.0, keyframe.stamp
         return LocalizationResult(result.T_target_source, result.covariance, self.state, result, jumped)

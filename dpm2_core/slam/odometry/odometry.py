@@ -46,6 +46,11 @@ class Odometry:
         """Make a keyframe of the next registered scan, however short the way."""
         self._keyframes.request()
 
+    def cross_breaks(self, stamp: int) -> None:
+        """A map has shown where the sensor was at that stamp (ns): the way across the breaks before it is known."""
+        if self._breaks and stamp > self._broken:
+            self._breaks = 0
+
     def reset(self) -> None:
         """Forget everything; the next scan is the first."""
         self._T = np.eye(4)
@@ -59,6 +64,7 @@ class Odometry:
         self._bridge: Bridge | None = None
         self._left = 0.0  # the time of the last pose before the pause that is being bridged
         self._breaks = 0
+        self._broken = 0  # stamp of the last break, ns
         self._other: OtherMotion | None = None  # since a frame came with a guess
         self._led = False  # by another odometry to the pose of this frame
         self._inertial: InertialMotion | None = None  # since a frame came with samples of an IMU
@@ -70,7 +76,8 @@ class Odometry:
         self.reset()
         self._T, self._twist, self._of_velocity = before._T, before._twist, before._of_velocity
         self._covariance, self._clock, self._registered = before._covariance, before._clock, before._registered
-        self._breaks, self._other, self._inertial = before._breaks, before._other, before._inertial
+        self._breaks, self._broken = before._breaks, before._broken
+        self._other, self._inertial = before._other, before._inertial
         self._keyframes.take_over(before._keyframes)
         twist = np.zeros(6) if self._twist is None else self._twist
         self._registration.update(self._registration.prepare(frame, twist), self._T)
@@ -171,6 +178,7 @@ class Odometry:
         if bridge.tries >= self._settings.restart_after and self._twist is not None:
             self._keyframes.add_uncertainty(self._covariance)
             self._bridge, self._failures, self._breaks = None, 0, self._breaks + 1
+            self._broken = self._clock.stamp or 0
             return replace(own, reason=f"broken by a pause: {result.reason}")
         self._failures += 1
         T = result.T_target_source if result.ok else self._T

@@ -44,6 +44,10 @@ class ScaledOdometry:
         """Make a keyframe of the next registered scan, however short the way."""
         self._active.request_keyframe()
 
+    def cross_breaks(self, stamp: int) -> None:
+        """A map has shown where the sensor was at that stamp (ns)."""
+        self._active.cross_breaks(stamp)
+
     def reset(self) -> None:
         """Forget everything; the next scan is the first."""
         self._open_air.reset()

@@ -151,5 +151,7 @@ def test_localization_tracks_notices_kidnapping_and_admits_being_lost(relocalize
     assert re.search(r"found \d+\.\d m away, not confirmed yet", doubted.registration.reason)
     assert not doubted.registration.ok
     assert (localizer.wants(9 + 10**9 - 1), localizer.wants(9 + 10**9)) == (False, True)
+    assert localizer.found == 8
     localizer.add(keyframe(10, 76.0, broken))
+    assert localizer.found == 10
     assert not localizer.wants(10 + 10**9)

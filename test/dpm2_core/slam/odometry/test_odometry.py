@@ -202,6 +202,21 @@ def test_scans_that_were_left_out_for_want_of_time_are_no_pause(suburb_drive: Dr
 
 
 @pytest.mark.slow
+def test_a_map_that_knows_the_way_ends_the_doubt_of_a_break(suburb_drive: Drive) -> None:
+    """By where the sensor was after it, not before."""
+    later = [replace(frame, stamp=frame.stamp + 3 * 10**9) for frame in suburb_drive[0][8:]]  # carried, as it were
+    odometry = make_odometry(SlamSettings())
+    tracked = [odometry.process(frame) for frame in (*suburb_drive[0][:8], *later[:-2])]
+    broken = next(t.stamp for t in tracked if t.breaks)
+    odometry.cross_breaks(broken)
+    doubtful = odometry.process(later[-2])
+    assert (doubtful.breaks, doubtful.state) == (1, State.DEGRADED)
+    odometry.cross_breaks(broken + 1)
+    known = odometry.process(later[-1])
+    assert (known.breaks, known.state) == (0, State.TRACKING)
+
+
+@pytest.mark.slow
 def test_an_unreadable_scan_keeps_its_reason(suburb_drive: Drive) -> None:
     frames, _ = suburb_drive
     broken = Frame(6 * 10**8, np.zeros((0, 4), np.float32), problem="000006.bin: 13 bytes")
