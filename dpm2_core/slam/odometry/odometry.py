@@ -63,8 +63,8 @@ class Odometry:
         self._first: Frame | None = None
         self._bridge: Bridge | None = None
         self._left = 0.0  # the time of the last pose before the pause that is being bridged
-        self._breaks = 0
-        self._broken = 0  # stamp of the last break, ns
+        self._breaks: int = 0
+        self._broken: int = 0  # stamp of the last break, ns
         self._other: OtherMotion | None = None  # since a frame came with a guess
         self._led = False  # by another odometry to the pose of this frame
         self._inertial: InertialMotion | None = None  # since a frame came with samples of an IMU
