@@ -46,11 +46,6 @@ class Odometry:
         """Make a keyframe of the next registered scan, however short the way."""
         self._keyframes.request()
 
-    def cross_breaks(self, stamp: int) -> None:
-        """A map has shown where the sensor was at that stamp (ns): the way across the breaks before it is known."""
-        if self._breaks and stamp > self._broken:
-            self._breaks = 0
-
     def reset(self) -> None:
         """Forget everything; the next scan is the first."""
         self._T = np.eye(4)
@@ -63,13 +58,18 @@ class Odometry:
         self._first: Frame | None = None
         self._bridge: Bridge | None = None
         self._left = 0.0  # the time of the last pose before the pause that is being bridged
-        self._breaks: int = 0
-        self._broken: int = 0  # stamp of the last break, ns
+        self._breaks = 0
+        self._broken = 0  # stamp of the last break, ns
         self._other: OtherMotion | None = None  # since a frame came with a guess
         self._led = False  # by another odometry to the pose of this frame
         self._inertial: InertialMotion | None = None  # since a frame came with samples of an IMU
         self._registration.clear()
         self._keyframes.reset()
+
+    def cross_breaks(self, stamp: int) -> None:
+        """A map has shown where the sensor was at that stamp (ns): the way across the breaks before it is known."""
+        if self._breaks and stamp > self._broken:
+            self._breaks = 0
 
     def take_over(self, before: Odometry, frame: Frame) -> None:
         """Go on where another one has just registered a frame: its pose and motion, and a map of that scan alone."""
