@@ -34,7 +34,7 @@ class MatchedSubscription:
         self._setting, self._depth = ros.reliability, _IMU_DEPTH if kind is Imu else ros.queue_depth
         self._given, self.topic = topic, node.resolve_topic_name(topic)
         self.reliability = ReliabilityPolicy.RELIABLE
-        self._qos = self.reliability, DurabilityPolicy.VOLATILE
+        self._durability = DurabilityPolicy.VOLATILE
         self._subscription: Any = None
         self._raw, self.problem = False, ""
         self.refresh()
@@ -60,10 +60,11 @@ class MatchedSubscription:
         keeps = self._wanted is CameraInfo and offered and all(i.qos_profile.durability == latched for i in offered)
         durability = latched if keeps else DurabilityPolicy.VOLATILE  # one that has been sent once, long ago
         kind = self._kind_of({info.topic_type for info in offered})
-        if self._subscription is not None and (requested, durability, kind) == (*self._qos, self._kind):
+        now = self.reliability, self._durability, self._kind
+        if self._subscription is not None and (requested, durability, kind) == now:
             return
         before, other_type = self._subscription, kind is not self._kind
-        self._qos = self.reliability, _ = requested, durability
+        self.reliability, self._durability = requested, durability
         self._kind, self._raw = kind, kind is not self._wanted
         if before is not None and other_type:  # DDS allows one type a topic
             self._node.destroy_subscription(before)

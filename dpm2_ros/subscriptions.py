@@ -229,14 +229,15 @@ class Inputs:
 
     def _on_camera_info(self, camera: CameraTopic, message: CameraInfo) -> None:
         check_header(message.header)
+        info = info_of(camera.topic, message)
         try:
-            decode_camera(info_of(camera.topic, message), np.eye(4), "camera")
+            decode_camera(info, np.eye(4), "camera")
         except UsageError:
             if camera.topic in self._calibrated:
                 raise  # what is known stays
         else:
             self._calibrated.add(camera.topic)
-        camera.info = message
+        camera.info = info
 
     def _on_static(self, message: Any) -> None:
         self._static_messages += 1

@@ -17,6 +17,7 @@ from dpm2_core.data import topics
 from dpm2_core.data.bag_file import open_bag
 from dpm2_core.data.frames import Calibration, CameraTopic, FrameBuilder
 from dpm2_core.data.gnss import FixBuffer
+from dpm2_core.data.image_messages import info_of
 from dpm2_core.data.imu import ImuBuffer
 from dpm2_core.data.kitti import checked_correction
 from dpm2_core.data.livox import LIVOX
@@ -200,7 +201,7 @@ class BagSource:
         info_topic = info_topic or f"{topic.removesuffix('/compressed').rpartition('/')[0]}/camera_info"
         info = self._bag.first(info_topic) if self._bag.types.get(info_topic) == CAMERA_INFO else None
         if info is not None:
-            return CameraTopic(topic, info)
+            return CameraTopic(topic, info_of(topic, info))
         if asked:
             raise UsageError(f"{self.path}: no CameraInfo on {info_topic} for {topic}; {self._contents()}")
         self.notes.append(f"images of {topic} are left out: no CameraInfo on {info_topic}")
@@ -224,8 +225,8 @@ class BagSource:
         the buffer then."""
         known, offset = self._calibration, round(self._settings.image_time_offset * 1e9)
         others = dict.fromkeys((camera.topic for camera in known.cameras), offset)
-        others |= dict.fromkeys(filter(None, (known.second_topic,)), 0)
-        others |= dict.fromkeys(filter(None, (self.imu_topic,)), -_SWEEP)
+        more = ((known.second_topic, 0), (self.imu_topic, -_SWEEP))
+        others |= {topic: ahead for topic, ahead in more if topic}
         beside = {topic: Beside(self._settings.image_tolerance) for topic in others if topic != self.imu_topic}
         gnss = known.gnss_topic  # nobody waits for fixes: a late one has its place on the way, too
         messages = self._bag.messages([self.points_topic, *others, *([gnss] if gnss else [])])

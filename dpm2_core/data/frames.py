@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from dpm2_core.data.gnss import FixBuffer
-from dpm2_core.data.image_messages import decode_camera, decode_image, info_of, is_fisheye, rectified
+from dpm2_core.data.image_messages import decode_camera, decode_image, is_fisheye, rectified
 from dpm2_core.data.imu import ImuBuffer
 from dpm2_core.data.messages import MessageError, decode_points, why_untimed
 from dpm2_core.data.settings import InputSettings
@@ -26,7 +26,8 @@ _LENGTH = 300  # characters of a problem, whatever is in the message
 
 @dataclass(eq=False)
 class CameraTopic:
-    """A camera by its messages: the full topic of its images, and its CameraInfo, None as long as there is none."""
+    """A camera by its messages: the full topic of its images, and what its CameraInfo says of them (`info_of`), None as
+    long as there is none."""
 
     topic: str
     info: Any = None
@@ -161,7 +162,7 @@ class FrameBuilder:
                 T_lidar_cam = self._calibration.transforms.lookup(lidar_frame, frame)
             except UsageError as error:
                 raise UsageError(f"{error}; {hint}") from None
-        return decode_camera(info_of(camera.topic, camera.info), T_lidar_cam, camera.topic)
+        return decode_camera(camera.info, T_lidar_cam, camera.topic)
 
     @property
     def angle_correction_deg(self) -> float:
@@ -217,9 +218,8 @@ class FrameBuilder:
             message = self._decode(topic, message)
             camera = self.camera(taken_by, lidar_frame, message.header.frame_id)
             pixels = decode_image(message, camera.size)
-            info = info_of(topic, taken_by.info)
-            if is_fisheye(info) and pixels.shape[1::-1] == camera.size:
-                pixels = rectified(pixels, info)
+            if is_fisheye(taken_by.info) and pixels.shape[1::-1] == camera.size:
+                pixels = rectified(pixels, taken_by.info)
             image = Image(pixels, camera)
         except (UsageError, ValueError) as error:
             self.problems[topic] = self._tell(topic, error, "; images are left out")

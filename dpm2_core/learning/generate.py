@@ -14,15 +14,14 @@ from pydantic import Field
 from dpm2_core.config import Settings
 from dpm2_core.data.packed import PackedWriter, Sample, write_packed
 from dpm2_core.data.source import Source
-from dpm2_core.descriptors import is_level, levelling
+from dpm2_core.descriptors import levelling
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Frame, Image, Points
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.deskew import deskew
 from dpm2_core.geometry.scale import ROOM_SCALE, scale_of
-from dpm2_core.geometry.tilt import up_of
 from dpm2_core.network.images import in_encoded_axes, small_image
-from dpm2_core.network.pyramid import crop
+from dpm2_core.network.pyramid import crop, tilt_of
 from dpm2_core.network.settings import NetworkSettings, preset
 from dpm2_core.sim.camera import calibration, render
 from dpm2_core.sim.lidar import Lidar
@@ -169,8 +168,7 @@ def _packed(frame: Frame, pose: Array, twist: Array, network: NetworkSettings, s
     if frame.time_offset is not None:
         points = deskew(points, frame.time_offset, twist)
     images = tuple(small_image(image, network.image) for image in frame.images)
-    up = up_of(crop(points, network.points))
-    if up is not None and not is_level(up):
+    if (up := tilt_of(crop(points, network.points))) is not None:
         R = levelling(up)
         points, pose = points[:, :3] @ R.T, pose @ se3.make(R.T, np.zeros(3))
         images = tuple(in_encoded_axes(image, R, 1.0) for image in images)

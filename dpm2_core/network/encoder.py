@@ -12,17 +12,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from dpm2_core.descriptors import Descriptors, is_level, levelling
+from dpm2_core.descriptors import Descriptors, levelling
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Frame, Image
 from dpm2_core.geometry.scale import scale_of
-from dpm2_core.geometry.tilt import up_of
 from dpm2_core.network.convnext import FeatureMap
 from dpm2_core.network.fusion import Fusion
 from dpm2_core.network.images import in_encoded_axes, small_image
 from dpm2_core.network.pointnext import Scale, view_axes
 from dpm2_core.network.precision import mixed_precision
-from dpm2_core.network.pyramid import PointBatch, build_pyramid, collate, crop
+from dpm2_core.network.pyramid import PointBatch, build_pyramid, collate, crop, tilt_of
 from dpm2_core.network.registry import image_backbone, point_backbone
 from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.network.spatial import paint
@@ -92,9 +91,7 @@ class Encoder(nn.Module):
         device = next(self.parameters()).device
         cloud, scale = crop(frame.points, self.settings.points), scale_of(frame.points)
         images = [small_image(image, self.settings.image) for image in frame.images] if self.image is not None else []
-        up = up_of(cloud)
-        if up is not None and is_level(up):  # as the network was trained; None: no ground to tell by
-            up = None
+        up = tilt_of(cloud)
         if scale != 1:
             cloud = crop(frame.points[:, :3] * np.float32(scale), self.settings.points)
         if up is None and scale == 1:

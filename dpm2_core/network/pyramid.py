@@ -12,12 +12,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from dpm2_core.descriptors import is_level
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Image
 from dpm2_core.geometry.corners import TEXTURE, Corners, image_corners, no_corners
 from dpm2_core.geometry.edges import vertical_edges
 from dpm2_core.geometry.point_grid import PointGrid
 from dpm2_core.geometry.sampling import farthest_points, interleaved, neighbours
+from dpm2_core.geometry.tilt import up_of
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.network.images import small_image
 from dpm2_core.network.settings import NetworkSettings, PointsSettings
@@ -64,6 +66,15 @@ def crop(points: NDArray[np.float32], settings: PointsSettings) -> NDArray[np.fl
     """Range crop and voxel grid of (N, 3+) points: (M, 3), ordered so that the order of the input does not matter."""
     xyz = points[voxel_first(points, settings.voxel, settings.near, settings.far), :3]
     return xyz[np.argsort(xyz[:, 0])]
+
+
+def tilt_of(cloud: NDArray[np.float32]) -> NDArray[np.float32] | None:
+    """Unit vector (3,) that points up in a cropped cloud of a tilted sensor, which the network reads in level axes.
+
+    None where the sensor is level, as the network was trained, or no ground shows how it is.
+    """
+    up = up_of(cloud)
+    return None if up is None or is_level(up) else up
 
 
 def build_pyramid(cloud: NDArray[np.float32], network: NetworkSettings, images: Sequence[Image] = ()) -> Pyramid:
