@@ -268,8 +268,10 @@ class Result:
             poses = self.sensor_poses
             truth = truth if self.source.T_cam_lidar is None else in_other_frame(truth, self.source.T_cam_lidar)
         failed = self.methods["failed"]
-        metrics = evaluate(truth, poses, failed_frames=failed, breaks=self.recorder.breaks, fps=self.fps)
-        return metrics.model_copy(update={"truth": self.ground_truth_name})
+        period = Trajectory(self.poses, np.array(self.recorder.stamps), "tum").period
+        metrics = evaluate(truth, poses, period=period, failed_frames=failed)
+        own = {"truth": self.ground_truth_name, "breaks": self.recorder.breaks, "fps": self.fps}
+        return metrics.model_copy(update=own)
 
     def save(self, out: Path, cloud: bool = True) -> list[str]:
         """Write all files, each whole or not at all; returns what could not be done, in words.

@@ -51,7 +51,8 @@ def eval_(
     estimate = read_trajectory(est)
     if calib is not None:
         estimate = in_camera_frame(estimate, calib)
-    metrics = evaluate(*matched(truth, estimate), chosen).model_copy(update={"truth": str(gt)})
+    period = max(truth.period, estimate.period)  # a truth of a faster clock is read at the estimate's stamps
+    metrics = evaluate(*matched(truth, estimate), chosen, period=period).model_copy(update={"truth": str(gt)})
     frame = FRAME_CAMERA if calib else FRAME_AS_GIVEN
     figures = {"gt": str(gt), "est": str(est), "frame": frame, **metrics.model_dump()}
     show(metrics_table(metrics, title=f"{est} against {gt}", frame=frame), figures, json_file)

@@ -99,10 +99,16 @@ def _decode_compressed(msg: Any, size: tuple[int, int] | None) -> NDArray[np.uin
     if "compresseddepth" in msg.format.lower():
         raise MessageError(f"compressed image format {msg.format[:40]!r} is not supported; supported: jpeg, png")
     try:
-        return decode_compressed(bytes(msg.data), size)
+        pixels = decode_compressed(bytes(msg.data), size)
     except ValueError as error:
         what = f"compressed image of format {msg.format[:40]!r} and {len(msg.data)} bytes"
         raise MessageError(f"{what} cannot be decoded: {error}") from None
+    encoding, _, compression = msg.format.lower().partition(";")  # "bayer_rggb8; jpeg compressed "
+    _, _, conversion = _IMAGE_ENCODINGS.get(encoding, ("", 0, None))
+    if conversion is None or not encoding.startswith("bayer_") or "compressed bgr" in compression:
+        return pixels
+    # image_transport compresses the mosaic as it is.
+    return np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels[..., 0]), conversion), np.uint8)
 
 
 def decode_camera(info: Any, T_lidar_cam: Array, name: str) -> Camera:

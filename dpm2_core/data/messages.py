@@ -228,11 +228,14 @@ def _time_offset(time: NDArray[Any], points: Points, stamp: int, unit: TimeUnit)
     seen = np.isfinite(points[:, :3]).all(1) & points[:, :3].any(1)  # drivers often zero the time of a missing return
     value = _first(time).astype(np.float64)
     seen &= np.isfinite(value)
-    if _is_absolute(value[seen & (value != 0)]):
-        seen &= value != 0  # of a missing return, although its point may have been moved into another frame since
-    if not seen.any():
+    zero = value == 0
+    if not (seen & ~zero).any():
         return None
-    first, last = value[seen].min(), value[seen].max()
+    first, last = _span(value[seen & ~zero])
+    if 0 < 10 * (last - first) < first:  # by a clock that began long before the scan
+        seen &= ~zero  # of a missing return, although its point may have been moved into another frame since
+    elif (seen & zero).any():
+        first, last = min(first, 0.0), max(last, 0.0)
     if first == last:
         return None
     scale = _SECONDS[unit] if unit != "auto" else _time_scale(first, last, time.dtype.kind == "f")
@@ -240,15 +243,20 @@ def _time_offset(time: NDArray[Any], points: Points, stamp: int, unit: TimeUnit)
     if max(abs(first), abs(last)) * scale > _LONGEST_SCAN:
         origin = stamp * 1e-9 / scale
         if max(abs(first - origin), abs(last - origin)) * scale > _LONGEST_SCAN:
-            origin = first  # the sensor's clock is not that of the stamps: the first point is all that can be known
+            # The sensor's clock is not that of the stamps: the first point is all that can be known.
+            known = value[seen]
+            middle = np.partition(known, len(known) // 2)[len(known) // 2]  # unlike a median always one of them
+            origin = known[np.abs(known - middle) * scale <= _LONGEST_SCAN].min()
     with np.errstate(invalid="ignore", over="ignore"):
         offset = (value - origin) * scale
     return np.where(seen & (np.abs(offset) <= _LONGEST_SCAN), offset, 0.0).astype(np.float32)  # else it means nothing
 
 
-def _is_absolute(times: NDArray[np.float64]) -> bool:
-    """Whether times (N,), none zero, are by a clock that began long before the scan."""
-    return len(times) > 0 and 0 < 10 * np.ptp(times) < times.min()
+def _span(times: NDArray[np.float64]) -> tuple[float, float]:
+    """The earliest and the latest of times (N,) but for one in a hundred at either end: a few may be anything."""
+    few = len(times) // 100
+    ordered = np.partition(times, (few, len(times) - 1 - few))
+    return float(ordered[few]), float(ordered[-1 - few])
 
 
 def _time_scale(first: float, last: float, floating: bool) -> float:

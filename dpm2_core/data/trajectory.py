@@ -22,6 +22,10 @@ Keys = NDArray[np.int64]
 _TUM, _KITTI, _KITTI_INDEXED, _KITTI_360 = 8, 12, 13, 17  # numbers a line
 
 
+FRAME_PERIOD = 0.1
+"""Of KITTI's scans, s."""
+
+
 @dataclass(frozen=True, eq=False)
 class Trajectory:
     """Poses and their keys.
@@ -38,6 +42,11 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.poses)
+
+    @property
+    def period(self) -> float:
+        """Median time from one pose to the next, s; that of KITTI's frames where there are no stamps."""
+        return _period(self.keys) * 1e-9 if self.kind == "tum" and len(self) > 1 else FRAME_PERIOD
 
 
 def write_kitti(path: Path | str, poses: Array, index: Sequence[int] | Keys | None = None) -> None:

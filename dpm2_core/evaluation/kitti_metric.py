@@ -13,13 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dpm2_core.data.trajectory import FRAME_PERIOD
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 
 OFFICIAL_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 """Segment lengths of the benchmark, m."""
-FRAME_PERIOD = 0.1
-"""Of KITTI's scans, s, by which the development kit gives each segment a speed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +29,7 @@ class SegmentErrors:
         length: (S,) m.
         t_err: (S,) error of the relative translation over the length, a ratio.
         r_err: (S,) error of the relative rotation over the length, rad/m.
-        speed: (S,) mean speed at 10 frames a second, m/s.
+        speed: (S,) mean speed, m/s.
     """
 
     length: Array
@@ -57,12 +56,15 @@ class SegmentErrors:
         return (float(self.t_err.mean()), float(self.r_err.mean())) if len(self) else None
 
 
-def segment_errors(gt: Array, est: Array, lengths: Sequence[float] = OFFICIAL_LENGTHS) -> SegmentErrors:
+def segment_errors(
+    gt: Array, est: Array, lengths: Sequence[float] = OFFICIAL_LENGTHS, period: float = FRAME_PERIOD
+) -> SegmentErrors:
     """Compare (N, 4, 4) poses with (N, 4, 4) ground truth of the same frames and the same sensor frame.
 
     Args:
         est: rows of NaN where a frame has no estimate; segments that begin or end there are left out.
         lengths: m. With those of the benchmark a segment starts every 10 frames, as there, with others at each frame.
+        period: s from one frame to the next, for the speeds.
     """
     step = 10 if tuple(lengths) == OFFICIAL_LENGTHS else 1
     travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(gt[:, :3, 3], axis=0), axis=1))])
@@ -73,7 +75,7 @@ def segment_errors(gt: Array, est: Array, lengths: Sequence[float] = OFFICIAL_LE
     both = known(est)[first] & known(est)[last]
     first, last, length = first[both], last[both], length[both]
     error = se3.inverse(relative(est, first, last)) @ relative(gt, first, last)
-    speed = length / (FRAME_PERIOD * (last - first + 1))  # as the development kit counts the frames
+    speed = length / (period * (last - first + 1))  # as the development kit counts the frames
     return SegmentErrors(length, np.linalg.norm(error[:, :3, 3], axis=1) / length, se3.angle(error) / length, speed)
 
 

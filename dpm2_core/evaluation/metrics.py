@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
+from dpm2_core.data.trajectory import FRAME_PERIOD
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.kitti_metric import OFFICIAL_LENGTHS, SegmentErrors, known, relative, segment_errors
 from dpm2_core.frame import Array
@@ -90,19 +91,18 @@ def evaluate(
     est: Array,
     lengths: Sequence[float] = OFFICIAL_LENGTHS,
     *,
+    period: float = FRAME_PERIOD,
     failed_frames: int | None = None,
-    breaks: int = 0,
-    fps: float | None = None,
 ) -> Metrics:
-    """Evaluate (N, 4, 4) poses against (N, 4, 4) ground truth of the same frames.
+    """Evaluate (N, 4, 4) poses against (N, 4, 4) ground truth of the same frames; what is not to be seen from these, as
+    breaks and speed, is left for the caller.
 
     Args:
         gt: rows of NaN where the ground truth is unknown; these frames are left out.
         est: in the sensor frame of `gt` (the world frames may differ); rows of NaN where there is no estimate.
         lengths: of the KITTI metric's segments, m.
+        period: s from one frame to the next, for the errors by speed.
         failed_frames: as the SLAM system counted them; by default the frames without an estimate.
-        breaks: as the SLAM system counted them.
-        fps: frames a second, to be reported along.
 
     Raises:
         UsageError: the two differ in length, or fewer than two frames have both poses.
@@ -115,15 +115,13 @@ def evaluate(
         raise UsageError(
             f"only {both.sum()} of {len(gt)} frames have both an estimate and ground truth; want 2 or more"
         )
-    segments = segment_errors(gt[has_gt], est[has_gt], lengths)
+    segments = segment_errors(gt[has_gt], est[has_gt], lengths, period)
     t_err, r_err = _percent(segments)
     rpe_trans, rpe_rot = rpe(gt, est)
     position = _position_errors(gt[both], est[both])
     return Metrics(
         frames=len(est),
         failed_frames=int((~has_est).sum()) if failed_frames is None else failed_frames,
-        breaks=breaks,
-        fps=fps,
         path_length_m=path_length(gt[has_gt]),
         t_err_percent=t_err,
         r_err_deg_per_100m=r_err,

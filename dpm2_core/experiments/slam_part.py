@@ -153,7 +153,8 @@ def _measured(folder: Path, source: Source, poses: tuple[Array, Array], drive: D
     truth, est = poses
     if source.T_cam_lidar is not None:
         truth, est = in_other_frame(truth, source.T_cam_lidar), in_other_frame(est, source.T_cam_lidar)
-    metrics: Metrics = evaluate(truth, est, tuple(drive["lengths"]), fps=fps).model_copy(update={"truth": source.truth})
+    metrics: Metrics = evaluate(truth, est, tuple(drive["lengths"]))
+    metrics = metrics.model_copy(update={"truth": source.truth, "fps": fps})
     write_json(folder / METRICS, metrics.model_dump())
     return metrics.model_dump(exclude={"per_length", "per_speed"})
 

@@ -17,7 +17,7 @@ from dpm2_core.frame import Array, Edge, Georeference, Keyframe, Points
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.slam.store.cloud_store import CloudStore, Loan
-from dpm2_core.slam.store.map_store import Change, MapStore
+from dpm2_core.slam.store.map_store import Change, MapStore, remove_log
 from dpm2_core.slam.store.rows import NO_POINTS as NO_POINTS
 from dpm2_core.slam.store.rows import (
     RemovedKeyframe,
@@ -230,15 +230,14 @@ def move_map(source: Path, target: Path) -> None:
     wal = Path(f"{source}-wal")
     if wal.exists() and wal.stat().st_size:  # see MapStore.close; renamed without it, the map would be damaged
         raise Dpm2Error(f"{target}: not written: the map could not be made one file; is the disk full?")
-    for suffix in ("-wal", "-shm"):  # of the map before, and of no other
-        Path(f"{target}{suffix}").unlink(missing_ok=True)
+    remove_log(target)
     source.replace(target)
 
 
 def remove_map(path: Path) -> None:
     """Remove a map file, if it is there, with what SQLite keeps beside it."""
-    for suffix in ("", "-wal", "-shm", "-journal"):
-        Path(f"{path}{suffix}").unlink(missing_ok=True)
+    path.unlink(missing_ok=True)
+    remove_log(path)
 
 
 def subset(data: MapData, nodes: Sequence[int], edges: list[Edge], trail: list[RemovedKeyframe]) -> MapData:

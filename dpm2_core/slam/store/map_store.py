@@ -272,6 +272,7 @@ class MapStore:
             try:
                 with closing(sqlite3.connect(part)) as copy:
                     self._connection.backup(copy)
+                remove_log(path)
                 part.replace(path)
             finally:
                 part.unlink(missing_ok=True)
@@ -295,6 +296,12 @@ class MapStore:
 def _insert(sql: sqlite3.Connection, table: str, rows: Sequence[tuple[Any, ...]]) -> None:
     if rows:
         sql.executemany(f"INSERT OR REPLACE INTO {table} VALUES ({','.join('?' * len(rows[0]))})", rows)
+
+
+def remove_log(path: Path) -> None:
+    """Remove what SQLite keeps beside a map file: another map of that name would be read with it, and be damaged."""
+    for suffix in ("-wal", "-shm", "-journal"):
+        Path(f"{path}{suffix}").unlink(missing_ok=True)
 
 
 def _connect(path: Path, mode: str) -> Connection:

@@ -55,6 +55,18 @@ def test_the_json_holds_the_fixed_keys_and_how_they_were_measured(tmp_path: Path
     assert json.loads((tmp_path / "m.json").read_text())["t_err_percent"] is None
 
 
+@pytest.mark.parametrize("faster", [1, 4])
+def test_speeds_are_those_of_the_stamps(tmp_path: Path, faster: int) -> None:
+    """1 m in 0.2 s; a truth with more poses is read at the estimate's. Class of 2 m/s: 11 m in 12 frames is 4.2 m/s."""
+    est = _drive()
+    truth = np.repeat(est, faster, axis=0)
+    truth[:, 2, 3] = np.arange(len(truth)) / faster
+    write_tum(tmp_path / "gt.txt", np.arange(len(truth)) * (200_000_000 // faster), truth)
+    write_tum(tmp_path / "est.txt", np.arange(len(est)) * 200_000_000, est)
+    eval_(tmp_path / "gt.txt", tmp_path / "est.txt", tmp_path / "m.json", "10")
+    assert [row["speed_mps"] for row in json.loads((tmp_path / "m.json").read_text())["per_speed"]] == [4.0]
+
+
 def test_lidar_poses_meet_camera_ground_truth_through_the_calibration(tmp_path: Path, kitti_excerpt: Path) -> None:
     """Compared without it, a drive that turns by 90 degrees seems decimetres off."""
     folder = kitti_excerpt / "00"

@@ -207,6 +207,31 @@ def test_a_time_of_zero_among_absolute_ones_means_nothing(began: float) -> None:
     np.testing.assert_allclose(relative, [0, 0.03, 0.06, 0.1])
 
 
+@pytest.mark.parametrize("wrong", [0, 7e9, 4294967295])
+@pytest.mark.parametrize(
+    ("began", "unit"), [(0, 1e-6), (0, 1e-9), (0, 1), (STAMP * 1e-9, 1), (60e9, 1e-9), (5.0, 1)]
+)  # fmt: skip
+def test_one_time_that_is_far_off_spoils_no_other(began: float, unit: float, wrong: float) -> None:
+    """As of a damaged packet: it took the unit from the others, or their beginning. Tolerance: float64 of an epoch."""
+    ramp = np.linspace(0, 0.1, 1000)
+    time = began + ramp / unit
+    spoiled = time.copy()
+    spoiled[500] = wrong
+    _, want = messages.decode_points(cloud(xyz(1000, timestamp=time)))
+    _, got = messages.decode_points(cloud(xyz(1000, timestamp=spoiled)))
+    assert want is not None
+    assert got is not None
+    np.testing.assert_allclose(want, ramp, atol=1e-6)
+    np.testing.assert_allclose(np.delete(got, 500), np.delete(want, 500), atol=1e-6)
+    assert abs(got[500]) <= 2
+
+
+def test_two_times_years_apart_are_no_sweep() -> None:
+    """Nothing says which of the two is right: neither point is moved by more than a sweep can last."""
+    _, offset = messages.decode_points(cloud(xyz(2, timestamp=np.array([5.0, STAMP * 1e-9 + 1e8]))))
+    assert offset is None or np.abs(offset).max() <= 2.0
+
+
 def test_odd_points_keep_their_place() -> None:
     columns = xyz(5)
     columns["x"][:] = [np.nan, np.inf, 0, -np.inf, 1]
@@ -335,6 +360,21 @@ def test_bayer_patterns_give_the_color_they_were_made_from(pattern: str, bits: i
     np.testing.assert_array_equal(decoded[2:-2, 2:-2], np.broadcast_to(color, (4, 4, 3)))
 
 
+def test_a_compressed_mosaic_gets_its_color() -> None:
+    """image_transport compresses a Bayer image as it is; one whose format says bgr8 has its color already."""
+    color = np.array([200, 120, 40], np.uint8)
+    mosaic = np.empty((8, 8), np.uint8)
+    for i, letter in enumerate("gbrg"):
+        mosaic[i // 2 :: 2, i % 2 :: 2] = color["rgb".index(letter)]
+    for form, pixels in (
+        ("bayer_gbrg8; png compressed ", mosaic),
+        ("bayer_gbrg8; png compressed bgr8", np.broadcast_to(color[::-1], (8, 8, 3))),
+    ):
+        data = cv2.imencode(".png", pixels)[1].reshape(-1)
+        decoded = image_messages.decode_image(SimpleNamespace(header=header(), format=form, data=data))
+        np.testing.assert_array_equal(decoded[2:-2, 2:-2], np.broadcast_to(color, (4, 4, 3)))
+
+
 def test_compressed_images() -> None:
     smooth = cv2.resize(picture(4, 4), (64, 48), interpolation=cv2.INTER_CUBIC)
     for form, tolerance in (("png", 0), ("jpeg", 30)):  # JPEG of a smooth image, quality 95
@@ -450,6 +490,7 @@ def test_times_that_no_sweep_can_have_are_left_out() -> None:
     """They would move the points to anywhere; the other points keep theirs."""
     _, offset = messages.decode_points(cloud(xyz(5, t=np.array([0.0, 0.05, 0.1, 1e300, np.nan]))), time_unit="s")
     assert offset is not None
+    np.testing.assert_allclose(offset[:3], [0, 0.05, 0.1])
     assert np.isfinite(offset).all()
     assert np.abs(offset).max() <= 2.0
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import shutil
 import signal
 import sqlite3
 import struct
@@ -539,3 +540,23 @@ def test_a_map_behind_another_one_is_the_map_of_both(tmp_path: Path, map_file: P
                 assert list(both.rows(table)) == list(merged.rows(table)), table
             assert len(list(both.rows("edges", where="from_node < 12"))) == 13
     assert not check_map(tmp_path / "both").problems
+
+
+def test_a_copy_replaces_a_map_whose_writer_was_killed(tmp_path: Path, keyframes: list[Keyframe]) -> None:
+    """Its log stayed beside the new map, which was then read with the old one's pages."""
+    path, target = tmp_path / "a.dpm2map", tmp_path / "b.dpm2map"
+    with MapStore.create(tmp_path / "killed") as store:
+        store.begin_session()
+        for node, keyframe in enumerate(keyframes):
+            store.write(Change([(node, keyframe, pack_cloud(keyframe.cloud), None)], poses={node: keyframe.T_odom_kf}))
+        for suffix in ("", "-wal"):  # as `kill -9` leaves them
+            shutil.copyfile(tmp_path / f"killed{suffix}", f"{target}{suffix}")
+    assert Path(f"{target}-wal").stat().st_size > 0
+    with MapStore.create(path) as store:
+        store.begin_session()
+        for node, keyframe in enumerate(keyframes[:2]):
+            store.write(Change([(node, keyframe, pack_cloud(keyframe.cloud), None)], poses={node: keyframe.T_odom_kf}))
+        store.copy_to(target)
+    assert not Path(f"{target}-wal").exists()
+    with MapStore.open(target) as store:
+        assert len(load_map(store).keyframes) == 2
