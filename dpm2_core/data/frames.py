@@ -126,7 +126,7 @@ class FrameBuilder:
     def _joined(
         self, points: Points, offset: Points | None, lidar_frame: str, late: float, second: Any
     ) -> tuple[Points, Points | None]:
-        """Points (N, 4) with those of a second LiDAR, `late` s after them; their times (N,) with its."""
+        """Points (N, 4) with those that a second LiDAR has measured, `late` s after them; their times (N,) with its."""
         topic = self._calibration.second_topic
         try:
             second = self._decode(topic, second)
@@ -136,6 +136,8 @@ class FrameBuilder:
             self.problems[topic] = self._tell(topic, error, "; going on without the second LiDAR")
             return points, offset
         self.problems.pop(topic, None)
+        seen = np.isfinite(others[:, :3]).all(1) & others[:, :3].any(1)  # moved, a missing return's zeros are a point
+        others, other_offset = others[seen], None if other_offset is None else other_offset[seen]
         if offset is not None or other_offset is not None or late:
             first = np.zeros(len(points), np.float32) if offset is None else offset
             then = np.zeros(len(others), np.float32) if other_offset is None else other_offset
@@ -194,7 +196,7 @@ class FrameBuilder:
         R = self._settings.imu_rotation()
         if R is not None:
             return R
-        if lidar_frame.lstrip("/") == imu_frame.lstrip("/"):
+        if lidar_frame and lidar_frame.lstrip("/") == imu_frame.lstrip("/"):
             return np.eye(3)
         try:
             return self._calibration.transforms.lookup(lidar_frame, imu_frame)[:3, :3]

@@ -102,6 +102,22 @@ def test_without_its_place_it_is_left_out_and_said(bags: Any, tmp_path: Path) ->
         InputSettings(q_lidar_imu=(0, 0, 0, 2))
 
 
+def test_two_frames_without_a_name_are_not_one(bags: Any, tmp_path: Path) -> None:
+    """Cloud and IMU without a frame_id may be turned any way; what is set by hand still counts."""
+    messages = drive(bags, frame="")
+    for _, topic, message in messages:
+        if topic == POINTS:
+            message.header.frame_id = ""
+    bag = bags.write(tmp_path / "b", messages)
+    source = BagSource(bag)
+    assert all(frame.imu is None for frame in source.frames())
+    (note,) = source.notes
+    assert note.startswith("/imu: no transform from '' to ''")
+    assert "input.q_lidar_imu" in note
+    given = BagSource(bag, InputSettings(q_lidar_imu=(0, 0, 0, 1)))
+    assert all(frame.imu is not None for frame in given.frames())
+
+
 def test_one_that_stops_is_missed_once(bags: Any, tmp_path: Path) -> None:
     source = BagSource(bags.write(tmp_path / "b", [quarter(bags), *drive(bags, until=1.45)]))
     assert [frame.imu is not None for frame in source.frames()] == [True] * 6 + [False] * 4
