@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from dpm2_core.data.bags import BagSource, interpolate
+from dpm2_core.data.messages import cloud_fields
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.vertical_angle import HDL64_CORRECTION_DEG
 from dpm2_core.errors import UsageError
@@ -112,6 +113,22 @@ def test_clouds_of_a_second_lidar_join_in_the_frame_of_the_first(bags: Any, tmp_
     assert frames[1].time_offset is not None
     np.testing.assert_allclose(frames[1].time_offset, [0.0] * 60 + [0.04] * 60, atol=1e-6)
     assert frames[2].time_offset is None
+
+
+def test_missing_returns_of_a_second_lidar_are_no_points_at_its_place(bags: Any, tmp_path: Path) -> None:
+    """Drivers send zeros for them, or NaN. Their times go with them."""
+    columns = {name: np.full(60, value, np.float32) for name, value in (("x", 5.0), ("y", 2.0), ("z", 3.0))}
+    columns["t"] = np.linspace(0, 0.1, 60, dtype=np.float32)
+    for name in "xyz":
+        columns[name][:20], columns[name][20:30] = 0, np.nan
+    fields = cloud_fields(columns, bags.store.types["sensor_msgs/msg/PointField"])
+    second = bags.new("sensor_msgs/PointCloud2", header=bags.header(1, "left"), **fields)
+    tree = (1, "/tf_static", bags.transform("velo_link", "left", (0, 2, 0)))
+    bag = bags.write(tmp_path / "b", [*clouds(bags, [1]), (1, "/second", second), tree])
+    (frame,) = BagSource(bag, InputSettings(points_topic=POINTS, second_points_topic="/second")).frames()
+    np.testing.assert_allclose(frame.points[60:], [[5, 4, 3, 0]] * 30, rtol=1e-6)
+    assert frame.time_offset is not None
+    np.testing.assert_allclose(frame.time_offset, [*[0] * 60, *columns["t"][30:]], atol=1e-6)  # float32 of 0.1 s
 
 
 def test_a_second_lidar_without_a_place_is_left_out(bags: Any, tmp_path: Path) -> None:
