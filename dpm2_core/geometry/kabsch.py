@@ -6,6 +6,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from dpm2_core.geometry.full_precision import full_precision
+
 
 def weighted_kabsch(source: Tensor, target: Tensor, weights: Tensor) -> Tensor:
     """T_target_source that minimizes sum w |target - T source|^2.
@@ -32,6 +34,7 @@ def weighted_kabsch(source: Tensor, target: Tensor, weights: Tensor) -> Tensor:
     return T
 
 
+@full_precision
 def transform(T: Tensor, points: Tensor) -> Tensor:
     """T (B, 4, 4) applied to points (B, N, 3), in the dtype of the points."""
     T = T.to(points.dtype)

@@ -6,7 +6,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from dpm2_core.geometry.full_precision import full_precision
 
+
+@full_precision
 def pixel_rays(uv: Tensor, K: Tensor, T_lidar_cam: Tensor) -> tuple[Tensor, Tensor]:
     """Rays through pixels.
 
@@ -26,6 +29,7 @@ def pixel_rays(uv: Tensor, K: Tensor, T_lidar_cam: Tensor) -> tuple[Tensor, Tens
     return T_lidar_cam[:, :3, 3], directions / directions.norm(dim=-1, keepdim=True)
 
 
+@full_precision
 def point_ray_distance(points: Tensor, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
     """Distance of points from rays, and whether they lie in front.
 
@@ -43,6 +47,7 @@ def point_ray_distance(points: Tensor, origins: Tensor, directions: Tensor) -> t
     return squared.clamp(min=0).sqrt(), along >= 0
 
 
+@full_precision
 def project(points: Tensor, K: Tensor, T_lidar_cam: Tensor) -> tuple[Tensor, Tensor]:
     """LiDAR points in the image.
 

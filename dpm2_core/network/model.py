@@ -131,4 +131,6 @@ def _reduced(result: Registration, scale: float) -> Registration:
     """A registration of a scene that was enlarged by `scale`."""
     T, S = result.T_target_source.copy(), np.repeat([1.0, 1 / scale], 3)
     T[:3, 3] /= scale
-    return replace(result, T_target_source=T, covariance=result.covariance * np.outer(S, S), rmse=result.rmse / scale)
+    floor = result.floor[0], result.floor[1] / scale
+    covariance = result.covariance * np.outer(S, S)
+    return replace(result, T_target_source=T, covariance=covariance, floor=floor, rmse=result.rmse / scale)

@@ -63,7 +63,9 @@ class PointBatch(NamedTuple):
 
 
 def crop(points: NDArray[np.float32], settings: PointsSettings) -> NDArray[np.float32]:
-    """Range crop and voxel grid of (N, 3+) points: (M, 3), ordered so that the order of the input does not matter."""
+    """Range crop and voxel grid of (N, 3+) points: (M, 3) by x, so that the order of a cloud with one point per voxel
+    does not matter; of several the first is kept.
+    """
     xyz = points[voxel_first(points, settings.voxel, settings.near, settings.far), :3]
     return xyz[np.argsort(xyz[:, 0])]
 

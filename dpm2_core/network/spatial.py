@@ -6,6 +6,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from dpm2_core.geometry.full_precision import full_precision
 from dpm2_core.geometry.rays import pixel_rays, point_ray_distance, project
 from dpm2_core.network import compiled_bias
 from dpm2_core.network.attention import hiding, zscore
@@ -16,13 +17,16 @@ from dpm2_core.network.views import Views
 
 def point_bias(points: Tensor, tokens: Tensor, token_mask: Tensor, alpha: float) -> Tensor:
     """z-score over the tokens of exp(-alpha |p - r|): points (B, N, 3), tokens (B, T, 3): (B, 1, N, T)."""
-    squared = (
-        (points * points).sum(-1)[..., None]
-        + (tokens * tokens).sum(-1)[:, None]
-        - 2 * points @ tokens.transpose(-1, -2)
-    )
-    distance = squared.clamp(min=1e-6).sqrt()
+    distance = _distances(points, tokens)
     return _near_bias(distance, torch.ones_like(distance, dtype=torch.bool), token_mask[:, None], (alpha,))
+
+
+@full_precision
+def _distances(points: Tensor, tokens: Tensor) -> Tensor:
+    """(B, N, T), m, of points (B, N, 3) from tokens (B, T, 3)."""
+    product = 2 * points @ tokens.transpose(-1, -2)
+    squared = (points * points).sum(-1)[..., None] + (tokens * tokens).sum(-1)[:, None] - product
+    return squared.clamp(min=1e-6).sqrt()
 
 
 def _near_bias(distance: Tensor, counted: Tensor, mask: Tensor, alphas: tuple[float, ...]) -> Tensor:

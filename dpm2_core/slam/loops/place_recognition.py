@@ -81,5 +81,6 @@ def _elsewhere(agree: float) -> Registration:
 def merged(keyframes: Sequence[Keyframe], poses: Array, nodes: Sequence[int], at: int) -> Descriptors:
     """The descriptors of several nodes in the frame of node `at`, which has some; `poses` (N, 4, 4) T_map_kf."""
     T_at_map = se3.inverse(poses[at])
-    found = ((node, keyframes[node].descriptors) for node in nodes)
+    first = [at, *(node for node in nodes if node != at)]  # the scale of what is merged, of a room or not, is its own
+    found = ((node, keyframes[node].descriptors) for node in first)
     return merge([d if node == at else d.moved(T_at_map @ poses[node]) for node, d in found if d is not None])

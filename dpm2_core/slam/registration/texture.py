@@ -18,6 +18,7 @@ from pydantic import Field
 from dpm2_core.config import Settings
 from dpm2_core.frame import Array, Image, Points, Registration
 from dpm2_core.geometry import se3
+from dpm2_core.geometry.calibration import with_calibration
 from dpm2_core.geometry.contrast import local_contrast
 
 
@@ -140,10 +141,12 @@ def along(
     if isinstance(found, str):
         return replace(result, reason="; ".join(part for part in (result.reason, found) if part))
     b = np.concatenate([np.zeros(3), result.open_direction])
-    gain = result.covariance @ b / (b @ result.covariance @ b + found.sigma**2)
+    prior = result.of_scene  # images say as little of calibration errors as points, and those grow with the new motion
+    gain = prior @ b / (b @ prior @ b + found.sigma**2)
     T = se3.orthonormalized(result.T_target_source @ se3.exp(gain * found.offset))
-    covariance = result.covariance - np.outer(gain, b @ result.covariance)
-    return replace(result, T_target_source=T, covariance=(covariance + covariance.T) / 2, method="visual")
+    covariance = prior - np.outer(gain, b @ prior)
+    moved = replace(result, T_target_source=T, covariance=(covariance + covariance.T) / 2, method="visual")
+    return with_calibration(moved, T_ref_target @ T)
 
 
 def _search(

@@ -15,6 +15,7 @@ from dpm2_core.geometry.kabsch import transform, weighted_kabsch
 from dpm2_core.geometry.point_grid import PointGrid
 from dpm2_core.geometry.rays import pixel_rays, point_ray_distance, project
 from dpm2_core.geometry.sampling import farthest_points, neighbours
+from dpm2_core.network.spatial import point_bias
 
 
 @pytest.mark.parametrize("n", [5, 200, 3000])
@@ -86,6 +87,21 @@ def test_rays_and_projection_are_inverse(noise: np.random.Generator) -> None:
     torch.testing.assert_close(back[0], uv, atol=1e-6, rtol=0)
     assert (depth > 0).all()
     assert (project(origins[:, None] - 7 * directions, K, T)[1] < 0).all()
+
+
+def test_geometry_is_exact_where_the_network_multiplies_in_bf16(noise: np.random.Generator) -> None:
+    """bf16 put points up to 0.4 m beside their partners, and rays meters beside pixels. Tolerance: float32 at 50 m."""
+    K, T = (value.float() for value in _camera())
+    points = torch.from_numpy(noise.uniform(-50, 50, (1, 30, 3))).float()
+    uv = torch.from_numpy(noise.uniform(0, 60, (8, 2))).float()
+    exact = (*pixel_rays(uv, K, T), *project(points, K, T), transform(T, points))
+    distance = point_ray_distance(points, *exact[:2])[0]
+    with torch.autocast("cpu", torch.bfloat16):
+        rounded = (*pixel_rays(uv, K, T), *project(points, K, T), transform(T, points))
+        torch.testing.assert_close(point_ray_distance(points, *exact[:2])[0], distance, atol=1e-3, rtol=1e-5)
+        bias = point_bias(points, points, torch.ones(1, 30, dtype=torch.bool), 1.0)
+    torch.testing.assert_close(rounded, exact, atol=1e-3, rtol=1e-5)
+    assert (bias[0, 0].argmax(-1) == torch.arange(30)).all()
 
 
 def test_kabsch_is_exact_and_batched(noise: np.random.Generator) -> None:

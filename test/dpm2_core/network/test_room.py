@@ -58,6 +58,8 @@ def test_what_is_said_of_a_room_is_what_is_said_of_the_street_that_it_resembles(
     np.testing.assert_allclose(small.T_target_source, T, atol=1e-3)  # the network works in bf16
     S = np.repeat([1.0, 1 / ROOM_SCALE], 3)
     np.testing.assert_allclose(small.covariance, large.covariance * np.outer(S, S), rtol=0.1, atol=1e-7)
+    assert small.floor == pytest.approx((large.floor[0], large.floor[1] / ROOM_SCALE), rel=0.01)
+    assert (np.linalg.eigvalsh(small.of_scene) > 0).all()
     assert small.rmse == pytest.approx(large.rmse / ROOM_SCALE, rel=0.05)
     many = network.register_many([b, d], [a, c])
     np.testing.assert_allclose(many[0].T_target_source, small.T_target_source, atol=1e-3)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -23,7 +24,7 @@ from dpm2_core.sim.sensors import real_sensor
 from dpm2_core.sim.settings import LidarConfig
 from dpm2_core.sim.world import World, build_world
 from dpm2_core.slam.loops.closure import LoopCloser, LoopSettings
-from dpm2_core.slam.loops.place_recognition import AGREEING, PlaceRecognition
+from dpm2_core.slam.loops.place_recognition import AGREEING, PlaceRecognition, merged
 from dpm2_core.slam.loops.relocalization import downsampled
 from dpm2_core.slam.loops.verification import Verifier
 from dpm2_core.slam.registration.icp import GeometricSettings
@@ -83,6 +84,16 @@ def errors(loops: Sequence[Edge], truth: Array) -> list[float]:
     true = [se3.inverse(truth[loop.from_node]) @ truth[loop.to_node] for loop in loops]
     off = [se3.inverse(T) @ loop.T_from_to for T, loop in zip(true, loops, strict=True)]
     return [float(np.linalg.norm(T[:3, 3])) for T in off]
+
+
+def test_what_is_merged_around_a_keyframe_has_the_scale_of_that_one(noise: np.random.Generator) -> None:
+    """Where a drive leaves a room: of the scale of the first it was one of the room, without the keyframe itself."""
+    scales = (5.0, 5.0, 1.0, 1.0)
+    sets = [replace(Descriptors.of(noise.normal(0, 9, (9 + i, 3)), noise.normal(size=(9 + i, 128))), scale=scale)
+            for i, scale in enumerate(scales)]  # fmt: skip
+    keyframes = [Keyframe(i, i, i, np.eye(4), np.zeros((0, 4), np.float32), None, "", d) for i, d in enumerate(sets)]
+    found = merged(keyframes, np.tile(np.eye(4), (4, 1, 1)), range(4), 2)
+    assert (found.scale, len(found)) == (1.0, 11 + 12)
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from dpm2_core.data.open import open_source
-from dpm2_core.frame import Array, Frame
+from dpm2_core.frame import Frame, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.slam.build import make_odometry, make_registration
 from dpm2_core.slam.registration.protocol import Prediction
@@ -21,14 +21,20 @@ from dpm2_core.slam.settings import SlamSettings
 from ....helpers.corridor import CAMERA, T_LIDAR_CAM, Paint, frame, random_paint, seen, stripes
 
 
-def registered(first: Frame, second: Frame, **visual: object) -> tuple[Array, Array, str, str]:
-    """Pose and covariance of the second in the frame of the first, method and reason."""
+def registered(first: Frame, second: Frame, **visual: object) -> Registration:
+    """Of the second in the frame of the first."""
     settings = VisualSettings.model_validate(visual)
     registration = make_registration(SlamSettings(registration="geometric", visual=settings))
     registration.update(registration.prepare(first, np.zeros(6)), np.eye(4))
     result = registration.register(registration.prepare(second, np.zeros(6)), Prediction([np.eye(4)]))
     assert result.ok
-    return result.T_target_source, result.covariance, result.method, result.reason
+    return result
+
+
+def assert_same(one: Registration, other: Registration) -> None:
+    assert np.array_equal(one.T_target_source, other.T_target_source)
+    assert np.array_equal(one.covariance, other.covariance)
+    assert (one.method, one.reason) == (other.method, other.reason)
 
 
 @pytest.mark.slow
@@ -36,16 +42,19 @@ def test_the_way_along_a_corridor_is_read_from_its_walls() -> None:
     """1.7 m that no point constrains, to 3 cm, a step of the fine search, at any exposure; its covariance shows it."""
     paint = random_paint()
     first, second = frame(0.0, paint), frame(1.7, paint, 1, gain=0.6)
-    blind, covariance, method, _ = registered(first, second, enabled=False)
-    assert method == "geometric"
-    assert np.sqrt(covariance[3, 3]) > 0.3
-    assert abs(blind[0, 3] - 1.7) > 0.5
-    T, covariance, method, _ = registered(first, second)
-    assert method == "visual"
-    assert T[0, 3] == pytest.approx(1.7, abs=0.03)
-    np.testing.assert_allclose(T[1:3, 3], 0, atol=0.03)
-    assert np.sqrt(np.linalg.eigvalsh(covariance)[-1]) < 0.1
-    assert np.linalg.eigvalsh(covariance)[0] > 0
+    blind = registered(first, second, enabled=False)
+    assert blind.method == "geometric"
+    assert np.sqrt(blind.covariance[3, 3]) > 0.3
+    assert abs(blind.T_target_source[0, 3] - 1.7) > 0.5
+    found = registered(first, second)
+    assert found.method == "visual"
+    assert found.T_target_source[0, 3] == pytest.approx(1.7, abs=0.03)
+    np.testing.assert_allclose(found.T_target_source[1:3, 3], 0, atol=0.03)
+    assert np.sqrt(np.linalg.eigvalsh(found.covariance)[-1]) < 0.1
+    # An image shows the scene, and nothing of the errors of calibration, which grow with the way that it has found.
+    assert found.floor[1] == pytest.approx(0.006 * 1.7, rel=0.05)
+    assert np.linalg.eigvalsh(found.of_scene)[0] > 0
+    assert found.of_scene[3, 3] < blind.of_scene[3, 3] / 9
 
 
 @pytest.mark.slow
@@ -55,11 +64,11 @@ def test_the_way_along_a_corridor_is_read_from_its_walls() -> None:
 )
 def test_an_image_that_does_not_constrain_is_not_used(paint: Paint, why: str) -> None:
     """Paint that repeats, or none: the result stays that of the points, with their uncertainty, and says why."""
-    T, covariance, method, reason = registered(frame(0.0, paint), frame(0.7, paint, 1))
-    assert method == "geometric"
-    assert why in reason
-    assert np.sqrt(covariance[3, 3]) > 0.3
-    assert np.isfinite(T).all()
+    result = registered(frame(0.0, paint), frame(0.7, paint, 1))
+    assert result.method == "geometric"
+    assert why in result.reason
+    assert np.sqrt(result.covariance[3, 3]) > 0.3
+    assert np.isfinite(result.T_target_source).all()
 
 
 @pytest.mark.slow
@@ -67,8 +76,7 @@ def test_without_images_nothing_changes() -> None:
     """Frames whose camera fails go the way they always went."""
     paint = random_paint()
     first, second = (Frame(f.stamp, f.points, index=f.index) for f in (frame(0.0, paint), frame(0.2, paint, 1)))
-    for one, other in zip(registered(first, second), registered(first, second, enabled=False), strict=True):
-        assert np.array_equal(one, other)
+    assert_same(registered(first, second), registered(first, second, enabled=False))
 
 
 @pytest.mark.slow
@@ -79,14 +87,13 @@ def test_of_two_cameras_the_first_is_asked_and_the_second_where_it_has_no_image(
     two = [replace(f, images=(*f.images, seen(x, paint, rear))) for x, f in
            ((0.0, frame(0.0, paint)), (1.7, frame(1.7, paint, 1)))]  # fmt: skip
     first, second = ([replace(f, images=(f.images[n],)) for f in two] for n in (0, 1))
-    for one, other in zip(registered(*two), registered(two[0], first[1]), strict=True):
-        assert np.array_equal(one, other)
-    T, _, method, _ = registered(second[0], two[1])
-    assert method == "visual"
-    assert T[0, 3] == pytest.approx(1.7, abs=0.03)
-    _, _, method, reason = registered(two[0], second[1])
-    assert method == "geometric"
-    assert "image" not in reason
+    assert_same(registered(*two), registered(two[0], first[1]))
+    by_second = registered(second[0], two[1])
+    assert by_second.method == "visual"
+    assert by_second.T_target_source[0, 3] == pytest.approx(1.7, abs=0.03)
+    by_none = registered(two[0], second[1])
+    assert by_none.method == "geometric"
+    assert "image" not in by_none.reason
 
 
 @pytest.mark.slow
