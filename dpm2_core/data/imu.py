@@ -29,8 +29,8 @@ def decode_imu(message: Any) -> tuple[Array, Array]:
     values = np.array([rates.x, rates.y, rates.z, forces.x, forces.y, forces.z])
     if message.angular_velocity_covariance[0] == -1:
         raise MessageError("an IMU without angular velocities")
-    if message.linear_acceleration_covariance[0] == -1:  # as REP-145 has it
-        values[3:] = np.nan
+    if message.linear_acceleration_covariance[0] == -1 or not values[3:].any():
+        values[3:] = np.nan  # as REP-145 has it; a gyroscope's driver may send zeros instead
     wrong = ~(np.abs(values) <= _LARGEST)
     if wrong[:3].any() or (wrong[3:].any() and not np.isnan(values[3:]).all()):
         raise MessageError(f"angular velocity {values[:3].tolist()} rad/s, acceleration {values[3:].tolist()} m/s2")

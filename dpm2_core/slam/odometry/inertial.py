@@ -49,7 +49,7 @@ class InertialMotion:
 
     Attributes:
         turn: R_before_now (3, 3) since the last registered frame; None where it is not known, or not believed.
-        problem: why it is None; empty if it is not.
+        problem: why it is None, or why a start at rest is not level; else empty.
         T_level_odom: (4, 4), by which poses become level.
     """
 
@@ -79,7 +79,7 @@ class InertialMotion:
             self._measured = self._turned(frame.stamp, self._before)
             self.problem = "" if self._measured is not None else "no samples at the time of the scan"
         if not self.problem and self._doubt > _CREDIBLE:
-            self.problem = "its turns are not those of the scans: is its orientation right?"
+            self.problem = "its turns are not those of the scans, and odom may be tilted: is its orientation right?"
         if self.problem:
             return frame if frame.imu is None else replace(frame, imu=None)
         self.turn = self._measured
@@ -112,7 +112,7 @@ class InertialMotion:
         self._variance += _BIAS_DRIFT**2 * seconds
         if self._span.seconds >= _SPAN:
             self._correct(T[:3, :3])
-        force = self._force(before, stamp)
+        force = self._force(before, stamp) if self._doubt <= _CREDIBLE else None
         if force is None:
             self._vertical.pause()
             return
@@ -127,7 +127,9 @@ class InertialMotion:
         self._bias, self._variance = s.rates.mean(0), _BIAS_AT_REST**2
         if s.up is None:
             return
-        self._vertical.start(T[:3, :3] @ s.forces.mean(0), T[:3, :3] @ s.up)
+        if not self._vertical.start(T[:3, :3] @ s.forces.mean(0), T[:3, :3] @ s.up):
+            self.problem = "its forces at rest are not gravity: odom is not level"
+            return
         R = self._vertical.turn
         self.T_level_odom = se3.make(R, T[:3, 3] - R @ T[:3, 3])
 
@@ -221,9 +223,13 @@ class _Vertical:
         self._velocity: Array | None = None
         self.pause()
 
-    def start(self, force: Array, axis: Array) -> None:
-        """At rest at the start; `axis` (3,) is to be up."""
-        self._up, self._axis, self._seconds = _metric(force), axis, _WEIGHT
+    def start(self, force: Array, axis: Array) -> bool:
+        """At rest at the start; `axis` (3,) is to be up. False: the force is not gravity, and shows no vertical."""
+        up = _metric(force)
+        if not _is_gravity(up):
+            return False
+        self._up, self._axis, self._seconds = up, axis, _WEIGHT
+        return True
 
     def pause(self) -> None:
         """What comes next does not follow on."""
@@ -240,7 +246,7 @@ class _Vertical:
         up, time = (self._sum - (velocity - self._velocity)) / self._time, self._time
         self.pause()
         self._velocity = velocity
-        if abs(np.linalg.norm(up) - _GRAVITY) > _POSSIBLE:
+        if not _is_gravity(up):
             return
         self._seconds = min(self._seconds + time, _MINUTE)
         self._up = self._up + time / self._seconds * (up - self._up)
@@ -260,6 +266,11 @@ def _angle(R: Array) -> float:
 def _metric(force: Array) -> Array:
     """A mean force (3,) in m/s2; some drivers count in g."""
     return force * _GRAVITY if np.linalg.norm(force) < _GRAVITY / 3 else force
+
+
+def _is_gravity(up: Array) -> bool:
+    """A mean force (3,) m/s2 without the changes of velocity."""
+    return bool(abs(np.linalg.norm(up) - _GRAVITY) <= _POSSIBLE)
 
 
 def _at_rest(rates: Array, forces: Array) -> bool:

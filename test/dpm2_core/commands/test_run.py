@@ -73,6 +73,8 @@ def test_the_imu_of_a_bag_is_used(sequence: Path, tmp_path: Path) -> None:
     assert "/imu: no samples at the time of the scan; going on without the IMU" in " ".join(done.stderr.split())
     timing = json.loads((tmp_path / "out" / "timing.json").read_text())
     assert timing["imu"] == {"used": 9, "no samples at the time of the scan": 3}
+    assert "IMU: no samples at the time of the scan (3 of 12 frames)" in " ".join(done.stderr.split())
+    assert "IMU: used" not in done.stderr
     assert json.loads((tmp_path / "out" / "metrics.json").read_text())["ape_rmse_m"] < 0.1
 
 

@@ -88,7 +88,8 @@ def test_a_wrong_orientation_is_noticed(robot: tuple[list[Frame], Array]) -> Non
     frames, truth = robot
     upside_down = np.diag([1.0, -1.0, -1.0])
     lies = run(with_imu(frames, lambda rates, forces: (rates @ upside_down, forces)))
-    assert lies[-1].imu == "its turns are not those of the scans: is its orientation right?"
+    assert lies[-1].imu is not None
+    assert lies[-1].imu.startswith("its turns are not those of the scans")
     assert sum(t.imu == "" for t in lies) < 25  # while it stands nothing shows it
     assert error(lies, truth) < 3 * error(run(without(frames)), truth)
 
@@ -186,6 +187,43 @@ def test_a_start_in_motion_or_without_a_known_base_is_not() -> None:
         motion.look(replace(frame, imu=replace(frame.imu, **changed)))
         motion.registered(T, T, frame.stamp, None)
         np.testing.assert_array_equal(motion.T_level_odom, np.eye(4))
+
+
+@pytest.mark.parametrize("gravity", [0.0, 0.05], ids=["zeros", "taken out"])
+def test_forces_without_gravity_make_nothing_level(gravity: float) -> None:
+    """What is left of them points anywhere; the gyroscope is of use all the same."""
+    motion, T = InertialMotion(), np.eye(4)
+    first, second = standing(T, 2, ImuConfig(gyro_bias=0.02))
+    for frame, twist in ((first, None), (second, np.zeros(6))):
+        assert frame.imu is not None
+        forces = np.tile([gravity, 0, 0], (len(frame.imu), 1))
+        motion.look(replace(frame, imu=replace(frame.imu, forces=forces)))
+        motion.registered(T, T, frame.stamp, twist)
+        if frame is first:
+            assert motion.problem == "its forces at rest are not gravity: odom is not level"
+    assert motion.problem == ""
+    assert motion.turn is not None
+    assert np.degrees(se3.angle(se3.make(motion.turn, np.zeros(3)))) < 0.02  # 0.2 by the bias, which is known
+    np.testing.assert_array_equal(motion.T_level_odom, np.eye(4))
+
+
+def test_one_that_is_left_out_does_not_tilt_the_frame() -> None:
+    """A circle of 20 m; /tf_static turns the IMU by 90 degrees about the way ahead."""
+    motion, twist, before = InertialMotion(), np.array([0, 0, 0.25, 5.0, 0, 0]), np.eye(4)
+    rates, forces = np.tile([0, -0.25, 0], (10, 1)), np.tile([0, -9.81, 1.25], (10, 1))
+    tilt, left_out = [], []
+    for i in range(300):
+        stamp = 10**9 + i * 10**8
+        samples = Inertial(np.arange(stamp - 9 * 10**7, stamp + 1, 10**7), rates, forces)
+        T = se3.exp(0.1 * i * twist)
+        motion.look(Frame(stamp, np.zeros((0, 4), np.float32), imu=samples))
+        motion.registered(before, T, stamp, twist if i else None)
+        left_out.append("odom may be tilted" in motion.problem)
+        tilt.append(se3.angle(motion.T_level_odom))
+        before = T
+    assert left_out[10:] == [True] * 290
+    assert np.degrees(tilt[10]) < 0.1  # 5 m, of each at most 0.02 degrees
+    assert tilt[-1] == tilt[10]  # 1.3 degrees more, were its forces still believed
 
 
 def test_the_level_follows_a_drifting_odometry_without_a_jump() -> None:
