@@ -145,14 +145,16 @@ def matched(gt: Trajectory, est: Trajectory, tolerance: float = 0.01) -> tuple[A
     """
     stamped = gt.kind == est.kind == "tum"
     numbered = "tum" not in (gt.kind, est.kind) and "kitti-indexed" in (gt.kind, est.kind)
-    if numbered and est.kind == "kitti" and len(est) <= gt.keys.max():  # of some frames: their lines are no numbers
-        numbered = False
+    for lines, other in ((est, gt), (gt, est)):
+        if numbered and lines.kind == "kitti" and len(lines) <= other.keys.max():  # of some frames: no line is a number
+            numbered = False
     if not stamped and not numbered:
         if len(gt) == len(est):
             return gt.poses, est.poses
         raise UsageError(
             f"ground truth has {len(gt)} poses ({gt.kind}), the estimate {len(est)} ({est.kind}), and neither frame"
-            " numbers (13 KITTI columns, the number first) nor stamps (both TUM) say which belong together"
+            " numbers (13 KITTI columns, the number first) nor stamps (both TUM) say which belong together;"
+            " `dpm2 eval --gt DRIVE` takes the true poses, with the numbers of their frames, from the drive"
         )
     gt_keys, order = np.unique(gt.keys, return_index=True)
     gt_poses = gt.poses[order]

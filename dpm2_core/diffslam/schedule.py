@@ -24,7 +24,7 @@ class ScheduleSettings(Settings):
     begin: int = Field(default=0, ge=0)
     """Epochs before the first k: an untrained network makes no clouds that a SLAM could run on."""
     most: float | None = Field(default=0.5, gt=0)
-    """Largest fraction of L_model that gamma L_slam may have in a step. Where a registration is lost, its error would
+    """Largest fraction of |L_model| that gamma L_slam may have in a step. Where a registration is lost, its error would
     be the whole step, and it is heavy-tailed. None: no bound, eq. 1 as it is in the paper."""
 
 
@@ -41,5 +41,5 @@ def total_loss(model_loss: Tensor, slam_loss: Callable[[], Tensor], epoch: int, 
         return model_loss
     weighted = settings.gamma * slam_loss()
     if settings.most is not None:
-        weighted = weighted * (settings.most * model_loss / weighted.clamp(min=_LEAST)).detach().clamp(max=1)
+        weighted = weighted * (settings.most * model_loss.abs() / weighted.clamp(min=_LEAST)).detach().clamp(max=1)
     return model_loss + weighted

@@ -114,6 +114,14 @@ def test_lines_are_numbers_only_where_there_is_one_for_each() -> None:
         matched(gt, _trajectory([0, 1, 2], "kitti"))
 
 
+def test_nor_are_those_of_the_ground_truth() -> None:
+    """The poses of an excerpt of frames 2 to 5 beside an estimate that has their numbers: line 2 is frame 4."""
+    truth = _trajectory([0, 1, 2, 3], "kitti")
+    assert _x(matched(truth, _trajectory([2, 3, 4, 5], "kitti-indexed"))[1]) == [2, 3, 4, 5]
+    with pytest.raises(UsageError, match=r"4 poses \(kitti\), the estimate 3 .*--gt DRIVE"):
+        matched(truth, _trajectory([2, 3, 5], "kitti-indexed"))
+
+
 def test_of_a_faster_estimate_the_nearest_counts() -> None:
     """At 200 Hz, two samples lie within the tolerance on either side."""
     ms = 10**6

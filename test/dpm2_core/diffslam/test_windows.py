@@ -90,3 +90,12 @@ def test_a_lost_registration_is_not_the_whole_step() -> None:
         assert float(total.detach()) == pytest.approx(4.0 * (1 + ratio))
         assert float(task.grad) == 1.0
         assert float(slam.grad) == pytest.approx(2.0 * (ratio / error if error else 1.0))
+
+
+def test_a_task_loss_below_zero_bounds_by_its_size() -> None:
+    """As a likelihood may be; the SLAM loss is descended all the same."""
+    slam = torch.tensor(9.0, requires_grad=True)
+    total = total_loss(torch.tensor(-2.0), lambda: slam, 0, ScheduleSettings(gamma=1.0, every=1, most=0.5))
+    total.backward()
+    assert float(total.detach()) == pytest.approx(-1.0)  # gamma L_slam is half of 2
+    assert float(slam.grad) == pytest.approx(1 / 9)
