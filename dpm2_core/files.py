@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any, Literal
 
-from dpm2_core.errors import Dpm2Error
+from dpm2_core.errors import Dpm2Error, UsageError
 
 
 @contextmanager
@@ -54,6 +54,18 @@ def write_json(path: Path | str, content: object) -> None:
     """
     with atomic_write(path) as file:
         file.write(json.dumps(content, indent=2) + "\n")
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder for results, and those above it; one that is there stays.
+
+    Raises:
+        UsageError: there can be none; it names `path` and says why.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"{path}: no folder can be made there: {error.strerror or error}") from error
 
 
 def expanded(path: str) -> str:

@@ -25,19 +25,25 @@ from dpm2_core.evaluation.figures import trajectory_png
 from dpm2_core.evaluation.ground_truth import in_other_frame, read_ground_truth, truth_by_stamp
 from dpm2_core.evaluation.metrics import Metrics, evaluate
 from dpm2_core.evaluation.run_folder import (
+    CLOUD,
     FRAMES,
+    GRAPH,
+    LOCALIZATION,
     LOOPS,
     METRICS,
+    PICTURE,
+    POSES,
     TIMING,
     TRAJECTORY,
     TRUTH,
+    remove_results,
     write_frames,
     write_loops,
     write_truth,
 )
 from dpm2_core.extras import MissingPackageError
-from dpm2_core.files import atomic_write, write_json
-from dpm2_core.frame import Array, Frame, OdometryResult
+from dpm2_core.files import atomic_write, make_folder, write_json
+from dpm2_core.frame import Array, Frame, OdometryResult, Points
 from dpm2_core.interrupt import interrupt_deferred
 from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.mapping.mapper import Mapper
@@ -81,7 +87,7 @@ class OfflineRun:
         self._config = config or Config()
         self._resources = ExitStack()
         self._truth: Array | Trajectory | None = None
-        made = None if map_file is None or map_file.exists() else map_file
+        self._begun = None if map_file is None or map_file.exists() else map_file  # a map file without a frame yet
         store = None if map_file is None else open_map(map_file, self._config, map_mode)
         if store is not None:
             self._resources.push(store)
@@ -96,18 +102,18 @@ class OfflineRun:
                 _check_span(self.source, self._start, self._stop, frames)
             if map_mode != "localize":  # the frame of the map is its own
                 self._truth = read_ground_truth(self.source, ground_truth, self._start, self._stop)
-        except BaseException:
-            self.close()
-            if made is not None:  # or the same command, with its mistake corrected, would find a map there
-                remove_map(made)
+        except BaseException as error:
+            self.__exit__(type(error))
             raise
         self._truth_name = self.source.truth if ground_truth is None else str(ground_truth)
 
     def __enter__(self) -> OfflineRun:
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
         self.close()
+        if error is not None and self._begun is not None:
+            remove_map(self._begun)  # or the same command, with its mistake corrected, would find a map there
 
     def __len__(self) -> int:
         """Number of frames to be processed."""
@@ -128,7 +134,7 @@ class OfflineRun:
             progress: called after each frame. watch: the same, with the frame and the map as they are then.
         """
         result = Result(self.source, self._config, self.slam.mapper, self._truth, self._truth_name)
-        began = perf_counter()
+        self._begun, began = None, perf_counter()
         try:
             with interrupt_deferred() as interrupted:
                 for frame in prefetch(self.source.frames(self._start, self._stop)):
@@ -276,35 +282,48 @@ class Result:
     def save(self, out: Path, cloud: bool = True) -> list[str]:
         """Write all files, each whole or not at all; returns what could not be done, in words.
 
+        Files of a run before, of which this one has none, are removed.
+
         Args:
             cloud: map.ply, too, and the map in trajectory.png; a long drive's takes hundreds of megabytes.
 
         Raises:
-            Dpm2Error: a file could not be written; the old one survives. UsageError: see `metrics`.
+            Dpm2Error: a file could not be written; the old one survives. UsageError: see `metrics`, or no folder can
+                be made there.
         """
-        out.mkdir(parents=True, exist_ok=True)
+        make_folder(out)
         save_config(self.config, out)
-        write_kitti(out / "trajectory_kitti.txt", self.sensor_poses)
+        write_kitti(out / POSES, self.sensor_poses)
         write_tum(out / TRAJECTORY, self.recorder.stamps, self.poses)
         points = self.mapper.cloud() if cloud else None
-        if points is not None:
-            write_ply(out / "map.ply", points)
-        self.mapper.write_g2o(out / "pose_graph.g2o")
+        if points is None:
+            remove_results(out, CLOUD)
+        else:
+            write_ply(out / CLOUD, points)
+        self.mapper.write_g2o(out / GRAPH)
         keys = zip(self.recorder.index, self.recorder.stamps, self.frame_states, self.frame_methods, strict=True)
         write_frames(out / FRAMES, list(keys), self.seconds)
         write_loops(out / LOOPS, self.mapper.loops, self.mapper.poses)
         write_json(out / TIMING, self.timing)
-        if self.metrics is not None:
+        if self.metrics is None:
+            remove_results(out, METRICS, TRUTH)
+        else:
             write_json(out / METRICS, self.metrics.model_dump())
             assert self.ground_truth is not None
             write_truth(out / TRUTH, *truth_by_stamp(self.ground_truth, self.recorder.stamps, self.recorder.index,
                                                      self.source.T_cam_lidar))  # fmt: skip
+        missing = self._draw(out / PICTURE, points)
+        remove_results(out, LOCALIZATION, *([PICTURE] if missing else []))
+        return missing
+
+    def _draw(self, path: Path, points: Points | None) -> list[str]:
+        """Write trajectory.png; returns why there is none."""
         if not len(self):
             return ["no trajectory.png: no frame was processed"]
         truth, poses = self._compared()
         title = f"{self.source.name}: {len(self)} frames"
         try:
-            trajectory_png(out / "trajectory.png", poses, truth, points, title)
+            trajectory_png(path, poses, truth, points, title)
         except MissingPackageError as error:
             return [f"no trajectory.png: {error}"]
         return []

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,8 @@ from dpm2_core.commands.options import progress_bar
 from dpm2_core.console import Console
 from dpm2_core.data.trajectory import write_tum
 from dpm2_core.errors import UsageError
-from dpm2_core.files import atomic_write
+from dpm2_core.evaluation.run_folder import LOCALIZATION, MAPPING, TRAJECTORY, remove_results
+from dpm2_core.files import make_folder, write_json
 from dpm2_core.frame import Array, State
 from dpm2_core.geometry import se3
 from dpm2_core.pipeline import OfflineRun, save_config
@@ -95,6 +95,8 @@ class LocalizationReport:
 def run_localized(drive: OfflineRun, out: Path, hint: Array | None, config: Config) -> tuple[str, dict[str, Any]]:
     """The drive through a map: localisation.json, trajectory.tum of the frames whose place was known, config.yaml.
 
+    Files that only a run that makes a map has are removed.
+
     Returns what came out as a sentence, and the content of localisation.json.
     """
     localizer, name = drive.slam.localizer, drive.source.name
@@ -102,7 +104,7 @@ def run_localized(drive: OfflineRun, out: Path, hint: Array | None, config: Conf
     report = LocalizationReport(localizer)
     if hint is not None:
         localizer.hint(hint)
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     with progress_bar() as bar:
         task = bar.add_task(name, total=len(drive))
 
@@ -115,10 +117,10 @@ def run_localized(drive: OfflineRun, out: Path, hint: Array | None, config: Conf
     if interrupted:
         Console(stderr=True).print("interrupted; writing what there is", style="yellow")
     save_config(config, out)
-    write_tum(out / "trajectory.tum", report.stamps, np.array(report.poses).reshape(-1, 4, 4))
+    write_tum(out / TRAJECTORY, report.stamps, np.array(report.poses).reshape(-1, 4, 4))
     summary = report.summary()
-    with atomic_write(out / "localisation.json") as file:
-        file.write(json.dumps(summary, indent=2) + "\n")
+    write_json(out / LOCALIZATION, summary)
+    remove_results(out, *MAPPING)
     until = summary["frames_until_found"]
     found = "not found" if until is None else f"found after {until} frames"
     located = f"place known in {len(report.stamps)} of {summary['frames']} frames"

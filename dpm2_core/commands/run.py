@@ -17,6 +17,7 @@ from dpm2_core.data.source import Source
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.evaluation.live_view import LiveView
 from dpm2_core.evaluation.report import metrics_table
+from dpm2_core.files import make_folder
 from dpm2_core.pipeline import OfflineRun, Result, Watch, open_recording, save_config
 from dpm2_core.slam.session import MapMode
 from dpm2_core.slam.settings import Config
@@ -90,7 +91,7 @@ def run(
         return
     mode: MapMode = "resume" if resume else "extend" if extend else "create"
     with OfflineRun(source, chosen, span, gt, map_file, mode) as drive:
-        out.mkdir(parents=True, exist_ok=True)
+        make_folder(out)
         save_config(chosen, out)  # now: whatever becomes of the run, it says how it was made
         if view or record is not None:
             with LiveView(drive.source.name, view, record) as live:

@@ -16,12 +16,16 @@ from typing import Any
 import numpy as np
 
 from dpm2_core.data.trajectory import Trajectory, read_trajectory, write_tum
-from dpm2_core.errors import UsageError
+from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.files import atomic_write
 from dpm2_core.frame import Array, Edge
 
 TRAJECTORY, FRAMES, LOOPS, TRUTH = "trajectory.tum", "frames.csv", "loops.csv", "ground_truth.tum"
 METRICS, TIMING = "metrics.json", "timing.json"
+POSES, CLOUD, GRAPH, PICTURE = "trajectory_kitti.txt", "map.ply", "pose_graph.g2o", "trajectory.png"
+LOCALIZATION = "localisation.json"
+MAPPING = (POSES, CLOUD, GRAPH, PICTURE, FRAMES, LOOPS, TRUTH, METRICS, TIMING)
+"""Files that a run has that makes a map, and one that localizes has not."""
 _LOOP_COLUMNS = ("from_x", "from_y", "from_z", "to_x", "to_y", "to_z", "accepted", "method", "confidence", "overlap",
                  "reason")  # fmt: skip
 
@@ -92,6 +96,19 @@ def write_truth(path: Path, stamps: Sequence[int], poses: Array) -> None:
     """
     known = np.isfinite(poses).all((1, 2))
     write_tum(path, np.asarray(stamps, np.int64)[known], poses[known])
+
+
+def remove_results(folder: Path, *names: str) -> None:
+    """Remove files of a run before this one that this one has none of: they would be taken for its own.
+
+    Raises:
+        Dpm2Error: one could not be removed.
+    """
+    for name in names:
+        try:
+            (folder / name).unlink(missing_ok=True)
+        except OSError as error:
+            raise Dpm2Error(f"{folder / name}: not removed: {error.strerror or error}") from error
 
 
 def read_run(path: Path) -> RunFolder:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from dpm2_core.data.ply import write_ply
 from dpm2_core.data.trajectory import write_tum
+from dpm2_core.files import make_folder
 from dpm2_core.frame import Array, OdometryResult
 from dpm2_core.geometry import se3
 from dpm2_core.slam.mapping.mapper import Mapper
@@ -77,9 +78,9 @@ def save_map(mapper: Mapper, directory: Path) -> None:
     """Write map.ply, trajectory.tum (one pose per keyframe) and pose_graph.g2o, each whole or not at all.
 
     Raises:
-        Dpm2Error: a file could not be written; the old one survives.
+        UsageError: the folder cannot be made. Dpm2Error: a file could not be written; the old one survives.
     """
-    directory.mkdir(parents=True, exist_ok=True)
+    make_folder(directory)
     write_ply(directory / "map.ply", mapper.cloud())
     write_tum(directory / "trajectory.tum", [k.stamp for k in mapper.keyframes], mapper.poses)
     mapper.write_g2o(directory / "pose_graph.g2o")

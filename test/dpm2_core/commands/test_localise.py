@@ -59,6 +59,8 @@ def test_the_drive_is_found_in_the_map_which_stays_as_it_is(
         assert len(list(map_.glob("*.dpm2map"))) > 1
     hints = [] if hint is None else ["--hint", hint]
     out = tmp_path / "out"
+    out.mkdir()
+    (out / "metrics.json").write_text("{}")  # of a run that made a map
     done = dpm2("run", recording, "--out", out, "--frames", "8:24", "--localise", map_, *hints, *QUICK)
     assert done.returncode == 0, done.stderr
     assert hashlib.sha256(made.read_bytes()).hexdigest() == before
@@ -70,6 +72,7 @@ def test_the_drive_is_found_in_the_map_which_stays_as_it_is(
     off = np.linalg.norm(estimate.poses[:, :3, 3] - truth(recording)[8:24, :3, 3], axis=1)
     assert off.max() < 0.1
     assert "found after 0 frames" in done.stdout
+    assert {path.name for path in out.iterdir()} == {"localisation.json", "trajectory.tum", "config.yaml"}
 
 
 def test_a_wrong_hint_only_costs_time(recording: Path, made: Path, tmp_path: Path) -> None:

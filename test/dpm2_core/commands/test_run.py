@@ -151,6 +151,33 @@ def test_errors_of_use(recording: Path, tmp_path: Path, arguments: list[str], wo
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("arguments", [["--out", "FILE"], ["--out", "FILE/below"], ["--record", "/nowhere/run.rrd"]])
+def test_what_cannot_be_written_is_an_error_of_use_and_leaves_no_map(
+    recording: Path, tmp_path: Path, arguments: list[str]
+) -> None:
+    """Or the same command, with its mistake corrected, would find a map there."""
+    (tmp_path / "file").write_text("mine")
+    given = [text.replace("FILE", str(tmp_path / "file")) for text in arguments]
+    out, path = ([] if "--out" in given else ["--out", tmp_path / "out"]), tmp_path / "drive.dpm2map"
+    done = dpm2("run", recording, *given, *out, "--map", path, "--frames", ":3", *QUICK)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
+    assert given[1] in done.stderr
+    assert not path.exists()
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_a_run_leaves_nothing_of_the_one_before(sequence: Path, tmp_path: Path) -> None:
+    """Errors of another drive would be shown as its own."""
+    out = tmp_path / "out"
+    run = ("run", sequence, "--out", out, "--frames", ":3", *QUICK)
+    assert dpm2(*run).returncode == 0
+    (out / "localisation.json").write_text("{}")  # of a run in a map
+    assert (out / "metrics.json").exists()
+    (sequence / "poses.txt").unlink()
+    assert dpm2(*run).returncode == 0
+    assert {path.name for path in out.iterdir()} == RESULTS - {"metrics.json", "ground_truth.tum"}
+
+
 def test_damaged_scans_fail_alone(sequence: Path, tmp_path: Path) -> None:
     """A scan cut short, one of NaN and an empty one: each costs its own frame, and is named."""
     (sequence / "velodyne" / "000004.bin").write_bytes(b"\0" * 1003)
