@@ -11,11 +11,12 @@ from dpm2_core.config import dump_settings
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Array, Edge, Keyframe, State
 from dpm2_core.slam.build import make_map, make_slam
-from dpm2_core.slam.loops.localizer import LocalizationResult, Localizer
+from dpm2_core.slam.loops.localizer import LOST, LocalizationResult, Localizer
+from dpm2_core.slam.loops.relocalization import nowhere
 from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.mapping.tiles import TiledMap
 from dpm2_core.slam.output import save_map
-from dpm2_core.slam.session import open_for_localization, open_session
+from dpm2_core.slam.session import check_for_localization, open_for_localization, open_session
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_ros.map_folder import MapFolder, file_beside
 from dpm2_ros.settings import NodeConfig
@@ -66,12 +67,15 @@ class ActiveMap:
         return placed.get(robot)
 
     def add(self, keyframe: Keyframe) -> list[Edge]:
-        """Take a keyframe in, or find it; returns the loops that were tried."""
-        state = None if self.localizer is None else self.localizer.state
-        result, before = self.slam.map_step(keyframe), self._T_map_odom or {}
-        if state is not None and result.located is not None:
-            self._tell(state, result.located)
+        """Take a keyframe in, or find it; returns the loops that were tried.
+
+        Raises:
+            RejectedError: it is not sound; see `Mapper.add`.
+        """
+        if self.localizer is not None:
+            self._find(keyframe, self.localizer)
             return []
+        result, before = self.slam.map_step(keyframe), self._T_map_odom or {}
         found = {robot: self.mapper.T_map_odom_of(robot) for robot in self.mapper.robots}
         placed = self._T_map_odom = {robot: T for robot, T in found.items() if T is not None}
         for robot in placed.keys() - before.keys():
@@ -87,51 +91,51 @@ class ActiveMap:
         Raises:
             UsageError, Dpm2Error: there is no file that would serve; what was before goes on.
         """
+        self._complete()
         if name and (path := self._maps.file(name)) != self._path:
-            self._exchange(path)
-            return self._looking()
-        growing = self.localizer is None
-        if growing:
-            if self._store is None:
-                raise UsageError("no map to find oneself in: ros.map_file is empty, or could not be written")
-            self.close()  # what is in memory is in the file
-        try:
-            self._load()
-        except Dpm2Error:
-            if growing:
-                self._resume()
-            raise
-        return self._looking()
-
-    def _looking(self) -> str:
+            self._exchange(open_for_localization(path, self._config.slam))
+        else:
+            if self.localizer is None:
+                self._check_places()
+                self.close()  # before it is opened again: beside a reader FILE-wal would stay
+            self._exchange(self._opened())
         return f"looking for the robot in {self._path}, {len(self.mapper.keyframes)} keyframes"
 
-    def _exchange(self, path: Path) -> None:
-        """Another map, to find oneself in; the one that was is complete in its file, if it has one."""
-        store = open_for_localization(path, self._config.slam)
+    def _check_places(self) -> None:
+        """Whether one could find oneself in the map that grows."""
+        if not isinstance(self._store, MapStore):
+            raise UsageError("no map to find oneself in: ros.map_file is empty, or could not be written")
+        if not self.mapper.keyframes:
+            raise UsageError("no map to find oneself in: there is no keyframe yet")
+        check_for_localization(self._store, self._config.slam)
+
+    def _exchange(self, store: MapStore | TiledMap) -> None:
+        """Go on with a file that was opened; the map that was is complete in its own, if it has one."""
         try:
             made = make_map(self._config.slam, store)
             self.close()
         except BaseException:
             store.close()
             raise
-        self._path, self._store, self.located, self._T_map_odom = path, store, None, None
+        self._path, self._store, self._folders = store.path, store, {}
+        self.located = self._T_map_odom = None
         self.slam.use(*made)
 
     def extend(self) -> str:
         """Let the map grow in which the robot was looked for, by a new session; says so in words.
 
         Raises:
-            UsageError: the robot's place is not known. Dpm2Error: the file cannot be written.
+            UsageError: the robot's place is not known, or the map is in tiles. Dpm2Error: the file cannot be written.
+                The robot is looked for as before.
         """
         if (localizer := self.localizer) is None:
             return f"a map is being made already, {len(self.mapper.keyframes)} keyframes"
         if not localizer.state.located:
             raise UsageError(f"not extended: the robot is {localizer.state} in {self._path}")
-        self.close()
-        self._resume()
+        if not isinstance(self._store, MapStore):
+            raise UsageError(f"not extended: {self._path} is a folder of tiles, which does not grow")
+        self._exchange(open_session(self._store.path, self._config.slam, dump_settings(self._config), resume=True))
         self.mapper.start_session(localizer.T_map_odom)
-        self._T_map_odom, self.located = None, None
         return f"{self._path} grows by a new session"
 
     def restart(self) -> None:
@@ -150,9 +154,7 @@ class ActiveMap:
         self.restart()
         if self.localizer is not None:
             return ""
-        self.finish()
-        if self.mapper.store_problem:
-            raise Dpm2Error(f"no reset: {self.mapper.store_problem}")
+        self._complete()
         info = self.save() if self.mapper.keyframes and self._maps.folder is not None else ""
         self.close()
         self._begin()
@@ -205,6 +207,16 @@ class ActiveMap:
                     self._path.parent.rmdir()
             self._store = None
 
+    def _complete(self) -> None:
+        """All that is known is in the file, if there is one.
+
+        Raises:
+            Dpm2Error: it cannot be written, and the map goes on in memory.
+        """
+        self.finish()
+        if self.mapper.store_problem:
+            raise Dpm2Error(f"the map goes on: {self.mapper.store_problem}")
+
     def _begin(self) -> None:
         """An empty map."""
         self._store = self._new_file()
@@ -237,31 +249,22 @@ class ActiveMap:
                 continue  # another node has just taken the name
         raise AssertionError
 
-    def _load(self) -> None:
-        """The file, to find oneself in; what was before stays if that fails."""
-        store = self._opened()
-        try:
-            made = make_map(self._config.slam, store)
-        except BaseException:
-            store.close()
-            raise
-        if self._store is not None:
-            self._store.close()
-        self._store, self.located = store, None
-        self.slam.use(*made)
-
     def _opened(self) -> MapStore | TiledMap:
         """The file or folder of tiles, open for reading only."""
         if self._path is None:
             raise UsageError("no map to find oneself in: ros.map_file does not name one" + self._maps.hint())
         return open_for_localization(self._path, self._config.slam)
 
-    def _resume(self) -> None:
-        """Go on with the file."""
-        assert self._path is not None
-        self._folders = {}
-        self._store = open_session(self._path, self._config.slam, dump_settings(self._config), resume=True)
-        self.slam.use(*make_map(self._config.slam, self._store))
+    def _find(self, keyframe: Keyframe, localizer: Localizer) -> None:
+        """Where it is in a map that stays as it is; one that cannot be read does not show it."""
+        before = localizer.state
+        try:
+            located = self.slam.map_step(keyframe).located
+        except Dpm2Error as error:
+            T_map_kf = localizer.T_map_odom @ keyframe.T_odom_kf
+            located = LocalizationResult(T_map_kf, LOST, localizer.state, nowhere(str(error)))
+        assert located is not None
+        self._tell(before, located)
 
     def _tell(self, before: State, located: LocalizationResult) -> None:
         self.located = located

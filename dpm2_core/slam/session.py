@@ -62,20 +62,28 @@ def open_for_localization(path: Path, settings: SlamSettings) -> MapStore | Tile
     Raises:
         UsageError: no map, one without descriptors, or with those of other weights. Dpm2Error: it cannot be read.
     """
-    weights = weights_id(weights_path(settings.neural.weights))
     if path.is_dir():
         tiles = TiledMap(path)
-        _check_same(path, tiles.weights, weights)
+        _check_same(path, tiles.weights, weights_id(weights_path(settings.neural.weights)))
         return tiles
     store = MapStore.open(path)
     try:
-        _check_weights(store, weights)
-        if not any(store.payload(node, "descriptors") for node, *_ in store.rows("keyframes", "node")):
-            raise UsageError(f"{path}: no keyframe has descriptors (made with slam.loops.descriptors off?)")
+        check_for_localization(store, settings)
     except BaseException:
         store.close()
         raise
     return store
+
+
+def check_for_localization(store: MapStore, settings: SlamSettings) -> None:
+    """Whether one could find oneself in a map file, which may be one that still grows.
+
+    Raises:
+        UsageError: it has no descriptors, or those of other weights. Dpm2Error: it cannot be read.
+    """
+    _check_weights(store, weights_id(weights_path(settings.neural.weights)))
+    if not any(store.payload(node, "descriptors") for node, *_ in store.rows("keyframes", "node")):
+        raise UsageError(f"{store.path}: no keyframe has descriptors (made with slam.loops.descriptors off?)")
 
 
 def _check_weights(store: MapStore, weights: str) -> None:

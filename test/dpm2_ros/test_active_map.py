@@ -4,7 +4,10 @@
 from __future__ import annotations
 
 import logging
+import sqlite3
 import threading
+from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +16,13 @@ import pytest
 
 from dpm2_core.cli import main
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.frame import Keyframe, Registration
+from dpm2_core.frame import Keyframe, Registration, State
 from dpm2_core.geometry import se3
 from dpm2_core.slam.store.check import check_map
 from dpm2_ros.active_map import ActiveMap
 from dpm2_ros.settings import NodeConfig
+
+from .conftest import pose, scan
 
 LOG = logging.getLogger("test")
 
@@ -173,6 +178,85 @@ def test_a_reset_that_cannot_save_keeps_the_map(tmp_path: Path) -> None:
     active.close()
     result = check_map(tmp_path / "a.dpm2map")
     assert (result.problems, result.keyframes) == ([], 3)
+
+
+def described(**ros: Any) -> NodeConfig:
+    """As a node is by default, but for the registration of its odometry."""
+    return NodeConfig.model_validate({"ros": ros, "slam": {"registration": "geometric"}})
+
+
+def street(n: int) -> Keyframe:
+    """After n scans along the street of the small drive."""
+    edge = Registration(se3.inverse(pose(n - 1)) @ pose(n), np.eye(6) * 1e-4, 1.0, 0.01, "test") if n else None
+    return Keyframe(n, n, n, se3.inverse(pose(0)) @ pose(n), scan(pose(n)), edge)
+
+
+@pytest.fixture
+def found(tmp_path: Path) -> Iterator[ActiveMap]:
+    """A robot that knows its place in tmp_path/drive.dpm2map, which stays as it is."""
+    made = ActiveMap(described(map_directory=str(tmp_path)), "", LOG)
+    for n in (0, 5, 10, 15):
+        made.add(street(n))
+    made.close()
+    active = ActiveMap(described(map_file=str(tmp_path / "drive.dpm2map"), localization_mode=True), "", LOG)
+    for n in (4, 5):
+        active.add(street(n))
+    assert active.slam.state(State.TRACKING) is State.TRACKING
+    yield active
+    active.close()
+
+
+@pytest.mark.weights
+def test_where_its_map_cannot_grow_a_robot_is_found_as_before(
+    found: ActiveMap, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another program writes to the file; once it has ended, the map grows at the robot's place."""
+    monkeypatch.setattr("dpm2_core.slam.store.map_store.BUSY", 0.1)
+    with closing(sqlite3.connect(tmp_path / "drive.dpm2map", isolation_level=None)) as other:
+        other.execute("BEGIN IMMEDIATE")
+        with pytest.raises(Dpm2Error, match="locked"):
+            found.extend()
+    found.add(street(9))
+    assert found.located is not None
+    assert found.located.registration.ok
+    assert "grows by a new session" in found.extend()
+    found.add(street(12))
+    T_map_odom = found.T_map_odom("")
+    assert T_map_odom is not None
+    np.testing.assert_allclose(T_map_odom, np.eye(4), atol=0.1)  # m: as exactly as it was found
+    assert len(found.mapper.keyframes) == 5
+
+
+@pytest.mark.weights
+def test_a_map_that_cannot_be_read_does_not_confirm_a_place(found: ActiveMap, tmp_path: Path) -> None:
+    """Its clouds are damaged while the robot is in it: degraded, then lost, as where nothing fits."""
+    with closing(sqlite3.connect(tmp_path / "drive.dpm2map", isolation_level=None)) as other:
+        other.execute("UPDATE payloads SET cloud = x'00'")
+    states = []
+    for n in (13, 14, 15):
+        found.add(street(n))
+        assert found.located is not None
+        assert "see dpm2 map check" in found.located.registration.reason
+        states.append(found.located.state)
+    assert states == [State.DEGRADED, State.DEGRADED, State.LOST]
+    assert found.T_map_odom("") is None
+
+
+@pytest.mark.weights
+@pytest.mark.parametrize("descriptors", [True, False])
+def test_a_growing_map_that_does_not_serve_goes_on(tmp_path: Path, descriptors: bool) -> None:
+    """No keyframe yet, or none with descriptors: the drive stays in one piece."""
+    active = ActiveMap((described if descriptors else config)(map_directory=str(tmp_path)), "", LOG)
+    before, reason = (0, "no keyframe yet") if descriptors else (3, "no keyframe has descriptors")
+    for keyframe in keyframes(before):
+        active.add(keyframe)
+    with pytest.raises(UsageError, match=reason):
+        active.localise()
+    for keyframe in keyframes(5)[before:]:
+        active.add(keyframe)
+    assert [(edge.from_node, edge.to_node) for edge in active.mapper.edges if edge.ok] == [(n, n + 1) for n in range(4)]
+    active.close()
+    assert check_map(tmp_path / "drive.dpm2map").keyframes == 5
 
 
 def test_an_odometry_that_starts_again_goes_on_in_the_same_map(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dpm2_core.data.thumbnail import usable_image
+from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Array, Image, Keyframe, Registration, State
 from dpm2_core.geometry import se3
 from dpm2_core.slam.loops.consistency import UNCERTAIN
@@ -73,7 +74,11 @@ class Localizer:
         self._hint, self.state = T_map_lidar, State.RELOCALIZING
 
     def add(self, keyframe: Keyframe) -> LocalizationResult:
-        """Find a keyframe, which has its cloud, in the map."""
+        """Find a keyframe, which has its cloud, in the map.
+
+        Raises:
+            Dpm2Error: the map cannot be read. It does not confirm the odometry then, as where nothing fits.
+        """
         self._stamp = keyframe.stamp
         if keyframe.edge is not None and keyframe.edge.worst_sigma > UNCERTAIN:
             self.state = State.LOST  # its odometry may have been
@@ -81,9 +86,14 @@ class Localizer:
             self._distrust += float(np.linalg.norm(keyframe.T_odom_kf[:3, 3] - self._T_last[:3, 3]))
         self._T_last = keyframe.T_odom_kf
         picture = usable_image(keyframe.thumbnail)
-        if self.state.located:
-            return self._track(keyframe, picture)
-        return self._find(keyframe, picture, nowhere("lost"))
+        try:
+            if self.state.located:
+                return self._track(keyframe, picture)
+            return self._find(keyframe, picture, nowhere("lost"))
+        except Dpm2Error:
+            self._failures += 1
+            self._doubt()
+            raise
 
     def _track(self, keyframe: Keyframe, picture: Image | None) -> LocalizationResult:
         """Where the odometry says, if the points agree; else look everywhere."""
@@ -108,10 +118,14 @@ class Localizer:
             result = replace(result, ok=False, reason=f"found {meters:.1f} m away, not confirmed yet")
         elif tracking:
             result = rejected
-        if tracking:
-            self.state = State.LOST if self._failures >= self._max_failures else State.DEGRADED
+        self._doubt()
         covariance = LOST if self.state is not State.DEGRADED else np.eye(6) * (0.1 + 0.01 * self._distrust) ** 2
         return LocalizationResult(T_predicted, covariance, self.state, result)
+
+    def _doubt(self) -> None:
+        """Its place, where it has one, is that of the odometry alone."""
+        if self.state.located:
+            self.state = State.LOST if self._failures >= self._max_failures else State.DEGRADED
 
     def _located(self, keyframe: Keyframe, result: Registration, jumped: bool) -> LocalizationResult:
         self.T_map_odom = se3.orthonormalized(result.T_target_source @ se3.inverse(keyframe.T_odom_kf))
