@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
@@ -22,7 +23,7 @@ from dpm2_core.data.ply import write_ply
 from dpm2_core.data.trajectory import write_kitti, write_tum
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.files import write_json
-from dpm2_core.frame import Array
+from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.mapping.tiles import write_tiles
 from dpm2_core.slam.store.map_data import MapData, load_map, map_cloud, save_as, trajectory
@@ -84,7 +85,7 @@ def merge(
     from dpm2_core.slam.build import make_loops
     from dpm2_core.slam.graph.pose_graph import PoseGraph
     from dpm2_core.slam.mapping.merge import align as aligned
-    from dpm2_core.slam.mapping.merge import loops_by, merge_maps, optimized
+    from dpm2_core.slam.mapping.merge import loops_by, merge_maps, optimized, tie_of
     from dpm2_core.slam.settings import Config
 
     given = [parse_transform(text) for text in transform or ()]
@@ -101,7 +102,7 @@ def merge(
                 first = optimized(merge_maps(first, other, T, loops), PoseGraph(chosen.pose_graph))
                 Console(stderr=True).print(f"{paths[number + 1]}: {len(loops)} loops to what came before")
             else:
-                first = merge_maps(first, other, given[number])
+                first = merge_maps(first, other, given[number], tie_of(first, other, given[number]))
         save_as(first, out)
     Console(stderr=True).print(f"{out}: {len(first)} keyframes", highlight=False, soft_wrap=True)
 
@@ -177,6 +178,30 @@ def _loaded(store: MapStore) -> MapData:
     return data
 
 
+def _tied(data: MapData, out: Path) -> MapData:
+    """What is tied to the first keyframe; says what is not, and is left out of a file."""
+    from dpm2_core.slam.mapping.parts import first_part
+
+    tied = first_part(data)
+    whole, left = (Counter(zip((k.robot for k in d.keyframes), d.session, strict=True)) for d in (data, tied))
+    for drive, count in sorted((whole - left).items()):
+        _say_without(out, drive, count, whole[drive], "no loop ties them to the first keyframe")
+    return tied
+
+
+def _say_without(out: Path, drive: tuple[str, int], count: int, total: int, reason: str) -> None:
+    """Say that keyframes of a drive (robot, session) are not in a file."""
+    robot, session = drive
+    name = f"session {session} of {robot}" if robot else f"session {session}"
+    info = f"{out}: without {count} of the {total} keyframes of {name}: {reason}"
+    Console(stderr=True).print(info, highlight=False, soft_wrap=True)
+
+
+def _cloud(data: MapData, out: Path, voxel: float) -> Points:
+    tied = _tied(data, out)
+    return map_cloud(tied.clouds, tied.poses, voxel)
+
+
 def _export_geojson(data: MapData, out: Path) -> None:
     from dpm2_core.geometry import geodesy
     from dpm2_core.slam.mapping.parts import placed_on_earth
@@ -188,12 +213,8 @@ def _export_geojson(data: MapData, out: Path) -> None:
         way = trajectory(placed, robot, session)[1][:, :3, 3]
         known = np.isfinite(way).all(axis=1)
         if not known.all():
-            drive = f"session {session} of {robot}" if robot else f"session {session}"
-            Console(stderr=True).print(
-                f"{out}: without {(~known).sum()} of the {len(way)} keyframes of {drive}: "
-                "no loop ties them to the first keyframe, and their own fixes are too few to tell where they are",
-                highlight=False, soft_wrap=True,
-            )  # fmt: skip
+            reason = "no loop ties them to the first keyframe, and their own fixes are too few to tell where they are"
+            _say_without(out, (robot, session), int((~known).sum()), len(way), reason)
         if not known.any():
             continue
         line = [[round(lon, 9), round(lat, 9), round(up, 3)] for lat, lon, up in geodesy.geodetic(way[known]).tolist()]
@@ -205,26 +226,27 @@ def _export_geojson(data: MapData, out: Path) -> None:
 def _export_page(data: MapData, out: Path, voxel: float) -> None:
     from dpm2_core.evaluation.map_page import write_map_page
 
-    write_map_page(out, data, voxel)
+    write_map_page(out, _tied(data, out), voxel)
 
 
 def _export_occupancy(data: MapData, out: Path, resolution: float) -> None:
     from dpm2_core.slam.mapping.occupancy import occupancy_grid, write_grid
     from dpm2_core.slam.mapping.occupancy_map import OccupancySettings
 
-    write_grid(out, occupancy_grid(data.clouds, data.poses, OccupancySettings(resolution=resolution)))
+    tied = _tied(data, out)
+    write_grid(out, occupancy_grid(tied.clouds, tied.poses, OccupancySettings(resolution=resolution)))
 
 
 _SPACING = {"voxel": 0.3, "resolution": 0.1, "": 0.0}
 """Default of each option that is a spacing, m."""
 _EXPORTS: dict[str, tuple[Callable[[MapData, Path, float], None], str]] = {
-    "ply": (lambda data, out, voxel: write_ply(out, map_cloud(data.clouds, data.poses, voxel)), "voxel"),
-    "pcd": (lambda data, out, voxel: write_pcd(out, map_cloud(data.clouds, data.poses, voxel)), "voxel"),
-    "las": (lambda data, out, voxel: write_las(out, map_cloud(data.clouds, data.poses, voxel)), "voxel"),
+    "ply": (lambda data, out, voxel: write_ply(out, _cloud(data, out, voxel)), "voxel"),
+    "pcd": (lambda data, out, voxel: write_pcd(out, _cloud(data, out, voxel)), "voxel"),
+    "las": (lambda data, out, voxel: write_las(out, _cloud(data, out, voxel)), "voxel"),
     "html": (_export_page, "voxel"),
     "occupancy": (_export_occupancy, "resolution"),
-    "tum": (lambda data, out, _: write_tum(out, *trajectory(data)), ""),
-    "kitti": (lambda data, out, _: write_kitti(out, trajectory(data)[1]), ""),
+    "tum": (lambda data, out, _: write_tum(out, *trajectory(_tied(data, out))), ""),
+    "kitti": (lambda data, out, _: write_kitti(out, trajectory(_tied(data, out))[1]), ""),
     "geojson": (lambda data, out, _: _export_geojson(data, out), ""),
     "g2o": (lambda data, out, _: graph_of(data).write_g2o(out), ""),
 }

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.frame import Array, Edge, Georeference, Points
+from dpm2_core.frame import Array, Edge, Georeference, Points, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.loops.closure import LoopCloser
@@ -17,6 +17,7 @@ from dpm2_core.slam.mapping.restore import restore
 from dpm2_core.slam.store.cloud_store import CloudStore, Loan
 from dpm2_core.slam.store.map_data import MapData
 
+_GIVEN_COVARIANCE = np.diag([0.05] * 3 + [1.0] * 3) ** 2  # of a transform by hand, rad and m: any loop is surer
 FindLoops = Callable[[MapData, MapData], list[Edge]]
 """Accepted loops from a node of one map to a node of another, each in its own numbers."""
 
@@ -46,6 +47,17 @@ def merge_maps(a: MapData, b: MapData, T_a_b: Array, loops: Sequence[Edge] = ())
         lambda i: a.describe(i) if i < n else b.describe(i - n),
         a.georeference or _seen_from(T_a_b, b.georeference),
     )
+
+
+def tie_of(a: MapData, b: MapData, T_a_b: Array) -> list[Edge]:
+    """A known transform (4, 4) as an edge between two maps, as `FindLoops` gives them; none where one is empty.
+
+    Without it the file would not say that it is known where the second map is in the first.
+    """
+    if not len(a) or not len(b):
+        return []
+    T = se3.inverse(a.poses[0]) @ T_a_b @ b.poses[0]
+    return [Edge("loop", 0, 0, Registration(T, _GIVEN_COVARIANCE, method="transform"))]
 
 
 def _seen_from(T_a_b: Array, known: Georeference | None) -> Georeference | None:

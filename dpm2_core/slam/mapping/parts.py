@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from dpm2_core.frame import Georeference
 from dpm2_core.geometry import geodesy
 from dpm2_core.slam.graph.fixes import Fixes
-from dpm2_core.slam.store.map_data import MapData
+from dpm2_core.slam.store.map_data import MapData, subset
 
 
 def parts_of(data: MapData) -> NDArray[np.int32]:
@@ -21,6 +21,23 @@ def parts_of(data: MapData) -> NDArray[np.int32]:
     ends = np.array([(edge.from_node, edge.to_node) for edge in data.constraints], np.intp).reshape(-1, 2)
     graph = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), (len(data), len(data)))
     return np.asarray(connected_components(graph, directed=False)[1], np.int32)
+
+
+def first_part(data: MapData) -> MapData:
+    """The map of the keyframes that are tied to the first one: of all others it is not known where in it they are."""
+    parts = parts_of(data)
+    own = parts == parts[0]
+    for node in np.flatnonzero(own).tolist():
+        loan = data.clouds.loan(node)  # by a loop that was rejected since then, it may be of another part
+        own[node] = loan is None or own[loan.lender]
+    new = {node: position for position, node in enumerate(np.flatnonzero(own).tolist())}
+    edges = [
+        replace(edge, from_node=new[edge.from_node], to_node=new[edge.to_node])
+        for edge in data.edges
+        if edge.from_node in new and edge.to_node in new
+    ]
+    trail = [replace(pruned, node=new[pruned.node]) for pruned in data.trail if pruned.node in new]
+    return subset(data, list(new), edges, trail)
 
 
 def located(data: MapData, own: NDArray[np.bool_]) -> Georeference | None:

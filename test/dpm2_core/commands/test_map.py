@@ -21,7 +21,8 @@ from dpm2_core.frame import Array, Edge, Georeference, Keyframe, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.sim.drive import simulate
 from dpm2_core.sim.settings import DriveConfig, LidarConfig
-from dpm2_core.slam.graph.pose_graph import PoseGraphSettings
+from dpm2_core.slam.graph.pose_graph import PoseGraph, PoseGraphSettings
+from dpm2_core.slam.mapping.merge import merge_maps, optimized
 from dpm2_core.slam.mapping.prune import prune
 from dpm2_core.slam.store.map_data import MapData, load_map, save_as
 from dpm2_core.slam.store.map_store import Change, MapStore
@@ -177,6 +178,49 @@ def test_merge_by_transform_keeps_the_place_on_earth_of_either_map(tmp_path: Pat
     assert "how certain is not known" in " ".join(info.stdout.split())
     figures = json.loads((tmp_path / "info.json").read_text(), parse_constant=pytest.fail)["georeference"]
     assert (figures["heading_sigma_deg"], figures["position_sigma_m"], figures["fixes"]) == (None, None, 0)
+
+
+def points_of(ply: Path) -> Array:
+    """(M, 3) m."""
+    return np.frombuffer(ply.read_bytes().partition(b"end_header\n")[2], "<f4").reshape(-1, 4)[:, :3]
+
+
+@pytest.mark.parametrize("robots", [("", ""), ("red", "blue")])
+def test_what_nothing_ties_to_the_first_keyframe_is_left_out_and_named(tmp_path: Path, robots: tuple[str, str]) -> None:
+    """Neither a second drive nor a second robot is drawn into the place of the first; pruned keyframes stay beside
+    those that have their place."""
+    one = ring(12)
+    two = merge_maps(one, one, np.eye(4))
+    keyframes = [replace(k, robot=robots[node // 12]) for node, k in enumerate(two.keyframes)]
+    session = two.session if robots == ("", "") else [1] * 24
+    apart = prune(replace(two, keyframes=keyframes, session=session), [5, 18])
+    alone = prune(replace(one, keyframes=keyframes[:12]), [5])
+    save_as(apart, tmp_path / "apart")
+    save_as(alone, tmp_path / "alone")
+    drive = "session 1 of blue" if robots[1] else "session 2"
+    for name in ("a.ply", "a.pcd", "a.html", "a.pgm", "a.tum"):
+        for path in ("apart", "alone"):
+            done = dpm2("map", "export", tmp_path / path, tmp_path / f"{path}.{name}")
+            assert done.returncode == 0
+            assert (f"without 11 of the 11 keyframes of {drive}: no loop ties" in done.stderr) == (path == "apart")
+        if name != "a.html":  # it has a title
+            assert (tmp_path / f"apart.{name}").read_bytes() == (tmp_path / f"alone.{name}").read_bytes()
+    assert len(read_trajectory(tmp_path / "apart.a.tum").keys) == 12
+
+
+def test_maps_that_are_joined_by_a_known_transform_stay_together(tmp_path: Path) -> None:
+    """Though no loop ties them: their clouds are both there, and the graph keeps the transform."""
+    save_as(ring(12), tmp_path / "one")
+    done = dpm2("map", "merge", tmp_path / "one", tmp_path / "one", "--out", tmp_path / "both",
+                "--transform", "600 0 0 0")  # fmt: skip
+    assert done.returncode == 0
+    done = dpm2("map", "export", tmp_path / "both", tmp_path / "both.ply")
+    assert "without" not in done.stderr
+    points = points_of(tmp_path / "both.ply")
+    far = points[:, 0] > 300
+    assert far.sum() == pytest.approx((~far).sum(), rel=0.01)  # a point between two voxels may be rounded into either
+    both = loaded(tmp_path / "both")
+    np.testing.assert_allclose(optimized(both, PoseGraph(PoseGraphSettings())).poses, both.poses, atol=1e-6)
 
 
 def test_check_and_recover(tmp_path: Path, map_file: Path) -> None:
