@@ -16,6 +16,8 @@ from dpm2_core.slam.bridge import Bridge, Limits
 from dpm2_core.slam.odometry.inertial import InertialMotion
 from dpm2_core.slam.odometry.keyframe_selection import KeyframeSelector
 from dpm2_core.slam.odometry.other import OtherMotion, Step
+from dpm2_core.slam.odometry.repeated import PROBLEM as REPEATED
+from dpm2_core.slam.odometry.repeated import RepeatedCloud
 from dpm2_core.slam.odometry.settings import OdometrySettings
 from dpm2_core.slam.odometry.starts import starts_from_rest, turned_starts
 from dpm2_core.slam.preprocess import Scan
@@ -55,6 +57,7 @@ class Odometry:
         self._clock = StreamClock()
         self._registered = np.eye(4), 0.0  # the last registered pose, and the seconds since
         self._failures = 0
+        self._repeated = RepeatedCloud()
         self._first: Frame | None = None
         self._bridge: Bridge | None = None
         self._left = 0.0  # the time of the last pose before the pause that is being bridged
@@ -88,6 +91,8 @@ class Odometry:
         dt = self._clock.advance(frame.stamp)
         twist = np.zeros(6) if self._twist is None else self._twist
         seconds = self._registered[1] + dt
+        if self._repeated.repeats(frame.points, float(np.linalg.norm(twist[3:])) * seconds) and frame.problem is None:
+            frame = replace(frame, problem=REPEATED)
         if frame.imu is not None and self._inertial is None:
             self._inertial = InertialMotion(not len(self._registration) and self._bridge is None)
         if self._inertial is not None:
@@ -107,6 +112,8 @@ class Odometry:
             scan, registration = self._begin_again(self._first, frame, registration, seconds)
         clock.append(perf_counter())
         self._update(scan, registration, dt)
+        if registration.ok:
+            self._repeated.keep()
         if registration.method == "first" and registration.ok and frame.time_offset is not None:
             self._first = frame
         T = self._T
@@ -224,9 +231,11 @@ class Odometry:
             return None
         T = T_before @ step.T
         information = np.linalg.inv(step.covariance).astype(np.float64)
-        result = self._registration.register(scan, Prediction([T], information=information))
-        result = self._gated(result, T, dt)
-        return result if result.ok and self._other.agrees(T_before, result) else None
+        prediction = Prediction([T], information=information)
+        result = self._gated(self._registration.register(scan, prediction), T, dt)
+        # A wrong step holds the scan where it leads; that few of its points fit there is what tells the two apart.
+        confirmed = result.ok and result.confidence >= prediction.convincing and self._other.agrees(T_before, result)
+        return result if confirmed else None
 
     def _registered_from_rest(self, scan: Scan, T: Array, dt: float) -> Registration:
         """While the velocity is unknown: the best of many starts; after a pause first as before it."""

@@ -171,6 +171,37 @@ def test_the_beginning_of_a_sweep_that_is_refused_does_not_become_the_map() -> N
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("often", [1, 4])
+def test_a_cloud_that_is_sent_again_is_no_halt(suburb_drive: Drive, often: int) -> None:
+    """Under new stamps, by a driver that hangs: the error was the way of the vehicle meanwhile, 8 m, in `tracking`."""
+    frames, truth = suburb_drive
+    again = range(12, 12 + often)
+    hung = [replace(frame, points=frames[11].points) if i in again else frame for i, frame in enumerate(frames)]
+    results = run(hung)
+    for i in again:
+        assert "same cloud as before" in results[i].registration.reason
+        assert results[i].state is not State.TRACKING
+    error = se3.inverse(truth[-1]) @ results[-1].T_odom_lidar
+    assert np.linalg.norm(error[:3, 3]) < 0.1  # m, as without
+    assert results[-1].state is State.TRACKING
+
+
+def test_a_vehicle_that_stands_may_see_the_same_cloud(suburb_drive: Drive) -> None:
+    """In a simulation without noise; also where the caller uses one array for all clouds."""
+    frames, _ = suburb_drive
+    results = run([replace(frames[0], stamp=frame.stamp) for frame in frames[:12]])
+    assert all(result.registration.ok for result in results)
+    assert results[-1].state is State.TRACKING
+    odometry, states = make_odometry(SlamSettings()), []
+    size = max(len(frame.points) for frame in frames)
+    buffer = np.empty((size, 4), np.float32)
+    for frame in frames[:12]:
+        buffer[:] = np.nan
+        buffer[: len(frame.points)] = frame.points
+        states.append(odometry.process(replace(frame, points=buffer)).state)
+    assert states[2:] == [State.TRACKING] * 10
+
+
 def test_skewed_scans_with_a_failed_one_at_the_start() -> None:
     """The motion within the first scan is that of the time since, not of one period."""
     frames, truth = make_drive("suburb", 8, deskewed=False)

@@ -111,3 +111,13 @@ def test_one_that_says_it_does_not_know_is_not_followed(suburb_drive: Drive) -> 
 def test_what_is_no_pose_is_refused(T: Array, covariance: Array | None) -> None:
     with pytest.raises(ValueError, match="finite numbers"):
         Guess(T, covariance)
+
+
+@pytest.mark.parametrize("wrong", ["still", "backwards"])
+def test_one_that_is_wrong_from_the_start_does_not_lead(suburb_drive: Drive, wrong: str) -> None:
+    """An encoder without a cable, a sign the wrong way round: it held each scan where it led, and then its map did."""
+    frames, truth = suburb_drive
+    guesses = [np.eye(4) if wrong == "still" else se3.inverse(T) for T in wheel_odometry(truth)]
+    alone, led = run(frames), run([replace(f, guess=Guess(T)) for f, T in zip(frames, guesses, strict=True)])
+    assert off(led, truth).max() < off(alone, truth).max() + 0.01
+    assert all(t.state is State.TRACKING for t in led[2:])
