@@ -26,7 +26,6 @@ _IMAGE_ENCODINGS: dict[str, tuple[str, int, int | None]] = {
     "mono8": ("u1", 1, cv2.COLOR_GRAY2RGB),
     "8uc1": ("u1", 1, cv2.COLOR_GRAY2RGB),
     "mono16": ("u2", 1, cv2.COLOR_GRAY2RGB),
-    "16uc1": ("u2", 1, cv2.COLOR_GRAY2RGB),
     "uyvy": ("u1", 2, cv2.COLOR_YUV2RGB_UYVY),
     "yuv422": ("u1", 2, cv2.COLOR_YUV2RGB_UYVY),
     "yuyv": ("u1", 2, cv2.COLOR_YUV2RGB_YUY2),
@@ -46,6 +45,7 @@ _IMAGE_ENCODINGS: dict[str, tuple[str, int, int | None]] = {
     "bayer_grbg16": ("u2", 1, cv2.COLOR_BayerGB2RGB),
 }
 
+_DEPTH = ("16uc1", "32fc1")  # mm, m (REP 118)
 _HALF_COLOR = ("nv12", "nv21")
 _FISHEYE = ("equidistant", "fisheye")
 _FISHEYE_COUNT = 4
@@ -96,7 +96,7 @@ def _check_even(encoding: str, width: int, height: int) -> None:
 
 
 def _decode_compressed(msg: Any, size: tuple[int, int] | None) -> NDArray[np.uint8]:
-    if "compresseddepth" in msg.format.lower():
+    if is_depth(msg):
         raise MessageError(f"compressed image format {msg.format[:40]!r} is not supported; supported: jpeg, png")
     try:
         pixels = decode_compressed(bytes(msg.data), size)
@@ -111,10 +111,17 @@ def _decode_compressed(msg: Any, size: tuple[int, int] | None) -> NDArray[np.uin
     return np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels[..., 0]), conversion), np.uint8)
 
 
+def is_depth(msg: Any) -> bool:
+    """Whether an image shows how far things are, not how they look."""
+    named = str(getattr(msg, "encoding", getattr(msg, "format", ""))).lower()  # "16UC1; png compressed "
+    return named.startswith(_DEPTH) or "compresseddepth" in named
+
+
 def decode_camera(info: Any, T_lidar_cam: Array, name: str) -> Camera:
     """sensor_msgs/CameraInfo to `Camera`: K and D as they are; P's left block where D is zero, the image rectified.
 
-    A fisheye (equidistant) comes as the pinhole camera of the same focal length that `rectified` makes of its images.
+    A fisheye (equidistant with 4 coefficients, also zeros) comes as the pinhole camera of the same focal length that
+    `rectified` makes of its images.
 
     Args:
         info: with model plumb_bob, rational_polynomial (whose 8 coefficients stay in OpenCV's order) or equidistant.
@@ -126,14 +133,15 @@ def decode_camera(info: Any, T_lidar_cam: Array, name: str) -> Camera:
     """
     K, P, D = (np.array(x, np.float64) for x in (info.k, info.p, info.d))
     K, P = K.reshape(3, 3), P.reshape(3, 4)
-    if not D.any():
+    if not D.any() and not is_fisheye(info):
         D, K = D[:0], P[:, :3].copy() if P[0, 0] else K
     elif info.distortion_model not in ("plumb_bob", "rational_polynomial", *_FISHEYE):
         raise MessageError(f"{name}: distortion model {info.distortion_model[:40]!r} is not supported; "
                            "supported: plumb_bob, rational_polynomial, equidistant")  # fmt: skip
     if not (K[0, 0] > 0 and K[1, 1] > 0 and np.isfinite(K).all()):
         raise MessageError(f"{name}: CameraInfo has no focal length (the camera is not calibrated)")
-    if len(D) not in _DISTORTIONS or not np.isfinite(D).all() or (is_fisheye(info) and len(D) != _FISHEYE_COUNT):
+    possible = (0, _FISHEYE_COUNT) if info.distortion_model in _FISHEYE else _DISTORTIONS
+    if len(D) not in possible or not np.isfinite(D).all():
         raise MessageError(f"{name}: CameraInfo has {len(D)} distortion coefficients, or some that are not finite")
     if not (0 < info.width <= _WIDEST_IMAGE and 0 < info.height <= _WIDEST_IMAGE):
         raise MessageError(f"{name}: CameraInfo has no image size, or one beyond {_WIDEST_IMAGE} pixels")
@@ -142,18 +150,24 @@ def decode_camera(info: Any, T_lidar_cam: Array, name: str) -> Camera:
 
 
 def info_of(topic: str, info: Any) -> Any:
-    """The CameraInfo of a topic's images: without distortion, so that P counts, for image_rect and the like, which
-    image_proc publishes beside the CameraInfo of the raw image, and for KITTI's, as kitti2bag does."""
+    """The CameraInfo of a topic's images: of the part of the sensor that they show, in their pixels (roi, binning); and
+    without distortion, so that P counts, for image_rect and the like, which image_proc publishes beside the CameraInfo
+    of the raw image, and for KITTI's, as kitti2bag does."""
     name = topic.removesuffix("/compressed").rpartition("/")[2]
-    if not (name.startswith("image_rect") or topic.startswith("/kitti/")) or not info.p[0]:
+    is_rectified = bool((name.startswith("image_rect") or topic.startswith("/kitti/")) and info.p[0])
+    roi, x, y = info.roi, max(info.binning_x, 1), max(info.binning_y, 1)
+    size = (roi.width or info.width) // x, (roi.height or info.height) // y  # zeros stand for all, and for no binning
+    part = np.array([[1 / x, 0, -roi.x_offset / x], [0, 1 / y, -roi.y_offset / y], [0, 0, 1]])
+    if not is_rectified and size == (info.width, info.height) and (part == np.eye(3)).all():
         return info
-    return SimpleNamespace(header=info.header, width=info.width, height=info.height, k=info.k, p=info.p, d=[],
-                           distortion_model=info.distortion_model)  # fmt: skip
+    k, p = ((part @ np.reshape(matrix, (3, -1))).ravel() for matrix in (info.k, info.p))
+    return SimpleNamespace(header=info.header, width=size[0], height=size[1], k=k, p=p,
+                           d=[] if is_rectified else info.d, distortion_model=info.distortion_model)  # fmt: skip
 
 
 def is_fisheye(info: Any) -> bool:
     """Whether images of a CameraInfo that `decode_camera` takes are to be `rectified`."""
-    return info.distortion_model in _FISHEYE and bool(np.any(info.d))
+    return info.distortion_model in _FISHEYE and len(info.d) == _FISHEYE_COUNT
 
 
 def rectified(pixels: NDArray[np.uint8], info: Any) -> NDArray[np.uint8]:

@@ -311,7 +311,6 @@ GRAY = RGB[..., 0].copy()
         ("bgra8", np.dstack([RGB[..., ::-1], GRAY]), RGB),
         ("mono8", GRAY, np.dstack([GRAY] * 3)),
         ("mono16", GRAY.astype(np.uint16) * 256 + 17, np.dstack([GRAY] * 3)),
-        ("16UC1", GRAY.astype(np.uint16) * 256 + 17, np.dstack([GRAY] * 3)),
     ],
 )
 def test_image_encodings(encoding: str, pixels: np.ndarray, want: np.ndarray, padding: int) -> None:
@@ -392,7 +391,9 @@ def test_compressed_images() -> None:
         (SimpleNamespace(**(vars(image(RGB, "rgb8")) | {"width": 0})), "0 x 6"),
         (SimpleNamespace(format="jpeg", data=b"\xff\xd8garbage"), "'jpeg' and 9 bytes cannot be decoded"),
         (SimpleNamespace(format="png", data=b""), "0 bytes cannot be decoded"),
+        (image(GRAY.astype(np.uint16), "16UC1"), "encoding '16UC1' is not supported"),  # depth in mm, as REP 118 has it
         (SimpleNamespace(format="16UC1; compressedDepth png", data=b"12345"), "compressedDepth"),
+        (SimpleNamespace(format="16UC1; png compressed ", data=b"12345"), "format '16UC1; png compressed ' is not sup"),
     ],
 )
 def test_images_that_cannot_be_used_are_named(msg: SimpleNamespace, message: str) -> None:
@@ -403,7 +404,12 @@ def test_images_that_cannot_be_used_are_named(msg: SimpleNamespace, message: str
 def info(**changes: Any) -> SimpleNamespace:
     K, P = np.array([500, 0, 320, 0, 510, 240, 0, 0, 1.0]), np.array([480, 0, 310, 0, 0, 490, 230, 0, 0, 0, 1, 0.0])
     base = {"k": K, "p": P, "d": [0.0] * 5, "distortion_model": "plumb_bob", "width": 640, "height": 480}
-    return SimpleNamespace(**(base | changes))
+    whole = {"binning_x": 0, "binning_y": 0, "roi": roi(0, 0, 0, 0), "header": header()}
+    return SimpleNamespace(**(base | whole | changes))
+
+
+def roi(x: int, y: int, width: int, height: int) -> SimpleNamespace:
+    return SimpleNamespace(x_offset=x, y_offset=y, width=width, height=height)
 
 
 def test_camera_of_a_rectified_image_has_the_rectified_intrinsics() -> None:
@@ -425,6 +431,42 @@ def test_the_info_of_a_raw_image_beside_its_rectified_one(model: str) -> None:
         assert not image_messages.is_fisheye(of_topic)
     for topic, of in (("/front/image_raw", raw), ("/front/image_rect", info(p=np.zeros(12), header=header()))):
         assert image_messages.info_of(topic, of) is of
+
+
+@pytest.mark.parametrize(
+    ("changes", "size"),
+    [
+        ({"binning_x": 2, "binning_y": 4}, (320, 120)),
+        ({"roi": roi(100, 40, 200, 300)}, (200, 300)),
+        ({"roi": roi(100, 40, 200, 300), "binning_x": 2, "binning_y": 2}, (100, 150)),
+        ({"roi": roi(0, 0, 640, 480), "binning_x": 1, "binning_y": 1}, (640, 480)),
+    ],
+)
+@pytest.mark.parametrize("topic", ["/front/image_raw", "/front/image_rect"])
+def test_the_info_of_a_part_of_the_sensor(changes: dict[str, Any], size: tuple[int, int], topic: str) -> None:
+    """A ray falls on the pixel of the whole sensor, less the corner of the part, in pixels of the binned image."""
+    D, ray = [0.1, 0.0, 0.0, 0.01, 0.0], np.array([0.1, -0.2, 1.0])
+    whole, part = (
+        image_messages.decode_camera(image_messages.info_of(topic, one), np.eye(4), "front")
+        for one in (info(d=D), info(d=D, **changes))
+    )
+    of = info(**changes)
+    corner, pixel = [of.roi.x_offset, of.roi.y_offset], [of.binning_x or 1, of.binning_y or 1]
+    np.testing.assert_allclose((part.K @ ray)[:2], ((whole.K @ ray)[:2] - corner) / pixel, rtol=1e-12)
+    assert (part.size, part.distortion) == (size, whole.distortion)
+
+
+def test_an_ideal_fisheye_has_no_coefficients() -> None:
+    """Of a simulator: the light is where the angle says, not where a pinhole camera has it."""
+    k = [200.0, 0, 320, 0, 200, 240, 0, 0, 1]
+    msg = info(distortion_model="equidistant", d=[0.0] * 4, k=k, p=np.zeros(12))
+    pixels = np.zeros((480, 640, 3), np.uint8)
+    cv2.circle(pixels, (round(320 + 200 * np.radians(50)), 240), 3, (255, 255, 255), -1)
+    assert image_messages.is_fisheye(msg)
+    camera = image_messages.decode_camera(msg, np.eye(4), "front")
+    u = np.argwhere(image_messages.rectified(pixels, msg)[..., 0] > 128).mean(0)[1]
+    assert u == pytest.approx((camera.K @ [np.tan(np.radians(50)), 0, 1])[0], abs=1.5)  # a spot of 7 pixels, spread
+    assert not image_messages.is_fisheye(info(distortion_model="equidistant", d=[]))
 
 
 def test_a_fisheye_becomes_a_pinhole_camera() -> None:
