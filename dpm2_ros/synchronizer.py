@@ -146,7 +146,7 @@ class Synchronizer:
         sensor.late += late
         if not late or now <= arrival + self._timeout:
             sensor.missed = 0  # a late one would have come in time, had that cloud waited
-        sensor.messages.add(stamp, message)
+        sensor.messages.add(stamp, message, [bundle.stamp for bundle in self._queue])
 
     def pop(self, now: float) -> Bundle | None:
         """The next cloud that has what goes with it or has waited long enough; None if there is none yet."""

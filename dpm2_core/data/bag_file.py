@@ -82,12 +82,15 @@ class Bag:
         except Exception as error:  # overwritten bytes raise anything from SerdeError to UnicodeDecodeError
             raise MessageError(f"{topic}: message of {len(data)} bytes is damaged ({_reason(error)})") from None
 
-    def first(self, topic: str) -> Any | None:
-        """The first message of a topic that can be decoded; None without."""
+    def decoded(self, topic: str) -> Iterator[Any]:
+        """The messages of a topic that can be decoded."""
         for _, _, data in self.messages([topic]):
             with suppress(MessageError):
-                return self.decode(topic, data)
-        return None
+                yield self.decode(topic, data)
+
+    def first(self, topic: str) -> Any | None:
+        """The first of those; None without."""
+        return next(self.decoded(topic), None)
 
     def topics(self, *types: str) -> list[str]:
         """Topics of these message types that have messages, sorted."""

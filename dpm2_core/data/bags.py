@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from itertools import islice
@@ -17,17 +17,17 @@ from dpm2_core.data import topics
 from dpm2_core.data.bag_file import open_bag
 from dpm2_core.data.frames import Calibration, CameraTopic, FrameBuilder
 from dpm2_core.data.gnss import FixBuffer
-from dpm2_core.data.image_messages import info_of
+from dpm2_core.data.image_messages import decode_camera, info_of, is_depth
 from dpm2_core.data.imu import ImuBuffer
 from dpm2_core.data.kitti import checked_correction
 from dpm2_core.data.livox import LIVOX
 from dpm2_core.data.messages import MessageError, serialized_stamp, stamp_ns
-from dpm2_core.data.pairing import Beside, clouds_after_others
+from dpm2_core.data.pairing import JUMP, Beside, RawMessage, clouds_after_others
 from dpm2_core.data.settings import InputSettings
+from dpm2_core.data.trajectory import interpolate
 from dpm2_core.data.transforms import transform_matrix
-from dpm2_core.errors import UsageError
+from dpm2_core.errors import UsageError, printable
 from dpm2_core.frame import Array, Camera, Frame
-from dpm2_core.geometry import se3
 
 Stamps = NDArray[np.int64]
 
@@ -39,7 +39,6 @@ FIX = "sensor_msgs/msg/NavSatFix"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 _TRUTH = ("nav_msgs/msg/Odometry", "nav_msgs/msg/Path")
 _SWEEP = 100_000_000  # ns: so far beyond its stamp may the last point of a cloud be, up to which the IMU is wanted
-_TRUTH_GAP = 1_000_000_000  # ns between two true poses beyond which nothing is known in between
 
 
 class BagSource:
@@ -63,8 +62,7 @@ class BagSource:
         correction = self._recorded_correction()
         self._calibration = Calibration(self.points_topic, second_topic=second, angle_correction_deg=correction)
         self.transforms = self._calibration.transforms
-        for _, _, data in self._bag.messages([topics.TF_STATIC]):
-            self.transforms.add(self._bag.decode(topics.TF_STATIC, data))
+        self._add_transforms()
         self.T_cam_lidar: Array | None = None
         if topics.GRAY_CAMERA in self.transforms.frames:
             self.T_cam_lidar = self.transforms.lookup(topics.GRAY_CAMERA, self.lidar_frame)
@@ -82,8 +80,8 @@ class BagSource:
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
         """Frames start..stop-1 as recorded, also where their stamps repeat or go back; `notes` says so."""
-        before, count, cameras = None, 0, [camera.topic for camera in self._calibration.cameras]
-        images: Counter[str] = Counter()
+        before, count, known = None, 0, self._calibration
+        found: Counter[str] = Counter()  # frames that have something of a topic
         self._imu.clear()
         self._gnss.clear()
         self._unsound.clear()
@@ -94,15 +92,26 @@ class BagSource:
                 self._note_once("time stamps do not increase", f"at frame {index}: {(stamp - before) * 1e-9:+.3f} s")
             frame = self._frames.frame(stamp, cloud, index, beside)
             before, count = stamp, count + 1
-            images.update(image.camera.name for image in frame.images)
+            found.update(image.camera.name for image in frame.images)
+            found.update(beside.keys() & {known.second_topic})
+            found[known.gnss_topic] += frame.fix is not None and stamp - frame.fix.stamp < JUMP
             if self._frames.time_problem:
                 self._note_once(f"{self.points_topic}: {self._frames.time_problem}", f"first at frame {index}")
             yield frame
         for topic, (left_out, why) in self._unsound.items():
             self._note_once(f"{topic}: {left_out} samples left out", f"the first: {why}")
-        for topic in (topic for topic in cameras if images[topic] < count):
-            within = f"within {self._settings.image_tolerance} s"
-            self._note_once(f"{count - images[topic]} of {count} frames have no image of {topic}", within)
+        self._note_missing(found, count)
+
+    def _note_missing(self, found: Counter[str], count: int) -> None:
+        """Say what of the other sensors is missing, given how many of `count` frames have something of each topic."""
+        known, within = self._calibration, f"within {self._settings.image_tolerance} s"
+        missing = [(camera.topic, "image", within) for camera in known.cameras if found[camera.topic] < count]
+        if known.second_topic and found[known.second_topic] < count:
+            missing.append((known.second_topic, "cloud", within))
+        if known.gnss_topic and not found[known.gnss_topic] and count:  # fixes are rarer than clouds
+            missing.append((known.gnss_topic, "fix", f"within {JUMP * 1e-9:g} s"))
+        for topic, what, within in missing:
+            self._note_once(f"{count - found[topic]} of {count} frames have no {what} of {topic}", within)
 
     @cached_property
     def stamps(self) -> Stamps:
@@ -165,11 +174,15 @@ class BagSource:
         return None if known.camera is None else cameras[0]
 
     def _choose_image(self, second: str) -> str:
-        """The image topic of the first camera, which is not the second one's; empty for none."""
+        """The image topic of the first camera, which is not the second one's; empty for none, or depth alone."""
         asked, found = self._settings.image_topic, [topic for topic in self._bag.topics(*IMAGES) if topic != second]
         silent = [topic for topic, kind in self._bag.types.items() if kind in IMAGES and topic not in (*found, second)]
         if silent and not asked:
             self.notes.append(f"no message on the image topic {', '.join(silent)}")
+        depth = [] if asked else [topic for topic in found if is_depth(self._bag.first(topic))]
+        if depth:
+            self.notes.append(f"depth images are not used: {', '.join(depth)}")
+        found = [topic for topic in found if topic not in depth]
         usual = topics.IMAGE if topics.IMAGE in found else topics.IMAGE.removesuffix("_raw")  # two kinds of kitti2bag
         return self._one_of(found, asked, usual, "image", "images")
 
@@ -197,14 +210,21 @@ class BagSource:
         return usual if usual in found else "".join(found)
 
     def _camera_topic(self, topic: str, info_topic: str, asked: bool) -> CameraTopic | None:
-        """The camera of an image topic with its CameraInfo; None without, which is an error where it is asked for."""
+        """The camera of an image topic with its first CameraInfo of use; None without, which is an error where it is
+        asked for."""
         info_topic = info_topic or f"{topic.removesuffix('/compressed').rpartition('/')[0]}/camera_info"
-        info = self._bag.first(info_topic) if self._bag.types.get(info_topic) == CAMERA_INFO else None
-        if info is not None:
-            return CameraTopic(topic, info_of(topic, info))
+        problem = f"no CameraInfo on {info_topic}"
+        for message in self._bag.decoded(info_topic) if self._bag.types.get(info_topic) == CAMERA_INFO else ():
+            info = info_of(topic, message)
+            try:
+                decode_camera(info, np.eye(4), info_topic)
+            except MessageError as error:  # drivers send zeros before the calibration is there
+                problem = str(error)
+            else:
+                return CameraTopic(topic, info)
         if asked:
-            raise UsageError(f"{self.path}: no CameraInfo on {info_topic} for {topic}; {self._contents()}")
-        self.notes.append(f"images of {topic} are left out: no CameraInfo on {info_topic}")
+            raise UsageError(f"{self.path}: {problem} for {topic}; {self._contents()}")
+        self.notes.append(f"images of {topic} are left out: {problem}")
         return None
 
     def _camera(self, camera: CameraTopic) -> Camera:
@@ -214,6 +234,18 @@ class BagSource:
         except UsageError as error:
             problem = str(error).removeprefix(f"{camera.topic}: ")
             raise UsageError(f"{self.path}: camera {camera.topic}: {problem}") from None
+
+    def _add_transforms(self) -> None:
+        """Those of /tf_static; one that is none is left out, and said."""
+        problems = list[str]()
+        for _, _, data in self._bag.messages([topics.TF_STATIC]):
+            try:
+                problems += self.transforms.add(self._bag.decode(topics.TF_STATIC, data))
+            except MessageError as error:
+                problems.append(str(error))
+        if problems:
+            what = f"{topics.TF_STATIC}: {len(problems)} transforms left out"
+            self._note_once(what, f"the first: {printable(problems[0])}")
 
     def _recorded_correction(self) -> float | None:
         topic, wanted = topics.VERTICAL_ANGLE_CORRECTION, self._settings.vertical_angle_correction_deg == "auto"
@@ -230,7 +262,8 @@ class BagSource:
         beside = {topic: Beside(self._settings.image_tolerance) for topic in others if topic != self.imu_topic}
         gnss = known.gnss_topic  # nobody waits for fixes: a late one has its place on the way, too
         messages = self._bag.messages([self.points_topic, *others, *([gnss] if gnss else [])])
-        for topic, time, data in clouds_after_others(messages, [self.points_topic], others):
+        waiting: deque[tuple[int, RawMessage]] = deque()
+        for topic, time, data in clouds_after_others(messages, [self.points_topic], others, waiting):
             stamp = serialized_stamp(data, time)
             if topic == self.points_topic:
                 found = ((other, sensor.nearest(stamp)) for other, sensor in beside.items())
@@ -240,7 +273,7 @@ class BagSource:
             elif topic in (self.imu_topic, gnss):
                 self._add_sample(topic, stamp, data)
             else:
-                beside[topic].add(stamp + others[topic], data)
+                beside[topic].add(stamp + others[topic], data, [cloud for cloud, _ in waiting])
 
     def _add_sample(self, topic: str, stamp: int, data: bytes) -> None:
         buffer = self._imu if topic == self.imu_topic else self._gnss
@@ -275,23 +308,3 @@ class BagSource:
 
 def _span(stamps: Stamps) -> str:
     return f"{stamps.min() * 1e-9:.3f} to {stamps.max() * 1e-9:.3f} s" if len(stamps) else "none"
-
-
-def interpolate(stamps: Stamps, poses: Array, at: Stamps) -> Array:
-    """Poses (M, 4, 4) known at `stamps` (M,) ns to `at` (N,): exact where known, else along the screw between the
-    neighbors; NaN outside and in gaps beyond 1 s. Returns (N, 4, 4)."""
-    out = np.full((len(at), 4, 4), np.nan)
-    stamps, order = np.unique(stamps, return_index=True)
-    if not len(stamps):
-        return out
-    poses = poses[order]
-    left = np.clip(np.searchsorted(stamps, at, "right") - 1, 0, None)
-    right = np.minimum(left + 1, len(stamps) - 1)
-    gap = stamps[right] - stamps[left]
-    known = stamps[left] == at
-    out[known] = poses[left[known]]
-    between = ~known & (at > stamps[left]) & (at < stamps[right]) & (gap <= _TRUTH_GAP)
-    T0, T1 = poses[left[between]], poses[right[between]]
-    fraction = ((at - stamps[left])[between] / gap[between])[:, None]
-    out[between] = T0 @ se3.exp(fraction * se3.log(se3.inverse(T0) @ T1))
-    return out

@@ -8,8 +8,10 @@ those that came before it left.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any
+
+import numpy as np
 
 from dpm2_core.data.messages import serialized_stamp
 
@@ -19,7 +21,8 @@ jumped: a looped bag, a clock that was set, a recording with a gap."""
 LATE = 500_000_000
 """ns of log time that a cloud of a recording waits for what goes with it."""
 BUFFER = 32
-"""Messages kept; bounds memory where no cloud comes, or the stamps are of no use."""
+"""Messages kept beside those that waiting clouds need; bounds memory where no cloud comes, or the stamps are of no use.
+"""
 
 RawMessage = tuple[str, int, bytes]
 """Topic, log time (ns) and serialized message of a recording."""
@@ -38,12 +41,18 @@ class Beside:
     def __init__(self, tolerance: float) -> None:
         self.tolerance = round(tolerance * 1e9)
         self.last = -float("inf")
-        self._messages: deque[tuple[int, Any]] = deque(maxlen=BUFFER)
+        self._messages: deque[tuple[int, Any]] = deque()
 
-    def add(self, stamp: int, message: Any) -> None:
-        """Take one with its stamp (ns)."""
+    def add(self, stamp: int, message: Any, waiting: Sequence[int] = ()) -> None:
+        """Take one with its stamp (ns); `waiting`: stamps (ns) of the clouds that have come, and not left."""
         self.last = stamp
         self._messages.append((stamp, message))
+        if len(self._messages) > BUFFER:
+            stamps = np.array([stamp for stamp, _ in self._messages])
+            needed = np.abs(stamps[:, None] - np.array(waiting, np.int64)).argmin(0)
+            others = np.setdiff1d(np.arange(len(stamps)), needed)
+            if len(others) > BUFFER:
+                del self._messages[int(others[0])]
 
     def nearest(self, stamp: int) -> tuple[int, Any] | None:
         """Stamp (ns) and message for a cloud with that stamp (ns); None if none is within the tolerance."""
@@ -62,7 +71,10 @@ def passed(last: float, cloud: int) -> bool:
 
 
 def clouds_after_others(
-    messages: Iterable[RawMessage], clouds: Collection[str], others: Mapping[str, int]
+    messages: Iterable[RawMessage],
+    clouds: Collection[str],
+    others: Mapping[str, int],
+    waiting: deque[tuple[int, RawMessage]] | None = None,
 ) -> Iterator[RawMessage]:
     """The messages of a recording, each cloud held back until every other sensor has passed it, or it has waited too
     long.
@@ -70,9 +82,10 @@ def clouds_after_others(
     Args:
         messages: in recorded order.
         clouds: topics. others: topics of the other sensors, with what is added to their stamps, ns.
+        waiting: where the clouds that are held back are kept, with their stamps (ns).
     """
     latest = dict.fromkeys(others, -float("inf"))
-    waiting: deque[tuple[int, RawMessage]] = deque()  # with their stamps
+    waiting = deque() if waiting is None else waiting
     for message in messages:
         topic, time, data = message
         if topic in clouds:

@@ -49,7 +49,8 @@ class InputSettings(Settings):
     """Use the camera where there is one."""
 
     image_topic: str = ""
-    """Image or CompressedImage topic of a bag; empty takes /kitti/camera_color_left/image_raw, else the only one."""
+    """Image or CompressedImage topic of a bag; empty takes /kitti/camera_color_left/image_raw, else the only one (those
+    of depth do not count)."""
 
     camera_info_topic: str = ""
     """CameraInfo topic of that image; empty takes the camera_info beside it."""

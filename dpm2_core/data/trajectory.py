@@ -22,6 +22,7 @@ Keys = NDArray[np.int64]
 _TUM, _KITTI, _KITTI_INDEXED, _KITTI_360 = 8, 12, 13, 17  # numbers a line
 
 
+_GAP = 1_000_000_000  # ns between two poses beyond which nothing is known in between
 FRAME_PERIOD = 0.1
 """Of KITTI's scans, s."""
 
@@ -171,6 +172,26 @@ def matched(gt: Trajectory, est: Trajectory, tolerance: float = 0.01) -> tuple[A
         # Ground truth of a faster clock (GNSS, motion capture): the frames are those of the estimate.
         return gt_poses[rows], est_poses[rows]
     return gt_poses, est_poses
+
+
+def interpolate(stamps: Keys, poses: Array, at: Keys) -> Array:
+    """Poses (M, 4, 4) known at `stamps` (M,) ns to `at` (N,): exact where known, else along the screw between the
+    neighbors; NaN outside and in gaps beyond 1 s. Returns (N, 4, 4)."""
+    out = np.full((len(at), 4, 4), np.nan)
+    stamps, order = np.unique(stamps, return_index=True)
+    if not len(stamps):
+        return out
+    poses = poses[order]
+    left = np.clip(np.searchsorted(stamps, at, "right") - 1, 0, None)
+    right = np.minimum(left + 1, len(stamps) - 1)
+    gap = stamps[right] - stamps[left]
+    known = stamps[left] == at
+    out[known] = poses[left[known]]
+    between = ~known & (at > stamps[left]) & (at < stamps[right]) & (gap <= _GAP)
+    T0, T1 = poses[left[between]], poses[right[between]]
+    fraction = ((at - stamps[left])[between] / gap[between])[:, None]
+    out[between] = T0 @ se3.exp(fraction * se3.log(se3.inverse(T0) @ T1))
+    return out
 
 
 def _period(keys: Keys) -> float:

@@ -37,18 +37,16 @@ class TransformTree:
     def __init__(self) -> None:
         self._parents: dict[str, tuple[str, Array]] = {}
 
-    def add(self, tf_message: Any) -> None:
-        """Take every transform of a tf2_msgs/TFMessage.
-
-        Raises:
-            UsageError: one of them is no rigid transform.
-        """
+    def add(self, tf_message: Any) -> list[str]:
+        """Take every rigid transform of a tf2_msgs/TFMessage; returns what is wrong with the others."""
+        problems = []
         for stamped in tf_message.transforms:
+            parent, child = stamped.header.frame_id, stamped.child_frame_id
             try:
-                T = transform_matrix(stamped.transform)
+                self.set(parent, child, transform_matrix(stamped.transform))
             except UsageError as error:
-                raise UsageError(f"tf {stamped.header.frame_id} -> {stamped.child_frame_id}: {error}") from None
-            self.set(stamped.header.frame_id, stamped.child_frame_id, T)
+                problems.append(f"tf {parent} -> {child}: {error}")
+        return problems
 
     def copy(self) -> TransformTree:
         """Another tree, of the same frames now."""

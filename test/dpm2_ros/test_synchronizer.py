@@ -67,6 +67,22 @@ def test_a_cloud_waits_for_all_other_sensors_alike() -> None:
     assert counts == [(1, PATIENCE + 1), (PATIENCE + 2, 0), (PATIENCE + 2, 0)]
 
 
+@pytest.mark.parametrize(("depth", "behind", "rate"), [(10, 9, 60), (100, 12, 30), (100, 50, 10)])
+def test_clouds_that_wait_for_the_worker_keep_their_images(depth: int, behind: int, rate: int) -> None:
+    """However many images come while it is behind."""
+    synchronizer, out = make(depth=depth), list[Bundle]()
+    clouds = [(0.1 * n, True) for n in range(60)]
+    for now, is_cloud in sorted([*clouds, *((n / rate, False) for n in range(6 * rate))]):
+        if is_cloud:
+            synchronizer.add_cloud(round(now * 1000) * MS, now, now)
+        else:
+            synchronizer.add("/image", round(now * 1000) * MS, now, now)
+        if len(synchronizer) > behind:
+            out += filter(None, [synchronizer.pop(now)])
+    assert len(out) >= 60 - behind - 1
+    assert all(abs(image_of(bundle) - bundle.cloud) < 1e-3 for bundle in out)  # one at the time of each, but rounding
+
+
 def test_a_camera_that_nobody_publishes_is_not_waited_for() -> None:
     """Nor is a camera that goes away; what it has delivered is used all the same."""
     synchronizer = make()

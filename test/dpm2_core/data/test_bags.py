@@ -11,12 +11,11 @@ import cv2
 import numpy as np
 import pytest
 
-from dpm2_core.data.bags import BagSource, interpolate
+from dpm2_core.data.bags import BagSource
 from dpm2_core.data.messages import cloud_fields
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.vertical_angle import HDL64_CORRECTION_DEG
 from dpm2_core.errors import UsageError
-from dpm2_core.geometry import se3
 
 POINTS, IMAGE, INFO = "/points", "/cam/image_raw", "/cam/camera_info"
 Message = tuple[float, str, Any]
@@ -129,6 +128,21 @@ def test_missing_returns_of_a_second_lidar_are_no_points_at_its_place(bags: Any,
     np.testing.assert_allclose(frame.points[60:], [[5, 4, 3, 0]] * 30, rtol=1e-6)
     assert frame.time_offset is not None
     np.testing.assert_allclose(frame.time_offset, [*[0] * 60, *columns["t"][30:]], atol=1e-6)  # float32 of 0.1 s
+
+
+@pytest.mark.parametrize(("ahead", "missing"), [(0, 0), (0.08, 4), (1000, 4)])
+def test_clouds_of_a_second_lidar_that_do_not_fit_are_counted(
+    bags: Any, tmp_path: Path, ahead: float, missing: int
+) -> None:
+    """Too far apart, or stamps of another clock: as of a camera, nothing else says that its points are missing."""
+    times = [1, 1.2, 1.4, 1.6]
+    second = [(t + 0.01, "/second", bags.cloud(t + ahead, frame="left")) for t in times]
+    tree = (1, "/tf_static", bags.transform("velo_link", "left", (0, 2, 0)))
+    bag = bags.write(tmp_path / "b", by_time([tree, *clouds(bags, times), *second]))
+    source = BagSource(bag, InputSettings(points_topic=POINTS, second_points_topic="/second"))
+    assert [len(frame.points) for frame in source.frames()] == [60 if missing else 120] * 4
+    said = [note for note in source.notes if "/second" in note]
+    assert said == ["4 of 4 frames have no cloud of /second (within 0.05 s)"] * bool(missing)
 
 
 def test_a_second_lidar_without_a_place_is_left_out(bags: Any, tmp_path: Path) -> None:
@@ -257,6 +271,37 @@ def test_without_camera_info_images_are_left_out(bags: Any, tmp_path: Path) -> N
     assert "images of /cam/image_raw are left out: no CameraInfo on /cam/camera_info" in source.notes[0]
     with pytest.raises(UsageError, match="no CameraInfo on /cam/camera_info for /cam/image_raw"):
         BagSource(bag, InputSettings(image_topic=IMAGE))
+
+
+def test_the_first_camera_info_of_use_counts(bags: Any, tmp_path: Path) -> None:
+    """Drivers send zeros before the calibration is there. With zeros alone the drive goes on without images."""
+    zeros = bags.info(1)
+    zeros.k = np.zeros(9)
+    messages = [*clouds(bags, [1]), (0.9, INFO, zeros), (1, IMAGE, bags.image(1, 7))]
+    place, info = rig(bags)
+    late = bags.write(tmp_path / "late", by_time([*messages, place, info]))
+    assert seen(BagSource(late)) == [7]
+    never = bags.write(tmp_path / "never", by_time([*messages, place]))
+    source = BagSource(never)
+    assert seen(source) == [None]
+    assert source.notes[0].startswith(f"images of {IMAGE} are left out: {INFO}: CameraInfo has no focal length (the c")
+    with pytest.raises(UsageError, match=f"{INFO}: CameraInfo has no focal length .* for {IMAGE}; topics: "):
+        BagSource(never, InputSettings(image_topic=IMAGE))
+
+
+def test_depth_is_no_image(bags: Any, tmp_path: Path) -> None:
+    """Alone it needs no place either; beside a camera it leaves no choice open."""
+    depth = bags.image(1, 3, encoding="16UC1", size=(16, 6))
+    depth.width = 8
+    messages = [*clouds(bags, [1]), (1, "/depth/image", depth), (1, "/depth/camera_info", bags.info(1))]
+    alone = BagSource(bags.write(tmp_path / "alone", messages))
+    assert seen(alone) == [None]
+    assert alone.notes[0] == "depth images are not used: /depth/image"
+    both = bags.write(tmp_path / "both", [*messages, *rig(bags), (1, IMAGE, bags.image(1, 7))])
+    assert seen(BagSource(both)) == [7]
+    asked = BagSource(both, InputSettings(image_topic="/depth/image"))
+    assert seen(asked) == [None]
+    assert "/depth/image: image encoding '16UC1' is not supported" in asked.notes[0]
 
 
 def test_compressed_images(bags: Any, tmp_path: Path) -> None:
@@ -419,18 +464,6 @@ def test_a_path_is_ground_truth(bags: Any, tmp_path: Path) -> None:
     np.testing.assert_array_equal(source.poses[:, 0, 3], [5, 6])
     with pytest.raises(UsageError, match="no Odometry or Path messages on /odom"):
         _ = BagSource(tmp_path / "b", InputSettings(ground_truth_topic="/odom")).poses
-
-
-def test_interpolation_is_exact_where_known_and_nothing_outside() -> None:
-    poses = se3.exp(np.random.default_rng(0).normal(size=(3, 6)))
-    stamps = np.array([0, 10**9, 5 * 10**9])
-    at = np.array([-1, 0, 10**9, 5 * 10**8, 2 * 10**9, 5 * 10**9, 6 * 10**9])
-    out = interpolate(stamps, poses, at)
-    np.testing.assert_array_equal(out[[1, 2, 5]], poses)
-    assert np.isnan(out[[0, 4, 6]]).all()  # before, in a gap of 4 s, after
-    half = se3.log(se3.inverse(poses[0]) @ out[3])
-    np.testing.assert_allclose(half * 2, se3.log(se3.inverse(poses[0]) @ poses[1]), atol=1e-9)
-    assert np.isnan(interpolate(np.empty(0, np.int64), np.empty((0, 4, 4)), at)).all()
 
 
 # --- damaged files

@@ -59,6 +59,16 @@ def test_a_cloud_has_the_fix_that_came_before_it(bags: Any, tmp_path: Path) -> N
     assert all(frame.fix is None for frame in BagSource(path).frames())  # off
 
 
+@pytest.mark.parametrize("ahead", [18, -18])
+def test_fixes_of_another_clock_are_said(bags: Any, tmp_path: Path, ahead: int) -> None:
+    """As of a receiver that counts leap seconds, by which every other clock goes."""
+    messages = [*drive(bags), *((t, "/other", nav(bags, t + ahead, frame="velo_link")) for t in (1.05, 1.35))]
+    path = bags.write(tmp_path / "b", sorted(messages, key=lambda m: m[0]))
+    source = BagSource(path, InputSettings(gnss_topic="/other"))
+    assert len(list(source.frames())) == 10
+    assert source.notes == ["10 of 10 frames have no fix of /other (within 1 s)"]
+
+
 def test_an_antenna_without_a_place_is_at_the_lidar_and_said(bags: Any, tmp_path: Path) -> None:
     source = BagSource(bags.write(tmp_path / "b", drive(bags)), InputSettings(gnss_topic="/fix"))
     fixes = [frame.fix for frame in source.frames() if frame.fix is not None]

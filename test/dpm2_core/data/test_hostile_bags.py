@@ -90,6 +90,20 @@ def test_a_bag_with_such_images_is_read_without_them(bags: Any, tmp_path: Path) 
     assert "30000 x 30000 pixels, the camera has 8 x 6" in source.notes[0]
 
 
+def test_transforms_and_a_calibration_that_are_none_cost_themselves(bags: Any, tmp_path: Path) -> None:
+    """Also where their names would write to a terminal."""
+    wrong, info = bags.transform("base", "\x1b[2Jgripper", (0.0, np.nan, 0.0)), bags.info(1)
+    info.k = np.full(9, np.nan)
+    image = (1, "/cam/image_raw", bags.image(1, 7))
+    messages = [(0.5, "/tf_static", wrong), (0.6, "/cam/camera_info", info), *rig(bags), image]
+    source = BagSource(bags.write(tmp_path / "bag", messages))
+    assert [(len(frame.points), len(frame.images)) for frame in source.frames()] == [(60, 1)]
+    note = source.notes[0]
+    assert note.startswith("/tf_static: 1 transforms left out (the first: tf base -> ")
+    assert "no rigid transform" in note
+    assert "\x1b" not in note
+
+
 def test_types_that_a_bag_defines_are_not_used(bags: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Neither one whose module could be imported, nor another idea of what a cloud is."""
     package = tmp_path / "lib" / "evil" / "msg"

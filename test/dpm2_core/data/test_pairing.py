@@ -3,8 +3,11 @@
 
 from __future__ import annotations
 
+import gc
 import struct
+from collections import deque
 from collections.abc import Iterator
+from weakref import WeakSet
 
 import numpy as np
 import pytest
@@ -29,14 +32,17 @@ def record(clouds: list[tuple[int, int]], images: list[tuple[int, int]]) -> list
     return sorted(messages, key=lambda message: message[1])
 
 
-def paired(messages: list[RawMessage], tolerance: float = 0.05, offset: int = 0) -> dict[int, int | None]:
-    """The stamp of each cloud to that of its image, ms after START."""
-    images, out = Beside(tolerance), {}
-    for topic, _, data in clouds_after_others(messages, ["/cloud"], {"/image": offset * MS}):
+def paired(
+    messages: list[RawMessage], tolerance: float = 0.05, offset: int = 0, silent: tuple[str, ...] = ()
+) -> dict[int, int | None]:
+    """The stamp of each cloud to that of its image, ms after START; `silent`: other topics that clouds wait for."""
+    images, out, waiting = Beside(tolerance), {}, deque[tuple[int, RawMessage]]()
+    others = {"/image": offset * MS, **dict.fromkeys(silent, 0)}
+    for topic, _, data in clouds_after_others(messages, ["/cloud"], others, waiting):
         second, ns = struct.unpack_from("<iI", data, 4)
         stamp = second * 1000 + ns // MS - START
         if topic == "/image":
-            images.add((stamp + offset) * MS, stamp)
+            images.add((stamp + offset) * MS, stamp, [cloud - START * MS for cloud, _ in waiting])
         else:
             _, out[stamp] = images.nearest(stamp * MS) or (0, None)
             images.forget(stamp * MS)
@@ -63,6 +69,12 @@ def test_each_cloud_has_the_nearest_image_of_the_recording(shots: list[int], del
 def test_an_image_joins_the_cloud_that_was_recorded_before_it_for_a_while(delay: int, joins: bool) -> None:
     messages = record([(100 * n, 0) for n in range(10)], [(0, delay)])
     assert paired(messages)[0] == (0 if joins else None)
+
+
+def test_a_cloud_that_waits_keeps_its_image() -> None:
+    """However many come meanwhile, here of a camera at 200 Hz while an IMU is silent."""
+    messages = record([(100 * n, 0) for n in range(20)], [(5 * n, 10) for n in range(400)])
+    assert paired(messages, silent=("/imu",)) == {100 * n: 100 * n for n in range(20)}
 
 
 def test_one_image_serves_two_clouds() -> None:
@@ -97,6 +109,15 @@ def test_memory_is_bounded() -> None:
     for n in range(10 * BUFFER):
         images.add(n * JUMP, n)
     assert images.nearest(0) is None
+    kept, clouds = WeakSet[Beside](), [100 * n * MS for n in range(2 * BUFFER)]
+    for n in range(1000):
+        message = Beside(0.05)  # as anything that a WeakSet takes
+        kept.add(message)
+        images.add(10 * n * MS, message, clouds)
+    del message
+    gc.collect()
+    assert BUFFER < len(kept) <= BUFFER + len(clouds)
+    assert [images.nearest(cloud) is not None for cloud in clouds] == [True] * len(clouds)
     held, most = 0, 0
     messages = record([(100 * n, 0) for n in range(100)], [])
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dpm2_core.data.trajectory import Trajectory, matched, read_trajectory, write_kitti, write_tum
+from dpm2_core.data.trajectory import Trajectory, interpolate, matched, read_trajectory, write_kitti, write_tum
 from dpm2_core.errors import UsageError
 from dpm2_core.geometry import se3
 
@@ -162,3 +162,15 @@ def test_lines_match_lines_only_if_there_are_as_many() -> None:
 def test_nothing_in_common_is_an_error(kind: str) -> None:
     with pytest.raises(UsageError, match="is one of the ground truth"):
         matched(_trajectory([0, 10**9], kind), _trajectory([5 * 10**9], kind))
+
+
+def test_interpolation_is_exact_where_known_and_nothing_outside() -> None:
+    poses = se3.exp(np.random.default_rng(0).normal(size=(3, 6)))
+    stamps = np.array([0, 10**9, 5 * 10**9])
+    at = np.array([-1, 0, 10**9, 5 * 10**8, 2 * 10**9, 5 * 10**9, 6 * 10**9])
+    out = interpolate(stamps, poses, at)
+    np.testing.assert_array_equal(out[[1, 2, 5]], poses)
+    assert np.isnan(out[[0, 4, 6]]).all()  # before, in a gap of 4 s, after
+    half = se3.log(se3.inverse(poses[0]) @ out[3])
+    np.testing.assert_allclose(half * 2, se3.log(se3.inverse(poses[0]) @ poses[1]), atol=1e-9)
+    assert np.isnan(interpolate(np.empty(0, np.int64), np.empty((0, 4, 4)), at)).all()
