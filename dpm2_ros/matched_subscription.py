@@ -8,12 +8,13 @@ from typing import Any
 
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import CameraInfo, Imu, PointCloud2
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, PointCloud2
 
 from dpm2_core.data.livox import LIVOX
 from dpm2_ros.message_types import message_type
 from dpm2_ros.settings import RosSettings
 
+_IMAGES = (Image, CompressedImage)
 _IMU_DEPTH = 1000  # samples that may wait: those of a second
 
 
@@ -22,7 +23,8 @@ class MatchedSubscription:
 
     A reliable subscriber never connects to a best-effort publisher, and a best-effort one loses data that a reliable
     publisher would have sent again. So it starts reliable, and `refresh`, called often, follows the publishers. It also
-    follows one of PointCloud2 that finds a Livox' CustomMsg on its topic, whose messages come serialized.
+    follows them from Image to CompressedImage and back, and from PointCloud2 to a Livox' CustomMsg, whose messages come
+    serialized.
 
     Attributes:
         topic: its full name, after remapping.
@@ -65,7 +67,7 @@ class MatchedSubscription:
             return
         before, other_type = self._subscription, kind is not self._kind
         self.reliability, self._durability = requested, durability
-        self._kind, self._raw = kind, kind is not self._wanted
+        self._kind, self._raw = kind, self._wanted is PointCloud2 and kind is not PointCloud2
         if before is not None and other_type:  # DDS allows one type a topic
             self._node.destroy_subscription(before)
         keep = HistoryPolicy.KEEP_LAST
@@ -78,6 +80,9 @@ class MatchedSubscription:
 
     def _kind_of(self, offered: set[str]) -> type:
         """What to subscribe to, given the types of the publishers."""
+        if self._wanted in _IMAGES:
+            kinds = [kind for kind in _IMAGES if f"sensor_msgs/msg/{kind.__name__}" in offered]
+            return kinds[0] if len(kinds) == 1 else self._wanted
         self.problem, custom = "", sorted(offered.intersection(LIVOX))
         if self._wanted is not PointCloud2 or not custom or "sensor_msgs/msg/PointCloud2" in offered:
             return self._wanted

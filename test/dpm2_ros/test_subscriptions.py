@@ -110,6 +110,20 @@ def test_image_type_and_calibration_follow_the_remapped_topic(
     assert {(image, kind), (info, CameraInfo)} <= listening
 
 
+def test_compressed_images_come_on_a_topic_of_any_name(node: Callable[..., Node]) -> None:
+    """Not only where it ends in /compressed: the type is that of the publisher."""
+    n = node()
+    publisher = n.create_publisher(CompressedImage, "/front/image_rect_compressed", LATCHED)
+    made = inputs(n, image_topic="/front/image_rect_compressed")
+    camera = made.synchronizer.sensors["/front/image_rect_compressed"]
+    message, end = CompressedImage(format="jpeg", data=b"1"), time.monotonic() + 20
+    while not camera.received and time.monotonic() < end:
+        publisher.publish(message)
+        rclpy.spin_once(n, timeout_sec=0.1)
+    _, taken = camera.messages.nearest(n.get_clock().now().nanoseconds) or (0, None)
+    assert taken == message
+
+
 def test_a_second_camera_is_found_as_the_first_one_is(node: Callable[..., Node]) -> None:
     """Its CameraInfo beside where its images really come from, whatever is set for the first one's."""
     n = node("/rear/image:=/back/image/compressed", namespace="/red")
