@@ -10,6 +10,8 @@ from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 
+_SAME = 1e-5  # m, and of a rotation's matrix: what rounding makes of one place
+
 
 class BaseFrame:
     """The frame that was asked for, once it is reachable; else the root above the LiDAR, also where that changes.
@@ -19,7 +21,7 @@ class BaseFrame:
 
     Attributes:
         name: whose pose it is; empty before it is known.
-        problem: why it is not known, in words.
+        problem: why it is not known, or which place of the LiDAR in it does not count yet, in words.
         above: the root above the frame that was asked for; where that is another one, it has a parent in /tf_static.
         T_start_lidar: (4, 4) LiDAR in the frame with which the drive began: its first pose is the origin of odom.
         T_base_start: (4, 4) that frame in the one of `name`: identity, unless a parent came later.
@@ -32,6 +34,7 @@ class BaseFrame:
         self.name = self.problem = ""
         self.above = self._wanted
         self.T_start_lidar = self.T_base_start = np.eye(4)
+        self._T_base_lidar: Array = np.eye(4)  # by the last look
 
     @property
     def child_problem(self) -> str:
@@ -46,30 +49,36 @@ class BaseFrame:
         return not self._wanted
 
     def restart(self) -> None:
-        """A new drive begins, in the frame of this moment."""
-        self.T_start_lidar, self.T_base_start = self.T_base_start @ self.T_start_lidar, np.eye(4)
+        """A new drive begins, in the frame and with the LiDAR's place of this moment."""
+        self.T_start_lidar, self.T_base_start = self._T_base_lidar, np.eye(4)
+        if self.name:
+            self.problem = ""
 
     def look(self, tree: TransformTree, lidar_frame: str) -> bool:
-        """Find the frame, or see whether it has changed; returns whether it has."""
+        """Find the frame, or see whether it has changed; returns whether it has.
+
+        Where the LiDAR has moved in it, the drive goes on with the place of before, and `problem` says so.
+        """
         if tree is self._tree:
             return False
         self._tree = tree
         if self._wanted:
             self.above = tree.root(self._wanted, self._own)
-            if self.name:
-                return False
         lidar_frame = lidar_frame.lstrip("/")
         name = self._wanted or tree.root(lidar_frame, self._own)
-        if name == self.name:
-            return False
         try:
-            T_base_lidar: Array = np.eye(4) if name == lidar_frame else tree.lookup(name, lidar_frame)
+            self._T_base_lidar = np.eye(4) if name == lidar_frame else tree.lookup(name, lidar_frame)
         except UsageError as error:
-            self.problem = f"ros.base_frame: {error}; neither dpm2/odom nor /tf before /tf_static has it"
+            if not self.name:
+                self.problem = f"ros.base_frame: {error}; neither dpm2/odom nor /tf before /tf_static has it"
+            return False
+        if name == self.name:
+            moved = not np.allclose(self._T_base_lidar, self.T_base_start @ self.T_start_lidar, atol=_SAME)
+            self.problem = f"/tf_static has moved the LiDAR in {name}: ~/reset takes its new place" if moved else ""
             return False
         if self.name:
-            self.T_base_start = T_base_lidar @ se3.inverse(self.T_start_lidar)
+            self.T_base_start = self._T_base_lidar @ se3.inverse(self.T_start_lidar)
         else:
-            self.T_start_lidar = T_base_lidar
+            self.T_start_lidar = self._T_base_lidar
         self.name, self.problem = name, ""
         return True

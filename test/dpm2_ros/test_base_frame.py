@@ -58,6 +58,21 @@ def test_without_one_it_never_has_a_parent_and_its_pose_is_consistent(order: tup
     np.testing.assert_allclose(base.T_start_lidar, whole.lookup("footprint", "lidar"), atol=1e-12)
 
 
+@pytest.mark.parametrize("wanted", ["base", ""])
+def test_a_lidar_that_is_moved_in_its_base_counts_from_the_next_drive_on(wanted: str) -> None:
+    """As by a calibration that is corrected while the node runs: one drive has one place, and what is wrong is said."""
+    base, moved = BaseFrame(wanted, ("odom",)), "/tf_static has moved the LiDAR in base: ~/reset takes its new place"
+    for x in (1.0, 1.8):
+        tree = TransformTree()
+        tree.set("base", "lidar", se3.make(np.eye(3), [x, 0, 0]))
+        base.look(tree, "lidar")
+        assert base.T_start_lidar[0, 3] == 1.0
+        assert base.problem == ("" if x == 1.0 else moved)
+    base.restart()
+    assert (base.T_start_lidar[0, 3], base.problem) == (1.8, "")
+    np.testing.assert_array_equal(base.T_base_start, np.eye(4))
+
+
 def test_a_base_below_another_frame_names_the_one_that_may_be_moved() -> None:
     """Two parents would tear /tf apart; also where the first one comes late. Its pose is known all the same."""
     early, late = BaseFrame("base", ("odom",)), BaseFrame("base", ("odom",))
