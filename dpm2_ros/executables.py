@@ -13,7 +13,7 @@ from typing import Any
 
 from dpm2_core.errors import UsageError, exit_code
 from dpm2_core.openmp import wait_passively
-from dpm2_ros.runtime import catch_signals, spin_node
+from dpm2_ros.runtime import catch_signals, ignore_signals, spin_node
 
 _MANAGED = "--lifecycle"
 
@@ -67,7 +67,10 @@ def _run(work: Callable[[Sequence[str]], int], arguments: Sequence[str] | None) 
                 raise
             raise UsageError("no ROS 2 here: install it and source its setup.bash, see docs/ros2.md") from None
 
-    return exit_code(with_ros)
+    try:
+        return exit_code(with_ros)
+    finally:
+        ignore_signals()
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import faulthandler
 import os
+import re
 import signal
 import sys
 import threading
@@ -36,6 +37,12 @@ def catch_signals() -> None:
         signal.signal(name, lambda *_: STOP.set())
 
 
+def ignore_signals() -> None:
+    """From here on SIGINT and SIGTERM do nothing, for a process that ends: Python keeps this, and no other handler."""
+    for name in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(name, signal.SIG_IGN)
+
+
 def use_dds_profile() -> None:
     """From here on Fast DDS has the shared memory that clouds need, unless the user has configured it.
 
@@ -57,7 +64,7 @@ def ros_context(arguments: Sequence[str], domain: int | None = None) -> None:
         domain: None takes that of the environment.
 
     Raises:
-        UsageError: `--ros-args` that ROS does not understand.
+        UsageError: `--ros-args` that ROS does not understand, or it cannot start, as without a folder for its logs.
     """
     import rclpy
     from rclpy.signals import SignalHandlerOptions
@@ -67,7 +74,10 @@ def ros_context(arguments: Sequence[str], domain: int | None = None) -> None:
     try:
         rclpy.init(args=list(arguments), domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # rclpy raises RCLError, UnknownROSArgsError and RuntimeError by the kind of mistake
-        raise UsageError(f"ROS arguments: {str(error).splitlines()[0]}") from None
+        what = "unknown ROS arguments" if type(error).__name__ == "UnknownROSArgsError" else "ROS does not start"
+        text = str(error).splitlines()[0]
+        hint = "; set ROS_LOG_DIR or HOME" if re.search(r"log(ging)? directory", text) else ""
+        raise UsageError(f"{what}: {text}{hint}") from None
 
 
 def spin_node(make: Callable[[], Any], arguments: Sequence[str]) -> int:

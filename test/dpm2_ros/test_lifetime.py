@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -28,6 +29,8 @@ from dpm2_ros.mapping import KEEP_ALL, LAST_ONE
 from dpm2_ros.runtime import end_ros, ros_context
 from tools.demo import evaluate_replay, map_poses
 from tools.replay import replay, ros_environment, start
+
+from .conftest import Harness
 
 QUICK = {"input.images": False, "slam.loops.descriptors": False, "slam.registration": "geometric"}
 """Neither camera nor network: it starts in half the time."""
@@ -84,6 +87,30 @@ def test_stopped_while_it_loads_the_network(ros: Callable[..., Any], tmp_path: P
     process.send_signal(signal.SIGINT)
     assert process.wait(180) == 0
     assert "Traceback" not in (tmp_path / "log").read_text()
+
+
+def test_a_second_signal_that_comes_while_python_ends(bag: Path, tmp_path: Path, domain: int) -> None:
+    """The process ends in hundreds of ms; signals every 5 ms meet each moment of it."""
+    log = tmp_path / "log"
+    process = start("bag_player", [str(bag), "--wait", "90"], ros_environment(domain), log)
+    try:
+        Harness.wait(lambda: "waiting 90 s" in log.read_text(), "the player")
+        process.send_signal(signal.SIGTERM)
+        while process.poll() is None:
+            process.send_signal(signal.SIGINT)
+            time.sleep(0.005)
+    finally:
+        process.kill()
+    assert process.wait() == 0
+
+
+def test_without_a_folder_for_logs_it_says_what_to_set(domain: int) -> None:
+    """As in a systemd unit, which has no HOME."""
+    environment = {name: text for name, text in ros_environment(domain).items() if name not in ("HOME", "ROS_LOG_DIR")}
+    command = [sys.executable, "-m", "dpm2_ros.executables", "bag_player"]
+    ended = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=180, check=False)
+    assert ended.returncode == 2
+    assert re.search(r"^error: ROS does not start: .*; set ROS_LOG_DIR or HOME$", ended.stderr, re.MULTILINE)
 
 
 def _handles_sigint(process: subprocess.Popen[bytes]) -> bool:
