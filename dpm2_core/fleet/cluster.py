@@ -98,7 +98,7 @@ class Cluster:
         """Connect to Ray, or start it; `run` does so with the first job.
 
         Raises:
-            UsageError: it is not installed, or nobody answers at that address.
+            UsageError: it is not installed, does not start, or nobody answers at that address.
         """
         if self._ray is not None:
             return
@@ -111,7 +111,7 @@ class Cluster:
         if not ray.is_initialized():
             try:
                 self._connect(ray)
-            except (ConnectionError, RuntimeError, ValueError, TimeoutError) as error:
+            except Exception as error:  # Ray raises that very class where it does not start in time
                 self.__exit__()
                 where = "Ray" if self._address is None else f"--ray {self._address}"
                 raise UsageError(f"{where}: {' '.join(str(error).split())}") from None

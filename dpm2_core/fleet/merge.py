@@ -62,6 +62,7 @@ def merge(folder: Path, out: Path, settings: SlamSettings, cluster: Cluster, vie
 
     Raises:
         UsageError: a map is there that is no merge of this folder, or no drive. Dpm2Error: nothing can be joined.
+        KeyboardInterrupt: it was stopped before all drives were looked at; the map stays as it is.
     """
     folder, left_out = folder.resolve(), dict[str, str]()
     before = _record(out)

@@ -22,7 +22,7 @@ from dpm2_core.fleet.joins import ENOUGH, edge_from, join_part, stretches
 from dpm2_core.fleet.part import Figures, Part, is_whole
 from dpm2_core.fleet.places import FleetIndex, places_part, vectors_of
 from dpm2_core.fleet.regions import Join
-from dpm2_core.fleet.run import View, do_parts
+from dpm2_core.fleet.run import Outcome, View, do_parts
 from dpm2_core.network.pretrained import weights_path
 from dpm2_core.slam.loops.retrieval import Vector
 from dpm2_core.slam.settings import SlamSettings
@@ -66,14 +66,14 @@ class Search:
         """What the drives' maps hold, of those that are sound and of the same weights.
 
         Raises:
-            Dpm2Error: there is none.
+            Dpm2Error: there is none. KeyboardInterrupt: it was stopped.
         """
         own = weights_id(weights_path(self.settings.neural.weights))
         found: dict[str, Figures] = {}
-        outcomes = do_parts(list(parts.values()), self.kept, self.cluster, self.view)
+        outcomes = self._done(list(parts.values()))
         for name, outcome in zip(parts, outcomes, strict=True):
             if outcome.figures is None:
-                left_out[name] = outcome.reason or "stopped"
+                left_out[name] = outcome.reason
             elif outcome.figures["weights"] != [own]:
                 left_out[name] = f"made with weights {', '.join(outcome.figures['weights'])}, not with {own}"
             else:
@@ -101,7 +101,7 @@ class Search:
         """Every loop that was tried between two drives, one of them at least not in `inside`.
 
         Raises:
-            Dpm2Error: a search failed.
+            Dpm2Error: a search failed. KeyboardInterrupt: it was stopped.
         """
         slam = self.settings.model_dump(mode="json")
         maps = {name: dict(part.arguments) for name, part in parts.items()}
@@ -115,7 +115,7 @@ class Search:
                     for number, stretch in enumerate(stretches(one, name, np.array(rows))):
                         part = join_part(number, stretch, maps, slam)
                         work[part.name] = part, one, name
-        outcomes = do_parts([part for part, *_ in work.values()], self.kept, self.cluster, self.view)
+        outcomes = self._done([part for part, *_ in work.values()])
         if failed := [outcome for outcome in outcomes if outcome.figures is None]:
             raise Dpm2Error(f"{len(failed)} of {len(work)} stretches failed: {failed[0].name}: {failed[0].reason}")
         found: dict[tuple[str, str, int, int], Join] = {}
@@ -127,6 +127,12 @@ class Search:
                 if key not in found or join.loop.ok:
                     found[key] = join
         return list(found.values())
+
+    def _done(self, parts: Sequence[Part]) -> list[Outcome]:
+        outcomes = do_parts(parts, self.kept, self.cluster, self.view)
+        if any(outcome.state == "stopped" for outcome in outcomes):
+            raise KeyboardInterrupt  # or the map would lose the drives that were not looked at
+        return outcomes
 
     def _candidates(self, name: str) -> Path:
         return self.kept / "candidates" / f"{name}.json"

@@ -112,6 +112,13 @@ def test_without_ray_or_without_its_cluster_one_line_says_so(tmp_path: Path, mon
     with pytest.raises(UsageError, match=r"^--ray 127\.0\.0\.1:9: nobody answers there"):
         Cluster("127.0.0.1:9").start()
 
+    def slow(*arguments: object, **more: object) -> None:
+        raise Exception("The current node timed out\n during startup.")  # as Ray does after 30 s
+
+    monkeypatch.setattr(ray, "init", slow)
+    with pytest.raises(UsageError, match=r"^Ray: The current node timed out during startup\.$"):
+        Cluster().start()
+
 
 @pytest.mark.slow
 def test_a_fleet_gives_what_runs_give_and_goes_on_where_it_was(

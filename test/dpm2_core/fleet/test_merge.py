@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Collection
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -16,18 +16,20 @@ import pytest
 from benchmarks.fleet_drives import poses_of, write_drive
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.evaluation.metrics import ape_rmse
-from dpm2_core.fleet.cluster import Cluster
+from dpm2_core.fleet.cluster import Cluster, Ended, Job
 from dpm2_core.fleet.drives import MAP
 from dpm2_core.fleet.joins import ENOUGH, stretches
 from dpm2_core.fleet.merge import merge
 from dpm2_core.fleet.part import DONE, Figures, Part
 from dpm2_core.fleet.places import WIDTH, FleetIndex
 from dpm2_core.fleet.regions import Join
+from dpm2_core.network.pretrained import weights_path
 from dpm2_core.sim.world import build_world
 from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.slam.store.check import check_map
 from dpm2_core.slam.store.map_data import MapData, load_map, save_as
 from dpm2_core.slam.store.map_store import MapStore
+from dpm2_core.slam.store.rows import weights_id
 from test.helpers.fleets import fleet_maps
 from test.helpers.full_disk import CHECKPOINT, largest_file
 
@@ -131,6 +133,26 @@ def test_a_map_that_does_not_fit_on_the_disk_leaves_the_one_before(
     assert check_map(out) == before
     assert (before.keyframes, before.problems) == (180, [])
     assert sorted(os.listdir(out.parent)) == ["town", "town.json"]
+
+
+class Stopped(Cluster):
+    """One job ends, then Ctrl-C."""
+
+    def run(self, jobs: Iterable[Job], watch: object = None) -> Iterator[Ended]:
+        weights = weights_id(weights_path(SlamSettings().neural.weights))
+        yield Ended(next(iter(jobs)).key, {"keyframes": 60, "weights": [weights]})
+        raise KeyboardInterrupt
+
+
+def test_a_merge_that_is_stopped_leaves_no_drive_out(tmp_path: Path) -> None:
+    """It became a map of the drives that had been looked at, in place of the one of all."""
+    for name, data in fleet_maps(3)[1].items():
+        (tmp_path / name).mkdir()
+        save_as(data, tmp_path / name / MAP)
+        (tmp_path / name / DONE).write_text('{"files": {}}')
+    with pytest.raises(KeyboardInterrupt):
+        merge(tmp_path, tmp_path / "town", SlamSettings(), Stopped())
+    assert not (tmp_path / "town").exists()
 
 
 def test_places_are_found_again_in_an_index_that_was_kept(tmp_path: Path, noise: np.random.Generator) -> None:
