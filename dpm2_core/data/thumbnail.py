@@ -46,7 +46,7 @@ def image_of(jpeg: bytes) -> Image | None:
     (length,) = struct.unpack_from(">H", jpeg, 4)
     try:
         fields = json.loads(jpeg[6 : 4 + length])
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
     if not isinstance(fields, dict) or fields.keys() != _KEYS:
         return None

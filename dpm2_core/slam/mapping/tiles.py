@@ -122,7 +122,7 @@ class TiledMap:
                 raise ValueError
         except FileNotFoundError:
             raise UsageError(f"{path}: no folder of tiles, as `dpm2 map export --tiles` writes it") from None
-        except (OSError, ValueError, KeyError, TypeError, OverflowError):
+        except (OSError, EOFError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
             raise Dpm2Error(f"{path}: the index of its tiles is damaged") from None
 
     def __enter__(self) -> TiledMap:

@@ -66,6 +66,8 @@ def test_a_foreign_image_has_no_camera(data: bytes) -> None:
     assert image_of(data) is None
     jpeg = bytes(cv2.imencode(".jpg", np.zeros((8, 8, 3), np.uint8))[1])
     assert image_of(jpeg) is None
+    endless = b"[" * 60_000  # JSON that is deeper than Python's stack
+    assert image_of(jpeg[:2] + b"\xff\xfe" + struct.pack(">H", len(endless) + 2) + endless + jpeg[2:]) is None
 
 
 @pytest.mark.parametrize(

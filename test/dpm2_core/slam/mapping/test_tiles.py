@@ -133,3 +133,16 @@ def test_a_table_that_cannot_be_is_damaged(folder: Path) -> None:
         np.save(folder / VECTORS, table)
         with pytest.raises(Dpm2Error, match="index of its tiles is damaged"):
             TiledMap(folder)
+    with (folder / VECTORS).open("wb") as file:
+        np.savez(file, table=np.zeros(3))
+    with pytest.raises(Dpm2Error, match="index of its tiles is damaged"):
+        TiledMap(folder)
+    (folder / VECTORS).write_bytes(b"")
+    with pytest.raises(Dpm2Error, match="index of its tiles is damaged"):
+        TiledMap(folder)
+
+
+def test_an_index_without_end_is_damaged(folder: Path) -> None:
+    (folder / INDEX).write_text("[" * 200_000)
+    with pytest.raises(Dpm2Error, match="index of its tiles is damaged"):
+        TiledMap(folder)
