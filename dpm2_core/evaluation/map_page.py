@@ -89,6 +89,7 @@ def _keyframes(data: MapData, middle: Array) -> list[dict[str, Any]]:
     return [
         {
             "at": (T[:3, 3] - middle).round(3).tolist(),
+            "yaw": round(float(np.degrees(np.arctan2(T[1, 0], T[0, 0]))), 1),
             "stamp": str(keyframe.stamp),  # ns are more than a number of JavaScript holds
             "frame": keyframe.index,
             "robot": keyframe.robot,

@@ -32,6 +32,9 @@ def test_positions_come_back(noise: np.random.Generator) -> None:
     found = content(map_page(data, 0.3, "ring"))
     at = np.array([keyframe["at"] for keyframe in found["keyframes"]]) + found["middle"]
     np.testing.assert_allclose(at, data.poses[:, :3, 3], atol=2e-3)
+    yaw = np.radians([keyframe["yaw"] for keyframe in found["keyframes"]])
+    ahead = np.column_stack([np.cos(yaw), np.sin(yaw)])
+    np.testing.assert_allclose(ahead, data.poses[:, :2, 0], atol=1e-3)  # the page says 0.1 degrees
     points = np.frombuffer(base64.b64decode(found["points"]), "<i2").reshape(-1, 3) * found["scale"] + found["middle"]
     away = np.abs(np.hypot(points[:, 0], points[:, 1]) - np.hypot(*data.poses[0, :2, 3]))
     np.testing.assert_allclose(away, 8.0, atol=0.1)  # of the walls, in clouds that are packed to half a centimeter
