@@ -145,20 +145,21 @@ class ActiveMap:
         if self.localizer is not None:
             self.localizer.restart()
 
-    def reset(self) -> str:
-        """Save the map and begin an empty one; or, in a map that stays as it is, look for the robot anew.
+    def keep(self) -> str:
+        """All that `reset` would end is in the file and in the folder, as far as there is one; says so in words.
 
         Raises:
-            Dpm2Error: it could not be saved, and goes on.
+            Dpm2Error: it cannot be written.
         """
-        self.restart()
-        if self.localizer is not None:
-            return ""
         self._complete()
-        info = self.save() if self.mapper.keyframes and self._maps.folder is not None else ""
-        self.close()
-        self._begin()
-        return info
+        return self.save() if self.saves and self.mapper.keyframes else ""
+
+    def reset(self) -> None:
+        """Begin an empty map; or, in a map that stays as it is, look for the robot anew."""
+        self.restart()
+        if self.localizer is None:
+            self.close()
+            self._begin()
 
     @property
     def saves(self) -> bool:

@@ -16,7 +16,7 @@ from dpm2_ros.diagnostics import OK, WARN, DiagnosticsPublisher, mapper_status, 
 from dpm2_ros.feed import ODOM, Feed
 from dpm2_ros.keyframes import weights_identity
 from dpm2_ros.lifecycle import ManagedNode
-from dpm2_ros.mapping import MapperThread
+from dpm2_ros.mapping import MapperThread, respond, slow_service
 from dpm2_ros.subscriptions import STEADY
 
 _MOST_ROBOTS = 64
@@ -42,7 +42,7 @@ class MapperNode(ManagedNode):
         self._weights = weights_identity(self._config.slam)
         self._open_map(back)
         self._feeds: dict[str, Feed] = {}
-        self.create_service(Trigger, "~/reset", self._on_reset)
+        slow_service(self, Trigger, "~/reset", self._on_reset)
         self._diagnostics = DiagnosticsPublisher(self, self._statuses)
 
     def activate(self, back: ExitStack) -> None:
@@ -97,11 +97,15 @@ class MapperNode(ManagedNode):
         for feed in self._feeds.values():
             feed.tick()
 
-    def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self._map.reset()
-        for feed in self._feeds.values():
-            feed.forget()
-        response.success, response.message = True, "the map is saved, and begins again empty"
+    async def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        await respond(self._map.keep(), response)
+        if response.success:
+            self._map.reset()
+            for feed in self._feeds.values():
+                feed.forget()
+            response.message = "; ".join(filter(None, (response.message, "the map begins again empty")))
+        else:
+            response.message = f"no reset: {response.message}"
         return response
 
     def _shared_frames(self) -> list[str]:

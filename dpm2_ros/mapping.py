@@ -180,9 +180,13 @@ class MapperThread:
         """The odometry has started again: the map stays, the robot's place in it is no longer known."""
         self._restarted = self._submit(self._active.restart)
 
+    def keep(self) -> Future[str]:
+        """Save the map before a `reset`; returns a message, empty where there is nothing to save."""
+        return self._thread.submit(self._active.keep)
+
     def reset(self) -> None:
-        """Save the map and begin an empty one; where it cannot be saved, it goes on."""
-        self._restarted = self._submit(self._reset)
+        """The odometry starts again, and with it an empty map."""
+        self._restarted = self._submit(lambda: self._change(self._active.reset))
 
     def close(self) -> None:
         """Finish what is waiting, save the map, end the thread.
@@ -243,10 +247,6 @@ class MapperThread:
         self._loop_candidates.publish(loop_to_msg(loop, stamp, *names))
         if loop.ok:
             self._loop_closures.publish(edge_to_msg(loop.T_from_to, loop.covariance, stamp, *names))
-
-    def _reset(self) -> None:
-        if info := self._change(self._active.reset):
-            self._node.get_logger().info(info)
 
     async def _on_save(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         await respond(self._thread.submit(self._active.save, self._config.ros.map_name), response)

@@ -23,26 +23,29 @@ class Requests:
     """The services of slam_node, and `initialpose`.
 
     Attributes:
-        reset: set once a new start is asked for.
+        reset: set once a new start is asked for, and the map saved.
     """
 
     def __init__(self, node: Node, mapper: MapperThread | None, base: BaseFrame, map_frame: str) -> None:
         """`mapper`: None where it is another node's."""
         self._mapper, self._base, self._map_frame = mapper, base, map_frame
         self.reset = threading.Event()
-        node.create_service(Trigger, "~/reset", self._on_reset)
+        slow_service(node, Trigger, "~/reset", self._on_reset)
         slow_service(node, Trigger, "~/load_map", self._on_load_map)
         slow_service(node, SetBool, "~/localization_mode", self._on_localization_mode)
         node.create_subscription(PoseWithCovarianceStamped, "initialpose", self._on_initial_pose, 10)
 
-    def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self.reset.set()
-        response.success = True
-        response.message = "the map is saved; odometry and map start again with the next cloud"
-        if self._mapper is None:
-            response.message = (
-                "odometry starts again with the next cloud, and its keyframes as a new session of the mapper's map"
-            )
+    async def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        begins = "odometry starts again with the next cloud, and its keyframes as a new session of the mapper's map"
+        response.success, response.message = True, ""
+        if self._mapper is not None:
+            begins = "odometry and map start again with the next cloud"
+            await respond(self._mapper.keep(), response)
+        if response.success:
+            self.reset.set()
+            response.message = "; ".join(filter(None, (response.message, begins)))
+        else:
+            response.message = f"no reset: {response.message}"
         return response
 
     async def _on_load_map(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:

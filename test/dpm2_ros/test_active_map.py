@@ -131,7 +131,8 @@ def test_an_empty_value_says_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyP
         active.add(keyframes(1)[0])
         with pytest.raises(UsageError, match=r"no map is saved: ros.map_directory is empty"):
             active.save()
-        assert active.reset() == ""
+        assert active.keep() == ""
+        active.reset()
         active.close()
     drive(tmp_path / "maps", count=0)
     assert list(tmp_path.iterdir()) == []
@@ -155,11 +156,12 @@ def test_a_file_that_cannot_be_made_is_known_until_there_is_one(tmp_path: Path) 
     active.close()
 
 
-def test_a_reset_saves_first(tmp_path: Path) -> None:
+def test_what_a_reset_ends_is_kept(tmp_path: Path) -> None:
     active = ActiveMap(config(map_directory=str(tmp_path)), "", LOG)
     for keyframe in keyframes(3):
         active.add(keyframe)
-    assert "map of 3 keyframes saved" in active.reset()
+    assert "map of 3 keyframes saved" in active.keep()
+    active.reset()
     assert len(active.mapper.keyframes) == 0
     active.add(keyframes(1)[0])
     active.close()
@@ -167,14 +169,16 @@ def test_a_reset_saves_first(tmp_path: Path) -> None:
     assert (tmp_path / "drive" / "map.ply").is_file()
 
 
-def test_a_reset_that_cannot_save_keeps_the_map(tmp_path: Path) -> None:
+def test_a_map_that_cannot_be_kept_goes_on(tmp_path: Path) -> None:
     active = ActiveMap(config(map_directory=str(tmp_path / "maps"), map_file=str(tmp_path / "a.dpm2map")), "", LOG)
     for keyframe in keyframes(2):
         active.add(keyframe)
     (tmp_path / "maps").write_text("in the way")
+    before = active.T_map_odom("")
     with pytest.raises(Dpm2Error, match=r"maps.*no map saved"):
-        active.reset()
-    active.add(keyframes(1)[0])  # the odometry has begun anew
+        active.keep()
+    assert active.T_map_odom("") is before
+    active.add(keyframes(3)[2])
     active.close()
     result = check_map(tmp_path / "a.dpm2map")
     assert (result.problems, result.keyframes) == ([], 3)

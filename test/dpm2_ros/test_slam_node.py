@@ -759,6 +759,26 @@ def test_a_map_that_cannot_be_saved_is_a_response(rig: Callable[..., Rig], drive
     (tmp_path / "map").unlink()  # so that the end of the node can save
 
 
+def test_a_reset_that_cannot_save_the_map_changes_nothing(rig: Callable[..., Rig], drive: Any, tmp_path: Path) -> None:
+    """Neither the odometry nor the robot's place; the response says why."""
+    r = rig(f"ros.map_directory:={tmp_path / 'map'}", f"ros.map_file:={tmp_path / 'a.dpm2map'}")
+    tf = r.harness.hear(TFMessage, "/tf")
+    r.send_and_wait(*range(6))
+    r.mapped(1)
+    (tmp_path / "map").write_text("in the way")
+    result = r.harness.call(Trigger, "/slam_node/reset")
+    assert not result.success
+    assert "no reset: " in result.message
+    assert str(tmp_path / "map") in result.message
+    placed = lambda: [t for m in tf for t in m.transforms if t.child_frame_id == "odom"]  # noqa: E731
+    before = len(placed())
+    r.send_and_wait(6)
+    assert transform_matrix(r.odom[-1].pose.pose)[0, 3] == pytest.approx(drive.pose(6)[0, 3], abs=0.1)
+    r.wait(lambda: len(placed()) > before, "map -> odom")
+    assert r.keyframes
+    (tmp_path / "map").unlink()  # so that the end of the node can save
+
+
 def test_reset_starts_again(rig: Callable[..., Rig], drive: Any) -> None:
     r = rig()
     r.send_and_wait(*range(6))
