@@ -50,6 +50,7 @@ class Options:
     clock: bool
     log: Path | None
     lockstep: bool = False
+    listener: str = ""
 
 
 class BagPlayer:
@@ -132,20 +133,29 @@ class BagPlayer:
         """Until the clouds (or, without any, anything) have their subscribers; not for ever."""
         options, log = self._options, self._node.get_logger()
         clouds = [topic for topic in self._publishers if self._bag.types[topic] == CLOUD] or list(self._publishers)
+        awaited = "a subscriber" if options.subscribers == 1 else f"{options.subscribers} subscribers"
+        awaited += f" named {options.listener}" * bool(options.listener) + f" to {', '.join(clouds)}"
         began, info = time.monotonic(), False
-        while sum(self._publishers[topic].get_subscription_count() for topic in clouds) < options.subscribers:
+        while self._listeners(clouds) < options.subscribers:
             waited = time.monotonic() - began
             if waited >= options.wait:
-                log.warning(f"playing without a subscriber to {', '.join(clouds)} yet")
+                log.warning(f"playing without {awaited} yet")
                 break
             if waited > 1.0 and not info:
-                log.info(f"waiting {options.wait:g} s at most for a subscriber to {', '.join(clouds)}")
+                log.info(f"waiting {options.wait:g} s at most for {awaited}")
                 info = True
             if STOP.wait(0.02):
                 return
         if self._lockstep is not None:
             self._lockstep.find(began + options.wait)
         STOP.wait(0.2)  # other topics of the same subscriber are matched within moments of each other
+
+    def _listeners(self, topics: Sequence[str]) -> int:
+        """Subscriptions, or, of nodes with the name that is waited for, nodes: one robot may have two LiDARs."""
+        if not self._options.listener:
+            return sum(self._publishers[topic].get_subscription_count() for topic in topics)
+        found = [info for topic in topics for info in self._node.get_subscriptions_info_by_topic(topic)]
+        return len({info.node_namespace for info in found if info.node_name == self._options.listener})
 
     def _await_delivery(self) -> None:
         """What is on its way must not end with the process: clouds above all; those that do not arrive are reported.
@@ -229,6 +239,7 @@ def _play(
     topics: Annotated[list[str] | None, typer.Option(help="only these topics; may be repeated")] = None,
     wait: Annotated[float, typer.Option(help="longest wait for a subscriber to the clouds, s", min=0)] = 30.0,
     subscribers: Annotated[int, typer.Option(help="how many listeners to wait for", min=1)] = 1,
+    listener: Annotated[str, typer.Option("--for", help="only nodes of this name count, such as slam_node")] = "",
     clock: Annotated[bool, typer.Option(help="publish /clock, for nodes with use_sim_time")] = True,
     log: Annotated[Path | None, typer.Option(help="CSV file for the moment at which each message went out")] = None,
     lockstep: Annotated[
@@ -241,7 +252,7 @@ def _play(
     node = rclpy.create_node("bag_player")
     try:
         options = Options(
-            bag, rate, start, duration, loop, tuple(topics or ()), wait, subscribers, clock, log, lockstep
+            bag, rate, start, duration, loop, tuple(topics or ()), wait, subscribers, clock, log, lockstep, listener
         )
         BagPlayer(node, options).play()
     finally:

@@ -56,6 +56,8 @@ PARAMETERS = {
     "map_file": "ros.map_file",
     "localization_mode": "ros.localization_mode",
 }
+SAVING = "120"
+"""s after Ctrl-C until `launch` sends SIGTERM, and SIGKILL 5 s later; its own 5 s are not enough to save a map."""
 SHOWN = {"points_topic": "/kitti/velo/pointcloud", "image_topic": "/kitti/camera_color_left/image_raw"}
 
 
@@ -101,6 +103,12 @@ def ending(value: dict[str, str]) -> str:
     return "mapper_node" if value["robots"] else "slam_node"
 
 
+def bag_options(value: dict[str, str]) -> list[str]:
+    """Of bag_player: it waits for each slam_node, however slowly one starts; RViz hears the clouds long before."""
+    heard = ["--for", "slam_node", "--subscribers", str(len(robots(value)))]
+    return [value["bag"], "--rate", value["rate"], "--wait", "300", *heard]
+
+
 def parameter_files(value: dict[str, str]) -> list[str]:
     """That of the user, if any; launch_ros itself only warns of one that is missing."""
     file = value["params_file"]
@@ -127,16 +135,18 @@ def _typed(given: dict[str, bool | str]) -> list[dict[str, bool | ParameterValue
 
 def _actions(context) -> list:
     value = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
-    common = {"package": "dpm2_ros", "output": "screen"}
+    common = {"package": "dpm2_ros", "output": "screen", "sigterm_timeout": SAVING}
     if value["lifecycle"] == "true":
         common["arguments"] = ["--lifecycle"]
     actions, last = [], ending(value)
     for executable, namespace, own in nodes(value):
+        # With its name the arguments come after all that params_file has for the node; without, before some of it.
+        given = {"name": executable, "namespace": namespace}
         files = [*parameter_files(value), *_typed(parameters(own))]
         ends = Shutdown() if executable == last else None
-        actions.append(Node(executable=executable, namespace=namespace, parameters=files, on_exit=ends, **common))
+        actions.append(Node(executable=executable, parameters=files, on_exit=ends, **given, **common))
     if value["bag"]:
-        options = [value["bag"], "--rate", value["rate"], "--wait", "30"]
+        options = bag_options(value)
         actions.append(Node(package="dpm2_ros", executable="bag_player", output="screen", arguments=options))
     if value["rviz"] == "true":
         actions.append(_rviz(value, bool(parameters(value).get("use_sim_time"))))

@@ -7,12 +7,14 @@ import csv
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import rclpy
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from rosgraph_msgs.msg import Clock
@@ -141,6 +143,30 @@ def test_it_waits_for_subscribers(ros: Callable[..., Any], bag: Path, tmp_path: 
         clouds = harness.hear(PointCloud2, topics.POINTS)
         assert player.wait(180) == 0
         harness.wait(lambda: len(clouds) == drive.frames, "every cloud")
+    finally:
+        player.kill()
+
+
+def test_it_waits_for_the_nodes_that_it_is_told(ros: Callable[..., Any], bag: Path, tmp_path: Path, drive: Any) -> None:
+    """Two of a name, in namespaces of their own; what another node hears, as RViz does, starts nothing."""
+    harness = ros()
+    clouds = harness.hear(PointCloud2, topics.POINTS)
+    environment = ros_environment(harness.node.context.get_domain_id())
+    awaited = ["--for", "robot", "--subscribers", "2", "--wait", "90", "--rate", "4"]
+    player = start("bag_player", [str(bag), *awaited], environment, tmp_path / "log")
+    try:
+        says = f"waiting 90 s at most for 2 subscribers named robot to {topics.POINTS}"
+        harness.wait(lambda: says in (tmp_path / "log").read_text(), "the player")
+        received: list[list[Any]] = [[], []]
+        for n, heard in enumerate(received):
+            assert not clouds
+            node = rclpy.create_node("robot", namespace=f"robot_{n}", context=harness.node.context)
+            node.create_subscription(PointCloud2, topics.POINTS, heard.append, 100)
+            node.close = lambda: None  # type: ignore[attr-defined]
+            harness.add(node)
+            time.sleep(1.0)  # with one of two it does not begin
+        assert player.wait(180) == 0
+        harness.wait(lambda: [len(heard) for heard in received] == [drive.frames] * 2, "every cloud, twice")
     finally:
         player.kill()
 

@@ -62,9 +62,9 @@ def defaults(launch_file: ModuleType) -> dict[str, str]:
     return {name: default for name, (default, _) in launch_file.ARGUMENTS.items()}
 
 
-def write(parameters: dict[str, Any], path: Path) -> Path:
-    """As launch_ros writes them for a node."""
-    path.write_text(yaml.safe_dump({"/**": {"ros__parameters": parameters}}))
+def write(parameters: dict[str, Any], path: Path, node: str = "/**") -> Path:
+    """As launch_ros writes them for a node; `node`: its full name, if the launch file gives it one."""
+    path.write_text(yaml.safe_dump({node: {"ros__parameters": parameters}}))
     return path
 
 
@@ -123,6 +123,47 @@ def test_every_argument_is_a_parameter_that_is_taken(launch_file: ModuleType, tm
     changed = {name for name, default in DEFAULTS.items() if of(config, name) != default}
     assert changed == set(launch_file.PARAMETERS.values()) - {CONFIG_FILE}
     assert (config.ros.embed_mapper, config.ros.localization_mode, config.ros.map_file) == (False, True, "town.dpm2map")
+
+
+@pytest.mark.parametrize("sections", [["slam_node"], ["/**", "slam_node"], ["slam_node", "/**"]])
+@pytest.mark.parametrize("namespace", ["", "red"])
+def test_an_argument_overrides_the_parameter_file_whatever_sections_that_has(
+    launch_file: ModuleType, tmp_path: Path, domain: int, namespace: str, sections: list[str]
+) -> None:
+    """rcl keeps the sections of all files in the order in which they appear first, and the last one decides."""
+    kept, lost = {"input.image_topic": "/of_the_file"}, {"input.points_topic": "/of_the_file"}
+    own = f"{namespace}/slam_node".lstrip("/")
+    tree = {
+        own if s == "slam_node" else s: {"ros__parameters": kept | (lost if s == "slam_node" else {})} for s in sections
+    }
+    (tmp_path / "user.yaml").write_text(yaml.safe_dump(tree, sort_keys=False))
+    value = defaults(launch_file) | {"points_topic": "/argument", "params_file": str(tmp_path / "user.yaml")}
+    value |= {"namespace": namespace, "rviz": "false"}
+    ((_, words),) = commands(launch_file, value, tmp_path)
+    ros_context(words, domain)
+    node = rclpy.create_node("slam_node", automatically_declare_parameters_from_overrides=True)
+    try:
+        config = load_parameters(node, NodeConfig)
+    finally:
+        end_ros(node)
+    assert (config.input.points_topic, config.input.image_topic) == ("/argument", "/of_the_file")
+
+
+def test_launch_waits_until_a_map_is_saved(launch_file: ModuleType, tmp_path: Path) -> None:
+    """From Ctrl-C to SIGTERM, after which SIGKILL is 5 s away, as in launch: 10 s were not enough on a busy machine."""
+    commands(launch_file, defaults(launch_file) | {"embed_mapper": "false", "rviz": "false"}, tmp_path)
+    given = {call.kwargs["executable"]: call.kwargs for call in launch_file.Node.call_args_list}
+    assert set(given) == {"slam_node", "mapper_node"}
+    assert all(float(node["sigterm_timeout"]) >= 60 for node in given.values())
+
+
+@pytest.mark.parametrize(("names", "count"), [("", "1"), ("red,blue", "2")])
+def test_the_bag_waits_for_each_slam_node(launch_file: ModuleType, tmp_path: Path, names: str, count: str) -> None:
+    """RViz hears the clouds before any of them."""
+    value = defaults(launch_file) | {"bag": "drive.mcap", "robots": names, "rviz": "false"}
+    words = dict(commands(launch_file, value, tmp_path))["bag_player"]
+    assert words[words.index("--for") + 1] == "slam_node"
+    assert words[words.index("--subscribers") + 1] == count
 
 
 def test_three_robots_have_namespaces_and_frames_of_their_own(launch_file: ModuleType) -> None:
@@ -224,11 +265,14 @@ def commands(launch_file: ModuleType, value: dict[str, str], folder: Path) -> li
     launch_file.OpaqueFunction.call_args.kwargs["function"](value)
     found = []
     for number, node in enumerate(call.kwargs for call in launch_file.Node.call_args_list):
+        name, namespace = node.get("name"), f"/{node.get('namespace', '')}".rstrip("/")
+        full = f"{namespace}/{name}" if name else "/**"
         files = [
-            given if isinstance(given, str) else str(write(given, folder / f"{number}_{k}.yaml"))
-            for k, given in enumerate(node["parameters"])
+            given if isinstance(given, str) else str(write(given, folder / f"{number}_{k}.yaml", full))
+            for k, given in enumerate(node.get("parameters", ()))
         ]
-        remap = ["-r", f"__ns:=/{node['namespace']}"] if node["namespace"] else []
+        remap = ["-r", f"__ns:={namespace}"] if namespace else []
+        remap += ["-r", f"__node:={name}"] if name else []
         ros = ["--ros-args", *remap, *(word for file in files for word in ("--params-file", file))]
         found.append((node["executable"], [*node.get("arguments", ()), *ros]))
     return found
