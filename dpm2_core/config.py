@@ -25,6 +25,20 @@ T = TypeVar("T", bound="Settings")
 _NOT_YAML = (yaml.YAMLError, ValueError, RecursionError)
 
 
+class _Loader(yaml.SafeLoader):
+    """The safe one, for which a key that is there twice is a mistake: else the first is dropped without a word."""
+
+    def compose_mapping_node(self, anchor: dict[Any, yaml.Node]) -> yaml.MappingNode:
+        node = super().compose_mapping_node(anchor)  # as it is written: `<<` is not carried out yet
+        seen = set[tuple[str, str]]()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode):
+                if (key.tag, key.value) in seen:
+                    raise yaml.composer.ComposerError(None, None, f"{key.value} is there twice", key.start_mark)
+                seen.add((key.tag, key.value))
+        return node
+
+
 class Settings(BaseModel):
     """Base of every configuration type: unknown keys are errors, values immutable, docstrings describe fields."""
 
@@ -84,7 +98,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
         UsageError: the file is missing, or holds something else.
     """
     try:
-        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
+        tree = yaml.load(path.read_text(encoding="utf-8"), _Loader)  # a SafeLoader
         json.dumps(tree, default=str, skipkeys=True)  # rejects a mapping that holds itself through an alias
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror}") from None

@@ -108,6 +108,14 @@ def test_an_override_of_one_of_two_keys_with_the_same_anchor_leaves_the_other(tm
     assert (settings.second.voxel, settings.middle.inner.voxel) == (9, 2)
 
 
+def test_a_key_overrides_what_is_merged_into_its_mapping(tmp_path: Path) -> None:
+    path = _file(
+        tmp_path, "second: &a {voxel: 2, names: [a]}\nmiddle: {inner: {<<: *a, voxel: 3}}\nperhaps: {<<: *a}\n"
+    )
+    settings = load_settings(Outer, path)
+    assert (settings.middle.inner, settings.perhaps) == (Inner(voxel=3, names=("a",)), Inner(voxel=2, names=("a",)))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "message"),
@@ -127,6 +135,8 @@ def test_an_override_of_one_of_two_keys_with_the_same_anchor_leaves_the_other(tm
         ("count: 1\ntext: [", "not valid YAML"),
         ("text: !!python/object/apply:os.getcwd []", "not valid YAML"),
         ("text: 2024-13-45", "not valid YAML"),
+        ("count: 1\ntext: a\ncount: 2", "count is there twice .*line 3"),
+        ("middle: {inner: {voxel: 1, voxel: 2}}", "voxel is there twice"),
         ("[" * 5000, "not valid YAML"),
         ("middle: &a {inner: *a}", "not valid YAML"),
         ("- a\n- b", "want a mapping of keys, found list"),
