@@ -16,6 +16,15 @@ Array = NDArray[np.float64]
 Points = NDArray[np.float32]
 
 
+def is_rigid(T: Array, tolerance: float = 1e-3) -> bool:
+    """Whether (4, 4) is a finite rigid transform; what is off by more than `tolerance` is damage, not rounding."""
+    if T.shape != (4, 4) or not np.isfinite(T).all() or np.abs(T[:3, :3]).max() > 2:
+        return False
+    R = T[:3, :3]
+    off = np.abs(R @ R.T - np.eye(3)).max() + np.abs(T[3] - [0, 0, 0, 1]).max()
+    return bool(off < tolerance and np.linalg.det(R) > 0)
+
+
 @dataclass(frozen=True, eq=False)
 class Camera:
     """A calibrated camera.
@@ -39,6 +48,10 @@ class Camera:
             raise ValueError(
                 f"{self.name}: K is {self.K.shape}, T_lidar_cam {self.T_lidar_cam.shape}; want (3, 3), (4, 4)"
             )
+        if not is_rigid(self.T_lidar_cam):
+            raise ValueError(f"{self.name}: T_lidar_cam is no rigid transform (is it transposed?)")
+        if not (np.isfinite(self.K).all() and self.K[0, 0] > 0 < self.K[1, 1] and (self.K[2] == (0, 0, 1)).all()):
+            raise ValueError(f"{self.name}: K is no matrix of intrinsics, whose last row is 0 0 1: {self.K.tolist()}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +67,8 @@ class Image:
             raise ValueError(
                 f"{self.camera.name}: image of {self.pixels.shape}, calibration for {self.camera.size[::-1]}"
             )
+        if self.pixels.dtype != np.uint8:
+            raise ValueError(f"{self.camera.name}: pixels are {self.pixels.dtype}, want uint8, 0 to 255")
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +87,8 @@ class Guess:
         for name, array, shape in (("pose", self.T_other_lidar, (4, 4)), ("covariance", self.covariance, (6, 6))):
             if array is not None and (array.shape != shape or not np.isfinite(array).all()):
                 raise ValueError(f"guess: its {name} is not {shape} finite numbers")
+        if not is_rigid(self.T_other_lidar):
+            raise ValueError("guess: its pose is no rigid transform (is it transposed?)")
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,6 +199,10 @@ class Frame:
             raise ValueError(f"frame {self.index}: points are {found}, want (N, 4) float32")
         if self.time_offset is not None and self.time_offset.shape != self.points.shape[:1]:
             raise ValueError(f"frame {self.index}: {len(self.time_offset)} time offsets for {len(self.points)} points")
+        if self.time_offset is not None and not np.isfinite(self.time_offset).all():
+            raise ValueError(f"frame {self.index}: some time offsets are not finite")
+        if not isinstance(self.stamp, int | np.integer):
+            raise ValueError(f"frame {self.index}: its stamp is {self.stamp!r}, want ns, an integer")
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,6 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from dpm2_core.frame import is_rigid as is_rigid
+
 Array = NDArray[np.float64]
 
 
@@ -106,15 +108,6 @@ def from_rows(rows: ArrayLike) -> Array:
     rows = np.asarray(rows, np.float64)
     matrices = rows.reshape(*rows.shape[:-1], 3, 4)
     return orthonormalized(make(matrices[..., :3], matrices[..., 3]))
-
-
-def is_rigid(T: Array, tolerance: float = 1e-3) -> bool:
-    """Whether (4, 4) is a finite rigid transform; what is off by more than `tolerance` is damage, not rounding."""
-    if T.shape != (4, 4) or not np.isfinite(T).all() or np.abs(T[:3, :3]).max() > 2:
-        return False
-    R = T[:3, :3]
-    off = np.abs(R @ R.T - np.eye(3)).max() + np.abs(T[3] - [0, 0, 0, 1]).max()
-    return bool(off < tolerance and np.linalg.det(R) > 0)
 
 
 def quaternion(T: Array) -> Array:

@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from dpm2_core.frame import Camera, Edge, Frame, Image, Registration
+from dpm2_core.frame import Camera, Edge, Frame, Guess, Image, Registration
+from dpm2_core.geometry import se3
 
 CAMERA = Camera(K=np.eye(3), T_lidar_cam=np.eye(4), size=(40, 30), name="left")
 
@@ -30,6 +33,28 @@ def test_a_camera_wants_matrices_of_the_right_shape() -> None:
         Camera(K=np.zeros((3, 4)), T_lidar_cam=np.eye(4), size=(40, 30))
     with pytest.raises(ValueError, match=r"T_lidar_cam \(3, 4\)"):
         Camera(K=np.eye(3), T_lidar_cam=np.zeros((3, 4)), size=(40, 30))
+
+
+def test_what_would_be_read_as_something_else_is_refused() -> None:
+    """Transposed matrices made a camera useless and a drive wrong by its length; seconds passed as nanoseconds."""
+    moved = se3.make(np.eye(3), np.array([1.0, 2.0, 3.0]))
+    with pytest.raises(ValueError, match=r"left: T_lidar_cam is no rigid transform"):
+        replace(CAMERA, T_lidar_cam=moved.T)
+    for K in (np.array([[9.0, 0, 0], [0, 9, 0], [20, 15, 1]]), np.diag([0.0, 9, 1]), np.full((3, 3), np.nan)):
+        with pytest.raises(ValueError, match=r"left: K is no matrix of intrinsics"):
+            replace(CAMERA, K=K)
+    for kind in (np.float32, np.uint16):
+        with pytest.raises(ValueError, match=r"left: pixels are .*, want uint8"):
+            Image(np.zeros((30, 40, 3), kind), CAMERA)  # type: ignore[arg-type]
+    for T in (moved.T, np.zeros((4, 4)), 2 * np.eye(4)):
+        with pytest.raises(ValueError, match=r"guess: its pose is no rigid transform"):
+            Guess(T)
+    points = np.zeros((3, 4), np.float32)
+    with pytest.raises(ValueError, match=r"frame 0: its stamp is 1.5, want ns"):
+        Frame(1.5, points)  # type: ignore[arg-type]
+    assert Frame(np.int64(3), points).stamp == 3  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="frame 0: some time offsets are not finite"):
+        Frame(0, points, np.array([0, np.nan, 0], np.float32))
 
 
 def test_a_frame_may_be_empty_and_may_hold_nan() -> None:
