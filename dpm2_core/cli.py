@@ -6,6 +6,8 @@ A command's module is imported when it is called, not to list it: numpy, gtsam a
 
 from __future__ import annotations
 
+import errno
+import os
 import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
@@ -151,9 +153,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def _status(arguments: Sequence[str] | None) -> int:
     args = None if arguments is None else list(arguments)
     try:
-        return exit_code(lambda: app(args=args, standalone_mode=False), "dpm2")
+        code = exit_code(lambda: app(args=args, standalone_mode=False), "dpm2")
+        if sys.stdout is not None:  # it is where a service has closed it
+            sys.stdout.flush()
+        return code
     except typer.Abort:  # Ctrl-C where the command itself makes nothing of it
         return 130
+    except OSError:
+        try:
+            sys.stdout.flush()  # fails again where it was this
+        except OSError as error:
+            if error.errno != errno.EPIPE:  # a reader that has what it wanted
+                print(f"dpm2: standard output: {error.strerror}", file=sys.stderr)
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what is left of it would be one more error at the end
+            return 1
+        raise
 
 
 if __name__ == "__main__":

@@ -165,6 +165,15 @@ def test_ctrl_c_ends_a_command_without_a_traceback_and_at_once(tmp_path: Path) -
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("arguments", [["version"], ["--help"], ["config", "dump"], ["eval", "--json", "-"]])
+def test_a_full_disk_under_stdout_is_one_line(straight: Path, arguments: list[str]) -> None:
+    given = ["--gt", straight, "--est", straight] if "eval" in arguments else []
+    with open("/dev/full", "w") as full:
+        command = [sys.executable, "-m", "dpm2_core.cli", *map(str, [*arguments, *given])]
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=120)
+    assert (done.returncode, done.stderr) == (1, "dpm2: standard output: No space left on device\n")
+
+
 def test_a_reader_that_stops_early_is_no_error() -> None:
     command = f"{sys.executable} -m dpm2_core.cli config dump | head -1"
     done = subprocess.run(["sh", "-c", command], capture_output=True, text=True, check=False, timeout=60)
