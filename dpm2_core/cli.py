@@ -75,6 +75,8 @@ GROUPS = {
 """The commands as `dpm2 --help` groups them: function or Typer in `dpm2_core.commands`, MODULE:NAME, and the help."""
 COMMANDS = {name: command for group in GROUPS.values() for name, command in group.items()}
 _LAST = "This machine"
+_UNWRITTEN = (errno.ENOSPC, errno.EDQUOT, errno.EPIPE)
+"""Of a file that is open, such as stdout, whose errors name no file."""
 
 
 class Commands(TyperGroup):
@@ -159,15 +161,13 @@ def _status(arguments: Sequence[str] | None) -> int:
         return code
     except typer.Abort:  # Ctrl-C where the command itself makes nothing of it
         return 130
-    except OSError:
-        try:
-            sys.stdout.flush()  # fails again where it was this
-        except OSError as error:
-            if error.errno != errno.EPIPE:  # a reader that has what it wanted
-                print(f"dpm2: standard output: {error.strerror}", file=sys.stderr)
-            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what is left of it would be one more error at the end
-            return 1
-        raise
+    except OSError as error:
+        if error.errno not in _UNWRITTEN:
+            raise
+        if error.errno != errno.EPIPE:  # a reader that has what it wanted
+            print(f"dpm2: not written: {error.strerror}", file=sys.stderr)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what is left for stdout would be one more error at the end
+        return 1
 
 
 if __name__ == "__main__":
