@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, TypeVar, get_args
 
 import yaml
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, ValidationInfo, field_validator
 from pydantic.fields import FieldInfo
 
 from dpm2_core.errors import UsageError
@@ -45,6 +45,23 @@ class Settings(BaseModel):
     model_config = ConfigDict(
         extra="forbid", frozen=True, validate_default=True, use_attribute_docstrings=True, allow_inf_nan=False
     )
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _truth_is_no_number(cls, value: Any, info: ValidationInfo) -> Any:
+        """`true`, `yes` and `on` are no 1: pydantic takes them for one where a number is wanted."""
+        if isinstance(value, bool):
+            kinds = set(_kinds(cls.model_fields[info.field_name or ""].annotation))
+            if bool not in kinds and kinds & {int, float}:
+                raise ValueError("want a number")
+        return value
+
+
+def _kinds(annotation: Any) -> Iterator[Any]:
+    """The types that an annotation allows, at any depth."""
+    yield annotation
+    for part in get_args(annotation):
+        yield from _kinds(part)
 
 
 def load_settings(kind: type[T], path: Path | None = None, overrides: Sequence[str] = ()) -> T:

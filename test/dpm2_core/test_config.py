@@ -160,6 +160,8 @@ def test_a_mistake_in_the_file_names_file_and_key_in_one_line(tmp_path: Path, te
         ("=3", "--set =3: want KEY=VALUE"),
         ("count=2024-13-45", "--set count=2024-13-45: count: "),
         ("count.a=1", "--set count.a=1: count: "),
+        ("count=true", "--set count=true: count: .*want a number, got True"),
+        ("middle.inner.voxel=on", "--set middle.inner.voxel=on: middle.inner.voxel: .*want a number"),
     ],
 )
 def test_a_mistake_on_the_command_line_names_the_setting(setting: str, message: str) -> None:
