@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import grey_opening, minimum_filter
 
 _OPENING = 7  # cells
+_FARTHEST = 500  # cells from the origin on each side: memory that one stray point cannot make larger
 _BESIDE = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], bool)
 
 
@@ -16,10 +17,12 @@ def height_above_ground(points: NDArray[np.floating], cell: float = 1.0, reach: 
 
     A cell that lies deeper than all that touch it by more than its own edge is not ground: what is mirrored in a window
     or a puddle appears below it. One such point in a real scan lifts everything within 5 m by 10 m.
+
+    Points more than 500 cells from the origin, the sensor, are taken together in the outermost cells.
     """
     if not len(points):
         return np.zeros(0, points.dtype)
-    x, y = (np.floor(points[:, axis] / cell).astype(np.int64) for axis in (0, 1))
+    x, y = (np.clip(np.floor(points[:, axis] / cell), -_FARTHEST, _FARTHEST).astype(np.int64) for axis in (0, 1))
     x, y, z = x - x.min(), y - y.min(), np.ascontiguousarray(points[:, 2])
     shape = int(x.max()) + 1, int(y.max()) + 1
     at = x * shape[1] + y  # one index is twice as fast as two

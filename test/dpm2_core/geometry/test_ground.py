@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -30,6 +32,18 @@ def test_a_point_mirrored_below_the_ground_lifts_nothing(reach: int) -> None:
     height = height_above_ground(np.concatenate([ground, mirrored]), 1.0, reach)
     assert (height[len(ground) :] < 0).all()
     np.testing.assert_array_equal(height[: len(ground)], height_above_ground(ground, 1.0, reach))
+
+
+def test_a_stray_point_far_off_takes_no_memory_and_changes_no_height() -> None:
+    x, y = np.meshgrid(np.arange(-10, 10, 0.25), np.arange(-10, 10, 0.25))
+    ground = np.stack([x.ravel(), y.ravel(), 0.1 * x.ravel()], -1)
+    stray = np.array([[3000.0, 3000.0, 5.0], [-3000.0, -3000.0, 9.0]])
+    tracemalloc.start()
+    height = height_above_ground(np.concatenate([ground, stray]))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 50e6  # four arrays of 1001 by 1001 cells; of 6 by 6 km they were 1.2 GB
+    np.testing.assert_array_equal(height[: len(ground)], height_above_ground(ground))
 
 
 def test_the_ground_below_a_roof_is_not_the_roof() -> None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -102,6 +103,18 @@ def test_an_unsound_keyframe_is_rejected_with_its_reason_and_the_map_goes_on(nam
         np.testing.assert_allclose(mapper.poses, [np.linalg.matrix_power(STEP, n) for n in range(3)], atol=1e-9)
         assert len(mapper.cloud()) > 1000
         assert [k.id for k in load_map(store).keyframes] == [0, 1, 2]
+
+
+def test_a_cloud_that_reaches_far_takes_no_memory() -> None:
+    """Three points 6 km apart, 37 bytes on the wire, are no cause for 500 MB."""
+    mapper, few = make_mapper(SETTINGS), np.float32([[3000, 3000, 0, 0], [-3000, -3000, 1, 0], [1, 0, 0, 0]])
+    tracemalloc.start()
+    mapper.add(replace(keyframe(0), cloud=few))
+    mapper.add(keyframe(1))
+    mapper.finish()
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 60e6  # cells of 1 m as far as a LiDAR sees
 
 
 def test_descriptors_of_another_network_never_reach_the_search() -> None:
