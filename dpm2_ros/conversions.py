@@ -51,9 +51,18 @@ def vector(xyz: Array) -> Vector3:
 
 def pose_to_msg(T: Array) -> Pose:
     """(4, 4) to geometry_msgs/Pose."""
-    x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat().tolist()
-    tx, ty, tz = T[:3, 3].tolist()
-    return Pose(position=Point(x=tx, y=ty, z=tz), orientation=Quaternion(x=x, y=y, z=z, w=w))
+    return poses_to_msgs(T[None])[0]
+
+
+def poses_to_msgs(T: Array) -> list[Pose]:
+    """(N, 4, 4) to geometry_msgs/Pose: many rotations take little longer than one."""
+    if not len(T):
+        return []
+    quaternions, positions = Rotation.from_matrix(T[:, :3, :3]).as_quat().tolist(), T[:, :3, 3].tolist()
+    return [
+        Pose(position=Point(x=tx, y=ty, z=tz), orientation=Quaternion(x=x, y=y, z=z, w=w))
+        for (tx, ty, tz), (x, y, z, w) in zip(positions, quaternions, strict=True)
+    ]
 
 
 def transform_to_msg(T_parent_child: Array, stamp: int, parent: str, child: str) -> TransformStamped:

@@ -22,15 +22,15 @@ from dpm2_core.frame import Array, Edge, Frame
 from dpm2_core.geometry import se3
 from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.mapping.occupancy_map import FREE, OCCUPIED, Grid
-from dpm2_ros.conversions import bytes_to_array, header, pose_to_msg
+from dpm2_ros.conversions import bytes_to_array, header, pose_to_msg, poses_to_msgs
 
 GRAY, GREEN, BLUE, RED = (0.7, 0.7, 0.7), (0.1, 0.8, 0.2), (0.2, 0.5, 1.0), (1.0, 0.2, 0.2)
 
 
 def path_to_msg(poses: Array, stamps: Sequence[int], frame_id: str) -> Path:
     """(N, 4, 4) optimized poses to nav_msgs/Path; stamps in ns."""
-    pairs = zip(stamps, poses, strict=True)
-    stamped = [PoseStamped(header=header(stamp, frame_id), pose=pose_to_msg(T)) for stamp, T in pairs]
+    pairs = zip(stamps, poses_to_msgs(poses), strict=True)
+    stamped = [PoseStamped(header=header(stamp, frame_id), pose=pose) for stamp, pose in pairs]
     return Path(header=header(stamps[-1] if stamps else 0, frame_id), poses=stamped)
 
 
