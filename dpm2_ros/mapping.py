@@ -258,8 +258,10 @@ class MapperThread:
                 self._submit(display.publish)
 
     def _path(self) -> Any:
-        stamps = [keyframe.stamp for keyframe in self._active.mapper.keyframes]
-        return path_to_msg(self._active.mapper.poses, stamps, self._config.ros.map_frame)
+        mapper = self._active.mapper
+        placed = mapper.placed
+        stamps = [keyframe.stamp for keyframe, known in zip(mapper.keyframes, placed, strict=True) if known]
+        return path_to_msg(mapper.poses[placed], stamps, self._config.ros.map_frame)
 
     def _pose_graph(self) -> Any:
         return pose_graph_to_msg(self._active.mapper, self._stamp, self._config.ros.map_frame)

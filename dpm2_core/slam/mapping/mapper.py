@@ -84,7 +84,7 @@ class Mapper:
         self._clouds = CloudStore()
         self._writer: MapWriter | None = None
         self._robots: dict[str, _Robot] = {}
-        self._placed = {0}  # nodes whose pose in the map is known from the start
+        self._known = {0}  # nodes whose pose in the map is known from the start
         self._T_start: Array = np.eye(4)  # T_map_odom of the first robot of the session
         self._tie: Array | None = None  # covariance of the session's first keyframe relative to the last of the map
         if store is not None:
@@ -111,9 +111,15 @@ class Mapper:
     def T_map_odom_of(self, robot: str) -> Array | None:
         """(4, 4) of a robot; None before it is known where in the map it is."""
         last = self._robots[robot].last if robot in self._robots else None
-        if last is None or self._graph.part(last) not in {self._graph.part(node) for node in self._placed}:
+        if last is None or self._graph.part(last) not in self._known_parts():
             return None
         return se3.orthonormalized(self._graph.pose(last) @ se3.inverse(self.keyframes[last].T_odom_kf))
+
+    @property
+    def placed(self) -> NDArray[np.bool_]:
+        """(N,) of each keyframe, whether it is known where in the map it is: what nothing ties to it is not drawn."""
+        known = self._known_parts()
+        return np.array([self._graph.part(node) in known for node in range(len(self.keyframes))], np.bool_)
 
     @property
     def robots(self) -> list[str]:
@@ -158,6 +164,7 @@ class Mapper:
                 by an edge; None: the new session is not tied to the map before a loop is found.
         """
         self._T_start, self._tie = T_map_odom, covariance
+        self._known.add(self.session_start)
 
     def described(self, keyframe: Keyframe) -> Keyframe:
         """The keyframe with descriptors, if loops are searched with them and its registration made none."""
@@ -220,17 +227,21 @@ class Mapper:
 
     def cloud(self, voxel_size: float | None = None) -> Points:
         """The map (M, 4) float32 in the map frame, one point in each voxel of that size (default: settings)."""
-        return map_cloud(self._clouds, self.poses, voxel_size or self._settings.voxel)
+        placed = np.flatnonzero(self.placed).tolist()
+        return map_cloud(self._clouds, self.poses, voxel_size or self._settings.voxel, placed)
 
     def update_grid(self, grid: OccupancyMap, seconds: float) -> bool:
         """Bring a grid that is kept for this map up to date; False if there is more to do than `seconds` allow."""
         if not self.keyframes:
             return True
-        return grid.update(self._clouds, self.poses, self._clouds.version, seconds)
+        return grid.update(self._clouds, self.poses, self._clouds.version, seconds, self.placed)
 
     def write_g2o(self, path: Path) -> None:
         """The pose graph as a g2o file."""
         self._graph.write_g2o(path)
+
+    def _known_parts(self) -> set[int]:
+        return {self._graph.part(node) for node in self._known if node < len(self.keyframes)}
 
     def _load(self, store: MapStore) -> None:
         data, channels = load_map(store), self._closer.channels
@@ -255,8 +266,6 @@ class Mapper:
     def _add_node(self, keyframe: Keyframe, last: int | None) -> list[Edge]:
         """A node with an edge to its robot's `last` one, also when some between them never arrived."""
         node, result = len(self.keyframes), keyframe.edge
-        if node == self.session_start:
-            self._placed.add(node)
         if result is not None and last is not None:
             before = self.keyframes[last]
             T_before_this = se3.inverse(before.T_odom_kf) @ keyframe.T_odom_kf

@@ -3,7 +3,8 @@
 
 What a keyframe sees is kept as a fan: how far it is free in each direction, and where something stands. A fan is drawn
 at the keyframe's pose, and, when that changes, taken back and drawn anew: 1 to 2 ms, where reading the cloud takes ten
-times as long.
+times as long. Where the map needs cells of another size all are drawn anew, and the grid that was there is shown until
+then: a robot that plans in it does not lose what it knew.
 """
 
 from __future__ import annotations
@@ -106,6 +107,7 @@ class OccupancyMap:
         self._entries: dict[int, _Entry] = {}  # by node
         self._low, self._size = np.zeros(2, np.int64), 0.0
         self._hits = self._seen = np.zeros((0, 0), np.int16)
+        self._before: Grid | None = None  # shown until everything is drawn in cells of another size
 
     def update(
         self,
@@ -113,31 +115,38 @@ class OccupancyMap:
         poses: Array,
         version: Callable[[int], object] = lambda node: None,
         seconds: float = np.inf,
+        placed: NDArray[np.bool_] | None = None,
     ) -> bool:
         """Bring it up to date, the newest keyframes first; False if there is more to do than `seconds` allow.
 
         Args:
             clouds: (M, 4) each, in its own frame, at `poses` (N, 4, 4) T_map_kf.
             version: another object once a cloud is another one.
+            placed: (N,) which of them are drawn, at least one; None: all.
         """
         end = time.monotonic() + seconds
-        self._make_room(poses)
-        for node in reversed(range(len(poses))):
+        placed = np.ones(len(poses), np.bool_) if placed is None else placed
+        self._make_room(poses[placed])
+        for node in np.flatnonzero(~placed).tolist():
+            self._take_back(node)
+        for node in np.flatnonzero(placed)[::-1].tolist():
             entry, now = self._entries.get(node), version(node)
             if entry is not None and entry.version is now and entry.T is not None and self._near(entry.T, poses[node]):
                 continue
             if time.monotonic() > end:
                 return False
-            if entry is not None and entry.T is not None:
-                self._draw(entry.fan, entry.T, -1)
+            self._take_back(node)
             if entry is None or entry.version is not now:
                 entry = self._entries[node] = _Entry(fan_of(clouds[node], poses[node], self._settings), now)
             entry.T = poses[node].copy()
             self._draw(entry.fan, entry.T, 1)
+        self._before = None
         return True
 
     def grid(self) -> Grid:
         """What is known by now: a cell is occupied where at least half of those that see it see something in it."""
+        if self._before is not None:
+            return self._before
         cells = np.full(self._seen.shape, UNKNOWN, np.uint8)
         cells[self._seen > 0] = FREE
         cells[(self._hits > 0) & (2 * self._hits >= self._seen)] = OCCUPIED
@@ -149,20 +158,50 @@ class OccupancyMap:
         return Grid(cut, (float(corner[0]), float(corner[1])), self._size)
 
     def _make_room(self, poses: Array) -> None:
-        """For all keyframes; in new cells, if there would be too many."""
-        reach, size = self._settings.reach + _BORDER, self._settings.resolution
-        low, high = poses[:, :2, 3].min(0) - reach, poses[:, :2, 3].max(0) + reach
-        while np.prod(np.ceil((high - low) / size) + 2) > self._most:
+        """For these keyframes; in cells of another size, if there would be too many."""
+        size, end = self._settings.resolution, self._low + self._seen.shape
+        first, last = self._corners(poses, size)
+        while np.prod(last - first) > self._most:
             size *= 2
-        first, last = np.floor(low / size).astype(np.int64), np.ceil(high / size).astype(np.int64)
-        if size == self._size and (first >= self._low).all() and (last <= self._low + self._seen.shape).all():
+            first, last = self._corners(poses, size)
+        if size == self._size and (first >= self._low).all() and (last <= end).all():
             return
-        margin = min(_MARGIN, max(0.0, (self._most**0.5 - float((last - first).max())) * size / 2)) // size
-        first, last = first - int(margin), last + int(margin)
-        hits, seen = (np.zeros(last - first, np.int16) for _ in range(2))
+        if size == self._size:  # what is drawn stays, even where it is to be drawn elsewhere
+            both = self._corners(np.array([*poses, *(e.T for e in self._entries.values() if e.T is not None)]), size)
+            if np.prod(both[1] - both[0]) <= self._most:
+                self._move(*both)
+                return
+        if self._seen.any():
+            self._before = self.grid()
         for entry in self._entries.values():
             entry.T = None
-        self._low, self._size, self._hits, self._seen = first, size, hits, seen
+        self._size, self._hits, self._seen = size, *(np.zeros((0, 0), np.int16) for _ in range(2))
+        self._move(first, last)
+
+    def _corners(self, poses: Array, size: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """First cell, and that after the last, of all that fans at (N, 4, 4) reach."""
+        reach = self._settings.reach + _BORDER
+        low, high = poses[:, :2, 3].min(0) - reach, poses[:, :2, 3].max(0) + reach
+        return np.floor(low / size).astype(np.int64), np.ceil(high / size).astype(np.int64)
+
+    def _move(self, first: NDArray[np.int64], last: NDArray[np.int64]) -> None:
+        """Have cells from a corner to another, with a margin, if there is room for one; those that are there stay."""
+        width, height = (last - first).tolist()
+        room = (((width - height) ** 2 + 4 * self._most) ** 0.5 - width - height) / 4  # on each side
+        margin = int(max(0.0, min(_MARGIN / self._size, room)))
+        low, shape, before = first - margin, last - first + 2 * margin, (self._hits, self._seen)
+        self._hits, self._seen = (np.zeros(shape, np.int16) for _ in range(2))
+        a, b = np.maximum(low, self._low), np.minimum(low + shape, self._low + before[0].shape)
+        new, old = (tuple(map(slice, a - corner, b - corner)) for corner in (low, self._low))
+        if (a < b).all():
+            self._hits[new], self._seen[new] = before[0][old], before[1][old]
+        self._low = low
+
+    def _take_back(self, node: int) -> None:
+        entry = self._entries.get(node)
+        if entry is not None and entry.T is not None:
+            self._draw(entry.fan, entry.T, -1)
+            entry.T = None
 
     def _near(self, T: Array, T_now: Array) -> bool:
         """Whether a fan that is drawn at T (4, 4) may stay."""

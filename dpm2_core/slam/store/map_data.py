@@ -260,10 +260,13 @@ def subset(data: MapData, nodes: Sequence[int], edges: list[Edge], trail: list[R
     )
 
 
-def map_cloud(clouds: CloudStore, poses: Array, voxel: float) -> Points:
-    """The cloud (M, 4) float32 of a map in its frame, one point in each voxel of `voxel` m."""
+def map_cloud(clouds: CloudStore, poses: Array, voxel: float, nodes: Iterable[int] | None = None) -> Points:
+    """The cloud (M, 4) float32 of a map in its frame, one point in each voxel of `voxel` m.
+
+    `nodes`: those whose clouds are in it; None: all.
+    """
     cloud = NO_POINTS
-    own = [node for node in range(len(poses)) if clouds.loan(node) is None]
+    own = [node for node in (range(len(poses)) if nodes is None else nodes) if clouds.loan(node) is None]
     for start in range(0, len(own), 50):  # in parts: memory is that of the map, not of all the clouds
         part = own[start : start + 50]
         cloud = np.concatenate([cloud, *(se3.transform(poses[node], clouds[node]) for node in part)])

@@ -19,6 +19,7 @@ from dpm2_core.sim.settings import LidarConfig
 from dpm2_core.sim.world import build_world
 from dpm2_core.slam.build import make_mapper
 from dpm2_core.slam.graph.pose_graph import PoseGraph, PoseGraphSettings
+from dpm2_core.slam.mapping.occupancy_map import OCCUPIED, OccupancyMap, OccupancySettings
 from dpm2_core.slam.output import TrajectoryRecorder, save_map
 from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.slam.store.map_data import save_as
@@ -219,6 +220,40 @@ def test_each_robot_has_its_own_odometry_and_is_placed_when_tied() -> None:
     assert [k.id for k in mapper.keyframes if k.robot == "red"] == list(range(8))
     assert (mapper.edges[-1].from_node, mapper.edges[-1].to_node) == (12, 13)
     assert mapper.T_map_odom_of("red") is None
+
+
+def test_a_robot_that_nothing_ties_is_not_drawn_into_the_map_of_another() -> None:
+    """A wall that blue sees 6 m before its start, on red's free road: not in grid and cloud before a loop ties them."""
+    x, y = (v.ravel() for v in np.meshgrid(np.arange(-20, 20, 0.4), np.arange(-20, 20, 0.4)))
+    road = np.column_stack([x, y, np.full(len(x), -1.7), np.zeros(len(x))]).astype(np.float32)
+    y, z = (v.ravel() for v in np.meshgrid(np.arange(-8, 8, 0.1), np.arange(-1.6, 1, 0.2)))
+    wall = np.column_stack([np.full(len(y), 6.0), y, z, np.zeros(len(y))]).astype(np.float32)
+    settings = SlamSettings.model_validate({"loops": {"enabled": False}})
+    mapper, grid = make_mapper(settings), OccupancyMap(OccupancySettings(), 10**7)
+    mapper.add(replace(drifting(circle(1), np.zeros(6), road)[0], robot="red"))
+    mapper.update_grid(grid, np.inf)
+    cells, cloud = grid.grid().cells, mapper.cloud()
+    assert (cells != OCCUPIED).all()
+    for one in drifting(circle(2), np.zeros(6), np.concatenate([road[road[:, 0] < 6], wall])):
+        mapper.add(replace(one, robot="blue"))
+    mapper.update_grid(grid, np.inf)
+    assert mapper.placed.tolist() == [True, False, False]
+    np.testing.assert_array_equal(grid.grid().cells, cells)
+    np.testing.assert_array_equal(mapper.cloud(), cloud)
+
+
+def test_another_drive_is_placed_where_one_says_where_it_begins(tmp_path: Path) -> None:
+    """Not because it comes into a map that is there: `dpm2 run --extend` does not know where it is before a loop."""
+    _, maps, _ = fleet_maps(1)
+    for place, expected in ((None, False), (np.eye(4), True)):
+        save_as(maps["d0"], tmp_path / f"map {expected}")
+        with MapStore.open(tmp_path / f"map {expected}") as store:
+            mapper = make_mapper(SlamSettings.model_validate({"loops": {"enabled": False}}), store)
+            if place is not None:
+                mapper.start_session(place)
+            mapper.add(drifting(circle(1), np.zeros(6), np.zeros((0, 4), np.float32))[0])
+            assert mapper.placed.tolist() == [True] * 60 + [expected]
+            assert (mapper.T_map_odom_of("") is not None) == expected
 
 
 def test_a_map_of_several_drives_is_loaded_with_the_poses_of_its_file(tmp_path: Path) -> None:

@@ -170,3 +170,57 @@ def test_the_newest_come_first_when_time_is_short(monkeypatch: pytest.MonkeyPatc
         pass
     assert [at(live.grid(), x + 3.05, 0.0) for x in (0.0, 50.0, 100.0)] == [OCCUPIED] * 3
     assert at(live.grid(), 25.0, 0.0) == UNKNOWN
+
+
+def known(grid: Grid) -> set[tuple[int, int]]:
+    """The cells of 0.1 m that are not unknown, by x and y; a larger cell is all of those in it."""
+    times = round(grid.resolution / 0.1)
+    places = np.argwhere(np.kron(grid.cells[::-1].T != UNKNOWN, np.ones((times, times), bool)))
+    return set(map(tuple, (places + np.round(np.array(grid.origin) / 0.1).astype(int)).tolist()))
+
+
+@pytest.mark.parametrize("most", [10**7, 300_000])
+def test_a_drive_that_leaves_the_grid_loses_nothing_of_it(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Time for three keyframes at each message. A grid of at most 300,000 cells must have larger ones from 24 m on."""
+    poses = np.repeat(np.eye(4)[None], 12, 0)
+    poses[:, 0, 3] = 10.0 * np.arange(12)
+    live, before, sizes = OccupancyMap(SETTINGS, most), set[tuple[int, int]](), set[float]()
+    for count_of in range(1, 13):
+        clock: Callable[[], float] = count().__next__
+        monkeypatch.setattr("dpm2_core.slam.mapping.occupancy_map.time.monotonic", clock)
+        live.update([room()] * count_of, poses[:count_of], seconds=3.5)
+        grid = live.grid()
+        sizes.add(grid.resolution)
+        now = known(grid)
+        assert before <= now
+        before = now if grid.resolution == 0.1 else set()  # cells of 0.2 m hold fans by their own rounding
+    assert sizes == ({0.1} if most == 10**7 else {0.1, 0.2})
+    while not live.update([room()] * 12, poses, seconds=1.5):
+        pass
+    fresh = OccupancyMap(SETTINGS, most)
+    fresh.update([room()] * 12, poses)
+    assert same(live.grid(), fresh.grid())
+
+
+def test_fans_outside_the_new_place_of_the_grid_leave_no_trace() -> None:
+    """Poses that move far at once, cells of the same size: there and back again."""
+    clouds, poses = [room(), room(thing=True)], np.repeat(np.eye(4)[None], 2, 0)
+    far = poses.copy()
+    far[:, 0, 3] = 90.0
+    live, fresh = OccupancyMap(SETTINGS, 10**7), OccupancyMap(SETTINGS, 10**7)
+    for where in (poses, far, poses):
+        live.update(clouds, where)
+    fresh.update(clouds, poses)
+    assert same(live.grid(), fresh.grid())
+
+
+def test_only_what_is_placed_is_drawn_and_taken_back_when_it_no_longer_is() -> None:
+    clouds, poses = [room(), room(thing=True)], np.repeat(np.eye(4)[None], 2, 0)
+    poses[1, 0, 3] = 50.0
+    live, fresh = OccupancyMap(SETTINGS, 10**7), OccupancyMap(SETTINGS, 10**7)
+    fresh.update(clouds[:1], poses[:1])
+    for placed in (True, False, True, False):
+        live.update(clouds, poses, placed=np.array([True, placed]))
+        assert same(live.grid(), fresh.grid()) != placed
+    live.update(clouds, poses)
+    assert at(live.grid(), 51.55, 0.05) == OCCUPIED
