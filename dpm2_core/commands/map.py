@@ -28,6 +28,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.slam.mapping.tiles import write_tiles
 from dpm2_core.slam.store.map_data import MapData, load_map, map_cloud, save_as, trajectory
 from dpm2_core.slam.store.map_store import MapStore
+from dpm2_core.slam.store.rows import weights_id
 
 app = typer.Typer(help="Map files: info, export, merge, prune, check; pose graphs: optimize.", no_args_is_help=True)
 app.command()(info)
@@ -42,8 +43,12 @@ def export(
         str,
         typer.Option(help="ply, pcd, las, html, occupancy (YAML and PGM for Nav2), tum, kitti, geojson or g2o."),
     ] = "",
-    voxel: Annotated[float | None, typer.Option(min=0.01, help="Spacing of the points of a cloud, m [0.3].")] = None,
-    resolution: Annotated[float | None, typer.Option(min=0.01, help="Cell of the occupancy grid, m [0.1].")] = None,
+    voxel: Annotated[
+        float | None, typer.Option(min=0.01, max=1000, help="Spacing of the points of a cloud, m [0.3].")
+    ] = None,
+    resolution: Annotated[
+        float | None, typer.Option(min=0.01, max=1000, help="Cell of the occupancy grid, m [0.1].")
+    ] = None,
     tiles: Annotated[
         float | None,
         typer.Option(metavar="METERS", help="A folder of map files, one for each square, for `dpm2 run --localise`."),
@@ -64,6 +69,10 @@ def export(
     write, requested = _EXPORTS[kind]
     if ignored := [name for name, value in spacing.items() if value is not None and name != requested]:
         raise UsageError(f"--{ignored[0]}: a map as {kind} has no use for it")
+    if kind == "occupancy" and out.suffix not in (".yaml", ".pgm"):
+        out = out.with_name(f"{out.name}.yaml")
+    if out.exists() and out.samefile(path):
+        raise UsageError(f"{out}: is the map itself")
     with MapStore.open(path) as store:
         write(_loaded(store), out, spacing.get(requested) or _SPACING[requested])
     Console(stderr=True).print(f"{out} written", highlight=False, soft_wrap=True)
@@ -82,6 +91,7 @@ def merge(
     settings: Overrides = None,
 ) -> None:
     """Join maps, by known transforms or by the places that they share."""
+    from dpm2_core.network.pretrained import weights_path
     from dpm2_core.slam.build import make_loops
     from dpm2_core.slam.graph.pose_graph import PoseGraph
     from dpm2_core.slam.mapping.merge import align as aligned
@@ -95,7 +105,13 @@ def merge(
         raise UsageError("merge: --config and --set are for --align; known transforms need no settings")
     chosen = load_settings(Config, config, settings or ()).slam
     with ExitStack() as stack:
-        first, *others = (load_map(stack.enter_context(MapStore.open(path)), descriptors=True) for path in paths)
+        maps = [load_map(stack.enter_context(MapStore.open(path)), descriptors=True) for path in paths]
+        described = {session.weights for data in maps for session in data.sessions if session.weights}
+        if align:
+            described.add(weights_id(weights_path(chosen.neural.weights)))
+        if len(described) > 1:
+            raise UsageError(f"merge: descriptors of several weights: {', '.join(sorted(described))}")
+        first, *others = maps
         for number, other in enumerate(others):
             if align:
                 T, loops = aligned(first, other, loops_by(make_loops(chosen)))

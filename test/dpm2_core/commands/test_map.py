@@ -5,9 +5,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+import sqlite3
 import subprocess
 import sys
 import time
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -81,6 +83,30 @@ def test_clouds_agree_in_every_format(tmp_path: Path, map_file: Path) -> None:
 def test_occupancy(tmp_path: Path, map_file: Path) -> None:
     assert dpm2("map", "export", map_file, tmp_path / "grid.yaml", "--resolution", 0.5).returncode == 0
     assert {p.name for p in tmp_path.glob("grid.*")} == {"grid.yaml", "grid.pgm"}
+
+
+def test_an_export_replaces_neither_the_map_nor_another_grid(tmp_path: Path, map_file: Path) -> None:
+    before = map_file.read_bytes()
+    done = dpm2("map", "export", map_file, map_file, "--format", "ply")
+    assert (done.returncode, "is the map itself" in done.stderr) == (2, True)
+    assert map_file.read_bytes() == before
+    assert dpm2("map", "export", map_file, tmp_path / "site-1.5", "--format", "occupancy").returncode == 0
+    assert {path.name for path in tmp_path.glob("site*")} == {"site-1.5.yaml", "site-1.5.pgm"}
+    done = dpm2("map", "export", map_file, tmp_path / "a.ply", "--voxel", "inf")
+    assert (done.returncode, (tmp_path / "a.ply").exists()) == (2, False)
+
+
+def test_maps_of_different_weights_are_not_merged(tmp_path: Path, map_file: Path) -> None:
+    """No robot could find itself in the result."""
+    other = tmp_path / "other.dpm2map"
+    other.write_bytes(map_file.read_bytes())
+    with closing(sqlite3.connect(other)) as connection:
+        connection.execute("UPDATE sessions SET weights = 'mine fedcba9876543210'")
+        connection.commit()
+    done = dpm2("map", "merge", map_file, other, "--out", tmp_path / "both.dpm2map", "--transform", "9 0 0 0")
+    assert done.returncode == 2
+    assert "mine fedcba9876543210, small 0123456789" in done.stderr
+    assert not (tmp_path / "both.dpm2map").exists()
 
 
 def test_what_cannot_be_exported(tmp_path: Path, map_file: Path) -> None:
