@@ -122,26 +122,32 @@ def read_run(path: Path) -> RunFolder:
     trajectory = read_trajectory(path / TRAJECTORY)
     if trajectory.kind != "tum":
         raise UsageError(f"{path / TRAJECTORY}: want 8 numbers a line, the stamp first")
-    frames, loops = _rows(path / FRAMES), _rows(path / LOOPS)
-    stages = [name for name in (frames[0] if frames else {}) if name.endswith("_ms")]
     try:
+        frames, loops = _rows(path / FRAMES), _rows(path / LOOPS)
+        stages = [name for name in (frames[0] if frames else {}) if name.endswith("_ms")]
         return RunFolder(
             path,
             trajectory,
             read_trajectory(path / TRUTH) if (path / TRUTH).is_file() else None,
             [row["state"] for row in frames],
-            {name.removesuffix("_ms"): np.array([float(row[name]) for row in frames]) for name in stages},
+            {name.removesuffix("_ms"): np.array([_number(row[name]) for row in frames]) for name in stages},
             [_loop(row) for row in loops],
             _json(path / METRICS),
             _json(path / TIMING),
         )
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, csv.Error) as error:
         raise UsageError(f"{path}: {FRAMES} or {LOOPS} is damaged: {error}") from None
 
 
 def _loop(row: dict[str, str]) -> LoopRow:
-    x, y, z, *end = (float(row[name]) for name in _LOOP_COLUMNS[:6])
+    x, y, z, *end = (_number(row[name]) for name in _LOOP_COLUMNS[:6])
     return LoopRow((x, y, z), (end[0], end[1], end[2]), row["accepted"] == "1", row["reason"])
+
+
+def _number(text: str) -> float:
+    if not np.isfinite(value := float(text)):
+        raise ValueError(f"{text} is no number")
+    return value
 
 
 def _rows(path: Path) -> list[dict[str, str]]:
@@ -155,7 +161,7 @@ def _json(path: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(path.read_text(encoding="utf-8"), parse_constant=_number)  # NaN is no JSON
     except (OSError, ValueError) as error:
         raise UsageError(f"{path}: not JSON: {error}") from None
     if not isinstance(content, dict):

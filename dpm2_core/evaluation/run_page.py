@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
@@ -38,7 +39,8 @@ class HtmlTable:
 
 
 def find_runs(folders: Sequence[Path]) -> list[tuple[str, Path]]:
-    """Every run in or below the folders, with a name: its folder's, and those above it as far as they are below.
+    """Every run in or below the folders, once, with a name of its own: its folder's, and those above it as far as they
+    are below, or as far as it takes to tell two runs apart.
 
     Raises:
         UsageError: no such folder, or no run in it.
@@ -51,7 +53,11 @@ def find_runs(folders: Sequence[Path]) -> list[tuple[str, Path]]:
         if not below:
             raise UsageError(f"{folder}: no run in or below it; want {TRAJECTORY}, which `dpm2 run` writes")
         found += [(str(path.relative_to(folder)) if path != folder else folder.resolve().name, path) for path in below]
-    return found
+    runs = {path.resolve(): Path(name).parts for name, path in reversed(found)}
+    while len(set(runs.values())) < len(runs):
+        often = Counter(runs.values())
+        runs = {path: parts if often[parts] == 1 else path.parts[-len(parts) - 1 :] for path, parts in runs.items()}
+    return [("/".join(parts), path) for path, parts in reversed(runs.items())]
 
 
 def runs_page(title: str, runs: Sequence[tuple[str, Path]], tables: Sequence[HtmlTable] = ()) -> str:

@@ -60,7 +60,10 @@ def test_a_trajectory_alone_is_enough(tmp_path: Path) -> None:
     [
         (LOOPS, "from_x,to_x\n1,2\n", "is damaged"),
         (FRAMES, "frame,stamp_ns,state,map_ms\n0,1,tracking,slow\n", "is damaged"),
+        (FRAMES, "frame,stamp_ns,state,map_ms\n0,1,tracking,nan\n", "is damaged"),
+        (FRAMES, f"frame,stamp_ns,state,map_ms\n0,1,{'x' * 200_000},1\n", "is damaged"),
         ("metrics.json", "{", "not JSON"),
+        ("metrics.json", '{"ape_rmse_m": NaN}', "not JSON"),
         ("timing.json", "[1]", "want a mapping"),
         (TRUTH, "1 2 3\n", "3 numbers"),
     ],

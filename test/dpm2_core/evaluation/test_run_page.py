@@ -83,6 +83,16 @@ def test_a_whole_kitti_sequence_of_four_methods_is_below_five_megabytes(tmp_path
     assert len(runs_page("08", runs)) < 5_000_000
 
 
+def test_runs_of_one_name_are_told_apart(tmp_path: Path) -> None:
+    """A baseline and a change over the same sequences; a run that is given twice is one."""
+    runs = [write_run(tmp_path / which / name, 5) for which in ("base", "new") for name in ("04", "05")]
+    for given in ([tmp_path / "base", tmp_path / "new"], [*runs, tmp_path / "new"]):
+        found = find_runs(given)
+        assert [name for name, _ in found] == ["base/04", "base/05", "new/04", "new/05"]
+        assert [path for _, path in found] == runs
+    assert [name for name, _ in find_runs([tmp_path / "base"])] == ["04", "05"]
+
+
 def test_no_folder_and_no_run_are_named(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no such folder"):
         find_runs([tmp_path / "none"])
