@@ -193,6 +193,9 @@ class Mapper:
         try:
             self._close_loops(keyframe.fix is not None and self._graph.add_fix(node, keyframe.fix))
             self._lend(node, odometry, self.loops[before:])
+            if not follows:  # from where it was before the way is not known: those clouds are no witnesses of this one
+                self._mark_moving(robot.window.finish(self.poses))
+                robot.window = MovingWindow(self._settings.moving)
             self._mark_moving(robot.window.add(node, cloud, self.poses))
         finally:
             self._store(node, thumbnail, [*odometry, *self.loops[before:]])
