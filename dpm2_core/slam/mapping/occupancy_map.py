@@ -106,7 +106,7 @@ class OccupancyMap:
         self._settings, self._most = settings, most
         self._entries: dict[int, _Entry] = {}  # by node
         self._low, self._size = np.zeros(2, np.int64), 0.0
-        self._hits = self._seen = np.zeros((0, 0), np.int16)
+        self._hits = self._seen = np.zeros((0, 0), np.int32)
         self._before: Grid | None = None  # shown until everything is drawn in cells of another size
 
     def update(
@@ -175,7 +175,7 @@ class OccupancyMap:
             self._before = self.grid()
         for entry in self._entries.values():
             entry.T = None
-        self._size, self._hits, self._seen = size, *(np.zeros((0, 0), np.int16) for _ in range(2))
+        self._size, self._hits, self._seen = size, *(np.zeros((0, 0), np.int32) for _ in range(2))
         self._move(first, last)
 
     def _corners(self, poses: Array, size: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -190,7 +190,7 @@ class OccupancyMap:
         room = (((width - height) ** 2 + 4 * self._most) ** 0.5 - width - height) / 4  # on each side
         margin = int(max(0.0, min(_MARGIN / self._size, room)))
         low, shape, before = first - margin, last - first + 2 * margin, (self._hits, self._seen)
-        self._hits, self._seen = (np.zeros(shape, np.int16) for _ in range(2))
+        self._hits, self._seen = (np.zeros(shape, np.int32) for _ in range(2))
         a, b = np.maximum(low, self._low), np.minimum(low + shape, self._low + before[0].shape)
         new, old = (tuple(map(slice, a - corner, b - corner)) for corner in (low, self._low))
         if (a < b).all():
@@ -215,10 +215,10 @@ class OccupancyMap:
         _draw_fan(self._hits, self._seen, x - low[0], y - low[1], turn, self._size, fan.free, fan.stands, sign)
 
 
-@compiled("void(i2[:,::1], i2[:,::1], f8, f8, f8, f8, f4[::1], f4[:,::1], i8)")
+@compiled("void(i4[:,::1], i4[:,::1], f8, f8, f8, f8, f4[::1], f4[:,::1], i8)")
 def _draw_fan(  # noqa: PLR0913
-    hits: NDArray[np.int16],
-    seen: NDArray[np.int16],
+    hits: NDArray[np.int32],
+    seen: NDArray[np.int32],
     x: float,
     y: float,
     turn: float,

@@ -224,3 +224,19 @@ def test_only_what_is_placed_is_drawn_and_taken_back_when_it_no_longer_is() -> N
         assert same(live.grid(), fresh.grid()) != placed
     live.update(clouds, poses)
     assert at(live.grid(), 51.55, 0.05) == OCCUPIED
+
+
+def test_a_robot_that_stays_for_days_keeps_its_walls() -> None:
+    """Counts of 16 bits had no walls after 16,384 keyframes at one place, and nothing after twice as many."""
+    settings, count = OccupancySettings(reach=2.0, resolution=0.5), 16_500
+    around = np.linspace(0, 2 * np.pi, 60, endpoint=False)
+    wall = np.stack([1.5 * np.cos(around), 1.5 * np.sin(around), 0 * around, 0 * around], 1)
+    floor = wall * [0.8, 0.8, 1, 1] - [0, 0, 0.6, 0]
+    cloud = np.concatenate([wall, wall + [0, 0, 0.5, 0], floor]).astype(np.float32)
+    grids = []
+    for keyframes in (2, count):
+        grid = OccupancyMap(settings, 10_000)
+        assert grid.update([cloud] * keyframes, np.tile(np.eye(4), (keyframes, 1, 1)))
+        grids.append(grid.grid().cells)
+    assert (grids[0] == OCCUPIED).any()
+    np.testing.assert_array_equal(*grids)
