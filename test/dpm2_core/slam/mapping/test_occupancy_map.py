@@ -232,7 +232,7 @@ def test_a_robot_that_stays_for_days_keeps_its_walls() -> None:
     around = np.linspace(0, 2 * np.pi, 60, endpoint=False)
     wall = np.stack([1.5 * np.cos(around), 1.5 * np.sin(around), 0 * around, 0 * around], 1)
     floor = wall * [0.8, 0.8, 1, 1] - [0, 0, 0.6, 0]
-    cloud = np.concatenate([wall, wall + [0, 0, 0.5, 0], floor]).astype(np.float32)
+    cloud = np.concatenate([wall, wall + np.array([0, 0, 0.5, 0]), floor]).astype(np.float32)
     grids = []
     for keyframes in (2, count):
         grid = OccupancyMap(settings, 10_000)
