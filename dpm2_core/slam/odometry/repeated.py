@@ -23,8 +23,8 @@ class RepeatedCloud:
 
     def repeats(self, points: Points, meters: float) -> bool:
         """Whether a cloud (N, 4) is the registered one to the last bit although the sensor should have moved so far."""
-        part = np.ascontiguousarray(points[:: max(1, len(points) // _LOOKED_AT)])
-        self._now = crc32(part) if len(part) else None
+        part = points[:: max(1, len(points) // _LOOKED_AT)]
+        self._now = crc32(part.tobytes()) if len(part) else None
         return self._now is not None and self._now == self._registered and meters > _STOPS
 
     def keep(self) -> None:
