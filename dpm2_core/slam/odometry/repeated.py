@@ -5,8 +5,6 @@ from __future__ import annotations
 
 from zlib import crc32
 
-import numpy as np
-
 from dpm2_core.frame import Points
 
 PROBLEM = "the same cloud as before: the LiDAR or its driver repeats itself"
