@@ -27,7 +27,8 @@ class Returns:
     """What each of R pulses brings back.
 
     Attributes:
-        distance: (R,) float32 m. intensity: (R,) float32 0..1. back: (R,) bool, whether it came back at all.
+        distance: (R,) float32 m of what it met, whether that came back or not; the LiDAR's range where it met nothing.
+        intensity: (R,) float32 0..1. back: (R,) bool, whether it came back at all.
         retro: (R,) bool, it met a retro-reflector.
     """
 
@@ -137,7 +138,7 @@ class SensorErrors:
         seen[self.ring[shown], self.column[shown]] = distance[shown]
         halo = cv2.erode(seen, np.ones((2 * _HALO + 1, 2 * _HALO + 1), np.uint8), borderValue=float("inf"))
         at = halo[self.ring, self.column]
-        lit = np.isfinite(at) & ~retro & (chance < self.settings.glare) & (~back | (distance > at))
+        lit = np.isfinite(at) & ~retro & (chance < self.settings.glare) & (distance > at)
         distance[lit], intensity[lit], back[lit] = at[lit], np.float32(0.3), True
         return lit
 
@@ -145,7 +146,6 @@ class SensorErrors:
         """Rain, snow or dust: pulses that return from a drop before they reach anything."""
         density = np.float32(self.settings.drops)
         at = -np.log(np.maximum(chance, np.float32(1e-7))) / density  # m, from an even density along the beam
-        reach = np.where(back, distance, np.float32(_NEAR))
-        hit = (at < np.minimum(reach, _NEAR)) & (at > self.config.min_range)
+        hit = (at < np.minimum(distance, _NEAR)) & (at > self.config.min_range)
         distance[hit], intensity[hit], back[hit] = at[hit], np.float32(0.02), True
         return hit

@@ -179,7 +179,7 @@ class Lidar:
         cosine /= np.sqrt(np.einsum("ij,ij->i", hits.normal, hits.normal)) + np.float32(1e-12)
         paint = mesh.color[face].sum(1, dtype=np.float32) / np.float32(3 * 150)
         reflectance = REFLECTANCE[material] * (np.float32(0.55) + np.float32(0.45) * np.minimum(paint, np.float32(1.6)))
-        distance = np.where(hits.face >= 0, hits.distance, 0).astype(np.float32)
+        distance = np.where(hits.face >= 0, hits.distance, config.range).astype(np.float32)
         # What is left of the pulse against what the receiver needs.
         strength = reflectance * (cosine + np.float32(0.02)) * (np.float32(30) / np.maximum(distance, 5)) ** 2
         strength *= self.errors.clear[which]

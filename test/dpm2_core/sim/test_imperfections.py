@@ -12,7 +12,7 @@ from dpm2_core.sim.lidar import Lidar, Scan
 from dpm2_core.sim.materials import Label
 from dpm2_core.sim.sensors import drawn_sensor, real_sensor
 from dpm2_core.sim.settings import HDL64E, Imperfections, LidarConfig
-from dpm2_core.sim.world import World
+from dpm2_core.sim.world import World, build_world
 
 EXACT = LidarConfig(noise=0.0, dropout=0.0, columns=720)
 TWIST = np.array([0, 0, 0.2, 10.0, 0, 0])
@@ -89,6 +89,19 @@ def test_drops_return_from_the_air_alike_in_scan_and_twin(highway: World) -> Non
     assert not scan.moving[stray].any()
     twin = {row.tobytes() for row in scan.static}
     assert np.mean([row.tobytes() in twin for row in scan.points[stray]]) > 0.95
+
+
+def test_no_drop_is_behind_what_the_pulse_met() -> None:
+    """Whether that returns or not: windows and dark paint swallow many pulses."""
+    world = build_world("loop", "indoor", seed=3, length=60)
+    T = world.pose_at(20.0, height=1.0)
+    scan = _with(drops=0.05).scan(world, T, 0.0, np.random.default_rng(0))
+    drops = scan.points[scan.label == Label.OUTLIER, :3]
+    distance = np.linalg.norm(drops, axis=1)
+    assert len(drops) > 100
+    toward = ((drops / distance[:, None]) @ T[:3, :3].T).astype(np.float32)
+    met = world.scene.cast(np.tile(T[:3, 3].astype(np.float32), (len(drops), 1)), toward, 80.0).distance
+    assert (distance - met).max() < 0.05  # surfaces are rough by 0.02 m
 
 
 def test_dirt_hides_always_the_same_directions(highway: World) -> None:
