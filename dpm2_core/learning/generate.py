@@ -15,7 +15,7 @@ from dpm2_core.config import Settings
 from dpm2_core.data.packed import PackedWriter, Sample, write_packed
 from dpm2_core.data.source import Source
 from dpm2_core.descriptors import levelling
-from dpm2_core.errors import UsageError
+from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Array, Frame, Image, Points
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.deskew import deskew
@@ -27,7 +27,7 @@ from dpm2_core.sim.camera import calibration, render
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.sensors import drawn_sensor
 from dpm2_core.sim.settings import PRESETS, CameraConfig, LidarConfig, PresetName
-from dpm2_core.sim.world import build_world
+from dpm2_core.sim.world import World, build_world
 
 
 class GenerateSettings(Settings):
@@ -74,11 +74,7 @@ def generate_world(folder: Path, seed: int, settings: GenerateSettings) -> None:
     kind = kinds[noise.choice(len(kinds), p=weights / weights.sum())]
     network = preset(settings.preset)
     world = build_world("random", kind, seed, settings.length, settings.traffic)
-    columns, height = int(noise.choice([1448, 1810, 2170])), settings.height + noise.uniform(-0.2, 0.3)
-    config = LidarConfig(beams=settings.beams, columns=columns, height=height)
-    if PRESETS[kind].indoor == "rooms":  # on a small robot or in the hand
-        config = config.model_copy(update={"height": noise.uniform(0.3, 1.6), "car_body": False, "min_range": 0.4})
-    lidar = Lidar(drawn_sensor(config, settings.real, settings.others, np.random.default_rng([seed, 79])))
+    lidar = _lidar(world, settings, noise)
     height, sway = lidar.config.height, lidar.config.real.sway
     camera = training_camera(network)
     weather = np.random.default_rng([seed, 81])
@@ -100,6 +96,18 @@ def generate_world(folder: Path, seed: int, settings: GenerateSettings) -> None:
     write_packed(folder, samples, {"source": "synthetic city", "preset": kind, "seed": seed, "sensor": sensor})
 
 
+def _lidar(world: World, settings: GenerateSettings, noise: np.random.Generator) -> Lidar:
+    """A world's own; indoors it fits below what the way leads under."""
+    columns, height = int(noise.choice([1448, 1810, 2170])), settings.height + noise.uniform(-0.2, 0.3)
+    config = LidarConfig(beams=settings.beams, columns=columns, height=height)
+    if PRESETS[world.preset].indoor == "rooms":  # on a small robot or in the hand
+        config = config.model_copy(update={"height": noise.uniform(0.3, 1.6), "car_body": False, "min_range": 0.4})
+    config = drawn_sensor(config, settings.real, settings.others, np.random.default_rng([world.seed, 79]))
+    if world.road.plan is not None:
+        config = config.model_copy(update={"height": min(config.height, world.road.plan.headroom - 0.1)})
+    return Lidar(config)
+
+
 def training_camera(network: NetworkSettings) -> CameraConfig:
     """KITTI's field of view at twice the network's image size: averaged down, it is free of aliasing."""
     height, width = network.image.size
@@ -109,7 +117,11 @@ def training_camera(network: NetworkSettings) -> CameraConfig:
 def generate(
     out: Path, settings: GenerateSettings, workers: int, progress: Callable[[int, int], None] = lambda done, total: None
 ) -> None:
-    """All worlds, several at a time; those that are there already stay, so a killed run continues."""
+    """All worlds, several at a time; those that are there already stay, so a killed run continues.
+
+    Raises:
+        Dpm2Error: a world could not be written. No other is begun then, nor after Ctrl-C.
+    """
     seeds = range(settings.first_seed, settings.first_seed + settings.worlds)
     folders = {seed: out / f"world_{seed:06d}" for seed in seeds}
     missing = [seed for seed in seeds if not folders[seed].exists()]
@@ -117,10 +129,16 @@ def generate(
     progress(done, settings.worlds)
     with ProcessPoolExecutor(workers) as pool:
         running = [pool.submit(generate_world, folders[seed], seed, settings) for seed in missing]
-        for future in as_completed(running):
-            future.result()
-            done += 1
-            progress(done, settings.worlds)
+        try:
+            for future in as_completed(running):
+                future.result()
+                done += 1
+                progress(done, settings.worlds)
+        except BaseException as error:
+            pool.shutdown(wait=False, cancel_futures=True)
+            if isinstance(error, OSError):
+                raise Dpm2Error(f"{out}: not written: {error.strerror or error}") from error
+            raise
 
 
 def pack(

@@ -9,7 +9,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +62,9 @@ def simulate(
         return False
     length = fitting_length(drive) if drive.road in ROAD_KINDS else 400.0
     world = build_world(drive.road, drive.preset, drive.seed, length, drive.traffic)
+    plan, height = world.road.plan, drive.lidar.height
+    if plan is not None and height >= plan.headroom:
+        raise UsageError(f"--height {height:g}: the way leads under what is {plan.headroom:.2f} m high")
     with _whole(out) as part:
         _Drive(world, drive).write(part, recipe, workers, progress)
     return True
@@ -134,6 +137,7 @@ def _is_there(out: Path, recipe: dict[str, Any]) -> bool:
 @contextmanager
 def _whole(out: Path) -> Iterator[Path]:
     """A folder that is named `out` when the block ends well, and is gone when it does not."""
+    out = out.resolve()
     part = out.with_name(f".{out.name}.{os.getpid()}.part")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -142,9 +146,11 @@ def _whole(out: Path) -> Iterator[Path]:
                 shutil.rmtree(left, ignore_errors=True)
         part.mkdir()
         yield part
-        with suppress(OSError):
-            out.rmdir()  # an empty folder may be there
-        part.rename(out)
+        if out.is_dir():  # empty, and it stays: a shell may be in it
+            for entry in sorted(part.iterdir()):  # `sequences`, by which a drive is known, is the last
+                entry.rename(out / entry.name)
+        else:
+            part.rename(out)
     except OSError as error:
         raise Dpm2Error(f"{out}: not written: {error.strerror or error}") from error
     finally:
@@ -248,7 +254,8 @@ class _Drive:
     def _poses(self, times: Array) -> Array:
         """T_world_lidar (K, 4, 4) at times (K,) s."""
         height, sway = self.lidar.config.height, self.lidar.config.real.sway
-        return np.stack([self.world.drive_pose(float(t), height, sway) for t in times]) @ self.lidar.T_level_lidar
+        poses = [self.world.drive_pose(float(t), height, sway) for t in times]
+        return np.reshape(poses, (-1, 4, 4)) @ self.lidar.T_level_lidar
 
     def _write_ground(self, path: Path) -> None:
         """Height of the ground, kerbs included, NaN where unknown; T_grid_cam0 is the first pose in its frame."""

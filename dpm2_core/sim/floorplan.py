@@ -18,6 +18,8 @@ _NARROW = 2.4
 AISLE = 6.2
 """Width of the lanes of a car park, m; the rows of cars between them are `ROW` deep."""
 ROW = 10.0
+PIPE = 0.57
+"""The lowest pipe of a deck hangs so far below its ceiling, m."""
 _TRIES = 50  # plans of a building, of which one is more than a single hall
 
 
@@ -71,6 +73,12 @@ class FloorPlan:
     rooms: list[Room]
     doors: list[Door]
     way: Array
+
+    @property
+    def headroom(self) -> float:
+        """Height of the lowest that the way leads under, m: doors, or the pipe below the ceiling of a deck."""
+        decks = [room.height - PIPE for room in self.rooms if room.kind == "deck"]
+        return min([door.top for door in self.doors] + decks)
 
 
 def office(length: float, rng: np.random.Generator) -> FloorPlan:

@@ -15,12 +15,12 @@ from typer.testing import CliRunner
 
 from dpm2_core.cli import app
 from dpm2_core.data.packed import PackedDrive, Sample, open_packed, write_packed
-from dpm2_core.errors import UsageError
+from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.scale import ROOM_SCALE
 from dpm2_core.learning.dataset import DataSettings, GroupDataset, Mixture
-from dpm2_core.learning.generate import pack
+from dpm2_core.learning.generate import GenerateSettings, generate, pack
 
 from ...helpers import rooms
 from ...helpers.networks import tiny
@@ -242,3 +242,10 @@ def test_frames_that_differ_leave_nothing_behind(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="some frames have an image and some have none"):
         write_packed(tmp_path / "d", [frame, frame._replace(images=())], {})
     assert not list(tmp_path.iterdir())
+
+
+def test_a_world_that_cannot_be_written_ends_the_others(tmp_path: Path) -> None:
+    (tmp_path / "world_001000.part").write_text("a file in the way of the first world")
+    with pytest.raises(Dpm2Error, match="not written: File exists"):
+        generate(tmp_path, GenerateSettings(worlds=20, frames=2, length=60, beams=16, mixture={"tunnel": 1}), 1)
+    assert len(list(tmp_path.glob("world_*"))) < 10  # of 20: those that were begun

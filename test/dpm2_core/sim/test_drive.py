@@ -19,7 +19,7 @@ from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.geometry import se3
 from dpm2_core.sim.drive import simulate
 from dpm2_core.sim.materials import Label
-from dpm2_core.sim.settings import CameraConfig, DriveConfig, LidarConfig
+from dpm2_core.sim.settings import CameraConfig, DriveConfig, GnssConfig, LidarConfig
 
 LIDAR = LidarConfig(beams=16, columns=360)
 CAMERA = CameraConfig(width=160, height=48, focal=95)
@@ -96,6 +96,15 @@ def test_without_images_there_are_none(tmp_path: Path) -> None:
     simulate(tmp_path / "out", DriveConfig(frames=1, images=False, lidar=LIDAR))
     assert not (tmp_path / "out" / "sequences" / "00" / "image_2").exists()
     assert len(KittiSource(tmp_path / "out")) == 1
+
+
+def test_a_drive_too_short_for_a_fix_into_the_folder_one_is_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    simulate(Path("."), DriveConfig(frames=1, images=False, lidar=LIDAR, gnss=GnssConfig()))
+    assert len(KittiSource(Path("."))) == 1
+    assert (tmp_path / "here" / "sequences" / "00" / "gnss.txt").read_text() == ""
+    assert [p.name for p in tmp_path.iterdir()] == ["here"]
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,10 +12,11 @@ from scipy.spatial import cKDTree
 
 from dpm2_core.errors import UsageError
 from dpm2_core.geometry import se3
+from dpm2_core.sim.drive import simulate
 from dpm2_core.sim.floorplan import FloorPlan, car_park, office
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.materials import Label
-from dpm2_core.sim.settings import PresetName
+from dpm2_core.sim.settings import DriveConfig, LidarConfig, PresetName
 from dpm2_core.sim.world import World, build_world
 
 SMALL = Lidar().config.model_copy(
@@ -117,3 +119,19 @@ def test_what_there_is_not_indoors_is_rejected() -> None:
         build_world("straight", "indoor", 0, 60)
     with pytest.raises(UsageError, match="--traffic 20: there is none indoors"):
         build_world("loop", "car_park", 0, 60, traffic=20)
+
+
+def test_the_way_is_free_below_the_headroom(inside: World) -> None:
+    """And a LiDAR that does not fit is an error: above a ceiling it sees nothing."""
+    headroom = _plan(inside).headroom
+    up = np.array([[0, 0, 1]], np.float32)
+    for s in np.arange(0, inside.road.drive.length, 0.1):
+        eye = inside.pose_at(s, height=1.0)[:3, 3].astype(np.float32)
+        assert eye[2] + inside.scene.cast(eye[None], up, 50.0).distance[0] > headroom - 0.01
+
+
+def test_a_lidar_that_does_not_fit_is_rejected(tmp_path: Path) -> None:
+    tall = LidarConfig(beams=16, columns=360, height=3.0)
+    with pytest.raises(UsageError, match=r"--height 3: the way leads under"):
+        simulate(tmp_path / "d", DriveConfig(preset="indoor", frames=1, images=False, lidar=tall))
+    assert not list(tmp_path.iterdir())
