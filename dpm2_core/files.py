@@ -9,6 +9,7 @@ import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from math import isfinite
 from pathlib import Path
 from typing import IO, Any, Literal
 
@@ -53,7 +54,20 @@ def write_json(path: Path | str, content: object) -> None:
         Dpm2Error: as `atomic_write`.
     """
     with atomic_write(path) as file:
-        file.write(json.dumps(content, indent=2) + "\n")
+        file.write(json_text(content))
+
+
+def json_text(content: object, indent: int = 2) -> str:
+    """The same as text; a number that is not finite is null, which JSON has a word for."""
+    return json.dumps(_known(content), indent=indent, allow_nan=False) + "\n"
+
+
+def _known(content: object) -> object:
+    if isinstance(content, dict):
+        return {key: _known(value) for key, value in content.items()}
+    if isinstance(content, (list, tuple)):
+        return [_known(value) for value in content]
+    return None if isinstance(content, float) and not isfinite(content) else content
 
 
 def make_folder(path: Path) -> None:

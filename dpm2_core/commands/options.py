@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -16,7 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from dpm2_core.console import Console
 from dpm2_core.data.source import parse_range as parse_range
 from dpm2_core.errors import UsageError, exit_code
-from dpm2_core.files import atomic_write
+from dpm2_core.files import atomic_write, json_text
 
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="YAML file; `dpm2 config dump` shows every key.")]
 Overrides = Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, such as slam.map.voxel=0.3.")]
@@ -35,7 +34,7 @@ def show(table: RenderableType, figures: Mapping[str, Any], json_file: Path | No
     Raises:
         Dpm2Error: the file cannot be written.
     """
-    text = "" if json_file is None else json.dumps(figures, indent=2) + "\n"
+    text = "" if json_file is None else json_text(figures)
     if str(json_file) == "-":
         sys.stdout.write(text)
         return

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import shlex
@@ -13,7 +12,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from dpm2_core.files import atomic_write
+from dpm2_core.files import atomic_write, json_text
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 _PACKAGES = ("numpy", "scipy", "numba", "small_gicp", "gtsam", "torch", "kiss-icp")
@@ -34,7 +33,7 @@ def write_record(path: Path, name: str, results: dict[str, Any], program: str = 
         **results,
     }
     with atomic_write(path) as file:
-        file.write(json.dumps(record, indent=1) + "\n")
+        file.write(json_text(record, indent=1))
 
 
 def git_commit() -> str | None:

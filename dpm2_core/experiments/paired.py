@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import isfinite
 from statistics import mean, stdev
 
 from scipy.stats import t as student
@@ -35,13 +36,14 @@ def paired_gain(without: Sequence[float], with_: Sequence[float], lower_is_bette
     """The gain of the second arm over the mean of the first; None where that is zero or there are no seeds.
 
     Args:
-        without, with_: a figure of each seed, in the same order.
+        without, with_: a figure of each seed, in the same order; a seed in which either is not finite is left out.
     """
-    size = abs(mean(without)) if without else 0.0
+    pairs = [pair for pair in zip(without, with_, strict=True) if all(map(isfinite, pair))]
+    size = abs(mean(a for a, _ in pairs)) if pairs else 0.0
     if not size:
         return None
     sign = -1 if lower_is_better else 1
-    gains = [sign * (b - a) / size for a, b in zip(without, with_, strict=True)]
+    gains = [sign * (b - a) / size for a, b in pairs]
     center, n = mean(gains), len(gains)
     half = float(student.ppf(0.975, n - 1)) * stdev(gains) / n**0.5 if n > 1 else None
     low, high = (None, None) if half is None else (center - half, center + half)

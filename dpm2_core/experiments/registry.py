@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from importlib import import_module
 from pathlib import Path
@@ -15,7 +17,7 @@ from dpm2_core.evaluation.run_page import HtmlTable, runs_page
 from dpm2_core.experiments.request import Experiment, Outcome, Request
 from dpm2_core.experiments.table import html_table
 from dpm2_core.files import atomic_write
-from dpm2_core.fleet.part import Figures, Progress, run_parts
+from dpm2_core.fleet.part import Figures, Part, Progress, run_parts
 
 _ALWAYS = frozenset({"data", "out", "sequences", "workers", "overrides"})
 
@@ -104,7 +106,9 @@ def carry_out(name: str, request: Request, progress: Progress | None = None) -> 
     experiment = load(name)
     _check_options(name, request, experiment)
     figures: dict[str, Figures] = {}
-    for stage in experiment.parts(request):
+    stages = experiment.parts(request)
+    _check_names(name, [part for stage in stages for part in stage])
+    for stage in stages:
         figures |= run_parts(stage, request.out, request.workers, progress)
     outcome = experiment.outcome(request, figures)
     commits = sorted({str(part["part"]["commit"]) for part in figures.values()})
@@ -125,6 +129,16 @@ def _check_options(name: str, request: Request, experiment: Experiment) -> None:
     ]
     if useless:
         raise UsageError(f"{name}: has no use for --{useless[0]}")
+
+
+def _check_names(name: str, parts: Sequence[Part]) -> None:
+    """Of two parts in one folder the second would overwrite the first, and both rows show its figures."""
+    folders = Counter(part.name for part in parts)
+    twice = [folder for folder, count in folders.items() if count > 1]
+    if twice:
+        raise UsageError(
+            f"{name}: two results of one name ({twice[0]}); name --sequences, --registration and --peer differently"
+        )
 
 
 def _record(request: Request, outcome: Outcome, figures: dict[str, Figures]) -> dict[str, Any]:

@@ -106,12 +106,17 @@ def slam_on(folder: Path, advance: Advance, task: str, weights: str, drive: tupl
         rows[run.sequence] = figures_of(run)
         stamps = [(i + 1) * _PERIOD for i in range(len(run.truth))]
         for kind, poses in run.poses.items():
-            place = folder / run.sequence.replace("/", "_") / kind
+            place = folder / folder_name(run.sequence) / kind
             place.mkdir(parents=True, exist_ok=True)
             write_tum(place / TRAJECTORY, stamps, poses)
             write_truth(place / TRUTH, stamps, run.truth)
         advance(len(rows), len(rows))
     return {"sequences": rows, **mean_figures(list(rows.values()))}
+
+
+def folder_name(sequence: str) -> str:
+    """Of the trajectories of a sequence."""
+    return sequence.replace("/", "_")
 
 
 def _logged(folder: Path, settings: SlamTaskTraining) -> Figures:
@@ -120,10 +125,11 @@ def _logged(folder: Path, settings: SlamTaskTraining) -> Figures:
     # A training that was stopped may have logged steps twice, and goes on after the last checkpoint.
     rows = list({row["step"]: row for row in map(json.loads, lines) if "norm" in row}.values())
     epoch = max(1, len(rows) // settings.epochs)
-    first = [row for row in rows if row.get("slam_loss") is not None][:epoch]
+    first = [row for row in rows if row.get("slam_loss") is not None and row["task_loss"]][:epoch]
     share = [settings.slam.gamma * row["slam_loss"] / row["task_loss"] for row in first]
+    last = [row["task_loss"] for row in rows[-epoch:] if row["task_loss"] is not None]  # None: it was not finite
     return {
-        "last_task_loss": median(row["task_loss"] for row in rows[-epoch:]),
+        "last_task_loss": median(last) if last else None,
         "slam_share_at_first": median(share) if share else None,
         "skipped_steps": sum(row["norm"] is None for row in rows),
     }

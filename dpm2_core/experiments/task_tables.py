@@ -7,18 +7,31 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from math import isfinite
 from pathlib import Path
+from statistics import mean
 from typing import Any
 
+from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.figures import trajectories_png
 from dpm2_core.experiments.kitti import aligned_ways
 from dpm2_core.experiments.paired import paired_gain
 from dpm2_core.experiments.request import Experiment, Outcome, Request
 from dpm2_core.experiments.sequences import learned_note
 from dpm2_core.experiments.table import Cells, ResultTable
-from dpm2_core.experiments.task_part import MEASURE, SLAM, TRAIN, Arm, Training, first_slam_epoch, settings_of
+from dpm2_core.experiments.task_part import (
+    MEASURE,
+    SLAM,
+    TRAIN,
+    Arm,
+    Training,
+    first_slam_epoch,
+    folder_name,
+    settings_of,
+)
 from dpm2_core.extras import MissingPackageError
 from dpm2_core.fleet.part import Figures, Part
+from dpm2_core.tasks.open import sequence_names
 from dpm2_core.tasks.training import WEIGHTS
 
 SEEDS = 3
@@ -54,7 +67,12 @@ class TaskTable:
         return Experiment(frozenset({"learn", "seeds", "config"}), self.parts, self.outcome)
 
     def parts(self, request: Request) -> Sequence[Sequence[Part]]:
-        """First epochs that the arms of a seed share, the arms, and their measuring."""
+        """First epochs that the arms of a seed share, the arms, and their measuring.
+
+        Raises:
+            UsageError: the SLAM loss would never count.
+        """
+        self._check_slam_loss(request)
         shared: list[Part] = []
         arms: list[Part] = []
         measured: list[Part] = []
@@ -76,6 +94,17 @@ class TaskTable:
                 tested = {"task": self.task, "weights": str(weights), "drive": self._tested(request)}
                 measured.append(Part(self._measured(seed, arm), self.measured, tested, [weights]))
         return [stage for stage in (shared, arms, measured) if stage]
+
+    def _check_slam_loss(self, request: Request) -> None:
+        """Without it all arms would be the same, and the gain an exact zero."""
+        settings = settings_of(self._training(request, 0, "with"))
+        if settings.slam.gamma == 0 or not any(map(settings.has_windows, range(settings.epochs))):
+            slam = settings.slam
+            raise UsageError(
+                f"{self.task}: the SLAM loss, which is to be compared, never counts: slam.gamma is {slam.gamma:g}, and"
+                f" slam.begin {slam.begin}, slam.every {slam.every} in {settings.epochs} epochs; --config replaces the"
+                " experiment's own values"
+            )
 
     def outcome(self, request: Request, figures: Mapping[str, Figures]) -> Outcome:
         """The table, a row an arm, and what the SLAM loss gains."""
@@ -99,13 +128,14 @@ class TaskTable:
                     gains.setdefault(arm, {})[figure] = asdict(gain)
                     gain_table.add(f"{figure}, {ROWS[arm]}", {"gain": {"percent": 100 * gain.mean}}, note=str(gain))
         notes = [*self.notes, *self._warnings(request, of, figures)]
-        pictures = self._pictures(request, notes) if self.measured == SLAM else []
+        pictures = self._pictures(request, figures, notes) if self.measured == SLAM else []
         return Outcome([table, gain_table], notes, [], pictures, {"gains": gains})
 
     def _warnings(
         self, request: Request, of: Mapping[str, Mapping[str, list[float]]], figures: Mapping[str, Figures]
     ) -> list[str]:
-        notes = learned_note(request.learn or self.learn, request.sequences or self.test)
+        words = (request.learn or self.learn, request.sequences or self.test)
+        notes = learned_note(*(sequence_names(request.data, chosen) for chosen in words))
         settings = settings_of(self._training(request, 0, "with"))
         if settings.has_windows(settings.epochs - 1):
             notes.append(
@@ -118,15 +148,15 @@ class TaskTable:
             notes.append("odometry on what the network makes is no better than standing still: nothing can be compared")
         return notes
 
-    def _pictures(self, request: Request, notes: list[str]) -> list[Path]:
+    def _pictures(self, request: Request, figures: Mapping[str, Figures], notes: list[str]) -> list[Path]:
         """The paper's figure 3: trajectories on the output of both arms of the first seed, a picture a sequence."""
         pictures = []
-        for folder in sorted(path for path in (request.out / self._measured(0, "with")).iterdir() if path.is_dir()):
-            without = request.out / self._measured(0, "without") / folder.name
-            ways = {"without SLAM loss": without / "output", "with SLAM loss": folder / "output"}
-            path = request.out / f"trajectories_{folder.name}.png"
+        for sequence in figures[self._measured(0, "with")]["sequences"]:
+            name = folder_name(sequence)
+            ways = {ROWS[arm]: request.out / self._measured(0, arm) / name / "output" for arm in ("without", "with")}
+            path = request.out / f"trajectories_{name}.png"
             try:
-                trajectories_png(path, *aligned_ways(ways), title=folder.name)
+                trajectories_png(path, *aligned_ways(ways), title=name)
             except MissingPackageError as error:
                 notes.append(f"no {path.name}: {error}")
                 break
@@ -153,7 +183,8 @@ class TaskTable:
 
 
 def _means(figures: Mapping[str, Sequence[float]]) -> Cells:
-    return {name: {"mean": sum(values) / len(values)} for name, values in figures.items()}
+    known = {name: [value for value in values if isfinite(value)] for name, values in figures.items()}
+    return {name: {"mean": mean(values) if values else None} for name, values in known.items()}
 
 
 _CARLA_LEARN, _CARLA_TEST = tuple(map(str, range(8))), tuple(map(str, range(9, 15)))

@@ -42,6 +42,12 @@ def folders_of(path: Path, sequences: Sequence[str] = ()) -> list[Path]:
     return [folder for folder in sequence_folders(path) if not chosen or chosen & set(names_of(folder, path))]
 
 
+def sequence_names(path: Path, sequences: Sequence[str] = ()) -> list[str]:
+    """What the sequences and pairs that `open_scans` takes are called, however they were named."""
+    pairs = [pair.name for pair in open_pairs(path) if not sequences or is_among(pair.number, sequences)]
+    return pairs + ["/".join(names_of(folder, path)) for folder in folders_of(path, sequences)]
+
+
 def names_of(folder: Path, path: Path) -> list[str]:
     """The names that a sequence folder below `path` can be chosen by: those of the folders on the way, its own last."""
     return [name for name in folder.relative_to(path).parts if name != "sequences"] or [folder.resolve().name]

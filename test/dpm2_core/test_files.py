@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -10,7 +11,15 @@ from pathlib import Path
 import pytest
 
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.files import atomic_write
+from dpm2_core.files import atomic_write, write_json
+
+
+def test_what_is_not_finite_is_null(tmp_path: Path) -> None:
+    """NaN and Infinity are no JSON: jq and browsers refuse the whole file."""
+    write_json(tmp_path / "a.json", {"a": [float("nan"), (1.5, float("-inf"))], "b": {"c": float("inf"), "d": "NaN"}})
+    assert json.loads((tmp_path / "a.json").read_text(), parse_constant=pytest.fail) == {
+        "a": [None, [1.5, None]], "b": {"c": None, "d": "NaN"},
+    }  # fmt: skip
 
 
 def test_the_file_appears_only_when_it_is_whole(tmp_path: Path) -> None:

@@ -4,11 +4,13 @@
 from __future__ import annotations
 
 import ast
+import json
 from pathlib import Path
 
 import pytest
 
 import dpm2_core.commands
+from dpm2_core.commands.options import show
 
 from ...helpers.command import dpm2
 
@@ -23,6 +25,11 @@ def test_no_parameter_of_a_command_is_ignored(module: Path) -> None:
             read = {node.id for part in function.body for node in ast.walk(part) if isinstance(node, ast.Name)}
             arguments = {argument.arg for argument in (*function.args.args, *function.args.kwonlyargs)}
             assert arguments <= read | {"self"}, f"{module.name}: {function.name}"
+
+
+def test_figures_on_stdout_are_json_where_one_is_not_known(capsys: pytest.CaptureFixture[str]) -> None:
+    show("", {"moved_m": float("nan")}, Path("-"))
+    assert json.loads(capsys.readouterr().out, parse_constant=pytest.fail) == {"moved_m": None}
 
 
 @pytest.mark.parametrize(("command", "words"), [

@@ -113,6 +113,7 @@ def test_robustness_at_every_share(kitti: Path, tmp_path: Path) -> None:
         (("robustness", "DATA", "--out", "OUT", "--peer", "kiss-icp"), "robustness: has no use for --peer"),
         (("kitti", "DATA", "--out", "OUT", "--lengths", "0"), "--lengths 0"),
         (("kitti", "DATA", "--out", "OUT", "--peer", "x=a.txt"), "put {sequence} where its name stands"),
+        (("kitti", "DATA", "--out", "OUT", "--sequences", "10,10"), "kitti: two results of one name (dpm2/10)"),
         (("kitti360", "DATA", "--out", "OUT"), "choose others with --sequences"),
     ],
 )
@@ -124,6 +125,13 @@ def test_what_cannot_be_done_is_said_in_one_line(
     assert done.returncode == 2
     assert done.stderr.strip().count("\n") <= 1  # the bar, and the line
     assert problem in done.stderr
+
+
+def test_two_peers_in_one_folder_are_refused(kitti: Path, tmp_path: Path) -> None:
+    """The second would overwrite the first, and both rows show its figures."""
+    peers = ("--peer", "my slam=a.txt", "--peer", "my_slam=b.txt")
+    done = dpm2("experiment", "kitti", kitti, "--out", tmp_path, "--sequences", "10", *peers)
+    assert (done.returncode, "two results of one name (my_slam/10)" in done.stderr) == (2, True)
 
 
 @pytest.mark.slow

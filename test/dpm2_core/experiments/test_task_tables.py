@@ -13,6 +13,9 @@ import pytest
 
 from dpm2_core.config import load_settings
 from dpm2_core.experiments.paired import paired_gain
+from dpm2_core.experiments.request import Request
+from dpm2_core.experiments.task_part import Training, train
+from dpm2_core.experiments.task_tables import GNDNET
 from dpm2_core.tasks.task import task_type
 
 from ...helpers.command import dpm2
@@ -92,6 +95,11 @@ def test_dslr_both_tables_from_the_same_trainings(tmp_path: Path) -> None:
     assert figures["still_rpe_m"] == pytest.approx(0.5)
     assert figures["target_rpe_m"] < figures["still_rpe_m"]
     assert (out / "trajectories_pairs_d1.png").stat().st_size > 5000
+    for arm in ("without", "with"):  # as if other sequences had been asked for before
+        slam = out / "dslr/seed_0" / arm / "slam"
+        shutil.copytree(slam / "pairs_d1", slam / "pairs_d0")
+    assert dpm2("experiment", "dslr-slam", *rest).returncode == 0
+    assert not (out / "trajectories_pairs_d0.png").exists()
     (data / "poses1.txt").unlink()
     again = dpm2("experiment", "dslr-slam", *rest[:2], tmp_path / "new", *rest[3:])
     assert again.returncode == 2
@@ -123,6 +131,44 @@ def test_a_gain_by_hand() -> None:
     assert one is not None
     assert (one.mean, one.low, str(one)) == (-0.5, None, "-50.0%, one seed")
     assert paired_gain([0.0], [1.0], lower_is_better=True) is None
+    nan = float("nan")
+    assert paired_gain([1.0, nan, 3.0, 9.0], [0.7, 1.0, 2.9, nan], lower_is_better=True) == gain
+    assert paired_gain([nan], [nan], lower_is_better=True) is None
+
+
+@pytest.mark.parametrize("settings", [("slam.gamma=0",), ("epochs=3", "slam.begin=5")])
+def test_without_any_slam_loss_there_is_nothing_to_compare(tmp_path: Path, settings: tuple[str, ...]) -> None:
+    done = dpm2("experiment", "gndnet", tmp_path, "--out", tmp_path / "out", *options(*settings))
+    assert done.returncode == 2
+    assert "the SLAM loss, which is to be compared, never counts: slam.gamma is" in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_was_learned_from_is_found_by_any_name_and_an_unknown_figure_is_left_out(tmp_path: Path) -> None:
+    """train/00 is both `train` and `00`; of two seeds one has no recall, as where nothing stands on the ground."""
+    for name in ("train/00", "train/01", "val/02"):
+        labelled_drive(tmp_path / name, range(2), points=300)
+    request = Request(tmp_path, tmp_path / "out", learn=("train",), sequences=("00", "val"), seeds=2)
+    figures = {part.name: dict.fromkeys(GNDNET.figures, 0.5) for part in GNDNET.parts(request)[-1]}
+    first = next(name for name in figures if "without" in name)
+    figures[first] = {**figures[first], "recall": float("nan"), "precision": 0.7}
+    outcome = GNDNET.outcome(request, figures)
+    assert "tested on what was learned from: train/00" in outcome.notes
+    cells = outcome.tables[0].rows[0].cells
+    assert (cells["recall"], cells["precision"]) == ({"mean": 0.5}, {"mean": pytest.approx(0.6)})
+    assert outcome.extra["gains"]["with"]["recall"]["seeds"] == 1
+
+
+def test_a_training_whose_last_losses_are_not_finite_has_no_last_loss(tmp_path: Path) -> None:
+    """At this rate the weights are beyond float32 after one step."""
+    labelled_drive(tmp_path / "data/sequences/00", range(4), points=300)
+    far = ("epochs=2", "optimizer=sgd", "rate=1e30", "clip=1e38")
+    settings = ["network={cells: 32, cell: 3, channels: 4}", *QUICK, *far]
+    arm = Training(task="gndnet", data=str(tmp_path / "data"), learn=["00"], config=None, settings=settings, seed=0,
+                   arm="without")  # fmt: skip
+    found = train(tmp_path / "out", lambda done, total: None, arm)
+    assert found["last_task_loss"] is None
+    assert found["skipped_steps"] > 0
 
 
 @pytest.mark.parametrize(
