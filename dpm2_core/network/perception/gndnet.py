@@ -7,6 +7,7 @@ scattered into the grid by themselves, so that a pillar may have any number of t
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
@@ -175,7 +176,8 @@ def ground_metrics(
 
     And what the authors' evaluation prints: `ground_iou`, `ground_precision` and `ground_recall`, which are of the
     ground, and `mse_authors` (m2), where the points of a cell are counted from one, which draws its mean height towards
-    the level that the car stands on.
+    the level that the car stands on. A figure is NaN where the scan has nothing that it is of; `miou` is then of the
+    other class alone.
 
     Args:
         points: (N, 3+) m. ground: (N,) bool. counted: (N,) bool, false for points without a class.
@@ -189,17 +191,22 @@ def ground_metrics(
     both = (found & obstacle).sum().item()
     neither = (~found & ~obstacle).sum().item()
     false, missed = (found & ~obstacle).sum().item(), (~found & obstacle).sum().item()
-    iou, ground_iou = both / max(both + false + missed, 1), neither / max(neither + false + missed, 1)
+    iou, ground_iou = _ratio(both, both + false + missed), _ratio(neither, neither + false + missed)
+    ious = [value for value in (iou, ground_iou) if not math.isnan(value)]
     return {
-        "mse": float((elevation - labels)[known].square().mean()) if bool(known.any()) else float("nan"),
-        "miou": (iou + ground_iou) / 2,
-        "precision": both / max(both + false, 1),
-        "recall": both / max(both + missed, 1),
+        "mse": float((elevation - labels)[known].square().mean()) if bool(known.any()) else math.nan,
+        "miou": _ratio(sum(ious), len(ious)),
+        "precision": _ratio(both, both + false),
+        "recall": _ratio(both, both + missed),
         "mse_authors": _mse_authors(points[ground], elevation, settings),
         "ground_iou": ground_iou,
-        "ground_precision": neither / max(neither + missed, 1),
-        "ground_recall": neither / max(neither + false, 1),
+        "ground_precision": _ratio(neither, neither + missed),
+        "ground_recall": _ratio(neither, neither + false),
     }
+
+
+def _ratio(part: float, whole: float) -> float:
+    return part / whole if whole else math.nan
 
 
 def _mse_authors(points: Tensor, elevation: Tensor, settings: GroundSettings) -> float:
@@ -209,7 +216,7 @@ def _mse_authors(points: Tensor, elevation: Tensor, settings: GroundSettings) ->
     count = points.new_zeros(settings.cells**2).index_add_(0, cell, torch.ones_like(height))
     total = points.new_zeros(settings.cells**2).index_add_(0, cell, height)
     error = (elevation.flatten() + settings.sensor_height - total / (count + 1))[count > 0]
-    return float(error.square().mean()) if len(error) else float("nan")
+    return float(error.square().mean()) if len(error) else math.nan
 
 
 def _block(inputs: int, middle: int, outputs: int) -> nn.Sequential:

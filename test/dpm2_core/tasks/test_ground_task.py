@@ -147,6 +147,22 @@ def test_gaps_take_the_nearest_cell_that_is_known() -> None:
     assert float(found[3, 3]) == pytest.approx(-1.2)
 
 
+def test_a_scan_without_obstacles_or_without_classes_counts_in_no_figure_of_them(scans: TaskScans) -> None:
+    """The ground is known exactly: each figure is that of the scans that have it, and not lower for an empty road."""
+    task, window, _ = with_elevation(scans, 0.0)
+    usual = measure(task, TaskScans([window[:1]]))
+    assert usual["recall"] > 0
+    assert window[0].labels is not None
+    ground = ground_of(window[0])[0]
+    road = replace(window[0], points=window[0].points[ground], labels=window[0].labels[ground])
+    nothing = replace(window[0], labels=torch.zeros_like(window[0].labels))
+    found = measure(task, TaskScans([[window[0], road, nothing]]))
+    assert found["recall"] == pytest.approx(usual["recall"])
+    empty = measure(task, TaskScans([[road]]))
+    assert math.isnan(empty["recall"])
+    assert empty["miou"] == empty["ground_iou"] > 0.9
+
+
 @pytest.mark.slow
 @pytest.mark.weights
 def test_the_shipped_weights_know_an_unseen_suburb(tmp_path: Path) -> None:

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from torch import Tensor
@@ -110,7 +112,7 @@ def test_metrics_by_hand() -> None:
 
 def test_the_authors_figures_are_of_the_ground_and_count_points_from_one() -> None:
     """Four points of ground 0.5 m above the car's level in one cell: their mean is 0.5 m, the authors' 2 / 5 m. Ground
-    that is found 0.3 m too low makes obstacles of all of it: precision of the ground 0 of 0, recall 0 of 4."""
+    that is found 0.3 m too low makes obstacles of all of it: recall of the ground 0 of 4, no precision."""
     points = torch.tensor([[0.5, 0.5, 0.5 - 1.733, 0.0]] * 4 + [[0.5, 0.5, 1.0, 0.0]] * 2)
     ground = torch.tensor([True] * 4 + [False] * 2)
     everything, true = torch.ones(6, dtype=torch.bool), torch.full((16, 16), 0.5 - 1.733)
@@ -118,7 +120,8 @@ def test_the_authors_figures_are_of_the_ground_and_count_points_from_one() -> No
     assert found["mse"] == pytest.approx(0.0, abs=1e-9)
     assert found["mse_authors"] == pytest.approx((0.5 - 2.0 / 5) ** 2, rel=1e-4)
     low = ground_metrics(points, ground, everything, true - 0.3, SMALL)
-    assert [low[f"ground_{name}"] for name in ("iou", "precision", "recall")] == [0, 0, 0]
+    assert [low[f"ground_{name}"] for name in ("iou", "recall")] == [0, 0]
+    assert math.isnan(low["ground_precision"])
     high = ground_metrics(points, ground, everything, true + 5, SMALL)  # nothing stands on it
     assert [high[f"ground_{name}"] for name in ("iou", "precision", "recall")] == pytest.approx([4 / 6, 4 / 6, 1])
     none = ground_metrics(points, ~everything, everything, true, SMALL)
