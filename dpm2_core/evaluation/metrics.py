@@ -42,7 +42,7 @@ class SpeedErrors(BaseModel):
 
 
 SPEED_STEP = 2.0
-"""Width of a class of speed, m/s, as in the development kit's plots."""
+"""Width of a class of speed, m/s: the development kit draws a value each 2 m/s, too, but of twice the width."""
 
 
 class Metrics(BaseModel):
@@ -193,7 +193,7 @@ def _of_length(segments: SegmentErrors, length: float) -> LengthErrors:
 
 def _by_speed(segments: SegmentErrors) -> tuple[SpeedErrors, ...]:
     out = []
-    for step in sorted({round(speed / SPEED_STEP) for speed in segments.speed.tolist()}):
+    for step in sorted({int(np.floor(speed / SPEED_STEP + 0.5)) for speed in segments.speed.tolist()}):
         center = step * SPEED_STEP
         chosen = segments.of_speed(center - SPEED_STEP / 2, center + SPEED_STEP / 2)
         t_err, r_err = _percent(chosen)

@@ -7,9 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.spatial.distance import pdist
 
 from dpm2_core.data.packed import open_packed
 from dpm2_core.descriptors import Descriptors
+from dpm2_core.errors import UsageError
+from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pyramid import build_pyramid, collate
@@ -20,8 +23,18 @@ NEAR, FAR = 5.0, 20.0  # m, between the frames of a pair
 SUCCESS = (0.6, 1.5)  # m, deg
 
 
+def _has_pair(poses: Array, low: float, high: float) -> bool:
+    """Whether two of (N, 4, 4) poses are so far apart, m."""
+    distance = pdist(poses[:, :3, 3])
+    return bool(((distance > low) & (distance <= high)).any())
+
+
 class PairSet:
-    """Pairs drawn once: half up to 5 m apart, half 5 to 20 m; every second one with the source turned at random."""
+    """Pairs drawn once: half up to 5 m apart, half 5 to 20 m; every second one with the source turned at random.
+
+    Raises:
+        UsageError: no two frames of a drive are so far apart.
+    """
 
     def __init__(self, root: Path, pairs: int, network: NetworkSettings, images: bool) -> None:
         noise = np.random.default_rng(0)
@@ -29,6 +42,9 @@ class PairSet:
         self.network, self.images = network, images
         self.frames: dict[tuple[int, int, float], int] = {}
         self.pairs: list[tuple[int, int, np.ndarray, float]] = []
+        for low, high in ((0.0, NEAR), (NEAR, FAR)):
+            if not any(_has_pair(drive.poses, low, high) for drive in self.drives):
+                raise UsageError(f"{root}: no two frames of a drive are {low:g} to {high:g} m apart, as is measured")
         while len(self.pairs) < pairs:
             d = int(noise.integers(len(self.drives)))
             poses = self.drives[d].poses

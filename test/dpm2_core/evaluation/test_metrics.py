@@ -153,3 +153,11 @@ def test_mean_and_root_mean_square_of_the_position_error() -> None:
     found = evaluate(truth, est)
     assert found.ape_mean_m == pytest.approx(2.0, abs=0.1)
     assert found.ape_rmse_m == pytest.approx(np.sqrt(5), abs=0.1)
+
+
+def test_a_speed_between_two_classes_is_in_one() -> None:
+    """Half to even put 5 m/s, of every segment of a steady drive, into the class that ends there."""
+    gt = np.tile(np.eye(4), (201, 1, 1))
+    gt[:, 0, 3] = np.arange(201)
+    found = evaluate(gt, gt, [9.5], period=9.5 / 11 / 5)  # 10 steps count as 11 frames
+    assert [(row.speed_mps, row.segments) for row in found.per_speed] == [(6.0, found.segments)]

@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pairs of frames to measure a network on: near and far ones, or an error that says which there are none of."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dpm2_core.data.packed import Sample, write_packed
+from dpm2_core.errors import UsageError
+from dpm2_core.evaluation.pair_set import PairSet
+from dpm2_core.geometry import se3
+from dpm2_core.network.settings import preset
+
+
+def packed(folder: Path, at: np.ndarray) -> Path:
+    """A drive with frames at such places, m."""
+    cloud = np.random.default_rng(0).uniform(-40, 40, (50, 3)).astype(np.float32)
+    write_packed(folder / "drive", [Sample(cloud, se3.make(np.eye(3), [x, 0, 0])) for x in at], {"source": "test"})
+    return folder
+
+
+def test_half_of_the_pairs_are_near(tmp_path: Path) -> None:
+    pairs = PairSet(packed(tmp_path, np.arange(40.0)), 20, preset("small"), False).pairs
+    distances = np.array([pair[3] for pair in pairs])
+    assert len(pairs) == 20
+    assert ((distances[::2] > 0) & (distances[::2] <= 5)).all()
+    assert ((distances[1::2] > 5) & (distances[1::2] <= 20)).all()
+
+
+@pytest.mark.parametrize(
+    ("at", "missing"),
+    [(np.arange(11) * 0.12, "5 to 20 m"), (np.arange(20) * 25.0, "0 to 5 m"), (np.zeros(1), "0 to 5 m")],
+    ids=["a room", "far apart", "one frame"],
+)
+def test_drives_without_such_pairs_are_named(tmp_path: Path, at: np.ndarray, missing: str) -> None:
+    """The search for them never ended, and a training with such a validation never began."""
+    with pytest.raises(UsageError, match=rf"{tmp_path}: no two frames of a drive are {missing} apart"):
+        PairSet(packed(tmp_path, at), 20, preset("small"), False)
