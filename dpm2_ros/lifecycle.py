@@ -65,12 +65,20 @@ class ManagedNode(LifecycleNodeMixin, GuardedNode):
         raise NotImplementedError
 
     def start(self, managed: bool) -> None:
-        """Take both steps; `managed`: wait to be told."""
+        """Take both steps; `managed`: wait to be told.
+
+        Raises:
+            UsageError, Dpm2Error: one cannot be done. The node is closed.
+        """
         if managed:
             self._serve()
-        else:
+            return
+        try:
             self._take(self.configure)
             self._take(self.activate)
+        except BaseException:
+            self.close()
+            raise
 
     def close(self) -> None:
         """End everything, whatever is under way; the map is saved.

@@ -120,6 +120,15 @@ def _handles_sigint(process: subprocess.Popen[bytes]) -> bool:
     return bool(int(caught, 16) >> (signal.SIGTERM - 1) & 1)
 
 
+def test_what_cannot_listen_leaves_no_map(run: Callable[..., Any], tmp_path: Path) -> None:
+    """Its map was opened before."""
+    pairs = [f"ros.map_directory:={tmp_path / 'map'}", f"input.second_points_topic:={topics.POINTS}"]
+    done = run("slam_node", "--ros-args", *GEOMETRIC, *(part for pair in pairs for part in ("-p", pair)))
+    assert done.returncode == 2
+    assert "is that of the first LiDAR" in done.stderr
+    assert not (tmp_path / "map").exists()
+
+
 def test_a_map_that_cannot_be_saved_at_the_end_is_exit_code_1(
     ros: Callable[..., Any], drive: Any, tmp_path: Path
 ) -> None:
