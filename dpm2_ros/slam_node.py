@@ -78,6 +78,7 @@ class SlamNode(ManagedNode):
         self._waited = False  # for the base frame
         warm_up(self._config.slam)
         self._known: Calibration | None = None
+        self._left: tuple[int, float] | None = None  # stamp and arrival of the last cloud before a deactivation
         self._begin()
         back.callback(self._give_up)
         self._index = 0
@@ -94,6 +95,8 @@ class SlamNode(ManagedNode):
         reading = self._config.input.model_copy(update={"images": self._config.input.images and self._slam.uses_images})
         self._inputs = Inputs(self, reading, ros, self._known)
         self._known = self._inputs.calibration
+        if self._left is not None:
+            self._inputs.synchronizer.follow(*self._left)
         self._frames = FrameBuilder(
             reading, self._known, self.get_logger().error, imu=self._inputs.imu, gnss=self._inputs.gnss
         )
@@ -118,6 +121,7 @@ class SlamNode(ManagedNode):
         """No more clouds, after the one that the worker is at."""
         self._stopping.set()
         worker.join()
+        self._left = self._inputs.synchronizer.left
         self.get_logger().info(self._diagnostics.account())
 
     def _begin(self) -> None:

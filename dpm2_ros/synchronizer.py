@@ -107,7 +107,7 @@ class Synchronizer:
         self._newest: int | None = None  # stamp of the last cloud accepted
         self._arrival = 0.0  # of that cloud
         self._jumped: Bundle | None = None
-        self._left = -float("inf"), 0.0  # stamp and arrival of the last cloud that went
+        self._left: tuple[float, float] = -float("inf"), 0.0  # stamp and arrival of the last cloud that went
 
     def __len__(self) -> int:
         """Clouds that are waiting."""
@@ -117,6 +117,16 @@ class Synchronizer:
     def received(self) -> int:
         """Clouds that have come in."""
         return sum(self.counts.values()) + (self._jumped is not None)
+
+    @property
+    def left(self) -> tuple[int, float] | None:
+        """Stamp (ns) and arrival (s) of the last cloud that went; None before one has."""
+        stamp, arrival = self._left
+        return None if stamp == -float("inf") else (int(stamp), arrival)
+
+    def follow(self, stamp: int, arrival: float) -> None:
+        """Go on where another one has ended: what is its `left`."""
+        self._left = self._newest, self._arrival = stamp, arrival
 
     def add_cloud(self, stamp: int, cloud: Any, now: float) -> StampCheck:
         """Take a cloud with its stamp (ns); `now` is when it arrived."""

@@ -168,6 +168,21 @@ def test_inactive_it_takes_no_cloud_and_keeps_the_map(ros: Callable[..., Any], d
     assert check_map(tmp_path / "drive.dpm2map").problems == []
 
 
+def test_time_that_goes_back_while_it_is_inactive_is_noticed(
+    ros: Callable[..., Any], drive: Any, tmp_path: Path
+) -> None:
+    """A simulation that begins anew, a bag that is played again: so does the odometry."""
+    m = Managed(ros(*FAST, f"ros.map_directory:={tmp_path}"), SlamNode)
+    lidar = Lidar(m.harness, drive)
+    assert m.change(CONFIGURE, ACTIVATE)
+    lidar.send(*range(12))  # 8.8 m
+    assert m.change(DEACTIVATE)
+    m.harness.wait(lambda: not lidar.clouds.get_subscription_count(), "the end of the subscription")
+    assert m.change(ACTIVATE)
+    lidar.send(0, 1)
+    assert lidar.odom[-1].pose.pose.position.x == pytest.approx(drive.pose(1)[0, 3], abs=0.1)  # m, as of any scan
+
+
 @pytest.mark.slow
 def test_a_robot_keeps_what_it_makes_while_its_mapper_is_inactive(
     ros: Callable[..., Any], drive: Any, tmp_path: Path
