@@ -138,10 +138,10 @@ class ActiveMap:
         self.mapper.start_session(localizer.T_map_odom)
         return f"{self._path} grows by a new session"
 
-    def restart(self) -> None:
-        """The robot's odometry has started again: a loop or a search has to find where it is."""
+    def restart(self, robot: str) -> None:
+        """A robot's odometry has started again: a loop or a search has to find where it is."""
         placed = self._T_map_odom or {}
-        self._T_map_odom = {robot: T for robot, T in placed.items() if robot != self._robot}
+        self._T_map_odom = {other: T for other, T in placed.items() if other != robot}
         if self.localizer is not None:
             self.localizer.restart()
 
@@ -156,8 +156,9 @@ class ActiveMap:
 
     def reset(self) -> None:
         """Begin an empty map; or, in a map that stays as it is, look for the robot anew."""
-        self.restart()
-        if self.localizer is None:
+        if self.localizer is not None:
+            self.localizer.restart()
+        else:
             self.close()
             self._begin()
 

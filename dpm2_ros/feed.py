@@ -238,6 +238,7 @@ class Feed:
             if main is not None and main is not stream:
                 self._node.get_logger().warning(f"robot {name} has started again: a new session of its own")
                 main.replaced()
+                self._mapper.restart(self._robot)
             self._main, stream.robot = stream, self._robot
             return True
         if main.heard < stream.since + BESIDE:

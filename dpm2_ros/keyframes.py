@@ -14,11 +14,11 @@ import sqlite3
 import threading
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 from nav_msgs.msg import Odometry
-from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import PointCloud2
@@ -41,7 +41,7 @@ BEHIND = 10
 
 _MOST_ACKED = 1001  # numbers in an acknowledgment
 _TICK, _BURST = 0.25, 8  # s, and the keyframes that are sent again in one
-_FAREWELL = 4.0  # s; DDS asks after 3 s for a receipt that has not come
+_FAREWELL = 4.0  # s; acknowledgments come twice a second, and those of one second are to agree
 
 
 class KeyframeSender:
@@ -62,7 +62,9 @@ class KeyframeSender:
         self._drives = list(self._left_behind())  # those that are over and not delivered, then the one that goes on
         self.restart()
         if self._keep:
-            node.create_subscription(UInt32MultiArray, "dpm2/keyframes_received", self._on_received, 10)
+            self._received = node.create_subscription(
+                UInt32MultiArray, "dpm2/keyframes_received", self._on_received, 10
+            )
             node.create_timer(_TICK, self._repeat, clock=STEADY)
 
     @property
@@ -72,13 +74,21 @@ class KeyframeSender:
             return sum(drive.arrived for drive in self._drives), sum(len(drive.file) for drive in self._drives)
 
     def restart(self) -> None:
-        """A new drive begins: a session of its own."""
+        """A new drive begins: a session of its own. The mapper is told at once that the one before is over."""
         session = secrets.token_hex(4)
         drive = Delivery(session, self._file(session), False, time.monotonic())
+        last = None
         with self._lock:
+            if not self._keep:
+                self._drives.clear()
             for earlier in self._drives:
+                if not earlier.earlier and len(earlier.file):
+                    with suppress(sqlite3.Error, RuntimeError):  # `_repeat` reads it again, and says so
+                        last = of_earlier_drive(earlier.file.read(len(earlier.file) - 1))[0]
                 earlier.earlier = True
             self._drives.append(drive)
+        if last is not None:
+            self._pose.publish(last)
 
     def send(self, keyframe: Keyframe) -> None:
         """A new one, in the frame whose pose is published."""
@@ -96,23 +106,34 @@ class KeyframeSender:
         self._publish(parts)
 
     def close(self) -> None:
-        """Before the node ends: wait until a mapper elsewhere has received what was sent last, or for `_FAREWELL`.
+        """Before the node ends: wait until the mapper, if one listens, has all in its file, or for `_FAREWELL`.
 
-        What it has not received stays on the disk, for the next start.
+        What it does not have stays on the disk, for the next start.
         """
-        end = time.monotonic() + (_FAREWELL if self._keep else 0.0)
-        received = [
-            publisher.wait_for_all_acked(Duration(seconds=max(0.0, end - time.monotonic())))
-            for publisher in (self._pose, self._descriptors, self._cloud)
-        ]
+        end = time.monotonic() + _FAREWELL
+        while self._keep and any(map(self._late, self._drives)) and self._received.get_publisher_count():
+            if time.monotonic() > end:
+                break
+            time.sleep(_TICK)
+            self._take_received()
+            self._repeat()
         with self._lock:
-            for k, drive in enumerate(self._drives):
-                late = len(drive.file) - drive.delivered
-                arrived = k == 0 and late <= BEHIND and all(received) and self._pose.get_subscription_count() > 0
-                keep = late > 0 and not arrived
-                drive.file.close(keep)
-                if keep and drive.file.path is not None:
+            for drive in self._drives:
+                late = self._late(drive)
+                drive.file.close(keep=late > 0)
+                if late and drive.file.path is not None:
                     self._log.warning(f"{late} keyframes not delivered: sent at the next start from {drive.file.path}")
+
+    @staticmethod
+    def _late(drive: Delivery) -> int:
+        """Keyframes that are not in the mapper's file."""
+        return len(drive.file) - drive.delivered
+
+    def _take_received(self) -> None:
+        """Acknowledgments that have come, where nobody calls back any more."""
+        with self._received.handle:  # not to be destroyed meanwhile
+            while (taken := self._received.handle.take_message(UInt32MultiArray, False)) is not None:
+                self._received.callback(taken[0])
 
     def _file(self, session: str) -> KeyframeFile:
         """Of a new drive, on the disk if that can be."""

@@ -51,7 +51,7 @@ class MapperThread:
         self._active = ActiveMap(config, robot, node.get_logger())
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="mapper", initializer=lower_priority)
         self._stamp = 0  # of the last keyframe, ns
-        self._restarted: Future[None] | None = None  # since when the odometry's start is known here
+        self._restarted: dict[str, Future[None]] = {}  # by robot: since when its odometry's start is known here
         self._lock = threading.Lock()
         self._added = self._taken = self._written = 0  # keyframes
         self._changes = self.keyframes
@@ -136,8 +136,8 @@ class MapperThread:
         Args:
             T_own_odom: (4, 4) frame `odom_frame` in that of the robot's keyframes; None: it is the same.
         """
-        restarting = robot == self._robot and self._restarted is not None and not self._restarted.done()
-        T_map_odom = None if restarting else self._active.T_map_odom(robot)
+        restarted = self._restarted.get(robot)
+        T_map_odom = self._active.T_map_odom(robot) if restarted is None or restarted.done() else None
         if T_map_odom is not None:
             T = T_map_odom if T_own_odom is None else T_map_odom @ T_own_odom
             self._tf.send(T, stamp + self._config.ros.ahead, odom_frame)
@@ -176,9 +176,9 @@ class MapperThread:
         self._config = config
         self._changes += 1
 
-    def restart(self) -> None:
-        """The odometry has started again: the map stays, the robot's place in it is no longer known."""
-        self._restarted = self._submit(self._active.restart)
+    def restart(self, robot: str) -> None:
+        """A robot's odometry has started again: the map stays, the robot's place in it is no longer known."""
+        self._restarted[robot] = self._submit(lambda: self._active.restart(robot))
 
     def keep(self) -> Future[str]:
         """Save the map before a `reset`; returns a message, empty where there is nothing to save."""
@@ -186,7 +186,7 @@ class MapperThread:
 
     def reset(self) -> None:
         """The odometry starts again, and with it an empty map."""
-        self._restarted = self._submit(lambda: self._change(self._active.reset))
+        self._restarted[self._robot] = self._submit(lambda: self._change(self._active.reset))
 
     def close(self) -> None:
         """Finish what is waiting, save the map, end the thread.

@@ -6,7 +6,7 @@ from __future__ import annotations
 import threading
 import time
 import traceback
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
@@ -148,9 +148,13 @@ class SlamNode(ManagedNode):
 
     def _restart(self) -> None:
         self._begin()
-        self._line.submit(self._sender.restart)
+        self._end_drive()
         if self._mapper is not None:
             self._mapper.reset()
+
+    def _end_drive(self) -> None:
+        """A mapper elsewhere is told, before it hears the next odometry, that the drive is over."""
+        wait([self._line.submit(self._sender.restart)])
 
     def _process(self, bundle: Bundle) -> None:
         """One frame, from messages to messages."""
@@ -160,9 +164,9 @@ class SlamNode(ManagedNode):
                 "its place in the map is unknown before a loop is found"
             )
             self._begin()
-            self._line.submit(self._sender.restart)
+            self._end_drive()
             if self._mapper is not None:
-                self._mapper.restart()
+                self._mapper.restart(self._robot)
         self._look_for_base(bundle.cloud.header.frame_id or "lidar")
         x, y, z = self._base.T_start_lidar[2, :3].tolist()
         self._frames.up = (x, y, z) if self._base.name else None  # what is up for the base is to be up in odom

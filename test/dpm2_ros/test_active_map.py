@@ -8,6 +8,7 @@ import sqlite3
 import threading
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -187,6 +188,17 @@ def test_a_map_that_cannot_be_kept_goes_on(tmp_path: Path) -> None:
 def described(**ros: Any) -> NodeConfig:
     """As a node is by default, but for the registration of its odometry."""
     return NodeConfig.model_validate({"ros": ros, "slam": {"registration": "geometric"}})
+
+
+def test_where_one_robot_starts_again_the_others_stay(tmp_path: Path) -> None:
+    active = ActiveMap(config(map_directory=str(tmp_path)), "red", LOG)
+    active.add(replace(keyframes(1)[0], robot="red"))
+    assert active.T_map_odom("red") is not None
+    active.restart("blue")
+    assert active.T_map_odom("red") is not None
+    active.restart("red")
+    assert active.T_map_odom("red") is None
+    active.close()
 
 
 def street(n: int) -> Keyframe:

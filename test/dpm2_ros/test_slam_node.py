@@ -28,10 +28,11 @@ from dpm2_core.data.topics import CAMERA_INFO, IMAGE, POINTS
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.geometry import se3
 from dpm2_ros.active_map import ActiveMap
-from dpm2_ros.conversions import cloud_to_msg, stamp_to_msg, transform_to_msg
+from dpm2_ros.conversions import EARLIER, cloud_to_msg, stamp_to_msg, transform_to_msg
 from dpm2_ros.keyframe_messages import BUDGET, received_to_msg
 from dpm2_ros.slam_node import SlamNode
 from dpm2_ros.tf import TFMessage
+from dpm2_ros.unsent import KeyframeFile, left_behind
 
 from ..helpers.diagnostics import figures, having, saying
 from .conftest import pose, scan
@@ -559,6 +560,36 @@ def test_keyframes_that_no_mapper_has_received_are_counted(rig: Callable[..., Ri
     received.publish(received_to_msg(poses[0].child_frame_id.rpartition(".")[2], 5, [7]))
     some = r.status("mapper", saying(f"6 of {drive.frames} keyframes"))
     assert some.level == DiagnosticStatus.OK
+
+
+def test_keyframes_stay_on_the_disk_whoever_else_has_heard_them(rig: Callable[..., Rig], tmp_path: Path) -> None:
+    """A recorder or RViz receives them, and no mapper."""
+    r = rig("ros.embed_mapper:=false", "slam.keyframes.distance:=0.5", f"ros.map_directory:={tmp_path}")
+    poses = r.harness.hear(Odometry, "/dpm2/keyframe_odom")
+    r.wait(lambda: r.node.count_subscribers("/dpm2/keyframe_odom"), "the subscription")
+    r.send_and_wait(*range(6))
+    r.wait(lambda: len(poses) >= 6, "every keyframe")
+    r.harness.remove(r.node)
+    ((_, path),) = left_behind(tmp_path, "")
+    file = KeyframeFile(path)
+    assert len(file) == 6
+    file.close(keep=False)
+
+
+def test_a_mapper_is_told_that_a_drive_is_over_that_it_has(rig: Callable[..., Rig]) -> None:
+    """Else it goes on to place the odometry of the next one by the one before."""
+    r = rig("ros.embed_mapper:=false", "slam.keyframes.distance:=0.5")
+    received = r.harness.publisher(UInt32MultiArray, "/dpm2/keyframes_received")
+    poses = r.harness.hear(Odometry, "/dpm2/keyframe_odom")
+    r.wait(lambda: r.node.count_subscribers("/dpm2/keyframe_odom"), "the subscription")
+    r.send_and_wait(*range(6))
+    r.wait(lambda: len(poses) >= 6, "every keyframe")
+    last = max(pose.child_frame_id for pose in poses)
+    received.publish(received_to_msg(last.rpartition(".")[2], 6, []))
+    r.status("mapper", saying("6 of 6 keyframes"))
+    time.sleep(2.5)  # until it is certain, and nothing of this drive is sent again
+    assert r.harness.call(Trigger, "/slam_node/reset").success
+    r.wait(lambda: any(pose.child_frame_id == last + EARLIER for pose in poses), "the end of the drive", timeout=20)
 
 
 def record_frames(r: Rig) -> list[Any]:

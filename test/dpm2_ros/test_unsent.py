@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import sqlite3
 import subprocess
 import sys
@@ -135,6 +136,15 @@ print(sum(file.read(n) == parts for n, parts in enumerate(sent)), len(file))
 """
     done = subprocess.run([sys.executable, "-c", program, tmp_path], capture_output=True, text=True, timeout=120)
     assert done.stdout == "100 100\n", done.stderr
+
+
+def test_what_holds_no_keyframe_holds_no_file() -> None:
+    """One is made with every new start of the odometry, also where nothing will be kept."""
+    before = len(os.listdir("/proc/self/fd"))
+    files = [KeyframeFile() for _ in range(10)]
+    assert len(os.listdir("/proc/self/fd")) == before
+    files[0].append([b"a", b"b", b"c"])
+    assert files[0].read(0) == [b"a", b"b", b"c"]
 
 
 def test_without_a_path_nothing_stays() -> None:

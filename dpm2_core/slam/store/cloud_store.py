@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import BinaryIO
 
@@ -38,15 +38,13 @@ class SpillFile:
     def __init__(self) -> None:
         self._where: list[tuple[int, int] | bytes] = []  # offset and length, or the bytes themselves
         self._end = 0
-        self._file: BinaryIO | None = None
-        with suppress(OSError):
-            self._file = tempfile.TemporaryFile(prefix="dpm2_", buffering=0)  # noqa: SIM115
+        self._file: BinaryIO | None = None  # none before there is a piece
 
     def append(self, data: bytes) -> int:
         """Keep a piece; returns its number."""
         try:
             if self._file is None:
-                raise OSError("no temporary file")
+                self._file = tempfile.TemporaryFile(prefix="dpm2_", buffering=0)  # noqa: SIM115
             self._file.seek(self._end)
             if self._file.write(data) != len(data):
                 raise OSError("disk full")
