@@ -135,7 +135,7 @@ def generate(
                 done += 1
                 progress(done, settings.worlds)
         except BaseException as error:
-            pool.shutdown(wait=False, cancel_futures=True)
+            pool.shutdown(cancel_futures=True)  # waits: the one of `with` cancels nothing
             if isinstance(error, OSError):
                 raise Dpm2Error(f"{out}: not written: {error.strerror or error}") from error
             raise
