@@ -108,7 +108,7 @@ def _fresh(parts: Sequence[Part], out: Path, workers: int, progress: Progress) -
             for future in as_completed(running):
                 yield running[future], future.result()
         except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
+            pool.shutdown(cancel_futures=True)
             raise
 
 

@@ -71,10 +71,12 @@ class Robot:
         return bool(self.lidar.get_subscription_count() and self.message(""))
 
     def send(self, *frames: int) -> None:
-        """Scans, 0.1 s apart whatever their place in the drive, each when the one before has come out."""
+        """Scans, 0.1 s apart whatever their place in the drive, each when the one before has come out; of one place no
+        two are the same, as of no LiDAR."""
         for n in frames:
             frame = next(iter(self._source.frames(n, n + 1)))
             self._stamp += 100_000_000
+            frame.points[:, 3] += self._stamp % 1_000_000_007 * 1e-12
             before = len(self.odom)
             self.lidar.publish(cloud_to_msg(frame.points, self._stamp, "lidar"))
             self.harness.wait(lambda before=before: len(self.odom) > before, f"the odometry of scan {n}")
