@@ -56,7 +56,7 @@ def _reference_table(shares: Mapping[str, Any]) -> FigureTable:
     for drive, rows in shares.items():
         for name, row in rows.items():
             values = [value for apart in row.values() for within, value in apart.items() if within != "pairs"]
-            table.add_row(drive, name, *(f"{value:.2f}" for value in values))
+            table.add_row(drive, name, *("-" if value is None else f"{value:.2f}" for value in values))
         table.add_section()
     return table
 

@@ -57,6 +57,10 @@ Watch = Callable[[Frame, SlamResult, Mapper], None]
 """Looks at a frame, what became of it, and the map as it is then."""
 
 
+_STAMPS = 10_000_000
+"""ns that the stamps of a truth may be from those of the frames, as for `matched`."""
+
+
 class OfflineRun:
     """One drive through the SLAM. A context manager: leaving it closes the map file, if there is one.
 
@@ -333,10 +337,20 @@ class Result:
         truth = self.ground_truth
         if not isinstance(truth, Trajectory):
             return None if truth is None else truth[: len(self)], self.poses
-        own = Trajectory(self.poses, np.array(self.recorder.stamps), "tum")
+        own, apart = Trajectory(self.poses, np.array(self.recorder.stamps), "tum"), _STAMPS
         if truth.kind == "kitti-indexed":
-            own = Trajectory(self.sensor_poses, np.array(self.recorder.index), "kitti-indexed")
+            own, apart = Trajectory(self.sensor_poses, np.array(self.recorder.index), "kitti-indexed"), 0
+        first, last = min(own.keys, default=0) - apart, max(own.keys, default=0) + apart
+        during = (truth.keys >= first) & (truth.keys <= last)
+        if during.any():  # else it is of another drive, which `matched` says
+            truth = Trajectory(truth.poses[during], truth.keys[during], truth.kind)
         return matched(truth, own)
+
+    @property
+    def sensor(self) -> str:
+        """Whose poses are compared with the truth."""
+        stamped = isinstance(self.ground_truth, Trajectory) and self.ground_truth.kind == "tum"
+        return "LiDAR" if stamped or self.source.T_cam_lidar is None else "left camera"
 
 
 def save_config(config: Config, out: Path) -> None:

@@ -143,9 +143,8 @@ def _report(result: Result, out: Path, json_file: Path | None) -> None:
         console.print("no place of this drive was found in the map: it stands in a frame of its own", style="yellow")
     for missing in result.save(out):
         console.print(missing, soft_wrap=True)
-    metrics, sensor = result.metrics, "LiDAR" if source.T_cam_lidar is None else "left camera"
-    title = f"{source.name}, {len(result)} frames"
-    shown = "" if metrics is None else metrics_table(metrics, title=title, frame=sensor)
+    metrics, title = result.metrics, f"{source.name}, {len(result)} frames"
+    shown = "" if metrics is None else metrics_table(metrics, title=title, frame=result.sensor)
     figures = {"source": source.name, **result.timing, "metrics": None if metrics is None else metrics.model_dump()}
     show(shown, figures, json_file)
     console.print(f"Results in {out}", soft_wrap=True)

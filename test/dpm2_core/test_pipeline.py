@@ -125,7 +125,9 @@ def test_ground_truth_as_poses_and_as_a_tum_file(recording: Path, tmp_path: Path
     assert stamped.metrics is not None
     assert given.metrics is not None
     assert stamped.metrics.truth == str(tmp_path / "truth.tum")
-    assert given.metrics.frames == 5
+    assert given.metrics.frames == stamped.metrics.frames == 5  # of the drive, not of the whole truth
+    assert stamped.metrics.path_length_m == pytest.approx(given.metrics.path_length_m, abs=0.1)
+    assert (stamped.sensor, given.sensor) == ("LiDAR", "left camera")
     # They differ by the distance between the sensors times the error of the rotation.
     assert stamped.metrics.ape_rmse_m == pytest.approx(given.metrics.ape_rmse_m, abs=5e-3)
     stamped.save(tmp_path / "out")

@@ -27,6 +27,8 @@ def first_part(data: MapData) -> MapData:
     """The map of the keyframes that are tied to the first one: of all others it is not known where in it they are."""
     parts = parts_of(data)
     own = parts == parts[0]
+    if own.all():
+        return data
     for node in np.flatnonzero(own).tolist():
         loan = data.clouds.loan(node)  # by a loop that was rejected since then, it may be of another part
         own[node] = loan is None or own[loan.lender]

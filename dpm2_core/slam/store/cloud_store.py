@@ -69,6 +69,9 @@ class CloudStore(LazySequence[Points]):
 
     An item is the (M, 4) float32 cloud without the points that were found to move; `whole` has them too. A keyframe
     that a revisit made redundant has none of its own: it borrows that of the keyframe it came back to.
+
+    Attributes:
+        name: of the map, for errors.
     """
 
     def __init__(
@@ -86,7 +89,7 @@ class CloudStore(LazySequence[Points]):
             loans: those among them that have no cloud of their own.
             name: of the map, for errors.
         """
-        self._name = name
+        self.name = name
         self._stored = stored
         self._spill = SpillFile()
         self._where: list[int | bytes | None] = [None] * len(moving)  # number in the temporary file; None: map file
@@ -149,7 +152,7 @@ class CloudStore(LazySequence[Points]):
         try:
             yield
         except CodecError as error:
-            raise Dpm2Error(f"{self._name}: keyframe {index}: {error}; see dpm2 map check") from None
+            raise Dpm2Error(f"{self.name}: keyframe {index}: {error}; see dpm2 map check") from None
 
     def __len__(self) -> int:
         return len(self._where)

@@ -245,7 +245,8 @@ def subset(data: MapData, nodes: Sequence[int], edges: list[Edge], trail: list[R
     where = list(nodes)
     new = {node: i for i, node in enumerate(where)}
     loans = {new[node]: Loan(new[loan.lender], loan.T_kf_lender) for node in where if (loan := data.clouds.loan(node))}
-    clouds = CloudStore(lambda i: data.clouds.packed(where[i]), [data.clouds.moving(node) for node in where], loans)
+    clouds = CloudStore(lambda i: data.clouds.packed(where[i]), [data.clouds.moving(node) for node in where], loans,
+                        data.clouds.name)  # fmt: skip
     return MapData(
         [data.keyframes[node] for node in where],
         [data.session[node] for node in where],
