@@ -8,6 +8,8 @@ from time import perf_counter
 
 import numpy as np
 
+from dpm2_core.data.repeated import PROBLEM as REPEATED
+from dpm2_core.data.repeated import RepeatedCloud
 from dpm2_core.data.stream_clock import SLOWEST, StreamClock
 from dpm2_core.frame import Array, Frame, OdometryResult, Registration, State
 from dpm2_core.geometry import se3
@@ -16,8 +18,6 @@ from dpm2_core.slam.bridge import Bridge, Limits
 from dpm2_core.slam.odometry.inertial import InertialMotion
 from dpm2_core.slam.odometry.keyframe_selection import KeyframeSelector
 from dpm2_core.slam.odometry.other import OtherMotion, Step
-from dpm2_core.data.repeated import PROBLEM as REPEATED
-from dpm2_core.data.repeated import RepeatedCloud
 from dpm2_core.slam.odometry.settings import OdometrySettings
 from dpm2_core.slam.odometry.starts import starts_from_rest, turned_starts
 from dpm2_core.slam.preprocess import Scan
