@@ -58,7 +58,7 @@ def write_json(path: Path | str, content: object) -> None:
 
 
 def json_text(content: object, indent: int = 2) -> str:
-    """The same as text; a number that is not finite is null, which JSON has a word for."""
+    """Content as JSON; a number that is not finite becomes null, since JSON has no NaN."""
     return json.dumps(_known(content), indent=indent, allow_nan=False) + "\n"
 
 

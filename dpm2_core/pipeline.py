@@ -19,7 +19,7 @@ from dpm2_core.data.open import open_source
 from dpm2_core.data.ply import write_ply
 from dpm2_core.data.prefetch import prefetch
 from dpm2_core.data.source import Source, Span
-from dpm2_core.data.trajectory import Trajectory, matched, write_kitti, write_tum
+from dpm2_core.data.trajectory import SAME_TIME, Trajectory, frame_period, matched, write_kitti, write_tum
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.figures import trajectory_png
 from dpm2_core.evaluation.ground_truth import in_other_frame, read_ground_truth, truth_by_stamp
@@ -55,10 +55,6 @@ from dpm2_core.slam.system import SlamResult
 
 Watch = Callable[[Frame, SlamResult, Mapper], None]
 """Looks at a frame, what became of it, and the map as it is then."""
-
-
-_STAMPS = 10_000_000
-"""ns that the stamps of a truth may be from those of the frames, as for `matched`."""
 
 
 class OfflineRun:
@@ -278,8 +274,7 @@ class Result:
             poses = self.sensor_poses
             truth = truth if self.source.T_cam_lidar is None else in_other_frame(truth, self.source.T_cam_lidar)
         failed = self.methods["failed"]
-        period = Trajectory(self.poses, np.array(self.recorder.stamps), "tum").period
-        metrics = evaluate(truth, poses, period=period, failed_frames=failed)
+        metrics = evaluate(truth, poses, period=frame_period(self.recorder.stamps), failed_frames=failed)
         own = {"truth": self.ground_truth_name, "breaks": self.recorder.breaks, "fps": self.fps}
         return metrics.model_copy(update=own)
 
@@ -337,7 +332,7 @@ class Result:
         truth = self.ground_truth
         if not isinstance(truth, Trajectory):
             return None if truth is None else truth[: len(self)], self.poses
-        own, apart = Trajectory(self.poses, np.array(self.recorder.stamps), "tum"), _STAMPS
+        own, apart = Trajectory(self.poses, np.array(self.recorder.stamps), "tum"), SAME_TIME * 1e9
         if truth.kind == "kitti-indexed":
             own, apart = Trajectory(self.sensor_poses, np.array(self.recorder.index), "kitti-indexed"), 0
         first, last = min(own.keys, default=0) - apart, max(own.keys, default=0) + apart

@@ -236,7 +236,7 @@ class BagSource:
             raise UsageError(f"{self.path}: camera {camera.topic}: {problem}") from None
 
     def _add_transforms(self) -> None:
-        """Those of /tf_static; one that is none is left out, and said."""
+        """Take those of /tf_static; the invalid ones are left out, with a note."""
         problems = list[str]()
         for _, _, data in self._bag.messages([topics.TF_STATIC]):
             try:

@@ -12,7 +12,7 @@ import numpy as np
 from dpm2_core.data.gnss import FixBuffer
 from dpm2_core.data.image_messages import decode_camera, decode_image, is_fisheye, rectified
 from dpm2_core.data.imu import ImuBuffer
-from dpm2_core.data.messages import MessageError, decode_points, why_untimed
+from dpm2_core.data.messages import MessageError, decode_points, returned, why_untimed
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.transforms import TransformTree
 from dpm2_core.data.vertical_angle import HDL64_CORRECTION_DEG, correct_vertical_angle
@@ -136,7 +136,7 @@ class FrameBuilder:
             self.problems[topic] = self._tell(topic, error, "; going on without the second LiDAR")
             return points, offset
         self.problems.pop(topic, None)
-        seen = np.isfinite(others[:, :3]).all(1) & others[:, :3].any(1)  # moved, a missing return's zeros are a point
+        seen = returned(others)  # moved, the zeros of a missing return would be a point
         others, other_offset = others[seen], None if other_offset is None else other_offset[seen]
         if offset is not None or other_offset is not None or late:
             first = np.zeros(len(points), np.float32) if offset is None else offset

@@ -224,8 +224,13 @@ def scale_intensity(points: Points, intensity_max: float | None = None, integer:
     return points
 
 
+def returned(points: Points) -> NDArray[np.bool_]:
+    """(N,) which of (N, 4) points the LiDAR has measured: where nothing came back drivers put NaN, or zeros."""
+    return np.asarray(np.isfinite(points[:, :3]).all(1) & points[:, :3].any(1))
+
+
 def _time_offset(time: NDArray[Any], points: Points, stamp: int, unit: TimeUnit) -> Points | None:
-    seen = np.isfinite(points[:, :3]).all(1) & points[:, :3].any(1)  # drivers often zero the time of a missing return
+    seen = returned(points)  # drivers often zero the time of a missing return
     value = _first(time).astype(np.float64)
     seen &= np.isfinite(value)
     zero = value == 0

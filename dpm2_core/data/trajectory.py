@@ -20,11 +20,11 @@ from dpm2_core.geometry import se3
 Keys = NDArray[np.int64]
 
 _TUM, _KITTI, _KITTI_INDEXED, _KITTI_360 = 8, 12, 13, 17  # numbers a line
-
-
 _GAP = 1_000_000_000  # ns between two poses beyond which nothing is known in between
 FRAME_PERIOD = 0.1
 """Of KITTI's scans, s."""
+SAME_TIME = 0.01
+"""s between the stamps of two poses of one frame."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,7 @@ class Trajectory:
     @property
     def period(self) -> float:
         """Median time from one pose to the next, s; that of KITTI's frames where there are no stamps."""
-        return _period(self.keys) * 1e-9 if self.kind == "tum" and len(self) > 1 else FRAME_PERIOD
+        return frame_period(self.keys) if self.kind == "tum" else FRAME_PERIOD
 
 
 def write_kitti(path: Path | str, poses: Array, index: Sequence[int] | Keys | None = None) -> None:
@@ -135,7 +135,7 @@ def _poses(rows: Array, columns: int) -> tuple[Array, NDArray[np.bool_]]:
     return se3.make(R, matrices[:, :, 3]), finite & (skew < 0.01) & (np.linalg.det(R) > 0)
 
 
-def matched(gt: Trajectory, est: Trajectory, tolerance: float = 0.01) -> tuple[Array, Array]:
+def matched(gt: Trajectory, est: Trajectory, tolerance: float = SAME_TIME) -> tuple[Array, Array]:
     """Ground truth (N, 4, 4) and the estimate (N, 4, 4) of the same frames, NaN where it has none.
 
     By stamp (nearest within `tolerance`, s) if both are TUM, by frame number if one carries it and the other has a line
@@ -192,6 +192,11 @@ def interpolate(stamps: Keys, poses: Array, at: Keys) -> Array:
     fraction = ((at - stamps[left])[between] / gap[between])[:, None]
     out[between] = T0 @ se3.exp(fraction * se3.log(se3.inverse(T0) @ T1))
     return out
+
+
+def frame_period(stamps: Keys | Sequence[int]) -> float:
+    """Median time from one of these stamps (N,) ns to the next, s; that of KITTI's frames where there are too few."""
+    return _period(np.asarray(stamps)) * 1e-9 if len(stamps) > 1 else FRAME_PERIOD
 
 
 def _period(keys: Keys) -> float:

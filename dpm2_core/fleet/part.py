@@ -102,14 +102,13 @@ def _fresh(parts: Sequence[Part], out: Path, workers: int, progress: Progress) -
             yield part.name, _named(part, out, partial(progress.frame, part.name))
         return
     context = multiprocessing.get_context("spawn")  # a fork would inherit torch's threads half
-    with ProcessPoolExecutor(workers, mp_context=context) as pool:
+    pool = ProcessPoolExecutor(workers, mp_context=context)
+    try:
         running = {pool.submit(_named, part, out): part.name for part in parts}
-        try:
-            for future in as_completed(running):
-                yield running[future], future.result()
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+        for future in as_completed(running):
+            yield running[future], future.result()
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def _named(part: Part, out: Path, advance: Advance = lambda done, total: None) -> Figures:

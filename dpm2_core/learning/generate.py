@@ -127,18 +127,17 @@ def generate(
     missing = [seed for seed in seeds if not folders[seed].exists()]
     done = settings.worlds - len(missing)
     progress(done, settings.worlds)
-    with ProcessPoolExecutor(workers) as pool:
+    pool = ProcessPoolExecutor(workers)
+    try:
         running = [pool.submit(generate_world, folders[seed], seed, settings) for seed in missing]
-        try:
-            for future in as_completed(running):
-                future.result()
-                done += 1
-                progress(done, settings.worlds)
-        except BaseException as error:
-            pool.shutdown(cancel_futures=True)  # waits: the one of `with` cancels nothing
-            if isinstance(error, OSError):
-                raise Dpm2Error(f"{out}: not written: {error.strerror or error}") from error
-            raise
+        for future in as_completed(running):
+            future.result()
+            done += 1
+            progress(done, settings.worlds)
+    except OSError as error:
+        raise Dpm2Error(f"{out}: not written: {error.strerror or error}") from error
+    finally:
+        pool.shutdown(cancel_futures=True)  # the end of a `with` would make the other worlds first
 
 
 def pack(

@@ -80,7 +80,7 @@ class Odometry:
         self._T, self._twist, self._of_velocity = before._T, before._twist, before._of_velocity
         self._covariance, self._clock, self._registered = before._covariance, before._clock, before._registered
         self._breaks, self._broken = before._breaks, before._broken
-        self._other, self._inertial = before._other, before._inertial
+        self._other, self._inertial, self._repeated = before._other, before._inertial, before._repeated
         self._keyframes.take_over(before._keyframes)
         twist = np.zeros(6) if self._twist is None else self._twist
         self._registration.update(self._registration.prepare(frame, twist), self._T)
