@@ -41,10 +41,15 @@ def atomic_write(path: Path | str, mode: Literal["w", "wb"] = "w") -> Iterator[I
             os.fsync(file.fileno())
         part.replace(target)
     except OSError as error:
-        raise Dpm2Error(f"{path}: not written: {error.strerror or error}") from error
+        raise not_written(path, error) from error
     finally:
         with suppress(OSError):
             part.unlink()
+
+
+def not_written(path: Path | str, error: OSError) -> Dpm2Error:
+    """What to raise where a file or folder could not be written: it names `path` and says why."""
+    return Dpm2Error(f"{path}: not written: {error.strerror or error}")
 
 
 def write_json(path: Path | str, content: object) -> None:

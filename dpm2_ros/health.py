@@ -193,6 +193,8 @@ class Diagnostics:
         if last is None:
             return self._status("odometry", OK, "the first cloud is being processed", figures)
         level, text = _LEVEL[last.state], str(last.state)
+        if not last.registration.ok:
+            level = max(level, WARN)  # as while it begins, where clouds in millimeters have no point in range
         if last.registration.reason:
             text += f": {last.registration.reason}"
         if last.breaks:

@@ -22,7 +22,8 @@ from dpm2_core.data.kitti import KittiSource
 from dpm2_core.data.messages import cloud_fields, point_columns
 from dpm2_core.data.prefetch import prefetch
 from dpm2_core.data.source import Span
-from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.errors import UsageError
+from dpm2_core.files import not_written
 from dpm2_core.frame import Array, Camera, Fix, Frame
 from dpm2_core.geometry import se3
 
@@ -152,7 +153,7 @@ def _new_folder(out: Path, overwrite: bool) -> Iterator[Path]:
             out.rename(part / "replaced")
         (part / out.name).rename(out)
     except OSError as error:
-        raise Dpm2Error(f"{out}: not written: {error.strerror or error}") from error
+        raise not_written(out, error) from error
     finally:
         shutil.rmtree(part, ignore_errors=True)
 

@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpm2_core.errors import UsageError
+from dpm2_core.files import not_written
 from dpm2_core.frame import Array, Camera, Image
 
 QUANTUM = 0.002  # m; 60 m fit in 16 bits, and the LiDAR's noise is ten times as much
@@ -32,6 +34,9 @@ class PackedWriter:
     """Writes a drive frame by frame: what is in memory does not grow with it but for poses and calibration.
 
     A folder appears when the block ends well; a killed run leaves nothing that looks whole.
+
+    Raises:
+        Dpm2Error: of the block, where files could not be written.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -46,7 +51,10 @@ class PackedWriter:
 
     def __enter__(self) -> PackedWriter:
         shutil.rmtree(self.part, ignore_errors=True)
-        self.part.mkdir(parents=True)
+        try:
+            self.part.mkdir(parents=True)
+        except OSError as error:
+            raise not_written(self.folder, error) from error
         return self
 
     def add(self, sample: Sample) -> None:
@@ -87,10 +95,13 @@ class PackedWriter:
         shutil.rmtree(self.folder, ignore_errors=True)
         os.replace(self.part, self.folder)
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         for file in self._files.values():
-            file.close()
+            with suppress(OSError):  # a full disk: what is left is removed
+                file.close()
         shutil.rmtree(self.part, ignore_errors=True)
+        if isinstance(error, OSError):
+            raise not_written(self.folder, error) from error
 
 
 class _GrowingArray:

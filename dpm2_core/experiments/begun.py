@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
-from dpm2_core.files import atomic_write, file_digest
+from dpm2_core.files import atomic_write, file_digest, make_folder
 
 _BEGUN, _CHECKPOINT, LOG = "begun.yaml", "checkpoint.pt", "log.jsonl"
 
@@ -22,7 +22,7 @@ def begin_training(folder: Path, text: str, weights: str, read: Sequence[Path] =
         read: files that the training begins with, such as weights.
         start: folder of a training whose checkpoint and log a new one goes on from.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     begun = folder / _BEGUN
     files = [*read, *([] if start is None else [start / _CHECKPOINT])]
     text += "".join(f"# {path}: {file_digest(path) if path.is_file() else 'missing'}\n" for path in files)

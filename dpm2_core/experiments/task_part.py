@@ -13,6 +13,7 @@ from dpm2_core.config import dump_settings, load_settings
 from dpm2_core.data.trajectory import write_tum
 from dpm2_core.evaluation.run_folder import TRAJECTORY, TRUTH, write_truth
 from dpm2_core.experiments.begun import LOG, begin_training
+from dpm2_core.files import make_folder
 from dpm2_core.fleet.part import Advance, Figures
 from dpm2_core.tasks.open import open_scans
 from dpm2_core.tasks.slam_figures import figures_of, slam_runs
@@ -107,7 +108,7 @@ def slam_on(folder: Path, advance: Advance, task: str, weights: str, drive: tupl
         stamps = [(i + 1) * _PERIOD for i in range(len(run.truth))]
         for kind, poses in run.poses.items():
             place = folder / folder_name(run.sequence) / kind
-            place.mkdir(parents=True, exist_ok=True)
+            make_folder(place)
             write_tum(place / TRAJECTORY, stamps, poses)
             write_truth(place / TRUTH, stamps, run.truth)
         advance(len(rows), len(rows))

@@ -22,7 +22,7 @@ from typing import Any
 
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.evaluation.record import git_commit
-from dpm2_core.files import atomic_write, file_digest
+from dpm2_core.files import atomic_write, file_digest, make_folder, not_written
 
 DONE = "part.json"
 """In the folder of a part that ended: what it was asked for, and its figures."""
@@ -177,7 +177,7 @@ def _folder(part: Part, out: Path) -> Iterator[Path]:
     """
     folder = out / part.name
     if not part.fresh:
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         yield folder
         return
     attempt, old = (folder.with_name(f".{folder.name}.{uuid.uuid4().hex}.attempt") for _ in range(2))
@@ -203,7 +203,7 @@ def _explained(folder: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise Dpm2Error(f"{folder}: not written: {error.strerror or error}") from error
+        raise not_written(folder, error) from error
 
 
 def _sizes(folder: Path) -> dict[str, int]:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.extras import needs
-from dpm2_core.files import atomic_write, write_json
+from dpm2_core.files import atomic_write, not_written, write_json
 from dpm2_core.fleet.part import Advance, Figures, Part
 from dpm2_core.slam.loops.retrieval import WIDTH, Vector, centered, pooled
 from dpm2_core.slam.store.check import check_map
@@ -177,7 +177,7 @@ class FleetIndex:
             if self._graph is None:
                 (self._folder / _INDEX).unlink(missing_ok=True)
         except OSError as error:
-            raise Dpm2Error(f"{rows}: not written: {error.strerror or error}") from error
+            raise not_written(rows, error) from error
         self._kept, self._new = self._kept + sum(map(len, self._new)), []
         if self._graph is not None and self._relinked:
             with atomic_write(self._folder / _INDEX, "wb") as file:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +12,17 @@ import torch
 from torch import nn
 
 from dpm2_core.errors import UsageError
+from dpm2_core.files import atomic_write, make_folder
 
 FORMAT = 1
 
 
 def save_checkpoint(path: Path, module: nn.Module, ema: nn.Module, optimiser: torch.optim.Optimizer, step: int) -> None:
-    """Weights, averaged weights, optimizer and step. Everything random follows from seed and step."""
+    """Weights, averaged weights, optimizer and step. Everything random follows from seed and step.
+
+    Raises:
+        Dpm2Error: not written, as on a full disk; the checkpoint before it stays.
+    """
     state = {
         "format": FORMAT,
         "module": module.state_dict(),
@@ -26,9 +30,8 @@ def save_checkpoint(path: Path, module: nn.Module, ema: nn.Module, optimiser: to
         "optimiser": optimiser.state_dict(),
         "step": step,
     }
-    part = path.with_suffix(".part")
-    torch.save(state, part)
-    os.replace(part, path)
+    with atomic_write(path, "wb") as file:
+        torch.save(state, file)
 
 
 def load_checkpoint(path: Path, module: nn.Module, ema: nn.Module, optimiser: torch.optim.Optimizer) -> int:
@@ -57,7 +60,7 @@ class Log:
     """One JSON object a line, and TensorBoard where its package is installed."""
 
     def __init__(self, folder: Path, append: bool) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         self.file = (folder / "log.jsonl").open("a" if append else "w", buffering=1)
         try:
             from torch.utils.tensorboard import SummaryWriter

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, NonNegativeFloat
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
@@ -31,9 +31,9 @@ _PLACES = 100  # that are tried
 class PackedSettings(Settings):
     """Which packed drives to train on."""
 
-    packed: dict[str, float] = Field({})
+    packed: dict[str, NonNegativeFloat] = Field({})
     """Folders of packed drives (`dpm2 train pack`) and the weight of each in the mixture."""
-    emphasis: dict[str, float] = Field({})
+    emphasis: dict[str, NonNegativeFloat] = Field({})
     """Factor on the weight of drives of a preset of the synthetic city, such as {tunnel: 3}."""
     groups: int = Field(4, gt=0)
     """Places in a batch, per process."""
@@ -116,7 +116,7 @@ class Mixture:
             drives += found
             factors = [settings.emphasis.get(str(drive.about.get("preset")), 1.0) for drive in found]
             chances += [weight * factor * len(drive) / frames for drive, factor in zip(found, factors, strict=True)]
-        if not drives:
+        if not sum(chances) > 0:
             raise UsageError("data.packed: want packed drives; `dpm2 train data` and `dpm2 train pack` make some")
         self.drives: Sequence[PackedDrive] = drives
         self.chances = np.array(chances) / sum(chances)

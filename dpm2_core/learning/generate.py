@@ -6,16 +6,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, NonNegativeFloat, field_validator
 
 from dpm2_core.config import Settings
-from dpm2_core.data.packed import PackedWriter, Sample, write_packed
+from dpm2_core.data.packed import PackedDrive, PackedWriter, Sample, write_packed
 from dpm2_core.data.source import Source
 from dpm2_core.descriptors import levelling
-from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Frame, Image, Points
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.deskew import deskew
@@ -41,10 +41,10 @@ class GenerateSettings(Settings):
     """Scans of each world, at random places of its road."""
     length: float = Field(180.0, ge=60)
     """Road of a world, m."""
-    mixture: dict[PresetName, float] = Field(
+    mixture: dict[PresetName, NonNegativeFloat] = Field(
         {"city": 0.3, "suburb": 0.3, "rural": 0.28, "highway": 0.06, "tunnel": 0.06}
     )
-    """Fraction of each kind of place."""
+    """Share of each kind of place; the shares need not add up to 1."""
     beams: Literal[16, 32, 64, 128] = 64
     """Of the LiDAR."""
     height: float = Field(1.73, gt=0.5, le=10)
@@ -64,6 +64,13 @@ class GenerateSettings(Settings):
     """Fraction of the worlds with drops of water on the lens."""
     preset: str = "small"
     """Network preset: its crop and image size are stored."""
+
+    @field_validator("mixture")
+    @classmethod
+    def _of_something(cls, mixture: dict[PresetName, float]) -> dict[PresetName, float]:
+        if not sum(mixture.values()) > 0:
+            raise ValueError("want a share above 0")
+        return mixture
 
 
 def generate_world(folder: Path, seed: int, settings: GenerateSettings) -> None:
@@ -93,7 +100,31 @@ def generate_world(folder: Path, seed: int, settings: GenerateSettings) -> None:
             images = (small_image(Image(pixels, view), network.image),)
         samples.append(_sample(points, T, images, network, scale))
     sensor = lidar.config.model_dump(mode="json", exclude_defaults=True)
-    write_packed(folder, samples, {"source": "synthetic city", "preset": kind, "seed": seed, "sensor": sensor})
+    about: dict[str, object] = {
+        "source": "synthetic city",
+        "preset": kind,
+        "seed": seed,
+        "sensor": sensor,
+        "settings": _asked(settings),
+    }
+    write_packed(folder, samples, about)
+
+
+def _asked(settings: GenerateSettings) -> dict[str, Any]:
+    """What a world is made by, beside its seed."""
+    return settings.model_dump(mode="json", exclude={"worlds", "first_seed"})
+
+
+def _check_same(folder: Path, settings: GenerateSettings) -> None:
+    """A world that is there already is one of these settings, as far as its file says.
+
+    Raises:
+        UsageError: it is of other ones; it names the first that differs.
+    """
+    made = PackedDrive(folder).about.get("settings")
+    for name, now in _asked(settings).items():
+        if isinstance(made, dict) and name in made and made[name] != now:
+            raise UsageError(f"{folder}: made with {name} {made[name]}, not {now}; remove it, or choose another folder")
 
 
 def _lidar(world: World, settings: GenerateSettings, noise: np.random.Generator) -> Lidar:
@@ -120,11 +151,14 @@ def generate(
     """All worlds, several at a time; those that are there already stay, so a killed run continues.
 
     Raises:
+        UsageError: a world that is there already was made by other settings.
         Dpm2Error: a world could not be written. No other is begun then, nor after Ctrl-C.
     """
     seeds = range(settings.first_seed, settings.first_seed + settings.worlds)
     folders = {seed: out / f"world_{seed:06d}" for seed in seeds}
     missing = [seed for seed in seeds if not folders[seed].exists()]
+    for seed in sorted(set(seeds) - set(missing)):
+        _check_same(folders[seed], settings)
     done = settings.worlds - len(missing)
     progress(done, settings.worlds)
     pool = ProcessPoolExecutor(workers)
@@ -134,8 +168,6 @@ def generate(
             future.result()
             done += 1
             progress(done, settings.worlds)
-    except OSError as error:
-        raise Dpm2Error(f"{out}: not written: {error.strerror or error}") from error
     finally:
         pool.shutdown(cancel_futures=True)  # the end of a `with` would make the other worlds first
 

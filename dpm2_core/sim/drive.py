@@ -17,8 +17,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.files import file_digest
+from dpm2_core.errors import UsageError
+from dpm2_core.files import file_digest, not_written
 from dpm2_core.geometry import se3
 from dpm2_core.sim.camera import calibration, render
 from dpm2_core.sim.gnss import Receiver
@@ -152,7 +152,7 @@ def _whole(out: Path) -> Iterator[Path]:
         else:
             part.rename(out)
     except OSError as error:
-        raise Dpm2Error(f"{out}: not written: {error.strerror or error}") from error
+        raise not_written(out, error) from error
     finally:
         shutil.rmtree(part, ignore_errors=True)
 

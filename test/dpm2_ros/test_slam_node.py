@@ -629,6 +629,16 @@ def test_bad_clouds_among_good_ones(rig: Callable[..., Rig], drive: Any) -> None
     assert figures(r.processed(drive.frames))["internal errors"] == "0"
 
 
+def test_clouds_without_a_point_in_range_are_a_warning_from_the_first(rig: Callable[..., Rig], drive: Any) -> None:
+    """As of a driver that sends millimeters: nothing has begun, and that is no good news."""
+    r = rig()
+    for n in range(3):
+        points = decode_points(drive.cloud(n))[0] * np.float32(1000)
+        r.lidar.publish(cloud_to_msg(points, time.time_ns(), "lidar"))  # the node's own clock: else that is a warning
+        r.wait(lambda n=n: len(r.odom) > n, "the pose of a cloud")
+    assert r.processed(3).level == DiagnosticStatus.WARN
+
+
 def test_clouds_that_are_not_of_this_drive_leave_it_alone(rig: Callable[..., Rig], drive: Any) -> None:
     """In another frame, or unreadable with a stamp from anywhere: rejected, counted by their reason, no restart."""
     r = rig()

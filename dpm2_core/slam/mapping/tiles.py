@@ -19,7 +19,7 @@ import numpy as np
 
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.files import write_json
+from dpm2_core.files import not_written, write_json
 from dpm2_core.frame import Array, Image, Points, Registration
 from dpm2_core.slam.loops.relocalization import RelocalizationSettings, Relocalizer, nowhere
 from dpm2_core.slam.loops.retrieval import WIDTH, Vector, centered, pooled
@@ -68,7 +68,7 @@ def write_tiles(data: MapData, folder: Path, size: float) -> int:
         write_json(part / INDEX, {"size": size, "tiles": counts, "weights": weights, "mean": mean.tolist()})
         part.rename(folder)
     except OSError as error:
-        raise Dpm2Error(f"{folder}: not written: {error.strerror or error}") from error
+        raise not_written(folder, error) from error
     finally:
         shutil.rmtree(part, ignore_errors=True)
     return len(squares)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from dpm2_core.errors import UsageError
 from dpm2_core.experiments.begun import begin_training
 
 WEIGHTS = "weights.safetensors"
@@ -61,3 +62,9 @@ def test_it_goes_on_from_the_checkpoint_of_another_one(tmp_path: Path) -> None:
     assert begin_training(folder, "steps: 10\n", WEIGHTS, start=start)
     assert (folder / "checkpoint.pt").read_text() == "of another one"
     assert not (folder / WEIGHTS).exists()
+
+
+def test_a_folder_that_cannot_be_is_an_error_that_names_it(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UsageError, match="file/training: no folder can be made there: Not a directory"):
+        begin_training(tmp_path / "file" / "training", "", WEIGHTS)

@@ -55,6 +55,11 @@ def test_without_a_drive_there_is_nothing_to_learn() -> None:
         Mixture(DataSettings())
 
 
+def test_drives_of_no_weight_are_none(packed: Path) -> None:
+    with pytest.raises(UsageError, match=r"data\.packed: want packed drives"):
+        Mixture(DataSettings(packed={str(packed): 0}))
+
+
 def test_foreign_folders_are_rejected(tmp_path: Path) -> None:
     """No poses, or another format."""
     (tmp_path / "about.json").write_text("{}")

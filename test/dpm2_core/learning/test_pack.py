@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
+import sys
 import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,6 +16,7 @@ from scipy.spatial import cKDTree
 from typer.testing import CliRunner
 
 from dpm2_core.cli import app
+from dpm2_core.config import load_settings
 from dpm2_core.data.packed import PackedDrive, Sample, open_packed, write_packed
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Array, Frame
@@ -249,3 +252,38 @@ def test_a_world_that_cannot_be_written_ends_the_others(tmp_path: Path) -> None:
     with pytest.raises(Dpm2Error, match="not written: File exists"):
         generate(tmp_path, GenerateSettings(worlds=20, frames=2, length=60, beams=16, mixture={"tunnel": 1}), 1)
     assert len(list(tmp_path.glob("world_*"))) < 10  # of 20: those that were begun
+
+
+def test_worlds_of_other_settings_are_not_taken_for_those_that_are_asked_for(tmp_path: Path) -> None:
+    """A set that is continued with another sensor would be of both, without a word."""
+    settings = GenerateSettings(worlds=1, frames=2, length=60, beams=16, mixture={"tunnel": 1})
+    generate(tmp_path, settings, 1)
+    generate(tmp_path, settings, 1)
+    generate(tmp_path, settings.model_copy(update={"first_seed": 999, "worlds": 2}), 1)
+    assert len(open_packed(tmp_path)) == 2
+    with pytest.raises(UsageError, match="world_001000: made with beams 16, not 32"):
+        generate(tmp_path, settings.model_copy(update={"beams": 32}), 1)
+
+
+def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path: Path) -> None:
+    """`ulimit -f` as the disk: a file may have no more than 64 kB."""
+    code = """
+import resource, signal, sys, numpy as np
+from pathlib import Path
+from dpm2_core.data.packed import Sample, write_packed
+from dpm2_core.errors import exit_code
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (65536, 65536))
+frame = Sample(np.ones((10_000, 3), np.float32), np.eye(4))
+sys.exit(exit_code(lambda: write_packed(Path(sys.argv[1]), [frame] * 3, {})))
+"""
+    done = subprocess.run([sys.executable, "-c", code, tmp_path / "d"], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1), done.stderr
+    assert done.stderr.startswith(f"error: {tmp_path / 'd'}: not written: ")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("mixture", [{}, {"city": 0}, {"city": -1, "tunnel": 2}])
+def test_a_mixture_of_nothing_is_an_error(mixture: dict[str, float]) -> None:
+    with pytest.raises(UsageError, match=r"mixture"):
+        load_settings(GenerateSettings, None, [f"mixture={mixture}"])
