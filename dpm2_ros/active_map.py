@@ -174,7 +174,8 @@ class ActiveMap:
             name: of the folder, and then also of a copy of the map file; with a number, where another drive has it.
 
         Raises:
-            UsageError: there is nothing to save. Dpm2Error: it cannot be written.
+            UsageError: there is nothing to save. Dpm2Error: it cannot be written; or the map file is incomplete, and the
+                folder alone is written.
         """
         if (folder := self._maps.folder) is None:
             raise UsageError("no map is saved: ros.map_directory is empty")
@@ -187,6 +188,10 @@ class ActiveMap:
             save_map(self.mapper, folder)
         except OSError as error:
             raise Dpm2Error(f"{folder}: no map saved: {error.strerror}") from None
+        if self.mapper.store_problem:
+            self.finish()  # it writes again: there may be room by now
+        if problem := self.mapper.store_problem:
+            raise Dpm2Error(f"map saved in {folder.resolve()}, but its file is incomplete: {problem}")
         path = self._path
         if name and self._store is not None:
             path = file_beside(folder)

@@ -167,7 +167,7 @@ class ManagedNode(LifecycleNodeMixin, GuardedNode):
             before, back = self._taken.pop()
             try:
                 back.close()
-            except Dpm2Error as error:  # the map file has what could not be saved besides
+            except Dpm2Error as error:  # the way back goes on: what could be saved is saved
                 self.get_logger().error(f"{error}")
             except Exception as error:
                 self.fail("transition", error)

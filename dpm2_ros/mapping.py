@@ -192,7 +192,7 @@ class MapperThread:
         """Finish what is waiting, save the map, end the thread.
 
         Raises:
-            Dpm2Error: the map could not be written.
+            Dpm2Error: the map could not be written, or its file is incomplete.
         """
         self._submit(self._active.finish)
         saved = self._thread.submit(self._active.save) if self._active.saves else None
@@ -203,6 +203,8 @@ class MapperThread:
                 self._node.get_logger().info(saved.result())
             except UsageError as error:
                 self._node.get_logger().info(str(error))
+        if self.store_problem:
+            raise Dpm2Error(f"map file incomplete: {self.store_problem}")
 
     def _submit(self, work: Callable[[], Any]) -> Future[Any]:
         future = self._thread.submit(work)
@@ -225,12 +227,15 @@ class MapperThread:
         return result
 
     def _take_in(self, make: Callable[[], Keyframe]) -> None:
+        behind = self.store_problem
         try:
             self._add(make())
         finally:
             self._taken += 1
             if not self.store_problem:
                 self._written = self._taken
+            elif not behind:
+                self._node.get_logger().error(f"map file incomplete: {self.store_problem}")
 
     def _add(self, keyframe: Keyframe) -> None:
         loops = self._active.add(keyframe)

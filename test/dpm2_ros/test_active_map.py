@@ -185,6 +185,23 @@ def test_a_map_that_cannot_be_kept_goes_on(tmp_path: Path) -> None:
     assert (result.problems, result.keyframes) == ([], 3)
 
 
+def test_a_map_whose_file_is_incomplete_is_not_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another program writes to the file, which is as a full disk: the folder is made, no copy; then all is saved."""
+    monkeypatch.setattr("dpm2_core.slam.store.map_store.BUSY", 0.1)
+    active = ActiveMap(config(map_directory=str(tmp_path)), "", LOG)
+    active.add(keyframes(1)[0])
+    with closing(sqlite3.connect(tmp_path / "drive.dpm2map", isolation_level=None)) as other:
+        other.execute("BEGIN IMMEDIATE")
+        active.add(keyframes(2)[1])
+        with pytest.raises(Dpm2Error, match=r"saved in .*town, but its file is incomplete: .*locked; 1 keyframes"):
+            active.save("town")
+    assert (tmp_path / "town" / "map.ply").is_file()
+    assert not (tmp_path / "town.dpm2map").exists()
+    assert "map of 2 keyframes saved" in active.save("town")
+    active.close()
+    assert check_map(tmp_path / "town.dpm2map").keyframes == 2
+
+
 def described(**ros: Any) -> NodeConfig:
     """As a node is by default, but for the registration of its odometry."""
     return NodeConfig.model_validate({"ros": ros, "slam": {"registration": "geometric"}})

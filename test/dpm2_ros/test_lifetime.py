@@ -6,11 +6,13 @@ from __future__ import annotations
 import os
 import re
 import signal
+import sqlite3
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -152,6 +154,34 @@ def test_a_map_that_cannot_be_saved_at_the_end_is_exit_code_1(
     assert "Traceback" not in output
     assert f"error: {tmp_path / 'map'}" in output
     assert (tmp_path / "map").read_text() == "in the way"
+
+
+def test_a_map_file_that_is_incomplete_at_the_end_is_exit_code_1(
+    ros: Callable[..., Any], drive: Any, tmp_path: Path
+) -> None:
+    """Another program writes to it, which is as a full disk; nothing else is to be saved."""
+    harness, path = ros(), tmp_path / "town.dpm2map"
+    keyframes = harness.hear(Odometry, "/dpm2/keyframe_odom", KEEP_ALL)
+    lidar = harness.publisher(PointCloud2, topics.POINTS)
+    parameters = ["-p", f"ros.map_file:={path}", "-p", "ros.map_directory:=''", *GEOMETRIC]
+    environment = ros_environment(harness.node.context.get_domain_id())
+    process = start("slam_node", ["--ros-args", *parameters], environment, tmp_path / "log")
+    try:
+        harness.wait(lidar.get_subscription_count, "slam_node")
+        harness.find("slam_node")
+        with closing(sqlite3.connect(path, isolation_level=None)) as other:
+            other.execute("BEGIN IMMEDIATE")
+            lidar.publish(drive.cloud(0))
+            harness.wait(lambda: keyframes, "a keyframe")
+            process.send_signal(signal.SIGINT)
+            assert process.wait(180) == 1
+    finally:
+        process.kill()
+    output = (tmp_path / "log").read_text()
+    assert "Traceback" not in output
+    problem = rf"map file incomplete: {path}: .*locked; 1 keyframes are in memory only"
+    assert len(re.findall(problem, output)) == 2  # at once, and at the end
+    assert re.search(rf"^error: {problem}$", output, re.MULTILINE)
 
 
 def test_a_drive_through_player_slam_node_and_mapper_node(
