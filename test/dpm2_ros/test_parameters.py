@@ -71,7 +71,10 @@ def test_some_change_while_a_node_runs(load: Load) -> None:
     assert seen[-1].ros.model_copy(update={"grid": config.ros.grid}) == config.ros
     refused = [
         ("ros.map_name", "../town"),
-        ("ros.grid.resolution", -1.0),
+        ("ros.grid.resolution", 1e-30),
+        ("ros.grid.reach", 1e9),
+        ("ros.grid.lowest", 3.0),  # above the highest: every wall would be free
+        ("ros.grid.highest", -1.0),
         ("ros.map_period", "often"),
         ("ros.map_frame", "m"),
     ]

@@ -45,22 +45,22 @@ class LoopSettings(Settings):
     descriptors: bool = True
     """Find places again by neural descriptors (`neural.weights`), which then every keyframe gets, whatever registers
     the scans; without, only keyframes near by the pose are candidates."""
-    gap: float = 50.0
+    gap: float = Field(50.0, ge=0)
     """Path that must lie between two keyframes of a loop, m."""
-    candidates: int = 4
+    candidates: int = Field(4, ge=1)
     """So many keyframes that look like the new one are registered by the network..."""
-    verified: int = 2
+    verified: int = Field(2, ge=1)
     """...and so many of them, the most confident first, by their points."""
     min_overlap: float = Field(0.2, ge=0, le=1)
     """Probability of the network's overlap head, below which the points are not asked."""
     decided_by: Literal["points", "overlap"] = "points"
     """What accepts a candidate of the network: the points and a second loop; or, as in the paper, its overlap head
     alone, which then also chooses the best of the candidates."""
-    radius: float = 8.0
+    radius: float = Field(8.0, ge=0)
     """The keyframe nearest by the pose is a candidate, too, if nearer than this, m; `drift` widens it."""
-    drift: float = 0.01
+    drift: float = Field(0.01, ge=0)
     """Widens the radius by so many meters per meter of path since that keyframe."""
-    surroundings: float = 22.0
+    surroundings: float = Field(22.0, gt=0)
     """Keyframes so near to a candidate along the path make up the map to register to, m."""
     verification: VerificationSettings = VerificationSettings()
     consistency: ConsistencySettings = ConsistencySettings()

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from pydantic import Field
 
 from dpm2_core.config import Settings
 from dpm2_core.frame import Array, Edge, Keyframe, Registration
@@ -22,17 +23,17 @@ _SLACK, _DRIFT = 1.0, 0.02  # m, and per meter of path: what odometry may be off
 class ConsistencySettings(Settings):
     """How far loops may differ from the odometry and from each other."""
 
-    drift: float = _DRIFT
+    drift: float = Field(_DRIFT, ge=0)
     """Expected odometry drift per meter; a loop that corrects more than this times the path, plus 1 m, is rejected."""
-    drift_turn: float = 0.02
+    drift_turn: float = Field(0.02, ge=0)
     """The same for rotation, degrees per meter (and 3 degrees)."""
-    certain: float = 2.0
+    certain: float = Field(2.0, ge=0)
     """A loop that corrects the odometry by no more than this, m (and degrees), needs no other loop to confirm it."""
-    reach: float = 100.0
+    reach: float = Field(100.0, gt=0)
     """Another loop confirms it if both its ends are nearer than this along the path, m..."""
-    circle: float = 0.4
+    circle: float = Field(0.4, ge=0)
     """...and the circle of the two misses its start by no more than this, m (and three times that, degrees)..."""
-    circle_drift: float = 0.01
+    circle_drift: float = Field(0.01, ge=0)
     """...and this per meter of the path in the circle (and three times that in degrees)."""
 
 

@@ -38,21 +38,21 @@ class VerificationSettings(Settings):
     """Spacing of the points that are registered, m, as in the odometry..."""
     map_voxel: float = Field(0.5, gt=0)
     """...and of those that they are registered to, m."""
-    min_inliers: float = 0.6
+    min_inliers: float = Field(0.6, ge=0, le=1)
     """Fraction of the points that must fit the map."""
-    min_structure: float = 0.6
+    min_structure: float = Field(0.6, ge=0, le=1)
     """The same for what stands above the ground: the road fits anywhere."""
-    min_points: int = 150
+    min_points: int = Field(150, ge=0)
     """So many points above the ground at least; with fewer, places cannot be distinguished."""
-    max_rmse: float = 0.2
+    max_rmse: float = Field(0.2, gt=0)
     """Largest residual of the points that fit, m."""
-    max_sigma: float = 0.1
+    max_sigma: float = Field(0.1, gt=0)
     """Largest standard deviation of the position in its worst direction, m: rejects loops along a tunnel."""
-    max_moved: float = 2.0
+    max_moved: float = Field(2.0, gt=0)
     """The points may not move the proposed pose farther than this, m..."""
-    max_turned: float = 5.0
+    max_turned: float = Field(5.0, gt=0)
     """...or turn it by more than this, degrees."""
-    range: float = 40.0
+    range: float = Field(40.0, gt=0)
     """Points farther than this from the sensor have no say, m: another lane sees other things behind them."""
 
 

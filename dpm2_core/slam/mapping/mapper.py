@@ -34,7 +34,7 @@ _MOST_MISSED = 1000  # keyframes between two, for which an edge is made less cer
 class MapSettings(Settings):
     """The map that is shown and saved."""
 
-    voxel: float = 0.3
+    voxel: float = Field(0.3, gt=0)
     """Spacing of its points, m."""
     thumbnail: int = Field(0, ge=0, le=1024)
     """Width of the image that a map file keeps of each keyframe, pixels. 0: only of those by whose picture one can say

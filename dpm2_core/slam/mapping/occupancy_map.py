@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from dpm2_core.config import Settings
 from dpm2_core.frame import Array, Points
@@ -32,14 +32,20 @@ OCCUPIED, FREE, UNKNOWN = 0, 254, 205  # gray values of map_server
 class OccupancySettings(Settings):
     """The grid that robots plan in."""
 
-    resolution: float = Field(0.1, gt=0)
+    resolution: float = Field(0.1, ge=0.01, le=1000)
     """Edge of a cell, m."""
-    lowest: float = 0.25
+    lowest: float = Field(0.25, ge=0)
     """Points nearer to the ground than this belong to it, m."""
     highest: float = 2.0
-    """Points higher above the ground than this are no obstacle, m."""
-    reach: float = Field(30.0, gt=0)
+    """Points higher above the ground than this are no obstacle, m; above `lowest`."""
+    reach: float = Field(30.0, gt=0, le=1000)
     """Points farther from the sensor than this are not used, m."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> OccupancySettings:
+        if not self.lowest < self.highest:  # else nothing would be an obstacle
+            raise ValueError(f"want lowest < highest, got {self.lowest} and {self.highest}")
+        return self
 
 
 @dataclass(frozen=True, eq=False)

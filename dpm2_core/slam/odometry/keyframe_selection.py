@@ -22,20 +22,20 @@ _TRACE = 30  # frames that a fix may be older than the one that it comes with
 class KeyframeSettings(Settings):
     """Spacing of keyframes and the drift that is assumed between them."""
 
-    distance: float = 5.0
+    distance: float = Field(5.0, ge=0)
     """Motion after which a scan becomes a keyframe, m."""
-    angle: float = 25.0
+    angle: float = Field(25.0, ge=0)
     """Turn after which a scan becomes a keyframe, degrees."""
     residual: float = Field(0.0, ge=0)
     """Residual of registrations, m, at which `distance` shrinks to 1 m; without one it grows to twice its value, as in
     DeepPointMap. 0: it stays as it is."""
-    voxel: float = 0.3
+    voxel: float = Field(0.3, gt=0)
     """Spacing of the points of a keyframe, m."""
-    range: float = 60.0
+    range: float = Field(60.0, gt=0)
     """Points farther than this do not enter the map, m."""
-    drift_translation: float = 0.01
+    drift_translation: float = Field(0.01, gt=0)
     """Standard deviation of the odometry per meter of motion, m: the stiffness of odometry edges in the pose graph."""
-    drift_rotation: float = 0.03
+    drift_rotation: float = Field(0.03, gt=0)
     """The same for rotation, degrees per meter."""
 
 

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from pydantic import Field
 
 from dpm2_core.config import Settings
 from dpm2_core.frame import Array, Frame, Registration
@@ -25,19 +26,19 @@ from dpm2_core.slam.registration.protocol import Prediction
 class GeometricSettings(Settings):
     """The geometric registration."""
 
-    gate: float = 2.0
+    gate: float = Field(2.0, gt=0)
     """Correspondences farther apart than this are ignored in the first iteration, m; it shrinks to `final_gate`."""
-    final_gate: float = 0.5
+    final_gate: float = Field(0.5, gt=0)
     """The same in the last iterations, m."""
-    noise: float = 0.06
+    noise: float = Field(0.06, gt=0)
     """Standard deviation of a point on a perfect plane, m: range noise and calibration."""
-    iterations: int = 15
+    iterations: int = Field(15, ge=1)
     """At most so many Gauss-Newton steps."""
-    min_points: int = 80
+    min_points: int = Field(80, ge=1)
     """A registration with fewer inliers is rejected."""
-    min_inliers: float = 0.5
+    min_inliers: float = Field(0.5, ge=0, le=1)
     """A registration with a smaller ratio of inliers is rejected."""
-    min_inliers_expected: float = 0.3
+    min_inliers_expected: float = Field(0.3, ge=0, le=1)
     """Lower threshold while the map has at most 3 scans and the result agrees with the predicted motion (0.3 m, 2
     degrees): while traffic occludes parts of so small a map, fewer points match. In a larger map few matches mean a
     wrong place."""

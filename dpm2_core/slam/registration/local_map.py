@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from dpm2_core.config import Settings
 from dpm2_core.frame import Array
@@ -22,15 +23,15 @@ _CELL = 3.0  # voxels: edge of the cells in which neighbors are searched
 class LocalMapSettings(Settings):
     """The local map of the odometry."""
 
-    voxel: float = 0.5
+    voxel: float = Field(0.5, gt=0)
     """Edge of the cells that hold one point each, m."""
-    spacing: float = 2.0
+    spacing: float = Field(2.0, ge=0)
     """A scan enters the map after this much motion, m (or a turn of 10 degrees)."""
-    radius: float = 100.0
+    radius: float = Field(100.0, gt=0)
     """Points farther than this from the sensor are forgotten, m."""
-    scans: int = 25
+    scans: int = Field(25, ge=1)
     """Points that entered this many scans ago are forgotten: bounds memory, and traces of moving things."""
-    plane_neighbours: int = 15
+    plane_neighbours: int = Field(15, ge=3)
     """Points that a local plane is fitted to."""
 
 

@@ -1,18 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Presets of the SLAM: changes to the defaults, under what is set besides."""
+"""Presets of the SLAM: changes to the defaults, under what is set besides; and which numbers are allowed."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
-from dpm2_core.config import dump_settings, load_settings
+from dpm2_core.config import dump_settings, flat_fields, load_settings
 from dpm2_core.errors import UsageError
+from dpm2_core.frame import Array, Frame
 from dpm2_core.slam import settings
+from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.settings import Config, SlamSettings
 
+NUMBERS = [n for n, info in flat_fields(Config) if n.startswith("slam.") and info.annotation in (int, float)]
 PAPER = yaml.safe_load((Path(settings.__file__).parent / "presets" / "paper.yaml").read_text())
 
 
@@ -47,3 +51,32 @@ def test_what_is_dumped_loads_back_equal(tmp_path: Path) -> None:
 def test_another_name_is_an_error_that_names_the_choice(name: str) -> None:
     with pytest.raises(UsageError, match=r"--set slam\.preset=.*'highway' or 'paper'"):
         load_settings(Config, None, [f"slam.preset={name}"])
+
+
+def test_no_number_of_the_slam_may_be_negative() -> None:
+    for name in NUMBERS:
+        with pytest.raises(UsageError, match=rf"--set {name}=-1: {name.rpartition('.')[0]}"):
+            load_settings(Config, None, [f"{name}=-1"])
+
+
+def _least(name: str) -> float:
+    """The smallest whole number that is allowed, but for what is above 0: then a hundredth."""
+    for value in (0, 0.01, 1, 3):
+        try:
+            load_settings(Config, None, [f"{name}={value}"])
+        except UsageError:
+            continue
+        return value
+    raise AssertionError(f"{name}: nothing small is allowed")
+
+
+@pytest.mark.parametrize("part", ["geometric", "local_map", "odometry", "keyframes", "map"])
+def test_the_least_that_is_allowed_runs(suburb_drive: tuple[list[Frame], Array], part: str) -> None:
+    """A zero ended in a traceback, some only after the whole drive."""
+    overrides = [f"{name}={_least(name)}" for name in NUMBERS if name.startswith(f"slam.{part}.")]
+    config = load_settings(Config, None, ["slam.registration=geometric", "slam.loops.descriptors=false", *overrides])
+    slam = make_slam(config.slam)
+    results = [slam.process(frame) for frame in suburb_drive[0][:4]]
+    slam.finish()
+    assert all(np.isfinite(result.T_map_lidar).all() for result in results)
+    slam.mapper.cloud()
