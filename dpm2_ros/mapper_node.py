@@ -98,7 +98,7 @@ class MapperNode(ManagedNode):
             feed.tick()
 
     async def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        await respond(self._map.keep(), response)
+        await respond(self, self._map.keep(), response)
         if response.success:
             self._map.reset()
             for feed in self._feeds.values():

@@ -254,7 +254,7 @@ class MapperThread:
             self._loop_closures.publish(edge_to_msg(loop.T_from_to, loop.covariance, stamp, *names))
 
     async def _on_save(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        await respond(self._thread.submit(self._active.save, self._config.ros.map_name), response)
+        await respond(self._node, self._thread.submit(self._active.save, self._config.ros.map_name), response)
         return response
 
     def _show(self) -> None:
@@ -294,7 +294,7 @@ def slow_service(node: Node, kind: type, name: str, callback: Callable[..., Any]
     node.create_service(kind, name, callback, callback_group=MutuallyExclusiveCallbackGroup())
 
 
-async def respond(work: Future[str], response: Any) -> None:
+async def respond(node: GuardedNode, work: Future[str], response: Any) -> None:
     """Fill the response of a service with the result of work in another thread: success, or why not."""
     while not work.done():
         await _OtherCallbacks()
@@ -302,6 +302,9 @@ async def respond(work: Future[str], response: Any) -> None:
         response.success, response.message = True, work.result()
     except Dpm2Error as error:
         response.success, response.message = False, str(error)
+    except Exception as error:  # a bug; who asked is to have an answer nevertheless
+        response.success, response.message = False, f"{type(error).__name__}: {error}"
+        node.fail("service", error)
 
 
 class _OtherCallbacks:

@@ -9,13 +9,13 @@ from concurrent.futures import Future
 from typing import Any
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from rclpy.node import Node
 from std_srvs.srv import SetBool, Trigger
 
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.errors import UsageError
 from dpm2_core.slam.mapping.admission import check_pose
 from dpm2_ros.base_frame import BaseFrame
+from dpm2_ros.guard import GuardedNode
 from dpm2_ros.mapping import MapperThread, respond, slow_service
 
 
@@ -26,9 +26,9 @@ class Requests:
         reset: set once a new start is asked for, and the map saved.
     """
 
-    def __init__(self, node: Node, mapper: MapperThread | None, base: BaseFrame, map_frame: str) -> None:
+    def __init__(self, node: GuardedNode, mapper: MapperThread | None, base: BaseFrame, map_frame: str) -> None:
         """`mapper`: None where it is another node's."""
-        self._mapper, self._base, self._map_frame = mapper, base, map_frame
+        self._node, self._mapper, self._base, self._map_frame = node, mapper, base, map_frame
         self.reset = threading.Event()
         slow_service(node, Trigger, "~/reset", self._on_reset)
         slow_service(node, Trigger, "~/load_map", self._on_load_map)
@@ -40,7 +40,7 @@ class Requests:
         response.success, response.message = True, ""
         if self._mapper is not None:
             begins = "odometry and map start again with the next cloud"
-            await respond(self._mapper.keep(), response)
+            await respond(self._node, self._mapper.keep(), response)
         if response.success:
             self.reset.set()
             response.message = "; ".join(filter(None, (response.message, begins)))
@@ -60,7 +60,7 @@ class Requests:
             response.success, response.message = False, "the mapper is another node's: ros.embed_mapper is off"
             return response
         try:
-            await respond(work(self._mapper), response)
+            await respond(self._node, work(self._mapper), response)
         except UsageError as error:
             response.success, response.message = False, str(error)
         return response

@@ -7,14 +7,19 @@ import os
 import sys
 import threading
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 import pytest
+from std_srvs.srv import Trigger
 
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.geometry import se3
 from dpm2_ros.display import path_to_msg
+from dpm2_ros.guard import GuardedNode
+from dpm2_ros.mapping import respond, slow_service
 from dpm2_ros.runtime import lower_priority
 
 
@@ -41,3 +46,28 @@ def test_the_path_of_a_long_drive_is_soon_made() -> None:
     np.testing.assert_allclose([transform_matrix(one.pose) for one in message.poses], poses, atol=1e-9)  # rounding
     assert [one.header.stamp.nanosec for one in message.poses] == list(range(2000))
     assert path_to_msg(np.zeros((0, 4, 4)), [], "map").poses == []
+
+
+class Failing(GuardedNode):
+    """A service whose work has a bug."""
+
+    def __init__(self) -> None:
+        super().__init__("failing")
+        self._pool = ThreadPoolExecutor(1)
+        slow_service(self, Trigger, "~/work", self._on_work)
+
+    async def _on_work(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        await respond(self, self._pool.submit(lambda: str(1 / 0)), response)
+        return response
+
+    def close(self) -> None:
+        self._pool.shutdown()
+
+
+def test_work_that_fails_by_a_bug_is_answered(ros: Callable[..., Any]) -> None:
+    """Who asked waited for ever; the node counts it, and says so in /diagnostics."""
+    harness = ros()
+    node = harness.add(Failing())
+    answer = harness.call(Trigger, "/failing/work")
+    assert (answer.success, answer.message) == (False, "ZeroDivisionError: division by zero")
+    assert node.errors == 1
