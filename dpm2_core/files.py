@@ -7,6 +7,8 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from math import isfinite
@@ -45,6 +47,30 @@ def atomic_write(path: Path | str, mode: Literal["w", "wb"] = "w") -> Iterator[I
     finally:
         with suppress(OSError):
             part.unlink()
+
+
+def part_beside(path: Path) -> Path:
+    """The hidden file or folder beside `path` in which this process writes what takes that name once it is whole.
+
+    Those of processes that were killed are removed, with what SQLite keeps beside them.
+    """
+    own = os.getpid()
+    for left in path.parent.glob(".*.part*"):
+        part = re.fullmatch(rf"\.{re.escape(path.name)}\.(\d+)\.part(-\w+)?", left.name)
+        if part and (int(part[1]) == own or not _alive(int(part[1]))):
+            with suppress(OSError):
+                shutil.rmtree(left) if left.is_dir() else left.unlink()
+    return path.with_name(f".{path.name}.{own}.part")
+
+
+def _alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except PermissionError:
+        return True
+    except (OSError, OverflowError):
+        return False
+    return True
 
 
 def not_written(path: Path | str, error: OSError) -> Dpm2Error:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.files import write_json
+from dpm2_core.files import part_beside, write_json
 from dpm2_core.fleet.cluster import Cluster
 from dpm2_core.fleet.drives import MAP
 from dpm2_core.fleet.growth import Growth, Standing, add_drives, grown, joins_of
@@ -26,8 +26,8 @@ from dpm2_core.fleet.regions import LARGEST, Join, solve
 from dpm2_core.fleet.run import View
 from dpm2_core.fleet.search import Search, affirmed, component
 from dpm2_core.slam.settings import SlamSettings
-from dpm2_core.slam.store.map_data import MapData, load_map, move_map, remove_map
-from dpm2_core.slam.store.map_store import MapStore
+from dpm2_core.slam.store.map_data import MapData, load_map, move_map
+from dpm2_core.slam.store.map_store import MapStore, remove_map
 
 
 @dataclass
@@ -174,8 +174,7 @@ def _anew(out: Path, search: Search, sizes: Mapping[str, int], joins: Sequence[J
                 break
         together = component(sizes, enough)
         moved = {name: replace(maps[name], poses=region.poses[name]) for name in together}
-        fresh = out.with_name(f".{out.name}.new")
-        remove_map(fresh)
+        fresh = part_beside(out)
         try:
             with MapStore.create(fresh) as store:
                 add_drives(store, {}, Growth(moved, enough), refused)

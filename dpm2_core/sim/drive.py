@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
 import shutil
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -18,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpm2_core.errors import UsageError
-from dpm2_core.files import file_digest, not_written
+from dpm2_core.files import file_digest, not_written, part_beside
 from dpm2_core.geometry import se3
 from dpm2_core.sim.camera import calibration, render
 from dpm2_core.sim.gnss import Receiver
@@ -138,12 +137,9 @@ def _is_there(out: Path, recipe: dict[str, Any]) -> bool:
 def _whole(out: Path) -> Iterator[Path]:
     """A folder that is named `out` when the block ends well, and is gone when it does not."""
     out = out.resolve()
-    part = out.with_name(f".{out.name}.{os.getpid()}.part")
+    part = part_beside(out)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        for left in out.parent.glob(f".{out.name}.*.part"):  # of runs that were killed
-            if not _alive(left.name.split(".")[-2]):
-                shutil.rmtree(left, ignore_errors=True)
         part.mkdir()
         yield part
         if out.is_dir():  # empty, and it stays: a shell may be in it
@@ -155,16 +151,6 @@ def _whole(out: Path) -> Iterator[Path]:
         raise not_written(out, error) from error
     finally:
         shutil.rmtree(part, ignore_errors=True)
-
-
-def _alive(pid: str) -> bool:
-    try:
-        os.kill(int(pid), 0)
-    except PermissionError:
-        return True
-    except (OSError, ValueError, OverflowError):
-        return False
-    return True
 
 
 class _Drive:

@@ -17,7 +17,7 @@ from dpm2_core.network.pretrained import weights_path
 from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.mapping.tiles import TiledMap
 from dpm2_core.slam.settings import Config, SlamSettings
-from dpm2_core.slam.store.map_store import MapStore
+from dpm2_core.slam.store.map_store import MapStore, remove_map
 from dpm2_core.slam.store.rows import Session, weights_id
 
 MapMode = Literal["create", "resume", "extend", "localize"]
@@ -46,12 +46,15 @@ def open_session(path: Path, settings: SlamSettings, config: str, resume: bool) 
     if path.exists() and not resume:
         raise UsageError(f"--map {path}: there is a file already; --resume goes on with it")
     # Not whether it exists now: another node may have made one of that name since.
-    store = MapStore.open(path, read_only=False) if resume and path.exists() else MapStore.create(path)
+    there = resume and path.exists()
+    store = MapStore.open(path, read_only=False) if there else MapStore.create(path)
     try:
         _check_weights(store, weights)
         store.begin_session(config, weights)
     except BaseException:
         store.close()
+        if not there:
+            remove_map(path)
         raise
     return store
 

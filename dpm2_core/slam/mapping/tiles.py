@@ -19,7 +19,7 @@ import numpy as np
 
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.files import not_written, write_json
+from dpm2_core.files import not_written, part_beside, write_json
 from dpm2_core.frame import Array, Image, Points, Registration
 from dpm2_core.slam.loops.relocalization import RelocalizationSettings, Relocalizer, nowhere
 from dpm2_core.slam.loops.retrieval import WIDTH, Vector, centered, pooled
@@ -54,9 +54,8 @@ def write_tiles(data: MapData, folder: Path, size: float) -> int:
     for node, (x, y) in enumerate(np.floor(data.poses[:, :2, 3] / size).astype(int).tolist()):
         if data.clouds.loan(node) is None:
             squares.setdefault((x, y), []).append(node)
-    part = folder.with_name(f".{folder.name}.part")
+    part = part_beside(folder)
     try:
-        shutil.rmtree(part, ignore_errors=True)
         part.mkdir(parents=True)
         vectors = np.array([_vector(data, node) for _, nodes in sorted(squares.items()) for node in nodes])
         mean = np.asarray(vectors.sum(0) / max(int(vectors.any(1).sum()), 1), np.float32)

@@ -12,12 +12,13 @@ from typing import Any, TypeVar
 import numpy as np
 
 from dpm2_core.descriptors import Descriptors
-from dpm2_core.errors import Dpm2Error
+from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.files import not_written, part_beside
 from dpm2_core.frame import Array, Edge, Georeference, Keyframe, Points
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.slam.store.cloud_store import CloudStore, Loan
-from dpm2_core.slam.store.map_store import Change, MapStore, remove_log
+from dpm2_core.slam.store.map_store import Change, MapStore, remove_log, remove_map
 from dpm2_core.slam.store.rows import NO_POINTS as NO_POINTS
 from dpm2_core.slam.store.rows import (
     RemovedKeyframe,
@@ -178,18 +179,20 @@ def save_as(data: MapData, path: Path) -> None:
     Raises:
         UsageError: there is a file already. Dpm2Error: it could not be written.
     """
-    part = path.with_name(f".{path.name}.part")
-    remove_map(part)
-    MapStore.create(path).close()  # rejects a file that is there, and a folder that cannot be written
+    _check_new(path)
+    part = part_beside(path)
     try:
         with MapStore.create(part) as store:
             append_map(store, data)
+        _check_new(path)  # another program may have made one meanwhile
         move_map(part, path)
-    except BaseException:
-        remove_map(path)
-        raise
     finally:
         remove_map(part)
+
+
+def _check_new(path: Path) -> None:
+    if path.exists():
+        raise UsageError(f"{path}: there is a file already")
 
 
 def append_map(store: MapStore, data: MapData) -> int:
@@ -225,19 +228,17 @@ def move_map(source: Path, target: Path) -> None:
     """Give a map that was closed another name; the map that had it goes, with what SQLite keeps beside it.
 
     Raises:
-        Dpm2Error: not all of it is in that one file, since the disk was full; the map that was there stays.
+        Dpm2Error: not all of it is in that one file, since the disk was full, or it is not there; the map that was
+            there stays.
     """
     wal = Path(f"{source}-wal")
     if wal.exists() and wal.stat().st_size:  # see MapStore.close; renamed without it, the map would be damaged
         raise Dpm2Error(f"{target}: not written: the map could not be made one file; is the disk full?")
-    remove_log(target)
-    source.replace(target)
-
-
-def remove_map(path: Path) -> None:
-    """Remove a map file, if it is there, with what SQLite keeps beside it."""
-    path.unlink(missing_ok=True)
-    remove_log(path)
+    try:
+        remove_log(target)
+        source.replace(target)
+    except OSError as error:
+        raise not_written(target, error) from error
 
 
 def subset(data: MapData, nodes: Sequence[int], edges: list[Edge], trail: list[RemovedKeyframe]) -> MapData:

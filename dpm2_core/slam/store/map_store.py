@@ -21,6 +21,7 @@ from typing import Any
 from dpm2_core._version import __version__
 from dpm2_core.database import Connection, connect
 from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.files import part_beside
 from dpm2_core.frame import Array, Edge, Georeference, Keyframe
 from dpm2_core.slam.store import schema
 from dpm2_core.slam.store.cloud_store import Loan
@@ -89,10 +90,13 @@ class MapStore:
                 path.touch(exist_ok=False)  # of two programs that want the same name, one gets it
             except FileExistsError:
                 raise UsageError(f"{path}: there is a file already") from None
-            store = cls(path, _connect(path, "rw"), False)
-            _durable(store._connection)
-            schema.create(store._connection)
-            return store
+            try:
+                with closing(_connect(path, "rw")) as sql:
+                    schema.create(sql)  # not in FILE-wal, the end of which a power cut may take
+                return cls.open(path, read_only=False)
+            except BaseException:
+                remove_map(path)  # what is no map yet would be in the way of the next one
+                raise
 
     @classmethod
     def open(cls, path: Path, read_only: bool = True) -> MapStore:
@@ -267,7 +271,7 @@ class MapStore:
         Raises:
             Dpm2Error: it could not be written.
         """
-        part = path.with_name(f".{path.name}.part")
+        part = part_beside(path)
         with _explained(path):
             try:
                 with closing(sqlite3.connect(part)) as copy:
@@ -275,7 +279,7 @@ class MapStore:
                 remove_log(path)
                 part.replace(path)
             finally:
-                part.unlink(missing_ok=True)
+                remove_map(part)
 
     @contextmanager
     def _transaction(self) -> Iterator[sqlite3.Connection]:
@@ -296,6 +300,12 @@ class MapStore:
 def _insert(sql: sqlite3.Connection, table: str, rows: Sequence[tuple[Any, ...]]) -> None:
     if rows:
         sql.executemany(f"INSERT OR REPLACE INTO {table} VALUES ({','.join('?' * len(rows[0]))})", rows)
+
+
+def remove_map(path: Path) -> None:
+    """Remove a map file, if it is there, with what SQLite keeps beside it."""
+    path.unlink(missing_ok=True)
+    remove_log(path)
 
 
 def remove_log(path: Path) -> None:

@@ -166,9 +166,9 @@ def row_crc(*values: bytes | str | int | float | None) -> int:
 
 
 def create(connection: sqlite3.Connection) -> None:
-    """An empty map in an empty database."""
-    connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
-    connection.executescript(f"BEGIN; {SCHEMA} PRAGMA user_version = {VERSION}; COMMIT;")
+    """An empty map in an empty database, whole or not at all."""
+    about = f"PRAGMA application_id = {APPLICATION_ID}; PRAGMA user_version = {VERSION};"
+    connection.executescript(f"BEGIN; {SCHEMA} {about} COMMIT;")
 
 
 def version_of(connection: sqlite3.Connection, path: Path) -> int:

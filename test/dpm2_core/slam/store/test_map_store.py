@@ -26,6 +26,8 @@ from dpm2_core.frame import Fix, Georeference, Keyframe
 from dpm2_core.geometry import se3
 from dpm2_core.slam.mapping.merge import merge_maps
 from dpm2_core.slam.mapping.prune import prune
+from dpm2_core.slam.session import open_session
+from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.slam.store import schema
 from dpm2_core.slam.store.check import check_map
 from dpm2_core.slam.store.cloud_codec import pack_cloud
@@ -475,6 +477,27 @@ def test_a_copy_that_does_not_fit_on_the_disk_is_an_error(tmp_path: Path, noise:
     assert os.listdir(tmp_path) == ["map"]
 
 
+@pytest.mark.parametrize("size", [20_000, 60_000])
+def test_a_map_that_cannot_be_begun_is_not_in_the_way_of_the_next(tmp_path: Path, size: int) -> None:
+    """Neither where its tables do not fit on the disk, 41 kB, nor where the settings of its first session do not."""
+    settings = SlamSettings(registration="geometric", loops={"descriptors": False})
+    path = tmp_path / "map"
+    with largest_file(size), pytest.raises(Dpm2Error, match=r"map: (disk I/O error|database or disk is full)"):
+        open_session(path, settings, "x" * 100_000, resume=True)
+    assert os.listdir(tmp_path) == []
+    with open_session(path, settings, "x" * 100_000, resume=False) as store:
+        assert store.session == 1
+
+
+def test_a_new_map_is_whole_without_its_log(tmp_path: Path) -> None:
+    """A power cut in the first seconds may take all of FILE-wal; what it left was no map, and in the way of one."""
+    with MapStore.create(tmp_path / "map") as store:
+        store.begin_session()
+        shutil.copyfile(tmp_path / "map", tmp_path / "copy")
+    with MapStore.open(tmp_path / "copy", read_only=False) as store:
+        assert store.begin_session() == 1
+
+
 @pytest.mark.parametrize("read_only", [True, False])
 def test_a_link_to_a_map_that_is_being_written_shows_all_of_it(
     tmp_path: Path, map_file: Path, keyframes: list[Keyframe], read_only: bool
@@ -507,6 +530,47 @@ def test_an_unfinished_copy_leaves_nothing_behind(
         with pytest.raises(UsageError, match="already"):
             save_as(data, map_file)
     assert os.listdir(tmp_path) == [map_file.name]
+
+
+COPY = """
+import os, signal, sys
+from dataclasses import replace
+from pathlib import Path
+from dpm2_core.slam.store.map_data import load_map, save_as
+from dpm2_core.slam.store.map_store import MapStore
+with MapStore.open(Path(sys.argv[1])) as store:
+    data = load_map(store)
+    if sys.argv[3:]:
+        data = replace(data, thumbnail=lambda node: os.kill(os.getpid(), signal.SIGKILL) if node == 5 else None)
+    save_as(data, Path(sys.argv[2]))
+"""
+
+
+def test_a_copy_that_is_killed_leaves_no_map_and_the_next_one_cleans_up(tmp_path: Path, map_file: Path) -> None:
+    """It left an empty map, which the check called sound, and for which the same call was refused."""
+    out = tmp_path / "copy"
+    killed = subprocess.run([sys.executable, "-c", COPY, str(map_file), str(out), "killed"], timeout=60, check=False)
+    assert killed.returncode == -signal.SIGKILL
+    assert not out.exists()
+    assert list(tmp_path.glob(".copy.*.part"))
+    with MapStore.open(map_file) as store:
+        save_as(load_map(store), out)
+    assert check_map(out).keyframes == 12
+    assert sorted(os.listdir(tmp_path)) == sorted([map_file.name, "copy"])
+
+
+def test_of_two_copies_of_one_name_the_first_that_is_whole_gets_it(tmp_path: Path, map_file: Path) -> None:
+    """The second took away what the first had written, and neither was left."""
+    out = tmp_path / "copy"
+
+    def meanwhile(node: int) -> None:
+        if node == 3:
+            subprocess.run([sys.executable, "-c", COPY, str(map_file), str(out)], timeout=60, check=True)
+
+    with pytest.raises(UsageError, match="copy: there is a file already"):
+        save_as(replace(ring(5), thumbnail=meanwhile), out)
+    assert check_map(out).keyframes == 12
+    assert sorted(os.listdir(tmp_path)) == sorted([map_file.name, "copy"])
 
 
 def test_what_is_written_together_is_there_together_or_not_at_all(tmp_path: Path, keyframes: list[Keyframe]) -> None:
