@@ -24,7 +24,7 @@ def slam_node(arguments: Sequence[str] | None = None) -> int:
     def work(arguments: Sequence[str]) -> int:
         from dpm2_ros.slam_node import SlamNode
 
-        return _spin(SlamNode, arguments)
+        return _spin("slam_node", SlamNode, arguments)
 
     return _run(work, arguments)
 
@@ -35,7 +35,7 @@ def mapper_node(arguments: Sequence[str] | None = None) -> int:
     def work(arguments: Sequence[str]) -> int:
         from dpm2_ros.mapper_node import MapperNode
 
-        return _spin(MapperNode, arguments)
+        return _spin("mapper_node", MapperNode, arguments)
 
     return _run(work, arguments)
 
@@ -51,8 +51,20 @@ def bag_player(arguments: Sequence[str] | None = None) -> int:
     return _run(work, arguments)
 
 
-def _spin(kind: Callable[[bool], Any], arguments: Sequence[str]) -> int:
-    return spin_node(lambda: kind(_MANAGED in arguments), [text for text in arguments if text != _MANAGED])
+def _spin(name: str, kind: Callable[[bool], Any], arguments: Sequence[str]) -> int:
+    if "--help" in arguments:
+        print(f"usage: {name} [{_MANAGED}] [--ros-args -p NAME:=VALUE ...]; docs/parameters.md lists the parameters")
+        return 0
+    of_ros = [text for text in arguments if text != _MANAGED]
+
+    def make() -> Any:
+        from rclpy.utilities import remove_ros_args
+
+        if unknown := remove_ros_args(["", *of_ros])[1:]:
+            raise UsageError(f"unknown argument {unknown[0]}; those of ROS, such as -p, come after --ros-args")
+        return kind(len(of_ros) < len(arguments))
+
+    return spin_node(make, of_ros)
 
 
 def _run(work: Callable[[Sequence[str]], int], arguments: Sequence[str] | None) -> int:
