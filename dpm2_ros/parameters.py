@@ -45,9 +45,7 @@ def load_parameters(node: Node, kind: type[T]) -> T:
     """
     fields = dict(flat_fields(kind))
     declared = {
-        name: parameter.value
-        for name, parameter in node.get_parameters_by_prefix("").items()
-        if not name.startswith(_OF_RCLPY)
+        name: parameter.value for name, parameter in node.get_parameters_by_prefix("").items() if name not in _OF_RCLPY
     }
     # `ros2 param dump` writes null for what is not set, which rcl reads as a text.
     unset = {name for name, info in fields.items() if info.default is None}
@@ -68,8 +66,18 @@ def load_parameters(node: Node, kind: type[T]) -> T:
         node.undeclare_parameter(name)
     _declare(node, CONFIG_FILE, file, "YAML file with settings, as for `dpm2 run --config`.", None)
     for name, info in fields.items():
-        _declare(node, name, _plain(functools.reduce(getattr, name.split("."), config)), _text(info), info)
+        value = _plain(functools.reduce(getattr, name.split("."), config))
+        if name.endswith("_topic") and value:
+            _check_topic(node, name, value)
+        _declare(node, name, value, _text(info), info)
     return config
+
+
+def _check_topic(node: Node, name: str, topic: str) -> None:
+    try:
+        node.resolve_topic_name(topic)
+    except Exception as error:  # RCLError, whose text ends with a place in the source of ROS
+        raise UsageError(f"{name}: {str(error).partition(', at /')[0]}, got {topic!r}") from None
 
 
 def follow_changes(node: Node, config: T, apply: Callable[[T], None]) -> None:

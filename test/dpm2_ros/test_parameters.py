@@ -172,6 +172,10 @@ def test_a_home_folder_is_meant_by_its_sign(load: Load, tmp_path: Path, monkeypa
         ("input.T_lidar_cam:=[1.0, 2.0]", "input.T_lidar_cam"),
         ("config_file:=/no/such.yaml", "/no/such.yaml: No such file"),
         ("config_file:=5", "config_file: want the path of a file, got 5"),
+        ("use_sim_times:=true", "unknown parameter use_sim_times"),
+        ("input.points_topic:='bad topic'", "input.points_topic: failed to resolve name: .*alphanumerics.*'bad topic'"),
+        ("input.gnss_topic:=1fix", "input.gnss_topic: .*must not start with a number, got '1fix'"),
+        ("ros.odom_topic:=x//y", "ros.odom_topic: .*must not contain repeated '/', got 'x//y'"),
         ("qos_overrides./points.subscription.depth:=3", "qos_overrides is not supported; ros.reliability"),
     ],
 )
