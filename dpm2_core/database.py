@@ -8,6 +8,7 @@ which others wrote, only that it is plain tables.
 
 from __future__ import annotations
 
+import os
 import re
 import sqlite3
 from collections.abc import Mapping, Sequence
@@ -71,8 +72,8 @@ def connect(path: Path, mode: str, timeout: float = 5.0, size: int | None = None
         size = sum(file.stat().st_size for suffix in ("", "-wal") if (file := Path(f"{path}{suffix}")).exists())
     # The mapper of a ROS node is made in one thread and used in another, never in two at once.
     return Connection(
-        f"file:{quote(str(path))}?mode={mode}", timeout, isolation_level=None, check_same_thread=False, uri=True,
-        size=size,
+        f"file:{quote(os.fsencode(path))}?mode={mode}", timeout, isolation_level=None, check_same_thread=False,
+        uri=True, size=size,
     )  # fmt: skip
 
 

@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import os
 import sqlite3
+import sys
 import time
 from contextlib import closing
 from pathlib import Path
@@ -11,6 +13,8 @@ from pathlib import Path
 import pytest
 
 from dpm2_core.database import check_schema, connect
+
+TABLE = "CREATE TABLE t (x INTEGER PRIMARY KEY, y TEXT NOT NULL)"
 
 
 @pytest.mark.slow
@@ -35,12 +39,21 @@ def test_a_large_table_is_read_whole(tmp_path: Path) -> None:
         assert sum(1 for _ in sql.execute("SELECT x, y FROM t ORDER BY x")) == 200_000
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere a name has to be text")
+@pytest.mark.parametrize("name", [b"st\xe4dt.dpm2map", b"a?b#c%20 d.dpm2map"])
+def test_a_file_of_any_name_is_opened(tmp_path: Path, name: bytes) -> None:
+    """Also of bytes that are not UTF-8, as of an archive from elsewhere."""
+    path = tmp_path / os.fsdecode(name)
+    with closing(connect(path, "rwc")) as sql:
+        sql.execute(TABLE)
+    with closing(connect(path, "ro")) as sql:
+        check_schema(sql, {"t": TABLE})
+    assert os.listdir(os.fsencode(tmp_path)) == [name]
+
+
 def test_a_value_beyond_bounds_is_not_made(tmp_path: Path) -> None:
     with closing(connect(tmp_path / "a", "rwc")) as sql, pytest.raises(sqlite3.DataError, match="too big"):
         sql.execute("SELECT zeroblob(1000000000)")
-
-
-TABLE = "CREATE TABLE t (x INTEGER PRIMARY KEY, y TEXT NOT NULL)"
 
 
 @pytest.mark.parametrize(
