@@ -19,6 +19,7 @@ from typer.core import TyperCommand, TyperGroup
 from dpm2_core._version import __version__
 from dpm2_core.console import QUIET
 from dpm2_core.errors import exit_code
+from dpm2_core.interrupt import terminate_as_interrupt
 from dpm2_core.openmp import wait_passively
 
 GROUPS = {
@@ -149,6 +150,7 @@ def version() -> None:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of the console script."""
     wait_passively()
+    terminate_as_interrupt()
     sys.exit(_status(arguments))
 
 

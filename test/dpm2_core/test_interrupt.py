@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from dpm2_core.interrupt import interrupt_deferred
+from dpm2_core.interrupt import interrupt_deferred, terminate_as_interrupt
 
 
 @pytest.fixture(autouse=True)
@@ -28,6 +28,21 @@ def test_the_first_waits_and_the_second_raises() -> None:
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_sigterm_is_as_ctrl_c() -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        terminate_as_interrupt()
+        with interrupt_deferred() as interrupted:
+            signal.raise_signal(signal.SIGTERM)
+            assert interrupted()
+            with pytest.raises(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGINT)
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGTERM)
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 @pytest.mark.parametrize("fails", [False, True])

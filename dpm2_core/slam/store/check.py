@@ -48,16 +48,15 @@ def check_map(path: Path, recover: Path | None = None) -> Findings:
     """Check a map file without changing it; write the good part of it to a new file if wanted.
 
     Raises:
-        UsageError: no map at all, or a later dpm2's. Dpm2Error: nothing can be read, or `recover` cannot be written.
+        UsageError: no map at all, or a later dpm2's. Dpm2Error: nothing can be read, `recover` cannot be written, or
+            there is no room for a copy in the folder for temporary files.
     """
     if not path.is_file():
         raise UsageError(f"{path}: no such map file")
     findings = Findings()
     with tempfile.TemporaryDirectory(prefix="dpm2_check_") as folder:
         copy = Path(folder) / "map"  # opening replays FILE-wal, which would change the damaged file
-        for suffix in ("", "-wal"):
-            with suppress(FileNotFoundError):
-                shutil.copyfile(f"{path.resolve()}{suffix}", f"{copy}{suffix}")
+        _copy(path, copy)
         with closing(_opened(copy, path, findings)) as sql:
             data = _Salvage(sql, copy.stat().st_size // _SMALLEST, findings).run()
             findings.keyframes = len(data)
@@ -66,6 +65,25 @@ def check_map(path: Path, recover: Path | None = None) -> Findings:
                     raise Dpm2Error(f"{path}: nothing in it can be recovered")
                 save_as(data, recover)
     return findings
+
+
+def _copy(path: Path, copy: Path) -> None:
+    """Copy a map with its FILE-wal; while a program writes to it, what is in it at one instant."""
+    source = path.resolve()
+    if Path(f"{source}-shm").exists():
+        # A damaged file, which SQLite cannot read, is copied as it lies there.
+        with suppress(sqlite3.Error), closing(connect(source, "ro")) as sql, closing(sqlite3.connect(copy)) as target:
+            sql.execute("BEGIN")
+            sql.execute("SELECT name FROM sqlite_master LIMIT 1").fetchone()
+            sql.backup(target)
+            return
+    try:
+        for suffix in ("", "-wal"):
+            with suppress(FileNotFoundError):
+                shutil.copyfile(f"{source}{suffix}", f"{copy}{suffix}")
+    except OSError as error:
+        reason = f"no copy of it could be made in {copy.parent.parent}, which TMPDIR can change"
+        raise Dpm2Error(f"{path}: not checked: {reason}: {error.strerror or error}") from error
 
 
 def _opened(copy: Path, path: Path, findings: Findings) -> sqlite3.Connection:

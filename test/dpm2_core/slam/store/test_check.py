@@ -3,9 +3,14 @@
 
 from __future__ import annotations
 
+import os
+import shutil
+import signal
 import sqlite3
 import subprocess
 import sys
+import tempfile
+import time
 from contextlib import closing
 from pathlib import Path
 
@@ -16,11 +21,13 @@ from dpm2_core.data.thumbnail import thumbnail
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Keyframe
 from dpm2_core.slam.store.check import check_map
-from dpm2_core.slam.store.map_data import MapData, load_map
-from dpm2_core.slam.store.map_store import MapStore
+from dpm2_core.slam.store.cloud_codec import pack_cloud
+from dpm2_core.slam.store.map_data import MapData, load_map, save_as
+from dpm2_core.slam.store.map_store import Change, MapStore
 from dpm2_core.slam.store.rows import with_crc
-
-from ....helpers.scenes import make_image
+from test.helpers.full_disk import largest_file
+from test.helpers.maps import ring
+from test.helpers.scenes import make_image
 
 
 def execute(path: Path, *statements: tuple[str, tuple[object, ...]]) -> None:
@@ -161,3 +168,55 @@ os._exit(0)
     assert Path(f"{map_file}-wal").stat().st_size
     assert check_map(map_file).problems == []
     assert [s.config for s in recovered(map_file).sessions] == ["slam: {}", "second"]
+
+
+def test_a_map_that_is_written_meanwhile_is_of_one_instant(
+    tmp_path: Path, keyframes: list[Keyframe], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A slow copy of FILE was of another instant than that of FILE-wal, which the writer had begun anew."""
+    copyfile = shutil.copyfile
+    with MapStore.create(tmp_path / "map") as store:
+        store.begin_session()
+
+        def write(count: int) -> None:
+            for node in range(store.size, store.size + count):
+                keyframe, poses = keyframes[node % 12], {n: np.eye(4) for n in range(node + 1)}
+                store.write(Change([(node, keyframe, pack_cloud(keyframe.cloud), bytes(50_000))], poses=poses))
+
+        def slow(source: str, target: str) -> None:
+            copyfile(source, target)
+            if not source.endswith("-wal"):
+                write(60)
+
+        write(50)
+        monkeypatch.setattr(shutil, "copyfile", slow)
+        findings = check_map(tmp_path / "map", tmp_path / "good")
+        assert Path(f"{tmp_path / 'map'}-wal").stat().st_size
+    assert (findings.problems, findings.keyframes, findings.lost) == ([], 50, 0)
+
+
+def test_a_map_without_room_for_its_copy_is_not_said_to_be_damaged(map_file: Path) -> None:
+    words = (
+        rf"drive.dpm2map: not checked: no copy .* in {tempfile.gettempdir()}, which TMPDIR can change: File too large"
+    )
+    with largest_file(20_000), pytest.raises(Dpm2Error, match=words):
+        check_map(map_file)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_check_that_is_stopped_leaves_no_copy(tmp_path: Path, number: signal.Signals) -> None:
+    save_as(ring(300, 3000), tmp_path / "map")  # a second and more
+    (tmp_path / "temporary").mkdir()
+    program = (
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        f"from dpm2_core.cli import main; main(['map', 'check', {str(tmp_path / 'map')!r}])"
+    )
+    environment = {**os.environ, "TMPDIR": str(tmp_path / "temporary")}
+    with subprocess.Popen([sys.executable, "-c", program], env=environment, stderr=subprocess.PIPE) as process:
+        while process.poll() is None and not list(tmp_path.glob("temporary/*/map")):
+            time.sleep(0.01)
+        process.send_signal(number)
+        _, errors = process.communicate(timeout=60)
+    assert (process.returncode, errors) == (130, b"")
+    assert os.listdir(tmp_path / "temporary") == []
