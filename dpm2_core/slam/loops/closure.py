@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Loops: places that look alike, and places near by the pose; each is registered and verified before it counts.
 
-A candidate must convince four times: the network, which finds it and registers it without any start; the points of the
-new keyframe, which must fit the map around it; the odometry, whose drift has limits; and, where the correction is
-large, a second loop that says the same. Where the odometry between its ends is not known, as of two drives or across a
-gap, it must also fit clearly better than any other place. Whatever fails is kept with the reason.
+A candidate must convince four times: the odometry, whose drift has limits, so that places beyond them are not asked for
+at all; the network, which finds it and registers it without any start; the points of the new keyframe, which must fit
+the map around it; and, where the correction is large, a second loop that says the same. Where the odometry between its
+ends is not known, as of two drives or across a gap, it must also fit clearly better than any other place. Whatever
+fails is kept with the reason.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Array, Edge, Keyframe, Points, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.scale import is_room
-from dpm2_core.slam.loops.consistency import Consistency, ConsistencySettings, OdometryChain
+from dpm2_core.slam.loops.consistency import Consistency, ConsistencySettings, OdometryChain, margin
 from dpm2_core.slam.loops.place_recognition import AGREEING, PlaceRecognition, merged
 from dpm2_core.slam.loops.verification import (
     SAME_PLACE,
@@ -34,6 +35,7 @@ from dpm2_core.slam.registration.icp import GeometricSettings
 if TYPE_CHECKING:  # torch takes seconds to import
     from dpm2_core.network.model import DeepPointMap2
 
+_SEEN = 40.0  # m, between two keyframes that see the same at most; rooms are enlarged
 _MERGED = 6.0  # m, path around a keyframe whose descriptors are merged with its own; rooms are enlarged
 
 
@@ -149,11 +151,16 @@ class LoopCloser:
     ) -> tuple[list[Edge], list[Edge]]:
         """Candidates that the network rejected, and those for the points to verify, the most likely first."""
         s, descriptors = self._settings, keyframes[node].descriptors
-        nearest = self._nearest(since, poses) if s.decided_by == "points" else None
+        distance = np.linalg.norm(poses[:, :3, 3] - poses[node, :3, 3], axis=1)
+        by_points = s.decided_by == "points"
+        nearest = self._nearest(since, distance) if by_points else None
         rejections: list[Edge] = []
         proposals: list[Edge] = []
         if self._places is not None and descriptors is not None:
-            similar = self._places.similar(descriptors, since > s.gap, s.candidates)
+            allowed = since > s.gap
+            if by_points:  # what the odometry would reject in any case is not asked for
+                allowed &= distance <= _SEEN / descriptors.scale + margin(since, s.consistency)
+            similar = self._places.similar(descriptors, allowed, s.candidates)
             found = self._registered(node, similar, keyframes)
             rank = "overlap" if s.decided_by == "overlap" else "confidence"
             for loop in sorted(found, key=lambda loop: -getattr(loop.registration, rank)):
@@ -183,10 +190,9 @@ class LoopCloser:
         results = self._places.register(source, known, 0.0 if by_head else AGREEING)
         return [Edge("loop", c, node, result) for c, result in zip(candidates, results, strict=True)]
 
-    def _nearest(self, since: Array, poses: Array) -> int | None:
+    def _nearest(self, since: Array, distance: Array) -> int | None:
         """The keyframe nearest by the pose, if it is near enough for the drift since then."""
-        s, positions = self._settings, poses[:, :3, 3]
-        distance = np.linalg.norm(positions - positions[-1], axis=1)
+        s = self._settings
         near = np.flatnonzero((since > s.gap) & np.isfinite(since) & (distance < s.radius + s.drift * since))
         return int(near[np.argmin(distance[near])]) if len(near) else None
 

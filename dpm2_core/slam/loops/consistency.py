@@ -17,13 +17,18 @@ from dpm2_core.frame import Array, Edge, Keyframe, Registration
 from dpm2_core.geometry import se3
 
 UNCERTAIN = 0.5  # m, standard deviation of an odometry edge beyond drift: a direction was open, or nothing fitted
+_STOREY = 2.0
+"""A loop that corrects the odometry by more than this, m, may be one to a storey that looks alike..."""
+_MOST_SIGMAS = 3.0
+"""...and is none where the odometry is no more than so many standard deviations off: on the next storey of a car park
+it is 3.7 to 5.1. The odometry promises little: at right loops of whole drives it is 0.2, on real ones perhaps 1."""
 _SLACK, _DRIFT = 1.0, 0.02  # m, and per meter of path: what odometry may be off by without such an edge
 
 
 class ConsistencySettings(Settings):
     """How far loops may differ from the odometry and from each other."""
 
-    drift: float = Field(_DRIFT, ge=0)
+    drift: float = Field(_DRIFT, gt=0)
     """Expected odometry drift per meter; a loop that corrects more than this times the path, plus 1 m, is rejected."""
     drift_turn: float = Field(0.02, ge=0)
     """The same for rotation, degrees per meter (and 3 degrees)."""
@@ -49,6 +54,7 @@ class OdometryChain:
         self._segment = np.zeros(256, np.int64)
         self._meters = np.zeros(256)  # since the segment began
         self._doubt = np.zeros(256)  # the same: three deviations of all uncertain edges, m or degrees, the larger
+        self._covariances: list[Array] = []  # (6, 6) of the way since the segment began, in the odometry frame
         self._T_odom_kf: list[Array] = []
         self._last: dict[str, int] = {}  # by robot
 
@@ -65,10 +71,13 @@ class OdometryChain:
         self._T_odom_kf.append(keyframe.T_odom_kf)
         if before is None or keyframe.edge is None:
             self._segment[node] = node
+            self._covariances.append(np.zeros((6, 6)))
             return
         step = np.linalg.norm(keyframe.T_odom_kf[:3, 3] - self._T_odom_kf[before][:3, 3])
         self._segment[node], self._meters[node] = self._segment[before], self._meters[before] + step
         self._doubt[node] = self._doubt[before] + _doubt(keyframe.edge)
+        A = se3.adjoint(keyframe.T_odom_kf)
+        self._covariances.append(self._covariances[before] + A @ keyframe.edge.covariance @ A.T)
 
     def since(self, node: int) -> Array:
         """(N,) meters of path between each node and this one; inf where the odometry between them is not known."""
@@ -86,6 +95,19 @@ class OdometryChain:
     def T(self, a: int, b: int) -> Array:
         """T_a_b (4, 4) by odometry, of two nodes of one segment."""
         return se3.inverse(self._T_odom_kf[a]) @ self._T_odom_kf[b]
+
+    def sigmas(self, loop: Edge) -> float:
+        """How far a loop within a segment is from the odometry, in standard deviations of both together."""
+        a, b = sorted((loop.from_node, loop.to_node))
+        back = se3.adjoint(se3.inverse(self._T_odom_kf[loop.to_node]))
+        covariance = back @ (self._covariances[b] - self._covariances[a]) @ back.T + loop.covariance
+        error = se3.log(se3.inverse(loop.T_from_to) @ self.T(loop.from_node, loop.to_node))
+        return float(np.sqrt(error @ np.linalg.solve(covariance, error)))
+
+
+def margin(since: Array | float, settings: ConsistencySettings) -> Array | float:
+    """How far a loop may be from the odometry, m, after so many meters of path; inf where that is not known."""
+    return _SLACK + settings.drift * since
 
 
 def _doubt(edge: Registration) -> float:
@@ -123,10 +145,12 @@ class Consistency:
         meters, degrees = se3.magnitude(se3.inverse(T_expected) @ loop.T_from_to)
         confirmed = [w for w in self._waiting if self._agree(loop, w, s)]
         if np.isfinite(since):
-            if meters > _SLACK + s.drift * since or degrees > 3 + s.drift_turn * since:
+            if meters > margin(since, s) or degrees > 3 + s.drift_turn * since:
                 return [loop.rejected(f"{meters:.1f} m, {degrees:.1f} deg from the odometry")]
             if meters <= s.certain and degrees <= s.certain:
                 return self._accept([loop, *confirmed])
+            if meters > _STOREY and (sigmas := self._path.sigmas(loop)) > _MOST_SIGMAS:
+                return [loop.rejected(f"{meters:.1f} m, {sigmas:.0f} standard deviations from the odometry")]
         if confirmed or self._agrees_with_accepted(loop, s):
             return self._accept([loop, *confirmed])
         self._waiting.append(loop)

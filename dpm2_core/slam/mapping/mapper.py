@@ -102,11 +102,11 @@ class Mapper:
         return self._graph.edges
 
     @property
-    def T_map_odom(self) -> Array:
-        """(4, 4) of the robot whose keyframe came last, which carries every correction."""
+    def T_map_odom(self) -> Array | None:
+        """(4, 4) of the robot whose keyframe came last, which carries every correction; None before it is known."""
         if len(self.keyframes) == self.session_start:
-            return self._T_start
-        return se3.orthonormalized(self._graph.pose(-1) @ se3.inverse(self.keyframes[-1].T_odom_kf))
+            return self._T_start if self.session_start in self._known else None
+        return self.T_map_odom_of(self.keyframes[-1].robot)
 
     def T_map_odom_of(self, robot: str) -> Array | None:
         """(4, 4) of a robot; None before it is known where in the map it is."""

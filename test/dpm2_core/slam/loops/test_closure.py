@@ -10,6 +10,7 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.frame import Array, Edge, Keyframe, Points, Registration
@@ -29,7 +30,7 @@ from dpm2_core.slam.loops.relocalization import downsampled
 from dpm2_core.slam.loops.verification import Verifier
 from dpm2_core.slam.registration.icp import GeometricSettings
 
-FIRM = np.diag([1e-3] * 3 + [0.02] * 3) ** 2
+FIRM, OFF = np.diag([1e-3] * 3 + [0.02] * 3) ** 2, np.diag([0.01] * 3 + [0.7] * 3) ** 2
 STREET = np.arange(40.0, 105.0, 5.0)
 
 
@@ -72,7 +73,7 @@ def drive(places: Sequence[tuple[float, float, float]], jump: Array, **settings:
     loops, keyframes, clouds = [], [], []
     search = closer(**settings)
     for i, place in enumerate(at):
-        edge = Registration(np.eye(4), FIRM, 1.0, 0.1, "test") if i else None
+        edge = Registration(np.eye(4), OFF if i == len(STREET) else FIRM, 1.0, 0.1, "test") if i else None
         clouds.append(scan(*place))
         keyframes.append(Keyframe(i, i, i, odometry[i], clouds[-1], edge, "", described(*place)))
         loops += search.close(keyframes, clouds, odometry[: i + 1])
@@ -100,9 +101,9 @@ def test_what_is_merged_around_a_keyframe_has_the_scale_of_that_one(noise: np.ra
 @pytest.mark.weights
 @pytest.mark.parametrize("heading", [0.0, np.pi, np.pi / 2], ids=["same", "reverse", "across"])
 def test_a_revisit_is_found_whatever_the_drift_and_heading(heading: float) -> None:
-    """The odometry is 3 m and 3 degrees off, and says nothing of where to look: the nearest by pose is off the mark."""
+    """The odometry is 2 m off, as it says it may be."""
     places = [(s, 2.5, heading) for s in (62.0, 67.0, 72.0)]
-    jump = se3.exp(np.array([0, 0, np.radians(1.5), 2.5, 1.0, 0]))
+    jump = se3.exp(np.array([0, 0, np.radians(0.6), 1.2, 0.6, 0]))
     loops, truth = drive(places, jump, gap=30.0, consistency={"drift": 0.05})
     accepted = [loop for loop in loops if loop.registration.ok]
     assert {loop.to_node for loop in accepted} == {len(STREET), len(STREET) + 1, len(STREET) + 2}
@@ -146,6 +147,24 @@ def test_a_place_never_seen_closes_no_loop_and_each_candidate_has_its_reason() -
         loops = search.close(keyframes, clouds, poses[: i + 1]) if elsewhere else loops
     assert loops
     assert all(not loop.registration.ok and loop.registration.reason for loop in loops)
+
+
+@pytest.mark.slow
+@pytest.mark.weights
+def test_what_the_odometry_would_reject_is_not_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At 65 m the drive is 300 m away by its odometry, which has come 60 m: no place of the street can be this one."""
+    asked = list[int]()
+    similar = PlaceRecognition.similar
+
+    def counted(self: PlaceRecognition, descriptors: Descriptors, allowed: NDArray[np.bool_], count: int) -> list[int]:
+        asked.append(int(allowed.sum()))
+        return similar(self, descriptors, allowed, count)
+
+    monkeypatch.setattr(PlaceRecognition, "similar", counted)
+    jump = se3.exp(np.array([0, 0, 0, 0, 300.0, 0]))
+    loops, _ = drive([(65.0, 0.0, 0.0)], jump, gap=30.0)
+    assert asked[-1] == 0
+    assert all(loop.to_node < len(STREET) for loop in loops)
 
 
 @pytest.mark.slow

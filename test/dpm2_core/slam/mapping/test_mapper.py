@@ -154,6 +154,7 @@ def test_a_lap_is_closed(lap: tuple[list[Keyframe], Array]) -> None:
     assert end < 0.1 * open_end
     assert ape_rmse(truth, mapper.poses) < 0.8 * ape_rmse(truth, open_ended.poses)  # the drift bends each step alike
     # the odometry was not touched: T_map_odom carries the correction
+    assert mapper.T_map_odom is not None
     last = mapper.T_map_odom @ keyframes[-1].T_odom_kf
     np.testing.assert_allclose(last, mapper.poses[-1], atol=1e-6)
 
@@ -270,9 +271,10 @@ def test_another_drive_is_placed_where_one_says_where_it_begins(tmp_path: Path) 
             mapper = make_mapper(SlamSettings.model_validate({"loops": {"enabled": False}}), store)
             if place is not None:
                 mapper.start_session(place)
+            assert (mapper.T_map_odom is not None) == expected
             mapper.add(drifting(circle(1), np.zeros(6), np.zeros((0, 4), np.float32))[0])
             assert mapper.placed.tolist() == [True] * 60 + [expected]
-            assert (mapper.T_map_odom_of("") is not None) == expected
+            assert (mapper.T_map_odom_of("") is not None) == (mapper.T_map_odom is not None) == expected
 
 
 def test_a_map_of_several_drives_is_loaded_with_the_poses_of_its_file(tmp_path: Path) -> None:
