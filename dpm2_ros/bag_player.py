@@ -71,6 +71,8 @@ class BagPlayer:
         once = [topic for topic in self._bag.topics(CAMERA_INFO) if self._bag.counts[topic] == 1]
         self._latched = (*LATCHED, *once)
         self._publishers = self._make_publishers()
+        self._timed = [topic for topic in self._publishers if topic not in self._latched]
+        self._looked_at: float | None = None  # time of the last message of these, s from the first
         recorded = CLOCK in self._publishers
         if recorded:
             node.get_logger().info(f"{CLOCK} is that of the recording")
@@ -83,21 +85,24 @@ class BagPlayer:
         """Play to the end, or until a signal, and say how much it was.
 
         Raises:
+            UsageError: there is nothing in the stretch that is asked for.
             Dpm2Error: the log cannot be written; in lockstep, there is no odometry, or not of every cloud.
         """
         self._publish_latched()
         self._await_subscribers()
         if self._lockstep is not None:
             self._lockstep.begin()
-        count = 0
-        while True:
-            count += self._play_once()
-            if STOP.is_set() or not self._options.loop:
-                break
+        count = played = self._play_once()
+        while played and self._options.loop and not STOP.is_set():
             self._node.get_logger().info(f"{self._options.bag}: again from the start")
+            count += (played := self._play_once())
+        if self._options.loop and not self._timed:  # what is latched stays there
+            STOP.wait()
         self._await_delivery()
         for note in self._bag.notes:
             self._node.get_logger().warning(note)
+        if not count and self._timed and not STOP.is_set():
+            raise UsageError(f"{self._options.bag}: {self._why_nothing()}")
         if self._options.log is not None:
             with atomic_write(self._options.log) as file:
                 file.writelines(["topic,log_time_ns,published_ns\n", *self._published])
@@ -203,15 +208,23 @@ class BagPlayer:
 
     def _selected(self) -> Iterator[tuple[str, int, bytes]]:
         """The messages of the stretch that is asked for."""
-        first = last = None
-        for topic, log_time, data in self._bag.messages([t for t in self._publishers if t not in self._latched]):
-            if first is None:
-                first = log_time + round(self._options.start * 1e9)
+        origin = first = last = None
+        for topic, log_time, data in self._bag.messages(self._timed):
+            if origin is None or first is None:
+                origin, first = log_time, log_time + round(self._options.start * 1e9)
                 last = None if self._options.duration is None else first + round(self._options.duration * 1e9)
+            self._looked_at = (log_time - origin) * 1e-9
             if last is not None and log_time > last:
                 return
             if log_time >= first:
                 yield topic, log_time, bytes(data)
+
+    def _why_nothing(self) -> str:
+        start, duration, at = self._options.start, self._options.duration, self._looked_at
+        if at is None:
+            return f"no message of {', '.join(self._timed)}"
+        end = "on" if duration is None else f"to {start + duration:g} s"
+        return f"no message from {start:g} s {end}; the {'last' if at < start else 'next'} one is at {at:.1f} s"
 
     def _tick(self, now: int) -> None:
         if self._clock is not None:

@@ -118,6 +118,16 @@ def test_it_loops_until_it_is_stopped(listener: Listener, bag: Path, drive: Any)
     assert stamps[drive.frames : 2 * drive.frames] == stamps[: drive.frames]
 
 
+def test_what_is_latched_alone_stays_there_until_it_is_stopped(listener: Listener, bag: Path) -> None:
+    """It was played again and again, thousands of times a second, each with a line in the log."""
+    player = listener.play(str(bag), "--wait", "90", "--loop", "--topics", topics.TF_STATIC)
+    listener.harness.wait(lambda: listener.static, "the transforms")
+    time.sleep(0.5)
+    player.send_signal(signal.SIGINT)
+    assert player.wait(60) == 0
+    assert "again from the start" not in listener.output()
+
+
 def test_a_recorded_clock_is_the_only_one(listener: Listener, tmp_path: Path) -> None:
     """Of a simulation, whose time is not that of the recording."""
     types = get_typestore(Stores.ROS2_JAZZY)
@@ -193,6 +203,12 @@ def test_without_a_subscriber_it_says_so_and_plays(
         (["BAG", "--no-such-option"], "--no-such-option"),
         (["BAG", "--topics", "/nothing"], "no topic /nothing; topics: "),
         (["BAG", "--ros-args", "--nonsense"], "nonsense"),
+        (["BAG", "--wait", "0", "--start", "100"], "no message from 100 s on; the last one is at 1.5 s"),
+        (["BAG", "--wait", "0", "--start", "100", "--loop"], "no message from 100 s on; the last one is at 1.5 s"),
+        (
+            ["BAG", "--wait", "0", "--start", "0.51", "--duration", "0.02"],
+            "no message from 0.51 s to 0.53 s; the next one is at 0.6 s",
+        ),
     ],
 )
 def test_mistakes_end_with_2_and_one_line(
