@@ -18,12 +18,13 @@ NO_POSE = "silent"
 
 
 class StatePublisher:
-    """`dpm2/state`: a `State`, or silent while there is no pose. Any thread may call."""
+    """`dpm2/state`: a `State`, or silent while no pose follows the last one. Any thread may call."""
 
     def __init__(self, node: Node) -> None:
         self._publisher = node.create_publisher(String, "dpm2/state", LAST_ONE)
-        self._lock, self._said, self._last = threading.Lock(), "", time.monotonic()
-        self.send(State.INITIALIZING)
+        self._lock, self._said = threading.Lock(), ""
+        self._last: float | None = None  # when a pose was published
+        self._say(str(State.INITIALIZING))
         node.create_timer(0.25, self._listen, clock=STEADY)
 
     def send(self, state: State) -> None:
@@ -32,7 +33,7 @@ class StatePublisher:
         self._say(str(state))
 
     def _listen(self) -> None:
-        if self._said != State.INITIALIZING and time.monotonic() - self._last > SILENT:
+        if self._last is not None and time.monotonic() - self._last > SILENT:
             self._say(NO_POSE)
 
     def _say(self, word: str) -> None:

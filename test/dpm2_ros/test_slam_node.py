@@ -205,6 +205,18 @@ def test_the_grid_is_latched_bounded_and_soon_there(rig: Callable[..., Rig], dri
     assert on_the_way == 0
 
 
+def test_it_is_silent_also_after_the_only_cloud(rig: Callable[..., Rig], monkeypatch: pytest.MonkeyPatch) -> None:
+    """But not before it: a driver may take its time to start."""
+    monkeypatch.setattr("dpm2_ros.state.SILENT", 0.5)
+    r = rig()
+    states = r.harness.hear(String, "/dpm2/state", LATCHED)
+    r.wait(lambda: states, "the latched state")
+    time.sleep(1.0)
+    assert [s.data for s in states] == ["initialising"]
+    r.send_and_wait(0)
+    r.wait(lambda: [s.data for s in states] == ["initialising", "silent"], "the silence")
+
+
 def test_the_state_is_latched_and_sent_at_each_change(rig: Callable[..., Rig], monkeypatch: pytest.MonkeyPatch) -> None:
     silent = lambda seconds: monkeypatch.setattr("dpm2_ros.state.SILENT", seconds)  # noqa: E731
     silent(300.0)  # clouds may take their time, but where it is the silence that is looked at
