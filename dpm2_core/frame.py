@@ -56,10 +56,16 @@ class Camera:
 
 @dataclass(frozen=True, eq=False)
 class Image:
-    """One image: pixels (H, W, 3) uint8 RGB, and the camera that took it."""
+    """One image.
+
+    Attributes:
+        pixels: (H, W, 3) uint8 RGB. camera: that took it.
+        time_offset: s, when it was taken relative to the stamp of its frame.
+    """
 
     pixels: NDArray[np.uint8]
     camera: Camera
+    time_offset: float = 0.0
 
     def __post_init__(self) -> None:
         height, width = self.pixels.shape[:2]
@@ -357,6 +363,7 @@ class OdometryResult:
         seconds: wall time of each stage.
         comparison: with another odometry, where there is one and the frame was registered.
         imu: why the IMU was of no use, in words, empty where it was; None while there has been none.
+        camera: why an image of the frame was left out, in words; empty where none was.
     """
 
     stamp: int
@@ -371,3 +378,4 @@ class OdometryResult:
     seconds: dict[str, float] = field(default_factory=dict)
     comparison: Comparison | None = None
     imu: str | None = None
+    camera: str = ""

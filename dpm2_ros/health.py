@@ -209,6 +209,8 @@ class Diagnostics:
         if problem := self._frames.time_problem:
             self._node.get_logger().warning(f"{topic}: {problem}", once=True)
             text = f"{text}; {problem}"
+        if last.camera:
+            text += f"; {last.camera}"
         if problem := self._clock_problem():
             self._node.get_logger().warning(problem, once=True)
             level, text = max(level, WARN), f"{text}; {problem}"

@@ -170,7 +170,8 @@ class CorruptedSource:
             pixels = exposed(pixels, -stops)
         if self._hit[_CAMERA][position]:
             pixels = np.zeros_like(pixels)
-        return Image(pixels, replace(image.camera, T_lidar_cam=image.camera.T_lidar_cam @ self._T_true_wrong))
+        camera = replace(image.camera, T_lidar_cam=image.camera.T_lidar_cam @ self._T_true_wrong)
+        return replace(image, pixels=pixels, camera=camera)
 
 
 def exposed(pixels: NDArray[np.uint8], stops: float) -> NDArray[np.uint8]:

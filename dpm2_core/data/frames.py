@@ -113,8 +113,8 @@ class FrameBuilder:
             points, offset = self._joined(points, offset, lidar_frame, (second[0] - stamp) * 1e-9, second[1])
         imu = None if self._imu is None else self._inertial(self._imu, lidar_frame, stamp, offset)
         fix = None if self._gnss is None else self._fix(self._gnss, lidar_frame, stamp)
-        taken = [(camera, beside[camera.topic][1]) for camera in self._calibration.cameras if camera.topic in beside]
-        found = (self._image(lidar_frame, camera, message) for camera, message in taken)
+        taken = [(camera, *beside[camera.topic]) for camera in self._calibration.cameras if camera.topic in beside]
+        found = (self._image(lidar_frame, camera, message, (at - stamp) * 1e-9) for camera, at, message in taken)
         images = tuple(image for image in found if image is not None)
         return Frame(stamp, points, offset, images, index, imu=imu, fix=fix)
 
@@ -214,7 +214,7 @@ class FrameBuilder:
             self.gnss_problem = self._tell(self._calibration.gnss_topic, error, "; the antenna is taken for the LiDAR")
             return fix
 
-    def _image(self, lidar_frame: str, taken_by: CameraTopic, message: Any) -> Image | None:
+    def _image(self, lidar_frame: str, taken_by: CameraTopic, message: Any, late: float) -> Image | None:
         topic = taken_by.topic
         try:
             message = self._decode(topic, message)
@@ -222,7 +222,7 @@ class FrameBuilder:
             pixels = decode_image(message, camera.size)
             if is_fisheye(taken_by.info) and pixels.shape[1::-1] == camera.size:
                 pixels = rectified(pixels, taken_by.info)
-            image = Image(pixels, camera)
+            image = Image(pixels, camera, late)
         except (UsageError, ValueError) as error:
             self.problems[topic] = self._tell(topic, error, "; images are left out")
             return None

@@ -117,7 +117,7 @@ class Slam:
             return result
         self._underway = frame.stamp
         width = max(self._thumbnail_width, PLACE_WIDTH if self._asks_pictures(result) else 0)
-        if not frame.images or not width:
+        if not frame.images or not width or result.camera:
             return result
         return replace(result, keyframe=replace(result.keyframe, thumbnail=thumbnail(frame.images[0], width)))
 

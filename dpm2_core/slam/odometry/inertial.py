@@ -49,6 +49,7 @@ class InertialMotion:
 
     Attributes:
         turn: R_before_now (3, 3) since the last registered frame; None where it is not known, or not believed.
+        turns: whether that is more than a bias could be; no scan has confirmed it yet.
         problem: why it is None, or why a start at rest is not level; else empty.
         T_level_odom: (4, 4), by which poses become level.
     """
@@ -63,13 +64,14 @@ class InertialMotion:
         self._bias, self._variance = np.zeros(3), _BIAS**2  # of the bias, (rad/s)^2
         self._measured: Array | None = None  # the turn, believed or not
         self._before: int | None = None  # stamp of the last registered frame
-        self._doubt, self._turns = 1.0, False  # and whether it says that it turns, which no scan has confirmed yet
+        self.turns = False
+        self._doubt = 1.0
         self._span = _Span(np.eye(3))
         self._vertical = _Vertical()
 
     def look(self, frame: Frame) -> Frame:
         """Take in a new frame's samples; returns the frame with those around its sweep, without their bias, or none."""
-        if self._turns:  # the last frame was not registered
+        if self.turns:  # the last frame was not registered
             self._remember(_UNSEEN)
         self._join(frame)
         self.turn = self._measured = None
@@ -84,7 +86,7 @@ class InertialMotion:
             return frame if frame.imu is None else replace(frame, imu=None)
         self.turn = self._measured
         if self.turn is not None and self._before is not None:
-            self._turns = _angle(self.turn) > _TURNING * (frame.stamp - self._before) * 1e-9
+            self.turns = _angle(self.turn) > _TURNING * (frame.stamp - self._before) * 1e-9
         return replace(frame, imu=replace(self._samples, rates=self._samples.rates - self._bias))
 
     def covariance(self, seconds: float) -> Array:
@@ -99,7 +101,7 @@ class InertialMotion:
         Args:
             twist: (6,) [rad/s, m/s] the motion between the two; None: nothing is known of it, T begins a map.
         """
-        measured, before, self._before, self._turns = self._measured, self._before, stamp, False
+        measured, before, self._before, self.turns = self._measured, self._before, stamp, False
         if before is None and twist is None:
             self._start_at_rest(T)
         if measured is None or before is None or twist is None:
@@ -163,7 +165,7 @@ class InertialMotion:
         self._remember(min(_angle(measured.T @ scans) ** 2 / variance / _USUAL, _WORST))
 
     def _remember(self, squared: float) -> None:
-        self._turns, self._doubt = False, (1 - _MEMORY) * self._doubt + _MEMORY * squared
+        self.turns, self._doubt = False, (1 - _MEMORY) * self._doubt + _MEMORY * squared
 
     def _correct(self, R: Array) -> None:
         """The bias, by what the scans say of the last second or more; the last of them has the axes R (3, 3)."""

@@ -8,8 +8,8 @@ from time import perf_counter
 
 import numpy as np
 
+from dpm2_core.data.repeated import IMAGE_PROBLEM, RepeatedCloud, RepeatedImages
 from dpm2_core.data.repeated import PROBLEM as REPEATED
-from dpm2_core.data.repeated import RepeatedCloud
 from dpm2_core.data.stream_clock import SLOWEST, StreamClock
 from dpm2_core.frame import Array, Frame, OdometryResult, Registration, State
 from dpm2_core.geometry import se3
@@ -57,7 +57,7 @@ class Odometry:
         self._clock = StreamClock()
         self._registered = np.eye(4), 0.0  # the last registered pose, and the seconds since
         self._failures = 0
-        self._repeated = RepeatedCloud()
+        self._repeated, self._images = RepeatedCloud(), RepeatedImages()
         self._first: Frame | None = None
         self._bridge: Bridge | None = None
         self._left = 0.0  # the time of the last pose before the pause that is being bridged
@@ -81,6 +81,7 @@ class Odometry:
         self._covariance, self._clock, self._registered = before._covariance, before._clock, before._registered
         self._breaks, self._broken = before._breaks, before._broken
         self._other, self._inertial, self._repeated = before._other, before._inertial, before._repeated
+        self._images = before._images
         self._keyframes.take_over(before._keyframes)
         twist = np.zeros(6) if self._twist is None else self._twist
         self._registration.update(self._registration.prepare(frame, twist), self._T)
@@ -91,13 +92,13 @@ class Odometry:
         dt = self._clock.advance(frame.stamp)
         twist = np.zeros(6) if self._twist is None else self._twist
         seconds = self._registered[1] + dt
-        if self._repeated.repeats(frame.points, float(np.linalg.norm(twist[3:])) * seconds) and frame.problem is None:
-            frame = replace(frame, problem=REPEATED)
         if frame.imu is not None and self._inertial is None:
             self._inertial = InertialMotion(not len(self._registration) and self._bridge is None)
         if self._inertial is not None:
             frame = self._inertial.look(frame)
             twist = self._turned(twist, seconds)
+        images = len(frame.images)
+        frame = self._without_repetitions(frame, float(np.linalg.norm(twist[3:])) * seconds)
         if frame.guess is not None and self._other is None:
             self._other = OtherMotion()
         if self._other is not None:
@@ -137,7 +138,18 @@ class Odometry:
             seconds=dict(zip(("preprocess", "register", "update"), np.diff(clock).tolist(), strict=True)),
             comparison=None if self._other is None else self._other.comparison,
             imu=None if self._inertial is None else self._inertial.problem,
+            camera=IMAGE_PROBLEM if len(frame.images) < images else "",
         )
+
+    def _without_repetitions(self, frame: Frame, meters: float) -> Frame:
+        """Without what the LiDAR or a camera has sent before; `meters`: the way since the last registered frame."""
+        imu = self._inertial
+        turn = imu.turn if imu is not None and imu.turns else None
+        if self._repeated.repeats(frame, meters, turn) and frame.problem is None:
+            frame = replace(frame, problem=REPEATED)
+        if imu is not None and frame.problem is not None:
+            imu.turns = False  # what shows no turn does not speak against it
+        return replace(frame, images=self._images.new(frame))
 
     def _turned(self, twist: Array, seconds: float) -> Array:
         """A twist (6,) with the turn since the last registered frame as it was measured, where it was."""

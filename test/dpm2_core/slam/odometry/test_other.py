@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dpm2_core.frame import Array, Frame, Guess, OdometryResult, State
+from dpm2_core.frame import Array, Frame, Guess, Inertial, OdometryResult, State
 from dpm2_core.geometry import se3
 from dpm2_core.sim.simulated_drive import wheel_odometry
 from dpm2_core.slam.build import make_odometry
@@ -19,6 +19,7 @@ from ....helpers.drives import Drive
 
 pytestmark = pytest.mark.slow
 JUMP = 15  # frame, in the middle
+TURN = [0, 0, np.radians(1), 0, 0, 0]
 
 
 def run(frames: list[Frame]) -> list[OdometryResult]:
@@ -121,3 +122,28 @@ def test_one_that_is_wrong_from_the_start_does_not_lead(suburb_drive: Drive, wro
     alone, led = run(frames), run([replace(f, guess=Guess(T)) for f, T in zip(frames, guesses, strict=True)])
     assert off(led, truth).max() < off(alone, truth).max() + 0.01
     assert all(t.state is State.TRACKING for t in led[2:])
+
+
+@pytest.mark.parametrize(
+    ("step", "sensor"),
+    [([0, 0, 0, 0.1, 0, 0], "wheels"), (TURN, "wheels"), (TURN, "imu")],
+)
+def test_a_cloud_that_is_sent_again_to_a_slow_robot_is_no_halt(
+    suburb_drive: Drive, step: list[float], sensor: str
+) -> None:
+    """At 1 m/s, or 10 deg/s on the spot, the scans alone may show a halt; wheels and an IMU say that it moves on."""
+    first, truth, frames = suburb_drive[0][0], [se3.exp(i * np.array(step)) for i in range(20)], []
+    for i, T in enumerate(truth):
+        seen, stamps = se3.inverse(truth[min(i, 8)]), (np.arange(-9, 1) + 10 * i) * 10**7
+        rates, forces = np.tile(10 * np.array(step[:3]), (10, 1)), np.tile([0, 0, 9.81], (10, 1))
+        frames.append(Frame(i * 10**8, np.asarray(se3.transform(seen, first.points), np.float32), index=i))
+        beside = {"guess": Guess(T)} if sensor == "wheels" else {"imu": Inertial(stamps, rates, forces)}
+        frames[-1] = replace(frames[-1], **beside)
+    results = run(frames)
+    assert [result.state for result in results[2:9]] == [State.TRACKING] * 7
+    for result in results[12:]:  # after 0.3 m or 3 deg
+        assert "same cloud as before" in result.registration.reason
+        assert result.state is not State.TRACKING
+    meters, degrees = se3.magnitude(se3.inverse(truth[-1]) @ results[-1].T_odom_lidar)
+    assert meters < 0.35  # what it takes to be seen; 1.1 m or 11 deg if the robot were to stand
+    assert degrees < (3.5 if sensor == "wheels" else 6)  # until then the halt passes for a bias of the gyroscope

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -11,9 +12,9 @@ import numpy as np
 import pytest
 
 from dpm2_core.data.open import open_source
-from dpm2_core.frame import Frame, Registration
+from dpm2_core.frame import Frame, Registration, State
 from dpm2_core.geometry import se3
-from dpm2_core.slam.build import make_odometry, make_registration
+from dpm2_core.slam.build import make_odometry, make_registration, make_slam
 from dpm2_core.slam.registration.protocol import Prediction
 from dpm2_core.slam.registration.texture import VisualSettings
 from dpm2_core.slam.settings import SlamSettings
@@ -96,13 +97,61 @@ def test_of_two_cameras_the_first_is_asked_and_the_second_where_it_has_no_image(
     assert "image" not in by_none.reason
 
 
+def noisy(one: Frame) -> Frame:
+    """With the noise of a camera, by which no two images are the same."""
+    noise = np.random.default_rng(one.index).integers(0, 3, one.images[0].pixels.shape, np.uint8)
+    return replace(one, images=tuple(replace(i, pixels=np.minimum(i.pixels, 253) + noise) for i in one.images))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("hangs", [lambda i: i > 5, lambda i: i > 5 and i % 2 == 0], ids=["for good", "every other"])
+def test_an_image_that_is_sent_again_is_left_out(hangs: Callable[[int], bool]) -> None:
+    """By a camera that hangs: it showed a halt, and the error was the way of the vehicle meanwhile, in `tracking`."""
+    paint = random_paint(3)
+    good = [noisy(frame(0.5 * i, paint, i)) for i in range(10)]
+    hung = [replace(f, images=good[5 if hangs(7) else i - 1].images) if hangs(i) else f for i, f in enumerate(good)]
+    without = [replace(f, images=()) if hangs(i) else f for i, f in enumerate(good)]
+    odometry = [make_odometry(SlamSettings()) for _ in range(2)]
+    for i, (one, other) in enumerate(zip(hung, without, strict=True)):
+        result, expected = odometry[0].process(one), odometry[1].process(other)
+        assert_same(result.registration, expected.registration)
+        assert ("the same image as before" in result.camera) == hangs(i)
+    if hangs(9):
+        assert result.state is not State.TRACKING
+
+
+@pytest.mark.slow
+def test_an_image_that_is_sent_again_is_no_picture_of_a_keyframe() -> None:
+    """It shows another place."""
+    frames = [noisy(frame(0.5 * i, random_paint(3), i)) for i in range(3)]
+    for images, shown in ((frames[2].images, True), (frames[1].images, False)):
+        slam = make_slam()
+        for one in frames[:2]:
+            slam.odometry_step(one)
+        slam.odometry.request_keyframe()
+        keyframe = slam.odometry_step(replace(frames[2], images=images)).keyframe
+        assert keyframe is not None
+        assert (keyframe.thumbnail is not None) == shown
+
+
+@pytest.mark.slow
+def test_the_same_image_is_good_for_two_clouds_and_at_rest_without_noise() -> None:
+    """Where it is the nearest of both, or where the cloud is the same too."""
+    first, second = (frame(0.5 * i, random_paint(3), i) for i in range(2))
+    late = replace(second, images=(replace(first.images[0], time_offset=-0.1),))
+    for again in (late, replace(first, stamp=second.stamp)):
+        odometry = make_odometry(SlamSettings())
+        odometry.process(first)
+        assert odometry.process(again).camera == ""
+
+
 @pytest.mark.slow
 def test_an_odometry_that_brakes_in_a_tunnel() -> None:
     """Six scans at 1 m, then ever shorter: by its velocity alone it would overshoot, and it would say `degraded`."""
     paint = random_paint(3)
     steps = [1.0] * 5 + [0.7, 0.4, 0.1, 0.0]
     at = np.concatenate([[0.0], np.cumsum(steps)])
-    frames = [frame(x, paint, i) for i, x in enumerate(at)]
+    frames = [noisy(frame(x, paint, i)) for i, x in enumerate(at)]
     odometry = {on: make_odometry(SlamSettings(visual=VisualSettings(enabled=on))) for on in (True, False)}
     tracks = {on: [odometry[on].process(f) for f in frames] for on in odometry}
     errors = {
