@@ -174,8 +174,8 @@ class ActiveMap:
             name: of the folder, and then also of a copy of the map file; with a number, where another drive has it.
 
         Raises:
-            UsageError: there is nothing to save. Dpm2Error: it cannot be written; or the map file is incomplete, and the
-                folder alone is written.
+            UsageError: there is nothing to save. Dpm2Error: it cannot be written, or its file is incomplete: then the
+                folder is written, and no copy.
         """
         if (folder := self._maps.folder) is None:
             raise UsageError("no map is saved: ros.map_directory is empty")

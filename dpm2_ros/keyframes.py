@@ -79,14 +79,16 @@ class KeyframeSender:
         drive = Delivery(session, self._file(session), False, time.monotonic())
         last = None
         with self._lock:
-            if not self._keep:
-                self._drives.clear()
-            for earlier in self._drives:
-                if not earlier.earlier and len(earlier.file):
-                    with suppress(sqlite3.Error, RuntimeError):  # `_repeat` reads it again, and says so
+            for empty in (earlier for earlier in self._drives if not len(earlier.file)):
+                empty.file.close(keep=False)
+            self._drives = [*(earlier for earlier in self._drives if len(earlier.file)), drive]
+            for earlier in self._drives[:-1]:
+                if not earlier.earlier:
+                    with suppress(sqlite3.Error, OSError, RuntimeError):  # `_repeat` reads it again, and says so
                         last = of_earlier_drive(earlier.file.read(len(earlier.file) - 1))[0]
                 earlier.earlier = True
-            self._drives.append(drive)
+            for earlier in self._drives[1:-1]:
+                earlier.file.pause()  # until its turn: without a mapper there may be hundreds
         if last is not None:
             self._pose.publish(last)
 
@@ -156,6 +158,7 @@ class KeyframeSender:
                 continue
             if len(file):
                 self._log.info(f"{len(file)} keyframes of an earlier drive are sent first, from {path}")
+            file.pause()
             yield Delivery(session, file, True, time.monotonic())
 
     def _publish(self, parts: Sequence[bytes]) -> None:
@@ -183,7 +186,7 @@ class KeyframeSender:
             try:
                 again = [self._read(drive, id) for id in drive.due(now, _BURST)]
                 last = self._read(drive, len(drive.file) - 1)[0] if drive.announces(now) else None
-            except (sqlite3.Error, RuntimeError) as error:
+            except (sqlite3.Error, OSError, RuntimeError) as error:
                 self._log.error(f"{drive.file.path}: not sent: {error}", throttle_duration_sec=10)
                 if drive.earlier:  # what cannot be read may not keep the others back
                     drive.file.close(keep=True)

@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from urllib.parse import quote
 
-from dpm2_core.database import check_schema, connect, statements
+from dpm2_core.database import Connection, check_schema, connect, statements
 from dpm2_core.slam.store.cloud_store import SpillFile
 
 _SUFFIX = ".unsent"
@@ -26,7 +26,8 @@ class KeyframeFile:
     Where the file is full or not wanted, keyframes go into a `SpillFile`, and end with the process.
 
     Raises:
-        sqlite3.Error, OSError: the file cannot be made, is no such file, is damaged, or another process has it.
+        sqlite3.Error, OSError: the file cannot be made, is no such file, is damaged, or another process has it; also
+            when it is opened again, after `pause`.
     """
 
     def __init__(self, path: Path | None = None) -> None:
@@ -35,35 +36,21 @@ class KeyframeFile:
         self._stored = 0  # in the file
         self._others: list[list[int]] = []  # after those: their numbers in the other one
         self._spill = SpillFile()
+        self._connection: Connection | None = None
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._connection = connect(path, "rwc", timeout=0.0)
-            try:
-                self._stored = self._opened()
-            except BaseException:
-                self._connection.close()
-                raise
+            self._connection, self._stored = _opened(path, "rwc")
 
-    def _opened(self) -> int:
-        """How many there are in the file.
-
-        Raises:
-            sqlite3.DatabaseError: what is there is not the keyframes of a drive.
-        """
-        # One process alone: a second one of the same name in the same folder takes a file of its own.
-        self._connection.execute("PRAGMA locking_mode = EXCLUSIVE")
-        self._connection.execute("PRAGMA journal_mode = WAL")
-        self._connection.execute("PRAGMA synchronous = NORMAL")
-        self._connection.execute("BEGIN EXCLUSIVE")
-        if not self._connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]:
-            self._connection.execute(_TABLES)
-        self._connection.execute("COMMIT")
-        check_schema(self._connection, statements(_TABLES))
-        query = "SELECT count(*), max(id), max(max(length(pose), length(descriptors), length(cloud))) FROM keyframe"
-        count, last, largest = self._connection.execute(query).fetchone()
-        if count and (last != count - 1 or largest > _LARGEST):
-            raise sqlite3.DatabaseError("malformed: not the keyframes of a drive")
-        return int(count)
+    def _opened(self) -> Connection:
+        """The file, opened again if need be."""
+        if self._connection is None:
+            assert self.path is not None
+            connection, stored = _opened(self.path, "rw")
+            if stored != self._stored:
+                connection.close()
+                raise sqlite3.DatabaseError(f"{stored} keyframes, {self._stored} before: another process has written")
+            self._connection = connection
+        return self._connection
 
     def __len__(self) -> int:
         return self._stored + len(self._others)
@@ -72,7 +59,7 @@ class KeyframeFile:
         """The next keyframe: its pose, its descriptors, its cloud, each serialized."""
         if self.path is not None and not self._others:  # those after one of these follow it: a file has no gap
             with suppress(sqlite3.Error):
-                self._connection.execute("INSERT INTO keyframe VALUES (?, ?, ?, ?)", (self._stored, *parts))
+                self._opened().execute("INSERT INTO keyframe VALUES (?, ?, ?, ?)", (self._stored, *parts))
                 self._stored += 1
                 return
         self._others.append([self._spill.append(part) for part in parts])
@@ -86,23 +73,54 @@ class KeyframeFile:
         if id >= self._stored:
             return [self._spill.read(number) for number in self._others[id - self._stored]]
         query = "SELECT pose, descriptors, cloud FROM keyframe WHERE id = ?"
-        parts: tuple[object, ...] | None = self._connection.execute(query, (id,)).fetchone()
+        parts: tuple[object, ...] | None = self._opened().execute(query, (id,)).fetchone()
         found = [part for part in parts or () if isinstance(part, bytes)]
         if len(found) != 3:
             raise sqlite3.DatabaseError(f"keyframe {id} is damaged")
         return found
 
+    def pause(self) -> None:
+        """Leave the file closed, for any process, until a keyframe is read or added."""
+        if self._connection is not None:
+            with suppress(sqlite3.Error):
+                self._connection.close()
+            self._connection = None
+
     def close(self, keep: bool) -> None:
         """`keep`: leave the file for the next start; else it is deleted."""
-        if self.path is None:
-            return
-        with suppress(sqlite3.Error):
-            self._connection.close()
-        if not keep:
+        self.pause()
+        if self.path is not None and not keep:
             for path in (self.path, Path(f"{self.path}-wal")):
                 path.unlink(missing_ok=True)
             with suppress(OSError):  # it is not empty
                 self.path.parent.rmdir()
+
+
+def _opened(path: Path, mode: str) -> tuple[Connection, int]:
+    """A file, and how many keyframes there are in it; `mode`: see `connect`.
+
+    Raises:
+        sqlite3.Error, OSError: see `KeyframeFile`.
+    """
+    connection = connect(path, mode, timeout=0.0)
+    try:
+        # One process alone: a second one of the same name in the same folder takes a file of its own.
+        connection.execute("PRAGMA locking_mode = EXCLUSIVE")
+        connection.execute("PRAGMA journal_mode = WAL")
+        connection.execute("PRAGMA synchronous = NORMAL")
+        connection.execute("BEGIN EXCLUSIVE")
+        if not connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]:
+            connection.execute(_TABLES)
+        connection.execute("COMMIT")
+        check_schema(connection, statements(_TABLES))
+        query = "SELECT count(*), max(id), max(max(length(pose), length(descriptors), length(cloud))) FROM keyframe"
+        count, last, largest = connection.execute(query).fetchone()
+        if count and (last != count - 1 or largest > _LARGEST):
+            raise sqlite3.DatabaseError("malformed: not the keyframes of a drive")
+    except BaseException:
+        connection.close()
+        raise
+    return connection, int(count)
 
 
 def path_of(folder: Path, robot: str, session: str) -> Path:

@@ -7,10 +7,17 @@ import os
 import sqlite3
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+import rclpy
 
+from dpm2_core.frame import Keyframe
+from dpm2_ros.keyframes import KeyframeSender
+from dpm2_ros.settings import RosSettings
 from dpm2_ros.unsent import KeyframeFile, left_behind, path_of
 
 WRITER = """
@@ -77,6 +84,52 @@ def test_a_file_belongs_to_one_process_and_one_robot(tmp_path: Path) -> None:
     assert not left_behind(tmp_path / "nowhere", "red")
     file.close(keep=False)
     assert path_of(tmp_path, "a/b", "0" * 8) != path_of(tmp_path, "a_b", "0" * 8)
+
+
+def test_a_file_that_is_closed_meanwhile_is_opened_again(tmp_path: Path) -> None:
+    """For one that another process has had, this is an error."""
+    path, before = tmp_path / "drive.00000001.unsent", len(os.listdir("/proc/self/fd"))
+    file = KeyframeFile(path)
+    for _ in range(2):
+        file.append([b"a", b"b", b"c"])
+        file.pause()
+        assert len(os.listdir("/proc/self/fd")) == before
+    assert file.read(1) == [b"a", b"b", b"c"]
+    file.pause()
+    other = KeyframeFile(path)
+    with pytest.raises(sqlite3.OperationalError, match="locked"):
+        file.read(1)
+    other.append([b"a", b"b", b"c"])
+    other.close(keep=True)
+    with pytest.raises(sqlite3.DatabaseError, match="3 keyframes, 2 before"):
+        file.read(1)
+    path.unlink()
+    with pytest.raises(sqlite3.OperationalError, match="unable to open"):
+        file.read(1)
+    assert not path.exists()
+
+
+def test_drives_that_wait_for_the_mapper_hold_no_file_open(ros: Callable[..., Any], tmp_path: Path) -> None:
+    """A looped bag, or many resets, with no mapper; then the next start. A drive without a keyframe leaves no file."""
+    ros()
+    node, opened = rclpy.create_node("robot", use_global_arguments=False), []  # nothing of it is called back
+    settings = RosSettings(embed_mapper=False, map_directory=str(tmp_path))
+    sender = KeyframeSender(node, "", settings)
+    for _ in range(20):
+        sender.send(Keyframe(0, 0, 0, np.eye(4), np.zeros((10, 4), np.float32)))
+        sender.restart()
+        sender.restart()
+        opened.append(len(os.listdir("/proc/self/fd")))
+    assert opened[0] == opened[-1]
+    assert len(left_behind(tmp_path, "")) == 20 + 1
+    sender.close()
+    before = len(os.listdir("/proc/self/fd"))
+    again = KeyframeSender(node, "", settings)
+    assert len(os.listdir("/proc/self/fd")) < before + 20
+    assert again.arrived == (0, 20)
+    again.close()
+    assert len(left_behind(tmp_path, "")) == 20
+    node.destroy_node()
 
 
 @pytest.mark.parametrize(
