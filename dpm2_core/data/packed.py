@@ -139,17 +139,26 @@ def write_packed(folder: Path, samples: Iterable[Sample], about: dict[str, objec
 
 
 class PackedDrive:
-    """A packed drive, opened lazily: `poses` (n, 4, 4) in memory, the rest memory-mapped."""
+    """A packed drive, opened lazily: `poses` (n, 4, 4) in memory, the rest memory-mapped.
+
+    Raises:
+        UsageError: it is none, or is damaged.
+    """
 
     def __init__(self, folder: Path) -> None:
         try:
             self.about = json.loads((folder / "about.json").read_text())
             self.poses: Array = np.load(folder / "poses.npy", allow_pickle=False)
             self.offsets = np.load(folder / "offsets.npy", allow_pickle=False)
-        except (OSError, ValueError) as error:
+            points = len(np.load(folder / "clouds.npy", mmap_mode="r", allow_pickle=False))
+        except (OSError, TypeError, ValueError) as error:
             raise UsageError(f"{folder}: no packed drive: {error}") from None
-        if self.about.get("format") != FORMAT:
-            raise UsageError(f"{folder}: packed format {self.about.get('format')}, want {FORMAT}: pack it again")
+        format = self.about.get("format") if isinstance(self.about, dict) else None
+        if format != FORMAT:
+            raise UsageError(f"{folder}: packed format {format}, want {FORMAT}: pack it again")
+        fit = self.poses.shape[1:] == (4, 4) and self.offsets.shape == (len(self.poses) + 1,)
+        if not fit or self.offsets[-1] != points or np.any(np.diff(self.offsets) < 0):
+            raise UsageError(f"{folder}: poses, offsets and clouds do not fit each other: pack it again")
         self.folder = folder
         self.name = folder.name
         self._maps: dict[str, NDArray] = {}

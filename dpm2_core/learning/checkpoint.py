@@ -38,7 +38,7 @@ def load_checkpoint(path: Path, module: nn.Module, ema: nn.Module, optimiser: to
     """Restore a run; returns the step it had finished.
 
     Raises:
-        UsageError: no checkpoint, or one of another network.
+        UsageError: no checkpoint, or one of another network or optimizer.
     """
     try:
         state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)  # executes nothing
@@ -49,11 +49,11 @@ def load_checkpoint(path: Path, module: nn.Module, ema: nn.Module, optimiser: to
     try:
         module.load_state_dict(state["module"])
         ema.load_state_dict(state["ema"])
-    except (KeyError, RuntimeError) as error:
+        optimiser.load_state_dict(state["optimiser"])
+        return int(state["step"])
+    except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
         first = str(error).splitlines()[-1].strip()
-        raise UsageError(f"{path}: checkpoint of another network: {first}") from None
-    optimiser.load_state_dict(state["optimiser"])
-    return int(state["step"])
+        raise UsageError(f"{path}: checkpoint of another network or optimizer: {first}") from None
 
 
 class Log:

@@ -227,6 +227,32 @@ def test_all_drives_of_a_data_set_are_packed_and_a_second_run_makes_only_what_is
     assert "no drives below" in str(nothing.exception)
 
 
+@pytest.mark.parametrize(
+    ("file", "content"),
+    [
+        ("about.json", b"[1]"),
+        ("clouds.npy", None),
+        ("offsets.npy", [0, 5, 10, 99]),
+        ("offsets.npy", [0, 10, 5, 15]),
+        ("offsets.npy", [0, 5, 15]),
+        ("poses.npy", [1, 2, 3]),
+    ],
+)
+def test_a_packed_drive_that_is_damaged_is_an_error_when_it_is_opened(
+    file: str, content: bytes | list[int] | None, tmp_path: Path
+) -> None:
+    """Not in the midst of a training, nor never; None: cut off."""
+    folder = tmp_path / "one"
+    write_packed(folder, [Sample(np.zeros((5, 3), np.float32), np.eye(4)) for _ in range(3)], {})
+    assert len(open_packed(tmp_path)[0][2].cloud) == 5
+    if isinstance(content, list):
+        np.save(folder / file, np.array(content))
+    else:
+        (folder / file).write_bytes((folder / file).read_bytes()[:-20] if content is None else content)
+    with pytest.raises(UsageError, match=f"{folder}: "):
+        open_packed(tmp_path)
+
+
 def test_packing_holds_a_frame_at_a_time(tmp_path: Path) -> None:
     """A hundred frames cost less memory than thirty of them together."""
     frame = Sample(np.random.default_rng(0).uniform(-50, 50, (30_000, 3)).astype(np.float32), np.eye(4))

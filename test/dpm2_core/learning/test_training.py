@@ -17,7 +17,7 @@ from safetensors.torch import load_file
 from dpm2_core.config import merged, settings_from
 from dpm2_core.errors import UsageError
 from dpm2_core.learning.augment import AugmentSettings
-from dpm2_core.learning.checkpoint import Log
+from dpm2_core.learning.checkpoint import Log, load_checkpoint, save_checkpoint
 from dpm2_core.learning.dataset import DataSettings, GroupDataset
 from dpm2_core.learning.registration_loss import LossSettings
 from dpm2_core.learning.train_image import ImageTrainingSettings
@@ -104,6 +104,24 @@ def test_a_checkpoint_of_another_network_is_rejected(settings: RegistrationTrain
     (tmp_path / "out" / "checkpoint.pt").write_bytes(b"garbage")
     with pytest.raises(UsageError, match="not a checkpoint"):
         train_registration(settings, tmp_path / "out", resume=True)
+
+
+@pytest.mark.parametrize("damage", ["optimizer", "no optimizer", "list"])
+def test_a_checkpoint_that_does_not_fit_is_an_error_of_use(damage: str, tmp_path: Path) -> None:
+    path, module = tmp_path / "checkpoint.pt", torch.nn.Linear(3, 3)
+    made = make_optimizer(module, OptimizerSettings(kind="adamw"))
+    module(torch.zeros(1, 3)).sum().backward()
+    made.step()
+    save_checkpoint(path, module, module, made, 7)
+    assert load_checkpoint(path, module, module, made) == 7
+    if damage == "optimizer":
+        made = make_optimizer(module, OptimizerSettings(kind="sgd"))
+    elif damage == "no optimizer":
+        torch.save({"format": 1, "module": module.state_dict(), "ema": module.state_dict()}, path)
+    else:
+        torch.save([1], path)
+    with pytest.raises(UsageError, match=f"{path}: checkpoint of another network or optimizer"):
+        load_checkpoint(path, module, module, made)
 
 
 @pytest.mark.slow
