@@ -15,6 +15,8 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from pydantic import TypeAdapter
+
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.files import part_beside, write_json
 from dpm2_core.fleet.cluster import Cluster
@@ -81,10 +83,10 @@ def merge(folder: Path, out: Path, settings: SlamSettings, cluster: Cluster, vie
             merged = _added(before, out, search, _sizes(places), joins, largest)
         if merged is None:
             merged = _anew(out, search, _sizes(places), search.joins(parts, index), largest)
-    others = [name for name in places if name not in merged.drives]
-    merged.left_out |= left_out | {name: f"no place in common with {next(iter(merged.drives))}" for name in others}
-    merged.made = {**made, "versions": {name: made["versions"][name] for name in merged.drives}}
-    write_json(_beside(out), asdict(merged))
+        others = [name for name in places if name not in merged.drives]
+        merged.left_out |= left_out | {name: f"no place in common with {next(iter(merged.drives))}" for name in others}
+        merged.made = {**made, "versions": {name: made["versions"][name] for name in merged.drives}}
+        write_json(_beside(out), asdict(merged))  # before Ray ends, which takes seconds
     return merged
 
 
@@ -95,9 +97,8 @@ def _beside(out: Path) -> Path:
 def _record(out: Path) -> Merged | None:
     """What is known of the map that is there. A map that this wrote may be changed, any other file not."""
     try:
-        record = json.loads(_beside(out).read_text(encoding="utf-8"))
-        merged = Merged(**{name: record[name] for name in ("drives", "left_out", "joins", "made")})
-    except (OSError, ValueError, TypeError, KeyError):
+        merged = TypeAdapter(Merged).validate_json(_beside(out).read_bytes())
+    except (OSError, ValueError):
         merged = None
     if out.exists() and merged is None:
         raise UsageError(f"{out}: there is a file already, which is no merge of drives")
@@ -178,6 +179,8 @@ def _anew(out: Path, search: Search, sizes: Mapping[str, int], joins: Sequence[J
         try:
             with MapStore.create(fresh) as store:
                 add_drives(store, {}, Growth(moved, enough), refused)
+            if not _beside(out).exists():  # a map without any would be taken for another program's, if this ends here
+                write_json(_beside(out), asdict(Merged({}, {})))
             move_map(fresh, out)
         finally:
             remove_map(fresh)

@@ -96,7 +96,7 @@ class FleetIndex:
             mean = np.array(listed["mean"], np.float32).reshape(WIDTH)
             total = sum(count for *_, count in drives)
             vectors = np.memmap(folder / _ROWS, np.float32, "r", shape=(total, WIDTH))
-        except (OSError, ValueError, KeyError, TypeError):
+        except (OSError, ValueError, KeyError, TypeError, OverflowError):
             return  # none, or one that is not whole: it is made anew
         self.drives, self._mean, self._kept = drives, mean, total
         with suppress(RuntimeError):  # none, or damaged: its places are compared one by one

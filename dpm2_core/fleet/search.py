@@ -6,13 +6,13 @@ What was found is kept in DIR/.merge, drive by drive and stretch by stretch: ano
 
 from __future__ import annotations
 
-import json
 from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.files import write_json
@@ -86,8 +86,10 @@ class Search:
         """All these drives in one index. Candidates are found once for each drive, when it comes."""
         index = FleetIndex(self.kept)
         versions = {name: part.arguments["version"] for name, part in parts.items()}
-        if any(versions.get(name) != version for name, version, _ in index.drives):
-            index.clear()  # a drive is gone, or another one by now
+        if any(
+            versions.get(name) != version or not self._candidates(name).is_file() for name, version, _ in index.drives
+        ):
+            index.clear()  # a drive is gone, or another one by now; or what was found for it is gone
         new = [name for name in parts if name not in {known for known, *_ in index.drives}]
         for name in new:
             vectors = vectors_of(self.kept, parts[name])
@@ -101,7 +103,7 @@ class Search:
         """Every loop that was tried between two drives, one of them at least not in `inside`.
 
         Raises:
-            Dpm2Error: a search failed. KeyboardInterrupt: it was stopped.
+            Dpm2Error: a search failed, or what is kept is damaged. KeyboardInterrupt: it was stopped.
         """
         slam = self.settings.model_dump(mode="json")
         maps = {name: dict(part.arguments) for name, part in parts.items()}
@@ -109,8 +111,7 @@ class Search:
         outside = False
         for name, *_ in index.drives:
             outside |= name not in inside
-            pairs = json.loads(self._candidates(name).read_text(encoding="utf-8")) if outside else {}
-            for one, rows in pairs.items():
+            for one, rows in (self._pairs(name) if outside else {}).items():
                 if one not in inside or name not in inside:
                     for number, stretch in enumerate(stretches(one, name, np.array(rows))):
                         part = join_part(number, stretch, maps, slam)
@@ -136,6 +137,14 @@ class Search:
 
     def _candidates(self, name: str) -> Path:
         return self.kept / "candidates" / f"{name}.json"
+
+    def _pairs(self, name: str) -> dict[str, list[list[int]]]:
+        """As `_candidates` wrote them."""
+        path = self._candidates(name)
+        try:
+            return TypeAdapter(dict[str, list[list[int]]]).validate_json(path.read_bytes())
+        except (OSError, ValueError):
+            raise Dpm2Error(f"{path}: damaged; without the folder {self.kept} it is made anew") from None
 
 
 def _candidates(index: FleetIndex, vectors: Vector) -> dict[str, list[list[int]]]:

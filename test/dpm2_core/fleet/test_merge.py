@@ -6,7 +6,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Collection, Iterable, Iterator
-from contextlib import nullcontext
+from contextlib import ExitStack, nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,15 +23,18 @@ from dpm2_core.fleet.merge import merge
 from dpm2_core.fleet.part import DONE, Figures, Part
 from dpm2_core.fleet.places import WIDTH, FleetIndex
 from dpm2_core.fleet.regions import Join
+from dpm2_core.fleet.run import View
+from dpm2_core.fleet.search import Search
 from dpm2_core.network.pretrained import weights_path
 from dpm2_core.sim.world import build_world
 from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.slam.store.check import check_map
-from dpm2_core.slam.store.map_data import MapData, load_map, save_as
+from dpm2_core.slam.store.map_data import MapData, load_map, move_map, save_as
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.slam.store.rows import weights_id
 from test.helpers.fleets import fleet_maps
 from test.helpers.full_disk import CHECKPOINT, largest_file
+from test.helpers.maps import ring
 
 NOISE = np.diag([1e-3] * 3 + [0.02] * 3) ** 2
 
@@ -135,6 +138,50 @@ def test_a_map_that_does_not_fit_on_the_disk_leaves_the_one_before(
     assert sorted(os.listdir(out.parent)) == ["town", "town.json"]
 
 
+@pytest.mark.parametrize("late", [False, True])
+def test_a_merge_that_is_stopped_at_its_end_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, late: bool
+) -> None:
+    """The map had its name, and no record of what it was: it counted as somebody else's file from then on."""
+    _, maps, joins = fleet_maps(3)
+    for name, data in maps.items():
+        (tmp_path / name).mkdir()
+        save_as(data, tmp_path / name / MAP)
+    monkeypatch.setattr("dpm2_core.fleet.merge.Search", lambda *arguments: Found(tmp_path, maps, joins))
+    out = tmp_path / "out" / "town"
+    out.parent.mkdir()
+
+    def stopped(source: Path, target: Path) -> None:
+        move_map(source, target)
+        raise KeyboardInterrupt
+
+    cluster = ExitStack()
+    if late:
+        cluster.callback(_interrupt)
+    else:
+        monkeypatch.setattr("dpm2_core.fleet.merge.move_map", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        merge(tmp_path, out, SlamSettings(), cluster)
+    monkeypatch.setattr("dpm2_core.fleet.merge.move_map", move_map)
+    file = out.stat().st_ino
+    assert sum(merge(tmp_path, out, SlamSettings(), nullcontext()).drives.values()) == 180
+    assert (out.stat().st_ino == file) == late, "a map with its record stays"
+    assert check_map(out).keyframes == 180
+
+
+def _interrupt() -> None:
+    """As Ctrl-C while Ray ends."""
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("drives", ['["a"]', '{"a": "x"}', "{"])
+def test_a_map_whose_record_is_damaged_is_not_replaced(tmp_path: Path, drives: str) -> None:
+    save_as(ring(3), tmp_path / "town")
+    (tmp_path / "town.json").write_text(f'{{"drives": {drives}, "left_out": {{}}, "joins": [], "made": {{}}}}')
+    with pytest.raises(UsageError, match="which is no merge of drives"):
+        merge(tmp_path, tmp_path / "town", SlamSettings(), Cluster())
+
+
 class Stopped(Cluster):
     """One job ends, then Ctrl-C."""
 
@@ -172,6 +219,29 @@ def test_places_are_found_again_in_an_index_that_was_kept(tmp_path: Path, noise:
     assert (kept.similar(drives[1], 3)[7] == -1).all()
     (tmp_path / "index.f32").write_bytes((tmp_path / "index.f32").read_bytes()[:1000])
     assert not FleetIndex(tmp_path).drives
+
+
+def test_candidates_that_are_gone_are_looked_for_anew(tmp_path: Path, noise: np.random.Generator) -> None:
+    """Damaged ones are an error that names what to remove."""
+    pytest.importorskip("faiss", reason="no faiss: pip install 'dpm2_ros[fleet]'")
+    search = Search(tmp_path, SlamSettings(), Cluster(), View())
+    parts = {name: Part(f"places/{name}", "", {"version": [1, 2]}) for name in "ab"}
+    for part in parts.values():
+        (search.kept / part.name).mkdir(parents=True)
+        np.save(search.kept / part.name / "places.npy", noise.normal(size=(50, WIDTH)).astype(np.float32))
+    search.index(parts)
+    file = search.kept / "candidates" / "b.json"
+    found = file.read_text()
+    file.unlink()
+    index = search.index(parts)
+    assert file.read_text() == found
+    assert index.drives == [("a", [1, 2], 50), ("b", [1, 2], 50)]
+    file.write_text(found[:100])
+    with pytest.raises(Dpm2Error, match=r"b.json: damaged; without the folder .*/.merge it is made anew"):
+        search.joins(parts, index)
+    listed = search.kept / "index.json"
+    listed.write_text(listed.read_text().replace("50", "-50"))
+    assert not FleetIndex(search.kept).drives
 
 
 def test_late_places_and_those_in_the_graph_are_found_alike(
