@@ -18,7 +18,7 @@ def bench(
         list[str] | None,
         typer.Argument(
             help="beside, covariance, diffslam, finetune, fleet, gaps, geometric (default), hard, imu, indoor, "
-            "loop-cost, map, memory, neural, paper, pose-graph, relocalise, roads, sensor, tilt, traffic."
+            "loop-cost, map, memory, neural, paper, pose-graph, relocalise, roads, sensor, tilt, traffic, views."
         ),
     ] = None,
     source: Annotated[

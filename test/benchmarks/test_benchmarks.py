@@ -9,10 +9,12 @@ import subprocess
 import sys
 from importlib.util import find_spec
 from pathlib import Path
+from typing import get_type_hints
 
 import numpy as np
 import pytest
 
+from benchmarks import BENCHES
 from benchmarks.harness import Options, drives, processors
 from benchmarks.memory import levelling
 from benchmarks.pairs import FITTED, fitted_poses, pairs_of, summarized
@@ -73,6 +75,12 @@ def test_poses_that_err_are_fitted_to_the_scans_and_those_that_are_far_off_stay(
 
 
 @pytest.mark.slow
+def test_the_help_names_every_benchmark() -> None:
+    """`--help` imports none of them."""
+    (argument,) = get_type_hints(bench, include_extras=True)["names"].__metadata__
+    assert argument.help.replace(" (default)", "").removesuffix(".").split(", ") == list(BENCHES)
+
+
 def test_the_geometric_benchmark_records_errors_speed_and_origin(sequence: Path, tmp_path: Path) -> None:
     bench(
         ["geometric"],
