@@ -17,6 +17,7 @@ from dpm2_core.data.source import Source
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.evaluation.live_view import LiveView
 from dpm2_core.evaluation.report import metrics_table
+from dpm2_core.evaluation.run_folder import TRAJECTORY
 from dpm2_core.files import make_folder
 from dpm2_core.pipeline import OfflineRun, Result, Watch, open_recording, save_config
 from dpm2_core.slam.session import MapMode
@@ -92,7 +93,8 @@ def run(
     mode: MapMode = "resume" if resume else "extend" if extend else "create"
     with OfflineRun(source, chosen, span, gt, map_file, mode) as drive:
         make_folder(out)
-        save_config(chosen, out)  # now: whatever becomes of the run, it says how it was made
+        if not (out / TRAJECTORY).exists():  # else it is beside the results of a run before until there are others
+            save_config(chosen, out)  # now: whatever becomes of the run, it says how it was made
         if view or record is not None:
             with LiveView(drive.source.name, view, record) as live:
                 result = _drive(drive, live.add)

@@ -233,13 +233,33 @@ def test_full_disk_keeps_the_old_map(recording: Path, tmp_path: Path) -> None:
     assert not [path for path in out.iterdir() if path.suffix == ".part"]
 
 
-@pytest.mark.parametrize("another", [False, True])
-def test_interrupted_run_writes_what_there_is(sequence: Path, tmp_path: Path, another: bool) -> None:
-    """All, or all but the map file, which is said, where another program has begun to write to that meanwhile."""
-    for i in range(FRAMES, 2000):  # the car stands still at the end, for longer than the test
+def test_a_run_that_is_killed_leaves_results_and_settings_of_the_one_before(sequence: Path, tmp_path: Path) -> None:
+    out, path = tmp_path / "out", tmp_path / "drive.dpm2map"
+    _stand_still(sequence)
+    assert dpm2("run", sequence, "--out", out, "--frames", ":3", *QUICK).returncode == 0
+    before = {file.name: file.read_bytes() for file in out.iterdir()}
+    run = ("run", str(sequence), "--out", str(out), "--map", str(path), *QUICK, "--set", "slam.map.voxel=0.7")
+    process = subprocess.Popen([sys.executable, "-m", "dpm2_core.cli", *run], stderr=subprocess.DEVNULL)
+    while not _keyframes(path):
+        assert process.poll() is None
+        time.sleep(0.05)
+    process.kill()
+    process.wait()
+    assert {file.name: file.read_bytes() for file in out.iterdir()} == before
+
+
+def _stand_still(sequence: Path) -> None:
+    """At the end of the drive, for longer than a test."""
+    for i in range(FRAMES, 2000):
         (sequence / "velodyne" / f"{i:06d}.bin").symlink_to(sequence / "velodyne" / f"{FRAMES - 1:06d}.bin")
     (sequence / "times.txt").write_text("".join(f"{0.1 * i:.1f}\n" for i in range(2000)))
     (sequence / "poses.txt").unlink(missing_ok=True)
+
+
+@pytest.mark.parametrize("another", [False, True])
+def test_interrupted_run_writes_what_there_is(sequence: Path, tmp_path: Path, another: bool) -> None:
+    """All, or all but the map file, which is said, where another program has begun to write to that meanwhile."""
+    _stand_still(sequence)
     out, path = tmp_path / "out", tmp_path / "drive.dpm2map"
     run = ("run", str(sequence), "--out", str(out), "--map", str(path), *QUICK)
     command = [sys.executable, "-m", "dpm2_core.cli", *run]
