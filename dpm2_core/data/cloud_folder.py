@@ -23,6 +23,8 @@ from dpm2_core.frame import Array, Frame
 
 SUFFIXES = (".pcd", ".ply")
 _PERIOD = 0.1  # s between scans whose names are no times
+_PCD_HEADER = 65536  # bytes in which it ends
+_MOST_COLUMNS = 1000  # of a PCD file; a normal and its curvature are 4, a histogram of features is 308
 _PAIR = re.compile(r"(?:.*\D)?(\d{9,10})[_-](\d{1,9})")
 """Seconds since 1970 and their fraction, of 3, 6 or 9 digits; nanoseconds also without the zeros before them."""
 _EPOCHS = ((10**8, 10**11, 10**9), (10**11, 10**14, 10**6), (10**14, 10**17, 10**3), (10**17, 10**20, 1))
@@ -91,11 +93,27 @@ def _cloud(path: Path, stamp: int) -> Any:
 
 
 def _read_pcd(path: Path) -> Mapping[str, NDArray[Any]]:
+    PointCloud = _pcd_type()
     try:
-        cloud = _pcd_type().from_path(path)
+        _check_columns(path)
+        cloud = PointCloud.from_path(path)
         return {name: np.ascontiguousarray(cloud.pc_data[name]) for name in cloud.fields}
     except Exception as error:  # damaged headers and data raise anything from ValueError to lzf's own errors
-        raise UsageError(f"{path}: cannot be read as PCD: {' '.join(str(error).split())[:200]}") from None
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise UsageError(f"{path}: cannot be read as PCD: {reason}") from None
+
+
+def _check_columns(path: Path) -> None:
+    """Not thousands of columns: the package makes a name for each, which is gigabytes for a few digits in a header.
+
+    Raises:
+        ValueError: there are.
+    """
+    with path.open("rb") as file:
+        header = file.read(_PCD_HEADER).partition(b"\nDATA")[0]
+    for line in header.splitlines():
+        if line.startswith(b"COUNT") and sum(map(int, line.split()[1:])) > _MOST_COLUMNS:
+            raise ValueError(f"more than {_MOST_COLUMNS} columns")
 
 
 def _pcd_type() -> Any:
