@@ -56,6 +56,7 @@ class Scan:
             the registration works on descriptors alone.
         description: neural descriptors, made when they are needed; None where the registration uses none.
         images: those that were taken with it, where the registration asks for them.
+        twist: (6,) [rad/s, m/s] at which it was taken, as far as it was known, where the registration asks for images.
     """
 
     points: Points
@@ -63,6 +64,7 @@ class Scan:
     source: Array = field(default_factory=lambda: np.zeros((0, 3)))
     description: LazyDescriptors | None = None
     images: tuple[Image, ...] = ()
+    twist: Array = field(default_factory=lambda: np.zeros(6))
 
     @property
     def descriptors(self) -> Descriptors | None:

@@ -62,11 +62,13 @@ class Texture:
     Attributes:
         levels: (h, w) float32, blurred by each of `_BLUR`.
         K: (3, 3) of the reduced image. T_cam_lidar: (4, 4).
+        sigma: standard deviation of the camera's place along the way, m, where the image has a time of its own.
     """
 
     levels: tuple[NDArray[np.float32], ...]
     K: Array
     T_cam_lidar: Array
+    sigma: float = 0.0
 
     def project(self, points: Array) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Pixels (..., N, 2) of points (..., N, 3) of the camera frame, m, and which of them the image shows."""
@@ -142,7 +144,7 @@ def along(
         return replace(result, reason="; ".join(part for part in (result.reason, found) if part))
     b = np.concatenate([np.zeros(3), result.open_direction])
     prior = result.of_scene  # images say as little of calibration errors as points, and those grow with the new motion
-    gain = prior @ b / (b @ prior @ b + found.sigma**2)
+    gain = prior @ b / (b @ prior @ b + found.sigma**2 + image.sigma**2)
     T = se3.orthonormalized(result.T_target_source @ se3.exp(gain * found.offset))
     covariance = prior - np.outer(gain, b @ prior)
     moved = replace(result, T_target_source=T, covariance=(covariance + covariance.T) / 2, method="visual")

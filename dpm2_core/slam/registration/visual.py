@@ -18,6 +18,8 @@ from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration
 from dpm2_core.slam.registration.texture import Reference, VisualSettings, along, reference, textured
 
 _LEAST_REACH = 0.6  # m: however well the motion is known
+_PERIOD = 0.1  # s, of most LiDARs: the prediction is of one period, its error over that time is the error of the speed
+_ANY_SPEED = 15.0  # m/s, standard deviation while it is not known
 
 
 class VisualScanRegistration:
@@ -42,7 +44,7 @@ class VisualScanRegistration:
         return VisualScanRegistration(self._settings, self._registration.fresh())
 
     def prepare(self, frame: Frame, twist: Array) -> Scan:
-        return replace(self._registration.prepare(frame, twist), images=frame.images)
+        return replace(self._registration.prepare(frame, twist), images=frame.images, twist=twist)
 
     def rejection(self, scan: Scan) -> str:
         return self._registration.rejection(scan)
@@ -53,7 +55,7 @@ class VisualScanRegistration:
             return result
         earlier = self._last[0].images[0].camera.name
         image = next((image for image in scan.images if image.camera.name == earlier), None)
-        return result if image is None else self._along(result, image, prediction.information)
+        return result if image is None else self._along(result, image, scan.twist, prediction.information)
 
     def update(self, scan: Scan, T_odom_lidar: Array) -> bool:
         if scan.images and self._wants(T_odom_lidar):
@@ -65,17 +67,24 @@ class VisualScanRegistration:
             return True
         return bool(np.linalg.norm(self._last[1][:3, 3] - T_odom_lidar[:3, 3]) >= self._settings.baseline)
 
-    def _along(self, result: Registration, image: Image, information: Array | None) -> Registration:
-        """The result moved along its open direction to where the images agree; unchanged if they do not."""
+    def _along(self, result: Registration, image: Image, twist: Array, information: Array | None) -> Registration:
+        """The result moved along its open direction to where the images agree; unchanged if they do not.
+
+        `twist` (6,) is the motion of the scan, by which the camera is elsewhere at an image that was taken later than
+        that of the earlier scan, relative to the scans.
+        """
         s = self._settings
-        reach = s.reach
+        reach, of_speed = s.reach, _ANY_SPEED
         if information is not None:
             b = np.concatenate([np.zeros(3), result.open_direction])
-            reach = min(reach, max(_LEAST_REACH, 4 * float(np.sqrt(b @ np.linalg.solve(information, b)))))
+            sigma = float(np.sqrt(b @ np.linalg.solve(information, b)))
+            reach, of_speed = min(reach, max(_LEAST_REACH, 4 * sigma)), sigma / _PERIOD
         assert self._last is not None
         scan, T_odom_ref = self._last
         if self._reference is None:
             axis = T_odom_ref[:3, :3].T @ result.T_target_source[:3, :3] @ result.open_direction
             self._reference = reference(scan.points, textured(scan.images[0], s.width), s.points, axis)
-        image_now = textured(image, s.width)
+        late = image.time_offset - scan.images[0].time_offset
+        camera = replace(image.camera, T_lidar_cam=se3.exp(late * twist) @ image.camera.T_lidar_cam)
+        image_now = replace(textured(replace(image, camera=camera), s.width), sigma=of_speed * abs(late))
         return along(s, result, self._reference, image_now, se3.inverse(T_odom_ref), reach)

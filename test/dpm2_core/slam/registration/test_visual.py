@@ -121,6 +121,23 @@ def test_an_image_that_is_sent_again_is_left_out(hangs: Callable[[int], bool]) -
 
 
 @pytest.mark.slow
+def test_a_camera_of_another_rate_than_the_scans() -> None:
+    """At 15 Hz beside 10 Hz and 10 m/s, each second image is 0.33 m from its scan: that was the error of each step."""
+    paint, late = random_paint(3), np.arange(10) % 2 / 30
+    frames = [frame(1.0 * i, paint, i) for i in range(10)]
+    odometry, tracked = make_odometry(SlamSettings()), []
+    for i, one in enumerate(frames):
+        image = replace(seen(i + 10 * late[i], paint, CAMERA), time_offset=late[i])
+        tracked.append(odometry.process(replace(one, images=(image,))))
+    x = np.array([t.T_odom_lidar[0, 3] for t in tracked])
+    sigma = np.array([t.registration.worst_sigma for t in tracked])
+    off = np.abs(np.diff(x) - 1.0)
+    assert (off < 3 * np.hypot(sigma[:-1], sigma[1:])).all()
+    assert off[2:].max() < 0.1  # when the motion is known
+    assert [t.state for t in tracked[4:]] == [State.TRACKING] * 6
+
+
+@pytest.mark.slow
 def test_an_image_that_is_sent_again_is_no_picture_of_a_keyframe() -> None:
     """It shows another place."""
     frames = [noisy(frame(0.5 * i, random_paint(3), i)) for i in range(3)]
