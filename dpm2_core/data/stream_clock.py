@@ -6,9 +6,10 @@ from __future__ import annotations
 from collections import deque
 
 _PERIOD = 0.1  # s, assumed between two stamps that do not advance
+_FASTEST = 0.005  # s: no stream has a shorter period; frames that arrived together and were stamped then have
 SLOWEST = 2.0
 """No stream has a longer period, s."""
-_RHYTHM = 9  # periods: their median is that of the stream
+_RHYTHM = 9  # periods: the rhythm of the stream, most of it between their quartiles
 
 
 class StreamClock:
@@ -24,16 +25,29 @@ class StreamClock:
         self._periods: deque[float] = deque(maxlen=_RHYTHM)
 
     def advance(self, stamp: int) -> float:
-        """Seconds since the frame before; stamps that repeat or jump back count as one nominal period."""
-        dt = _PERIOD if self.stamp is None or stamp <= self.stamp else (stamp - self.stamp) * 1e-9
+        """Seconds since the frame before; stamps that repeat or jump back count as one nominal period.
+
+        They are no fewer than usual: a driver that stamps on arrival may have been late with the frame before, and
+        what moves as far as in a period is not to count as so much faster.
+        """
+        dt = 0.0 if self.stamp is None else (stamp - self.stamp) * 1e-9
+        if dt < _FASTEST:
+            dt = _PERIOD
         if self.stamp is not None:
             self._periods.append(dt)
+            dt = max(dt, self._quartile(1))
         self.stamp = stamp
         self.now += dt
         return dt
 
     def pause(self, least: float) -> float:
-        """Seconds without a registration that are a pause: `least`, or 1.5 periods where the stream is slow."""
+        """Seconds without a registration that are a pause: `least`, or 1.5 periods where the stream is slow.
+
+        One or two long ones of nine are gaps; more are the rhythm of the stream, as where two frames come at a time.
+        """
         if len(self._periods) > 1:
-            return max(least, 1.5 * sorted(self._periods)[(len(self._periods) - 1) // 2])
+            return max(least, 1.5 * self._quartile(3))
         return SLOWEST  # whether that is a pause or the rhythm of the stream is not known yet
+
+    def _quartile(self, which: int) -> float:
+        return sorted(self._periods)[(len(self._periods) - 1) * which // 4]

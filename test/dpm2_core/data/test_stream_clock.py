@@ -17,6 +17,30 @@ def test_stamps_that_do_not_advance_count_as_a_period() -> None:
     assert clock.stamp == 4_000_000_000
 
 
+def test_a_stamp_that_was_late_is_no_short_period() -> None:
+    """Nor is that of two that were given together. A stream that gets faster is believed with the third frame."""
+    late, together, faster = StreamClock(), StreamClock(), StreamClock()
+    stamps = (*range(0, 900, 100), 985, 1000, 1100, 1155, 1300)  # ms
+    periods = [late.advance(stamp * 10**6) for stamp in stamps]
+    assert periods == pytest.approx([0.1] * 9 + [0.185] + [0.1] * 3 + [0.145])
+    stamps = (0, 1, 200, 201, 400, 401, 600, 601)
+    assert [together.advance(stamp * 10**6) for stamp in stamps] == pytest.approx([0.1, 0.1] + [0.199, 0.1] * 3)
+    stamps = (*range(0, 1000, 100), *range(950, 1150, 50))
+    assert [faster.advance(stamp * 10**6) for stamp in stamps] == pytest.approx([0.1] * 12 + [0.05] * 2)
+
+
+def test_one_frame_after_each_of_another_rhythm_is_as_its_stamp_says() -> None:
+    """Two frames at a time are no pause between, and a gap or two in a stream still are."""
+    clock = StreamClock()
+    periods = [clock.advance((800 * i + j) * 10**6) for i in range(6) for j in (0, 100)]
+    assert periods[1:] == pytest.approx([0.1, 0.7] * 5 + [0.1])
+    assert clock.pause(0.65) == pytest.approx(1.05)
+    regular = StreamClock()
+    for tenth in (*range(8), 18, 19, 29):
+        regular.advance(tenth * 10**8)
+    assert regular.pause(0.65) == 0.65
+
+
 def test_a_pause_is_longer_than_the_rhythm_of_the_stream() -> None:
     """A stream of one frame per second does not pause each second; before two periods its rhythm is not known."""
     clock = StreamClock()

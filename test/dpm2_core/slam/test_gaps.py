@@ -130,6 +130,16 @@ def test_a_stream_of_a_frame_a_second_is_no_gap(world: World) -> None:
     assert [t.state for t in run(frames)[1:]] == [State.TRACKING] * 5
 
 
+@pytest.mark.slow
+def test_two_frames_at_a_time_are_no_gaps(world: World) -> None:
+    """Every eighth frame and the one after it: each gap was a pause, and no bridge closed before the next began."""
+    frames, poses = scanned(world, along(world), [0.8 * i + 0.1 * j for i in range(7) for j in range(2)])
+    tracked = run(frames)
+    assert [t.state for t in tracked[6:]] == [State.TRACKING] * 8  # before that the rhythm is not known
+    assert off(tracked, poses)[6:].max() < 0.1
+    assert tracked[-1].breaks == 0
+
+
 def test_real_gaps(kitti_root: object) -> None:
     """Frames 30 to 49 of the excerpt of KITTI 00 missing: it used to be 19 m wrong and `tracking`."""
     source = open_source(f"{kitti_root}/sequences/00")

@@ -221,6 +221,16 @@ def test_a_clock_that_is_set_from_uptime_to_utc(suburb_drive: Drive) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("ms", [1, 15, 55])
+def test_a_stamp_that_is_late_is_no_leap(suburb_drive: Drive, ms: int) -> None:
+    """One cloud is stamped on its arrival, so long before the next one: it was a meter off for good, as `tracking`."""
+    frames, truth = suburb_drive
+    tracked = run([*frames[:12], replace(frames[12], stamp=frames[13].stamp - ms * 10**6), *frames[13:]])
+    assert errors(tracked, truth)[:, 0].max() < 0.05  # as without
+    assert [t.state for t in tracked[2:]] == [State.TRACKING] * (len(frames) - 2)
+
+
+@pytest.mark.slow
 def test_scans_that_were_left_out_for_want_of_time_are_no_pause(suburb_drive: Drive) -> None:
     """What a pause asks for takes more time yet, and more would be left out: up to 2 s the stream is a slow one."""
     frames, truth = suburb_drive
