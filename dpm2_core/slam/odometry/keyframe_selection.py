@@ -50,6 +50,7 @@ class KeyframeSelector:
     def reset(self) -> None:
         self._last: Keyframe | None = None
         self._uncertainty = np.zeros((6, 6))
+        self._weakest: Registration | None = None  # the least certain one since the last keyframe
         self._requested = False
         self._trace: deque[tuple[int, Array]] = deque(maxlen=_TRACE)  # of the frames before, without a break
         self._fix: Fix | None = None  # the last one, its antenna in the odometry frame
@@ -58,7 +59,7 @@ class KeyframeSelector:
     def take_over(self, before: KeyframeSelector) -> None:
         """Go on after the keyframes of another one."""
         self._last, self._uncertainty, self._requested = before._last, before._uncertainty, before._requested
-        self._trace, self._fix = before._trace, before._fix
+        self._weakest, self._trace, self._fix = before._weakest, before._trace, before._fix
 
     def request(self) -> None:
         """Make a keyframe of the next registered scan at any distance: relocalization needs one even at standstill."""
@@ -75,6 +76,9 @@ class KeyframeSelector:
             self._fix = None
             return None
         self._follow(frame, T_odom_lidar)
+        # What is registered with a doubt enters the map, and the next scan fits there however far that is off.
+        if self._weakest is None or registration.worst_sigma > self._weakest.worst_sigma:
+            self._weakest = registration
         s, last, edge = self._settings, self._last, None
         if s.residual:
             self._spacing.registered(registration.rmse)
@@ -84,7 +88,7 @@ class KeyframeSelector:
             if not self._requested and meters < self._spacing.meters and degrees < s.angle:
                 return None
             sigma = np.repeat([np.radians(s.drift_rotation), s.drift_translation], 3) * max(meters, 1.0)
-            covariance = registration.covariance + np.diag(sigma**2) + self._uncertainty
+            covariance = self._weakest.covariance + np.diag(sigma**2) + self._uncertainty
             edge = replace(registration, T_target_source=T_last_this, covariance=covariance)
         near = scan.points[np.einsum("ij,ij->i", scan.points[:, :3], scan.points[:, :3]) < s.range**2]
         cloud = near[voxel_first(near, s.voxel)]
@@ -94,6 +98,7 @@ class KeyframeSelector:
         if self._fix is not None:
             keyframe = replace(keyframe, fix=_seen_from(se3.inverse(T_odom_lidar), self._fix))
         self._last, self._uncertainty, self._requested, self._fix = keyframe, np.zeros((6, 6)), False, None
+        self._weakest = None
         return keyframe
 
     def _follow(self, frame: Frame, T_odom_lidar: Array) -> None:

@@ -34,6 +34,20 @@ def test_by_the_residual_the_spacing_settles(rmse: float, spacing: float) -> Non
     assert np.diff(at)[-3:] == pytest.approx(spacing, abs=1.01)  # a scan per meter
 
 
+def test_an_edge_is_no_firmer_than_a_registration_on_its_way() -> None:
+    """Scans that leave the way open for a while enter the map; the next one fits there, and knows no more."""
+    selector, scan = KeyframeSelector(KeyframeSettings(distance=5)), Scan(np.zeros((5, 4), np.float32))
+    worst = []
+    for meter in range(16):
+        sigma = 1.0 if meter in (2, 7) else 0.02
+        T = se3.make(np.eye(3), [float(meter), 0, 0])
+        registration = Registration(T, np.diag([1e-6] * 3 + [sigma**2, 1e-4, 1e-4]))
+        keyframe = selector.select(Frame(meter, scan.points), scan, T, registration)
+        if keyframe is not None and keyframe.edge is not None:
+            worst.append(keyframe.edge.worst_sigma)
+    assert worst == pytest.approx([1.0, 1.0, 0.05], abs=0.01)  # the last one: 1 % of 5 m, and 0.02 m
+
+
 def fixes_on_the_way(fixes: dict[int, Fix], failed: int | None = None) -> dict[int, Fix]:
     """Those of keyframes, by their frame; the robot goes 1 m a second forward, turned by 90 degrees to the left.
 
