@@ -38,6 +38,7 @@ _TURNING = 0.1  # rad/s: slower turns prove nothing
 _GRAVITY = 9.81
 _POSSIBLE = 1.5  # m/s2 that a mean force without the changes of velocity may differ from it
 _STEADY = (0.05, 0.1, 0.3)  # noise and mean of the rates, rad/s, and noise of the forces, m/s2, of a sensor at rest
+_SLOPE = np.radians(60.0)  # no vehicle stands on a steeper one
 _FEWEST = 5  # samples that show it
 _WEIGHT = 5.0  # s that a start at rest counts as much as
 _MINUTE = 60.0  # s of which the mean force shows the vertical
@@ -50,7 +51,7 @@ class InertialMotion:
     Attributes:
         turn: R_before_now (3, 3) since the last registered frame; None where it is not known, or not believed.
         turns: whether that is more than a bias could be; no scan has confirmed it yet.
-        problem: why it is None, or why a start at rest is not level; else empty.
+        problem: why it is None, or why a start at rest is not level or may be upside down; else empty.
         T_level_odom: (4, 4), by which poses become level.
     """
 
@@ -134,6 +135,11 @@ class InertialMotion:
             return
         R = self._vertical.turn
         self.T_level_odom = se3.make(R, T[:3, 3] - R @ T[:3, 3])
+        if (angle := _angle(R)) > _SLOPE:  # right for a LiDAR that hangs where /tf_static does not say so
+            self.problem = (
+                f"its forces at rest point {np.degrees(angle):.0f} deg away from up, and odom is turned by that: "
+                f"is its orientation or sign right?"
+            )
 
     def _join(self, frame: Frame) -> None:
         """The samples with those of a frame; from anew where time has gone back."""

@@ -108,7 +108,7 @@ class Odometry:
         clock.append(perf_counter())
         pauses = self._pauses(frame, dt) and not self._registration.rejection(scan)
         T_predicted = self._begin_stretch(dt) if pauses else self._predicted(twist, dt)
-        registration = self._register(scan, T_predicted, dt, frame.problem)
+        scan, registration = self._register(frame, scan, T_predicted, dt)
         if self._first is not None and registration.ok:
             scan, registration = self._begin_again(self._first, frame, registration, seconds)
         clock.append(perf_counter())
@@ -203,34 +203,42 @@ class Odometry:
         T = result.T_target_source if result.ok else self._T
         return replace(result, T_target_source=T, ok=False, reason=result.reason or "after a pause: not confirmed yet")
 
-    def _register(self, scan: Scan, T_predicted: Array, dt: float, problem: str | None) -> Registration:
-        if problem is not None:
-            return Registration(T_predicted, self._unknown(dt), 0.0, np.inf, "none", False, problem)
+    def _register(self, frame: Frame, scan: Scan, T_predicted: Array, dt: float) -> tuple[Scan, Registration]:
+        """The registration of a frame, and the scan that it holds for: the given one, or one without the IMU."""
+        if frame.problem is not None:
+            return scan, Registration(T_predicted, self._unknown(dt), 0.0, np.inf, "none", False, frame.problem)
         if not len(self._registration):
             rejection = self._registration.rejection(scan)
-            return Registration(
+            return scan, Registration(
                 T_predicted, np.zeros((6, 6)), float(not rejection), 0.0, "first", not rejection, rejection
             )
         led = self._register_by_other(scan, dt)
         self._led = led is not None
         if led is not None:
-            return led
+            return scan, led
         if self._twist is None:
-            return self._registered_from_rest(scan, T_predicted, dt)
+            return scan, self._registered_from_rest(scan, T_predicted, dt)
         seconds = self._registered[1] + dt
         widen = min(seconds / dt, 5.0)
         information = np.linalg.inv(self._of_prediction(seconds)).astype(np.float64)
         result = self._registration.register(scan, Prediction([T_predicted], widen, information))
         result = self._gated(result, T_predicted, dt)
         if not result.ok and self._inertial is not None and self._inertial.turn is not None:
-            T = predicted(self._registered[0], self._twist, seconds)  # should the IMU be wrong
-            steady = self._gated(self._registration.register(scan, Prediction([T], widen)), T, dt)
-            result = steady if steady.ok else result
+            steady = self._register_without_imu(frame, self._twist, dt)
+            scan, result = steady if steady[1].ok else (scan, result)
         if result.ok or not self._settings.turns:
-            return result
+            return scan, result
         starts = turned_starts(T_predicted, self._settings.turns)
         turned = self._gated(self._registration.register(scan, Prediction(starts, widen)), T_predicted, dt)
-        return turned if turned.ok else result
+        return scan, turned if turned.ok else result
+
+    def _register_without_imu(self, frame: Frame, twist: Array, dt: float) -> tuple[Scan, Registration]:
+        """Should the IMU be wrong: from a steady motion, in prediction and scan; a wrong turn bends a scan as well."""
+        seconds = self._registered[1] + dt
+        scan = self._registration.prepare(replace(frame, imu=None), twist)
+        T = predicted(self._registered[0], twist, seconds)
+        result = self._registration.register(scan, Prediction([T], min(seconds / dt, 5.0)))
+        return scan, self._gated(result, T, dt)
 
     def _step_of_other(self) -> Step | None:
         """What another odometry says of the way since the last registered frame."""

@@ -95,6 +95,22 @@ def test_a_wrong_orientation_is_noticed(robot: tuple[list[Frame], Array]) -> Non
 
 
 @pytest.mark.slow
+def test_a_gyroscope_that_repeats_its_last_rates_is_left_out_before_a_scan_is_lost(
+    robot: tuple[list[Frame], Array],
+) -> None:
+    """In a bend of 100 deg/s, which ends; the scan that shows it is not to be bent by those rates."""
+    frames, truth = robot
+    assert frames[20].imu is not None
+    last = frames[20].imu.rates[-1]
+    good, bad = frames[:20], with_imu(frames[20:], lambda rates, forces: (np.tile(last, (len(rates), 1)), forces))
+    repeats = run(good + bad)
+    assert all(t.registration.ok for t in repeats)
+    assert repeats[-1].imu is not None
+    assert repeats[-1].imu.startswith("its turns are not those of the scans")
+    assert error(repeats, truth) < 2 * error(run(without(frames)), truth)
+
+
+@pytest.mark.slow
 def test_forces_that_are_not_known_cost_the_level_alone(robot: tuple[list[Frame], Array]) -> None:
     frames, truth = robot
     gyroscope = run(with_imu(frames, lambda rates, forces: (rates, np.full_like(forces, np.nan))))
@@ -205,6 +221,19 @@ def test_forces_without_gravity_make_nothing_level(gravity: float) -> None:
     assert motion.turn is not None
     assert np.degrees(se3.angle(se3.make(motion.turn, np.zeros(3)))) < 0.02  # 0.2 by the bias, which is known
     np.testing.assert_array_equal(motion.T_level_odom, np.eye(4))
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0], ids=["as they are", "reversed"])
+def test_a_start_upside_down_is_said(sign: float) -> None:
+    """A reversed sign and a LiDAR that hangs, of which nothing is known, look alike."""
+    motion, T = InertialMotion(), np.eye(4)
+    frame = standing(T, 1)[0]
+    assert frame.imu is not None
+    motion.look(replace(frame, imu=replace(frame.imu, forces=sign * frame.imu.forces)))
+    motion.registered(T, T, frame.stamp, None)
+    upwards = motion.T_level_odom[:3, :3] @ (sign * frame.imu.forces.mean(0))
+    np.testing.assert_allclose(upwards / np.linalg.norm(upwards), [0, 0, 1], atol=1e-9)
+    assert ("deg away from up" in motion.problem) == (sign < 0)
 
 
 def test_one_that_is_left_out_does_not_tilt_the_frame() -> None:
