@@ -172,6 +172,8 @@ class SlamNode(ManagedNode):
         self._frames.up = (x, y, z) if self._base.name else None  # what is up for the base is to be up in odom
         frame = self._frames.frame(bundle.stamp, bundle.cloud, self._index, bundle.beside)
         tracked = self._tracked(replace(frame, dropped=bundle.dropped))
+        if tracked.imu and tracked.registration.method == "first":  # of the level; diagnostics may miss one cloud
+            self.get_logger().warning(f"{self.calibration.imu_topic}: {tracked.imu}")
         self._index += 1
         self._held.append(tracked)
         if self._base.name:

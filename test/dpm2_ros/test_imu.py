@@ -35,6 +35,7 @@ class Robot:
 
     def __init__(self, ros: Callable[..., Any], drive: Any, *parameters: str, place: bool = True) -> None:
         self.harness, self.drive = ros("input.images:=false", "ros.base_frame:=base_link", *parameters), drive
+        self.gravity = 9.81  # m/s2
         self.wait, publisher = self.harness.wait, self.harness.publisher
         self.lidar, self.imu = publisher(PointCloud2, POINTS), publisher(Imu, "/imu", reliable=False)
         frames = {"lidar": T_BASE_LIDAR} | ({"imu_link": T_BASE_IMU} if place else {})
@@ -49,7 +50,7 @@ class Robot:
     def sample(self, stamp: int, rates: Any = BIAS) -> None:
         """One of a robot at rest."""
         up = T_BASE_IMU[:3, :3].T @ [np.sin(PITCH), 0, np.cos(PITCH)]
-        message = Imu(header=header(stamp, "imu_link"), linear_acceleration=vector(9.81 * up))
+        message = Imu(header=header(stamp, "imu_link"), linear_acceleration=vector(self.gravity * up))
         message.angular_velocity = vector(np.asarray(rates))
         self.imu.publish(message)
 
@@ -108,3 +109,13 @@ def test_without_its_place_it_is_left_out_and_said(robot: Callable[..., Robot]) 
     assert said.message.startswith("no transform from 'imu_link' to 'lidar'")
     assert said.level == DiagnosticStatus.WARN
     np.testing.assert_allclose(transform_matrix(r.odom[0].pose.pose)[:3, :3], np.eye(3), atol=0.01)
+
+
+def test_forces_of_the_other_sign_are_said_at_the_start(
+    robot: Callable[..., Robot], monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("dpm2_ros.diagnostics.PERIOD", 60.0)  # they miss the first cloud
+    r = robot()
+    r.gravity = -r.gravity
+    r.send(0, 1, 2)
+    assert capfd.readouterr().err.count("/imu: its forces at rest point 170 deg away from up") == 1
