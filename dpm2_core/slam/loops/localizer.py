@@ -54,20 +54,21 @@ class Localizer:
         self._failures = 0
         self._distrust = 0.0  # m, path since the map last confirmed the odometry
         self._T_last: Array | None = None
+        self._far: Array | None = None  # T_map_odom by the last result that was far off, while tracking
         self._stamp: int | None = None
         self.found: int | None = None
         self.T_map_odom: Array = np.eye(4)
         self.state = State.RELOCALIZING
 
     def wants(self, stamp: int) -> bool:
-        """Whether to ask for a keyframe now (ns): once a second, also at a halt, unless the map confirms the place."""
-        confirmed = self.state.located and self.state is not State.DEGRADED
-        return not confirmed and (self._stamp is None or stamp - self._stamp >= _PATIENCE)
+        """Whether to ask for a keyframe now (ns): once a second, also at a halt, until another confirms the place."""
+        return self.state is not State.TRACKING and (self._stamp is None or stamp - self._stamp >= _PATIENCE)
 
     def restart(self) -> None:
         """The odometry has begun anew: one may be anywhere."""
         self.T_map_odom, self.state = np.eye(4), State.RELOCALIZING
-        self._failures, self._distrust, self._T_last, self._stamp, self.found = 0, 0.0, None, None, None
+        self._failures, self._distrust, self._far = 0, 0.0, None
+        self._T_last, self._stamp, self.found = None, None, None
 
     def hint(self, T_map_lidar: Array) -> None:
         """Prior for the pose of the next keyframe (4, 4), for example from RViz."""
@@ -111,16 +112,27 @@ class Localizer:
         tracking = self.state.located
         T_predicted = self.T_map_odom @ keyframe.T_odom_kf
         if result.ok:
-            meters, _ = se3.magnitude(se3.inverse(T_predicted) @ result.T_target_source)
-            near = meters <= 2.0 + 0.02 * self._distrust
-            if not tracking or near or self._failures >= self._max_failures:
+            meters = self._apart(T_predicted, result)
+            near = meters <= self._allowed
+            repeated = self._far is not None and self._apart(self._far @ keyframe.T_odom_kf, result) <= self._allowed
+            if not tracking or near or (repeated and self._failures >= self._max_failures):
                 return self._located(keyframe, result, jumped=not (tracking and near))
+            self._far = result.T_target_source @ se3.inverse(keyframe.T_odom_kf)
             result = replace(result, ok=False, reason=f"found {meters:.1f} m away, not confirmed yet")
         elif tracking:
             result = rejected
         self._doubt()
         covariance = LOST if self.state is not State.DEGRADED else np.eye(6) * (0.1 + 0.01 * self._distrust) ** 2
         return LocalizationResult(T_predicted, covariance, self.state, result)
+
+    @property
+    def _allowed(self) -> float:
+        """How far two results may be apart that say the same, m: what the odometry may drift between them."""
+        return 2.0 + 0.02 * self._distrust
+
+    @staticmethod
+    def _apart(T_map_lidar: Array, result: Registration) -> float:
+        return se3.magnitude(se3.inverse(T_map_lidar) @ result.T_target_source)[0]
 
     def _doubt(self) -> None:
         """Its place, where it has one, is that of the odometry alone."""
@@ -130,5 +142,5 @@ class Localizer:
     def _located(self, keyframe: Keyframe, result: Registration, jumped: bool) -> LocalizationResult:
         self.T_map_odom = se3.orthonormalized(result.T_target_source @ se3.inverse(keyframe.T_odom_kf))
         self.state = State.RELOCALIZED if jumped else State.TRACKING
-        self._failures, self._distrust, self.found = 0, 0.0, keyframe.stamp
+        self._failures, self._distrust, self._far, self.found = 0, 0.0, None, keyframe.stamp
         return LocalizationResult(result.T_target_source, result.covariance, self.state, result, jumped)

@@ -23,6 +23,7 @@ _CELL = 2.0  # m, of the grid whose lowest points are the ground
 _ABOVE = 0.5  # m over it: what stands there
 _WELL = 0.75  # fraction of that which fits where a pose is right; with less, a place beside it may fit better
 _CLEARLY = 0.5  # of what does not fit at the second best place, at most so much does not fit at the best
+LEAST = 0.02  # that does not fit, however well a place does: small rooms of one plan all fit to 100 %
 _ELSEWHERE = 0.8  # fit that a place which was not tried is assumed to have: in car parks they have 0.5 to 0.89
 SAME_PLACE = 5.0  # m, poses nearer to each other than this are of one place
 
@@ -83,7 +84,7 @@ def objection_of_others(best: Registration, others: Sequence[Registration]) -> s
         others: verifications at other places, also those that were not accepted.
     """
     second = max([_ELSEWHERE, *(other.confidence for other in others)])
-    if 1 - best.confidence <= _CLEARLY * (1 - second):
+    if max(1 - best.confidence, LEAST) <= _CLEARLY * (1 - second):
         return ""
     if second == _ELSEWHERE:
         return f"{best.confidence:.0%} of the points fit: no more than at a place that looks alike"
