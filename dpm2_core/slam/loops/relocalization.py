@@ -30,7 +30,6 @@ from dpm2_core.slam.loops.verification import (
     Along,
     VerificationSettings,
     Verifier,
-    meters_apart,
     objection_of_others,
 )
 from dpm2_core.slam.registration.texture import VisualSettings
@@ -40,6 +39,7 @@ if TYPE_CHECKING:  # torch takes seconds to import
 
 
 _REACH = 1.0  # m, along the road around a place that a picture has found
+_HEIGHT = 4.0  # m, that a meter of height counts for: 3 m up, on the next storey, one sees other things
 
 
 class RelocalizationSettings(Settings):
@@ -53,7 +53,7 @@ class RelocalizationSettings(Settings):
     """Where they do not say how far along a road one is: so many keyframes, no two of them next to each other, are
     compared by their pictures."""
     surroundings: float = Field(22.0, gt=0)
-    """Keyframes so near to a candidate make up the map to register to, m..."""
+    """Keyframes so near to a candidate make up the map to register to, m; a meter of height counts for four..."""
     keyframes: int = Field(9, ge=1)
     """...but no more than so many, the nearest."""
     hint_radius: float = Field(20.0, gt=0)
@@ -202,12 +202,13 @@ class Relocalizer:
             if result.ok
         ]
         for proposal in sorted(in_map, key=lambda r: -r.confidence):
-            if all(meters_apart(proposal, other) > SAME_PLACE for other in proposals):
+            if all(_is_elsewhere(proposal, other) for other in proposals):
                 proposals.append(proposal)
         return proposals
 
     def _distance(self, T_map_lidar: Array) -> Array:
-        return np.linalg.norm(self._poses[:, :3, 3] - T_map_lidar[:3, 3], axis=1)
+        """Of each keyframe (N,) from a pose (4, 4), m."""
+        return _distance(self._poses, T_map_lidar)
 
 
 def _unique(places: Sequence[Registration]) -> Registration:
@@ -215,8 +216,24 @@ def _unique(places: Sequence[Registration]) -> Registration:
     best = max(places, key=lambda place: (place.ok, place.confidence))
     if not best.ok:
         return nowhere("; ".join(place.reason for place in places))
-    objection = objection_of_others(best, [place for place in places if meters_apart(place, best) > SAME_PLACE])
-    return nowhere(objection) if objection else best
+    others = [place for place in places if _is_elsewhere(place, best)]
+    objection = objection_of_others(best, others)
+    if objection:
+        return nowhere(objection)
+    for other in others:  # which of two equal storeys fits better depends on where the keyframes were taken
+        beside = np.linalg.norm((other.T_target_source - best.T_target_source)[:2, 3])
+        if beside <= SAME_PLACE and other.ok and not objection_of_others(other, []):
+            return nowhere(f"{other.confidence:.0%} of the points fit on another storey, too")
+    return best
+
+
+def _is_elsewhere(place: Registration, other: Registration) -> bool:
+    return bool(_distance(place.T_target_source, other.T_target_source) > SAME_PLACE)
+
+
+def _distance(poses: Array, pose: Array) -> Array:
+    """Between the positions of (..., 4, 4) poses and another (4, 4), m."""
+    return np.linalg.norm((poses[..., :3, 3] - pose[:3, 3]) * [1.0, 1.0, _HEIGHT], axis=-1)
 
 
 def downsampled(points: Points, voxel: float, reach: float) -> Points:

@@ -86,10 +86,13 @@ def test_another_street_is_not_found_and_a_wrong_hint_finds_nothing(relocalizer:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("away", [(0.0, 500.0, 0.0), (0.0, 0.0, 3.0)], ids=["far", "next storey"])
 @pytest.mark.parametrize(("kept", "found"), [(1.0, False), (0.5, True)], ids=["alike", "clearly better"])
-def test_a_place_is_found_only_where_it_fits_clearly_better_than_another_one(kept: float, found: bool) -> None:
-    """The street stands twice in the map: as it is, and 500 m away with a share of the directions kept."""
-    at, far = np.arange(55.0, 71.0, 5.0), se3.make(np.eye(3), np.array([0, 500.0, 0]))
+def test_a_place_is_found_only_where_it_fits_clearly_better_than_another_one(
+    kept: float, found: bool, away: tuple[float, float, float]
+) -> None:
+    """The street stands twice in the map: as it is, and far away or above with a share of the directions kept."""
+    at, far = np.arange(55.0, 71.0, 5.0), se3.make(np.eye(3), np.array(away))
     poses, clouds = np.array([world().pose_at(s) for s in at]), [seen(s) for s in at]
     partly = [cloud[np.sin(8 * np.arctan2(cloud[:, 1], cloud[:, 0])) <= 2 * kept - 1] for cloud in clouds]
     result = made(clouds + partly, np.concatenate([poses, far @ poses])).find(seen(63.0, 0.5, time=7.0))
@@ -98,6 +101,17 @@ def test_a_place_is_found_only_where_it_fits_clearly_better_than_another_one(kep
         assert off(result, world().pose_at(63.0, 0.5))[0] < 0.1
     else:
         assert re.match(r"two places of the map fit alike: \d+% and \d+%", result.reason)
+
+
+@pytest.mark.slow
+def test_no_place_is_found_where_another_storey_would_be_believed_alone() -> None:
+    """One stands where a keyframe was taken; on the next storey, which is built alike, 93 % of the points fit."""
+    at, up = np.arange(55.0, 71.0, 5.0), se3.make(np.eye(3), np.array([0, 0, 3.0]))
+    poses, clouds = np.array([world().pose_at(s) for s in at]), [seen(s) for s in at]
+    partly = [cloud[np.sin(8 * np.arctan2(cloud[:, 1], cloud[:, 0])) <= 0.6] for cloud in clouds]
+    result = made(clouds + partly, np.concatenate([poses, up @ poses])).find(clouds[2])
+    assert not result.ok
+    assert re.match(r"9\d% of the points fit on another storey, too", result.reason)
 
 
 @pytest.mark.slow
