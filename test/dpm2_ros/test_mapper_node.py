@@ -120,6 +120,7 @@ def test_map_to_odom_goes_out_with_every_odometry(mapper: Any) -> None:
 
 def test_robots_whose_odometry_frames_have_one_name_are_reported(mapper: Any) -> None:
     """map -> odom would be that of the one and of the other in turn."""
+    told, announced = mapper.diagnostics, list[tuple[Any, Odometry]]()
     for robot in ("red", "blue"):
         kinds = ((Odometry, "odom"), (PointCloud2, ""), (UInt8MultiArray, "cloud"))
         topics = [f"/{robot}/dpm2/keyframe_{end}".rstrip("_") for _, end in kinds]
@@ -133,9 +134,12 @@ def test_robots_whose_odometry_frames_have_one_name_are_reported(mapper: Any) ->
         for wire, message in zip(wires, (pose, *payload_to_msgs(keyframe, name)), strict=True):
             wire.publish(message)
         mapper.wait(lambda before=before: keyframes(mapper) > before, "its keyframe")
+        announced.append((wires[0], pose))
+    for wire, pose in announced:  # what was heard more than 5 s ago is over, and this machine may be busy
+        wire.publish(pose)
 
     def said() -> bool:
-        return any("one odom_frame of two robots: odom" in s.message for m in mapper.diagnostics for s in m.status)
+        return any("one odom_frame of two robots: odom" in s.message for m in told for s in m.status)
 
     mapper.wait(said, "the report")
 
