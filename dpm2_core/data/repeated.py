@@ -67,6 +67,8 @@ class RepeatedImages:
         One image may be the nearest of two clouds. In a simulation without noise a robot at rest sees the same again,
         but then its cloud is the same too.
         """
+        if not frame.images:
+            return ()
         cloud, found = _checksum(frame.points), []
         for image in frame.images:
             now = crc32(image.pixels[::_ROWS].tobytes()), cloud, frame.stamp + round(image.time_offset * 1e9)

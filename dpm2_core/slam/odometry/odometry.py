@@ -149,7 +149,8 @@ class Odometry:
             frame = replace(frame, problem=REPEATED)
         if imu is not None and frame.problem is not None:
             imu.turns = False  # what shows no turn does not speak against it
-        return replace(frame, images=self._images.new(frame))
+        images = self._images.new(frame)
+        return frame if len(images) == len(frame.images) else replace(frame, images=images)
 
     def _turned(self, twist: Array, seconds: float) -> Array:
         """A twist (6,) with the turn since the last registered frame as it was measured, where it was."""
