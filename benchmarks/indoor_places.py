@@ -19,14 +19,14 @@ from dpm2_core.data.kitti import KittiSource
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.frame import Array, Edge, Frame, Keyframe
 from dpm2_core.geometry import se3
-from dpm2_core.pipeline import Config, OfflineRun
+from dpm2_core.pipeline import OfflineRun
 from dpm2_core.sim.drive import fitting_length
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import DriveConfig
 from dpm2_core.sim.world import build_world
 from dpm2_core.slam.build import make_localizer
 from dpm2_core.slam.mapping.mapper import Mapper
-from dpm2_core.slam.settings import SlamSettings
+from dpm2_core.slam.settings import Config, SlamSettings
 from dpm2_core.tables import FigureTable
 
 HEIGHT = 0.8

@@ -18,8 +18,9 @@ from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.evaluation.live_view import LiveView
 from dpm2_core.evaluation.report import metrics_table
 from dpm2_core.evaluation.run_folder import TRAJECTORY
+from dpm2_core.evaluation.run_result import Result, save_config
 from dpm2_core.files import make_folder
-from dpm2_core.pipeline import OfflineRun, Result, Watch, open_recording, save_config
+from dpm2_core.pipeline import OfflineRun, Watch, open_recording
 from dpm2_core.slam.session import MapMode
 from dpm2_core.slam.settings import Config
 from dpm2_core.slam.system import SlamResult

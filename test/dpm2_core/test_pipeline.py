@@ -14,8 +14,9 @@ from dpm2_core.config import load_settings
 from dpm2_core.data.open import open_source
 from dpm2_core.data.trajectory import read_trajectory, write_kitti, write_tum
 from dpm2_core.errors import UsageError
+from dpm2_core.evaluation.run_result import Result
 from dpm2_core.frame import Frame
-from dpm2_core.pipeline import OfflineRun, Result
+from dpm2_core.pipeline import OfflineRun
 from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.output import TrajectoryRecorder
 from dpm2_core.slam.settings import Config

@@ -121,7 +121,7 @@ def test_a_failure_leaves_nothing(tmp_path: Path) -> None:
 def test_a_killed_run_leaves_nothing_that_looks_whole_and_the_next_one_cleans_up(tmp_path: Path) -> None:
     program = (
         "import sys, pathlib; from dpm2_core.sim.drive import simulate; from dpm2_core.sim.settings import DriveConfig;"
-        "drive = DriveConfig(frames=2000, images=False, lidar={'beams': 16, 'columns': 360});"
+        "drive = DriveConfig(frames=300, images=False, lidar={'beams': 16, 'columns': 360});"
         "simulate(pathlib.Path(sys.argv[1]), drive)"
     )
     child = subprocess.Popen([sys.executable, "-c", program, str(tmp_path / "out")])

@@ -1,0 +1,255 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a run found: its trajectory beside the ground truth, its times, and the files that it leaves."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dpm2_core.config import dump_settings
+from dpm2_core.data.ply import write_ply
+from dpm2_core.data.source import Source
+from dpm2_core.data.trajectory import SAME_TIME, Trajectory, frame_period, matched, write_kitti, write_tum
+from dpm2_core.errors import UsageError
+from dpm2_core.evaluation.figures import trajectory_png
+from dpm2_core.evaluation.ground_truth import in_other_frame, truth_by_stamp
+from dpm2_core.evaluation.metrics import Metrics, evaluate
+from dpm2_core.evaluation.run_folder import (
+    CLOUD,
+    FRAMES,
+    GRAPH,
+    LOCALIZATION,
+    LOOPS,
+    METRICS,
+    PICTURE,
+    POSES,
+    TIMING,
+    TRAJECTORY,
+    TRUTH,
+    remove_results,
+    write_frames,
+    write_loops,
+    write_truth,
+)
+from dpm2_core.extras import MissingPackageError
+from dpm2_core.files import atomic_write, make_folder, write_json
+from dpm2_core.frame import Array, OdometryResult, Points
+from dpm2_core.slam.mapping.mapper import Mapper
+from dpm2_core.slam.output import TrajectoryRecorder
+from dpm2_core.slam.settings import Config
+
+
+@dataclass(eq=False)
+class Result:
+    """What a run found. Clouds of the map stay in the map file, if there is one: save before the run is closed.
+
+    Attributes:
+        ground_truth: LiDAR poses (N, 4, 4) of the frames, or a trajectory to be matched by stamp or number, or None.
+        ground_truth_name: what it was read from.
+        recorder: the odometry's pose of every frame.
+        imu: frames by why the IMU was of no use to them, "used" where it was; empty where there is none.
+        frame_methods: of each frame, how it was registered, "failed" if it was not. frame_states: after each.
+        seconds: wall time of each frame by stage.
+        wall_s: of the whole run, reading included.
+    """
+
+    source: Source
+    config: Config
+    mapper: Mapper
+    ground_truth: Array | Trajectory | None
+    ground_truth_name: str
+    recorder: TrajectoryRecorder = field(default_factory=TrajectoryRecorder)
+    imu: Counter[str] = field(default_factory=Counter)
+    frame_methods: list[str] = field(default_factory=list)
+    frame_states: list[str] = field(default_factory=list)
+    seconds: dict[str, list[float]] = field(default_factory=dict)
+    wall_s: float = 0.0
+    interrupted: bool = False
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return len(self.recorder)
+
+    def add(self, tracked: OdometryResult) -> None:
+        """Take in the next frame."""
+        self.recorder.add(tracked)
+        self.frame_methods.append(tracked.registration.method if tracked.registration.ok else "failed")
+        self.frame_states.append(str(tracked.state))
+        if tracked.imu is not None:
+            self.imu[tracked.imu or "used"] += 1
+        for stage, time in tracked.seconds.items():
+            self.seconds.setdefault(stage, []).append(time)
+
+    @property
+    def registered(self) -> list[bool]:
+        """Of each frame, whether its registration succeeded."""
+        return [method != "failed" for method in self.frame_methods]
+
+    @property
+    def methods(self) -> Counter[str]:
+        """How many frames were registered how; "failed" for those that were not."""
+        return Counter(self.frame_methods)
+
+    @property
+    def states(self) -> Counter[str]:
+        """Frames in each state."""
+        return Counter(self.frame_states)
+
+    @cached_property
+    def poses(self) -> Array:
+        """(N, 4, 4) T_map_lidar of all frames after all corrections; read when the run has ended.
+
+        Raises:
+            UsageError: the run has localized, and made no map.
+        """
+        keyframes = self.mapper.poses[self.mapper.session_start :]
+        if len(keyframes) != self.recorder.keyframes:
+            raise UsageError(
+                "a run that localizes corrects no poses: look at T_map_lidar of each result, by `progress`"
+            )
+        return self.recorder.poses(keyframes)
+
+    @property
+    def sensor_poses(self) -> Array:
+        """(N, 4, 4) of the left camera, as KITTI has them; of the LiDAR where the calibration is not known."""
+        return self.poses if self.source.T_cam_lidar is None else in_other_frame(self.poses, self.source.T_cam_lidar)
+
+    @property
+    def connected(self) -> bool:
+        """Whether a loop ties this drive to those that were in the map file before; True if there were none."""
+        first = self.mapper.session_start
+        return first == 0 or any(edge.from_node < first <= edge.to_node for edge in self.mapper.edges)
+
+    @property
+    def fps(self) -> float:
+        """Frames per second of processing alone; 0 without frames."""
+        total = self._frame_seconds
+        return len(total) / float(total.sum()) if len(total) else 0.0
+
+    @property
+    def _frame_seconds(self) -> Array:
+        return np.asarray(np.sum(list(self.seconds.values()), axis=0)) if self.seconds else np.zeros(0)
+
+    @property
+    def timing(self) -> dict[str, Any]:
+        """Content of timing.json."""
+        stages = {**self.seconds, "total": self._frame_seconds.tolist()}
+        return {
+            "frames": len(self),
+            "fps": self.fps,
+            "wall_s": self.wall_s,
+            "answers": dict(self.methods),
+            "states": dict(self.states),
+            "breaks": self.recorder.breaks,
+            **({"imu": dict(self.imu)} if self.imu else {}),
+            "stages_ms": {stage: _summary(times) for stage, times in stages.items()},
+        }
+
+    @cached_property
+    def metrics(self) -> Metrics | None:
+        """Against the ground truth; None without any.
+
+        Raises:
+            UsageError: nothing of the ground truth belongs to this drive.
+        """
+        truth, poses = self._compared()
+        if truth is None:
+            return None
+        if not isinstance(self.ground_truth, Trajectory):
+            if np.isfinite(truth[:, 0, 0]).sum() < 2:
+                return None
+            poses = self.sensor_poses
+            truth = truth if self.source.T_cam_lidar is None else in_other_frame(truth, self.source.T_cam_lidar)
+        failed = self.methods["failed"]
+        metrics = evaluate(truth, poses, period=frame_period(self.recorder.stamps), failed_frames=failed)
+        own = {"truth": self.ground_truth_name, "breaks": self.recorder.breaks, "fps": self.fps}
+        return metrics.model_copy(update=own)
+
+    def save(self, out: Path, cloud: bool = True) -> list[str]:
+        """Write all files, each whole or not at all; returns what could not be done, in words.
+
+        Files of a run before, of which this one has none, are removed.
+
+        Args:
+            cloud: map.ply, too, and the map in trajectory.png; a long drive's takes hundreds of megabytes.
+
+        Raises:
+            Dpm2Error: a file could not be written; the old one survives. UsageError: see `metrics`, or no folder can
+                be made there.
+        """
+        make_folder(out)
+        save_config(self.config, out)
+        write_kitti(out / POSES, self.sensor_poses)
+        write_tum(out / TRAJECTORY, self.recorder.stamps, self.poses)
+        points = self.mapper.cloud() if cloud else None
+        if points is None:
+            remove_results(out, CLOUD)
+        else:
+            write_ply(out / CLOUD, points)
+        self.mapper.write_g2o(out / GRAPH)
+        keys = zip(self.recorder.index, self.recorder.stamps, self.frame_states, self.frame_methods, strict=True)
+        write_frames(out / FRAMES, list(keys), self.seconds)
+        write_loops(out / LOOPS, self.mapper.loops, self.mapper.poses)
+        write_json(out / TIMING, self.timing)
+        if self.metrics is None:
+            remove_results(out, METRICS, TRUTH)
+        else:
+            write_json(out / METRICS, self.metrics.model_dump())
+            assert self.ground_truth is not None
+            write_truth(out / TRUTH, *truth_by_stamp(self.ground_truth, self.recorder.stamps, self.recorder.index,
+                                                     self.source.T_cam_lidar))  # fmt: skip
+        missing = self._draw(out / PICTURE, points)
+        remove_results(out, LOCALIZATION, *([PICTURE] if missing else []))
+        return missing
+
+    def _draw(self, path: Path, points: Points | None) -> list[str]:
+        """Write trajectory.png; returns why there is none."""
+        if not len(self):
+            return ["no trajectory.png: no frame was processed"]
+        truth, poses = self._compared()
+        title = f"{self.source.name}: {len(self)} frames"
+        try:
+            trajectory_png(path, poses, truth, points, title)
+        except MissingPackageError as error:
+            return [f"no trajectory.png: {error}"]
+        return []
+
+    def _compared(self) -> tuple[Array | None, Array]:
+        """Ground truth and estimate (M, 4, 4) of the same frames."""
+        truth = self.ground_truth
+        if not isinstance(truth, Trajectory):
+            return None if truth is None else truth[: len(self)], self.poses
+        own, apart = Trajectory(self.poses, np.array(self.recorder.stamps), "tum"), SAME_TIME * 1e9
+        if truth.kind == "kitti-indexed":
+            own, apart = Trajectory(self.sensor_poses, np.array(self.recorder.index), "kitti-indexed"), 0
+        first, last = min(own.keys, default=0) - apart, max(own.keys, default=0) + apart
+        during = (truth.keys >= first) & (truth.keys <= last)
+        if during.any():  # else it is of another drive, which `matched` says
+            truth = Trajectory(truth.poses[during], truth.keys[during], truth.kind)
+        return matched(truth, own)
+
+    @property
+    def sensor(self) -> str:
+        """Whose poses are compared with the truth."""
+        stamped = isinstance(self.ground_truth, Trajectory) and self.ground_truth.kind == "tum"
+        return "LiDAR" if stamped or self.source.T_cam_lidar is None else "left camera"
+
+
+def save_config(config: Config, out: Path) -> None:
+    """Write config.yaml, which `--config` reads back.
+
+    Raises:
+        Dpm2Error: it could not be written.
+    """
+    with atomic_write(out / "config.yaml") as file:
+        file.write(dump_settings(config))
+
+
+def _summary(times: list[float]) -> dict[str, float]:
+    median, p95 = np.percentile(np.array(times) * 1e3, [50, 95]) if times else (0.0, 0.0)
+    return {"median": round(float(median), 3), "p95": round(float(p95), 3)}
