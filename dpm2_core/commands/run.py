@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated
 
@@ -92,16 +93,15 @@ def run(
             show(found, figures, json_file)
         return
     mode: MapMode = "resume" if resume else "extend" if extend else "create"
-    with OfflineRun(source, chosen, span, gt, map_file, mode) as drive:
-        make_folder(out)
+    with ExitStack() as open_things:
+        drive = open_things.enter_context(OfflineRun(source, chosen, span, gt, map_file, mode))
+        make_folder(out)  # the recording may go there
+        live = None
+        if view or record is not None:
+            live = open_things.enter_context(LiveView(drive.source.name, view, record))
         if not (out / TRAJECTORY).exists():  # else it is beside the results of a run before until there are others
             save_config(chosen, out)  # now: whatever becomes of the run, it says how it was made
-        if view or record is not None:
-            with LiveView(drive.source.name, view, record) as live:
-                result = _drive(drive, live.add)
-        else:
-            result = _drive(drive, None)
-        _report(result, out, json_file)
+        _report(_drive(drive, None if live is None else live.add), out, json_file)
 
 
 def _drive(drive: OfflineRun, watch: Watch | None) -> Result:

@@ -152,7 +152,7 @@ def test_errors_of_use(recording: Path, tmp_path: Path, arguments: list[str], wo
 
 
 @pytest.mark.parametrize("arguments", [["--out", "FILE"], ["--out", "FILE/below"], ["--record", "/nowhere/run.rrd"]])
-def test_what_cannot_be_written_is_an_error_of_use_and_leaves_no_map(
+def test_what_cannot_be_written_is_an_error_of_use_and_leaves_no_map_and_no_settings(
     recording: Path, tmp_path: Path, arguments: list[str]
 ) -> None:
     """Or the same command, with its mistake corrected, would find a map there."""
@@ -163,6 +163,7 @@ def test_what_cannot_be_written_is_an_error_of_use_and_leaves_no_map(
     assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
     assert given[1] in done.stderr
     assert not path.exists()
+    assert not (tmp_path / "out" / "config.yaml").exists()
     assert (tmp_path / "file").read_text() == "mine"
 
 
