@@ -204,11 +204,11 @@ class LoopCloser:
         proposed = proposal.registration
         by_pose = proposed.method == "pose"
         cloud = clouds[proposal.to_node]
-        result = self._verifier.verify(cloud, around, proposed.T_target_source, 2.0 if by_pose else 1.0).registration
+        result = self._verifier.verify(cloud, around, proposed.T_target_source, 2.0 if by_pose else 1.0)
         if not result.ok and not by_pose:
             again = self._map_to_map(proposal, keyframes, poses)
             if again.ok:
-                second = self._verifier.verify(cloud, around, again.T_target_source).registration
+                second = self._verifier.verify(cloud, around, again.T_target_source)
                 result = second if second.ok else result
         return replace(proposal, registration=result)
 

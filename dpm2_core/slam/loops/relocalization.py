@@ -166,7 +166,7 @@ class Relocalizer:
         verifier = self._verifier.suited_to(cloud)
         around = verifier.surroundings([self._clouds[n] for n in nodes], T_at_map @ self._poses[nodes])
         open_way = None if along is None else along(nodes)
-        result = verifier.verify(cloud, around, T_at_map @ T_map_lidar, widen, open_way).registration
+        result = verifier.verify(cloud, around, T_at_map @ T_map_lidar, widen, open_way)
         T = se3.orthonormalized(self._poses[nodes[0]] @ result.T_target_source)
         return replace(result, T_target_source=T, method="relocalisation")
 

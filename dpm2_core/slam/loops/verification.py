@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,23 +55,6 @@ class VerificationSettings(Settings):
     """...or turn it by more than this, degrees."""
     range: float = Field(40.0, gt=0)
     """Points farther than this from the sensor have no say, m: another lane sees other things behind them."""
-
-
-@dataclass(frozen=True, eq=False)
-class VerificationResult:
-    """What the points say.
-
-    Attributes:
-        registration: the refined pose; `ok` says whether it is accepted, `reason` why not.
-        structure: fraction of the points above the ground that fit. points: number of those.
-        moved: from the proposed pose, m. turned: the same, degrees.
-    """
-
-    registration: Registration
-    structure: float = 0.0
-    points: int = 0
-    moved: float = 0.0
-    turned: float = 0.0
 
 
 def objection_of_others(best: Registration, others: Sequence[Registration]) -> str:
@@ -131,8 +114,8 @@ class Verifier:
 
     def verify(
         self, cloud: Points, around: LocalMap, T_proposed: Array, widen: float = 1.0, along: Along | None = None
-    ) -> VerificationResult:
-        """Verify a pose of a cloud (M, 4) in a map.
+    ) -> Registration:
+        """The refined pose of a cloud (M, 4) in a map; `ok` says whether it is accepted, `reason` why not.
 
         Args:
             widen: factor on how far from the proposed pose the points may look for theirs.
@@ -141,7 +124,7 @@ class Verifier:
         source = self.source(cloud)
         result = self._registration.register(source, around, T_proposed, widen)
         if not result.ok:
-            return VerificationResult(result)
+            return result
         standing = height_above_ground(source, _CELL, reach=0) > _ABOVE
         points = int(standing.sum())
         share, structure = self._shares(source, around, result.T_target_source, standing)
@@ -150,12 +133,9 @@ class Verifier:
             if along is not None and result.worst_sigma > self._settings.max_sigma:
                 result = along(result)
             share, structure = self._shares(source, around, result.T_target_source, standing)
-        meters, degrees = se3.magnitude(se3.inverse(T_proposed) @ result.T_target_source)
-        found = VerificationResult(
-            replace(result, confidence=min(result.confidence, structure)), structure, points, meters, degrees
-        )
-        reason = self._objection(found, share, widen)
-        return replace(found, registration=replace(found.registration, ok=not reason, reason=reason))
+        T_proposed_found = se3.inverse(T_proposed) @ result.T_target_source
+        reason = self._misfit(result, share, structure, points) or self._departure(T_proposed_found, widen)
+        return replace(result, confidence=min(result.confidence, structure), ok=not reason, reason=reason)
 
     def _shares(self, source: Array, around: LocalMap, T: Array, standing: NDArray[np.bool_]) -> tuple[float, float]:
         """Fractions that lie on a surface of the map: of the points (N, 3), and of those that stand."""
@@ -163,19 +143,24 @@ class Verifier:
         fits = residual**2 < 9 * (self._noise**2 + spread)  # False for NaN
         return float(fits.mean()), float(fits[standing].mean()) if standing.any() else 0.0
 
-    def _objection(self, e: VerificationResult, share: float, widen: float) -> str:
-        """Why it is not accepted; empty if it is."""
-        s, result = self._settings, e.registration
+    def _misfit(self, result: Registration, share: float, structure: float, points: int) -> str:
+        """Why the points, so many of them above the ground, do not confirm a pose; empty if they do."""
+        s = self._settings
         if share < s.min_inliers:
             return f"only {share:.0%} of the points fit"
-        if e.points < s.min_points:
-            return f"only {e.points} points above the ground"
-        if e.structure < s.min_structure:
-            return f"only {e.structure:.0%} of what stands there fits"
+        if points < s.min_points:
+            return f"only {points} points above the ground"
+        if structure < s.min_structure:
+            return f"only {structure:.0%} of what stands there fits"
         if result.rmse > s.max_rmse:
             return f"residual {result.rmse:.2f} m"
         if (sigma := result.worst_sigma) > s.max_sigma:
             return f"position uncertain by {sigma:.2f} m"
-        if e.moved > widen * s.max_moved or e.turned > widen * s.max_turned:
-            return f"points and proposal {e.moved:.1f} m, {e.turned:.1f} deg apart"
+        return ""
+
+    def _departure(self, T_proposed_found: Array, widen: float) -> str:
+        """Why a pose is too far from the proposed one; empty if it is not."""
+        meters, degrees = se3.magnitude(T_proposed_found)
+        if meters > widen * self._settings.max_moved or degrees > widen * self._settings.max_turned:
+            return f"points and proposal {meters:.1f} m, {degrees:.1f} deg apart"
         return ""
