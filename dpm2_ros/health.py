@@ -267,8 +267,8 @@ class Diagnostics:
         return self._status("imu", WARN if problem else OK, text, {"received": inputs.imu_received})
 
     def _gnss(self) -> DiagnosticStatus:
-        inputs, problem, located = self._inputs, self._frames.gnss_problem, None
-        problem = problem or self._fix_problem()
+        inputs, located = self._inputs, None
+        problem = self._fix_problem() or self._frames.problems.get(inputs.calibration.gnss_topic)
         if self._mapper is not None:
             located = self._mapper.slam.mapper.georeference
         text = "in use" if located is not None else "the map's place on Earth is not known yet"

@@ -72,7 +72,6 @@ class FrameBuilder:
     Attributes:
         up: see `Inertial`.
         problems: topic of a sensor beside the LiDAR to why its last message could not be used; only where that is so.
-        gnss_problem: why the antenna's place is not known; empty if it is.
         time_problem: why the last cloud cannot be de-skewed; empty if it can, or needs not.
     """
 
@@ -89,7 +88,7 @@ class FrameBuilder:
         self._told: set[str] = set()
         self.problems: dict[str, str] = {}
         self.time_problem = ""
-        self._imu, self._gnss, self.gnss_problem = imu, gnss, ""
+        self._imu, self._gnss = imu, gnss
         self.up: tuple[float, float, float] | None = (0.0, 0.0, 1.0)
 
     def frame(self, stamp: int, cloud: Any, index: int, beside: Mapping[str, tuple[int, Any]] | None = None) -> Frame:
@@ -205,14 +204,17 @@ class FrameBuilder:
 
     def _fix(self, buffer: FixBuffer, lidar_frame: str, stamp: int) -> Fix | None:
         """The last fix before a scan, with the place of its antenna."""
-        fix, self.gnss_problem = buffer.take(stamp), ""
-        if fix is None or buffer.frame.lstrip("/") == lidar_frame.lstrip("/"):
-            return fix
+        fix, topic = buffer.take(stamp), self._calibration.gnss_topic
+        if fix is None:
+            return None
         try:
-            return replace(fix, antenna=self._calibration.transforms.lookup(lidar_frame, buffer.frame)[:3, 3])
+            if buffer.frame.lstrip("/") != lidar_frame.lstrip("/"):
+                fix = replace(fix, antenna=self._calibration.transforms.lookup(lidar_frame, buffer.frame)[:3, 3])
         except (UsageError, ValueError) as error:
-            self.gnss_problem = self._tell(self._calibration.gnss_topic, error, "; the antenna is taken for the LiDAR")
+            self.problems[topic] = self._tell(topic, error, "; the antenna is taken for the LiDAR")
             return fix
+        self.problems.pop(topic, None)
+        return fix
 
     def _image(self, lidar_frame: str, taken_by: CameraTopic, message: Any, late: float) -> Image | None:
         topic = taken_by.topic

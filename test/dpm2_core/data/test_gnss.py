@@ -11,6 +11,7 @@ import pytest
 
 from dpm2_core.data.bags import BagSource
 from dpm2_core.data.convert import EPOCH_NS, convert_kitti
+from dpm2_core.data.frames import Calibration, FrameBuilder
 from dpm2_core.data.gnss import FixBuffer, decode_fix
 from dpm2_core.data.kitti import KittiSource
 from dpm2_core.data.messages import MessageError
@@ -80,6 +81,23 @@ def test_an_antenna_without_a_place_is_at_the_lidar_and_said(bags: Any, tmp_path
     own = BagSource(bags.write(tmp_path / "own", drive(bags, frame="velo_link")), InputSettings(gnss_topic="/fix"))
     assert sum(frame.fix is not None for frame in own.frames()) == 2
     assert own.notes == []
+
+
+def test_an_antenna_without_a_place_is_known_until_it_has_one(bags: Any) -> None:
+    """Clouds without a fix of their own, nine of ten, took the problem away: /diagnostics mostly said "in use"."""
+    fixes, calibration, said = FixBuffer(), Calibration(POINTS, gnss_topic="/fix"), list[str]()
+    builder = FrameBuilder(InputSettings(gnss_topic="/fix"), calibration, said.append, gnss=fixes)
+    known = []
+    for i in range(30):  # 10 Hz clouds, 1 Hz fixes; /tf_static comes before the last of these
+        stamp = SECOND + i * SECOND // 10
+        if i % 10 == 0:
+            fixes.add(stamp, nav(bags, stamp / SECOND))
+        if i == 20:
+            calibration.transforms.add(bags.transform("velo_link", "gnss", (0.3, 0.2, 1.0)))
+        builder.frame(stamp, bags.cloud(stamp / SECOND), i)
+        known.append("no transform from 'gnss'" in builder.problems.get("/fix", ""))
+    assert known == [True] * 20 + [False] * 10
+    assert len(said) == 1
 
 
 def test_a_topic_that_is_not_there(bags: Any, tmp_path: Path) -> None:
