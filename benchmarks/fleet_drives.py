@@ -71,11 +71,10 @@ def write_drive(folder: Path, world: World, poses: Array, seed: int) -> None:
         mapper, edge = make_mapper(settings, store), None
         for number, T_world_kf in enumerate(poses):
             scan = lidar.scan(world, T_world_kf, _TRAFFIC * seed + number / 2, rng)
-            near = scan.points[np.einsum("ij,ij->i", scan.points[:, :3], scan.points[:, :3]) < 60.0**2]
             if number:
                 T = se3.inverse(odometry[number - 1]) @ odometry[number]
                 edge = Registration(T, _COVARIANCE, 0.9, 0.05, "simulated")
-            cloud = near[voxel_first(near, 0.3)]
+            cloud = scan.points[voxel_first(scan.points, 0.3, far=60.0)]
             mapper.add(Keyframe(number, number * 10**9, number, odometry[number], cloud, edge))
         mapper.finish()
     (folder / DONE).write_text(json.dumps({"files": {MAP: (folder / MAP).stat().st_size}}))

@@ -9,7 +9,7 @@ import numpy as np
 
 from dpm2_core.frame import Array, Frame, Points, Registration
 from dpm2_core.geometry import se3
-from dpm2_core.slam.loops.relocalization import downsampled
+from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.slam.preprocess import Preprocessor
 from dpm2_core.slam.settings import SlamSettings
 
@@ -44,4 +44,4 @@ def measured(frame: Frame, settings: SlamSettings) -> Points:
 
 def kept(points: Points, settings: SlamSettings) -> Points:
     """Of such points those (M, 4) that a keyframe keeps."""
-    return downsampled(points, settings.keyframes.voxel, settings.keyframes.range)
+    return points[voxel_first(points, settings.keyframes.voxel, far=settings.keyframes.range)]

@@ -22,7 +22,6 @@ from dpm2_core.descriptors import Descriptors
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Array, Image, Points, Registration
 from dpm2_core.geometry import se3
-from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.slam.loops.pictures import BETWEEN, KnownMap, PicturedPlaces
 from dpm2_core.slam.loops.place_recognition import PlaceRecognition
 from dpm2_core.slam.loops.verification import (
@@ -234,12 +233,6 @@ def _is_elsewhere(place: Registration, other: Registration) -> bool:
 def _distance(poses: Array, pose: Array) -> Array:
     """Between the positions of (..., 4, 4) poses and another (4, 4), m."""
     return np.linalg.norm((poses[..., :3, 3] - pose[:3, 3]) * [1.0, 1.0, _HEIGHT], axis=-1)
-
-
-def downsampled(points: Points, voxel: float, reach: float) -> Points:
-    """The cloud (M, 4) that a keyframe would have of a scan (N, 4): a point in each voxel, none beyond `reach` m."""
-    near = points[np.einsum("ij,ij->i", points[:, :3], points[:, :3]) < reach**2]
-    return near[voxel_first(near, voxel)]
 
 
 def nowhere(reason: str) -> Registration:

@@ -105,8 +105,7 @@ class Verifier:
 
     def source(self, cloud: Points) -> Array:
         """Those points (N, 3) of a cloud (M, 4) that are registered."""
-        near = cloud[np.einsum("ij,ij->i", cloud[:, :3], cloud[:, :3]) < self._settings.range**2]
-        return near[voxel_first(near, self._settings.voxel), :3].astype(np.float64)
+        return cloud[voxel_first(cloud, self._settings.voxel, far=self._settings.range), :3].astype(np.float64)
 
     def register(self, source: Array, around: LocalMap, T_proposed: Array, widen: float) -> Registration:
         """Points (N, 3) of `source` in a map, not verified."""

@@ -90,8 +90,7 @@ class KeyframeSelector:
             sigma = np.repeat([np.radians(s.drift_rotation), s.drift_translation], 3) * max(meters, 1.0)
             covariance = self._weakest.covariance + np.diag(sigma**2) + self._uncertainty
             edge = replace(registration, T_target_source=T_last_this, covariance=covariance)
-        near = scan.points[np.einsum("ij,ij->i", scan.points[:, :3], scan.points[:, :3]) < s.range**2]
-        cloud = near[voxel_first(near, s.voxel)]
+        cloud = scan.points[voxel_first(scan.points, s.voxel, far=s.range)]
         keyframe_id = 0 if last is None else last.id + 1
         known = scan.descriptors if scan.description is not None and scan.description.made else None
         keyframe = Keyframe(keyframe_id, frame.stamp, frame.index, T_odom_lidar, cloud, edge, self._robot, known)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.frame import Array, Edge, Keyframe, Points, Registration
 from dpm2_core.geometry import se3
+from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.network.decoder import Correlated, Decoder
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pose_solver import Solved
@@ -26,7 +27,6 @@ from dpm2_core.sim.settings import LidarConfig
 from dpm2_core.sim.world import World, build_world
 from dpm2_core.slam.loops.closure import LoopCloser, LoopSettings
 from dpm2_core.slam.loops.place_recognition import AGREEING, PlaceRecognition, merged
-from dpm2_core.slam.loops.relocalization import downsampled
 from dpm2_core.slam.loops.verification import Verifier
 from dpm2_core.slam.registration.icp import GeometricSettings
 
@@ -247,7 +247,7 @@ def joined(*parts: tuple[float, float]) -> tuple[list[Edge], Array]:
         for s in np.arange(start, stop, 4.0):
             truth.append(world.pose_at(s, height=0.8))
             points = lidar.scan(world, truth[-1], 0.5 * s, np.random.default_rng(int(s))).points
-            clouds.append(downsampled(points, 0.3, 40.0))
+            clouds.append(points[voxel_first(points, 0.3, far=40.0)])
             edge = Registration(np.eye(4), FIRM, 1.0, 0.1, "test") if s > start else None
             keyframes.append(search.described(Keyframe(len(truth), 0, 0, truth[-1], clouds[-1], edge, robot)))
             loops += search.close(keyframes, clouds, np.array(truth))
