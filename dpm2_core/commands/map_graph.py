@@ -36,8 +36,8 @@ def optimize(
     try:
         solution = optimize(data, RobustSettings())
         poses = least_squares(replace(data, poses=solution.poses), solution.kept)
-    except RuntimeError as error:  # gtsam's: the system is singular
-        raise Dpm2Error(f"{graph}: {' '.join(str(error).split())}") from None
+    except Dpm2Error as error:
+        raise Dpm2Error(f"{graph}: {error}") from None
     seconds = time.perf_counter() - began
     optimized = replace(file, graph=replace(data, poses=poses))
     figures: dict[str, Any] = {

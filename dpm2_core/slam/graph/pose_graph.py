@@ -185,11 +185,8 @@ class PoseGraph:
             if not self.busy:
                 self._submit()
             return
-        try:
-            self._apply(robust.optimize(self._sending(), self._settings), self._sent)
-            self.problem = ""
-        except (RuntimeError, np.linalg.LinAlgError) as error:  # gtsam's or numpy's: the system is singular
-            raise Dpm2Error(f"pose graph: {' '.join(str(error).split())}") from None
+        self._apply(robust.optimize(self._sending(), self._settings), self._sent)
+        self.problem = ""
 
     def collect(self, wait: bool = False) -> bool:
         """Take in what the other process found, if it has; call it with every keyframe.

@@ -10,6 +10,7 @@ stay. Only the nodes at the ends of loops are unknowns: the odometry between the
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +22,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from dpm2_core.config import Settings
+from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.graph_data import (
@@ -82,11 +84,21 @@ class Solution:
         return info
 
 
+@contextmanager
+def _solvable() -> Iterator[None]:
+    """Raises Dpm2Error where the system is singular, for example because a covariance is not positive definite."""
+    try:
+        yield
+    except (RuntimeError, np.linalg.LinAlgError) as error:  # gtsam's or numpy's
+        raise Dpm2Error(f"pose graph: {' '.join(str(error).split())}") from None
+
+
+@_solvable()
 def optimize(graph: GraphData, settings: RobustSettings) -> Solution:
     """Optimize and check the loops; deterministic.
 
     Raises:
-        RuntimeError: the system is singular, for example because a covariance is not positive definite.
+        Dpm2Error: the system is singular.
     """
     odometry = integrate(graph)
     apart = np.sqrt(chain_chi2(graph, odometry))
@@ -108,8 +120,13 @@ def optimize(graph: GraphData, settings: RobustSettings) -> Solution:
     return Solution(condensed.spread(poses), used, sigmas, apart, count, settled)
 
 
+@_solvable()
 def least_squares(graph: GraphData, kept: NDArray[np.bool_], iterations: int = 50) -> Array:
-    """(N, 4, 4) the plain least-squares optimum over the odometry and the loops kept, every node an unknown."""
+    """(N, 4, 4) the plain least-squares optimum over the odometry and the loops kept, every node an unknown.
+
+    Raises:
+        Dpm2Error: the system is singular.
+    """
     condensed = CondensedOdometry(graph, integrate(graph), np.arange(len(graph)))
     return _solved(_factors(graph, condensed, graph.ends, graph.poses, kept, None), graph.poses, iterations)
 

@@ -118,8 +118,8 @@ def _serve(requests: IO[bytes], results: IO[bytes]) -> None:
         result: Any
         try:
             result = optimize(graph, RobustSettings(**settings))
-        except RuntimeError as error:  # gtsam's: the system is singular
-            result = Dpm2Error(f"pose graph: {' '.join(str(error).split())}")
+        except Dpm2Error as error:
+            result = error
         pickle.dump(result, results, protocol=5)
         results.flush()
 

@@ -1,0 +1,32 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A graph in the process that solves it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dpm2_core.errors import Dpm2Error
+from dpm2_core.slam.graph.graph_data import GraphData
+from dpm2_core.slam.graph.robust import RobustSettings
+from dpm2_core.slam.graph.worker import GraphWorker
+
+
+@pytest.mark.slow
+def test_a_graph_that_cannot_be_solved_is_said_and_the_process_lives() -> None:
+    """Where numpy found it singular, not gtsam, the process ended, and that was all that was said."""
+    steps, chained = np.tile(np.eye(4), (5, 1, 1)), np.arange(5) > 0
+    covariances = np.where(chained[:, None, None], 1e-4 * np.eye(6), 0)
+    sound = GraphData(steps, chained, steps, covariances)
+    singular = GraphData(steps, chained, steps, covariances, np.array([[0, 4]]), np.eye(4)[None], np.zeros((1, 6, 6)))
+    worker = GraphWorker()
+    try:
+        worker.submit(singular, RobustSettings())
+        with pytest.raises(Dpm2Error, match="pose graph: Singular matrix"):
+            worker.take(wait=True)
+        worker.submit(sound, RobustSettings())
+        solution = worker.take(wait=True)
+    finally:
+        worker.close()
+    assert solution is not None
+    np.testing.assert_allclose(solution.poses, steps, atol=1e-9)  # what was right already, but for rounding
