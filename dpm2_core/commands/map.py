@@ -26,7 +26,7 @@ from dpm2_core.files import write_json
 from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.mapping.tiles import write_tiles
-from dpm2_core.slam.store.map_data import MapData, load_map, map_cloud, save_as, trajectory
+from dpm2_core.slam.store.map_data import MapData, load_map, map_cloud, save_as, trajectory, ways
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.slam.store.rows import weights_id
 
@@ -199,7 +199,7 @@ def _tied(data: MapData, out: Path) -> MapData:
     from dpm2_core.slam.mapping.parts import first_part
 
     tied = first_part(data)
-    whole, left = (Counter(zip((k.robot for k in d.keyframes), d.session, strict=True)) for d in (data, tied))
+    whole, left = (Counter({drive: len(poses) for drive, (_, poses) in ways(d).items()}) for d in (data, tied))
     for drive, count in sorted((whole - left).items()):
         _say_without(out, drive, count, whole[drive], "no loop ties them to the first keyframe")
     return tied
@@ -225,8 +225,8 @@ def _export_geojson(data: MapData, out: Path) -> None:
     if data.georeference is None:
         raise UsageError(f"{out}: the map has no georeference; see input.gnss_topic")
     placed, features = placed_on_earth(data), []
-    for robot, session in sorted({(k.robot, s) for k, s in zip(data.keyframes, data.session, strict=True)}):
-        way = trajectory(placed, robot, session)[1][:, :3, 3]
+    for (robot, session), (_, poses) in ways(placed).items():
+        way = poses[:, :3, 3]
         known = np.isfinite(way).all(axis=1)
         if not known.all():
             reason = "no loop ties them to the first keyframe, and their own fixes are too few to tell where they are"

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,8 +11,9 @@ import numpy as np
 import typer
 
 from dpm2_core.commands.options import JsonFile, show
+from dpm2_core.frame import Array
 from dpm2_core.slam.mapping.restore import restore_solved
-from dpm2_core.slam.store.map_data import MapData, load_map, trajectory
+from dpm2_core.slam.store.map_data import MapData, load_map, ways
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.tables import FigureTable
 
@@ -49,15 +51,15 @@ def info(path: MapFile, json_file: JsonFile = None) -> None:
 
 
 def _figures(path: Path, data: MapData, with_descriptors: int) -> dict[str, Any]:
-    loops = [edge for edge in data.edges if edge.kind == "loop"]
+    loops, drives = [edge for edge in data.edges if edge.kind == "loop"], ways(data)
     return {
         "map": str(path),
         "keyframes": len(data),
         "own_clouds": sum(data.clouds.loan(node) is None for node in range(len(data))),
         "with_descriptors": with_descriptors,
         "pruned": len(data.trail),
-        "robots": sorted({keyframe.robot for keyframe in data.keyframes}),
-        "length_m": _length(data),
+        "robots": sorted({robot for robot, _ in drives}),
+        "length_m": _length(drives.values()),
         "extent_m": np.ptp(data.poses[:, :3, 3], axis=0).tolist() if len(data) else [],
         "loops_accepted": sum(edge.ok for edge in loops),
         "loops_tried": len(loops),
@@ -119,12 +121,10 @@ def _size(path: Path) -> int:
     return sum(part.stat().st_size for suffix in ("", "-wal") if (part := Path(f"{file}{suffix}")).exists())
 
 
-def _length(data: MapData) -> float:
-    """Of the ways of each robot in each session through all keyframes that ever were, m."""
-    drives = {(keyframe.robot, session) for keyframe, session in zip(data.keyframes, data.session, strict=True)}
-    drives |= {(pruned.robot, pruned.session) for pruned in data.trail}
-    ways = (trajectory(data, robot, session)[1][:, :3, 3] for robot, session in sorted(drives))
-    return float(sum(np.linalg.norm(np.diff(way, axis=0), axis=1).sum() for way in ways))
+def _length(drives: Iterable[tuple[list[int], Array]]) -> float:
+    """Of the ways of all drives, m."""
+    steps = (np.diff(poses[:, :3, 3], axis=0) for _, poses in drives)
+    return float(sum(np.linalg.norm(step, axis=1).sum() for step in steps))
 
 
 def graph_of(data: MapData) -> PoseGraph:

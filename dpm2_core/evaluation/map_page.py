@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import base64
-from collections import defaultdict
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from dpm2_core.evaluation.page import data_url, escape, page
 from dpm2_core.files import atomic_write
 from dpm2_core.frame import Array, Edge, Points
 from dpm2_core.geometry.voxel import voxel_first
-from dpm2_core.slam.store.map_data import MapData, map_cloud
+from dpm2_core.slam.store.map_data import MapData, map_cloud, ways
 
 MOST_POINTS = 1_000_000
 """6 MB, 8 MB as text."""
@@ -102,14 +101,7 @@ def _keyframes(data: MapData, middle: Array) -> list[dict[str, Any]]:
 
 def _tracks(data: MapData, middle: Array) -> list[list[list[float]]]:
     """The way of each session, through keyframes that were pruned as well."""
-    ways = defaultdict(list)
-    for keyframe, session, T in zip(data.keyframes, data.session, data.poses, strict=True):
-        ways[keyframe.robot, session].append((keyframe.stamp, T[:3, 3]))
-    for removed in data.trail:
-        T = data.poses[removed.node] @ removed.T_node_kf
-        ways[removed.robot, removed.session].append((removed.stamp, T[:3, 3]))
-    tracks = [np.array([position for _, position in sorted(way, key=lambda step: step[0])]) for way in ways.values()]
-    return [(track - middle).round(3).tolist() for track in tracks]
+    return [(poses[:, :3, 3] - middle).round(3).tolist() for _, poses in ways(data).values()]
 
 
 def _loop(edge: Edge) -> dict[str, Any]:

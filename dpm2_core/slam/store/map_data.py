@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from itertools import groupby
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -276,16 +277,19 @@ def map_cloud(clouds: CloudStore, poses: Array, voxel: float, nodes: Iterable[in
     return cloud
 
 
-def trajectory(data: MapData, robot: str | None = None, session: int = 0) -> tuple[list[int], Array]:
-    """Stamps (ns) and (K, 4, 4) T_map_kf of all keyframes that ever were, pruned ones too, by robot and time.
+def ways(data: MapData) -> dict[tuple[str, int], tuple[list[int], Array]]:
+    """Stamps (ns) and (K, 4, 4) T_map_kf of each drive (robot, session) by time, those of pruned keyframes too."""
+    steps = [(k.robot, s, k.stamp, T) for k, s, T in zip(data.keyframes, data.session, data.poses, strict=True)]
+    steps += [(p.robot, p.session, p.stamp, data.poses[p.node] @ p.T_node_kf) for p in data.trail]
+    steps.sort(key=lambda step: step[:3])
+    drives = {drive: list(way) for drive, way in groupby(steps, lambda step: step[:2])}
+    return {drive: ([step[2] for step in way], np.array([step[3] for step in way])) for drive, way in drives.items()}
 
-    `robot`: of that one in that `session` only; None: of all.
-    """
-    rows = [(k.robot, s, k.stamp, T) for k, s, T in zip(data.keyframes, data.session, data.poses, strict=True)]
-    rows += [(p.robot, p.session, p.stamp, data.poses[p.node] @ p.T_node_kf) for p in data.trail]
-    rows = [row for row in rows if robot is None or row[:2] == (robot, session)]
-    rows.sort(key=lambda row: row[:3])
-    return [row[2] for row in rows], np.array([row[3] for row in rows]).reshape(-1, 4, 4)
+
+def trajectory(data: MapData) -> tuple[list[int], Array]:
+    """Stamps (ns) and (K, 4, 4) T_map_kf of all `ways`, one after the other."""
+    found = ways(data).values()
+    return [stamp for stamps, _ in found for stamp in stamps], np.concatenate([data.poses[:0], *(T for _, T in found)])
 
 
 def odometry_by_node(edges: Iterable[Edge]) -> dict[int, Edge]:

@@ -14,6 +14,7 @@ import pytest
 
 from dpm2_core.data.convert import EPOCH_NS
 from dpm2_core.data.kitti import KittiSource
+from dpm2_core.data.trajectory import read_trajectory
 from dpm2_core.frame import Array, Edge, Fix, Georeference, Registration
 from dpm2_core.geometry import geodesy, se3
 from dpm2_core.sim.drive import simulate
@@ -21,6 +22,7 @@ from dpm2_core.sim.settings import DriveConfig, GnssConfig, LidarConfig
 from dpm2_core.slam.mapping.merge import merge_maps
 from dpm2_core.slam.store.map_data import MapData, load_map, save_as
 from dpm2_core.slam.store.map_store import MapStore
+from dpm2_core.slam.store.rows import RemovedKeyframe
 
 from ...helpers.command import dpm2
 from ...helpers.drives import first_scans
@@ -165,6 +167,24 @@ def test_a_drive_that_nothing_places_is_left_out_and_named(tmp_path: Path) -> No
     assert done.returncode == 0
     assert "without 40 of the 40 keyframes of session 2" in done.stderr
     assert set(lines_of(tmp_path / "a.geojson")) == {1}
+
+
+def test_a_drive_of_which_all_is_pruned_is_written_and_where_nothing_places_it_named(tmp_path: Path) -> None:
+    """Drives were looked for among the keyframes that are left: GeoJSON left it out in silence, the page had it."""
+    data = two_drives(fixes=False)
+    beside = se3.exp([0, 0, 0, 0, 2.0, 0])
+    trail = [RemovedKeyframe(100 + node, "", 3, node * 10**9, node, beside) for node in range(20)]
+    trail += [RemovedKeyframe(200 + node, "", 4, node * 10**9, node, beside) for node in range(40, 50)]
+    sessions = [replace(data.sessions[0], number=number) for number in (1, 2, 3, 4)]
+    save_as(replace(data, trail=trail, sessions=sessions), tmp_path / "map")
+    done = dpm2("map", "export", tmp_path / "map", tmp_path / "a.geojson")
+    lines = lines_of(tmp_path / "a.geojson")
+    assert sorted(lines) == [1, 3]
+    np.testing.assert_allclose(lines[3], (data.poses[:20] @ beside)[:, :3, 3], atol=0.01)  # the file has mm
+    assert "without 10 of the 10 keyframes of session 4" in done.stderr
+    done = dpm2("map", "export", tmp_path / "map", tmp_path / "a.tum")
+    assert len(read_trajectory(tmp_path / "a.tum")) == 60
+    assert "without 10 of the 10 keyframes of session 4" in done.stderr
 
 
 def test_only_fixes_that_are_in_the_graph_count_as_used(tmp_path: Path) -> None:

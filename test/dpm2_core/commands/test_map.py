@@ -228,7 +228,7 @@ def test_what_nothing_ties_to_the_first_keyframe_is_left_out_and_named(tmp_path:
         for path in ("apart", "alone"):
             done = dpm2("map", "export", tmp_path / path, tmp_path / f"{path}.{name}")
             assert done.returncode == 0
-            assert (f"without 11 of the 11 keyframes of {drive}: no loop ties" in done.stderr) == (path == "apart")
+            assert (f"without 12 of the 12 keyframes of {drive}: no loop ties" in done.stderr) == (path == "apart")
         if name != "a.html":  # it has a title
             assert (tmp_path / f"apart.{name}").read_bytes() == (tmp_path / f"alone.{name}").read_bytes()
     assert len(read_trajectory(tmp_path / "apart.a.tum").keys) == 12
