@@ -15,7 +15,7 @@ import numpy as np
 from dpm2_core.data.thumbnail import usable_image
 from dpm2_core.frame import Array, Image, Keyframe, Points, Registration
 from dpm2_core.geometry import se3
-from dpm2_core.slam.loops.verification import LEAST, Along, Verifier, meters_apart
+from dpm2_core.slam.loops.verification import Along, Verifier, meters_apart, second_best
 from dpm2_core.slam.registration.texture import (
     Reference,
     Texture,
@@ -164,9 +164,9 @@ class PicturedPlaces:
 
 
 def _objection(best: Registration, others: Sequence[Registration]) -> str:
-    """Why the place that correlates best is not believed; empty if it is. See `objection_of_others`."""
-    second = max([_ELSEWHERE, *(other.confidence for other in others)])
-    if max(1 - best.confidence, LEAST) <= _CLEARLY * (1 - second):
+    """Why the place that correlates best is not believed; empty if it is."""
+    second = second_best(best, others, _ELSEWHERE, _CLEARLY)
+    if second is None:
         return ""
     if second == _ELSEWHERE:
         return f"the picture correlates by {best.confidence:.2f}: no more than with a place that looks alike"

@@ -23,7 +23,7 @@ _CELL = 2.0  # m, of the grid whose lowest points are the ground
 _ABOVE = 0.5  # m over it: what stands there
 _WELL = 0.75  # fraction of that which fits where a pose is right; with less, a place beside it may fit better
 _CLEARLY = 0.5  # of what does not fit at the second best place, at most so much does not fit at the best
-LEAST = 0.02  # that does not fit, however well a place does: small rooms of one plan all fit to 100 %
+_LEAST = 0.02  # that does not fit, however well a place does: small rooms of one plan all fit to 100 %
 _ELSEWHERE = 0.8  # fit that a place which was not tried is assumed to have: in car parks they have 0.5 to 0.89
 SAME_PLACE = 5.0  # m, poses nearer to each other than this are of one place
 
@@ -57,17 +57,29 @@ class VerificationSettings(Settings):
     """Points farther than this from the sensor have no say, m: another lane sees other things behind them."""
 
 
-def objection_of_others(best: Registration, others: Sequence[Registration]) -> str:
-    """Why a verified pose is not believed without a prior: another place fits nearly as well; empty if none does.
+def second_best(best: Registration, others: Sequence[Registration], assumed: float, clearly: float) -> float | None:
+    """Confidence of the place that fits nearly as well as the best one; None where the best is clear.
 
     As the ratio test of D. Lowe, "Distinctive Image Features from Scale-Invariant Keypoints", IJCV 2004, with what does
     not fit as the distance.
 
     Args:
+        others: results at other places, also those that were not accepted.
+        assumed: confidence of a place that was not tried.
+        clearly: of what does not fit at the second best place, at most so much does not at a clear one.
+    """
+    second = max([assumed, *(other.confidence for other in others)])
+    return None if max(1 - best.confidence, _LEAST) <= clearly * (1 - second) else second
+
+
+def objection_of_others(best: Registration, others: Sequence[Registration]) -> str:
+    """Why a verified pose is not believed without a prior: another place fits nearly as well; empty if none does.
+
+    Args:
         others: verifications at other places, also those that were not accepted.
     """
-    second = max([_ELSEWHERE, *(other.confidence for other in others)])
-    if max(1 - best.confidence, LEAST) <= _CLEARLY * (1 - second):
+    second = second_best(best, others, _ELSEWHERE, _CLEARLY)
+    if second is None:
         return ""
     if second == _ELSEWHERE:
         return f"{best.confidence:.0%} of the points fit: no more than at a place that looks alike"
