@@ -18,8 +18,6 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 from rich.progress import track
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from benchmarks.harness import Options
 from benchmarks.lossy_link import LOSS, Link, inside
@@ -33,6 +31,7 @@ from dpm2_core.evaluation.record import write_record
 from dpm2_core.frame import Array
 from dpm2_core.sim.simulated_drive import SimulatedDrive
 from dpm2_core.slam.build import make_slam
+from dpm2_core.slam.mapping.parts import parts_of
 from dpm2_core.slam.settings import Config
 from dpm2_core.slam.store.map_data import MapData, load_map
 from dpm2_core.slam.store.map_store import MapStore
@@ -108,16 +107,16 @@ def bench(
     source = open_road(path)
     with tempfile.TemporaryDirectory(prefix="dpm2_bench_robots_") as folder:
         data, made, missed = _drive(source, Path(folder))
-    edges = np.array([(edge.from_node, edge.to_node) for edge in data.constraints]).T
-    maps, _ = connected_components(coo_array((np.ones(edges.shape[1]), edges), shape=(len(data), len(data))))
     errors, alone = _errors(source, data), _alone(source)
     robots = {name: _evaluated(data, name, made[name], errors) for name in SPANS}
     results = {
         "road": ROAD,
         "packet_loss": LOSS,
         "outage": {"seconds": OUTAGE[1] - OUTAGE[0], "keyframes_made_meanwhile": missed},
-        "maps": int(maps),
-        "loops_between_robots": sum(data.keyframes[a].robot != data.keyframes[b].robot for a, b in edges.T),
+        "maps": int(parts_of(data).max()) + 1,
+        "loops_between_robots": sum(
+            data.keyframes[edge.from_node].robot != data.keyframes[edge.to_node].robot for edge in data.constraints
+        ),
         "ape_rmse_m": _rms(errors),
         "single_robot_ape_rmse_m": alone,
         "robots": robots,

@@ -16,15 +16,13 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
 from dpm2_core.errors import UsageError
 from dpm2_core.files import atomic_write
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
-from dpm2_core.slam.graph.graph_data import GraphData, integrate
+from dpm2_core.slam.graph.graph_data import GraphData, components, integrate
 
 _VERTEX = {"VERTEX_SE2": 4, "VERTEX_SE3:QUAT": 8}  # numbers on a line
 _EDGE = {"EDGE_SE2": 11, "EDGE_SE3:QUAT": 30}
@@ -95,14 +93,12 @@ def read_g2o(path: Path) -> G2o:
 def require_connected(path: Path, file: G2o) -> None:
     """Raises UsageError that names a part of the graph which no edge ties to the rest."""
     graph = file.graph
-    nodes = np.flatnonzero(graph.chained)
-    rows, columns = np.concatenate([nodes, graph.ends[:, 0]]), np.concatenate([nodes - 1, graph.ends[:, 1]])
-    size = (len(graph), len(graph))
-    count, part = connected_components(coo_array((np.ones(len(rows)), (rows, columns)), size), directed=False)
-    if count > 1:
-        members = file.ids[part == np.argmin(np.bincount(part))]
+    part = components(len(graph), np.concatenate([graph.odometry_ends, graph.ends]))
+    sizes = np.bincount(part)
+    if len(sizes) > 1:
+        members = file.ids[part == np.argmin(sizes)]
         some = ", ".join(map(str, members[:5])) + (", ..." if len(members) > 5 else "")
-        raise UsageError(f"{path}: {count} parts that no edge connects; one has {len(members)} vertices: {some}")
+        raise UsageError(f"{path}: {len(sizes)} parts that no edge connects; one has {len(members)} vertices: {some}")
 
 
 def write_g2o(path: Path, file: G2o, loops: NDArray[np.bool_] | None = None) -> None:
@@ -114,7 +110,7 @@ def write_g2o(path: Path, file: G2o, loops: NDArray[np.bool_] | None = None) -> 
     graph, suffix = file.graph, "SE2" if file.planar else "SE3:QUAT"
     chosen = np.arange(len(graph.ends)) if loops is None else np.flatnonzero(loops)
     steps = np.flatnonzero(graph.chained)
-    ends = np.concatenate([np.stack([steps - 1, steps], -1), graph.ends[chosen]])
+    ends = np.concatenate([graph.odometry_ends, graph.ends[chosen]])
     T = np.concatenate([graph.steps[steps], graph.T_from_to[chosen]])
     covariances = np.concatenate([graph.step_covariances[steps], graph.covariances[chosen]])
     order = _TANGENT[file.planar]

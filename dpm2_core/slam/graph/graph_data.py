@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
@@ -43,6 +45,18 @@ class GraphData:
     def __len__(self) -> int:
         return len(self.poses)
 
+    @property
+    def odometry_ends(self) -> Index:
+        """(S, 2) from and to of each step of the odometry, in order."""
+        nodes = np.flatnonzero(self.chained)
+        return np.stack([nodes - 1, nodes], -1)
+
+
+def components(count: int, ends: Index) -> NDArray[np.int32]:
+    """(N,) number of the part of the graph that each of `count` nodes is in, from 0, by edges (E, 2)."""
+    graph = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), (count, count))
+    return np.asarray(connected_components(graph, directed=False)[1], np.int32)
+
 
 def loop_errors(poses: Array, ends: Index, T_from_to: Array) -> Array:
     """(E, 6) tangent from what each edge measured to what the poses say."""
@@ -56,9 +70,9 @@ def mahalanobis(errors: Array, covariances: Array) -> Array:
 
 def total_chi2(graph: GraphData, poses: Array, loops: NDArray[np.bool_] | slice = slice(None)) -> float:
     """Sum over the odometry and the chosen loops."""
-    nodes = np.flatnonzero(graph.chained)
-    ends = np.stack([nodes - 1, nodes], -1)
-    odometry = mahalanobis(loop_errors(poses, ends, graph.steps[nodes]), graph.step_covariances[nodes])
+    steps = graph.odometry_ends
+    nodes = steps[:, 1]
+    odometry = mahalanobis(loop_errors(poses, steps, graph.steps[nodes]), graph.step_covariances[nodes])
     errors = loop_errors(poses, graph.ends[loops], graph.T_from_to[loops])
     return float(odometry.sum() + mahalanobis(errors, graph.covariances[loops]).sum())
 

@@ -18,8 +18,6 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from dpm2_core.config import Settings
 from dpm2_core.errors import Dpm2Error
@@ -30,6 +28,7 @@ from dpm2_core.slam.graph.graph_data import (
     GraphData,
     Index,
     chain_chi2,
+    components,
     integrate,
     loop_errors,
     mahalanobis,
@@ -179,10 +178,8 @@ def _factors(
 
 def _anchors(graph: GraphData, condensed: CondensedOdometry, ends: Index) -> Iterator[int]:
     """The fixed nodes, and one in each part of the graph that has none."""
-    count = len(condensed.nodes)
     tied = np.flatnonzero(condensed.tied)
-    rows, columns = np.concatenate([tied, ends[:, 0]]), np.concatenate([tied - 1, ends[:, 1]])
-    part = connected_components(coo_array((np.ones(len(rows)), (rows, columns)), (count, count)), directed=False)[1]
+    part = components(len(condensed.nodes), np.concatenate([np.stack([tied - 1, tied], -1), ends]))
     fixed = np.searchsorted(condensed.nodes, graph.fixed)
     yield from np.unique(fixed).tolist()
     first = np.unique(part, return_index=True)[1]

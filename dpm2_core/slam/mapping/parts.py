@@ -7,20 +7,18 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from dpm2_core.frame import Georeference
 from dpm2_core.geometry import geodesy
 from dpm2_core.slam.graph.fixes import Fixes
+from dpm2_core.slam.graph.graph_data import components
 from dpm2_core.slam.store.map_data import MapData, subset
 
 
 def parts_of(data: MapData) -> NDArray[np.int32]:
     """(N,) number of the part that each node is in, by the accepted edges."""
     ends = np.array([(edge.from_node, edge.to_node) for edge in data.constraints], np.intp).reshape(-1, 2)
-    graph = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), (len(data), len(data)))
-    return np.asarray(connected_components(graph, directed=False)[1], np.int32)
+    return components(len(data), ends)
 
 
 def first_part(data: MapData) -> MapData:
