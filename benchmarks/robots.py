@@ -108,12 +108,13 @@ def bench(
     with tempfile.TemporaryDirectory(prefix="dpm2_bench_robots_") as folder:
         data, made, missed = _drive(source, Path(folder))
     errors, alone = _errors(source, data), _alone(source)
+    maps = int(parts_of(data).max()) + 1
     robots = {name: _evaluated(data, name, made[name], errors) for name in SPANS}
     results = {
         "road": ROAD,
         "packet_loss": LOSS,
         "outage": {"seconds": OUTAGE[1] - OUTAGE[0], "keyframes_made_meanwhile": missed},
-        "maps": int(parts_of(data).max()) + 1,
+        "maps": maps,
         "loops_between_robots": sum(
             data.keyframes[edge.from_node].robot != data.keyframes[edge.to_node].robot for edge in data.constraints
         ),
