@@ -38,14 +38,12 @@ from dpm2_core.fleet.part import Part
 from dpm2_core.fleet.places import WIDTH, FleetIndex
 from dpm2_core.fleet.run import Outcome, View, carry_out
 from dpm2_core.frame import Array
-from dpm2_core.network.pretrained import weights_path
 from dpm2_core.sim.drive import simulate
 from dpm2_core.sim.settings import DriveConfig, LidarConfig
 from dpm2_core.sim.world import build_world
 from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.slam.store.map_data import load_map
 from dpm2_core.slam.store.map_store import MapStore
-from dpm2_core.slam.store.rows import weights_id
 from dpm2_core.tables import FigureTable
 
 METERS, LENGTH, SHARED = 150.0, 110.0, 40.0
@@ -124,7 +122,7 @@ def bench_town(folder: Path, options: Options) -> dict[str, Any]:
 
 def _key(poses: Array) -> str:
     """Of a drive that is kept, so that another one is not taken for it."""
-    weights = weights_id(weights_path(SlamSettings().neural.weights))
+    weights = SlamSettings().weights_id()
     return hashlib.sha256(poses.round(6).tobytes() + weights.encode()).hexdigest()[:12]
 
 

@@ -16,14 +16,13 @@ from dpm2_core.fleet.part import DONE
 from dpm2_core.frame import Array, Keyframe, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.voxel import voxel_first
-from dpm2_core.network.pretrained import weights_path
+from dpm2_core.network.pretrained import weights_id
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import LidarConfig
 from dpm2_core.sim.world import World
 from dpm2_core.slam.build import make_mapper
 from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.slam.store.map_store import MapStore
-from dpm2_core.slam.store.rows import weights_id
 
 STEP = 5.0
 """m between two keyframes."""
@@ -67,7 +66,7 @@ def write_drive(folder: Path, world: World, poses: Array, seed: int) -> None:
     odometry = odometry_of(poses)
     folder.mkdir(parents=True)
     with MapStore.create(folder / MAP) as store:
-        store.begin_session("", weights_id(weights_path(settings.neural.weights)))
+        store.begin_session("", weights_id(settings.neural.weights))
         mapper, edge = make_mapper(settings, store), None
         for number, T_world_kf in enumerate(poses):
             scan = lidar.scan(world, T_world_kf, _TRAFFIC * seed + number / 2, rng)

@@ -25,10 +25,8 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import UInt8MultiArray, UInt32MultiArray
 
 from dpm2_core.frame import Keyframe
-from dpm2_core.network.pretrained import weights_path
 from dpm2_core.slam.mapping.admission import RejectedError
 from dpm2_core.slam.settings import SlamSettings
-from dpm2_core.slam.store.rows import weights_id
 from dpm2_ros.conversions import edge_to_msg, keyframe_name
 from dpm2_ros.deliveries import Delivery
 from dpm2_ros.keyframe_messages import WIRE, of_earlier_drive, payload_to_msgs
@@ -210,6 +208,4 @@ def weights_identity(settings: SlamSettings) -> str:
     Raises:
         UsageError: there is no such file.
     """
-    if not settings.uses_descriptors:
-        return ""
-    return weights_id(weights_path(settings.neural.weights)).split()[-1]
+    return settings.weights_id().split(" ")[-1]

@@ -28,7 +28,6 @@ from dpm2_core.geometry import se3
 from dpm2_core.slam.mapping.tiles import write_tiles
 from dpm2_core.slam.store.map_data import MapData, load_map, map_cloud, save_as, trajectory, ways
 from dpm2_core.slam.store.map_store import MapStore
-from dpm2_core.slam.store.rows import weights_id
 
 app = typer.Typer(help="Map files: info, export, merge, prune, check; pose graphs: optimize.", no_args_is_help=True)
 app.command()(info)
@@ -91,7 +90,7 @@ def merge(
     settings: Overrides = None,
 ) -> None:
     """Join maps, by known transforms or by the places that they share."""
-    from dpm2_core.network.pretrained import weights_path
+    from dpm2_core.network.pretrained import weights_id
     from dpm2_core.slam.build import make_loops
     from dpm2_core.slam.graph.pose_graph import PoseGraph
     from dpm2_core.slam.mapping.merge import align as aligned
@@ -108,7 +107,7 @@ def merge(
         maps = [load_map(stack.enter_context(MapStore.open(path)), descriptors=True) for path in paths]
         described = {session.weights for data in maps for session in data.sessions if session.weights}
         if align:
-            described.add(weights_id(weights_path(chosen.neural.weights)))
+            described.add(weights_id(chosen.neural.weights))
         if len(described) > 1:
             raise UsageError(f"merge: descriptors of several weights: {', '.join(sorted(described))}")
         first, *others = maps

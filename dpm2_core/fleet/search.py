@@ -23,10 +23,9 @@ from dpm2_core.fleet.part import Figures, Part, is_whole
 from dpm2_core.fleet.places import FleetIndex, places_part, vectors_of
 from dpm2_core.fleet.regions import Join
 from dpm2_core.fleet.run import Outcome, View, do_parts
-from dpm2_core.network.pretrained import weights_path
+from dpm2_core.network.pretrained import weights_id
 from dpm2_core.slam.loops.retrieval import Vector
 from dpm2_core.slam.settings import SlamSettings
-from dpm2_core.slam.store.rows import weights_id
 
 _KEPT = ".merge"
 _CANDIDATES = 8
@@ -68,7 +67,7 @@ class Search:
         Raises:
             Dpm2Error: there is none. KeyboardInterrupt: it was stopped.
         """
-        own = weights_id(weights_path(self.settings.neural.weights))
+        own = weights_id(self.settings.neural.weights)
         found: dict[str, Figures] = {}
         outcomes = self._done(list(parts.values()))
         for name, outcome in zip(parts, outcomes, strict=True):

@@ -9,8 +9,8 @@ from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
-from dpm2_core.errors import UsageError
-from dpm2_core.files import expanded
+from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.files import expanded, file_digest
 from dpm2_core.openmp import allowed
 
 if TYPE_CHECKING:  # torch takes seconds to import, and the geometric SLAM does without
@@ -47,6 +47,22 @@ def weights_path(weights: str) -> Path:
         names = ", ".join(pretrained_names()) or "none"
         raise UsageError(f"slam.neural.weights {weights}: no such file; weights that come with dpm2: {names}")
     return path
+
+
+def weights_id(weights: str) -> str:
+    """What identifies weights: name and the first 16 digits of the file's SHA-256.
+
+    Args:
+        weights: name of shipped weights, or path of a file.
+
+    Raises:
+        UsageError: there is neither. Dpm2Error: the file cannot be read.
+    """
+    path = weights_path(weights)
+    try:
+        return f"{path.stem} {file_digest(path)[:16]}"
+    except OSError as error:
+        raise Dpm2Error(f"{path}: {error.strerror}") from None
 
 
 def load_once(path: Path, threads: int, load: Callable[[Path], M]) -> M:

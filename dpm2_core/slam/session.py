@@ -13,12 +13,12 @@ import numpy as np
 from dpm2_core.config import dump_settings
 from dpm2_core.data.source import Source
 from dpm2_core.errors import UsageError
-from dpm2_core.network.pretrained import weights_path
+from dpm2_core.network.pretrained import weights_id
 from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.mapping.tiles import TiledMap
 from dpm2_core.slam.settings import Config, SlamSettings
 from dpm2_core.slam.store.map_store import MapStore, remove_map
-from dpm2_core.slam.store.rows import Session, weights_id
+from dpm2_core.slam.store.rows import Session
 
 MapMode = Literal["create", "resume", "extend", "localize"]
 """What to do with a map file: make it, go on with the drive that was cut off, add another drive, or only read it."""
@@ -42,7 +42,7 @@ def open_session(path: Path, settings: SlamSettings, config: str, resume: bool) 
     Raises:
         UsageError: the file is there, or holds descriptors of other weights. Dpm2Error: it cannot be written.
     """
-    weights = weights_id(weights_path(settings.neural.weights)) if settings.uses_descriptors else ""
+    weights = settings.weights_id()
     if path.exists() and not resume:
         raise UsageError(f"--map {path}: there is a file already; --resume goes on with it")
     # Not whether it exists now: another node may have made one of that name since.
@@ -67,7 +67,7 @@ def open_for_localization(path: Path, settings: SlamSettings) -> MapStore | Tile
     """
     if path.is_dir():
         tiles = TiledMap(path)
-        _check_same(path, tiles.weights, weights_id(weights_path(settings.neural.weights)))
+        _check_same(path, tiles.weights, weights_id(settings.neural.weights))
         return tiles
     store = MapStore.open(path)
     try:
@@ -84,7 +84,7 @@ def check_for_localization(store: MapStore, settings: SlamSettings) -> None:
     Raises:
         UsageError: it has no descriptors, or those of other weights. Dpm2Error: it cannot be read.
     """
-    _check_weights(store, weights_id(weights_path(settings.neural.weights)))
+    _check_weights(store, weights_id(settings.neural.weights))
     if not any(store.payload(node, "descriptors") for node, *_ in store.rows("keyframes", "node")):
         raise UsageError(f"{store.path}: no keyframe has descriptors (made with slam.loops.descriptors off?)")
 

@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 
 from dpm2_core.config import Settings, merged, read_yaml
 from dpm2_core.data.settings import InputSettings
+from dpm2_core.network.pretrained import weights_id
 from dpm2_core.slam.filters import FilterSettings
 from dpm2_core.slam.graph.pose_graph import PoseGraphSettings
 from dpm2_core.slam.loops.closure import LoopSettings
@@ -68,6 +69,10 @@ class SlamSettings(Settings):
     def uses_descriptors(self) -> bool:
         """Whether keyframes may have descriptors, which only those of the same weights can be compared with."""
         return self.registration != "geometric" or (self.loops.enabled and self.loops.descriptors)
+
+    def weights_id(self) -> str:
+        """Of the weights that make descriptors, see `network.pretrained.weights_id`; empty where none are made."""
+        return weights_id(self.neural.weights) if self.uses_descriptors else ""
 
 
 class Config(Settings):

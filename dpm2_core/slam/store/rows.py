@@ -10,14 +10,11 @@ import struct
 from collections.abc import Container
 from dataclasses import dataclass
 from itertools import accumulate
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from dpm2_core.descriptors import Descriptors, quantized
-from dpm2_core.errors import Dpm2Error
-from dpm2_core.files import file_digest
 from dpm2_core.frame import Array, Edge, Fix, Georeference, Keyframe, Points, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.slam.store.cloud_store import Loan
@@ -45,25 +42,13 @@ class RemovedKeyframe:
 
 @dataclass(frozen=True)
 class Session:
-    """One drive into a map: number from 1, version of the program, start (ISO 8601), YAML, weights (`weights_id`)."""
+    """One drive into a map: number from 1, version of the program, start (ISO 8601), YAML, `weights_id` of pretrained.py."""
 
     number: int
     program: str
     started: str
     config: str
     weights: str
-
-
-def weights_id(path: Path) -> str:
-    """What identifies weights: name and the first 16 digits of the file's SHA-256.
-
-    Raises:
-        Dpm2Error: the file cannot be read.
-    """
-    try:
-        return f"{path.stem} {file_digest(path)[:16]}"
-    except OSError as error:
-        raise Dpm2Error(f"{path}: {error.strerror}") from None
 
 
 def array_bytes(array: Array) -> bytes:

@@ -25,13 +25,11 @@ from dpm2_core.fleet.places import WIDTH, FleetIndex
 from dpm2_core.fleet.regions import Join
 from dpm2_core.fleet.run import View
 from dpm2_core.fleet.search import Search
-from dpm2_core.network.pretrained import weights_path
 from dpm2_core.sim.world import build_world
 from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.slam.store.check import check_map
 from dpm2_core.slam.store.map_data import MapData, load_map, move_map, save_as
 from dpm2_core.slam.store.map_store import MapStore
-from dpm2_core.slam.store.rows import weights_id
 from test.helpers.fleets import fleet_maps
 from test.helpers.full_disk import CHECKPOINT, largest_file
 from test.helpers.maps import ring
@@ -186,7 +184,7 @@ class Stopped(Cluster):
     """One job ends, then Ctrl-C."""
 
     def run(self, jobs: Iterable[Job], watch: object = None) -> Iterator[Ended]:
-        weights = weights_id(weights_path(SlamSettings().neural.weights))
+        weights = SlamSettings().weights_id()
         yield Ended(next(iter(jobs)).key, {"keyframes": 60, "weights": [weights]})
         raise KeyboardInterrupt
 
