@@ -238,6 +238,13 @@ class Registration:
     overlap: float = float("nan")
     floor: tuple[float, float] = (0.0, 0.0)
 
+    @classmethod
+    def failed(cls, method: str, reason: str, T_guess: Array | None = None) -> Registration:
+        """No pose was found, and why: near a guess (4, 4) all the same or, without one, anywhere."""
+        if T_guess is None:
+            return cls(np.eye(4), 1e6 * np.eye(6), 0.0, np.inf, method, False, reason)
+        return cls(T_guess, np.diag(np.repeat([0.1, 1.0], 3)), 0.0, np.inf, method, False, reason)
+
     @property
     def of_scene(self) -> Array:
         """(6, 6) `covariance` without `floor`: how well the scans determine the pose."""

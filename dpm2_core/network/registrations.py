@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -26,7 +25,7 @@ def register_batch(
     """The registrations of a batch, T_target_source each."""
     solved = solve_batch(decoder, source, target, correlated, solver)
     if solved is None:
-        return [_nothing("0 matching descriptors, want 3")] * len(source.xyz)
+        return [Registration.failed("neural", "0 matching descriptors, want 3")] * len(source.xyz)
     if decoder.settings.precision and solver == "consensus":  # whose figures the head has learned from
         confidence = confidence_of(decoder, solved).sigmoid()
         improbable = [_improbable(*row) for row in zip(solved.share.tolist(), confidence.tolist(), strict=True)]
@@ -72,12 +71,8 @@ def _registration(
     T: Tensor, covariance: Tensor, confidence: float, rmse: float, overlap: float, objection: str
 ) -> Registration:
     if not bool(T.isfinite().all() and covariance.isfinite().all()):
-        return _nothing("no finite pose")
+        return Registration.failed("neural", "no finite pose")
     # Rigid to float64: the solver composes many steps, and an exponential of a large one leaves 1 + 2e-15 behind.
     rigid = se3.orthonormalized(T.double().numpy())
     result = Registration(rigid, covariance.numpy(), confidence, rmse, "neural", not objection, objection, overlap)
     return with_calibration(result, rigid)
-
-
-def _nothing(reason: str) -> Registration:
-    return Registration(np.eye(4), np.eye(6) * 1e6, 0.0, np.inf, "neural", False, reason)

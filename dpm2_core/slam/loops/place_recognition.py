@@ -68,14 +68,11 @@ class PlaceRecognition:
         """
         agree = self._network.agreement(source, targets) if agreeing else [1.0] * len(targets)
         return [
-            self._network.register(source, target) if part >= agreeing else _elsewhere(part)
+            self._network.register(source, target)
+            if part >= agreeing
+            else Registration.failed("neural", f"another place: {part:.0%} of the descriptors agree on a motion")
             for part, target in zip(agree, targets, strict=True)
         ]
-
-
-def _elsewhere(agree: float) -> Registration:
-    reason = f"another place: {agree:.0%} of the descriptors agree on a motion"
-    return Registration(np.eye(4), np.eye(6) * 1e6, 0.0, np.inf, "neural", False, reason)
 
 
 def merged(keyframes: Sequence[Keyframe], poses: Array, nodes: Sequence[int], at: int) -> Descriptors:

@@ -237,4 +237,4 @@ def _distance(poses: Array, pose: Array) -> Array:
 
 def nowhere(reason: str) -> Registration:
     """No pose, and why."""
-    return Registration(np.eye(4), np.eye(6) * 1e6, 0.0, np.inf, "relocalisation", False, reason)
+    return Registration.failed("relocalisation", reason)

@@ -88,7 +88,7 @@ class GeometricRegistration:
         s = self._settings
         if len(source) < s.min_points or len(target) < s.min_points:
             reason = f"{len(source)} points against a map of {len(target)}; {s.min_points} needed"
-            return _failed(T_guess, reason)
+            return Registration.failed("geometric", reason, T_guess)
         T, gate = T_guess, s.gate * widen
         H = np.zeros((6, 6))
         inliers, rmse, coarse = 0, np.inf, len(source) > 4 * s.min_points
@@ -99,7 +99,7 @@ class GeometricRegistration:
             points = np.ascontiguousarray(source[::4]) if coarse else source
             H, gradient, inliers, rmse = self._linearize(points, target, T, gate)
             if inliers < s.min_points / 4:
-                return _failed(T_guess, f"{inliers} of {len(points)} points near the map")
+                return Registration.failed("geometric", f"{inliers} of {len(points)} points near the map", T_guess)
             pull = prior @ se3.log(se3.inverse(T_guess) @ T)
             step = np.linalg.solve(H + prior, -gradient - pull)
             T = se3.orthonormalized(T @ se3.exp(step))
@@ -274,10 +274,6 @@ def _covariance(H: Array) -> Array:
     information[3:, 3:] -= _NORMAL_NOISE**2 * np.trace(information[3:, 3:]) * np.eye(3)
     eigenvalues, axes = np.linalg.eigh(information)
     return (axes / np.maximum(eigenvalues, 1.0)) @ axes.T  # no direction is worse than 1 m or 1 rad
-
-
-def _failed(T_guess: Array, reason: str) -> Registration:
-    return Registration(T_guess, np.diag([0.1, 0.1, 0.1, 1.0, 1.0, 1.0]), 0.0, np.inf, "geometric", False, reason)
 
 
 def _closed(result: Registration, b: Array) -> Registration:

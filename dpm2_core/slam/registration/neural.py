@@ -120,13 +120,13 @@ class NeuralScanRegistration:
     def _registered(self, scan: Scan, T_near: Array, frames: int) -> Registration:
         """T_odom_lidar by the descriptors of the frames nearest to a pose (4, 4), merged."""
         if scan.descriptors is None:
-            return _failed(T_near, self.rejection(scan))
+            return Registration.failed("neural", self.rejection(scan), T_near)
         if (around := self._map.around(T_near, frames)) is None:
-            return _failed(T_near, "no descriptors around")
+            return Registration.failed("neural", "no descriptors around", T_near)
         T_odom_kf, target = around
         result = self._model.register(scan.descriptors, target)
         if not result.ok:
-            return _failed(T_near, result.reason)
+            return Registration.failed("neural", result.reason, T_near)
         return replace(result, T_target_source=se3.orthonormalized(T_odom_kf @ result.T_target_source))
 
     def update(self, scan: Scan, T_odom_lidar: Array) -> bool:
@@ -147,8 +147,3 @@ class NeuralScanRegistration:
             small = tuple(small_image(image, network.image) for image in images)
             description = LazyDescriptors(partial(self.describe, few, small))
         self._map.insert(description, T_odom_lidar)
-
-
-def _failed(T_predicted: Array, reason: str) -> Registration:
-    covariance = np.diag([0.1, 0.1, 0.1, 1.0, 1.0, 1.0])
-    return Registration(T_predicted, covariance, 0.0, np.inf, "neural", False, reason)
