@@ -50,14 +50,19 @@ def checked_cloud(message: Any) -> tuple[Any, str]:
     return message, ""
 
 
+def check_transforms(message: Any) -> None:
+    """Raises RejectedError for a TFMessage of more transforms than any robot sends at once."""
+    if len(message.transforms) > _MOST_TRANSFORMS:
+        raise RejectedError("size", f"{len(message.transforms)} transforms; at most {_MOST_TRANSFORMS} are read")
+
+
 def extended(tree: TransformTree, message: Any) -> tuple[TransformTree, str]:
     """A tree with the transforms of a TFMessage that are sound, and what is wrong with the last of the others.
 
     Raises:
         RejectedError: there are too many.
     """
-    if len(message.transforms) > _MOST_TRANSFORMS:
-        raise RejectedError("size", f"{len(message.transforms)} transforms; at most {_MOST_TRANSFORMS} are read")
+    check_transforms(message)
     tree, problem = tree.copy(), ""
     for stamped in message.transforms:
         parent, child = stamped.header.frame_id, stamped.child_frame_id

@@ -19,7 +19,7 @@ from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Comparison, Guess
 from dpm2_core.geometry import se3
 from dpm2_core.slam.mapping.admission import RejectedError, check_covariance, check_pose
-from dpm2_ros.checks import check_header
+from dpm2_ros.checks import check_header, check_transforms
 from dpm2_ros.conversions import check_frame, covariance_from_ros
 from dpm2_ros.guard import GuardedNode
 from dpm2_ros.matched_subscription import MatchedSubscription
@@ -32,7 +32,6 @@ WAIT = 0.1
 """s that a cloud waits for the odometry that comes after it."""
 PATIENCE = 5
 """Clouds in a row without it, after which none waits any more until it is there again."""
-_MOST_TRANSFORMS = 500  # in a message
 _MEMORY = 0.02  # fraction of the newest step in how much longer its ways are than those of the scans
 _SLIPS = 0.01  # so much is said
 _DOUBTFUL = 1.5  # times as far off as assumed
@@ -144,8 +143,7 @@ class OtherOdometry:
         return T, covariance
 
     def _on_tf(self, message: Any) -> None:
-        if len(message.transforms) > _MOST_TRANSFORMS:
-            raise RejectedError("size", f"{len(message.transforms)} transforms; at most {_MOST_TRANSFORMS} are read")
+        check_transforms(message)
         with self._changed:
             for stamped in message.transforms:
                 parent, child = stamped.header.frame_id.lstrip("/"), stamped.child_frame_id.lstrip("/")

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 from rich.console import Group
 
-from dpm2_core.commands.options import JsonFile, parse_lengths, parse_range, progress_bar, show
+from dpm2_core.commands.options import JsonFile, parse_lengths, parse_names, parse_range, progress_bar, show
 from dpm2_core.console import Console
 from dpm2_core.errors import UsageError
 from dpm2_core.tables import FigureTable
@@ -63,10 +63,10 @@ def experiment(
     request = Request(
         data,
         out,
-        sequences=_split(sequences),
-        learn=_split(learn),
+        sequences=parse_names(sequences),
+        learn=parse_names(learn),
         weights=weights,
-        registrations=_split(registration),
+        registrations=parse_names(registration),
         peers=tuple(peer or ()),
         lengths=None if lengths is None else parse_lengths(lengths),
         frames=None if frames is None else parse_range(frames),
@@ -92,7 +92,3 @@ def experiment(
     for note in outcome.notes:
         console.print(note, style="yellow", soft_wrap=True)
     console.print(f"Results in {out / name}.json and .html", soft_wrap=True)
-
-
-def _split(text: str | None) -> tuple[str, ...]:
-    return () if text is None else tuple(part.strip() for part in text.split(",") if part.strip())

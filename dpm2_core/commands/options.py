@@ -45,6 +45,11 @@ def show(table: RenderableType, figures: Mapping[str, Any], json_file: Path | No
             file.write(text)
 
 
+def parse_names(text: str | None) -> tuple[str, ...]:
+    """`a, b` to names; none of None."""
+    return () if text is None else tuple(part.strip() for part in text.split(",") if part.strip())
+
+
 def parse_lengths(text: str) -> tuple[float, ...]:
     """`10,20,30` to meters."""
     try:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from dpm2_core.commands.options import JsonFile, progress_bar, show
+from dpm2_core.commands.options import JsonFile, parse_names, progress_bar, show
 from dpm2_core.commands.train import ConfigOption, OutOption, ResumeOption, SetOption, reject_overwriting, train
 from dpm2_core.config import load_settings
 from dpm2_core.console import Console
@@ -76,7 +76,7 @@ def _add(name: str, help_: str) -> None:
         short = {"slam.gamma": slam_weight, "slam.every": slam_every}
         overrides = [*(settings or []), *(f"{key}={value}" for key, value in short.items() if value is not None)]
         chosen = load_settings(task_type(name).training_type, config, overrides)
-        sets = (src, _names(sequences)), None if val is None else (val, _names(val_sequences))
+        sets = (src, parse_names(sequences)), None if val is None else (val, parse_names(val_sequences))
         if val is None and val_sequences is not None:
             raise UsageError("--val-sequences: of which folder? give --val")
         _train(name, chosen, out, resume, sets)
@@ -105,7 +105,7 @@ def movers(
     from dpm2_core.tasks.task import task_type  # torch is slow to import
 
     chosen = load_settings(task_type("movers").training_type, config, settings or [])
-    _train("movers", chosen, out, resume, ((src, _names(sequences)), None if val is None else (val, ())))
+    _train("movers", chosen, out, resume, ((src, parse_names(sequences)), None if val is None else (val, ())))
 
 
 Scans = tuple[Path, Sequence[str]]
@@ -127,10 +127,6 @@ def _train(name: str, settings: TaskTraining, out: Path, resume: bool, sets: tup
     typer.echo(f"{out / WEIGHTS}: written", err=True)
 
 
-def _names(text: str | None) -> tuple[str, ...]:
-    return () if text is None else tuple(part.strip() for part in text.split(",") if part.strip())
-
-
 def eval_task(
     name: Annotated[str, typer.Argument(metavar="TASK", help="gndnet, dslr, ae_lidar or movers.")],
     weights: Annotated[Path, typer.Argument(help="What `dpm2 train TASK` wrote: weights.safetensors.")],
@@ -148,7 +144,7 @@ def eval_task(
 
     needs = task_type(name).needs
     task = load_task(name, weights)
-    scans = open_scans(src, needs, _names(sequences))
+    scans = open_scans(src, needs, parse_names(sequences))
     if picture is not None:
         draw(task, scans, frame, picture)
         Console(stderr=True).print(f"{picture}: written", soft_wrap=True)
@@ -156,7 +152,7 @@ def eval_task(
     if slam:
         from dpm2_core.tasks.slam_figures import slam_figures  # imports the whole SLAM
 
-        figures |= slam_figures(task, src, _names(sequences))
+        figures |= slam_figures(task, src, parse_names(sequences))
     table = FigureTable(f"{name}, {len(scans)} scans of {src}", names=["figure"], figures=["value"])
     for figure, value in figures.items():
         table.add_row(figure, f"{value:.4g}")

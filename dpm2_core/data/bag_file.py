@@ -27,10 +27,10 @@ from rosbags.typesys.store import Typestore
 
 from dpm2_core.data.livox import LIVOX, cloud_of_custom, custom_of_ros1
 from dpm2_core.data.messages import MessageError
+from dpm2_core.data.pairing import RawMessage
 from dpm2_core.database import check_plain
 from dpm2_core.errors import UsageError
 
-RawMessages = Iterator[tuple[str, int, bytes]]
 _MCAP_MAGIC = b"\x89MCAP0\r\n"
 
 
@@ -48,10 +48,10 @@ class Bag:
     path: Path
     types: dict[str, str]
     counts: dict[str, int]
-    _read: Callable[[Collection[str]], RawMessages]
+    _read: Callable[[Collection[str]], Iterator[RawMessage]]
     notes: list[str] = field(default_factory=list)
 
-    def messages(self, topics: Collection[str]) -> RawMessages:
+    def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
         """(topic, log time in ns, serialized message) of some topics, in order of log time.
 
         Where the file turns out damaged the messages end, and `notes` says so.
@@ -155,7 +155,7 @@ def _open_indexed(path: Path, paths: list[Path]) -> Bag:
     return Bag(path, types, dict(counts), partial(_read_indexed, paths))
 
 
-def _read_indexed(paths: list[Path], topics: Collection[str]) -> RawMessages:
+def _read_indexed(paths: list[Path], topics: Collection[str]) -> Iterator[RawMessage]:
     with _opened(paths) as readers:
         requested = [[c for c in reader.connections if c.topic in topics] for reader in readers]
         streams = [reader.messages(connections=c) for reader, c in zip(readers, requested, strict=True) if c]
@@ -176,7 +176,7 @@ def _open_ros1(path: Path) -> Bag:
     return Bag(path, types, dict(counts), partial(_read_ros1, path))
 
 
-def _read_ros1(path: Path, topics: Collection[str]) -> RawMessages:
+def _read_ros1(path: Path, topics: Collection[str]) -> Iterator[RawMessage]:
     with Ros1Reader(path) as reader:
         requested = [connection for connection in reader.connections if connection.topic in topics]
         for connection, time, data in reader.messages(connections=requested):
@@ -212,7 +212,7 @@ def _salvage(path: Path, files: list[Path], reason: str) -> Bag:
     return bag
 
 
-def _read_whole(files: list[Path], topics: Collection[str]) -> RawMessages:
+def _read_whole(files: list[Path], topics: Collection[str]) -> Iterator[RawMessage]:
     return ((topic, time, data) for topic, _, time, data in _whole_messages(files) if topic in topics)
 
 

@@ -10,6 +10,7 @@ from pydantic import AfterValidator, Field
 from scipy.spatial.transform import Rotation
 
 from dpm2_core.config import Settings
+from dpm2_core.data.messages import TimeUnit
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 
@@ -84,7 +85,7 @@ class InputSettings(Settings):
     time_field: str | None = None
     """PointCloud2 field with the time of each point; null looks for a usual name (t, time_offset_ns, ...), "": none."""
 
-    time_unit: Literal["auto", "s", "ms", "us", "ns"] = "auto"
+    time_unit: TimeUnit = "auto"
     """Unit of that field; auto takes that of its name (_ns), else the one in which a scan lasts 2 ms to 2 s."""
 
     intensity_max: Annotated[float, Field(gt=0)] | None = None

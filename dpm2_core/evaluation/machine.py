@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Literal
 
 from dpm2_core._version import __version__
+from dpm2_core.evaluation.record import package_version
 
 Level = Literal["ok", "note", "warning", "error"]
 """A note says what is not there and may not be needed; a warning, what will be felt; an error, what does not work."""
@@ -63,7 +64,7 @@ def python() -> Finding:
 
 def packages(names: tuple[str, ...] = _PACKAGES) -> Finding:
     """Versions of the packages that everything needs."""
-    versions = {name: _version(name) for name in names}
+    versions = {name: package_version(name) for name in names}
     found = ", ".join(f"{name} {version or 'missing'}" for name, version in versions.items())
     if not all(versions.values()):
         return Finding("packages", "error", found, f"pip install {DISTRIBUTION}")
@@ -78,7 +79,7 @@ def extras() -> Finding:
         name = re.match(r"[\w.-]+", line)
         if extra and name:
             wanted.setdefault(extra[1], []).append(name[0])
-    there = {extra for extra, names in wanted.items() if all(map(_version, names))}
+    there = {extra for extra, names in wanted.items() if all(map(package_version, names))}
     missing = sorted(set(wanted) - there)
     found = f"{', '.join(sorted(there)) or 'none'}; without {', '.join(missing) or 'none'}"
     return Finding("extras", "ok" if not missing else "note", found)
@@ -173,7 +174,8 @@ def ros() -> Finding:
     if find_spec("rclpy") is None:
         where = f"{os.environ['ROS_DISTRO']} is sourced, but not for this Python" if "ROS_DISTRO" in os.environ else ""
         return Finding("ROS 2", "warning", where or "none", "dpm2 works without; the nodes need it: docs/ros2.md")
-    kind = os.environ.get("ROS_DISTRO") or f"wheels, rclpy {_version('ros-rclpy') or _version('rclpy') or '?'}"
+    rclpy = package_version("ros-rclpy") or package_version("rclpy") or "?"
+    kind = os.environ.get("ROS_DISTRO") or f"wheels, rclpy {rclpy}"
     if find_spec("tf2_msgs") is None:
         return Finding("ROS 2", "warning", f"{kind}, without tf2_msgs", "no /tf: python -m dpm2_ros.build_tf2_msgs")
     return Finding("ROS 2", "ok", kind)
@@ -197,13 +199,6 @@ def dds(timeout: float = 15.0) -> Finding:
     buffer = _read("/proc/sys/net/core/rmem_max").strip()
     found = f"{answer['rmw']}, a cloud of 2 MB in {answer['ms']:.0f} ms{chosen}; rmem_max {buffer or 'unknown'}"
     return Finding("DDS", "ok", found)
-
-
-def _version(package: str) -> str:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return ""
 
 
 def _read(path: str) -> str:

@@ -29,7 +29,7 @@ def write_record(path: Path, name: str, results: dict[str, Any], program: str = 
         "command": shlex.join([*program.split(), *sys.argv[1:]]),
         "commit": git_commit(),
         "machine": {"processor": _processor(), "cpus": os.cpu_count(), "threads": threads},
-        "versions": {"python": platform.python_version(), **{p: _version(p) for p in _PACKAGES}},
+        "versions": {"python": platform.python_version(), **{p: package_version(p) for p in _PACKAGES}},
         **results,
     }
     with atomic_write(path) as file:
@@ -52,7 +52,8 @@ def _git(*arguments: str) -> str:
     return done.stdout.strip()
 
 
-def _version(package: str) -> str | None:
+def package_version(package: str) -> str | None:
+    """Of an installed package; None where it is not."""
     try:
         return version(package)
     except PackageNotFoundError:

@@ -30,9 +30,9 @@ from dpm2_core.slam.mapping.restore import restore
 from dpm2_core.slam.store.map_data import MapData, append_map, odometry_by_node
 from dpm2_core.slam.store.map_store import Change, MapStore
 from dpm2_core.slam.store.rows import edge_of, pose_of
+from dpm2_core.slam.store.writer import STILL
 
 _STRAINED = 2.0  # standard deviations by which the loops to a drive have been pulled at, in all
-_STILL = 1e-4  # m and rad: poses that move by less are not worth writing
 _TOGETHER = 200  # nodes that are asked for at once
 
 
@@ -256,7 +256,7 @@ class _Region:
         return Growth(
             {name: replace(data, poses=solved[begins[name] :][: len(data)]) for name, data in maps.items()},
             checked,
-            {node: T for node, T in moved.items() if np.abs(T - self._poses[node]).max() > _STILL},
+            {node: T for node, T in moved.items() if np.abs(T - self._poses[node]).max() > STILL},
             {number: loop for number, loop in self._judged().items() if not loop.ok},
         )
 

@@ -42,7 +42,7 @@ class RemovedKeyframe:
 
 @dataclass(frozen=True)
 class Session:
-    """One drive into a map: number from 1, version of the program, start (ISO 8601), YAML, `weights_id` of pretrained.py."""
+    """One drive into a map: number from 1, version of the program, start (ISO 8601), YAML, weights (`weights_id`)."""
 
     number: int
     program: str

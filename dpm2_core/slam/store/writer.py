@@ -14,7 +14,8 @@ from dpm2_core.slam.store.map_store import Change, MapStore
 from dpm2_core.slam.store.rows import array_bytes, edge_of
 
 _BATCH = 20  # keyframes a transaction while catching up: memory is that of so many clouds
-_STILL = 1e-4  # m and rad: poses that move by less are not worth writing
+STILL = 1e-4
+"""m and rad: poses that move by less are not worth writing."""
 
 
 class MapWriter:
@@ -98,7 +99,7 @@ class MapWriter:
     def _moved(self, poses: Array) -> dict[int, Array]:
         """Poses that the file does not have, by node."""
         known = min(len(self._written), len(poses))
-        moved = np.abs(poses[:known] - self._written[:known]).max((1, 2), initial=0.0) > _STILL
+        moved = np.abs(poses[:known] - self._written[:known]).max((1, 2), initial=0.0) > STILL
         return {int(node): poses[node] for node in (*np.flatnonzero(moved), *range(known, len(poses)))}
 
 
