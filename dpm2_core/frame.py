@@ -148,6 +148,10 @@ class Fix:
         if not np.abs(C).max() <= 1e12 or not np.allclose(C, C.T) or np.linalg.eigvalsh(C)[0] <= 0:
             raise ValueError(f"fix: {C.ravel().tolist()} is no covariance")
 
+    def moved(self, T_new_old: Array) -> Fix:
+        """The same with its antenna in another frame, by (4, 4) T_new_old."""
+        return replace(self, antenna=T_new_old[:3, :3] @ self.antenna + T_new_old[:3, 3])
+
 
 @dataclass(frozen=True, eq=False)
 class Georeference:

@@ -202,7 +202,7 @@ def keyframe_to_base(keyframe: Keyframe, T_base_lidar: Array) -> Keyframe:
         edge = replace(edge, T_target_source=T_before_this, covariance=A @ edge.covariance @ A.T)
     fix = keyframe.fix
     if fix is not None:
-        fix = replace(fix, antenna=T_base_lidar[:3, :3] @ fix.antenna + T_base_lidar[:3, 3])
+        fix = fix.moved(T_base_lidar)
     return replace(
         keyframe,
         fix=fix,

@@ -53,7 +53,7 @@ class KeyframeSelector:
         self._weakest: Registration | None = None  # the least certain one since the last keyframe
         self._requested = False
         self._trace: deque[tuple[int, Array]] = deque(maxlen=_TRACE)  # of the frames before, without a break
-        self._fix: Fix | None = None  # the last one, its antenna in the odometry frame
+        self._fix: tuple[Fix, Array] | None = None  # the last one, and T_odom_lidar when it was measured
         self._spacing = Spacing(self._settings.distance, self._settings.residual)
 
     def take_over(self, before: KeyframeSelector) -> None:
@@ -95,7 +95,8 @@ class KeyframeSelector:
         known = scan.descriptors if scan.description is not None and scan.description.made else None
         keyframe = Keyframe(keyframe_id, frame.stamp, frame.index, T_odom_lidar, cloud, edge, self._robot, known)
         if self._fix is not None:
-            keyframe = replace(keyframe, fix=_seen_from(se3.inverse(T_odom_lidar), self._fix))
+            fix, T_odom_then = self._fix
+            keyframe = replace(keyframe, fix=fix.moved(se3.inverse(T_odom_lidar) @ T_odom_then))
         self._last, self._uncertainty, self._requested, self._fix = keyframe, np.zeros((6, 6)), False, None
         self._weakest = None
         return keyframe
@@ -111,9 +112,4 @@ class KeyframeSelector:
         after = next(i for i, (stamp, _) in enumerate(trace) if stamp >= fix.stamp)
         (t0, T0), (t1, T1) = trace[max(after - 1, 0)], trace[after]
         part = (fix.stamp - t0) / (t1 - t0) if t1 > t0 else 0.0
-        self._fix = _seen_from(T0 @ se3.exp(part * se3.log(se3.inverse(T0) @ T1)), fix)
-
-
-def _seen_from(T_other_this: Array, fix: Fix) -> Fix:
-    """The fix with its antenna in another frame."""
-    return replace(fix, antenna=T_other_this[:3, :3] @ fix.antenna + T_other_this[:3, 3])
+        self._fix = fix, T0 @ se3.exp(part * se3.log(se3.inverse(T0) @ T1))

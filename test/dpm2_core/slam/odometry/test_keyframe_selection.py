@@ -48,14 +48,14 @@ def test_an_edge_is_no_firmer_than_a_registration_on_its_way() -> None:
     assert worst == pytest.approx([1.0, 1.0, 0.05], abs=0.01)  # the last one: 1 % of 5 m, and 0.02 m
 
 
-def fixes_on_the_way(fixes: dict[int, Fix], failed: int | None = None) -> dict[int, Fix]:
+def fixes_on_the_way(fixes: dict[int, Fix], failed: int | None = None, start: float = 0.0) -> dict[int, Fix]:
     """Those of keyframes, by their frame; the robot goes 1 m a second forward, turned by 90 degrees to the left.
 
-    `fixes`: by the frame with which they come. `failed`: a frame that is not registered.
+    `fixes`: by the frame with which they come. `failed`: a frame that is not registered. `start`: m, of the way there.
     """
     selector, scan, out = KeyframeSelector(KeyframeSettings(distance=5)), Scan(np.zeros((5, 4), np.float32)), {}
     for second in range(13):
-        T = se3.make(se3.rotation(np.array([0, 0, np.pi / 2])), [0.0, float(second), 0.0])
+        T = se3.make(se3.rotation(np.array([0, 0, np.pi / 2])), [0.0, start + second, 0.0])
         frame = Frame(second * 10**9, scan.points, fix=fixes.get(second))
         registration = Registration(T, np.eye(6) * 1e-4, ok=second != failed)
         keyframe = selector.select(frame, scan, T, registration)
@@ -75,6 +75,12 @@ def test_a_fix_travels_with_the_next_keyframe_as_seen_from_there() -> None:
     assert found[5].stamp == 3_250_000_000  # the later of the two
     np.testing.assert_allclose(found[5].antenna, [-1.75, 0, 1.5], atol=1e-9)  # behind, where it is looked back from
     np.testing.assert_allclose(found[10].antenna, [-1.0, 0, 1.5], atol=1e-9)
+
+
+def test_far_from_the_start_of_the_drive_fixes_are_taken_as_near_it() -> None:
+    """Their antennas were put into the odometry frame, where one beyond 1 km was refused: the frame was an error."""
+    near, far = (fixes_on_the_way({4: measured(3.25)}, start=start)[5] for start in (0.0, 5000.0))
+    np.testing.assert_allclose(far.antenna, near.antenna, atol=1e-9)  # 1e-12 m is the last digit of 5 km
 
 
 def test_a_fix_without_a_known_way_is_left_out() -> None:
