@@ -94,11 +94,6 @@ class TransformHistory:
             track = self._tracks[child] = _Track(parent)
         track.add(stamp, pose, covariance)
 
-    def newest(self, child: str) -> int | None:
-        """Stamp (ns) of its last sample."""
-        track = self._tracks.get(child)
-        return track.stamps[-1] if track is not None and track.stamps else None
-
     def lookup(self, target: str, source: str, stamp: int, static: TransformTree) -> tuple[Array, Array | None]:
         """T_target_source (4, 4) at a stamp (ns), between two samples, and its covariance (6, 6) if one is stated.
 

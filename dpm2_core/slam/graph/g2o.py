@@ -35,17 +35,15 @@ class G2o:
 
     Attributes:
         graph: nodes in ascending order of their ids; each that an edge ties to the one before it continues a
-            trajectory, all other edges are loops.
+            trajectory, all other edges are loops. Without VERTEX lines the poses are those of the odometry.
         ids: (N,) of the file.
         planar: the file is of SE2 lines: z, roll and pitch are zero and their variances arbitrary.
-        has_poses: whether it had VERTEX lines; if not, the poses are those of the odometry.
         ignored: count of the lines of each tag that is not understood.
     """
 
     graph: GraphData
     ids: NDArray[np.int64]
     planar: bool
-    has_poses: bool = True
     ignored: dict[str, int] = field(default_factory=dict)
 
 
@@ -87,7 +85,7 @@ def read_g2o(path: Path) -> G2o:
     graph = _graph(poses if poses is not None else np.tile(np.eye(4), (len(ids), 1, 1)), ends, T, covariances, fixed)
     if poses is None:
         graph = replace(graph, poses=integrate(graph))
-    return G2o(graph, ids, planar, poses is not None, ignored)
+    return G2o(graph, ids, planar, ignored)
 
 
 def require_connected(path: Path, file: G2o) -> None:

@@ -239,16 +239,10 @@ class PoseGraph:
         except RuntimeError:  # gtsam's: the system is singular, as with one fix, which says nothing of the heading
             return None
 
-    def relative_covariance(self, a: int, b: int) -> Array:
-        """(6, 6) of xi in T_a_b @ Exp(xi) of two different nodes; small between neighbors, however far from the start.
-
-        Raises:
-            ValueError: it is one node.
-        """
-        return self.relative_covariances([(a, b)])[0]
-
     def relative_covariances(self, pairs: Sequence[tuple[int, int]]) -> Array:
-        """(P, 6, 6) `relative_covariance` of each pair: the graph is factorized once for many.
+        """(P, 6, 6) of xi in T_a_b @ Exp(xi) of each pair; small between neighbors, however far from the start.
+
+        The graph is factorized once for many.
 
         Raises:
             ValueError: a pair is one node.

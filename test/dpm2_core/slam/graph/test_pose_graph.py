@@ -170,12 +170,12 @@ def test_no_process_outlives_a_killed_program() -> None:
 def test_the_relative_covariance_of_neighbors_is_that_of_their_edge() -> None:
     graph = PoseGraph(PoseGraphSettings())
     drive(graph, 30)
-    np.testing.assert_allclose(graph.relative_covariance(20, 21), STEP, rtol=1e-3, atol=1e-9)
+    np.testing.assert_allclose(graph.relative_covariances([(20, 21)])[0], STEP, rtol=1e-3, atol=1e-9)
     assert np.trace(graph.covariance(29)) > 20 * np.trace(STEP)
     with pytest.raises(ValueError, match="relative to itself"):
-        graph.relative_covariance(3, 3)
+        graph.relative_covariances([(3, 3)])
     pairs = [(node % 29, 29) for node in range(50)]  # more than are asked for at once
-    each = [graph.relative_covariance(a, b) for a, b in pairs]
+    each = [graph.relative_covariances([pair])[0] for pair in pairs]
     np.testing.assert_allclose(graph.relative_covariances(pairs), each, rtol=1e-6, atol=1e-12)
 
 
@@ -230,7 +230,8 @@ def test_trajectories_that_grow_side_by_side_are_tied_by_loops() -> None:
     assert [graph.part(node) for node in (0, 1, 23, 24)] == [0, 0, 0, 2]
     assert {(e.from_node, e.to_node) for e in graph.edges} == {(n, n + 2) for n in range(22)} | {(8, 9), (18, 19)}
     np.testing.assert_allclose(graph.covariance(0), graph.covariance(0).T)
-    assert np.trace(graph.relative_covariance(8, 9)) < np.trace(graph.relative_covariance(0, 23))
+    near, far = graph.relative_covariances([(8, 9), (0, 23)])
+    assert np.trace(near) < np.trace(far)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -1.0, 0.0])
