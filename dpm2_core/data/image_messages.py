@@ -12,9 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpm2_core.data.compressed import decode_compressed
-from dpm2_core.data.messages import _DISTORTIONS, _WIDEST_IMAGE, MessageError
+from dpm2_core.data.messages import MessageError
 from dpm2_core.frame import Array, Camera
 
+DISTORTIONS = (0, 4, 5, 8, 12, 14)
+"""Numbers of coefficients of a camera's distortion that OpenCV supports."""
+_WIDEST_IMAGE = 1 << 15
 # Encoding to (numpy type, channels, OpenCV conversion to RGB). 8UC3 and 8UC4 are BGR(A), as in cv_bridge.
 _IMAGE_ENCODINGS: dict[str, tuple[str, int, int | None]] = {
     "rgb8": ("u1", 3, None),
@@ -140,7 +143,7 @@ def decode_camera(info: Any, T_lidar_cam: Array, name: str) -> Camera:
                            "supported: plumb_bob, rational_polynomial, equidistant")  # fmt: skip
     if not (K[0, 0] > 0 and K[1, 1] > 0 and np.isfinite(K).all()):
         raise MessageError(f"{name}: CameraInfo has no focal length (the camera is not calibrated)")
-    possible = (0, _FISHEYE_COUNT) if info.distortion_model in _FISHEYE else _DISTORTIONS
+    possible = (0, _FISHEYE_COUNT) if info.distortion_model in _FISHEYE else DISTORTIONS
     if len(D) not in possible or not np.isfinite(D).all():
         raise MessageError(f"{name}: CameraInfo has {len(D)} distortion coefficients, or some that are not finite")
     if not (0 < info.width <= _WIDEST_IMAGE and 0 < info.height <= _WIDEST_IMAGE):

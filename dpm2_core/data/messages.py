@@ -47,8 +47,6 @@ _LONGEST_SCAN = 2.0
 
 
 _LARGEST_POINT = 1 << 16
-_DISTORTIONS = (0, 4, 5, 8, 12, 14)  # numbers of coefficients that OpenCV supports
-_WIDEST_IMAGE = 1 << 15
 
 
 class MessageError(UsageError):

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from dpm2_core.data.compressed import decode_compressed
+from dpm2_core.data.image_messages import DISTORTIONS
 from dpm2_core.frame import Array, Camera, Image
 from dpm2_core.geometry import se3
 
@@ -19,7 +20,6 @@ PLACE_WIDTH = 320
 _START, _COMMENT = b"\xff\xd8", b"\xff\xfe"
 _QUALITY = 80
 _KEYS = {"K", "T_lidar_cam", "size", "distortion", "name"}
-_DISTORTIONS = (0, 4, 5, 8, 12, 14)  # coefficients that OpenCV takes
 _LARGEST = 4096  # pixels of width and height
 
 
@@ -74,7 +74,7 @@ def _camera(fields: dict[str, object]) -> Camera:
     if not ((size >= 1) & (size <= _LARGEST)).all():
         raise ValueError(f"size of {size.tolist()} pixels")
     distortion = np.asarray(fields["distortion"], np.float64)
-    if distortion.ndim != 1 or len(distortion) not in _DISTORTIONS or not np.isfinite(distortion).all():
+    if distortion.ndim != 1 or len(distortion) not in DISTORTIONS or not np.isfinite(distortion).all():
         raise ValueError("distortion is not 4, 5, 8, 12 or 14 finite numbers")
     return Camera(K, T, (int(size[0]), int(size[1])), tuple(distortion.tolist()), str(fields["name"]))
 
