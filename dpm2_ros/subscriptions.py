@@ -23,10 +23,10 @@ from dpm2_core.data.frames import Calibration, CameraTopic
 from dpm2_core.data.gnss import FixBuffer
 from dpm2_core.data.image_messages import decode_camera, info_of
 from dpm2_core.data.imu import ImuBuffer
-from dpm2_core.data.kitti import checked_correction
 from dpm2_core.data.livox import LIVOX
 from dpm2_core.data.messages import stamp_ns
 from dpm2_core.data.settings import InputSettings
+from dpm2_core.data.vertical_angle import checked_correction
 from dpm2_core.errors import UsageError
 from dpm2_core.slam.mapping.admission import RejectedError
 from dpm2_ros.checks import check_header, check_size, checked_cloud, extended

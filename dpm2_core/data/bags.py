@@ -19,13 +19,13 @@ from dpm2_core.data.frames import Calibration, CameraTopic, FrameBuilder
 from dpm2_core.data.gnss import FixBuffer
 from dpm2_core.data.image_messages import decode_camera, info_of, is_depth
 from dpm2_core.data.imu import ImuBuffer
-from dpm2_core.data.kitti import checked_correction
 from dpm2_core.data.livox import LIVOX
 from dpm2_core.data.messages import MessageError, serialized_stamp, stamp_ns
 from dpm2_core.data.pairing import JUMP, Beside, RawMessage, clouds_after_others
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.trajectory import interpolate
 from dpm2_core.data.transforms import transform_matrix
+from dpm2_core.data.vertical_angle import checked_correction
 from dpm2_core.errors import UsageError, printable
 from dpm2_core.frame import Array, Camera, Frame
 

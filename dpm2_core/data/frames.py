@@ -168,11 +168,9 @@ class FrameBuilder:
     @property
     def angle_correction_deg(self) -> float:
         """Added to the elevation of each point: what is set, else what the recording says, else KITTI's for KITTI."""
-        requested, known = self._settings.vertical_angle_correction_deg, self._calibration
-        if requested != "auto":
-            return requested
-        usual = HDL64_CORRECTION_DEG if known.points_topic.startswith("/kitti/") else 0.0
-        return usual if known.angle_correction_deg is None else known.angle_correction_deg
+        known = self._calibration.angle_correction_deg
+        usual = HDL64_CORRECTION_DEG if self._calibration.points_topic.startswith("/kitti/") else 0.0
+        return self._settings.angle_correction(usual if known is None else known)
 
     def _inertial(self, buffer: ImuBuffer, lidar_frame: str, stamp: int, offset: Points | None) -> Inertial | None:
         """The samples up to the last point of a scan, along the LiDAR's axes."""

@@ -21,24 +21,12 @@ from dpm2_core.data.messages import scale_intensity
 from dpm2_core.data.scan_file import chosen, image_size, images_of, read_scan
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.text import parse_row, read_lines, read_numbers
-from dpm2_core.data.vertical_angle import HDL64_CORRECTION_DEG, correct_vertical_angle
+from dpm2_core.data.vertical_angle import HDL64_CORRECTION_DEG, checked_correction, correct_vertical_angle
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Camera, Fix, Frame, Inertial
 from dpm2_core.geometry import se3
 
-_MAX_CORRECTION_DEG = 5.0
 _PERIOD = 0.1  # s between scans, where times.txt does not say
-
-
-def checked_correction(value: float, where: str) -> float:
-    """A correction from a file or a message, within the bounds of the setting.
-
-    Raises:
-        UsageError: it is not; the message begins with `where`.
-    """
-    if not abs(value) <= _MAX_CORRECTION_DEG:
-        raise UsageError(f"{where}: want a vertical angle correction of -5 to 5 degrees, got {value}")
-    return value
 
 
 class KittiSource:

@@ -67,8 +67,7 @@ class Kitti360Source:
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
         """Frames start..stop-1 by position; `Frame.index` is the number in the file name."""
-        requested = self._settings.vertical_angle_correction_deg
-        degrees = 0.0 if requested == "auto" else requested
+        degrees = self._settings.angle_correction(0.0)
         for scan, stamp in list(zip(self._scans, self.stamps, strict=True))[start:stop]:
             points, problem = read_scan(scan)
             points = correct_vertical_angle(scale_intensity(points, self._settings.intensity_max), degrees)

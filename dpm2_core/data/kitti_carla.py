@@ -57,7 +57,6 @@ class KittiCarlaSource:
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
         """Frames start..stop-1 by position; `Frame.index` is the number in the file name."""
-        requested = self._settings.vertical_angle_correction_deg
         for sweep, stamp in list(zip(self._sweeps, self.stamps, strict=True))[start:stop]:
             number, problem, offset = int(sweep.stem[6:]), None, None
             try:
@@ -68,7 +67,7 @@ class KittiCarlaSource:
             points[:, 3] = np.abs(points[:, 3])
             if len(points):
                 offset = (columns[:, 4] - stamp * 1e-9).astype(np.float32)
-            points = correct_vertical_angle(points, 0.0 if requested == "auto" else requested)
+            points = correct_vertical_angle(points, self._settings.angle_correction(0.0))
             images = images_of(self._image_path(number), self.camera, self.notes)
             yield Frame(int(stamp), points, offset, images, index=number, problem=problem)
 

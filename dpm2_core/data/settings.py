@@ -103,6 +103,11 @@ class InputSettings(Settings):
         place = self.T_lidar_cam
         return None if place is None else se3.make(Rotation.from_quat(place[3:]).as_matrix(), place[:3])
 
+    def angle_correction(self, known: float) -> float:
+        """Degrees to add to the elevation of each point: what is set here, else what is `known` of the recording."""
+        requested = self.vertical_angle_correction_deg
+        return known if requested == "auto" else requested
+
     def imu_rotation(self) -> Array | None:
         """R_lidar_imu (3, 3); None if it is not set here."""
         return None if self.q_lidar_imu is None else np.asarray(Rotation.from_quat(self.q_lidar_imu).as_matrix())

@@ -5,10 +5,22 @@ from __future__ import annotations
 
 import numpy as np
 
+from dpm2_core.errors import UsageError
 from dpm2_core.frame import Points
 
 HDL64_CORRECTION_DEG = 0.205
 """What KITTI's scans lack in elevation: the intrinsic calibration of its HDL-64 (J.-E. Deschaud, "IMLS-SLAM", 2018)."""
+
+
+def checked_correction(value: float, where: str) -> float:
+    """A correction from a file or a message, within the bounds of the setting.
+
+    Raises:
+        UsageError: it is not; the message begins with `where`.
+    """
+    if not abs(value) <= 5:
+        raise UsageError(f"{where}: want a vertical angle correction of -5 to 5 degrees, got {value}")
+    return value
 
 
 def correct_vertical_angle(points: Points, degrees: float) -> Points:
