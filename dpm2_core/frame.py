@@ -337,6 +337,14 @@ class Edge:
         """Whether it constrains the poses."""
         return self.registration.ok
 
+    def between(self, from_node: int, to_node: int) -> Edge:
+        """The same edge where its ends have other numbers."""
+        return replace(self, from_node=from_node, to_node=to_node)
+
+    def shifted(self, first: int) -> Edge:
+        """The same edge where node 0 is number `first`."""
+        return self.between(self.from_node + first, self.to_node + first)
+
     def rejected(self, reason: str) -> Edge:
         """The same edge, which does not constrain the poses."""
         return replace(self, registration=replace(self.registration, ok=False, reason=reason))

@@ -34,12 +34,11 @@ def merge_maps(a: MapData, b: MapData, T_a_b: Array, loops: Sequence[Edge] = ())
     moving = [*(a.clouds.moving(i) for i in range(n)), *(b.clouds.moving(i) for i in range(len(b)))]
     loans = {i: loan for i in range(n) if (loan := a.clouds.loan(i))}
     loans |= {n + i: Loan(n + loan.lender, loan.T_kf_lender) for i in range(len(b)) if (loan := b.clouds.loan(i))}
-    moved = [replace(edge, from_node=edge.from_node + n, to_node=edge.to_node + n) for edge in b.edges]
     return MapData(
         [*a.keyframes, *b.keyframes],
         [*a.session, *(number + sessions for number in b.session)],
         np.concatenate([a.poses, T_a_b @ b.poses]),
-        [*a.edges, *moved, *(replace(edge, to_node=edge.to_node + n) for edge in loops)],
+        [*a.edges, *(e.shifted(n) for e in b.edges), *(e.between(e.from_node, e.to_node + n) for e in loops)],
         [*a.trail, *(replace(p, node=p.node + n, session=p.session + sessions) for p in b.trail)],
         [*a.sessions, *(replace(s, number=s.number + sessions) for s in b.sessions)],
         CloudStore(lambda i: a.clouds.packed(i) if i < n else b.clouds.packed(i - n), moving, loans),
@@ -93,7 +92,7 @@ def loops_by(closer: LoopCloser) -> FindLoops:
             clouds: Sequence[Points] = both.clouds
             for loop in closer.close(keyframes, clouds, both.poses[: len(keyframes)]):
                 if loop.ok and loop.from_node < len(a) <= loop.to_node:
-                    out.append(replace(loop, to_node=loop.to_node - len(a)))
+                    out.append(loop.between(loop.from_node, loop.to_node - len(a)))
         return out
 
     return find

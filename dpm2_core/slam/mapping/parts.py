@@ -30,14 +30,7 @@ def first_part(data: MapData) -> MapData:
     for node in np.flatnonzero(own).tolist():
         loan = data.clouds.loan(node)  # by a loop that was rejected since then, it may be of another part
         own[node] = loan is None or own[loan.lender]
-    new = {node: position for position, node in enumerate(np.flatnonzero(own).tolist())}
-    edges = [
-        replace(edge, from_node=new[edge.from_node], to_node=new[edge.to_node])
-        for edge in data.edges
-        if edge.from_node in new and edge.to_node in new
-    ]
-    trail = [replace(pruned, node=new[pruned.node]) for pruned in data.trail if pruned.node in new]
-    return subset(data, list(new), edges, trail)
+    return subset(data, np.flatnonzero(own).tolist(), data.edges, data.trail)
 
 
 def located(data: MapData, own: NDArray[np.bool_]) -> Georeference | None:

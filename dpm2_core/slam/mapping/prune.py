@@ -57,11 +57,6 @@ def prune(data: MapData, nodes: Collection[int]) -> MapData:
     for node in kept:
         if (loan := data.clouds.loan(node)) is not None and loan.lender in gone:
             raise ValueError(f"keyframe {node} borrows the cloud of {loan.lender}")
-    new = {node: position for position, node in enumerate(kept)}
-    edges = [
-        replace(edge, from_node=new[edge.from_node], to_node=new[edge.to_node])
-        for edge in eliminate(data.edges, sorted(gone))
-    ]
     anchors = {node: _anchor(data, node, kept) for node in gone}
     trail = [
         RemovedKeyframe(
@@ -69,7 +64,7 @@ def prune(data: MapData, nodes: Collection[int]) -> MapData:
             keyframe.robot,
             data.session[node],
             keyframe.stamp,
-            new[anchors[node]],
+            anchors[node],
             se3.inverse(data.poses[anchors[node]]) @ data.poses[node],
         )
         for node in sorted(gone)
@@ -78,8 +73,9 @@ def prune(data: MapData, nodes: Collection[int]) -> MapData:
     for old in data.trail:
         anchor = anchors.get(old.node, old.node)
         T_anchor_old = se3.inverse(data.poses[anchor]) @ data.poses[old.node]
-        trail.append(replace(old, node=new[anchor], T_node_kf=T_anchor_old @ old.T_node_kf))
-    return subset(replace(data, keyframes=_with_fixes(data, sorted(gone), kept)), kept, edges, trail)
+        trail.append(replace(old, node=anchor, T_node_kf=T_anchor_old @ old.T_node_kf))
+    keyframes = _with_fixes(data, sorted(gone), kept)
+    return subset(replace(data, keyframes=keyframes), kept, eliminate(data.edges, sorted(gone)), trail)
 
 
 def _with_fixes(data: MapData, gone: Sequence[int], kept: Sequence[int]) -> list[Keyframe]:

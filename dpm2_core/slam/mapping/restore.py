@@ -3,9 +3,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
-from dpm2_core.frame import Edge
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.store.map_data import MapData, odometry_by_node
 
@@ -14,10 +11,10 @@ def restore(graph: PoseGraph, data: MapData) -> None:
     """Take the nodes and constraints of a map into a pose graph, behind what is there."""
     first, chain = len(graph), odometry_by_node(data.constraints)
     for node, T_map_kf in enumerate(data.poses):
-        graph.add_node(T_map_kf, shifted(chain[node], first) if node in chain else None)
+        graph.add_node(T_map_kf, chain[node].shifted(first) if node in chain else None)
     for edge in data.constraints:
         if chain.get(edge.to_node) is not edge:
-            graph.add_loop(shifted(edge, first))
+            graph.add_loop(edge.shifted(first))
     for node, keyframe in enumerate(data.keyframes):
         if keyframe.fix is not None:
             graph.add_fix(first + node, keyframe.fix)
@@ -35,8 +32,3 @@ def restore_solved(graph: PoseGraph, data: MapData) -> None:
         graph.place(node, T_map_kf)
     if data.georeference is not None:  # again: the poses say which fixes constrain them
         graph.set_georeference(data.georeference)
-
-
-def shifted(edge: Edge, first: int) -> Edge:
-    """The edge where its node 0 is number `first`."""
-    return replace(edge, from_node=edge.from_node + first, to_node=edge.to_node + first)

@@ -11,7 +11,6 @@ import json
 import math
 import shutil
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import replace
 from functools import reduce
 from pathlib import Path
 
@@ -80,10 +79,7 @@ def _vector(data: MapData, node: int) -> Vector:
 
 def _of(data: MapData, nodes: Sequence[int]) -> MapData:
     """The map of some nodes, and the edges between them."""
-    new = {node: number for number, node in enumerate(nodes)}
-    within = [edge for edge in data.edges if edge.ok and edge.from_node in new and edge.to_node in new]
-    edges = [replace(edge, from_node=new[edge.from_node], to_node=new[edge.to_node]) for edge in within]
-    return subset(data, nodes, edges, [])
+    return subset(data, nodes, data.constraints, [])
 
 
 def _name(tile: Tile) -> str:

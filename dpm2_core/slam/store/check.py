@@ -9,6 +9,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -133,7 +134,6 @@ class _Salvage:
         keyframes, session, loans = self._keyframes()
         poses = self._poses(keyframes)
         good = sorted(keyframes)
-        new = {node: position for position, node in enumerate(good)}
         last = max(good, default=-1) + 1
         moving: list[bytes | None] = [None] * last
         for node, mask in self._rows("moving"):
@@ -144,9 +144,8 @@ class _Salvage:
             except (ValueError, TypeError) as error:
                 self._problem(f"keyframe {node}: which points move is lost: {error}")
         self._fixes(keyframes)
-        edges = self._edges(new)
-        edges = self._bridged(edges, [keyframes[node] for node in good], [session[node] for node in good])
-        trail = self._trail(new)
+        edges = self._bridged(self._edges(keyframes), keyframes, session)
+        trail = self._trail(keyframes)
         # A map in the old numbers with holes, of which the good nodes are then taken.
         nothing = pack_cloud(NO_POINTS)
         filler = Keyframe(0, 0, 0, np.eye(4), NO_POINTS)
@@ -250,38 +249,38 @@ class _Salvage:
                 self._problem(f"georeference: {error}")
         return None
 
-    def _edges(self, new: dict[int, int]) -> list[Edge]:
+    def _edges(self, keyframes: dict[int, Keyframe]) -> list[Edge]:
         edges = []
         for row in self._rows("edges"):
             try:
                 edge = rows.edge_of(row)
-                rows.check_ends(edge, new)
+                rows.check_ends(edge, keyframes)
             except ValueError as error:
                 self._problem(f"edge {row[0]}: {error}")
             else:
-                edges.append(replace(edge, from_node=new[edge.from_node], to_node=new[edge.to_node]))
+                edges.append(edge)
         return edges
 
-    def _trail(self, new: dict[int, int]) -> list[RemovedKeyframe]:
+    def _trail(self, keyframes: dict[int, Keyframe]) -> list[RemovedKeyframe]:
         trail = []
         for row in self._rows("trail", "rowid"):
-            try:
-                pruned = rows.removed_of(row)
-                trail.append(replace(pruned, node=new[pruned.node]))
-            except (ValueError, KeyError):
-                self._problem(f"trail {row[0]}: not a pose beside a keyframe that is there")
+            with suppress(ValueError):
+                if (pruned := rows.removed_of(row)).node in keyframes:
+                    trail.append(pruned)
+                    continue
+            self._problem(f"trail {row[0]}: not a pose beside a keyframe that is there")
         return trail
 
-    def _bridged(self, edges: list[Edge], keyframes: list[Keyframe], session: list[int]) -> list[Edge]:
+    def _bridged(self, edges: list[Edge], keyframes: dict[int, Keyframe], session: dict[int, int]) -> list[Edge]:
         """With odometry edges over the holes that lost keyframes and edges have left."""
         tied = {edge.to_node for edge in edges if edge.kind == "odometry"}
         out = list(edges)
-        for node in range(1, len(keyframes)):
-            a, b = keyframes[node - 1], keyframes[node]
-            if node not in tied and (session[node], b.robot) == (session[node - 1], a.robot) and b.id > 0:
+        for before, node in pairwise(sorted(keyframes)):
+            a, b = keyframes[before], keyframes[node]
+            if node not in tied and (session[node], b.robot) == (session[before], a.robot) and b.id > 0:
                 T_a_b = se3.inverse(a.T_odom_kf) @ b.T_odom_kf
                 bridge = Registration(T_a_b, _BRIDGE_COVARIANCE, method="bridge")
-                out.append(Edge("odometry", node - 1, node, bridge))
+                out.append(Edge("odometry", before, node, bridge))
         return out
 
     def _sessions(self, session: dict[int, int]) -> list[Session]:

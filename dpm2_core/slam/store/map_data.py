@@ -219,7 +219,7 @@ def append_map(store: MapStore, data: MapData) -> int:
             moving={} if mask is None else {first + node: mask},
         )
         store.write(change, sessions)
-    edges = [replace(edge, from_node=edge.from_node + first, to_node=edge.to_node + first) for edge in data.edges]
+    edges = [edge.shifted(first) for edge in data.edges]
     trail = [replace(p, node=p.node + first, session=p.session + before) for p in data.trail]
     store.write(Change(edges=edges, trail=trail, georeference=None if first else data.georeference))
     return first
@@ -242,8 +242,11 @@ def move_map(source: Path, target: Path) -> None:
         raise not_written(target, error) from error
 
 
-def subset(data: MapData, nodes: Sequence[int], edges: list[Edge], trail: list[RemovedKeyframe]) -> MapData:
-    """The map of some of its nodes, lenders among them, renumbered; `edges` and `trail` are in the new numbers."""
+def subset(data: MapData, nodes: Sequence[int], edges: Iterable[Edge], trail: Iterable[RemovedKeyframe]) -> MapData:
+    """The map of some of its nodes, lenders among them, with those of `edges` and `trail` that are between and at them.
+
+    All is given in the numbers of `data`, and renumbered.
+    """
     where = list(nodes)
     new = {node: i for i, node in enumerate(where)}
     loans = {new[node]: Loan(new[loan.lender], loan.T_kf_lender) for node in where if (loan := data.clouds.loan(node))}
@@ -253,8 +256,8 @@ def subset(data: MapData, nodes: Sequence[int], edges: list[Edge], trail: list[R
         [data.keyframes[node] for node in where],
         [data.session[node] for node in where],
         data.poses[where],
-        edges,
-        trail,
+        [e.between(new[e.from_node], new[e.to_node]) for e in edges if e.from_node in new and e.to_node in new],
+        [replace(pruned, node=new[pruned.node]) for pruned in trail if pruned.node in new],
         data.sessions,
         clouds,
         lambda node: data.thumbnail(where[node]),
