@@ -71,8 +71,8 @@ def add_drives(store: MapStore, inside: Mapping[str, int], growth: Growth, refus
     for name, data in growth.maps.items():
         append_map(store, _renamed(name, data))
     spans = spans_of({**inside, **{name: len(data) for name, data in growth.maps.items()}})
-    joins = [join for join in (*growth.joins, *refused) if join.one in spans and join.other in spans]
-    loops = [_in_file(join, {end: spans[end].start for end in (join.one, join.other)}) for join in joins]
+    first = {name: span.start for name, span in spans.items()}
+    loops = [join.loop_at(first) for join in (*growth.joins, *refused) if {join.one, join.other} <= first.keys()]
     known = None
     if next(store.rows("georeference"), None) is None:
         known = next(filter(None, map(_georeference, growth.maps.values())), None)
@@ -104,11 +104,6 @@ def _renamed(name: str, data: MapData) -> MapData:
         keyframes=[replace(k, robot=f"{name}/{k.robot}".rstrip("/")) for k in data.keyframes],
         trail=[replace(p, robot=f"{name}/{p.robot}".rstrip("/")) for p in data.trail],
     )
-
-
-def _in_file(join: Join, first: Mapping[str, int]) -> Edge:
-    loop = join.loop
-    return replace(loop, from_node=loop.from_node + first[join.one], to_node=loop.to_node + first[join.other])
 
 
 @dataclass(frozen=True)
@@ -243,14 +238,13 @@ class _Region:
             restore(graph, data)
         loops = len(graph.loops)
         for join in joins:
-            graph.add_loop(_in_file(join, begins))
+            graph.add_loop(join.loop_at(begins))
         for node in self._own:  # the first loop between two parts has moved one of them
             graph.place(self._at[node], self._poses[node])
         for node in self._outer:
             graph.hold(self._at[node], self._poses[node])
         graph.optimize()
-        checked = [replace(join, loop=replace(join.loop, registration=loop.registration))
-                   for join, loop in zip(joins, graph.loops[loops:], strict=True)]  # fmt: skip
+        checked = [join.judged(loop.registration) for join, loop in zip(joins, graph.loops[loops:], strict=True)]
         solved = np.array([se3.orthonormalized(T) for T in graph.poses])  # else rounding doubles with each addition
         moved = {node: solved[self._at[node]] for node in self._own}
         return Growth(

@@ -34,6 +34,15 @@ class Join:
     other: str
     loop: Edge
 
+    def loop_at(self, first: Mapping[str, int]) -> Edge:
+        """The loop in a graph, by the node of it with which each drive begins."""
+        loop = self.loop
+        return replace(loop, from_node=loop.from_node + first[self.one], to_node=loop.to_node + first[self.other])
+
+    def judged(self, registration: Registration) -> Join:
+        """The join with the verdict that a graph has come to."""
+        return replace(self, loop=replace(self.loop, registration=registration))
+
 
 @dataclass(frozen=True, eq=False)
 class Region:
@@ -89,12 +98,7 @@ def solve(maps: Mapping[str, MapData], joins: Sequence[Join], settings: PoseGrap
 def side_by_side(maps: Mapping[str, MapData], joins: Sequence[Join]) -> MapData:
     """The drives in one map, each with the poses that it has, and their joins as loops; its frame that of the first."""
     first = first_nodes(maps)
-    loops = [
-        replace(
-            join.loop, from_node=join.loop.from_node + first[join.one], to_node=join.loop.to_node + first[join.other]
-        )
-        for join in joins
-    ]
+    loops = [join.loop_at(first) for join in joins]
     drives = list(maps.values())
     both = _halved(drives)
     return replace(both, edges=[*both.edges, *loops], georeference=drives[0].georeference)
@@ -122,12 +126,9 @@ def _region(maps: Mapping[str, MapData], joins: Sequence[Join], settings: PoseGr
     for (name, node), T in (held or {}).items():
         graph.hold(first[name] + node, T)
     graph.optimize()
-    verdicts = {(loop.from_node, loop.to_node): loop for loop in graph.loops}
-    out = [
-        replace(join, loop=replace(join.loop, registration=verdicts[ends].registration))
-        for join in joins
-        for ends in [(join.loop.from_node + first[join.one], join.loop.to_node + first[join.other])]
-    ]
+    verdicts = {(loop.from_node, loop.to_node): loop.registration for loop in graph.loops}
+    loops = [join.loop_at(first) for join in joins]
+    out = [join.judged(verdicts[loop.from_node, loop.to_node]) for join, loop in zip(joins, loops, strict=True)]
     return Region({name: graph.poses[at : at + len(maps[name])] for name, at in first.items()}, out)
 
 
@@ -158,8 +159,7 @@ def _borders(maps: Mapping[str, MapData], solved: Sequence[Region], inner: Mappi
         graph.add_loop(replace(join.loop, from_node=where[join.one, join.loop.from_node],
                                to_node=where[join.other, join.loop.to_node]))  # fmt: skip
     graph.optimize()
-    checked = [replace(join, loop=replace(join.loop, registration=loop.registration))
-               for join, loop in zip(outer, graph.loops, strict=True)]  # fmt: skip
+    checked = [join.judged(loop.registration) for join, loop in zip(outer, graph.loops, strict=True)]
     poses: dict[str, Array] = {}
     for number, region in enumerate(solved):
         held = {end: graph.pose(node) for end, node in where.items() if end[0] in region.poses}
