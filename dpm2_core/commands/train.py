@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`dpm2 train`: make training data, train registration (phase1) and overlap (phase2)."""
+"""`dpm2 train`: training data (data, pack), image branch, registration (phase1), overlap and confidence (phase2), ablation."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def phase2(
     out: OutOption = Path("out/phase2"),
     resume: ResumeOption = False,
 ) -> None:
-    """Overlap head alone, on the network of the registration training."""
+    """The heads that judge a pose, overlap and confidence, on the network of the registration training."""
     from dpm2_core.learning.train_overlap import OverlapTrainingSettings, train_overlap
 
     reject_overwriting(out, resume)

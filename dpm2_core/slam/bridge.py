@@ -23,9 +23,9 @@ from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration, a
 _TIES = 3
 """So many results must agree, and most of all that there are: two meet by chance."""
 _MOVED = 0.5
-"""They are evidence only when the robot has moved so far from one to the next, m..."""
+"""Results count apart only where the robot has moved this far between them, m."""
 _AS_WELL = 0.85
-"""...or when the scan fits the map before at least this much as well as its own stretch: one stands where one stood."""
+"""A scan that fits the map before this well, relative to its own stretch, counts at a halt, too."""
 _NEAR = 1.0  # m, added to what a vehicle can do
 _DRIVES = 1.0  # m/s: no slower
 _BRAKES = 0.35  # m/s2: the way is searched so far around that of an even change of the motion, times seconds squared

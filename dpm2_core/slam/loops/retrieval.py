@@ -80,10 +80,7 @@ class PlaceIndex:
         self._count += 1
 
     def similarities(self, query: Vector) -> NDArray[np.float32]:
-        """Cosine (N,) of each keyframe's vector and the (528,) query, both less the mean of all; -1 without a vector.
-
-        The mean descriptor is subtracted: components shared by all places do not discriminate.
-        """
+        """Cosine (N,) of each keyframe's vector and the (528,) query, both less the mean of all; -1 where none is."""
         mean = (self._sum / max(self._used, 1)).astype(np.float32)
         requested = query - mean
         vectors, squared = self._vectors[: self._count], self._squared[: self._count]

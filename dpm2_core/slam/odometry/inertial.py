@@ -120,7 +120,7 @@ class InertialMotion:
             self._vertical.pause()
             return
         self._vertical.add(T_before[:3, :3] @ force, T[:3, :3] @ twist[3:], seconds)
-        self._follow(T_before, T, seconds)
+        self._level_frame(T_before, T, seconds)
 
     def _start_at_rest(self, T: Array) -> None:
         """Where a drive begins at rest, the samples before the first frame show the bias and which way is up."""
@@ -194,7 +194,7 @@ class InertialMotion:
         R = turned(seconds, s.rates - self._bias, seconds[inside])
         return None if R is None else np.einsum("nij,nj->i", R, s.forces[inside]) / inside.sum()
 
-    def _follow(self, T_before: Array, T: Array, seconds: float) -> None:
+    def _level_frame(self, T_before: Array, T: Array, seconds: float) -> None:
         """Turn the level frame a little about the LiDAR's position, so that no pose jumps."""
         wanted = self._vertical.turn @ self.T_level_odom[:3, :3].T
         angle = _angle(wanted)

@@ -75,7 +75,7 @@ class KeyframeSelector:
             self._trace.clear()  # the way is not known
             self._fix = None
             return None
-        self._follow(frame, T_odom_lidar)
+        self._trace_fix(frame, T_odom_lidar)
         # What is registered with a doubt enters the map, and the next scan fits there however far that is off.
         if self._weakest is None or registration.worst_sigma > self._weakest.worst_sigma:
             self._weakest = registration
@@ -101,7 +101,7 @@ class KeyframeSelector:
         self._weakest = None
         return keyframe
 
-    def _follow(self, frame: Frame, T_odom_lidar: Array) -> None:
+    def _trace_fix(self, frame: Frame, T_odom_lidar: Array) -> None:
         """Note the way, and where on it a fix was measured: it comes late, and between two scans."""
         trace, fix = self._trace, frame.fix
         if trace and frame.stamp <= trace[-1][0]:

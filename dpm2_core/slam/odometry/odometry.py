@@ -192,7 +192,7 @@ class Odometry:
         if certain:
             self._bridge, self._registration = None, bridge.registration
             self._failures = 0
-            self._follow(scan, result, None)
+            self._go_on(scan, result, None)
             return result
         self._covariance = bridge.covariance(self._T) + own.covariance
         if bridge.tries >= self._settings.restart_after and self._twist is not None:
@@ -313,11 +313,11 @@ class Odometry:
                 self._other.compare(T_step, registration.of_scene, self._led)
         if self._bridge is None:
             self._failures = 0
-        self._follow(scan, registration, None if registration.method == "first" else self._twist)
+        self._go_on(scan, registration, None if registration.method == "first" else self._twist)
         if registration.method != "first" and registration.worst_sigma >= OPEN:
             self._covariance[3:, 3:] += of_motion  # what the scene leaves open ends at 1 m; the motion does not
 
-    def _follow(self, scan: Scan, registration: Registration, twist: Array | None) -> None:
+    def _go_on(self, scan: Scan, registration: Registration, twist: Array | None) -> None:
         """Go on from a registered pose; `twist` (6,): the motion that led there, None where none did."""
         T_before, self._T = self._registered[0], registration.T_target_source
         if self._inertial is not None and self._clock.stamp is not None:

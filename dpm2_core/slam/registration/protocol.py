@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a scan finds its pose: the part of the odometry that can be exchanged, and its geometric version."""
+"""How a scan finds its pose: the part of the odometry that can be exchanged, and what it is told beforehand."""
 
 from __future__ import annotations
 
