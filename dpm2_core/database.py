@@ -61,6 +61,12 @@ class _Steps:
         return self.taken > self._most
 
 
+def size_with_log(path: Path) -> int:
+    """Bytes of a database file and of its FILE-wal, which lies beside the file that a link leads to."""
+    source = path.resolve()
+    return sum(file.stat().st_size for suffix in ("", "-wal") if (file := Path(f"{source}{suffix}")).exists())
+
+
 def connect(path: Path, mode: str, timeout: float = 5.0, size: int | None = None) -> Connection:
     """Open a database file.
 
@@ -69,7 +75,7 @@ def connect(path: Path, mode: str, timeout: float = 5.0, size: int | None = None
         size: of the file where it is to be another than that of `path` now, bytes.
     """
     if size is None:
-        size = sum(file.stat().st_size for suffix in ("", "-wal") if (file := Path(f"{path}{suffix}")).exists())
+        size = size_with_log(path)
     # The mapper of a ROS node is made in one thread and used in another, never in two at once.
     return Connection(
         f"file:{quote(os.fsencode(path))}?mode={mode}", timeout, isolation_level=None, check_same_thread=False,

@@ -21,7 +21,7 @@ from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.session import MapMode, open_map, resume_at
 from dpm2_core.slam.settings import Config
-from dpm2_core.slam.store.map_store import remove_map
+from dpm2_core.slam.store.map_file import remove_map
 from dpm2_core.slam.system import SlamResult
 
 Watch = Callable[[Frame, SlamResult, Mapper], None]

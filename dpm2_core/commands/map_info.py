@@ -11,6 +11,7 @@ import numpy as np
 import typer
 
 from dpm2_core.commands.options import JsonFile, show
+from dpm2_core.database import size_with_log
 from dpm2_core.frame import Array
 from dpm2_core.slam.mapping.restore import restore_solved
 from dpm2_core.slam.store.map_data import MapData, load_map, ways
@@ -64,7 +65,7 @@ def _figures(path: Path, data: MapData, with_descriptors: int) -> dict[str, Any]
         "loops_accepted": sum(edge.ok for edge in loops),
         "loops_tried": len(loops),
         "georeference": _georeference_figures(data),
-        "bytes": _size(path),
+        "bytes": size_with_log(path),
         "sessions": [
             {
                 "session": s.number,
@@ -113,12 +114,6 @@ def _georeference(figures: dict[str, Any] | None) -> str:
         f"{where} (sigma {figures['heading_sigma_deg']:.2f}); sigma {east:.2f}, {north:.2f}, {up:.2f} m; "
         f"{figures['fixes_used']} of {figures['fixes']} fixes used"
     )
-
-
-def _size(path: Path) -> int:
-    """Bytes of the file and of what SQLite keeps beside it, which lies beside the file that a link leads to."""
-    file = path.resolve()
-    return sum(part.stat().st_size for suffix in ("", "-wal") if (part := Path(f"{file}{suffix}")).exists())
 
 
 def _length(drives: Iterable[tuple[list[int], Array]]) -> float:

@@ -28,8 +28,9 @@ from dpm2_core.fleet.regions import LARGEST, Join, solve
 from dpm2_core.fleet.run import View
 from dpm2_core.fleet.search import Search, affirmed, component
 from dpm2_core.slam.settings import SlamSettings
-from dpm2_core.slam.store.map_data import MapData, load_map, move_map
-from dpm2_core.slam.store.map_store import MapStore, remove_map
+from dpm2_core.slam.store.map_data import MapData, load_map
+from dpm2_core.slam.store.map_file import move_map, remove_map
+from dpm2_core.slam.store.map_store import MapStore
 
 
 @dataclass

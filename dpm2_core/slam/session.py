@@ -17,7 +17,8 @@ from dpm2_core.network.pretrained import weights_id
 from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.mapping.tiles import TiledMap
 from dpm2_core.slam.settings import Config, SlamSettings
-from dpm2_core.slam.store.map_store import MapStore, remove_map
+from dpm2_core.slam.store.map_file import remove_map
+from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.slam.store.rows import Session
 
 MapMode = Literal["create", "resume", "extend", "localize"]

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import shutil
 import sqlite3
 import tempfile
 from collections.abc import Iterator
@@ -24,6 +23,7 @@ from dpm2_core.slam.store import rows, schema
 from dpm2_core.slam.store.cloud_codec import pack_cloud, unpack_cloud, unpack_mask
 from dpm2_core.slam.store.cloud_store import CloudStore, Loan
 from dpm2_core.slam.store.map_data import NO_POINTS, MapData, save_as, subset
+from dpm2_core.slam.store.map_file import copy_with_log
 from dpm2_core.slam.store.rows import RemovedKeyframe, Session
 
 _SMALLEST = 20  # bytes of a row: a file has at most so many as fit, and a small one no row 2^62
@@ -79,9 +79,7 @@ def _copy(path: Path, copy: Path) -> None:
             sql.backup(target)
             return
     try:
-        for suffix in ("", "-wal"):
-            with suppress(FileNotFoundError):
-                shutil.copyfile(f"{source}{suffix}", f"{copy}{suffix}")
+        copy_with_log(source, copy)
     except OSError as error:
         reason = f"no copy of it could be made in {copy.parent.parent}, which TMPDIR can change"
         raise Dpm2Error(f"{path}: not checked: {reason}: {error.strerror or error}") from error

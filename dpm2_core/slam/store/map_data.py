@@ -14,12 +14,13 @@ import numpy as np
 
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.files import not_written, part_beside
+from dpm2_core.files import part_beside
 from dpm2_core.frame import Array, Edge, Georeference, Keyframe, Points
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.slam.store.cloud_store import CloudStore, Loan
-from dpm2_core.slam.store.map_store import Change, MapStore, remove_log, remove_map
+from dpm2_core.slam.store.map_file import move_map, remove_map
+from dpm2_core.slam.store.map_store import Change, MapStore
 from dpm2_core.slam.store.rows import NO_POINTS as NO_POINTS
 from dpm2_core.slam.store.rows import (
     RemovedKeyframe,
@@ -223,23 +224,6 @@ def append_map(store: MapStore, data: MapData) -> int:
     trail = [replace(p, node=p.node + first, session=p.session + before) for p in data.trail]
     store.write(Change(edges=edges, trail=trail, georeference=None if first else data.georeference))
     return first
-
-
-def move_map(source: Path, target: Path) -> None:
-    """Give a map that was closed another name; the map that had it goes, with what SQLite keeps beside it.
-
-    Raises:
-        Dpm2Error: not all of it is in that one file, since the disk was full, or it is not there; the map that was
-            there stays.
-    """
-    wal = Path(f"{source}-wal")
-    if wal.exists() and wal.stat().st_size:  # see MapStore.close; renamed without it, the map would be damaged
-        raise Dpm2Error(f"{target}: not written: the map could not be made one file; is the disk full?")
-    try:
-        remove_log(target)
-        source.replace(target)
-    except OSError as error:
-        raise not_written(target, error) from error
 
 
 def subset(data: MapData, nodes: Sequence[int], edges: Iterable[Edge], trail: Iterable[RemovedKeyframe]) -> MapData:

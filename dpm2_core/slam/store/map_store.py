@@ -8,7 +8,6 @@ take the last seconds with it, but never the map.
 
 from __future__ import annotations
 
-import shutil
 import sqlite3
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
@@ -25,6 +24,7 @@ from dpm2_core.files import part_beside
 from dpm2_core.frame import Array, Edge, Georeference, Keyframe
 from dpm2_core.slam.store import schema
 from dpm2_core.slam.store.cloud_store import Loan
+from dpm2_core.slam.store.map_file import copy_with_log, remove_log, remove_map
 from dpm2_core.slam.store.rows import (
     RemovedKeyframe,
     Session,
@@ -302,18 +302,6 @@ def _insert(sql: sqlite3.Connection, table: str, rows: Sequence[tuple[Any, ...]]
         sql.executemany(f"INSERT OR REPLACE INTO {table} VALUES ({','.join('?' * len(rows[0]))})", rows)
 
 
-def remove_map(path: Path) -> None:
-    """Remove a map file, if it is there, with what SQLite keeps beside it."""
-    path.unlink(missing_ok=True)
-    remove_log(path)
-
-
-def remove_log(path: Path) -> None:
-    """Remove what SQLite keeps beside a map file: another map of that name would be read with it, and be damaged."""
-    for suffix in ("-wal", "-shm", "-journal"):
-        Path(f"{path}{suffix}").unlink(missing_ok=True)
-
-
 def _connect(path: Path, mode: str) -> Connection:
     return connect(path.resolve(), mode, BUSY)
 
@@ -348,9 +336,7 @@ def _head(path: Path) -> bytes:
 def _copied(path: Path) -> MapStore:
     folder = tempfile.TemporaryDirectory(prefix="dpm2_map_")
     copy = Path(folder.name) / "map"
-    for suffix in ("", "-wal"):
-        with suppress(FileNotFoundError):
-            shutil.copyfile(f"{path.resolve()}{suffix}", f"{copy}{suffix}")
+    copy_with_log(path, copy)
     store = MapStore(path, _connect(copy, "rw"), True)
     store._copy = folder
     return store

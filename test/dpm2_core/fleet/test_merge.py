@@ -28,7 +28,8 @@ from dpm2_core.fleet.search import Search
 from dpm2_core.sim.world import build_world
 from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.slam.store.check import check_map
-from dpm2_core.slam.store.map_data import MapData, load_map, move_map, save_as
+from dpm2_core.slam.store.map_data import MapData, load_map, save_as
+from dpm2_core.slam.store.map_file import move_map
 from dpm2_core.slam.store.map_store import MapStore
 from test.helpers.fleets import fleet_maps
 from test.helpers.full_disk import CHECKPOINT, largest_file

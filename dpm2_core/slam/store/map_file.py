@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A map file and what SQLite keeps beside it, FILE-wal foremost: they are copied, moved and removed together."""
+
+from __future__ import annotations
+
+import shutil
+from contextlib import suppress
+from pathlib import Path
+
+from dpm2_core.errors import Dpm2Error
+from dpm2_core.files import not_written
+
+
+def copy_with_log(path: Path, copy: Path) -> None:
+    """Copy what of a map file and its FILE-wal is there, as it lies there.
+
+    Raises:
+        OSError: it could not be read or written.
+    """
+    source = path.resolve()  # SQLite names FILE-wal after the file, not after a link to it
+    for suffix in ("", "-wal"):
+        with suppress(FileNotFoundError):
+            shutil.copyfile(f"{source}{suffix}", f"{copy}{suffix}")
+
+
+def move_map(source: Path, target: Path) -> None:
+    """Give a map that was closed another name; the map that had it goes, with what SQLite keeps beside it.
+
+    Raises:
+        Dpm2Error: not all of it is in that one file, since the disk was full, or it is not there; the map that was
+            there stays.
+    """
+    wal = Path(f"{source}-wal")
+    if wal.exists() and wal.stat().st_size:  # see MapStore.close; renamed without it, the map would be damaged
+        raise Dpm2Error(f"{target}: not written: the map could not be made one file; is the disk full?")
+    try:
+        remove_log(target)
+        source.replace(target)
+    except OSError as error:
+        raise not_written(target, error) from error
+
+
+def remove_map(path: Path) -> None:
+    """Remove a map file, if it is there, with what SQLite keeps beside it."""
+    path.unlink(missing_ok=True)
+    remove_log(path)
+
+
+def remove_log(path: Path) -> None:
+    """Remove what SQLite keeps beside a map file: another map of that name would be read with it, and be damaged."""
+    for suffix in ("-wal", "-shm", "-journal"):
+        Path(f"{path}{suffix}").unlink(missing_ok=True)
