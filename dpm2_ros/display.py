@@ -36,9 +36,9 @@ def path_to_msg(poses: Array, stamps: Sequence[int], frame_id: str) -> Path:
 
 def pose_graph_to_msg(mapper: Mapper, stamp: int, frame_id: str) -> MarkerArray:
     """Nodes gray, odometry edges green, accepted loops blue, rejected ones red."""
-    positions = mapper.poses[:, :3, 3]
-    odometry = [edge for edge in mapper.edges if edge.kind == "odometry"]
-    kept = [edge for edge in mapper.edges if edge.kind == "loop"]
+    positions, edges = mapper.poses[:, :3, 3], mapper.edges
+    odometry = [edge for edge in edges if edge.kind == "odometry"]
+    kept = [edge for edge in edges if edge.kind == "loop"]
     rejected = {(loop.from_node, loop.to_node): loop for loop in mapper.loops}
     for loop in kept:
         rejected.pop((loop.from_node, loop.to_node), None)

@@ -82,11 +82,11 @@ class Health:
                 out["breaks"] = str(self.last.breaks)
             if self._last_good is not None:
                 out["last good registration (s ago)"] = f"{now - self._last_good:.1f}"
-            if self._latency:
-                p50, p95 = np.percentile(list(self._latency), [50, 95]) * 1000
-                out |= {"latency p50 (ms)": f"{p50:.1f}", "latency p95 (ms)": f"{p95:.1f}"}
-            out |= {f"{stage} p50 (ms)": f"{1000 * np.median(list(s)):.1f}" for stage, s in self._seconds.items()}
-        return out
+            latency, seconds = list(self._latency), {stage: list(s) for stage, s in self._seconds.items()}
+        if latency:  # from here on without the lock, for which the worker would wait
+            p50, p95 = np.percentile(latency, [50, 95]) * 1000
+            out |= {"latency p50 (ms)": f"{p50:.1f}", "latency p95 (ms)": f"{p95:.1f}"}
+        return out | {f"{stage} p50 (ms)": f"{1000 * np.median(s):.1f}" for stage, s in seconds.items()}
 
     def _rate(self, now: float) -> float:
         recent = [done for done in self._done if done > now - 5]

@@ -179,9 +179,9 @@ class Inputs:
         if stamped := stamp_ns(message.header):
             self._times.append((stamped, self._node.get_clock().now().nanoseconds))
         stamp = self._stamp(message)
+        for topic, sensor in self.synchronizer.sensors.items():  # without the lock, for which the worker would wait
+            sensor.present = bool(self._node.count_publishers(topic))
         with self._arrived:
-            for topic, sensor in self.synchronizer.sensors.items():
-                sensor.present = bool(self._node.count_publishers(topic))
             lost = self.losses.add(stamp, number)
             check = self.synchronizer.add_cloud(stamp, message, time.monotonic())
             self._arrived.notify()

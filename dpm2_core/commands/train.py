@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`dpm2 train`: training data (data, pack), image branch, registration (phase1), overlap and confidence (phase2), ablation."""
+"""`dpm2 train`: training data (data, pack), image branch, registration (phase1), its judges (phase2), ablation."""
 
 from __future__ import annotations
 
