@@ -25,6 +25,7 @@ _TRIALS = 100  # headings
 _NEAR = 10_000.0  # m from the median of all: farther fixes are wrong, and none of them is the origin
 _TILT = np.radians(5.0)  # standard deviation of the map's level: a drive may begin on a hill
 _ANY_TURN, _ANY_PLACE = 1e2, 1e6  # rad and m, standard deviations of what is not measured
+_FLAT = 100.0  # m, standard deviation of a height from which on it counts as not measured
 
 
 class Fixes:
@@ -102,10 +103,16 @@ class Fixes:
         fixes = [self._fixes[k][1] for k in chosen]
         T = self.georeference.T_enu_map @ data.poses[at]  # with the rotations of now: theirs is not measured
         R = T[:, :3, :3]
+        arms = (R @ np.array([fix.antenna for fix in fixes])[..., None])[..., 0]
         local = _local(self.georeference.origin, geodesy.ecef([fix.geodetic for fix in fixes]))
-        T[:, :3, 3] = local - (R @ np.array([fix.antenna for fix in fixes])[..., None])[..., 0]
+        measured = np.array([fix.covariance for fix in fixes])
+        # A residual is the logarithm of a pose: where heights are free to go far, they take up those of east and north.
+        flat = measured[:, 2, 2] > _FLAT**2
+        local[flat, 2] = (T[:, :3, 3] + arms)[flat, 2]
+        measured[flat, 2], measured[flat, :, 2], measured[flat, 2, 2] = 0.0, 0.0, _FLAT**2
+        T[:, :3, 3] = local - arms
         covariances = np.tile(np.eye(6) * _ANY_TURN**2, (len(at) + 1, 1, 1))
-        covariances[:-1, 3:, 3:] = np.swapaxes(R, 1, 2) @ np.array([fix.covariance for fix in fixes]) @ R
+        covariances[:-1, 3:, 3:] = np.swapaxes(R, 1, 2) @ measured @ R
         covariances[-1] = np.diag([_TILT, _TILT, _ANY_TURN, _ANY_PLACE, _ANY_PLACE, _ANY_PLACE]) ** 2
         yaw = np.arctan2(T_map_enu[1, 0], T_map_enu[0, 0])
         level = se3.make(se3.rotation(np.array([0.0, 0.0, yaw])), T_map_enu[:3, 3])
