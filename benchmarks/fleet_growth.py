@@ -20,7 +20,7 @@ from dpm2_core.fleet.places import FleetIndex
 from dpm2_core.fleet.regions import LARGEST, Join, solve
 from dpm2_core.frame import Array, Edge, Keyframe, Registration
 from dpm2_core.geometry import se3
-from dpm2_core.slam.graph.pose_graph import PoseGraphSettings
+from dpm2_core.slam.graph.robust import RobustSettings
 from dpm2_core.slam.loops.retrieval import WIDTH
 from dpm2_core.slam.store.cloud_codec import pack_cloud
 from dpm2_core.slam.store.cloud_store import CloudStore
@@ -85,7 +85,7 @@ def _at_once(folder: Path, joins: list[Join]) -> dict[str, Any]:
     with ExitStack() as stack:
         stores = [(path.stem, stack.enter_context(MapStore.open(path))) for path in sorted(folder.glob("d*.dpm2map"))]
         maps = {name: load_map(store, descriptors=False) for name, store in stores}
-        region = solve(maps, joins, PoseGraphSettings(), LARGEST)
+        region = solve(maps, joins, RobustSettings(), LARGEST)
         solved = time.process_time()
         moved = {name: replace(data, poses=region.poses[name]) for name, data in maps.items()}
         with MapStore.create(folder / "town.dpm2map") as store:
@@ -123,7 +123,7 @@ def _added(store: MapStore, index: FleetIndex, sizes: dict[str, int], drive: tup
     growth: Growth | None = Growth({name: data})
     if joins:
         ties = list(zip(list(sizes), list(sizes)[1:], strict=False))
-        growth = grown(Standing(store, sizes, ties, PoseGraphSettings(), LARGEST), {name: data}, joins)
+        growth = grown(Standing(store, sizes, ties, RobustSettings(), LARGEST), {name: data}, joins)
     assert growth is not None
     assert all(join.loop.ok for join in growth.joins)
     solved = time.process_time()

@@ -47,7 +47,8 @@ class ActiveMap:
         self.file_problem = ""
         self._T_map_odom: dict[str, Array] | None = None  # by robot, while the map grows; None before any keyframe
         self._store: MapStore | TiledMap | None = self._opened() if ros.localization_mode else self._new_file()
-        self.slam = make_slam(config.slam, robot, self._store)
+        # gtsam holds Python's lock while it works, and the odometry must not wait
+        self.slam = make_slam(config.slam, robot, self._store, background=True)
 
     @property
     def mapper(self) -> Mapper:
@@ -112,7 +113,7 @@ class ActiveMap:
     def _exchange(self, store: MapStore | TiledMap) -> None:
         """Go on with a file that was opened; the map that was is complete in its own, if it has one."""
         try:
-            made = make_map(self._config.slam, store)
+            made = make_map(self._config.slam, store, background=True)
             self.close()
         except BaseException:
             store.close()
@@ -227,7 +228,7 @@ class ActiveMap:
     def _begin(self) -> None:
         """An empty map."""
         self._store = self._new_file()
-        self.slam.use(*make_map(self._config.slam, self._store))
+        self.slam.use(*make_map(self._config.slam, self._store, background=True))
         self._T_map_odom = None
 
     def _new_file(self) -> MapStore | None:

@@ -45,8 +45,6 @@ class MapperThread:
     """
 
     def __init__(self, node: GuardedNode, config: NodeConfig, robot: str) -> None:
-        graph = config.slam.pose_graph.model_copy(update={"background": True})  # gtsam holds Python's lock
-        config = config.model_copy(update={"slam": config.slam.model_copy(update={"pose_graph": graph})})
         self._node, self._config, self._robot = node, config, robot
         self._active = ActiveMap(config, robot, node.get_logger())
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="mapper", initializer=lower_priority)

@@ -124,8 +124,9 @@ def _length(drives: Iterable[tuple[list[int], Array]]) -> float:
 
 def graph_of(data: MapData) -> PoseGraph:
     """The pose graph of a map, with the poses that it has."""
-    from dpm2_core.slam.graph.pose_graph import PoseGraph, PoseGraphSettings
+    from dpm2_core.slam.graph.pose_graph import PoseGraph
+    from dpm2_core.slam.graph.robust import RobustSettings
 
-    graph = PoseGraph(PoseGraphSettings())
+    graph = PoseGraph(RobustSettings())
     restore_solved(graph, data)
     return graph

@@ -24,7 +24,8 @@ from dpm2_core.fleet.search import affirmed, component
 from dpm2_core.frame import Array, Edge, Georeference
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.graph_data import loop_errors, mahalanobis
-from dpm2_core.slam.graph.pose_graph import PoseGraph, PoseGraphSettings
+from dpm2_core.slam.graph.pose_graph import PoseGraph
+from dpm2_core.slam.graph.robust import RobustSettings
 from dpm2_core.slam.mapping.parts import located, parts_of
 from dpm2_core.slam.mapping.restore import restore
 from dpm2_core.slam.store.map_data import MapData, append_map, odometry_by_node
@@ -118,7 +119,7 @@ class Standing:
     store: MapStore
     sizes: Mapping[str, int]
     ties: Collection[tuple[str, str]]
-    settings: PoseGraphSettings
+    settings: RobustSettings
     largest: int
 
     def between(self, names: Collection[str]) -> set[str]:
@@ -200,7 +201,7 @@ class _Region:
         Dpm2Error: the file is damaged.
     """
 
-    def __init__(self, store: MapStore, spans: Sequence[range], settings: PoseGraphSettings) -> None:
+    def __init__(self, store: MapStore, spans: Sequence[range], settings: RobustSettings) -> None:
         try:
             self._read(store, spans, settings)
         except KeyError as error:
@@ -208,7 +209,7 @@ class _Region:
         except ValueError as error:
             raise Dpm2Error(f"{store.path}: {error}; see dpm2 map check") from None
 
-    def _read(self, store: MapStore, spans: Sequence[range], settings: PoseGraphSettings) -> None:
+    def _read(self, store: MapStore, spans: Sequence[range], settings: RobustSettings) -> None:
         own = [node for span in spans for node in span]
         edges = store.rows("edges", where=_within(spans, "from_node", "to_node"))
         read = [(int(row[0]), edge_of(row)) for row in edges]

@@ -16,7 +16,8 @@ import numpy as np
 
 from dpm2_core.frame import Array, Edge, Registration
 from dpm2_core.geometry import se3
-from dpm2_core.slam.graph.pose_graph import PoseGraph, PoseGraphSettings
+from dpm2_core.slam.graph.pose_graph import PoseGraph
+from dpm2_core.slam.graph.robust import RobustSettings
 from dpm2_core.slam.mapping.merge import merge_maps
 from dpm2_core.slam.mapping.restore import restore
 from dpm2_core.slam.store.map_data import MapData
@@ -71,7 +72,7 @@ def regions_of(sizes: Mapping[str, int], joins: Sequence[Join], largest: int = L
     return regions
 
 
-def solve(maps: Mapping[str, MapData], joins: Sequence[Join], settings: PoseGraphSettings,
+def solve(maps: Mapping[str, MapData], joins: Sequence[Join], settings: RobustSettings,
           largest: int = LARGEST) -> Region:  # fmt: skip
     """The poses of all drives in one frame, that of the first, and each join accepted, or rejected with the reason.
 
@@ -117,7 +118,7 @@ def _halved(maps: Sequence[MapData]) -> MapData:
     return merge_maps(_halved(maps[:half]), _halved(maps[half:]), np.eye(4))
 
 
-def _region(maps: Mapping[str, MapData], joins: Sequence[Join], settings: PoseGraphSettings,
+def _region(maps: Mapping[str, MapData], joins: Sequence[Join], settings: RobustSettings,
             held: Mapping[tuple[str, int], Array] | None = None) -> Region:  # fmt: skip
     """Solve drives and their joins; `held`: (4, 4) of nodes that stay there."""
     data, first = side_by_side(maps, joins), first_nodes(maps)
@@ -133,7 +134,7 @@ def _region(maps: Mapping[str, MapData], joins: Sequence[Join], settings: PoseGr
 
 
 def _borders(maps: Mapping[str, MapData], solved: Sequence[Region], inner: Mapping[int, Sequence[Join]],
-             outer: Sequence[Join], settings: PoseGraphSettings) -> tuple[dict[str, Array], list[Join]]:  # fmt: skip
+             outer: Sequence[Join], settings: RobustSettings) -> tuple[dict[str, Array], list[Join]]:  # fmt: skip
     """Poses of all drives from those of the regions, and the joins between these, checked."""
     ends = {(join.one, join.loop.from_node) for join in outer} | {(join.other, join.loop.to_node) for join in outer}
     graph, where = PoseGraph(settings), dict[tuple[str, int], int]()
@@ -168,7 +169,7 @@ def _borders(maps: Mapping[str, MapData], solved: Sequence[Region], inner: Mappi
 
 
 def _moved(maps: Mapping[str, MapData], region: Region, joins: Sequence[Join],
-           held: Mapping[tuple[str, int], Array], settings: PoseGraphSettings) -> dict[str, Array]:  # fmt: skip
+           held: Mapping[tuple[str, int], Array], settings: RobustSettings) -> dict[str, Array]:  # fmt: skip
     """Poses of a region whose borders have come to be elsewhere: moved as it is, or solved again where that differs."""
     if not held:
         return region.poses

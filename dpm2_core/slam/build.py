@@ -35,7 +35,12 @@ if TYPE_CHECKING:  # torch takes seconds to import
     from dpm2_core.network.model import DeepPointMap2
 
 
-def make_slam(settings: SlamSettings | None = None, robot: str = "", store: MapStore | TiledMap | None = None) -> Slam:
+def make_slam(
+    settings: SlamSettings | None = None,
+    robot: str = "",
+    store: MapStore | TiledMap | None = None,
+    background: bool = False,
+) -> Slam:
     """The SLAM with all its parts.
 
     Args:
@@ -43,22 +48,26 @@ def make_slam(settings: SlamSettings | None = None, robot: str = "", store: MapS
         store: the map file: to write, or to go on with, its session begun (`open_session`); or, open for reading only
             (`open_for_localization`), a folder of tiles, too, to find oneself in. None: the map is in memory, its
             clouds in a temporary file.
+        background: a large pose graph is optimized in another process while the drive goes on, as for a robot that
+            drives; the result then depends on its timing.
 
     Raises:
         UsageError: a network has no weights to run with.
     """
     s = settings or SlamSettings()
-    return Slam(make_odometry(s, robot), *make_map(s, store), s.map.thumbnail, s.visual)
+    return Slam(make_odometry(s, robot), *make_map(s, store, background), s.map.thumbnail, s.visual)
 
 
-def make_map(s: SlamSettings, store: MapStore | TiledMap | None = None) -> tuple[Mapper, Localizer | None]:
-    """The mapper, and in a map that stays as it is what finds keyframes there; `store` as for `make_slam`.
+def make_map(
+    s: SlamSettings, store: MapStore | TiledMap | None = None, background: bool = False
+) -> tuple[Mapper, Localizer | None]:
+    """The mapper, and in a map that stays as it is what finds keyframes there; arguments as for `make_slam`.
 
     The mapper of a folder of tiles is empty: they are never all in memory.
     """
     if isinstance(store, TiledMap):
         return make_mapper(s), make_tiled_localizer(s, store)
-    mapper = make_mapper(s, store)
+    mapper = make_mapper(s, store, background)
     return mapper, make_localizer(s, mapper) if store is not None and store.read_only else None
 
 
@@ -94,9 +103,9 @@ def make_registration(s: SlamSettings) -> ScanRegistration:
     return VisualScanRegistration(s.visual, chosen) if s.visual.enabled else chosen
 
 
-def make_mapper(s: SlamSettings, store: MapStore | None = None) -> Mapper:
+def make_mapper(s: SlamSettings, store: MapStore | None = None, background: bool = False) -> Mapper:
     """The mapper with its collaborators; with a map file, if there is one."""
-    return Mapper(s.map, PoseGraph(s.pose_graph), make_loops(s), store)
+    return Mapper(s.map, PoseGraph(s.pose_graph, background), make_loops(s), store)
 
 
 def make_localizer(s: SlamSettings, mapper: Mapper) -> Localizer:

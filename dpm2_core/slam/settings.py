@@ -13,7 +13,7 @@ from dpm2_core.config import Settings, merged, read_yaml
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.network.pretrained import weights_id
 from dpm2_core.slam.filters import FilterSettings
-from dpm2_core.slam.graph.pose_graph import PoseGraphSettings
+from dpm2_core.slam.graph.robust import RobustSettings
 from dpm2_core.slam.loops.closure import LoopSettings
 from dpm2_core.slam.loops.relocalization import RelocalizationSettings
 from dpm2_core.slam.mapping.mapper import MapSettings
@@ -48,7 +48,7 @@ class SlamSettings(Settings):
     keyframes: KeyframeSettings = KeyframeSettings()
     loops: LoopSettings = LoopSettings()
     relocalise: RelocalizationSettings = RelocalizationSettings()
-    pose_graph: PoseGraphSettings = PoseGraphSettings()
+    pose_graph: RobustSettings = RobustSettings()
     map: MapSettings = MapSettings()
 
     @model_validator(mode="before")

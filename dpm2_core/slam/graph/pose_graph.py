@@ -31,13 +31,6 @@ _FIXES = 10, 20
 _ATTEMPTS = 2  # processes that may die over one graph
 
 
-class PoseGraphSettings(RobustSettings):
-    """Optimization of the keyframe poses."""
-
-    background: bool = False
-    """Optimize in another process while the drive goes on, for a live system; the result then depends on its timing."""
-
-
 class PoseGraph:
     """Keyframe poses T_map_kf, odometry edges and loop edges; node n is the n-th one added.
 
@@ -45,8 +38,9 @@ class PoseGraph:
         problem: why the last optimization failed, in words; empty since one went well.
     """
 
-    def __init__(self, settings: PoseGraphSettings) -> None:
-        self._settings = settings
+    def __init__(self, settings: RobustSettings, background: bool = False) -> None:
+        """`background`: `optimize` hands a large graph to another process; what comes of it depends on its timing."""
+        self._settings, self._background = settings, background
         self._poses: list[Array] = []
         self._steps: list[Edge | None] = []  # the odometry to each node; None where a trajectory begins
         self._trajectories = Trajectories()
@@ -180,7 +174,7 @@ class PoseGraph:
         Raises:
             Dpm2Error: the graph cannot be solved.
         """
-        if self._settings.background and len(self._loops) + len(self._fixes) >= SHORT:
+        if self._background and len(self._loops) + len(self._fixes) >= SHORT:
             self.collect()
             if not self.busy:
                 self._submit()
@@ -311,6 +305,7 @@ class PoseGraph:
 
     def _move(self, part: int, T: Array) -> None:
         """All of a part to T @ T_map_kf."""
+        T = se3.orthonormalized(T)  # by poses of this graph: else their rounding doubles with each part that is moved
         for node in np.flatnonzero(self._trajectories.in_part(part, self._loops)):
             self._poses[node] = T @ self._poses[node]
         self._moved = True
@@ -322,14 +317,12 @@ class PoseGraph:
     def _apply(self, solution: Solution, loops: int) -> None:
         fixes = self._sent_fixes
         count = len(solution.poses) - bool(fixes)
-        old, self._poses[:count] = self._poses[:count], list(solution.poses[self._trajectories.places(count)])
+        self._poses[:count] = list(solution.poses[self._trajectories.places(count)])
         if fixes:
             self._fixes.solved(fixes, solution.poses[-1], solution.kept[loops:])
-        last = dict(zip(self._trajectories.of[:count], range(count), strict=True))  # solved for, of each trajectory
         for node in range(count, len(self)):
-            at = last.get(self._trajectories.of[node])
-            if at is not None:  # else another trajectory: nothing ties it to what moved
-                self._poses[node] = self._poses[at] @ se3.inverse(old[at]) @ self._poses[node]
+            if (step := self._steps[node]) is not None:
+                self._poses[node] = self._poses[step.from_node] @ step.T_from_to
         for number, loop in enumerate(self._loops[:loops]):
             checked = replace(loop.registration, ok=bool(solution.kept[number]), reason=solution.reason(number))
             self._loops[number] = replace(loop, registration=checked)

@@ -77,9 +77,7 @@ class GraphWorker:
         try:
             assert process.stdin is not None
             assert process.stdout is not None
-            pickle.dump(
-                (graph, settings.model_dump(include=set(RobustSettings.model_fields))), process.stdin, protocol=5
-            )
+            pickle.dump((graph, settings.model_dump()), process.stdin, protocol=5)
             process.stdin.flush()
             self._solution = pickle.load(process.stdout)
         except (OSError, ValueError, EOFError, pickle.UnpicklingError):

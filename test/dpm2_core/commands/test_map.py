@@ -23,7 +23,8 @@ from dpm2_core.frame import Array, Edge, Georeference, Keyframe, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.sim.drive import simulate
 from dpm2_core.sim.settings import DriveConfig, LidarConfig
-from dpm2_core.slam.graph.pose_graph import PoseGraph, PoseGraphSettings
+from dpm2_core.slam.graph.pose_graph import PoseGraph
+from dpm2_core.slam.graph.robust import RobustSettings
 from dpm2_core.slam.mapping.merge import merge_maps, optimized
 from dpm2_core.slam.mapping.prune import prune
 from dpm2_core.slam.store.map_data import MapData, load_map, save_as
@@ -136,7 +137,7 @@ def test_the_graph_of_several_drives_lies_where_their_map_does(tmp_path: Path) -
 
     _, maps, joins = fleet_maps(2)
     joins.insert(0, joins.pop())  # the wrong one
-    poses = solve(maps, joins, PoseGraphSettings()).poses
+    poses = solve(maps, joins, RobustSettings()).poses
     data = replace(side_by_side(maps, joins), poses=np.concatenate(list(poses.values())))
     save_as(data, tmp_path / "map")
     assert dpm2("map", "export", tmp_path / "map", tmp_path / "a.g2o").returncode == 0
@@ -246,7 +247,7 @@ def test_maps_that_are_joined_by_a_known_transform_stay_together(tmp_path: Path)
     far = points[:, 0] > 300
     assert far.sum() == pytest.approx((~far).sum(), rel=0.01)  # a point between two voxels may be rounded into either
     both = loaded(tmp_path / "both")
-    np.testing.assert_allclose(optimized(both, PoseGraph(PoseGraphSettings())).poses, both.poses, atol=1e-6)
+    np.testing.assert_allclose(optimized(both, PoseGraph(RobustSettings())).poses, both.poses, atol=1e-6)
 
 
 def test_check_and_recover(tmp_path: Path, map_file: Path) -> None:

@@ -22,13 +22,13 @@ from dpm2_core.fleet.growth import Growth, Standing, add_drives, grown, joins_of
 from dpm2_core.fleet.regions import LARGEST, Join, solve
 from dpm2_core.frame import Edge, Fix, Georeference, Registration
 from dpm2_core.geometry import geodesy, se3
-from dpm2_core.slam.graph.pose_graph import PoseGraphSettings
+from dpm2_core.slam.graph.robust import RobustSettings
 from dpm2_core.slam.store.check import check_map
 from dpm2_core.slam.store.map_data import MapData, load_map
 from dpm2_core.slam.store.map_store import MapStore
 from test.helpers.fleets import NOISE, fleet_maps
 
-SETTINGS = PoseGraphSettings()
+SETTINGS = RobustSettings()
 
 
 def _made(path: Path, maps: Mapping[str, MapData], joins: Sequence[Join]) -> dict[str, int]:

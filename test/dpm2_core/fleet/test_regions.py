@@ -7,7 +7,7 @@ import numpy as np
 
 from dpm2_core.evaluation.metrics import ape_rmse
 from dpm2_core.fleet.regions import regions_of, solve
-from dpm2_core.slam.graph.pose_graph import PoseGraphSettings
+from dpm2_core.slam.graph.robust import RobustSettings
 from test.helpers.fleets import fleet_maps
 
 
@@ -16,7 +16,7 @@ def test_stages_give_the_poses_of_the_whole_and_refuse_what_cannot_be() -> None:
     truth, maps, joins = fleet_maps(5)
     sizes = {name: len(data) for name, data in maps.items()}
     assert [len(regions_of(sizes, joins, largest)) for largest in (1000, 130)] == [1, 3]
-    whole, staged = (solve(maps, joins, PoseGraphSettings(), largest) for largest in (1000, 130))
+    whole, staged = (solve(maps, joins, RobustSettings(), largest) for largest in (1000, 130))
     for region in (whole, staged):
         assert len(region.joins) == len(joins)
         for join in region.joins:

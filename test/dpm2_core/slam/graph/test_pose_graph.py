@@ -19,7 +19,8 @@ from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Array, Edge, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph import pose_graph
-from dpm2_core.slam.graph.pose_graph import PoseGraph, PoseGraphSettings
+from dpm2_core.slam.graph.pose_graph import PoseGraph
+from dpm2_core.slam.graph.robust import RobustSettings
 
 STEP = np.diag([2e-3, 2e-3, 2e-3, 0.02, 0.02, 0.02]) ** 2
 LOOP = np.diag([5e-3, 5e-3, 5e-3, 0.05, 0.05, 0.05]) ** 2
@@ -53,7 +54,7 @@ def truth(count: int) -> Array:
 def background(monkeypatch: pytest.MonkeyPatch) -> Iterator[PoseGraph]:
     """A graph of a lap with a loop that goes to the other process however small it is."""
     monkeypatch.setattr(pose_graph, "SHORT", 0)
-    graph = PoseGraph(PoseGraphSettings(background=True))
+    graph = PoseGraph(RobustSettings(), background=True)
     drive(graph, 55)
     graph.add_loop(loop(0, 50))
     yield graph
@@ -61,7 +62,7 @@ def background(monkeypatch: pytest.MonkeyPatch) -> Iterator[PoseGraph]:
 
 
 def test_a_wrong_loop_is_rejected_with_a_reason_and_is_no_edge() -> None:
-    graph = PoseGraph(PoseGraphSettings())
+    graph = PoseGraph(RobustSettings())
     drive(graph, 55)
     graph.add_loop(loop(0, 50))
     graph.add_loop(loop(5, 30))  # 40 m wrong
@@ -75,7 +76,7 @@ def test_a_wrong_loop_is_rejected_with_a_reason_and_is_no_edge() -> None:
 
 
 def test_background_gives_what_inline_gives(background: PoseGraph) -> None:
-    inline = PoseGraph(PoseGraphSettings())
+    inline = PoseGraph(RobustSettings())
     drive(inline, 55)
     inline.add_loop(loop(0, 50))
     inline.optimize()
@@ -142,7 +143,7 @@ def test_no_process_outlives_a_killed_program() -> None:
         "import time, numpy as np\n"
         "from dpm2_core.slam.graph import pose_graph as p\n"
         "p.SHORT = 0\n"
-        "g = p.PoseGraph(p.PoseGraphSettings(background=True))\n"
+        "g = p.PoseGraph(p.RobustSettings(), background=True)\n"
         "from dpm2_core.frame import Edge, Registration\n"
         "r = Registration(np.eye(4), np.eye(6) * 1e-2)\n"
         "g.add_node(np.eye(4))\n"
@@ -168,7 +169,7 @@ def test_no_process_outlives_a_killed_program() -> None:
 
 
 def test_the_relative_covariance_of_neighbors_is_that_of_their_edge() -> None:
-    graph = PoseGraph(PoseGraphSettings())
+    graph = PoseGraph(RobustSettings())
     drive(graph, 30)
     np.testing.assert_allclose(graph.relative_covariances([(20, 21)])[0], STEP, rtol=1e-3, atol=1e-9)
     assert np.trace(graph.covariance(29)) > 20 * np.trace(STEP)
@@ -180,7 +181,7 @@ def test_the_relative_covariance_of_neighbors_is_that_of_their_edge() -> None:
 
 
 def test_a_node_that_is_held_stays_and_the_others_come_to_it() -> None:
-    graph = PoseGraph(PoseGraphSettings())
+    graph = PoseGraph(RobustSettings())
     drive(graph, 20)
     T = se3.exp(np.array([0, 0, 0.5, 30.0, 0, 0]))
     before = graph.poses
@@ -195,7 +196,7 @@ def test_a_node_that_is_held_stays_and_the_others_come_to_it() -> None:
 
 
 def test_a_loop_makes_the_far_end_certain() -> None:
-    graph = PoseGraph(PoseGraphSettings())
+    graph = PoseGraph(RobustSettings())
     drive(graph, 55)
     before = np.trace(graph.covariance(50))
     graph.add_loop(loop(0, 50))
@@ -211,7 +212,7 @@ def test_trajectories_that_grow_side_by_side_are_tied_by_loops() -> None:
     truth = se3.exp(np.array([0, 0, 1.0, 20.0, 0, 0]) * turn[:, None])
     own = se3.exp(np.array([0.0, 0.0, 2.5, 300.0, -40.0, 0.0]))  # of the second robot's frame
     sigma = np.diag([1e-3] * 3 + [0.02] * 3) ** 2
-    graph, last = PoseGraph(PoseGraphSettings()), {}
+    graph, last = PoseGraph(RobustSettings()), {}
     for k in range(len(truth)):
         for robot, frame in enumerate((np.eye(4), own)):
             T = frame @ truth[k]
@@ -237,7 +238,7 @@ def test_trajectories_that_grow_side_by_side_are_tied_by_loops() -> None:
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -1.0, 0.0])
 def test_an_unsound_edge_is_rejected_and_the_graph_stays_as_it_was(bad: float) -> None:
     """One of them would turn all poses to NaN with the next loop."""
-    graph = PoseGraph(PoseGraphSettings())
+    graph = PoseGraph(RobustSettings())
     drive(graph, 55)
     covariance = STEP.copy()
     covariance[4, 4] = bad

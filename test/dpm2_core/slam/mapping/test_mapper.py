@@ -18,7 +18,8 @@ from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import LidarConfig
 from dpm2_core.sim.world import build_world
 from dpm2_core.slam.build import make_mapper
-from dpm2_core.slam.graph.pose_graph import PoseGraph, PoseGraphSettings
+from dpm2_core.slam.graph.pose_graph import PoseGraph
+from dpm2_core.slam.graph.robust import RobustSettings
 from dpm2_core.slam.mapping.occupancy_map import OCCUPIED, OccupancyMap, OccupancySettings
 from dpm2_core.slam.output import TrajectoryRecorder, save_map
 from dpm2_core.slam.settings import SlamSettings
@@ -55,7 +56,7 @@ def circle(count: int, radius: float = 20.0) -> Array:
 
 def test_a_loop_edge_spreads_the_drift() -> None:
     poses = circle(40)
-    graph = PoseGraph(PoseGraphSettings())
+    graph = PoseGraph(RobustSettings())
     for keyframe in drifting(poses, np.array([0, 0, 5e-4, 0.01, 0, 0.005]), np.zeros((0, 4), np.float32)):
         n = len(graph)
         graph.add_node(keyframe.T_odom_kf, keyframe.edge and Edge("odometry", n - 1, n, keyframe.edge))
@@ -70,7 +71,7 @@ def test_a_loop_edge_spreads_the_drift() -> None:
 
 def test_one_wrong_loop_among_right_ones_bends_little() -> None:
     poses = circle(40)
-    graph = PoseGraph(PoseGraphSettings())
+    graph = PoseGraph(RobustSettings())
     for keyframe in drifting(poses, np.zeros(6), np.zeros((0, 4), np.float32)):
         n = len(graph)
         graph.add_node(keyframe.T_odom_kf, keyframe.edge and Edge("odometry", n - 1, n, keyframe.edge))
@@ -81,7 +82,7 @@ def test_one_wrong_loop_among_right_ones_bends_little() -> None:
 
 
 def test_g2o_reads_back_at_full_precision(tmp_path: Path) -> None:
-    graph = PoseGraph(PoseGraphSettings())
+    graph = PoseGraph(RobustSettings())
     poses = circle(5)
     for keyframe in drifting(poses, np.array([1e-3, 2e-3, 3e-3, 0.1, 0.2, 0.3]), np.zeros((0, 4), np.float32)):
         n = len(graph)

@@ -15,7 +15,8 @@ import pytest
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Edge, Keyframe, Points, Registration
 from dpm2_core.geometry import se3
-from dpm2_core.slam.graph.pose_graph import PoseGraph, PoseGraphSettings
+from dpm2_core.slam.graph.pose_graph import PoseGraph
+from dpm2_core.slam.graph.robust import RobustSettings
 from dpm2_core.slam.loops.closure import LoopCloser
 from dpm2_core.slam.mapping.mapper import Mapper, MapSettings
 from dpm2_core.slam.store.map_data import load_map
@@ -47,7 +48,7 @@ class KnownLoops(LoopCloser):
 
 
 def make(store: MapStore | None = None, **settings: object) -> Mapper:
-    return Mapper(MapSettings.model_validate(settings), PoseGraph(PoseGraphSettings()), KnownLoops(), store)
+    return Mapper(MapSettings.model_validate(settings), PoseGraph(RobustSettings()), KnownLoops(), store)
 
 
 def laps(count: int, seed: int = 0) -> list[Keyframe]:
@@ -100,7 +101,7 @@ def test_the_file_has_the_verdicts_of_the_last_optimization(tmp_path: Path) -> N
     path = tmp_path / "a.dpm2map"
     with MapStore.create(path) as store:
         store.begin_session()
-        mapper = Mapper(MapSettings(), PoseGraph(PoseGraphSettings()), OneWrong(), store)
+        mapper = Mapper(MapSettings(), PoseGraph(RobustSettings()), OneWrong(), store)
         for keyframe in laps(2):
             mapper.add(keyframe)
         mapper.finish()
@@ -244,5 +245,5 @@ def test_descriptors_that_the_network_cannot_compare_are_told(map_file: Path) ->
     for read_only in (True, False):
         with MapStore.open(map_file, read_only) as store:
             with pytest.raises(UsageError, match="descriptors of 16 channels, the network makes 128") as caught:
-                Mapper(MapSettings(), PoseGraph(PoseGraphSettings()), Network(), store)
+                Mapper(MapSettings(), PoseGraph(RobustSettings()), Network(), store)
             assert str(map_file) in str(caught.value)

@@ -12,7 +12,8 @@ import pytest
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Array, Edge, Fix, Keyframe, Registration
 from dpm2_core.geometry import se3
-from dpm2_core.slam.graph.pose_graph import PoseGraph, PoseGraphSettings
+from dpm2_core.slam.graph.pose_graph import PoseGraph
+from dpm2_core.slam.graph.robust import RobustSettings
 from dpm2_core.slam.mapping.merge import align, merge_maps, optimized
 from dpm2_core.slam.mapping.prune import composed, eliminate, inverted, prune, redundant_nodes
 from dpm2_core.slam.store.cloud_codec import pack_cloud
@@ -133,9 +134,9 @@ def test_the_optimum_stays_when_nodes_go() -> None:
     T_first_last = se3.inverse(data.poses[0]) @ data.poses[39]
     edges.append(Edge("loop", 0, 39, Registration(T_first_last, SIGMA * 0.01)))
     data = replace(data, edges=edges)
-    before = optimized(data, PoseGraph(PoseGraphSettings())).poses
+    before = optimized(data, PoseGraph(RobustSettings())).poses
     gone = [n for n in range(1, 39) if n % 3]
-    after = optimized(prune(data, gone), PoseGraph(PoseGraphSettings())).poses
+    after = optimized(prune(data, gone), PoseGraph(RobustSettings())).poses
     kept = [n for n in range(40) if n not in gone]
     moved = np.linalg.norm(before[kept][:, :3, 3] - data.poses[kept][:, :3, 3], axis=1).max()
     assert moved > 0.1
@@ -176,7 +177,7 @@ def test_maps_are_aligned_by_their_loops_though_one_of_them_is_off() -> None:
     loops = [Edge("loop", a, b, same) for a, b in ((3, 3), (13, 13), (23, 23), (5, 30))]
     T, used = align(a, b, lambda one, two: loops)
     np.testing.assert_allclose(T, T_a_b, atol=1e-6)
-    both = optimized(merge_maps(a, b, T, used[:3]), PoseGraph(PoseGraphSettings()))
+    both = optimized(merge_maps(a, b, T, used[:3]), PoseGraph(RobustSettings()))
     np.testing.assert_allclose(both.poses[40:], both.poses[:40], atol=1e-3)
     with pytest.raises(Dpm2Error, match="no place"):
         align(a, b, lambda one, two: [])
