@@ -16,15 +16,15 @@ from dpm2_core.frame import Fix
 _NO_FIX = -1  # -2, Jazzy's default, says that the driver sets no status at all
 _MOST = 100  # fixes kept; bounds memory where no cloud comes
 _LEAST = 0.01  # m, added to every standard deviation: no antenna's place and no clock is known better
-_ASSUMED = (5.0, 5.0, 10.0)  # m east, north, up where the receiver states none: that of a plain one under open sky
+_ASSUMED = np.array([5.0, 5.0, 10.0])  # m east, north, up where none is stated: that of a plain receiver, open sky
 _UNKNOWN = 1e4  # m, of an altitude that is not known
 
 
 def decode_fix(message: Any, stamp: int) -> Fix | None:
     """The position that a sensor_msgs/NavSatFix with that stamp (ns) states, its antenna at the LiDAR; None: no fix.
 
-    A covariance that is unknown, or all zero, is taken to be that of a plain receiver; an altitude of NaN is unknown,
-    as the message's definition has it.
+    A variance that is unknown, or 0, is taken to be that of a plain receiver; an altitude of NaN is unknown, as the
+    message's definition has it.
 
     Raises:
         MessageError: no place on Earth, or no covariance.
@@ -35,8 +35,9 @@ def decode_fix(message: Any, stamp: int) -> Fix | None:
     if not place[:2].any():
         raise MessageError("latitude and longitude 0, which receivers send before they know")
     covariance = np.array(message.position_covariance, np.float64).reshape(3, 3)
-    if message.position_covariance_type == 0 or not covariance.any():
-        covariance = np.diag(_ASSUMED) ** 2
+    unstated = (np.diag(covariance) == 0) | (message.position_covariance_type == 0)
+    covariance[unstated], covariance[:, unstated] = 0.0, 0.0
+    covariance[unstated, unstated] = _ASSUMED[unstated] ** 2
     if np.isnan(place[2]):
         place[2], covariance[2], covariance[:, 2] = 0.0, 0.0, 0.0
         covariance[2, 2] = _UNKNOWN**2
