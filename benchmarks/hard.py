@@ -10,11 +10,11 @@ from typing import Any
 from rich.console import Group
 from rich.progress import Progress
 
+from benchmarks.figures import verdicts_png
 from benchmarks.geometric import BASELINE, Method, Outcome, dpm2, kiss_icp
 from benchmarks.hardships import EVERY, Case, cases, judged
 from benchmarks.harness import Options, Report, drives, processors, requested, truth_of, unique_name
 from dpm2_core.data.source import Source
-from dpm2_core.evaluation.figures import verdicts_png
 from dpm2_core.evaluation.metrics import evaluate
 from dpm2_core.frame import State
 from dpm2_core.sim.settings import PresetName

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from rich.progress import Progress
 
+from benchmarks.figures import success_png
 from benchmarks.geometric import BASELINE, Method, dpm2, kiss_config, kiss_icp, summary
 from benchmarks.harness import (
     Options,
@@ -31,7 +32,6 @@ from benchmarks.pairs import PairMethod, all_pairs, by_registration, gicp_from_i
 from benchmarks.repeated import repeated
 from benchmarks.unseen import corruption, image_matters, overlap, synthetic
 from benchmarks.unseen_sensors import other_sensors
-from dpm2_core.evaluation.figures import success_png
 from dpm2_core.evaluation.record import git_commit
 from dpm2_core.files import file_digest
 from dpm2_core.frame import Array, Frame

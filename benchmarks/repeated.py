@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from benchmarks.figures import bars_png
 from benchmarks.harness import Options, drives, truth_of, unique_name
-from dpm2_core.evaluation.figures import bars_png
 from dpm2_core.frame import Array, Frame, Image, Points
 from dpm2_core.geometry import se3
 from dpm2_core.learning.generate import training_camera

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from rich.console import Group
 
+from benchmarks.figures import lines_png
 from benchmarks.harness import Options, Report, drives
 from benchmarks.scan_statistics import RANGES, statistics
-from dpm2_core.evaluation.figures import lines_png
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import HDL64E, LidarConfig, PresetName
 from dpm2_core.sim.world import build_world

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dpm2_core.evaluation.figures import trajectory_png, verdicts_png
+from dpm2_core.evaluation.figures import trajectory_png
 from dpm2_core.geometry import se3
 
 ORANGE = np.array([255, 159, 28])
@@ -77,15 +77,3 @@ def test_a_drive_that_went_nowhere_still_gives_a_image(
     trajectory_png(tmp_path / "p.png", est, np.full_like(est, np.nan), cloud)
     assert _picture(tmp_path / "p.png").shape[1] == 1800
     assert [entry.name for entry in tmp_path.iterdir()] == ["p.png"]
-
-
-def test_verdicts_have_the_colors_of_their_meaning(tmp_path: Path) -> None:
-    """One cell each of right, said and silent: the red of `silent` is in the picture where that verdict is given."""
-
-    def reds(verdict: str) -> int:
-        panels = {"00": {"gap": {"ours": ("right", 0.1), "theirs": (verdict, 12.0)}}, "04": {"blind": {}}}
-        verdicts_png(tmp_path / "verdicts.png", panels)
-        return int((np.abs(_picture(tmp_path / "verdicts.png") - [231, 154, 146]).max(-1) < 6).sum())
-
-    legend = reds("said")
-    assert reds("silent") > legend + 500
