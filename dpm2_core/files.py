@@ -63,6 +63,32 @@ def part_beside(path: Path) -> Path:
     return path.with_name(f".{path.name}.{own}.part")
 
 
+@contextmanager
+def new_folder(path: Path) -> Iterator[Path]:
+    """A folder that is named `path` when the block ends well, and is gone when it does not.
+
+    An empty one that is there is filled in the order of the names: it stays, since a shell may be in it.
+
+    Raises:
+        Dpm2Error: it could not be written.
+    """
+    path = path.resolve()
+    part = part_beside(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part.mkdir()
+        yield part
+        if path.is_dir() and not any(path.iterdir()):
+            for entry in sorted(part.iterdir()):
+                entry.rename(path / entry.name)
+        else:
+            part.rename(path)
+    except OSError as error:
+        raise not_written(path, error) from error
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+
+
 def _alive(pid: int) -> bool:
     try:
         os.kill(pid, 0)

@@ -5,10 +5,8 @@ from __future__ import annotations
 
 import io
 import json
-import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpm2_core.errors import UsageError
-from dpm2_core.files import file_digest, not_written, part_beside
+from dpm2_core.files import file_digest, new_folder
 from dpm2_core.geometry import se3
 from dpm2_core.sim.camera import calibration, render
 from dpm2_core.sim.gnss import Receiver
@@ -64,7 +62,7 @@ def simulate(
     plan, height = world.road.plan, drive.lidar.height
     if plan is not None and height >= plan.headroom:
         raise UsageError(f"--height {height:g}: the way leads under what is {plan.headroom:.2f} m high")
-    with _whole(out) as part:
+    with new_folder(out) as part:  # `sequences`, by which a drive is known, comes last
         _Drive(world, drive).write(part, recipe, workers, progress)
     return True
 
@@ -131,26 +129,6 @@ def _is_there(out: Path, recipe: dict[str, Any]) -> bool:
             f"{out}: holds a drive with other {', '.join(differ) or 'settings'}; remove it or choose another"
         )
     return True
-
-
-@contextmanager
-def _whole(out: Path) -> Iterator[Path]:
-    """A folder that is named `out` when the block ends well, and is gone when it does not."""
-    out = out.resolve()
-    part = part_beside(out)
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        part.mkdir()
-        yield part
-        if out.is_dir():  # empty, and it stays: a shell may be in it
-            for entry in sorted(part.iterdir()):  # `sequences`, by which a drive is known, is the last
-                entry.rename(out / entry.name)
-        else:
-            part.rename(out)
-    except OSError as error:
-        raise not_written(out, error) from error
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
 
 
 class _Drive:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import math
-import shutil
 from collections.abc import Callable, Collection, Sequence
 from functools import reduce
 from pathlib import Path
@@ -18,7 +17,7 @@ import numpy as np
 
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.files import not_written, part_beside, write_json
+from dpm2_core.files import new_folder, write_json
 from dpm2_core.frame import Array, Image, Points, Registration
 from dpm2_core.slam.loops.relocalization import RelocalizationSettings, Relocalizer, nowhere
 from dpm2_core.slam.loops.retrieval import WIDTH, Vector, centered, pooled
@@ -53,9 +52,7 @@ def write_tiles(data: MapData, folder: Path, size: float) -> int:
     for node, (x, y) in enumerate(np.floor(data.poses[:, :2, 3] / size).astype(int).tolist()):
         if data.clouds.loan(node) is None:
             squares.setdefault((x, y), []).append(node)
-    part = part_beside(folder)
-    try:
-        part.mkdir(parents=True)
+    with new_folder(folder) as part:
         vectors = np.array([_vector(data, node) for _, nodes in sorted(squares.items()) for node in nodes])
         mean = np.asarray(vectors.sum(0) / max(int(vectors.any(1).sum()), 1), np.float32)
         np.save(part / VECTORS, centered(vectors, mean))
@@ -64,11 +61,6 @@ def write_tiles(data: MapData, folder: Path, size: float) -> int:
         counts = [[*tile, len(nodes)] for tile, nodes in sorted(squares.items())]
         weights = sorted({session.weights for session in data.sessions if session.weights})
         write_json(part / INDEX, {"size": size, "tiles": counts, "weights": weights, "mean": mean.tolist()})
-        part.rename(folder)
-    except OSError as error:
-        raise not_written(folder, error) from error
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
     return len(squares)
 
 
