@@ -25,7 +25,7 @@ from dpm2_ros.base_frame import BaseFrame
 from dpm2_ros.conversions import BodyMotion, keyframe_to_base, odometry_to_msg
 from dpm2_ros.display import Projection
 from dpm2_ros.health import Diagnostics, Health
-from dpm2_ros.keyframes import KeyframeSender, weights_identity
+from dpm2_ros.keyframe_sender import KeyframeSender, weights_identity
 from dpm2_ros.lifecycle import ManagedNode
 from dpm2_ros.other_odometry import OtherOdometry
 from dpm2_ros.requests import Requests
