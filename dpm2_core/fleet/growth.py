@@ -22,7 +22,6 @@ from dpm2_core.fleet.joins import ENOUGH
 from dpm2_core.fleet.regions import Join
 from dpm2_core.fleet.search import affirmed, component
 from dpm2_core.frame import Array, Edge, Georeference
-from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.graph_data import loop_errors, mahalanobis
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.graph.robust import RobustSettings
@@ -246,7 +245,7 @@ class _Region:
             graph.hold(self._at[node], self._poses[node])
         graph.optimize()
         checked = [join.judged(loop.registration) for join, loop in zip(joins, graph.loops[loops:], strict=True)]
-        solved = np.array([se3.orthonormalized(T) for T in graph.poses])  # else rounding doubles with each addition
+        solved = graph.poses
         moved = {node: solved[self._at[node]] for node in self._own}
         return Growth(
             {name: replace(data, poses=solved[begins[name] :][: len(data)]) for name, data in maps.items()},

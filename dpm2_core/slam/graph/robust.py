@@ -219,7 +219,7 @@ def _aligned(graph: GraphData, poses: Array, used: NDArray[np.bool_], kernel: fl
         swap = ends_number[ties, 0] == this
         before, after = np.where(swap, ends[:, 1], ends[:, 0]), np.where(swap, ends[:, 0], ends[:, 1])
         T_before_after = np.where(swap[:, None, None], se3.inverse(T), T)
-        moves = poses[before] @ T_before_after @ se3.inverse(poses[after])
+        moves = se3.orthonormalized(poses[before] @ T_before_after @ se3.inverse(poses[after]))  # else rounding doubles
         trials = np.concatenate([np.eye(4)[None], moves])
         costs = []
         for move in trials:

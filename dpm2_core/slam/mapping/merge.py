@@ -76,7 +76,7 @@ def align(a: MapData, b: MapData, find_loops: FindLoops) -> tuple[Array, list[Ed
     guesses = [a.poses[e.from_node] @ e.T_from_to @ se3.inverse(b.poses[e.to_node]) for e in loops]
     # The one that the others are nearest to: a start for the optimization, which weighs them all.
     apart = [np.median([np.linalg.norm((T - other)[:3, 3]) for other in guesses]) for T in guesses]
-    return guesses[int(np.argmin(apart))], loops
+    return se3.orthonormalized(guesses[int(np.argmin(apart))]), loops  # else each merge doubles the rounding
 
 
 def loops_by(closer: LoopCloser) -> FindLoops:

@@ -235,6 +235,38 @@ def test_trajectories_that_grow_side_by_side_are_tied_by_loops() -> None:
     assert np.trace(near) < np.trace(far)
 
 
+def off_rotation(poses: Array) -> float:
+    """How far R R^T is from the identity at most."""
+    R = poses[:, :3, :3]
+    return float(np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max())
+
+
+def test_rotations_stay_rotations_over_hundreds_of_background_solves(background: PoseGraph) -> None:
+    """A keyframe comes during each. Its rounding was tripled each time: after 35 none was rigid any more."""
+    for _ in range(300):
+        background.optimize()
+        background.add_node(background.pose(len(background) - 1) @ T_STEP, step(background))
+        assert background.collect(wait=True)
+    assert off_rotation(background.poses) < 1e-9  # rounding adds up to some 1e-14; it is a transform up to 1e-3
+
+
+@pytest.mark.parametrize("moved", [False, True], ids=["by its first loop", "by the optimization"])
+def test_rotations_stay_rotations_over_hundreds_of_maps_that_are_solved_again(moved: bool) -> None:
+    """Each begins with the poses of the last, and its second drive is moved: the rounding was doubled each time."""
+    poses = se3.exp(np.random.default_rng(0).normal(size=(4, 6)))
+    for _ in range(300):
+        graph = PoseGraph(RobustSettings())
+        for node, T in enumerate(poses):
+            graph.add_node(T, step(graph) if node % 2 else None)
+        graph.add_loop(loop(1, 2))
+        if moved:
+            for node in (2, 3):
+                graph.place(node, DRIFT @ poses[node])
+        graph.optimize()
+        poses = graph.poses
+    assert off_rotation(poses) < 1e-9  # as above
+
+
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -1.0, 0.0])
 def test_an_unsound_edge_is_rejected_and_the_graph_stays_as_it_was(bad: float) -> None:
     """One of them would turn all poses to NaN with the next loop."""

@@ -181,3 +181,14 @@ def test_maps_are_aligned_by_their_loops_though_one_of_them_is_off() -> None:
     np.testing.assert_allclose(both.poses[40:], both.poses[:40], atol=1e-3)
     with pytest.raises(Dpm2Error, match="no place"):
         align(a, b, lambda one, two: [])
+
+
+def test_a_map_that_is_merged_again_and_again_stays_rigid() -> None:
+    """Each time behind another one, as `dpm2 map merge new old`: the rounding of its rotations was doubled."""
+    new, old = laps(1, 4), laps(1, 4)
+    loop = Edge("loop", 1, 2, Registration(se3.exp([0.1, 0.2, 0.3, 1, 2, 3]), SIGMA))
+    for _ in range(60):
+        T, _loops = align(new, old, lambda one, two: [loop])
+        old = replace(old, poses=merge_maps(new, old, T).poses[len(new) :])
+    R = old.poses[:, :3, :3]
+    np.testing.assert_allclose(R @ np.swapaxes(R, -1, -2), np.broadcast_to(np.eye(3), R.shape), atol=1e-9)
