@@ -113,6 +113,8 @@ class Slam:
         if localizer is not None and localizer.found is not None:
             self.odometry.cross_breaks(localizer.found)
         result = self.odometry.process(frame)
+        if localizer is not None and result.state is State.LOST:
+            localizer.odometry_lost(frame.stamp)
         if result.keyframe is None:
             return result
         self._underway = frame.stamp

@@ -58,7 +58,22 @@ class Localizer:
         self._stamp: int | None = None
         self.found: int | None = None
         self.T_map_odom: Array = np.eye(4)
-        self.state = State.RELOCALIZING
+        self._state = State.RELOCALIZING
+        self._broken = 0  # stamp of the last frame whose odometry was lost, ns
+
+    @property
+    def state(self) -> State:
+        """As of the last keyframe, or LOST if the odometry has been lost since: it may have been carried off."""
+        broken = self._stamp is not None and self._broken > self._stamp
+        return State.LOST if broken and self._state.located else self._state
+
+    def odometry_lost(self, stamp: int) -> None:
+        """The odometry was lost at that stamp (ns): later keyframes may be anywhere, wherever it leads.
+
+        May be called in another thread than the other methods: a keyframe from before, which still waits, is found as
+        ever, and the state stays LOST.
+        """
+        self._broken = stamp
 
     def wants(self, stamp: int) -> bool:
         """Whether to ask for a keyframe now (ns): once a second, also at a halt, until another confirms the place."""
@@ -66,13 +81,13 @@ class Localizer:
 
     def restart(self) -> None:
         """The odometry has begun anew: one may be anywhere."""
-        self.T_map_odom, self.state = np.eye(4), State.RELOCALIZING
+        self.T_map_odom, self._state, self._broken = np.eye(4), State.RELOCALIZING, 0
         self._failures, self._distrust, self._far = 0, 0.0, None
         self._T_last, self._stamp, self.found = None, None, None
 
     def hint(self, T_map_lidar: Array) -> None:
         """Prior for the pose of the next keyframe (4, 4), for example from RViz."""
-        self._hint, self.state = T_map_lidar, State.RELOCALIZING
+        self._hint, self._state = T_map_lidar, State.RELOCALIZING
 
     def add(self, keyframe: Keyframe) -> LocalizationResult:
         """Find a keyframe, which has its cloud, in the map.
@@ -80,15 +95,16 @@ class Localizer:
         Raises:
             Dpm2Error: the map cannot be read. It does not confirm the odometry then, as where nothing fits.
         """
+        broken = self._stamp is not None and self._stamp < self._broken < keyframe.stamp
+        if broken or (keyframe.edge is not None and keyframe.edge.worst_sigma > UNCERTAIN):
+            self._state = State.LOST if self._state.located else self._state  # its odometry may have been
         self._stamp = keyframe.stamp
-        if keyframe.edge is not None and keyframe.edge.worst_sigma > UNCERTAIN:
-            self.state = State.LOST  # its odometry may have been
         if self._T_last is not None:
             self._distrust += float(np.linalg.norm(keyframe.T_odom_kf[:3, 3] - self._T_last[:3, 3]))
         self._T_last = keyframe.T_odom_kf
         picture = usable_image(keyframe.thumbnail)
         try:
-            if self.state.located:
+            if self._state.located:
                 return self._track(keyframe, picture)
             return self._find(keyframe, picture, nowhere("lost"))
         except Dpm2Error:
@@ -109,7 +125,7 @@ class Localizer:
         """Look in the whole map, or around the hint; while tracking, a far-off result must be repeated."""
         result = self._relocalizer.find(keyframe.cloud, self._hint, keyframe.descriptors, picture)
         self._hint = None
-        tracking = self.state.located
+        tracking = self._state.located
         T_predicted = self.T_map_odom @ keyframe.T_odom_kf
         if result.ok:
             meters = self._apart(T_predicted, result)
@@ -122,8 +138,8 @@ class Localizer:
         elif tracking:
             result = rejected
         self._doubt()
-        covariance = LOST if self.state is not State.DEGRADED else np.eye(6) * (0.1 + 0.01 * self._distrust) ** 2
-        return LocalizationResult(T_predicted, covariance, self.state, result)
+        covariance = LOST if self._state is not State.DEGRADED else np.eye(6) * (0.1 + 0.01 * self._distrust) ** 2
+        return LocalizationResult(T_predicted, covariance, self._state, result)
 
     @property
     def _allowed(self) -> float:
@@ -136,11 +152,11 @@ class Localizer:
 
     def _doubt(self) -> None:
         """Its place, where it has one, is that of the odometry alone."""
-        if self.state.located:
-            self.state = State.LOST if self._failures >= self._max_failures else State.DEGRADED
+        if self._state.located:
+            self._state = State.LOST if self._failures >= self._max_failures else State.DEGRADED
 
     def _located(self, keyframe: Keyframe, result: Registration, jumped: bool) -> LocalizationResult:
         self.T_map_odom = se3.orthonormalized(result.T_target_source @ se3.inverse(keyframe.T_odom_kf))
-        self.state = State.RELOCALIZED if jumped else State.TRACKING
+        self._state = State.RELOCALIZED if jumped else State.TRACKING
         self._failures, self._distrust, self._far, self.found = 0, 0.0, None, keyframe.stamp
-        return LocalizationResult(result.T_target_source, result.covariance, self.state, result, jumped)
+        return LocalizationResult(result.T_target_source, result.covariance, self._state, result, jumped)

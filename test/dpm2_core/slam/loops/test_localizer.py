@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 
 from dpm2_core.descriptors import Descriptors
-from dpm2_core.frame import Array, Image, Keyframe, Points, Registration, State
+from dpm2_core.frame import Array, Frame, Image, Keyframe, Points, Registration, State
 from dpm2_core.geometry import se3
+from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.loops.localizer import Localizer
 from dpm2_core.slam.loops.relocalization import nowhere
+from dpm2_core.slam.settings import SlamSettings
 
 FIRM = np.diag([1e-3] * 3 + [0.02] * 3) ** 2
 
@@ -70,3 +72,39 @@ def test_a_far_off_place_counts_when_it_is_found_again(found: tuple[float, ...],
     localizer = Localizer(Places(*found))
     states = [localizer.add(halt(node)).state for node in range(4)]
     assert states == [State.RELOCALIZED, State.DEGRADED, State.DEGRADED, last]
+
+
+def test_after_the_odometry_was_lost_a_place_that_fits_is_not_enough() -> None:
+    """In another aisle of a warehouse 90 % of the points fit; with a firm edge that was `tracking`, 22 m wrong."""
+    localizer = Localizer(Places(0.0, 30.0, confirms=True))
+    for node in range(2):
+        localizer.add(halt(node))
+    assert localizer.state is State.TRACKING
+    localizer.odometry_lost(2 * 10**9 + 1)
+    assert localizer.state is State.LOST
+    waiting = localizer.add(halt(2))  # made before the loss; in the node it is found in another thread, later
+    assert (waiting.state, localizer.state) == (State.TRACKING, State.LOST)
+    found = localizer.add(halt(3))
+    assert (found.state, found.jumped, localizer.state) == (State.RELOCALIZED, True, State.RELOCALIZED)
+    assert localizer.T_map_odom[0, 3] == 30.0
+    localizer.restart()
+    localizer.odometry_lost(4 * 10**9)
+    assert localizer.state is State.RELOCALIZING  # there is no place to lose
+
+
+@pytest.mark.slow
+def test_the_slam_says_that_its_odometry_was_lost(suburb_drive: tuple[list[Frame], Array]) -> None:
+    """It came back with a firm edge, and the localizer knew nothing of it."""
+    frames, blind = suburb_drive[0], np.full((40, 4), 0.2, np.float32)
+    slam = make_slam(SlamSettings.model_validate({"registration": "geometric", "loops": {"descriptors": False}}))
+    slam.use(slam.mapper, Localizer(Places(0.0, 30.0, confirms=True)))
+    points = [frame.points for frame in frames[:15]] + [blind] * 6 + [frame.points for frame in frames[21:]]
+    results = [slam.process(Frame(n * 10**8, cloud)) for n, cloud in enumerate(points)]
+    states = [result.state for result in results]
+    lost = states.index(State.LOST)
+    found = states.index(State.RELOCALIZED, lost)
+    assert states[14] is State.TRACKING
+    assert State.TRACKING not in states[lost:found]
+    T_map_lidar = results[found].T_map_lidar
+    assert T_map_lidar is not None
+    np.testing.assert_allclose(T_map_lidar, at(30.0), atol=1e-9)
