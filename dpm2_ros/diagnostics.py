@@ -52,6 +52,8 @@ def mapper_status(node: Node, mapper: MapperThread) -> DiagnosticStatus:
         problems.append(f"map file incomplete: {mapper.store_problem}")
     if mapper.graph_problem:
         problems.append(f"poses not optimized: {mapper.graph_problem}")
+    if missing := list(mapper.missing.values()):
+        problems.append(f"{len(missing)} keyframes could not be taken in: {missing[-1]}")
     text = "; ".join([f"{mapper.keyframes} keyframes, {accepted} loops", *problems])
     return status(node, "mapper", WARN if problems else OK, text, figures | {"waiting": mapper.waiting})
 

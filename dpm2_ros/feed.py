@@ -264,7 +264,8 @@ class Feed:
     def _acknowledge(self, stream: Stream, now: float) -> None:
         if stream.session:
             stream.acknowledged = now
-            self._received.publish(received_to_msg(stream.session, *stream.arrived(self._mapper.written)))
+            written, missing = self._mapper.written, self._mapper.missing
+            self._received.publish(received_to_msg(stream.session, *stream.arrived(written, missing)))
 
 
 @contextmanager

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
@@ -52,6 +52,7 @@ class MapperThread:
         self._restarted: dict[str, Future[None]] = {}  # by robot: since when its odometry's start is known here
         self._lock = threading.Lock()
         self._added = self._taken = self._written = 0  # keyframes
+        self._missing: dict[int, str] = {}
         self._changes = self.keyframes
         ros = config.ros
         self._tf = TransformBroadcaster(
@@ -95,8 +96,14 @@ class MapperThread:
 
     @property
     def written(self) -> int:
-        """So many keyframes, of all that were ever added, are in the map file (without one: in the map) or rejected."""
+        """So many keyframes, of all that were ever added, are in the map file (without one: in the map) or rejected,
+        but for those that are missing."""
         return self._written
+
+    @property
+    def missing(self) -> Mapping[int, str]:
+        """Keyframes that were not unsound, but could not be taken in, by number: why, in words."""
+        return self._missing
 
     @property
     def channels(self) -> int | None:
@@ -144,7 +151,7 @@ class MapperThread:
         """Take in the keyframe that `make`, called in this thread, returns; how many came before it."""
         with self._lock:
             number, self._added = self._added, self._added + 1
-            self._submit(lambda: self._take_in(make))
+            self._submit(lambda: self._take_in(number, make))
         return number
 
     def hint(self, T_map_base: Array) -> str:
@@ -224,10 +231,16 @@ class MapperThread:
         self._changes += 1
         return result
 
-    def _take_in(self, make: Callable[[], Keyframe]) -> None:
-        behind = self.store_problem
+    def _take_in(self, number: int, make: Callable[[], Keyframe]) -> None:
+        before, behind = self.keyframes, self.store_problem
         try:
             self._add(make())
+        except RejectedError:
+            raise
+        except Exception as error:
+            if self.keyframes == before and not self.localizing:
+                self._missing[number] = str(error) or type(error).__name__
+            raise
         finally:
             self._taken += 1
             if not self.store_problem:

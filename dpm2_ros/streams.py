@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict, deque
+from collections.abc import Container
 from dataclasses import dataclass
 from typing import Any
 
@@ -70,12 +71,13 @@ class Stream:
         self._queue: deque[tuple[int, Parts]] = deque(maxlen=AHEAD)  # without a session
         self._bad: tuple[float, int] | None = None  # since when, and how often, messages of the next one were rejected
 
-    def arrived(self, written: int) -> tuple[int, list[int]]:
+    def arrived(self, written: int, missing: Container[int] = ()) -> tuple[int, list[int]]:
         """Ids that have come: all below a number, which are in the map file, and some above, which wait in memory.
 
-        `written`: of the mapper's numbers, how many are in its file.
+        Args:
+            written: of the mapper's numbers, how many are in its file. missing: those of them that are not.
         """
-        while self._given and self._given[0][1] < written:
+        while self._given and (number := self._given[0][1]) < written and number not in missing:
             self._given.popleft()
         below = self._given[0][0] if self._given else self.next
         return below, [*range(below, self.next), *sorted(self._above)][:_MOST_WAITING]

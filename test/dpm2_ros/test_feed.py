@@ -10,10 +10,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import UInt8MultiArray, UInt32MultiArray
 
+from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Keyframe
 from dpm2_core.geometry import se3
 from dpm2_core.slam.settings import SlamSettings
@@ -21,6 +23,7 @@ from dpm2_core.slam.store.map_data import load_map
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_ros.conversions import edge_to_msg, keyframe_name
 from dpm2_ros.deliveries import Delivery
+from dpm2_ros.diagnostics import mapper_status
 from dpm2_ros.feed import Feed, keyframe_from
 from dpm2_ros.guard import GuardedNode
 from dpm2_ros.keyframe_messages import WIRE, payload_to_msgs
@@ -120,6 +123,34 @@ def test_what_is_acknowledged_for_good_is_in_the_map_file(robot: Robot) -> None:
     robot.node.busy.set()
     robot.harness.wait(lambda: robot.acknowledged(DRIVE) == (COUNT, 0), "all of them in the file")
     assert robot.stored == COUNT + 1
+
+
+@pytest.mark.parametrize("error", [Dpm2Error("the graph is full"), ZeroDivisionError("a bug")])
+def test_a_keyframe_that_could_not_be_taken_in_stays_with_its_robot(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    """It was acknowledged as one in the map file, so that its robot deleted it; /diagnostics said OK."""
+    mapper = robot.node.mapper.slam.mapper
+    add, errors = mapper.add, [error]
+
+    def failing(keyframe: Keyframe) -> Any:
+        if keyframe.id == 1 and errors:
+            raise errors.pop()
+        return add(keyframe)
+
+    monkeypatch.setattr(mapper, "add", failing)
+    robot.send(COUNT, DRIVE)
+    robot.wait(DRIVE, COUNT)
+    robot.harness.wait(lambda: robot.node.mapper.waiting == 0, "the mapper")
+    robot.heard.clear()
+    robot.wait(DRIVE, COUNT)
+    found = mapper_status(robot.node, robot.node.mapper)
+    assert (found.level, found.message) == (
+        DiagnosticStatus.WARN,
+        f"{COUNT - 1} keyframes, 0 loops; 1 keyframes could not be taken in: {error}",
+    )
+    assert robot.acknowledged(DRIVE) == (1, COUNT - 1)
+    assert robot.stored == COUNT - 1
 
 
 def test_a_drive_whose_place_is_not_decided_stays_with_its_robot(robot: Robot) -> None:

@@ -59,6 +59,7 @@ def test_what_is_not_in_the_map_file_counts_as_waiting() -> None:
     assert stream.arrived(written=0) == (0, [0, 1, 2, 4])
     assert stream.arrived(written=9) == (1, [1, 2, 4])
     assert stream.arrived(written=10) == (2, [2, 4])
+    assert stream.arrived(written=11, missing=[10]) == (2, [2, 4])
     stream.replaced()
     assert stream.arrived(written=11) == (3, [])
 
