@@ -214,6 +214,14 @@ class Frame:
         if not isinstance(self.stamp, int | np.integer):
             raise ValueError(f"frame {self.index}: its stamp is {self.stamp!r}, want ns, an integer")
 
+    def later(self, seconds: float) -> Frame:
+        """The same, its points and images timed from a moment so much after the stamp; not moved there."""
+        if not seconds:
+            return self
+        offset = None if self.time_offset is None else self.time_offset - np.float32(seconds)
+        images = tuple(replace(image, time_offset=image.time_offset - seconds) for image in self.images)
+        return replace(self, stamp=self.stamp + round(seconds * 1e9), time_offset=offset, images=images)
+
 
 @dataclass(frozen=True, eq=False)
 class Registration:

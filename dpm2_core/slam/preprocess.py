@@ -48,7 +48,7 @@ class PreprocessSettings(Settings):
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """A prepared scan in the LiDAR frame at its stamp.
+    """A prepared scan in the LiDAR frame at the time that its frame counts from.
 
     Attributes:
         points: (P, 4) float32, all that were measured within range and that the filter, if any, left.
@@ -87,7 +87,7 @@ class Preprocessor:
         s = self._settings
         points, used = _in_range(np.ascontiguousarray(frame.points), s.min_range**2, s.max_range**2)
         if s.deskew and frame.time_offset is not None:
-            points = deskew(points, frame.time_offset[used], twist, _turn(frame))
+            points = deskew(points, frame.time_offset[used], twist, measured_turn(frame))
         return points if self._filter is None else self._filter(points)
 
     def prepare(self, frame: Frame, twist: Array) -> Scan:
@@ -113,7 +113,7 @@ def _in_range(points: Points, least: float, most: float) -> tuple[Points, NDArra
     return used[:count], index[:count]
 
 
-def _turn(frame: Frame) -> Callable[[Array], Array | None] | None:
+def measured_turn(frame: Frame) -> Callable[[Array], Array | None] | None:
     """How the LiDAR turned around the stamp, for `deskew`; None without an IMU."""
     imu = frame.imu
     return None if imu is None else partial(turned, (imu.stamps - frame.stamp) * 1e-9, imu.rates)

@@ -16,6 +16,7 @@ from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.spacing import Spacing
 
+_SAME = np.eye(4)
 _TRACE = 30  # frames that a fix may be older than the one that it comes with
 
 
@@ -69,8 +70,15 @@ class KeyframeSelector:
         """The odometry was broken by that much (6, 6): the next edge is to be no firmer."""
         self._uncertainty = self._uncertainty + covariance
 
-    def select(self, frame: Frame, scan: Scan, T_odom_lidar: Array, registration: Registration) -> Keyframe | None:
-        """The keyframe that this scan makes, or None. A scan that was not registered never makes one."""
+    def select(
+        self, frame: Frame, scan: Scan, T_odom_lidar: Array, registration: Registration, T_scan_lidar: Array = _SAME
+    ) -> Keyframe | None:
+        """The keyframe that this scan makes, or None. A scan that was not registered never makes one.
+
+        Args:
+            T_odom_lidar: (4, 4) at the frame's stamp.
+            T_scan_lidar: (4, 4) of the LiDAR at the stamp, in the frame of the scan's points.
+        """
         if not registration.ok:
             self._trace.clear()  # the way is not known
             self._fix = None
@@ -93,6 +101,10 @@ class KeyframeSelector:
         cloud = scan.points[voxel_first(scan.points, s.voxel, far=s.range)]
         keyframe_id = 0 if last is None else last.id + 1
         known = scan.descriptors if scan.description is not None and scan.description.made else None
+        if (T_scan_lidar != _SAME).any():
+            T_lidar_scan = se3.inverse(T_scan_lidar)
+            cloud = se3.transform(T_lidar_scan, cloud)
+            known = None if known is None else known.moved(T_lidar_scan)
         keyframe = Keyframe(keyframe_id, frame.stamp, frame.index, T_odom_lidar, cloud, edge, self._robot, known)
         if self._fix is not None:
             fix, T_odom_then = self._fix

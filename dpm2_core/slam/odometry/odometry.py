@@ -20,6 +20,7 @@ from dpm2_core.slam.odometry.keyframe_selection import KeyframeSelector
 from dpm2_core.slam.odometry.other import OtherMotion, Step
 from dpm2_core.slam.odometry.settings import OdometrySettings
 from dpm2_core.slam.odometry.starts import starts_from_rest, turned_starts
+from dpm2_core.slam.odometry.sweep import Sweep
 from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration
 
@@ -52,9 +53,11 @@ class Odometry:
         """Forget everything; the next scan is the first."""
         self._T = np.eye(4)
         self._twist: Array | None = None  # unknown until two scans are registered
+        self._change = np.zeros(6)  # of the twist, from one registered scan to the next
         self._of_velocity = _ANY_VELOCITY
         self._covariance = np.zeros((6, 6))
         self._clock = StreamClock()
+        self._sweep = Sweep()
         self._registered = np.eye(4), 0.0  # the last registered pose, and the seconds since
         self._failures = 0
         self._repeated, self._images = RepeatedCloud(), RepeatedImages()
@@ -79,16 +82,18 @@ class Odometry:
         self.reset()
         self._T, self._twist, self._of_velocity = before._T, before._twist, before._of_velocity
         self._covariance, self._clock, self._registered = before._covariance, before._clock, before._registered
+        self._sweep = before._sweep
         self._breaks, self._broken = before._breaks, before._broken
         self._other, self._inertial, self._repeated = before._other, before._inertial, before._repeated
         self._images = before._images
         self._keyframes.take_over(before._keyframes)
         twist = np.zeros(6) if self._twist is None else self._twist
-        self._registration.update(self._registration.prepare(frame, twist), self._T)
+        self._registration.update(self._registration.prepare(self._sweep.centered(frame), twist), self._T)
 
     def process(self, frame: Frame) -> OdometryResult:
         """Pose of one frame; never raises for what a sensor may deliver, and always gives a finite pose."""
         clock = [perf_counter()]
+        given, frame = frame, self._sweep.centered(frame)
         dt = self._clock.advance(frame.stamp)
         twist = np.zeros(6) if self._twist is None else self._twist
         seconds = self._registered[1] + dt
@@ -123,13 +128,15 @@ class Odometry:
             T = registration.T_target_source
         if self._inertial is not None:
             T = self._inertial.T_level_odom @ T
-        keyframe = self._keyframes.select(frame, scan, T, registration)
+        T_scan_lidar = self._sweep.to_stamp(frame, self._twist)
+        T = T @ T_scan_lidar
+        keyframe = self._keyframes.select(given, scan, T, registration, T_scan_lidar)
         clock.append(perf_counter())
         return OdometryResult(
-            stamp=frame.stamp,
+            stamp=given.stamp,
             index=frame.index,
             T_odom_lidar=T,
-            covariance=self._covariance,
+            covariance=self._covariance + self._sweep.covariance(self._change),
             twist=np.zeros(6) if self._twist is None else self._twist,
             state=self._state(registration),
             registration=registration,
@@ -198,7 +205,7 @@ class Odometry:
         if bridge.tries >= self._settings.restart_after and self._twist is not None:
             self._keyframes.add_uncertainty(self._covariance)
             self._bridge, self._failures, self._breaks = None, 0, self._breaks + 1
-            self._broken = self._clock.stamp or 0
+            self._broken = (self._clock.stamp or 0) - round(self._sweep.middle * 1e9)
             return replace(own, reason=f"broken by a pause: {result.reason}")
         self._failures += 1
         T = result.T_target_source if result.ok else self._T
@@ -288,11 +295,14 @@ class Odometry:
     ) -> tuple[Scan, Registration]:
         """The second scan has shown the velocity, `seconds` later: undo the motion in the first too; register anew."""
         self._first = None
-        twist = se3.log(se3.inverse(self._T) @ registration.T_target_source) / seconds
+        T_first_this = se3.inverse(self._T) @ registration.T_target_source
+        twist = se3.log(T_first_this) / seconds
+        self._T = self._T @ se3.exp(self._sweep.middle * twist)  # the first pose was handed out at its stamp
+        self._registered = self._T, self._registered[1]
         self._registration.clear()
         self._registration.update(self._registration.prepare(first, twist), self._T)
         scan = self._registration.prepare(frame, twist)
-        known = Prediction([registration.T_target_source], information=np.eye(6) / _KNOWN**2)
+        known = Prediction([self._T @ T_first_this], information=np.eye(6) / _KNOWN**2)
         return scan, self._registration.register(scan, known)
 
     def _update(self, scan: Scan, registration: Registration, dt: float) -> None:
@@ -308,7 +318,9 @@ class Odometry:
             self._of_velocity = of_motion / (seconds + dt) ** 2
             # Not from the predicted pose of the frame before, of which an error would count as motion in one period.
             T_step = se3.inverse(T_registered) @ registration.T_target_source
-            self._twist = se3.log(T_step) / (seconds + dt)
+            twist = se3.log(T_step) / (seconds + dt)
+            self._change = np.zeros(6) if self._twist is None else twist - self._twist
+            self._twist = twist
             if self._other is not None:
                 self._other.compare(T_step, registration.of_scene, self._led)
         if self._bridge is None:

@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From the stamp of a cloud to the middle of its sweep, and back.
+
+Scans are registered where the LiDAR was in the middle of its sweep, whatever moment of it the driver stamps, and poses
+are handed out at the stamp. Were the points brought to the stamp itself, each error of the velocity would move the scan
+by half a sweep, and so the next velocity: of clouds stamped at their start such errors never decay.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dpm2_core.frame import Array, Frame
+from dpm2_core.geometry import se3
+from dpm2_core.slam.preprocess import measured_turn
+
+_CENTERED = 0.1  # of a sweep: a stamp so near to its middle counts as the middle
+
+
+class Sweep:
+    """Learns it from the first cloud with times; a cloud of which less was seen does not change it.
+
+    Attributes:
+        middle: s after the stamp.
+    """
+
+    def __init__(self) -> None:
+        self.middle = 0.0
+        self._known = False
+
+    def centered(self, frame: Frame) -> Frame:
+        """The frame, timed from the middle of its sweep."""
+        if not self._known and frame.time_offset is not None and len(frame.time_offset):
+            start, end = float(frame.time_offset.min()), float(frame.time_offset.max())
+            middle = (start + end) / 2
+            self.middle, self._known = middle if abs(middle) > _CENTERED * (end - start) else 0.0, True
+        return frame.later(self.middle)
+
+    def to_stamp(self, frame: Frame, twist: Array | None) -> Array:
+        """T_scan_lidar (4, 4): where the LiDAR was at the stamp, seen from where it was in the middle.
+
+        Args:
+            frame: as `centered` gives it, with its IMU if that is of use. twist: (6,) [rad/s, m/s], None if not known.
+        """
+        if not self.middle or twist is None:
+            return np.eye(4)
+        turn = measured_turn(frame)
+        R = None if turn is None else turn(np.array([-self.middle]))
+        T = se3.exp(-self.middle * twist)
+        return T if R is None else se3.make(R[0], T[:3, 3])
+
+    def covariance(self, change: Array) -> Array:
+        """(6, 6) [rad, m] of that way, where the twist changes by so much (6,) from one scan to the next."""
+        off = self.middle * change
+        return np.diag(np.repeat([np.linalg.norm(off[:3]), np.linalg.norm(off[3:])], 3)) ** 2
