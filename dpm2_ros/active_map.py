@@ -46,7 +46,7 @@ class ActiveMap:
         self.located: LocalizationResult | None = None
         self.file_problem = ""
         self._T_map_odom: dict[str, Array] | None = None  # by robot, while the map grows; None before any keyframe
-        self._store: MapStore | TiledMap | None = self._opened() if ros.localization_mode else self._new_file()
+        self._store: MapStore | TiledMap | None = self._opened() if ros.localization_mode else self._first_file()
         # gtsam holds Python's lock while it works, and the odometry must not wait
         self.slam = make_slam(config.slam, robot, self._store, background=True)
 
@@ -230,6 +230,13 @@ class ActiveMap:
         self._store = self._new_file()
         self.slam.use(*make_map(self._config.slam, self._store, background=True))
         self._T_map_odom = None
+
+    def _first_file(self) -> MapStore | None:
+        """A map file; a warning where that which was asked for exists, as after a crash: it does not go on."""
+        store, name = self._new_file(), self._config.ros.map_file
+        if store is not None and name != AUTO and self._path != (asked := self._maps.of_robot(Path(name))):
+            self._log.warning(f"{asked} is there already and stays as it is: {self._path} begins without its drives")
+        return store
 
     def _new_file(self) -> MapStore | None:
         """A map file, if there is to be one. A file that cannot be made is no reason not to map."""

@@ -40,9 +40,13 @@ class MapFolder:
             raise UsageError("ros.map_name: ros.map_directory is empty")
         return self.folder / f"{name.removesuffix(_SUFFIX)}{_SUFFIX}"
 
+    def of_robot(self, requested: Path) -> Path:
+        """The path of that name and the robot's."""
+        return requested.with_name(self._of_robot(requested.stem) + requested.suffix)
+
     def free(self, requested: Path) -> Iterator[Path]:
         """Paths of that name, the robot's and a number that do not exist yet, nor a folder for their clouds."""
-        for path in _numbered(requested.with_name(self._of_robot(requested.stem) + requested.suffix)):
+        for path in _numbered(self.of_robot(requested)):
             if not path.exists() and (self.folder is None or not (self.folder / path.stem).exists()):
                 yield path
 

@@ -71,6 +71,24 @@ def test_nothing_is_overwritten(tmp_path: Path) -> None:
         before = after
 
 
+def test_a_map_that_was_asked_for_by_name_and_does_not_go_on_is_named(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As after a crash of mapper_node; a drive without a name of its own begins a new map, and so does a reset."""
+    caplog.set_level(logging.WARNING)
+    town = tmp_path / "town.dpm2map"
+    for file in ("auto", "auto", str(town)):
+        drive(tmp_path, map_file=file)
+    assert caplog.text == ""
+    active = ActiveMap(config(map_directory=str(tmp_path), map_file=str(town)), "", LOG)
+    assert f"{town} is there already and stays as it is: {tmp_path / 'town-2.dpm2map'} begins" in caplog.text
+    caplog.clear()
+    active.add(keyframes(1)[0])
+    active.reset()
+    active.close()
+    assert caplog.text == ""
+
+
 def test_a_folder_without_its_map_file_keeps_its_name(tmp_path: Path) -> None:
     """As `ros.map_file:=''` leaves one, or dpm2 0.1."""
     drive(tmp_path, map_file="")
