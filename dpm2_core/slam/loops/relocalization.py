@@ -45,9 +45,8 @@ class RelocalizationSettings(Settings):
     """Finding oneself in a map."""
 
     candidates: int = Field(6, ge=1)
-    """So many keyframes that look like the scan are registered by the network..."""
-    verified: int = Field(3, ge=1)
-    """...and so many of the resulting places are verified by the points, the most confident first."""
+    """So many keyframes that look like the scan are registered by the network, and all resulting places verified by the
+    points: the best must be clearly better than the others."""
     pictured: int = Field(150, ge=0)
     """Where they do not say how far along a road one is: so many keyframes, no two of them next to each other, are
     compared by their pictures."""
@@ -171,10 +170,8 @@ class Relocalizer:
 
     def _by_points(self, cloud: Points, descriptors: Descriptors, allowed: NDArray[np.bool_]) -> list[Registration]:
         """The places that the descriptors propose among `allowed` (N,) keyframes, `ok` if the points confirm them."""
-        s = self._settings
-        nodes = self._places.similar(descriptors, allowed, s.candidates)
-        proposals = self._proposals(descriptors, nodes)[: s.verified]
-        return [self._verified(cloud, proposal.T_target_source) for proposal in proposals]
+        nodes = self._places.similar(descriptors, allowed, self._settings.candidates)
+        return [self._verified(cloud, proposal.T_target_source) for proposal in self._proposals(descriptors, nodes)]
 
     def _across(self, places: Sequence[Registration]) -> Array:
         """Where across the road, seen from a keyframe beside it that looks the same way, and with which heading."""
