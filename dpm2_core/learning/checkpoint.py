@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import math
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -59,9 +60,15 @@ def load_checkpoint(path: Path, module: nn.Module, ema: nn.Module, optimiser: to
 class Log:
     """One JSON object a line, and TensorBoard where its package is installed."""
 
-    def __init__(self, folder: Path, append: bool) -> None:
+    def __init__(self, folder: Path, start: int = 0) -> None:
+        """Goes on where a run that was stopped left off, before step `start`; what it had logged after that is done
+        again."""
         make_folder(folder)
-        self.file = (folder / "log.jsonl").open("a" if append else "w", buffering=1)
+        path = folder / "log.jsonl"
+        kept = _lines_before(path, start)
+        with atomic_write(path) as file:
+            file.writelines(kept)
+        self.file = path.open("a", buffering=1)
         try:
             from torch.utils.tensorboard import SummaryWriter
 
@@ -82,3 +89,15 @@ class Log:
         self.file.close()
         if self.board is not None:
             self.board.close()
+
+
+def _lines_before(path: Path, start: int) -> list[str]:
+    """Of a log, those of steps before `start`; a last line that was cut off is none."""
+    if not start or not path.exists():
+        return []
+    kept = []
+    for line in path.read_text(encoding="utf-8").splitlines():
+        with suppress(ValueError, KeyError, TypeError):
+            if json.loads(line)["step"] < start:
+                kept.append(f"{line}\n")
+    return kept

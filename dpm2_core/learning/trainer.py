@@ -169,7 +169,7 @@ class Trainer:
             wrapped = DistributedDataParallel(module, find_unused_parameters=True) if world > 1 else module
             if self.settings.compile:
                 wrapped.compile(dynamic=False)
-            log = Log(self.out, append=resume) if rank == 0 else None
+            log = Log(self.out, start) if rank == 0 else None
             columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
             with Progress(*columns, disable=rank != 0) as progress:
                 task = progress.add_task("training", total=self.settings.steps, completed=start)

@@ -261,11 +261,26 @@ def test_tensorboard_has_the_figures_of_the_log(settings: RegistrationTrainingSe
 def test_without_tensorboard_the_log_alone_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its package is an optional one."""
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)  # what a missing package looks like to import
-    log = Log(tmp_path, append=False)
+    log = Log(tmp_path)
     log.write(7, {"loss": 0.5})
     log.close()
     assert json.loads((tmp_path / "log.jsonl").read_text()) == {"step": 7, "loss": 0.5}
     assert not (tmp_path / "tensorboard").exists()
+
+
+def test_a_log_that_goes_on_has_each_step_once(tmp_path: Path) -> None:
+    """Steps since the last checkpoint are done again after a kill; they stood there twice."""
+    log = Log(tmp_path)
+    for step in range(4):
+        log.write(step, {"loss": 0.5})
+    log.close()
+    with (tmp_path / "log.jsonl").open("a") as file:
+        file.write('{"step": 4, "lo')
+    log = Log(tmp_path, start=2)
+    log.write(2, {"loss": 0.25})
+    log.close()
+    lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert [(line["step"], line["loss"]) for line in lines] == [(0, 0.5), (1, 0.5), (2, 0.25)]
 
 
 def test_overlap_keeps_what_the_weights_say_of_registration(
