@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Points of a scan that was taken while moving, as if all had been taken at its stamp."""
+"""What was measured while moving, as if at the stamp: points of a scan, and the camera of an image."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dpm2_core.frame import Image
 from dpm2_core.geometry import se3
 
 _DESKEW_STEPS = 64  # poses along a sweep: at 1 rad/s and 0.1 s the remaining error is 1 mm at 1 m, 8 cm at 100 m
@@ -37,6 +39,15 @@ def deskew(
     out = points.copy()
     out[:, :3] = np.einsum("nij,nj->ni", T[step, :3, :3], points[:, :3]) + T[step, :3, 3]
     return out
+
+
+def placed(image: Image, seconds: float, twist: NDArray[np.float64]) -> Image:
+    """The image, with its camera where that was so many seconds later, in the LiDAR frame of before.
+
+    `twist` (6,) [rad/s, m/s] is the motion of the LiDAR.
+    """
+    T_lidar_cam = se3.exp(seconds * twist) @ image.camera.T_lidar_cam
+    return replace(image, camera=replace(image.camera, T_lidar_cam=T_lidar_cam))
 
 
 def _along(times: se3.Array, R: se3.Array, velocity: se3.Array) -> se3.Array:

@@ -13,6 +13,7 @@ from time import perf_counter
 
 from dpm2_core.data.thumbnail import PLACE_WIDTH, thumbnail
 from dpm2_core.frame import Array, Edge, Frame, Keyframe, OdometryResult, State
+from dpm2_core.geometry.deskew import placed
 from dpm2_core.slam.loops.localizer import LocalizationResult, Localizer
 from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.odometry.odometry import Odometry
@@ -121,7 +122,9 @@ class Slam:
         width = max(self._thumbnail_width, PLACE_WIDTH if self._asks_pictures(result) else 0)
         if not frame.images or not width or result.camera:
             return result
-        return replace(result, keyframe=replace(result.keyframe, thumbnail=thumbnail(frame.images[0], width)))
+        image = frame.images[0]
+        picture = thumbnail(placed(image, image.time_offset, result.twist), width)
+        return replace(result, keyframe=replace(result.keyframe, thumbnail=picture))
 
     def _asks_pictures(self, result: OdometryResult) -> bool:
         """Whether the place of a keyframe is looked for by its picture, now or later: its points leave it open."""

@@ -13,6 +13,7 @@ import numpy as np
 
 from dpm2_core.frame import Array, Frame, Image, Registration
 from dpm2_core.geometry import se3
+from dpm2_core.geometry.deskew import placed
 from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration
 from dpm2_core.slam.registration.texture import Reference, VisualSettings, along, reference, textured
@@ -84,7 +85,8 @@ class VisualScanRegistration:
         if self._reference is None:
             axis = T_odom_ref[:3, :3].T @ result.T_target_source[:3, :3] @ result.open_direction
             self._reference = reference(scan.points, textured(scan.images[0], s.width), s.points, axis)
+        # Only the difference: the twist itself follows from images, and a camera moved by its whole offset at it leads
+        # the odometry astray from half a period on. What is left is the offset times the change of speed.
         late = image.time_offset - scan.images[0].time_offset
-        camera = replace(image.camera, T_lidar_cam=se3.exp(late * twist) @ image.camera.T_lidar_cam)
-        image_now = replace(textured(replace(image, camera=camera), s.width), sigma=of_speed * abs(late))
+        image_now = replace(textured(placed(image, late, twist), s.width), sigma=of_speed * abs(late))
         return along(s, result, self._reference, image_now, se3.inverse(T_odom_ref), reach)

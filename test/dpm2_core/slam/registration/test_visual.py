@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from dpm2_core.data.open import open_source
+from dpm2_core.data.thumbnail import usable_image
 from dpm2_core.frame import Frame, Registration, State
 from dpm2_core.geometry import se3
 from dpm2_core.slam.build import make_odometry, make_registration, make_slam
@@ -135,6 +136,29 @@ def test_a_camera_of_another_rate_than_the_scans() -> None:
     assert (off < 3 * np.hypot(sigma[:-1], sigma[1:])).all()
     assert off[2:].max() < 0.1  # when the motion is known
     assert [t.state for t in tracked[4:]] == [State.TRACKING] * 6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("late", [0.1, -0.1])
+def test_a_picture_of_another_time_than_its_keyframe(late: float) -> None:
+    """Its camera is placed where that was then: places were found by it that were off by the speed times that time."""
+    paint, slam = random_paint(3), make_slam()
+
+    def place(i: float) -> float:
+        return 0.03 * max(0.0, i - 3) ** 2  # at rest, then 6 m/s^2
+
+    for i in range(14):
+        image = replace(seen(place(i + 10 * late), paint, CAMERA), time_offset=late)
+        slam.odometry.request_keyframe()
+        result = slam.odometry_step(replace(frame(place(i), paint, i), images=(image,)))
+    assert result.keyframe is not None
+    picture = usable_image(result.keyframe.thumbnail)
+    assert picture is not None
+    ahead = place(13 + 10 * late) - place(13)
+    # The speed is that of the way of this image from the one before, 0.9 m/s off at most.
+    np.testing.assert_allclose(picture.camera.T_lidar_cam[:3, 3], [ahead, 0, 0], atol=0.1)
+    # The odometry is that of the camera, off by as much; by a speed that follows from its images it would go astray.
+    assert result.T_odom_lidar[0, 3] == pytest.approx(place(13) + ahead, abs=0.1)
 
 
 @pytest.mark.slow
