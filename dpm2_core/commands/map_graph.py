@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +13,8 @@ import numpy as np
 import typer
 
 from dpm2_core.commands.options import JsonFile, show
-from dpm2_core.errors import Dpm2Error
+from dpm2_core.console import Console
+from dpm2_core.errors import Dpm2Error, printable
 from dpm2_core.tables import FigureTable
 
 
@@ -25,29 +27,37 @@ def optimize(
 
     --json has the result for each loop, and why.
     """
+    from dpm2_core.slam.graph.calibrated import optimize_calibrated, scaled
     from dpm2_core.slam.graph.g2o import read_g2o, require_connected, write_g2o
-    from dpm2_core.slam.graph.graph_data import total_chi2
-    from dpm2_core.slam.graph.robust import RobustSettings, least_squares, optimize
+    from dpm2_core.slam.graph.graph_data import total_chi2, trajectories
+    from dpm2_core.slam.graph.robust import least_squares
 
     file = read_g2o(graph)
     require_connected(graph, file)
-    data = file.graph
+    data, dof = file.graph, 3 if file.planar else 6
     began = time.perf_counter()
     try:
-        solution = optimize(data, RobustSettings())
-        poses = least_squares(replace(data, poses=solution.poses), solution.kept)
+        with Console(stderr=True).status("") as status:
+            result = optimize_calibrated(data, dof, status.update)
+            solution, scale = result.solution, result.scale
+            status.update("least squares")
+            poses = least_squares(scaled(replace(data, poses=solution.poses), scale), solution.kept)
     except Dpm2Error as error:
         raise Dpm2Error(f"{graph}: {error}") from None
     seconds = time.perf_counter() - began
     optimized = replace(file, graph=replace(data, poses=poses))
+    chi2_after = total_chi2(data, poses, solution.kept)
     figures: dict[str, Any] = {
         "vertices": len(data),
+        "trajectories": int(trajectories(data)[-1]) + 1,
         "edges": int(data.chained.sum()) + len(data.ends),
         "loops": len(data.ends),
         "kept": int(solution.kept.sum()),
         "rejected": int((~solution.kept).sum()),
         "chi2_before": total_chi2(data, data.poses),
-        "chi2_after": total_chi2(data, poses, solution.kept),
+        "chi2_after": chi2_after,
+        "chi2_per_dof": chi2_after / (dof * int(solution.kept.sum())) if solution.kept.any() else None,
+        "covariance_scale": scale,
         "seconds": seconds,
     }
     write_g2o(out, optimized, solution.kept)
@@ -55,11 +65,44 @@ def optimize(
         {"from": int(a), "to": int(b), "kept": bool(kept), "reason": solution.reason(loop)}
         for loop, ((a, b), kept) in enumerate(zip(file.ids[data.ends], solution.kept, strict=True))
     ]
-    record = {**figures, "settled": solution.settled, "ignored": file.ignored, "verdicts": verdicts}
-    show(_table(graph, figures, file.ignored, solution.settled), record, json_file)
+    warnings = _warnings(figures, solution.settled, result.undecided)
+    record = {
+        **figures,
+        "settled": solution.settled,
+        "ignored": file.ignored,
+        "warnings": warnings,
+        "verdicts": verdicts,
+    }
+    show(_table(graph, figures, file.ignored), record, json_file)
+    for warning in warnings:
+        print(printable(f"{graph}: {warning}"), file=sys.stderr)  # with --quiet too
 
 
-def _table(graph: Path, figures: dict[str, Any], ignored: dict[str, int], settled: bool) -> FigureTable:
+def _warnings(figures: dict[str, Any], settled: bool, undecided: bool) -> list[str]:
+    """Why the result may be wrong, in sentences."""
+    scale, fit, out = figures["covariance_scale"], figures["chi2_per_dof"], []
+    if not settled:
+        out.append("the results had not come to rest; these are the last ones")
+    if figures["trajectories"] > 0.1 * figures["vertices"]:
+        out.append(f"{figures['trajectories']} trajectories: most vertices are not tied to the one before by an edge")
+    if figures["kept"] < 0.5 * figures["loops"]:
+        out.append(f"only {figures['kept']} of {figures['loops']} loops agree; the rest was left out")
+    if undecided:
+        out.append(
+            "the odometry is too loose to tell a wrong loop from a right one, and the loops do not check each other:"
+            " wrong ones may have been kept"
+        )
+    if fit is not None and fit > 2 * scale:  # about 0.5 where the loops kept fit
+        out.append(
+            f"what was kept does not fit: chi2 is {fit / scale:.3g} per degree of freedom; wrong loops among it?"
+        )
+    if not 0.1 < scale < 10:
+        size = f"{1 / scale:.3g} times too large" if scale < 1 else f"{scale:.3g} times too small"
+        out.append(f"the covariances are {size} for what agrees; loops were judged by what fits")
+    return out
+
+
+def _table(graph: Path, figures: dict[str, Any], ignored: dict[str, int]) -> FigureTable:
     table = FigureTable(str(graph), names=["what"], text=["value"], header=False)
     for name, value in figures.items():
         note = {"chi2_before": ", with every loop", "chi2_after": ", with the loops kept"}.get(name, "")
@@ -67,6 +110,4 @@ def _table(graph: Path, figures: dict[str, Any], ignored: dict[str, int], settle
         table.add_row(name.replace("_", " "), text + note)
     for tag, count in ignored.items():
         table.add_row("ignored", f"{count} lines {tag}")
-    if not settled:
-        table.add_row("note", "the results had not come to rest; these are the last ones")
     return table

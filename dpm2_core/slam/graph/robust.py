@@ -93,15 +93,19 @@ def _solvable() -> Iterator[None]:
 
 
 @_solvable()
-def optimize(graph: GraphData, settings: RobustSettings) -> Solution:
+def optimize(graph: GraphData, settings: RobustSettings, used: NDArray[np.bool_] | None = None) -> Solution:
     """Optimize and check the loops; deterministic.
+
+    Args:
+        used: (E,) loops to begin with; without it those that the odometry does not contradict.
 
     Raises:
         Dpm2Error: the system is singular.
     """
     odometry = integrate(graph)
     apart = np.sqrt(chain_chi2(graph, odometry))
-    used = ~(apart > settings.odometry_sigmas)
+    if used is None:
+        used = ~(apart > settings.odometry_sigmas)
     start = _aligned(graph, graph.poses, used, settings.loop_kernel)
     condensed = CondensedOdometry(graph, odometry, np.concatenate([graph.ends.ravel(), graph.fixed]))
     ends = np.searchsorted(condensed.nodes, graph.ends)

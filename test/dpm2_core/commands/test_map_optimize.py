@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.pose_graph import are_right, made_drive
+from dpm2_core.slam.graph.calibrated import scaled
 from dpm2_core.slam.graph.g2o import G2o, read_g2o, write_g2o
 
 from ...helpers.command import dpm2
@@ -28,6 +29,32 @@ def test_wrong_loops_are_named_and_left_out(tmp_path: Path) -> None:
     assert (record["kept"], record["rejected"]) == (20, 10)
     assert [check["kept"] for check in record["verdicts"]] == right.tolist()
     assert record["chi2_after"] < 1e-2 * record["chi2_before"]
+
+
+def test_covariances_that_do_not_fit_are_said(tmp_path: Path) -> None:
+    """Information of identity, as many programs write: all 13 wrong loops of a graph were kept and the map was bent,
+    without a word."""
+    _, graph = made_drive(15, count=1500, right=20)
+    path, out, info = tmp_path / "in.g2o", tmp_path / "out.g2o", tmp_path / "out.json"
+    write_g2o(path, G2o(scaled(graph, 1e4), np.arange(1500), planar=False))
+    done = dpm2("map", "optimize", "-q", path, "--out", out, "--json", info)
+    record = json.loads(info.read_text())
+    assert (record["kept"], record["rejected"], record["trajectories"]) == (20, 15, 1)
+    assert [warning for warning in record["warnings"] if "times too large" in warning] == record["warnings"]
+    assert done.stderr.count("\n") == 1
+    assert "in.g2o: the covariances are" in done.stderr
+    assert 0.2e-4 < record["chi2_per_dof"] < 5e-4
+    write_g2o(path, G2o(graph, np.arange(1500), planar=False))
+    done = dpm2("map", "optimize", path, "--out", out, "--json", "-")
+    assert (json.loads(done.stdout)["warnings"], done.stderr) == ([], "")
+
+
+def test_what_is_no_drive_is_said(tmp_path: Path) -> None:
+    path = tmp_path / "star.g2o"
+    path.write_text("".join(f"EDGE_SE2 0 {k} 1 0 0 1 0 0 1 0 1\n" for k in range(1, 12)))
+    done = dpm2("map", "optimize", path, "--out", tmp_path / "out.g2o")
+    assert done.returncode == 0
+    assert "11 trajectories: most vertices are not tied" in done.stderr
 
 
 def test_bad_input_is_one_line_and_leaves_no_file(tmp_path: Path) -> None:

@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Robust least squares on a graph whose covariances may be wrong by a common factor, as those of many g2o files are.
+
+How far loops are from the odometry between their ends says how large the covariances ought to be, before anything is
+solved: right loops are the near ones, so a low quantile tells also where most are wrong. Loops that are far off by that
+measure start out set aside; chi2 per degree of freedom of what agrees then refines the factor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from dpm2_core.slam.graph.graph_data import GraphData, chain_chi2, integrate, loop_errors, mahalanobis, total_chi2
+from dpm2_core.slam.graph.robust import RobustSettings, Solution, optimize
+
+_SETTINGS = RobustSettings(odometry_sigmas=5.0)  # tighter than where the covariances are only believed
+_QUANTILE, _AMONG_RIGHT = 0.2, 0.3  # of all loops, and which one of the right ones it is where a third is wrong
+_LEAST = 8  # loops; fewer do not say how large the covariances are
+_APART = 10  # nodes; nearer ones often repeat the odometry
+_ROOM = 2.0  # chi2 per degree of freedom is of what passed, without the tail of its distribution
+_AGAIN = 0.05  # of the loops kept, so many of those set aside are tried again: few, since each may slow the solver
+_STAGES = 6
+_TOO_FIRM = 4.0  # a larger factor says that the covariances are too small, unless most loops are wrong
+_SHARE = 0.35  # of chi2 in the loops; about half where they check each other
+
+
+@dataclass(frozen=True, eq=False)
+class Calibrated:
+    """The outcome.
+
+    Attributes:
+        solution: its sigmas are those of the covariances times `scale`.
+        scale: factor on all covariances that the loops were judged by; 1 where too few loops tell.
+        undecided: the odometry is too loose to tell a wrong loop from a right one, and the loops are too few to check
+            each other.
+    """
+
+    solution: Solution
+    scale: float
+    undecided: bool
+
+
+def scaled(graph: GraphData, factor: float) -> GraphData:
+    """With all covariances times a factor; the least-squares optimum is the same."""
+    return replace(graph, covariances=graph.covariances * factor, step_covariances=graph.step_covariances * factor)
+
+
+def chi2_per_dof(graph: GraphData, solution: Solution, dof: int) -> float:
+    """chi2 over what was kept, per degree of freedom (`dof` of each loop kept); nan without a loop."""
+    count = int(solution.kept.sum())
+    return total_chi2(graph, solution.poses, solution.kept) / (dof * count) if count else float("nan")
+
+
+def optimize_calibrated(graph: GraphData, dof: int, report: Callable[[str], None] = lambda _: None) -> Calibrated:
+    """Optimize and check the loops by covariances that fit them; deterministic.
+
+    Args:
+        dof: degrees of freedom of an edge: 3 of SE2, 6 of SE3.
+        report: is told of each stage.
+
+    Raises:
+        Dpm2Error: the system is singular.
+    """
+    first = chain_scale(graph, dof)
+    if first is None:
+        return Calibrated(optimize(graph, RobustSettings()), 1.0, False)
+    loose = _others_pass(graph, first)
+    if loose and first > _TOO_FIRM:  # by covariances so large any loop passes: perhaps there are only wrong ones
+        return Calibrated(optimize(graph, RobustSettings()), 1.0, False)
+    solution, scale = _stages(graph, dof, first, report)
+    return Calibrated(solution, scale, loose and _loop_share(graph, solution) < _SHARE)
+
+
+def _stages(graph: GraphData, dof: int, first: float, report: Callable[[str], None]) -> tuple[Solution, float]:
+    scale, poses, used = first, graph.poses, None
+    most = np.inf if first > _TOO_FIRM else max(first, 1.0)  # where wrong loops were kept, they would let in others
+    for stage in range(_STAGES):
+        report(f"stage {stage + 1}: covariances times {scale:.3g}")
+        solution = optimize(scaled(replace(graph, poses=poses), scale), _SETTINGS, used)
+        fitting = min(most, _ROOM * chi2_per_dof(graph, solution, dof))
+        if not fitting > 0 or (stage and 0.5 < fitting / scale < 1.25) or stage == _STAGES - 1:
+            break
+        near = min(len(solution.sigmas) - 1, int((1 + _AGAIN) * solution.kept.sum()))
+        scale, poses, used = fitting, solution.poses, solution.sigmas <= np.sort(solution.sigmas)[near]
+    return solution, scale
+
+
+def chain_scale(graph: GraphData, dof: int) -> float | None:
+    """Factor on all covariances by which the right loops agree with the odometry; None where too few loops tell."""
+    far = np.abs(graph.ends[:, 1] - graph.ends[:, 0]) > _APART
+    apart = chain_chi2(graph, integrate(graph))[far]
+    apart = apart[np.isfinite(apart)]
+    if len(apart) < _LEAST:
+        return None
+    factor = float(np.quantile(apart, _QUANTILE) / chi2.ppf(_AMONG_RIGHT, dof))
+    return factor if factor > 0 else None  # without noise there is nothing to fit
+
+
+def _others_pass(graph: GraphData, factor: float) -> bool:
+    """Whether the odometry would mostly let loops pass that lie between other places than their own."""
+    ends = np.stack([graph.ends[:, 0], np.roll(graph.ends[:, 1], len(graph.ends) // 2)], -1)
+    other = scaled(replace(graph, ends=ends), factor)
+    return bool((np.sqrt(chain_chi2(other, integrate(other))) < _SETTINGS.odometry_sigmas).mean() > 0.5)
+
+
+def _loop_share(graph: GraphData, solution: Solution) -> float:
+    """How much of chi2 is in the loops: where each can have its way, nearly all of it is in the odometry."""
+    kept = solution.kept
+    errors = loop_errors(solution.poses, graph.ends[kept], graph.T_from_to[kept])
+    total = total_chi2(graph, solution.poses, kept)
+    return float(mahalanobis(errors, graph.covariances[kept]).sum() / total) if total else 0.0
