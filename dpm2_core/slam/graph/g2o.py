@@ -26,6 +26,7 @@ from dpm2_core.slam.graph.graph_data import GraphData, components, integrate
 
 _VERTEX = {"VERTEX_SE2": 4, "VERTEX_SE3:QUAT": 8}  # numbers on a line
 _EDGE = {"EDGE_SE2": 11, "EDGE_SE3:QUAT": 30}
+_MOST_STARTS = 0.1  # of the nodes: in an order that breaks more often, neighbors are tied by chance, perhaps by a loop
 _TANGENT = {True: np.array([3, 4, 2]), False: np.array([3, 4, 5, 0, 1, 2])}  # of the file's order, by planar
 
 
@@ -34,8 +35,9 @@ class G2o:
     """A pose graph with what the file says beyond it.
 
     Attributes:
-        graph: nodes in ascending order of their ids; each that an edge ties to the one before it continues a
-            trajectory, all other edges are loops. Without VERTEX lines the poses are those of the odometry.
+        graph: nodes in ascending order of their ids, or as the file names them where ids do not follow the drive; each
+            that an edge ties to the one before it continues a trajectory, all other edges are loops. Without VERTEX
+            lines the poses are those of the odometry.
         ids: (N,) of the file.
         planar: the file is of SE2 lines: z, roll and pitch are zero and their variances arbitrary.
         ignored: count of the lines of each tag that is not understood.
@@ -77,11 +79,16 @@ def read_g2o(path: Path) -> G2o:
             raise UsageError(f"{path}:{line}: edge of vertex {missing[0]}, which has no VERTEX line")
         ids, poses = own[order], _poses(path, vertices, given, planar)[order]
     ends = np.searchsorted(ids, named)
+    as_named = np.searchsorted(ids, own) if vertices.numbers else np.argsort(np.unique(ends, return_index=True)[1])
     if len(same := np.flatnonzero(ends[:, 0] == ends[:, 1])):
         raise UsageError(f"{path}:{edges.at[same[0]]}: edge from vertex {named[same[0], 0]} to itself")
     if unknown := sorted(set(fixed_ids) - set(ids.tolist())):
         raise UsageError(f"{path}: FIX {unknown[0]}: no such vertex")
     fixed = np.searchsorted(ids, np.array(sorted(set(fixed_ids)), np.int64))
+    if _starts(as_named, ends) < min(_starts(np.arange(len(ids)), ends), len(ids) * _MOST_STARTS):
+        place = np.argsort(as_named)
+        ids, ends, fixed = ids[as_named], place[ends], np.sort(place[fixed])
+        poses = None if poses is None else poses[as_named]
     graph = _graph(poses if poses is not None else np.tile(np.eye(4), (len(ids), 1, 1)), ends, T, covariances, fixed)
     if poses is None:
         graph = replace(graph, poses=integrate(graph))
@@ -209,6 +216,13 @@ def _covariances(path: Path, lines: _Lines, upper: Array, planar: bool) -> Array
         out[:, 0, 0] = out[:, 1, 1] = out[:, 2, 2]
         out[:, 5, 5] = (out[:, 3, 3] + out[:, 4, 4]) / 2
     return out
+
+
+def _starts(order: NDArray[np.intp], ends: NDArray[np.intp]) -> int:
+    """How many trajectories there are where nodes come in this order."""
+    place = np.argsort(order)
+    pairs = np.sort(place[ends], axis=1)
+    return len(order) - len(np.unique(pairs[pairs[:, 1] - pairs[:, 0] == 1, 1]))
 
 
 def _graph(poses: Array, ends: NDArray[np.intp], T: Array, covariances: Array, fixed: NDArray[np.intp]) -> GraphData:

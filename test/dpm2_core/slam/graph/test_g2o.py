@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -54,6 +55,30 @@ def test_an_edge_backwards_along_the_chain_is_odometry(tmp_path: Path) -> None:
     np.testing.assert_allclose(result.poses[:, 0, 3], [0, 2, 4])
     # 1 rad of error at the far end of 2 m shows as 2 m sideways, seen from this one.
     np.testing.assert_allclose(result.step_covariances[1][4, 4], 1 + 2**2)
+
+
+@pytest.mark.parametrize("vertices", [True, False])
+def test_ids_that_do_not_follow_the_drive(tmp_path: Path, vertices: bool) -> None:
+    """Each node was a trajectory of its own and the odometry a heap of loops, right ones of which were rejected."""
+    ids = np.random.default_rng(0).permutation(30).tolist()
+    lines = [f"VERTEX_SE2 {id} {k} 0 0" for k, id in enumerate(ids)] if vertices else []
+    lines += [f"EDGE_SE2 {a} {b} 1 0 0 {I3}" for a, b in pairwise(ids)]
+    lines += [f"EDGE_SE2 {ids[3]} {ids[20]} 17 0 0 {I3}", f"FIX {ids[5]} {ids[2]}"]
+    result = read_g2o(file(tmp_path, *lines))
+    assert result.ids.tolist() == ids
+    assert result.graph.chained.tolist() == [False] + [True] * 29
+    np.testing.assert_array_equal(result.graph.ends, [[3, 20]])
+    np.testing.assert_array_equal(result.graph.fixed, [2, 5])
+    np.testing.assert_allclose(result.graph.poses[:, 0, 3], np.arange(30), atol=1e-12)
+
+
+def test_edges_in_no_order_are_not_taken_for_a_drive(tmp_path: Path) -> None:
+    """Their ends follow each other in the file, also those of a loop, which would then count as odometry."""
+    edges = [(a, a + 1) for a in range(0, 40, 2)] + [(a, (a + 20) % 40) for a in range(20)]
+    rows = [edges[k] for k in np.random.default_rng(0).permutation(len(edges))]
+    result = read_g2o(file(tmp_path, *(f"EDGE_SE2 {a} {b} 1 0 0 {I3}" for a, b in rows)))
+    assert result.ids.tolist() == list(range(40))
+    assert result.graph.chained.sum() == 20
 
 
 @pytest.mark.parametrize(
