@@ -130,21 +130,14 @@ class LoopCloser:
                 failed.append(loop)
                 continue
             if self._consistency.is_first(loop, self._settings.consistency):
-                unseen = [p for p in proposals[number + 1 :] if self._elsewhere(p, loop)][:most]
-                others = [f for f in failed if self._elsewhere(f, loop)]
+                others = [f for f in failed if _is_elsewhere(f, loop, poses)]
+                unseen = [p for p in proposals[number + 1 :] if _is_elsewhere(p, loop, poses)]
                 others += [self._verified(p, keyframes, clouds, poses) for p in unseen]
                 if objection := objection_of_others(loop.registration, [o.registration for o in others]):
                     return [*tried, *failed, loop.rejected(objection)]
             T_expected = se3.inverse(poses[loop.from_node]) @ poses[node]
             return tried + failed + self._consistency.check(loop, T_expected, self._settings.consistency)
         return tried + failed + [proposal.rejected("others are more likely") for proposal in proposals[most:]]
-
-    def _elsewhere(self, one: Edge, other: Edge) -> bool:
-        """Whether the new keyframe is at another place by one loop than by the other, if that is known."""
-        if not np.isfinite(self._path.between(one.from_node, other.from_node)):
-            return False
-        T_from_to = self._path.T(other.from_node, one.from_node) @ one.T_from_to
-        return se3.magnitude(se3.inverse(other.T_from_to) @ T_from_to)[0] > SAME_PLACE
 
     def _proposals(
         self, node: int, since: Array, keyframes: Sequence[Keyframe], poses: Array
@@ -228,3 +221,12 @@ class LoopCloser:
         """The candidate and those nearer to it than `reach` m along the path, without what the new one just passed."""
         near = (self._path.since(candidate) <= reach) & (self._path.since(node) > self._settings.gap / 2)
         return np.flatnonzero(near).tolist()
+
+
+def _is_elsewhere(one: Edge, other: Edge, poses: Array) -> bool:
+    """Whether the new keyframe is at another place of the map (N, 4, 4) by one loop than by the other.
+
+    What nothing ties to the map yet counts as elsewhere: a place there that fits as well leaves both in doubt.
+    """
+    T_map_one, T_map_other = (poses[loop.from_node] @ loop.T_from_to for loop in (one, other))
+    return se3.magnitude(se3.inverse(T_map_other) @ T_map_one)[0] > SAME_PLACE
