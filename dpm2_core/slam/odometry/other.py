@@ -48,6 +48,7 @@ class OtherMotion:
         self.step: Step | None = None
         self.comparison: Comparison | None = None
         self._raw: Array | None = None  # the step, possible or not
+        self._hangs = False  # it repeats a pose that no vehicle can have stopped at
         self._now: Guess | None = None
         self._last: Guess | None = None  # that of the last registered frame
         self._doubt = 1.0  # squared sigmas by which it has been off of late
@@ -67,9 +68,11 @@ class OtherMotion:
         covariance = _spread(T) + grown
         if twist is not None:
             off = se3.log(se3.inverse(predicted(np.eye(4), twist, seconds)) @ T)
-            impossible = off @ np.linalg.solve(covariance + of_prediction, off) > _POSSIBLE
+            impossible = bool(off @ np.linalg.solve(covariance + of_prediction, off) > _POSSIBLE)
+            same = np.array_equal(self._last.T_other_lidar, guess.T_other_lidar)
+            self._hangs = same and (self._hangs or impossible)
             unsure = np.trace(grown[3:, 3:]) > np.trace(of_prediction[3:, 3:])  # by its own account
-            if impossible or unsure or self._doubt > _CREDIBLE:
+            if impossible or self._hangs or unsure or self._doubt > _CREDIBLE:
                 return
         self.step = Step(T, covariance)
 

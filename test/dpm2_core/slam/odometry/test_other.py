@@ -13,6 +13,7 @@ from dpm2_core.frame import Array, Frame, Guess, Inertial, OdometryResult, State
 from dpm2_core.geometry import se3
 from dpm2_core.sim.simulated_drive import wheel_odometry
 from dpm2_core.slam.build import make_odometry
+from dpm2_core.slam.odometry.other import OtherMotion
 from dpm2_core.slam.settings import SlamSettings
 
 from ....helpers.drives import Drive
@@ -46,6 +47,18 @@ def test_in_a_tunnel_it_tells_the_way(tunnel_drive: Drive) -> None:
     assert off(led, truth)[-1] < 0.03 * way
     assert off(led, truth)[-1] < 0.5 * off(alone, truth)[-1]
     assert all(t.comparison is not None and t.comparison.used for t in led[2:])
+
+
+def test_one_that_repeats_its_last_pose_is_no_halt() -> None:
+    """As of a driver that goes on sending: where all is open the speed is soon unknown, and the halt was believed."""
+    other, twist = OtherMotion(), np.array([0, 0, 0, 8.0, 0, 0])
+    sent, sigmas = [0.0, 0.8, 0.8, 0.8, 1.6], [0.1, 0.1, 0.1, 1.0, 1.0]  # m; of the way by the motion before
+    led = []
+    for x, sigma in zip(sent, sigmas, strict=True):
+        other.look(Guess(se3.make(np.eye(3), [x, 0, 0])), twist, 0.1, sigma**2 * np.eye(6))
+        led.append(other.step is not None)
+        other.keep()
+    assert led == [False, True, False, False, True]
 
 
 @pytest.mark.parametrize("jump", [0.5, 1000.0])
