@@ -3,9 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
 
 import numpy as np
 from numba import float32, float64, int64, types
@@ -16,8 +14,7 @@ from dpm2_core.config import Settings
 from dpm2_core.descriptors import Descriptors, LazyDescriptors
 from dpm2_core.frame import Array, Frame, Image, Points
 from dpm2_core.geometry.compiled import READ_F4, compiled
-from dpm2_core.geometry.deskew import deskew
-from dpm2_core.geometry.turning import turned
+from dpm2_core.geometry.deskew import deskew, measured_turn
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.slam.filters import PointFilter
 
@@ -111,9 +108,3 @@ def _in_range(points: Points, least: float, most: float) -> tuple[Points, NDArra
         index[count] = i
         count += squared >= least and squared <= most and squared > 0  # False for NaN
     return used[:count], index[:count]
-
-
-def measured_turn(frame: Frame) -> Callable[[Array], Array | None] | None:
-    """How the LiDAR turned around the stamp, for `deskew`; None without an IMU."""
-    imu = frame.imu
-    return None if imu is None else partial(turned, (imu.stamps - frame.stamp) * 1e-9, imu.rates)

@@ -14,13 +14,13 @@ from dpm2_core.data.stream_clock import SLOWEST, StreamClock
 from dpm2_core.frame import Array, Frame, OdometryResult, Registration, State
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.motion import OPEN, combined, covariance, predicted, spread
+from dpm2_core.geometry.sweep import Sweep
 from dpm2_core.slam.bridge import Bridge, Limits
 from dpm2_core.slam.odometry.inertial import InertialMotion
 from dpm2_core.slam.odometry.keyframe_selection import KeyframeSelector
 from dpm2_core.slam.odometry.other import OtherMotion, Step
 from dpm2_core.slam.odometry.settings import OdometrySettings
 from dpm2_core.slam.odometry.starts import starts_from_rest, turned_starts
-from dpm2_core.slam.odometry.sweep import Sweep
 from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration
 

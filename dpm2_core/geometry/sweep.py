@@ -12,7 +12,7 @@ import numpy as np
 
 from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
-from dpm2_core.slam.preprocess import measured_turn
+from dpm2_core.geometry.deskew import measured_turn
 
 _CENTERED = 0.1  # of a sweep: a stamp so near to its middle counts as the middle
 
