@@ -17,7 +17,9 @@ from scipy.stats import chi2
 from dpm2_core.slam.graph.graph_data import GraphData, chain_chi2, integrate, loop_errors, mahalanobis, total_chi2
 from dpm2_core.slam.graph.robust import RobustSettings, Solution, optimize
 
-_SETTINGS = RobustSettings(odometry_sigmas=5.0)  # tighter than where the covariances are only believed
+# Tighter than where the covariances are only believed. A few steps of the solver tell most wrong loops; to go on to an
+# optimum that has them in it takes minutes.
+_SETTINGS = RobustSettings(odometry_sigmas=5.0, iterations=10)
 _QUANTILE, _AMONG_RIGHT = 0.2, 0.3  # of all loops, and which one of the right ones it is where a third is wrong
 _LEAST = 8  # loops; fewer do not say how large the covariances are
 _APART = 10  # nodes; nearer ones often repeat the odometry
