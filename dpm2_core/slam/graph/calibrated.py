@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from dpm2_core.slam.graph.graph_data import GraphData, chain_chi2, integrate, loop_errors, mahalanobis, total_chi2
 from dpm2_core.slam.graph.robust import RobustSettings, Solution, optimize
@@ -98,7 +98,7 @@ def chain_scale(graph: GraphData, dof: int) -> float | None:
     apart = apart[np.isfinite(apart)]
     if len(apart) < _LEAST:
         return None
-    factor = float(np.quantile(apart, _QUANTILE) / chi2.ppf(_AMONG_RIGHT, dof))
+    factor = float(np.quantile(apart, _QUANTILE) / chdtri(dof, 1 - _AMONG_RIGHT))
     return factor if factor > 0 else None  # without noise there is nothing to fit
 
 
