@@ -141,7 +141,7 @@ def test_a_keyframe_that_could_not_be_taken_in_stays_with_its_robot(
     monkeypatch.setattr(mapper, "add", failing)
     robot.send(COUNT, DRIVE)
     robot.wait(DRIVE, COUNT)
-    robot.harness.wait(lambda: robot.node.mapper.waiting == 0, "the mapper")
+    robot.harness.wait(lambda: robot.node.mapper.keyframes == COUNT - 1, "the mapper")
     robot.heard.clear()
     robot.wait(DRIVE, COUNT)
     found = mapper_status(robot.node, robot.node.mapper)
