@@ -27,7 +27,7 @@ def optimize(
 
     --json has the result for each loop, and why.
     """
-    from dpm2_core.slam.graph.calibrated import optimize_calibrated, scaled
+    from dpm2_core.slam.graph.calibrated import chi2_per_dof, optimize_calibrated, scaled
     from dpm2_core.slam.graph.g2o import read_g2o, require_connected, write_g2o
     from dpm2_core.slam.graph.graph_data import total_chi2, trajectories
     from dpm2_core.slam.graph.robust import least_squares
@@ -46,7 +46,7 @@ def optimize(
         raise Dpm2Error(f"{graph}: {error}") from None
     seconds = time.perf_counter() - began
     optimized = replace(file, graph=replace(data, poses=poses))
-    chi2_after = total_chi2(data, poses, solution.kept)
+    fit = chi2_per_dof(data, poses, solution.kept, dof)
     figures: dict[str, Any] = {
         "vertices": len(data),
         "trajectories": int(trajectories(data)[-1]) + 1,
@@ -55,8 +55,8 @@ def optimize(
         "kept": int(solution.kept.sum()),
         "rejected": int((~solution.kept).sum()),
         "chi2_before": total_chi2(data, data.poses),
-        "chi2_after": chi2_after,
-        "chi2_per_dof": chi2_after / (dof * int(solution.kept.sum())) if solution.kept.any() else None,
+        "chi2_after": total_chi2(data, poses, solution.kept),
+        "chi2_per_dof": fit if np.isfinite(fit) else None,
         "covariance_scale": scale,
         "seconds": seconds,
     }

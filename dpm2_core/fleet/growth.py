@@ -302,4 +302,4 @@ def _poses(store: MapStore, spans: Sequence[range]) -> Iterator[tuple[Any, ...]]
 
 
 def _between(edge: Edge, at: Mapping[int, int]) -> Edge:
-    return replace(edge, from_node=at[edge.from_node], to_node=at[edge.to_node])
+    return edge.between(at[edge.from_node], at[edge.to_node])

@@ -90,7 +90,7 @@ def verify(
             for loop in closer.close(keyframes, clouds, poses[: len(keyframes)]):
                 if loop.from_node < len(first.nodes) <= loop.to_node:
                     ends = first.nodes[loop.from_node], second.nodes[loop.to_node - len(first.nodes)]
-                    tried[ends] = replace(loop, from_node=ends[0], to_node=ends[1])  # later: confirmed by another one
+                    tried[ends] = loop.between(*ends)  # later: confirmed by another one
             advance(count, len(second.keyframes))
     return {"loops": [edge_figures(loop) for loop in tried.values()]}
 

@@ -37,8 +37,7 @@ class Join:
 
     def loop_at(self, first: Mapping[str, int]) -> Edge:
         """The loop in a graph, by the node of it with which each drive begins."""
-        loop = self.loop
-        return replace(loop, from_node=loop.from_node + first[self.one], to_node=loop.to_node + first[self.other])
+        return self.loop.between(self.loop.from_node + first[self.one], self.loop.to_node + first[self.other])
 
     def judged(self, registration: Registration) -> Join:
         """The join with the verdict that a graph has come to."""
@@ -157,8 +156,7 @@ def _borders(maps: Mapping[str, MapData], solved: Sequence[Region], inner: Mappi
                 step = Edge("odometry", where[before], where[end], Registration(T, covariance))
             graph.add_node(region.poses[end[0]][end[1]], step)
     for join in outer:
-        graph.add_loop(replace(join.loop, from_node=where[join.one, join.loop.from_node],
-                               to_node=where[join.other, join.loop.to_node]))  # fmt: skip
+        graph.add_loop(join.loop.between(where[join.one, join.loop.from_node], where[join.other, join.loop.to_node]))
     graph.optimize()
     checked = [join.judged(loop.registration) for join, loop in zip(outer, graph.loops, strict=True)]
     poses: dict[str, Array] = {}

@@ -12,8 +12,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from dpm2_core.frame import Array
 from dpm2_core.slam.graph.graph_data import GraphData, chain_chi2, integrate, loop_errors, mahalanobis, total_chi2
 from dpm2_core.slam.graph.robust import RobustSettings, Solution, optimize
 
@@ -51,10 +53,10 @@ def scaled(graph: GraphData, factor: float) -> GraphData:
     return replace(graph, covariances=graph.covariances * factor, step_covariances=graph.step_covariances * factor)
 
 
-def chi2_per_dof(graph: GraphData, solution: Solution, dof: int) -> float:
-    """chi2 over what was kept, per degree of freedom (`dof` of each loop kept); nan without a loop."""
-    count = int(solution.kept.sum())
-    return total_chi2(graph, solution.poses, solution.kept) / (dof * count) if count else float("nan")
+def chi2_per_dof(graph: GraphData, poses: Array, kept: NDArray[np.bool_], dof: int) -> float:
+    """chi2 over odometry and loops kept, per degree of freedom (`dof` of each loop kept); nan without a loop."""
+    count = int(kept.sum())
+    return total_chi2(graph, poses, kept) / (dof * count) if count else float("nan")
 
 
 def optimize_calibrated(graph: GraphData, dof: int, report: Callable[[str], None] = lambda _: None) -> Calibrated:
@@ -67,10 +69,11 @@ def optimize_calibrated(graph: GraphData, dof: int, report: Callable[[str], None
     Raises:
         Dpm2Error: the system is singular.
     """
-    first = chain_scale(graph, dof)
+    odometry = integrate(graph)
+    first = _chain_scale(graph, odometry, dof)
     if first is None:
         return Calibrated(optimize(graph, RobustSettings()), 1.0, False)
-    loose = _others_pass(graph, first)
+    loose = _others_pass(graph, odometry, first)
     if loose and first > _TOO_FIRM:  # by covariances so large any loop passes: perhaps there are only wrong ones
         return Calibrated(optimize(graph, RobustSettings()), 1.0, False)
     solution, scale = _stages(graph, dof, first, report)
@@ -83,7 +86,7 @@ def _stages(graph: GraphData, dof: int, first: float, report: Callable[[str], No
     for stage in range(_STAGES):
         report(f"stage {stage + 1}: covariances times {scale:.3g}")
         solution = optimize(scaled(replace(graph, poses=poses), scale), _SETTINGS, used)
-        fitting = min(most, _ROOM * chi2_per_dof(graph, solution, dof))
+        fitting = min(most, _ROOM * chi2_per_dof(graph, solution.poses, solution.kept, dof))
         if not fitting > 0 or (stage and 0.5 < fitting / scale < 1.25) or stage == _STAGES - 1:
             break
         near = min(len(solution.sigmas) - 1, int((1 + _AGAIN) * solution.kept.sum()))
@@ -91,10 +94,10 @@ def _stages(graph: GraphData, dof: int, first: float, report: Callable[[str], No
     return solution, scale
 
 
-def chain_scale(graph: GraphData, dof: int) -> float | None:
+def _chain_scale(graph: GraphData, odometry: Array, dof: int) -> float | None:
     """Factor on all covariances by which the right loops agree with the odometry; None where too few loops tell."""
     far = np.abs(graph.ends[:, 1] - graph.ends[:, 0]) > _APART
-    apart = chain_chi2(graph, integrate(graph))[far]
+    apart = chain_chi2(graph, odometry)[far]
     apart = apart[np.isfinite(apart)]
     if len(apart) < _LEAST:
         return None
@@ -102,11 +105,11 @@ def chain_scale(graph: GraphData, dof: int) -> float | None:
     return factor if factor > 0 else None  # without noise there is nothing to fit
 
 
-def _others_pass(graph: GraphData, factor: float) -> bool:
+def _others_pass(graph: GraphData, odometry: Array, factor: float) -> bool:
     """Whether the odometry would mostly let loops pass that lie between other places than their own."""
     ends = np.stack([graph.ends[:, 0], np.roll(graph.ends[:, 1], len(graph.ends) // 2)], -1)
     other = scaled(replace(graph, ends=ends), factor)
-    return bool((np.sqrt(chain_chi2(other, integrate(other))) < _SETTINGS.odometry_sigmas).mean() > 0.5)
+    return bool((np.sqrt(chain_chi2(other, odometry)) < _SETTINGS.odometry_sigmas).mean() > 0.5)
 
 
 def _loop_share(graph: GraphData, solution: Solution) -> float:

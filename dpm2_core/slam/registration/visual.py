@@ -85,8 +85,8 @@ class VisualScanRegistration:
         if self._reference is None:
             axis = T_odom_ref[:3, :3].T @ result.T_target_source[:3, :3] @ result.open_direction
             self._reference = reference(scan.points, textured(scan.images[0], s.width), s.points, axis)
-        # Only the difference: the twist itself follows from images, and a camera moved by its whole offset at it leads
-        # the odometry astray from half a period on. What is left is the offset times the change of speed.
+        # Only the difference: the twist itself follows from the images, so that moving the camera by its whole offset
+        # feeds an error back, and it grows from half a period on. What is left is the offset times the change of speed.
         late = image.time_offset - scan.images[0].time_offset
         image_now = replace(textured(placed(image, late, twist), s.width), sigma=of_speed * abs(late))
         return along(s, result, self._reference, image_now, se3.inverse(T_odom_ref), reach)

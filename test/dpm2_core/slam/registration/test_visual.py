@@ -157,7 +157,7 @@ def test_a_picture_of_another_time_than_its_keyframe(late: float) -> None:
     ahead = place(13 + 10 * late) - place(13)
     # The speed is that of the way of this image from the one before, 0.9 m/s off at most.
     np.testing.assert_allclose(picture.camera.T_lidar_cam[:3, 3], [ahead, 0, 0], atol=0.1)
-    # The odometry is that of the camera, off by as much; by a speed that follows from its images it would go astray.
+    # The odometry is that of the camera, off by as much: a correction by a speed that its images give would diverge.
     assert result.T_odom_lidar[0, 3] == pytest.approx(place(13) + ahead, abs=0.1)
 
 
