@@ -87,7 +87,7 @@ def _stages(graph: GraphData, dof: int, first: float, report: Callable[[str], No
         report(f"stage {stage + 1}: covariances times {scale:.3g}")
         solution = optimize(scaled(replace(graph, poses=poses), scale), _SETTINGS, used)
         fitting = min(most, _ROOM * chi2_per_dof(graph, solution.poses, solution.kept, dof))
-        if not fitting > 0 or (stage and 0.5 < fitting / scale < 1.25) or stage == _STAGES - 1:
+        if not 0 < fitting < np.inf or (stage and 0.5 < fitting / scale < 1.25) or stage == _STAGES - 1:
             break
         near = min(len(solution.sigmas) - 1, int((1 + _AGAIN) * solution.kept.sum()))
         scale, poses, used = fitting, solution.poses, solution.sigmas <= np.sort(solution.sigmas)[near]
