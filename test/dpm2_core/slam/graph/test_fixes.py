@@ -178,6 +178,7 @@ def test_without_fixes_nothing_changes() -> None:
 @pytest.mark.slow
 def test_another_process_solves_the_same(clean: PoseGraph) -> None:
     graph, _ = driven(120, background=True)
+    graph.close()
     assert errors(graph).max() < SIGMA
     np.testing.assert_allclose(enu_of(graph, graph.poses), enu_of(clean, clean.poses), atol=0.5)
 
