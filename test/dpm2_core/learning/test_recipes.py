@@ -9,6 +9,7 @@ import pytest
 
 from dpm2_core.config import Settings, load_settings
 from dpm2_core.experiments.ablation import AblationSettings
+from dpm2_core.experiments.variants import AS_PAPER, TABLE_4
 from dpm2_core.learning.generate import GenerateSettings
 from dpm2_core.learning.train_image import ImageTrainingSettings
 from dpm2_core.learning.train_overlap import OverlapTrainingSettings
@@ -20,6 +21,7 @@ from dpm2_core.tasks.drives import TaskDriveSettings
 CONFIG = Path(__file__).parents[3] / "config"
 READ_BY: dict[str, type[Settings]] = {
     "ablation": AblationSettings,
+    "ablation_paper": AblationSettings,
     "ablation_start": RegistrationTrainingSettings,
     "movers_drives": TaskDriveSettings,
     "train_paper_overlap": OverlapTrainingSettings,
@@ -43,12 +45,25 @@ def test_every_key_of_a_recipe_is_a_setting(name: str) -> None:
 
 
 def test_no_recipe_of_the_network_is_forgotten_here() -> None:
-    assert {path.stem for path in CONFIG.glob("train_*.yaml")} <= set(READ_BY)
+    assert {path.stem for kind in ("train", "ablation") for path in CONFIG.glob(f"{kind}*.yaml")} <= set(READ_BY)
 
 
 def test_the_sensor_of_the_dynamic_objects_drives_is_the_simulators_own() -> None:
     """YAML cannot name it, so it stands there again."""
     assert load_settings(TaskDriveSettings, CONFIG / "movers_drives.yaml").lidar == HDL64E
+
+
+def test_both_ablations_differ_in_the_fusion_and_in_how_long_they_train() -> None:
+    """So that what stands in one table can be held against the other."""
+    shipped, paper = (
+        load_settings(AblationSettings, CONFIG / f"{name}.yaml") for name in ("ablation", "ablation_paper")
+    )
+    assert paper.training.network["fusion"] == {**shipped.training.network["fusion"], **AS_PAPER["fusion"]}
+    network = {**paper.training.network, "fusion": shipped.training.network["fusion"]}
+    optimiser = paper.training.optimiser.model_copy(update={"steps": shipped.training.optimiser.steps})
+    assert paper.training.model_copy(update={"network": network, "optimiser": optimiser}) == shipped.training
+    assert (paper.measure, paper.seeds, paper.pairs) == (shipped.measure, shipped.seeds, shipped.pairs)
+    assert {name: paper.variants[name] for name in TABLE_4} == TABLE_4
 
 
 def test_the_recipes_of_the_paper_are_of_its_network_and_fit_each_other() -> None:
