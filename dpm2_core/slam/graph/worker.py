@@ -60,15 +60,15 @@ class GraphWorker:
 
     def close(self) -> None:
         """End the process."""
+        while self._waiter is not None:
+            if (process := self._process) is not None:
+                process.kill()
+            self._waiter.join(0.1)  # at a time: it may be about to start the process
+            if not self._waiter.is_alive():
+                self._waiter, self._solution = None, None
         process, self._process = self._process, None
         if process is not None:
-            process.kill()
-            process.wait()
-        if self._waiter is not None:
-            self._waiter.join()
-            self._waiter, self._solution = None, None
-        if process is not None:
-            _shut(process)
+            _end(process)
 
     def _exchange(self, graph: GraphData, settings: RobustSettings) -> None:
         process = self._process
@@ -81,9 +81,7 @@ class GraphWorker:
             process.stdin.flush()
             self._solution = pickle.load(process.stdout)
         except (OSError, ValueError, EOFError, pickle.UnpicklingError):
-            process.kill()
-            status = process.wait()
-            self._process = None
+            self._process, status = None, _end(process)
             self._solution = Dpm2Error(f"the pose graph optimizer's process ended by itself (status {status})")
 
 
@@ -99,11 +97,15 @@ def _start() -> subprocess.Popen[bytes]:
     )
 
 
-def _shut(process: subprocess.Popen[bytes]) -> None:
+def _end(process: subprocess.Popen[bytes]) -> int:
+    """Its exit status."""
+    process.kill()
+    status = process.wait()
     for pipe in (process.stdin, process.stdout):
         if pipe is not None:
             with suppress(OSError):  # what it had not read yet
                 pipe.close()
+    return status
 
 
 def _serve(requests: IO[bytes], results: IO[bytes]) -> None:

@@ -3,6 +3,11 @@
 
 from __future__ import annotations
 
+import signal
+import subprocess
+import time
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -30,3 +35,21 @@ def test_a_graph_that_cannot_be_solved_is_said_and_the_process_lives() -> None:
         worker.close()
     assert solution is not None
     np.testing.assert_allclose(solution.poses, steps, atol=1e-9)  # what was right already, but for rounding
+
+
+def test_a_worker_that_is_closed_while_its_process_starts_leaves_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It waited for the solution instead, and the process stayed until its pipe was closed."""
+    started: list[subprocess.Popen[bytes]] = []
+    popen = subprocess.Popen
+
+    def slow(*args: Any, **options: Any) -> subprocess.Popen[bytes]:
+        time.sleep(0.2)  # longer than `close` needs to look
+        started.append(popen(*args, **options))
+        return started[-1]
+
+    monkeypatch.setattr(subprocess, "Popen", slow)
+    worker = GraphWorker()
+    worker.submit(GraphData(np.eye(4)[None], np.zeros(1, bool), np.eye(4)[None], np.zeros((1, 6, 6))), RobustSettings())
+    worker.close()
+    assert [process.poll() for process in started] == [-signal.SIGKILL]
+    assert not worker.busy
