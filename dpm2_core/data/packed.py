@@ -20,6 +20,7 @@ from dpm2_core.frame import Array, Camera, Image
 
 QUANTUM = 0.002  # m; 60 m fit in 16 bits, and the LiDAR's noise is ten times as much
 FORMAT = 1
+_VIEWS = ("pixels", "K", "T_lidar_cam")  # files of a drive with images
 
 
 class Sample(NamedTuple):
@@ -141,6 +142,9 @@ def write_packed(folder: Path, samples: Iterable[Sample], about: dict[str, objec
 class PackedDrive:
     """A packed drive, opened lazily: `poses` (n, 4, 4) in memory, the rest memory-mapped.
 
+    Attributes:
+        has_images: whether its frames have some.
+
     Raises:
         UsageError: it is none, or is damaged.
     """
@@ -150,15 +154,21 @@ class PackedDrive:
             self.about = json.loads((folder / "about.json").read_text())
             self.poses: Array = np.load(folder / "poses.npy", allow_pickle=False)
             self.offsets = np.load(folder / "offsets.npy", allow_pickle=False)
-            points = len(np.load(folder / "clouds.npy", mmap_mode="r", allow_pickle=False))
-        except (OSError, TypeError, ValueError) as error:
+            self.has_images = (folder / "pixels.npy").exists()
+            clouds, *views = [_mapped(folder, name).shape for name in ("clouds", *(_VIEWS if self.has_images else ()))]
+        except (EOFError, OSError, TypeError, ValueError) as error:
             raise UsageError(f"{folder}: no packed drive: {error}") from None
         format = self.about.get("format") if isinstance(self.about, dict) else None
         if format != FORMAT:
             raise UsageError(f"{folder}: packed format {format}, want {FORMAT}: pack it again")
-        fit = self.poses.shape[1:] == (4, 4) and self.offsets.shape == (len(self.poses) + 1,)
-        if not fit or self.offsets[-1] != points or np.any(np.diff(self.offsets) < 0):
+        frames = len(self.poses)
+        fit = self.poses.shape[1:] == (4, 4) and self.offsets.shape == (frames + 1,)
+        if not fit or clouds != (self.offsets[-1], 3) or np.any(np.diff(self.offsets) < 0):
             raise UsageError(f"{folder}: poses, offsets and clouds do not fit each other: pack it again")
+        if any(shape[0] != frames for shape in views):
+            raise UsageError(f"{folder}: poses, images and their calibration do not fit each other: pack it again")
+        if not np.isfinite(self.poses).all():
+            raise UsageError(f"{folder}: a pose is not finite: pack it again")
         self.folder = folder
         self.name = folder.name
         self._maps: dict[str, NDArray] = {}
@@ -173,17 +183,21 @@ class PackedDrive:
 
     def _map(self, name: str) -> NDArray:
         if name not in self._maps:
-            self._maps[name] = np.load(self.folder / f"{name}.npy", mmap_mode="r", allow_pickle=False)
+            self._maps[name] = _mapped(self.folder, name)
         return self._maps[name]
 
     def _images(self, index: int) -> tuple[Image, ...]:
-        if not (self.folder / "pixels.npy").exists():
+        if not self.has_images:
             return ()
-        pixels, K, T = (self._map(name)[index] for name in ("pixels", "K", "T_lidar_cam"))
+        pixels, K, T = (self._map(name)[index] for name in _VIEWS)
         return tuple(
             Image(np.array(p), Camera(np.array(k), np.array(t), (p.shape[1], p.shape[0])))
             for p, k, t in zip(pixels, K, T, strict=True)
         )
+
+
+def _mapped(folder: Path, name: str) -> NDArray:
+    return np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False)
 
 
 def _is_unfinished(folder: Path) -> bool:

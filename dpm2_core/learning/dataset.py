@@ -63,7 +63,7 @@ class DataSettings(GroupSettings):
 
 
 Draw = Callable[[Array, np.random.Generator], NDArray[np.intp]]
-"""Of the poses (n, 4, 4) of a drive, NaN where unknown: indices (F,) of the frames of a place."""
+"""Of the poses (n, 4, 4) of a drive: indices (F,) of the frames of a place."""
 
 
 class Batch(NamedTuple):
@@ -82,12 +82,12 @@ class Batch(NamedTuple):
 def draw_group(poses: Array, noise: np.random.Generator, frames: int, radius: float) -> NDArray[np.intp]:
     """Indices (frames,) of one frame and others whose distance from it is about uniform in 0..radius m.
 
-    poses (n, 4, 4), NaN where unknown; frames repeat where the neighborhood holds too few.
+    poses (n, 4, 4); frames repeat where the neighborhood holds too few.
     """
-    known = np.flatnonzero(np.isfinite(poses[:, :3, 3]).all(1))
-    first = noise.choice(known)
-    distance = np.linalg.norm(poses[known, :3, 3] - poses[first, :3, 3], axis=1)
-    others = known[(distance <= radius) & (known != first)]
+    frame = np.arange(len(poses))
+    first = noise.choice(frame)
+    distance = np.linalg.norm(poses[:, :3, 3] - poses[first, :3, 3], axis=1)
+    others = frame[(distance <= radius) & (frame != first)]
     if len(others) == 0:
         return np.full(frames, first)
     distance = np.linalg.norm(poses[others, :3, 3] - poses[first, :3, 3], axis=1)
@@ -128,11 +128,17 @@ class Mixture:
 
 class GroupDataset(Dataset[Batch]):
     """Batches without an end; batch `n` of a process depends on seed, rank and `n` alone, so a resumed run sees the
-    same."""
+    same.
+
+    Raises:
+        UsageError: no packed drives, or images are wanted and none has any.
+    """
 
     def __init__(self, settings: GroupSettings, network: NetworkSettings, draw: Draw, seed: int) -> None:
         self.settings, self.network, self.draw, self.seed = settings, network, draw, seed
         self.drives = Mixture(settings)
+        if settings.images and not any(drive.has_images for drive in self.drives.drives):
+            raise UsageError("data.images: no packed drive of data.packed has images; data.images=false learns without")
 
     def __getitem__(self, place: tuple[int, int]) -> Batch:
         """Batch of (step, rank of the process)."""

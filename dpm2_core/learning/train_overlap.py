@@ -63,15 +63,15 @@ class OverlapTrainingSettings(Settings):
 def draw_overlap(poses: Array, noise: np.random.Generator) -> NDArray[np.intp]:
     """Indices (FRAMES,) of a frame, two within OVERLAP m of it, one within HARD m and one beyond.
 
-    poses (n, 4, 4), NaN where unknown. A kind that the drive does not have repeats another kind.
+    poses (n, 4, 4). A kind that the drive does not have repeats another kind.
     """
-    known = np.flatnonzero(np.isfinite(poses[:, :3, 3]).all(1))
+    frames = np.arange(len(poses))
     for _ in range(20):
-        first = noise.choice(known)
-        distance = np.linalg.norm(poses[known, :3, 3] - poses[first, :3, 3], axis=1)
-        near = known[(distance <= OVERLAP) & (known != first)]
-        hard = known[(distance > OVERLAP) & (distance <= HARD)]
-        far = known[distance > HARD]
+        first = noise.choice(frames)
+        distance = np.linalg.norm(poses[:, :3, 3] - poses[first, :3, 3], axis=1)
+        near = frames[(distance <= OVERLAP) & (frames != first)]
+        hard = frames[(distance > OVERLAP) & (distance <= HARD)]
+        far = frames[distance > HARD]
         if len(near) and (len(hard) or len(far)):
             break
     near = near if len(near) else np.array([first])

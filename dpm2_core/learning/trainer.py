@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
 from dpm2_core.config import Settings
+from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.learning.checkpoint import Log, load_checkpoint, save_checkpoint
 from dpm2_core.network.encoder import to_device
 from dpm2_core.network.precision import mixed_precision
@@ -156,7 +157,8 @@ class Trainer:
         """Train, with `resume` on from the checkpoint; `until`: stop after this step, with a checkpoint.
 
         Raises:
-            UsageError: nothing to resume.
+            UsageError: nothing to resume, or it has more steps than are wanted.
+            Dpm2Error: no step had a finite gradient.
         """
         keep_memory()
         with process_group() as (rank, world, device):
@@ -164,12 +166,15 @@ class Trainer:
             ema = copy.deepcopy(module).requires_grad_(False)
             optimizer = make_optimizer(module, self.settings)
             start = load_checkpoint(self.out / "checkpoint.pt", module, ema, optimizer) if resume else 0
+            if start > self.settings.steps:
+                raise UsageError(f"{self.out}: has {start} steps, optimiser.steps wants {self.settings.steps}")
             steps = range(start, self.settings.steps if until is None else min(until, self.settings.steps))
             batches = self.batches(start, rank)
             wrapped = DistributedDataParallel(module, find_unused_parameters=True) if world > 1 else module
             if self.settings.compile:
                 wrapped.compile(dynamic=False)
             log = Log(self.out, start) if rank == 0 else None
+            learned = not steps
             columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
             with Progress(*columns, disable=rank != 0) as progress:
                 task = progress.add_task("training", total=self.settings.steps, completed=start)
@@ -178,6 +183,7 @@ class Trainer:
                     batch = next(batches)
                     waited = time.perf_counter() - begin
                     figures = self._step(wrapped, ema, optimizer, to_device(batch, device), step)
+                    learned |= math.isfinite(figures["norm"])
                     figures |= {"seconds": time.perf_counter() - begin, "waited": waited}
                     progress.update(task, advance=1, description=f"loss {figures['loss']:.3f}")
                     if log is not None:
@@ -185,6 +191,8 @@ class Trainer:
                         self._keep(ema, optimizer, log, step + 1, last=step == steps[-1])
             if log is not None:
                 log.close()
+                if not learned:
+                    raise Dpm2Error(f"none of {len(steps)} steps had a finite gradient: nothing was learned")
                 self.save(ema)
 
     def _step(

@@ -9,6 +9,7 @@ import sys
 import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from dpm2_core.cli import app
 from dpm2_core.config import load_settings
 from dpm2_core.data.packed import PackedDrive, Sample, open_packed, write_packed
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.frame import Array, Frame
+from dpm2_core.frame import Array, Camera, Frame, Image
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.scale import ROOM_SCALE
 from dpm2_core.learning.dataset import DataSettings, GroupDataset, Mixture
@@ -236,14 +237,20 @@ def test_all_drives_of_a_data_set_are_packed_and_a_second_run_makes_only_what_is
         ("offsets.npy", [0, 10, 5, 15]),
         ("offsets.npy", [0, 5, 15]),
         ("poses.npy", [1, 2, 3]),
+        ("poses.npy", [[[np.nan] * 4] * 4] * 3),
+        ("clouds.npy", [[0, 0]] * 15),
+        ("pixels.npy", None),
+        ("K.npy", b""),
+        ("T_lidar_cam.npy", [[np.eye(4)]] * 2),
     ],
 )
 def test_a_packed_drive_that_is_damaged_is_an_error_when_it_is_opened(
-    file: str, content: bytes | list[int] | None, tmp_path: Path
+    file: str, content: bytes | list[Any] | None, tmp_path: Path
 ) -> None:
     """Not in the midst of a training, nor never; None: cut off."""
     folder = tmp_path / "one"
-    write_packed(folder, [Sample(np.zeros((5, 3), np.float32), np.eye(4)) for _ in range(3)], {})
+    image = Image(np.zeros((4, 8, 3), np.uint8), Camera(np.eye(3), np.eye(4), (8, 4)))
+    write_packed(folder, [Sample(np.zeros((5, 3), np.float32), np.eye(4), (image,)) for _ in range(3)], {})
     assert len(open_packed(tmp_path)[0][2].cloud) == 5
     if isinstance(content, list):
         np.save(folder / file, np.array(content))

@@ -8,6 +8,7 @@ import os
 import socket
 import subprocess
 import sys
+from itertools import repeat
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,7 @@ import torch
 from safetensors.torch import load_file
 
 from dpm2_core.config import merged, settings_from
-from dpm2_core.errors import UsageError
+from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.learning.augment import AugmentSettings
 from dpm2_core.learning.checkpoint import Log, load_checkpoint, save_checkpoint
 from dpm2_core.learning.dataset import DataSettings, GroupDataset
@@ -28,7 +29,7 @@ from dpm2_core.learning.train_registration import (
     set_pairs_of,
     train_registration,
 )
-from dpm2_core.learning.trainer import OptimizerSettings, learning_rate, make_optimizer
+from dpm2_core.learning.trainer import OptimizerSettings, Trainer, learning_rate, make_optimizer
 from dpm2_core.network.weights import network_settings, read_metadata
 
 from ...helpers import ranks
@@ -104,6 +105,30 @@ def test_a_checkpoint_of_another_network_is_rejected(settings: RegistrationTrain
     (tmp_path / "out" / "checkpoint.pt").write_bytes(b"garbage")
     with pytest.raises(UsageError, match="not a checkpoint"):
         train_registration(settings, tmp_path / "out", resume=True)
+
+
+def test_a_training_of_fewer_steps_is_not_gone_on_with(settings: RegistrationTrainingSettings, tmp_path: Path) -> None:
+    """Its weights said that they had two steps, of four."""
+    train_registration(settings, tmp_path / "out")
+    fewer = settings.model_copy(update={"optimiser": settings.optimiser.model_copy(update={"steps": 2})})
+    with pytest.raises(UsageError, match=r"has 4 steps, optimiser\.steps wants 2"):
+        train_registration(fewer, tmp_path / "out", resume=True)
+
+
+def test_a_training_that_learns_nothing_says_so(tmp_path: Path) -> None:
+    """Each step was skipped, and untrained weights were written as if all was well."""
+
+    class Broken(torch.nn.Linear):
+        def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+            loss = super().forward(x).sum() * torch.nan
+            return loss, {"loss": loss.detach()}
+
+    saved: list[torch.nn.Module] = []
+    steps = OptimizerSettings(steps=3, compile=False, bf16=False)
+    training = Trainer(Broken(2, 1), lambda start, rank: repeat((torch.ones(2),)), steps, tmp_path, saved.append)
+    with pytest.raises(Dpm2Error, match="none of 3 steps had a finite gradient"):
+        training.run()
+    assert not saved
 
 
 @pytest.mark.parametrize("damage", ["optimizer", "no optimizer", "list"])
