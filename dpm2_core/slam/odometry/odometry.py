@@ -113,7 +113,10 @@ class Odometry:
         clock.append(perf_counter())
         pauses = self._pauses(frame, dt) and not self._registration.rejection(scan)
         T_predicted = self._begin_stretch(dt) if pauses else self._predicted(twist, dt)
-        scan, registration = self._register(frame, scan, T_predicted, dt)
+        prepared = scan
+        scan, registration = self._register(frame, prepared, T_predicted, dt)
+        if scan is not prepared:  # the IMU was of no use: nor is it on the way to the stamp
+            frame = replace(frame, imu=None)
         if self._first is not None and registration.ok:
             scan, registration = self._begin_again(self._first, frame, registration, seconds)
         clock.append(perf_counter())

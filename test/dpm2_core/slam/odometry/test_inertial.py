@@ -111,6 +111,19 @@ def test_a_gyroscope_that_repeats_its_last_rates_is_left_out_before_a_scan_is_lo
 
 
 @pytest.mark.slow
+def test_a_scan_that_was_registered_without_it_is_handed_out_without_it(robot: tuple[list[Frame], Array]) -> None:
+    """In deg/s for once, stamped at the start of the sweep: the scan's pose was right, but on the way from the middle
+    of the sweep to the stamp the IMU still turned it, here by 40 degrees."""
+    frames = [frame.later(-0.05) for frame in robot[0][:17]]
+    wrong = with_imu(frames[16:], lambda rates, forces: (np.degrees(rates), forces))
+    told = run(without(frames[:13]) + frames[13:16] + wrong)[-1]
+    plain = run(without(frames))[-1]
+    assert told.registration.ok
+    # Half a sweep by two measures of one turn, at 100 deg/s and each right to some percent.
+    assert np.degrees(se3.angle(se3.inverse(plain.T_odom_lidar) @ told.T_odom_lidar)) < 0.5
+
+
+@pytest.mark.slow
 def test_forces_that_are_not_known_cost_the_level_alone(robot: tuple[list[Frame], Array]) -> None:
     frames, truth = robot
     gyroscope = run(with_imu(frames, lambda rates, forces: (rates, np.full_like(forces, np.nan))))
