@@ -181,6 +181,8 @@ class FrameBuilder:
         try:
             if found is None:
                 raise UsageError("no samples at the time of the scan")
+            if not found.rates.any() and np.isnan(found.forces).all():  # no gyroscope is so still
+                raise UsageError("its rates and forces are all 0: it measures neither")
             R = self._imu_rotation(lidar_frame, buffer.frame)
         except UsageError as error:
             self.problems[topic] = self._tell(topic, error, "; going on without the IMU")

@@ -124,6 +124,17 @@ def test_one_that_stops_is_missed_once(bags: Any, tmp_path: Path) -> None:
     assert source.notes == ["/imu: no samples at the time of the scan; going on without the IMU"]
 
 
+def test_one_of_zeros_is_left_out_and_said(bags: Any, tmp_path: Path) -> None:
+    """As of a driver that fills in the orientation alone: it counted as one that does not turn, in a bend too."""
+    zeros = {"frame": "velo_link", "rates": (0, 0, 0)}
+    source = BagSource(bags.write(tmp_path / "b", drive(bags, forces=(0, 0, 0), **zeros)))
+    assert all(frame.imu is None for frame in source.frames())
+    said = "its rates and forces are all 0: it measures neither"
+    assert source.notes == [f"/imu: {said}; going on without the IMU"]
+    still = BagSource(bags.write(tmp_path / "still", drive(bags, **zeros)))  # of a simulator, at rest
+    assert all(frame.imu is not None for frame in still.frames())
+
+
 def test_which_topic(bags: Any, tmp_path: Path) -> None:
     two = [*drive(bags, frame="velo_link"), (0.9, "/other", imu(bags, 0.9, frame="velo_link"))]
     usual = BagSource(bags.write(tmp_path / "usual", sorted(two, key=lambda m: m[0])))
