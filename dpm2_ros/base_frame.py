@@ -54,6 +54,10 @@ class BaseFrame:
         if self.name:
             self.problem = ""
 
+    def forget(self) -> None:
+        """Another LiDAR: neither its place nor the root above it is known yet."""
+        self._tree, self.name, self.T_base_start = None, "", np.eye(4)
+
     def look(self, tree: TransformTree, lidar_frame: str) -> bool:
         """Find the frame, or see whether it has changed; returns whether it has.
 

@@ -76,6 +76,7 @@ class SlamNode(ManagedNode):
         self._base = BaseFrame(ros.base_frame, (ros.odom_frame, ros.own_frame, ros.map_frame))
         self._requests = Requests(self, self._mapper, self._base, ros.map_frame)
         self._waited = False  # for the base frame
+        self._lidar_frame = ""  # of the last cloud
         warm_up(self._config.slam)
         self._known: Calibration | None = None
         self._left: tuple[int, float] | None = None  # stamp and arrival of the last cloud before a deactivation
@@ -156,18 +157,29 @@ class SlamNode(ManagedNode):
         """A mapper elsewhere is told, before it hears the next odometry, that the drive is over."""
         wait([self._line.submit(self._sender.restart)])
 
+    def _begin_again(self, why: str) -> None:
+        """Another drive in the same map, if there has been one."""
+        if self._before is None and not self._held:
+            return
+        self.get_logger().warning(
+            f"{why}: the odometry starts again, its place in the map is unknown before a loop is found"
+        )
+        self._begin()
+        self._end_drive()
+        if self._mapper is not None:
+            self._mapper.restart(self._robot)
+
     def _process(self, bundle: Bundle) -> None:
         """One frame, from messages to messages."""
-        if bundle.restarted and (self._before is not None or self._held):
-            self.get_logger().warning(
-                "time went back by more than a second (a looped bag, a clock that was set): the odometry starts again, "
-                "its place in the map is unknown before a loop is found"
-            )
-            self._begin()
-            self._end_drive()
-            if self._mapper is not None:
-                self._mapper.restart(self._robot)
-        self._look_for_base(bundle.cloud.header.frame_id or "lidar")
+        lidar_frame, before = bundle.cloud.header.frame_id or "lidar", self._lidar_frame
+        if lidar_frame != before and before:
+            self._begin_again(f"clouds come in frame {lidar_frame}, no longer in {before}")
+            self._base.forget()
+            self._waited = False
+        elif bundle.restarted:
+            self._begin_again("time went back by more than a second (a looped bag, a clock that was set)")
+        self._lidar_frame = lidar_frame
+        self._look_for_base(lidar_frame)
         x, y, z = self._base.T_start_lidar[2, :3].tolist()
         self._frames.up = (x, y, z) if self._base.name else None  # what is up for the base is to be up in odom
         frame = self._frames.frame(bundle.stamp, bundle.cloud, self._index, bundle.beside)

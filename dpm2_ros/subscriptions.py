@@ -36,7 +36,8 @@ from dpm2_ros.settings import RosSettings
 from dpm2_ros.synchronizer import Bundle, StampCheck, Synchronizer
 from dpm2_ros.tf import TFMessage
 
-_OTHER_FRAME = 2.0  # s without a cloud after which one in another frame begins another drive
+OTHER_FRAME = 2.0
+"""s without a cloud after which one in another frame begins another drive."""
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 """For timers that must go on when /clock stops at the end of a bag."""
 
@@ -158,7 +159,7 @@ class Inputs:
         """An unreadable cloud counts as a failed scan where one was due; any other is not of this drive."""
         cloud, problem = checked_cloud(message)
         now, frame, last = time.monotonic(), cloud.header.frame_id, self.synchronizer.last_arrival
-        if self._frame not in (None, frame) and last is not None and now - last < _OTHER_FRAME:
+        if self._frame not in (None, frame) and last is not None and now - last < OTHER_FRAME:
             raise RejectedError("another frame", f"a cloud in frame {frame[:80]!r}; the drive's is {self._frame!r}")
         if problem and not (frame == self._frame and self.synchronizer.due(stamp_ns(cloud.header), now)):
             raise RejectedError("unreadable", problem)

@@ -73,6 +73,20 @@ def test_a_lidar_that_is_moved_in_its_base_counts_from_the_next_drive_on(wanted:
     np.testing.assert_array_equal(base.T_base_start, np.eye(4))
 
 
+def test_the_place_of_another_lidar_is_not_that_of_the_first() -> None:
+    """Where /tf_static does not know it yet, there is no base."""
+    base, tree = BaseFrame("base", ("odom",)), TransformTree()
+    tree.set("base", "lidar", se3.make(np.eye(3), [1.0, 0, 0]))
+    assert base.look(tree, "lidar")
+    base.forget()
+    assert not base.look(tree, "rear")
+    assert (base.name, bool(base.problem)) == ("", True)
+    tree = tree.copy()
+    tree.set("base", "rear", se3.make(np.eye(3), [-1.5, 0, 0]))
+    assert base.look(tree, "rear")
+    assert (base.name, base.problem, base.T_start_lidar[0, 3]) == ("base", "", -1.5)
+
+
 def test_a_base_below_another_frame_names_the_one_that_may_be_moved() -> None:
     """Two parents would tear /tf apart; also where the first one comes late. Its pose is known all the same."""
     early, late = BaseFrame("base", ("odom",)), BaseFrame("base", ("odom",))

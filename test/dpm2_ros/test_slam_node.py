@@ -674,6 +674,26 @@ def test_clouds_that_are_not_of_this_drive_leave_it_alone(rig: Callable[..., Rig
     assert figures(r.processed(8))["lost on the way"] == "0"
 
 
+def test_another_lidar_on_the_topic_begins_another_drive(
+    rig: Callable[..., Rig], drive: Any, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Turned about and elsewhere on the robot, which goes on: its points were taken for those of the first one."""
+    monkeypatch.setattr("dpm2_ros.subscriptions.OTHER_FRAME", 0.0)
+    T_base_rear = se3.exp([0.0, 0.0, np.pi, -1.5, 0.0, 0.0])
+    r = rig("ros.base_frame:=base_link")
+    publish_static(r, "base_link", "lidar", np.eye(4))
+    publish_static(r, "base_link", "rear", T_base_rear)
+    r.send_and_wait(*range(4))
+    for n in range(4, 8):
+        r.lidar.publish(cloud_to_msg(scan(pose(n) @ T_base_rear), drive.stamp(n), "rear"))
+        r.wait(lambda n=n: len(r.odom) > n, f"the odometry of cloud {n}")
+    for n, message in enumerate(r.odom):
+        expected = se3.inverse(drive.pose(0 if n < 4 else 4)) @ drive.pose(n)
+        assert message.child_frame_id == "base_link"
+        assert np.linalg.norm(transform_matrix(message.pose.pose)[:3, 3] - expected[:3, 3]) < ACCURATE
+    assert "clouds come in frame rear, no longer in lidar: the odometry starts again" in capfd.readouterr().err
+
+
 def test_stamps_that_repeat_or_go_back(rig: Callable[..., Rig], drive: Any) -> None:
     r = rig()
     r.send_and_wait(0, 1, 2)
