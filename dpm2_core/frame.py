@@ -186,7 +186,7 @@ class Frame:
         images: zero, one or several images.
         index: position in its source (KITTI frame number, message count of a bag).
         problem: why the scan could not be read; `points` is then empty and the frame counts as failed, not lost.
-        guess: where another odometry has the LiDAR at that time; the search for the pose begins there.
+        guess: where another odometry has the LiDAR in the middle of the sweep; the search for the pose begins there.
         imu: samples since those of the frame before, up to the last point; None where there is no IMU.
         fix: the last one before the stamp that no frame before had; None where there is none.
         dropped: scans since the frame before that came, but were left out for want of time.
@@ -364,14 +364,17 @@ class Comparison:
 
     Attributes:
         T_other, T_scans: (4, 4) T_before_now, as each of the two has it.
-        used: whether the pose was searched from where the other one leads; else it was outweighed.
+        used: whether the pose was searched from where the other one leads; else it was outweighed, or is `unsure`.
         doubt: so many times as far as assumed it has been off of late; 1: as assumed, or better.
+        unsure: it was not used, since by its own covariance it knows less than the motion before; nothing contradicts
+            it.
     """
 
     T_other: Array
     T_scans: Array
     used: bool
     doubt: float
+    unsure: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -95,7 +95,7 @@ class OtherOdometry:
     def judge(self, comparison: Comparison | None) -> str:
         """What the scan of the last cloud said to it; returns why it was outweighed, or an empty text."""
         self._comparison = comparison
-        if comparison is None:
+        if comparison is None or comparison.unsure:
             return ""
         if comparison.used:  # a jump is no slip
             ways = [np.linalg.norm(T[:3, 3]) for T in (comparison.T_other, comparison.T_scans)]
@@ -123,6 +123,8 @@ class OtherOdometry:
             said.append(f"{self._struck[1]}, {ago:.0f} s ago")
         if self._comparison is not None and self._comparison.doubt > _DOUBTFUL:
             said.append(f"{self._comparison.doubt:.1f} times as far off as assumed")
+        if self._comparison is not None and self._comparison.unsure:
+            said.append("left out: by its own covariance it knows less than the motion before")
         if abs(self.slip) > _SLIPS:
             said.append(f"its ways are {abs(self.slip):.1%} too {'long' if self.slip > 0 else 'short'}")
         return "; ".join(said)

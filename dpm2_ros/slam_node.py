@@ -18,6 +18,7 @@ from dpm2_core.data.frames import Calibration, FrameBuilder
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Frame, Keyframe, OdometryResult, State
 from dpm2_core.geometry import se3
+from dpm2_core.geometry.sweep import Sweep
 from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.loops.localizer import LOST
 from dpm2_core.slam.system import Slam
@@ -129,6 +130,7 @@ class SlamNode(ManagedNode):
         """The state of a drive at its start."""
         self._slam.odometry.reset()
         self._base.restart()
+        self._sweep = Sweep()
         self._held: list[OdometryResult] = []  # until the base frame is known
         self._covariance = np.zeros((6, 6))
         self._before: BodyMotion | None = None  # the last registered frame, of which `_covariance` is
@@ -206,7 +208,8 @@ class SlamNode(ManagedNode):
         other, base = self._other, self._base
         if other is None or not base.name:
             return self._slam.odometry_step(frame)
-        guess = other.guess(frame.stamp, base.name, base.T_base_start @ base.T_start_lidar)
+        at = self._sweep.centered(frame).stamp  # where the scan is registered
+        guess = other.guess(at, base.name, base.T_base_start @ base.T_start_lidar)
         tracked = self._slam.odometry_step(replace(frame, guess=guess))
         if problem := other.judge(tracked.comparison):
             self.get_logger().warning(f"{other.source}: {problem}", throttle_duration_sec=5)

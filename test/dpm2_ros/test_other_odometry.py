@@ -10,19 +10,20 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
-from sensor_msgs.msg import PointCloud2
+from sensor_msgs.msg import PointCloud2, PointField
 
-from dpm2_core.data.messages import stamp_ns
+from dpm2_core.data.messages import cloud_fields, stamp_ns
 from dpm2_core.data.topics import POINTS
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
-from dpm2_ros.conversions import edge_to_msg, transform_to_msg
+from dpm2_ros.conversions import edge_to_msg, header, transform_to_msg
 from dpm2_ros.slam_node import SlamNode
 from dpm2_ros.tf import TFMessage
 
 from ..helpers.diagnostics import figures, having, saying
+from .conftest import pose, scan
 
 T_BASE_LIDAR = se3.exp([0.0, 0.0, 0.2, 0.8, 0.0, 1.2])
 JUMP, SLIP = 9, 0.02  # cloud before which the wheels jump by 0.5 m; fraction by which their ways are too long
@@ -49,6 +50,7 @@ class Robot:
         wheels = self.topic or self.tf
         self.wait(lambda: self.lidar.get_subscription_count() and wheels.get_subscription_count(), "subscriptions")
         self.wait(lambda: "lidar" in self.node.calibration.transforms.frames, "/tf_static")
+        self.covariance = lambda n: 1e-4 * np.eye(6)  # that the topic states by cloud n
         self._T, self.wheels = se3.exp([0.0, 0.0, 1.0, 5.0, 0.0, 0.0]), {}  # an origin of their own
 
     def base(self, t: float) -> Array:
@@ -69,7 +71,7 @@ class Robot:
             stamp = round(self.drive.start + t * self.drive.period)
             self.wheels[stamp] = self._T
             if self.topic:
-                self.topic.publish(edge_to_msg(self._T, 1e-4 * np.eye(6), stamp, "odom", "base_link"))
+                self.topic.publish(edge_to_msg(self._T, self.covariance(n), stamp, "odom", "base_link"))
             self.tf.publish(TFMessage(transforms=[transform_to_msg(self._T, stamp, "odom", "base_link")]))
             if not n:
                 break
@@ -172,6 +174,30 @@ def test_what_is_no_odometry_is_rejected(robot: Callable[..., Robot], drive: Any
     assert sum(r.node.rejections.values()) == 3
     for n, message in enumerate(r.odom):
         assert np.linalg.norm((transform_matrix(message.pose.pose) - r.base(n))[:3, 3]) < ACCURATE
+
+
+def test_one_that_is_unsure_by_its_own_covariance_is_not_called_outweighed(robot: Callable[..., Robot]) -> None:
+    """By 1000 m2 a cloud: "outweighed: 0.00 m, 0.0 deg from what the scans show" was said of what is right."""
+    r = robot("topic")
+    r.covariance = lambda n: (1e-4 + 1e3 * n) * np.eye(6)
+    r.send(*range(5))
+    said = r.status(saying("left out: by its own covariance"))
+    assert "outweighed" not in said.message
+    assert having(outweighed=0)(said)
+
+
+def test_it_is_asked_for_the_middle_of_the_sweep(robot: Callable[..., Robot], drive: Any) -> None:
+    """Where the scan is registered. At the stamp, here that of the first point, a robot that speeds up had ways that
+    are too short; here the wheels begin between the two."""
+    r = robot("tf")
+    for stamp in (drive.stamp(0) + 40_000_000, drive.stamp(0) + 60_000_000):
+        r.tf.publish(TFMessage(transforms=[transform_to_msg(np.eye(4), stamp, "odom", "base_link")]))
+    points = scan(pose(0))
+    columns = {name: points[:, i] for i, name in enumerate(("x", "y", "z"))}
+    columns["t"] = np.linspace(0, drive.period, len(points)).astype(np.uint32)
+    r.lidar.publish(PointCloud2(header=header(drive.stamp(0), "lidar"), **cloud_fields(columns, PointField)))
+    r.wait(lambda: r.odom, "the odometry of the cloud")
+    r.status(having(**{"clouds with it": 1, "without": 0}))
 
 
 @pytest.mark.parametrize(

@@ -48,6 +48,7 @@ class OtherMotion:
         self.step: Step | None = None
         self.comparison: Comparison | None = None
         self._raw: Array | None = None  # the step, possible or not
+        self._unsure = False  # by its own covariance, and by nothing else
         self._hangs = False  # it repeats a pose that no vehicle can have stopped at
         self._now: Guess | None = None
         self._last: Guess | None = None  # that of the last registered frame
@@ -60,7 +61,7 @@ class OtherMotion:
             twist: (6,) [rad/s, m/s] there; None if it is not known.
             of_prediction: covariance (6, 6) of the pose that follows from it.
         """
-        self._now, self.step, self._raw, self.comparison = guess, None, None, None
+        self._now, self.step, self._raw, self.comparison, self._unsure = guess, None, None, None, False
         if guess is None or self._last is None:
             return
         T = self._raw = se3.orthonormalized(se3.inverse(self._last.T_other_lidar) @ guess.T_other_lidar)
@@ -71,8 +72,10 @@ class OtherMotion:
             impossible = bool(off @ np.linalg.solve(covariance + of_prediction, off) > _POSSIBLE)
             same = np.array_equal(self._last.T_other_lidar, guess.T_other_lidar)
             self._hangs = same and (self._hangs or impossible)
-            unsure = np.trace(grown[3:, 3:]) > np.trace(of_prediction[3:, 3:])  # by its own account
-            if impossible or self._hangs or unsure or self._doubt > _CREDIBLE:
+            if impossible or self._hangs or self._doubt > _CREDIBLE:
+                return
+            self._unsure = bool(np.trace(grown[3:, 3:]) > np.trace(of_prediction[3:, 3:]))
+            if self._unsure:
                 return
         self.step = Step(T, covariance)
 
@@ -89,7 +92,7 @@ class OtherMotion:
         off = se3.log(se3.inverse(self._raw) @ T_scans)
         squared = float(off @ np.linalg.solve(of_scene + _spread(self._raw) + MAP_NOISE, off)) / _USUAL
         self._doubt = max(1.0, (1 - _MEMORY) * self._doubt + _MEMORY * min(squared, _WORST))
-        self.comparison = Comparison(self._raw, T_scans, used, self._doubt**0.5)
+        self.comparison = Comparison(self._raw, T_scans, used, self._doubt**0.5, self._unsure)
 
     def keep(self) -> None:
         """This frame was registered: the next step begins here."""

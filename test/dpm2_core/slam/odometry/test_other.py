@@ -70,6 +70,7 @@ def test_slip_and_jumps_are_outweighed_and_told(suburb_drive: Drive, jump: float
     assert [t.index for t in led[1:] if t.comparison is None or not t.comparison.used] == [JUMP]
     at_jump = led[JUMP].comparison
     assert at_jump is not None
+    assert not at_jump.unsure
     apart = np.linalg.norm(at_jump.T_other[:3, 3]) - np.linalg.norm(at_jump.T_scans[:3, 3])
     assert apart == pytest.approx(jump, rel=0.1, abs=0.05)
     assert at_jump.doubt > led[JUMP - 1].comparison.doubt  # type: ignore[union-attr]
@@ -113,7 +114,8 @@ def test_one_that_says_it_does_not_know_is_not_followed(suburb_drive: Drive) -> 
     unsure = [
         replace(f, guess=Guess(f.guess.T_other_lidar, 9.0 * (f.index + 1) * np.eye(6))) for f in frames if f.guess
     ]
-    assert [t.comparison.used for t in run(unsure) if t.comparison][1:] == [False] * 6
+    told = [t.comparison for t in run(unsure) if t.comparison][1:]
+    assert [(c.used, c.unsure) for c in told] == [(False, True)] * 6
     constant = [replace(f, guess=Guess(f.guess.T_other_lidar, 9.0 * np.eye(6))) for f in frames if f.guess]
     assert [t.comparison.used for t in run(constant) if t.comparison] == [True] * 7  # what does not grow says nothing
 
