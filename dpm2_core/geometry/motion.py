@@ -59,3 +59,10 @@ def combined(of_scene: Array, of_prediction: Array) -> Array:
     information, axes = np.linalg.eigh(np.linalg.inv(of_scene))
     shown = (axes * np.maximum(information - 1, 0)) @ axes.T
     return np.asarray(np.linalg.inv(shown + np.linalg.inv(of_prediction)))
+
+
+def along_open(of_scene: Array, other: Array) -> Array:
+    """Of a covariance `other` (3, 3) the part along the directions that a scene, of_scene (3, 3) [m], leaves open."""
+    variances, axes = np.linalg.eigh(of_scene)
+    left = axes[:, variances >= OPEN**2]
+    return np.asarray(left @ (left.T @ other @ left) @ left.T)

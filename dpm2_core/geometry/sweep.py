@@ -15,26 +15,30 @@ from dpm2_core.geometry import se3
 from dpm2_core.geometry.deskew import measured_turn
 
 _CENTERED = 0.1  # of a sweep: a stamp so near to its middle counts as the middle
+_WHOLE = 1.2  # times as long as another one: that one is a part of a sweep
 
 
 class Sweep:
-    """Learns it from the first cloud with times; a cloud of which less was seen does not change it.
+    """The sweep of the last cloud with times. Each has its own: what a driver sends first is a part of a sweep.
 
     Attributes:
-        middle: s after the stamp.
+        middle: s after the stamp. span: s from the first to the last point; 0: not known.
     """
 
     def __init__(self) -> None:
-        self.middle = 0.0
-        self._known = False
+        self.middle = self.span = 0.0
 
     def centered(self, frame: Frame) -> Frame:
         """The frame, timed from the middle of its sweep."""
-        if not self._known and frame.time_offset is not None and len(frame.time_offset):
+        if frame.time_offset is not None and len(frame.time_offset):
             start, end = float(frame.time_offset.min()), float(frame.time_offset.max())
-            middle = (start + end) / 2
-            self.middle, self._known = middle if abs(middle) > _CENTERED * (end - start) else 0.0, True
+            middle, self.span = (start + end) / 2, end - start
+            self.middle = middle if abs(middle) > _CENTERED * self.span else 0.0
         return frame.later(self.middle)
+
+    def is_part(self, span: float) -> bool:
+        """Whether another sweep, of `span` s, was only a part of one as this."""
+        return self.span > _WHOLE * span
 
     def to_stamp(self, frame: Frame, twist: Array | None) -> Array:
         """T_scan_lidar (4, 4): where the LiDAR was at the stamp, seen from where it was in the middle.

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
 from time import perf_counter
 
@@ -13,7 +14,7 @@ from dpm2_core.data.repeated import PROBLEM as REPEATED
 from dpm2_core.data.stream_clock import SLOWEST, StreamClock
 from dpm2_core.frame import Array, Frame, OdometryResult, Registration, State
 from dpm2_core.geometry import se3
-from dpm2_core.geometry.motion import OPEN, combined, covariance, predicted, spread
+from dpm2_core.geometry.motion import OPEN, along_open, combined, covariance, predicted, spread
 from dpm2_core.geometry.sweep import Sweep
 from dpm2_core.slam.bridge import Bridge, Limits
 from dpm2_core.slam.odometry.inertial import InertialMotion
@@ -60,8 +61,10 @@ class Odometry:
         self._sweep = Sweep()
         self._registered = np.eye(4), 0.0  # the last registered pose, and the seconds since
         self._failures = 0
+        self._open = 0.0  # s, for which the scene has left a direction open
         self._repeated, self._images = RepeatedCloud(), RepeatedImages()
-        self._first: Frame | None = None
+        self._first: Frame | None = None  # until the second one is registered
+        self._first_sweep = Sweep()
         self._bridge: Bridge | None = None
         self._left = 0.0  # the time of the last pose before the pause that is being bridged
         self._breaks = 0
@@ -95,6 +98,8 @@ class Odometry:
         clock = [perf_counter()]
         given, frame = frame, self._sweep.centered(frame)
         dt = self._clock.advance(frame.stamp)
+        if self._first is not None and self._sweep.is_part(self._first_sweep.span):
+            self._forget_first(dt)
         twist = np.zeros(6) if self._twist is None else self._twist
         seconds = self._registered[1] + dt
         if frame.imu is not None and self._inertial is None:
@@ -124,7 +129,7 @@ class Odometry:
         if registration.ok:
             self._repeated.keep()
         if registration.method == "first" and registration.ok and frame.time_offset is not None:
-            self._first = frame
+            self._first, self._first_sweep = frame, copy(self._sweep)
         T = self._T
         if self._bridge is not None and registration.ok:
             registration = self._cross(self._bridge, scan, registration)
@@ -150,6 +155,13 @@ class Odometry:
             imu=None if self._inertial is None else self._inertial.problem,
             camera=IMAGE_PROBLEM if len(frame.images) < images else "",
         )
+
+    def _forget_first(self, dt: float) -> None:
+        """The first scan shows a part of the scene, as drivers begin in mid-sweep: the next one is the first."""
+        self._first = None
+        self._registration.clear()
+        self._keyframes.add_uncertainty(self._unknown(dt))
+        self._keyframes.request()
 
     def _without_repetitions(self, frame: Frame, meters: float) -> Frame:
         """Without what the LiDAR or a camera has sent before; `meters`: the way since the last registered frame."""
@@ -223,10 +235,16 @@ class Odometry:
             return scan, Registration(
                 T_predicted, np.zeros((6, 6)), float(not rejection), 0.0, "first", not rejection, rejection
             )
-        led = self._register_by_other(scan, dt)
-        self._led = led is not None
-        if led is not None:
-            return scan, led
+        led, fits = self._register_by_other(scan, dt)
+        self._led = fits
+        if not fits:
+            own = self._register_alone(frame, scan, T_predicted, dt)
+            # Along a tunnel most of a scan fits a map that was made at rest at rest: it says nothing of the step.
+            self._led = led is not None and own[1].worst_sigma >= OPEN
+        return (scan, led) if self._led and led is not None else own
+
+    def _register_alone(self, frame: Frame, scan: Scan, T_predicted: Array, dt: float) -> tuple[Scan, Registration]:
+        """The same by the motion so far, or from rest."""
         if self._twist is None:
             return scan, self._registered_from_rest(scan, T_predicted, dt)
         seconds = self._registered[1] + dt
@@ -255,18 +273,18 @@ class Odometry:
         """What another odometry says of the way since the last registered frame."""
         return None if self._other is None else self._other.step
 
-    def _register_by_other(self, scan: Scan, dt: float) -> Registration | None:
-        """From where another odometry leads; None without one, or where the scan does not confirm it."""
+    def _register_by_other(self, scan: Scan, dt: float) -> tuple[Registration | None, bool]:
+        """From where another odometry leads, and whether the scan fits there; None without one, or far from there."""
         T_before, step = self._registered[0], self._step_of_other()
         if self._other is None or step is None:
-            return None
+            return None, False
         T = T_before @ step.T
         information = np.linalg.inv(step.covariance).astype(np.float64)
         prediction = Prediction([T], information=information)
         result = self._gated(self._registration.register(scan, prediction), T, dt)
         # A wrong step holds the scan where it leads; that few of its points fit there is what tells the two apart.
-        confirmed = result.ok and result.confidence >= prediction.convincing and self._other.agrees(T_before, result)
-        return result if confirmed else None
+        agrees = result.ok and self._other.agrees(T_before, result)
+        return (result if agrees else None), agrees and result.confidence >= prediction.convincing
 
     def _registered_from_rest(self, scan: Scan, T: Array, dt: float) -> Registration:
         """While the velocity is unknown: the best of many starts; after a pause first as before it."""
@@ -300,7 +318,7 @@ class Odometry:
         self._first = None
         T_first_this = se3.inverse(self._T) @ registration.T_target_source
         twist = se3.log(T_first_this) / seconds
-        self._T = self._T @ se3.exp(self._sweep.middle * twist)  # the first pose was handed out at its stamp
+        self._T = self._T @ se3.exp(self._first_sweep.middle * twist)  # the first pose was handed out at its stamp
         self._registered = self._T, self._registered[1]
         self._registration.clear()
         self._registration.update(self._registration.prepare(first, twist), self._T)
@@ -329,8 +347,10 @@ class Odometry:
         if self._bridge is None:
             self._failures = 0
         self._go_on(scan, registration, None if registration.method == "first" else self._twist)
-        if registration.method != "first" and registration.worst_sigma >= OPEN:
-            self._covariance[3:, 3:] += of_motion  # what the scene leaves open ends at 1 m; the motion does not
+        self._open = self._open + seconds + dt if registration.worst_sigma >= OPEN else 0.0
+        if registration.method != "first" and self._open:
+            # What the scene leaves open ends at 1 m; the motion does not, and each pose follows from the one before.
+            self._covariance[3:, 3:] += along_open(registration.of_scene[3:, 3:], self._of_velocity) * self._open**2
 
     def _go_on(self, scan: Scan, registration: Registration, twist: Array | None) -> None:
         """Go on from a registered pose; `twist` (6,): the motion that led there, None where none did."""

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -29,6 +31,20 @@ def test_a_frame_is_timed_from_the_middle_of_its_sweep(stamp_at: float) -> None:
     np.testing.assert_allclose(centered.time_offset, np.linspace(-0.05, 0.05, 11), atol=1e-6)  # float32
     without = sweep.centered(Frame(2 * 10**9, np.ones((3, 4), np.float32)))
     assert without.stamp == pytest.approx(2 * 10**9 - round(stamp_at * 1e9), abs=2)
+
+
+def test_each_cloud_has_a_middle_of_its_own() -> None:
+    """A driver begins in the midst of a sweep, and what it sends first was the measure of all that followed."""
+    sweep, whole = Sweep(), a_frame(START)
+    assert whole.time_offset is not None
+    late = whole.time_offset > 0.075
+    assert sweep.centered(replace(whole, points=whole.points[late], time_offset=whole.time_offset[late])).stamp == (
+        pytest.approx(10**9 + 40_000_000, abs=10)  # ns: times are float32
+    )
+    span = sweep.span
+    assert sweep.centered(whole).stamp == pytest.approx(10**9, abs=10)
+    assert sweep.is_part(span)
+    assert not sweep.is_part(sweep.span)
 
 
 def test_a_stamp_near_the_middle_is_left() -> None:

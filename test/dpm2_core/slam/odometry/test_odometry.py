@@ -81,6 +81,11 @@ def test_a_tunnel_is_never_reported_as_tracking(tunnel_drive: Drive) -> None:
         step = se3.inverse(tracked[i - 1].T_odom_lidar) @ tracked[i].T_odom_lidar
         off = se3.log(se3.inverse(se3.inverse(truth[i - 1]) @ truth[i]) @ step)[3]
         assert abs(off) < 3 * np.sqrt(tracked[i].covariance[3, 3])
+    # and of its poses: each follows from the one before, so that the doubt grows with the way
+    sigmas = [float(np.sqrt(t.covariance[3, 3])) for t in tracked[1:]]
+    assert sigmas[1:] == sorted(sigmas[1:])
+    along = [float((se3.inverse(T) @ t.T_odom_lidar)[0, 3]) for T, t in zip(truth[1:], tracked[1:], strict=True)]
+    assert np.all(np.abs(along) < 3 * np.array(sigmas))
     # and the direction that is not known is the one along the tunnel
     covariance = tracked[-1].registration.covariance[3:, 3:]
     worst = np.linalg.eigh(covariance)[1][:, -1]
@@ -191,6 +196,22 @@ def test_the_beginning_of_a_sweep_that_is_refused_does_not_become_the_map() -> N
     assert not tracked[0].registration.ok
     assert tracked[-1].state == State.TRACKING
     assert errors(tracked[1:], se3.inverse(truth[1]) @ truth[1:])[:, 0].max() < 0.05
+
+
+@pytest.mark.slow
+def test_a_first_cloud_that_is_a_part_of_a_sweep_is_not_gone_by() -> None:
+    """Stamped at its first point, the last quarter, as drivers begin: it was the map, and its middle that of all."""
+    frames, truth = make_drive("suburb", 12, deskewed=False)
+    times = frames[0].time_offset
+    assert times is not None
+    last = times > 0.025
+    part = replace(frames[0], points=frames[0].points[last], time_offset=times[last]).later(float(times[last].min()))
+    tracked = run([part, *(frame.later(-0.05) for frame in frames[1:])])
+    poses = np.array([t.T_odom_lidar for t in tracked])
+    steps = se3.inverse(se3.inverse(truth[2:-1]) @ truth[3:]) @ se3.inverse(poses[2:-1]) @ poses[3:]
+    assert np.linalg.norm(steps[:, :3, 3], axis=1).max() < 0.05  # as of whole ones; 0.34 before
+    assert {t.state for t in tracked[2:]} == {State.TRACKING}
+    assert [t.index for t in tracked if t.keyframe is not None][:2] == [0, 1]  # a part of the place, and all of it
 
 
 @pytest.mark.slow
