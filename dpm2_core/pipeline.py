@@ -12,7 +12,7 @@ from dpm2_core.data.open import open_source
 from dpm2_core.data.prefetch import prefetch
 from dpm2_core.data.source import Source, Span
 from dpm2_core.data.trajectory import Trajectory
-from dpm2_core.errors import UsageError
+from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.evaluation.ground_truth import read_ground_truth
 from dpm2_core.evaluation.run_result import Result
 from dpm2_core.frame import Array, Frame
@@ -103,12 +103,19 @@ class OfflineRun:
 
         Args:
             progress: called after each frame. watch: the same, with the frame and the map as they are then.
+
+        Raises:
+            Dpm2Error: none of the scans could be read.
         """
         result = Result(self.source, self._config, self.slam.mapper, self._truth, self._truth_name)
-        self._begun, began = None, perf_counter()
+        began, problems = perf_counter(), list[str]()
         try:
             with interrupt_deferred() as interrupted:
                 for frame in prefetch(self.source.frames(self._start, self._stop)):
+                    if frame.problem is None:
+                        self._begun = None
+                    else:
+                        problems.append(frame.problem)
                     step = self.slam.process(frame)
                     result.add(step.odometry)
                     if watch is not None:
@@ -120,6 +127,8 @@ class OfflineRun:
             result.interrupted = True
         result.wall_s = perf_counter() - began
         self.slam.finish()
+        if problems and len(problems) == len(result) and not result.interrupted:
+            raise Dpm2Error(f"{self.source.name}: none of {len(result)} scans could be read; the first: {problems[0]}")
         return result
 
 

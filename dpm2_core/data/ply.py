@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Point clouds as binary PLY, which CloudCompare, MeshLab, Open3D and Blender open."""
+"""Point clouds as PLY, which CloudCompare, MeshLab, Open3D and Blender open: written as binary, read as any."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,7 @@ _TYPES = {
     "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4",
     "double": "<f8", "float64": "<f8",
 }  # fmt: skip
+_CODINGS = ("binary_little_endian", "binary_big_endian", "ascii")
 
 
 def read_ply(path: Path | str, names: Sequence[str]) -> Array:
@@ -59,7 +61,7 @@ def read_ply(path: Path | str, names: Sequence[str]) -> Array:
 
 
 def read_vertices(path: Path | str) -> dict[str, NDArray[Any]]:
-    """Every property (N,) of the vertices, the first element of a little-endian binary PLY, by its name.
+    """Every property (N,) of the vertices, the first element of a PLY, binary or ASCII, by its name.
 
     Raises:
         UsageError: not such a file, or cut short.
@@ -71,8 +73,9 @@ def read_vertices(path: Path | str) -> dict[str, NDArray[Any]]:
     end = data.find(b"end_header")
     start = data.find(b"\n", end) + 1
     header = [line.split() for line in data[: max(end, 0)].decode("ascii", "replace").splitlines()]
-    if ["ply"] not in header[:1] or ["format", "binary_little_endian", "1.0"] not in header or not start:
-        raise UsageError(f"{path}: no little-endian binary PLY")
+    coding = next((line[1] for line in header if line[:1] == ["format"] and line[2:] == ["1.0"]), "")
+    if ["ply"] not in header[:1] or coding not in _CODINGS or not start:
+        raise UsageError(f"{path}: no PLY of version 1.0, binary or ASCII")
     elements = [i for i, line in enumerate(header) if line[:1] == ["element"]]
     try:
         first, last = elements[0], [*elements, len(header)][1]
@@ -80,7 +83,26 @@ def read_vertices(path: Path | str) -> dict[str, NDArray[Any]]:
         layout = np.dtype([(line[2], _TYPES[line[1]]) for line in header[first + 1 : last] if line[0] == "property"])
     except (IndexError, ValueError, KeyError) as error:
         raise UsageError(f"{path}: header of the PLY is damaged ({error})") from None
-    if count < 0 or len(data) - start < count * layout.itemsize:
+    names = layout.names or ()
+    least = len(names) if coding == "ascii" else layout.itemsize  # bytes of a vertex
+    if count < 0 or len(data) - start < count * least:
         raise UsageError(f"{path}: ends before its {count} points do")
-    vertices = np.frombuffer(data, layout, count, start)
-    return {name: vertices[name] for name in layout.names or ()}
+    if not count or not names:
+        return {name: np.empty(0, layout[name]) for name in names}
+    if coding == "ascii":
+        vertices = _from_text(path, data[start:], layout, count)
+    else:
+        stored = layout.newbyteorder(">") if coding == "binary_big_endian" else layout
+        vertices = np.frombuffer(data, stored, count, start).astype(layout, copy=False)
+    return {name: vertices[name] for name in names}
+
+
+def _from_text(path: Path | str, data: bytes, layout: np.dtype[Any], count: int) -> NDArray[Any]:
+    """(count,) of this layout, a line each."""
+    try:
+        vertices = np.loadtxt(BytesIO(data), layout, comments=None, max_rows=count, ndmin=1, encoding="ascii")
+    except ValueError as error:
+        raise UsageError(f"{path}: damaged ({error})") from None
+    if len(vertices) < count:
+        raise UsageError(f"{path}: ends before its {count} points do")
+    return np.asarray(vertices)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dpm2_core.data.ply import read_ply, write_ply
+from dpm2_core.data.ply import read_ply, read_vertices, write_ply
 from dpm2_core.errors import UsageError
 
 
@@ -62,5 +62,40 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="ends before its 10 points do"):
         read_ply(path, ("x",))
     path.write_text("hello")
-    with pytest.raises(UsageError, match="no little-endian binary PLY"):
+    with pytest.raises(UsageError, match=r"map\.ply: no PLY of version 1\.0, binary or ASCII"):
         read_ply(path, ("x",))
+
+
+def _coded(coding: str, points: np.ndarray, body: bytes) -> bytes:
+    properties = "property double x\nproperty uint t\nproperty uchar intensity\n"
+    faces = "element face 1\nproperty list uchar int vertex_indices\n"
+    return f"ply\nformat {coding} 1.0\nelement vertex {len(points)}\n{properties}{faces}end_header\n".encode() + body
+
+
+def test_big_endian_and_ascii_are_read(tmp_path: Path) -> None:
+    """As MeshLab, Open3D and PCL write them; a drive of such scans was one of unreadable ones."""
+    points = np.array([(1.25, 4_000_000_000, 255), (-1e-3, 0, 0), (float("nan"), 7, 1)],
+                      [("x", "<f8"), ("t", "<u4"), ("intensity", "u1")])  # fmt: skip
+    text = "\r\n".join(" ".join(str(value) for value in row) for row in points.tolist()).encode()
+    wide = points.astype(points.dtype.newbyteorder(">")).tobytes()
+    for coding, body in (("binary_big_endian", wide), ("ascii", text + b"\n3 0 1 2\n")):
+        (tmp_path / "scan.ply").write_bytes(_coded(coding, points, body))
+        found = read_vertices(tmp_path / "scan.ply")
+        assert {name: part.dtype for name, part in found.items()} == dict(points.dtype.descr)
+        for name, part in found.items():
+            np.testing.assert_array_equal(part, points[name])
+
+
+@pytest.mark.parametrize(
+    ("body", "reason"),
+    [
+        (b"1 2 3\n", "ends before"),
+        (b"1 2 3\n4 5\n" * 9, "damaged"),
+        (b"1 2 a\n" * 9, "damaged"),
+        (b"\xff" * 99, "damaged"),
+    ],
+)
+def test_damaged_text_is_an_error_that_names_the_file(tmp_path: Path, body: bytes, reason: str) -> None:
+    (tmp_path / "scan.ply").write_bytes(_coded("ascii", np.zeros(2), body))
+    with pytest.raises(UsageError, match=f"scan.ply: {reason}"):
+        read_vertices(tmp_path / "scan.ply")
