@@ -62,10 +62,13 @@ def segment_errors(
     """Compare (N, 4, 4) poses with (N, 4, 4) ground truth of the same frames and the same sensor frame.
 
     Args:
+        gt: rows of NaN where the ground truth is unknown; these frames count for the speeds alone.
         est: rows of NaN where a frame has no estimate; segments that begin or end there are left out.
         lengths: m. With those of the benchmark a segment starts every 10 frames, as there, with others at each frame.
         period: s from one frame to the next, for the speeds.
     """
+    at = np.flatnonzero(known(gt))  # position of each true pose among the frames
+    gt, est = gt[at], est[at]
     step = 10 if tuple(lengths) == OFFICIAL_LENGTHS else 1
     travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(gt[:, :3, 3], axis=0), axis=1))])
     first, length = (grid.ravel() for grid in np.meshgrid(np.arange(0, len(gt), step), lengths, indexing="ij"))
@@ -75,7 +78,7 @@ def segment_errors(
     both = known(est)[first] & known(est)[last]
     first, last, length = first[both], last[both], length[both]
     error = se3.inverse(relative(est, first, last)) @ relative(gt, first, last)
-    speed = length / (period * (last - first + 1))  # as the development kit counts the frames
+    speed = length / (period * (at[last] - at[first] + 1))  # as the development kit counts the frames
     return SegmentErrors(length, np.linalg.norm(error[:, :3, 3], axis=1) / length, se3.angle(error) / length, speed)
 
 

@@ -115,7 +115,7 @@ def evaluate(
         raise UsageError(
             f"only {both.sum()} of {len(gt)} frames have both an estimate and ground truth; want 2 or more"
         )
-    segments = segment_errors(gt[has_gt], est[has_gt], lengths, period)
+    segments = segment_errors(gt, est, lengths, period)
     t_err, r_err = _percent(segments)
     rpe_trans, rpe_rot = rpe(gt, est)
     position = _position_errors(gt[both], est[both])

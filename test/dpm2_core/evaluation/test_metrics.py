@@ -161,3 +161,13 @@ def test_a_speed_between_two_classes_is_in_one() -> None:
     gt[:, 0, 3] = np.arange(201)
     found = evaluate(gt, gt, [9.5], period=9.5 / 11 / 5)  # 10 steps count as 11 frames
     assert [(row.speed_mps, row.segments) for row in found.per_speed] == [(6.0, found.segments)]
+
+
+def test_gaps_of_the_ground_truth_make_no_drive_faster() -> None:
+    """10 m/s all the way; with every other 4 frames without a truth it seemed to be 16 to 20 m/s."""
+    gt, est = _straight(), _straight()
+    gt[np.arange(101) // 4 % 2 == 1] = np.nan
+    found = evaluate(gt, est, [20.0], period=0.1)
+    assert found.segments == 40
+    # As the kit counts, 20 m end at the first known frame beyond: of 22 to 26 frames.
+    assert {row.speed_mps for row in found.per_speed} == {8.0, 10.0}
