@@ -14,9 +14,9 @@ from dpm2_core.config import load_settings
 from dpm2_core.data.kitti import read_calib
 from dpm2_core.data.open import open_source
 from dpm2_core.data.settings import InputSettings
-from dpm2_core.data.trajectory import Trajectory, matched, read_trajectory
+from dpm2_core.data.trajectory import Trajectory, matched, matched_period, read_trajectory
 from dpm2_core.errors import UsageError
-from dpm2_core.evaluation.kitti_metric import OFFICIAL_LENGTHS
+from dpm2_core.evaluation.kitti_metric import OFFICIAL_LENGTHS, known
 from dpm2_core.evaluation.metrics import evaluate
 from dpm2_core.evaluation.report import metrics_table
 from dpm2_core.geometry import se3
@@ -51,7 +51,7 @@ def eval_(
     estimate = read_trajectory(est)
     if calib is not None:
         estimate = in_camera_frame(estimate, calib)
-    period = max(truth.period, estimate.period)  # a truth of a faster clock is read at the estimate's stamps
+    period = matched_period(truth.period, estimate.period)
     metrics = evaluate(*matched(truth, estimate), chosen, period=period).model_copy(update={"truth": str(gt)})
     frame = FRAME_CAMERA if calib else FRAME_AS_GIVEN
     figures = {"gt": str(gt), "est": str(est), "frame": frame, **metrics.model_dump()}
@@ -59,17 +59,18 @@ def eval_(
 
 
 def _of_drive(path: Path, settings: list[str]) -> Trajectory:
-    """True poses of a drive by frame number, of the left camera where its place is known, as `dpm2 run` writes them."""
+    """True poses of all frames of a drive, NaN where there is none, by frame number; of the left camera where its place
+    is known, as `dpm2 run` writes them."""
     source = open_source(path, load_settings(InputSettings, None, [*settings, "images=false"]))
     if source.poses is None:
         raise UsageError(f"{path}: the drive has no ground truth")
     T = np.eye(4) if source.T_cam_lidar is None else source.T_cam_lidar
     numbers = getattr(source, "numbers", None)  # those in the file names
     numbers = np.arange(len(source)) if numbers is None else numbers
-    known = np.isfinite(source.poses).all((1, 2))
-    if not known.any():
+    if not known(source.poses).any():
         raise UsageError(f"{path}: no frame has a pose; {'; '.join(source.notes)}")
-    return Trajectory(T @ source.poses[known] @ se3.inverse(T), numbers[known], "kitti-indexed")
+    # Frames without a pose stay: a file with a line for each frame is matched line by line.
+    return Trajectory(T @ source.poses @ se3.inverse(T), numbers, "kitti-indexed")
 
 
 def in_camera_frame(trajectory: Trajectory, calib: Path) -> Trajectory:

@@ -23,8 +23,8 @@ _TUM, _KITTI, _KITTI_INDEXED, _KITTI_360 = 8, 12, 13, 17  # numbers a line
 _GAP = 1_000_000_000  # ns between two poses beyond which nothing is known in between
 FRAME_PERIOD = 0.1
 """Of KITTI's scans, s."""
-SAME_TIME = 0.01
-"""s between the stamps of two poses of one frame."""
+_SAME_TIME = 100_000  # ns between the stamps of one frame in two files: one of four decimals; 3 mm at 30 m/s
+_CLEARLY = 0.75  # one period to the other where the rates are not the same: a frame lost here and there, jitter
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,11 +135,12 @@ def _poses(rows: Array, columns: int) -> tuple[Array, NDArray[np.bool_]]:
     return se3.make(R, matrices[:, :, 3]), finite & (skew < 0.01) & (np.linalg.det(R) > 0)
 
 
-def matched(gt: Trajectory, est: Trajectory, tolerance: float = SAME_TIME) -> tuple[Array, Array]:
-    """Ground truth (N, 4, 4) and the estimate (N, 4, 4) of the same frames, NaN where it has none.
+def matched(gt: Trajectory, est: Trajectory) -> tuple[Array, Array]:
+    """Ground truth (N, 4, 4) and the estimate (N, 4, 4) of the same frames, NaN where either has none.
 
-    By stamp (nearest within `tolerance`, s) if both are TUM, by frame number if one carries it and the other has a line
-    for each number, else line by line.
+    If both are TUM and their stamps are not the same, one is interpolated: the ground truth at the stamps of the
+    estimate, or the estimate where the ground truth is clearly slower. Else by stamp, by frame number if one carries it
+    and the other has a line for each number, else line by line.
 
     Raises:
         UsageError: nothing says which pose belongs to which, or none belong together.
@@ -157,21 +158,47 @@ def matched(gt: Trajectory, est: Trajectory, tolerance: float = SAME_TIME) -> tu
             " numbers (13 KITTI columns, the number first) nor stamps (both TUM) say which belong together;"
             " `dpm2 eval --gt DRIVE` takes the true poses, with the numbers of their frames, from the drive"
         )
-    gt_keys, order = np.unique(gt.keys, return_index=True)
-    gt_poses = gt.poses[order]
-    rows, apart = _nearest(gt_keys, est.keys)
-    near = np.flatnonzero(apart <= (round(tolerance * 1e9) if stamped else 0))
-    if not len(near):
-        unit = "time stamp" if stamped else "frame number"
-        raise UsageError(f"no {unit} of the estimate ({est.keys[0]}...) is one of the ground truth ({gt.keys[0]}...)")
-    near = near[np.argsort(apart[near], kind="stable")]  # of several for one frame the nearest, or the first (a loop)
-    rows, first = np.unique(rows[near], return_index=True)
-    est_poses = np.full_like(gt_poses, np.nan)
-    est_poses[rows] = est.poses[near[first]]
-    if stamped and _period(gt_keys) < 0.75 * _period(est.keys):
-        # Ground truth of a faster clock (GNSS, motion capture): the frames are those of the estimate.
-        return gt_poses[rows], est_poses[rows]
-    return gt_poses, est_poses
+    gt, est = _ordered(gt), _ordered(est)
+    if stamped and not (same_stamps(gt.keys, est.keys) and gt.period >= _CLEARLY * est.period):
+        return _interpolated(gt, est)
+    rows, apart = _nearest(gt.keys, est.keys)
+    near = apart <= (_SAME_TIME if stamped else 0)
+    if not near.any():
+        numbers = f"({est.keys[0]}...) is one of the ground truth ({gt.keys[0]}...)"
+        raise UsageError(f"no frame number of the estimate {numbers}")
+    est_poses = np.full_like(gt.poses, np.nan)
+    est_poses[rows[near]] = est.poses[near]
+    return gt.poses, est_poses
+
+
+def matched_period(gt: float, est: float) -> float:
+    """s from one frame of `matched` to the next, given the periods of both, s."""
+    return gt if est < _CLEARLY * gt else est
+
+
+def same_stamps(a: Keys, b: Keys) -> bool:
+    """Whether (N,) and (M,) stamps, ns, are those of the same frames: most of the fewer are among the others."""
+    few, many = sorted((np.unique(a), np.unique(b)), key=len)
+    return bool(2 * np.count_nonzero(_nearest(many, few)[1] <= _SAME_TIME) > len(few))
+
+
+def _ordered(trajectory: Trajectory) -> Trajectory:
+    """Ascending keys, of equal ones (a loop) the first."""
+    keys, first = np.unique(trajectory.keys, return_index=True)
+    return Trajectory(trajectory.poses[first], keys, trajectory.kind)
+
+
+def _interpolated(gt: Trajectory, est: Trajectory) -> tuple[Array, Array]:
+    """Both at the stamps of the estimate, or of the ground truth where that is clearly slower: a second of a bend, of
+    which nothing is known in between, is no line."""
+    at = gt.keys if est.period < _CLEARLY * gt.period else est.keys
+    true, estimated = (interpolate(each.keys, each.poses, at) for each in (gt, est))
+    if not np.isfinite(true + estimated).any():
+        raise UsageError(
+            f"the estimate (time stamps from {est.keys[0]} to {est.keys[-1]} ns) has no pose during the ground truth"
+            f" ({gt.keys[0]} to {gt.keys[-1]} ns): none at one of its stamps or between two up to 1 s apart"
+        )
+    return true, estimated
 
 
 def interpolate(stamps: Keys, poses: Array, at: Keys) -> Array:
@@ -196,12 +223,7 @@ def interpolate(stamps: Keys, poses: Array, at: Keys) -> Array:
 
 def frame_period(stamps: Keys | Sequence[int]) -> float:
     """Median time from one of these stamps (N,) ns to the next, s; that of KITTI's frames where there are too few."""
-    return _period(np.asarray(stamps)) * 1e-9 if len(stamps) > 1 else FRAME_PERIOD
-
-
-def _period(keys: Keys) -> float:
-    """Median step between neighbors."""
-    return float(np.median(np.diff(keys))) if len(keys) > 1 else 0.0
+    return float(np.median(np.diff(np.asarray(stamps)))) * 1e-9 if len(stamps) > 1 else FRAME_PERIOD
 
 
 def _nearest(keys: Keys, requested: Keys) -> tuple[NDArray[np.intp], Keys]:

@@ -14,10 +14,11 @@ import numpy as np
 from dpm2_core.config import dump_settings
 from dpm2_core.data.ply import write_ply
 from dpm2_core.data.source import Source
-from dpm2_core.data.trajectory import SAME_TIME, Trajectory, frame_period, matched, write_kitti, write_tum
+from dpm2_core.data.trajectory import Trajectory, frame_period, matched, matched_period, write_kitti, write_tum
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.figures import trajectory_png
 from dpm2_core.evaluation.ground_truth import in_other_frame, truth_by_stamp
+from dpm2_core.evaluation.kitti_metric import known
 from dpm2_core.evaluation.metrics import Metrics, evaluate
 from dpm2_core.evaluation.run_folder import (
     CLOUD,
@@ -157,7 +158,7 @@ class Result:
         Raises:
             UsageError: nothing of the ground truth belongs to this drive.
         """
-        truth, poses = self._compared()
+        truth, poses = self._compared() if len(self) else (None, np.empty((0, 4, 4)))
         if truth is None:
             return None
         if not isinstance(self.ground_truth, Trajectory):
@@ -165,8 +166,10 @@ class Result:
                 return None
             poses = self.sensor_poses
             truth = truth if self.source.T_cam_lidar is None else in_other_frame(truth, self.source.T_cam_lidar)
-        failed = self.methods["failed"]
-        metrics = evaluate(truth, poses, period=frame_period(self.recorder.stamps), failed_frames=failed)
+        period, failed = frame_period(self.recorder.stamps), self.methods["failed"]
+        if isinstance(self.ground_truth, Trajectory) and self.ground_truth.kind == "tum":
+            period = matched_period(self.ground_truth.period, period)
+        metrics = evaluate(truth, poses, period=period, failed_frames=failed)
         own = {"truth": self.ground_truth_name, "breaks": self.recorder.breaks, "fps": self.fps}
         return metrics.model_copy(update=own)
 
@@ -224,14 +227,13 @@ class Result:
         truth = self.ground_truth
         if not isinstance(truth, Trajectory):
             return None if truth is None else truth[: len(self)], self.poses
-        own, apart = Trajectory(self.poses, np.array(self.recorder.stamps), "tum"), SAME_TIME * 1e9
+        own = Trajectory(self.poses, np.array(self.recorder.stamps), "tum")
         if truth.kind == "kitti-indexed":
-            own, apart = Trajectory(self.sensor_poses, np.array(self.recorder.index), "kitti-indexed"), 0
-        first, last = min(own.keys, default=0) - apart, max(own.keys, default=0) + apart
-        during = (truth.keys >= first) & (truth.keys <= last)
-        if during.any():  # else it is of another drive, which `matched` says
-            truth = Trajectory(truth.poses[during], truth.keys[during], truth.kind)
-        return matched(truth, own)
+            own = Trajectory(self.sensor_poses, np.array(self.recorder.index), "kitti-indexed")
+        true, est = matched(truth, own)
+        during = np.flatnonzero(known(est))  # all frames have a pose: the truth before and after is not of this drive
+        drive = slice(during[0], during[-1] + 1)
+        return true[drive], est[drive]
 
     @property
     def sensor(self) -> str:

@@ -15,7 +15,7 @@ from dpm2_core.data.corrupt import CorruptedSource, parse_corruption
 from dpm2_core.data.open import open_source
 from dpm2_core.data.prefetch import prefetch
 from dpm2_core.data.source import Source, Span
-from dpm2_core.data.trajectory import Trajectory, matched, read_trajectory, write_tum
+from dpm2_core.data.trajectory import Trajectory, interpolate, matched, read_trajectory, same_stamps, write_tum
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.evaluation.ground_truth import in_other_frame, read_ground_truth
 from dpm2_core.evaluation.kitti_metric import known
@@ -122,12 +122,16 @@ def given(folder: Path, advance: Advance, drive: Drive, file: str) -> Figures:
     if found.kind == "kitti" and len(found) == len(source) != len(truth):
         found = Trajectory(found.poses[start:stop], found.keys[start:stop], found.kind)
     own_keys = {"tum": stamps, "kitti-indexed": index, "kitti": np.arange(len(truth))}[found.kind]
+    if found.kind == "tum" and not same_stamps(stamps, found.keys):
+        found = Trajectory(interpolate(found.keys, found.poses, stamps), stamps, found.kind)
     try:
         _, poses = matched(Trajectory(truth, own_keys, found.kind), found)
     except UsageError as error:
         raise UsageError(f"{file}: {error}") from None
     if len(poses) != len(truth):
         raise UsageError(f"{file}: {len(poses)} poses belong to the {len(truth)} frames of {source.name}")
+    if not known(poses).any():
+        raise UsageError(f"{file}: has no pose during the frames of {source.name}")
     if found.kind != "tum" and source.T_cam_lidar is not None:
         poses = in_other_frame(poses, se3.inverse(source.T_cam_lidar))
     there = known(poses)

@@ -12,8 +12,9 @@ import pytest
 
 from dpm2_core.config import load_settings
 from dpm2_core.data.open import open_source
-from dpm2_core.data.trajectory import read_trajectory, write_kitti, write_tum
-from dpm2_core.errors import UsageError
+from dpm2_core.data.ply import write_ply
+from dpm2_core.data.trajectory import interpolate, read_trajectory, write_kitti, write_tum
+from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.evaluation.run_result import Result
 from dpm2_core.frame import Frame
 from dpm2_core.pipeline import OfflineRun
@@ -133,6 +134,41 @@ def test_ground_truth_as_poses_and_as_a_tum_file(recording: Path, tmp_path: Path
     assert stamped.metrics.ape_rmse_m == pytest.approx(given.metrics.ape_rmse_m, abs=5e-3)
     stamped.save(tmp_path / "out")
     assert {path.name for path in (tmp_path / "out").iterdir()} == FILES
+
+
+def test_a_drive_without_a_readable_scan_is_an_error(tmp_path: Path) -> None:
+    """It ended with a trajectory of identities and exit code 0. A new map file goes: the next run may have it."""
+    (tmp_path / "scans").mkdir()
+    for n in range(3):
+        (tmp_path / "scans" / f"{n}.ply").write_bytes(b"hello")
+    words = r"scans: none of 3 scans could be read; the first: .*0.ply: no PLY"
+    with (
+        pytest.raises(Dpm2Error, match=words),
+        OfflineRun(tmp_path / "scans", CONFIG, map_file=tmp_path / "drive.dpm2map") as drive,
+    ):
+        drive.run()
+    assert [path.name for path in tmp_path.iterdir()] == ["scans"]
+    write_ply(tmp_path / "scans" / "1.ply", np.ones((5, 4), np.float32))
+    assert len(OfflineRun(tmp_path / "scans", CONFIG).run()) == 3
+
+
+@pytest.mark.slow
+def test_a_tum_file_of_another_clock_gives_the_figures_of_the_poses(recording: Path, tmp_path: Path) -> None:
+    """Of 25 Hz, 12 ms late and longer than the drive: the nearest pose was 0.1 m off, and most frames were left out."""
+    source = open_source(recording)
+    assert source.poses is not None
+    stamps = np.array([frame.stamp for frame in source.frames()])
+    at = np.arange(stamps[0] + 12_000_000, stamps[-1], 40_000_000)
+    write_tum(tmp_path / "truth.tum", at.tolist(), interpolate(stamps, source.poses, at))
+    source.T_cam_lidar = None  # type: ignore[misc]  # the poses of the LiDAR in either case
+    given = OfflineRun(source, CONFIG, (1, 6)).run().metrics
+    stamped = OfflineRun(source, CONFIG, (1, 6), tmp_path / "truth.tum").run().metrics
+    assert given is not None
+    assert stamped is not None
+    assert (stamped.frames, stamped.failed_frames) == (given.frames, 0)
+    # Of the truth between two frames that lie on a bend a part of a millimeter is missing.
+    assert stamped.ape_rmse_m == pytest.approx(given.ape_rmse_m, abs=1e-3)
+    assert stamped.rpe_trans_m == pytest.approx(given.rpe_trans_m, abs=2e-3)
 
 
 def test_a_run_goes_on_in_its_map_file(recording: Path, tmp_path: Path) -> None:

@@ -118,3 +118,22 @@ def test_a_drive_is_its_own_ground_truth(tmp_path: Path) -> None:
     (folder / "poses.txt").unlink()
     run = CliRunner().invoke(app, ["eval", "--gt", str(folder), "--est", str(tmp_path / "est.txt")])
     assert "no ground truth" in str(run.exception)
+
+
+def test_frames_of_a_drive_without_a_pose_stay(tmp_path: Path) -> None:
+    """Scans 3 and 4 are missing, and the poses end at frame 6: the estimate's ten lines were taken for frames 0 to 9,
+    as there are more of them than known poses; an exact one had a t_err of 28 %."""
+    folder = tmp_path / "sequences" / "07"
+    (folder / "velodyne").mkdir(parents=True)
+    poses = np.stack([se3.exp([0, 0.02 * n, 0, 0, 0, n]) for n in range(12)])
+    numbers = [n for n in range(12) if n not in (3, 4)]
+    for n in numbers:
+        np.zeros(4, "<f4").tofile(folder / "velodyne" / f"{n:06d}.bin")
+    (folder / "calib.txt").write_text("Tr: 0 -1 0 0.1 0 0 -1 -0.2 1 0 0 -0.3\n")
+    (tmp_path / "poses").mkdir()
+    write_kitti(tmp_path / "poses" / "07.txt", poses[:7])
+    write_kitti(tmp_path / "est.txt", poses[numbers])
+    eval_(tmp_path, tmp_path / "est.txt", tmp_path / "m.json")
+    found = json.loads((tmp_path / "m.json").read_text())
+    assert found["ape_rmse_m"] < 1e-6  # the file has 13 digits
+    assert (found["frames"], found["failed_frames"]) == (10, 0)
