@@ -203,6 +203,8 @@ class Diagnostics:
             level, text = ERROR, f"{text}; {self.frame_problem}"
         if self.tf_problem:
             level, text = max(level, WARN), f"{text}; {self.tf_problem}"
+        if (count := self._node.count_publishers(topic)) > 1:
+            level, text = max(level, WARN), f"{text}; {count} publishers on {topic}: a drive has one LiDAR"
         if synchronizer.dropped > self._dropped_before:
             level, text = max(level, WARN), f"{text}; cannot keep up, {synchronizer.dropped} clouds dropped"
         self._dropped_before = synchronizer.dropped

@@ -674,6 +674,18 @@ def test_clouds_that_are_not_of_this_drive_leave_it_alone(rig: Callable[..., Rig
     assert figures(r.processed(8))["lost on the way"] == "0"
 
 
+def test_two_publishers_of_clouds_are_a_warning(rig: Callable[..., Rig]) -> None:
+    """As of two robots without namespaces: 0.5 m off, tracking and degraded in turn, and nothing said why."""
+    r = rig()
+    r.send_and_wait(0)
+    assert "publishers" not in r.processed(1).message
+    other = r.harness.publisher(PointCloud2, POINTS)
+    said = r.status("odometry", saying(f"2 publishers on {POINTS}: a drive has one LiDAR"))
+    assert said.level == DiagnosticStatus.WARN
+    r.harness.node.destroy_publisher(other)
+    r.status("odometry", lambda s: "publishers" not in s.message)
+
+
 def test_another_lidar_on_the_topic_begins_another_drive(
     rig: Callable[..., Rig], drive: Any, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
