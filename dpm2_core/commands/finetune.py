@@ -30,7 +30,6 @@ def finetune(
     Run the result with --set slam.neural.weights=OUT/weights.safetensors.
     """
     from dpm2_core.data.open import open_source
-    from dpm2_core.data.settings import InputSettings
     from dpm2_core.learning import finetune as work
     from dpm2_core.learning import finetune_data, finetune_settings
     from dpm2_core.network.pretrained import load_network, weights_path  # torch is slow to import
@@ -40,7 +39,7 @@ def finetune(
     chosen = load_settings(finetune_settings.FinetuneSettings, config, settings or [])
     start = weights_path(chosen.weights)
     network = load_network(chosen.weights, threads=2).settings
-    sources = [open_source(path, InputSettings(images=False)) for path in src]
+    sources = [open_source(path, chosen.input) for path in src]
     console = Console(stderr=True)
     with console.status("") as status:
         finetune_data.prepare(sources, chosen, network, SlamSettings(), out, status.update)

@@ -42,6 +42,7 @@ class PairSet:
         self.network, self.images = network, images
         self.frames: dict[tuple[int, int, float], int] = {}
         self.pairs: list[tuple[int, int, np.ndarray, float]] = []
+        self._scale: list[float] = []
         for low, high in ((0.0, NEAR), (NEAR, FAR)):
             if not any(_has_pair(drive.poses, low, high) for drive in self.drives):
                 raise UsageError(f"{root}: no two frames of a drive are {low:g} to {high:g} m apart, as is measured")
@@ -59,6 +60,7 @@ class PairSet:
             turn = se3.exp([0, 0, yaw, 0, 0, 0])
             T = se3.inverse(poses[b]) @ poses[a] @ se3.inverse(turn)
             self.pairs.append((self._frame(d, a, yaw), self._frame(d, b, 0.0), T, float(distance[b])))
+            self._scale.append(float(self.drives[d].about.get("scale", 1.0)))
 
     def _frame(self, drive: int, index: int, yaw: float) -> int:
         return self.frames.setdefault((drive, index, yaw), len(self.frames))
@@ -98,15 +100,19 @@ class PairSet:
         return np.array(rows)
 
     def measure(self, model: DeepPointMap2) -> dict[str, float]:
-        """Medians and success rates of near and far pairs, and of turned ones; kinds without a pair are left out."""
+        """Medians and success rates of near and far pairs, and of turned ones; kinds without a pair are left out.
+
+        Rooms are packed enlarged: distances and the limits of a success are, too; the medians are m of the room.
+        """
         rows = self.errors(model)
+        meters = rows[:, 2] / np.array(self._scale)
         near = rows[:, 0] <= NEAR
         good = (rows[:, 2] < SUCCESS[0]) & (rows[:, 3] < SUCCESS[1])
         out = {}
         for name, chosen in (("near", near), ("far", ~near), ("turned", rows[:, 1] > 0)):
             if not chosen.any():
                 continue
-            out[f"{name}_m"] = float(np.median(rows[chosen, 2]))
+            out[f"{name}_m"] = float(np.median(meters[chosen]))
             out[f"{name}_deg"] = float(np.median(rows[chosen, 3]))
             out[f"{name}_success"] = float(good[chosen].mean())
         out["chi2"] = float(np.median(rows[good, 4])) if good.any() else float("nan")

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.pair_set import NEAR
 from dpm2_core.frame import Array, Frame
 from dpm2_core.learning.finetune_settings import DRIVES, HELD_OUT, REHEARSAL, FinetuneSettings
-from dpm2_core.learning.generate import generate, pack
+from dpm2_core.learning.generate import check_same, generate, pack
 from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.pipeline import OfflineRun
 from dpm2_core.slam.settings import Config, SlamSettings
@@ -51,21 +52,24 @@ def prepare(
     """Drives with their references, their last parts and the rehearsal, packed below `out`; what is there stays.
 
     Raises:
-        UsageError: the SLAM could hardly follow a drive.
+        UsageError: the SLAM could hardly follow a drive, or one that is there was made by other settings.
     """
+    asked = settings.model_dump(mode="json", include={"reference", "held_out", "input"})
     slam = slam.model_copy(update={"registration": settings.reference})
     for i, source in enumerate(sources):
         name = f"{i:02d}_{source.name.replace('/', '_')}"
         if (out / DRIVES / name).exists():  # the last to be written
+            check_same(out / DRIVES / name, asked)
             continue
-        referenced = refer(source, slam, lambda name=name: advance(f"{name}: reference by SLAM"))  # type: ignore[misc]
+        referenced = refer(source, slam, partial(advance, f"{name}: reference by SLAM"))
         known = np.flatnonzero(np.isfinite(referenced.poses[:, 0, 0]))
         if len(known) < 2 * settings.frames:
             raise UsageError(f"{source.name}: the SLAM followed {len(known)} of {len(source)} scans; nothing to learn")
         cut = round(len(source) * (1 - settings.held_out))
         for folder, part in ((HELD_OUT, range(cut, len(source))), (DRIVES, range(cut))):
             if folder == DRIVES or _reaches_far(referenced.poses[part.start :]):
-                pack(referenced, out / folder / name, network, part, lambda name=name: advance(f"{name}: packing"))  # type: ignore[misc]
+                packing = partial(advance, f"{name}: packing")
+                pack(referenced, out / folder / name, network, part, packing, asked)
     if settings.rehearsal_share > 0 and not settings.rehearsal:
         worlds = settings.rehearsal_worlds.model_copy(update={"preset": network.preset})
         generate(out / REHEARSAL, worlds, 1, lambda done, total: advance(f"rehearsal: world {done} of {total}"))

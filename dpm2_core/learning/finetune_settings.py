@@ -8,6 +8,7 @@ from typing import Literal
 from pydantic import Field
 
 from dpm2_core.config import Settings
+from dpm2_core.data.settings import InputSettings
 from dpm2_core.learning.augment import AugmentSettings
 from dpm2_core.learning.generate import GenerateSettings
 from dpm2_core.learning.registration_loss import LossSettings
@@ -57,6 +58,8 @@ class RehearsalWorlds(GenerateSettings):
 class FinetuneSettings(Settings):
     """A fine-tuning."""
 
+    input: InputSettings = InputSettings(images=False)
+    """How drives are read: sequence, topics, time field. Images are not learned from."""
     weights: str = "small"
     """Name of weights that come with dpm2, or path of a .safetensors file: what to start from."""
     reference: Literal["geometric", "refined"] = "geometric"

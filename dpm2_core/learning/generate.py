@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any, Literal
@@ -104,6 +104,7 @@ def generate_world(folder: Path, seed: int, settings: GenerateSettings) -> None:
         "source": "synthetic city",
         "preset": kind,
         "seed": seed,
+        "scale": scale,
         "sensor": sensor,
         "settings": _asked(settings),
     }
@@ -115,14 +116,14 @@ def _asked(settings: GenerateSettings) -> dict[str, Any]:
     return settings.model_dump(mode="json", exclude={"worlds", "first_seed"})
 
 
-def _check_same(folder: Path, settings: GenerateSettings) -> None:
-    """A world that is there already is one of these settings, as far as its file says.
+def check_same(folder: Path, asked: Mapping[str, Any]) -> None:
+    """A packed drive that is there already was made by the settings that are `asked` for, as far as its file says.
 
     Raises:
-        UsageError: it is of other ones; it names the first that differs.
+        UsageError: by other ones; it names the first that differs.
     """
     made = PackedDrive(folder).about.get("settings")
-    for name, now in _asked(settings).items():
+    for name, now in asked.items():
         if isinstance(made, dict) and name in made and made[name] != now:
             raise UsageError(f"{folder}: made with {name} {made[name]}, not {now}; remove it, or choose another folder")
 
@@ -158,7 +159,7 @@ def generate(
     folders = {seed: out / f"world_{seed:06d}" for seed in seeds}
     missing = [seed for seed in seeds if not folders[seed].exists()]
     for seed in sorted(set(seeds) - set(missing)):
-        _check_same(folders[seed], settings)
+        check_same(folders[seed], _asked(settings))
     done = settings.worlds - len(missing)
     progress(done, settings.worlds)
     pool = ProcessPoolExecutor(workers)
@@ -178,13 +179,14 @@ def pack(
     network: NetworkSettings,
     frames: range | None = None,
     advance: Callable[[], None] = lambda: None,
+    settings: Mapping[str, Any] | None = None,
 ) -> int:
     """Pack the frames of a source that have a pose, one after the other; returns how many.
 
     Points with time offsets are moved to where they are seen from at the stamp, by the true motion. All is as the
     network sees it: scans of a tilted sensor in level axes, and a drive that begins in a room enlarged.
 
-    `frames`: positions to look at; `advance` is called after each.
+    `frames`: positions to look at; `advance` is called after each. `settings`: what made the poses, see `check_same`.
 
     Raises:
         UsageError: the source has no poses, or its frames do not all have as many images of one size.
@@ -208,7 +210,7 @@ def pack(
         if before is None:
             raise UsageError(f"{source.name}: no readable frame with a pose")
         writer.add(_packed(*before, twist, network, scale))
-        writer.finish({"source": source.name, "scale": scale})
+        writer.finish({"source": source.name, "scale": scale, "settings": dict(settings or {})})
     return len(writer)
 
 

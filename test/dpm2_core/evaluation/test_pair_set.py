@@ -12,13 +12,18 @@ from dpm2_core.data.packed import Sample, write_packed
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.pair_set import PairSet
 from dpm2_core.geometry import se3
+from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.settings import preset
 
+from ...helpers.networks import tiny
 
-def packed(folder: Path, at: np.ndarray) -> Path:
+
+def packed(folder: Path, at: np.ndarray, **about: object) -> Path:
     """A drive with frames at such places, m."""
     cloud = np.random.default_rng(0).uniform(-40, 40, (50, 3)).astype(np.float32)
-    write_packed(folder / "drive", [Sample(cloud, se3.make(np.eye(3), [x, 0, 0])) for x in at], {"source": "test"})
+    write_packed(
+        folder / "drive", [Sample(cloud, se3.make(np.eye(3), [x, 0, 0])) for x in at], {"source": "test", **about}
+    )
     return folder
 
 
@@ -39,3 +44,14 @@ def test_drives_without_such_pairs_are_named(tmp_path: Path, at: np.ndarray, mis
     """The search for them never ended, and a training with such a validation never began."""
     with pytest.raises(UsageError, match=rf"{tmp_path}: no two frames of a drive are {missing} apart"):
         PairSet(packed(tmp_path, at), 20, preset("small"), False)
+
+
+def test_errors_in_a_room_are_those_of_the_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is packed five times as large, and the table of a fine-tuning said 0.015 m where it was 0.003 m."""
+    rows = np.array([[1.0 if i % 2 == 0 else 6.0, 0, 0.015, 0.1, 1.0] for i in range(20)])
+    monkeypatch.setattr(PairSet, "errors", lambda self, model: rows)
+    found = PairSet(packed(tmp_path, np.arange(40.0), scale=5.0), 20, preset("small"), False).measure(
+        DeepPointMap2(tiny())
+    )
+    assert found["near_m"] == pytest.approx(0.003)
+    assert (found["far_m"], found["near_success"]) == (pytest.approx(0.003), 1.0)

@@ -149,6 +149,9 @@ def test_a_stopped_training_goes_on_to_the_same_weights(
     network = load_model(Path(settings.weights)).settings
     prepare([open_source(recording)], settings, network, SlamSettings(threads=1), data)
     assert sum(len(packed) for packed in open_packed(data / "drives")) == 20
+    other = settings.model_copy(update={"held_out": 0.4})  # another part was held out, and it went on without a word
+    with pytest.raises(UsageError, match=f"{data}.*: made with held_out {settings.held_out}, not 0.4; remove it"):
+        prepare([open_source(recording)], other, network, SlamSettings(threads=1), data)
     whole = finetune(settings, tmp_path / "whole", data=data)
     finetune(settings, tmp_path / "parts", until=2, data=data)
     parts = finetune(settings, tmp_path / "parts", resume=True, data=data)
