@@ -172,7 +172,12 @@ def _stamp(line: str, where: str) -> int:
 def _find(path: Path, sequence: str) -> tuple[Path, str]:
     """Root of the dataset and name of the drive."""
     if (path / "velodyne_points").is_dir():
-        return path.resolve().parents[1], path.resolve().name
+        drive = path.resolve()
+        if drive.parent.name != "data_3d_raw":
+            raise UsageError(
+                f"{path}: a drive of KITTI-360 lies in data_3d_raw; KITTI raw is not read, its odometry is"
+            )
+        return drive.parents[1], drive.name
     found = sorted(p.name for p in (path / "data_3d_raw").glob("*") if (p / "velodyne_points").is_dir())
     if not found:
         raise UsageError(f"{path}: no drive (data_3d_raw/*/velodyne_points) below it")

@@ -9,6 +9,7 @@ from time import perf_counter
 from typing import TypedDict
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dpm2_core.config import load_settings
 from dpm2_core.data.corrupt import CorruptedSource, parse_corruption
@@ -115,30 +116,45 @@ def given(folder: Path, advance: Advance, drive: Drive, file: str) -> Figures:
     config = load_settings(Config, None, drive["settings"])
     source = open_recording(drive["data"], config, False)
     start, stop = span_of(source, _span(drive))
-    found, truth = read_trajectory(Path(file)), _truth(source, (start, stop))
+    truth = _truth(source, (start, stop))
     # Only names and stamps are wanted, but a source gives them with its frames alone.
     keys = [(frame.index, frame.stamp) for frame in prefetch(source.frames(start, stop))]
     index, stamps = (np.array(column, np.int64) for column in zip(*keys, strict=True))
-    if found.kind == "kitti" and len(found) == len(source) != len(truth):
-        found = Trajectory(found.poses[start:stop], found.keys[start:stop], found.kind)
-    own_keys = {"tum": stamps, "kitti-indexed": index, "kitti": np.arange(len(truth))}[found.kind]
-    if found.kind == "tum" and not same_stamps(stamps, found.keys):
-        found = Trajectory(interpolate(found.keys, found.poses, stamps), stamps, found.kind)
+    poses = _poses_of(Path(file), source, (start, stop), truth, {"tum": stamps, "kitti-indexed": index})
+    if not known(poses).any():
+        raise UsageError(f"{file}: has no pose during the frames of {source.name}")
+    there = known(poses)
+    write_tum(folder / TRAJECTORY, stamps[there].tolist(), poses[there])
+    write_truth(folder / TRUTH, stamps.tolist(), truth)
+    advance(len(truth), len(truth))
+    return _measured(folder, source, (truth, poses), drive, None)
+
+
+def _poses_of(
+    file: Path, source: Source, span: tuple[int, int], truth: Array, keys: dict[str, NDArray[np.int64]]
+) -> Array:
+    """Poses (N, 4, 4) of the LiDAR in the frames of a span, of the true poses `truth`, with those `keys`; NaN: none.
+
+    Raises:
+        UsageError: no such file, or one of other frames.
+    """
+    found = read_trajectory(file)
+    if found.kind == "kitti" and len(found) != len(truth):  # of the whole recording, or of one that it is a part of
+        whole = read_ground_truth(source, file, *span)
+        assert isinstance(whole, np.ndarray)
+        return whole
+    own_keys = keys.get(found.kind, np.arange(len(truth), dtype=np.int64))
+    if found.kind == "tum" and not same_stamps(own_keys, found.keys):
+        found = Trajectory(interpolate(found.keys, found.poses, own_keys), own_keys, found.kind)
     try:
         _, poses = matched(Trajectory(truth, own_keys, found.kind), found)
     except UsageError as error:
         raise UsageError(f"{file}: {error}") from None
     if len(poses) != len(truth):
         raise UsageError(f"{file}: {len(poses)} poses belong to the {len(truth)} frames of {source.name}")
-    if not known(poses).any():
-        raise UsageError(f"{file}: has no pose during the frames of {source.name}")
     if found.kind != "tum" and source.T_cam_lidar is not None:
         poses = in_other_frame(poses, se3.inverse(source.T_cam_lidar))
-    there = known(poses)
-    write_tum(folder / TRAJECTORY, stamps[there].tolist(), poses[there])
-    write_truth(folder / TRUTH, stamps.tolist(), truth)
-    advance(len(truth), len(truth))
-    return _measured(folder, source, (truth, poses), drive, None)
+    return poses
 
 
 def _truth(source: Source, frames: Span) -> Array:

@@ -165,6 +165,21 @@ def test_a_file_of_other_stamps_is_read_at_those_of_the_frames(tmp_path: Path) -
     assert found["ape_rmse_m"] < 1e-3  # a line between poses is 7 mm off at this acceleration, at each frame the same
 
 
+def test_a_file_of_a_whole_sequence_is_read_at_the_frames_of_an_excerpt(tmp_path: Path) -> None:
+    """Scans 3 to 8 of twelve, of which frames 1 to 4 are asked for: it was an error whose advice did not apply."""
+    folder, at = tmp_path / "sequences" / "10", np.arange(12.0) ** 2
+    (folder / "velodyne").mkdir(parents=True)
+    for n in range(3, 9):
+        np.zeros(4, "<f4").tofile(folder / "velodyne" / f"{n:06d}.bin")
+    (folder / "calib.txt").write_text("Tr: 1 0 0 0 0 1 0 0 0 0 1 0\n")
+    for name in (folder / "poses.txt", tmp_path / "peer.txt"):
+        write_kitti(name, se3.make(np.eye(3), np.column_stack([at, 0 * at, 0 * at])))
+    drive = Drive(data=str(folder), settings=(), frames=(1, 5), lengths=(1.0,))
+    found = given(tmp_path, lambda *_: None, drive, str(tmp_path / "peer.txt"))
+    assert (found["frames"], found["failed_frames"]) == (4, 0)
+    assert found["ape_rmse_m"] < 1e-9
+
+
 def test_the_list_has_every_experiment() -> None:
     done = dpm2("experiment", "--list", "--json", "-")
     assert done.returncode == 0
