@@ -153,8 +153,13 @@ def _also_from(neural: Registration, prediction: Prediction) -> Prediction:
 
 
 def _sure(points: Registration, prediction: Prediction) -> bool:
-    """Whether they fit well, with no direction left open."""
-    return points.ok and points.confidence >= prediction.convincing and points.worst_sigma <= _SURE_SIGMA
+    """Whether they fit well, with no direction left open; just where the motion leads those suffice that make a result.
+
+    Of a scan that has moved much finds nothing in a young map of few beams. Both the network and the likelihood of the
+    points then prefer the place where the map was made, as what the beams meet looks the same from there.
+    """
+    fits = points.confidence >= prediction.convincing or prediction.expects(points.T_target_source)
+    return points.ok and fits and points.worst_sigma <= _SURE_SIGMA
 
 
 def _difference(a: Registration, b: Registration) -> Array:

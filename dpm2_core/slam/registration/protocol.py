@@ -57,6 +57,13 @@ class Prediction:
         """
         return self.information is not None and float(np.linalg.eigvalsh(self.information[3:, 3:])[0]) >= 1.0
 
+    def expects(self, T_odom_lidar: Array) -> bool:
+        """Whether the motion so far leads to that pose (4, 4) itself, to one standard deviation."""
+        if not self.known or self.information is None:
+            return False
+        xi = se3.log(se3.inverse(self.starts[0]) @ T_odom_lidar)
+        return bool(xi @ self.information @ xi <= 1.0)
+
     @property
     def convincing(self) -> float:
         """Confidence of points from which their pose is not doubted, if it leaves no direction open.
