@@ -34,11 +34,11 @@ class FusedScanRegistration:
     """ICP and the network's registration, fused.
 
     If both agree (see `agree`), they are fused by their information: ICP dominates in structured scenes, the network
-    along degenerate directions such as a tunnel. If they disagree, ICP starts from the network's pose as well, and the
-    more likely of its results is kept. Where little is known of the motion, it does so at once: a direction that seems
-    open from afar may be closed at the right place. If ICP fails, it is tried again from the network's pose; if it
-    fails there too, or converges elsewhere, the network's pose is returned, less sure than it claims. `reason` says
-    which of the two disagreed, and why.
+    along degenerate directions such as a tunnel. If they disagree and the points are not sure, ICP starts from the
+    network's pose as well, and the more likely of its results is kept. Where little is known of the motion, it does so
+    at once: a direction that seems open from afar may be closed at the right place. If ICP fails, it is tried again
+    from the network's pose; if it fails there too, or converges elsewhere, the network's pose is returned, less sure
+    than it claims. `reason` says which of the two disagreed, and why.
     """
 
     def __init__(
@@ -87,7 +87,7 @@ class FusedScanRegistration:
         if not points.ok:
             return self._led(scan, neural)
         if not agree(points, neural):
-            if prediction.known:
+            if prediction.known and not _sure(points, prediction):
                 starts = [points.T_target_source, neural.T_target_source]
                 likelier = self._geometric.register(scan, replace(prediction, starts=starts))
                 if likelier.ok and agree(likelier, neural):

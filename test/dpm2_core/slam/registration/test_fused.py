@@ -242,6 +242,9 @@ def test_points_that_fit_just_where_the_motion_leads_are_enough(suburb_drive: Dr
     assert 0.5 <= result.confidence < 0.7
     assert (result.method, case.oracle.asked) == ("geometric", 0)
     assert error < 0.02
+    contradicted, error = Case(([*frames[:5], noisy], truth)).register([0, 0, 0, -0.35, 0, 0])
+    assert contradicted.reason.startswith("neural and points 0.35 m")
+    assert error < 0.02
     case.prediction = replace(case.prediction, starts=[case.truth @ se3.exp([0, 0, 0, 0.15, 0, 0])])  # 1.5 deviations
     case.register([0, 0, 0, 0.05, 0, 0])
     assert case.oracle.asked == 1
