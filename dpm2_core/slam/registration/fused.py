@@ -15,7 +15,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.icp import GeometricScanRegistration
 from dpm2_core.slam.registration.neural import NeuralScanRegistration
-from dpm2_core.slam.registration.protocol import MAP_NOISE, Prediction, agree
+from dpm2_core.slam.registration.protocol import CHI2_95, MAP_NOISE, Prediction, agree
 
 _LED = np.diag(np.repeat([np.radians(2), 0.5], 3) ** -2.0)
 """Information of a network pose with a standard deviation of 2 degrees and 0.5 m: enough to initialize ICP."""
@@ -34,11 +34,12 @@ class FusedScanRegistration:
     """ICP and the network's registration, fused.
 
     If both agree (see `agree`), they are fused by their information: ICP dominates in structured scenes, the network
-    along degenerate directions such as a tunnel. If they disagree and the points are not sure, ICP starts from the
-    network's pose as well, and the more likely of its results is kept. Where little is known of the motion, it does so
-    at once: a direction that seems open from afar may be closed at the right place. If ICP fails, it is tried again
-    from the network's pose; if it fails there too, or converges elsewhere, the network's pose is returned, less sure
-    than it claims. `reason` says which of the two disagreed, and why.
+    along degenerate directions such as a tunnel. If they disagree, ICP starts from the network's pose as well, and the
+    more likely of its results is kept, unless the points are just where the motion leads: among what repeats, such as
+    doors and parked cars, a place beside may fit better. Where little is known of the motion, it starts there at once:
+    a direction that seems open from afar may be closed at the right place. If ICP fails, it is tried again from the
+    network's pose; if it fails there too, or converges elsewhere, the network's pose is returned, less sure than it
+    claims. `reason` says which of the two disagreed, and why.
     """
 
     def __init__(
@@ -86,8 +87,10 @@ class FusedScanRegistration:
             return _because(points, f"neural: {neural.reason}")
         if not points.ok:
             return self._led(scan, neural)
+        if prediction.expects(points.T_target_source) and not agree(points, neural, CHI2_95):
+            return _because(points, f"neural and points {_apart(points, neural)} apart")
         if not agree(points, neural):
-            if prediction.known and not _sure(points, prediction):
+            if prediction.known:
                 starts = [points.T_target_source, neural.T_target_source]
                 likelier = self._geometric.register(scan, replace(prediction, starts=starts))
                 if likelier.ok and agree(likelier, neural):

@@ -13,20 +13,22 @@ from dpm2_core.frame import Array, Frame, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.slam.preprocess import Scan
 
-CHI2 = 22.46
-"""99.9 % quantile of chi2 with 6 degrees of freedom: two poses that are farther apart contradict each other."""
+_EXACT = 0.3  # m: at the default steadiness that lasts 0.17 s
+CHI2, CHI2_95 = 22.46, 12.59
+"""99.9 and 95 % quantile of chi2 with 6 degrees of freedom: two poses that are farther apart than the first contradict
+each other, farther than the second hardly agree."""
 
 # What the covariances of two registrations leave out, rad and m: the poses of the frames that make up the maps.
 MAP_NOISE = np.diag(np.repeat([np.radians(0.1), 0.03], 3) ** 2)
 
 
-def agree(a: Registration, b: Registration) -> bool:
-    """Whether two results may be one pose: xi^T (S_a + S_b + S_map)^-1 xi <= `CHI2`, xi (6,) being their difference.
+def agree(a: Registration, b: Registration, most: float = CHI2) -> bool:
+    """Whether two results may be one pose: xi^T (S_a + S_b + S_map)^-1 xi <= `most`, xi (6,) being their difference.
 
     Errors of calibration are the same in both.
     """
     xi = se3.log(se3.inverse(a.T_target_source) @ b.T_target_source)
-    return bool(xi @ np.linalg.solve(a.of_scene + b.of_scene + MAP_NOISE, xi) <= CHI2)
+    return bool(xi @ np.linalg.solve(a.of_scene + b.of_scene + MAP_NOISE, xi) <= most)
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,8 +60,8 @@ class Prediction:
         return self.information is not None and float(np.linalg.eigvalsh(self.information[3:, 3:])[0]) >= 1.0
 
     def expects(self, T_odom_lidar: Array) -> bool:
-        """Whether the motion so far leads to that pose (4, 4) itself, to one standard deviation."""
-        if not self.known or self.information is None:
+        """Whether the motion so far leads to that pose (4, 4) itself: to one standard deviation, at most `_EXACT`."""
+        if self.information is None or np.linalg.eigvalsh(self.information[3:, 3:])[0] < _EXACT**-2.0:
             return False
         xi = se3.log(se3.inverse(self.starts[0]) @ T_odom_lidar)
         return bool(xi @ self.information @ xi <= 1.0)
