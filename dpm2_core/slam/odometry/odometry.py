@@ -85,7 +85,7 @@ class Odometry:
         self.reset()
         self._T, self._twist, self._of_velocity = before._T, before._twist, before._of_velocity
         self._covariance, self._clock, self._registered = before._covariance, before._clock, before._registered
-        self._sweep = before._sweep
+        self._sweep, self._open = before._sweep, before._open
         self._breaks, self._broken = before._breaks, before._broken
         self._other, self._inertial, self._repeated = before._other, before._inertial, before._repeated
         self._images = before._images
