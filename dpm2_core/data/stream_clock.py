@@ -17,28 +17,43 @@ class StreamClock:
 
     Attributes:
         stamp: of the last frame, ns; None before the first. now: s since the first frame.
+        late: s by which the frame before the last one was late, as the last one shows.
     """
 
     def __init__(self) -> None:
         self.stamp: int | None = None
-        self.now = 0.0
+        self.now = self.late = 0.0
         self._periods: deque[float] = deque(maxlen=_RHYTHM)
+        self._behind, self._in_burst = 0.0, False
 
     def advance(self, stamp: int) -> float:
         """Seconds since the frame before; stamps that repeat or jump back count as one nominal period.
 
-        They are no fewer than usual: a driver that stamps on arrival may have been late with the frame before, and
-        what moves as far as in a period is not to count as so much faster.
+        A driver or network that holds frames back, stamped on arrival, makes the periods after it short: what moves as
+        far as in a period is not to count as so much faster. So do periods below 0.6 of the usual count as usual, until
+        they have made up for the time before them; without such a time they are believed after three.
         """
         dt = 0.0 if self.stamp is None else (stamp - self.stamp) * 1e-9
         if dt < _FASTEST:
             dt = _PERIOD
         if self.stamp is not None:
-            self._periods.append(dt)
-            dt = max(dt, self._quartile(1))
+            dt = self._without_bursts(dt)
+            self.now += dt - self.late
         self.stamp = stamp
-        self.now += dt
         return dt
+
+    def _without_bursts(self, dt: float) -> float:
+        usual = self._quartile(1) if len(self._periods) > 3 else dt  # fewer are no rhythm
+        if dt >= 0.6 * usual:
+            self._periods.append(dt)
+            self._behind, self._in_burst, self.late = min(dt - usual, _RHYTHM * usual), False, 0.0
+            return dt
+        self.late = 0.0 if self._in_burst else max(self._behind, 0.0)
+        self._in_burst = True
+        if self._behind < 0.5 * (usual - dt):
+            self._periods.append(dt)
+        self._behind -= usual - dt
+        return usual
 
     def pause(self, least: float) -> float:
         """Seconds without a registration that are a pause: `least`, or 1.5 periods where the stream is slow.

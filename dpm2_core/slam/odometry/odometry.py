@@ -100,6 +100,8 @@ class Odometry:
         dt = self._clock.advance(frame.stamp)
         if self._first is not None and self._sweep.is_part(self._first_sweep.span):
             self._forget_first(dt)
+        if self._clock.late:
+            self._undo_lateness(self._clock.late)
         twist = np.zeros(6) if self._twist is None else self._twist
         seconds = self._registered[1] + dt
         if frame.imu is not None and self._inertial is None:
@@ -162,6 +164,18 @@ class Odometry:
         self._registration.clear()
         self._keyframes.add_uncertainty(self._unknown(dt))
         self._keyframes.request()
+
+    def _undo_lateness(self, late: float) -> None:
+        """The frame before came `late` s too late: it did not move more slowly, or less was to be predicted for it."""
+        T_registered, seconds = self._registered
+        if self._twist is None or self._bridge is not None:
+            return
+        if seconds:
+            seconds = max(seconds - late, 0.0)
+            self._registered = T_registered, seconds
+            self._T = predicted(T_registered, self._twist, seconds)
+        else:
+            self._twist = self._twist - self._change
 
     def _without_repetitions(self, frame: Frame, meters: float) -> Frame:
         """Without what the LiDAR or a camera has sent before; `meters`: the way since the last registered frame."""

@@ -275,6 +275,16 @@ def test_a_stamp_that_is_late_is_no_leap(suburb_drive: Drive, ms: int) -> None:
 
 
 @pytest.mark.slow
+def test_frames_that_are_held_and_come_in_a_burst_are_no_leap(suburb_drive: Drive) -> None:
+    """Five within 40 ms, stamped on arrival: two or three meters off for good, as `tracking` or lost."""
+    frames, truth = suburb_drive
+    held = [replace(frames[10 + k], stamp=frames[14].stamp - (4 - k) * 10 * 10**6) for k in range(5)]
+    tracked = run([*frames[:10], *held, *frames[15:]])
+    assert errors(tracked, truth)[:, 0].max() < 0.05  # as without
+    assert [t.state for t in tracked[2:]] == [State.TRACKING] * (len(frames) - 2)
+
+
+@pytest.mark.slow
 def test_scans_that_were_left_out_for_want_of_time_are_no_pause(suburb_drive: Drive) -> None:
     """What a pause asks for takes more time yet, and more would be left out: up to 2 s the stream is a slow one."""
     frames, truth = suburb_drive
