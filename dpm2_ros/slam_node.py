@@ -208,7 +208,7 @@ class SlamNode(ManagedNode):
         other, base = self._other, self._base
         if other is None or not base.name:
             return self._slam.odometry_step(frame)
-        at = self._sweep.centered(frame).stamp  # where the scan is registered
+        at = frame.stamp + round(self._sweep.look(frame) * 1e9)  # where the scan is registered
         guess = other.guess(at, base.name, base.T_base_start @ base.T_start_lidar)
         tracked = self._slam.odometry_step(replace(frame, guess=guess))
         if problem := other.judge(tracked.comparison):

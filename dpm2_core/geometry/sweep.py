@@ -28,13 +28,17 @@ class Sweep:
     def __init__(self) -> None:
         self.middle = self.span = 0.0
 
-    def centered(self, frame: Frame) -> Frame:
-        """The frame, timed from the middle of its sweep."""
+    def look(self, frame: Frame) -> float:
+        """How long after the stamp of the frame the middle of its sweep is, s."""
         if frame.time_offset is not None and len(frame.time_offset):
             start, end = float(frame.time_offset.min()), float(frame.time_offset.max())
             middle, self.span = (start + end) / 2, end - start
             self.middle = middle if abs(middle) > _CENTERED * self.span else 0.0
-        return frame.later(self.middle)
+        return self.middle
+
+    def centered(self, frame: Frame) -> Frame:
+        """The frame, timed from the middle of its sweep."""
+        return frame.later(self.look(frame))
 
     def is_part(self, span: float) -> bool:
         """Whether another sweep, of `span` s, was only a part of one as this."""

@@ -57,14 +57,21 @@ class Prediction:
 
         At the default steadiness that lasts 0.3 s.
         """
-        return self.information is not None and float(np.linalg.eigvalsh(self.information[3:, 3:])[0]) >= 1.0
+        return self._sigma <= 1.0
 
     def expects(self, T_odom_lidar: Array) -> bool:
         """Whether the motion so far leads to that pose (4, 4) itself: to one standard deviation, at most `_EXACT`."""
-        if self.information is None or np.linalg.eigvalsh(self.information[3:, 3:])[0] < _EXACT**-2.0:
+        if self.information is None or self._sigma > _EXACT:
             return False
         xi = se3.log(se3.inverse(self.starts[0]) @ T_odom_lidar)
         return bool(xi @ self.information @ xi <= 1.0)
+
+    @property
+    def _sigma(self) -> float:
+        """m, in the least certain direction."""
+        if self.information is None:
+            return np.inf
+        return float(max(np.linalg.eigvalsh(self.information[3:, 3:])[0], 1e-12)) ** -0.5
 
     @property
     def convincing(self) -> float:
