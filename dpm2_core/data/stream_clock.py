@@ -5,10 +5,13 @@ from __future__ import annotations
 
 from collections import deque
 
-_PERIOD = 0.1  # s, assumed between two stamps that do not advance
+NOMINAL = 0.1
+"""Period of a stream of which none is known, and between two stamps that do not advance, s."""
 _FASTEST = 0.005  # s: no stream has a shorter period; frames that arrived together and were stamped then have
 SLOWEST = 2.0
 """No stream has a longer period, s."""
+DOUBTED = 0.8, 1.25
+"""Of the usual period: one beyond may be due to stamps of arrival."""
 _RHYTHM = 9  # periods: the rhythm of the stream, most of it between their quartiles
 
 
@@ -17,43 +20,33 @@ class StreamClock:
 
     Attributes:
         stamp: of the last frame, ns; None before the first. now: s since the first frame.
-        late: s by which the frame before the last one was late, as the last one shows.
     """
 
     def __init__(self) -> None:
         self.stamp: int | None = None
-        self.now = self.late = 0.0
+        self.now = 0.0
         self._periods: deque[float] = deque(maxlen=_RHYTHM)
-        self._behind, self._in_burst = 0.0, False
 
     def advance(self, stamp: int) -> float:
-        """Seconds since the frame before; stamps that repeat or jump back count as one nominal period.
-
-        A driver or network that holds frames back, stamped on arrival, makes the periods after it short: what moves as
-        far as in a period is not to count as so much faster. So do periods below 0.6 of the usual count as usual, until
-        they have made up for the time before them; without such a time they are believed after three.
-        """
+        """Seconds since the frame before; stamps that repeat or jump back count as one nominal period."""
         dt = 0.0 if self.stamp is None else (stamp - self.stamp) * 1e-9
         if dt < _FASTEST:
-            dt = _PERIOD
+            dt = NOMINAL
         if self.stamp is not None:
-            dt = self._without_bursts(dt)
-            self.now += dt - self.late
+            self.now += dt
+            self._periods.append(dt)
         self.stamp = stamp
         return dt
 
-    def _without_bursts(self, dt: float) -> float:
-        usual = self._quartile(1) if len(self._periods) > 3 else dt  # fewer are no rhythm
-        if dt >= 0.6 * usual:
-            self._periods.append(dt)
-            self._behind, self._in_burst, self.late = min(dt - usual, _RHYTHM * usual), False, 0.0
-            return dt
-        self.late = 0.0 if self._in_burst else max(self._behind, 0.0)
-        self._in_burst = True
-        if self._behind < 0.5 * (usual - dt):
-            self._periods.append(dt)
-        self._behind -= usual - dt
-        return usual
+    def correct(self, dt: float) -> None:
+        """The last period was so long, s, whatever its stamps say."""
+        if self._periods:
+            self._periods[-1] = dt
+
+    @property
+    def usual(self) -> float:
+        """Period of the stream, s; 0 before it is known."""
+        return self._quartile(2) if len(self._periods) > 4 else 0.0
 
     def pause(self, least: float) -> float:
         """Seconds without a registration that are a pause: `least`, or 1.5 periods where the stream is slow.

@@ -10,6 +10,7 @@ from dpm2_core.geometry.se3 import Array
 
 OPEN = 0.9
 """Standard deviation of a registered position, m, from which the scene leaves a direction open: it ends at 1 m."""
+_FREE = 0.05  # m: the speed tells nothing where it leads less far
 _HORIZON = 10.0  # s: farther ahead no motion is extrapolated
 _STEPS = 10  # of a motion that changes
 _TURN = 0.3  # rad/s, standard deviation of the yaw rate in traffic
@@ -28,6 +29,25 @@ def between(T: Array, before: Array, after: Array, seconds: float) -> Array:
         part = (i + 0.5) / _STEPS
         T = T @ se3.exp(((1 - part) * before + part * after) * step)
     return T
+
+
+def period_by_motion(T: Array, stamped: tuple[float, Array], usual: tuple[float, Array], steadiness: float) -> float:
+    """Seconds that a period lasted of which the stamp is in doubt, by how far the LiDAR has moved in it.
+
+    A driver or network that holds frames back, and whose stamps are those of arrival, makes one period long and those
+    of the burst after it short; of lost frames the stamps are right. The speed goes on through both: the period is as
+    stamped where an acceleration explains the pose, or between that and as usual.
+
+    Args:
+        T: pose (4, 4) that was found.
+        stamped, usual: period, s, and pose (4, 4) to which the motion so far leads in it.
+        steadiness: standard deviation of the acceleration, m/s2.
+    """
+    dt, T_stamped = stamped
+    off, way = ((se3.inverse(T_stamped) @ end)[:3, 3] for end in (T, usual[1]))
+    if min(np.linalg.norm(off), np.linalg.norm(way)) <= _FREE + 0.5 * steadiness * dt * dt:
+        return dt
+    return dt + float(np.clip(off @ way / (way @ way), 0.0, 1.0)) * (usual[0] - dt)
 
 
 def covariance(speed: float, seconds: float, acceleration: float, of_velocity: Array) -> Array:

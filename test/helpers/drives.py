@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -11,15 +12,20 @@ from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import LidarConfig, PresetName
-from dpm2_core.sim.world import build_world
+from dpm2_core.sim.world import World, build_world
 
 Drive = tuple[list[Frame], Array]
 """Frames and their (N, 4, 4) true poses relative to the first."""
 
 
+@cache
+def _straight(preset: PresetName) -> World:
+    return build_world("straight", preset, seed=11, length=200.0)
+
+
 def make_drive(preset: PresetName, frames: int, *, deskewed: bool = True, start: float = 2.0) -> Drive:
     """A drive at 10 Hz, from `start` s of the way on."""
-    world = build_world("straight", preset, seed=11, length=200.0)
+    world = _straight(preset)
     lidar = Lidar(LidarConfig(columns=1024))
     rng = np.random.default_rng(0)
     poses = np.array([world.drive_pose(start + 0.1 * i) for i in range(frames)])

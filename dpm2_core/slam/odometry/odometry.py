@@ -11,10 +11,10 @@ import numpy as np
 
 from dpm2_core.data.repeated import IMAGE_PROBLEM, RepeatedCloud, RepeatedImages
 from dpm2_core.data.repeated import PROBLEM as REPEATED
-from dpm2_core.data.stream_clock import SLOWEST, StreamClock
+from dpm2_core.data.stream_clock import DOUBTED, NOMINAL, SLOWEST, StreamClock
 from dpm2_core.frame import Array, Frame, OdometryResult, Registration, State
 from dpm2_core.geometry import se3
-from dpm2_core.geometry.motion import OPEN, along_open, combined, covariance, predicted, spread
+from dpm2_core.geometry.motion import OPEN, along_open, combined, covariance, period_by_motion, predicted, spread
 from dpm2_core.geometry.sweep import Sweep
 from dpm2_core.slam.bridge import Bridge, Limits
 from dpm2_core.slam.odometry.inertial import InertialMotion
@@ -26,6 +26,7 @@ from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration
 
 _KNOWN = 0.5  # m and rad, standard deviation of the second pose, still skewed: where the points find it alone
+_BURST = 0.6  # of the usual period: while no motion is known, a frame that comes sooner was held back
 _ANY_VELOCITY = 15.0**2 * np.eye(3)  # covariance, m/s: so much until two scans are registered
 
 
@@ -100,8 +101,6 @@ class Odometry:
         dt = self._clock.advance(frame.stamp)
         if self._first is not None and self._sweep.is_part(self._first_sweep.span):
             self._forget_first(dt)
-        if self._clock.late:
-            self._undo_lateness(self._clock.late)
         twist = np.zeros(6) if self._twist is None else self._twist
         seconds = self._registered[1] + dt
         if frame.imu is not None and self._inertial is None:
@@ -121,7 +120,9 @@ class Odometry:
         pauses = self._pauses(frame, dt) and not self._registration.rejection(scan)
         T_predicted = self._begin_stretch(dt) if pauses else self._predicted(twist, dt)
         prepared = scan
-        scan, registration = self._register(frame, prepared, T_predicted, dt)
+        scan, registration, dt = self._register_in_time(frame, prepared, T_predicted, dt)
+        seconds = self._registered[1] + dt
+        self._clock.correct(dt)
         if scan is not prepared:  # the IMU was of no use: nor is it on the way to the stamp
             frame = replace(frame, imu=None)
         if self._first is not None and registration.ok:
@@ -164,18 +165,6 @@ class Odometry:
         self._registration.clear()
         self._keyframes.add_uncertainty(self._unknown(dt))
         self._keyframes.request()
-
-    def _undo_lateness(self, late: float) -> None:
-        """The frame before came `late` s too late: it did not move more slowly, or less was to be predicted for it."""
-        T_registered, seconds = self._registered
-        if self._twist is None or self._bridge is not None:
-            return
-        if seconds:
-            seconds = max(seconds - late, 0.0)
-            self._registered = T_registered, seconds
-            self._T = predicted(T_registered, self._twist, seconds)
-        else:
-            self._twist = self._twist - self._change
 
     def _without_repetitions(self, frame: Frame, meters: float) -> Frame:
         """Without what the LiDAR or a camera has sent before; `meters`: the way since the last registered frame."""
@@ -240,22 +229,46 @@ class Odometry:
         T = result.T_target_source if result.ok else self._T
         return replace(result, T_target_source=T, ok=False, reason=result.reason or "after a pause: not confirmed yet")
 
-    def _register(self, frame: Frame, scan: Scan, T_predicted: Array, dt: float) -> tuple[Scan, Registration]:
-        """The registration of a frame, and the scan that it holds for: the given one, or one without the IMU."""
+    def _register_in_time(
+        self, frame: Frame, scan: Scan, T_predicted: Array, dt: float
+    ) -> tuple[Scan, Registration, float]:
+        """As `_register`, and how long the period was, s: as stamped or, where that is in doubt, as the points say."""
+        scan_, result, self._led = self._register(frame, scan, T_predicted, dt)
+        usual = self._clock.usual or self._sweep.span
+        if self._twist is None:
+            return scan_, result, usual if dt < _BURST * usual else dt
+        usual = usual or NOMINAL
+        if DOUBTED[0] * usual <= dt <= DOUBTED[1] * usual or result.method == "none":
+            return scan_, result, dt
+        T_usual = self._predicted(self._turned(self._twist, self._registered[1] + usual), usual)
+        if dt < usual or not result.ok or result.confidence < Prediction([T_predicted]).convincing:
+            other = self._register(frame, scan, T_usual, usual)
+            if other[1].ok and (not result.ok or other[1].confidence > result.confidence):
+                scan_, result, self._led = other
+        if result.ok:
+            steadiness = self._settings.steadiness
+            dt = period_by_motion(result.T_target_source, (dt, T_predicted), (usual, T_usual), steadiness)
+        return scan_, result, dt
+
+    def _register(self, frame: Frame, scan: Scan, T_predicted: Array, dt: float) -> tuple[Scan, Registration, bool]:
+        """The registration of a frame, the scan that it holds for (the given one, or one without the IMU), and whether
+        another odometry has led to it."""
         if frame.problem is not None:
-            return scan, Registration(T_predicted, self._unknown(dt), 0.0, np.inf, "none", False, frame.problem)
+            return scan, Registration(T_predicted, self._unknown(dt), 0.0, np.inf, "none", False, frame.problem), False
         if not len(self._registration):
             rejection = self._registration.rejection(scan)
-            return scan, Registration(
+            first = Registration(
                 T_predicted, np.zeros((6, 6)), float(not rejection), 0.0, "first", not rejection, rejection
             )
+            return scan, first, False
         led, fits = self._register_by_other(scan, dt)
-        self._led = fits
-        if not fits:
-            own = self._register_alone(frame, scan, T_predicted, dt)
-            # Along a tunnel most of a scan fits a map that was made at rest at rest: it says nothing of the step.
-            self._led = led is not None and own[1].worst_sigma >= OPEN
-        return (scan, led) if self._led and led is not None else own
+        if led is not None and fits:
+            return scan, led, True
+        own = self._register_alone(frame, scan, T_predicted, dt)
+        # Along a tunnel most of a scan fits a map that was made at rest at rest: it says nothing of the step.
+        if led is not None and own[1].worst_sigma >= OPEN:
+            return scan, led, True
+        return *own, False
 
     def _register_alone(self, frame: Frame, scan: Scan, T_predicted: Array, dt: float) -> tuple[Scan, Registration]:
         """The same by the motion so far, or from rest."""

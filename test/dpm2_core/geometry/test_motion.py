@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Constant velocity: predictions compose, and their uncertainty grows with time up to what a vehicle can do."""
+"""Constant velocity: predictions compose, their uncertainty grows with time up to what a vehicle can do, and the way
+tells how long a period was of which the stamp is in doubt."""
 
 from __future__ import annotations
 
@@ -8,8 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
-from dpm2_core.geometry.motion import between, combined, covariance, predicted
+from dpm2_core.geometry.motion import between, combined, covariance, period_by_motion, predicted
 
 TWIST = np.array([0.01, -0.02, 0.3, 15.0, 0.2, -0.1])
 OF_VELOCITY = np.diag([0.2, 0.2, 0.2]) ** 2
@@ -61,3 +63,43 @@ def test_a_direction_that_the_scene_leaves_open_keeps_the_uncertainty_of_the_pre
     result = R.T @ combined(of_scene, predicted_sigma**2 * np.eye(3)) @ R
     assert result[0, 0] == pytest.approx(predicted_sigma**2)
     assert result[1, 1] <= min(predicted_sigma**2, seen_sigma**2 / (1 - seen_sigma**2)) * (1 + 1e-9)
+
+
+def moved(speed: float, seconds: float) -> Array:
+    """Pose (4, 4) so much later, in a slight curve."""
+    return se3.exp(seconds * np.array([0, 0, 0.1, speed, 0, 0]))
+
+
+def found(speed: float, stamped: float, true: float, usual: float = 0.1) -> float:
+    """The period of a frame that came after `true` s."""
+    ends = [(seconds, moved(speed, seconds)) for seconds in (stamped, usual)]
+    return period_by_motion(moved(speed, true), ends[0], ends[1], 10.0)
+
+
+@given(st.floats(5, 40), st.floats(0.3, 1))
+def test_at_a_steady_speed_the_way_is_the_time(speed: float, share: float) -> None:
+    """A frame that was held back by 0.2 s, of which a part was lost frames, and one of a burst."""
+    true = 0.1 + 0.2 * (1 - share)
+    assert found(speed, 0.3, true) == pytest.approx(true, abs=0.01 + 0.5 / speed)  # what an acceleration may explain
+    assert found(speed, 0.01, 0.1) == pytest.approx(0.1, abs=1e-3)
+
+
+@given(st.floats(-40, 40), st.floats(-8, 8), st.sampled_from([0.01, 0.05, 0.2, 0.3, 0.6]))
+def test_an_acceleration_of_a_vehicle_leaves_the_stamp(speed: float, acceleration: float, dt: float) -> None:
+    """Of lost frames and of a stream that has become faster: brakes and gas are no delay."""
+    T = moved(speed, dt)
+    T[0, 3] += 0.5 * acceleration * dt * dt
+    ends = [(seconds, moved(speed, seconds)) for seconds in (dt, 0.1)]
+    assert period_by_motion(T, ends[0], ends[1], 10.0) == dt
+
+
+def test_at_a_halt_the_stamp_is_believed() -> None:
+    """A stream that changes its rate meanwhile would else have the speed of another rate from then on."""
+    assert found(0.0, 0.05, 0.1) == 0.05
+    assert found(0.3, 0.05, 0.1) == 0.05
+
+
+def test_a_way_beyond_both_is_one_of_them() -> None:
+    """Whatever the pose, the period is one that stamp or stream allow."""
+    assert found(20.0, 0.3, 0.01) == pytest.approx(0.1)
+    assert found(20.0, 0.3, 0.9) == pytest.approx(0.3)
