@@ -30,8 +30,8 @@ class Kitti360Source:
     """One drive, by the root and `input.sequence` (such as 0009), or by its folder in data_3d_raw.
 
     Poses were published for a part of the frames only, those where the car had moved; the others are NaN. They are of
-    the moment when the LiDAR faces forward. Scans are as measured: each point has a time offset by its azimuth, the
-    LiDAR turning counter-clockwise. Images are those of the rectified left camera, image_00.
+    the moment when the LiDAR faces forward. Scans are as measured: each point has a time offset by its azimuth, see
+    `azimuth_time`. Images are those of the rectified left camera, image_00.
 
     Raises:
         UsageError: no scans or no calibration, or a text file is damaged; the message names file and line.
@@ -127,8 +127,15 @@ class Kitti360Source:
 
 
 def azimuth_time(points: Points) -> Points:
-    """(N,) s from facing forward, -0.05..0.05, of points (N, 4) of a LiDAR that turns counter-clockwise at 10 Hz."""
-    return (np.arctan2(points[:, 1], points[:, 0]) * (_PERIOD / (2 * np.pi))).astype(np.float32)
+    """(N,) s from facing forward, -0.05..0.05, of points (N, 4) of a LiDAR that turns clockwise, seen from above.
+
+    What is on the left was measured before what is on the right: so it is in the data set's devkit (kitti360Scripts,
+    `curl_velodyne_data` moves a point on the left by a part of the way back to the previous pose) and in KISS-ICP's
+    reader of KITTI raw. In real scans of KITTI odometry, the same sensor, the rings have been moved that way by what
+    KITTI untwisted, and the world agrees best from scan to scan with it. Other converters call the rotation
+    counter-clockwise. No scan of KITTI-360 itself was at hand.
+    """
+    return (-np.arctan2(points[:, 1], points[:, 0]) * (_PERIOD / (2 * np.pi))).astype(np.float32)
 
 
 def read_keyed(path: Path) -> dict[str, Array]:

@@ -15,6 +15,7 @@ from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.trajectory import read_trajectory
 from dpm2_core.errors import UsageError
 from dpm2_core.geometry import se3
+from dpm2_core.geometry.deskew import deskew
 
 DRIVE = "2013_05_28_drive_0009_sync"
 T_LIDAR_CAM = se3.make([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0.8, 0.3, -0.2])
@@ -94,10 +95,21 @@ def test_frames(root: Path) -> None:
     assert next(open_source(root, InputSettings(images=False)).frames()).images == ()
 
 
-def test_the_lidar_turns_counter_clockwise_from_behind() -> None:
-    """Forward is now, left is a quarter of a turn later."""
+def test_the_lidar_turns_clockwise_from_behind() -> None:
+    """Forward is now, left was a quarter of a turn earlier; it was later, which doubled the distortion of a scan."""
     points = np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, -1, 0, 0]], np.float32)
-    np.testing.assert_allclose(azimuth_time(points), [0, 0.025, -0.025], atol=1e-7)
+    np.testing.assert_allclose(azimuth_time(points), [0, -0.025, 0.025], atol=1e-7)
+
+
+def test_points_are_moved_as_by_the_devkit() -> None:
+    """kitti360Scripts moves a point by the part azimuth / 2 pi of the way from this pose to the previous one."""
+    points = np.array([[3, 9, 0, 1], [-8, 2, 1, 1], [4, -7, 2, 1], [20, 0, 0, 1]], np.float32)
+    T_previous_now = se3.exp([0, 0, 0.02, 1.4, 0, 0])  # 14 m/s, a curve
+    part = np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi)
+    back = se3.log(se3.inverse(T_previous_now))
+    want = [se3.transform(se3.exp(a * back), p[None, :3].astype(float))[0] for a, p in zip(part, points, strict=True)]
+    got = deskew(points, azimuth_time(points), se3.log(T_previous_now) / 0.1)
+    np.testing.assert_allclose(got[:, :3], want, atol=0.012)  # half of one of the 63 steps of a sweep
 
 
 def test_pose_files_are_read_by_themselves(root: Path) -> None:
