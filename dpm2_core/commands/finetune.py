@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from dpm2_core.commands.options import JsonFile, show
-from dpm2_core.commands.train import ConfigOption, OutOption, ResumeOption, SetOption, reject_overwriting
+from dpm2_core.commands.train import ConfigOption, OutOption, ResumeOption, SetOption
 from dpm2_core.config import load_settings
 from dpm2_core.console import Console
 from dpm2_core.tables import FigureTable
@@ -30,14 +30,15 @@ def finetune(
     Run the result with --set slam.neural.weights=OUT/weights.safetensors.
     """
     from dpm2_core.data.open import open_source
+    from dpm2_core.experiments.begun import begin_or_resume
     from dpm2_core.learning import finetune as work
     from dpm2_core.learning import finetune_data, finetune_settings
     from dpm2_core.network.pretrained import load_network, weights_path  # torch is slow to import
     from dpm2_core.slam.settings import SlamSettings
 
-    reject_overwriting(out, resume)
     chosen = load_settings(finetune_settings.FinetuneSettings, config, settings or [])
     start = weights_path(chosen.weights)
+    begin_or_resume(out, resume, chosen, [start], {"SRC": [str(path.resolve()) for path in src]})
     network = load_network(chosen.weights, threads=2).settings
     sources = [open_source(path, chosen.input) for path in src]
     console = Console(stderr=True)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from dpm2_core.commands.options import JsonFile, parse_names, progress_bar, show
-from dpm2_core.commands.train import ConfigOption, OutOption, ResumeOption, SetOption, reject_overwriting, train
+from dpm2_core.commands.train import ConfigOption, OutOption, ResumeOption, SetOption, train
 from dpm2_core.config import load_settings
 from dpm2_core.console import Console
 from dpm2_core.errors import UsageError
@@ -114,14 +114,16 @@ Scans = tuple[Path, Sequence[str]]
 
 def _train(name: str, settings: TaskTraining, out: Path, resume: bool, sets: tuple[Scans, Scans | None]) -> None:
     """Train a task on the first scans, measuring on the second."""
+    from dpm2_core.experiments.begun import begin_or_resume
     from dpm2_core.tasks.open import open_scans  # torch is slow to import
     from dpm2_core.tasks.task import task_type
     from dpm2_core.tasks.training import WEIGHTS, new_task, train_task
 
-    reject_overwriting(out, resume)
     kind = task_type(name)
     (src, sequences), val = sets
     scans = open_scans(src, kind.learns_from(settings), sequences)
+    data = {"task": name, "SRC": str(src.resolve()), "sequences": list(sequences), "scans": len(scans)}
+    begin_or_resume(out, resume, settings, data=data)
     measured = None if val is None else open_scans(val[0], kind.needs, val[1])
     train_task(new_task(name, settings), scans, out, resume, measured)
     typer.echo(f"{out / WEIGHTS}: written", err=True)

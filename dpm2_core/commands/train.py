@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -12,6 +12,11 @@ from dpm2_core.commands.options import parse_range, progress_bar
 from dpm2_core.config import load_settings
 from dpm2_core.console import Console
 from dpm2_core.errors import UsageError
+
+if TYPE_CHECKING:  # torch is slow to import
+    from dpm2_core.learning.train_image import ImageTrainingSettings
+    from dpm2_core.learning.train_overlap import OverlapTrainingSettings
+    from dpm2_core.learning.train_registration import RegistrationTrainingSettings
 
 train = typer.Typer(help="Make training data and train the network.", no_args_is_help=True)
 
@@ -97,8 +102,9 @@ def image(
     """The image branch alone, before the registration training with images."""
     from dpm2_core.learning.train_image import ImageTrainingSettings, train_image
 
-    reject_overwriting(out, resume)
-    train_image(load_settings(ImageTrainingSettings, config, settings or []), out, resume)
+    chosen = load_settings(ImageTrainingSettings, config, settings or [])
+    _begin(out, resume, chosen)
+    train_image(chosen, out, resume)
 
 
 @train.command()
@@ -111,8 +117,9 @@ def phase1(
     """Registration: encoder, decoder, similarity and offset heads."""
     from dpm2_core.learning.train_registration import RegistrationTrainingSettings, train_registration
 
-    reject_overwriting(out, resume)
-    train_registration(load_settings(RegistrationTrainingSettings, config, settings or []), out, resume)
+    chosen = load_settings(RegistrationTrainingSettings, config, settings or [])
+    _begin(out, resume, chosen)
+    train_registration(chosen, out, resume)
 
 
 @train.command()
@@ -125,8 +132,9 @@ def phase2(
     """The heads that judge a pose, overlap and confidence, on the network of the registration training."""
     from dpm2_core.learning.train_overlap import OverlapTrainingSettings, train_overlap
 
-    reject_overwriting(out, resume)
-    train_overlap(load_settings(OverlapTrainingSettings, config, settings or []), out, resume)
+    chosen = load_settings(OverlapTrainingSettings, config, settings or [])
+    _begin(out, resume, chosen)
+    train_overlap(chosen, out, resume)
 
 
 @train.command()
@@ -152,9 +160,13 @@ def ablation(
     Console().print(f"written to {report}")
 
 
-def reject_overwriting(out: Path, resume: bool) -> None:
-    """Raise UsageError where a new training would replace another, or there is none to resume."""
-    if (out / "checkpoint.pt").exists() and not resume:
-        raise UsageError(f"{out}: holds a training; --resume continues it, another --out keeps it")
-    if resume and not (out / "checkpoint.pt").exists():
-        raise UsageError(f"{out}: no checkpoint.pt to resume")
+def _begin(
+    out: Path, resume: bool, settings: ImageTrainingSettings | RegistrationTrainingSettings | OverlapTrainingSettings
+) -> None:
+    """Ready `out` for a training on packed drives, see `begin_or_resume`."""
+    from dpm2_core.data.packed import open_packed
+    from dpm2_core.experiments.begun import begin_or_resume
+
+    frames = {folder: sum(map(len, open_packed(Path(folder)))) for folder in settings.data.packed}
+    read = [Path(settings.start)] if settings.start else []
+    begin_or_resume(out, resume, settings, read, {"frames": frames})

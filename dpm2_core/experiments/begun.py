@@ -1,15 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A training in the folder of a part: it goes on from its checkpoint, unless something else is asked for now."""
+"""A training in a folder goes on from its checkpoint, unless something else is asked for now: then one of an experiment
+begins anew, and one that a user resumes is an error."""
 
 from __future__ import annotations
 
+import json
+import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
-from dpm2_core.files import atomic_write, file_digest, make_folder
+from dpm2_core.config import Settings
+from dpm2_core.errors import UsageError
+from dpm2_core.files import atomic_write, file_digest, json_text, make_folder
 
 _BEGUN, _CHECKPOINT, LOG = "begun.yaml", "checkpoint.pt", "log.jsonl"
+_ASKED = "begun.json"
+_FREE = {"workers", "save_every", "validate_every"}  # they do not change what is learned
 
 
 def begin_training(folder: Path, text: str, weights: str, read: Sequence[Path] = (), start: Path | None = None) -> bool:
@@ -25,7 +33,7 @@ def begin_training(folder: Path, text: str, weights: str, read: Sequence[Path] =
     make_folder(folder)
     begun = folder / _BEGUN
     files = [*read, *([] if start is None else [start / _CHECKPOINT])]
-    text += "".join(f"# {path}: {file_digest(path) if path.is_file() else 'missing'}\n" for path in files)
+    text += "".join(f"# {path}: {_content(path)}\n" for path in files)
     if not (begun.is_file() and begun.read_text(encoding="utf-8") == text):
         for old in (_CHECKPOINT, LOG, weights):
             (folder / old).unlink(missing_ok=True)
@@ -35,3 +43,63 @@ def begin_training(folder: Path, text: str, weights: str, read: Sequence[Path] =
         with atomic_write(begun) as file:  # the last: what is killed before is begun anew
             file.write(text)
     return (folder / _CHECKPOINT).exists()
+
+
+def begin_or_resume(
+    folder: Path, resume: bool, settings: Settings, read: Sequence[Path] = (), data: dict[str, Any] | None = None
+) -> None:
+    """Ready a folder for a training that a user asks for; with `resume`, for what was asked for when it began.
+
+    Settings that do not change what is learned may differ. A folder that does not say what was asked for is gone on
+    with.
+
+    Args:
+        read: files that the training begins with, such as weights; their content counts.
+        data: what it learns from, beside the settings.
+
+    Raises:
+        UsageError: there is a training that is not to be resumed, there is none to resume, or it was asked for
+            something else; the message names the first setting that differs, and both values.
+    """
+    asked, there = folder / _ASKED, (folder / _CHECKPOINT).exists()
+    if there and not resume:
+        raise UsageError(f"{folder}: holds a training; --resume continues it, another --out keeps it")
+    if resume and not there:
+        raise UsageError(f"{folder}: no checkpoint.pt to resume")
+    now = dict(_values(settings)) | {f"content of {path}": _content(path) for path in read} | (data or {})
+    now["processes"] = int(os.environ.get("WORLD_SIZE", "1"))
+    now = json.loads(json_text(now))  # as it is read again
+    if not resume or not asked.is_file():
+        with atomic_write(asked) as file:
+            file.write(json_text(now))
+        return
+    try:
+        before = json.loads(asked.read_text(encoding="utf-8"))
+        differing = [key for key in now if key in before and before[key] != now[key]]
+    except (OSError, ValueError, TypeError) as error:
+        raise UsageError(f"{asked}: {error}") from None
+    if differing:
+        name, old, new = _difference(differing[0], before[differing[0]], now[differing[0]])
+        raise UsageError(f"{folder}: began with {name} {old}, not {new}; --resume goes on with the same alone")
+
+
+def _content(path: Path) -> str:
+    return file_digest(path) if path.is_file() else "missing"
+
+
+def _values(settings: Settings, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted keys and values of what changes what is learned."""
+    for name, value in settings:
+        if isinstance(value, Settings):
+            yield from _values(value, f"{prefix}{name}.")
+        elif name not in _FREE:
+            yield f"{prefix}{name}", settings.model_dump(mode="json", include={name})[name]
+
+
+def _difference(name: str, before: Any, now: Any) -> tuple[str, Any, Any]:
+    """The first key in which two values differ, at any depth, and its values."""
+    if isinstance(before, dict) and isinstance(now, dict):
+        for key in [*now, *before]:
+            if before.get(key) != now.get(key):
+                return _difference(f"{name}.{key}", before.get(key), now.get(key))
+    return name, before, now

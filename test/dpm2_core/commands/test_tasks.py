@@ -48,7 +48,11 @@ def test_train_resume_and_measure(recording: Path, tmp_path: Path) -> None:
     again = train(recording, out)
     assert again.returncode == 2
     assert "--resume continues it" in again.stderr
-    assert train(recording, out, "--resume").returncode == 0  # nothing is left to do
+    same = ("--resume", "--slam-weight", "0.5", "--slam-every", "3")
+    assert train(recording, out, *same).returncode == 0  # nothing is left to do
+    other = train(recording, out, "--resume", "--slam-weight", "0.5")
+    assert (other.returncode, other.stderr.count("\n")) == (2, 1)
+    assert "began with slam.every 3, not " in other.stderr
     assert len((out / "log.jsonl").read_text().splitlines()) == len(log)
 
     weights, image = out / "weights.safetensors", tmp_path / "ground.png"

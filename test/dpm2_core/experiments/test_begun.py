@@ -6,11 +6,22 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from pydantic import Field
 
+from dpm2_core.config import Settings
 from dpm2_core.errors import UsageError
-from dpm2_core.experiments.begun import begin_training
+from dpm2_core.experiments.begun import begin_or_resume, begin_training
+from dpm2_core.learning.trainer import OptimizerSettings
 
 WEIGHTS = "weights.safetensors"
+
+
+class Training(Settings):
+    """Settings of a training."""
+
+    network: dict[str, dict[str, int]] = Field({"points": {"stem": 16}})
+    workers: int = 1
+    optimiser: OptimizerSettings = OptimizerSettings()
 
 
 def left(folder: Path) -> None:
@@ -68,3 +79,52 @@ def test_a_folder_that_cannot_be_is_an_error_that_names_it(tmp_path: Path) -> No
     (tmp_path / "file").write_text("")
     with pytest.raises(UsageError, match="file/training: no folder can be made there: Not a directory"):
         begin_training(tmp_path / "file" / "training", "", WEIGHTS)
+
+
+@pytest.mark.parametrize(
+    ("tree", "data", "difference"),
+    [
+        ({"optimiser": {"seed": 9}}, {"SRC": "a"}, "optimiser.seed 0, not 9"),
+        ({"optimiser": {"steps": 4000}}, {"SRC": "a"}, "optimiser.steps 3000, not 4000"),
+        ({"network": {"points": {"stem": 8}}}, {"SRC": "a"}, "network.points.stem 16, not 8"),
+        ({}, {"SRC": "b"}, "SRC a, not b"),
+    ],
+)
+def test_a_training_is_not_resumed_with_something_else(
+    tmp_path: Path, tree: dict[str, object], data: dict[str, object], difference: str
+) -> None:
+    """It went on with another seed, rate or data without a word, and its weights said what was asked for last."""
+    begin_or_resume(tmp_path, False, Training(), data={"SRC": "a"})
+    left(tmp_path)
+    begin_or_resume(tmp_path, True, Training(), data={"SRC": "a"})
+    with pytest.raises(UsageError, match=f"began with {difference}; --resume goes on with the same alone"):
+        begin_or_resume(tmp_path, True, Training.model_validate(tree), data=data)
+    begin_or_resume(tmp_path, True, Training(), data={"SRC": "a"})
+
+
+def test_weights_of_another_content_and_other_processes_are_something_else(
+    tmp_path: Path, read: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of the same name, and under torchrun; what does not change what is learned is free."""
+    out = tmp_path / "out"
+    begin_or_resume(out, False, Training(), [read])
+    left(out)
+    free = Training(workers=3, optimiser=OptimizerSettings(save_every=7, validate_every=9))
+    begin_or_resume(out, True, free, [read])
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    with pytest.raises(UsageError, match="processes 1, not 2"):
+        begin_or_resume(out, True, Training(), [read])
+    read.write_text("others!")
+    with pytest.raises(UsageError, match=rf"content of {read} \w+, not \w+"):
+        begin_or_resume(out, True, Training(), [read])
+
+
+def test_a_checkpoint_that_does_not_say_how_it_began_is_gone_on_with(tmp_path: Path) -> None:
+    """One of before; a new training does not replace it."""
+    left(tmp_path)
+    begin_or_resume(tmp_path, True, Training())
+    with pytest.raises(UsageError, match="holds a training; --resume continues it"):
+        begin_or_resume(tmp_path, False, Training())
+    (tmp_path / "checkpoint.pt").unlink()
+    with pytest.raises(UsageError, match=r"no checkpoint\.pt to resume"):
+        begin_or_resume(tmp_path, True, Training())
