@@ -220,8 +220,8 @@ class Trainer:
         return {name: float(value) for name, value in figures.items()} | {"norm": float(norm), "rate": rate}
 
     def _keep(self, ema: nn.Module, optimizer: torch.optim.Optimizer, log: Log, done: int, last: bool) -> None:
-        """Checkpoint and validation, where they are due after so many steps."""
-        if last or done % self.settings.save_every == 0:
-            save_checkpoint(self.out / "checkpoint.pt", self.module, ema, optimizer, done)
+        """Validation, then checkpoint, where they are due after so many steps: what is stopped is repeated."""
         if self.validate is not None and (last or done % self.settings.validate_every == 0):
             log.write(done - 1, self.validate(ema))
+        if last or done % self.settings.save_every == 0:
+            save_checkpoint(self.out / "checkpoint.pt", self.module, ema, optimizer, done)

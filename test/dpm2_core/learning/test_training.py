@@ -131,6 +131,33 @@ def test_a_training_that_learns_nothing_says_so(tmp_path: Path) -> None:
     assert not saved
 
 
+def test_a_validation_that_is_stopped_is_repeated(tmp_path: Path) -> None:
+    """The checkpoint said that its step was done, so the figures of the last steps were lost for good."""
+
+    class Line(torch.nn.Linear):
+        def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+            loss = super().forward(x).sum() ** 2
+            return loss, {"loss": loss.detach()}
+
+    outcomes = iter([1.0, None, 2.0])
+
+    def validate(module: torch.nn.Module) -> dict[str, float]:
+        if (figure := next(outcomes)) is None:
+            raise KeyboardInterrupt
+        return {"figure": figure}
+
+    def train(resume: bool) -> None:
+        steps = OptimizerSettings(steps=4, compile=False, bf16=False, save_every=2, validate_every=2)
+        Trainer(Line(2, 1), lambda *_: repeat((torch.ones(2),)), steps, tmp_path, lambda m: None, validate).run(resume)
+
+    with pytest.raises(KeyboardInterrupt):
+        train(False)
+    train(True)
+    rows = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert [(row["step"], row["figure"]) for row in rows if "figure" in row] == [(1, 1.0), (3, 2.0)]
+    assert list(losses(tmp_path)) == [0, 1, 2, 3]
+
+
 @pytest.mark.parametrize("damage", ["optimizer", "no optimizer", "list"])
 def test_a_checkpoint_that_does_not_fit_is_an_error_of_use(damage: str, tmp_path: Path) -> None:
     path, module = tmp_path / "checkpoint.pt", torch.nn.Linear(3, 3)
