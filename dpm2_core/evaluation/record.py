@@ -37,12 +37,16 @@ def write_record(path: Path, name: str, results: dict[str, Any], program: str = 
 
 
 def git_commit() -> str | None:
-    """The commit that was measured, with "+" where files differ from it; None outside its own repository."""
+    """The commit that was measured, with "+" where the program or a benchmark differs from it, new files among them.
+
+    None outside its own repository.
+    """
     try:
         if _git("rev-parse", "--show-prefix"):
             return None  # installed below a repository of something else
         commit = _git("rev-parse", "--short=12", "HEAD")
-        return commit + ("+" if _git("status", "--porcelain", "--untracked-files=no", "--", "dpm2_core") else "")
+        changed = _git("status", "--porcelain", "--untracked-files=all", "--", "dpm2_core", "benchmarks/*.py")
+        return commit + ("+" if changed else "")
     except (OSError, subprocess.CalledProcessError):
         return None
 

@@ -32,3 +32,18 @@ def test_the_commit_is_that_of_the_programs_own_repository(repository: Path, mon
     installed.mkdir(parents=True)
     monkeypatch.setattr(record, "REPOSITORY", installed)
     assert record.git_commit() is None
+
+
+@pytest.mark.parametrize(
+    ("file", "marked"),
+    [("benchmarks/map.py", True), ("dpm2_core/new.py", True), ("benchmarks/map.json", False), ("out/a.py", False)],
+)
+def test_a_changed_benchmark_and_a_new_module_are_no_clean_commit(
+    repository: Path, monkeypatch: pytest.MonkeyPatch, file: str, marked: bool
+) -> None:
+    """Only files of dpm2_core that git knew counted, though a benchmark says what a success is."""
+    monkeypatch.setattr(record, "REPOSITORY", repository)
+    path = repository / file
+    path.parent.mkdir()
+    path.write_text("LATERAL = 9\n")
+    assert (record.git_commit() or "").endswith("+") == marked
