@@ -11,7 +11,7 @@ import typer
 from dpm2_core.commands.options import parse_range, progress_bar
 from dpm2_core.config import load_settings
 from dpm2_core.console import Console
-from dpm2_core.errors import UsageError
+from dpm2_core.errors import Dpm2Error, UsageError, printable
 
 if TYPE_CHECKING:  # torch is slow to import
     from dpm2_core.learning.train_image import ImageTrainingSettings
@@ -60,6 +60,7 @@ def pack(
     from dpm2_core.data.open import sequences_below
 
     overrides = [*(settings or []), *(["images=false"] if no_image else [])]
+    _check_packing(frames, preset, overrides)
     if not every:
         if out.exists():
             raise UsageError(f"{out}: is there already; remove it, or choose another folder")
@@ -67,9 +68,27 @@ def pack(
         return
     if any(setting.startswith("sequence=") for setting in overrides):
         raise UsageError("--all: packs every drive; leave --set sequence= out")
-    for name in sequences_below(src):
+    left_out = []
+    names = sequences_below(src)
+    for name in names:
         if not (out / name).exists():
-            _pack_one(src, out / name, frames, preset, [*overrides, f"sequence={name}"])
+            try:
+                _pack_one(src, out / name, frames, preset, [*overrides, f"sequence={name}"])
+            except UsageError as error:  # of this drive; a full disk ends them all
+                typer.echo(f"{out / name}: left out: {printable(str(error))}", err=True)
+                left_out.append(name)
+    if left_out:
+        raise Dpm2Error(f"{len(left_out)} of {len(names)} drives were left out: {', '.join(left_out)}")
+
+
+def _check_packing(frames: str, preset: str, overrides: list[str]) -> None:
+    """Raise UsageError for what is wrong whatever the drive."""
+    from dpm2_core.data.settings import InputSettings
+    from dpm2_core.network.settings import preset as network_preset
+
+    load_settings(InputSettings, None, overrides)
+    network_preset(preset)
+    parse_range(frames)
 
 
 def _pack_one(src: Path, out: Path, frames: str, preset: str, overrides: list[str]) -> None:
@@ -84,11 +103,13 @@ def _pack_one(src: Path, out: Path, frames: str, preset: str, overrides: list[st
     chosen = range(len(source))[start:stop]
     if not chosen:
         raise UsageError(f"--frames {frames}: {src} has {len(source)} frames")
-    with progress_bar() as bar:
-        task = bar.add_task(f"{source.name} -> {out}", total=len(chosen))
-        packed = write(source, out, network, chosen, lambda: bar.advance(task))
-    for note in source.notes:
-        typer.echo(note, err=True)
+    try:
+        with progress_bar() as bar:
+            task = bar.add_task(f"{source.name} -> {out}", total=len(chosen))
+            packed = write(source, out, network, chosen, lambda: bar.advance(task))
+    finally:
+        for note in source.notes:  # such as an image that cannot be read
+            typer.echo(note, err=True)
     typer.echo(f"{out}: {packed} frames", err=True)
 
 

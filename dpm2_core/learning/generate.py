@@ -189,20 +189,22 @@ def pack(
     `frames`: positions to look at; `advance` is called after each. `settings`: what made the poses, see `check_same`.
 
     Raises:
-        UsageError: the source has no poses, or its frames do not all have as many images of one size.
+        UsageError: the source has no poses, or some of its frames lack an image that others have.
     """
     if source.poses is None:
         raise UsageError(f"{source.name}: no ground truth poses, training needs them")
     chosen = frames or range(len(source))
     with PackedWriter(folder) as writer:
         before: tuple[Frame, Array] | None = None  # a motion needs the next pose, so each frame waits for it
-        twist, scale = np.zeros(6), 0.0
+        twist, scale, first = np.zeros(6), 0.0, None
         for position, frame in enumerate(source.frames(chosen.start, chosen.stop), chosen.start):
             advance()
             pose = source.poses[position]
             if position not in chosen or frame.problem is not None or not np.isfinite(pose).all():
                 continue
             scale = scale or scale_of(frame.points)
+            first = first or (frame.index, _cameras(frame))
+            _check_cameras(source.name, first, (frame.index, _cameras(frame)))
             if before is not None:
                 twist = _twist(before, (frame, pose))
                 writer.add(_packed(*before, twist, network, scale))
@@ -212,6 +214,21 @@ def pack(
         writer.add(_packed(*before, twist, network, scale))
         writer.finish({"source": source.name, "scale": scale, "settings": dict(settings or {})})
     return len(writer)
+
+
+def _cameras(frame: Frame) -> list[str]:
+    return [image.camera.name for image in frame.images]
+
+
+def _check_cameras(name: str, first: tuple[int, list[str]], now: tuple[int, list[str]]) -> None:
+    """Raise UsageError where two frames, each its number and cameras, do not have as many images."""
+    fewer, more = sorted((first, now), key=lambda seen: len(seen[1]))
+    if len(fewer[1]) < len(more[1]):
+        lacking = ", ".join(sorted(set(more[1]) - set(fewer[1])) or more[1])
+        raise UsageError(
+            f"{name}: frame {fewer[0]} has no usable image of {lacking}, frame {more[0]} has one; --no-image packs "
+            "the drive without images"
+        )
 
 
 def _packed(frame: Frame, pose: Array, twist: Array, network: NetworkSettings, scale: float) -> Sample:

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -27,6 +28,7 @@ from dpm2_core.learning.dataset import DataSettings, GroupDataset, Mixture
 from dpm2_core.learning.generate import GenerateSettings, generate, pack
 
 from ...helpers import rooms
+from ...helpers.command import dpm2
 from ...helpers.networks import tiny
 from ...helpers.scenes import boxes, make_image
 
@@ -150,7 +152,7 @@ def test_packed_sweeps_are_rigid_and_fit_each_other(tmp_path: Path) -> None:
 def test_what_cannot_be_packed(tmp_path: Path) -> None:
     """No poses; none in the range; images in some frames only."""
     source = Sweeps(boxes(np.random.default_rng(0), 200), images=False)
-    with pytest.raises(UsageError, match="some frames have an image"):
+    with pytest.raises(UsageError, match="sweeps: frame 0 has no usable image of camera, frame 3 has one"):
         pack(source, tmp_path / "d", tiny())
     with pytest.raises(UsageError, match="no readable frame with a pose"):
         pack(source, tmp_path / "d", tiny(), range(2, 3))
@@ -226,6 +228,28 @@ def test_all_drives_of_a_data_set_are_packed_and_a_second_run_makes_only_what_is
     assert "packs every drive" in str(one_of_all.exception)
     nothing = CliRunner().invoke(app, ["train", "pack", str(tmp_path / "all" / "03"), str(tmp_path / "x"), "--all"])
     assert "no drives below" in str(nothing.exception)
+
+
+def test_a_drive_that_cannot_be_packed_does_not_keep_the_others_back(kitti: Path, tmp_path: Path) -> None:
+    """The first without scans or with one image missing ended the call, and each later one, without a name."""
+    for name in ("01", "05"):
+        shutil.copytree(kitti / "sequences" / "03", kitti / "sequences" / name)
+    for scan in (kitti / "sequences" / "01" / "velodyne").iterdir():
+        scan.unlink()
+    drive = kitti / "sequences" / "03"
+    (drive / "calib.txt").write_text("P2: 50 0 20 0 0 50 15 0 0 0 1 0\nTr: 0 -1 0 0 0 0 -1 0 1 0 0 0\n")
+    (drive / "image_2").mkdir()
+    for n in (0, 1, 3):
+        cv2.imwrite(str(drive / "image_2" / f"{n:06d}.png"), np.zeros((30, 40, 3), np.uint8))
+    (drive / "image_2" / "000002.png").write_bytes(b"cut off")
+    done = dpm2("train", "pack", kitti, tmp_path / "all", "--all")
+    assert done.returncode == 1
+    assert "01: left out: " in done.stderr
+    assert "image_2/000002.png cannot be read" in done.stderr
+    assert "03: left out: 03: frame 2 has no usable image of camera_color_left, frame 0 has one" in done.stderr
+    assert done.stderr.endswith("dpm2: 2 of 3 drives were left out: 01, 03\n")
+    assert [packed.name for packed in open_packed(tmp_path / "all")] == ["05"]
+    assert dpm2("train", "pack", kitti, tmp_path / "all", "--all", "--preset", "none").returncode == 2  # of any drive
 
 
 @pytest.mark.parametrize(
