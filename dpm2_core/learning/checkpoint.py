@@ -7,7 +7,8 @@ import json
 import math
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
+from zipfile import ZipFile
 
 import torch
 from torch import nn
@@ -39,14 +40,19 @@ def load_checkpoint(path: Path, module: nn.Module, ema: nn.Module, optimiser: to
     """Restore a run; returns the step it had finished.
 
     Raises:
-        UsageError: no checkpoint, or one of another network or optimizer.
+        UsageError: no checkpoint, a damaged one, or one of another network or optimizer.
     """
     try:
+        with path.open("rb") as file:
+            whole = _is_whole(file)
+    except OSError as error:
+        raise UsageError(f"{path}: {error.strerror}") from None
+    if not whole:
+        raise UsageError(f"{path}: damaged, or not a checkpoint; remove it to begin anew, without --resume")
+    try:
         state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)  # executes nothing
-    except (OSError, RuntimeError, ValueError, EOFError) as error:
-        raise UsageError(f"{path}: no checkpoint: {error}") from None
-    except Exception as error:  # weights_only rejects pickled code with pickle.UnpicklingError
-        raise UsageError(f"{path}: not a checkpoint of this program: {str(error).splitlines()[0]}") from None
+    except Exception:  # what torch says is of its own settings, such as how to execute what the file holds
+        raise UsageError(f"{path}: not a checkpoint of this program") from None
     try:
         module.load_state_dict(state["module"])
         ema.load_state_dict(state["ema"])
@@ -55,6 +61,14 @@ def load_checkpoint(path: Path, module: nn.Module, ema: nn.Module, optimiser: to
     except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
         first = str(error).splitlines()[-1].strip()
         raise UsageError(f"{path}: checkpoint of another network or optimizer: {first}") from None
+
+
+def _is_whole(file: IO[bytes]) -> bool:
+    """Whether it is an archive, as torch writes, and all in it has its checksum, which torch does not look at."""
+    try:
+        return ZipFile(file).testzip() is None
+    except Exception:  # anything from BadZipFile to struct.error by the kind of damage
+        return False
 
 
 class Log:

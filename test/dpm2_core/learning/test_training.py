@@ -176,6 +176,27 @@ def test_a_checkpoint_that_does_not_fit_is_an_error_of_use(damage: str, tmp_path
         load_checkpoint(path, module, module, made)
 
 
+@pytest.mark.parametrize("damage", ["empty", "text", "zeros", "half", "flipped", "folder", "none"])
+def test_a_damaged_checkpoint_is_one_line_of_its_own(damage: str, tmp_path: Path) -> None:
+    """It was nothing at all, or paragraphs of torch on settings of its own; flipped bytes were weights."""
+    path, module = tmp_path / "checkpoint.pt", torch.nn.Linear(32, 32)
+    made = make_optimizer(module, OptimizerSettings())
+    save_checkpoint(path, module, module, made, 7)
+    whole = path.read_bytes()
+    middle = len(whole) // 2
+    path.unlink()
+    if damage == "folder":
+        path.mkdir()
+    elif damage != "none":
+        flipped = whole[:middle] + bytes(byte ^ 255 for byte in whole[middle : middle + 64]) + whole[middle + 64 :]
+        contents = {"empty": b"", "text": b"hello", "zeros": bytes(len(whole)), "half": whole[:middle]}
+        path.write_bytes(contents.get(damage, flipped))
+    said = {"folder": "Is a directory", "none": "No such file or directory"}
+    want = said.get(damage, "damaged, or not a checkpoint; remove it to begin anew, without --resume")
+    with pytest.raises(UsageError, match=f"^{path}: {want}$"):
+        load_checkpoint(path, module, module, made)
+
+
 @pytest.mark.slow
 def test_overlap_changes_the_heads_that_judge_alone(settings: RegistrationTrainingSettings, tmp_path: Path) -> None:
     """Every other tensor of the weights stays as the registration training left it."""
