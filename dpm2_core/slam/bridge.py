@@ -61,6 +61,7 @@ class Bridge:
         registration: the map before the pause.
         twist: (6,) [rad/s, m/s] the motion there; None where it was not known.
         tries: scans of the stretch that were registered to the map before.
+        held: whether they were held back on their way: the pause may have been as short as a period.
     """
 
     def __init__(
@@ -71,6 +72,7 @@ class Bridge:
         self.twist = twist
         self._of_velocity = of_velocity
         self.tries = 0
+        self.held = False
         self._T = T
         self._limits = limits
         self._ties: list[_Tie] = []
@@ -79,6 +81,7 @@ class Bridge:
         """A new stretch, so long after the last pose before the pause: where it begins (4, 4); there, if another
         odometry knows the way."""
         self._seconds = seconds
+        self.held = False
         self._ties.clear()
         self._after: Array | None = None
         self._T_other = T_other
@@ -137,7 +140,7 @@ class Bridge:
         ends = [] if self._T_other is None else [self._T_other]
         ends += [between(self._T, before + rate, after + rate, seconds) for rate in rates]
         way = seconds * float(np.linalg.norm(before[3:] + after[3:])) / 2
-        parts = [part for part in _PARTS if (1 - part) * way <= _STOPS * seconds**2 / 4]
+        parts = [part for part in _PARTS if self.held or (1 - part) * way <= _STOPS * seconds**2 / 4]
         ends += [between(self._T, part * before, part * after, seconds) for part in parts]
         poses = np.repeat(ends, len(offsets), 0)
         poses[:, :3, 3] += np.concatenate([offsets @ T[:3, :3].T for T in ends])
@@ -177,11 +180,12 @@ class Bridge:
         T_before_begin = se3.inverse(self._T) @ T_begin
         before, after = self.twist[3:], T_before_begin[:3, :3] @ self._after[3:]
         way, mean = T_before_begin[:3, 3], (before + after) / 2
-        off = float(np.linalg.norm(way - self._seconds * mean))
+        seconds = min(max(way @ mean / max(mean @ mean, 1e-9), 0.0), self._seconds) if self.held else self._seconds
+        off = float(np.linalg.norm(way - seconds * mean))
         if off > _NEAR + self._limits.acceleration * self._seconds**2 / 4:
             return f"after a pause: {off:.0f} m from where the motion before and after leads"
         speeds, most = np.linalg.norm([before, after], axis=1), self._limits.acceleration
-        if speeds.min() > _DRIVES and before @ after > 0 and speeds.sum() < most * self._seconds:
+        if not self.held and speeds.min() > _DRIVES and before @ after > 0 and speeds.sum() < most * self._seconds:
             # It did not reverse: it has come at least as far as it needs to stop, and to be as fast again.
             ahead = mean / np.linalg.norm(mean)
             least, came = float(speeds @ [before @ ahead, after @ ahead]) / (2 * most), float(way @ ahead)

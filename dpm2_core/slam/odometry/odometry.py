@@ -27,6 +27,7 @@ from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration
 
 _KNOWN = 0.5  # m and rad, standard deviation of the second pose, still skewed: where the points find it alone
 _BURST = 0.6  # of the usual period: while no motion is known, a frame that comes sooner was held back
+_BETTER = 0.02  # confidence: so much more of the points must fit where the stamp does not lead
 _ANY_VELOCITY = 15.0**2 * np.eye(3)  # covariance, m/s: so much until two scans are registered
 
 
@@ -235,15 +236,18 @@ class Odometry:
         """As `_register`, and how long the period was, s: as stamped or, where that is in doubt, as the points say."""
         scan_, result, self._led = self._register(frame, scan, T_predicted, dt)
         usual = self._clock.usual or self._sweep.span
+        burst = dt < _BURST * usual
+        if burst and self._bridge is not None:
+            self._bridge.held = True
         if self._twist is None:
-            return scan_, result, usual if dt < _BURST * usual else dt
+            return scan_, result, usual if burst else dt
         usual = usual or NOMINAL
         if DOUBTED[0] * usual <= dt <= DOUBTED[1] * usual or result.method == "none":
             return scan_, result, dt
         T_usual = self._predicted(self._turned(self._twist, self._registered[1] + usual), usual)
         if dt < usual or not result.ok or result.confidence < Prediction([T_predicted]).convincing:
             other = self._register(frame, scan, T_usual, usual)
-            if other[1].ok and (not result.ok or other[1].confidence > result.confidence):
+            if other[1].ok and (not result.ok or other[1].confidence > result.confidence + _BETTER):
                 scan_, result, self._led = other
         if result.ok:
             steadiness = self._settings.steadiness

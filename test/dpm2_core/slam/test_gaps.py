@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -137,6 +138,18 @@ def test_two_frames_at_a_time_are_no_gaps(world: World) -> None:
     tracked = run(frames)
     assert [t.state for t in tracked[6:]] == [State.TRACKING] * 8  # before that the rhythm is not known
     assert off(tracked, poses)[6:].max() < 0.1
+    assert tracked[-1].breaks == 0
+
+
+@pytest.mark.slow
+def test_a_pause_after_which_the_frames_of_it_come_in_a_burst_is_none(world: World) -> None:
+    """A driver stalls for 1.5 s, then gives its frames, stamped on arrival: it was `tracking` in a place 4 m off."""
+    frames, poses = scanned(world, along(world), [0.1 * i for i in range(32)])
+    arrival = frames[24].stamp
+    held = [replace(frame, stamp=arrival - (24 - i) * 8 * 10**6) for i, frame in enumerate(frames[10:25], 10)]
+    tracked = run([*frames[:10], *held, *frames[25:]])
+    assert [t.state for t in tracked[14:]] == [State.TRACKING] * 18
+    assert off(tracked, poses)[14:].max() < 0.1
     assert tracked[-1].breaks == 0
 
 
