@@ -46,7 +46,7 @@ def load_checkpoint(path: Path, module: nn.Module, ema: nn.Module, optimiser: to
         with path.open("rb") as file:
             whole = _is_whole(file)
     except OSError as error:
-        raise UsageError(f"{path}: {error.strerror}") from None
+        raise UsageError(f"{path}: no checkpoint: {error.strerror}") from None
     if not whole:
         raise UsageError(f"{path}: damaged, or not a checkpoint; remove it to begin anew, without --resume")
     try:

@@ -191,7 +191,7 @@ def test_a_damaged_checkpoint_is_one_line_of_its_own(damage: str, tmp_path: Path
         flipped = whole[:middle] + bytes(byte ^ 255 for byte in whole[middle : middle + 64]) + whole[middle + 64 :]
         contents = {"empty": b"", "text": b"hello", "zeros": bytes(len(whole)), "half": whole[:middle]}
         path.write_bytes(contents.get(damage, flipped))
-    said = {"folder": "Is a directory", "none": "No such file or directory"}
+    said = {"folder": "no checkpoint: Is a directory", "none": "no checkpoint: No such file or directory"}
     want = said.get(damage, "damaged, or not a checkpoint; remove it to begin anew, without --resume")
     with pytest.raises(UsageError, match=f"^{path}: {want}$"):
         load_checkpoint(path, module, module, made)
