@@ -14,11 +14,12 @@ from typing import Any, TypeVar
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import nn
 
 from dpm2_core.config import Settings
 from dpm2_core.errors import UsageError
+from dpm2_core.files import atomic_write
 from dpm2_core.network.heads import ConfidenceHead
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.settings import NetworkSettings, settings_from
@@ -37,14 +38,26 @@ def save_weights(model: DeepPointMap2, path: Path, about: dict[str, str], half: 
 
 
 def write_tensors(state: Mapping[str, torch.Tensor], path: Path, metadata: dict[str, str], half: bool) -> None:
-    """Write tensors and what is to be known of them, whole or not at all; `half` stores fp16."""
+    """Write tensors and what is to be known of them, whole or not at all; `half` stores fp16.
+
+    The same tensors and metadata give the same bytes, by which weights are told apart.
+    """
     stored = {
         name: (value.half() if half and value.is_floating_point() else value).contiguous().cpu()
         for name, value in state.items()
     }
-    part = path.with_suffix(".part")
-    save_file(stored, part, metadata)
-    part.replace(path)
+    with atomic_write(path, "wb") as file:
+        file.write(_in_order(save(stored, metadata)))
+
+
+def _in_order(file: bytes) -> bytes:
+    """A safetensors file with its metadata by name: the package writes them in the order of a hash map, any."""
+    end = 8 + int.from_bytes(file[:8], "little")
+    header = json.loads(file[8:end])
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    text = json.dumps(header, ensure_ascii=False, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)  # the tensors are aligned
+    return len(text).to_bytes(8, "little") + text + file[end:]
 
 
 def read_tensors(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:

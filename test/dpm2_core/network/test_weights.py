@@ -43,6 +43,19 @@ def test_round_trip(model: DeepPointMap2, saved: Path) -> None:
     assert load_weights(model, saved)["steps"] == "3"
 
 
+def test_the_same_weights_are_the_same_file(model: DeepPointMap2, tmp_path: Path) -> None:
+    """What is known of them stood in any order, so that equal trainings were of other weights to a map."""
+    path = tmp_path / "equal.safetensors"
+    about = {key: f"{key} \u00e4\n" for key in "abcdefgh"}
+    files = set()
+    for keys in (about, reversed(about)):  # 10! orders: chance does not pass
+        save_weights(model, path, {key: about[key] for key in keys})
+        files.add(path.read_bytes())
+    assert len(files) == 1
+    assert about.items() <= read_tensors(path)[1].items()
+    load_weights(model, path)
+
+
 def test_overlap_is_checked_after_overlap_alone(model: DeepPointMap2, saved: Path, tmp_path: Path) -> None:
     """An untrained head says NaN, never a figure that would pass a gate."""
     noise = np.random.default_rng(0)
