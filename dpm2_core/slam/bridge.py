@@ -180,7 +180,9 @@ class Bridge:
         T_before_begin = se3.inverse(self._T) @ T_begin
         before, after = self.twist[3:], T_before_begin[:3, :3] @ self._after[3:]
         way, mean = T_before_begin[:3, 3], (before + after) / 2
-        seconds = min(max(way @ mean / max(mean @ mean, 1e-9), 0.0), self._seconds) if self.held else self._seconds
+        seconds = self._seconds
+        if self.held:  # the time that fits best
+            seconds = float(np.clip(way @ mean / (mean @ mean + 1e-9), 0.0, seconds))
         off = float(np.linalg.norm(way - seconds * mean))
         if off > _NEAR + self._limits.acceleration * self._seconds**2 / 4:
             return f"after a pause: {off:.0f} m from where the motion before and after leads"
