@@ -26,6 +26,7 @@ from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration
 
 _KNOWN = 0.5  # m and rad, standard deviation of the second pose, still skewed: where the points find it alone
+_BENT = 0.1  # m at half of the sweep and the usual range: by so much a wrong motion must bend a scan to count
 _BURST = 0.6  # of the usual period: while no motion is known, a frame that comes sooner was held back
 _BETTER = 0.02  # confidence: so much more of the points must fit where the stamp does not lead
 _ANY_VELOCITY = 15.0**2 * np.eye(3)  # covariance, m/s: so much until two scans are registered
@@ -126,6 +127,8 @@ class Odometry:
         self._clock.correct(dt)
         if scan is not prepared:  # the IMU was of no use: nor is it on the way to the stamp
             frame = replace(frame, imu=None)
+        if self._first is None and registration.ok and registration.method != "first" and not self._led:
+            scan, registration = self._straightened(frame, scan, registration, twist, seconds)
         if self._first is not None and registration.ok:
             scan, registration = self._begin_again(self._first, frame, registration, seconds)
         clock.append(perf_counter())
@@ -341,6 +344,23 @@ class Odometry:
         if result.ok and degrees > 3 + self._settings.max_turn * time:
             return replace(result, ok=False, reason=f"{degrees:.0f} deg from the prediction")
         return result
+
+    def _straightened(
+        self, frame: Frame, scan: Scan, registration: Registration, twist: Array, seconds: float
+    ) -> tuple[Scan, Registration]:
+        """Anew, where the motion that was found is not that by which the scan was prepared, so that it was bent."""
+        if not self._sweep.span or (self._inertial is not None and self._inertial.turn is not None):
+            return scan, registration
+        T = registration.T_target_source
+        found = se3.log(se3.inverse(self._registered[0]) @ T) / seconds
+        change = np.linalg.norm((found - twist).reshape(2, 3), axis=1)
+        reach = float(np.median(np.linalg.norm(scan.points, axis=1)))
+        if self._sweep.span / 2 * (change[0] * reach + change[1]) < _BENT:
+            return scan, registration
+        again = self._registration.prepare(frame, found)
+        information = np.linalg.inv(self._of_prediction(seconds)).astype(np.float64)
+        result = self._registration.register(again, Prediction([T], 1.0, information))
+        return (again, result) if result.ok else (scan, registration)
 
     def _begin_again(
         self, first: Frame, frame: Frame, registration: Registration, seconds: float

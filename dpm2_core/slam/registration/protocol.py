@@ -13,7 +13,7 @@ from dpm2_core.frame import Array, Frame, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.slam.preprocess import Scan
 
-_EXACT = 0.3  # m: at the default steadiness that lasts 0.17 s
+_EXACT = 0.1  # m
 CHI2, CHI2_95 = 22.46, 12.59
 """99.9 and 95 % quantile of chi2 with 6 degrees of freedom: two poses that are farther apart than the first contradict
 each other, farther than the second hardly agree."""
@@ -57,21 +57,14 @@ class Prediction:
 
         At the default steadiness that lasts 0.3 s.
         """
-        return self._sigma <= 1.0
+        return self.information is not None and float(np.linalg.eigvalsh(self.information[3:, 3:])[0]) >= 1.0
 
     def expects(self, T_odom_lidar: Array) -> bool:
         """Whether the motion so far leads to that pose (4, 4) itself: to one standard deviation, at most `_EXACT`."""
-        if self.information is None or self._sigma > _EXACT:
+        if self.information is None or not self.known:
             return False
         xi = se3.log(se3.inverse(self.starts[0]) @ T_odom_lidar)
-        return bool(xi @ self.information @ xi <= 1.0)
-
-    @property
-    def _sigma(self) -> float:
-        """m, in the least certain direction."""
-        if self.information is None:
-            return np.inf
-        return float(max(np.linalg.eigvalsh(self.information[3:, 3:])[0], 1e-12)) ** -0.5
+        return bool(xi @ self.information @ xi <= 1.0 and np.linalg.norm(xi[3:]) <= _EXACT)
 
     @property
     def convincing(self) -> float:

@@ -129,6 +129,26 @@ def test_a_bump_is_forgotten_whatever_moment_of_a_sweep_is_stamped(stamp_at: flo
 
 
 @pytest.mark.slow
+def test_a_turn_that_begins_bends_no_scan() -> None:
+    """From rest to 90 deg/s in 0.3 s: scans were straightened by the motion before alone, 0.3 m off as `tracking`."""
+    world, lidar = build_world("straight", "suburb", seed=11, length=200.0), Lidar(LidarConfig(columns=720))
+    rng = np.random.default_rng(0)
+
+    def pose(t: float) -> np.ndarray:
+        begun = np.clip(t - 0.4, 0, 0.3)
+        return world.drive_pose(2.0) @ se3.exp([0, 0, np.radians(90) * (begun**2 / 0.6 + max(t - 0.7, 0)), 0, 0, 0])
+
+    odometry, off = make_odometry(SlamSettings(registration="geometric")), []
+    for i in range(11):
+        twist = se3.log(se3.inverse(pose(0.1 * i - 0.05)) @ pose(0.1 * i + 0.05)) / 0.1
+        scan = lidar.scan(world, pose(0.1 * i), 2 + 0.1 * i, rng, twist=twist)
+        tracked = odometry.process(Frame(i * 10**8, scan.points, scan.time_offset, index=i))
+        off.append(np.linalg.norm((se3.inverse(pose(0)) @ pose(0.1 * i))[:3, 3] - tracked.T_odom_lidar[:3, 3]))
+    assert tracked.state is State.TRACKING
+    assert max(off) < 0.15  # 0.11: within a sweep the turn is not even
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "bad"),
     [
