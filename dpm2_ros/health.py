@@ -139,6 +139,8 @@ class Diagnostics:
             arrived, made = self._sender.arrived
             text = f"{arrived} of {made} keyframes have arrived at the mapper"
             level = WARN if made - arrived > BEHIND else OK
+            if problem := self._sender.problem:
+                level, text = ERROR, f"{text}; {problem}"
             out.append(self._status("mapper", level, text, {"keyframes": made, "delivered": arrived}))
         elif self._mapper.localizing:
             out.append(self._localization(self._mapper))

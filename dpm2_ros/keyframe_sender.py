@@ -71,6 +71,13 @@ class KeyframeSender:
         with self._lock:
             return sum(drive.arrived for drive in self._drives), sum(len(drive.file) for drive in self._drives)
 
+    @property
+    def problem(self) -> str:
+        """Why keyframes that the mapper lacks would end with this process; empty if none would."""
+        with self._lock:
+            file = self._drives[-1].file
+            return f"{len(file) - file.stored} keyframes in memory only: {file.problem}" if file.problem else ""
+
     def restart(self) -> None:
         """A new drive begins: a session of its own. The mapper is told at once that the one before is over."""
         session = secrets.token_hex(4)
@@ -99,8 +106,10 @@ class KeyframeSender:
         parts = [bytes(serialize_message(part)) for part in (pose, *payload_to_msgs(keyframe, name, self._weights))]
         if self._keep:
             with self._lock:
-                first = drive is self._drives[0]
+                first, before = drive is self._drives[0], drive.file.problem
                 drive.append(parts, time.monotonic() if first else None)
+                if drive.file.problem and not before:
+                    self._log.error(f"{drive.file.path}: {drive.file.problem}; what follows is in memory only")
             if not first:
                 return
         self._publish(parts)
@@ -119,10 +128,13 @@ class KeyframeSender:
             self._repeat()
         with self._lock:
             for drive in self._drives:
-                late = self._late(drive)
-                drive.file.close(keep=late > 0)
-                if late and drive.file.path is not None:
-                    self._log.warning(f"{late} keyframes not delivered: sent at the next start from {drive.file.path}")
+                late, file = self._late(drive), drive.file
+                lost = min(late, len(file) - file.stored)
+                file.close(keep=late > lost)
+                if file.path is not None and late > lost:
+                    self._log.warning(f"{late - lost} keyframes not delivered: sent at the next start from {file.path}")
+                if file.path is not None and lost:
+                    self._log.error(f"{lost} keyframes neither delivered nor in {file.path}: {file.problem}")
 
     @staticmethod
     def _late(drive: Delivery) -> int:

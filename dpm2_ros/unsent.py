@@ -23,7 +23,11 @@ _LARGEST = 200_000  # bytes of a message: twice what a keyframe may have
 class KeyframeFile:
     """The messages of a drive's keyframes, those of number 0 first, each added whole or not at all.
 
-    Where the file is full or not wanted, keyframes go into a `SpillFile`, and end with the process.
+    Where the file is full or not wanted, keyframes go into a `SpillFile`, and end with the process unless there is room
+    for them later.
+
+    Attributes:
+        stored: keyframes in the file. problem: why the last one could not be added to it; empty if it was.
 
     Raises:
         sqlite3.Error, OSError: the file cannot be made, is no such file, is damaged, or another process has it; also
@@ -33,36 +37,47 @@ class KeyframeFile:
     def __init__(self, path: Path | None = None) -> None:
         """`path`: made where there is none; None: nothing of it is to outlive the process."""
         self.path = path
-        self._stored = 0  # in the file
+        self.stored, self.problem = 0, ""
         self._others: list[list[int]] = []  # after those: their numbers in the other one
         self._spill = SpillFile()
         self._connection: Connection | None = None
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._connection, self._stored = _opened(path, "rwc")
+            self._connection, self.stored = _opened(path, "rwc")
 
     def _opened(self) -> Connection:
         """The file, opened again if need be."""
         if self._connection is None:
             assert self.path is not None
             connection, stored = _opened(self.path, "rw")
-            if stored != self._stored:
+            if stored != self.stored:
                 connection.close()
-                raise sqlite3.DatabaseError(f"{stored} keyframes, {self._stored} before: another process has written")
+                raise sqlite3.DatabaseError(f"{stored} keyframes, {self.stored} before: another process has written")
             self._connection = connection
         return self._connection
 
     def __len__(self) -> int:
-        return self._stored + len(self._others)
+        return self.stored + len(self._others)
 
     def append(self, parts: Sequence[bytes]) -> None:
         """The next keyframe: its pose, its descriptors, its cloud, each serialized."""
-        if self.path is not None and not self._others:  # those after one of these follow it: a file has no gap
-            with suppress(sqlite3.Error):
-                self._opened().execute("INSERT INTO keyframe VALUES (?, ?, ?, ?)", (self._stored, *parts))
-                self._stored += 1
+        if self.path is not None:
+            try:
+                while self._others:  # in turn: a file has no gap
+                    self._insert([self._spill.read(number) for number in self._others[0]])
+                    del self._others[0]
+                    if not self._others:
+                        self._spill = SpillFile()
+                self._insert(parts)
+                self.problem = ""
                 return
+            except sqlite3.Error as error:
+                self.problem = str(error)
         self._others.append([self._spill.append(part) for part in parts])
+
+    def _insert(self, parts: Sequence[bytes]) -> None:
+        self._opened().execute("INSERT INTO keyframe VALUES (?, ?, ?, ?)", (self.stored, *parts))
+        self.stored += 1
 
     def read(self, id: int) -> list[bytes]:
         """The three messages of a keyframe.
@@ -70,8 +85,8 @@ class KeyframeFile:
         Raises:
             sqlite3.DatabaseError: it is damaged.
         """
-        if id >= self._stored:
-            return [self._spill.read(number) for number in self._others[id - self._stored]]
+        if id >= self.stored:
+            return [self._spill.read(number) for number in self._others[id - self.stored]]
         query = "SELECT pose, descriptors, cloud FROM keyframe WHERE id = ?"
         parts: tuple[object, ...] | None = self._opened().execute(query, (id,)).fetchone()
         found = [part for part in parts or () if isinstance(part, bytes)]

@@ -20,6 +20,8 @@ from dpm2_ros.keyframe_sender import KeyframeSender
 from dpm2_ros.settings import RosSettings
 from dpm2_ros.unsent import KeyframeFile, left_behind, path_of
 
+from ..helpers.full_disk import largest_file
+
 WRITER = """
 import resource, signal, sys
 from pathlib import Path
@@ -132,6 +134,24 @@ def test_drives_that_wait_for_the_mapper_hold_no_file_open(ros: Callable[..., An
     node.destroy_node()
 
 
+def test_a_full_disk_is_said_and_what_ends_with_the_process_is_counted(ros: Callable[..., Any], tmp_path: Path) -> None:
+    """All were said to be sent at the next start, and while it drove nothing was said."""
+    ros()
+    node = rclpy.create_node("robot", use_global_arguments=False)
+    sender = KeyframeSender(node, "", RosSettings(embed_mapper=False, map_directory=str(tmp_path)))
+    cloud = np.random.default_rng(0).uniform(-50, 50, (2000, 4)).astype(np.float32)
+    with largest_file(200_000):
+        for n in range(30):
+            sender.send(Keyframe(n, n, n, np.eye(4), cloud))
+        problem = sender.problem
+        sender.close()
+    ((_, path),) = left_behind(tmp_path, "")
+    stored = len(KeyframeFile(path))
+    assert 0 < stored < 30
+    assert problem.startswith(f"{30 - stored} keyframes in memory only: ")
+    node.destroy_node()
+
+
 @pytest.mark.parametrize(
     "damage",
     [
@@ -189,6 +209,25 @@ print(sum(file.read(n) == parts for n, parts in enumerate(sent)), len(file))
 """
     done = subprocess.run([sys.executable, "-c", program, tmp_path], capture_output=True, text=True, timeout=120)
     assert done.stdout == "100 100\n", done.stderr
+
+
+def test_what_found_no_room_is_in_the_file_once_there_is_some(tmp_path: Path) -> None:
+    """It stayed in memory to the end, and was said to be sent at the next start."""
+    path = path_of(tmp_path, "", "5f3a9c01")
+    file, sent = KeyframeFile(path), [[bytes([n]), b"", os.urandom(50_000)] for n in range(30)]
+    with largest_file(600_000):
+        for parts in sent[:20]:
+            file.append(parts)
+    stored = file.stored
+    assert 0 < stored < len(file) == 20
+    assert file.problem
+    for parts in sent[20:]:
+        file.append(parts)
+    assert (file.stored, file.problem) == (30, "")
+    file.close(keep=True)
+    again = KeyframeFile(path)
+    assert [again.read(n) for n in range(30)] == sent
+    again.close(keep=False)
 
 
 def test_what_holds_no_keyframe_holds_no_file() -> None:
