@@ -72,6 +72,7 @@ class MapStore:
         self.path = path
         self.read_only = read_only
         self.session = 0
+        self._file = _identity(path)
         self._newest = 0  # number of the last session that this program has written
         self._connection = connection
         self._together = False
@@ -177,6 +178,11 @@ class MapStore:
         newest = sql.execute("SELECT coalesce(max(session), 0) FROM sessions").fetchone()[0]
         if self.session and newest > self._newest:
             raise Dpm2Error(f"{self.path}: another program has begun to write to it")
+
+    @property
+    def in_place(self) -> bool:
+        """Whether its path still is the file that was opened, and not one that was removed or moved since."""
+        return _identity(self.path) == self._file
 
     @property
     def size(self) -> int:
@@ -325,6 +331,15 @@ def _open_read_only(path: Path) -> MapStore:
     except sqlite3.OperationalError:  # a folder that cannot be written: SQLite needs FILE-shm to read FILE-wal
         connection.close()
         return _copied(path)
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    """What a file is, whatever its name; None where there is none."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_dev, status.st_ino
 
 
 def _head(path: Path) -> bytes:

@@ -22,7 +22,8 @@ class MapWriter:
     """What the file does not have yet.
 
     Attributes:
-        problem: why the last attempt to write failed, in words; empty when the file is up to date.
+        problem: why the last attempt to write failed, in words, or that the file is no longer at its path; empty when
+            it is up to date.
     """
 
     def __init__(self, store: MapStore, clouds: CloudStore, poses: Array) -> None:
@@ -60,7 +61,7 @@ class MapWriter:
                 self._write(poses, self._keyframes[:_BATCH], last=False)
             self._write(poses, self._keyframes, last=True)
             self._rewrite()
-            self.problem = ""
+            self.problem = "" if self._store.in_place else f"{self._store.path}: removed or moved since it was opened"
         except Dpm2Error as error:
             self.problem = f"{error}; {len(self._keyframes)} keyframes are in memory only"
 

@@ -174,6 +174,30 @@ def test_a_second_session_counts_on(tmp_path: Path) -> None:
         assert len([e for e in data.edges if e.kind == "odometry"]) == LAP - 1
 
 
+def test_a_file_that_is_moved_away_is_said_and_still_written(tmp_path: Path) -> None:
+    """All said that the map was saved in a file that was not there."""
+    path, elsewhere = tmp_path / "town.dpm2map", tmp_path / "elsewhere.dpm2map"
+    with MapStore.create(path) as store:
+        store.begin_session()
+        mapper = make(store)
+        mapper.add(laps(1)[0])
+        mapper.finish()
+        assert mapper.store_problem == ""
+        path.rename(elsewhere)
+        mapper.add(laps(1)[1])
+        mapper.finish()
+        assert mapper.store_problem == f"{path}: removed or moved since it was opened"
+        path.write_bytes(b"another file")
+        mapper.finish()
+        assert "removed or moved" in mapper.store_problem
+        path.unlink()
+        elsewhere.rename(path)
+        mapper.finish()
+        assert mapper.store_problem == ""
+    with MapStore.open(path) as store:
+        assert store.size == 2
+
+
 FULL_DISK = """
 import resource, signal, sys
 sys.path.insert(0, sys.argv[2])
