@@ -189,7 +189,8 @@ class ActiveMap:
             save_map(self.mapper, folder)
         except OSError as error:
             raise Dpm2Error(f"{folder}: no map saved: {error.strerror}") from None
-        if self.mapper.store_problem:
+        moved = isinstance(self._store, MapStore) and not self._store.in_place  # since the last keyframe
+        if self.mapper.store_problem or moved:
             self.finish()  # it writes again: there may be room by now
         if problem := self.mapper.store_problem:
             raise Dpm2Error(f"map saved in {folder.resolve()}, but its file is incomplete: {problem}")

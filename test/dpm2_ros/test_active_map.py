@@ -220,6 +220,21 @@ def test_a_map_whose_file_is_incomplete_is_not_saved(tmp_path: Path, monkeypatch
     assert check_map(tmp_path / "town.dpm2map").keyframes == 2
 
 
+@pytest.mark.parametrize("name", ["", "town"])
+def test_a_map_whose_file_was_moved_since_the_last_keyframe_is_not_saved(tmp_path: Path, name: str) -> None:
+    """It said that the map is saved in a file that was not there; back in its place, it is saved."""
+    active = ActiveMap(config(map_directory=str(tmp_path)), "", LOG)
+    active.add(keyframes(1)[0])
+    path, elsewhere = tmp_path / "drive.dpm2map", tmp_path / "elsewhere"
+    path.rename(elsewhere)
+    with pytest.raises(Dpm2Error, match=f"but its file is incomplete: {path}: removed or moved"):
+        active.save(name)
+    elsewhere.rename(path)
+    assert "map of 1 keyframes saved" in active.save(name)
+    active.close()
+    assert check_map(path).keyframes == 1
+
+
 def described(**ros: Any) -> NodeConfig:
     """As a node is by default, but for the registration of its odometry."""
     return NodeConfig.model_validate({"ros": ros, "slam": {"registration": "geometric"}})
