@@ -129,6 +129,8 @@ class KeyframeSender:
         with self._lock:
             for drive in self._drives:
                 late, file = self._late(drive), drive.file
+                if late:
+                    file.catch_up()  # there may be room by now
                 lost = min(late, len(file) - file.stored)
                 file.close(keep=late > lost)
                 if file.path is not None and late > lost:

@@ -61,19 +61,25 @@ class KeyframeFile:
 
     def append(self, parts: Sequence[bytes]) -> None:
         """The next keyframe: its pose, its descriptors, its cloud, each serialized."""
-        if self.path is not None:
-            try:
-                while self._others:  # in turn: a file has no gap
-                    self._insert([self._spill.read(number) for number in self._others[0]])
-                    del self._others[0]
-                    if not self._others:
-                        self._spill = SpillFile()
+        if not self.catch_up(parts):
+            self._others.append([self._spill.append(part) for part in parts])
+
+    def catch_up(self, parts: Sequence[bytes] | None = None) -> bool:
+        """Write what waits in memory, and then that keyframe; whether all are in the file. See `problem`."""
+        if self.path is None:
+            return False
+        try:
+            while self._others:  # in turn: a file has no gap
+                self._insert([self._spill.read(number) for number in self._others[0]])
+                del self._others[0]
+                if not self._others:
+                    self._spill = SpillFile()
+            if parts is not None:
                 self._insert(parts)
-                self.problem = ""
-                return
-            except sqlite3.Error as error:
-                self.problem = str(error)
-        self._others.append([self._spill.append(part) for part in parts])
+            self.problem = ""
+        except sqlite3.Error as error:
+            self.problem = str(error)
+        return not self.problem
 
     def _insert(self, parts: Sequence[bytes]) -> None:
         self._opened().execute("INSERT INTO keyframe VALUES (?, ?, ?, ?)", (self.stored, *parts))
