@@ -45,6 +45,7 @@ class ActiveMap:
         self._folders: dict[str, Path] = {}  # of this drive, by the name under which it was saved
         self.located: LocalizationResult | None = None
         self.file_problem = ""
+        self._unreadable = False  # a keyframe of the map to be found in
         self._T_map_odom: dict[str, Array] | None = None  # by robot, while the map grows; None before any keyframe
         self._store: MapStore | TiledMap | None = self._opened() if ros.localization_mode else self._first_file()
         # gtsam holds Python's lock while it works, and the odometry must not wait
@@ -120,6 +121,7 @@ class ActiveMap:
             raise
         self._path, self._store, self._folders = store.path, store, {}
         self.located = self._T_map_odom = None
+        self._unreadable = False
         self.slam.use(*made)
 
     def extend(self) -> str:
@@ -277,6 +279,9 @@ class ActiveMap:
         try:
             located = self.slam.map_step(keyframe).located
         except Dpm2Error as error:
+            if not self._unreadable:  # once a map, not with each keyframe
+                self._log.error(str(error))
+            self._unreadable = True
             T_map_kf = localizer.T_map_odom @ keyframe.T_odom_kf
             located = LocalizationResult(T_map_kf, LOST, localizer.state, nowhere(str(error)))
         assert located is not None

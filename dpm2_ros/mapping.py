@@ -208,6 +208,10 @@ class MapperThread:
                 self._node.get_logger().info(saved.result())
             except UsageError as error:
                 self._node.get_logger().info(str(error))
+            except Dpm2Error as error:
+                if not self.store_problem:  # which is the graver one
+                    raise
+                self._node.get_logger().error(str(error))
         if self.store_problem:
             raise Dpm2Error(f"map file incomplete: {self.store_problem}")
 

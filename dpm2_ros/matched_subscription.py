@@ -62,6 +62,9 @@ class MatchedSubscription:
         keeps = self._wanted is CameraInfo and offered and all(i.qos_profile.durability == latched for i in offered)
         durability = latched if keeps else DurabilityPolicy.VOLATILE  # one that has been sent once, long ago
         kind = self._kind_of({info.topic_type for info in offered})
+        best_effort = [info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT for info in offered]
+        if requested == ReliabilityPolicy.RELIABLE and best_effort and all(best_effort):
+            self.problem = f"{self.topic} is best effort, ros.reliability asks for reliable"
         now = self.reliability, self._durability, self._kind
         if self._subscription is not None and (requested, durability, kind) == now:
             return
@@ -80,10 +83,11 @@ class MatchedSubscription:
 
     def _kind_of(self, offered: set[str]) -> type:
         """What to subscribe to, given the types of the publishers."""
+        self.problem = ""
         if self._wanted in _IMAGES:
             kinds = [kind for kind in _IMAGES if f"sensor_msgs/msg/{kind.__name__}" in offered]
             return kinds[0] if len(kinds) == 1 else self._wanted
-        self.problem, custom = "", sorted(offered.intersection(LIVOX))
+        custom = sorted(offered.intersection(LIVOX))
         if self._wanted is not PointCloud2 or not custom or "sensor_msgs/msg/PointCloud2" in offered:
             return self._wanted
         found = message_type(custom[0])

@@ -294,8 +294,13 @@ def test_where_its_map_cannot_grow_a_robot_is_found_as_before(
 
 
 @pytest.mark.weights
-def test_a_map_that_cannot_be_read_does_not_confirm_a_place(found: ActiveMap, tmp_path: Path) -> None:
-    """Its clouds are damaged while the robot is in it: degraded, then lost, as where nothing fits."""
+def test_a_map_that_cannot_be_read_does_not_confirm_a_place(
+    found: ActiveMap, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Its clouds are damaged while the robot is in it: degraded, then lost, as where nothing fits.
+
+    The log had the reason only with a change of the state: never, where the robot had not been found yet.
+    """
     with closing(sqlite3.connect(tmp_path / "drive.dpm2map", isolation_level=None)) as other:
         other.execute("UPDATE payloads SET cloud = x'00'")
     states = []
@@ -306,6 +311,8 @@ def test_a_map_that_cannot_be_read_does_not_confirm_a_place(found: ActiveMap, tm
         states.append(found.located.state)
     assert states == [State.DEGRADED, State.DEGRADED, State.LOST]
     assert found.T_map_odom("") is None
+    (told,) = (record for record in caplog.records if record.levelno == logging.ERROR)
+    assert "see dpm2 map check" in told.getMessage()
 
 
 @pytest.mark.weights

@@ -170,11 +170,12 @@ def test_a_map_that_cannot_be_saved_at_the_end_is_exit_code_1(
 def test_a_map_file_that_is_incomplete_at_the_end_is_exit_code_1(
     ros: Callable[..., Any], drive: Any, tmp_path: Path
 ) -> None:
-    """Another program writes to it, which is as a full disk; nothing else is to be saved."""
+    """Another program writes to it, which is as a full disk; that the folder cannot be made was the only error."""
     harness, path = ros(), tmp_path / "town.dpm2map"
+    (tmp_path / "map").write_text("in the way")
     keyframes = harness.hear(Odometry, "/dpm2/keyframe_odom", KEEP_ALL)
     lidar = harness.publisher(PointCloud2, topics.POINTS)
-    parameters = ["-p", f"ros.map_file:={path}", "-p", "ros.map_directory:=''", *GEOMETRIC]
+    parameters = ["-p", f"ros.map_file:={path}", "-p", f"ros.map_directory:={tmp_path / 'map'}", *GEOMETRIC]
     environment = ros_environment(harness.node.context.get_domain_id())
     process = start("slam_node", ["--ros-args", *parameters], environment, tmp_path / "log")
     try:
@@ -193,6 +194,7 @@ def test_a_map_file_that_is_incomplete_at_the_end_is_exit_code_1(
     problem = rf"map file incomplete: {path}: .*locked; 1 keyframes are in memory only"
     assert len(re.findall(problem, output)) == 2  # at once, and at the end
     assert re.search(rf"^error: {problem}$", output, re.MULTILINE)
+    assert f"{tmp_path / 'map'}: no map saved" in output
 
 
 def test_a_drive_through_player_slam_node_and_mapper_node(

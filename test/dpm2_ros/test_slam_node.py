@@ -764,6 +764,18 @@ def test_clouds_that_stop_are_noticed(rig: Callable[..., Rig]) -> None:
     assert r.status("odometry", saying("no cloud on /kitti/velo/pointcloud for")).level == DiagnosticStatus.STALE
 
 
+def test_a_lidar_whose_clouds_are_less_reliable_than_asked_for_is_reported(ros: Callable[..., Any]) -> None:
+    """It named the very topic as the one to listen to."""
+    harness = ros("input.points_topic:=/points", "input.images:=false", "ros.reliability:=reliable")
+    harness.publisher(PointCloud2, "/points", reliable=False)
+    harness.add(SlamNode())
+    status = harness.status("slam_node: odometry", saying("is best effort"))
+    assert (status.level, status.message) == (
+        DiagnosticStatus.ERROR,
+        "/points is best effort, ros.reliability asks for reliable",
+    )
+
+
 def test_a_wrong_topic_is_reported_with_the_right_one(ros: Callable[..., Any], drive: Any) -> None:
     r = Rig.__new__(Rig)
     r.harness = ros("input.points_topic:=/points", "input.images:=false")

@@ -165,6 +165,65 @@ def test_a_full_disk_is_said_and_what_ends_with_the_process_is_counted(
     node.destroy_node()
 
 
+@pytest.mark.parametrize(
+    "damage",
+    [
+        "DELETE FROM keyframe WHERE id = 1",
+        "UPDATE keyframe SET cloud = zeroblob(1000000)",
+        "CREATE VIEW v AS SELECT 1",
+        "DROP TABLE keyframe",
+    ],
+)
+def test_what_is_no_such_file_is_an_error(tmp_path: Path, damage: str) -> None:
+    path = tmp_path / "drive.00000001.unsent"
+    file = KeyframeFile(path)
+    for _ in range(3):
+        file.append([b"a", b"b", b"c"])
+    file.close(keep=True)
+    with sqlite3.connect(path) as connection:
+        connection.execute(damage)
+        if damage.startswith("DROP"):
+            connection.execute("CREATE TABLE other (id INTEGER)")
+    connection.close()
+    with pytest.raises(sqlite3.DatabaseError, match="malformed"):
+        KeyframeFile(path)
+    path.write_bytes(b"no database " * 1000)
+    with pytest.raises(sqlite3.DatabaseError, match="not a database"):
+        KeyframeFile(path)
+
+
+def test_text_in_place_of_a_message_is_an_error_when_it_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "drive.00000001.unsent"
+    file = KeyframeFile(path)
+    file.append([b"a", b"b", b"c"])
+    file.close(keep=True)
+    with sqlite3.connect(path) as connection:
+        connection.execute("UPDATE keyframe SET cloud = 'text'")
+    connection.close()
+    file = KeyframeFile(path)
+    with pytest.raises(sqlite3.DatabaseError, match="keyframe 0 is damaged"):
+        file.read(0)
+
+
+@pytest.mark.parametrize("path", ["None", "Path(sys.argv[1]) / 'drive.5f3a9c01.unsent'"])
+def test_a_full_disk_costs_no_keyframe_of_this_process(path: str, tmp_path: Path) -> None:
+    """A process that may write 1 MB of 5, with a file of its own for the next start and without."""
+    program = f"""
+import os, resource, signal, sys
+from pathlib import Path
+from dpm2_ros.unsent import KeyframeFile
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 20, 1 << 20))
+file = KeyframeFile({path})
+sent = [[bytes([n]), b"", os.urandom(50_000)] for n in range(100)]
+for parts in sent:
+    file.append(parts)
+print(sum(file.read(n) == parts for n, parts in enumerate(sent)), len(file))
+"""
+    done = subprocess.run([sys.executable, "-c", program, tmp_path], capture_output=True, text=True, timeout=120)
+    assert done.stdout == "100 100\n", done.stderr
+
+
 def test_what_found_no_room_is_in_the_file_once_there_is_some(tmp_path: Path) -> None:
     """It stayed in memory to the end, and was said to be sent at the next start."""
     path = path_of(tmp_path, "", "5f3a9c01")
