@@ -53,16 +53,16 @@ class MatchedSubscription:
     def refresh(self) -> None:
         """Follow the publishers of this moment."""
         requested, offered = self.reliability, self._node.get_publishers_info_by_topic(self.topic)
+        best_effort = [info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT for info in offered]
         if self._setting != "auto":
             requested = ReliabilityPolicy[self._setting.upper()]
         elif offered:
-            reliable = all(info.qos_profile.reliability != ReliabilityPolicy.BEST_EFFORT for info in offered)
-            requested = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+            requested = ReliabilityPolicy.BEST_EFFORT if any(best_effort) else ReliabilityPolicy.RELIABLE
         latched = DurabilityPolicy.TRANSIENT_LOCAL
         keeps = self._wanted is CameraInfo and offered and all(i.qos_profile.durability == latched for i in offered)
         durability = latched if keeps else DurabilityPolicy.VOLATILE  # one that has been sent once, long ago
+        self.problem = ""
         kind = self._kind_of({info.topic_type for info in offered})
-        best_effort = [info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT for info in offered]
         if requested == ReliabilityPolicy.RELIABLE and best_effort and all(best_effort):
             self.problem = f"{self.topic} is best effort, ros.reliability asks for reliable"
         now = self.reliability, self._durability, self._kind
@@ -83,7 +83,6 @@ class MatchedSubscription:
 
     def _kind_of(self, offered: set[str]) -> type:
         """What to subscribe to, given the types of the publishers."""
-        self.problem = ""
         if self._wanted in _IMAGES:
             kinds = [kind for kind in _IMAGES if f"sensor_msgs/msg/{kind.__name__}" in offered]
             return kinds[0] if len(kinds) == 1 else self._wanted

@@ -237,25 +237,25 @@ class Odometry:
         self, frame: Frame, scan: Scan, T_predicted: Array, dt: float
     ) -> tuple[Scan, Registration, float]:
         """As `_register`, and how long the period was, s: as stamped or, where that is in doubt, as the points say."""
-        scan_, result, self._led = self._register(frame, scan, T_predicted, dt)
+        usable, result, self._led = self._register(frame, scan, T_predicted, dt)
         usual = self._clock.usual or self._sweep.span
         burst = dt < _BURST * usual
         if burst and self._bridge is not None:
             self._bridge.held = True
         if self._twist is None:
-            return scan_, result, usual if burst else dt
+            return usable, result, usual if burst else dt
         usual = usual or NOMINAL
         if DOUBTED[0] * usual <= dt <= DOUBTED[1] * usual or result.method == "none":
-            return scan_, result, dt
+            return usable, result, dt
         T_usual = self._predicted(self._turned(self._twist, self._registered[1] + usual), usual)
         if dt < usual or not result.ok or result.confidence < Prediction([T_predicted]).convincing:
             other = self._register(frame, scan, T_usual, usual)
             if other[1].ok and (not result.ok or other[1].confidence > result.confidence + _BETTER):
-                scan_, result, self._led = other
+                usable, result, self._led = other
         if result.ok:
             steadiness = self._settings.steadiness
             dt = period_by_motion(result.T_target_source, (dt, T_predicted), (usual, T_usual), steadiness)
-        return scan_, result, dt
+        return usable, result, dt
 
     def _register(self, frame: Frame, scan: Scan, T_predicted: Array, dt: float) -> tuple[Scan, Registration, bool]:
         """The registration of a frame, the scan that it holds for (the given one, or one without the IMU), and whether
@@ -283,8 +283,7 @@ class Odometry:
             return scan, self._registered_from_rest(scan, T_predicted, dt)
         seconds = self._registered[1] + dt
         widen = min(seconds / dt, 5.0)
-        information = np.linalg.inv(self._of_prediction(seconds)).astype(np.float64)
-        result = self._registration.register(scan, Prediction([T_predicted], widen, information))
+        result = self._registration.register(scan, Prediction([T_predicted], widen, self._information(seconds)))
         result = self._gated(result, T_predicted, dt)
         if not result.ok and self._inertial is not None and self._inertial.turn is not None:
             steady = self._register_without_imu(frame, self._twist, dt)
@@ -358,8 +357,7 @@ class Odometry:
         if self._sweep.span / 2 * (change[0] * reach + change[1]) < _BENT:
             return scan, registration
         again = self._registration.prepare(frame, found)
-        information = np.linalg.inv(self._of_prediction(seconds)).astype(np.float64)
-        result = self._registration.register(again, Prediction([T], 1.0, information))
+        result = self._registration.register(again, Prediction([T], information=self._information(seconds)))
         return (again, result) if result.ok else (scan, registration)
 
     def _begin_again(
@@ -435,6 +433,10 @@ class Odometry:
         if self._inertial is not None and self._inertial.turn is not None:
             result[:3, :3] = self._inertial.covariance(seconds)
         return result
+
+    def _information(self, seconds: float) -> Array:
+        """Inverse (6, 6) of `_of_prediction`."""
+        return np.linalg.inv(self._of_prediction(seconds)).astype(np.float64)
 
     def _unknown(self, dt: float) -> Array:
         """Covariance (6, 6) of what is only predicted."""

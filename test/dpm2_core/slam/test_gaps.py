@@ -62,7 +62,7 @@ def along(world: World, turn: float = 0.0) -> Pose:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("gap", "turn"), [(1.0, 15.0), (2.0, -15.0), (3.0, 0.0)])
+@pytest.mark.parametrize(("gap", "turn"), [(1.0, 15.0), (2.0, 0.0), (2.0, -15.0), (3.0, 0.0), (3.0, 15.0)])
 def test_a_gap_across_which_the_views_overlap_is_bridged(world: World, gap: float, turn: float) -> None:
     frames, poses = scanned(world, along(world, turn), with_gap(10, gap, 6))
     tracked = run(frames)
