@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How the LiDAR moves, by the scans that were registered, an IMU and another odometry; and where it is next."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from dpm2_core.frame import Array, Registration
+from dpm2_core.geometry import se3
+from dpm2_core.geometry.motion import OPEN, along_open, combined, covariance, predicted, spread
+from dpm2_core.slam.odometry.inertial import InertialMotion
+from dpm2_core.slam.odometry.other import OtherMotion, Step
+from dpm2_core.slam.odometry.settings import OdometrySettings
+
+ANY_VELOCITY = 15.0**2 * np.eye(3)
+"""Covariance (3, 3) of the velocity, m/s, until two scans are registered."""
+
+
+class MotionState:
+    """Pose and motion; poses are of the LiDAR in the odometry frame, at the middle of a sweep.
+
+    Attributes:
+        settings: of what a vehicle can do.
+        T, covariance: the last frame's pose (4, 4), registered or predicted, and its covariance (6, 6) [rad, m].
+        twist: (6,) [rad/s, m/s] between the last two registered frames; None until there are two.
+        change: (6,) of the twist, from one registered frame to the next.
+        of_velocity: covariance (3, 3) of the twist's velocity, m/s.
+        T_registered, seconds: the last registered pose (4, 4), and the time from then to the last frame.
+        inertial: the IMU, since a frame came with samples. other: another odometry, since a frame came with a guess.
+    """
+
+    def __init__(self, settings: OdometrySettings) -> None:
+        self.settings = settings
+        self.T, self.covariance = np.eye(4), np.zeros((6, 6))
+        self.twist: Array | None = None
+        self.change = np.zeros(6)
+        self.of_velocity = ANY_VELOCITY
+        self.T_registered, self.seconds = np.eye(4), 0.0
+        self.inertial: InertialMotion | None = None
+        self.other: OtherMotion | None = None
+        self._open = 0.0  # s, for which the scene has left a direction open
+
+    def begin(self, T: Array) -> None:
+        """A map begins at T (4, 4), to which no motion has led."""
+        self.T, self.twist, self.of_velocity = T, None, ANY_VELOCITY
+
+    @property
+    def known_twist(self) -> Array:
+        """(6,); zeros while it is unknown."""
+        return np.zeros(6) if self.twist is None else self.twist
+
+    @property
+    def turn(self) -> Array | None:
+        """R_before_now (3, 3) since the last registered frame, as an IMU has measured it."""
+        return None if self.inertial is None else self.inertial.turn
+
+    @property
+    def step(self) -> Step | None:
+        """What another odometry says of the way since the last registered frame."""
+        return None if self.other is None else self.other.step
+
+    def turned(self, twist: Array, seconds: float) -> Array:
+        """A twist (6,) with the turn since the last registered frame as it was measured, where it was."""
+        if self.turn is None:
+            return twist
+        return np.concatenate([se3.rotation_vector(self.turn) / seconds, twist[3:]])
+
+    def predicted(self, twist: Array, dt: float) -> Array:
+        """Pose (4, 4) of a frame, `dt` s after the one before, with a measured turn from the last registered one."""
+        if self.turn is None:
+            return predicted(self.T, twist, dt)
+        return predicted(self.T_registered, twist, self.seconds + dt)
+
+    def of_prediction(self, seconds: float) -> Array:
+        """Covariance (6, 6) [rad, m] of a pose that is predicted from one that was registered so long before."""
+        result = spread(self.settings.steadiness * seconds * seconds, seconds, self.of_velocity)
+        if self.inertial is not None and self.inertial.turn is not None:
+            result[:3, :3] = self.inertial.covariance(seconds)
+        return result
+
+    def information(self, seconds: float) -> Array:
+        """Inverse (6, 6) of `of_prediction`."""
+        return np.linalg.inv(self.of_prediction(seconds)).astype(np.float64)
+
+    def unknown(self, dt: float) -> Array:
+        """Covariance (6, 6) of a frame's pose, `dt` s after the one before, that is only predicted."""
+        speed = float(np.linalg.norm(self.known_twist[3:]))
+        return covariance(speed, self.seconds + dt, self.settings.steadiness, self.of_velocity)
+
+    def gated(self, result: Registration, T_predicted: Array, dt: float) -> Registration:
+        """Reject what no vehicle can do; the allowance grows while nothing has been registered."""
+        time = self.seconds + dt
+        meters, degrees = se3.magnitude(se3.inverse(T_predicted) @ result.T_target_source)
+        unknown = 3 * float(np.linalg.eigvalsh(self.of_velocity)[-1]) ** 0.5 * time
+        if result.ok and meters > 0.5 + unknown + self.settings.max_acceleration * time * time:
+            return replace(result, ok=False, reason=f"{meters:.1f} m from the prediction")
+        if result.ok and degrees > 3 + self.settings.max_turn * time:
+            return replace(result, ok=False, reason=f"{degrees:.0f} deg from the prediction")
+        return result
+
+    def move(self, registration: Registration, dt: float, led: bool) -> None:
+        """A frame was registered, `dt` s after the one before: the motion that led there. `led`: from where the other
+        odometry was. `register` follows."""
+        seconds = self.seconds + dt
+        of_prediction = self.step.covariance if led and self.step is not None else self.of_prediction(seconds)
+        of_motion = combined(registration.of_scene[3:, 3:], of_prediction[3:, 3:])
+        self.of_velocity = of_motion / seconds**2
+        # Not from the predicted pose of the frame before, of which an error would count as motion in one period.
+        T_step = se3.inverse(self.T_registered) @ registration.T_target_source
+        twist = se3.log(T_step) / seconds
+        self.change = np.zeros(6) if self.twist is None else twist - self.twist
+        self.twist = twist
+        if self.other is not None:
+            self.other.compare(T_step, registration.of_scene, led)
+
+    def register(self, registration: Registration, stamp: int | None, moved: bool) -> None:
+        """Go on from a registered pose; `moved`: the twist led there, else nothing is known of the way."""
+        T_before, self.T = self.T_registered, registration.T_target_source
+        if self.inertial is not None and stamp is not None:
+            self.inertial.registered(T_before, self.T, stamp, self.twist if moved else None)
+        self.T_registered, self.seconds = self.T, 0.0
+        if self.other is not None:
+            self.other.keep()
+        self.covariance = registration.covariance.copy()
+
+    def widen(self, registration: Registration, seconds: float, moved: bool) -> None:
+        """By how far the pose may be off along directions that scenes have left open up to this frame, `seconds` after
+        the one before it: what a scene leaves open ends at 1 m, the motion does not."""
+        self._open = self._open + seconds if registration.worst_sigma >= OPEN else 0.0
+        if moved and self._open:
+            self.covariance[3:, 3:] += along_open(registration.of_scene[3:, 3:], self.of_velocity) * self._open**2
+
+    def coast(self, dt: float) -> None:
+        """A frame was not registered, `dt` s after the one before: follow the prediction, ever less certain."""
+        self.covariance = self.unknown(dt)
+        self.seconds += dt
+        if (step := self.step) is not None:
+            self.T, self.covariance = self.T_registered @ step.T, step.covariance
+        elif self.twist is not None:
+            self.T = predicted(self.T_registered, self.turned(self.twist, self.seconds), self.seconds)

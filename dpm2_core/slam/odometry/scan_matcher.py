@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The registration of one frame to the map, from wherever its pose may be expected."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from dpm2_core.frame import Array, Frame, Registration
+from dpm2_core.geometry.motion import OPEN, predicted
+from dpm2_core.slam.bridge import Bridge
+from dpm2_core.slam.odometry.motion_state import MotionState
+from dpm2_core.slam.odometry.settings import OdometrySettings
+from dpm2_core.slam.odometry.starts import starts_from_rest, turned_starts
+from dpm2_core.slam.preprocess import Scan
+from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration
+
+
+class Match(NamedTuple):
+    """A frame in the map.
+
+    Attributes:
+        scan: for which the result holds: the given one, or one that was prepared anew.
+        result: the registration. led: another odometry has led to it.
+    """
+
+    scan: Scan
+    result: Registration
+    led: bool = False
+
+
+@dataclass(frozen=True)
+class ScanMatcher:
+    """Registers frames from where the motion so far, an IMU or another odometry leads, or from rest.
+
+    Attributes:
+        registration: the map. motion: up to the last registered frame. bridge: across a pause, while there is one.
+    """
+
+    settings: OdometrySettings
+    registration: ScanRegistration
+    motion: MotionState
+    bridge: Bridge | None
+
+    def match(self, frame: Frame, scan: Scan, T_predicted: Array, dt: float) -> Match:
+        """Of a prepared frame, predicted at T_predicted (4, 4), `dt` s after the one before."""
+        if frame.problem is not None:
+            unknown = self.motion.unknown(dt)
+            return Match(scan, Registration(T_predicted, unknown, 0.0, np.inf, "none", False, frame.problem))
+        if not len(self.registration):
+            problem = self.registration.rejection(scan)
+            fits = float(not problem)
+            return Match(scan, Registration(T_predicted, np.zeros((6, 6)), fits, 0.0, "first", not problem, problem))
+        led, fits_there = self._led_by_other(scan, dt)
+        if led is not None and fits_there:
+            return Match(scan, led, led=True)
+        own = self._alone(frame, scan, T_predicted, dt)
+        # Along a tunnel most of a scan fits a map that was made at rest at rest: it says nothing of the step.
+        if led is not None and own.result.worst_sigma >= OPEN:
+            return Match(scan, led, led=True)
+        return own
+
+    def _alone(self, frame: Frame, scan: Scan, T_predicted: Array, dt: float) -> Match:
+        """By the motion so far, or from rest."""
+        motion = self.motion
+        if motion.twist is None:
+            return Match(scan, self._from_rest(scan, T_predicted, dt))
+        seconds = motion.seconds + dt
+        widen = min(seconds / dt, 5.0)
+        result = self.registration.register(scan, Prediction([T_predicted], widen, motion.information(seconds)))
+        result = motion.gated(result, T_predicted, dt)
+        if not result.ok and motion.turn is not None:
+            steady = self._without_imu(frame, motion.twist, dt)
+            scan, result = (steady.scan, steady.result) if steady.result.ok else (scan, result)
+        if result.ok or not self.settings.turns:
+            return Match(scan, result)
+        starts = turned_starts(T_predicted, self.settings.turns)
+        turned = motion.gated(self.registration.register(scan, Prediction(starts, widen)), T_predicted, dt)
+        return Match(scan, turned if turned.ok else result)
+
+    def _without_imu(self, frame: Frame, twist: Array, dt: float) -> Match:
+        """Should the IMU be wrong: from a steady motion, in prediction and scan; a wrong turn bends a scan as well."""
+        motion = self.motion
+        seconds = motion.seconds + dt
+        scan = self.registration.prepare(replace(frame, imu=None), twist)
+        T = predicted(motion.T_registered, twist, seconds)
+        result = self.registration.register(scan, Prediction([T], min(seconds / dt, 5.0)))
+        return Match(scan, motion.gated(result, T, dt))
+
+    def _led_by_other(self, scan: Scan, dt: float) -> tuple[Registration | None, bool]:
+        """From where another odometry leads, and whether the scan fits there; None without one, or far from there."""
+        motion = self.motion
+        if motion.other is None or (step := motion.step) is None:
+            return None, False
+        T = motion.T_registered @ step.T
+        information = np.linalg.inv(step.covariance).astype(np.float64)
+        prediction = Prediction([T], information=information)
+        result = motion.gated(self.registration.register(scan, prediction), T, dt)
+        # A wrong step holds the scan where it leads; that few of its points fit there is what tells the two apart.
+        agrees = result.ok and motion.other.agrees(motion.T_registered, result)
+        return (result if agrees else None), agrees and result.confidence >= prediction.convincing
+
+    def _from_rest(self, scan: Scan, T: Array, dt: float) -> Registration:
+        """While the velocity is unknown: the best of many starts; after a pause first as before it."""
+        if self.bridge is not None and self.bridge.twist is not None:
+            expected = self.bridge.expected(T, dt)
+            result = self.registration.register(scan, expected)
+            if result.ok and result.confidence >= expected.convincing:
+                return result
+        for starts in starts_from_rest(T, self.settings.turns):
+            prediction = Prediction(starts, widen=2.0)
+            result = self.registration.register(scan, prediction)
+            if result.ok and result.confidence >= prediction.convincing:
+                break
+        return result
