@@ -26,7 +26,8 @@ from benchmarks.harness import (
 from benchmarks.pairs import pairs_of
 from dpm2_core.data.open import open_source
 from dpm2_core.data.source import Source
-from dpm2_core.frame import Array, Frame, Registration
+from dpm2_core.estimates import Registration
+from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
 from dpm2_core.sim.drive import simulate
 from dpm2_core.sim.settings import DriveConfig, LidarConfig

@@ -11,9 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from dpm2_core.data.trajectory import read_trajectory, write_kitti
+from dpm2_core.estimates import Keyframe, Registration
 from dpm2_core.fleet.drives import MAP
 from dpm2_core.fleet.part import DONE
-from dpm2_core.frame import Array, Keyframe, Registration
+from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.network.pretrained import weights_id

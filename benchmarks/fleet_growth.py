@@ -15,10 +15,11 @@ from typing import Any
 
 import numpy as np
 
+from dpm2_core.estimates import Edge, Keyframe, Registration
 from dpm2_core.fleet.growth import Growth, Standing, add_drives, grown
 from dpm2_core.fleet.places import FleetIndex
 from dpm2_core.fleet.regions import LARGEST, Join, solve
-from dpm2_core.frame import Array, Edge, Keyframe, Registration
+from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.robust import RobustSettings
 from dpm2_core.slam.loops.retrieval import WIDTH

@@ -12,7 +12,8 @@ from rich.console import Group
 from rich.progress import Progress
 
 from benchmarks.harness import Options, Report, drives, processors, requested, settings_of, truth_of, unique_name
-from dpm2_core.frame import Array, Frame, OdometryResult, State
+from dpm2_core.estimates import OdometryResult, State
+from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
 from dpm2_core.slam.build import make_odometry
 from dpm2_core.slam.settings import SlamSettings

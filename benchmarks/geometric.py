@@ -24,10 +24,11 @@ from benchmarks.harness import (
     truth_of,
     unique_name,
 )
+from dpm2_core.estimates import State
 from dpm2_core.evaluation.metrics import Metrics, evaluate
 from dpm2_core.experiments.peers import kiss_icp_config
 from dpm2_core.extras import MissingPackageError
-from dpm2_core.frame import Array, Frame, State
+from dpm2_core.frame import Array, Frame
 from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.output import TrajectoryRecorder
 from dpm2_core.tables import FigureTable

@@ -15,8 +15,8 @@ from benchmarks.geometric import BASELINE, Method, Outcome, dpm2, kiss_icp
 from benchmarks.hardships import EVERY, Case, cases, judged
 from benchmarks.harness import Options, Report, drives, processors, requested, truth_of, unique_name
 from dpm2_core.data.source import Source
+from dpm2_core.estimates import State
 from dpm2_core.evaluation.metrics import evaluate
-from dpm2_core.frame import State
 from dpm2_core.sim.settings import PresetName
 from dpm2_core.sim.simulated_drive import SimulatedDrive
 from dpm2_core.tables import FigureTable

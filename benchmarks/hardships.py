@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from dpm2_core.frame import Array, Frame, State
+from dpm2_core.estimates import State
+from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
 
 EVERY = (1, 3, 6, 10)

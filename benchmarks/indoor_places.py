@@ -17,7 +17,8 @@ from benchmarks.loops import error_of
 from benchmarks.relocalise_visits import kept, measured, row_of, success_rates
 from dpm2_core.data.kitti import KittiSource
 from dpm2_core.data.settings import InputSettings
-from dpm2_core.frame import Array, Edge, Frame, Keyframe
+from dpm2_core.estimates import Edge, Keyframe
+from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
 from dpm2_core.pipeline import OfflineRun
 from dpm2_core.sim.drive import fitting_length

@@ -13,7 +13,8 @@ from rich.progress import Progress
 from benchmarks.harness import Options, Report, settings_of
 from benchmarks.memory import resident_mb
 from dpm2_core.descriptors import Descriptors
-from dpm2_core.frame import Array, Keyframe, Registration
+from dpm2_core.estimates import Keyframe, Registration
+from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.world import build_world

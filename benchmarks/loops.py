@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from dpm2_core.frame import Array, Edge
+from dpm2_core.estimates import Edge
+from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 
 WRONG_M, WRONG_DEG = 5.0, 5.0

@@ -22,8 +22,9 @@ from benchmarks.harness import Options, Report, truth_of
 from dpm2_core.config import load_settings
 from dpm2_core.data.open import open_source
 from dpm2_core.errors import Dpm2Error
+from dpm2_core.estimates import Keyframe, Registration
 from dpm2_core.evaluation.metrics import ape_rmse
-from dpm2_core.frame import Array, Keyframe, Registration
+from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.sim.drive import simulate

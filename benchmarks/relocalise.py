@@ -17,7 +17,8 @@ from benchmarks.harness import Options, Report, processors, settings_of
 from benchmarks.relocalise_open import open_roads
 from benchmarks.relocalise_visits import kept, measured, row_of, success_rates
 from benchmarks.roads import open_road, road_files
-from dpm2_core.frame import Array, Frame, Keyframe, Points, Registration
+from dpm2_core.estimates import Keyframe, Registration
+from dpm2_core.frame import Array, Frame, Points
 from dpm2_core.geometry import se3
 from dpm2_core.network.pretrained import load_network
 from dpm2_core.sim.lidar import Lidar

@@ -13,7 +13,8 @@ from rich.progress import Progress
 
 from benchmarks.relocalise_visits import kept, measured, row_of, success_rates
 from dpm2_core.data.thumbnail import PLACE_WIDTH, thumbnail, usable_image
-from dpm2_core.frame import Array, Frame, Image, Keyframe
+from dpm2_core.estimates import Keyframe
+from dpm2_core.frame import Array, Frame, Image
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.sim.camera import calibration, render
 from dpm2_core.sim.lidar import Lidar

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from dpm2_core.frame import Array, Frame, Points, Registration
+from dpm2_core.estimates import Registration
+from dpm2_core.frame import Array, Frame, Points
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.slam.preprocess import Preprocessor

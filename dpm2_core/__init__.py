@@ -37,9 +37,10 @@ if TYPE_CHECKING:
     from dpm2_core.data.trajectory import write_kitti, write_tum
     from dpm2_core.descriptors import Descriptors
     from dpm2_core.errors import Dpm2Error, UsageError
+    from dpm2_core.estimates import Edge, Keyframe, OdometryResult, Registration, State
     from dpm2_core.evaluation.figures import trajectory_png
     from dpm2_core.evaluation.matches import matches_png
-    from dpm2_core.frame import Camera, Edge, Frame, Image, Keyframe, OdometryResult, Registration, State
+    from dpm2_core.frame import Camera, Frame, Image
     from dpm2_core.network.pretrained import load_network
     from dpm2_core.pipeline import OfflineRun
     from dpm2_core.slam.build import make_odometry, make_slam
@@ -91,9 +92,10 @@ _MODULES = {
     "data.trajectory": "write_kitti write_tum",
     "descriptors": "Descriptors",
     "errors": "Dpm2Error UsageError",
+    "estimates": "Edge Keyframe OdometryResult Registration State",
     "evaluation.figures": "trajectory_png",
     "evaluation.matches": "matches_png",
-    "frame": "Camera Edge Frame Image Keyframe OdometryResult Registration State",
+    "frame": "Camera Frame Image",
     "network.pretrained": "load_network",
     "pipeline": "OfflineRun",
     "slam.build": "make_odometry make_slam",

@@ -9,7 +9,8 @@ from typing import Any
 
 from dpm2_core.config import dump_settings
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.frame import Array, Edge, Keyframe, State
+from dpm2_core.estimates import Edge, Keyframe, State
+from dpm2_core.frame import Array
 from dpm2_core.slam.build import make_map, make_slam
 from dpm2_core.slam.loops.localizer import LOST, LocalizationResult, Localizer
 from dpm2_core.slam.loops.relocalization import nowhere

@@ -20,7 +20,8 @@ from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Header
 
-from dpm2_core.frame import Array, Keyframe, OdometryResult, Points
+from dpm2_core.estimates import Keyframe, OdometryResult
+from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.mapping.admission import MAX_ID, RejectedError
 

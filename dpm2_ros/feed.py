@@ -18,7 +18,8 @@ from dpm2_core.data.messages import stamp_ns
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.errors import UsageError
-from dpm2_core.frame import Keyframe, Points, Registration
+from dpm2_core.estimates import Keyframe, Registration
+from dpm2_core.frame import Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.mapping.admission import RejectedError, check_covariance, check_descriptors, check_pose
 from dpm2_core.slam.store.cloud_codec import CodecError, unpack_cloud

@@ -13,7 +13,7 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from dpm2_core.data.frames import FrameBuilder
-from dpm2_core.frame import OdometryResult, State
+from dpm2_core.estimates import OdometryResult, State
 from dpm2_ros.diagnostics import ERROR, OK, STALE, WARN, DiagnosticsPublisher, mapper_status, message_status, status
 from dpm2_ros.guard import GuardedNode
 from dpm2_ros.keyframe_sender import BEHIND, KeyframeSender

@@ -16,7 +16,8 @@ from std_msgs.msg import MultiArrayDimension, MultiArrayLayout, UInt8MultiArray,
 
 from dpm2_core.data.thumbnail import image_of
 from dpm2_core.descriptors import Descriptors
-from dpm2_core.frame import Fix, Keyframe
+from dpm2_core.estimates import Keyframe
+from dpm2_core.frame import Fix
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.slam.mapping.admission import RejectedError
 from dpm2_core.slam.store.cloud_codec import pack_cloud

@@ -24,7 +24,7 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import UInt8MultiArray, UInt32MultiArray
 
-from dpm2_core.frame import Keyframe
+from dpm2_core.estimates import Keyframe
 from dpm2_core.slam.mapping.admission import RejectedError
 from dpm2_core.slam.settings import SlamSettings
 from dpm2_ros.conversions import edge_to_msg, keyframe_name

@@ -20,7 +20,8 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.frame import Array, Edge, Keyframe
+from dpm2_core.estimates import Edge, Keyframe
+from dpm2_core.frame import Array
 from dpm2_core.slam.loops.localizer import LocalizationResult
 from dpm2_core.slam.mapping.admission import RejectedError
 from dpm2_core.slam.mapping.occupancy_map import OccupancyMap

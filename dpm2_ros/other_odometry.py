@@ -16,7 +16,8 @@ from rclpy.qos import QoSProfile
 from dpm2_core.data.messages import stamp_ns
 from dpm2_core.data.transforms import TransformTree, transform_matrix
 from dpm2_core.errors import UsageError
-from dpm2_core.frame import Array, Comparison, Guess
+from dpm2_core.estimates import Comparison
+from dpm2_core.frame import Array, Guess
 from dpm2_core.geometry import se3
 from dpm2_core.slam.mapping.admission import RejectedError, check_covariance, check_pose
 from dpm2_ros.checks import check_header, check_transforms

@@ -16,7 +16,8 @@ from nav_msgs.msg import Odometry
 
 from dpm2_core.data.frames import Calibration, FrameBuilder
 from dpm2_core.errors import UsageError
-from dpm2_core.frame import Array, Frame, Keyframe, OdometryResult, State
+from dpm2_core.estimates import Keyframe, OdometryResult, State
+from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.sweep import Sweep
 from dpm2_core.slam.build import make_slam

@@ -9,7 +9,7 @@ import time
 from rclpy.node import Node
 from std_msgs.msg import String
 
-from dpm2_core.frame import State
+from dpm2_core.estimates import State
 from dpm2_ros.subscriptions import LAST_ONE, STEADY
 
 SILENT = 2.0

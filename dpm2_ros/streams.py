@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from dpm2_core.descriptors import Descriptors
-from dpm2_core.frame import Keyframe
+from dpm2_core.estimates import Keyframe
 from dpm2_ros.keyframe_messages import Payload
 
 AHEAD = 64

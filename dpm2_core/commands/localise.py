@@ -13,10 +13,11 @@ from dpm2_core.commands.options import progress_bar
 from dpm2_core.console import Console
 from dpm2_core.data.trajectory import write_tum
 from dpm2_core.errors import UsageError
+from dpm2_core.estimates import State
 from dpm2_core.evaluation.run_folder import LOCALIZATION, MAPPING, TRAJECTORY, remove_results
 from dpm2_core.evaluation.run_result import save_config
 from dpm2_core.files import make_folder, write_json
-from dpm2_core.frame import Array, State
+from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.pipeline import OfflineRun
 from dpm2_core.slam.loops.localizer import Localizer

@@ -11,8 +11,9 @@ import cv2
 import numpy as np
 
 from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.estimates import Edge, OdometryResult, State
 from dpm2_core.extras import needs
-from dpm2_core.frame import Array, Edge, Frame, OdometryResult, State
+from dpm2_core.frame import Array, Frame
 from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.system import SlamResult
 

@@ -12,9 +12,10 @@ import cv2
 import numpy as np
 
 from dpm2_core.data.compressed import decode_compressed
+from dpm2_core.estimates import Edge
 from dpm2_core.evaluation.page import data_url, escape, page
 from dpm2_core.files import atomic_write
-from dpm2_core.frame import Array, Edge, Points
+from dpm2_core.frame import Array, Points
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.slam.store.map_data import MapData, map_cloud, ways
 

@@ -17,8 +17,9 @@ import numpy as np
 
 from dpm2_core.data.trajectory import Trajectory, read_trajectory, write_tum
 from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.estimates import Edge
 from dpm2_core.files import atomic_write
-from dpm2_core.frame import Array, Edge
+from dpm2_core.frame import Array
 
 TRAJECTORY, FRAMES, LOOPS, TRUTH = "trajectory.tum", "frames.csv", "loops.csv", "ground_truth.tum"
 METRICS, TIMING = "metrics.json", "timing.json"

@@ -16,6 +16,7 @@ from dpm2_core.data.ply import write_ply
 from dpm2_core.data.source import Source
 from dpm2_core.data.trajectory import Trajectory, frame_period, matched, matched_period, write_kitti, write_tum
 from dpm2_core.errors import UsageError
+from dpm2_core.estimates import OdometryResult
 from dpm2_core.evaluation.figures import trajectory_png
 from dpm2_core.evaluation.ground_truth import in_other_frame, truth_by_stamp
 from dpm2_core.evaluation.kitti_metric import known
@@ -39,7 +40,7 @@ from dpm2_core.evaluation.run_folder import (
 )
 from dpm2_core.extras import MissingPackageError
 from dpm2_core.files import atomic_write, make_folder, write_json
-from dpm2_core.frame import Array, OdometryResult, Points
+from dpm2_core.frame import Array, Points
 from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.output import TrajectoryRecorder
 from dpm2_core.slam.settings import Config

@@ -18,10 +18,11 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order
 
 from dpm2_core.errors import Dpm2Error
+from dpm2_core.estimates import Edge
 from dpm2_core.fleet.joins import ENOUGH
 from dpm2_core.fleet.regions import Join
 from dpm2_core.fleet.search import affirmed, component
-from dpm2_core.frame import Array, Edge, Georeference
+from dpm2_core.frame import Array, Georeference
 from dpm2_core.slam.graph.graph_data import loop_errors, mahalanobis
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.graph.robust import RobustSettings

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpm2_core.config import settings_from
+from dpm2_core.estimates import Edge, Keyframe, Registration
 from dpm2_core.fleet.part import Advance, Figures, Part
-from dpm2_core.frame import Array, Edge, Keyframe, Points, Registration
+from dpm2_core.frame import Array, Points
 from dpm2_core.slam.build import make_loops
 from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.slam.store.lazy import LazySequence

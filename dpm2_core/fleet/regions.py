@@ -14,7 +14,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from dpm2_core.frame import Array, Edge, Registration
+from dpm2_core.estimates import Edge, Registration
+from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.graph.robust import RobustSettings

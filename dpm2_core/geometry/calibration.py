@@ -13,7 +13,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from dpm2_core.frame import Array, Registration
+from dpm2_core.estimates import Registration
+from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 
 _AXES = 0.006

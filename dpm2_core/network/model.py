@@ -11,7 +11,8 @@ import torch
 from torch import nn
 
 from dpm2_core.descriptors import Descriptors
-from dpm2_core.frame import Array, Frame, Registration
+from dpm2_core.estimates import Registration
+from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
 from dpm2_core.network.decoder import Decoder, Prepared
 from dpm2_core.network.encoder import Encoder

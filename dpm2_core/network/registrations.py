@@ -6,7 +6,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dpm2_core.frame import Registration
+from dpm2_core.estimates import Registration
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.calibration import with_calibration
 from dpm2_core.network.decoder import Correlated, Decoder

@@ -14,7 +14,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dpm2_core.frame import Array, Registration
+from dpm2_core.estimates import Registration
+from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.motion import between, covariance, predicted, spread, velocity_change
 from dpm2_core.slam.preprocess import Scan

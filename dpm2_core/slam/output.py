@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from dpm2_core.data.ply import write_ply
 from dpm2_core.data.trajectory import write_tum
+from dpm2_core.estimates import OdometryResult
 from dpm2_core.files import make_folder
-from dpm2_core.frame import Array, OdometryResult
+from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.slam.mapping.mapper import Mapper
 

@@ -12,7 +12,8 @@ from dataclasses import dataclass, replace
 from time import perf_counter
 
 from dpm2_core.data.thumbnail import PLACE_WIDTH, thumbnail
-from dpm2_core.frame import Array, Edge, Frame, Keyframe, OdometryResult, State
+from dpm2_core.estimates import Edge, Keyframe, OdometryResult, State
+from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry.deskew import placed
 from dpm2_core.slam.loops.localizer import LocalizationResult, Localizer
 from dpm2_core.slam.mapping.mapper import Mapper

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.covariance import calibration
-from dpm2_core.frame import Registration
+from dpm2_core.estimates import Registration
 from dpm2_core.geometry import se3
 
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from benchmarks.hardships import Case, cases, judged
-from dpm2_core.frame import Array, Frame, State
+from dpm2_core.estimates import State
+from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
 
 

@@ -13,7 +13,8 @@ from benchmarks.loops import check_loops, revisits
 from benchmarks.relocalise_visits import success_rates
 from benchmarks.roads import road_files
 from dpm2_core.errors import UsageError
-from dpm2_core.frame import Array, Edge, Registration
+from dpm2_core.estimates import Edge, Registration
+from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 
 

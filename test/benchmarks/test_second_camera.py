@@ -10,7 +10,8 @@ import pytest
 
 from benchmarks import second_camera
 from dpm2_core.descriptors import Descriptors
-from dpm2_core.frame import Frame, Registration
+from dpm2_core.estimates import Registration
+from dpm2_core.frame import Frame
 from dpm2_core.geometry import se3
 from dpm2_core.network.model import DeepPointMap2
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dpm2_core.data.packed import Sample, write_packed
 from dpm2_core.descriptors import Descriptors
-from dpm2_core.frame import Edge, Keyframe, Registration
+from dpm2_core.estimates import Edge, Keyframe, Registration
 from dpm2_core.geometry import se3, se3_torch
 from dpm2_core.slam.store.cloud_codec import pack_cloud
 from dpm2_core.slam.store.map_store import Change, MapStore

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dpm2_core.frame import Camera, Edge, Frame, Guess, Image, Registration
+from dpm2_core.frame import Camera, Frame, Guess, Image
 from dpm2_core.geometry import se3
 
 CAMERA = Camera(K=np.eye(3), T_lidar_cam=np.eye(4), size=(40, 30), name="left")
@@ -75,27 +75,7 @@ def test_every_point_wants_its_time_offset() -> None:
         Frame(stamp=0, points=points, time_offset=np.zeros(4, np.float32))
 
 
-def test_a_rejected_edge_keeps_what_was_measured() -> None:
-    loop = Edge("loop", 3, 90, Registration(2 * np.eye(4), np.eye(6), 0.9, 0.05, "points"))
-    rejected = loop.rejected("too far")
-    assert loop.ok
-    assert not rejected.ok
-    assert (rejected.from_node, rejected.to_node, rejected.registration.reason) == (3, 90, "too far")
-    np.testing.assert_array_equal(rejected.T_from_to, loop.T_from_to)
-
-
 def test_nouns_cannot_be_changed() -> None:
     frame = Frame(stamp=0, points=np.zeros((1, 4), np.float32))
     with pytest.raises(AttributeError):
         frame.stamp = 1  # type: ignore[misc]
-
-
-def test_the_open_direction_is_that_of_the_largest_uncertainty_of_the_scene() -> None:
-    """The uncertainty that grew with the motion, equal in all directions, says nothing of the scene."""
-    axis = np.array([0.6, 0.8, 0.0])
-    scene = np.diag(np.full(6, 1e-4))
-    scene[3:, 3:] += 0.25 * np.outer(axis, axis)
-    floor = (0.01, 0.3)
-    result = Registration(np.eye(4), scene + np.diag(np.repeat(floor, 3) ** 2), floor=floor)
-    assert abs(result.open_direction @ axis) == pytest.approx(1.0)
-    assert result.worst_sigma == pytest.approx(np.sqrt(0.25 + 1e-4))

@@ -29,7 +29,8 @@ from std_msgs.msg import UInt8MultiArray
 
 from dpm2_core.data.convert import convert_kitti
 from dpm2_core.data.kitti import KittiSource
-from dpm2_core.frame import Array, Keyframe, Points
+from dpm2_core.estimates import Keyframe
+from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
 from dpm2_ros.conversions import cloud_to_msg, edge_to_msg, keyframe_name
 from dpm2_ros.runtime import end_ros, ros_context

@@ -17,7 +17,7 @@ import pytest
 
 from dpm2_core.cli import main
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.frame import Keyframe, Registration, State
+from dpm2_core.estimates import Keyframe, Registration, State
 from dpm2_core.geometry import se3
 from dpm2_core.slam.store.check import check_map
 from dpm2_ros.active_map import ActiveMap

@@ -14,7 +14,8 @@ from hypothesis.extra import numpy as hnp
 from dpm2_core.data.messages import decode_points, stamp_ns
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.errors import UsageError
-from dpm2_core.frame import Array, Fix, Keyframe, Registration
+from dpm2_core.estimates import Keyframe, Registration
+from dpm2_core.frame import Array, Fix
 from dpm2_core.geometry import se3
 from dpm2_ros import conversions
 

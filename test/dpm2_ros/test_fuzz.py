@@ -33,7 +33,8 @@ from dpm2_core.data.messages import stamp_ns
 from dpm2_core.data.open import open_source
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.transforms import transform_matrix
-from dpm2_core.frame import Frame, OdometryResult
+from dpm2_core.estimates import OdometryResult
+from dpm2_core.frame import Frame
 from dpm2_core.slam.build import make_odometry
 from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.slam.store.cloud_codec import pack_cloud, unpack_cloud

@@ -12,7 +12,8 @@ from sensor_msgs.msg import PointField
 
 from dpm2_core.data.thumbnail import thumbnail
 from dpm2_core.descriptors import Descriptors
-from dpm2_core.frame import Fix, Keyframe
+from dpm2_core.estimates import Keyframe
+from dpm2_core.frame import Fix
 from dpm2_core.slam.mapping.admission import RejectedError
 from dpm2_core.slam.store.cloud_codec import unpack_cloud
 from dpm2_ros.keyframe_messages import (

@@ -22,7 +22,7 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import UInt8MultiArray
 
 from dpm2_core.data.topics import POINTS
-from dpm2_core.frame import Keyframe
+from dpm2_core.estimates import Keyframe
 from dpm2_core.geometry import se3
 from dpm2_core.slam.store.check import check_map
 from dpm2_core.slam.store.map_data import load_map

@@ -20,7 +20,8 @@ from std_srvs.srv import Trigger
 from dpm2_core.data.trajectory import read_trajectory
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.descriptors import Descriptors
-from dpm2_core.frame import Fix, Keyframe
+from dpm2_core.estimates import Keyframe
+from dpm2_core.frame import Fix
 from dpm2_core.geometry import se3
 from dpm2_core.slam.store.map_data import load_map
 from dpm2_core.slam.store.map_store import MapStore

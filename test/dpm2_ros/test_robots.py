@@ -22,7 +22,8 @@ from dpm2_core.data.open import open_source
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.frame import Array, Keyframe
+from dpm2_core.estimates import Keyframe
+from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.slam.store.map_data import MapData, load_map
 from dpm2_core.slam.store.map_store import MapStore

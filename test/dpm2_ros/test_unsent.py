@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import rclpy
 
-from dpm2_core.frame import Keyframe
+from dpm2_core.estimates import Keyframe
 from dpm2_ros.keyframe_sender import KeyframeSender
 from dpm2_ros.settings import RosSettings
 from dpm2_ros.unsent import KeyframeFile, left_behind, path_of

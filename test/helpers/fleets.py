@@ -7,8 +7,9 @@ from itertools import pairwise
 
 import numpy as np
 
+from dpm2_core.estimates import Edge, Keyframe, Registration
 from dpm2_core.fleet.regions import Join
-from dpm2_core.frame import Array, Edge, Keyframe, Registration
+from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.slam.store.cloud_codec import pack_cloud
 from dpm2_core.slam.store.cloud_store import CloudStore

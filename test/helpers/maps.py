@@ -6,7 +6,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from dpm2_core.frame import Edge, Keyframe, Registration
+from dpm2_core.estimates import Edge, Keyframe, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.slam.store.cloud_codec import pack_cloud
 from dpm2_core.slam.store.cloud_store import CloudStore

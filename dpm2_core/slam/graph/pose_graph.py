@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.frame import Array, Edge, Fix, Georeference
+from dpm2_core.estimates import Edge
+from dpm2_core.frame import Array, Fix, Georeference
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph import robust
 from dpm2_core.slam.graph.fixes import Fixes

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dpm2_core.frame import Edge
+from dpm2_core.estimates import Edge
 
 
 class Trajectories:

@@ -19,7 +19,8 @@ from pydantic import Field
 
 from dpm2_core.config import Settings
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.frame import Array, Edge, Keyframe, Points, Registration
+from dpm2_core.estimates import Edge, Keyframe, Registration
+from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.scale import is_room
 from dpm2_core.slam.loops.consistency import Consistency, ConsistencySettings, OdometryChain, margin

@@ -13,7 +13,8 @@ import numpy as np
 from pydantic import Field
 
 from dpm2_core.config import Settings
-from dpm2_core.frame import Array, Edge, Keyframe, Registration
+from dpm2_core.estimates import Edge, Keyframe, Registration
+from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 
 UNCERTAIN = 0.5  # m, standard deviation of an odometry edge beyond drift: a direction was open, or nothing fitted

@@ -9,7 +9,8 @@ import numpy as np
 
 from dpm2_core.data.thumbnail import usable_image
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.frame import Array, Image, Keyframe, Registration, State
+from dpm2_core.estimates import Keyframe, Registration, State
+from dpm2_core.frame import Array, Image
 from dpm2_core.geometry import se3
 from dpm2_core.slam.loops.consistency import UNCERTAIN
 from dpm2_core.slam.loops.relocalization import FindsPlaces, nowhere

@@ -13,7 +13,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from dpm2_core.data.thumbnail import usable_image
-from dpm2_core.frame import Array, Image, Keyframe, Points, Registration
+from dpm2_core.estimates import Keyframe, Registration
+from dpm2_core.frame import Array, Image, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.loops.verification import Along, Verifier, meters_apart, second_best
 from dpm2_core.slam.registration.texture import (

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpm2_core.descriptors import Descriptors, merge
-from dpm2_core.frame import Array, Frame, Keyframe, Points, Registration
+from dpm2_core.estimates import Keyframe, Registration
+from dpm2_core.frame import Array, Frame, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.loops.retrieval import PlaceIndex, pooled
 

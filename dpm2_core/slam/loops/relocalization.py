@@ -20,7 +20,8 @@ from pydantic import Field
 from dpm2_core.config import Settings
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.frame import Array, Image, Points, Registration
+from dpm2_core.estimates import Registration
+from dpm2_core.frame import Array, Image, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.loops.pictures import BETWEEN, KnownMap, PicturedPlaces
 from dpm2_core.slam.loops.place_recognition import PlaceRecognition

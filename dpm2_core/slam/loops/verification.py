@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from dpm2_core.config import Settings
-from dpm2_core.frame import Array, Points, Registration
+from dpm2_core.estimates import Registration
+from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.ground import height_above_ground
 from dpm2_core.geometry.scale import is_room

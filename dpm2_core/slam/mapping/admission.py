@@ -10,7 +10,8 @@ import numpy as np
 
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.errors import UsageError
-from dpm2_core.frame import Array, Keyframe, Points
+from dpm2_core.estimates import Keyframe
+from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.store.cloud_codec import MAX_POINTS
 from dpm2_core.slam.store.rows import FARTHEST

@@ -13,7 +13,8 @@ from pydantic import Field
 
 from dpm2_core.config import Settings
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.frame import Array, Edge, Georeference, Keyframe, Points, Registration
+from dpm2_core.estimates import Edge, Keyframe, Registration
+from dpm2_core.frame import Array, Georeference, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.loops.closure import LoopCloser

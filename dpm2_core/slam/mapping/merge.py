@@ -9,7 +9,8 @@ from dataclasses import replace
 import numpy as np
 
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.frame import Array, Edge, Georeference, Points, Registration
+from dpm2_core.estimates import Edge, Registration
+from dpm2_core.frame import Array, Georeference, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.loops.closure import LoopCloser

@@ -10,7 +10,8 @@ from typing import Literal
 import numpy as np
 from scipy.spatial import KDTree
 
-from dpm2_core.frame import Edge, Fix, Keyframe
+from dpm2_core.estimates import Edge, Keyframe
+from dpm2_core.frame import Fix
 from dpm2_core.geometry import se3
 from dpm2_core.slam.mapping.parts import parts_of
 from dpm2_core.slam.store.map_data import MapData, subset

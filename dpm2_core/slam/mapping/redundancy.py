@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from pydantic import Field
 
 from dpm2_core.config import Settings
-from dpm2_core.frame import Edge
+from dpm2_core.estimates import Edge
 from dpm2_core.geometry import se3
 from dpm2_core.slam.store.cloud_store import Loan
 

@@ -17,8 +17,9 @@ import numpy as np
 
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.estimates import Registration
 from dpm2_core.files import new_folder, write_json
-from dpm2_core.frame import Array, Image, Points, Registration
+from dpm2_core.frame import Array, Image, Points
 from dpm2_core.slam.loops.relocalization import RelocalizationSettings, Relocalizer, nowhere
 from dpm2_core.slam.loops.retrieval import WIDTH, Vector, centered, pooled
 from dpm2_core.slam.mapping.merge import merge_maps

@@ -10,7 +10,8 @@ import numpy as np
 from pydantic import Field
 
 from dpm2_core.config import Settings
-from dpm2_core.frame import Array, Fix, Frame, Keyframe, Registration
+from dpm2_core.estimates import Keyframe, Registration
+from dpm2_core.frame import Array, Fix, Frame
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.slam.preprocess import Scan

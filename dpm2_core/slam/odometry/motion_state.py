@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from dpm2_core.frame import Array, Registration
+from dpm2_core.estimates import Registration
+from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.motion import OPEN, along_open, combined, covariance, predicted, spread
 from dpm2_core.slam.odometry.inertial import InertialMotion

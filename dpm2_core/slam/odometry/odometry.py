@@ -12,7 +12,8 @@ import numpy as np
 from dpm2_core.data.repeated import IMAGE_PROBLEM, RepeatedCloud, RepeatedImages
 from dpm2_core.data.repeated import PROBLEM as REPEATED
 from dpm2_core.data.stream_clock import DOUBTED, NOMINAL, SLOWEST, StreamClock
-from dpm2_core.frame import Array, Frame, OdometryResult, Registration, State
+from dpm2_core.estimates import OdometryResult, Registration, State
+from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.motion import period_by_motion
 from dpm2_core.geometry.sweep import Sweep

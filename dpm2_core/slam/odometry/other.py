@@ -13,7 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dpm2_core.frame import Array, Comparison, Guess, Registration
+from dpm2_core.estimates import Comparison, Registration
+from dpm2_core.frame import Array, Guess
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.motion import predicted
 from dpm2_core.slam.registration.protocol import MAP_NOISE

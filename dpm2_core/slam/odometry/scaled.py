@@ -8,7 +8,8 @@ map.
 
 from __future__ import annotations
 
-from dpm2_core.frame import Frame, OdometryResult
+from dpm2_core.estimates import OdometryResult
+from dpm2_core.frame import Frame
 from dpm2_core.geometry.scale import is_room
 from dpm2_core.slam.odometry.odometry import Odometry
 

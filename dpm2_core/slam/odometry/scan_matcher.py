@@ -8,7 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dpm2_core.frame import Array, Frame, Registration
+from dpm2_core.estimates import Registration
+from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry.motion import OPEN, predicted
 from dpm2_core.slam.bridge import Bridge
 from dpm2_core.slam.odometry.motion_state import MotionState

@@ -10,7 +10,8 @@ import numpy as np
 from scipy.linalg import eigh
 
 from dpm2_core.descriptors import LazyDescriptors
-from dpm2_core.frame import Array, Frame, Registration
+from dpm2_core.estimates import Registration
+from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
 from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.icp import GeometricScanRegistration

@@ -14,7 +14,8 @@ import numpy as np
 from pydantic import Field
 
 from dpm2_core.config import Settings
-from dpm2_core.frame import Array, Frame, Registration
+from dpm2_core.estimates import Registration
+from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.calibration import with_calibration
 from dpm2_core.slam.preprocess import Preprocessor, Scan

@@ -12,7 +12,8 @@ from pydantic import Field
 
 from dpm2_core.config import Settings
 from dpm2_core.descriptors import Descriptors, LazyDescriptors
-from dpm2_core.frame import Array, Frame, Image, Points, Registration
+from dpm2_core.estimates import Registration
+from dpm2_core.frame import Array, Frame, Image, Points
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.network.images import small_image

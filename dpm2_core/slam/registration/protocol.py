@@ -9,7 +9,8 @@ from typing import Protocol, Self
 
 import numpy as np
 
-from dpm2_core.frame import Array, Frame, Registration
+from dpm2_core.estimates import Registration
+from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
 from dpm2_core.slam.preprocess import Scan
 

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from dpm2_core.config import Settings
-from dpm2_core.frame import Array, Image, Points, Registration
+from dpm2_core.estimates import Registration
+from dpm2_core.frame import Array, Image, Points
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.calibration import with_calibration
 from dpm2_core.geometry.contrast import local_contrast

@@ -11,7 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from dpm2_core.frame import Array, Frame, Image, Registration
+from dpm2_core.estimates import Registration
+from dpm2_core.frame import Array, Frame, Image
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.deskew import placed
 from dpm2_core.slam.preprocess import Scan

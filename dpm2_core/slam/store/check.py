@@ -17,7 +17,8 @@ import numpy as np
 from dpm2_core.data.thumbnail import image_of
 from dpm2_core.database import connect
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.frame import Array, Edge, Georeference, Keyframe, Registration
+from dpm2_core.estimates import Edge, Keyframe, Registration
+from dpm2_core.frame import Array, Georeference
 from dpm2_core.geometry import se3
 from dpm2_core.slam.store import rows, schema
 from dpm2_core.slam.store.cloud_codec import pack_cloud, unpack_cloud, unpack_mask

@@ -14,8 +14,9 @@ import numpy as np
 
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.estimates import Edge, Keyframe
 from dpm2_core.files import part_beside
-from dpm2_core.frame import Array, Edge, Georeference, Keyframe, Points
+from dpm2_core.frame import Array, Georeference, Points
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.slam.store.cloud_store import CloudStore, Loan

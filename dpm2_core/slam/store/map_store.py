@@ -20,8 +20,9 @@ from typing import Any
 from dpm2_core._version import __version__
 from dpm2_core.database import Connection, connect
 from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.estimates import Edge, Keyframe
 from dpm2_core.files import part_beside
-from dpm2_core.frame import Array, Edge, Georeference, Keyframe
+from dpm2_core.frame import Array, Georeference
 from dpm2_core.slam.store import schema
 from dpm2_core.slam.store.cloud_store import Loan
 from dpm2_core.slam.store.map_file import copy_with_log, remove_log, remove_map

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from dpm2_core.descriptors import Descriptors, quantized
-from dpm2_core.frame import Array, Edge, Fix, Georeference, Keyframe, Points, Registration
+from dpm2_core.estimates import Edge, Keyframe, Registration
+from dpm2_core.frame import Array, Fix, Georeference, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.store.cloud_store import Loan
 from dpm2_core.slam.store.schema import row_crc

@@ -8,7 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.frame import Array, Edge, Georeference, Keyframe
+from dpm2_core.estimates import Edge, Keyframe
+from dpm2_core.frame import Array, Georeference
 from dpm2_core.slam.store.cloud_store import CloudStore
 from dpm2_core.slam.store.map_store import Change, MapStore
 from dpm2_core.slam.store.rows import array_bytes, edge_of

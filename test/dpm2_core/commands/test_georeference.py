@@ -15,7 +15,8 @@ import pytest
 from dpm2_core.data.convert import EPOCH_NS
 from dpm2_core.data.kitti import KittiSource
 from dpm2_core.data.trajectory import read_trajectory
-from dpm2_core.frame import Array, Edge, Fix, Georeference, Registration
+from dpm2_core.estimates import Edge, Registration
+from dpm2_core.frame import Array, Fix, Georeference
 from dpm2_core.geometry import geodesy, se3
 from dpm2_core.sim.drive import simulate
 from dpm2_core.sim.settings import DriveConfig, GnssConfig, LidarConfig

@@ -18,8 +18,9 @@ import pytest
 
 from dpm2_core.data.trajectory import read_trajectory
 from dpm2_core.errors import Dpm2Error
+from dpm2_core.estimates import Edge, Keyframe, Registration
 from dpm2_core.fleet.regions import side_by_side, solve
-from dpm2_core.frame import Array, Edge, Georeference, Keyframe, Registration
+from dpm2_core.frame import Array, Georeference
 from dpm2_core.geometry import se3
 from dpm2_core.sim.drive import simulate
 from dpm2_core.sim.settings import DriveConfig, LidarConfig

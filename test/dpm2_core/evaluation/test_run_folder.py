@@ -10,6 +10,7 @@ import pytest
 
 from dpm2_core.data.trajectory import write_tum
 from dpm2_core.errors import UsageError
+from dpm2_core.estimates import Edge, Registration
 from dpm2_core.evaluation.run_folder import (
     FRAMES,
     LOOPS,
@@ -20,7 +21,6 @@ from dpm2_core.evaluation.run_folder import (
     write_loops,
     write_truth,
 )
-from dpm2_core.frame import Edge, Registration
 from dpm2_core.geometry import se3
 
 POSES = se3.exp(np.arange(4)[:, None] * np.array([0, 0, 0.1, 1.0, 0.2, 0]))

@@ -13,10 +13,10 @@ import pytest
 
 from dpm2_core.data.trajectory import write_tum
 from dpm2_core.errors import UsageError
+from dpm2_core.estimates import Edge, Registration
 from dpm2_core.evaluation.metrics import evaluate
 from dpm2_core.evaluation.run_folder import write_frames, write_loops, write_truth
 from dpm2_core.evaluation.run_page import HtmlTable, find_runs, runs_page
-from dpm2_core.frame import Edge, Registration
 from dpm2_core.geometry import se3
 
 from ...helpers.command import dpm2

@@ -17,10 +17,11 @@ import numpy as np
 import pytest
 
 from dpm2_core.errors import Dpm2Error
+from dpm2_core.estimates import Edge, Registration
 from dpm2_core.evaluation.metrics import ape_rmse
 from dpm2_core.fleet.growth import Growth, Standing, add_drives, grown, joins_of
 from dpm2_core.fleet.regions import LARGEST, Join, solve
-from dpm2_core.frame import Edge, Fix, Georeference, Registration
+from dpm2_core.frame import Fix, Georeference
 from dpm2_core.geometry import geodesy, se3
 from dpm2_core.slam.graph.robust import RobustSettings
 from dpm2_core.slam.store.check import check_map

@@ -11,7 +11,8 @@ import pytest
 
 from benchmarks.gaps import evaluated, gaps, summary
 from dpm2_core.data.open import open_source
-from dpm2_core.frame import Array, Frame, OdometryResult, State
+from dpm2_core.estimates import OdometryResult, State
+from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import LidarConfig

@@ -12,7 +12,8 @@ from types import FrameType
 import numpy as np
 import pytest
 
-from dpm2_core.frame import Array, Frame, State
+from dpm2_core.estimates import State
+from dpm2_core.frame import Array, Frame
 from dpm2_core.pipeline import OfflineRun
 from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.loops.localizer import LocalizationResult

@@ -11,7 +11,8 @@ import gtsam
 import numpy as np
 import pytest
 
-from dpm2_core.frame import Array, Edge, Fix, Georeference, Registration
+from dpm2_core.estimates import Edge, Registration
+from dpm2_core.frame import Array, Fix, Georeference
 from dpm2_core.geometry import geodesy, se3
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.graph.robust import RobustSettings

@@ -16,7 +16,8 @@ import numpy as np
 import pytest
 
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.frame import Array, Edge, Registration
+from dpm2_core.estimates import Edge, Registration
+from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph import pose_graph
 from dpm2_core.slam.graph.pose_graph import PoseGraph

@@ -13,7 +13,8 @@ import torch
 from numpy.typing import NDArray
 
 from dpm2_core.descriptors import Descriptors
-from dpm2_core.frame import Array, Edge, Keyframe, Points, Registration
+from dpm2_core.estimates import Edge, Keyframe, Registration
+from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.network.decoder import Correlated, Decoder

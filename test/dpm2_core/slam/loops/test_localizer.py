@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from dpm2_core.descriptors import Descriptors
-from dpm2_core.frame import Array, Frame, Image, Keyframe, Points, Registration, State
+from dpm2_core.estimates import Keyframe, Registration, State
+from dpm2_core.frame import Array, Frame, Image, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.loops.localizer import Localizer

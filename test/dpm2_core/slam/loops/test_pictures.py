@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from dpm2_core.data.thumbnail import PLACE_WIDTH, thumbnail, usable_image
-from dpm2_core.frame import Array, Image, Keyframe
+from dpm2_core.estimates import Keyframe
+from dpm2_core.frame import Array, Image
 from dpm2_core.geometry import se3
 from dpm2_core.network.pretrained import load_network
 from dpm2_core.slam.loops.localizer import Localizer

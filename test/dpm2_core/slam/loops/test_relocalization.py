@@ -10,7 +10,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from dpm2_core.frame import Array, Keyframe, Points, Registration, State
+from dpm2_core.estimates import Keyframe, Registration, State
+from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
 from dpm2_core.network.pretrained import load_network
 from dpm2_core.sim.lidar import Lidar

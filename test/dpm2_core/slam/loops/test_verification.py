@@ -6,7 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dpm2_core.frame import Array, Points, Registration
+from dpm2_core.estimates import Registration
+from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.ground import height_above_ground
 from dpm2_core.sim.lidar import Lidar

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from dpm2_core.descriptors import Descriptors
-from dpm2_core.frame import Array, Keyframe, Registration
+from dpm2_core.estimates import Keyframe, Registration
+from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.slam.build import make_mapper
 from dpm2_core.slam.loops.closure import LoopCloser

@@ -10,9 +10,10 @@ import gtsam
 import numpy as np
 import pytest
 
+from dpm2_core.estimates import Edge, Keyframe, OdometryResult, Registration, State
 from dpm2_core.evaluation.metrics import ape_rmse
 from dpm2_core.fleet.regions import side_by_side
-from dpm2_core.frame import Array, Edge, Keyframe, OdometryResult, Registration, State
+from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import LidarConfig

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from dpm2_core.errors import UsageError
-from dpm2_core.frame import Array, Edge, Keyframe, Points, Registration
+from dpm2_core.estimates import Edge, Keyframe, Registration
+from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.graph.robust import RobustSettings

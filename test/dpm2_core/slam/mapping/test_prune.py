@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.frame import Array, Edge, Fix, Keyframe, Registration
+from dpm2_core.estimates import Edge, Keyframe, Registration
+from dpm2_core.frame import Array, Fix
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.graph.robust import RobustSettings

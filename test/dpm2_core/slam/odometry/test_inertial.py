@@ -9,7 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dpm2_core.frame import Array, Frame, Inertial, OdometryResult
+from dpm2_core.estimates import OdometryResult
+from dpm2_core.frame import Array, Frame, Inertial
 from dpm2_core.geometry import se3
 from dpm2_core.sim.imu import GRAVITY, Imu
 from dpm2_core.sim.settings import ImuConfig

@@ -6,7 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dpm2_core.frame import Fix, Frame, Registration
+from dpm2_core.estimates import Registration
+from dpm2_core.frame import Fix, Frame
 from dpm2_core.geometry import se3
 from dpm2_core.slam.odometry.keyframe_selection import KeyframeSelector, KeyframeSettings
 from dpm2_core.slam.preprocess import Scan

@@ -7,7 +7,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dpm2_core.frame import Registration
+from dpm2_core.estimates import Registration
 from dpm2_core.geometry import se3
 from dpm2_core.slam.odometry.motion_state import MotionState
 from dpm2_core.slam.odometry.settings import OdometrySettings

@@ -9,7 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dpm2_core.frame import Array, Frame, Guess, Inertial, OdometryResult, State
+from dpm2_core.estimates import OdometryResult, State
+from dpm2_core.frame import Array, Frame, Guess, Inertial
 from dpm2_core.geometry import se3
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import LidarConfig

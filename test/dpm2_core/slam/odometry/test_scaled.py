@@ -6,7 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dpm2_core.frame import Frame, State
+from dpm2_core.estimates import State
+from dpm2_core.frame import Frame
 from dpm2_core.geometry import se3
 from dpm2_core.slam.build import make_odometry
 from dpm2_core.slam.odometry.scaled import ScaledOdometry

@@ -14,7 +14,8 @@ import torch
 
 from dpm2_core.descriptors import Descriptors, LazyDescriptors
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.frame import Frame, Registration, State
+from dpm2_core.estimates import Registration, State
+from dpm2_core.frame import Frame
 from dpm2_core.geometry import se3
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pretrained import load_network

@@ -13,7 +13,8 @@ import pytest
 
 from dpm2_core.data.open import open_source
 from dpm2_core.data.thumbnail import usable_image
-from dpm2_core.frame import Frame, Registration, State
+from dpm2_core.estimates import Registration, State
+from dpm2_core.frame import Frame
 from dpm2_core.geometry import se3
 from dpm2_core.slam.build import make_odometry, make_registration, make_slam
 from dpm2_core.slam.registration.protocol import Prediction

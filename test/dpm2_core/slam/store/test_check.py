@@ -19,7 +19,7 @@ import pytest
 
 from dpm2_core.data.thumbnail import thumbnail
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.frame import Keyframe
+from dpm2_core.estimates import Keyframe
 from dpm2_core.slam.store.check import check_map
 from dpm2_core.slam.store.cloud_codec import pack_cloud
 from dpm2_core.slam.store.map_data import MapData, load_map, save_as

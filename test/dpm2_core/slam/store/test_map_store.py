@@ -22,7 +22,8 @@ import pytest
 
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.frame import Fix, Georeference, Keyframe
+from dpm2_core.estimates import Keyframe
+from dpm2_core.frame import Fix, Georeference
 from dpm2_core.geometry import se3
 from dpm2_core.slam.mapping.merge import merge_maps
 from dpm2_core.slam.mapping.prune import prune
@@ -43,7 +44,7 @@ import sys
 from pathlib import Path
 import numpy as np
 from dpm2_core.descriptors import Descriptors
-from dpm2_core.frame import Edge, Keyframe, Registration
+from dpm2_core.estimates import Edge, Keyframe, Registration
 from dpm2_core.slam.store.cloud_codec import pack_cloud
 from dpm2_core.slam.store.map_store import Change, MapStore
 rng = np.random.default_rng(0)
