@@ -28,7 +28,7 @@ from benchmarks.harness import (
     write_report,
 )
 from benchmarks.neural_view import view
-from benchmarks.pairs import PairMethod, all_pairs, by_registration, gicp_from_identity, kiss_from_identity
+from benchmarks.pairs import APART, PairMethod, all_pairs, by_registration, gicp_from_identity, kiss_from_identity
 from benchmarks.repeated import repeated
 from benchmarks.unseen import corruption, image_matters, overlap, synthetic
 from benchmarks.unseen_sensors import other_sensors
@@ -103,8 +103,8 @@ def _of_drives(one: Callable[[Array, list[Frame], DeepPointMap2, Options], Any])
 
 
 def real_pairs(poses: Array, frames: list[Frame], network: DeepPointMap2, options: Options) -> dict[str, Any]:
-    """Near pairs by the network, and refined by the points; those 10-20 m apart by every method; none with a prior.
-    The network's errors are also stated against poses that the points have fitted."""
+    """Near pairs by the network, and refined by the points; those 10 m apart or more by every method; none with a
+    prior. The network's errors are also stated against poses that the points have fitted."""
     methods: dict[str, PairMethod] = {
         name: by_registration(make_registration(settings_of(options, f"slam.registration={name}")))
         for name in ("neural", "refined", "geometric")
@@ -114,7 +114,7 @@ def real_pairs(poses: Array, frames: list[Frame], network: DeepPointMap2, option
         methods["small_gicp"] = gicp
     if (config := kiss_config(options)) is not None:
         methods[BASELINE] = kiss_from_identity(config)
-    kinds = {"consecutive": near, "8 apart": near, "10-20 m": methods}
+    kinds = {"consecutive": near, "8 apart": near} | {f"{low}-{high} m": methods for low, high in APART}
     points = make_registration(settings_of(options, "slam.registration=geometric"))
     return all_pairs(kinds, frames, poses, options.pairs, points)
 

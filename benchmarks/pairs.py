@@ -17,6 +17,8 @@ from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration
 
 SUCCESS_M, SUCCESS_DEG = 0.6, 1.5
 """Errors below which a registration counts as a success."""
+APART = (10, 20), (20, 30), (30, 40), (40, 50)
+"""Distances of the far pairs, m."""
 MANY = 10
 """Times as many pairs where no odometry asks for each: of frames that are described anyway they cost little, and
 medians of 45 pairs differ by a third."""
@@ -40,14 +42,15 @@ def pairs_of(poses: Array, most: int) -> dict[str, list[tuple[int, int]]]:
     kinds: dict[str, list[tuple[int, int]]] = {
         "consecutive": [(i, i + 1) for i in range(n - 1)],
         "8 apart": [(i, i + 8) for i in range(n - 8)],
-        "10-20 m": [],
     }
-    rng = np.random.default_rng(0)
-    for i in range(n):
-        distance = np.linalg.norm(at[i + 1 :] - at[i], axis=1)
-        reach = np.flatnonzero((distance >= 10) & (distance <= 20))
-        if len(reach):
-            kinds["10-20 m"].append((i, i + 1 + int(rng.choice(reach))))
+    for low, high in APART:
+        rng, kind = np.random.default_rng(0), f"{low}-{high} m"
+        kinds[kind] = []
+        for i in range(n):
+            distance = np.linalg.norm(at[i + 1 :] - at[i], axis=1)
+            reach = np.flatnonzero((distance >= low) & (distance <= high))
+            if len(reach):
+                kinds[kind].append((i, i + 1 + int(rng.choice(reach))))
     known: NDArray[np.bool_] = np.isfinite(poses.sum((1, 2)))
     out = {}
     for kind, pairs in kinds.items():

@@ -80,7 +80,8 @@ class Batch(NamedTuple):
 
 
 def draw_group(poses: Array, noise: np.random.Generator, frames: int, radius: float) -> NDArray[np.intp]:
-    """Indices (frames,) of one frame and others whose distance from it is about uniform in 0..radius m.
+    """Indices (frames,) of one frame and others up to `radius` m from it, as many up to a quarter of it as
+    beyond: of near pairs a network learns accuracy, of far ones reach.
 
     poses (n, 4, 4); frames repeat where the neighborhood holds too few.
     """
@@ -92,7 +93,7 @@ def draw_group(poses: Array, noise: np.random.Generator, frames: int, radius: fl
         return np.full(frames, first)
     distance = np.linalg.norm(poses[others, :3, 3] - poses[first, :3, 3], axis=1)
     chosen = [first]
-    for requested in noise.uniform(0, radius, frames - 1):
+    for requested in radius * noise.uniform(0, 1, frames - 1) ** 2:
         gap = np.abs(distance - requested)
         if len(others) >= frames - 1:
             gap[np.isin(others, chosen)] = np.inf
