@@ -19,6 +19,10 @@ from dpm2_core.files import atomic_write, json_text
 
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="YAML file; `dpm2 config dump` shows every key.")]
 Overrides = Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, such as slam.map.voxel=0.3.")]
+Workers = Annotated[
+    int | None,
+    typer.Option("--workers", min=1, help="By default one per processor; the result is the same."),
+]
 JsonFile = Annotated[
     Path | None, typer.Option("--json", metavar="FILE", help="Write the figures to a file; -: to stdout, alone.")
 ]

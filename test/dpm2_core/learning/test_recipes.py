@@ -31,6 +31,7 @@ READ_BY: dict[str, type[Settings]] = {
     "train_small_corners": RegistrationTrainingSettings,
     "train_small_image": ImageTrainingSettings,
     "train_small_light": RegistrationTrainingSettings,
+    "train_small_far": RegistrationTrainingSettings,
     "train_small_phase2": OverlapTrainingSettings,
     "train_small_pose": RegistrationTrainingSettings,
     "train_small_real": RegistrationTrainingSettings,
