@@ -30,20 +30,21 @@ def _has_pair(poses: Array, low: float, high: float) -> bool:
 
 
 class PairSet:
-    """Pairs drawn once: half up to 5 m apart, half 5 to 20 m; every second one with the source turned at random.
+    """Pairs drawn once: half up to 5 m apart, half 5 to `farthest` m; of every second two the source turned at random.
 
     Raises:
         UsageError: no two frames of a drive are so far apart.
     """
 
-    def __init__(self, root: Path, pairs: int, network: NetworkSettings, images: bool) -> None:
+    def __init__(self, root: Path, pairs: int, network: NetworkSettings, images: bool, farthest: float = FAR) -> None:
         noise = np.random.default_rng(0)
         self.drives = open_packed(root)
         self.network, self.images = network, images
         self.frames: dict[tuple[int, int, float], int] = {}
         self.pairs: list[tuple[int, int, np.ndarray, float]] = []
         self._scale: list[float] = []
-        for low, high in ((0.0, NEAR), (NEAR, FAR)):
+        bounds = (0.0, NEAR), (NEAR, farthest)
+        for low, high in bounds:
             if not any(_has_pair(drive.poses, low, high) for drive in self.drives):
                 raise UsageError(f"{root}: no two frames of a drive are {low:g} to {high:g} m apart, as is measured")
         while len(self.pairs) < pairs:
@@ -51,7 +52,7 @@ class PairSet:
             poses = self.drives[d].poses
             a = int(noise.integers(len(poses)))
             distance = np.linalg.norm(poses[:, :3, 3] - poses[a, :3, 3], axis=1)
-            low, high = (0.0, NEAR) if len(self.pairs) % 2 == 0 else (NEAR, FAR)
+            low, high = bounds[len(self.pairs) % 2]
             others = np.flatnonzero((distance > low) & (distance <= high))
             if len(others) == 0:
                 continue

@@ -12,7 +12,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from dpm2_core.config import Settings
-from dpm2_core.evaluation.pair_set import PairSet
+from dpm2_core.evaluation.pair_set import FAR, PairSet
 from dpm2_core.learning.dataset import DataSettings, GroupDataset
 from dpm2_core.learning.pair_sampling import SetPairs, merge_tokens, sample_set_pairs
 from dpm2_core.learning.registration_loss import LossSettings, registration_loss
@@ -167,7 +167,9 @@ def validator(
     settings: RegistrationTrainingSettings, network: NetworkSettings
 ) -> Callable[[nn.Module], dict[str, float]]:
     """A function that measures a module on frame pairs of unseen worlds."""
-    pairs = PairSet(Path(settings.validation), settings.validation_pairs, network, settings.data.images)
+    data = settings.data
+    farthest = max(data.radius, FAR)
+    pairs = PairSet(Path(settings.validation), settings.validation_pairs, network, data.images, farthest)
 
     def validate(module: nn.Module) -> dict[str, float]:
         assert isinstance(module, RegistrationTraining)

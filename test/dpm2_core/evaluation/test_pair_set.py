@@ -27,12 +27,14 @@ def packed(folder: Path, at: np.ndarray, **about: object) -> Path:
     return folder
 
 
-def test_half_of_the_pairs_are_near(tmp_path: Path) -> None:
-    pairs = PairSet(packed(tmp_path, np.arange(40.0)), 20, preset("small"), False).pairs
+@pytest.mark.parametrize("farthest", [20, 35])
+def test_half_of_the_pairs_are_near(tmp_path: Path, farthest: float) -> None:
+    pairs = PairSet(packed(tmp_path, np.arange(40.0)), 40, preset("small"), False, farthest).pairs
     distances = np.array([pair[3] for pair in pairs])
-    assert len(pairs) == 20
+    assert len(pairs) == 40
     assert ((distances[::2] > 0) & (distances[::2] <= 5)).all()
-    assert ((distances[1::2] > 5) & (distances[1::2] <= 20)).all()
+    assert ((distances[1::2] > 5) & (distances[1::2] <= farthest)).all()
+    assert distances.max() > farthest - 10  # 20 draws
 
 
 @pytest.mark.parametrize(
