@@ -30,7 +30,7 @@ def _has_pair(poses: Array, low: float, high: float) -> bool:
 
 
 class PairSet:
-    """Pairs drawn once: half up to 5 m apart, half 5 to `farthest` m; of every second two the source turned at random.
+    """Pairs drawn once: half up to 5 m apart, half 5 to `farthest` m, two of four with the source turned at random.
 
     Raises:
         UsageError: no two frames of a drive are so far apart.
