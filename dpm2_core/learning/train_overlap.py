@@ -15,6 +15,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from dpm2_core.config import Settings
+from dpm2_core.data.packed import open_packed
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3_torch
 from dpm2_core.learning.dataset import GroupDataset, GroupSettings
@@ -160,8 +161,10 @@ def train_overlap(settings: OverlapTrainingSettings, out: Path, resume: bool = F
 
 
 def validator(settings: OverlapTrainingSettings, network: NetworkSettings) -> Callable[[nn.Module], dict[str, float]]:
-    """A function that measures the average precision on fixed batches of unseen worlds."""
-    options = settings.data.model_copy(update={"packed": {settings.validation: 1.0}})
+    """A function that measures the average precision on fixed batches of unseen worlds, by their images if they have
+    any."""
+    images = settings.data.images and any(drive.has_images for drive in open_packed(Path(settings.validation)))
+    options = settings.data.model_copy(update={"packed": {settings.validation: 1.0}, "images": images})
     data = GroupDataset(options, network, draw_overlap, seed=1)
     batch = cache(lambda number: data[number, 0])
 

@@ -16,6 +16,7 @@ import torch
 from safetensors.torch import load_file
 
 from dpm2_core.config import merged, settings_from
+from dpm2_core.data.packed import Sample, write_packed
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.learning.augment import AugmentSettings
 from dpm2_core.learning.checkpoint import Log, load_checkpoint, save_checkpoint
@@ -207,6 +208,19 @@ def test_overlap_changes_the_heads_that_judge_alone(settings: RegistrationTraini
     changed = {name for name in before if not torch.equal(before[name], after[name])}
     heads = {".".join(name.split(".")[:2]) for name in changed}
     assert heads == {"decoder.overlap", "decoder.confidence"}
+
+
+@pytest.mark.slow
+def test_overlap_with_images_is_validated_on_worlds_without(
+    settings: RegistrationTrainingSettings, samples: list[Sample], tmp_path: Path
+) -> None:
+    """As in the recipe of the shipped weights: it was an error that no packed drive has images."""
+    write_packed(tmp_path / "val" / "world", [sample._replace(images=()) for sample in samples], {"source": "boxes"})
+    start = train_registration(settings, tmp_path / "one")
+    second = _overlap(settings, start, steps=1)
+    second = second.model_copy(update={"validation": str(tmp_path / "val"), "validation_batches": 1})
+    train_overlap(second, tmp_path / "two")
+    assert "average_precision" in (tmp_path / "two" / "log.jsonl").read_text()
 
 
 def _overlap(settings: RegistrationTrainingSettings, start: Path, **optimiser: float) -> OverlapTrainingSettings:
