@@ -320,11 +320,11 @@ def test_a_scan_that_enters_the_map_is_registered_once_more(suburb_drive: Drive)
     for refined in (0, 16):
         neural = NeuralSettings(frames=1, refined=refined)
         registration = make_registration(SlamSettings(registration="neural", neural=neural))
-        for i in (0, 4, 8):
+        for i in (0, 4, 12, 8):
             registration.update(registration.prepare(frames[i], np.zeros(6)), truth[i])
-        for i in (12, 9):
+        for i in (6, 9):  # between two of the map, which both together make surer than the nearest alone
             scan = registration.prepare(frames[i], np.zeros(6))
             ends.append(registration.register(scan, Prediction([truth[i]])).T_target_source)
     assert not np.array_equal(ends[0], ends[2])  # farther than `spacing` from the last one
     assert np.array_equal(ends[1], ends[3])
-    assert np.linalg.norm((ends[2] - truth[12])[:3, 3]) < 0.2
+    assert np.linalg.norm((ends[2] - truth[6])[:3, 3]) < 0.2
