@@ -32,10 +32,12 @@ from dpm2_core.network.weights import load_fitting, load_weights, save_weights
 class RegistrationTraining(nn.Module):
     """The network with its loss, as one module, so that it compiles and distributes whole."""
 
-    def __init__(self, network: NetworkSettings, loss: LossSettings) -> None:
+    def __init__(self, network: NetworkSettings, loss: LossSettings, encoder: bool = True) -> None:
+        """`encoder` False: it does not learn."""
         super().__init__()
         self.loss = loss
         self.model = DeepPointMap2(network)
+        self.model.encoder.requires_grad_(encoder)
         channels: list[int] = self.model.encoder.points.channels  # type: ignore[assignment]
         sizes = [stage.points for stage in network.points.stages]
         self.level = min(range(len(sizes)), key=lambda i: abs(sizes[i] - 256))  # key-points as dense as descriptors
@@ -50,7 +52,7 @@ class RegistrationTraining(nn.Module):
         self, points: PointBatch, views: Views | None, plans: tuple[SetPairs, ...]
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Mean loss over the plans, and figures of the first."""
-        encoded = self.model.encoder(points, views)
+        encoded = self.model.encoder(points, views)  # without a graph where it does not learn
         total, figures = self.pair_loss(encoded.tokens, plans)
         if self.loss.backbone:
             auxiliary = self._backbone_loss(encoded.scales[self.level], plans[0])
@@ -114,6 +116,8 @@ class RegistrationTrainingSettings(Settings):
     """Fraction of steps that also register merged sets: one frame to the others, or half to half."""
     start: str = ""
     """Weights (safetensors) to start from; empty: random."""
+    encoder: bool = True
+    """Whether the encoder learns; else the decoder alone, for the descriptors that `start` makes."""
     partial: bool = False
     """Take from `start` what fits, where the network is another; the rest is random, and named in the new weights."""
 
@@ -139,7 +143,7 @@ def train_registration(
     optimizer, weights = settings.optimiser, out / "weights.safetensors"
     torch.manual_seed(optimizer.seed)
     network = preset(settings.preset, settings.network)
-    module = RegistrationTraining(network, settings.loss)
+    module = RegistrationTraining(network, settings.loss, settings.encoder)
     random: list[str] = []
     if settings.start and settings.partial:
         random = load_fitting(module.model, Path(settings.start))

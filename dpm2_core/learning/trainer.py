@@ -128,8 +128,7 @@ def update_ema(ema: nn.Module, module: nn.Module, decay: float, step: int) -> No
         average.copy_(value)
     averaged: list[Tensor] = list(ema.parameters())
     now: list[Tensor] = list(module.parameters())
-    torch._foreach_mul_(averaged, decay)
-    torch._foreach_add_(averaged, now, alpha=1 - decay)
+    torch._foreach_lerp_(averaged, now, 1 - decay)  # exact for what does not learn
 
 
 @dataclass(frozen=True)

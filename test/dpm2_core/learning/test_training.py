@@ -211,6 +211,18 @@ def test_overlap_changes_the_heads_that_judge_alone(settings: RegistrationTraini
 
 
 @pytest.mark.slow
+def test_the_decoder_alone_learns_where_the_encoder_does_not(
+    settings: RegistrationTrainingSettings, tmp_path: Path
+) -> None:
+    """So that the descriptors stay those of the weights that it began with."""
+    start = train_registration(settings, tmp_path / "one")
+    second = settings.model_copy(update={"start": str(start), "encoder": False})
+    before, after = load_file(start), load_file(train_registration(second, tmp_path / "two"))
+    changed = {name.split(".")[0] for name in before if not torch.equal(before[name], after[name])}
+    assert changed == {"decoder"}
+
+
+@pytest.mark.slow
 def test_overlap_with_images_is_validated_on_worlds_without(
     settings: RegistrationTrainingSettings, samples: list[Sample], tmp_path: Path
 ) -> None:
