@@ -157,7 +157,7 @@ def test_no_process_outlives_a_killed_program() -> None:
         "from dpm2_core.slam.graph import pose_graph as p\n"
         "p.SHORT = 0\n"
         "g = p.PoseGraph(p.RobustSettings(), background=True)\n"
-        "from dpm2_core.frame import Edge, Registration\n"
+        "from dpm2_core.estimates import Edge, Registration\n"
         "r = Registration(np.eye(4), np.eye(6) * 1e-2)\n"
         "g.add_node(np.eye(4))\n"
         "for n in range(9): g.add_node(np.eye(4), Edge('odometry', n, n + 1, r))\n"
