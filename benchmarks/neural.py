@@ -114,7 +114,7 @@ def real_pairs(poses: Array, frames: list[Frame], network: DeepPointMap2, option
         methods["small_gicp"] = gicp
     if (config := kiss_config(options)) is not None:
         methods[BASELINE] = kiss_from_identity(config)
-    kinds = {"consecutive": near, "8 apart": near} | {f"{low}-{high} m": methods for low, high in APART}
+    kinds = {"consecutive": near, "8 apart": near} | dict.fromkeys(APART, methods)
     points = make_registration(settings_of(options, "slam.registration=geometric"))
     return all_pairs(kinds, frames, poses, options.pairs, points)
 

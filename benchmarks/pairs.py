@@ -17,8 +17,8 @@ from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration
 
 SUCCESS_M, SUCCESS_DEG = 0.6, 1.5
 """Errors below which a registration counts as a success."""
-APART = (10, 20), (20, 30), (30, 40), (40, 50)
-"""Distances of the far pairs, m."""
+APART = {f"{low}-{low + 10} m": (low, low + 10) for low in (10, 20, 30, 40)}
+"""Distances of the far pairs, m, by their name."""
 MANY = 10
 """Times as many pairs where no odometry asks for each: of frames that are described anyway they cost little, and
 medians of 45 pairs differ by a third."""
@@ -43,9 +43,8 @@ def pairs_of(poses: Array, most: int) -> dict[str, list[tuple[int, int]]]:
         "consecutive": [(i, i + 1) for i in range(n - 1)],
         "8 apart": [(i, i + 8) for i in range(n - 8)],
     }
-    for low, high in APART:
-        rng, kind = np.random.default_rng(0), f"{low}-{high} m"
-        kinds[kind] = []
+    for kind, (low, high) in APART.items():
+        rng, kinds[kind] = np.random.default_rng(0), []
         for i in range(n):
             distance = np.linalg.norm(at[i + 1 :] - at[i], axis=1)
             reach = np.flatnonzero((distance >= low) & (distance <= high))

@@ -15,14 +15,14 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from dpm2_core.console import Console
 from dpm2_core.data.source import parse_range as parse_range
 from dpm2_core.errors import UsageError, exit_code
+from dpm2_core.evaluation.machine import processors
 from dpm2_core.files import atomic_write, json_text
 
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="YAML file; `dpm2 config dump` shows every key.")]
 Overrides = Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, such as slam.map.voxel=0.3.")]
-Workers = Annotated[
-    int | None,
-    typer.Option("--workers", min=1, help="By default one per processor; the result is the same."),
-]
+Workers = Annotated[int, typer.Option(min=1, help="At a time; they do not change the result.")]
+PROCESSORS = processors()
+"""The default."""
 JsonFile = Annotated[
     Path | None, typer.Option("--json", metavar="FILE", help="Write the figures to a file; -: to stdout, alone.")
 ]

@@ -8,10 +8,9 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from dpm2_core.commands.options import Workers, progress_bar
+from dpm2_core.commands.options import PROCESSORS, Workers, progress_bar
 from dpm2_core.config import settings_from
 from dpm2_core.console import Console
-from dpm2_core.evaluation.machine import processors
 from dpm2_core.sim.sensors import real_sensor
 from dpm2_core.sim.settings import DriveConfig, PresetName
 
@@ -43,7 +42,7 @@ def sim(
         bool, typer.Option("--imu", help="With imu.txt, of an IMU at 100 Hz that errs as real ones.")
     ] = False,
     gnss: Annotated[bool, typer.Option("--gnss", help="With gnss.txt, fixes of a plain receiver at 5 Hz.")] = False,
-    workers: Workers = None,
+    workers: Workers = PROCESSORS,
 ) -> None:
     """Simulate a drive: scans, images, poses, point labels, scans without moving objects, and a map of the ground."""
     from dpm2_core.sim.drive import simulate  # embree and the rest are slow to import for the other commands
@@ -55,7 +54,6 @@ def sim(
     if sensor == "real":
         drive = drive.model_copy(update={"lidar": real_sensor(drive.lidar)})
     console = Console(stderr=True)
-    workers = workers or processors()
     with progress_bar(console) as bar:
         task = bar.add_task(f"{preset} -> {out}", total=None)
         made = simulate(out, drive, workers, lambda done, total: bar.update(task, completed=done, total=total))

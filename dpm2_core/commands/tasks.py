@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from dpm2_core.commands.options import JsonFile, Workers, parse_names, progress_bar, show
+from dpm2_core.commands.options import PROCESSORS, JsonFile, Workers, parse_names, progress_bar, show
 from dpm2_core.commands.train import ConfigOption, OutOption, ResumeOption, SetOption, train
 from dpm2_core.config import load_settings
 from dpm2_core.console import Console
 from dpm2_core.errors import UsageError
-from dpm2_core.evaluation.machine import processors
 from dpm2_core.tables import FigureTable
 
 if TYPE_CHECKING:  # torch is slow to import
@@ -31,7 +30,7 @@ def tasks_data(
     out: Annotated[Path, typer.Argument(help="Folder to fill with train/NN and val/NN; what is there stays.")],
     config: ConfigOption = None,
     settings: SetOption = None,
-    workers: Workers = None,
+    workers: Workers = PROCESSORS,
 ) -> None:
     """Synthetic drives for gndnet, dslr and ae_lidar, with exact labels and twins without traffic."""
     from dpm2_core.tasks.drives import TaskDriveSettings, make_task_drives
@@ -39,7 +38,7 @@ def tasks_data(
     chosen = load_settings(TaskDriveSettings, config, settings or [])
     with progress_bar() as bar:
         task = bar.add_task(f"{out}")
-        make_task_drives(out, chosen, workers or processors(), lambda name, done, total: bar.update(
+        make_task_drives(out, chosen, workers, lambda name, done, total: bar.update(
             task, description=f"{out}/{name}", completed=done, total=total))  # fmt: skip
 
 

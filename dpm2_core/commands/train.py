@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from dpm2_core.commands.options import Workers, parse_range, progress_bar
+from dpm2_core.commands.options import PROCESSORS, Workers, parse_range, progress_bar
 from dpm2_core.config import load_settings
 from dpm2_core.console import Console
 from dpm2_core.errors import Dpm2Error, UsageError, printable
-from dpm2_core.evaluation.machine import processors
 
 if TYPE_CHECKING:  # torch is slow to import
     from dpm2_core.learning.train_image import ImageTrainingSettings
@@ -32,12 +31,12 @@ def data(
     out: Annotated[Path, typer.Argument(help="Folder to fill; worlds that are there already stay.")],
     config: ConfigOption = None,
     settings: SetOption = None,
-    workers: Workers = None,
+    workers: Workers = PROCESSORS,
 ) -> None:
     """Scans of many synthetic worlds, packed for training."""
     from dpm2_core.learning.generate import GenerateSettings, generate  # torch and embree are slow to import
 
-    chosen, workers = load_settings(GenerateSettings, config, settings or []), workers or processors()
+    chosen = load_settings(GenerateSettings, config, settings or [])
     with progress_bar() as bar:
         task = bar.add_task(f"worlds -> {out}", total=chosen.worlds)
         generate(out, chosen, workers, lambda done, total: bar.update(task, completed=done, total=total))

@@ -101,10 +101,23 @@ class MotionState:
             return replace(result, ok=False, reason=f"{degrees:.0f} deg from the prediction")
         return result
 
-    def move(self, registration: Registration, dt: float, led: bool) -> None:
-        """A frame was registered, `dt` s after the one before: the motion that led there. `led`: from where the other
-        odometry was. `register` follows."""
-        seconds = self.seconds + dt
+    def advance(self, registration: Registration, dt: float, stamp: int | None, led: bool) -> None:
+        """A frame was registered, `dt` s after the one before: go on from its pose, by the motion that led there.
+
+        Args:
+            registration: that of a map's first frame tells no motion. led: another odometry led to it.
+        """
+        seconds, moved = self.seconds + dt, registration.method != "first"
+        if moved:
+            self._move(registration, seconds, led)
+        self.register(registration, stamp, moved)
+        self._open = self._open + seconds if registration.worst_sigma >= OPEN else 0.0
+        if moved and self._open:
+            # What the scene leaves open ends at 1 m; the motion does not, and each pose follows from the one before.
+            self.covariance[3:, 3:] += along_open(registration.of_scene[3:, 3:], self.of_velocity) * self._open**2
+
+    def _move(self, registration: Registration, seconds: float, led: bool) -> None:
+        """The motion from the last registered frame to one `seconds` later."""
         of_prediction = self.step.covariance if led and self.step is not None else self.of_prediction(seconds)
         of_motion = combined(registration.of_scene[3:, 3:], of_prediction[3:, 3:])
         self.of_velocity = of_motion / seconds**2
@@ -125,13 +138,6 @@ class MotionState:
         if self.other is not None:
             self.other.keep()
         self.covariance = registration.covariance.copy()
-
-    def widen(self, registration: Registration, seconds: float, moved: bool) -> None:
-        """By how far the pose may be off along directions that scenes have left open up to this frame, `seconds` after
-        the one before it: what a scene leaves open ends at 1 m, the motion does not."""
-        self._open = self._open + seconds if registration.worst_sigma >= OPEN else 0.0
-        if moved and self._open:
-            self.covariance[3:, 3:] += along_open(registration.of_scene[3:, 3:], self.of_velocity) * self._open**2
 
     def coast(self, dt: float) -> None:
         """A frame was not registered, `dt` s after the one before: follow the prediction, ever less certain."""

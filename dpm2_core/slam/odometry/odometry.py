@@ -231,7 +231,7 @@ class Odometry:
         if DOUBTED[0] * usual <= dt <= DOUBTED[1] * usual or result.method == "none":
             return match, dt
         T_usual = motion.predicted(motion.turned(motion.twist, motion.seconds + usual), usual)
-        if dt < usual or not result.ok or result.confidence < Prediction([T_predicted]).convincing:
+        if dt < usual or not Prediction([T_predicted]).convinced(result):
             other = matcher.match(frame, scan, T_usual, usual)
             if other.result.ok and (not result.ok or other.result.confidence > result.confidence + _BETTER):
                 match, result = other, other.result
@@ -287,14 +287,10 @@ class Odometry:
                 if self._bridge is not None:
                     motion.covariance = motion.covariance + self._bridge.covariance(motion.T)
             return
-        moved, seconds = result.method != "first", motion.seconds + dt
-        if moved:
-            motion.move(result, dt, match.led)
         if self._bridge is None:
             self._failures = 0
-        motion.register(result, self._clock.stamp, moved)
+        motion.advance(result, dt, self._clock.stamp, match.led)
         self._registration.update(match.scan, motion.T)
-        motion.widen(result, seconds, moved)
 
     def _state(self, registration: Registration) -> State:
         if self._failures >= self._settings.lost_after:

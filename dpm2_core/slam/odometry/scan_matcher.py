@@ -101,18 +101,18 @@ class ScanMatcher:
         result = motion.gated(self.registration.register(scan, prediction), T, dt)
         # A wrong step holds the scan where it leads; that few of its points fit there is what tells the two apart.
         agrees = result.ok and motion.other.agrees(motion.T_registered, result)
-        return (result if agrees else None), agrees and result.confidence >= prediction.convincing
+        return (result if agrees else None), agrees and prediction.convinced(result)
 
     def _from_rest(self, scan: Scan, T: Array, dt: float) -> Registration:
         """While the velocity is unknown: the best of many starts; after a pause first as before it."""
         if self.bridge is not None and self.bridge.twist is not None:
             expected = self.bridge.expected(T, dt)
             result = self.registration.register(scan, expected)
-            if result.ok and result.confidence >= expected.convincing:
+            if expected.convinced(result):
                 return result
         for starts in starts_from_rest(T, self.settings.turns):
             prediction = Prediction(starts, widen=2.0)
             result = self.registration.register(scan, prediction)
-            if result.ok and result.confidence >= prediction.convincing:
+            if prediction.convinced(result):
                 break
         return result

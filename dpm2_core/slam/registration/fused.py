@@ -162,7 +162,7 @@ def _sure(points: Registration, prediction: Prediction) -> bool:
     Of a scan that has moved much finds nothing in a young map of few beams. Both the network and the likelihood of the
     points then prefer the place where the map was made, as what the beams meet looks the same from there.
     """
-    fits = points.confidence >= prediction.convincing or prediction.expects(points.T_target_source)
+    fits = prediction.convinced(points) or prediction.expects(points.T_target_source)
     return points.ok and fits and points.worst_sigma <= _SURE_SIGMA
 
 

@@ -76,6 +76,10 @@ class Prediction:
         """
         return 0.7 if self.known else 0.75
 
+    def convinced(self, points: Registration) -> bool:
+        """Whether a result of points fits well enough not to be doubted; see `convincing`."""
+        return points.ok and points.confidence >= self.convincing
+
 
 class ScanRegistration(Protocol):
     """Registers scans to what it remembers of earlier ones. T_target_source of its results is T_odom_lidar.

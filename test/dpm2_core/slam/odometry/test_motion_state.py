@@ -27,9 +27,7 @@ def driven(frames: int, period: float = 0.1, along: float = 0.01) -> MotionState
     motion.register(registered(np.eye(4)), None, moved=False)
     for i in range(1, frames):
         result = registered(se3.exp(TWIST * period * i), along=along)
-        motion.move(result, period, led=False)
-        motion.register(result, None, moved=True)
-        motion.widen(result, period, moved=True)
+        motion.advance(result, period, None, led=False)
     return motion
 
 
@@ -71,7 +69,5 @@ def test_along_an_open_direction_the_covariance_grows_with_the_time_in_it_and_en
     assert long.covariance[3, 3] > 4 * short.covariance[3, 3]
     np.testing.assert_allclose(long.covariance[4, 4], 0.01**2)
     out = registered(se3.exp(TWIST * 2))
-    long.move(out, 0.1, led=False)
-    long.register(out, None, moved=True)
-    long.widen(out, 0.1, moved=True)
+    long.advance(out, 0.1, None, led=False)
     np.testing.assert_allclose(long.covariance, out.covariance)
