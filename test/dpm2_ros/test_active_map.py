@@ -205,7 +205,7 @@ def test_a_map_that_cannot_be_kept_goes_on(tmp_path: Path) -> None:
 
 def test_a_map_whose_file_is_incomplete_is_not_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Another program writes to the file, which is as a full disk: the folder is made, no copy; then all is saved."""
-    monkeypatch.setattr("dpm2_core.slam.store.map_store.BUSY", 0.1)
+    monkeypatch.setattr("dpm2_core.slam.store.map_connection.BUSY", 0.1)
     active = ActiveMap(config(map_directory=str(tmp_path)), "", LOG)
     active.add(keyframes(1)[0])
     with closing(sqlite3.connect(tmp_path / "drive.dpm2map", isolation_level=None)) as other:
@@ -277,7 +277,7 @@ def test_where_its_map_cannot_grow_a_robot_is_found_as_before(
     found: ActiveMap, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Another program writes to the file; once it has ended, the map grows at the robot's place."""
-    monkeypatch.setattr("dpm2_core.slam.store.map_store.BUSY", 0.1)
+    monkeypatch.setattr("dpm2_core.slam.store.map_connection.BUSY", 0.1)
     with closing(sqlite3.connect(tmp_path / "drive.dpm2map", isolation_level=None)) as other:
         other.execute("BEGIN IMMEDIATE")
         with pytest.raises(Dpm2Error, match="locked"):

@@ -9,7 +9,6 @@ take the last seconds with it, but never the map.
 from __future__ import annotations
 
 import sqlite3
-import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field
@@ -18,14 +17,14 @@ from pathlib import Path
 from typing import Any
 
 from dpm2_core._version import __version__
-from dpm2_core.database import Connection, connect
-from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.errors import Dpm2Error
 from dpm2_core.estimates import Edge, Keyframe
 from dpm2_core.files import part_beside
 from dpm2_core.frame import Array, Georeference
 from dpm2_core.slam.store import schema
 from dpm2_core.slam.store.cloud_store import Loan
-from dpm2_core.slam.store.map_file import copy_with_log, remove_log, remove_map
+from dpm2_core.slam.store.map_connection import MapConnection, create_map, explained, open_map
+from dpm2_core.slam.store.map_file import remove_log, remove_map
 from dpm2_core.slam.store.rows import (
     RemovedKeyframe,
     Session,
@@ -38,10 +37,6 @@ from dpm2_core.slam.store.rows import (
     removed_row,
     with_crc,
 )
-
-BUSY = 5.0
-"""s to wait for another program: a reader never blocks the writer for long, another writer is an error."""
-_HEAD = b"SQLite format 3"
 
 
 @dataclass
@@ -68,64 +63,27 @@ class Change:
 class MapStore:
     """An open map file. Not for two threads at once."""
 
-    def __init__(self, path: Path, connection: sqlite3.Connection, read_only: bool) -> None:
+    def __init__(self, path: Path, connection: MapConnection, read_only: bool) -> None:
         """Use `create` and `open`."""
         self.path = path
         self.read_only = read_only
         self.session = 0
         self._file = _identity(path)
         self._newest = 0  # number of the last session that this program has written
-        self._connection = connection
+        self._opened = connection
+        self._connection = connection.sql
         self._together = False
-        self._copy: tempfile.TemporaryDirectory[str] | None = None
 
     @classmethod
     def create(cls, path: Path) -> MapStore:
-        """A new, empty map; `begin_session` comes next.
-
-        Raises:
-            UsageError: there is a file already. Dpm2Error: it cannot be made.
-        """
-        with _explained(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            try:
-                path.touch(exist_ok=False)  # of two programs that want the same name, one gets it
-            except FileExistsError:
-                raise UsageError(f"{path}: there is a file already") from None
-            try:
-                with closing(_connect(path, "rw")) as sql:
-                    schema.create(sql)  # not in FILE-wal, the end of which a power cut may take
-                return cls.open(path, read_only=False)
-            except BaseException:
-                remove_map(path)  # what is no map yet would be in the way of the next one
-                raise
+        """A new, empty map; `begin_session` comes next. Raises as `create_map` does."""
+        create_map(path)
+        return cls.open(path, read_only=False)
 
     @classmethod
     def open(cls, path: Path, read_only: bool = True) -> MapStore:
-        """A map that is there. Opened read-only, no byte of it changes; else an older one is brought up to date.
-
-        Raises:
-            UsageError: no map, or one of a later dpm2. Dpm2Error: it cannot be read, or written, or is damaged.
-        """
-        if not path.is_file():
-            raise UsageError(f"{path}: no such map file")
-        with _explained(path):
-            if _head(path)[:15] != _HEAD:
-                raise UsageError(f"{path}: not a dpm2 map")
-            store = _open_read_only(path) if read_only else cls(path, _connect(path, "rw"), False)
-            try:
-                version = schema.version_of(store._connection, path)
-                schema.check(store._connection, version)
-                if version < schema.VERSION and not read_only:
-                    schema.migrate(store._connection, version)
-                elif version < schema.TABLES:
-                    store = _migrated_copy(store, version)
-                if not read_only:
-                    _durable(store._connection)
-            except BaseException:
-                store.close()
-                raise
-            return store
+        """A map that is there; see `open_map`, also for what it raises."""
+        return cls(path, open_map(path, read_only), read_only)
 
     def begin_session(self, config: str = "", weights: str = "") -> int:
         """Note that this program writes from now on; returns the number of the session, from 1.
@@ -192,7 +150,7 @@ class MapStore:
         Raises:
             Dpm2Error: it cannot be read.
         """
-        with _explained(self.path):
+        with explained(self.path):
             return int(self._connection.execute("SELECT coalesce(max(node), -1) + 1 FROM keyframes").fetchone()[0])
 
     @contextmanager
@@ -217,7 +175,7 @@ class MapStore:
         """
         names = () if columns else schema.CONTENT.get(table, ())
         requested = ", ".join((*names, "crc")) if names else columns or "*"
-        with _explained(self.path):
+        with explained(self.path):
             before = None
             query = f"SELECT rowid, {requested} FROM {table} {where and f'WHERE {where}'} ORDER BY rowid"
             for key, *row in self._connection.execute(query):
@@ -234,7 +192,7 @@ class MapStore:
         Raises:
             Dpm2Error: it cannot be read.
         """
-        with _explained(self.path):
+        with explained(self.path):
             row = self._connection.execute(f"SELECT {what} FROM payloads WHERE node = ?", (node,)).fetchone()
         return None if row is None else row[0]
 
@@ -248,9 +206,7 @@ class MapStore:
             with suppress(sqlite3.Error):  # there is a reader, or the disk is full: FILE-wal stays, and nothing is lost
                 self._connection.execute("PRAGMA busy_timeout = 200")
                 self._connection.execute("PRAGMA journal_mode = DELETE")
-        self._connection.close()
-        if self._copy is not None:
-            self._copy.cleanup()
+        self._opened.close()
 
     def __enter__(self) -> MapStore:
         return self
@@ -265,7 +221,7 @@ class MapStore:
         Raises:
             Dpm2Error: it cannot be read.
         """
-        with _explained(self.path):
+        with explained(self.path):
             self._connection.execute("BEGIN")
             try:
                 yield
@@ -279,7 +235,7 @@ class MapStore:
             Dpm2Error: it could not be written.
         """
         part = part_beside(path)
-        with _explained(path):
+        with explained(path):
             try:
                 with closing(sqlite3.connect(part)) as copy:
                     self._connection.backup(copy)
@@ -290,7 +246,7 @@ class MapStore:
 
     @contextmanager
     def _transaction(self) -> Iterator[sqlite3.Connection]:
-        with _explained(self.path):
+        with explained(self.path):
             if self._together:
                 yield self._connection
                 return
@@ -309,31 +265,6 @@ def _insert(sql: sqlite3.Connection, table: str, rows: Sequence[tuple[Any, ...]]
         sql.executemany(f"INSERT OR REPLACE INTO {table} VALUES ({','.join('?' * len(rows[0]))})", rows)
 
 
-def _connect(path: Path, mode: str) -> Connection:
-    return connect(path.resolve(), mode, BUSY)
-
-
-def _durable(connection: sqlite3.Connection) -> None:
-    connection.execute("PRAGMA journal_mode = WAL")
-    connection.execute("PRAGMA synchronous = NORMAL")
-
-
-def _open_read_only(path: Path) -> MapStore:
-    """As it lies there where it is whole; with FILE-wal as a reader of that; from a copy where not even that can be."""
-    wal = Path(f"{path.resolve()}-wal")  # SQLite names it after the file, not after a link to it
-    if not wal.exists() or not wal.stat().st_size:
-        if _head(path)[18] == 1:  # closed, with a journal on rollback: a reader leaves no trace
-            return MapStore(path, _connect(path, "ro"), True)
-        return MapStore(path, _connect(path, "ro&immutable=1"), True)
-    connection = _connect(path, "ro")
-    try:
-        connection.execute("SELECT name FROM sqlite_master LIMIT 1").fetchone()
-        return MapStore(path, connection, True)
-    except sqlite3.OperationalError:  # a folder that cannot be written: SQLite needs FILE-shm to read FILE-wal
-        connection.close()
-        return _copied(path)
-
-
 def _identity(path: Path) -> tuple[int, int] | None:
     """What a file is, whatever its name; None where there is none."""
     try:
@@ -341,42 +272,3 @@ def _identity(path: Path) -> tuple[int, int] | None:
     except OSError:
         return None
     return status.st_dev, status.st_ino
-
-
-def _head(path: Path) -> bytes:
-    """The first 100 bytes, zeros where the file is shorter; see the SQLite file format."""
-    with path.open("rb") as file:
-        return file.read(100).ljust(100, b"\0")
-
-
-def _copied(path: Path) -> MapStore:
-    folder = tempfile.TemporaryDirectory(prefix="dpm2_map_")
-    copy = Path(folder.name) / "map"
-    copy_with_log(path, copy)
-    store = MapStore(path, _connect(copy, "rw"), True)
-    store._copy = folder
-    return store
-
-
-def _migrated_copy(store: MapStore, version: int) -> MapStore:
-    """An older map, read-only: brought up to date in memory."""
-    size = store.path.stat().st_size
-    memory = Connection(":memory:", isolation_level=None, check_same_thread=False, size=size)
-    with closing(store._connection) as source:
-        source.backup(memory)
-    schema.migrate(memory, version)
-    store._connection = memory
-    return store
-
-
-@contextmanager
-def _explained(path: Path) -> Iterator[None]:
-    """What SQLite and the system complain of, in one line that names the file."""
-    try:
-        yield
-    except sqlite3.Error as error:
-        text = str(error)
-        hint = "; see dpm2 map check" if "malformed" in text or "not a database" in text else ""
-        raise Dpm2Error(f"{path}: {text}{hint}") from error
-    except OSError as error:
-        raise Dpm2Error(f"{path}: {error.strerror or error}") from error

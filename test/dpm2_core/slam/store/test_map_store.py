@@ -425,7 +425,7 @@ def test_what_is_no_map_is_rejected_in_one_line(tmp_path: Path, map_file: Path) 
 
 
 def test_two_writers(map_file: Path, keyframes: list[Keyframe], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("dpm2_core.slam.store.map_store.BUSY", 0.1)
+    monkeypatch.setattr("dpm2_core.slam.store.map_connection.BUSY", 0.1)
     with closing(sqlite3.connect(map_file)) as one, MapStore.open(map_file, read_only=False) as two:
         one.execute("BEGIN IMMEDIATE")
         with pytest.raises(Dpm2Error, match="locked"):

@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How a map file is opened: to write, to read as it lies there, or from a copy; what SQLite complains of, in words."""
+
+from __future__ import annotations
+
+import sqlite3
+import tempfile
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+from dpm2_core.database import Connection, connect
+from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.slam.store import schema
+from dpm2_core.slam.store.map_file import copy_with_log, remove_map
+
+BUSY = 5.0
+"""s to wait for another program: a reader never blocks the writer for long, another writer is an error."""
+_HEAD = b"SQLite format 3"
+
+
+class MapConnection(NamedTuple):
+    """An open map file, and the folder of the copy that stands for it, if there is one: both are to be closed."""
+
+    sql: sqlite3.Connection
+    copy: tempfile.TemporaryDirectory[str] | None = None
+
+    def close(self) -> None:
+        self.sql.close()
+        if self.copy is not None:
+            self.copy.cleanup()
+
+
+def create_map(path: Path) -> None:
+    """Make a new, empty map file.
+
+    Raises:
+        UsageError: there is a file already. Dpm2Error: it cannot be made.
+    """
+    with explained(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            path.touch(exist_ok=False)  # of two programs that want the same name, one gets it
+        except FileExistsError:
+            raise UsageError(f"{path}: there is a file already") from None
+        try:
+            with closing(_connect(path, "rw")) as sql:
+                schema.create(sql)  # not in FILE-wal, the end of which a power cut may take
+        except BaseException:
+            remove_map(path)  # what is no map yet would be in the way of the next one
+            raise
+
+
+def open_map(path: Path, read_only: bool) -> MapConnection:
+    """Open a map file. Read-only, no byte of it changes; else an older one is brought up to date.
+
+    Raises:
+        UsageError: no map, or one of a later dpm2. Dpm2Error: it cannot be read, or written, or is damaged.
+    """
+    if not path.is_file():
+        raise UsageError(f"{path}: no such map file")
+    with explained(path):
+        if _head(path)[:15] != _HEAD:
+            raise UsageError(f"{path}: not a dpm2 map")
+        opened = _open_to_read(path) if read_only else MapConnection(_connect(path, "rw"))
+        try:
+            version = schema.version_of(opened.sql, path)
+            schema.check(opened.sql, version)
+            if version < schema.VERSION and not read_only:
+                schema.migrate(opened.sql, version)
+            elif version < schema.TABLES:
+                return _migrated_copy(opened, path, version)
+            if not read_only:
+                opened.sql.execute("PRAGMA journal_mode = WAL")
+                opened.sql.execute("PRAGMA synchronous = NORMAL")
+        except BaseException:
+            opened.close()
+            raise
+        return opened
+
+
+def _connect(path: Path, mode: str) -> Connection:
+    return connect(path.resolve(), mode, BUSY)
+
+
+def _open_to_read(path: Path) -> MapConnection:
+    """As it lies there where it is whole; with FILE-wal as a reader of that; from a copy where not even that can be."""
+    wal = Path(f"{path.resolve()}-wal")  # SQLite names it after the file, not after a link to it
+    if not wal.exists() or not wal.stat().st_size:
+        if _head(path)[18] == 1:  # closed, with a journal on rollback: a reader leaves no trace
+            return MapConnection(_connect(path, "ro"))
+        return MapConnection(_connect(path, "ro&immutable=1"))
+    connection = _connect(path, "ro")
+    try:
+        connection.execute("SELECT name FROM sqlite_master LIMIT 1").fetchone()
+        return MapConnection(connection)
+    except sqlite3.OperationalError:  # a folder that cannot be written: SQLite needs FILE-shm to read FILE-wal
+        connection.close()
+        return _copied(path)
+
+
+def _head(path: Path) -> bytes:
+    """The first 100 bytes, zeros where the file is shorter; see the SQLite file format."""
+    with path.open("rb") as file:
+        return file.read(100).ljust(100, b"\0")
+
+
+def _copied(path: Path) -> MapConnection:
+    folder = tempfile.TemporaryDirectory(prefix="dpm2_map_")
+    copy = Path(folder.name) / "map"
+    copy_with_log(path, copy)
+    return MapConnection(_connect(copy, "rw"), folder)
+
+
+def _migrated_copy(opened: MapConnection, path: Path, version: int) -> MapConnection:
+    """An older map, read-only: brought up to date in memory."""
+    memory = Connection(":memory:", isolation_level=None, check_same_thread=False, size=path.stat().st_size)
+    opened.sql.backup(memory)
+    opened.close()
+    schema.migrate(memory, version)
+    return MapConnection(memory)
+
+
+@contextmanager
+def explained(path: Path) -> Iterator[None]:
+    """What SQLite and the system complain of, in one line that names the file.
+
+    Raises:
+        Dpm2Error: in the place of their errors.
+    """
+    try:
+        yield
+    except sqlite3.Error as error:
+        text = str(error)
+        hint = "; see dpm2 map check" if "malformed" in text or "not a database" in text else ""
+        raise Dpm2Error(f"{path}: {text}{hint}") from error
+    except OSError as error:
+        raise Dpm2Error(f"{path}: {error.strerror or error}") from error
