@@ -10,10 +10,12 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
 import torch
+import typer
 
-from dpm2_core.errors import UsageError, exit_code
+from dpm2_core.commands.options import run_command
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.settings import preset
 from dpm2_core.network.weights import load_fitting, network_settings, read_metadata, save_weights
@@ -35,18 +37,18 @@ def average(files: Sequence[Path]) -> DeepPointMap2:
     return model
 
 
-def main(arguments: Sequence[str]) -> None:
-    """Write the mean.
-
-    Raises:
-        UsageError: no files are named, or as `average`.
-    """
-    if len(arguments) < 2:
-        raise UsageError("want OUT IN...")
-    out, *files = map(Path, arguments)
+def average_weights(
+    out: Annotated[Path, typer.Argument(help="Weights to write.")],
+    files: Annotated[list[Path], typer.Argument(metavar="IN...", help="Weights of the stages, the last one last.")],
+    encoder: Annotated[Path | None, typer.Option(help="Weights whose encoder it has instead of the mean.")] = None,
+) -> None:
+    """Write the mean of weights; what a decoder has learned may go with the descriptors of another stage."""
+    model = average(files)
+    if encoder is not None:
+        model.encoder.load_state_dict(average([encoder]).encoder.state_dict())
     out.parent.mkdir(parents=True, exist_ok=True)
-    save_weights(average(files), out, read_metadata(files[-1]))
+    save_weights(model, out, read_metadata(files[-1]))
 
 
 if __name__ == "__main__":
-    sys.exit(exit_code(lambda: main(sys.argv[1:])))
+    sys.exit(run_command(average_weights))

@@ -12,7 +12,7 @@ from dpm2_core.errors import UsageError
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.settings import preset
 from dpm2_core.network.weights import load_model, read_metadata, save_weights
-from tools.average_weights import main
+from tools.average_weights import average_weights
 
 
 def test_the_mean_is_a_network_of_the_preset(tmp_path: Path) -> None:
@@ -22,7 +22,7 @@ def test_the_mean_is_a_network_of_the_preset(tmp_path: Path) -> None:
         networks.append(DeepPointMap2(preset("small", {"fusion": {"edges": edges}})))
         files.append(tmp_path / f"{steps}.safetensors")
         save_weights(networks[-1], files[-1], {"phase": "1", "steps": str(steps)})
-    main([str(tmp_path / "new" / "mean.safetensors"), *map(str, files)])
+    average_weights(tmp_path / "new" / "mean.safetensors", files)
     mean = load_model(tmp_path / "new" / "mean.safetensors")
     assert mean.settings == preset("small")
     assert read_metadata(tmp_path / "new" / "mean.safetensors")["steps"] == "20"
@@ -31,10 +31,20 @@ def test_the_mean_is_a_network_of_the_preset(tmp_path: Path) -> None:
         torch.testing.assert_close(tensor, (one[name] + other[name]) / 2, rtol=2e-3, atol=1e-3)  # stored in fp16
 
 
+def test_a_decoder_goes_with_the_encoder_of_another_stage(tmp_path: Path) -> None:
+    files = []
+    for seed in (1, 2):
+        torch.manual_seed(seed)
+        files.append(tmp_path / f"{seed}.safetensors")
+        save_weights(DeepPointMap2(preset("small")), files[-1], {"phase": "1"})
+    average_weights(tmp_path / "both.safetensors", files[:1], encoder=files[1])
+    both, *stages = (load_model(path).state_dict() for path in (tmp_path / "both.safetensors", *files))
+    for name, tensor in both.items():
+        assert torch.equal(tensor, stages[name.startswith("encoder.")][name]), name
+
+
 def test_what_cannot_be_averaged_is_named(tmp_path: Path) -> None:
     (tmp_path / "text.safetensors").write_text("no weights")
     for file in (tmp_path / "missing.safetensors", tmp_path / "text.safetensors"):
         with pytest.raises(UsageError, match=file.name):
-            main([str(tmp_path / "out"), str(file)])
-    with pytest.raises(UsageError, match="want OUT IN"):
-        main([str(tmp_path / "out")])
+            average_weights(tmp_path / "out", [file])
