@@ -143,7 +143,7 @@ class PackedDrive:
     """A packed drive, opened lazily: `poses` (n, 4, 4) in memory, the rest memory-mapped.
 
     Attributes:
-        has_images: whether its frames have some.
+        has_images: whether its frames have some. preset: of the synthetic city; empty where it is from elsewhere.
 
     Raises:
         UsageError: it is none, or is damaged.
@@ -170,6 +170,7 @@ class PackedDrive:
         if not np.isfinite(self.poses).all():
             raise UsageError(f"{folder}: a pose is not finite: pack it again")
         self.folder = folder
+        self.preset = str(self.about.get("preset", ""))
         self.name = folder.name
         self._maps: dict[str, NDArray] = {}
 

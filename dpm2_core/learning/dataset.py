@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from pydantic import Field, NonNegativeFloat
+from pydantic import Field, NonNegativeFloat, PositiveFloat
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
@@ -56,14 +56,17 @@ class DataSettings(GroupSettings):
     """Frames of each place: one, and others within `radius` of it."""
     radius: float = Field(20.0, gt=0)
     """m."""
+    radii: dict[str, PositiveFloat] = Field({})
+    """The same for drives of a preset of the synthetic city, such as {tunnel: 15}: what looks alike all along shows
+    from afar nothing to learn from."""
 
-    def draw(self, poses: Array, noise: np.random.Generator) -> NDArray[np.intp]:
+    def draw(self, drive: PackedDrive, noise: np.random.Generator) -> NDArray[np.intp]:
         """See `draw_group`."""
-        return draw_group(poses, noise, self.frames, self.radius)
+        return draw_group(drive.poses, noise, self.frames, self.radii.get(drive.preset, self.radius))
 
 
-Draw = Callable[[Array, np.random.Generator], NDArray[np.intp]]
-"""Of the poses (n, 4, 4) of a drive: indices (F,) of the frames of a place."""
+Draw = Callable[[PackedDrive, np.random.Generator], NDArray[np.intp]]
+"""Of a drive: indices (F,) of the frames of a place."""
 
 
 class Batch(NamedTuple):
@@ -115,7 +118,7 @@ class Mixture:
             found = open_packed(Path(folder))
             frames = sum(len(drive) for drive in found)
             drives += found
-            factors = [settings.emphasis.get(str(drive.about.get("preset")), 1.0) for drive in found]
+            factors = [settings.emphasis.get(drive.preset, 1.0) for drive in found]
             chances += [weight * factor * len(drive) / frames for drive, factor in zip(found, factors, strict=True)]
         if not sum(chances) > 0:
             raise UsageError("data.packed: want packed drives; `dpm2 train data` and `dpm2 train pack` make some")
@@ -165,7 +168,7 @@ class GroupDataset(Dataset[Batch]):
         """
         for _ in range(_PLACES):
             drive = self.drives.choose(noise)
-            found = [drive[index] for index in self.draw(drive.poses, noise)]
+            found = [drive[index] for index in self.draw(drive, noise)]
             if min(len(sample.cloud) for sample in found) >= _LEAST:
                 return [augment(sample, self.settings.augment, noise) for sample in found]
         raise Dpm2Error(f"of {_PLACES} places of the packed drives, each has a scan of fewer than {_LEAST} points")

@@ -10,7 +10,6 @@ not forgotten.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from dpm2_core.data.packed import PackedDrive
 from dpm2_core.diffslam.trajectory_loss import trajectory_loss
 from dpm2_core.evaluation.pair_set import PairSet
 from dpm2_core.frame import Array
@@ -108,7 +108,10 @@ def finetune(
     start_from, optimizer, weights = weights_path(settings.weights), settings.optimiser, out / "weights.safetensors"
     torch.manual_seed(optimizer.seed)
     module = Finetuned(load_model(start_from), settings)
-    segments = partial(draw_road_segment, frames=settings.frames, radius=settings.radius)
+
+    def segments(drive: PackedDrive, noise: np.random.Generator) -> NDArray[np.intp]:
+        return draw_road_segment(drive.poses, noise, settings.frames, settings.radius)
+
     places = GroupDataset(_packed(settings, data or out), module.model.settings, segments, optimizer.seed)
 
     def batches(start: int, rank: int) -> Iterator[tuple[PointBatch, Tensor, tuple[SetPairs]]]:

@@ -15,7 +15,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from dpm2_core.config import Settings
-from dpm2_core.data.packed import open_packed
+from dpm2_core.data.packed import PackedDrive, open_packed
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3_torch
 from dpm2_core.learning.dataset import GroupDataset, GroupSettings
@@ -79,6 +79,10 @@ def draw_overlap(poses: Array, noise: np.random.Generator) -> NDArray[np.intp]:
     hard = hard if len(hard) else far if len(far) else near
     far = far if len(far) else hard
     return np.array([first, *noise.choice(near, 2), noise.choice(hard), noise.choice(far)])
+
+
+def _draw(drive: PackedDrive, noise: np.random.Generator) -> NDArray[np.intp]:
+    return draw_overlap(drive.poses, noise)
 
 
 class OverlapTraining(nn.Module):
@@ -145,7 +149,7 @@ def train_overlap(settings: OverlapTrainingSettings, out: Path, resume: bool = F
     network = network_settings(Path(settings.start))
     module = OverlapTraining(network)
     about = load_weights(module.model, Path(settings.start))
-    data = GroupDataset(settings.data, network, draw_overlap, optimizer.seed)
+    data = GroupDataset(settings.data, network, _draw, optimizer.seed)
 
     def batches(start: int, rank: int) -> Iterator[tuple[PointBatch, Views | None, Tensor, Tensor]]:
         found = data.batches(start, rank)
@@ -165,7 +169,7 @@ def validator(settings: OverlapTrainingSettings, network: NetworkSettings) -> Ca
     any."""
     images = settings.data.images and any(drive.has_images for drive in open_packed(Path(settings.validation)))
     options = settings.data.model_copy(update={"packed": {settings.validation: 1.0}, "images": images})
-    data = GroupDataset(options, network, draw_overlap, seed=1)
+    data = GroupDataset(options, network, _draw, seed=1)
     batch = cache(lambda number: data[number, 0])
 
     @torch.inference_mode()

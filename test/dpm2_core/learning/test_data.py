@@ -131,6 +131,19 @@ def test_groups_are_near_and_spread() -> None:
     np.testing.assert_allclose(share, expected, atol=0.05)  # 600 distances: 2 sigma is 0.04
 
 
+def test_the_radius_may_be_another_where_all_looks_alike(tmp_path: Path) -> None:
+    """In a tunnel pairs far apart taught the network to match what is not the same."""
+    cloud = np.zeros((0, 3), np.float32)
+    samples = [Sample(cloud, se3.make(np.eye(3), [x, 0, 0]), ()) for x in np.arange(100.0)]
+    settings = DataSettings(radius=50, radii={"tunnel": 15})
+    for preset, farthest in (("tunnel", 15), ("city", 50)):
+        write_packed(tmp_path / preset, samples, {"preset": preset})
+        (drive,) = open_packed(tmp_path / preset)
+        places = [settings.draw(drive, np.random.default_rng(seed)) for seed in range(50)]
+        apart = [abs(place[1:] - place[0]).max() for place in places]
+        assert 0.8 * farthest < max(apart) <= farthest
+
+
 def test_a_lonely_frame_is_its_own_group() -> None:
     """No neighbor within the radius: it repeats."""
     poses = np.tile(np.eye(4), (2, 1, 1))
