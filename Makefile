@@ -102,7 +102,8 @@ TRAIN = OMP_WAIT_POLICY=active $(BIN)/python -m dpm2_core.cli train
 RESUMED = $(if $(wildcard out/$(1)/checkpoint.pt),--resume)
 # The training that train_small_light.yaml describes once more, with more of the reference points on vertical edges.
 HEIGHTS = $(TRAIN) phase1 --config config/train_small_light.yaml --set network.fusion.edges=0.65
-train-small: train-data  ## train the weights that are shipped: registration, image branch, both, poses, rooms, image corners, light, heights, overlap (2 cores: 8 hours; continues)
+FAR = $(TRAIN) phase1 --config config/train_small_far.yaml
+train-small: train-data  ## train the weights that are shipped: registration, image branch, both, poses, rooms, image corners, light, heights, far, overlap (2 cores: 11 hours; continues)
 	$(TRAIN) phase1 --config config/train_small.yaml --out out/phase1 $(call RESUMED,phase1)
 	$(TRAIN) image --config config/train_small_image.yaml --out out/image $(call RESUMED,image)
 	$(TRAIN) phase1 --config config/train_small_camera.yaml --out out/camera $(call RESUMED,camera)
@@ -115,6 +116,14 @@ train-small: train-data  ## train the weights that are shipped: registration, im
 	$(HEIGHTS) --out out/settled --set start=out/heights/weights.safetensors --set optimiser.steps=400 --set optimiser.rate=3e-4 \
 		$(call RESUMED,settled)
 	$(BIN)/python -m tools.average_weights out/average/weights.safetensors $(foreach stage,light heights settled,out/$(stage)/weights.safetensors)
+	$(FAR) --out out/far --set start=out/average/weights.safetensors $(call RESUMED,far)
+	$(BIN)/python -m tools.average_weights out/far_decoder/weights.safetensors out/far/weights.safetensors \
+		--encoder out/average/weights.safetensors
+	$(FAR) --out out/settled_far --set start=out/far_decoder/weights.safetensors --set encoder=false --set optimiser.steps=300 \
+		--set optimiser.rate=1.5e-4 --set optimiser.ema=0.98 --set data.groups=6 --set pairs=6 \
+		--set 'data.radii={highway: 15, tunnel: 15}' $(call RESUMED,settled_far)
+	$(BIN)/python -m tools.average_weights out/reach/weights.safetensors \
+		$(foreach stage,average far_decoder settled_far,out/$(stage)/weights.safetensors)
 	$(TRAIN) phase2 --config config/train_small_phase2.yaml --out out/phase2 $(call RESUMED,phase2)
 
 train-ground: setup  ## train the weights of slam.filter.kind=ground (2 cores: 10 minutes, 1.5 GB)
