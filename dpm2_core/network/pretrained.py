@@ -4,13 +4,17 @@
 from __future__ import annotations
 
 import copy
+import json
 from collections.abc import Callable, Sequence
+from hashlib import sha256
 from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
+from safetensors import SafetensorError, deserialize, safe_open
+
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.files import expanded, file_digest
+from dpm2_core.files import expanded
 from dpm2_core.openmp import allowed
 
 if TYPE_CHECKING:  # torch takes seconds to import, and the geometric SLAM does without
@@ -50,19 +54,32 @@ def weights_path(weights: str) -> Path:
 
 
 def weights_id(weights: str) -> str:
-    """What identifies weights: name and the first 16 digits of the file's SHA-256.
+    """What identifies the descriptors that weights make: name, and the first 16 digits of the SHA-256 of the encoder.
+
+    Weights with another decoder have the same: it reads the descriptors of a map that was made before.
 
     Args:
         weights: name of shipped weights, or path of a file.
 
     Raises:
-        UsageError: there is neither. Dpm2Error: the file cannot be read.
+        UsageError: there is neither, or it is no weights. Dpm2Error: the file cannot be read.
     """
     path = weights_path(weights)
     try:
-        return f"{path.stem} {file_digest(path)[:16]}"
+        with safe_open(path, "np") as file:
+            network = dict(json.loads((file.metadata() or {}).get("network", "{}")))
+        tensors = sorted(deserialize(path.read_bytes()))
     except OSError as error:
-        raise Dpm2Error(f"{path}: {error.strerror}") from None
+        raise Dpm2Error(f"{path}: {error.strerror or error}") from None
+    except (SafetensorError, TypeError, ValueError) as error:
+        raise UsageError(f"{path}: not weights: {error}") from None
+    network.pop("decoder", None)
+    digest = sha256(json.dumps(network, sort_keys=True).encode())
+    for name, tensor in tensors:
+        if name.startswith("encoder."):
+            digest.update(f"{name} {tensor['dtype']} {tensor['shape']}".encode())
+            digest.update(tensor["data"])
+    return f"{path.stem} {digest.hexdigest()[:16]}"
 
 
 def load_once(path: Path, threads: int, load: Callable[[Path], M]) -> M:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import shutil
 import subprocess
@@ -20,12 +21,13 @@ from dpm2_core.frame import Frame
 from dpm2_core.network import weights as weights_module
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.perception import dynamic_objects
-from dpm2_core.network.pretrained import PRETRAINED_DIR, load_network, load_once
+from dpm2_core.network.pretrained import PRETRAINED_DIR, load_network, load_once, weights_id
 from dpm2_core.network.weights import save_weights
 from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.session import open_for_localization, open_session
 from dpm2_core.slam.settings import SlamSettings
 
+from ...helpers.networks import tiny
 from ...helpers.scenes import boxes
 
 
@@ -122,3 +124,33 @@ def test_loading_does_not_import_the_compiler_of_torch() -> None:
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def test_a_map_outlives_another_decoder_and_not_another_encoder(model: DeepPointMap2, tmp_path: Path) -> None:
+    """Of a new decoder the descriptors are the same; maps with them had been those of other weights."""
+    file, before = tmp_path / "tiny.safetensors", ""
+    for part in ("decoder", "encoder"):
+        save_weights(model, file, {})
+        before = weights_id(str(file))
+        changed = copy.deepcopy(model)
+        with torch.no_grad():
+            next(changed.get_submodule(part).parameters()).add_(1.0)
+        save_weights(changed, file, {"steps": "more"})
+        assert (weights_id(str(file)) == before) == (part == "decoder")
+
+
+def test_the_encoder_of_another_network_is_another_one(tmp_path: Path) -> None:
+    """The same tensors, and other settings of what is made of a scan."""
+    torch.manual_seed(0)
+    network, file = DeepPointMap2(tiny()), tmp_path / "tiny.safetensors"
+    save_weights(network, file, {})
+    before = weights_id(str(file))
+    network.settings = tiny().model_copy(update={"points": tiny().points.model_copy(update={"far": 55.0})})
+    save_weights(network, file, {})
+    assert weights_id(str(file)) != before
+
+
+def test_what_is_no_weights_has_no_descriptors(tmp_path: Path) -> None:
+    (tmp_path / "text").write_text("no weights, and long enough for a header")
+    with pytest.raises(UsageError, match="text: not weights"):
+        weights_id(str(tmp_path / "text"))
