@@ -217,9 +217,9 @@ class KeyframeSender:
 
 
 def weights_identity(settings: SlamSettings) -> str:
-    """The identity of what made descriptors: the first 16 digits of the SHA-256 of the network's file; "" without one.
+    """The identity of what made descriptors, the digits of `network.pretrained.weights_id`; "" without descriptors.
 
     Raises:
-        UsageError: there is no such file.
+        UsageError: there are no such weights.
     """
     return settings.weights_id().split(" ")[-1]
