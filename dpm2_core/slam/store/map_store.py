@@ -78,7 +78,11 @@ class MapStore:
     def create(cls, path: Path) -> MapStore:
         """A new, empty map; `begin_session` comes next. Raises as `create_map` does."""
         create_map(path)
-        return cls.open(path, read_only=False)
+        try:
+            return cls.open(path, read_only=False)
+        except BaseException:
+            remove_map(path)  # it would be in the way of the next one
+            raise
 
     @classmethod
     def open(cls, path: Path, read_only: bool = True) -> MapStore:
