@@ -13,7 +13,7 @@ from dpm2_core.data.settings import InputSettings
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.scale import ROOM_SCALE, is_room, scale_of
 from dpm2_core.geometry.voxel import voxel_first
-from test.helpers.rooms import frames, walk
+from test.helpers.rooms import FURNITURE, frames, scan, walk
 
 MIDDLE = se3.make(np.eye(3), [0, 0, 0.6])
 
@@ -27,6 +27,16 @@ def test_a_room_and_a_street(voxel: float) -> None:
     assert is_room(room) is True
     assert is_room(street) is False
     assert (scale_of(room), scale_of(street)) == (ROOM_SCALE, 1)
+
+
+def test_a_hall_is_a_room_from_wherever_in_it() -> None:
+    """It shows as many cells as what may be either: keyframes a step apart were of a room and of a street, and such
+    descriptors are not compared."""
+    hull = np.array([[-6.3, -6.3, 0], [6.3, 6.3, 5.0]])
+    for x in (-2.9, 0.0, 2.9):
+        points = scan(se3.make(np.eye(3), [x, 0, 1.3]), hull, FURNITURE, 0)
+        assert len(voxel_first(points, 0.5)) > 800
+        assert is_room(points) is True
 
 
 def test_too_little_says_nothing() -> None:
