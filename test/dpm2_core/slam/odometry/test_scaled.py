@@ -53,10 +53,10 @@ def test_a_street_is_as_if_there_were_no_rooms() -> None:
 
 
 def test_a_start_that_may_be_of_either_is_decided_without_a_jump() -> None:
-    """A small hall; then half of the view is covered, and what is left is a room's."""
-    hall = np.array([[-7, -3.5, 0], [7, 3.5, 4.0]])
+    """A long hall; then half of the view is covered, and what is left is a room's."""
+    hall = np.array([[-11.3, -3.8, 0], [11.3, 3.8, 4.3]])
     things = boxes((-6, -2.5), (6, 2.5), 4, np.array([1.0, 1.0, 2.0]))
-    poses = se3.make(np.eye(3), [[-3 + 0.15 * i, 0, 1.0] for i in range(16)])
+    poses = se3.make(np.eye(3), [[-3 + 0.15 * i, 0, 1.2] for i in range(16)])
     clouds = [scan(T, hall, things, i) for i, T in enumerate(poses)]
     clouds[8:] = [points[points[:, 0] > 0.3] for points in clouds[8:]]
     odometry, scales = make_odometry(geometric("auto")), []
