@@ -445,8 +445,8 @@ def test_a_drive_may_begin_in_a_column() -> None:
         moving = float(np.mean([scan.moving.mean() for scan in scans]))
     tracked = run([Frame(i * 10**8, scan.points) for i, scan in enumerate(scans)])
     assert all(t.registration.ok for t in tracked)
-    # The column moves by 1.6 m per frame against the road. What little of that stands holds the car to an eighth of such
-    # a step in every scan, which is said, and to a few centimeters at the end
+    # The column moves by 1.6 m per frame against the road. What little of that stands holds the car to an eighth of
+    # such a step in every scan, which is said, and to a few centimeters at the end
     off = errors(tracked, se3.inverse(truth[0]) @ truth)[:, 0]
     assert off.max() < 0.2
     assert {t.state for t, meters in zip(tracked, off, strict=True) if meters > 0.1} <= {State.DEGRADED}
