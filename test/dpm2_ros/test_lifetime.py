@@ -103,7 +103,7 @@ def test_a_second_signal_that_comes_while_python_ends(bag: Path, tmp_path: Path,
             time.sleep(0.005)
     finally:
         process.kill()
-    assert process.wait() == 0
+    assert process.wait() == 0, log.read_text()
 
 
 def test_without_a_folder_for_logs_it_says_what_to_set(domain: int) -> None:
