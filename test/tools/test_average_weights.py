@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from dpm2_core.commands.options import run_command
 from dpm2_core.errors import UsageError
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.settings import preset
@@ -48,3 +49,11 @@ def test_what_cannot_be_averaged_is_named(tmp_path: Path) -> None:
     for file in (tmp_path / "missing.safetensors", tmp_path / "text.safetensors"):
         with pytest.raises(UsageError, match=file.name):
             average_weights(tmp_path / "out", [file])
+
+
+def test_what_is_averaged_must_be_named(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """As a program: exit code 2, and what is missing."""
+    for arguments, missing in (([], "out"), (["mean.safetensors"], "IN")):
+        monkeypatch.setattr("sys.argv", ["average_weights", *arguments])
+        assert run_command(average_weights) == 2
+        assert missing in capsys.readouterr().err

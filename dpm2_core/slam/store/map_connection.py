@@ -32,8 +32,8 @@ class MapConnection(NamedTuple):
             self.copy.cleanup()
 
 
-def create_map(path: Path) -> None:
-    """Make a new, empty map file.
+def create_map(path: Path) -> MapConnection:
+    """Make a new, empty map file, and open it to write.
 
     Raises:
         UsageError: there is a file already. Dpm2Error: it cannot be made.
@@ -47,6 +47,7 @@ def create_map(path: Path) -> None:
         try:
             with closing(_connect(path, "rw")) as sql:
                 schema.create(sql)  # not in FILE-wal, the end of which a power cut may take
+            return open_map(path, read_only=False)
         except BaseException:
             remove_map(path)  # what is no map yet would be in the way of the next one
             raise

@@ -77,12 +77,7 @@ class MapStore:
     @classmethod
     def create(cls, path: Path) -> MapStore:
         """A new, empty map; `begin_session` comes next. Raises as `create_map` does."""
-        create_map(path)
-        try:
-            return cls.open(path, read_only=False)
-        except BaseException:
-            remove_map(path)  # it would be in the way of the next one
-            raise
+        return cls(path, create_map(path), read_only=False)
 
     @classmethod
     def open(cls, path: Path, read_only: bool = True) -> MapStore:

@@ -128,10 +128,10 @@ def test_loading_does_not_import_the_compiler_of_torch() -> None:
 
 def test_a_map_outlives_another_decoder_and_not_another_encoder(model: DeepPointMap2, tmp_path: Path) -> None:
     """Of a new decoder the descriptors are the same; maps with them had been those of other weights."""
-    file, before = tmp_path / "tiny.safetensors", ""
+    file = tmp_path / "tiny.safetensors"
+    save_weights(model, file, {})
+    before = weights_id(str(file))
     for part in ("decoder", "encoder"):
-        save_weights(model, file, {})
-        before = weights_id(str(file))
         changed = copy.deepcopy(model)
         with torch.no_grad():
             next(changed.get_submodule(part).parameters()).add_(1.0)
