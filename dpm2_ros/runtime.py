@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from queue import Empty, SimpleQueue
 from typing import Any
 
 from dpm2_core.errors import Dpm2Error, UsageError
@@ -27,7 +28,40 @@ _SWITCH = 5e-4
 network in the thread of the map keeps it waiting each time."""
 _PROFILE, _NEW_NAME = "FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE"
 _NICER = 10  # steps of niceness: a tenth of the fraction of the odometry where both want a processor
-STOP = threading.Event()
+
+
+class Stop:
+    """As `threading.Event`, for signal handlers.
+
+    An event's `set` waits for ever in a handler that interrupts its `wait` or `set`.
+    """
+
+    def __init__(self) -> None:
+        self._is_set = False
+        self._wake = SimpleQueue[None]()  # its `put` may interrupt itself and `get`
+
+    def is_set(self) -> bool:
+        """Whether `set` was called."""
+        return self._is_set
+
+    def set(self) -> None:
+        """From here on `is_set`, and no `wait` waits."""
+        self._is_set = True
+        self._wake.put(None)
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """Until `set`, or for `timeout` s.
+
+        Returns:
+            Whether it is set.
+        """
+        if not self._is_set:
+            with suppress(Empty):
+                self._wake.put(self._wake.get(timeout=timeout))  # the next that waits
+        return self._is_set
+
+
+STOP = Stop()
 """Set by the first signal."""
 
 

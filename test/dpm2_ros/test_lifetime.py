@@ -28,7 +28,7 @@ from dpm2_core.data.messages import stamp_ns
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.evaluation.metrics import ape_rmse
 from dpm2_ros.mapping import KEEP_ALL, LAST_ONE
-from dpm2_ros.runtime import end_ros, ros_context
+from dpm2_ros.runtime import Stop, end_ros, ros_context
 from tools.demo import evaluate_replay, map_poses
 from tools.replay import replay, ros_environment, start
 
@@ -104,6 +104,38 @@ def test_a_second_signal_that_comes_while_python_ends(bag: Path, tmp_path: Path,
     finally:
         process.kill()
     assert process.wait() == 0, log.read_text()
+
+
+STOPPED = """
+import faulthandler, random, signal
+from dpm2_ros.runtime import Stop
+faulthandler.dump_traceback_later(60, exit=True)
+for _ in range(2000):
+    stop = Stop()
+    signal.signal(signal.SIGALRM, lambda *_: stop.set())
+    signal.setitimer(signal.ITIMER_REAL, random.uniform(1e-5, 5e-4))
+    while not stop.wait(1e-5):
+        pass
+"""
+
+
+def test_a_signal_may_meet_each_moment_of_a_wait() -> None:
+    """With `threading.Event` one of some hundred did not come back: `bag_player` waits a hundred times per second."""
+    subprocess.run([sys.executable, "-c", STOPPED], check=True, timeout=120)
+
+
+def test_who_waits_is_woken_and_later_waits_end_at_once() -> None:
+    stop = Stop()
+    assert not stop.wait(0)
+    waiting = [threading.Thread(target=stop.wait) for _ in range(3)]
+    for thread in waiting:
+        thread.start()
+    stop.set()
+    for thread in waiting:
+        thread.join(60)
+    assert not any(thread.is_alive() for thread in waiting)
+    assert stop.wait()
+    assert stop.is_set()
 
 
 def test_without_a_folder_for_logs_it_says_what_to_set(domain: int) -> None:
@@ -275,7 +307,7 @@ def test_ros_ends_in_time_or_the_process_does(domain: int) -> None:
     stuck = "ctypes.PyDLL(None).sleep(120)"
     code = f"""
 import ctypes
-from dpm2_ros.runtime import end_ros, ros_context
+from dpm2_ros.runtime import Stop, end_ros, ros_context
 class Stuck:
     def destroy_node(self): {stuck}
 ros_context([], {domain})
