@@ -48,6 +48,7 @@ _IMAGE_ENCODINGS: dict[str, tuple[str, int, int | None]] = {
     "bayer_grbg16": ("u2", 1, cv2.COLOR_BayerGB2RGB),
 }
 
+_SENSOR_BITS = (10, 12, 14, 16)
 _DEPTH = ("16uc1", "32fc1")  # mm, m (REP 118)
 _HALF_COLOR = ("nv12", "nv21")
 _FISHEYE = ("equidistant", "fisheye")
@@ -55,7 +56,7 @@ _FISHEYE_COUNT = 4
 
 
 def decode_image(msg: Any, size: tuple[int, int] | None = None) -> NDArray[np.uint8]:
-    """sensor_msgs/Image or CompressedImage to (H, W, 3) uint8 RGB; of 16 bits the upper 8 count.
+    """sensor_msgs/Image or CompressedImage to (H, W, 3) uint8 RGB; of 10 to 16 bits the upper 8 count.
 
     Args:
         msg: the message.
@@ -84,9 +85,15 @@ def decode_image(msg: Any, size: tuple[int, int] | None = None) -> NDArray[np.ui
     shape, strides = (height, width, channels), (step, pixel, dtype.itemsize)
     pixels = np.ndarray(shape, dtype, memoryview(msg.data), strides=strides)
     if dtype.itemsize == 2:
-        pixels = (pixels >> 8).astype(np.uint8)
+        pixels = _upper_eight(pixels)
     pixels = np.ascontiguousarray(pixels)
     return pixels if conversion is None else cv2.cvtColor(pixels, conversion)
+
+
+def _upper_eight(pixels: NDArray[np.uint16]) -> NDArray[np.uint8]:
+    """Of the bits that an image uses: a camera of 10, 12 or 14 leaves the upper ones of its 16 zero."""
+    used = int(pixels.max()).bit_length()
+    return (pixels >> (next(bits for bits in _SENSOR_BITS if used <= bits) - 8)).astype(np.uint8)
 
 
 def _check_even(encoding: str, width: int, height: int) -> None:

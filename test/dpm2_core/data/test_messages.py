@@ -320,6 +320,17 @@ def test_image_encodings(encoding: str, pixels: np.ndarray, want: np.ndarray, pa
         np.testing.assert_array_equal(decoded, want)
 
 
+@pytest.mark.parametrize("bits", [10, 12, 14, 16])
+def test_the_upper_bits_that_a_camera_uses_count(bits: int) -> None:
+    """Many cameras leave those above zero: of 12 bits the upper 8 of 16 are nearly black."""
+    pixels = GRAY.astype(np.uint16) << (bits - 8)
+    pixels[0, 0] = (1 << bits) - 1
+    decoded = image_messages.decode_image(image(pixels, "mono16"))[..., 0]
+    assert decoded[0, 0] == 255
+    np.testing.assert_array_equal(decoded[1:], GRAY[1:])
+    assert not image_messages.decode_image(image(np.zeros_like(pixels), "mono16")).any()
+
+
 @pytest.mark.parametrize("padding", [0, 6])
 @pytest.mark.parametrize("encoding", ["uyvy", "yuv422", "yuyv", "yuv422_yuy2", "yvyu", "nv12", "nv21"])
 def test_yuv_gives_the_color_it_was_made_from(encoding: str, padding: int) -> None:
