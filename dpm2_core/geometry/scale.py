@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from dpm2_core.frame import Points
+from dpm2_core.geometry.scatter import scattered
 from dpm2_core.geometry.voxel import voxel_first
 
 _CELL = 0.5  # m: so much surface counts once, however many beams meet it
@@ -19,6 +20,7 @@ _NEAREST = 0.3  # m
 # shows 740 to 925 within 10 m; of 1,000 scans outside and in car parks none has three quarters within 11 m.
 _ROOM = (800, 18.0)
 _HALL = 10.0
+_FOG = 0.35  # of what is near: less of it hides neither
 _OPEN = (1300, 25.0)
 _LEAST = 30  # cells: fewer say nothing
 ROOM_SCALE = 5.0
@@ -32,10 +34,12 @@ def is_room(points: Points) -> bool | None:
     Args:
         points: (N, 4) a scan in the LiDAR frame, or a keyframe's cloud; NaN and zeros are passed over.
     """
-    some = points[:: max(1, len(points) // _FEW), :3]
-    away = np.linalg.norm(some, axis=1)
+    some = points[:: max(1, len(points) // _FEW)]
+    away = np.linalg.norm(some[:, :3], axis=1)
     valid = (away > _NEAREST) & (away < 1e4)  # False for NaN
     some, away = some[valid], away[valid]
+    fixed = ~scattered(some, _FOG)
+    some, away = some[fixed], away[fixed]
     cells = voxel_first(some, _CELL) if len(some) else np.zeros(0, int)
     if len(cells) < _LEAST:
         return None

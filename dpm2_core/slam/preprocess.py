@@ -8,13 +8,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from numba import float32, float64, int64, types
 from numpy.typing import NDArray
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
 from dpm2_core.config import Settings
 from dpm2_core.descriptors import Descriptors, LazyDescriptors
 from dpm2_core.frame import Array, Frame, Image, Points
 from dpm2_core.geometry.compiled import READ_F4, compiled
 from dpm2_core.geometry.deskew import deskew, measured_turn
+from dpm2_core.geometry.scatter import scattered
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.slam.filters import PointFilter
 
@@ -26,6 +27,9 @@ class PreprocessSettings(Settings):
     """Nearer returns are dropped (the vehicle itself), m."""
     max_range: float = 90.0
     """Farther returns are dropped, m."""
+    scatter: float = Field(0.35, ge=0, le=1)
+    """What floats in the air (fog, dust, smoke, spray, snow) is dropped where it is this fraction of the returns within
+    8 m, or more. Denser maps need less of it to be misled."""
     map_voxel: float = 0.5
     """Spacing of the points that enter the local map, m."""
     source_voxel: float = 0.8
@@ -79,10 +83,14 @@ class Preprocessor:
     def measured(self, frame: Frame, twist: Array) -> Points:
         """The valid points (P, 4); `twist` (6,) [rad/s, m/s] is the motion that deskewing undoes.
 
-        NaN, inf and zero points are dropped, those out of range, and what the filter leaves out.
+        NaN, inf and zero points are dropped, those out of range, what floats in the air where that is much, and what
+        the filter leaves out.
         """
         s = self._settings
         points, used = _in_range(np.ascontiguousarray(frame.points), s.min_range**2, s.max_range**2)
+        floating = scattered(points, s.scatter)
+        if floating.any():
+            points, used = points[~floating], used[~floating]
         if s.deskew and frame.time_offset is not None:
             points = deskew(points, frame.time_offset[used], twist, measured_turn(frame))
         return points if self._filter is None else self._filter(points)

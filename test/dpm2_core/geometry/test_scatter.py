@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fog and dust are found among surfaces, and hardly any surface among them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dpm2_core.geometry import se3
+from dpm2_core.geometry.scatter import scattered
+from test.helpers.rooms import dusty, frames
+
+HERE = se3.make(np.eye(3), [[0.3, 0, 0.6]])
+
+
+@pytest.mark.parametrize("street", [False, True])
+@pytest.mark.parametrize("fraction", [0.3, 0.6, 0.8])
+def test_dust_is_found(street: bool, fraction: float) -> None:
+    points, met = dusty(frames(HERE, street)[0].points, fraction, 0)
+    found = scattered(points, 0)
+    assert found[met].mean() > 0.7  # what lies beside a surface is not told from it
+    assert found[~met].mean() < 0.2
+
+
+@pytest.mark.parametrize("street", [False, True])
+def test_of_clean_scans_nearly_nothing_is_found(street: bool) -> None:
+    points = frames(HERE, street)[0].points
+    assert scattered(points, 0).mean() < 0.02
+    assert not scattered(points, 0.35).any()
+
+
+def test_less_than_asked_for_is_left() -> None:
+    points = frames(HERE)[0].points
+    assert not scattered(dusty(points, 0.1, 0)[0], 0.35).any()
+    assert scattered(dusty(points, 0.9, 0)[0], 0.35).any()
+
+
+def test_what_is_far_away_stays() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-40, 40, (4000, 4)).astype(np.float32)
+    away = np.linalg.norm(points[:, :3], axis=1)
+    assert not scattered(points, 0)[away > 8.1].any()
+
+
+@pytest.mark.parametrize("least", [0, 0.35])
+@pytest.mark.parametrize("count", [0, 1, 4])
+def test_too_few_points_say_nothing(count: int, least: float) -> None:
+    points = np.full((count, 4), 1, np.float32)
+    points.flags.writeable = False  # as those of messages
+    assert scattered(points, least).tolist() == [False] * count
