@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What breaks odometries, made of any drive: few frames per second, gaps, a blind sensor, a bad start, kidnapping."""
+"""What breaks odometries, made of any drive: few frames per second, gaps, blindness, fog, a bad start, kidnapping."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from dpm2_core.data.corrupt import in_dust
 from dpm2_core.estimates import State
 from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
@@ -17,6 +18,8 @@ from dpm2_core.geometry import se3
 EVERY = (1, 3, 6, 10)
 """Every so manieth frame: at 10 Hz and 50 km/h 1.4, 4, 8 and 14 m apart."""
 GAPS, BLIND = (1.0, 2.0, 3.0, 5.0), (1.0, 2.0, 3.0)  # s
+FOG = {"fog 40 m": (0.4, 40.0), "fog 20 m": (0.6, 20.0)}
+"""Fraction of pulses that return from it, and how far one sees, m."""
 _BEFORE, _AFTER = 14, 14  # frames around a gap or a blind sensor
 _START = 18  # frames of a drive that begins at a bad moment
 _AWAY = 2.0  # s that a robot is carried
@@ -57,6 +60,8 @@ def cases(frames: Sequence[Frame], truth: Array) -> Iterator[Case]:
                 yield _interrupted(f"{kind} {seconds:g} s", frames, truth, first, missing)
     yield from _starts(frames, truth, period)
     if count >= 3 * _AFTER // 2:
+        for name, (dust, sight) in FOG.items():
+            yield Case(name, [_foggy(frame, dust, sight) for frame in frames], truth)
         yield _kidnapped(frames, truth)
 
 
@@ -97,6 +102,13 @@ def _dirty(frame: Frame) -> Frame:
     rng = np.random.default_rng(frame.index)
     points = np.c_[rng.uniform(-0.5, 0.5, (300, 3)), np.zeros(300)].astype(np.float32)
     return Frame(frame.stamp, points, index=frame.index)
+
+
+def _foggy(frame: Frame, dust: float, sight: float) -> Frame:
+    points = in_dust(frame.points, dust, np.random.default_rng(frame.index))
+    seen = np.linalg.norm(points[:, :3], axis=1) <= sight
+    offset = None if frame.time_offset is None else frame.time_offset[seen]
+    return replace(frame, points=points[seen], time_offset=offset)
 
 
 def _starts(frames: Sequence[Frame], truth: Array, period: float) -> Iterator[Case]:

@@ -39,8 +39,8 @@ def run(
         str | None,
         typer.Option(
             help="Let sensors fail, NAME=VALUE,...: fractions of frames camera (black), no_image, overexposed, "
-            "underexposed (by stops), obstruction; fraction of beams; extrinsic_deg, extrinsic_m, time_offset (s); "
-            "seed."
+            "underexposed (by stops), obstruction; fraction of beams, of pulses that meet dust; sight (m); "
+            "extrinsic_deg, extrinsic_m, time_offset (s); seed."
         ),
     ] = None,
     map_file: Annotated[

@@ -42,6 +42,10 @@ class CorruptionSettings(Settings):
     """Fraction of frames in which a random box near the LiDAR hides all that is behind it."""
     beams: Ratio = 0.0
     """Fraction of the LiDAR's beams that are dead all the time; a beam is a band of 0.4 deg of elevation."""
+    dust: Ratio = 0.0
+    """Fraction of pulses that return from the air within 6 m, if from nothing before (fog, dust, smoke, snow)."""
+    sight: float | None = Field(None, gt=0)
+    """Returns from farther away are lost, m."""
     extrinsic_deg: float = Field(0.0, ge=0, le=180)
     """The calibration of every camera is turned by that much about a random axis, degrees."""
     extrinsic_m: float = Field(0.0, ge=0)
@@ -52,7 +56,8 @@ class CorruptionSettings(Settings):
 
 _BAND = np.radians(0.4)  # the spacing of an HDL-64
 # Streams of random numbers, so that no corruption changes another.
-_CAMERA, _NO_IMAGE, _OVER, _UNDER, _OBSTRUCTION, _BEAMS, _EXTRINSIC, _BOX = range(8)
+_CAMERA, _NO_IMAGE, _OVER, _UNDER, _OBSTRUCTION, _BEAMS, _EXTRINSIC, _BOX, _DUST = range(9)
+_DUSTY = (0.4, 6.0)  # m, evenly along a pulse
 
 
 class Box(NamedTuple):
@@ -85,6 +90,19 @@ def hidden_by(box: Box, points: Points) -> NDArray[np.bool_]:
         enter = np.minimum(first, second).max(1, initial=0)
         leave = np.maximum(first, second).min(1, initial=1)
         return enter <= leave
+
+
+def in_dust(points: Points, fraction: float, rng: np.random.Generator) -> Points:
+    """(N, 4) in the LiDAR frame, of which that fraction returns from the air, if from nothing before; intensities stay.
+
+    The points that a fraction of 0.3 moves are among those that one of 0.5 moves.
+    """
+    away = np.linalg.norm(points[:, :3], axis=1)
+    chance, at = rng.random(len(points)), rng.uniform(*_DUSTY, len(points))
+    met = (chance < fraction) & (at < away)  # False for NaN
+    points = points.copy()
+    points[met, :3] *= (at[met] / away[met]).astype(np.float32)[:, None]
+    return points
 
 
 class CorruptedSource:
@@ -150,9 +168,14 @@ class CorruptedSource:
         kept = ~self._dead[self._bands(frame.points)]
         if self._hit[_OBSTRUCTION][position]:
             kept &= ~hidden_by(random_box(self._rng(_BOX, position)), frame.points)
+        points = frame.points
+        if self._settings.dust:
+            points = in_dust(points, self._settings.dust, self._rng(_DUST, position))
+        if self._settings.sight is not None:
+            kept &= ~(np.linalg.norm(points[:, :3], axis=1) > self._settings.sight)  # NaN stays
         offset = None if frame.time_offset is None else frame.time_offset[kept]
         images = () if self._hit[_NO_IMAGE][position] else tuple(self._image(i, position) for i in frame.images)
-        return replace(frame, points=frame.points[kept], time_offset=offset, images=images)
+        return replace(frame, points=points[kept], time_offset=offset, images=images)
 
     @staticmethod
     def _bands(points: Points) -> NDArray[np.intp]:

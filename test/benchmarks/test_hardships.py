@@ -30,7 +30,7 @@ def test_a_long_drive_has_room_for_all(hard: dict[str, Case]) -> None:
     assert list(hard) == [
         "every 1", "every 3", "every 6", "every 10",
         "gap 1 s", "gap 2 s", "gap 3 s", "gap 5 s", "blind 1 s", "blind 2 s", "blind 3 s",
-        "start at speed", "start in a curve", "kidnapped",
+        "start at speed", "start in a curve", "fog 40 m", "fog 20 m", "kidnapped",
     ]  # fmt: skip
     assert all(len(case.frames) == len(case.truth) for case in hard.values())
     assert [case.name for case in cases(*drive(6))] == ["every 1", "every 3"]
@@ -57,6 +57,15 @@ def test_a_gap_is_empty_and_a_blind_sensor_sees_its_window(hard: dict[str, Case]
     assert dirty[-1] is blind.frames[blind.event - 1]
     assert dirty[0] is blind.frames[blind.base + 1]  # what is coasted while nothing is seen is no base to judge from
     assert gap.base == gap.event - 1
+
+
+def test_in_fog_one_sees_the_fog() -> None:
+    """Of points 30 m away the fog of 20 m sight returns 6 in 10, and the rest is lost."""
+    frames = [Frame(i * 10**8, np.full((200, 4), 30 / np.sqrt(3), np.float32), index=i) for i in range(60)]
+    case = next(case for case in cases(frames, np.tile(np.eye(4), (60, 1, 1))) if case.name == "fog 20 m")
+    away = np.concatenate([np.linalg.norm(frame.points[:, :3], axis=1) for frame in case.frames])
+    np.testing.assert_allclose(len(away) / 12_000, 0.6, atol=0.02)
+    assert away.max() < 6.01
 
 
 def test_who_is_kidnapped_is_back_where_it_was(hard: dict[str, Case]) -> None:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dpm2_core.frame import Array, Frame, Inertial, Points
 from dpm2_core.geometry import se3
@@ -96,14 +95,3 @@ def walk(count: int) -> Array:
     """(count, 4, 4) a circle of 0.7 m about the middle of the room, 0.6 m above the floor, begun at a halt."""
     angle = np.cumsum(np.minimum(np.arange(count) * 0.01, 0.08))
     return np.array([se3.exp([0, 0, a, 0, 0, 0]) @ se3.make(np.eye(3), [0.7, 0, 0.6]) for a in angle])
-
-
-def dusty(points: Points, fraction: float, seed: int, reach: float = 3.0) -> tuple[Points, NDArray[np.bool_]]:
-    """A scan (N, 4) in which so many pulses meet dust within `reach` m, where nothing else is before; and which did."""
-    rng = np.random.default_rng(seed)
-    away = np.linalg.norm(points[:, :3], axis=1)
-    at = 0.4 + (reach - 0.4) * np.sqrt(rng.random(len(points)))
-    met = (rng.random(len(points)) < fraction) & (at < away)
-    points = points.copy()
-    points[met, :3] *= (at[met] / away[met]).astype(np.float32)[:, None]
-    return points, met

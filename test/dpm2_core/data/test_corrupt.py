@@ -63,7 +63,7 @@ def test_nothing_asked_for_changes_nothing() -> None:
 
 EVERYTHING = {
     "camera": 0.3, "no_image": 0.2, "overexposed": 0.3, "underexposed": 0.3, "obstruction": 0.5, "beams": 0.2,
-    "extrinsic_deg": 2.0, "extrinsic_m": 0.1, "time_offset": 0.2,
+    "dust": 0.4, "sight": 25.0, "extrinsic_deg": 2.0, "extrinsic_m": 0.1, "time_offset": 0.2,
 }  # fmt: skip
 
 
@@ -144,6 +144,31 @@ def test_rays_along_the_axes_of_a_box_and_points_that_are_none() -> None:
     )
     expected = [True, False, True, False, False, False, False, False]
     np.testing.assert_array_equal(hidden_by(box, points.astype(np.float32)), expected)
+
+
+def test_dust_returns_its_share_of_pulses_from_near_by() -> None:
+    """Along the same ray; what 0.3 moves 0.6 moves alike."""
+    clean = [frame.points for frame in Drive().frames()]
+    some, many = ([frame.points for frame in corrupted(dust=fraction)] for fraction in (0.3, 0.6))
+    for points, fewer, more in zip(clean, some, many, strict=True):
+        away, nearer = (np.linalg.norm(p[:, :3].astype(float), axis=1) for p in (points, more))
+        moved = nearer < away - 1e-3
+        np.testing.assert_allclose(moved.mean(), 0.6, atol=0.05)  # hardly anything of 60 m is within 6 m
+        assert nearer[moved].min() > 0.39
+        assert nearer[moved].max() < 6.01
+        np.testing.assert_allclose(
+            more[moved, :3] / nearer[moved, None], points[moved, :3] / away[moved, None], atol=1e-5
+        )
+        changed = (fewer != points).any(1)
+        np.testing.assert_array_equal(fewer[changed], more[changed])
+
+
+def test_beyond_sight_nothing_returns() -> None:
+    for frame, clean in zip(corrupted(sight=25.0), Drive().frames(), strict=True):
+        away = np.linalg.norm(clean.points[:, :3], axis=1)
+        np.testing.assert_array_equal(frame.points, clean.points[away <= 25])
+        assert frame.time_offset is not None
+        assert len(frame.time_offset) == len(frame.points)
 
 
 def test_an_obstruction_takes_points_of_its_share_of_frames_and_their_times() -> None:

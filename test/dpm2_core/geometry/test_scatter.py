@@ -6,9 +6,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from dpm2_core.data.corrupt import in_dust
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.scatter import scattered
-from test.helpers.rooms import dusty, frames
+from test.helpers.rooms import frames
 
 HERE = se3.make(np.eye(3), [[0.3, 0, 0.6]])
 
@@ -16,8 +17,9 @@ HERE = se3.make(np.eye(3), [[0.3, 0, 0.6]])
 @pytest.mark.parametrize("street", [False, True])
 @pytest.mark.parametrize("fraction", [0.3, 0.6, 0.8])
 def test_dust_is_found(street: bool, fraction: float) -> None:
-    points, met = dusty(frames(HERE, street)[0].points, fraction, 0)
-    found = scattered(points, 0)
+    clean = frames(HERE, street)[0].points
+    points = in_dust(clean, fraction, np.random.default_rng(0))
+    met, found = (points != clean).any(1), scattered(points, 0)
     assert found[met].mean() > 0.7  # what lies beside a surface is not told from it
     assert found[~met].mean() < 0.2
 
@@ -30,9 +32,9 @@ def test_of_clean_scans_nearly_nothing_is_found(street: bool) -> None:
 
 
 def test_less_than_asked_for_is_left() -> None:
-    points = frames(HERE)[0].points
-    assert not scattered(dusty(points, 0.1, 0)[0], 0.35).any()
-    assert scattered(dusty(points, 0.9, 0)[0], 0.35).any()
+    points = frames(HERE, street=True)[0].points
+    assert not scattered(in_dust(points, 0.1, np.random.default_rng(0)), 0.35).any()
+    assert scattered(in_dust(points, 0.9, np.random.default_rng(0)), 0.35).any()
 
 
 def test_what_is_far_away_stays() -> None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from dpm2_core.data.corrupt import in_dust
 from dpm2_core.estimates import State
 from dpm2_core.frame import Frame
 from dpm2_core.geometry import se3
@@ -13,7 +14,7 @@ from dpm2_core.slam.build import make_odometry
 from dpm2_core.slam.odometry.scaled import ScaledOdometry
 from dpm2_core.slam.settings import SlamSettings
 
-from ....helpers.rooms import boxes, dusty, frames, scan, walk
+from ....helpers.rooms import boxes, frames, scan, walk
 
 
 def geometric(preset: str) -> SlamSettings:
@@ -79,7 +80,7 @@ def test_dust_in_a_corridor_does_not_hold_the_robot() -> None:
     for i, x in enumerate(way):
         points = scan(se3.make(np.eye(3), [x, 0, 0.6]), hull, things, i)
         points = points[np.linalg.norm(points[:, :3], axis=1) < 8]
-        result = odometry.process(Frame(i * 10**8, dusty(points, 0.3, i, reach=6)[0], index=i))
+        result = odometry.process(Frame(i * 10**8, in_dust(points, 0.3, np.random.default_rng(i)), index=i))
         assert result.registration.ok
         np.testing.assert_allclose(result.T_odom_lidar[:3, 3], [x, 0, 0], atol=0.05)
 
