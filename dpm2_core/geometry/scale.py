@@ -20,7 +20,6 @@ _NEAREST = 0.3  # m
 # shows 740 to 925 within 10 m; of 1,000 scans outside and in car parks none has three quarters within 11 m.
 _ROOM = (800, 18.0)
 _HALL = 10.0
-_FOG = 0.35  # of what is near: less of it hides neither
 _OPEN = (1300, 25.0)
 _LEAST = 30  # cells: fewer say nothing
 ROOM_SCALE = 5.0
@@ -38,7 +37,7 @@ def is_room(points: Points) -> bool | None:
     away = np.linalg.norm(some[:, :3], axis=1)
     valid = (away > _NEAREST) & (away < 1e4)  # False for NaN
     some, away = some[valid], away[valid]
-    fixed = ~scattered(some, _FOG)
+    fixed = ~scattered(some)
     some, away = some[fixed], away[fixed]
     cells = voxel_first(some, _CELL) if len(some) else np.zeros(0, int)
     if len(cells) < _LEAST:

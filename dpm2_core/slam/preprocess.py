@@ -15,7 +15,7 @@ from dpm2_core.descriptors import Descriptors, LazyDescriptors
 from dpm2_core.frame import Array, Frame, Image, Points
 from dpm2_core.geometry.compiled import READ_F4, compiled
 from dpm2_core.geometry.deskew import deskew, measured_turn
-from dpm2_core.geometry.scatter import scattered
+from dpm2_core.geometry.scatter import MANY, scattered
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.slam.filters import PointFilter
 
@@ -27,7 +27,7 @@ class PreprocessSettings(Settings):
     """Nearer returns are dropped (the vehicle itself), m."""
     max_range: float = 90.0
     """Farther returns are dropped, m."""
-    scatter: float = Field(0.35, ge=0, le=1)
+    scatter: float = Field(MANY, ge=0, le=1)
     """What floats in the air (fog, dust, smoke, spray, snow) is dropped where it is this fraction of the returns within
     8 m, or more. Denser maps need less of it to be misled."""
     map_voxel: float = 0.5

@@ -28,13 +28,13 @@ def test_dust_is_found(street: bool, fraction: float) -> None:
 def test_of_clean_scans_nearly_nothing_is_found(street: bool) -> None:
     points = frames(HERE, street)[0].points
     assert scattered(points, 0).mean() < 0.02
-    assert not scattered(points, 0.35).any()
+    assert not scattered(points).any()
 
 
 def test_less_than_asked_for_is_left() -> None:
     points = frames(HERE, street=True)[0].points
-    assert not scattered(in_dust(points, 0.1, np.random.default_rng(0)), 0.35).any()
-    assert scattered(in_dust(points, 0.9, np.random.default_rng(0)), 0.35).any()
+    assert not scattered(in_dust(points, 0.1, np.random.default_rng(0))).any()
+    assert scattered(in_dust(points, 0.9, np.random.default_rng(0))).any()
 
 
 def test_what_is_far_away_stays() -> None:
