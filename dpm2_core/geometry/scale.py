@@ -17,7 +17,7 @@ _FEW = 20_000  # points are enough
 _NEAREST = 0.3  # m
 # Cells seen, and the distance within which three quarters of them are, m. Measured: rooms and offices 130 to 530 cells
 # within 8 m; streets, tunnels, highways and car parks, also with 16 beams, 1,900 to 11,000 within 14 m and more. A hall
-# shows 740 to 925 within 10 m; of 1,000 scans outside and in car parks none has three quarters within 11 m.
+# shows 740 to 925 within 10 m with 16 beams; a yard of 18 by 20 m, seen by a LiDAR 70 degrees wide, 2,300 and more.
 _ROOM = (800, 18.0)
 _HALL = 10.0
 _OPEN = (1300, 25.0)
@@ -43,9 +43,9 @@ def is_room(points: Points) -> bool | None:
     if len(cells) < _LEAST:
         return None
     reach = float(np.percentile(away[cells], 75))
-    if reach <= _HALL or (len(cells) <= _ROOM[0] and reach <= _ROOM[1]):
-        return True
-    return False if len(cells) >= _OPEN[0] or reach >= _OPEN[1] else None
+    if len(cells) >= _OPEN[0] or reach >= _OPEN[1]:
+        return False
+    return True if reach <= _HALL or (len(cells) <= _ROOM[0] and reach <= _ROOM[1]) else None
 
 
 def scale_of(points: Points) -> float:

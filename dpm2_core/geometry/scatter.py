@@ -25,7 +25,7 @@ _LEAST = 5  # points of a strip; fewer say nothing
 _ALONE, _CHANCE = 0.3, 3.0
 """A point is alone where fewer of the others are as far away in both of its strips; or not more than there are in all
 directions, by so many standard deviations. Of a surface one strip has more, even if it is seen at a grazing angle."""
-MANY = 0.35
+MANY = 0.2
 """Of what is near: less hides nothing, and does not hold an odometry whose map is as sparse as those of streets."""
 _SOME, _LEAST_NEAR = 6000, 100  # points tell whether there are many; of these so many must be near
 

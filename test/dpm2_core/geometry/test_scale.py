@@ -39,6 +39,17 @@ def test_a_hall_is_a_room_from_wherever_in_it() -> None:
         assert is_room(points) is True
 
 
+def test_a_yard_that_is_seen_densely_is_none() -> None:
+    """A hand-held LiDAR 70 degrees wide, in a yard: what it sees is near, and much more than of a hall. One scan in 90
+    was of a room, and could not be compared with the others: the odometry was lost there."""
+    rng = np.random.default_rng(0)
+    azimuth, elevation = np.radians(rng.uniform(-35, 35, 20_000)), np.radians(rng.uniform(-35, 35, 20_000))
+    rays = np.stack([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)], -1)
+    points = np.ones((20_000, 4), np.float32)
+    points[:, :3] = rays * rng.uniform(3, 10, 20_000)[:, None]
+    assert is_room(points) is False
+
+
 def test_too_little_says_nothing() -> None:
     points = frames(MIDDLE[None])[0].points
     assert is_room(points[:10]) is None
