@@ -79,6 +79,22 @@ def test_the_figures_at_few_frames_per_second_are_those_of_the_record() -> None:
     assert all(rate["adaptive"]["failed_frames"] == 0 for rate in rates)
 
 
+def test_the_figures_in_fog_are_those_of_the_record() -> None:
+    methods, marks = (
+        {"adaptive": "adaptive", "points alone": "geometric", "KISS-ICP": "kiss-icp"},
+        {"!": "silent", "?": "said"},
+    )
+    drives = record("hard.json")["drives"]
+    found = list(rows("README.md", "| in fog | 00 | 04 | city | suburb |"))
+    assert len(found) == len(methods)
+    for cells in found:
+        (method,) = (key for words, key in methods.items() if words in cells[0])
+        for drive, cell in zip(("00", "04", "city", "suburb"), cells[1:], strict=True):
+            figures, (error, _, mark) = drives[drive]["fog 20 m"][method], cell.partition(" ")
+            assert equals(error, figures["error_m"]), (method, drive)
+            assert marks.get(mark, "right") == figures["verdict"], (method, drive)
+
+
 def test_the_figures_of_the_livox_are_those_of_the_record() -> None:
     methods = {"dpm2, `adaptive`": "adaptive", "dpm2, `neural`": "neural", "KISS-ICP": "kiss-icp"}
     (cases,) = record("livox.json")["drives"].values()
