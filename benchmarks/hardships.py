@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from dpm2_core.data.corrupt import in_dust
+from dpm2_core.data.corrupt import in_fog
 from dpm2_core.estimates import State
 from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
@@ -105,8 +105,7 @@ def _dirty(frame: Frame) -> Frame:
 
 
 def _foggy(frame: Frame, dust: float, sight: float) -> Frame:
-    points = in_dust(frame.points, dust, np.random.default_rng(frame.index))
-    seen = np.linalg.norm(points[:, :3], axis=1) <= sight
+    points, seen = in_fog(frame.points, dust, sight, np.random.default_rng(frame.index))
     offset = None if frame.time_offset is None else frame.time_offset[seen]
     return replace(frame, points=points[seen], time_offset=offset)
 

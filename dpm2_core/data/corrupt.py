@@ -105,6 +105,12 @@ def in_dust(points: Points, fraction: float, rng: np.random.Generator) -> Points
     return points
 
 
+def in_fog(points: Points, dust: float, sight: float, rng: np.random.Generator) -> tuple[Points, NDArray[np.bool_]]:
+    """(N, 4) in dust, see `in_dust`, and which of them (N,) are within `sight`, m, or no measurement."""
+    points = in_dust(points, dust, rng) if dust else points
+    return points, ~(np.linalg.norm(points[:, :3], axis=1) > sight)
+
+
 class CorruptedSource:
     """A `Source` whose frames are corrupted as they are read; poses and calibration in files stay true."""
 
@@ -168,11 +174,9 @@ class CorruptedSource:
         kept = ~self._dead[self._bands(frame.points)]
         if self._hit[_OBSTRUCTION][position]:
             kept &= ~hidden_by(random_box(self._rng(_BOX, position)), frame.points)
-        points = frame.points
-        if self._settings.dust:
-            points = in_dust(points, self._settings.dust, self._rng(_DUST, position))
-        if self._settings.sight is not None:
-            kept &= ~(np.linalg.norm(points[:, :3], axis=1) > self._settings.sight)  # NaN stays
+        s = self._settings
+        points, seen = in_fog(frame.points, s.dust, s.sight or np.inf, self._rng(_DUST, position))
+        kept &= seen
         offset = None if frame.time_offset is None else frame.time_offset[kept]
         images = () if self._hit[_NO_IMAGE][position] else tuple(self._image(i, position) for i in frame.images)
         return replace(frame, points=points[kept], time_offset=offset, images=images)
