@@ -18,7 +18,8 @@ from dpm2_core.geometry.compiled import READ_F4, compiled
 
 _NEAR = 8.0  # m: farther away they return too little to be many
 _LONG, _SHORT = 24, 4  # degrees, edges of a strip of directions
-_STRIPS = (360 // _LONG) * (180 // _SHORT)
+_ROWS = 180 // _SHORT, -(-180 // _LONG)  # of strips along the horizon and across
+_STRIPS = max(360 // _LONG * _ROWS[0], 360 // _SHORT * _ROWS[1])
 _FINEST, _SHIFT = 0.04, 0.5  # of ln(range + 0.5 m): the noise of ranges is more than 4 % of short ones
 _BINS = int(log((_NEAR + _SHIFT) / _SHIFT) / _FINEST) + 3  # with an empty one at either end
 _LEAST = 5  # points of a strip; fewer say nothing
@@ -39,12 +40,14 @@ def scattered(points: Points, least: float = MANY) -> NDArray[np.bool_]:
     Args:
         least: fraction of what is near. None are found where fewer are.
     """
+    every = max(1, len(points) // _SOME) if least > 0 else 1
+    some = np.ascontiguousarray(points[::every])
+    alone = _alone(some)
     if least > 0:
-        some = np.ascontiguousarray(points[:: max(1, len(points) // _SOME)])
         near = np.einsum("ij,ij->i", some[:, :3], some[:, :3]) < _NEAR**2
-        if near.sum() < _LEAST_NEAR or _alone(some)[near].mean() < least:
+        if near.sum() < _LEAST_NEAR or alone[near].mean() < least:
             return np.zeros(len(points), np.bool_)
-    return _alone(np.ascontiguousarray(points))
+    return alone if every == 1 else _alone(np.ascontiguousarray(points))
 
 
 @compiled(boolean[::1](READ_F4))
@@ -63,7 +66,7 @@ def _alone(points: Points) -> NDArray[np.bool_]:
             distance[i] = 1 + int(log((away + _SHIFT) / _SHIFT) / _FINEST)
         for way in range(2):
             wide, high = (_LONG, _SHORT) if way == 0 else (_SHORT, _LONG)
-            strip[way, i] = int(azimuth / wide) * (180 // high) + int(elevation / high)
+            strip[way, i] = int(azimuth / wide) * _ROWS[way] + int(elevation / high)
             total[way, strip[way, i]] += 1
             count[way, strip[way, i], distance[i]] += distance[i] > 0
     usual = np.bincount(distance, minlength=_BINS) / max(len(points), 1)

@@ -44,6 +44,15 @@ def test_what_is_far_away_stays() -> None:
     assert not scattered(points, 0)[away > 8.1].any()
 
 
+def test_what_is_overhead_is_not_compared_with_the_floor() -> None:
+    """The last strip of one direction and the first of the next were one."""
+    azimuth, elevation = np.radians(np.repeat([1.0, 5.0], [12, 50])), np.radians(np.repeat([82.0, -75.0], [12, 50]))
+    away = np.concatenate([np.linspace(1.2, 7, 12), np.full(50, 1.2)])
+    flat = away * np.cos(elevation)
+    points = np.stack([flat * -np.cos(azimuth), flat * -np.sin(azimuth), away * np.sin(elevation), away], -1)
+    assert scattered(points.astype(np.float32), 0).tolist() == [True] * 12 + [False] * 50
+
+
 @pytest.mark.parametrize("least", [0, 0.35])
 @pytest.mark.parametrize("count", [0, 1, 4])
 def test_too_few_points_say_nothing(count: int, least: float) -> None:
