@@ -15,6 +15,7 @@ import numpy as np
 
 from benchmarks.loops import error_of
 from benchmarks.relocalise_visits import kept, measured, row_of, success_rates
+from dpm2_core.data.corrupt import in_dust
 from dpm2_core.data.kitti import KittiSource
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.estimates import Edge, Keyframe
@@ -34,6 +35,8 @@ HEIGHT = 0.8
 """Of the LiDAR above the floor, m."""
 VISITS, VISITS_SEED = 60, 5
 """Random places and headings in each world."""
+DUST = 0.3
+"""Fraction of the pulses that meet dust in visits of their own; the maps are made without."""
 WRONG_M, WRONG_DEG = 0.5, 5.0
 """A loop that is off by more than either is wrong: the next room."""
 
@@ -46,15 +49,16 @@ class Visit:
     truth: Array
 
 
-def visits_to(config: DriveConfig, settings: SlamSettings) -> list[Visit]:
-    """Random visits to the world of a drive, whose map begins where the drive does."""
+def visits_to(config: DriveConfig, settings: SlamSettings, dust: float = 0.0) -> list[Visit]:
+    """Random visits to the world of a drive, whose map begins where the drive does; with `dust`, the same in dust."""
     world = build_world(config.road, config.preset, config.seed, fitting_length(config))
     lidar, rng = Lidar(config.lidar), np.random.default_rng(VISITS_SEED)
     T_map_world, visits = se3.inverse(world.drive_pose(0.0, HEIGHT)), list[Visit]()
     for i in range(VISITS):
         T, time = world.sample_pose(rng, height=HEIGHT, sway=config.lidar.real.sway)
         T = T @ se3.exp(np.array([0, 0, rng.uniform(-np.pi, np.pi), 0, 0, 0]))
-        frame = Frame(0, lidar.scan(world, T, time, rng).points)
+        points = in_dust(lidar.scan(world, T, time, rng).points, dust, np.random.default_rng(i))
+        frame = Frame(0, points)
         cloud = kept(measured(frame, settings), settings)
         visits.append(Visit(Keyframe(i, 0, i, np.eye(4), cloud), T_map_world @ T))
     return visits
@@ -107,12 +111,12 @@ def is_wrong(truth: Array, loop: Edge) -> bool:
     return meters > WRONG_M or degrees > WRONG_DEG
 
 
-def relocalise_table(worlds: dict[str, Any]) -> FigureTable:
-    """What `relocalised` found."""
+def relocalise_table(worlds: dict[str, Any], key: str, title: str) -> FigureTable:
+    """What `relocalised` found, of the results under a key."""
     figures = ("right %", "no answer", "wrong", "median m", "other worlds' taken for it", "p95 s")
-    table = FigureTable("relocalization from one scan, without a prior", names=["world"], figures=figures)
+    table = FigureTable(title, names=["world"], figures=figures)
     for name, world in worlds.items():
-        r = world["relocalisation"]
+        r = world[key]
         median = "-" if r["median_error_m"] is None else f"{r['median_error_m']:.3f}"
         table.add_row(name, f"{100 * r['right']:.0f}", f"{r['no_answer']} of {r['visits']}", str(r["wrong"]), median,
                       f"{r['mistaken']} of {r['other_worlds']}", f"{r['seconds']['p95']:.2f}")  # fmt: skip

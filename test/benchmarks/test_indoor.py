@@ -24,5 +24,6 @@ def test_a_few_scans_of_a_building_are_evaluated(tmp_path: Path, monkeypatch: py
     assert row["keyframes"] >= 1
     assert row["loops"] >= row["wrong_loops"] == 0
     assert (row["relocalisation"]["visits"], sum(row["joins"].values())) == (4, 6)
+    assert (row["relocalisation_in_dust"]["visits"], row["relocalisation_in_dust"]["wrong"]) == (4, 0)
     for kind in ("odometry", "slam"):
         assert 0 < row[kind]["ape_rmse_m"] < 0.1  # m, in a room
