@@ -14,7 +14,7 @@ JOBS ?= -n 3 --dist worksteal
 # The environment is self-contained: a sourced ROS 2, another environment's bootstrap or its libraries must not leak in.
 unexport PYTHONPATH PYTHONHOME VIRTUAL_ENV AMENT_PREFIX_PATH ROS_DISTRO LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: help setup demo test test-fast fuzz lint bench measure bench-ros bench-robots bench-memory train-data train-small train-movers train-ground ablation sim diagrams parameters topics docs dist dist-check lint-release picture clean
+.PHONY: help setup demo test test-fast fuzz lint bench measure bench-ros bench-livox bench-robots bench-memory train-data train-small train-movers train-ground ablation sim diagrams parameters topics docs dist dist-check lint-release picture clean
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:[^#]*##/\t/' | expand -t 16
 
@@ -57,6 +57,17 @@ bench: setup  ## the figures of benchmarks/, beside KISS-ICP
 
 bench-ros: setup  ## the KITTI excerpt through bag, player and slam_node at 10 Hz
 	$(BIN)/python -m benchmarks.ros $(ARGS)
+
+BALM ?= https://github.com/hku-mars/BALM
+LIVOX := out/livox/sequences/00
+$(LIVOX)/poses.txt: | setup  # what is written last
+	$(BIN)/python -m pip install -qq --disable-pip-version-check -e '.[datasets,bench]'
+	@test -d out/livox/BALM || git clone -q --depth 1 $(BALM) out/livox/BALM
+	rm -rf $(LIVOX) && $(BIN)/python -m benchmarks.livox_drive out/livox/BALM/datas/benchmark_realworld $(LIVOX)
+
+bench-livox: $(LIVOX)/poses.txt  ## `dpm2 bench hard` on a public drive of a hand-held Livox Avia, which it downloads
+	$(BIN)/python -m dpm2_core.cli bench hard --source $(LIVOX) --set input.vertical_angle_correction_deg=0 --out out/livox $(ARGS)
+	cp out/livox/hard.json benchmarks/livox.json
 
 bench-robots: setup  ## three robots and one mapper_node behind a link that loses packets and is cut for 30 s (root, nftables)
 	$(BIN)/python -m benchmarks.robots $(ARGS)

@@ -22,6 +22,8 @@ COMMANDS: dict[str, Sequence[str]] = {
     "roads": (), "indoor": (), "finetune": (),
 }  # fmt: skip
 """Benchmarks and their options, the quick ones first."""
+TARGETS = {"livox": "bench-livox"}
+"""Records that a target of the Makefile makes."""
 _CODE = ("dpm2_core", "benchmarks/*.py")
 
 
@@ -31,10 +33,11 @@ def remaining(names: Sequence[str]) -> list[str]:
     Raises:
         UsageError: no such record.
     """
+    known = [*COMMANDS, *TARGETS]
     for name in names:
-        if name not in COMMANDS:
-            raise UsageError(f"{name}: no such record; choose from {', '.join(COMMANDS)}")
-    return [name for name in names or COMMANDS if not _is_current(measured_at(RECORDS / f"{name}.json"))]
+        if name not in known:
+            raise UsageError(f"{name}: no such record; choose from {', '.join(known)}")
+    return [name for name in names or known if not _is_current(measured_at(RECORDS / f"{name}.json"))]
 
 
 def measured_at(path: Path) -> str | None:
@@ -65,7 +68,8 @@ def main(names: Sequence[str]) -> None:
         raise UsageError("a record names the commit that it is of: commit what has changed first")
     for name in remaining(names):
         print(f"{name}: at {measured_at(RECORDS / f'{name}.json') or 'no commit'}, measured again", flush=True)
-        command = [sys.executable, "-m", "dpm2_core.cli", "bench", name, *COMMANDS[name]]
+        bench = [sys.executable, "-m", "dpm2_core.cli", "bench", name, *COMMANDS.get(name, ())]
+        command = ["make", TARGETS[name]] if name in TARGETS else bench
         if subprocess.run(command, cwd=REPOSITORY, check=False).returncode:
             raise Dpm2Error(f"{name}: the benchmark failed; what was measured before it is kept")
 
