@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks import BENCHES
 from dpm2_core.errors import UsageError
-from dpm2_core.evaluation.record import git_commit
+from dpm2_core.evaluation.record import REPOSITORY, git_commit
 from tools import measure
 
 
@@ -17,6 +17,13 @@ def test_every_record_is_a_benchmark_with_options_that_it_takes() -> None:
     for name, options in measure.COMMANDS.items():
         taken = BENCHES[name].options
         assert {option.removeprefix("--") for option in options if option.startswith("--")} <= taken
+
+
+def test_other_records_are_made_by_targets_of_the_makefile() -> None:
+    makefile = (REPOSITORY / "Makefile").read_text()
+    for name, target in measure.TARGETS.items():
+        assert f"\n{target}:" in makefile
+        assert f"benchmarks/{name}.json" in makefile
 
 
 def test_records_of_this_code_are_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
