@@ -45,6 +45,7 @@ def scattered(points: Points, least: float = MANY) -> NDArray[np.bool_]:
     Args:
         least: fraction of what is near. None are found where fewer are.
     """
+    points = np.ascontiguousarray(points)
     every = max(1, len(points) // _SOME) if least > 0 else 1
     alone, near = _alone(points, every)
     if least > 0 and (near < _LEAST_NEAR or alone.sum() < least * near):
@@ -69,8 +70,8 @@ def _in_cells(
             face, depth, u, v = (2 if x < 0 else 3), abs(x), y, z
         else:
             face, depth, u, v = (4 if y < 0 else 5), abs(y), x, z
-        column = min(int((u / depth + 1) * (edge / 2)), edge - 1)
-        row = min(int((v / depth + 1) * (edge / 2)), edge - 1)
+        column = max(0, min(int((u / depth + 1) * (edge / 2)), edge - 1))  # 0 for NaN, too
+        row = max(0, min(int((v / depth + 1) * (edge / 2)), edge - 1))
         if (column // _PATCH + 7 * (row // _PATCH) + 3 * face) % every == 0:
             cell[i], away[i] = (face * side + row + _LONGEST) * side + column + _LONGEST, sqrt(x * x + y * y + z * z)
             start[cell[i] + 1] += 1

@@ -71,3 +71,8 @@ def test_too_few_points_say_nothing(count: int, least: float) -> None:
     points = np.full((count, 4), 1, np.float32)
     points.flags.writeable = False  # as those of messages
     assert scattered(points, least).tolist() == [False] * count
+
+
+def test_what_is_no_direction_does_no_harm() -> None:
+    points = np.tile(np.float32([[0, 0, 0, 0], [np.nan, 1, 1, 1], [np.inf, 1, 1, 1], [2, 0, 0, 1]]), (50, 1))
+    assert not scattered(np.asfortranarray(points), 0).any()
