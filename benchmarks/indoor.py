@@ -63,8 +63,7 @@ def bench_indoor(options: Options) -> Report:
             results[name], mappers[name] = _drive(Path(folder) / str(seed), settings, progress, name)
             progress.console.print(f"{name}: {results[name]}", soft_wrap=True)
             suited = settings.indoors() if results[name]["preset"] == "indoor" else settings
-            visits[name] = visits_to(config, suited)
-            dusty[name] = visits_to(config, suited, DUST)
+            visits[name], dusty[name] = visits_to(config, suited)
             results[name]["joins"] = joins(Path(folder) / str(seed), settings)
         for name, mapper in mappers.items():
             results[name]["relocalisation"] = found = relocalised(settings, mapper, visits, name)

@@ -49,19 +49,19 @@ class Visit:
     truth: Array
 
 
-def visits_to(config: DriveConfig, settings: SlamSettings, dust: float = 0.0) -> list[Visit]:
-    """Random visits to the world of a drive, whose map begins where the drive does; with `dust`, the same in dust."""
+def visits_to(config: DriveConfig, settings: SlamSettings) -> tuple[list[Visit], list[Visit]]:
+    """Random visits to the world of a drive, whose map begins where the drive does; and the same scans in dust."""
     world = build_world(config.road, config.preset, config.seed, fitting_length(config))
     lidar, rng = Lidar(config.lidar), np.random.default_rng(VISITS_SEED)
-    T_map_world, visits = se3.inverse(world.drive_pose(0.0, HEIGHT)), list[Visit]()
+    T_map_world, clear, dusty = se3.inverse(world.drive_pose(0.0, HEIGHT)), list[Visit](), list[Visit]()
     for i in range(VISITS):
         T, time = world.sample_pose(rng, height=HEIGHT, sway=config.lidar.real.sway)
         T = T @ se3.exp(np.array([0, 0, rng.uniform(-np.pi, np.pi), 0, 0, 0]))
-        points = in_dust(lidar.scan(world, T, time, rng).points, dust, np.random.default_rng(i))
-        frame = Frame(0, points)
-        cloud = kept(measured(frame, settings), settings)
-        visits.append(Visit(Keyframe(i, 0, i, np.eye(4), cloud), T_map_world @ T))
-    return visits
+        scan = lidar.scan(world, T, time, rng).points
+        for visits, points in ((clear, scan), (dusty, in_dust(scan, DUST, np.random.default_rng(i)))):
+            cloud = kept(measured(Frame(0, points), settings), settings)
+            visits.append(Visit(Keyframe(i, 0, i, np.eye(4), cloud), T_map_world @ T))
+    return clear, dusty
 
 
 def relocalised(settings: SlamSettings, mapper: Mapper, visits: dict[str, list[Visit]], home: str) -> dict[str, Any]:

@@ -17,7 +17,8 @@ from dpm2_core.frame import Points
 from dpm2_core.geometry.compiled import READ_F4, compiled
 
 _NEAR = 8.0  # m: farther away they return too little to be many
-_CELLS = 80  # along each edge of a cube around the sensor, of 0.7 to 1.4 degrees; of scans below 40,000 points fewer
+_CELLS = 80  # along each edge of a cube around the sensor: of 0.7 to 1.4 degrees
+_DENSE = 40_000  # points; scans of fewer get larger cells
 _ENOUGH, _LEAST = 15, 5  # points of a strip: it is lengthened until it has so many; fewer than 5 say nothing
 _LONGEST = 12  # cells on either side
 _LIKE, _LONGER = 0.03, 0.2  # of range + _SHIFT is as far away; by so much more for each further cell on either side
@@ -88,7 +89,7 @@ def _in_cells(
 def _alone(points: Points, every: int) -> tuple[NDArray[np.bool_], int]:
     """Which of (N, 4) points are near and unlike those around them, and how many are near; of all patches of directions
     one in `every` is looked at."""
-    edge = max(1, min(_CELLS, int(0.4 * sqrt(len(points)))))
+    edge = max(1, int(_CELLS * min(1.0, sqrt(len(points) / _DENSE))))
     cell, away, of_cells, start = _in_cells(points, edge, every)
     near = np.flatnonzero((cell >= 0) & (away < _NEAR))
     bins = (np.log((away[near] + _SHIFT) / _SHIFT) / _BIN).astype(np.int64)
