@@ -24,6 +24,7 @@ $(READY): setup.py pyproject.toml
 	@test -n "$(PYTHON)" || { echo "no Python 3.11 or 3.12 on PATH; set PYTHON=/path/to/python3.11" >&2; exit 2; }
 	@test -x $(BIN)/python || $(PYTHON) -m venv .venv || { rm -rf .venv; echo "the venv module is missing (Debian, Ubuntu: apt install python3-venv)" >&2; exit 1; }
 	$(BIN)/python -m pip install -qq --disable-pip-version-check --no-compile -e '.[$(EXTRAS)]'
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check --no-compile --no-deps 'ouster-sdk>=1,<2' || echo "continuing without Ouster recordings" >&2
 	@$(BIN)/python -m dpm2_ros.build_tf2_msgs || echo "continuing without /tf" >&2
 	@touch $@
 

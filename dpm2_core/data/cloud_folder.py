@@ -7,14 +7,13 @@ import re
 from collections.abc import Iterator, Mapping
 from decimal import Decimal
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dpm2_core.data.frames import Calibration, FrameBuilder
-from dpm2_core.data.messages import cloud_fields
+from dpm2_core.data.messages import point_cloud
 from dpm2_core.data.ply import read_vertices
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.errors import UsageError
@@ -88,8 +87,7 @@ def _cloud(path: Path, stamp: int) -> Any:
     parts = {name: part.astype(np.float64) if part.dtype.itemsize == 8 else part for name, part in columns.items()}
     if not parts:
         raise UsageError(f"{path}: no fields")
-    time = SimpleNamespace(sec=stamp // 10**9, nanosec=stamp % 10**9)
-    return SimpleNamespace(header=SimpleNamespace(stamp=time, frame_id=""), **cloud_fields(parts, SimpleNamespace))
+    return point_cloud(parts, stamp)
 
 
 def _read_pcd(path: Path) -> Mapping[str, NDArray[Any]]:

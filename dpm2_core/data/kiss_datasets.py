@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The data sets that KISS-ICP reads, as a `Source`: MulRan, Newer College, NCLT, HeLiPR, Boreas, Ouster pcap, ...
+"""The data sets that KISS-ICP reads, as a `Source`: MulRan, Newer College, NCLT, HeLiPR, Boreas, ...
 
 I. Vizzo et al., "KISS-ICP", RA-L 2023; its package `kiss_icp.datasets` (MIT) has the loaders.
 """
@@ -20,7 +20,7 @@ from dpm2_core.extras import needs
 from dpm2_core.frame import Array, Frame
 
 _PERIOD = 0.1  # s between sweeps, where the loader knows no times of them
-_OWN = ("generic", "mcap", "rosbag")  # read without it, with times and intensities
+_OWN = ("generic", "mcap", "ouster", "rosbag")  # read without it, with times and intensities
 
 
 class KissSource:
@@ -44,8 +44,6 @@ class KissSource:
         if kind not in names:
             raise UsageError(f"input.dataset={kind}: there is no such loader; there are {', '.join(names)}")
         arguments = {"data_dir": self.path, "sequence": self._settings.sequence}
-        if kind == "ouster":
-            arguments = {"data_dir": self.path}
         self._set = self._asked(lambda: dataset_factory(kind, **arguments))
         self._count = int(self._asked(lambda: len(self._set)))
         if not self._count:

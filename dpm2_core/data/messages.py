@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Callable, Collection, Mapping
+from types import SimpleNamespace
 from typing import Any, Literal, cast
 
 import numpy as np
@@ -302,6 +303,12 @@ def cloud_fields(columns: Mapping[str, NDArray[Any]], point_field: Callable[...,
         "data": cloud.view(np.uint8) if len(cloud) else np.empty(0, np.uint8),
         "is_dense": False,
     }
+
+
+def point_cloud(columns: Mapping[str, NDArray[Any]], stamp: int) -> Any:
+    """As a sensor_msgs/PointCloud2 of a stamp, ns: what is not a message becomes points as messages do."""
+    time = SimpleNamespace(sec=stamp // 10**9, nanosec=stamp % 10**9)
+    return SimpleNamespace(header=SimpleNamespace(stamp=time, frame_id=""), **cloud_fields(columns, SimpleNamespace))
 
 
 def point_columns(points: Points) -> dict[str, Points]:

@@ -30,7 +30,8 @@ def sequences_below(path: Path | str) -> list[str]:
 
 
 def open_source(path: Path | str, settings: InputSettings | None = None) -> Source:
-    """Open whatever `path` is: a folder of KITTI odometry, KITTI-360 or KITTI-CARLA or of PCD or PLY files, or a bag.
+    """Open whatever `path` is: a folder of KITTI odometry, KITTI-360 or KITTI-CARLA or of PCD or PLY files, a bag, or
+    what an Ouster LiDAR has sent.
 
     Raises:
         UsageError: there is nothing, or nothing that can be read; the message says what was found.
@@ -38,10 +39,14 @@ def open_source(path: Path | str, settings: InputSettings | None = None) -> Sour
     path, settings = Path(path), settings or InputSettings()
     if not path.exists():
         raise UsageError(f"{path}: no such file or folder")
-    if settings.dataset or path.suffix == ".pcap":
+    if settings.dataset:
         from dpm2_core.data.kiss_datasets import KissSource
 
-        return KissSource(path, settings if settings.dataset else settings.model_copy(update={"dataset": "ouster"}))
+        return KissSource(path, settings)
+    if path.suffix in (".pcap", ".osf"):
+        from dpm2_core.data.ouster import OusterSource
+
+        return OusterSource(path, settings)
     # rosbags and its type store are slow to import, and of no use for a KITTI folder.
     if path.is_file() or any(
         file.suffix in (".mcap", ".db3") or file.name == "metadata.yaml" for file in path.iterdir()

@@ -32,15 +32,16 @@ class InputSettings(Settings):
     one."""
 
     dataset: str = ""
-    """Loader of KISS-ICP's that reads the recording (extra datasets): mulran, ncd, nclt, helipr, boreas, apollo, ouster
-    (a pcap file), ...; empty recognizes the recording by itself."""
+    """Loader of KISS-ICP's that reads the recording (extra datasets): mulran, ncd, nclt, helipr, boreas, apollo, ...;
+    empty recognizes the recording by itself."""
 
     kitti_poses: Literal["auto", "kitti", "semantic_kitti"] = "auto"
     """Ground truth of KITTI odometry: poses/NN.txt (kitti), poses.txt in the sequence's folder, which SemanticKITTI
     publishes (semantic_kitti), or the latter where it is there, else the former (auto)."""
 
     points_topic: str = ""
-    """PointCloud2 or Livox CustomMsg topic of a bag; empty takes /kitti/velo/pointcloud, else the only one."""
+    """PointCloud2 or Livox CustomMsg topic of a bag; empty takes /kitti/velo/pointcloud, else the only one. Of a
+    recording of several Ousters: the serial number of one."""
 
     second_points_topic: str = ""
     """Topic of a second LiDAR, whose place /tf_static knows: each cloud of `points_topic` is joined by the nearest of

@@ -134,9 +134,6 @@ def test_loaders_that_cannot_are_named(mulran: Path, monkeypatch: pytest.MonkeyP
         open_source(mulran, InputSettings(dataset="kiti"))
     with pytest.raises(UsageError, match=r"KISS-ICP's loader nclt: "):
         open_source(mulran, InputSettings(dataset="nclt"))
-    (mulran / "drive.pcap").write_bytes(b"123")
-    with pytest.raises(UsageError, match=r"drive.pcap: KISS-ICP's loader ouster: "):
-        open_source(mulran / "drive.pcap")
     monkeypatch.setitem(sys.modules, "kiss_icp.datasets", None)
     with pytest.raises(MissingPackageError, match=r"input.dataset=mulran needs the package .*dpm2_ros\[datasets\]"):
         open_source(mulran, InputSettings(dataset="mulran"))

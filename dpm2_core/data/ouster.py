@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A recording of an Ouster LiDAR as it comes over the network, as a `Source`: .pcap, or .osf of Ouster's own tools."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dpm2_core.data.frames import Calibration, FrameBuilder
+from dpm2_core.data.messages import point_cloud
+from dpm2_core.data.settings import InputSettings
+from dpm2_core.errors import UsageError
+from dpm2_core.extras import MissingPackageError
+from dpm2_core.frame import Array, Frame
+
+SUFFIXES = (".pcap", ".osf")
+# Its dependencies hold rosbags and others at releases that this package cannot use; to read, it needs none of them.
+INSTALL = "pip install --no-deps 'ouster-sdk>=1,<2'"
+_RECEIVED = 1  # the bit of a column's status
+_INTENSITY = ("REFLECTIVITY", "SIGNAL")  # the first that a recording has
+
+
+class OusterSource:
+    """Sweeps in the frame of the sensor's housing, stamped when their first column was measured. See `Source`.
+
+    Intensity is the reflectivity, and each column has its time. Neither images, nor the IMU, nor ground truth.
+    A .pcap needs the sensor's metadata beside it: the .json whose name begins alike.
+
+    Raises:
+        UsageError: the file cannot be read, or has several sensors of which `input.points_topic` names none.
+        MissingPackageError: ouster-sdk is not installed.
+    """
+
+    T_cam_lidar: Array | None = None
+    poses: Array | None = None
+    truth = ""
+
+    def __init__(self, path: Path | str, settings: InputSettings | None = None) -> None:
+        self.path, settings = Path(path), settings or InputSettings()
+        self.name, self.notes = self.path.stem, list[str]()
+        self._project, self._sweeps = _opened(self.path, settings.points_topic)
+        # An .osf has an index, or one would be written into it.
+        self._count = len(self._sweeps) if self._sweeps.is_indexed else sum(1 for _ in self._sweeps)
+        if not self._count:
+            raise UsageError(f"{self.path}: no sweep of the sensor that its metadata describes")
+        self._frames = FrameBuilder(settings, Calibration(str(self.path)), self.notes.append)
+
+    def __len__(self) -> int:
+        return self._count
+
+    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
+        """Frames start..stop-1 by position; the first that cannot be read has `problem` set and is the last."""
+        wanted, stamp = range(*slice(start, stop).indices(self._count)), 0
+        # By its index the package (1.0) finds the first sweep of an .osf in place of its last.
+        upcoming = islice(self._sweeps, wanted.start, wanted.stop)
+        for index in wanted:
+            try:
+                if (sweep := next(upcoming, None)) is None:
+                    raise UsageError("its data are not there")
+                columns, stamp = self._columns(sweep[0], stamp)
+            except Exception as error:  # damaged files raise several kinds of the package's own
+                problem = f"{self.path}: sweep {index}: {_reason(error)}"
+                self.notes.append(problem)
+                yield Frame(stamp, np.empty((0, 4), np.float32), index=index, problem=problem)
+                return
+            yield self._frames.frame(stamp, point_cloud(columns, stamp), index)
+
+    def _columns(self, sweep: Any, last: int) -> tuple[dict[str, NDArray[Any]], int]:
+        """Fields of PointCloud2 of what has returned, and the stamp, ns; `last` where no column was received."""
+        received = (sweep.status & _RECEIVED).astype(bool)
+        times = sweep.timestamp.astype(np.int64)
+        stamp = int(times[received][0]) if received.any() else last
+        ranges = sweep.field("RANGE")
+        returned = (ranges > 0) & received
+        xyz = self._project(ranges)[returned].astype(np.float32)
+        columns: dict[str, NDArray[Any]] = {axis: xyz[:, i] for i, axis in enumerate("xyz")}
+        columns["time_ns"] = np.broadcast_to((times - stamp).astype(np.float64), ranges.shape)[returned]
+        known = next((name for name in _INTENSITY if sweep.has_field(name)), None)
+        if known is not None:
+            columns["intensity"] = sweep.field(known)[returned]
+        return columns, stamp
+
+
+def _opened(path: Path, sensor: str) -> tuple[Callable[[NDArray[Any]], Array], Any]:
+    """(H, W) ranges to (H, W, 3) m, and the sweeps of the sensor with that serial number; empty: of the only one."""
+    try:
+        from ouster.sdk import core, open_source
+    except ModuleNotFoundError as error:
+        raise MissingPackageError(f"reading {path} needs the package {error.name}: {INSTALL}") from None
+    try:
+        core.init_logger("error")
+        sensors = [str(info.sn) for info in open_source(str(path)).sensor_info]
+        if len(sensors) > 1 and sensor not in sensors:
+            named = f"input.points_topic={sensor}" if sensor else "input.points_topic is empty"
+            raise UsageError(f"{path}: {named}, want one of its sensors: {', '.join(sensors)}")
+        chosen = sensors.index(sensor) if sensor in sensors else 0
+        sweeps = open_source(str(path), collate=False, sensor_idx=chosen, index=path.suffix == ".pcap")
+        return core.XYZLut(sweeps.sensor_info[0]), sweeps
+    except UsageError:
+        raise
+    except Exception as error:  # of the package, whose own are derived from nothing else
+        raise UsageError(f"{path}: cannot be read as a recording of an Ouster: {_reason(error)}") from None
+
+
+def _reason(error: Exception) -> str:
+    """The last sentence of an error of the package, whose first ones repeat what was asked for."""
+    return " ".join(str(error).rpartition("more details:")[2].split())[:200] or type(error).__name__
