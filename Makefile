@@ -7,7 +7,7 @@ PYTHON ?= $(firstword $(shell for p in python3.11 python3.12 python3; do \
 	$$p -c 'import sys; sys.exit(sys.version_info[:2] not in ((3, 11), (3, 12)))' 2>/dev/null && echo $$p; done))
 BIN := .venv/bin
 READY := .venv/.ready
-EXTRAS ?= plot,sim,test,docs,view,fleet
+EXTRAS ?= plot,sim,test,docs,view,fleet,datasets
 # One more than two processors: it fills the pauses in which the tests of ROS wait.
 JOBS ?= -n 3 --dist worksteal
 

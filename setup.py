@@ -62,7 +62,7 @@ EXTRAS = {
         "faiss-cpu>=1.9,<2",  # places that look alike among many
     ],
     "view": ["rerun-sdk>=0.41,<1"],  # dpm2 run --view, --record
-    "datasets": ["kiss-icp>=1.2,<2", "pypcd4>=1.1,<2", "natsort>=8,<9"],  # input.dataset, folders of PCD files
+    "datasets": ["kiss-icp>=1.2,<2", "pypcd4>=1.1,<2"],  # input.dataset, folders of PCD files
     "timm": ["timm>=1,<2"],  # image backbones timm:NAME
     "train": ["tensorboard>=2.16,<3"],  # curves beside log.jsonl
     "peers": ["kiss-slam>=0.0.2,<1"],  # dpm2 experiment --peer kiss-slam

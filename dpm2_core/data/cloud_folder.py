@@ -51,7 +51,7 @@ class CloudFolder:
         found = [file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES] if folder.is_dir() else []
         if not found:
             raise UsageError(f"{folder}: no .pcd or .ply file in this folder")
-        times = _times(found)
+        times = name_times(found)
         if times:
             self._files = [found[i] for i in np.argsort(times)]
             self.stamps = np.sort(np.array(times, np.int64))
@@ -125,8 +125,8 @@ def _numbers(file: Path) -> list[Decimal]:
     return [Decimal(number) for number in re.findall(r"\d+(?:\.\d+)?", file.stem)]
 
 
-def _times(files: list[Path]) -> list[int]:
-    """ns of each file; empty where they are not all times since 1970, each another one."""
+def name_times(files: list[Path]) -> list[int]:
+    """ns of each file by its name; empty where they are not all times since 1970, each another one."""
     pairs = [match for file in files if (match := _PAIR.fullmatch(file.stem))]
     widths = {len(match[2]) for match in pairs}
     if len(pairs) == len(files) and (max(widths) == 9 or widths in ({6}, {3})):

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from dpm2_core.data.cloud_folder import name_times
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.errors import UsageError
 from dpm2_core.extras import needs
@@ -48,7 +49,7 @@ class KissSource:
         self._count = int(self._asked(lambda: len(self._set)))
         if not self._count:
             raise UsageError(f"{self.path}: KISS-ICP's loader {kind} finds no scans here")
-        self.poses = self._poses()
+        self._stamps, self.poses = self._times(), self._poses()
         self.truth = f"gt_poses of KISS-ICP's loader {kind}" if self.poses is not None else ""
 
     def __len__(self) -> int:
@@ -65,8 +66,7 @@ class KissSource:
                 offset = self._offsets(np.asarray(times, np.float64).ravel(), len(points))
             except UsageError as error:
                 problem = str(error)
-            stamps = self._stamps()
-            yield Frame(int(stamps[index]), points, offset, index=index, problem=problem)
+            yield Frame(int(self._stamps[index]), points, offset, index=index, problem=problem)
 
     def _asked(self, what: Any) -> Any:
         """What the loader answers; it prints, exits and asserts where something is missing."""
@@ -90,15 +90,17 @@ class KissSource:
         self.notes.append(f"{self.path}: no ground truth: {poses.shape} poses for {self._count} scans")
         return None
 
-    def _stamps(self) -> Array:
-        """(len,) ns."""
+    def _times(self) -> Array:
+        """(len,) ns: what the loader says, else the names of the scans where they are times, else 10 per second."""
         known = getattr(self._set, "get_frames_timestamps", None)
-        seconds = np.arange(self._count) * _PERIOD
         if known is not None:
             found = np.asarray(self._asked(known), np.float64).ravel()
             if len(found) == self._count and np.isfinite(found).all():
-                seconds = found
-        return np.asarray(np.round(seconds * 1e9), np.int64)
+                return np.asarray(np.round(found * 1e9), np.int64)
+        names = [Path(str(file)) for file in getattr(self._set, "scan_files", ())]
+        if len(names) == self._count and (named := name_times(names)):
+            return np.asarray(named, np.int64)
+        return np.asarray(np.round(np.arange(self._count) * _PERIOD * 1e9), np.int64)
 
     def _offsets(self, times: Array, count: int) -> Any:
         """(count,) s relative to the end of the sweep; None where the points have no times."""

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Folders of PCD and PLY files, and the data sets that KISS-ICP reads."""
+"""Folders of PCD and PLY files."""
 
 from __future__ import annotations
 
-import sys
 import tracemalloc
 from pathlib import Path
 
@@ -11,12 +10,8 @@ import numpy as np
 import pytest
 
 from dpm2_core.data.cloud_folder import CloudFolder
-from dpm2_core.data.kiss_datasets import KissSource
 from dpm2_core.data.open import open_source
 from dpm2_core.data.ply import write_ply
-from dpm2_core.data.settings import InputSettings
-from dpm2_core.errors import UsageError
-from dpm2_core.extras import MissingPackageError
 
 RAMP = np.linspace(0, 0.1, 40)
 POINTS = np.random.default_rng(0).uniform(-20, 20, (40, 3)).astype(np.float32)
@@ -97,46 +92,6 @@ def test_a_damaged_file_is_a_failed_frame(tmp_path: Path) -> None:
     assert problems[3] is None
     assert "1.pcd: cannot be read as PCD" in (problems[1] or "")
     assert "2.pcd: cannot be read as PCD" in (problems[2] or "")
-
-
-@pytest.fixture
-def mulran(tmp_path: Path) -> Path:
-    """Two scans of 64 x 1024 points as MulRan has them, 1 m apart."""
-    (tmp_path / "KAIST01" / "Ouster").mkdir(parents=True)
-    rows = []
-    for n in range(2):
-        scan = np.zeros((64 * 1024, 4), np.float32)
-        scan[:, 0] = 10 - n
-        scan.tofile(tmp_path / "KAIST01" / "Ouster" / f"{EPOCH * 10**9 + n * 10**8}.bin")
-        pose = np.hstack([np.eye(3), [[-n], [0], [0]]])
-        rows.append(f"{EPOCH * 10**9 + n * 10**8}," + ",".join(str(v) for v in pose.ravel()) + "\n")
-    (tmp_path / "KAIST01" / "global_pose.csv").write_text("".join(rows))
-    return tmp_path / "KAIST01"
-
-
-def test_a_data_set_of_kiss_icp(mulran: Path) -> None:
-    """The times end at the stamp, as KISS-ICP's own de-skewing has it."""
-    pytest.importorskip("kiss_icp")
-    source = open_source(mulran, InputSettings(dataset="mulran"))
-    assert isinstance(source, KissSource)
-    first, second = source.frames()
-    assert (len(source), len(first.points), first.points[0, 0], second.points[0, 0]) == (2, 65536, 10, 9)
-    assert first.time_offset is not None
-    assert (first.time_offset[0], first.time_offset[-1]) == (pytest.approx(-0.1), 0.0)
-    assert second.stamp - first.stamp == 100_000_000
-    assert source.poses is not None
-    np.testing.assert_allclose(np.linalg.norm(source.poses[1, :3, 3]), 1, atol=1e-3)
-
-
-def test_loaders_that_cannot_are_named(mulran: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("kiss_icp")
-    with pytest.raises(UsageError, match=r"input.dataset=kiti: there is no such loader; there are apollo, boreas"):
-        open_source(mulran, InputSettings(dataset="kiti"))
-    with pytest.raises(UsageError, match=r"KISS-ICP's loader nclt: "):
-        open_source(mulran, InputSettings(dataset="nclt"))
-    monkeypatch.setitem(sys.modules, "kiss_icp.datasets", None)
-    with pytest.raises(MissingPackageError, match=r"input.dataset=mulran needs the package .*dpm2_ros\[datasets\]"):
-        open_source(mulran, InputSettings(dataset="mulran"))
 
 
 def test_a_header_of_millions_of_columns_is_refused_before_they_are_made(tmp_path: Path) -> None:

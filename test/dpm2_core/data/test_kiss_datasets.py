@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The data sets that KISS-ICP reads."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dpm2_core.data.kiss_datasets import KissSource
+from dpm2_core.data.open import open_source
+from dpm2_core.data.settings import InputSettings
+from dpm2_core.errors import UsageError
+from dpm2_core.extras import MissingPackageError
+
+STAMPS = (1_700_000_000_000_000_000, 1_700_000_000_300_000_000)
+"""ns: of two scans between which two were lost."""
+
+
+@pytest.fixture
+def mulran(tmp_path: Path) -> Path:
+    """Two scans of 64 x 1024 points as MulRan has them, 1 m apart."""
+    (tmp_path / "KAIST01" / "Ouster").mkdir(parents=True)
+    rows = []
+    for n in range(2):
+        scan = np.zeros((64 * 1024, 4), np.float32)
+        scan[:, 0] = 10 - n
+        scan.tofile(tmp_path / "KAIST01" / "Ouster" / f"{STAMPS[n]}.bin")
+        pose = np.hstack([np.eye(3), [[-n], [0], [0]]])
+        rows.append(f"{STAMPS[n]}," + ",".join(str(v) for v in pose.ravel()) + "\n")
+    (tmp_path / "KAIST01" / "global_pose.csv").write_text("".join(rows))
+    return tmp_path / "KAIST01"
+
+
+def test_a_data_set_of_kiss_icp(mulran: Path) -> None:
+    """The times end at the stamp, as KISS-ICP's own de-skewing has it."""
+    pytest.importorskip("kiss_icp")
+    source = open_source(mulran, InputSettings(dataset="mulran"))
+    assert isinstance(source, KissSource)
+    first, second = source.frames()
+    assert (len(source), len(first.points), first.points[0, 0], second.points[0, 0]) == (2, 65536, 10, 9)
+    assert first.time_offset is not None
+    assert (first.time_offset[0], first.time_offset[-1]) == (pytest.approx(-0.1), 0.0)
+    assert (first.stamp, second.stamp) == STAMPS
+    assert source.poses is not None
+    np.testing.assert_allclose(np.linalg.norm(source.poses[1, :3, 3]), 1, atol=1e-3)
+
+
+def test_loaders_that_cannot_are_named(mulran: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("kiss_icp")
+    with pytest.raises(UsageError, match=r"input.dataset=kiti: there is no such loader; there are apollo, boreas"):
+        open_source(mulran, InputSettings(dataset="kiti"))
+    with pytest.raises(UsageError, match=r"KISS-ICP's loader nclt: "):
+        open_source(mulran, InputSettings(dataset="nclt"))
+    monkeypatch.setitem(sys.modules, "kiss_icp.datasets", None)
+    with pytest.raises(MissingPackageError, match=r"input.dataset=mulran needs the package .*dpm2_ros\[datasets\]"):
+        open_source(mulran, InputSettings(dataset="mulran"))
+
+
+def test_velodyne_of_helipr(tmp_path: Path) -> None:
+    """`input.sequence` names the LiDAR; the names of the scans are their times."""
+    pytest.importorskip("kiss_icp")
+    (tmp_path / "LiDAR" / "Velodyne").mkdir(parents=True)
+    (tmp_path / "LiDAR_GT").mkdir()
+    kind = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("i", "<f4"), ("ring", "<u2"), ("time", "<f4")])
+    rows = []
+    for n, stamp in enumerate(STAMPS):
+        scan = np.zeros(100, kind)
+        scan["x"], scan["time"] = 10 - n, np.linspace(0, 0.1, 100)
+        scan.tofile(tmp_path / "LiDAR" / "Velodyne" / f"{stamp}.bin")
+        rows.append(f"{stamp} {n} 0 0 0 0 0 1\n")
+    (tmp_path / "LiDAR_GT" / "global_Velodyne_gt.txt").write_text("".join(rows))
+    source = open_source(tmp_path, InputSettings(dataset="helipr", sequence="Velodyne"))
+    first, second = source.frames()
+    assert (first.stamp, second.stamp, second.points[0, 0]) == (*STAMPS, 9)
+    assert first.time_offset is not None
+    assert source.poses is not None
+    assert source.poses[1, 0, 3] == 1
+    with pytest.raises(UsageError, match=r"KISS-ICP's loader helipr: "):
+        open_source(tmp_path, InputSettings(dataset="helipr", sequence="Ouster"))
+
+
+def test_nclt(tmp_path: Path) -> None:
+    """Names are microseconds, and there is truth for a part of the scans alone; those count."""
+    pytest.importorskip("kiss_icp")
+    drive = tmp_path / "2012-01-08"
+    (drive / "velodyne_sync").mkdir(parents=True)
+    (tmp_path / "ground_truth").mkdir()
+    for n, stamp in enumerate((STAMPS[0] - 10**9, *STAMPS)):
+        scan = np.full((50, 4), (100 + n) * 200, "<i2")
+        scan.tofile(drive / "velodyne_sync" / f"{stamp // 1000}.bin")
+    rows = [f"{(STAMPS[0] + late) // 1000},{late / 1e9},0,0,0,0,0\n" for late in (-(10**8), 10**9)]
+    (tmp_path / "ground_truth" / "groundtruth_2012-01-08.csv").write_text("".join(rows))
+    source = open_source(drive, InputSettings(dataset="nclt"))
+    first, second = source.frames()
+    assert (first.stamp, second.stamp, second.points[0, 0], second.time_offset) == (*STAMPS, 2, None)
+    assert source.notes == [f"{drive}: no time field: not de-skewed"]
