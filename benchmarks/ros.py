@@ -19,7 +19,7 @@ from benchmarks.harness import Options, Report, drives, unique_name, write_repor
 from dpm2_core.commands.options import run_command
 from dpm2_core.console import Console
 from dpm2_core.data.bags import BagSource
-from dpm2_core.data.convert import convert_kitti
+from dpm2_core.data.convert import convert
 from dpm2_core.data.kitti import KittiSource
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.tables import FigureTable
@@ -50,7 +50,7 @@ def bench(
             title = unique_name(drive, results)
             bag, work = Path(folder) / f"bag_{title}", Path(folder) / title
             work.mkdir()
-            convert_kitti(KittiSource(drive.path), bag)
+            convert(KittiSource(drive.path), bag)
             source = BagSource(bag, InputSettings(images=False))
             runs: dict[str, list[Outcome]] = {name: [] for name in WITH}
             for _ in range(repetitions):

@@ -18,7 +18,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from dpm2_core.commands.options import run_command
 from dpm2_core.console import Console
 from dpm2_core.data.bags import BagSource
-from dpm2_core.data.convert import convert_kitti
+from dpm2_core.data.convert import convert
 from dpm2_core.data.kitti import KittiSource
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.trajectory import read_trajectory
@@ -96,7 +96,7 @@ def prepare(src: Path | None, out: Path, frames: int, seed: int, console: Consol
     made_from = bag.with_suffix(".source")  # the same name elsewhere is another drive
     if not (bag / "metadata.yaml").is_file() or made_from.read_text() != str(src.resolve()):
         with console.status(f"converting {src} to {bag}"):
-            for note in convert_kitti(KittiSource(src), bag, overwrite=True):
+            for note in convert(KittiSource(src), bag, overwrite=True):
                 console.print(note, style="yellow")
         made_from.write_text(str(src.resolve()))
     return bag

@@ -138,7 +138,7 @@ class BagSource:
         asked, found = self._settings.ground_truth_topic, self._bag.topics(*_TRUTH)
         if asked and asked not in found:
             raise UsageError(f"{self.path}: no Odometry or Path messages on {asked}; {self._contents()}")
-        return next((topic for topic in (asked, topics.ODOMETRY, topics.PATH) if topic in found), "")
+        return next((topic for topic in (asked, *topics.TRUTHS) if topic in found), "")
 
     def _choose_points(self) -> str:
         asked, found = self._settings.points_topic, self._bag.topics(*CLOUDS)

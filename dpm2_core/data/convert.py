@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A KITTI odometry sequence as a rosbag2 MCAP recording that `ros2 bag play`, Foxglove and dpm2 read alike."""
+"""Any recording as a rosbag2 MCAP recording that `ros2 bag play`, Foxglove and dpm2 read alike."""
 
 from __future__ import annotations
 
@@ -15,38 +15,38 @@ import numpy as np
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
-from scipy.spatial.transform import Rotation
 
-from dpm2_core.data import topics
+from dpm2_core.data import bag_messages, topics
 from dpm2_core.data.kitti import KittiSource
-from dpm2_core.data.messages import cloud_fields, point_columns
 from dpm2_core.data.prefetch import prefetch
-from dpm2_core.data.source import Span
+from dpm2_core.data.source import Source, Span
 from dpm2_core.errors import UsageError
 from dpm2_core.files import not_written
-from dpm2_core.frame import Array, Camera, Fix, Frame
+from dpm2_core.frame import Array, Frame, Image, Inertial
 from dpm2_core.geometry import se3
 
 EPOCH_NS = 1_316_995_200_000_000_000
-"""Added to times.txt: 26 September 2011, KITTI's first day. ROS takes a stamp near 0 for none."""
+"""Added to stamps that are no times since 1970, as KITTI's: 26 September 2011, its first day. ROS takes a stamp near 0
+for none."""
+_EARLIEST = 10**17  # ns, in 1973
 
 # The odometry set has no such calibration: kitti2bag's base_link, the middle of the wheelbase at ground level.
 _T_BASE_LIDAR = se3.make(np.eye(3), [-0.59, 0.0, 1.73])
 
-_TYPES = get_typestore(Stores.ROS2_JAZZY).types
 
-
-def convert_kitti(
-    source: KittiSource,
+def convert(
+    source: Source,
     out: Path,
     frames: Span = (0, None),
     zstd: bool = False,
     overwrite: bool = False,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[str]:
-    """Write frames of a sequence to the new folder `out`; it appears whole or not at all.
+    """Write frames of a drive to the new folder `out`; it appears whole or not at all.
 
-    Points are written as they are; the vertical angle correction that they need is recorded beside them.
+    KITTI odometry has the topics and frames of kitti2bag, which the nodes listen to without being told; its points are
+    written as they are, and the vertical angle correction that they need is recorded beside them. Other drives have
+    those of `topics.OTHER`.
 
     Args:
         source: with its images, as rgb8.
@@ -65,62 +65,112 @@ def convert_kitti(
     start, end = frames
     positions = range(len(source))[start:end]
     if not positions:
-        raise UsageError(f"{source.path}: no frames {start}:{'' if end is None else end}; it has {len(source)}")
+        raise UsageError(f"{source.name}: no frames {start}:{'' if end is None else end}; it has {len(source)}")
     with _new_folder(out, overwrite) as folder:
         writer = Writer(folder, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP)
         if zstd:
             writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
         with writer:
-            bag = _KittiBag(writer, source, positions)
-            for done, frame in enumerate(prefetch(bag.source.frames(positions.start, positions.stop)), 1):
-                bag.write(frame)
-                progress(done, len(positions))
+            bag = _Bag(writer, source)
+            for done, frame in enumerate(prefetch(bag.source.frames(positions.start, positions.stop))):
+                bag.write(frame, positions[done])
+                progress(done + 1, len(positions))
+            bag.write_path()
     return source.notes
 
 
-class _KittiBag:
-    """The topics of one recording; the constructor writes those that come once."""
+class _Bag:
+    """The topics of one recording."""
 
-    def __init__(self, writer: Writer, source: KittiSource, positions: range) -> None:
-        self._writer = writer
-        self.source = copy(source)
-        self.source.vertical_angle_correction_deg = 0.0  # recorded here, applied by who reads
+    def __init__(self, writer: Writer, source: Source) -> None:
+        self._writer, self.source = writer, source
         self._connections: dict[str, Any] = {}
         self._typestore = get_typestore(Stores.ROS2_JAZZY)
-        first = EPOCH_NS + int(source.stamps[positions.start])
-        correction = _TYPES["std_msgs/msg/Float64"](data=source.vertical_angle_correction_deg)
-        self._put(topics.VERTICAL_ANGLE_CORRECTION, first, correction, latched=True)
-        transforms = [_transform(first, parent, child, T) for parent, child, T in _static_frames(source)]
-        self._put(topics.TF_STATIC, first, _TYPES["tf2_msgs/msg/TFMessage"](transforms=transforms), latched=True)
-        self._poses: dict[int, Array] = {}
-        if source.poses is not None:
-            rows = [(i, source.poses[i]) for i in positions if np.isfinite(source.poses[i]).all()]
-            self._poses = {int(source.numbers[i]): T for i, T in rows}
-            stamped = [_pose_stamped(EPOCH_NS + int(source.stamps[i]), T) for i, T in rows]
-            path = _TYPES["nav_msgs/msg/Path"](header=_header(first, topics.MAP), poses=stamped)
-            self._put(topics.PATH, first, path, latched=True)
+        self._first: int | None = None  # ns
+        self._later = 0  # ns, added to each stamp
+        self._names = topics.OTHER
+        self._correction_deg: float | None = None
+        self._links: dict[str, tuple[str, Array]] = {}  # frame to its parent and T_parent_frame
+        self._cameras: list[str] = []
+        self._path: list[tuple[int, Array]] = []
+        self._R_lidar_imu = np.eye(3)
+        # ns; frames may share what came between them
+        self._last = dict.fromkeys((topics.IMU, topics.FIX), -float("inf"))
+        if isinstance(source, KittiSource):
+            self.source = copy(source)
+            self.source.vertical_angle_correction_deg = 0.0  # recorded here, applied by who reads
+            self._names, self._correction_deg = topics.KITTI, source.vertical_angle_correction_deg
+            self._R_lidar_imu = source.R_lidar_imu
+            self._links[self._names.lidar] = (topics.BASE, _T_BASE_LIDAR)
+        if source.T_cam_lidar is not None:
+            self._links[topics.GRAY_CAMERA] = (self._names.lidar, se3.inverse(source.T_cam_lidar))
 
-    def write(self, frame: Frame) -> None:
+    def write(self, frame: Frame, position: int) -> None:
         """IMU, fix and image first: who waits for the cloud then has them already."""
-        stamp = EPOCH_NS + frame.stamp
+        if self._first is None:
+            self._later = EPOCH_NS if frame.stamp < _EARLIEST else 0
+            self._first = frame.stamp + self._later
+            if self._correction_deg is not None:
+                correction = bag_messages.number(self._correction_deg)
+                self._put(topics.VERTICAL_ANGLE_CORRECTION, self._first, correction, latched=True)
+        stamp = frame.stamp + self._later
+        self._link(stamp, frame)
         if frame.imu is not None:
-            R = self.source.R_lidar_imu  # back along its own axes
-            samples = zip(frame.imu.stamps.tolist(), frame.imu.rates @ R, frame.imu.forces @ R, strict=True)
-            for time, rates, forces in samples:
-                self._put(topics.IMU, EPOCH_NS + time, _imu(EPOCH_NS + time, rates, forces))
-        if frame.fix is not None:
-            time = EPOCH_NS + frame.fix.stamp
-            self._put(topics.FIX, time, _fix(time, frame.fix))
+            self._write_imu(frame.imu)
+        if frame.fix is not None and frame.fix.stamp > self._last[topics.FIX]:
+            self._last[topics.FIX] = frame.fix.stamp
+            time = frame.fix.stamp + self._later
+            self._put(topics.FIX, time, bag_messages.nav_sat_fix(time, frame.fix))
         if frame.problem:
             self.source.notes.append(f"{frame.problem}: written as an empty cloud")
         for image in frame.images:
-            self._put(topics.CAMERA_INFO, stamp, _camera_info(stamp, image.camera))
-            self._put(topics.IMAGE, stamp, _image(stamp, image.pixels))
-        if frame.index in self._poses:
-            self._put(topics.ODOMETRY, stamp, _odometry(stamp, self._poses[frame.index]))
-        fields = cloud_fields(point_columns(frame.points), _TYPES["sensor_msgs/msg/PointField"])
-        cloud = _TYPES["sensor_msgs/msg/PointCloud2"](header=_header(stamp, topics.LIDAR), **fields)
-        self._put(topics.POINTS, stamp, cloud)
+            self._write_image(image, stamp + round(image.time_offset * 1e9))
+        T = None if self.source.poses is None else self.source.poses[position]
+        if T is not None and np.isfinite(T).all():
+            self._path.append((stamp, T))
+            self._put(f"{self._names.truth}/odom", stamp, bag_messages.odometry(stamp, self._names.lidar, T))
+        self._put(self._names.points, stamp, bag_messages.cloud(stamp, self._names.lidar, frame))
+
+    def write_path(self) -> None:
+        """In the place of the first message, where players look for it."""
+        if self._first is not None and self.source.poses is not None:
+            path = bag_messages.path(self._first, self._path)
+            self._put(f"{self._names.truth}/path", self._first, path, latched=True)
+
+    def _link(self, stamp: int, frame: Frame) -> None:
+        """All frames so far, where there is a new one: who comes late is sent the last message alone."""
+        links, lidar = dict(self._links), self._names.lidar
+        for image in frame.images:
+            if image.camera.name not in self._cameras:
+                self._cameras.append(image.camera.name)
+            links[self._optical(image)] = (lidar, image.camera.T_lidar_cam)
+        if frame.imu is not None:
+            links[topics.IMU_LINK] = (lidar, se3.make(self._R_lidar_imu, np.zeros(3)))
+        if frame.fix is not None:
+            links[topics.GNSS_LINK] = (lidar, se3.make(np.eye(3), frame.fix.antenna))
+        if links and (links.keys() != self._links.keys() or topics.TF_STATIC not in self._connections):
+            self._links = links
+            self._put(topics.TF_STATIC, stamp, bag_messages.transforms(stamp, links), latched=True)
+
+    def _number(self, image: Image) -> str:
+        """Of its camera, behind its name."""
+        number = self._cameras.index(image.camera.name)
+        return f"_{number + 1}" if number else ""
+
+    def _optical(self, image: Image) -> str:
+        return self._names.optical + self._number(image)
+
+    def _write_image(self, image: Image, stamp: int) -> None:
+        frame, topic = self._optical(image), self._names.camera + self._number(image)
+        self._put(f"{topic}/camera_info", stamp, bag_messages.camera_info(stamp, frame, image.camera))
+        self._put(f"{topic}/image_raw", stamp, bag_messages.image(stamp, frame, image.pixels))
+
+    def _write_imu(self, imu: Inertial) -> None:
+        R = self._R_lidar_imu  # back along its own axes
+        for time, rates, forces in zip(imu.stamps.tolist(), imu.rates @ R, imu.forces @ R, strict=True):
+            if time > self._last[topics.IMU]:
+                self._last[topics.IMU] = time
+                self._put(topics.IMU, time + self._later, bag_messages.imu(time + self._later, rates, forces))
 
     def _put(self, topic: str, stamp: int, msg: Any, latched: bool = False) -> None:
         kind = msg.__msgtype__
@@ -158,100 +208,8 @@ def _new_folder(out: Path, overwrite: bool) -> Iterator[Path]:
         shutil.rmtree(part, ignore_errors=True)
 
 
-def _static_frames(source: KittiSource) -> list[tuple[str, str, Array]]:
-    """(parent, child, T_parent_child)."""
-    frames = [(topics.BASE, topics.LIDAR, _T_BASE_LIDAR)]
-    if source.T_cam_lidar is not None:
-        frames.append((topics.LIDAR, topics.GRAY_CAMERA, se3.inverse(source.T_cam_lidar)))
-    if source.camera is not None:
-        frames.append((topics.LIDAR, topics.COLOR_CAMERA, source.camera.T_lidar_cam))
-    if source.imu is not None:
-        frames.append((topics.LIDAR, topics.IMU_LINK, se3.make(source.R_lidar_imu, np.zeros(3))))
-    if source.fixes:
-        frames.append((topics.LIDAR, topics.GNSS_LINK, se3.make(np.eye(3), source.fixes[0].antenna)))
-    return frames
-
-
 def _qos(latched: bool) -> Qos:
     infinite = QosTime(9223372036, 854775807)
     durability = QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE
     return Qos(QosHistory.KEEP_LAST, 1 if latched else 10, QosReliability.RELIABLE, durability, infinite, infinite,
                QosLiveliness.AUTOMATIC, infinite, False)  # fmt: skip
-
-
-def _header(stamp: int, frame: str) -> Any:
-    time = _TYPES["builtin_interfaces/msg/Time"](sec=stamp // 10**9, nanosec=stamp % 10**9)
-    return _TYPES["std_msgs/msg/Header"](stamp=time, frame_id=frame)
-
-
-def _parts(T: Array) -> tuple[list[float], list[float]]:
-    return T[:3, 3].tolist(), Rotation.from_matrix(T[:3, :3]).as_quat().tolist()
-
-
-def _transform(stamp: int, parent: str, child: str, T: Array) -> Any:
-    t, q = _parts(T)
-    transform = _TYPES["geometry_msgs/msg/Transform"](
-        translation=_TYPES["geometry_msgs/msg/Vector3"](*t), rotation=_TYPES["geometry_msgs/msg/Quaternion"](*q)
-    )
-    return _TYPES["geometry_msgs/msg/TransformStamped"](
-        header=_header(stamp, parent), child_frame_id=child, transform=transform
-    )
-
-
-def _pose(T: Array) -> Any:
-    t, q = _parts(T)
-    return _TYPES["geometry_msgs/msg/Pose"](
-        position=_TYPES["geometry_msgs/msg/Point"](*t), orientation=_TYPES["geometry_msgs/msg/Quaternion"](*q)
-    )
-
-
-def _pose_stamped(stamp: int, T: Array) -> Any:
-    return _TYPES["geometry_msgs/msg/PoseStamped"](header=_header(stamp, topics.MAP), pose=_pose(T))
-
-
-def _odometry(stamp: int, T: Array) -> Any:
-    zero = _TYPES["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
-    twist = _TYPES["geometry_msgs/msg/Twist"](linear=zero, angular=zero)
-    return _TYPES["nav_msgs/msg/Odometry"](
-        header=_header(stamp, topics.MAP),
-        child_frame_id=topics.LIDAR,
-        pose=_TYPES["geometry_msgs/msg/PoseWithCovariance"](pose=_pose(T), covariance=np.zeros(36)),
-        twist=_TYPES["geometry_msgs/msg/TwistWithCovariance"](twist=twist, covariance=np.zeros(36)),
-    )
-
-
-def _imu(stamp: int, rates: Array, forces: Array) -> Any:
-    vector, unknown = _TYPES["geometry_msgs/msg/Vector3"], np.zeros(9)  # covariances
-    no_orientation = np.array([-1.0, *np.zeros(8)])  # as REP-145 has it
-    return _TYPES["sensor_msgs/msg/Imu"](
-        header=_header(stamp, topics.IMU_LINK), orientation=_TYPES["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
-        orientation_covariance=no_orientation, angular_velocity=vector(*rates.tolist()),
-        angular_velocity_covariance=unknown, linear_acceleration=vector(*forces.tolist()),
-        linear_acceleration_covariance=unknown,
-    )  # fmt: skip
-
-
-def _fix(stamp: int, fix: Fix) -> Any:
-    latitude, longitude, altitude = fix.geodetic.tolist()
-    return _TYPES["sensor_msgs/msg/NavSatFix"](
-        header=_header(stamp, topics.GNSS_LINK), status=_TYPES["sensor_msgs/msg/NavSatStatus"](status=0, service=1),
-        latitude=latitude, longitude=longitude, altitude=altitude, position_covariance=fix.covariance.ravel(),
-        position_covariance_type=2,  # of the diagonal
-    )  # fmt: skip
-
-
-def _image(stamp: int, pixels: np.ndarray) -> Any:
-    height, width = pixels.shape[:2]
-    return _TYPES["sensor_msgs/msg/Image"](
-        header=_header(stamp, topics.COLOR_CAMERA), height=height, width=width, encoding="rgb8", is_bigendian=0,
-        step=3 * width, data=np.ascontiguousarray(pixels).reshape(-1),
-    )  # fmt: skip
-
-
-def _camera_info(stamp: int, camera: Camera) -> Any:
-    roi = _TYPES["sensor_msgs/msg/RegionOfInterest"](x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
-    return _TYPES["sensor_msgs/msg/CameraInfo"](
-        header=_header(stamp, topics.COLOR_CAMERA), height=camera.size[1], width=camera.size[0],
-        distortion_model="plumb_bob", d=np.zeros(5), k=camera.K.reshape(-1), r=np.eye(3).reshape(-1),
-        p=np.c_[camera.K, np.zeros(3)].reshape(-1), binning_x=0, binning_y=0, roi=roi,
-    )  # fmt: skip

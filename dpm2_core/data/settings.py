@@ -97,7 +97,8 @@ class InputSettings(Settings):
     /kitti/vertical_angle_correction_deg of a bag), else KITTI's 0.205 for folders and topics under /kitti/, else 0."""
 
     ground_truth_topic: str = ""
-    """Odometry or Path topic with true poses; empty takes /kitti/ground_truth/odom, else /kitti/ground_truth/path."""
+    """Odometry or Path topic with true poses; empty takes odom, else path, of /kitti/ground_truth, else of
+    /ground_truth."""
 
     def extrinsic(self) -> Array | None:
         """T_lidar_cam as (4, 4); None if it is not set here."""

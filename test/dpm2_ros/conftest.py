@@ -27,7 +27,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import UInt8MultiArray
 
-from dpm2_core.data.convert import convert_kitti
+from dpm2_core.data.convert import convert
 from dpm2_core.data.kitti import KittiSource
 from dpm2_core.estimates import Keyframe
 from dpm2_core.frame import Array, Points
@@ -137,7 +137,7 @@ def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def bag(sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The drive as a bag."""
     out = tmp_path_factory.mktemp("bags") / "drive"
-    convert_kitti(KittiSource(sequence), out)
+    convert(KittiSource(sequence), out)
     return out
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dpm2_core.data.convert import convert_kitti
+from dpm2_core.data.convert import convert
 from dpm2_core.data.kitti import KittiSource
 from dpm2_core.data.trajectory import read_trajectory
 from dpm2_core.errors import Dpm2Error
@@ -67,7 +67,7 @@ def test_the_imu_of_a_bag_is_used(sequence: Path, tmp_path: Path) -> None:
     np.savetxt(sequence / "imu.txt", np.column_stack([times, *imu.measure(times, pose)]), "%.9e")
     with (sequence / "calib.txt").open("a") as file:
         file.write("Tr_imu_to_velo: 0 -1 0 0 1 0 0 0 0 0 1 0\n")
-    convert_kitti(KittiSource(sequence), tmp_path / "bag")
+    convert(KittiSource(sequence), tmp_path / "bag")
     done = dpm2("run", tmp_path / "bag", "--out", tmp_path / "out", "--set", "slam.registration=geometric")
     assert done.returncode == 0, done.stderr
     assert "/imu: no samples at the time of the scan; going on without the IMU" in " ".join(done.stderr.split())
@@ -105,7 +105,7 @@ def test_writes_everything_and_is_right(recording: Path, tmp_path: Path) -> None
 
 
 def test_a_bag_gives_the_same(recording: Path, tmp_path: Path) -> None:
-    convert_kitti(KittiSource(recording), tmp_path / "bag")
+    convert(KittiSource(recording), tmp_path / "bag")
     for source, out in ((recording, "folder"), (tmp_path / "bag", "bag_out")):
         done = dpm2("run", source, "--out", tmp_path / out, "--frames", "2:9", *QUICK)
         assert done.returncode == 0, done.stderr

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from dpm2_core.data.bags import BagSource
-from dpm2_core.data.convert import EPOCH_NS, convert_kitti
+from dpm2_core.data.convert import EPOCH_NS, convert
 from dpm2_core.data.frames import Calibration, FrameBuilder
 from dpm2_core.data.gnss import FixBuffer, decode_fix
 from dpm2_core.data.kitti import KittiSource
@@ -181,7 +181,7 @@ def test_a_folder_becomes_a_bag_with_the_same_fixes(kitti_folder: Any, tmp_path:
         file.write("Tr_gnss_to_velo: 1 0 0 0.3 0 1 0 0.2 0 0 1 1\n")
     source = KittiSource(folder)
     assert source.notes == []
-    convert_kitti(source, tmp_path / "bag")
+    convert(source, tmp_path / "bag")
     bag = BagSource(tmp_path / "bag", InputSettings(gnss_topic=FIX))
     taken = {}
     for ours, theirs in zip(bag.frames(), source.frames(), strict=True):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from dpm2_core.data.bags import BagSource
-from dpm2_core.data.convert import EPOCH_NS, convert_kitti
+from dpm2_core.data.convert import EPOCH_NS, convert
 from dpm2_core.data.imu import ImuBuffer, decode_imu
 from dpm2_core.data.kitti import KittiSource
 from dpm2_core.data.messages import MessageError, cloud_fields
@@ -220,7 +220,7 @@ def test_a_folder_becomes_a_bag_with_the_same_samples(kitti_folder: Any, tmp_pat
         file.write("Tr_imu_to_velo: 0 -1 0 0 1 0 0 0 0 0 1 0\n")
     source = KittiSource(folder)
     assert source.notes == []
-    convert_kitti(source, tmp_path / "bag")
+    convert(source, tmp_path / "bag")
     bag = BagSource(tmp_path / "bag")
     for ours, theirs in zip(bag.frames(), source.frames(), strict=True):
         assert ours.imu is not None
