@@ -58,7 +58,7 @@ class Kitti360Source:
         self._T_rect_cam = se3.orthonormalized(se3.make(R_rect.reshape(3, 3), np.zeros(3)))
         self._T_cam_lidar = se3.inverse(T_lidar_cam)
         self.T_cam_lidar: Array | None = self._T_rect_cam @ self._T_cam_lidar
-        self.stamps = self._stamps(velodyne / "timestamps.txt")
+        self.stamps = read_stamps(velodyne / "timestamps.txt", self.numbers, self.notes)
         self.poses: Array | None = self._poses()
         self.camera = self._camera()
 
@@ -73,14 +73,6 @@ class Kitti360Source:
             points = correct_vertical_angle(scale_intensity(points, self._settings.intensity_max), degrees)
             images = images_of(self._image_path(scan.stem), self.camera, self.notes)
             yield Frame(int(stamp), points, azimuth_time(points), images, index=int(scan.stem), problem=problem)
-
-    def _stamps(self, path: Path) -> NDArray[np.int64]:
-        """(len,) ns; line k of timestamps.txt is of scan k."""
-        lines = read_lines(path)
-        if len(lines) <= self.numbers[-1]:
-            self.notes.append(f"{path}: missing or too short; frames are taken to be {_PERIOD} s apart")
-            return np.round(self.numbers * _PERIOD * 1e9).astype(np.int64)
-        return np.array([_stamp(lines[number], f"{path}:{number + 1}") for number in self.numbers], np.int64)
 
     def _poses(self) -> Array | None:
         """(len, 4, 4) T_world_lidar, from poses.txt (of the IMU) or else cam0_to_world.txt; None without either."""
@@ -138,6 +130,15 @@ def azimuth_time(points: Points) -> Points:
     return (-np.arctan2(points[:, 1], points[:, 0]) * (_PERIOD / (2 * np.pi))).astype(np.float32)
 
 
+def read_stamps(path: Path, numbers: NDArray[np.int64], notes: list[str]) -> NDArray[np.int64]:
+    """(len(numbers),) ns: line k of timestamps.txt is of scan k; where it is too short a note says so."""
+    lines = read_lines(path)
+    if len(lines) <= numbers[-1]:
+        notes.append(f"{path}: missing or too short; frames are taken to be {_PERIOD} s apart")
+        return np.round(numbers * _PERIOD * 1e9).astype(np.int64)
+    return np.array([_stamp(lines[number], f"{path}:{number + 1}") for number in numbers], np.int64)
+
+
 def read_keyed(path: Path) -> dict[str, Array]:
     """The `name: numbers` lines of a calibration file, as float64 of any length; other lines are left out.
 
@@ -180,10 +181,6 @@ def _find(path: Path, sequence: str) -> tuple[Path, str]:
     """Root of the dataset and name of the drive."""
     if (path / "velodyne_points").is_dir():
         drive = path.resolve()
-        if drive.parent.name != "data_3d_raw":
-            raise UsageError(
-                f"{path}: a drive of KITTI-360 lies in data_3d_raw; KITTI raw is not read, its odometry is"
-            )
         return drive.parents[1], drive.name
     found = sorted(p.name for p in (path / "data_3d_raw").glob("*") if (p / "velodyne_points").is_dir())
     if not found:

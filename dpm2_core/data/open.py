@@ -11,7 +11,7 @@ from dpm2_core.errors import UsageError
 
 
 def sequences_below(path: Path | str) -> list[str]:
-    """What `input.sequence` may be in a folder of KITTI odometry, KITTI-360 or KITTI-CARLA with several drives.
+    """What `input.sequence` may be in a folder of KITTI odometry, raw, -360 or -CARLA with several drives.
 
     Raises:
         UsageError: there is no such folder, or it holds none.
@@ -21,17 +21,27 @@ def sequences_below(path: Path | str) -> list[str]:
         raise UsageError(f"{path}: no such folder")
     found = (
         [p.parent.name for p in path.glob("data_3d_raw/*/velodyne_points")]
+        or [p.parent.name for p in path.glob("*_drive_*/velodyne_points")]
         or [p.parent.parent.name for p in path.glob("*/generated/frames")]
         or [p.parent.name for p in (path / "sequences" if (path / "sequences").is_dir() else path).glob("*/velodyne")]
     )
     if not found:
-        raise UsageError(f"{path}: no drives below it (sequences/NN, data_3d_raw/DRIVE or TOWN/generated)")
+        raise UsageError(
+            f"{path}: no drives below it (sequences/NN, DATE_drive_NNNN_sync, data_3d_raw/DRIVE or TOWN/generated)"
+        )
     return sorted(found)
 
 
+def _is_kitti_raw(path: Path) -> bool:
+    """A drive, or the folder of a date; KITTI-360 has the same in data_3d_raw."""
+    if (path / "velodyne_points").is_dir():
+        return path.parent.name != "data_3d_raw"
+    return path.name != "data_3d_raw" and any(path.glob("*_drive_*/velodyne_points"))
+
+
 def open_source(path: Path | str, settings: InputSettings | None = None) -> Source:
-    """Open whatever `path` is: a folder of KITTI odometry, KITTI-360 or KITTI-CARLA or of PCD or PLY files, a bag, or
-    what an Ouster LiDAR has sent.
+    """Open whatever `path` is: a folder of KITTI odometry, raw, -360 or -CARLA or of PCD or PLY files, a bag, or what
+    an Ouster LiDAR has sent.
 
     Raises:
         UsageError: there is nothing, or nothing that can be read; the message says what was found.
@@ -54,6 +64,10 @@ def open_source(path: Path | str, settings: InputSettings | None = None) -> Sour
         from dpm2_core.data.bags import BagSource
 
         return BagSource(path, settings)
+    if _is_kitti_raw(path.resolve()):
+        from dpm2_core.data.kitti_raw import KittiRawSource
+
+        return KittiRawSource(path, settings)
     if (path / "data_3d_raw").is_dir() or (path / "velodyne_points").is_dir():
         from dpm2_core.data.kitti360 import Kitti360Source
 

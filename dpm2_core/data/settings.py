@@ -28,8 +28,8 @@ class InputSettings(Settings):
     """How recordings and sensor messages are read."""
 
     sequence: str = ""
-    """Sequence of a root folder: 04 of KITTI odometry, 0009 of KITTI-360, Town01 of KITTI-CARLA; empty takes the only
-    one."""
+    """Sequence of a root folder: 04 of KITTI odometry, 0009 of KITTI raw or KITTI-360, Town01 of KITTI-CARLA; empty
+    takes the only one."""
 
     dataset: str = ""
     """Loader of KISS-ICP's that reads the recording (extra datasets): mulran, ncd, nclt, helipr, boreas, apollo, ...;

@@ -120,13 +120,6 @@ def test_pose_files_are_read_by_themselves(root: Path) -> None:
         assert trajectory.kind == "kitti-indexed"
 
 
-def test_a_drive_of_kitti_raw_is_said_to_be_one(tmp_path: Path) -> None:
-    """It was an error about a folder beside the user's own."""
-    (tmp_path / "2011_09_30_drive_0016_sync" / "velodyne_points" / "data").mkdir(parents=True)
-    with pytest.raises(UsageError, match="lies in data_3d_raw; KITTI raw is not read"):
-        open_source(tmp_path / "2011_09_30_drive_0016_sync", InputSettings())
-
-
 def test_what_is_missing_is_named(root: Path) -> None:
     """A drive that is not there, no scans, a damaged scan, no calibration."""
     with pytest.raises(UsageError, match=rf"no sequence 0003.*{DRIVE}"):
