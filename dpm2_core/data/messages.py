@@ -305,10 +305,11 @@ def cloud_fields(columns: Mapping[str, NDArray[Any]], point_field: Callable[...,
     }
 
 
-def point_cloud(columns: Mapping[str, NDArray[Any]], stamp: int) -> Any:
+def point_cloud(columns: Mapping[str, NDArray[Any]], stamp: int, frame: str = "") -> Any:
     """As a sensor_msgs/PointCloud2 of a stamp, ns: what is not a message becomes points as messages do."""
     time = SimpleNamespace(sec=stamp // 10**9, nanosec=stamp % 10**9)
-    return SimpleNamespace(header=SimpleNamespace(stamp=time, frame_id=""), **cloud_fields(columns, SimpleNamespace))
+    header = SimpleNamespace(stamp=time, frame_id=frame)
+    return SimpleNamespace(header=header, **cloud_fields(columns, SimpleNamespace))
 
 
 def point_columns(points: Points) -> dict[str, Points]:

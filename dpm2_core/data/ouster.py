@@ -4,15 +4,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from itertools import islice
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dpm2_core.data.frames import Calibration, FrameBuilder
-from dpm2_core.data.messages import point_cloud
+from dpm2_core.data.imu import ImuBuffer
+from dpm2_core.data.messages import MessageError, point_cloud
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.errors import UsageError
 from dpm2_core.extras import MissingPackageError
@@ -22,14 +25,16 @@ SUFFIXES = (".pcap", ".osf")
 # Its dependencies hold rosbags and others at releases that this package cannot use; to read, it needs none of them.
 INSTALL = "pip install --no-deps 'ouster-sdk>=1,<2'"
 _RECEIVED = 1  # the bit of a column's status
+_FRAME = "os_sensor"  # of the housing
+_PERIOD = 100_000_000  # ns, the longest sweep
 _INTENSITY = ("REFLECTIVITY", "SIGNAL")  # the first that a recording has
 
 
 class OusterSource:
     """Sweeps in the frame of the sensor's housing, stamped when their first column was measured. See `Source`.
 
-    Intensity is the reflectivity, and each column has its time. Neither images, nor the IMU, nor ground truth.
-    A .pcap needs the sensor's metadata beside it: the .json whose name begins alike.
+    Intensity is the reflectivity, and each column has its time. Of a .pcap the sensor's IMU is read, too; it needs the
+    sensor's metadata beside it: the .json whose name begins alike. There are neither images nor ground truth.
 
     Raises:
         UsageError: the file cannot be read, or has several sensors of which `input.points_topic` names none.
@@ -43,12 +48,14 @@ class OusterSource:
     def __init__(self, path: Path | str, settings: InputSettings | None = None) -> None:
         self.path, settings = Path(path), settings or InputSettings()
         self.name, self.notes = self.path.stem, list[str]()
-        self._project, self._sweeps = _opened(self.path, settings.points_topic)
+        self._sensor, self._project, self._sweeps = _opened(self.path, settings.points_topic)
         # An .osf has an index, or one would be written into it.
         self._count = len(self._sweeps) if self._sweeps.is_indexed else sum(1 for _ in self._sweeps)
         if not self._count:
             raise UsageError(f"{self.path}: no sweep of the sensor that its metadata describes")
-        self._frames = FrameBuilder(settings, Calibration(str(self.path)), self.notes.append)
+        self._imu = ImuBuffer() if settings.imu and self.path.suffix == ".pcap" else None
+        calibration = Calibration(str(self.path), imu_topic="IMU")
+        self._frames = FrameBuilder(settings, calibration, self.notes.append, imu=self._imu)
 
     def __len__(self) -> int:
         return self._count
@@ -58,17 +65,35 @@ class OusterSource:
         wanted, stamp = range(*slice(start, stop).indices(self._count)), 0
         # By its index the package (1.0) finds the first sweep of an .osf in place of its last.
         upcoming = islice(self._sweeps, wanted.start, wanted.stop)
+        samples = None
+        if self._imu is not None:
+            self._imu.clear()
+            samples = _samples(self.path, self._sensor)
         for index in wanted:
             try:
                 if (sweep := next(upcoming, None)) is None:
                     raise UsageError("its data are not there")
                 columns, stamp = self._columns(sweep[0], stamp)
+                if samples is not None:
+                    self._fill(samples, stamp + _PERIOD)
             except Exception as error:  # damaged files raise several kinds of the package's own
                 problem = f"{self.path}: sweep {index}: {_reason(error)}"
                 self.notes.append(problem)
                 yield Frame(stamp, np.empty((0, 4), np.float32), index=index, problem=problem)
                 return
-            yield self._frames.frame(stamp, point_cloud(columns, stamp), index)
+            yield self._frames.frame(stamp, point_cloud(columns, stamp, _FRAME), index)
+
+    def _fill(self, samples: Iterator[tuple[int, Any]], until: int) -> None:
+        """Samples of the IMU up to the first one after a time, ns."""
+        assert self._imu is not None
+        try:
+            for stamp, message in samples:
+                with suppress(MessageError):  # one that no sensor measures, or that is not newer than the last
+                    self._imu.add(stamp, message)
+                if stamp > until:
+                    break
+        except Exception as error:  # as below
+            self.notes.append(f"{self.path}: going on without the IMU: {_reason(error)}")
 
     def _columns(self, sweep: Any, last: int) -> tuple[dict[str, NDArray[Any]], int]:
         """Fields of PointCloud2 of what has returned, and the stamp, ns; `last` where no column was received."""
@@ -86,8 +111,27 @@ class OusterSource:
         return columns, stamp
 
 
-def _opened(path: Path, sensor: str) -> tuple[Callable[[NDArray[Any]], Array], Any]:
-    """(H, W) ranges to (H, W, 3) m, and the sweeps of the sensor with that serial number; empty: of the only one."""
+def _samples(path: Path, sensor: int) -> Iterator[tuple[int, Any]]:
+    """Stamp, ns, and sensor_msgs/Imu along the axes of the housing, of each sample of a sensor's IMU."""
+    from ouster.sdk import core, open_packet_source
+
+    packets = open_packet_source(str(path))
+    R = packets.sensor_info[sensor].imu_to_sensor_transform[:3, :3]
+    header, known = SimpleNamespace(frame_id=_FRAME), np.zeros(9)  # covariances
+    for index, packet in packets:
+        if index == sensor and isinstance(packet, core.ImuPacket):
+            rates, forces = np.reshape(packet.gyro(), (-1, 3)) @ R.T, np.reshape(packet.accel(), (-1, 3)) @ R.T
+            for stamp, rate, force in zip(np.ravel(packet.timestamp()).tolist(), rates, forces, strict=True):
+                rate, force = (SimpleNamespace(**dict(zip("xyz", xyz, strict=True))) for xyz in (rate, force))
+                yield stamp, SimpleNamespace(
+                    header=header, angular_velocity=rate, linear_acceleration=force,
+                    angular_velocity_covariance=known, linear_acceleration_covariance=known,
+                )  # fmt: skip
+
+
+def _opened(path: Path, sensor: str) -> tuple[int, Callable[[NDArray[Any]], Array], Any]:
+    """Of the sensor with that serial number, or the only one: its position in the file, what makes (H, W, 3) m of its
+    ranges (H, W), and its sweeps."""
     try:
         from ouster.sdk import core, open_source
     except ModuleNotFoundError as error:
@@ -100,7 +144,7 @@ def _opened(path: Path, sensor: str) -> tuple[Callable[[NDArray[Any]], Array], A
             raise UsageError(f"{path}: {named}, want one of its sensors: {', '.join(sensors)}")
         chosen = sensors.index(sensor) if sensor in sensors else 0
         sweeps = open_source(str(path), collate=False, sensor_idx=chosen, index=path.suffix == ".pcap")
-        return core.XYZLut(sweeps.sensor_info[0]), sweeps
+        return chosen, core.XYZLut(sweeps.sensor_info[0]), sweeps
     except UsageError:
         raise
     except Exception as error:  # of the package, whose own are derived from nothing else

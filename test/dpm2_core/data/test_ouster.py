@@ -20,14 +20,14 @@ from dpm2_core.extras import MissingPackageError
 START, PERIOD = 1_700_000_000_000_000_000, 100_000_000  # ns
 COLUMNS, SWEEPS = 512, 3
 LOST = 16  # columns of the second sweep, the first packet of it
-PORT = 7502  # of UDP
+PORT, IMU_PORT = 7502, 7503  # of UDP
 
 
 def sensor(number: int = 7) -> Any:
     """Its metadata."""
     core = pytest.importorskip("ouster.sdk.core", reason="no ouster-sdk: make setup")
     lidar = core.SensorInfo.from_default(core.LidarMode(COLUMNS, 10))
-    lidar.sn, lidar.config.udp_port_lidar = number, PORT
+    lidar.sn, lidar.config.udp_port_lidar, lidar.config.udp_port_imu = number, PORT, IMU_PORT
     lidar.format.udp_profile_lidar = lidar.config.udp_profile_lidar = core.UDPProfileLidar.RNG19_RFL8_SIG16_NIR16
     return lidar
 
@@ -73,15 +73,23 @@ def pcap(tmp_path: Path) -> Path:
     path = tmp_path / "drive.pcap"
     blocks = [struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1)]
     for n, sweep in enumerate(sweeps(info)):
-        for packet in core.frame_to_packets(sweep, core.PacketFormat(info), info.init_id, info.sn):
-            data = bytes(packet.buf)
-            udp = struct.pack(">HHHH", PORT, PORT, 8 + len(data), 0)
-            ip = struct.pack(">BBHHHBBH", 0x45, 0, 28 + len(data), 0, 0x4000, 64, 17, 0) + b"\1" * 4 + b"\2" * 4
-            frame = b"\0" * 12 + b"\x08\x00" + ip + udp + data
-            blocks += [struct.pack("<IIII", START // 10**9, n * PERIOD // 1000, len(frame), len(frame)), frame]
+        packets = core.frame_to_packets(sweep, core.PacketFormat(info), info.init_id, info.sn)
+        blocks += [packet_of(PORT, bytes(packet.buf), n) for packet in packets]
+        for stamp in range(START + n * PERIOD, START + (n + 1) * PERIOD, PERIOD // 10):
+            # Of its system, the accelerometer and the gyroscope; in g and degrees per second.
+            sample = struct.pack("<QQQ6f", stamp, stamp, stamp, 0, 0, 1, 0, 0, np.degrees(0.5))
+            blocks.append(packet_of(IMU_PORT, sample, n))
     path.write_bytes(b"".join(blocks))
     path.with_suffix(".json").write_text(info.to_json_string())
     return path
+
+
+def packet_of(port: int, data: bytes, sweep: int) -> bytes:
+    """A UDP packet as it is in a .pcap, with the time of its arrival."""
+    udp = struct.pack(">HHHH", port, port, 8 + len(data), 0)
+    ip = struct.pack(">BBHHHBBH", 0x45, 0, 28 + len(data), 0, 0x4000, 64, 17, 0) + b"\1" * 4 + b"\2" * 4
+    frame = b"\0" * 12 + b"\x08\x00" + ip + udp + data
+    return struct.pack("<IIII", START // 10**9, sweep * PERIOD // 1000, len(frame), len(frame)) + frame
 
 
 @pytest.mark.parametrize("kind", ["osf", "pcap"])
@@ -115,6 +123,18 @@ def test_a_part_is_those_sweeps(kind: str, request: pytest.FixtureRequest) -> No
     source = open_source(request.getfixturevalue(kind))
     assert [(frame.index, frame.stamp) for frame in source.frames(2)] == [(2, START + 2 * PERIOD)]
     assert [frame.index for frame in source.frames(0, 1)] == [0]
+
+
+def test_the_samples_of_the_imu_come_with_their_sweeps(pcap: Path) -> None:
+    for frame in open_source(pcap).frames():
+        assert frame.imu is not None
+        lost = LOST * PERIOD // COLUMNS if frame.index == 1 else 0
+        begin = START + frame.index * PERIOD
+        assert begin <= frame.imu.stamps[0] <= begin + PERIOD // 10
+        assert begin + lost <= frame.imu.stamps[-1] <= begin + PERIOD
+        np.testing.assert_allclose(frame.imu.rates, [[0, 0, 0.5]] * len(frame.imu), atol=1e-6)
+        np.testing.assert_allclose(frame.imu.forces, [[0, 0, 9.80665]] * len(frame.imu), atol=1e-5)
+    assert all(frame.imu is None for frame in open_source(pcap, InputSettings(imu=False)).frames())
 
 
 def test_of_several_sensors_one_is_named(tmp_path: Path) -> None:
