@@ -36,8 +36,10 @@ def kitti(
     overwrite: Overwrite = False,
 ) -> None:
     """KITTI odometry to a bag with the topic names of kitti2bag, ground truth included where there is some."""
+    from dpm2_core.data.kitti import KittiSource
+
     settings = InputSettings(sequence=sequence, images=images)
-    _convert(lambda: open_source(src, settings), src, out, (start, end), zstd, overwrite)
+    _convert(lambda: KittiSource(src, settings), src, out, (start, end), zstd, overwrite)
 
 
 @app.command()

@@ -60,7 +60,7 @@ class CloudFolder:
             self.stamps = np.round(np.arange(len(found)) * _PERIOD * 1e9).astype(np.int64)
         if any(file.suffix.lower() == ".pcd" for file in self._files):
             _pcd_type()  # now, rather than at the first scan
-        self._frames = FrameBuilder(settings or InputSettings(), Calibration(str(folder)), self.notes.append)
+        self._frames = FrameBuilder(settings or InputSettings(), Calibration(self.name), self.notes.append)
 
     def __len__(self) -> int:
         return len(self._files)

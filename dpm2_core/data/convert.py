@@ -29,6 +29,7 @@ EPOCH_NS = 1_316_995_200_000_000_000
 """Added to stamps that are no times since 1970, as KITTI's: 26 September 2011, its first day. ROS takes a stamp near 0
 for none."""
 _EARLIEST = 10**17  # ns, in 1973
+_PERIOD = 100_000_000  # ns, between two clouds where the clock went back
 
 # The odometry set has no such calibration: kitti2bag's base_link, the middle of the wheelbase at ground level.
 _T_BASE_LIDAR = se3.make(np.eye(3), [-0.59, 0.0, 1.73])
@@ -87,15 +88,15 @@ class _Bag:
         self._connections: dict[str, Any] = {}
         self._typestore = get_typestore(Stores.ROS2_JAZZY)
         self._first: int | None = None  # ns
-        self._later = 0  # ns, added to each stamp
+        self._later = self._shift = 0  # ns, added to stamps, and besides to the times of recording
+        self._recorded: dict[str, int] = {}  # ns, of the last message of each topic
         self._names = topics.OTHER
         self._correction_deg: float | None = None
         self._links: dict[str, tuple[str, Array]] = {}  # frame to its parent and T_parent_frame
-        self._cameras: list[str] = []
+        camera = getattr(source, "camera", None)  # the first one, also where its images come late
+        self._cameras: list[str] = [] if camera is None else [camera.name]
         self._path: list[tuple[int, Array]] = []
         self._R_lidar_imu = np.eye(3)
-        # ns; frames may share what came between them
-        self._last = dict.fromkeys((topics.IMU, topics.FIX), -float("inf"))
         if isinstance(source, KittiSource):
             self.source = copy(source)
             self.source.vertical_angle_correction_deg = 0.0  # recorded here, applied by who reads
@@ -107,19 +108,11 @@ class _Bag:
 
     def write(self, frame: Frame, position: int) -> None:
         """IMU, fix and image first: who waits for the cloud then has them already."""
-        if self._first is None:
-            self._later = EPOCH_NS if frame.stamp < _EARLIEST else 0
-            self._first = frame.stamp + self._later
-            if self._correction_deg is not None:
-                correction = bag_messages.number(self._correction_deg)
-                self._put(topics.VERTICAL_ANGLE_CORRECTION, self._first, correction, latched=True)
-        stamp = frame.stamp + self._later
+        stamp = self._begin(frame)
         self._link(stamp, frame)
         if frame.imu is not None:
             self._write_imu(frame.imu)
-        if frame.fix is not None and frame.fix.stamp > self._last[topics.FIX]:
-            self._last[topics.FIX] = frame.fix.stamp
-            time = frame.fix.stamp + self._later
+        if frame.fix is not None and self._is_new(topics.FIX, time := frame.fix.stamp + self._later):
             self._put(topics.FIX, time, bag_messages.nav_sat_fix(time, frame.fix))
         if frame.problem:
             self.source.notes.append(f"{frame.problem}: written as an empty cloud")
@@ -136,6 +129,24 @@ class _Bag:
         if self._first is not None and self.source.poses is not None:
             path = bag_messages.path(self._first, self._path)
             self._put(f"{self._names.truth}/path", self._first, path, latched=True)
+
+    def _begin(self, frame: Frame) -> int:
+        """The stamp to write, ns. Readers go by the time of recording, which goes on where the clock went back."""
+        self._later = EPOCH_NS if frame.stamp < _EARLIEST else 0  # of each, since a clock may be set during a drive
+        stamp = frame.stamp + self._later
+        if self._first is None:
+            self._first = stamp
+            if self._correction_deg is not None:
+                correction = bag_messages.number(self._correction_deg)
+                self._put(topics.VERTICAL_ANGLE_CORRECTION, stamp, correction, latched=True)
+        last = self._recorded.get(self._names.points, stamp)
+        if stamp + self._shift < last:
+            self._shift = last + _PERIOD - stamp
+        return stamp
+
+    def _is_new(self, topic: str, stamp: int) -> bool:
+        """Whether a message is newer than the last of its topic: frames may share what came between them."""
+        return topic not in self._recorded or stamp + self._shift > self._recorded[topic]
 
     def _link(self, stamp: int, frame: Frame) -> None:
         """All frames so far, where there is a new one: who comes late is sent the last message alone."""
@@ -162,14 +173,14 @@ class _Bag:
 
     def _write_image(self, image: Image, stamp: int) -> None:
         frame, topic = self._optical(image), self._names.camera + self._number(image)
-        self._put(f"{topic}/camera_info", stamp, bag_messages.camera_info(stamp, frame, image.camera))
-        self._put(f"{topic}/image_raw", stamp, bag_messages.image(stamp, frame, image.pixels))
+        if self._is_new(f"{topic}/image_raw", stamp):
+            self._put(f"{topic}/camera_info", stamp, bag_messages.camera_info(stamp, frame, image.camera))
+            self._put(f"{topic}/image_raw", stamp, bag_messages.image(stamp, frame, image.pixels))
 
     def _write_imu(self, imu: Inertial) -> None:
         R = self._R_lidar_imu  # back along its own axes
         for time, rates, forces in zip(imu.stamps.tolist(), imu.rates @ R, imu.forces @ R, strict=True):
-            if time > self._last[topics.IMU]:
-                self._last[topics.IMU] = time
+            if self._is_new(topics.IMU, time + self._later):
                 self._put(topics.IMU, time + self._later, bag_messages.imu(time + self._later, rates, forces))
 
     def _put(self, topic: str, stamp: int, msg: Any, latched: bool = False) -> None:
@@ -178,13 +189,14 @@ class _Bag:
             self._connections[topic] = self._writer.add_connection(
                 topic, kind, typestore=self._typestore, offered_qos_profiles=[_qos(latched)]
             )
-        self._writer.write(self._connections[topic], stamp, self._typestore.serialize_cdr(msg, kind))
+        self._recorded[topic] = stamp if latched else stamp + self._shift
+        self._writer.write(self._connections[topic], self._recorded[topic], self._typestore.serialize_cdr(msg, kind))
 
 
 @contextmanager
 def _new_folder(out: Path, overwrite: bool) -> Iterator[Path]:
     """A folder to make and fill that takes the name `out` when the block ends well, and vanishes when it does not."""
-    out = out.absolute()
+    out = out.resolve()
     if out.suffix in (".mcap", ".db3", ".bag"):
         raise UsageError(f"{out}: a rosbag2 recording is a folder; leave out the {out.suffix}")
     if out.exists() and not (overwrite and (out / "metadata.yaml").is_file()):

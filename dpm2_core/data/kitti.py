@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpm2_core.data.messages import scale_intensity
-from dpm2_core.data.scan_file import chosen, image_size, images_of, read_scan
+from dpm2_core.data.scan_file import chosen, image_path, image_size, images_of, read_scan
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.text import parse_row, read_lines, read_numbers
 from dpm2_core.data.vertical_angle import HDL64_CORRECTION_DEG, checked_correction, correct_vertical_angle
@@ -211,8 +211,7 @@ class KittiSource:
         return Camera(K, se3.inverse(T_cam2_cam0 @ self.T_cam_lidar), size, name="camera_color_left")
 
     def _image_path(self, scan: Path) -> Path | None:
-        paths = (self.path / "image_2" / f"{scan.stem}{suffix}" for suffix in (".png", ".jpg"))
-        return next((path for path in paths if path.is_file()), None)
+        return image_path(self.path / "image_2", scan.stem)
 
 
 def read_calib(path: Path) -> dict[str, Array]:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpm2_core.data.messages import scale_intensity
-from dpm2_core.data.scan_file import chosen, image_size, images_of, read_scan
+from dpm2_core.data.scan_file import chosen, image_path, image_size, images_of, read_scan
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.text import parse_row, read_lines, read_numbers
 from dpm2_core.data.vertical_angle import correct_vertical_angle
@@ -104,7 +104,7 @@ class Kitti360Source:
     def _camera(self) -> Camera | None:
         if not self._settings.images:
             return None
-        paths = (path for scan in self._scans if (path := self._image_path(scan.stem)).is_file())
+        paths = (path for scan in self._scans if (path := self._image_path(scan.stem)))
         size = image_size(paths)
         if size is None:
             return None
@@ -114,8 +114,8 @@ class Kitti360Source:
         assert self.T_cam_lidar is not None
         return Camera(P.reshape(3, 4)[:, :3], se3.inverse(self.T_cam_lidar), size, name="image_00")
 
-    def _image_path(self, stem: str) -> Path:
-        return self.root / "data_2d_raw" / self.drive / "image_00" / "data_rect" / f"{stem}.png"
+    def _image_path(self, stem: str) -> Path | None:
+        return image_path(self.root / "data_2d_raw" / self.drive / "image_00" / "data_rect", stem)
 
 
 def azimuth_time(points: Points) -> Points:
@@ -180,7 +180,7 @@ def _stamp(line: str, where: str) -> int:
 def _find(path: Path, sequence: str) -> tuple[Path, str]:
     """Root of the dataset and name of the drive."""
     if (path / "velodyne_points").is_dir():
-        drive = path.resolve()
+        drive = path.absolute()
         return drive.parents[1], drive.name
     found = sorted(p.name for p in (path / "data_3d_raw").glob("*") if (p / "velodyne_points").is_dir())
     if not found:

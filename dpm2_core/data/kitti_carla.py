@@ -64,7 +64,7 @@ class KittiCarlaSource:
             except UsageError as error:
                 columns, problem = np.empty((0, 5)), str(error)
             points = columns[:, :4].astype(np.float32)
-            points[:, 3] = np.abs(points[:, 3])
+            points[:, 3] = np.minimum(np.abs(points[:, 3]), 1)  # rounded, a cosine may be above it
             if len(points):
                 offset = (columns[:, 4] - stamp * 1e-9).astype(np.float32)
             points = correct_vertical_angle(points, self._settings.angle_correction(0.0))

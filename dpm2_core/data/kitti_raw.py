@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from dpm2_core.data.kitti360 import azimuth_time, read_keyed, read_stamps
 from dpm2_core.data.messages import scale_intensity
-from dpm2_core.data.scan_file import chosen, image_size, images_of, read_scan
+from dpm2_core.data.scan_file import chosen, image_path, image_size, images_of, read_scan
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.text import read_numbers
 from dpm2_core.data.vertical_angle import HDL64_CORRECTION_DEG, correct_vertical_angle
@@ -24,6 +24,7 @@ from dpm2_core.frame import Array, Camera, Frame
 from dpm2_core.geometry import se3
 
 _EARTH = 6378137.0  # m, the radius of the data set's projection
+_CALIBRATION = "calib_velo_to_cam.txt"
 _OXTS = 30  # numbers in a file of oxts
 
 
@@ -41,19 +42,27 @@ class KittiRawSource:
     def __init__(self, path: Path | str, settings: InputSettings | None = None) -> None:
         self._settings = settings or InputSettings()
         self.path = _find(Path(path), self._settings.sequence)
-        self.name, self.notes, self.truth = self.path.resolve().name, list[str](), ""
-        velodyne, date = self.path / "velodyne_points", self.path.resolve().parent
+        self.name, self.notes, self.truth = self.path.absolute().name, list[str](), ""
+        velodyne = self.path / "velodyne_points"
         self._scans = [scan for scan in sorted((velodyne / "data").glob("*.bin")) if scan.stem.isdecimal()]
         if not self._scans:
             raise UsageError(f"{velodyne}: no scans (data/NNNNNNNNNN.bin) in this folder: want a drive that is `_sync`")
         numbers = np.array([int(scan.stem) for scan in self._scans])
         self.stamps = read_stamps(velodyne / "timestamps.txt", numbers, self.notes)
+        self.T_cam_lidar: Array | None = None
+        self.camera: Camera | None = None
+        self.poses: Array | None = None
+        folders = (self.path.absolute().parent, self.path.resolve().parent)  # a drive may be a link to another disk
+        date = next((folder for folder in folders if (folder / _CALIBRATION).is_file()), None)
+        if date is None:
+            self.notes.append(f"{folders[0] / _CALIBRATION}: no such file; without calibration the points alone count")
+            return
         self._cameras = date / "calib_cam_to_cam.txt"
         self._intrinsics = read_keyed(self._cameras)
         R_rect = se3.make(self._numbers("R_rect_00", 9).reshape(3, 3), np.zeros(3))
-        self.T_cam_lidar: Array | None = se3.orthonormalized(R_rect) @ _rigid(date / "calib_velo_to_cam.txt")
-        self.camera = self._camera()
-        self.poses: Array | None = self._poses(date / "calib_imu_to_velo.txt")
+        self.T_cam_lidar = se3.orthonormalized(R_rect) @ _rigid(date / _CALIBRATION)
+        self.camera = self._camera(self.T_cam_lidar)
+        self.poses = self._poses(date / "calib_imu_to_velo.txt")
 
     def __len__(self) -> int:
         return len(self._scans)
@@ -73,18 +82,18 @@ class KittiRawSource:
             raise UsageError(f"{self._cameras}: no {name} of {count} numbers")
         return row
 
-    def _camera(self) -> Camera | None:
-        paths = (path for scan in self._scans if (path := self._image_path(scan.stem)).is_file())
+    def _camera(self, T_cam_lidar: Array) -> Camera | None:
+        paths = (path for scan in self._scans if (path := self._image_path(scan.stem)))
         size = image_size(paths) if self._settings.images else None
-        if size is None or self.T_cam_lidar is None:
+        if size is None:
             return None
         P = self._numbers("P_rect_02", 12).reshape(3, 4)
         # P_rect_02 = K [I | t] with t from the left gray camera 0, which T_cam_lidar refers to.
         T_cam2_cam0 = se3.make(np.eye(3), np.linalg.solve(P[:, :3], P[:, 3]))
-        return Camera(P[:, :3], se3.inverse(T_cam2_cam0 @ self.T_cam_lidar), size, name="camera_color_left")
+        return Camera(P[:, :3], se3.inverse(T_cam2_cam0 @ T_cam_lidar), size, name="camera_color_left")
 
-    def _image_path(self, stem: str) -> Path:
-        return self.path / "image_02" / "data" / f"{stem}.png"
+    def _image_path(self, stem: str) -> Path | None:
+        return image_path(self.path / "image_02" / "data", stem)
 
     def _poses(self, mounting: Path) -> Array | None:
         """(len, 4, 4) T_world_lidar, x to the east and z up, from the first scan's place; None without oxts."""

@@ -57,14 +57,14 @@ def open_source(path: Path | str, settings: InputSettings | None = None) -> Sour
         from dpm2_core.data.ouster import OusterSource
 
         return OusterSource(path, settings)
+    is_kitti = (path / "velodyne").is_dir() or (path / "sequences").is_dir()  # whatever lies beside the scans
+    beside = [] if is_kitti or path.is_file() else list(path.iterdir())
     # rosbags and its type store are slow to import, and of no use for a KITTI folder.
-    if path.is_file() or any(
-        file.suffix in (".mcap", ".db3") or file.name == "metadata.yaml" for file in path.iterdir()
-    ):
+    if path.is_file() or any(f.suffix in (".mcap", ".db3") or f.name == "metadata.yaml" for f in beside):
         from dpm2_core.data.bags import BagSource
 
         return BagSource(path, settings)
-    if _is_kitti_raw(path.resolve()):
+    if _is_kitti_raw(path.absolute()):
         from dpm2_core.data.kitti_raw import KittiRawSource
 
         return KittiRawSource(path, settings)
@@ -76,7 +76,7 @@ def open_source(path: Path | str, settings: InputSettings | None = None) -> Sour
         from dpm2_core.data.kitti_carla import KittiCarlaSource
 
         return KittiCarlaSource(path, settings)
-    if any(file.suffix.lower() in (".pcd", ".ply") for file in path.iterdir()):
+    if any(f.suffix.lower() in (".pcd", ".ply") for f in beside):
         from dpm2_core.data.cloud_folder import CloudFolder
 
         return CloudFolder(path, settings)

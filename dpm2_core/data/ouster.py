@@ -54,7 +54,7 @@ class OusterSource:
         if not self._count:
             raise UsageError(f"{self.path}: no sweep of the sensor that its metadata describes")
         self._imu = ImuBuffer() if settings.imu and self.path.suffix == ".pcap" else None
-        calibration = Calibration(str(self.path), imu_topic="IMU")
+        calibration = Calibration(self.path.name, imu_topic="IMU")
         self._frames = FrameBuilder(settings, calibration, self.notes.append, imu=self._imu)
 
     def __len__(self) -> int:

@@ -47,6 +47,12 @@ def image_size(paths: Iterable[Path]) -> tuple[int, int] | None:
     return next((pixels.shape[1::-1] for pixels in map(read_image, paths) if pixels is not None), None)
 
 
+def image_path(folder: Path, stem: str) -> Path | None:
+    """The image of a frame by its number: PNG, or JPEG as smaller copies of data sets have."""
+    paths = (folder / f"{stem}{suffix}" for suffix in (".png", ".jpg"))
+    return next((path for path in paths if path.is_file()), None)
+
+
 def images_of(path: Path | None, camera: Camera | None, notes: list[str]) -> tuple[Image, ...]:
     """The image of a frame, if it has one and there is a camera; a note says why one is left out."""
     if camera is None or path is None or not path.is_file():

@@ -21,6 +21,7 @@ from dpm2_core.data.bag_file import open_bag
 from dpm2_core.data.bags import BagSource
 from dpm2_core.data.convert import EPOCH_NS, convert
 from dpm2_core.data.kitti import KittiSource
+from dpm2_core.data.open import open_source
 from dpm2_core.data.ply import write_ply
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.source import Span
@@ -196,6 +197,7 @@ import sys, time
 from pathlib import Path
 from dpm2_core.data.convert import convert
 from dpm2_core.data.kitti import KittiSource
+from dpm2_core.data.open import open_source
 def progress(done, total):
     print(done, flush=True)
     time.sleep(60 if done == 3 else 0)
@@ -224,6 +226,7 @@ import resource, sys
 from pathlib import Path
 from dpm2_core.data.convert import convert
 from dpm2_core.data.kitti import KittiSource
+from dpm2_core.data.open import open_source
 from dpm2_core.errors import Dpm2Error, UsageError
 resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, 1_000_000))
 try:
@@ -344,3 +347,57 @@ def test_a_folder_of_clouds_by_command(tmp_path: Path) -> None:
     source = BagSource(tmp_path / "bag")
     assert [(frame.stamp - EPOCH_NS, frame.points[0, 0]) for frame in source.frames()] == [(10**8, 1), (2 * 10**8, 2)]
     assert set(open_bag(tmp_path / "bag").types) == {"/points"}
+
+
+class OddClock:
+    """Clouds whose numbers are their first coordinates, with a sample of an IMU before each and an image every 2nd."""
+
+    name, truth, T_cam_lidar, poses = "clock", "", None, None
+
+    def __init__(self, stamps: list[int]) -> None:
+        self.stamps, self.notes = stamps, list[str]()
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
+        """All of them."""
+        for index, stamp in enumerate(self.stamps):
+            imu = Inertial(np.array([stamp - 10**7]), np.ones((1, 3)), np.ones((1, 3)))
+            yield Frame(stamp, np.full((3, 4), index, np.float32), index=index, imu=imu)
+
+
+@pytest.mark.parametrize(
+    "stamps",
+    [
+        [STAMP, STAMP + 10**8, STAMP - 10**9, STAMP - 9 * 10**8],  # set back while driving
+        [5 * 10**9, 5 * 10**9 + 10**8, STAMP, STAMP + 10**8],  # set once it hears of the time
+    ],
+)
+def test_the_order_is_kept_where_the_clock_is_set(tmp_path: Path, stamps: list[int]) -> None:
+    """Players and readers go by the time of recording, and nothing is lost."""
+    convert(OddClock(stamps), tmp_path / "bag")
+    bag = open_bag(tmp_path / "bag")
+    clouds = [bag.decode(topic, data) for topic, _, data in bag.messages(["/points"])]
+    assert [float(np.frombuffer(cloud.data, "<f4")[0]) for cloud in clouds] == [0, 1, 2, 3]
+    said = [cloud.header.stamp.sec * 10**9 + cloud.header.stamp.nanosec for cloud in clouds]
+    assert said == [stamp if stamp > 10**17 else stamp + EPOCH_NS for stamp in stamps]
+    assert bag.counts["/imu"] == 4
+
+
+def test_the_first_camera_is_that_although_its_images_come_late(tmp_path: Path) -> None:
+    """By what the source knows. And an image that two clouds have is written once."""
+    drive = OtherDrive()
+    drive.camera = drive.cameras[1]  # type: ignore[attr-defined]
+    convert(drive, tmp_path / "bag")
+    counts = open_bag(tmp_path / "bag").counts
+    assert (counts["/camera/image_raw"], counts["/camera_2/image_raw"]) == (3, 2)
+
+
+def test_what_lies_beside_the_scans_does_not_hide_them(kitti_folder: MakeFolder, tmp_path: Path) -> None:
+    folder = kitti_folder()
+    write_ply(folder / "map.ply", np.zeros((5, 4), np.float32))
+    (folder / "metadata.yaml").write_text("notes: mine")
+    assert isinstance(open_source(folder), KittiSource)
+    result = CliRunner().invoke(app, ["kitti", str(tmp_path), str(tmp_path / "bag")])
+    assert "no KITTI sequence" in str(result.exception)

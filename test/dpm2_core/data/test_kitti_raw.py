@@ -112,7 +112,7 @@ def test_a_drive_is_named_in_the_folder_of_its_date(date: Path) -> None:
 @pytest.mark.parametrize(
     ("file", "content", "said"),
     [
-        ("calib_velo_to_cam.txt", None, "calib_velo_to_cam.txt: no such file"),
+        ("calib_imu_to_velo.txt", None, "calib_imu_to_velo.txt: no such file"),
         ("calib_velo_to_cam.txt", "R: 1 0 0", "calib_velo_to_cam.txt: want R of 9 and T of 3 numbers"),
         ("calib_velo_to_cam.txt", "R: 1 0 0 0 1 0 0 0 2\nT: 0 0 0", "calib_velo_to_cam.txt: R is no rotation"),
         ("calib_cam_to_cam.txt", "R_rect_00: 1", "calib_cam_to_cam.txt: no R_rect_00 of 9 numbers"),
@@ -132,3 +132,24 @@ def test_a_drive_without_scans_is_said_to_be_none(date: Path) -> None:
         scan.rename(scan.with_suffix(".txt"))  # as those of an unsynchronized drive are
     with pytest.raises(UsageError, match=r"no scans .*want a drive that is `_sync`"):
         open_source(date / DRIVE)
+
+
+def test_without_calibration_the_points_count(date: Path) -> None:
+    (date / "calib_velo_to_cam.txt").unlink()
+    source = open_source(date / DRIVE)
+    assert "calib_velo_to_cam.txt: no such file; without calibration the points alone count" in source.notes[0]
+    assert (source.poses, next(source.frames()).images) == (None, ())
+
+
+def test_a_drive_on_another_disk_with_smaller_images(date: Path, tmp_path: Path) -> None:
+    """A link beside the calibration, and JPEG as many copies have."""
+    (tmp_path / "disk").mkdir()
+    (date / DRIVE).rename(tmp_path / "disk" / "drive")
+    (date / DRIVE).symlink_to(tmp_path / "disk" / "drive")
+    for image in (date / DRIVE / "image_02/data").iterdir():
+        cv2.imwrite(str(image.with_suffix(".jpg")), cv2.imread(str(image)))
+        image.unlink()
+    source = open_source(date / DRIVE)
+    assert (source.name, source.notes) == (DRIVE, [])
+    assert all(len(frame.images) == 1 for frame in source.frames())
+    assert source.poses is not None
