@@ -1,22 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A driver or a relay that sends a scan or an image again under a new stamp: to the odometry it would look like a halt.
+"""A driver or a relay that sends a scan, a part of it or an image again under a new stamp: that would look like a halt.
 
-Both are compared by checksums: a caller may use its arrays again.
+A caller may use its arrays again.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from zlib import crc32
 
 import numpy as np
+from numpy.typing import NDArray
 
+from dpm2_core.data.messages import returned
 from dpm2_core.frame import Array, Frame, Guess, Image, Points
 from dpm2_core.geometry import se3
 
 PROBLEM = "the same cloud as before: the LiDAR or its driver repeats itself"
 IMAGE_PROBLEM = "the same image as before: the camera or its driver repeats itself"
-_STOPS = 0.3  # m: robots of simulations without noise stop dead, and then see the same again; at 3 m/s none does
-_TURNS = 3.0  # degrees
+PART_PROBLEM = "a part of the cloud is that of before: of LiDARs whose clouds are made one, one repeats itself"
+_STOPS = 1.5  # m/s: robots of simulations without noise stop dead, and then see the same again; none that is faster
+_MOVED, _TURNS = 0.3, 3.0  # m, degrees
+_PART = (
+    0.3  # of the points, of those that are the same again as of the others; noise leaves 0.2 at most, in coarse steps
+)
+_LEAST = 200  # points that are compared
 _LOOKED_AT = 8192  # points: noise changes any few of them
 _ROWS = 8  # of an image each so many-th row: noise changes any of them
 _Seen = tuple[int, Guess | None, Array]  # checksum; the guess when it was new; R (3, 3) that it has turned since
@@ -30,11 +38,11 @@ class RepeatedCloud:
         self._now: _Seen | None = None
         self._again = False
 
-    def repeats(self, frame: Frame, meters: float, turn: Array | None = None) -> bool:
+    def repeats(self, frame: Frame, speed: float, turn: Array | None = None) -> bool:
         """Whether a cloud is the registered one to the last bit although the sensor should have moved meanwhile.
 
         Args:
-            meters: the way since the last registered frame by the motion before. A repetition that was taken for a halt
+            speed: m/s, by the motion before. A repetition that was taken for a halt
                 has ended that motion; the frame's guess and `turn` count from when the cloud was new.
             turn: R_before_now (3, 3) since the last registered frame, as an IMU has it; None where it shows none.
         """
@@ -47,12 +55,32 @@ class RepeatedCloud:
         self._now, moved = (checksum, guess, R), [se3.make(R, np.zeros(3))]
         if guess is not None and frame.guess is not None:
             moved.append(se3.inverse(guess.T_other_lidar) @ frame.guess.T_other_lidar)
-        self._again |= meters > _STOPS or any((np.array(se3.magnitude(T)) > (_STOPS, _TURNS)).any() for T in moved)
+        self._again |= speed > _STOPS or any((np.array(se3.magnitude(T)) > (_MOVED, _TURNS)).any() for T in moved)
         return self._again
 
     def keep(self) -> None:
         """This cloud was registered."""
         self._registered = self._now
+
+
+class RepeatedPart:
+    """Remembers the last cloud."""
+
+    def __init__(self) -> None:
+        self._last, self._known = np.zeros((0, 4), np.float32), np.zeros(0, np.uint64)
+
+    def new(self, frame: Frame) -> Frame:
+        """A frame without the points that are those of the one before, to the last bit, where they are many.
+
+        There must be as many others: in a simulation without noise a robot at rest sees nearly all of them again.
+        """
+        before, known = self._last, self._known
+        self._last, self._known = frame.points.copy(), _marks(_some(frame.points))
+        if len(self._known) < _LEAST or not _PART < np.isin(self._known, known).mean() < 1 - _PART:
+            return frame
+        new = ~np.isin(_marks(frame.points), _marks(before))
+        offset = None if frame.time_offset is None else frame.time_offset[new]
+        return replace(frame, points=frame.points[new], time_offset=offset)
 
 
 class RepeatedImages:
@@ -81,3 +109,18 @@ class RepeatedImages:
 
 def _checksum(points: Points) -> int:
     return crc32(points[:: max(1, len(points) // _LOOKED_AT)].tobytes())
+
+
+def _some(points: Points) -> Points:
+    """About one in 32 of those that have returned, by the bits of x: of each cloud the same ones."""
+    x = np.ascontiguousarray(points[:, 0]).view(np.uint32)
+    some = points[x * np.uint32(2654435761) < 2**27]
+    return some[returned(some)]
+
+
+def _marks(points: Points) -> NDArray[np.uint64]:
+    """(N,) a number for the bits of each place."""
+    x, y, z = np.ascontiguousarray(points[:, :3].T).view(np.uint32).astype(np.uint64)
+    return (
+        (x * np.uint64(0x9E3779B97F4A7C15)) ^ (y * np.uint64(0xC2B2AE3D27D4EB4F)) ^ (z * np.uint64(0x165667B19E3779F9))
+    )

@@ -9,7 +9,7 @@ from time import perf_counter
 
 import numpy as np
 
-from dpm2_core.data.repeated import IMAGE_PROBLEM, RepeatedCloud, RepeatedImages
+from dpm2_core.data.repeated import IMAGE_PROBLEM, PART_PROBLEM, RepeatedCloud, RepeatedImages, RepeatedPart
 from dpm2_core.data.repeated import PROBLEM as REPEATED
 from dpm2_core.data.stream_clock import DOUBTED, NOMINAL, SLOWEST, StreamClock
 from dpm2_core.estimates import OdometryResult, Registration, State
@@ -60,7 +60,7 @@ class Odometry:
         self._clock = StreamClock()
         self._sweep = Sweep()
         self._failures = 0
-        self._repeated, self._images = RepeatedCloud(), RepeatedImages()
+        self._repeated, self._part, self._images = RepeatedCloud(), RepeatedPart(), RepeatedImages()
         self._first: Frame | None = None  # until the second one is registered
         self._first_sweep = Sweep()
         self._bridge: Bridge | None = None
@@ -81,7 +81,7 @@ class Odometry:
         self._motion, self._clock, self._sweep = copy(before._motion), before._clock, before._sweep
         self._motion.settings = self._settings
         self._breaks, self._broken = before._breaks, before._broken
-        self._repeated, self._images = before._repeated, before._images
+        self._repeated, self._part, self._images = before._repeated, before._part, before._images
         self._keyframes.take_over(before._keyframes)
         scan = self._registration.prepare(self._sweep.centered(frame), self._motion.known_twist)
         self._registration.update(scan, self._motion.T)
@@ -89,7 +89,8 @@ class Odometry:
     def process(self, frame: Frame) -> OdometryResult:
         """Pose of one frame; never raises for what a sensor may deliver, and always gives a finite pose."""
         clock, motion = [perf_counter()], self._motion
-        given, frame = frame, self._sweep.centered(frame)
+        given = self._part.new(frame)
+        is_part, frame = given is not frame, self._sweep.centered(given)
         dt = self._clock.advance(frame.stamp)
         if self._first is not None and self._sweep.is_part(self._first_sweep.span):
             self._forget_first(dt)
@@ -106,6 +107,8 @@ class Odometry:
         match = self._unbent(frame, match, twist, motion.seconds + dt)
         clock.append(perf_counter())
         scan, registration = match.scan, match.result
+        if is_part:
+            registration = replace(registration, reason="; ".join(filter(None, (registration.reason, PART_PROBLEM))))
         self._update(match, dt)
         if registration.ok:
             self._repeated.keep()
@@ -147,7 +150,7 @@ class Odometry:
         if motion.inertial is not None:
             frame = motion.inertial.look(frame)
             twist = motion.turned(twist, seconds)
-        frame = self._without_repetitions(frame, float(np.linalg.norm(twist[3:])) * seconds)
+        frame = self._without_repetitions(frame, float(np.linalg.norm(twist[3:])))
         if frame.guess is not None and motion.other is None:
             motion.other = OtherMotion()
         if motion.other is not None:
@@ -162,11 +165,11 @@ class Odometry:
         self._keyframes.add_uncertainty(self._motion.unknown(dt))
         self._keyframes.request()
 
-    def _without_repetitions(self, frame: Frame, meters: float) -> Frame:
-        """Without what the LiDAR or a camera has sent before; `meters`: the way since the last registered frame."""
+    def _without_repetitions(self, frame: Frame, speed: float) -> Frame:
+        """Without what the LiDAR or a camera has sent before; `speed`: m/s, by the motion so far."""
         imu = self._motion.inertial
         turn = imu.turn if imu is not None and imu.turns else None
-        if self._repeated.repeats(frame, meters, turn) and frame.problem is None:
+        if self._repeated.repeats(frame, speed, turn) and frame.problem is None:
             frame = replace(frame, problem=REPEATED)
         if imu is not None and frame.problem is not None:
             imu.turns = False  # what shows no turn does not speak against it

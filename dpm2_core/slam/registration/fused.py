@@ -89,7 +89,7 @@ class FusedScanRegistration:
         if not points.ok:
             return self._led(scan, neural)
         if prediction.expects(points.T_target_source) and not agree(points, neural, CHI2_95):
-            return _because(points, f"neural and points {_apart(points, neural)} apart")
+            return _outvoting(points, neural, prediction)
         if not agree(points, neural):
             if prediction.known:
                 starts = [points.T_target_source, neural.T_target_source]
@@ -99,7 +99,7 @@ class FusedScanRegistration:
                 points = likelier if likelier.ok else points
             elif points.worst_sigma > _SURE_SIGMA and self._seen(scan):
                 return self._led(scan, neural)  # where points fit anywhere, they fit best where nothing has moved
-            return _because(points, f"neural and points {_apart(points, neural)} apart")
+            return _outvoting(points, neural, prediction)
         if not self._always and _sure(points, prediction):
             return points  # all that they needed was the start
         return self._fused(scan, points, neural, prediction.information)
@@ -112,9 +112,7 @@ class FusedScanRegistration:
             return replace(neural, covariance=covariance, reason=f"not refined: {points.reason}")
         if agree(points, neural):
             return self._fused(scan, points, neural, None)
-        xi = _difference(points, neural)
-        why = f"neural and points {_apart(points, neural)} apart"
-        return replace(neural, covariance=neural.covariance + np.outer(xi, xi), reason=why)
+        return _instead(neural, points)
 
     def _fused(self, scan: Scan, points: Registration, neural: Registration, prior: Array | None) -> Registration:
         return _mean(points, neural, prior, self._seen(scan))
@@ -169,6 +167,23 @@ def _sure(points: Registration, prediction: Prediction) -> bool:
 def _difference(a: Registration, b: Registration) -> Array:
     """xi (6,) [rad, m] that leads from one result to the other."""
     return se3.log(se3.inverse(a.T_target_source) @ b.T_target_source)
+
+
+def _outvoting(points: Registration, neural: Registration, prediction: Prediction) -> Registration:
+    """The points, that exclude the network: where they fit well by themselves they know it."""
+    if prediction.convinced(points):
+        return _because(points, f"neural and points {_apart(points, neural)} apart")
+    return _instead(points, neural)
+
+
+def _instead(result: Registration, other: Registration) -> Registration:
+    """One of two that exclude each other, as uncertain as they are apart: which of them is right nothing has shown."""
+    xi = _difference(result, other)
+    return replace(
+        result,
+        covariance=result.covariance + np.outer(xi, xi),
+        reason=f"neural and points {_apart(result, other)} apart",
+    )
 
 
 def _apart(a: Registration, b: Registration) -> str:

@@ -257,6 +257,22 @@ def test_a_cloud_that_is_sent_again_is_no_halt(suburb_drive: Drive, often: int) 
     assert results[-1].state is State.TRACKING
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("first", [0, 12])
+def test_one_of_two_lidars_that_sends_its_last_cloud_again_holds_nothing(suburb_drive: Drive, first: int) -> None:
+    """What was made one cloud of both stood still with the half that had died: the error was the whole way."""
+    frames, truth = suburb_drive
+    behind = frames[first].points[frames[first].points[:, 0] < 0]
+    joined = [
+        frame if i < first else replace(frame, points=np.concatenate([frame.points[frame.points[:, 0] > 0], behind]))
+        for i, frame in enumerate(frames)
+    ]
+    results = run(joined)
+    assert all("a part of the cloud is that of before" in result.registration.reason for result in results[first + 1 :])
+    assert np.linalg.norm((se3.inverse(truth[-1]) @ results[-1].T_odom_lidar)[:3, 3]) < 0.15  # m, with half of the view
+    assert results[-1].state is State.TRACKING
+
+
 def test_a_vehicle_that_stands_may_see_the_same_cloud(suburb_drive: Drive) -> None:
     """In a simulation without noise; also where the caller uses one array for all clouds."""
     frames, _ = suburb_drive

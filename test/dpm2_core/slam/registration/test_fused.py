@@ -140,6 +140,7 @@ def test_a_network_that_is_wrong_and_sure_of_it_is_outvoted(case: Case) -> None:
     assert (result.ok, result.method) == (True, "geometric")
     assert "m, 0.0 deg apart" in result.reason
     assert error < 0.02
+    assert result.worst_sigma < 0.05  # nearly all points fit
 
 
 def test_the_network_leads_the_points_where_the_motion_does_not(case: Case) -> None:
@@ -246,6 +247,7 @@ def test_points_that_fit_just_where_the_motion_leads_are_enough(suburb_drive: Dr
     contradicted, error = Case(([*frames[:5], noisy], truth)).register([0, 0, 0, -0.35, 0, 0])
     assert contradicted.reason.startswith("neural and points 0.35 m")
     assert error < 0.02
+    assert contradicted.worst_sigma > 0.3  # half of the points fit, and the network excludes them
     hardly, error = Case(([*frames[:5], noisy], truth)).register([0, 0, 0, -0.2, 0, 0])  # 3.7 standard deviations
     assert hardly.reason.startswith("neural and points 0.20 m")
     assert error < 0.02
