@@ -28,7 +28,7 @@ $(READY): setup.py pyproject.toml
 	@$(BIN)/python -m dpm2_ros.build_tf2_msgs || echo "continuing without /tf" >&2
 	@touch $@
 
-demo: setup ros  ## simulate a drive, replay it into slam_node, check and show what comes out; SRC=<KITTI sequence or bag> for your own
+demo: setup ros  ## simulate a drive, replay it into slam_node, check and show what comes out; SRC=<bag, KITTI sequence or another recording> for your own
 	$(BIN)/python -m tools.demo $(if $(SRC),"$(SRC)") --out out/demo
 
 .PHONY: ros

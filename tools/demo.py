@@ -19,7 +19,7 @@ from dpm2_core.commands.options import run_command
 from dpm2_core.console import Console
 from dpm2_core.data.bags import BagSource
 from dpm2_core.data.convert import convert
-from dpm2_core.data.kitti import KittiSource
+from dpm2_core.data.open import open_source
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.trajectory import read_trajectory
 from dpm2_core.errors import Dpm2Error, UsageError
@@ -76,14 +76,15 @@ def demo(
 
 
 def prepare(src: Path | None, out: Path, frames: int, seed: int, console: Console) -> Path:
-    """The bag to play: `src` itself, a KITTI sequence converted, or a simulated one; what was made before is reused.
+    """The bag to play: `src` itself, another recording converted, or a simulated one; what was made before is reused.
 
     Raises:
         UsageError: `src` is nothing that can be read.
     """
     if src is not None and not src.exists():
         raise UsageError(f"{src}: no such file or folder")
-    if src is not None and (src.is_file() or any(src.glob("*.mcap")) or any(src.glob("*.db3"))):
+    files = [] if src is None else [src] if src.is_file() else list(src.iterdir())
+    if src is not None and any(file.suffix in (".mcap", ".db3") for file in files):
         return src
     if src is None:
         src = out / f"city_{frames}_{seed}"
@@ -96,7 +97,7 @@ def prepare(src: Path | None, out: Path, frames: int, seed: int, console: Consol
     made_from = bag.with_suffix(".source")  # the same name elsewhere is another drive
     if not (bag / "metadata.yaml").is_file() or made_from.read_text() != str(src.resolve()):
         with console.status(f"converting {src} to {bag}"):
-            for note in convert(KittiSource(src), bag, overwrite=True):
+            for note in convert(open_source(src), bag, overwrite=True):
                 console.print(note, style="yellow")
         made_from.write_text(str(src.resolve()))
     return bag
