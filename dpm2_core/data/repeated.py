@@ -24,7 +24,7 @@ _MOVED, _TURNS = 0.3, 3.0  # m, degrees
 _PART = (
     0.3  # of the points, of those that are the same again as of the others; noise leaves 0.2 at most, in coarse steps
 )
-_LEAST = 200  # points that are compared
+_LEAST = 100  # points that are compared
 _LOOKED_AT = 8192  # points: noise changes any few of them
 _ROWS = 8  # of an image each so many-th row: noise changes any of them
 _Seen = tuple[int, Guess | None, Array]  # checksum; the guess when it was new; R (3, 3) that it has turned since
@@ -67,20 +67,29 @@ class RepeatedPart:
     """Remembers the last cloud."""
 
     def __init__(self) -> None:
-        self._last, self._known = np.zeros((0, 4), np.float32), np.zeros(0, np.uint64)
+        self._buffer, self._count = np.zeros((0, 4), np.float32), 0
+        self._known = np.zeros(0, np.uint64)
 
     def new(self, frame: Frame) -> Frame:
         """A frame without the points that are those of the one before, to the last bit, where they are many.
 
         There must be as many others: in a simulation without noise a robot at rest sees nearly all of them again.
         """
-        before, known = self._last, self._known
-        self._last, self._known = frame.points.copy(), _marks(_some(frame.points))
-        if len(self._known) < _LEAST or not _PART < np.isin(self._known, known).mean() < 1 - _PART:
-            return frame
-        new = ~np.isin(_marks(frame.points), _marks(before))
-        offset = None if frame.time_offset is None else frame.time_offset[new]
-        return replace(frame, points=frame.points[new], time_offset=offset)
+        before, known, self._known = self._buffer[: self._count], self._known, _marks(_some(frame.points))
+        if len(self._known) >= _LEAST and _PART < np.isin(self._known, known).mean() < 1 - _PART:
+            new = ~np.isin(_marks(frame.points), _marks(before))
+            offset = None if frame.time_offset is None else frame.time_offset[new]
+            self._keep(frame.points)
+            return replace(frame, points=frame.points[new], time_offset=offset)
+        self._keep(frame.points)
+        return frame
+
+    def _keep(self, points: Points) -> None:
+        """In one place for all clouds: new memory for each would take longer than the rest."""
+        self._count = len(points)
+        if len(self._buffer) < self._count:
+            self._buffer = np.empty((self._count, 4), np.float32)
+        self._buffer[: self._count] = points
 
 
 class RepeatedImages:
@@ -112,9 +121,8 @@ def _checksum(points: Points) -> int:
 
 
 def _some(points: Points) -> Points:
-    """About one in 32 of those that have returned, by the bits of x: of each cloud the same ones."""
-    x = np.ascontiguousarray(points[:, 0]).view(np.uint32)
-    some = points[x * np.uint32(2654435761) < 2**27]
+    """About one in 64 of those that have returned, by the bits of x: of each cloud the same ones."""
+    some = points[points[:, :1].view(np.uint32)[:, 0] * np.uint32(2654435761) < 2**26]
     return some[returned(some)]
 
 
