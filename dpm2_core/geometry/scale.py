@@ -21,6 +21,9 @@ _NEAREST = 0.3  # m
 _ROOM = (800, 18.0)
 _HALL = 10.0
 _OPEN = (1300, 25.0)
+_ENCLOSED = 2.0  # m: rooms in which one works are larger than this to all sides
+_SECTORS = 6  # of half a turn: a LiDAR that looks ahead alone sees nothing of what is behind it
+_FEWER = 2000  # points
 _LEAST = 30  # cells: fewer say nothing
 ROOM_SCALE = 5.0
 """Of scans in rooms. Measured, 16 beams, pairs up to 1 / 1 to 2 m apart that are registered to 0.3 m and 3 degrees:
@@ -51,3 +54,14 @@ def is_room(points: Points) -> bool | None:
 def scale_of(points: Points) -> float:
     """The factor by which a scan (N, 4), or a keyframe's cloud, is enlarged for the network: 1 in the open."""
     return ROOM_SCALE if is_room(points) else 1.0
+
+
+def is_enclosed(points: Points) -> bool:
+    """Whether a scan (N, 4) shows nothing but what is near, all around: a lift's cabin, which may move along."""
+    some = points[:: max(1, len(points) // _FEWER)]
+    away = np.linalg.norm(some[:, :3], axis=1)
+    valid = away > 0  # False for NaN
+    if valid.sum() < _FEWER // 4 or np.percentile(away[valid], 99) > _ENCLOSED:
+        return False
+    heading = np.arctan2(some[valid, 1], some[valid, 0])
+    return len(np.unique(np.floor(heading / (np.pi / _SECTORS)))) >= 2 * _SECTORS

@@ -16,6 +16,7 @@ from dpm2_core.estimates import OdometryResult, Registration, State
 from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.motion import period_by_motion
+from dpm2_core.geometry.scale import is_enclosed
 from dpm2_core.geometry.sweep import Sweep
 from dpm2_core.slam.bridge import Bridge, Limits
 from dpm2_core.slam.odometry.inertial import InertialMotion
@@ -27,6 +28,7 @@ from dpm2_core.slam.odometry.settings import OdometrySettings
 from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration
 
+_ENCLOSED = "all that is seen is near: what encloses the LiDAR, as a lift does, may move along"
 _KNOWN = 0.5  # m and rad, standard deviation of the second pose, still skewed: where the points find it alone
 _BENT = 0.1  # m at half of the sweep and the usual range: by so much a wrong motion must bend a scan to count
 _BURST = 0.6  # of the usual period: while no motion is known, a frame that comes sooner was held back
@@ -107,8 +109,10 @@ class Odometry:
         match = self._unbent(frame, match, twist, motion.seconds + dt)
         clock.append(perf_counter())
         scan, registration = match.scan, match.result
-        if is_part:
-            registration = replace(registration, reason="; ".join(filter(None, (registration.reason, PART_PROBLEM))))
+        enclosed = is_enclosed(scan.points)
+        if is_part or enclosed:
+            said = (registration.reason, PART_PROBLEM if is_part else "", _ENCLOSED if enclosed else "")
+            registration = replace(registration, reason="; ".join(filter(None, said)))
         self._update(match, dt)
         if registration.ok:
             self._repeated.keep()
@@ -130,7 +134,7 @@ class Odometry:
             T_odom_lidar=T,
             covariance=motion.covariance + self._sweep.covariance(motion.change),
             twist=motion.known_twist,
-            state=self._state(registration),
+            state=self._state(registration, enclosed),
             registration=registration,
             keyframe=keyframe,
             breaks=self._breaks,
@@ -295,11 +299,12 @@ class Odometry:
         motion.advance(result, dt, self._clock.stamp, match.led)
         self._registration.update(match.scan, motion.T)
 
-    def _state(self, registration: Registration) -> State:
+    def _state(self, registration: Registration, enclosed: bool) -> State:
         if self._failures >= self._settings.lost_after:
             return State.LOST
         if self._motion.twist is None and self._bridge is None:
             return State.INITIALIZING
-        if not registration.ok or registration.worst_sigma > self._settings.degraded_sigma or self._breaks:
+        uncertain = not registration.ok or registration.worst_sigma > self._settings.degraded_sigma
+        if uncertain or enclosed or self._breaks:
             return State.DEGRADED
         return State.TRACKING

@@ -11,7 +11,7 @@ import pytest
 from dpm2_core.data.kitti import KittiSource
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.geometry import se3
-from dpm2_core.geometry.scale import ROOM_SCALE, is_room, scale_of
+from dpm2_core.geometry.scale import ROOM_SCALE, is_enclosed, is_room, scale_of
 from dpm2_core.geometry.voxel import voxel_first
 from test.helpers.rooms import FURNITURE, frames, scan, walk
 
@@ -68,3 +68,32 @@ def test_no_scan_of_kitti_is_a_room(kitti_root: Path, sequence: str) -> None:
     """What the defaults do on real streets stays as it is."""
     source = KittiSource(kitti_root / "sequences" / sequence, InputSettings(images=False))
     assert {is_room(frame.points) for frame in source.frames()} == {False}
+
+
+CABIN = np.array([[-1.05, -1.1, 0], [1.05, 1.1, 2.4]])
+
+
+@pytest.mark.parametrize(
+    ("hull", "enclosed"),
+    [
+        (CABIN, True),
+        (CABIN * [1, 4, 1], False),  # a corridor
+        (CABIN * [1.5, 1.5, 1], False),  # a small room
+    ],
+)
+def test_a_cabin_encloses_and_a_room_does_not(hull: np.ndarray, enclosed: bool) -> None:
+    points = scan(MIDDLE, hull, np.zeros((0, 2, 3)), 0)
+    assert is_enclosed(points) is enclosed
+    again = np.concatenate([points, np.full((500, 4), np.nan, np.float32), np.zeros((500, 4), np.float32)])
+    assert is_enclosed(again) is enclosed
+
+
+def test_a_part_of_the_view_encloses_nothing() -> None:
+    """A door that is open, a LiDAR that looks ahead alone, a handful of points."""
+    points = scan(MIDDLE, CABIN, np.zeros((0, 2, 3)), 0)
+    door = points.copy()
+    door[(np.abs(points[:, 1]) < 0.4) & (points[:, 0] > 0.9), :3] *= 8
+    assert not is_enclosed(door)
+    assert not is_enclosed(points[points[:, 0] > 0])
+    assert not is_enclosed(points[:: len(points) // 100])
+    assert not is_enclosed(points[:0])

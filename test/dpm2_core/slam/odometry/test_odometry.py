@@ -19,6 +19,7 @@ from dpm2_core.slam.build import make_odometry
 from dpm2_core.slam.odometry.settings import OdometrySettings
 from dpm2_core.slam.settings import SlamSettings
 
+from ....helpers import rooms
 from ....helpers.drives import Drive, make_drive
 
 
@@ -271,6 +272,17 @@ def test_one_of_two_lidars_that_sends_its_last_cloud_again_holds_nothing(suburb_
     assert all("a part of the cloud is that of before" in result.registration.reason for result in results[first + 1 :])
     assert np.linalg.norm((se3.inverse(truth[-1]) @ results[-1].T_odom_lidar)[:3, 3]) < 0.15  # m, with half of the view
     assert results[-1].state is State.TRACKING
+
+
+def test_within_what_may_move_along_nothing_is_tracked() -> None:
+    """In a lift: all of the way up was missing afterwards, and each frame was `tracking`."""
+    cabin, pose = np.array([[-1.05, -1.1, 0], [1.05, 1.1, 2.4]]), se3.make(np.eye(3), [0, 0, 0.6])
+    clouds = [rooms.scan(pose, cabin, np.zeros((0, 2, 3)), seed) for seed in range(6)]
+    odometry = make_odometry(SlamSettings(preset="indoor"))
+    results = [odometry.process(Frame(n * 10**8, points, index=n)) for n, points in enumerate(clouds)]
+    assert all(result.registration.ok for result in results)
+    assert {result.state for result in results[1:]} == {State.DEGRADED}
+    assert "may move along" in results[-1].registration.reason
 
 
 def test_a_vehicle_that_stands_may_see_the_same_cloud(suburb_drive: Drive) -> None:
