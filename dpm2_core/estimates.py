@@ -40,6 +40,10 @@ class Registration:
     overlap: float = float("nan")
     floor: tuple[float, float] = (0.0, 0.0)
 
+    def because(self, why: str) -> Registration:
+        """The same, with one more reason in words."""
+        return replace(self, reason="; ".join(part for part in (self.reason, why) if part))
+
     @classmethod
     def failed(cls, method: str, reason: str, T_guess: Array | None = None) -> Registration:
         """No pose was found, and why: near a guess (4, 4) all the same or, without one, anywhere."""

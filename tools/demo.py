@@ -19,7 +19,7 @@ from dpm2_core.commands.options import run_command
 from dpm2_core.console import Console
 from dpm2_core.data.bags import BagSource
 from dpm2_core.data.convert import convert
-from dpm2_core.data.open import open_source
+from dpm2_core.data.open import is_rosbag2, open_source
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.trajectory import read_trajectory
 from dpm2_core.errors import Dpm2Error, UsageError
@@ -83,8 +83,7 @@ def prepare(src: Path | None, out: Path, frames: int, seed: int, console: Consol
     """
     if src is not None and not src.exists():
         raise UsageError(f"{src}: no such file or folder")
-    files = [] if src is None else [src] if src.is_file() else list(src.iterdir())
-    if src is not None and any(file.suffix in (".mcap", ".db3") for file in files):
+    if src is not None and is_rosbag2(src):
         return src
     if src is None:
         src = out / f"city_{frames}_{seed}"

@@ -52,7 +52,7 @@ def drive(
     zstd: Zstd = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """Any recording (KITTI-360, KITTI-CARLA, MulRan, Ouster, PCD, ROS 1, ...) to a bag of the same topics."""
+    """Any recording (KITTI-360, MulRan, Ouster, PCD, ROS 1, ...) to a bag with /points, /camera/image_raw, /imu, ..."""
     chosen = load_settings(Config, config, settings or []).input
     _convert(lambda: open_source(src, chosen), src, out, parse_range(frames), zstd, overwrite)
 

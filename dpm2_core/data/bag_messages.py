@@ -27,8 +27,7 @@ def _parts(T: Array) -> tuple[list[float], list[float]]:
     return T[:3, 3].tolist(), Rotation.from_matrix(T[:3, :3]).as_quat().tolist()
 
 
-def transform(stamp: int, parent: str, child: str, T: Array) -> Any:
-    """T_parent_child (4, 4)."""
+def _transform(stamp: int, parent: str, child: str, T: Array) -> Any:
     t, q = _parts(T)
     transform = _TYPES["geometry_msgs/msg/Transform"](
         translation=_TYPES["geometry_msgs/msg/Vector3"](*t), rotation=_TYPES["geometry_msgs/msg/Quaternion"](*q)
@@ -45,8 +44,7 @@ def _pose(T: Array) -> Any:
     )
 
 
-def pose_stamped(stamp: int, T: Array) -> Any:
-    """T_map_lidar (4, 4)."""
+def _pose_stamped(stamp: int, T: Array) -> Any:
     return _TYPES["geometry_msgs/msg/PoseStamped"](header=header(stamp, topics.MAP), pose=_pose(T))
 
 
@@ -101,8 +99,8 @@ def camera_info(stamp: int, frame: str, camera: Camera) -> Any:
     roi = _TYPES["sensor_msgs/msg/RegionOfInterest"](x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
     return _TYPES["sensor_msgs/msg/CameraInfo"](
         header=header(stamp, frame), height=camera.size[1], width=camera.size[0], distortion_model=model, d=D,
-        k=camera.K.reshape(-1),
-        r=np.eye(3).reshape(-1), p=np.c_[camera.K, np.zeros(3)].reshape(-1), binning_x=0, binning_y=0, roi=roi,
+        k=camera.K.reshape(-1), r=np.eye(3).reshape(-1), p=np.c_[camera.K, np.zeros(3)].reshape(-1),
+        binning_x=0, binning_y=0, roi=roi,
     )  # fmt: skip
 
 
@@ -117,7 +115,7 @@ def cloud(stamp: int, lidar: str, frame: Frame) -> Any:
 
 def path(stamp: int, poses: list[tuple[int, Array]]) -> Any:
     """Stamps, ns, and T_map_lidar (4, 4)."""
-    stamped = [pose_stamped(at, T) for at, T in poses]
+    stamped = [_pose_stamped(at, T) for at, T in poses]
     return _TYPES["nav_msgs/msg/Path"](header=header(stamp, topics.MAP), poses=stamped)
 
 
@@ -128,5 +126,5 @@ def number(value: float) -> Any:
 
 def transforms(stamp: int, links: dict[str, tuple[str, Array]]) -> Any:
     """tf2_msgs/TFMessage of each child's parent and T_parent_child (4, 4)."""
-    rows = [transform(stamp, parent, child, T) for child, (parent, T) in links.items()]
+    rows = [_transform(stamp, parent, child, T) for child, (parent, T) in links.items()]
     return _TYPES["tf2_msgs/msg/TFMessage"](transforms=rows)

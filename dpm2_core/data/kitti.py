@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpm2_core.data.messages import scale_intensity
-from dpm2_core.data.scan_file import chosen, image_path, image_size, images_of, read_scan
+from dpm2_core.data.scan_file import chosen, image_of, image_size, images_of, numbered_scans, read_scan
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.text import parse_row, read_lines, read_numbers
 from dpm2_core.data.vertical_angle import HDL64_CORRECTION_DEG, checked_correction, correct_vertical_angle
@@ -26,6 +26,8 @@ from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Camera, Fix, Frame, Inertial
 from dpm2_core.geometry import se3
 
+ROUNDED = 0.01
+"""By so much a rotation in a calibration file may be off, as its numbers are rounded."""
 _PERIOD = 0.1  # s between scans, where times.txt does not say
 
 
@@ -45,8 +47,7 @@ class KittiSource:
         self.name = self.path.resolve().name
         self.notes: list[str] = []
         self.truth = ""
-        scans = sorted((self.path / "velodyne").glob("*.bin"))
-        self._scans = [scan for scan in scans if scan.stem.isdecimal()]
+        self._scans = numbered_scans(self.path / "velodyne")
         if not self._scans:
             raise UsageError(f"{self.path}: no scans (velodyne/NNNNNN.bin) in this folder")
         self.numbers = np.array([int(scan.stem) for scan in self._scans])
@@ -205,13 +206,18 @@ class KittiSource:
             return None
         if "P2" not in calib:
             raise UsageError(f"{self.path / 'calib.txt'}: no P2, which image_2 needs; without images it is not needed")
-        K, offset = calib["P2"][:, :3], calib["P2"][:, 3]
-        # P2 = K [I | t] with t from the left gray camera 0, which the poses and Tr refer to.
-        T_cam2_cam0 = se3.make(np.eye(3), np.linalg.solve(K, offset))
-        return Camera(K, se3.inverse(T_cam2_cam0 @ self.T_cam_lidar), size, name="camera_color_left")
+        return left_color_camera(calib["P2"], self.T_cam_lidar, size)
 
     def _image_path(self, scan: Path) -> Path | None:
-        return image_path(self.path / "image_2", scan.stem)
+        return image_of(scan, self.path / "image_2")
+
+
+def left_color_camera(P2: Array, T_cam_lidar: Array, size: tuple[int, int]) -> Camera:
+    """KITTI's camera 2, of its projection matrix (3, 4) and the transform (4, 4) to the rectified gray camera 0."""
+    K, offset = P2[:, :3], P2[:, 3]
+    # P2 = K [I | t] with t from the left gray camera 0, which the poses and Tr refer to.
+    T_cam2_cam0 = se3.make(np.eye(3), np.linalg.solve(K, offset))
+    return Camera(K, se3.inverse(T_cam2_cam0 @ T_cam_lidar), size, name="camera_color_left")
 
 
 def read_calib(path: Path) -> dict[str, Array]:
@@ -229,8 +235,7 @@ def read_calib(path: Path) -> dict[str, Array]:
         row, name = parse_row(text, 12, f"{path}:{number}: {key}"), key.strip()
         matrix = row.reshape(3, 4)
         if name.startswith("Tr"):
-            R = matrix[:, :3]
-            if np.abs(R @ R.T - np.eye(3)).max() > 0.01 or np.linalg.det(R) < 0:
+            if not se3.is_rigid(se3.make(matrix[:, :3], matrix[:, 3]), ROUNDED):
                 raise UsageError(f"{path}:{number}: {name} is no rigid transform")
             calib[name] = se3.from_rows(row)
         elif matrix[0, 0] <= 0 or matrix[1, 1] <= 0 or not np.allclose(matrix[2, :3], [0, 0, 1]):

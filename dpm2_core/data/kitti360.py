@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpm2_core.data.messages import scale_intensity
-from dpm2_core.data.scan_file import chosen, image_path, image_size, images_of, read_scan
+from dpm2_core.data.scan_file import chosen, image_of, image_size, images_of, numbered_scans, read_scan
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.text import parse_row, read_lines, read_numbers
 from dpm2_core.data.vertical_angle import correct_vertical_angle
@@ -26,7 +26,55 @@ from dpm2_core.geometry import se3
 _PERIOD = 0.1  # s, a turn of the LiDAR
 
 
-class Kitti360Source:
+class SweptDrive:
+    """Scans of KITTI's LiDAR as measured: each point has a time offset by its azimuth, see `azimuth_time`.
+
+    What KITTI-360 and KITTI raw have in common. Those who derive from it set the camera.
+    """
+
+    def __init__(self, scans: Path, images: Path, settings: InputSettings, correction_deg: float) -> None:
+        """`correction_deg` is added to the elevation of the points where the settings say nothing else.
+
+        Raises:
+            UsageError: there are no scans.
+        """
+        self._settings, self._images, self._correction_deg = settings, images, correction_deg
+        self.notes: list[str] = []
+        self.camera: Camera | None = None
+        self._scans = numbered_scans(scans / "data")
+        if not self._scans:
+            raise UsageError(f"{scans}: no scans (data/NNNNNNNNNN.bin) in this folder: want a drive that is `_sync`")
+        self.numbers = np.array([int(scan.stem) for scan in self._scans])
+        self.stamps = self._stamps(scans / "timestamps.txt")
+
+    def __len__(self) -> int:
+        return len(self._scans)
+
+    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
+        """Frames start..stop-1 by position; `Frame.index` is the number in the file name."""
+        degrees = self._settings.angle_correction(self._correction_deg)
+        for scan, stamp in list(zip(self._scans, self.stamps, strict=True))[start:stop]:
+            points, problem = read_scan(scan)
+            points = correct_vertical_angle(scale_intensity(points, self._settings.intensity_max), degrees)
+            images = images_of(image_of(scan, self._images), self.camera, self.notes)
+            yield Frame(int(stamp), points, azimuth_time(points), images, index=int(scan.stem), problem=problem)
+
+    def _stamps(self, path: Path) -> NDArray[np.int64]:
+        """(len,) ns; line k of timestamps.txt is of scan k."""
+        lines = read_lines(path)
+        if len(lines) <= self.numbers[-1]:
+            self.notes.append(f"{path}: missing or too short; frames are taken to be {_PERIOD} s apart")
+            return np.round(self.numbers * _PERIOD * 1e9).astype(np.int64)
+        return np.array([_stamp(lines[number], f"{path}:{number + 1}") for number in self.numbers], np.int64)
+
+    def _image_size(self) -> tuple[int, int] | None:
+        """None without images, or where none are wanted."""
+        if not self._settings.images:
+            return None
+        return image_size(path for scan in self._scans if (path := image_of(scan, self._images)))
+
+
+class Kitti360Source(SweptDrive):
     """One drive, by the root and `input.sequence` (such as 0009), or by its folder in data_3d_raw.
 
     Poses were published for a part of the frames only, those where the car had moved; the others are NaN. They are of
@@ -38,41 +86,20 @@ class Kitti360Source:
     """
 
     def __init__(self, path: Path | str, settings: InputSettings | None = None) -> None:
-        self._settings = settings or InputSettings()
-        self.root, self.drive = _find(Path(path), self._settings.sequence)
-        self.name = self.drive
-        self.notes: list[str] = []
-        self.truth = ""
-        velodyne = self.root / "data_3d_raw" / self.drive / "velodyne_points"
-        scans = sorted((velodyne / "data").glob("*.bin"))
-        self._scans = [scan for scan in scans if scan.stem.isdecimal()]
-        if not self._scans:
-            raise UsageError(f"{velodyne}: no scans (data/NNNNNNNNNN.bin) in this folder")
-        self.numbers = np.array([int(scan.stem) for scan in self._scans])
+        settings = settings or InputSettings()
+        self.root, self.drive = _find(Path(path), settings.sequence)
+        self.name, self.truth = self.drive, ""
+        scans = self.root / "data_3d_raw" / self.drive / "velodyne_points"
+        super().__init__(scans, self.root / "data_2d_raw" / self.drive / "image_00" / "data_rect", settings, 0.0)
         calibration = self.root / "calibration"
         T_lidar_cam = se3.from_rows(_only_row(calibration / "calib_cam_to_velo.txt"))
         self._intrinsics = read_keyed(calibration / "perspective.txt")
-        R_rect = self._intrinsics.get("R_rect_00")
-        if R_rect is None or len(R_rect) != 9:
-            raise UsageError(f"{calibration / 'perspective.txt'}: no R_rect_00 of 9 numbers")
+        R_rect = required(self._intrinsics, "R_rect_00", 9, calibration / "perspective.txt")
         self._T_rect_cam = se3.orthonormalized(se3.make(R_rect.reshape(3, 3), np.zeros(3)))
         self._T_cam_lidar = se3.inverse(T_lidar_cam)
         self.T_cam_lidar: Array | None = self._T_rect_cam @ self._T_cam_lidar
-        self.stamps = read_stamps(velodyne / "timestamps.txt", self.numbers, self.notes)
         self.poses: Array | None = self._poses()
         self.camera = self._camera()
-
-    def __len__(self) -> int:
-        return len(self._scans)
-
-    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
-        """Frames start..stop-1 by position; `Frame.index` is the number in the file name."""
-        degrees = self._settings.angle_correction(0.0)
-        for scan, stamp in list(zip(self._scans, self.stamps, strict=True))[start:stop]:
-            points, problem = read_scan(scan)
-            points = correct_vertical_angle(scale_intensity(points, self._settings.intensity_max), degrees)
-            images = images_of(self._image_path(scan.stem), self.camera, self.notes)
-            yield Frame(int(stamp), points, azimuth_time(points), images, index=int(scan.stem), problem=problem)
 
     def _poses(self) -> Array | None:
         """(len, 4, 4) T_world_lidar, from poses.txt (of the IMU) or else cam0_to_world.txt; None without either."""
@@ -102,20 +129,12 @@ class Kitti360Source:
         return poses
 
     def _camera(self) -> Camera | None:
-        if not self._settings.images:
-            return None
-        paths = (path for scan in self._scans if (path := self._image_path(scan.stem)))
-        size = image_size(paths)
+        size = self._image_size()
         if size is None:
             return None
-        P = self._intrinsics.get("P_rect_00")
-        if P is None or len(P) != 12:
-            raise UsageError(f"{self.root / 'calibration' / 'perspective.txt'}: no P_rect_00 of 12 numbers")
+        P = required(self._intrinsics, "P_rect_00", 12, self.root / "calibration" / "perspective.txt")
         assert self.T_cam_lidar is not None
         return Camera(P.reshape(3, 4)[:, :3], se3.inverse(self.T_cam_lidar), size, name="image_00")
-
-    def _image_path(self, stem: str) -> Path | None:
-        return image_path(self.root / "data_2d_raw" / self.drive / "image_00" / "data_rect", stem)
 
 
 def azimuth_time(points: Points) -> Points:
@@ -128,15 +147,6 @@ def azimuth_time(points: Points) -> Points:
     counter-clockwise. No scan of KITTI-360 itself was at hand.
     """
     return (-np.arctan2(points[:, 1], points[:, 0]) * (_PERIOD / (2 * np.pi))).astype(np.float32)
-
-
-def read_stamps(path: Path, numbers: NDArray[np.int64], notes: list[str]) -> NDArray[np.int64]:
-    """(len(numbers),) ns: line k of timestamps.txt is of scan k; where it is too short a note says so."""
-    lines = read_lines(path)
-    if len(lines) <= numbers[-1]:
-        notes.append(f"{path}: missing or too short; frames are taken to be {_PERIOD} s apart")
-        return np.round(numbers * _PERIOD * 1e9).astype(np.int64)
-    return np.array([_stamp(lines[number], f"{path}:{number + 1}") for number in numbers], np.int64)
 
 
 def read_keyed(path: Path) -> dict[str, Array]:
@@ -158,6 +168,18 @@ def read_keyed(path: Path) -> dict[str, Array]:
         if colon and values:
             found[name.strip()] = parse_row(text, len(words), f"{path}:{number}: {name}")
     return found
+
+
+def required(rows: dict[str, Array], name: str, count: int, path: Path) -> Array:
+    """(count,) numbers of a name in a file that `read_keyed` has read.
+
+    Raises:
+        UsageError: they are missing.
+    """
+    row = rows.get(name)
+    if row is None or len(row) != count:
+        raise UsageError(f"{path}: no {name} of {count} numbers")
+    return row
 
 
 def _only_row(path: Path) -> Array:
@@ -185,5 +207,14 @@ def _find(path: Path, sequence: str) -> tuple[Path, str]:
     found = sorted(p.name for p in (path / "data_3d_raw").glob("*") if (p / "velodyne_points").is_dir())
     if not found:
         raise UsageError(f"{path}: no drive (data_3d_raw/*/velodyne_points) below it")
+    return path, chosen_drive(path, sequence, found)
+
+
+def chosen_drive(path: Path, sequence: str, found: list[str]) -> str:
+    """Of the drives below a folder the one that is meant, also by its four digits (0009).
+
+    Raises:
+        UsageError: none or several.
+    """
     matching = [name for name in found if sequence in ("", name, name.removesuffix("_sync")[-4:])]
-    return path, chosen(path, sequence, found, matching)
+    return chosen(path, sequence, found, matching)

@@ -32,6 +32,12 @@ def sequences_below(path: Path | str) -> list[str]:
     return sorted(found)
 
 
+def is_rosbag2(path: Path) -> bool:
+    """A .mcap or .db3 file, or a folder with one or with the metadata of one."""
+    files = [path] if path.is_file() else path.iterdir()
+    return any(file.suffix in (".mcap", ".db3") or file.name == "metadata.yaml" for file in files)
+
+
 def _is_kitti_raw(path: Path) -> bool:
     """A drive, or the folder of a date; KITTI-360 has the same in data_3d_raw."""
     if (path / "velodyne_points").is_dir():
@@ -58,9 +64,8 @@ def open_source(path: Path | str, settings: InputSettings | None = None) -> Sour
 
         return OusterSource(path, settings)
     is_kitti = (path / "velodyne").is_dir() or (path / "sequences").is_dir()  # whatever lies beside the scans
-    beside = [] if is_kitti or path.is_file() else list(path.iterdir())
     # rosbags and its type store are slow to import, and of no use for a KITTI folder.
-    if path.is_file() or any(f.suffix in (".mcap", ".db3") or f.name == "metadata.yaml" for f in beside):
+    if path.is_file() or (not is_kitti and is_rosbag2(path)):
         from dpm2_core.data.bags import BagSource
 
         return BagSource(path, settings)
@@ -76,7 +81,7 @@ def open_source(path: Path | str, settings: InputSettings | None = None) -> Sour
         from dpm2_core.data.kitti_carla import KittiCarlaSource
 
         return KittiCarlaSource(path, settings)
-    if any(f.suffix.lower() in (".pcd", ".ply") for f in beside):
+    if not is_kitti and any(file.suffix.lower() in (".pcd", ".ply") for file in path.iterdir()):
         from dpm2_core.data.cloud_folder import CloudFolder
 
         return CloudFolder(path, settings)

@@ -53,7 +53,7 @@ class OusterSource:
         self._count = len(self._sweeps) if self._sweeps.is_indexed else sum(1 for _ in self._sweeps)
         if not self._count:
             raise UsageError(f"{self.path}: no sweep of the sensor that its metadata describes")
-        self._imu = ImuBuffer() if settings.imu and self.path.suffix == ".pcap" else None
+        self._imu, self._reads_imu = ImuBuffer(), settings.imu and self.path.suffix == ".pcap"
         calibration = Calibration(self.path.name, imu_topic="IMU")
         self._frames = FrameBuilder(settings, calibration, self.notes.append, imu=self._imu)
 
@@ -65,17 +65,14 @@ class OusterSource:
         wanted, stamp = range(*slice(start, stop).indices(self._count)), 0
         # By its index the package (1.0) finds the first sweep of an .osf in place of its last.
         upcoming = islice(self._sweeps, wanted.start, wanted.stop)
-        samples = None
-        if self._imu is not None:
-            self._imu.clear()
-            samples = _samples(self.path, self._sensor)
+        samples = _samples(self.path, self._sensor) if self._reads_imu else iter(())
+        self._imu.clear()
         for index in wanted:
             try:
                 if (sweep := next(upcoming, None)) is None:
                     raise UsageError("its data are not there")
                 columns, stamp = self._columns(sweep[0], stamp)
-                if samples is not None:
-                    self._fill(samples, stamp + _PERIOD)
+                self._fill(samples, stamp + _PERIOD)
             except Exception as error:  # damaged files raise several kinds of the package's own
                 problem = f"{self.path}: sweep {index}: {_reason(error)}"
                 self.notes.append(problem)
@@ -85,7 +82,6 @@ class OusterSource:
 
     def _fill(self, samples: Iterator[tuple[int, Any]], until: int) -> None:
         """Samples of the IMU up to the first one after a time, ns."""
-        assert self._imu is not None
         try:
             for stamp, message in samples:
                 with suppress(MessageError):  # one that no sensor measures, or that is not newer than the last

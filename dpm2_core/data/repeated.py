@@ -21,9 +21,8 @@ IMAGE_PROBLEM = "the same image as before: the camera or its driver repeats itse
 PART_PROBLEM = "a part of the cloud is that of before: of LiDARs whose clouds are made one, one repeats itself"
 _STOPS = 1.5  # m/s: robots of simulations without noise stop dead, and then see the same again; none that is faster
 _MOVED, _TURNS = 0.3, 3.0  # m, degrees
-_PART = (
-    0.3  # of the points, of those that are the same again as of the others; noise leaves 0.2 at most, in coarse steps
-)
+# Of the points, of those that are the same again as of the others; noise leaves 0.2 at most, in coarse steps.
+_PART = 0.3
 _LEAST = 100  # points that are compared
 _LOOKED_AT = 8192  # points: noise changes any few of them
 _ROWS = 8  # of an image each so many-th row: noise changes any of them
@@ -42,8 +41,8 @@ class RepeatedCloud:
         """Whether a cloud is the registered one to the last bit although the sensor should have moved meanwhile.
 
         Args:
-            speed: m/s, by the motion before. A repetition that was taken for a halt
-                has ended that motion; the frame's guess and `turn` count from when the cloud was new.
+            speed: m/s, by the motion before. A repetition that was taken for a halt has ended that motion; the frame's
+                guess and `turn` count from when the cloud was new.
             turn: R_before_now (3, 3) since the last registered frame, as an IMU has it; None where it shows none.
         """
         before, checksum = self._registered, _checksum(frame.points)
@@ -75,14 +74,14 @@ class RepeatedPart:
 
         There must be as many others: in a simulation without noise a robot at rest sees nearly all of them again.
         """
-        before, known, self._known = self._buffer[: self._count], self._known, _marks(_some(frame.points))
-        if len(self._known) >= _LEAST and _PART < np.isin(self._known, known).mean() < 1 - _PART:
-            new = ~np.isin(_marks(frame.points), _marks(before))
-            offset = None if frame.time_offset is None else frame.time_offset[new]
-            self._keep(frame.points)
-            return replace(frame, points=frame.points[new], time_offset=offset)
+        known, self._known = self._known, _marks(_some(frame.points))
+        many = len(self._known) >= _LEAST and _PART < np.isin(self._known, known).mean() < 1 - _PART
+        new = ~np.isin(_marks(frame.points), _marks(self._buffer[: self._count])) if many else None
         self._keep(frame.points)
-        return frame
+        if new is None:
+            return frame
+        offset = None if frame.time_offset is None else frame.time_offset[new]
+        return replace(frame, points=frame.points[new], time_offset=offset)
 
     def _keep(self, points: Points) -> None:
         """In one place for all clouds: new memory for each would take longer than the rest."""
@@ -129,6 +128,4 @@ def _some(points: Points) -> Points:
 def _marks(points: Points) -> NDArray[np.uint64]:
     """(N,) a number for the bits of each place."""
     x, y, z = np.ascontiguousarray(points[:, :3].T).view(np.uint32).astype(np.uint64)
-    return (
-        (x * np.uint64(0x9E3779B97F4A7C15)) ^ (y * np.uint64(0xC2B2AE3D27D4EB4F)) ^ (z * np.uint64(0x165667B19E3779F9))
-    )
+    return x * np.uint64(0x9E3779B97F4A7C15) ^ y * np.uint64(0xC2B2AE3D27D4EB4F) ^ z * np.uint64(0x165667B19E3779F9)

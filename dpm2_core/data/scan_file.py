@@ -14,6 +14,11 @@ from dpm2_core.errors import UsageError
 from dpm2_core.frame import Camera, Image, Points
 
 
+def numbered_scans(folder: Path) -> list[Path]:
+    """NNNNNN.bin, in the order of their numbers; other files are left out."""
+    return [scan for scan in sorted(folder.glob("*.bin")) if scan.stem.isdecimal()]
+
+
 def read_scan(path: Path) -> tuple[Points, str | None]:
     """A velodyne file to (N, 4) float32 [x, y, z in m, intensity 0..1], or an empty array and what is wrong."""
     nothing = np.empty((0, 4), np.float32)
@@ -47,9 +52,9 @@ def image_size(paths: Iterable[Path]) -> tuple[int, int] | None:
     return next((pixels.shape[1::-1] for pixels in map(read_image, paths) if pixels is not None), None)
 
 
-def image_path(folder: Path, stem: str) -> Path | None:
-    """The image of a frame by its number: PNG, or JPEG as smaller copies of data sets have."""
-    paths = (folder / f"{stem}{suffix}" for suffix in (".png", ".jpg"))
+def image_of(scan: Path, folder: Path) -> Path | None:
+    """The image of a scan, by its number: PNG, or JPEG as smaller copies of data sets have."""
+    paths = (folder / f"{scan.stem}{suffix}" for suffix in (".png", ".jpg"))
     return next((path for path in paths if path.is_file()), None)
 
 

@@ -16,8 +16,6 @@ PATH = "/kitti/ground_truth/path"
 VERTICAL_ANGLE_CORRECTION = "/kitti/vertical_angle_correction_deg"
 """std_msgs/Float64, latched: degrees to add to the elevation of each point, which the recording itself lacks."""
 
-TRUTHS = (ODOMETRY, PATH, "/ground_truth/odom", "/ground_truth/path")
-"""Where ground truth is looked for."""
 
 MAP, BASE, LIDAR, IMU_LINK, GNSS_LINK = "map", "base_link", "velo_link", "imu_link", "gnss_link"
 GRAY_CAMERA = "camera_gray_left"
@@ -43,4 +41,6 @@ class Names:
 
 KITTI = Names(POINTS, "/kitti/camera_color_left", "/kitti/ground_truth", LIDAR, COLOR_CAMERA)
 OTHER = Names("/points", "/camera", "/ground_truth", "lidar", "camera")
-"""Under /kitti/ points need a correction, and images are rectified."""
+"""Not below /kitti/, where points need a correction and images are rectified."""
+TRUTHS = tuple(f"{names.truth}/{kind}" for names in (KITTI, OTHER) for kind in ("odom", "path"))
+"""Where ground truth is looked for."""

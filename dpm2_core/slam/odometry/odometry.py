@@ -110,9 +110,10 @@ class Odometry:
         clock.append(perf_counter())
         scan, registration = match.scan, match.result
         enclosed = is_enclosed(scan.points)
-        if is_part or enclosed:
-            said = (registration.reason, PART_PROBLEM if is_part else "", _ENCLOSED if enclosed else "")
-            registration = replace(registration, reason="; ".join(filter(None, said)))
+        if is_part:
+            registration = registration.because(PART_PROBLEM)
+        if enclosed:
+            registration = registration.because(_ENCLOSED)
         self._update(match, dt)
         if registration.ok:
             self._repeated.keep()

@@ -83,9 +83,9 @@ class FusedScanRegistration:
             points, prediction = None, _also_from(neural, prediction)
         points = points or self._geometric.register(scan, prediction)
         if neural is None:
-            return _because(points, "neural: no descriptors yet")
+            return points.because("neural: no descriptors yet")
         if not neural.ok:
-            return _because(points, f"neural: {neural.reason}")
+            return points.because(f"neural: {neural.reason}")
         if not points.ok:
             return self._led(scan, neural)
         if prediction.expects(points.T_target_source) and not agree(points, neural, CHI2_95):
@@ -172,24 +172,16 @@ def _difference(a: Registration, b: Registration) -> Array:
 def _outvoting(points: Registration, neural: Registration, prediction: Prediction) -> Registration:
     """The points, that exclude the network: where they fit well by themselves they know it."""
     if prediction.convinced(points):
-        return _because(points, f"neural and points {_apart(points, neural)} apart")
+        return points.because(_apart(points, neural))
     return _instead(points, neural)
 
 
 def _instead(result: Registration, other: Registration) -> Registration:
     """One of two that exclude each other, as uncertain as they are apart: which of them is right nothing has shown."""
     xi = _difference(result, other)
-    return replace(
-        result,
-        covariance=result.covariance + np.outer(xi, xi),
-        reason=f"neural and points {_apart(result, other)} apart",
-    )
+    return replace(result, covariance=result.covariance + np.outer(xi, xi), reason=_apart(result, other))
 
 
 def _apart(a: Registration, b: Registration) -> str:
     xi = _difference(a, b)
-    return f"{np.linalg.norm(xi[3:]):.2f} m, {np.degrees(np.linalg.norm(xi[:3])):.1f} deg"
-
-
-def _because(result: Registration, why: str) -> Registration:
-    return replace(result, reason="; ".join(part for part in (result.reason, why) if part))
+    return f"neural and points {np.linalg.norm(xi[3:]):.2f} m, {np.degrees(np.linalg.norm(xi[:3])):.1f} deg apart"

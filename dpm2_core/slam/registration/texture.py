@@ -142,7 +142,7 @@ def along(
     """
     found = _search(s, known, image, T_ref_target @ result.T_target_source, result.open_direction, reach)
     if isinstance(found, str):
-        return replace(result, reason="; ".join(part for part in (result.reason, found) if part))
+        return result.because(found)
     b = np.concatenate([np.zeros(3), result.open_direction])
     prior = result.of_scene  # images say as little of calibration errors as points, and those grow with the new motion
     gain = prior @ b / (b @ prior @ b + found.sigma**2 + image.sigma**2)
