@@ -17,6 +17,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.geometry.ground import height_above_ground
 from dpm2_core.geometry.scale import is_room
 from dpm2_core.geometry.voxel import voxel_first
+from dpm2_core.slam.loops.probe import probed
 from dpm2_core.slam.registration.icp import GeometricRegistration, GeometricSettings
 from dpm2_core.slam.registration.local_map import LocalMap, LocalMapSettings
 
@@ -141,7 +142,7 @@ class Verifier:
         points = int(standing.sum())
         share, structure = self._shares(source, around, result.T_target_source, standing)
         if result.worst_sigma > self._settings.max_sigma or structure < _WELL:
-            result = self._registration.probed(source, around, result)
+            result = probed(self._registration, source, around, result)
             if along is not None and result.worst_sigma > self._settings.max_sigma:
                 result = along(result)
             share, structure = self._shares(source, around, result.T_target_source, standing)
