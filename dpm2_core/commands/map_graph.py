@@ -14,7 +14,7 @@ import typer
 
 from dpm2_core.commands.options import JsonFile, show
 from dpm2_core.console import Console
-from dpm2_core.errors import Dpm2Error, printable
+from dpm2_core.errors import Dpm2Error, UsageError, printable
 from dpm2_core.tables import FigureTable
 
 
@@ -32,6 +32,8 @@ def optimize(
     from dpm2_core.slam.graph.graph_data import total_chi2, trajectories
     from dpm2_core.slam.graph.robust import least_squares
 
+    if out.exists() and graph.exists() and out.samefile(graph):
+        raise UsageError(f"{out}: is the graph itself; the loops that are refused would be gone")
     file = read_g2o(graph)
     require_connected(graph, file)
     data, dof = file.graph, 3 if file.planar else 6
@@ -83,7 +85,7 @@ def _warnings(figures: dict[str, Any], settled: bool, undecided: bool) -> list[s
     scale, fit, out = figures["covariance_scale"], figures["chi2_per_dof"], []
     if not settled:
         out.append("the results had not come to rest; these are the last ones")
-    if figures["trajectories"] > 0.1 * figures["vertices"]:
+    if figures["trajectories"] > max(1, 0.1 * figures["vertices"]):
         out.append(f"{figures['trajectories']} trajectories: most vertices are not tied to the one before by an edge")
     if figures["kept"] < 0.5 * figures["loops"]:
         out.append(f"only {figures['kept']} of {figures['loops']} loops agree; the rest was left out")

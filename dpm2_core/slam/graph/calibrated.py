@@ -71,13 +71,17 @@ def optimize_calibrated(graph: GraphData, dof: int, report: Callable[[str], None
     """
     odometry = integrate(graph)
     first = _chain_scale(graph, odometry, dof)
-    if first is None:
-        return Calibrated(optimize(graph, RobustSettings()), 1.0, False)
-    loose = _others_pass(graph, odometry, first)
-    if loose and first > _TOO_FIRM:  # by covariances so large any loop passes: perhaps there are only wrong ones
-        return Calibrated(optimize(graph, RobustSettings()), 1.0, False)
-    solution, scale = _stages(graph, dof, first, report)
-    return Calibrated(solution, scale, loose and _loop_share(graph, solution) < _SHARE)
+    if first is not None:
+        loose = _others_pass(graph, odometry, first)
+        solution, scale = _stages(graph, dof, first, report)
+        agree = scale < _TOO_FIRM * first and solution.kept.sum() > max(len(np.unique(graph.ends)), len(graph.ends) / 2)
+        if not loose or first <= _TOO_FIRM or agree:
+            return Calibrated(solution, scale, loose and _loop_share(graph, solution) < _SHARE)
+    # Too few loops, or by covariances so large any loop passes: perhaps there are only wrong ones. There are right ones
+    # where most of more than one for each place agree.
+    solution = optimize(graph, RobustSettings())
+    loose = bool(solution.kept.any()) and _others_pass(graph, odometry, 1.0)
+    return Calibrated(solution, 1.0, loose and _loop_share(graph, solution) < _SHARE)
 
 
 def _stages(graph: GraphData, dof: int, first: float, report: Callable[[str], None]) -> tuple[Solution, float]:
@@ -106,10 +110,10 @@ def _chain_scale(graph: GraphData, odometry: Array, dof: int) -> float | None:
 
 
 def _others_pass(graph: GraphData, odometry: Array, factor: float) -> bool:
-    """Whether the odometry would mostly let loops pass that lie between other places than their own."""
-    ends = np.stack([graph.ends[:, 0], np.roll(graph.ends[:, 1], len(graph.ends) // 2)], -1)
-    other = scaled(replace(graph, ends=ends), factor)
-    return bool((np.sqrt(chain_chi2(other, odometry)) < _SETTINGS.odometry_sigmas).mean() > 0.5)
+    """Whether the odometry would mostly let loops pass that end half of the graph away from where they do."""
+    other = np.stack([graph.ends[:, 0], (graph.ends[:, 1] + len(graph) // 2) % len(graph)], -1)
+    apart = np.sqrt(chain_chi2(scaled(replace(graph, ends=other), factor), odometry))
+    return bool((apart < _SETTINGS.odometry_sigmas).mean() > 0.5)
 
 
 def _loop_share(graph: GraphData, solution: Solution) -> float:

@@ -144,7 +144,7 @@ def _read_lines(path: Path) -> tuple[dict[str, _Lines], dict[str, int], list[int
     ignored: dict[str, int] = {}
     fixed: list[int] = []
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror}") from None
     except UnicodeDecodeError:
@@ -161,12 +161,14 @@ def _read_lines(path: Path) -> tuple[dict[str, _Lines], dict[str, int], list[int
                 ignored[tag] = ignored.get(tag, 0) + 1
             else:
                 if len(words) - 1 != want:
-                    raise UsageError(f"{path}:{number}: {tag} with {len(words) - 1} numbers, want {want}")
+                    raise UsageError(f"{tag} with {len(words) - 1} numbers, want {want}")
                 ids = 1 if tag in _VERTEX else 2
                 rows = lines.setdefault(tag, _Lines())
                 rows.ids.append([_id(word) for word in words[1 : 1 + ids]])
                 rows.numbers.append([float(word) for word in words[1 + ids :]])
                 rows.at.append(number)
+        except UsageError as error:
+            raise UsageError(f"{path}:{number}: {error}") from None
         except ValueError:
             raise UsageError(f"{path}:{number}: not a number in: {' '.join(words)[:60]}") from None
     return lines, ignored, fixed
@@ -175,7 +177,7 @@ def _read_lines(path: Path) -> tuple[dict[str, _Lines], dict[str, int], list[int
 def _id(word: str) -> int:
     number = int(word)
     if abs(number) >= 2**63:
-        raise ValueError(word)
+        raise UsageError(f"vertex {word}: ids have 63 bits")
     return number
 
 

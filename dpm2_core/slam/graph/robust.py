@@ -9,7 +9,7 @@ stay. Only the nodes at the ends of loops are unknowns: the odometry between the
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -36,6 +36,9 @@ from dpm2_core.slam.graph.graph_data import (
 )
 
 _FIX_KERNEL = 1.0  # as `loop_kernel`: many fixes in a row may be wrong alike, and none may outvote the odometry
+_SHARED = (
+    0.6  # loops per place; at 0.5 no two share one, and wrong ones may have their way where all are solved at once
+)
 _FIXED = 1e-6  # rad and m, standard deviation of a pose that stays
 
 
@@ -114,7 +117,10 @@ def optimize(graph: GraphData, settings: RobustSettings, used: NDArray[np.bool_]
     while not settled and count < settings.rounds:
         count += 1
         factors = _factors(graph, condensed, ends, poses, used, settings.loop_kernel)
-        poses = _solved(factors, poses, settings.iterations)
+        starts = [poses]
+        if count == 1 and len(graph.ends) > _SHARED * len(condensed.nodes):
+            starts.append(_at_once(factors, poses))
+        poses = _solved(factors, starts, settings.iterations)
         sigmas = np.sqrt(mahalanobis(loop_errors(poses, ends, graph.T_from_to), graph.covariances))
         kept = sigmas <= settings.loop_sigmas
         settled = bool((kept == used).all())
@@ -131,7 +137,8 @@ def least_squares(graph: GraphData, kept: NDArray[np.bool_], iterations: int = 5
         Dpm2Error: the system is singular.
     """
     condensed = CondensedOdometry(graph, integrate(graph), np.arange(len(graph)))
-    return _solved(_factors(graph, condensed, graph.ends, graph.poses, kept, None), graph.poses, iterations)
+    factors = _factors(graph, condensed, graph.ends, graph.poses, kept, None)
+    return _solved(factors, [graph.poses, _at_once(factors, graph.poses)], iterations)
 
 
 def joint_covariance(graph: GraphData, poses: Array, kept: NDArray[np.bool_], nodes: Index) -> Array:
@@ -197,11 +204,29 @@ def _values(poses: Array) -> Any:
     return values
 
 
-def _solved(factors: Any, poses: Array, iterations: int) -> Array:
+def _at_once(factors: Any, poses: Array) -> Array:
+    """Poses (N, 4, 4) that follow from all rotations at once, as a linear problem; those given, where it is singular.
+
+    From far away the steps of a solver may end in a local optimum: with whole turns in it, and right loops that
+    contradict it. L. Carlone et al., "Initialization techniques for 3D SLAM", ICRA 2015 (chordal relaxation).
+    """
+    try:
+        return _poses(gtsam.InitializePose3.initialize(factors), len(poses))
+    except RuntimeError:
+        return poses
+
+
+def _solved(factors: Any, starts: Sequence[Array], iterations: int) -> Array:
+    """The best of what the starts (N, 4, 4) lead to."""
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(iterations)
-    solved = gtsam.LevenbergMarquardtOptimizer(factors, _values(poses), parameters).optimize()
-    return np.array([solved.atPose3(node).matrix() for node in range(len(poses))])
+    solvers = [gtsam.LevenbergMarquardtOptimizer(factors, _values(start), parameters) for start in starts]
+    solved = [solver.optimize() for solver in solvers]
+    return _poses(min(solved, key=factors.error), len(starts[0]))
+
+
+def _poses(values: Any, count: int) -> Array:
+    return np.array([values.atPose3(node).matrix() for node in range(count)])
 
 
 def _aligned(graph: GraphData, poses: Array, used: NDArray[np.bool_], kernel: float) -> Array:

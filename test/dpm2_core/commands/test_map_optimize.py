@@ -57,6 +57,22 @@ def test_what_is_no_drive_is_said(tmp_path: Path) -> None:
     assert "11 trajectories: most vertices are not tied" in done.stderr
 
 
+def test_a_short_chain_is_one_drive(tmp_path: Path) -> None:
+    path = tmp_path / "chain.g2o"
+    path.write_text("".join(f"EDGE_SE2 {k} {k + 1} 1 0 0 1 0 0 1 0 1\n" for k in range(3)))
+    assert dpm2("map", "optimize", path, "--out", tmp_path / "out.g2o").stderr == ""
+
+
+def test_the_graph_itself_is_not_overwritten(tmp_path: Path) -> None:
+    path, link = tmp_path / "in.g2o", tmp_path / "link.g2o"
+    path.write_text("EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\nEDGE_XY 0 1 2 3\n")
+    link.symlink_to(path)
+    for out in (path, link):
+        done = dpm2("map", "optimize", path, "--out", out)
+        assert (done.returncode, "is the graph itself" in done.stderr) == (2, True)
+    assert "EDGE_XY" in path.read_text()
+
+
 def test_bad_input_is_one_line_and_leaves_no_file(tmp_path: Path) -> None:
     out = tmp_path / "out.g2o"
     (tmp_path / "two.g2o").write_text("EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\nEDGE_SE2 7 8 1 0 0 1 0 0 1 0 1\n")

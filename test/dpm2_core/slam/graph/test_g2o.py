@@ -95,12 +95,19 @@ def test_edges_in_no_order_are_not_taken_for_a_drive(tmp_path: Path) -> None:
         ([f"EDGE_SE2 0 1 1 0 0 {I3}", f"EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1 {I6}"], "SE2 and SE3 lines in one graph"),
         ([f"EDGE_SE2 0 1 1 0 0 {I3}", "FIX 9"], "FIX 9: no such vertex"),
         (["EDGE_XY 0 1 2 3"], "no EDGE_SE2 or EDGE_SE3:QUAT line"),
-        ([f"EDGE_SE2 0 {2**70} 1 0 0 {I3}"], r"graph.g2o:1: not a number"),
+        ([f"EDGE_SE2 0 {2**70} 1 0 0 {I3}"], r"graph.g2o:1: vertex 11805916"),
     ],
 )
 def test_what_is_wrong_is_named(tmp_path: Path, lines: list[str], message: str) -> None:
     with pytest.raises(UsageError, match=message):
         read_g2o(file(tmp_path, *lines))
+
+
+def test_a_byte_order_mark_hides_no_line(tmp_path: Path) -> None:
+    path = file(tmp_path, f"EDGE_SE2 0 1 1 0 0 {I3}", f"EDGE_SE2 1 2 1 0 0 {I3}")
+    path.write_text(path.read_text(), encoding="utf-8-sig")
+    read = read_g2o(path)
+    assert (len(read.graph), read.ignored) == (3, {})
 
 
 def test_a_missing_and_a_binary_file(tmp_path: Path) -> None:
