@@ -145,7 +145,10 @@ class BagSource:
         if asked or not found:
             if asked in found:
                 return asked
-            raise UsageError(f"{self.path}: no PointCloud2 messages{f' on {asked}' * bool(asked)}; {self._contents()}")
+            hint = "" if asked else "; of a driver's packets make clouds first, by replaying them into it"
+            raise UsageError(
+                f"{self.path}: no PointCloud2 messages{f' on {asked}' * bool(asked)}; {self._contents()}{hint}"
+            )
         if len(found) > 1:
             if topics.POINTS not in found:
                 raise UsageError(f"{self.path}: several PointCloud2 topics, choose one with input.points_topic: "

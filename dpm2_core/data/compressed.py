@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 MAX_PIXELS = 1 << 26
 """Of an image whose camera is not known: 67 million."""
+_SENSOR_BITS = (10, 12, 14, 16)
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8"
 _FRAMES = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # JPEG segments that give the size
@@ -52,10 +53,18 @@ def decode_compressed(data: bytes, size: tuple[int, int] | None = None) -> NDArr
     if not 0 < found[0] * found[1] <= MAX_PIXELS:
         raise ValueError(f"{found[0]} x {found[1]} pixels, at most {MAX_PIXELS} are decoded")
     try:
-        flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+        flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:
         pixels = None
     if pixels is None:
         raise ValueError("damaged")
+    if pixels.dtype == np.uint16:
+        pixels = upper_eight(pixels)
     return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB, dst=pixels), np.uint8)
+
+
+def upper_eight(pixels: NDArray[np.uint16]) -> NDArray[np.uint8]:
+    """Of the bits that an image uses: a camera of 10, 12 or 14 leaves the upper ones of its 16 zero."""
+    used = int(pixels.max()).bit_length()
+    return (pixels >> (next(bits for bits in _SENSOR_BITS if used <= bits) - 8)).astype(np.uint8)

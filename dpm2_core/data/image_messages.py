@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dpm2_core.data.compressed import decode_compressed
+from dpm2_core.data.compressed import decode_compressed, upper_eight
 from dpm2_core.data.messages import MessageError
 from dpm2_core.frame import Array, Camera
 
@@ -48,7 +48,6 @@ _IMAGE_ENCODINGS: dict[str, tuple[str, int, int | None]] = {
     "bayer_grbg16": ("u2", 1, cv2.COLOR_BayerGB2RGB),
 }
 
-_SENSOR_BITS = (10, 12, 14, 16)
 _DEPTH = ("16uc1", "32fc1")  # mm, m (REP 118)
 _HALF_COLOR = ("nv12", "nv21")
 _FISHEYE = ("equidistant", "fisheye")
@@ -85,15 +84,9 @@ def decode_image(msg: Any, size: tuple[int, int] | None = None) -> NDArray[np.ui
     shape, strides = (height, width, channels), (step, pixel, dtype.itemsize)
     pixels = np.ndarray(shape, dtype, memoryview(msg.data), strides=strides)
     if dtype.itemsize == 2:
-        pixels = _upper_eight(pixels)
+        pixels = upper_eight(pixels)
     pixels = np.ascontiguousarray(pixels)
     return pixels if conversion is None else cv2.cvtColor(pixels, conversion)
-
-
-def _upper_eight(pixels: NDArray[np.uint16]) -> NDArray[np.uint8]:
-    """Of the bits that an image uses: a camera of 10, 12 or 14 leaves the upper ones of its 16 zero."""
-    used = int(pixels.max()).bit_length()
-    return (pixels >> (next(bits for bits in _SENSOR_BITS if used <= bits) - 8)).astype(np.uint8)
 
 
 def _check_even(encoding: str, width: int, height: int) -> None:

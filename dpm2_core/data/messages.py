@@ -31,6 +31,7 @@ _TIME_NAMES = (
     "offsettime",
     "timeoffset",
     "pointtime",
+    "pointtimeoffset",
     "relativetime",
     "deltatime",
     "reltime",
@@ -163,7 +164,11 @@ def decode_points(
 def why_untimed(msg: Any) -> str:
     """Why `decode_points` found no times in a PointCloud2, in words."""
     time, _ = _usual_time([field.name for field in msg.fields])
-    return "no time field" if time is None else f"all points have the same {time}"
+    if time is None:
+        return "no time field"
+    values = _first(cloud_view(msg, [time])[time])
+    few = len(np.unique(values[values != 0])) <= 1
+    return f"all points have the same {time}" if few else f"{time} is no possible time of most points"
 
 
 def _usual(available: list[str], names: tuple[str, ...]) -> str | None:
@@ -243,9 +248,11 @@ def _time_offset(time: NDArray[Any], points: Points, stamp: int, unit: TimeUnit)
     if first == last:
         return None
     scale = _SECONDS[unit] if unit != "auto" else _time_scale(first, last, time.dtype.kind == "f")
-    origin = 0.0
-    if max(abs(first), abs(last)) * scale > _LONGEST_SCAN:
-        origin = stamp * 1e-9 / scale
+    origin, clock = 0.0, stamp * 1e-9 / scale
+    # Of a clock that has begun within 2 s, as in a simulation, absolute times look like relative ones.
+    by_clock = _away(first, last, clock) + (last - first) / 10 < _away(first, last, 0.0)
+    if by_clock or max(abs(first), abs(last)) * scale > _LONGEST_SCAN:
+        origin = clock
         if max(abs(first - origin), abs(last - origin)) * scale > _LONGEST_SCAN:
             # The sensor's clock is not that of the stamps: the first point is all that can be known.
             known = value[seen]
@@ -253,7 +260,13 @@ def _time_offset(time: NDArray[Any], points: Points, stamp: int, unit: TimeUnit)
             origin = known[np.abs(known - middle) * scale <= _LONGEST_SCAN].min()
     with np.errstate(invalid="ignore", over="ignore"):
         offset = (value - origin) * scale
-    return np.where(seen & (np.abs(offset) <= _LONGEST_SCAN), offset, 0.0).astype(np.float32)  # else it means nothing
+    valid = seen & (np.abs(offset) <= _LONGEST_SCAN)  # else it means nothing
+    return np.where(valid, offset, 0.0).astype(np.float32) if 2 * valid.sum() > seen.sum() else None
+
+
+def _away(first: float, last: float, time: float) -> float:
+    """How far a time is from the times of a scan."""
+    return max(first - time, time - last, 0.0)
 
 
 def _span(times: NDArray[np.float64]) -> tuple[float, float]:

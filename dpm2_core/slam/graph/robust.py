@@ -39,6 +39,7 @@ _FIX_KERNEL = 1.0  # as `loop_kernel`: many fixes in a row may be wrong alike, a
 _SHARED = (
     0.6  # loops per place; at 0.5 no two share one, and wrong ones may have their way where all are solved at once
 )
+_WORTH = 5.0  # times the error of the poses: the kernel hardly counts how far off these are. With wrong loops it is 13.
 _FIXED = 1e-6  # rad and m, standard deviation of a pose that stays
 
 
@@ -100,13 +101,15 @@ def optimize(graph: GraphData, settings: RobustSettings, used: NDArray[np.bool_]
     """Optimize and check the loops; deterministic.
 
     Args:
-        used: (E,) loops to begin with; without it those that the odometry does not contradict.
+        used: (E,) loops to begin with, from poses that agree with them; without it those that the odometry does not
+            contradict.
 
     Raises:
         Dpm2Error: the system is singular.
     """
     odometry = integrate(graph)
     apart = np.sqrt(chain_chi2(graph, odometry))
+    afar = used is None and len(graph.ends) > _SHARED * len(np.unique(graph.ends))
     if used is None:
         used = ~(apart > settings.odometry_sigmas)
     start = _aligned(graph, graph.poses, used, settings.loop_kernel)
@@ -117,9 +120,8 @@ def optimize(graph: GraphData, settings: RobustSettings, used: NDArray[np.bool_]
     while not settled and count < settings.rounds:
         count += 1
         factors = _factors(graph, condensed, ends, poses, used, settings.loop_kernel)
-        starts = [poses]
-        if count == 1 and len(graph.ends) > _SHARED * len(condensed.nodes):
-            starts.append(_at_once(factors, poses))
+        anchor = next(_anchors(graph, condensed, ends[used]))
+        starts = _starts(factors, poses, anchor) if afar and count == 1 else [poses]
         poses = _solved(factors, starts, settings.iterations)
         sigmas = np.sqrt(mahalanobis(loop_errors(poses, ends, graph.T_from_to), graph.covariances))
         kept = sigmas <= settings.loop_sigmas
@@ -137,8 +139,7 @@ def least_squares(graph: GraphData, kept: NDArray[np.bool_], iterations: int = 5
         Dpm2Error: the system is singular.
     """
     condensed = CondensedOdometry(graph, integrate(graph), np.arange(len(graph)))
-    factors = _factors(graph, condensed, graph.ends, graph.poses, kept, None)
-    return _solved(factors, [graph.poses, _at_once(factors, graph.poses)], iterations)
+    return _solved(_factors(graph, condensed, graph.ends, graph.poses, kept, None), [graph.poses], iterations)
 
 
 def joint_covariance(graph: GraphData, poses: Array, kept: NDArray[np.bool_], nodes: Index) -> Array:
@@ -204,16 +205,19 @@ def _values(poses: Array) -> Any:
     return values
 
 
-def _at_once(factors: Any, poses: Array) -> Array:
-    """Poses (N, 4, 4) that follow from all rotations at once, as a linear problem; those given, where it is singular.
+def _starts(factors: Any, poses: Array, anchor: int) -> list[Array]:
+    """The poses (N, 4, 4), and those that follow from all rotations at once, as a linear problem, if they are no worse.
 
     From far away the steps of a solver may end in a local optimum: with whole turns in it, and right loops that
     contradict it. L. Carlone et al., "Initialization techniques for 3D SLAM", ICRA 2015 (chordal relaxation).
     """
     try:
-        return _poses(gtsam.InitializePose3.initialize(factors), len(poses))
-    except RuntimeError:
-        return poses
+        linear = _poses(gtsam.InitializePose3.initialize(factors), len(poses))
+    except RuntimeError:  # a singular system
+        return [poses]
+    linear = se3.orthonormalized(poses[anchor] @ se3.inverse(linear[anchor]) @ linear)
+    near = factors.error(_values(linear)) < _WORTH * factors.error(_values(poses))
+    return [poses, linear] if near else [poses]
 
 
 def _solved(factors: Any, starts: Sequence[Array], iterations: int) -> Array:

@@ -82,7 +82,9 @@ class InertialMotion:
             self._measured = self._turned(frame.stamp, self._before)
             self.problem = "" if self._measured is not None else "no samples at the time of the scan"
         if not self.problem and self._doubt > _CREDIBLE:
-            self.problem = "its turns are not those of the scans, and odom may be tilted: is its orientation right?"
+            self.problem = (
+                "its turns are not those of the scans, and odom may be tilted: is its orientation or unit right?"
+            )
         if self.problem:
             return frame if frame.imu is None else replace(frame, imu=None)
         self.turn = self._measured
@@ -271,9 +273,10 @@ def _angle(R: Array) -> float:
     return float(np.linalg.norm(se3.rotation_vector(R)))
 
 
-def _metric(force: Array) -> Array:
-    """A mean force (3,) in m/s2; some drivers count in g."""
-    return force * _GRAVITY if np.linalg.norm(force) < _GRAVITY / 3 else force
+def _metric(forces: Array) -> Array:
+    """Forces (N, 3), or a mean one (3,), in m/s2; some drivers count in g."""
+    mean = np.atleast_2d(forces).mean(0)
+    return forces * _GRAVITY if np.linalg.norm(mean) < _GRAVITY / 3 else forces
 
 
 def _is_gravity(up: Array) -> bool:
@@ -284,4 +287,4 @@ def _is_gravity(up: Array) -> bool:
 def _at_rest(rates: Array, forces: Array) -> bool:
     noise, mean, shaking = _STEADY
     still = rates.std(0).max() < noise and np.abs(rates.mean(0)).max() < mean
-    return bool(still and forces.std(0).max() < shaking)  # False where they are unknown
+    return bool(still and _metric(forces).std(0).max() < shaking)  # False where they are unknown

@@ -67,6 +67,8 @@ def test_no_point_cloud_lists_the_topics(bags: Any, tmp_path: Path) -> None:
         UsageError, match=r"no PointCloud2 messages; topics: /cam/camera_info \(.*CameraInfo, 1\), /lid"
     ):
         BagSource(bag)
+    with pytest.raises(UsageError, match="of a driver's packets make clouds first"):
+        BagSource(bag)
 
 
 def test_two_point_clouds_are_a_question_except_for_kitti(bags: Any, tmp_path: Path) -> None:

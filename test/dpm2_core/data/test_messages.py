@@ -207,6 +207,27 @@ def test_a_time_of_zero_among_absolute_ones_means_nothing(began: float) -> None:
     np.testing.assert_allclose(relative, [0, 0.03, 0.06, 0.1])
 
 
+@pytest.mark.parametrize("unit", ["s", "ns"])
+@pytest.mark.parametrize("began", [0.05, 0.3, 1.0, 1.7, 2.5])
+def test_absolute_times_of_a_clock_that_has_just_begun(began: float, unit: str) -> None:
+    """As of a simulation, for layouts of Hesai, RoboSense and Livox: taken for relative they put points 1.7 s off."""
+    ramp, stamp = np.linspace(0, 0.1, 200), round(began * 1e9)
+    for first in (0.0, -0.1) if began > 0.1 else (0.0,):  # stamped at its first or its last point
+        time = (began + first + ramp) * (1e9 if unit == "ns" else 1)
+        _, offset = messages.decode_points(cloud(xyz(200, timestamp=time), stamp))
+        np.testing.assert_allclose(offset, first + ramp, atol=1e-6)
+        _, offset = messages.decode_points(cloud(xyz(200, time=(first + ramp).astype(np.float32)), stamp))
+        np.testing.assert_allclose(offset, first + ramp, atol=1e-6)
+
+
+def test_times_that_mean_nothing_are_none() -> None:
+    """Unsigned ones from before the stamp: as zeros nearly all of them would have passed for known."""
+    early = np.uint32(np.arange(-20_000_000, 80_000_000, 1_000_000) % 2**32)
+    msg = cloud(xyz(100, t=early))
+    assert messages.decode_points(msg)[1] is None
+    assert messages.why_untimed(msg) == "t is no possible time of most points"
+
+
 @pytest.mark.parametrize("wrong", [0, 7e9, 4294967295])
 @pytest.mark.parametrize(
     ("began", "unit"), [(0, 1e-6), (0, 1e-9), (0, 1), (STAMP * 1e-9, 1), (60e9, 1e-9), (5.0, 1)]
@@ -391,6 +412,15 @@ def test_compressed_images() -> None:
         data = cv2.imencode(f".{form}", cv2.cvtColor(smooth, cv2.COLOR_RGB2BGR))[1].reshape(-1)
         decoded = image_messages.decode_image(SimpleNamespace(header=header(), format=form, data=data))
         assert np.abs(decoded.astype(int) - smooth).max() <= tolerance
+
+
+@pytest.mark.parametrize("bits", [10, 12, 16])
+def test_the_upper_bits_of_a_png_count_as_those_of_an_image(bits: int) -> None:
+    """By the upper eight of its 16 a camera of 12 bits is nearly black."""
+    pixels = np.linspace(0, 2**bits - 1, 48).astype(np.uint16).reshape(6, 8)
+    data = cv2.imencode(".png", pixels)[1].reshape(-1)
+    decoded = image_messages.decode_image(SimpleNamespace(header=header(), format="mono16; png compressed ", data=data))
+    np.testing.assert_array_equal(decoded, image_messages.decode_image(image(pixels, "mono16")))
 
 
 @pytest.mark.parametrize(
