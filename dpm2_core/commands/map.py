@@ -29,6 +29,8 @@ from dpm2_core.slam.mapping.tiles import write_tiles
 from dpm2_core.slam.store.map_data import MapData, load_map, map_cloud, save_as, trajectory, ways
 from dpm2_core.slam.store.map_store import MapStore
 
+_OFF = 30.0  # m from where satellites have a map: receivers err by meters, and over its length so does a heading
+
 app = typer.Typer(help="Map files: info, export, merge, prune, check; pose graphs: optimize.", no_args_is_help=True)
 app.command()(info)
 app.command()(optimize)
@@ -94,7 +96,7 @@ def merge(
     from dpm2_core.slam.build import make_loops
     from dpm2_core.slam.graph.pose_graph import PoseGraph
     from dpm2_core.slam.mapping.merge import align as aligned
-    from dpm2_core.slam.mapping.merge import loops_by, merge_maps, optimized, tie_of
+    from dpm2_core.slam.mapping.merge import loops_by, merge_maps, off_by_satellites, optimized, tie_of
     from dpm2_core.slam.settings import Config
 
     given = [parse_transform(text) for text in transform or ()]
@@ -117,6 +119,9 @@ def merge(
                 first = optimized(merge_maps(first, other, T, loops), PoseGraph(chosen.pose_graph))
                 Console(stderr=True).print(f"{paths[number + 1]}: {len(loops)} loops to what came before")
             else:
+                if (off := off_by_satellites(first, other, given[number])) > _OFF:
+                    doubt = f"{off:.0f} m from where the fixes of both maps have it: is its --transform right?"
+                    Console(stderr=True).print(f"{paths[number + 1]}: {doubt}", highlight=False, soft_wrap=True)
                 first = merge_maps(first, other, given[number], tie_of(first, other, given[number]))
         save_as(first, out)
     Console(stderr=True).print(f"{out}: {len(first)} keyframes", highlight=False, soft_wrap=True)

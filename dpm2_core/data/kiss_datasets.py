@@ -38,6 +38,7 @@ class KissSource:
     def __init__(self, path: Path | str, settings: InputSettings | None = None) -> None:
         self._settings, self.path = settings or InputSettings(), Path(path)
         self.name, self.notes = self.path.resolve().stem, list[str]()
+        self._printed = ""  # by the loader when it was made, perhaps what it lacks
         kind = self._settings.dataset
         with needs("datasets", f"input.dataset={kind}"):
             from kiss_icp.datasets import available_dataloaders, dataset_factory
@@ -70,15 +71,16 @@ class KissSource:
 
     def _asked(self, what: Any) -> Any:
         """What the loader answers; it prints, exits and asserts where something is missing."""
-        said = io.StringIO()
+        printed = io.StringIO()
         try:
-            with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-                return what()
+            with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
+                answer = what()
         except (Exception, SystemExit) as error:
-            words = " ".join(said.getvalue().split()[-30:] if isinstance(error, SystemExit) else str(error).split())
-            raise UsageError(
-                f"{self.path}: KISS-ICP's loader {self._settings.dataset}: {words or type(error).__name__}"
-            ) from None
+            said = printed.getvalue() if isinstance(error, SystemExit) else f"{self._printed} {error}"
+            words = " ".join(said.split()[-30:]) or type(error).__name__
+            raise UsageError(f"{self.path}: KISS-ICP's loader {self._settings.dataset}: {words}") from None
+        self._printed = self._printed or printed.getvalue()
+        return answer
 
     def _poses(self) -> Array | None:
         poses = getattr(self._set, "gt_poses", None)

@@ -11,7 +11,7 @@ import numpy as np
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.estimates import Edge, Registration
 from dpm2_core.frame import Array, Georeference, Points
-from dpm2_core.geometry import se3
+from dpm2_core.geometry import geodesy, se3
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.loops.closure import LoopCloser
 from dpm2_core.slam.mapping.restore import restore
@@ -63,6 +63,18 @@ def tie_of(a: MapData, b: MapData, T_a_b: Array) -> list[Edge]:
 def _seen_from(T_a_b: Array, known: Georeference | None) -> Georeference | None:
     """The georeference of b as one of a."""
     return None if known is None else replace(known, T_enu_map=known.T_enu_map @ se3.inverse(T_a_b))
+
+
+def off_by_satellites(a: MapData, b: MapData, T_a_b: Array) -> float:
+    """How far a transform (4, 4) puts the keyframes of `b` from where both maps are on Earth, m, their median; 0 where
+    that is not known."""
+    if a.georeference is None or b.georeference is None or not len(b):
+        return 0.0
+    T_ecef_a, T_ecef_b = (
+        geodesy.enu_frame(known.origin) @ known.T_enu_map for known in (a.georeference, b.georeference)
+    )
+    away = T_a_b @ b.poses - se3.inverse(T_ecef_a) @ T_ecef_b @ b.poses
+    return float(np.median(np.linalg.norm(away[:, :2, 3], axis=1)))
 
 
 def align(a: MapData, b: MapData, find_loops: FindLoops) -> tuple[Array, list[Edge]]:

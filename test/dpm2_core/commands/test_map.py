@@ -208,6 +208,17 @@ def test_merge_by_transform_keeps_the_place_on_earth_of_either_map(tmp_path: Pat
     assert (figures["heading_sigma_deg"], figures["position_sigma_m"], figures["fixes"]) == (None, None, 0)
 
 
+def test_merge_by_a_transform_that_the_fixes_contradict_says_so(tmp_path: Path, map_file: Path) -> None:
+    """As of a wrong sign, or the two maps the other way round."""
+    with MapStore.open(map_file, read_only=False) as store:
+        store.write(Change(georeference=Georeference(np.array([49.0, 8.4, 110.0]), se3.exp([0, 0, 1.0, 2, 3, 4]))))
+    for words, said in (("500 0 0 0", "500 m from where the fixes of both maps have it"), ("1 0 0 0", "")):
+        out = tmp_path / f"{words}.dpm2map"
+        done = dpm2("map", "merge", map_file, map_file, "--out", out, "--transform", words)
+        assert done.returncode == 0
+        assert (said in done.stderr, "fixes" in done.stderr) == (True, bool(said))
+
+
 def points_of(ply: Path) -> Array:
     """(M, 3) m."""
     return np.frombuffer(ply.read_bytes().partition(b"end_header\n")[2], "<f4").reshape(-1, 4)[:, :3]

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import sys
 from pathlib import Path
 
@@ -97,3 +98,19 @@ def test_nclt(tmp_path: Path) -> None:
     first, second = source.frames()
     assert (first.stamp, second.stamp, second.points[0, 0], second.time_offset) == (*STAMPS, 2, None)
     assert source.notes == [f"{drive}: no time field: not de-skewed"]
+
+
+def test_what_a_loader_lacks_is_said_with_the_error_that_follows(tmp_path: Path) -> None:
+    """Newer College's prints that a package is missing, and fails only at the first scan."""
+    pytest.importorskip("kiss_icp")
+    if importlib.util.find_spec("pyntcloud") is not None:
+        pytest.skip("pyntcloud is installed")
+    scans = tmp_path / "raw_format" / "ouster_scan"
+    scans.mkdir(parents=True)
+    (scans / "cloud_1583836591_182590976.pcd").write_text("")
+    (tmp_path / "ground_truth").mkdir()
+    row = "1583836591,182590976,0,0,0,0,0,0,1\n"
+    (tmp_path / "ground_truth" / "registered_poses.csv").write_text("#sec,nsec,x,y,z,qx,qy,qz,qw\n" + 2 * row)
+    (frame,) = open_source(tmp_path, InputSettings(dataset="ncd")).frames()
+    assert frame.problem is not None
+    assert "pip install pyntcloud" in frame.problem
