@@ -21,6 +21,7 @@ IMAGE_PROBLEM = "the same image as before: the camera or its driver repeats itse
 PART_PROBLEM = "a part of the cloud is that of before: of LiDARs whose clouds are made one, one repeats itself"
 _STOPS = 1.5  # m/s: robots of simulations without noise stop dead, and then see the same again; none that is faster
 _MOVED, _TURNS = 0.3, 3.0  # m, degrees
+_STILL, _LONG = 0.02, 30  # m and clouds: a robot that has moved less in so many stands; if all differ, noise has no end
 # Of the points, of those that are the same again as of the others; noise leaves 0.2 at most, in coarse steps.
 _PART = 0.3
 _LEAST = 100  # points that are compared
@@ -36,6 +37,8 @@ class RepeatedCloud:
         self._registered: _Seen | None = None
         self._now: _Seen | None = None
         self._again = False
+        self._T_still, self._differ = np.eye(4), 0  # where it stands, and how many clouds have differed there
+        self._has_noise = False  # the same cloud twice is then none, wherever the robot is
 
     def repeats(self, frame: Frame, speed: float, turn: Array | None = None) -> bool:
         """Whether a cloud is the registered one to the last bit although the sensor should have moved meanwhile.
@@ -54,18 +57,32 @@ class RepeatedCloud:
         self._now, moved = (checksum, guess, R), [se3.make(R, np.zeros(3))]
         if guess is not None and frame.guess is not None:
             moved.append(se3.inverse(guess.T_other_lidar) @ frame.guess.T_other_lidar)
-        self._again |= speed > _STOPS or any((np.array(se3.magnitude(T)) > (_MOVED, _TURNS)).any() for T in moved)
+        self._again |= (
+            self._has_noise
+            or speed > _STOPS
+            or any((np.array(se3.magnitude(T)) > (_MOVED, _TURNS)).any() for T in moved)
+        )
         return self._again
 
-    def keep(self) -> None:
-        """This cloud was registered."""
+    def keep(self, T_odom_lidar: Array, same: float) -> None:
+        """This cloud was registered, at a pose (4, 4); `same`: see `RepeatedPart`."""
         self._registered = self._now
+        stands = np.linalg.norm(T_odom_lidar[:3, 3] - self._T_still[:3, 3]) < _STILL
+        if not stands or same > _PART:  # of a simulation without noise all but what moves there is the same
+            self._T_still, self._differ = T_odom_lidar, 0
+        self._differ += 1
+        self._has_noise |= self._differ > _LONG
 
 
 class RepeatedPart:
-    """Remembers the last cloud."""
+    """Remembers the last cloud.
+
+    Attributes:
+        same: share of the points of the last cloud that are those of the one before to the last bit.
+    """
 
     def __init__(self) -> None:
+        self.same = 0.0
         self._buffer, self._count = np.zeros((0, 4), np.float32), 0
         self._known = np.zeros(0, np.uint64)
 
@@ -75,7 +92,8 @@ class RepeatedPart:
         There must be as many others: in a simulation without noise a robot at rest sees nearly all of them again.
         """
         known, self._known = self._known, _marks(_some(frame.points))
-        many = len(self._known) >= _LEAST and _PART < np.isin(self._known, known).mean() < 1 - _PART
+        self.same = float(np.isin(self._known, known).mean()) if len(self._known) >= _LEAST else 0.0
+        many = _PART < self.same < 1 - _PART
         new = ~np.isin(_marks(frame.points), _marks(self._buffer[: self._count])) if many else None
         self._keep(frame.points)
         if new is None:

@@ -116,7 +116,7 @@ class Odometry:
             registration = registration.because(_ENCLOSED)
         self._update(match, dt)
         if registration.ok:
-            self._repeated.keep()
+            self._repeated.keep(motion.T, self._part.same)
         if registration.method == "first" and registration.ok and frame.time_offset is not None:
             self._first, self._first_sweep = frame, copy(self._sweep)
         T = motion.T

@@ -8,6 +8,7 @@ import pytest
 
 from dpm2_core.data.repeated import RepeatedCloud, RepeatedPart
 from dpm2_core.frame import Frame, Points
+from dpm2_core.geometry import se3
 
 
 def cloud(rng: np.random.Generator, count: int = 30_000) -> Points:
@@ -75,8 +76,21 @@ def test_the_speed_says_whether_a_robot_may_have_stopped(noise: np.random.Genera
     """m/s, whatever the rate of the scans; a repetition that was taken for a halt stays one."""
     points, seen = cloud(noise), RepeatedCloud()
     assert not seen.repeats(Frame(0, points), 5.0)
-    seen.keep()
+    seen.keep(np.eye(4), 0.0)
     assert seen.repeats(Frame(1, points), speed) is stuck
-    seen.keep()
+    seen.keep(np.eye(4), 0.0)
     assert seen.repeats(Frame(2, points), 0.0) is stuck
     assert not seen.repeats(Frame(3, cloud(noise)), 5.0)
+
+
+@pytest.mark.parametrize(("same", "step", "stuck"), [(0.0, 0.0, True), (0.9, 0.0, False), (0.0, 0.01, False)])
+def test_a_sensor_whose_clouds_differ_at_rest_never_sends_the_same_twice(
+    noise: np.random.Generator, same: float, step: float, stuck: bool
+) -> None:
+    """After 3 s at rest; not one without noise before which somebody walks, nor a robot that creeps at 0.1 m/s."""
+    seen = RepeatedCloud()
+    for index in range(32):
+        points = cloud(noise, 1000)
+        assert not seen.repeats(Frame(index, points), 0.0)
+        seen.keep(se3.make(np.eye(3), [index * step, 0, 0]), same)
+    assert seen.repeats(Frame(32, points), 0.0) is stuck
