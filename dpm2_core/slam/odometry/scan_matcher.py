@@ -18,6 +18,8 @@ from dpm2_core.slam.odometry.starts import starts_from_rest, turned_starts
 from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration
 
+_BETTER = 0.02  # confidence: so much more of the points must fit without the IMU
+
 
 class Match(NamedTuple):
     """A frame in the map.
@@ -72,9 +74,11 @@ class ScanMatcher:
         widen = min(seconds / dt, 5.0)
         result = self.registration.register(scan, Prediction([T_predicted], widen, motion.information(seconds)))
         result = motion.gated(result, T_predicted, dt)
-        if not result.ok and motion.turn is not None:
+        # A wrong turn leads to a place of its own and holds the scan there: that few of its points fit is what tells.
+        if motion.turn is not None and not Prediction([T_predicted]).convinced(result):
             steady = self._without_imu(frame, motion.twist, dt)
-            scan, result = (steady.scan, steady.result) if steady.result.ok else (scan, result)
+            if steady.result.ok and (not result.ok or steady.result.confidence > result.confidence + _BETTER):
+                scan, result = steady.scan, steady.result
         if result.ok or not self.settings.turns:
             return Match(scan, result)
         starts = turned_starts(T_predicted, self.settings.turns)
