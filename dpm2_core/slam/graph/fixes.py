@@ -87,7 +87,9 @@ class Fixes:
             if np.median(apart / sigmas) < 2 * _KERNEL:
                 return
         T_enu_map = fitted(here, _local(origin, there), sigmas)
-        if T_enu_map is not None:
+        if T_enu_map is None:  # if there was one most fixes deny it, as those of another robot, and no other is better
+            self.georeference = None
+        else:
             self.georeference, self._solved = Georeference(origin, T_enu_map), 0
 
     def joined(self, data: GraphData, places: Index, chosen: Sequence[int]) -> GraphData:

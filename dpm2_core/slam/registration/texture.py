@@ -83,6 +83,8 @@ class Texture:
     def sample(self, points: Array, level: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Texture (S, N) at points (S, N, 3) of the camera frame, m, and which of them the image shows."""
         uv, shown = self.project(points)
+        if not shown.size:  # OpenCV takes no empty map
+            return np.zeros(shown.shape, np.float32), shown
         found = cv2.remap(self.levels[level], uv[..., 0], uv[..., 1], cv2.INTER_LINEAR)
         return np.asarray(found, np.float32), shown
 

@@ -75,6 +75,19 @@ def test_an_image_that_does_not_constrain_is_not_used(paint: Paint, why: str) ->
 
 
 @pytest.mark.slow
+def test_a_camera_that_shows_no_point_is_said_and_not_used() -> None:
+    """One that looks back from a LiDAR that sees ahead alone, or not in its optical frame: it ended the run."""
+    paint = random_paint()
+    back = replace(CAMERA, T_lidar_cam=np.diag([-1.0, -1, 1, 1]) @ T_LIDAR_CAM)
+    first, second = (
+        replace(f, points=f.points[f.points[:, 0] > 1], images=(seen(x, paint, back),))
+        for x, f in ((0.0, frame(0.0, paint)), (1.7, frame(1.7, paint, 1)))
+    )
+    result = registered(first, second)
+    assert (result.method, result.reason) == ("geometric", "image: only 0 points in it")
+
+
+@pytest.mark.slow
 def test_without_images_nothing_changes() -> None:
     """Frames whose camera fails go the way they always went."""
     paint = random_paint()
