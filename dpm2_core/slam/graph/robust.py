@@ -36,9 +36,8 @@ from dpm2_core.slam.graph.graph_data import (
 )
 
 _FIX_KERNEL = 1.0  # as `loop_kernel`: many fixes in a row may be wrong alike, and none may outvote the odometry
-_SHARED = (
-    0.6  # loops per place; at 0.5 no two share one, and wrong ones may have their way where all are solved at once
-)
+_SHARED = 0.6
+"""Loops per place: at 0.5 no two share one, and wrong ones may have their way where all are solved at once."""
 _WORTH = 5.0  # times the error of the poses: the kernel hardly counts how far off these are. With wrong loops it is 13.
 _FIXED = 1e-6  # rad and m, standard deviation of a pose that stays
 
@@ -120,8 +119,9 @@ def optimize(graph: GraphData, settings: RobustSettings, used: NDArray[np.bool_]
     while not settled and count < settings.rounds:
         count += 1
         factors = _factors(graph, condensed, ends, poses, used, settings.loop_kernel)
-        anchor = next(_anchors(graph, condensed, ends[used]))
-        starts = _starts(factors, poses, anchor) if afar and count == 1 else [poses]
+        starts = [poses]
+        if afar and count == 1:
+            starts += _linear(factors, poses, next(_anchors(graph, condensed, ends[used])))
         poses = _solved(factors, starts, settings.iterations)
         sigmas = np.sqrt(mahalanobis(loop_errors(poses, ends, graph.T_from_to), graph.covariances))
         kept = sigmas <= settings.loop_sigmas
@@ -205,8 +205,8 @@ def _values(poses: Array) -> Any:
     return values
 
 
-def _starts(factors: Any, poses: Array, anchor: int) -> list[Array]:
-    """The poses (N, 4, 4), and those that follow from all rotations at once, as a linear problem, if they are no worse.
+def _linear(factors: Any, poses: Array, anchor: int) -> list[Array]:
+    """The poses (N, 4, 4) that follow from all rotations at once, as a linear problem; none where they fit far worse.
 
     From far away the steps of a solver may end in a local optimum: with whole turns in it, and right loops that
     contradict it. L. Carlone et al., "Initialization techniques for 3D SLAM", ICRA 2015 (chordal relaxation).
@@ -214,10 +214,9 @@ def _starts(factors: Any, poses: Array, anchor: int) -> list[Array]:
     try:
         linear = _poses(gtsam.InitializePose3.initialize(factors), len(poses))
     except RuntimeError:  # a singular system
-        return [poses]
+        return []
     linear = se3.orthonormalized(poses[anchor] @ se3.inverse(linear[anchor]) @ linear)
-    near = factors.error(_values(linear)) < _WORTH * factors.error(_values(poses))
-    return [poses, linear] if near else [poses]
+    return [linear] if factors.error(_values(linear)) < _WORTH * factors.error(_values(poses)) else []
 
 
 def _solved(factors: Any, starts: Sequence[Array], iterations: int) -> Array:

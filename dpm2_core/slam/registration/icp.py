@@ -273,11 +273,10 @@ class GeometricScanRegistration:
             self._local_map.insert(scan.cloud, T_odom_lidar)
             self._forget_second()
         else:
-            way = None if self._T_second is None else se3.log(se3.inverse(T_odom_lidar) @ self._T_second)
-            self._scans, self._way = (
-                self._scans + 1,
-                way if way is not None and np.linalg.norm(way[3:]) > _APART else None,
-            )
+            self._scans += 1
+            self._way = None if self._T_second is None else se3.log(se3.inverse(T_odom_lidar) @ self._T_second)
+            if self._way is not None and np.linalg.norm(self._way[3:]) < _APART:
+                self._way = None  # of two trials of a scan the pose that was taken
         return wanted
 
 
