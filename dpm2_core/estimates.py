@@ -44,6 +44,10 @@ class Registration:
         """The same, with one more reason in words."""
         return replace(self, reason="; ".join(part for part in (self.reason, why) if part))
 
+    def doubted(self, way: Array) -> Registration:
+        """As uncertain as another pose is away, to which `way` (6,) leads: which of the two is right nothing shows."""
+        return replace(self, covariance=self.covariance + np.outer(way, way))
+
     @classmethod
     def failed(cls, method: str, reason: str, T_guess: Array | None = None) -> Registration:
         """No pose was found, and why: near a guess (4, 4) all the same or, without one, anywhere."""

@@ -167,8 +167,9 @@ def why_untimed(msg: Any) -> str:
     if time is None:
         return "no time field"
     values = _first(cloud_view(msg, [time])[time])
-    few = len(np.unique(values[values != 0])) <= 1
-    return f"all points have the same {time}" if few else f"{time} is no possible time of most points"
+    known = values[np.isfinite(values) & (values != 0)]
+    constant = bool((known == known[:1]).all())  # of none too
+    return f"all points have the same {time}" if constant else f"{time} is no possible time of most points"
 
 
 def _usual(available: list[str], names: tuple[str, ...]) -> str | None:

@@ -71,17 +71,23 @@ def optimize_calibrated(graph: GraphData, dof: int, report: Callable[[str], None
     """
     odometry = integrate(graph)
     first = _chain_scale(graph, odometry, dof)
+    loose, solution, scale = False, None, 1.0
     if first is not None:
         loose = _others_pass(graph, odometry, first)
         solution, scale = _stages(graph, dof, first, report)
-        agree = scale < _TOO_FIRM * first and solution.kept.sum() > max(len(np.unique(graph.ends)), len(graph.ends) / 2)
-        if not loose or first <= _TOO_FIRM or agree:
-            return Calibrated(solution, scale, loose and _loop_share(graph, solution) < _SHARE)
-    # Too few loops, or by covariances so large any loop passes: perhaps there are only wrong ones. There are right ones
-    # where most of more than one for each place agree.
-    solution = optimize(graph, RobustSettings())
-    loose = bool(solution.kept.any()) and _others_pass(graph, odometry, 1.0)
-    return Calibrated(solution, 1.0, loose and _loop_share(graph, solution) < _SHARE)
+        if loose and first > _TOO_FIRM and not _agree(graph, solution, scale / first):
+            solution = None  # by covariances so large any loop passes: perhaps there are only wrong ones
+    if solution is None:
+        solution, scale = optimize(graph, RobustSettings()), 1.0
+        loose = bool(solution.kept.any()) and _others_pass(graph, odometry, scale)
+    return Calibrated(solution, scale, loose and _loop_share(graph, solution) < _SHARE)
+
+
+def _agree(graph: GraphData, solution: Solution, grown: float) -> bool:
+    """Whether most loops are kept and they are more than one for each place, by covariances that have not grown much
+    beyond what the odometry asks for: wrong ones alone do not."""
+    most = solution.kept.sum() > max(len(np.unique(graph.ends)), len(graph.ends) / 2)
+    return bool(grown < _TOO_FIRM and most)
 
 
 def _stages(graph: GraphData, dof: int, first: float, report: Callable[[str], None]) -> tuple[Solution, float]:

@@ -11,9 +11,10 @@ import numpy as np
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.estimates import Edge, Registration
 from dpm2_core.frame import Array, Georeference, Points
-from dpm2_core.geometry import geodesy, se3
+from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.loops.closure import LoopCloser
+from dpm2_core.slam.mapping.parts import frame_of
 from dpm2_core.slam.mapping.restore import restore
 from dpm2_core.slam.store.cloud_store import CloudStore, Loan
 from dpm2_core.slam.store.map_data import MapData
@@ -70,10 +71,7 @@ def off_by_satellites(a: MapData, b: MapData, T_a_b: Array) -> float:
     that is not known."""
     if a.georeference is None or b.georeference is None or not len(b):
         return 0.0
-    T_ecef_a, T_ecef_b = (
-        geodesy.enu_frame(known.origin) @ known.T_enu_map for known in (a.georeference, b.georeference)
-    )
-    away = T_a_b @ b.poses - se3.inverse(T_ecef_a) @ T_ecef_b @ b.poses
+    away = T_a_b @ b.poses - se3.inverse(frame_of(a.georeference)) @ frame_of(b.georeference) @ b.poses
     return float(np.median(np.linalg.norm(away[:, :2, 3], axis=1)))
 
 

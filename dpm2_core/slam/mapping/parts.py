@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dpm2_core.frame import Georeference
+from dpm2_core.frame import Array, Georeference
 from dpm2_core.geometry import geodesy
 from dpm2_core.slam.graph.fixes import Fixes
 from dpm2_core.slam.graph.graph_data import components
@@ -43,6 +43,11 @@ def located(data: MapData, own: NDArray[np.bool_]) -> Georeference | None:
     return fixes.georeference
 
 
+def frame_of(known: Georeference) -> Array:
+    """T_ecef_map (4, 4)."""
+    return np.asarray(geodesy.enu_frame(known.origin) @ known.T_enu_map)
+
+
 def placed_on_earth(data: MapData) -> MapData:
     """The map with poses (N, 4, 4) T_ecef_kf.
 
@@ -59,5 +64,5 @@ def placed_on_earth(data: MapData) -> MapData:
         own = parts == part
         known = data.georeference if own[0] else located(data, own)
         if known is not None:
-            poses[own] = geodesy.enu_frame(known.origin) @ known.T_enu_map @ data.poses[own]
+            poses[own] = frame_of(known) @ data.poses[own]
     return replace(data, poses=poses)

@@ -26,13 +26,12 @@ from dpm2_core.slam.odometry.other import OtherMotion
 from dpm2_core.slam.odometry.scan_matcher import Match, ScanMatcher
 from dpm2_core.slam.odometry.settings import OdometrySettings
 from dpm2_core.slam.preprocess import Scan
-from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration
+from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration, fits_better
 
 _ENCLOSED = "all that is seen is near: what encloses the LiDAR, as a lift does, may move along"
 _KNOWN = 0.5  # m and rad, standard deviation of the second pose, still skewed: where the points find it alone
 _BENT = 0.1  # m at half of the sweep and the usual range: by so much a wrong motion must bend a scan to count
 _BURST = 0.6  # of the usual period: while no motion is known, a frame that comes sooner was held back
-_BETTER = 0.02  # confidence: so much more of the points must fit where the stamp does not lead
 
 
 class Odometry:
@@ -241,7 +240,7 @@ class Odometry:
         T_usual = motion.predicted(motion.turned(motion.twist, motion.seconds + usual), usual)
         if dt < usual or not Prediction([T_predicted]).convinced(result):
             other = matcher.match(frame, scan, T_usual, usual)
-            if other.result.ok and (not result.ok or other.result.confidence > result.confidence + _BETTER):
+            if fits_better(other.result, result):
                 match, result = other, other.result
         if result.ok:
             steadiness = self._settings.steadiness

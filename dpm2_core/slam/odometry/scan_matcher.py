@@ -16,9 +16,7 @@ from dpm2_core.slam.odometry.motion_state import MotionState
 from dpm2_core.slam.odometry.settings import OdometrySettings
 from dpm2_core.slam.odometry.starts import starts_from_rest, turned_starts
 from dpm2_core.slam.preprocess import Scan
-from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration
-
-_BETTER = 0.02  # confidence: so much more of the points must fit without the IMU
+from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration, fits_better
 
 
 class Match(NamedTuple):
@@ -77,7 +75,7 @@ class ScanMatcher:
         # A wrong turn leads to a place of its own and holds the scan there: that few of its points fit is what tells.
         if motion.turn is not None and not Prediction([T_predicted]).convinced(result):
             steady = self._without_imu(frame, motion.twist, dt)
-            if steady.result.ok and (not result.ok or steady.result.confidence > result.confidence + _BETTER):
+            if fits_better(steady.result, result):
                 scan, result = steady.scan, steady.result
         if result.ok or not self.settings.turns:
             return Match(scan, result)

@@ -178,8 +178,7 @@ def _outvoting(points: Registration, neural: Registration, prediction: Predictio
 
 def _instead(result: Registration, other: Registration) -> Registration:
     """One of two that exclude each other, as uncertain as they are apart: which of them is right nothing has shown."""
-    xi = _difference(result, other)
-    return replace(result, covariance=result.covariance + np.outer(xi, xi)).because(_apart(result, other))
+    return result.doubted(_difference(result, other)).because(_apart(result, other))
 
 
 def _apart(a: Registration, b: Registration) -> str:

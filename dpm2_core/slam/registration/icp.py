@@ -225,7 +225,7 @@ class GeometricScanRegistration:
             return result
         way = se3.log(se3.inverse(T) @ self._T_second)
         doubt = f"many points have moved otherwise, by {np.linalg.norm(way[3:]):.1f} m"
-        return replace(result, covariance=result.covariance + np.outer(way, way)).because(doubt)
+        return result.doubted(way).because(doubt)
 
     def _steered(self, source: Array, T: Array) -> Array:
         """A start (4, 4) at the heading where the scan fits best: a curve may have begun or ended meanwhile.
@@ -306,7 +306,7 @@ def _with_spread(chosen: Registration, likely: Sequence[Registration]) -> Regist
     """With the way (6,) to the farthest of the results that are nearly as likely in its covariance."""
     T = se3.inverse(chosen.T_target_source)
     way = max((se3.log(T @ other.T_target_source) for other in likely), key=lambda xi: float(np.linalg.norm(xi[3:])))
-    return replace(chosen, covariance=chosen.covariance + np.outer(way, way))
+    return chosen.doubted(way)
 
 
 def _apart(T: Array, T_other: Array) -> bool:

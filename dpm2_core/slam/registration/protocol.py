@@ -15,6 +15,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.slam.preprocess import Scan
 
 _EXACT = 0.1  # m
+_BETTER = 0.02  # confidence: so much more of the points must fit where the motion or the stamp did not lead
 CHI2, CHI2_95 = 22.46, 12.59
 """99.9 and 95 % quantile of chi2 with 6 degrees of freedom: two poses that are farther apart than the first contradict
 each other, farther than the second hardly agree."""
@@ -30,6 +31,11 @@ def agree(a: Registration, b: Registration, most: float = CHI2) -> bool:
     """
     xi = se3.log(se3.inverse(a.T_target_source) @ b.T_target_source)
     return bool(xi @ np.linalg.solve(a.of_scene + b.of_scene + MAP_NOISE, xi) <= most)
+
+
+def fits_better(result: Registration, other: Registration) -> bool:
+    """Whether one of two results for a scan is to be preferred to the other, from where it was expected."""
+    return result.ok and (not other.ok or result.confidence > other.confidence + _BETTER)
 
 
 @dataclass(frozen=True, eq=False)

@@ -87,7 +87,8 @@ def test_the_speed_says_whether_a_robot_may_have_stopped(noise: np.random.Genera
 def test_a_sensor_whose_clouds_differ_at_rest_never_sends_the_same_twice(
     noise: np.random.Generator, same: float, step: float, stuck: bool
 ) -> None:
-    """After 3 s at rest; not one without noise before which somebody walks, nor a robot that creeps at 0.1 m/s."""
+    """It has noise, as 3 s at rest have shown. Two cases show none: a simulation without noise in which a person walks
+    past, and a robot that creeps at 0.1 m/s."""
     seen = RepeatedCloud()
     for index in range(32):
         points = cloud(noise, 1000)
