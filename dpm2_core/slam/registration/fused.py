@@ -16,7 +16,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.icp import GeometricScanRegistration
 from dpm2_core.slam.registration.neural import NeuralScanRegistration
-from dpm2_core.slam.registration.protocol import CHI2_95, MAP_NOISE, Prediction, agree
+from dpm2_core.slam.registration.protocol import CHI2_95, MAP_NOISE, Prediction, agree, near
 
 _LED = np.diag(np.repeat([np.radians(2), 0.5], 3) ** -2.0)
 """Information of a network pose with a standard deviation of 2 degrees and 0.5 m: enough to initialize ICP."""
@@ -73,15 +73,22 @@ class FusedScanRegistration:
         return self._geometric.rejection(scan)
 
     def register(self, scan: Scan, prediction: Prediction) -> Registration:
-        points = None if self._always else self._geometric.register(scan, prediction)
-        if points is not None and _sure(points, prediction):
-            return points
+        points = None if self._always else self._geometric.located(scan, prediction)
+        if points is not None:
+            doubted = self._geometric.doubted(scan, prediction, points)
+            if _sure(doubted, prediction):
+                return doubted
+        # Not beside the doubt: with it, everything agrees with them.
+        return self._geometric.doubted(scan, prediction, self._with_network(scan, prediction, points))
+
+    def _with_network(self, scan: Scan, prediction: Prediction, points: Registration | None) -> Registration:
+        """The network's pose, and that of the points, if they were registered."""
         neural = self._neural.register(scan, prediction) if len(self._neural) else None
         if neural is not None and neural.ok and not prediction.possible(neural.T_target_source):
             neural = replace(neural, ok=False, reason="found where no vehicle can have come")
         if neural is not None and neural.ok and not prediction.known:
             points, prediction = None, _also_from(neural, prediction)
-        points = points or self._geometric.register(scan, prediction)
+        points = points or self._geometric.located(scan, prediction)
         if neural is None:
             return points.because("neural: no descriptors yet")
         if not neural.ok:
@@ -90,14 +97,16 @@ class FusedScanRegistration:
             return self._led(scan, neural)
         if prediction.expects(points.T_target_source) and not agree(points, neural, CHI2_95):
             return _outvoting(points, neural, prediction)
-        if not agree(points, neural):
-            if prediction.known:
-                starts = [points.T_target_source, neural.T_target_source]
-                likelier = self._geometric.register(scan, replace(prediction, starts=starts))
-                if likelier.ok and agree(likelier, neural):
-                    return self._fused(scan, likelier, neural, None)
-                points = likelier if likelier.ok else points
-            elif points.worst_sigma > _SURE_SIGMA and self._seen(scan):
+        agreed, starts = agree(points, neural), [points.T_target_source, neural.T_target_source]
+        # What leaves a direction open at the wrong place, so that both agree, may close it at the right one.
+        if prediction.known and not (agreed and (points.worst_sigma <= _SURE_SIGMA or near(*starts))):
+            likelier = self._geometric.located(scan, replace(prediction, starts=starts))
+            decides = not agreed or likelier.worst_sigma <= _SURE_SIGMA
+            if likelier.ok and decides and agree(likelier, neural):
+                return self._fused(scan, likelier, neural, None)
+            points = likelier if likelier.ok and not agreed else points
+        if not agreed:
+            if not prediction.known and points.worst_sigma > _SURE_SIGMA and self._seen(scan):
                 return self._led(scan, neural)  # where points fit anywhere, they fit best where nothing has moved
             return _outvoting(points, neural, prediction)
         if not self._always and _sure(points, prediction):
@@ -106,7 +115,7 @@ class FusedScanRegistration:
 
     def _led(self, scan: Scan, neural: Registration) -> Registration:
         """The points from the pose of the network, when the motion so far did not lead them to a result."""
-        points = self._geometric.register(scan, Prediction([neural.T_target_source], 1.0, _LED))
+        points = self._geometric.located(scan, Prediction([neural.T_target_source], 1.0, _LED))
         if not points.ok:
             covariance = neural.covariance + _UNCONFIRMED
             return replace(neural, covariance=covariance, reason=f"not refined: {points.reason}")
@@ -160,7 +169,7 @@ def _sure(points: Registration, prediction: Prediction) -> bool:
     Of a scan that has moved much finds nothing in a young map of few beams. Both the network and the likelihood of the
     points then prefer the place where the map was made, as what the beams meet looks the same from there.
     """
-    fits = prediction.convinced(points) or prediction.expects(points.T_target_source)
+    fits = prediction.confirmed(points) or prediction.expects(points.T_target_source)
     return points.ok and fits and points.worst_sigma <= _SURE_SIGMA
 
 

@@ -21,7 +21,7 @@ from dpm2_core.geometry.calibration import with_calibration
 from dpm2_core.slam.preprocess import Preprocessor, Scan
 from dpm2_core.slam.registration.local_map import LocalMap
 from dpm2_core.slam.registration.point_to_plane import linearize
-from dpm2_core.slam.registration.protocol import Prediction
+from dpm2_core.slam.registration.protocol import Prediction, fits_better, near
 
 
 class GeometricSettings(Settings):
@@ -46,7 +46,6 @@ class GeometricSettings(Settings):
 
 
 _COARSE, _FINE = (1e-3, 0.02), (1e-4, 1e-3)  # rad and m: a smaller step ends the pass
-_EXPECTED = (0.3, 2.0)  # m and degrees from the prediction; hard braking makes 0.1 m in 0.1 s
 CORRELATED = 10
 _NORMAL_NOISE = 0.12  # rad, of fitted normals; measured rms along smooth tunnels: 0.02 to 0.12, on open roads over 0.2
 
@@ -63,7 +62,14 @@ DISTINCT = 0.06
 _FEW = 400  # points show which heading fits where the motion is not known, and which places of a search are likely;
 _PLACES = 6  # so many of them are registered to,
 _PART = 4  # by one point in so many; all points compare the best two
+_AXES = np.eye(6)
 _HEADINGS = np.array([se3.exp([0, 0, np.radians(yaw), 0, 0, 0]) for yaw in (0, 3, -3, 6, -6, 9, -9)])
+_JOLTS = np.array(
+    [np.eye(4)]
+    + [se3.exp(np.radians(deg) * _AXES[2]) for deg in range(-45, 46, 3)]
+    + [se3.exp(np.radians(deg) * axis) for axis in _AXES[:2] for deg in range(-20, 21, 4)]
+)
+"""From where the motion leads: as a robot that begins or ends a turn, or is shaken, is found at 5 frames per second."""
 _BETTER = 0.06  # so much must another heading fit better (0 to 2): on a plain 0.05 is chance
 _NEAR = (1.0, 5.0)  # m and degrees: results within are one place
 
@@ -114,7 +120,7 @@ class GeometricRegistration:
                     break
                 coarse, gate = False, s.final_gate
         ratio = inliers / len(points)
-        expected = predicted and target.is_young and _close(T_guess, T)
+        expected = predicted and target.is_young and near(T_guess, T)
         least = s.min_inliers_expected if expected else s.min_inliers
         ok = inliers >= s.min_points and ratio >= least
         reason = "" if ok else f"{inliers} of {len(points)} points fit the map"
@@ -198,24 +204,41 @@ class GeometricScanRegistration:
         return "" if len(scan.source) >= least else f"{len(scan.source)} points; a map needs {least}"
 
     def register(self, scan: Scan, prediction: Prediction) -> Registration:
+        return self.doubted(scan, prediction, self.located(scan, prediction))
+
+    def located(self, scan: Scan, prediction: Prediction) -> Registration:
+        """As `register`, whatever many of the points may do together."""
         p = prediction
         if p.unique:
             return self._searched(scan.source, p)
         starts = p.starts if p.known or not len(scan.source) else [self._steered(scan.source, T) for T in p.starts]
         found = [self._registration.register(scan.source, self._local_map, T, p.widen, p.information) for T in starts]
-        likeliest = self._registration.likeliest
-        result = found[0] if len(found) == 1 else likeliest(scan.source, self._local_map, found)
-        return self._doubted(scan.source, result)
+        if len(found) > 1:
+            return self._registration.likeliest(scan.source, self._local_map, found)
+        if p.known and not p.confirmed(found[0]) and len(scan.source):
+            return self._jolted(scan.source, p, found[0])
+        return found[0]
 
-    def _doubted(self, source: Array, result: Registration) -> Registration:
-        """A result whose covariance holds the way to a second pose, where many of the (N, 3) points move otherwise.
+    def _jolted(self, source: Array, prediction: Prediction, result: Registration) -> Registration:
+        """Of points (N, 3) that fit badly where the motion leads: from where they fit best beside, if they fit better.
+
+        What begins or ends between two scans, as a turn does, leaves the points of a room at the wrong walls.
+        """
+        T_steered = self._steered(source, prediction.starts[0], _JOLTS)
+        if T_steered is prediction.starts[0]:
+            return result
+        other = self._registration.register(source, self._local_map, T_steered, prediction.widen)
+        return other if fits_better(other, result) else result
+
+    def doubted(self, scan: Scan, prediction: Prediction, result: Registration) -> Registration:
+        """A result whose covariance holds the way to a second pose, where many of the points move otherwise.
 
         They are a crowd that walks along or the walls beside it, trucks or the street between them: which of them
         stands still the points do not say. Where the second pose is no longer found and as many points do not fit, it
         is where its motion leads.
         """
-        self._T_second = None
-        if not result.ok or result.confidence > 1 - _UNFIT:
+        self._T_second, source = None, scan.source
+        if prediction.unique or not result.ok or result.confidence > 1 - _UNFIT:
             return result
         T = result.T_target_source
         T_expected = None if self._way is None else T @ se3.exp(self._way * (self._scans + 1) / self._scans)
@@ -227,13 +250,13 @@ class GeometricScanRegistration:
         doubt = f"many points have moved otherwise, by {np.linalg.norm(way[3:]):.1f} m"
         return result.doubted(way).because(doubt)
 
-    def _steered(self, source: Array, T: Array) -> Array:
+    def _steered(self, source: Array, T: Array, motions: Array = _HEADINGS) -> Array:
         """A start (4, 4) at the heading where the scan fits best: a curve may have begun or ended meanwhile.
 
         Otherwise 0.6 s after the last scan one in 40 settles beside its place, with 80 % of its points on the map. It
         costs no time: a better start needs fewer steps.
         """
-        poses = T @ _HEADINGS
+        poses = T @ motions
         fit = self._local_map.fit(_few(source), poses)
         return np.asarray(poses[fit.argmax()]) if fit.max() > fit[0] + _BETTER else T
 
@@ -283,11 +306,6 @@ class GeometricScanRegistration:
 def _few(source: Array) -> Array:
     """At most `_FEW` of the points (N, 3), N >= 1."""
     return source[:: -(-len(source) // _FEW)]
-
-
-def _close(T: Array, T_other: Array) -> bool:
-    meters, degrees = se3.magnitude(se3.inverse(T) @ T_other)
-    return meters <= _EXPECTED[0] and degrees <= _EXPECTED[1]
 
 
 def _covariance(H: Array) -> Array:

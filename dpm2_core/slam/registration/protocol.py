@@ -14,7 +14,9 @@ from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
 from dpm2_core.slam.preprocess import Scan
 
+_EXPECTED = (0.3, 2.0)  # m and degrees from the prediction; hard braking makes 0.1 m in 0.1 s
 _EXACT = 0.1  # m
+_NEARLY_ALL = 0.9  # confidence
 _BETTER = 0.02  # confidence: so much more of the points must fit where the motion or the stamp did not lead
 CHI2, CHI2_95 = 22.46, 12.59
 """99.9 and 95 % quantile of chi2 with 6 degrees of freedom: two poses that are farther apart than the first contradict
@@ -31,6 +33,12 @@ def agree(a: Registration, b: Registration, most: float = CHI2) -> bool:
     """
     xi = se3.log(se3.inverse(a.T_target_source) @ b.T_target_source)
     return bool(xi @ np.linalg.solve(a.of_scene + b.of_scene + MAP_NOISE, xi) <= most)
+
+
+def near(T_predicted: Array, T: Array) -> bool:
+    """Whether a pose (4, 4) is where one was predicted, as far as a vehicle's motion changes from scan to scan."""
+    meters, degrees = se3.magnitude(se3.inverse(T_predicted) @ T)
+    return meters <= _EXPECTED[0] and degrees <= _EXPECTED[1]
 
 
 def fits_better(result: Registration, other: Registration) -> bool:
@@ -68,7 +76,7 @@ class Prediction:
 
     def expects(self, T_odom_lidar: Array) -> bool:
         """Whether the motion so far leads to that pose (4, 4) itself: to one standard deviation, at most `_EXACT`."""
-        if self.information is None or not self.known:
+        if self.information is None or not self.known or not near(self.starts[0], T_odom_lidar):
             return False
         xi = se3.log(se3.inverse(self.starts[0]) @ T_odom_lidar)
         return bool(xi @ self.information @ xi <= 1.0 and np.linalg.norm(xi[3:]) <= _EXACT)
@@ -85,6 +93,13 @@ class Prediction:
     def convinced(self, points: Registration) -> bool:
         """Whether a result of points fits well enough not to be doubted; see `convincing`."""
         return points.ok and points.confidence >= self.convincing
+
+    def confirmed(self, points: Registration) -> bool:
+        """Whether they are convincing where the motion leads, if it leads anywhere. Beside it, as after a jolt, nearly
+        all must fit, or they may be at the wrong walls: after a turn of 10 degrees from scan to scan 77 % of them did,
+        2.6 degrees off."""
+        led = not self.known or near(self.starts[0], points.T_target_source)
+        return self.convinced(points) and (led or points.confidence >= _NEARLY_ALL)
 
 
 class ScanRegistration(Protocol):

@@ -88,16 +88,14 @@ def test_the_most_likely_start_wins_whatever_its_place(suburb_drive: Drive) -> N
 
 
 @pytest.mark.parametrize("off", [[0, 0, 0.14, 1, 0.5, 0], [0, 0, -0.14, 1, 0, 0], [0, 0, 0.16, 2, 1, 0]])
-def test_the_heading_is_looked_for_where_the_motion_is_not_known(suburb_drive: Drive, off: list[float]) -> None:
-    """8 or 9 degrees off, as where a curve has ended. A motion that is known is followed, to a wrong place, too."""
+def test_the_heading_is_looked_for_where_a_curve_may_have_ended(suburb_drive: Drive, off: list[float]) -> None:
+    """8 or 9 degrees off: always, where the motion is not known, and where few points fit if it is."""
     registration, scan, truth = make_case(suburb_drive, 1.0)
     start = truth @ se3.exp(off)
-    for information in (np.eye(6) / 2**2, None):
+    for information in (np.eye(6), np.eye(6) / 2**2, None):
         result = registration.register(scan, Prediction([start], information=information))
         assert result.ok
         assert error(result.T_target_source, truth) < 0.05
-    followed = registration.register(scan, Prediction([start], information=np.eye(6)))
-    assert not followed.ok or error(followed.T_target_source, truth) > 0.3, "else the case is none"
 
 
 def test_on_a_plain_the_heading_stays_that_of_the_motion() -> None:
