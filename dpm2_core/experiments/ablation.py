@@ -96,6 +96,7 @@ def _measured(settings: AblationSettings, name: str, seed: int, out: Path) -> di
     if weights.exists() and known.exists() and (stored := json.loads(known.read_text()))["asked"] == asked:
         return dict(stored["figures"])
     if not weights.exists():
+        known.unlink(missing_ok=True)  # of weights before: what is stopped while it measures is measured again
         train_registration(training, folder, resume=resume)
     model = load_model(weights)
     images = training.data.images and model.encoder.image is not None

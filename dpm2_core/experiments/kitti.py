@@ -73,7 +73,8 @@ def _kitti_outcome(request: Request, figures: Mapping[str, Figures]) -> Outcome:
     if not all(sequence in PAPER for sequence in sequences) or request.frames or request.lengths:
         notes.append("other sequences, frames or lengths than the paper's: its row is no comparison")
     runs = run_folders(names, sequences, request.out)
-    return Outcome([table, speed], notes, runs, _pictures(runs, sequences, request.out, notes))
+    _pictures(runs, sequences, request.out, notes)
+    return Outcome([table, speed], notes, runs)
 
 
 def _kitti360_parts(request: Request) -> Sequence[Sequence[Part]]:
@@ -91,21 +92,18 @@ def _kitti360_outcome(request: Request, figures: Mapping[str, Figures]) -> Outco
         table.add(name, {"0007": {"ape_mean_m": ape}}, "the paper", "of 0009 it says: accurate")
     runs = run_folders(names, sequences, request.out)
     notes = missing_note(sequences, TESTED_360)
-    return Outcome([table], notes, runs, _pictures(runs, sequences, request.out, notes))
+    _pictures(runs, sequences, request.out, notes)
+    return Outcome([table], notes, runs)
 
 
-def _pictures(runs: Sequence[tuple[str, Path]], sequences: Sequence[str], out: Path, notes: list[str]) -> list[Path]:
+def _pictures(runs: Sequence[tuple[str, Path]], sequences: Sequence[str], out: Path, notes: list[str]) -> None:
     """The paper's figure 5: the trajectories of all methods and the truth, a picture a sequence."""
-    pictures: list[Path] = []
     for sequence in sequences:
         folders = {label.rpartition(", ")[0]: path for label, path in runs if path.name == sequence}
         ways, truth = aligned_ways(folders)
         draw = partial(trajectories_png, ways=ways, truth=truth, title=sequence)
-        made = drawn(out / f"trajectories_{sequence}.png", notes, draw)
-        if not made:
+        if not drawn(out / f"trajectories_{sequence}.png", notes, draw):
             break  # the others would say the same
-        pictures += made
-    return pictures
 
 
 def aligned_ways(folders: Mapping[str, Path]) -> tuple[dict[str, Array], Array | None]:

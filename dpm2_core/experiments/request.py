@@ -54,24 +54,23 @@ class Outcome:
 
     Attributes:
         tables: the paper's, with ours beside. notes: what a reader must know, in words.
-        runs: folders of runs by label and sequence, for the report. pictures: files.
+        runs: folders of runs by label and sequence, for the report.
     """
 
     tables: list[ResultTable]
     notes: list[str] = field(default_factory=list)
     runs: list[tuple[str, Path]] = field(default_factory=list)
-    pictures: list[Path] = field(default_factory=list)
     extra: dict[str, Any] = field(default_factory=dict)
 
 
-def drawn(path: Path, notes: list[str], draw: Callable[[Path], None]) -> list[Path]:
-    """The picture, drawn; none, and a note, where what draws is not installed."""
+def drawn(path: Path, notes: list[str], draw: Callable[[Path], None]) -> bool:
+    """Draw a picture; False, and a note, where what draws is not installed."""
     try:
         draw(path)
     except MissingPackageError as error:
         notes.append(f"no {path.name}: {error}")
-        return []
-    return [path]
+        return False
+    return True
 
 
 @dataclass(frozen=True)

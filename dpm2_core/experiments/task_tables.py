@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from math import isfinite
 from pathlib import Path
 from statistics import mean
@@ -16,7 +17,7 @@ from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.figures import trajectories_png
 from dpm2_core.experiments.kitti import aligned_ways
 from dpm2_core.experiments.paired import paired_gain
-from dpm2_core.experiments.request import Experiment, Outcome, Request
+from dpm2_core.experiments.request import Experiment, Outcome, Request, drawn
 from dpm2_core.experiments.sequences import learned_note
 from dpm2_core.experiments.table import Cells, ResultTable
 from dpm2_core.experiments.task_part import (
@@ -29,13 +30,16 @@ from dpm2_core.experiments.task_part import (
     folder_name,
     settings_of,
 )
-from dpm2_core.extras import MissingPackageError
 from dpm2_core.fleet.part import Figures, Part
 from dpm2_core.tasks.open import sequence_names
 from dpm2_core.tasks.training import WEIGHTS
 
 SEEDS = 3
 ARMS: tuple[Arm, ...] = ("without", "with", "placebo")
+COMPARED: Mapping[str, tuple[Arm, Arm]] = {
+    "with": ("without", "with"), "placebo": ("without", "placebo"), "with_over_placebo": ("placebo", "with"),
+}  # fmt: skip
+"""Arms by what their gain is called. Only the last is what the loss itself gains: two intervals say nothing of it."""
 ROWS = {"without": "without SLAM loss", "with": "with SLAM loss", "placebo": "with that of another window"}
 
 
@@ -120,16 +124,18 @@ class TaskTable:
             table.add(name, {figure: {"mean": value} for figure, value in row.items()}, "the paper")
         gains: dict[str, dict[str, Any]] = {}
         gain_table = ResultTable("Gain, and its 95 % interval", ["gain"], {"percent": "+.1f"},
-                                 "Relative to the mean without, seed by seed; positive is better.")  # fmt: skip
-        for arm in ("with", "placebo"):
+                                 "Over the mean of the arm named last, seed by seed; positive is better.")  # fmt: skip
+        for key, (before, arm) in COMPARED.items():
             for figure in self.figures:
-                gain = paired_gain(of["without"][figure], of[arm][figure], figure not in self.higher)
+                gain = paired_gain(of[before][figure], of[arm][figure], figure not in self.higher)
                 if gain is not None:
-                    gains.setdefault(arm, {})[figure] = asdict(gain)
-                    gain_table.add(f"{figure}, {ROWS[arm]}", {"gain": {"percent": 100 * gain.mean}}, note=str(gain))
+                    gains.setdefault(key, {})[figure] = asdict(gain)
+                    compared = f"{figure}: {ROWS[arm]} for {ROWS[before]}"
+                    gain_table.add(compared, {"gain": {"percent": 100 * gain.mean}}, note=str(gain))
         notes = [*self.notes, *self._warnings(request, of, figures)]
-        pictures = self._pictures(request, figures, notes) if self.measured == SLAM else []
-        return Outcome([table, gain_table], notes, [], pictures, {"gains": gains})
+        if self.measured == SLAM:
+            self._pictures(request, figures, notes)
+        return Outcome([table, gain_table], notes, [], {"gains": gains})
 
     def _warnings(
         self, request: Request, of: Mapping[str, Mapping[str, list[float]]], figures: Mapping[str, Figures]
@@ -148,20 +154,15 @@ class TaskTable:
             notes.append("odometry on what the network makes is no better than standing still: nothing can be compared")
         return notes
 
-    def _pictures(self, request: Request, figures: Mapping[str, Figures], notes: list[str]) -> list[Path]:
+    def _pictures(self, request: Request, figures: Mapping[str, Figures], notes: list[str]) -> None:
         """The paper's figure 3: trajectories on the output of both arms of the first seed, a picture a sequence."""
-        pictures = []
         for sequence in figures[self._measured(0, "with")]["sequences"]:
             name = folder_name(sequence)
             ways = {ROWS[arm]: request.out / self._measured(0, arm) / name / "output" for arm in ("without", "with")}
-            path = request.out / f"trajectories_{name}.png"
-            try:
-                trajectories_png(path, *aligned_ways(ways), title=name)
-            except MissingPackageError as error:
-                notes.append(f"no {path.name}: {error}")
+            positions, truth = aligned_ways(ways)
+            draw = partial(trajectories_png, ways=positions, truth=truth, title=name)
+            if not drawn(request.out / f"trajectories_{name}.png", notes, draw):
                 break
-            pictures.append(path)
-        return pictures
 
     def _training(self, request: Request, seed: int, arm: Arm) -> Training:
         defaults = () if request.config is not None else self.defaults

@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
-from pathlib import Path
 from typing import Any
 
 from dpm2_core.config import load_settings
@@ -111,8 +110,9 @@ class VariantTable:
             notes += missing_note(sequences, TESTED)
         names = [self._name(variant) for variant in self.variants] if self.judged else []
         runs = run_folders(names, sequences, request.out)
-        pictures = [] if self.variants is TABLE_3 else self._panel(request, sequences[0], notes)
-        return Outcome(tables, notes, runs, pictures)
+        if self.variants is not TABLE_3:
+            self._panel(request, sequences[0], notes)
+        return Outcome(tables, notes, runs)
 
     def _run(self, request: Request, variant: str, sequence: str) -> Part:
         weights = request.out / self._training(variant) / WEIGHTS
@@ -121,13 +121,13 @@ class VariantTable:
         own = replace(request, weights=str(weights), overrides=slam)
         return own_part(self._name(variant), sequence, own, [*ORIGINAL_POSES, *settings])
 
-    def _panel(self, request: Request, sequence: str, notes: list[str]) -> list[Path]:
+    def _panel(self, request: Request, sequence: str, notes: list[str]) -> None:
         """The paper's figure 7: what one reference point reads from the image, by every variant that attends."""
         source = open_source(request.data, load_settings(Config, None, [f"input.sequence='{sequence}'"]).input)
         (frame,) = islice(source.frames(0, 1), 1)
         if not frame.images:
             notes.append("no attention maps: the data set has no images")
-            return []
+            return
         looked = {}
         for variant in self.variants:
             model = load_model(request.out / self._training(variant) / WEIGHTS)
@@ -137,7 +137,7 @@ class VariantTable:
                 notes.append(f"no attention map of {variant}: {error}")
         title = f"{sequence}, frame {frame.index}: attention of one reference point"
         path = request.out / f"attention_{sequence}.png"
-        return drawn(path, notes, lambda to: attention_png(to, looked, title))
+        drawn(path, notes, lambda to: attention_png(to, looked, title))
 
     def _name(self, variant: str) -> str:
         return f"variant {variant}"

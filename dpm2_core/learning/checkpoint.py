@@ -16,8 +16,6 @@ from torch import nn
 from dpm2_core.errors import UsageError
 from dpm2_core.files import atomic_write, make_folder
 
-FORMAT = 1
-
 
 def save_checkpoint(path: Path, module: nn.Module, ema: nn.Module, optimiser: torch.optim.Optimizer, step: int) -> None:
     """Weights, averaged weights, optimizer and step. Everything random follows from seed and step.
@@ -26,7 +24,6 @@ def save_checkpoint(path: Path, module: nn.Module, ema: nn.Module, optimiser: to
         Dpm2Error: not written, as on a full disk; the checkpoint before it stays.
     """
     state = {
-        "format": FORMAT,
         "module": module.state_dict(),
         "ema": ema.state_dict(),
         "optimiser": optimiser.state_dict(),

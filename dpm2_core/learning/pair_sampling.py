@@ -8,6 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from dpm2_core.geometry.full_precision import full_precision
 from dpm2_core.geometry.kabsch import transform
 from dpm2_core.network.tokens import Tokens
 
@@ -64,6 +65,12 @@ def sample_set_pairs(
     )
 
 
+@full_precision
+def _turned(axis: Tensor, T: Tensor) -> Tensor:
+    """Axes (B, N, 2) in the frame to which T (B, 4, 4) leads, not yet of length 1."""
+    return axis @ T[:, :2, :2].transpose(1, 2)
+
+
 def merge_tokens(tokens: Tokens, index: Tensor, T: Tensor, view_aligned: bool) -> Tokens:
     """Sets (B, S * N) of frames index (B, S) of a batch of tokens, moved by T (B, S, 4, 4).
 
@@ -78,7 +85,7 @@ def merge_tokens(tokens: Tokens, index: Tensor, T: Tensor, view_aligned: bool) -
     xyz = transform(T, tokens.xyz[flat])
     axis = tokens.axis[flat]
     if view_aligned:
-        axis = axis @ T[:, :2, :2].transpose(1, 2)
+        axis = _turned(axis, T)
         axis = axis / axis.norm(dim=-1, keepdim=True).clamp(min=1e-6)
 
     def joined(x: Tensor) -> Tensor:

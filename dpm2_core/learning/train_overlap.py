@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 import torch
@@ -94,6 +95,12 @@ class OverlapTraining(nn.Module):
         self.model.requires_grad_(False)
         self.model.decoder.overlap.requires_grad_(True)
         self.model.decoder.confidence.requires_grad_(network.decoder.precision)  # else it is not asked
+
+    def train(self, mode: bool = True) -> Self:
+        """But for what is frozen, running means included."""
+        super().train(mode)
+        self.model.encoder.eval()
+        return self
 
     def forward(
         self, points: PointBatch, views: Views | None, distance: Tensor, T_target_source: Tensor

@@ -162,7 +162,7 @@ class Trainer:
         keep_memory()
         with process_group() as (rank, world, device):
             module = self.module.to(device)
-            ema = copy.deepcopy(module).requires_grad_(False)
+            ema = copy.deepcopy(module).requires_grad_(False).eval()  # validation leaves running means as they are
             optimizer = make_optimizer(module, self.settings)
             start = load_checkpoint(self.out / "checkpoint.pt", module, ema, optimizer) if resume else 0
             if start > self.settings.steps:

@@ -37,9 +37,17 @@ def open_scans(path: Path | str, needs: Sequence[RequiredData] = (), sequences: 
 
 
 def folders_of(path: Path, sequences: Sequence[str] = ()) -> list[Path]:
-    """The sequence folders below `path` that have one of these names, or are below one; all if none is named."""
-    chosen = set(sequences)
-    return [folder for folder in sequence_folders(path) if not chosen or chosen & set(names_of(folder, path))]
+    """The sequence folders below `path` that have one of these names, or are below one; all if none is named.
+
+    A name is that of the outermost folders that have it: of train/00/sequences/00 and train/01/sequences/00, 00 is the
+    first.
+    """
+    names = {folder: names_of(folder, path) for folder in sequence_folders(path)}
+    taken = set(names) if not sequences else set()
+    for name in sequences:
+        level = {folder: of.index(name) for folder, of in names.items() if name in of}
+        taken |= {folder for folder in level if level[folder] == min(level.values())}
+    return [folder for folder in names if folder in taken]
 
 
 def sequence_names(path: Path, sequences: Sequence[str] = ()) -> list[str]:

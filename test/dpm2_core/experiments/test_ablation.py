@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from dpm2_core.evaluation.pair_set import PairSet
 from dpm2_core.experiments.ablation import MIXTURES, TABLE_4, AblationSettings, ablation, ablation_tables, gains
 from dpm2_core.learning.dataset import DataSettings
 from dpm2_core.learning.registration_loss import LossSettings
@@ -64,6 +65,30 @@ def test_seeds_are_trainings_of_their_own(packed: Path, tmp_path: Path) -> None:
     other = settings.model_copy(update={"training": settings.training.model_copy(update={"optimiser": optimiser})})
     (row,) = ablation(other, tmp_path).values()
     assert not set(row["same"]["near_m"]) & {first, second}, "figures of the training before"
+
+
+@pytest.mark.slow
+def test_a_training_that_is_stopped_while_it_is_measured_is_measured_again(
+    packed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Beside its weights lay the figures of the training before it, which were printed as its own."""
+    variants = {"no camera": {"image": {"backbone": "none"}}}
+    settings = AblationSettings(
+        training=quick(packed), variants=variants, seeds=1, measure={"same": str(packed)}, pairs=2
+    )
+    (before,) = ablation(settings, tmp_path).values()
+    optimiser = settings.training.optimiser.model_copy(update={"rate": 0.1})
+    other = settings.model_copy(update={"training": settings.training.model_copy(update={"optimiser": optimiser})})
+
+    def stopped(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(PairSet, "measure", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            ablation(other, tmp_path)
+    (after,) = ablation(other, tmp_path).values()
+    assert after["same"]["near_m"] != before["same"]["near_m"]
 
 
 def test_a_gain_is_of_the_same_seeds() -> None:

@@ -76,3 +76,8 @@ def test_the_recipes_of_the_paper_are_of_its_network_and_fit_each_other() -> Non
     assert second.optimiser.rate == pytest.approx(first.optimiser.rate / 10)
     assert second.optimiser.decay == pytest.approx(first.optimiser.decay / 10)
     assert (first.loss.pairing, first.loss.coarse, first.loss.backbone, first.loss.offset) == (1, 0.1, 0.1, 1)
+
+
+def test_the_papers_network_has_its_reference_points() -> None:
+    """The farthest ones, as of v1; it had half of them on edges and corners, as `small` does."""
+    assert [preset(name).fusion.reference for name in ("paper", "v1")] == ["fps", "fps"]

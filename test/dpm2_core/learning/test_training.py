@@ -23,7 +23,7 @@ from dpm2_core.learning.checkpoint import Log, load_checkpoint, save_checkpoint
 from dpm2_core.learning.dataset import DataSettings, GroupDataset
 from dpm2_core.learning.registration_loss import LossSettings
 from dpm2_core.learning.train_image import ImageTrainingSettings
-from dpm2_core.learning.train_overlap import OverlapTrainingSettings, train_overlap
+from dpm2_core.learning.train_overlap import OverlapTraining, OverlapTrainingSettings, train_overlap
 from dpm2_core.learning.train_registration import (
     RegistrationTraining,
     RegistrationTrainingSettings,
@@ -132,6 +132,25 @@ def test_a_training_that_learns_nothing_says_so(tmp_path: Path) -> None:
     assert not saved
 
 
+def test_validation_leaves_the_running_means_as_they_are(tmp_path: Path) -> None:
+    """Those of the validation drives came into the weights: each figure was of a forward pass that learns."""
+
+    class Normed(torch.nn.BatchNorm1d):
+        def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+            loss = (super().forward(x) - x).square().mean()
+            return loss, {"loss": loss.detach()}
+
+    def validate(module: torch.nn.Module) -> dict[str, float]:
+        return {"seen": float(module(torch.full((8, 2), 100.0))[0])}
+
+    steps = OptimizerSettings(steps=2, compile=False, bf16=False, validate_every=1)
+    saved: list[torch.nn.Module] = []
+    for name, validator in (("with", validate), ("without", None)):
+        batches = lambda start, rank: repeat((torch.ones(8, 2),))  # noqa: E731
+        Trainer(Normed(2), batches, steps, tmp_path / name, saved.append, validator).run()
+    assert torch.equal(saved[0].running_mean, saved[1].running_mean)  # type: ignore[arg-type]
+
+
 def test_a_validation_that_is_stopped_is_repeated(tmp_path: Path) -> None:
     """The checkpoint said that its step was done, so the figures of the last steps were lost for good."""
 
@@ -233,6 +252,13 @@ def test_overlap_with_images_is_validated_on_worlds_without(
     second = second.model_copy(update={"validation": str(tmp_path / "val"), "validation_batches": 1})
     train_overlap(second, tmp_path / "two")
     assert "average_precision" in (tmp_path / "two" / "log.jsonl").read_text()
+
+
+def test_overlap_leaves_the_running_means_of_the_encoder_as_they_are() -> None:
+    """A backbone of timm has such: its descriptors were no longer those of the maps."""
+    module = OverlapTraining(tiny()).train()
+    assert module.model.decoder.training
+    assert not any(part.training for part in module.model.encoder.modules())
 
 
 def _overlap(settings: RegistrationTrainingSettings, start: Path, **optimiser: float) -> OverlapTrainingSettings:

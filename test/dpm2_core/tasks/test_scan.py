@@ -94,6 +94,15 @@ def test_damaged_files_are_named_at_once(
     assert f"00/{'labels' if 'labels for' in message else kind}/{name[:6]}" in str(rejected.value)
 
 
+def test_a_name_is_that_of_the_outermost_folders_that_have_it(write_drive: Callable[..., Path], tmp_path: Path) -> None:
+    """Each drive of `dpm2 train tasks-data` is a data set of its own with a sequence 00: that name took all of them."""
+    for drive in ("00", "01"):
+        write_drive(tmp_path / drive / "sequences" / "00")
+    assert open_scans(tmp_path, sequences=["00"]).lengths == open_scans(tmp_path / "00").lengths
+    assert open_scans(tmp_path / "01", sequences=["00"]).lengths == open_scans(tmp_path / "01").lengths
+    assert open_scans(tmp_path, sequences=["00", "01"]).lengths == open_scans(tmp_path).lengths
+
+
 def test_no_scans(tmp_path: Path) -> None:
     """An empty folder, a folder that is not there, velodyne/ without scans."""
     with pytest.raises(UsageError, match="no such folder"):
