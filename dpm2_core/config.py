@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """YAML files and `key=value` settings into one typed configuration; every error names file, key and what is allowed.
 
-Each part of the package keeps its own `Settings` type beside the code it configures; `slam.system.Config` joins them.
+Each part of the package keeps its own `Settings` type beside the code it configures; `slam.settings.Config` joins them.
 """
 
 from __future__ import annotations

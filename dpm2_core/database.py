@@ -67,19 +67,16 @@ def size_with_log(path: Path) -> int:
     return sum(file.stat().st_size for suffix in ("", "-wal") if (file := Path(f"{source}{suffix}")).exists())
 
 
-def connect(path: Path, mode: str, timeout: float = 5.0, size: int | None = None) -> Connection:
+def connect(path: Path, mode: str, timeout: float = 5.0) -> Connection:
     """Open a database file.
 
     Args:
         mode: of SQLite's file URIs: ro, rw, rwc; `ro&immutable=1` for a file without a writer.
-        size: of the file where it is to be another than that of `path` now, bytes.
     """
-    if size is None:
-        size = size_with_log(path)
     # The mapper of a ROS node is made in one thread and used in another, never in two at once.
     return Connection(
         f"file:{quote(os.fsencode(path))}?mode={mode}", timeout, isolation_level=None, check_same_thread=False,
-        uri=True, size=size,
+        uri=True, size=size_with_log(path),
     )  # fmt: skip
 
 

@@ -124,7 +124,7 @@ def _descriptor(description: str, value: Any, info: FieldInfo | None) -> Paramet
     descriptor = ParameterDescriptor(description=description, dynamic_typing=value is None)
     if info is None:
         return descriptor
-    descriptor.additional_constraints = f"{_kind(info)} {_allowed(info)}".strip()
+    descriptor.additional_constraints = f"{_type_name(info.annotation)} {_allowed(info)}".strip()
     limits = {type(limit): limit for limit in _limits(info)}
     if annotated_types.Ge in limits and annotated_types.Le in limits:  # ROS ranges have two closed ends
         low, high = limits[annotated_types.Ge].ge, limits[annotated_types.Le].le
@@ -163,10 +163,6 @@ def _allowed(info: FieldInfo) -> str:
     signs = (("ge", "at least"), ("gt", "above"), ("le", "at most"), ("lt", "below"))
     pairs = ((word, getattr(limit, sign, None)) for limit in _limits(info) for sign, word in signs)
     return ", ".join(f"{word} {value:g}" for word, value in pairs if value is not None)
-
-
-def _kind(info: FieldInfo) -> str:
-    return _type_name(info.annotation)
 
 
 def _type_name(annotation: Any) -> str:
@@ -221,8 +217,7 @@ def _sections(kind: type[Settings]) -> Iterator[str]:
                 "| parameter | type | default | meaning |",
                 "|---|---|---|---|",
             )
-        allowed = _allowed(info)
-        kind_text = f"{_kind(info)}, {allowed}" if allowed else _kind(info)
+        kind_text = ", ".join(filter(None, (_type_name(info.annotation), _allowed(info))))
         default = json.dumps(_plain(info.get_default(call_default_factory=True)), default=str)
         text = _text(info).replace("|", "&#124;") + (" *Changeable.*" if name in CHANGEABLE else "")
         yield f"| `{name}` | {kind_text} | `{default}` | {text} |"

@@ -21,7 +21,6 @@ from dpm2_core.errors import UsageError
 from dpm2_core.extras import MissingPackageError
 from dpm2_core.frame import Array, Frame
 
-SUFFIXES = (".pcap", ".osf")
 # Its dependencies hold rosbags and others at releases that this package cannot use; to read, it needs none of them.
 INSTALL = "pip install --no-deps 'ouster-sdk>=1,<2'"
 _RECEIVED = 1  # the bit of a column's status

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from dpm2_core.geometry.full_precision import full_precision
+from dpm2_core.geometry.se3_torch import make
 
 
 def weighted_kabsch(source: Tensor, target: Tensor, weights: Tensor) -> Tensor:
@@ -28,10 +29,7 @@ def weighted_kabsch(source: Tensor, target: Tensor, weights: Tensor) -> Tensor:
     sign = torch.ones(len(U), 3, dtype=U.dtype, device=U.device)
     sign[:, 2] = torch.linalg.det(U @ Vt).sign()  # reflection guard
     R = (U * sign[:, None]) @ Vt
-    T = torch.eye(4, dtype=R.dtype, device=R.device).repeat(len(R), 1, 1)
-    T[:, :3, :3] = R
-    T[:, :3, 3] = target_mean - (R @ source_mean[..., None])[..., 0]
-    return T
+    return make(R, target_mean - (R @ source_mean[..., None])[..., 0])
 
 
 @full_precision

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The DeepPointMap2 network: a frame becomes 256 descriptors, two sets of descriptors become a pose."""
+"""The DeepPointMap2 network: a frame becomes a few hundred descriptors, two sets of descriptors become a pose."""

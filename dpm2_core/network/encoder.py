@@ -60,9 +60,7 @@ class Encoder(nn.Module):
         scales = self.points(points, self._colors(points, views)) if self.painted else self.points(points)
         if self.fusion is None:
             scale = scales[self.level]
-            axis = view_axes(scale.xyz)
-            if not self.settings.points.view_aligned:
-                axis = torch.zeros_like(axis) + torch.tensor([1.0, 0.0], device=axis.device)
+            axis = view_axes(scale.xyz, self.settings.points.view_aligned)
             return Encoded(Tokens(scale.xyz, scale.features, axis, scale.mask), scales, [])
         maps = []
         if self.painted:

@@ -58,9 +58,7 @@ class ReferencePoints(nn.Module):
         else:
             xyz = self.fixed.expand(len(finest.xyz), -1, -1)  # type: ignore[operator]
             mask = torch.ones_like(xyz[..., 0], dtype=torch.bool)
-        axis = view_axes(xyz)
-        if not self.view_aligned:
-            axis = torch.zeros_like(axis) + torch.tensor([1.0, 0.0], device=axis.device)
+        axis = view_axes(xyz, self.view_aligned)
         parts = [to_view(xyz, axis) / self.far] + [scales[i].features[:, : self.n] for i in self.levels]
         dtype = parts[-1].dtype
         return Tokens(xyz, self.embed(torch.cat([part.to(dtype) for part in parts], -1)), axis, mask)

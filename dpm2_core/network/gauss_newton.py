@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dpm2_core.geometry.compiled import compiled
+from dpm2_core.geometry.se3_torch import hat
 from dpm2_core.network.matching import Correspondences
 
 Array = NDArray[np.float64]
@@ -26,9 +27,7 @@ def whitened_residuals(T: Tensor, pairs: Correspondences) -> tuple[Tensor, Tenso
     L = torch.cat([L[:, :half], R.transpose(-1, -2) @ L[:, half:]], 1)  # all in the source frame
     # In the source frame the step turns the target's point, in the target frame the source's.
     lever_arm = torch.cat([moved_back[:, :half], source[:, half:]], 1)
-    zero = torch.zeros_like(lever_arm[..., 0])
-    x, y, z = lever_arm.unbind(-1)
-    minus_hat = torch.stack([zero, z, -y, -z, zero, x, y, -x, zero], -1).unflatten(-1, (3, 3))
+    minus_hat = hat(-lever_arm)
     eye = torch.eye(3, dtype=source.dtype, device=source.device).expand_as(minus_hat)
     jacobian = L.transpose(-1, -2) @ torch.cat([minus_hat, eye], -1)
     residual = (L.transpose(-1, -2) @ (source - moved_back)[..., None])[..., 0]
@@ -62,12 +61,8 @@ def weighted_gauss_newton(T: Tensor, pairs: Correspondences, rounds: int = ROUND
 
 def exp(xi: Tensor) -> Tensor:
     """SE(3) exponential of (B, 6) [rotation, translation]."""
-    w, v = xi[:, :3], xi[:, 3:]
-    zero = torch.zeros_like(w[:, 0])
-    x, y, z = w.unbind(-1)
-    generator = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
     out = xi.new_zeros(len(xi), 4, 4)
-    out[:, :3, :3], out[:, :3, 3] = generator, v
+    out[:, :3, :3], out[:, :3, 3] = hat(xi[:, :3]), xi[:, 3:]
     return torch.linalg.matrix_exp(out)
 
 

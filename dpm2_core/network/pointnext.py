@@ -34,12 +34,14 @@ def gather(values: Tensor, index: Tensor) -> Tensor:
     return nn.functional.embedding(flat, values.reshape(-1, channels)).view(*index.shape, channels)
 
 
-def view_axes(xyz: Tensor) -> Tensor:
-    """Horizontal unit vectors (..., 2) from the sensor at the origin to points (..., 3); (1, 0) straight above it."""
+def view_axes(xyz: Tensor, view_aligned: bool = True) -> Tensor:
+    """Horizontal unit vectors (..., 2) from the sensor to points (..., 3); (1, 0) above it, or all if not aligned."""
     xy = xyz[..., :2]
     length = xy.norm(dim=-1, keepdim=True)
     forward = torch.zeros_like(xy)
     forward[..., 0] = 1
+    if not view_aligned:
+        return forward
     return torch.where(length > 1e-3, xy / length.clamp(min=1e-3), forward)
 
 

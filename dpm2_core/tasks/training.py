@@ -88,7 +88,7 @@ def measure(module: nn.Module, scans: TaskScans) -> dict[str, float]:
 
 @torch.no_grad()
 def draw(task: Task, scans: TaskScans, index: int, path: Path) -> None:
-    """`Task.picture` of a scan.
+    """`Task.figure` of a scan.
 
     Raises:
         UsageError: there is no such scan.

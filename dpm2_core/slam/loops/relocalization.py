@@ -91,7 +91,7 @@ class Relocalizer:
         network: DeepPointMap2,
         known: KnownMap,
     ) -> None:
-        self._settings, self._visual = settings, visual
+        self._settings = settings
         self._keyframes, self._clouds, self._poses = known.keyframes, known.clouds, known.poses
         self._places = PlaceRecognition(network)
         self._places.update(self._keyframes)

@@ -198,11 +198,8 @@ def _check_new(path: Path) -> None:
         raise UsageError(f"{path}: there is a file already")
 
 
-def append_map(store: MapStore, data: MapData) -> int:
+def append_map(store: MapStore, data: MapData) -> None:
     """Write a map behind what is in the file; its nodes and sessions count on. Clouds pass through one at a time.
-
-    Returns:
-        The node that its first keyframe has in the file.
 
     Raises:
         Dpm2Error: it could not be written.
@@ -224,7 +221,6 @@ def append_map(store: MapStore, data: MapData) -> int:
     edges = [edge.shifted(first) for edge in data.edges]
     trail = [replace(p, node=p.node + first, session=p.session + before) for p in data.trail]
     store.write(Change(edges=edges, trail=trail, georeference=None if first else data.georeference))
-    return first
 
 
 def subset(data: MapData, nodes: Sequence[int], edges: Iterable[Edge], trail: Iterable[RemovedKeyframe]) -> MapData:

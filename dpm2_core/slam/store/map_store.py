@@ -166,7 +166,7 @@ class MapStore:
             finally:
                 self._together = False
 
-    def rows(self, table: str, columns: str = "", checked: bool = True, where: str = "") -> Iterator[tuple[Any, ...]]:
+    def rows(self, table: str, columns: str = "", where: str = "") -> Iterator[tuple[Any, ...]]:
         """Rows of a table in their order, without checksums; `where`: a condition of SQL.
 
         Raises:
@@ -181,7 +181,7 @@ class MapStore:
                 if before is not None and key <= before:  # a tree whose pages lead in a circle has no end
                     raise sqlite3.DatabaseError(f"malformed: {table} {key} comes after {before}")
                 before = key
-                if names and row.pop() != schema.row_crc(*row) and checked:
+                if names and row.pop() != schema.row_crc(*row):
                     raise Dpm2Error(f"{self.path}: {table} {row[0]} is damaged; see dpm2 map check")
                 yield tuple(row)
 
