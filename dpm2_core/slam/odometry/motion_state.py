@@ -133,7 +133,7 @@ class MotionState:
         self.change = np.zeros(6) if self.twist is None else twist - self.twist
         self.twist = twist
         if self.other is not None:
-            self.other.compare(T_step, registration.of_scene, led)
+            self.other.compare(T_step, registration.of_scene, seconds, led)
 
     def register(self, registration: Registration, stamp: int | None, moved: bool) -> None:
         """Go on from a registered pose; `moved`: the twist led there, else nothing is known of the way."""

@@ -23,8 +23,9 @@ from dpm2_core.slam.registration.protocol import MAP_NOISE
 _STANDING = np.array([0.5 * np.pi / 180, 0.05])
 _SHARE = 0.05
 _POSSIBLE = 9.0  # squared sigmas from the scan, or from the motion before, of which one is hard braking already
-_MEMORY = 0.1  # fraction of the newest frame in how far the steps are doubted
-_WORST = 25.0  # squared sigmas of one frame count so much: a single jump is forgiven
+_JUDGED = (0.5, 1.0)  # m or s: a shorter way of a slow robot is within what a step may be off, whatever is wrong
+_MEMORY = 0.1  # fraction of the newest way in how far the steps are doubted
+_WORST = 25.0  # squared sigmas of one way count so much: a single jump is forgiven
 _CREDIBLE = 4.0  # doubt up to which it is used
 _USUAL = 3.0  # squared sigmas that it may be off; more makes it doubtful
 
@@ -35,6 +36,29 @@ class Step:
 
     T: Array
     covariance: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _Way:
+    """Some steps in a row, by both: each T (4, 4), the covariance (6, 6) of that by the scans, and how long it took."""
+
+    T_other: Array
+    T_scans: Array
+    of_scans: Array
+    seconds: float
+
+    def and_then(self, step: _Way) -> _Way:
+        return _Way(
+            self.T_other @ step.T_other,
+            self.T_scans @ step.T_scans,
+            self.of_scans + step.of_scans,
+            self.seconds + step.seconds,
+        )
+
+    @property
+    def is_judged(self) -> bool:
+        meters = max(se3.magnitude(T)[0] for T in (self.T_other, self.T_scans))
+        return meters >= _JUDGED[0] or self.seconds >= _JUDGED[1]
 
 
 class OtherMotion:
@@ -53,6 +77,7 @@ class OtherMotion:
         self._hangs = False  # it repeats a pose that no vehicle can have stopped at
         self._now: Guess | None = None
         self._last: Guess | None = None  # that of the last registered frame
+        self._way: _Way | None = None  # since it was last judged
         self._doubt = 1.0  # squared sigmas by which it has been off of late
 
     def look(self, guess: Guess | None, twist: Array | None, seconds: float, of_prediction: Array) -> None:
@@ -86,13 +111,18 @@ class OtherMotion:
         off = se3.log(se3.inverse(T_before @ self.step.T) @ result.T_target_source)
         return bool(off @ np.linalg.solve(result.of_scene + self.step.covariance + MAP_NOISE, off) <= _POSSIBLE)
 
-    def compare(self, T_scans: Array, of_scene: Array, used: bool) -> None:
-        """With the step (4, 4) that the scans show, to a covariance (6, 6)."""
+    def compare(self, T_scans: Array, of_scene: Array, seconds: float, used: bool) -> None:
+        """With the step (4, 4) that the scans show, to a covariance (6, 6), since the last registered frame."""
         if self._raw is None:
+            self._way = None
             return
-        off = se3.log(se3.inverse(self._raw) @ T_scans)
-        squared = float(off @ np.linalg.solve(of_scene + _spread(self._raw) + MAP_NOISE, off)) / _USUAL
-        self._doubt = max(1.0, (1 - _MEMORY) * self._doubt + _MEMORY * min(squared, _WORST))
+        step = _Way(self._raw, T_scans, of_scene, seconds)
+        way = self._way = step if self._way is None else self._way.and_then(step)
+        if way.is_judged:
+            off = se3.log(se3.inverse(way.T_other) @ way.T_scans)
+            squared = float(off @ np.linalg.solve(way.of_scans + _spread(way.T_other) + MAP_NOISE, off)) / _USUAL
+            self._doubt = max(1.0, (1 - _MEMORY) * self._doubt + _MEMORY * min(squared, _WORST))
+            self._way = None
         self.comparison = Comparison(self._raw, T_scans, used, self._doubt**0.5, self._unsure)
 
     def keep(self) -> None:

@@ -65,6 +65,18 @@ def test_one_that_repeats_its_last_pose_is_no_halt() -> None:
     assert led == [False, True, False, False, True]
 
 
+@pytest.mark.parametrize(("sent", "used"), [(0.0, False), (-0.05, False), (0.05, True)])
+def test_of_a_slow_robot_it_is_judged_over_a_longer_way(sent: float, used: bool) -> None:
+    """0.05 m per scan is what a step may be off: wheels that stand, or turn backwards, were believed for good."""
+    other, step = OtherMotion(), se3.make(np.eye(3), [0.05, 0, 0])
+    known = 0.01**2 * np.eye(6)
+    for i in range(60):
+        other.look(Guess(se3.make(np.eye(3), [sent * i, 0, 0])), np.array([0, 0, 0, 0.5, 0, 0]), 0.1, known)
+        other.compare(step, known, 0.1, True)
+        other.keep()
+    assert (other.step is not None) == used
+
+
 @pytest.mark.parametrize("jump", [0.5, 1000.0])
 def test_slip_and_jumps_are_outweighed_and_told(suburb_drive: Drive, jump: float) -> None:
     """The error is that without another odometry; the jump, and no other frame, is said to be one."""
