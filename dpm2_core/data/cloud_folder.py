@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
+from datetime import UTC, datetime
 from decimal import Decimal
 from pathlib import Path
 from typing import Any
@@ -21,11 +22,13 @@ from dpm2_core.extras import needs
 from dpm2_core.frame import Array, Frame
 
 SUFFIXES = (".pcd", ".ply")
-_PERIOD = 0.1  # s between scans whose names are no times
+_LONGEST = 30_000_000_000  # ns from one scan to the next: beyond it numbers count something else, such as ms
 _PCD_HEADER = 65536  # bytes in which it ends
 _MOST_COLUMNS = 1000  # of a PCD file; a normal and its curvature are 4, a histogram of features is 308
 _PAIR = re.compile(r"(?:.*\D)?(\d{9,10})[_-](\d{1,9})")
 """Seconds since 1970 and their fraction, of 3, 6 or 9 digits; nanoseconds also without the zeros before them."""
+_DATE = re.compile(r"(?:.*\D)?(\d{4})\D?([01]\d)\D?([0-3]\d)\D([0-2]\d)\D?([0-5]\d)\D?([0-5]\d)(?:\D(\d{1,9}))?")
+"""2023-11-14_22-13-20_750, or 20231114_221320.750: a date, taken to be in UTC, and decimals of the second."""
 _EPOCHS = ((10**8, 10**11, 10**9), (10**11, 10**14, 10**6), (10**14, 10**17, 10**3), (10**17, 10**20, 1))
 """From, to, ns: a number in a name that is a time since 1970 after 1973."""
 
@@ -35,7 +38,7 @@ class CloudFolder:
 
     Fields are those of PointCloud2: intensity, and the time of each point, under their usual names. The stamp is the
     last number in the name where all of them are times since 1970 (s, ms, us or ns), or the last two, seconds and their
-    fraction; else they are 0.1 s apart.
+    fraction, or a date and the time of day; else they are `input.period` apart.
 
     Raises:
         UsageError: no such file in the folder, or what reads PCD is not installed.
@@ -46,7 +49,7 @@ class CloudFolder:
     truth = ""
 
     def __init__(self, path: Path | str, settings: InputSettings | None = None) -> None:
-        folder = Path(path)
+        folder, settings = Path(path), settings or InputSettings()
         self.name, self.notes = folder.resolve().name, list[str]()
         found = [file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES] if folder.is_dir() else []
         if not found:
@@ -57,10 +60,10 @@ class CloudFolder:
             self.stamps = np.sort(np.array(times, np.int64))
         else:
             self._files = sorted(found, key=lambda file: (not _numbers(file), _numbers(file), file.name))
-            self.stamps = np.round(np.arange(len(found)) * _PERIOD * 1e9).astype(np.int64)
+            self.stamps = settings.steady_stamps(np.arange(len(found)), f"{folder}: the names are no times", self.notes)
         if any(file.suffix.lower() == ".pcd" for file in self._files):
             _pcd_type()  # now, rather than at the first scan
-        self._frames = FrameBuilder(settings or InputSettings(), Calibration(self.name), self.notes.append)
+        self._frames = FrameBuilder(settings, Calibration(self.name), self.notes.append)
 
     def __len__(self) -> int:
         return len(self._files)
@@ -125,14 +128,29 @@ def _numbers(file: Path) -> list[Decimal]:
     return [Decimal(number) for number in re.findall(r"\d+(?:\.\d+)?", file.stem)]
 
 
+def _of_date(match: re.Match[str]) -> int:
+    """ns since 1970 of a `_DATE`; 0 of a day that there is not."""
+    year, month, day, hour, minute, second = (int(match[i]) for i in range(1, 7))
+    try:
+        seconds = datetime(year, month, day, hour, minute, second, tzinfo=UTC).timestamp()
+    except ValueError:
+        return 0
+    return int(seconds) * 10**9 + int((match[7] or "0").ljust(9, "0"))
+
+
 def name_times(files: list[Path]) -> list[int]:
-    """ns of each file by its name; empty where they are not all times since 1970, each another one."""
+    """ns of each file by its name; empty where they are not all times since 1970, each another one, of one drive."""
+    dates = [match for file in files if (match := _DATE.fullmatch(file.stem))]
     pairs = [match for file in files if (match := _PAIR.fullmatch(file.stem))]
     widths = {len(match[2]) for match in pairs}
-    if len(pairs) == len(files) and (max(widths) == 9 or widths in ({6}, {3})):
+    if len(dates) == len(files):
+        found = [_of_date(match) for match in dates]
+    elif len(pairs) == len(files) and (max(widths) == 9 or widths in ({6}, {3})):
         found = [int(match[1]) * 10**9 + int(match[2]) * 10 ** (9 - max(widths)) for match in pairs]
     else:
         last = [numbers[-1] for file in files if (numbers := _numbers(file))]
         of = ((low, high, ns) for low, high, ns in _EPOCHS if all(low <= number < high for number in last))
         found = [round(number * ns) for *_, ns in of for number in last]
-    return found if len(set(found)) == len(files) else []
+    steps = np.diff(np.unique(np.array(found, np.int64)))
+    one_drive = len(steps) + 1 == len(files) and (not len(steps) or np.median(steps) <= _LONGEST)
+    return found if one_drive else []

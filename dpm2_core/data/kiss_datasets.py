@@ -20,7 +20,7 @@ from dpm2_core.errors import UsageError
 from dpm2_core.extras import needs
 from dpm2_core.frame import Array, Frame
 
-_PERIOD = 0.1  # s between sweeps, where the loader knows no times of them
+_SWEEP = 0.1  # s, a turn of the LiDAR
 _OWN = ("generic", "mcap", "ouster", "rosbag")  # read without it, with times and intensities
 
 
@@ -102,7 +102,8 @@ class KissSource:
         names = [Path(str(file)) for file in getattr(self._set, "scan_files", ())]
         if len(names) == self._count and (named := name_times(names)):
             return np.asarray(named, np.int64)
-        return np.asarray(np.round(np.arange(self._count) * _PERIOD * 1e9), np.int64)
+        why = f"{self.path}: the loader knows no times"
+        return np.asarray(self._settings.steady_stamps(np.arange(self._count), why, self.notes))
 
     def _offsets(self, times: Array, count: int) -> Any:
         """(count,) s relative to the end of the sweep; None where the points have no times."""
@@ -111,4 +112,4 @@ class KissSource:
             if note not in self.notes:
                 self.notes.append(note)
             return None
-        return ((times - times.max()) / np.ptp(times) * _PERIOD).astype(np.float32)
+        return ((times - times.max()) / np.ptp(times) * _SWEEP).astype(np.float32)

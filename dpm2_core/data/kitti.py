@@ -28,7 +28,6 @@ from dpm2_core.geometry import se3
 
 ROUNDED = 0.01
 """By so much a rotation in a calibration file may be off, as its numbers are rounded."""
-_PERIOD = 0.1  # s between scans, where times.txt does not say
 
 
 class KittiSource:
@@ -55,7 +54,8 @@ class KittiSource:
         calib = read_calib(self.path / "calib.txt")
         self.T_cam_lidar: Array | None = calib.get("Tr")
         if self.T_cam_lidar is None:
-            self.notes.append(f"{self.path / 'calib.txt'} has no Tr: poses are of the LiDAR, not of the left camera")
+            lacks = "has no Tr" if (self.path / "calib.txt").is_file() else "is missing"
+            self.notes.append(f"{self.path / 'calib.txt'} {lacks}: poses are of the LiDAR, not of the left camera")
         self.stamps = self._stamps()
         self.poses: Array | None = self._poses()
         self.camera = self._camera(calib)
@@ -141,11 +141,11 @@ class KittiSource:
         seconds = self._of_each_scan(times)[:, 0]
         known = np.isfinite(seconds)
         if not known.any():
-            self.notes.append(f"{path}: missing or too short; frames are taken to be {_PERIOD} s apart")
-            seconds = (self.numbers - self.numbers[0]) * _PERIOD
-        elif not known.all():
+            since = self.numbers - self.numbers[0]
+            return self._settings.steady_stamps(since, f"{path}: missing or too short", self.notes)
+        if not known.all():
             last = int(np.flatnonzero(known)[-1])
-            step = float(np.median(np.diff(times[:, 0]))) if len(times) > 1 else _PERIOD
+            step = float(np.median(np.diff(times[:, 0]))) if len(times) > 1 else self._settings.period
             self.notes.append(f"{path}: {len(times)} times for {n} scans; the rest continue every {step:.3f} s")
             seconds = np.where(known, seconds, seconds[last] + (self.numbers - self.numbers[last]) * step)
         return np.round(seconds * 1e9).astype(np.int64)

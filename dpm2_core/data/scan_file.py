@@ -30,7 +30,17 @@ def read_scan(path: Path) -> tuple[Points, str | None]:
         return nothing, f"{path}: {size} bytes are no whole number of points (16 bytes each)"
     if size % 20 == 0 and _are_rings(values[4::5]) and not _are_rings(values[::5]):
         return nothing, f"{path}: 5 numbers a point, the last a ring, as nuScenes has them; want 4"
-    return values.reshape(-1, 4), None
+    points = values.reshape(-1, 4)
+    if _are_none(points):
+        return nothing, f"{path}: no places that a LiDAR measures; want 4 float32 a point, x, y, z in m and intensity"
+    return points, None
+
+
+def _are_none(points: Points) -> bool:
+    """Whether most of (N, 4) are no places that a LiDAR measures, as integers of another layout read as floats."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        distance = np.abs(points[:, :3]).max(1, initial=0)
+    return len(points) > 0 and bool(np.mean((distance > 0) & ~((distance > 1e-3) & (distance < 1e5))) > 0.5)
 
 
 def _are_rings(values: NDArray[np.float32]) -> bool:

@@ -6,6 +6,7 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import AfterValidator, Field
 from scipy.spatial.transform import Rotation
 
@@ -83,6 +84,9 @@ class InputSettings(Settings):
     """NavSatFix topic, whose fixes hold the map in its place on Earth; /tf_static is asked for the antenna's; empty:
     none."""
 
+    period: Annotated[float, Field(gt=0, le=3600)] = 0.1
+    """Time between the scans of a folder in which nothing says when they were taken, s."""
+
     time_field: str | None = None
     """PointCloud2 field with the time of each point; null looks for a usual name (t, time_offset_ns, ...), "": none."""
 
@@ -104,6 +108,11 @@ class InputSettings(Settings):
         """T_lidar_cam as (4, 4); None if it is not set here."""
         place = self.T_lidar_cam
         return None if place is None else se3.make(Rotation.from_quat(place[3:]).as_matrix(), place[:3])
+
+    def steady_stamps(self, numbers: NDArray[np.integer], why: str, notes: list[str]) -> NDArray[np.int64]:
+        """(N,) ns of scans by their numbers (N,), since nothing says when they were taken; a note tells why."""
+        notes.append(f"{why}: scans are taken to be {self.period:g} s apart (input.period)")
+        return np.round(numbers * self.period * 1e9).astype(np.int64)
 
     def angle_correction(self, known: float) -> float:
         """Degrees to add to the elevation of each point: what is set here, else what is `known` of the recording."""

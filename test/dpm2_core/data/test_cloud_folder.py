@@ -12,6 +12,7 @@ import pytest
 from dpm2_core.data.cloud_folder import CloudFolder
 from dpm2_core.data.open import open_source
 from dpm2_core.data.ply import write_ply
+from dpm2_core.data.settings import InputSettings
 
 RAMP = np.linspace(0, 0.1, 40)
 POINTS = np.random.default_rng(0).uniform(-20, 20, (40, 3)).astype(np.float32)
@@ -38,7 +39,11 @@ def test_pcd_files_in_every_encoding(tmp_path: Path, encoding: str) -> None:
     assert frames[1].stamp == 100_000_000
     assert frames[0].time_offset is not None
     np.testing.assert_allclose(frames[0].time_offset, RAMP, atol=1e-6)
-    assert source.notes == []
+    assert [note.partition(": ")[2] for note in source.notes] == [
+        "the names are no times: scans are taken to be 0.1 s apart (input.period)"
+    ]
+    slow = CloudFolder(tmp_path, InputSettings(period=0.5))
+    assert [frame.stamp for frame in slow.frames()] == [0, 500_000_000, 1_000_000_000]
     assert [frame.index for frame in source.frames(1, 2)] == [1]
 
 
@@ -51,6 +56,23 @@ def test_names_that_are_times(tmp_path: Path, scale: int) -> None:
     assert [frame.stamp for frame in source.frames()] == [(EPOCH + n) * 10**9 for n in range(3)]
     assert len(source.notes) == 1
     assert "no time field: not de-skewed" in source.notes[0]
+
+
+@pytest.mark.parametrize("name", ["2023-11-14_22-13-2{}_750", "scan-20231114T22132{}.750", "2023-11-14-22-13-2{}-75"])
+def test_names_that_are_dates(tmp_path: Path, name: str) -> None:
+    """As loggers name files; decimals of the second as far as they go."""
+    for n in range(3):
+        write_ply(tmp_path / f"{name.format(n)}.ply", np.zeros((5, 4), np.float32) + n + 1)
+    found = [frame.stamp for frame in CloudFolder(tmp_path).frames()]
+    assert found == [1_700_000_000 * 10**9 + 750_000_000 + n * 10**9 for n in range(3)]
+
+
+@pytest.mark.parametrize("names", [("251370668", "251371071"), ("2023-13-14_22-13-20", "2023-13-14_22-13-21")])
+def test_names_that_only_look_like_times(tmp_path: Path, names: tuple[str, str]) -> None:
+    """Milliseconds since a start were seconds in 1977, 403 apart; a month 13."""
+    for n, name in enumerate(names):
+        write_ply(tmp_path / f"{name}.ply", np.zeros((5, 4), np.float32) + n + 1)
+    assert [frame.stamp for frame in CloudFolder(tmp_path).frames()] == [0, 100_000_000]
 
 
 @pytest.mark.parametrize("name", ["cloud_{}_{}.ply", "{}-{}.ply"])

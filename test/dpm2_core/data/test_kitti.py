@@ -197,7 +197,7 @@ def test_without_tr_the_lidar_goes_on_alone(kitti_folder: MakeFolder, calib: str
     assert source.camera is None
     assert source.poses is None
     notes = " | ".join(source.notes)
-    assert "has no Tr: poses are of the LiDAR" in notes
+    assert f"calib.txt {'has no Tr' if calib else 'is missing'}: poses are of the LiDAR" in notes
     assert "images are left out" in notes
     assert "no ground truth" in notes
     assert len(list(source.frames())) == 5
@@ -251,6 +251,16 @@ def test_scans_with_a_ring_of_each_point_are_refused(kitti_folder: MakeFolder, n
     assert frames[1].problem is not None
     assert "5 numbers a point" in frames[1].problem
     assert [frame.problem for frame in frames if frame.index != 1] == [None] * 4
+
+
+def test_integers_are_no_floats(kitti_folder: MakeFolder, noise: np.random.Generator) -> None:
+    """NCLT's four uint16 a point, two points a point: 1e-38 m away, without a word."""
+    folder = kitti_folder()
+    noise.integers(0, 2000, (400, 8)).astype("<u2").tofile(folder / "velodyne" / "000001.bin")
+    frame = [*KittiSource(folder).frames()][1]
+    assert frame.problem is not None
+    assert "no places that a LiDAR measures" in frame.problem
+    assert not len(frame.points)
 
 
 def test_times_that_end_early_continue_at_their_pace(kitti_folder: MakeFolder) -> None:
