@@ -7,6 +7,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from dpm2_core.config import dump_settings
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.estimates import Edge, Keyframe, State
@@ -23,6 +25,7 @@ from dpm2_ros.map_folder import MapFolder, file_beside
 from dpm2_ros.settings import NodeConfig
 
 AUTO = "auto"
+_FOUND = np.diag([0.01] * 3 + [0.1] * 3) ** 2  # rad, m: how far the map itself may be off around a robot found in it
 
 
 class ActiveMap:
@@ -134,12 +137,13 @@ class ActiveMap:
         """
         if (localizer := self.localizer) is None:
             return f"a map is being made already, {len(self.mapper.keyframes)} keyframes"
-        if not localizer.state.located:
+        located = self.located
+        if located is None or not localizer.state.located:
             raise UsageError(f"not extended: the robot is {localizer.state} in {self._path}")
         if not isinstance(self._store, MapStore):
             raise UsageError(f"not extended: {self._path} is a folder of tiles, which does not grow")
         self._exchange(open_session(self._store.path, self._config.slam, dump_settings(self._config), resume=True))
-        self.mapper.start_session(localizer.T_map_odom)
+        self.mapper.start_session(localizer.T_map_odom, located.covariance + _FOUND)
         return f"{self._path} grows by a new session"
 
     def restart(self, robot: str) -> None:

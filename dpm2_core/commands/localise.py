@@ -55,6 +55,7 @@ class LocalizationReport:
         self._frames: Counter[State] = Counter()
         self._first: int | None = None
         self._events: list[dict[str, Any]] = []
+        self._reason = ""  # why the last keyframe was not found, where none has been
 
     def add(self, result: SlamResult) -> str:
         """Take in the result of the next frame; returns the event that it is, or an empty text."""
@@ -66,6 +67,8 @@ class LocalizationReport:
         if state.located and result.T_map_lidar is not None:
             self.stamps.append(tracked.stamp)
             self.poses.append(result.T_map_lidar)
+        if located is not None and self._first is None and not located.registration.ok:
+            self._reason = located.registration.reason
         if located is None or located.state is before or located.state is State.TRACKING:
             return ""
         kind = "kidnapped" if located.jumped and before.located else "found" if located.jumped else str(located.state)
@@ -83,10 +86,11 @@ class LocalizationReport:
         return f"frame {tracked.index}: {kind} {event.get('position_m', '')}{located.registration.reason}"
 
     def summary(self) -> dict[str, Any]:
-        """Counts of frames by state, how many passed until the first result (None: there was none), and events."""
+        """Counts of frames by state, how many passed until the first result (None: there was none, and why), events."""
         return {
             "frames": self._frames.total(),
             "frames_until_found": self._first,
+            "not_found": self._reason if self._first is None else "",
             "frames_located": len(self.stamps),
             "frames_by_state": {str(state): count for state, count in sorted(self._frames.items())},
             "kidnappings": sum(event["event"] == "kidnapped" for event in self._events),

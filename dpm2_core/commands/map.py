@@ -60,7 +60,7 @@ def export(
         if format or voxel is not None or resolution is not None:
             raise UsageError("--tiles: squares of the map as it is; --format, --voxel and --resolution do not apply")
         with MapStore.open(path) as store:
-            count = write_tiles(_loaded(store), out, tiles)
+            count = write_tiles(_tied(_loaded(store), out), out, tiles)
         Console(stderr=True).print(f"{out} written: {count} tiles", highlight=False, soft_wrap=True)
         return
     kind = format or _ENDINGS.get(out.suffix.lower(), "")

@@ -123,9 +123,9 @@ class Result:
 
     @property
     def connected(self) -> bool:
-        """Whether a loop ties this drive to those that were in the map file before; True if there were none."""
+        """Whether it is known where in the map this drive is; True if there was none before."""
         first = self.mapper.session_start
-        return first == 0 or any(edge.from_node < first <= edge.to_node for edge in self.mapper.edges)
+        return first == 0 or bool(self.mapper.placed[first:].any())
 
     @property
     def fps(self) -> float:

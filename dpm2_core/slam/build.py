@@ -5,6 +5,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from dpm2_core.network.pretrained import load_network
 from dpm2_core.slam.filters import make_filter
 from dpm2_core.slam.graph.pose_graph import PoseGraph
@@ -27,6 +29,7 @@ from dpm2_core.slam.registration.neural import NeuralScanRegistration
 from dpm2_core.slam.registration.protocol import ScanRegistration
 from dpm2_core.slam.registration.visual import VisualScanRegistration
 from dpm2_core.slam.settings import SlamSettings
+from dpm2_core.slam.store.lazy import Chosen
 from dpm2_core.slam.store.map_data import MapData
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.slam.system import Slam
@@ -114,7 +117,13 @@ def make_localizer(s: SlamSettings, mapper: Mapper) -> Localizer:
     Raises:
         UsageError: the network has no weights to run with.
     """
-    known = KnownMap(mapper.keyframes, mapper.clouds, mapper.poses, mapper.thumbnail)
+    nodes = np.flatnonzero(mapper.placed).tolist()  # where the others are in the map is not known
+    known = KnownMap(
+        [mapper.keyframes[node] for node in nodes],
+        Chosen(mapper.clouds, nodes),
+        mapper.poses[nodes],
+        lambda i: mapper.thumbnail(nodes[i]),
+    )
     relocalizer = Relocalizer(s.relocalise, s.visual, _verifier(s), _network(s), known)
     return Localizer(relocalizer, s.relocalise.max_failures)
 

@@ -121,5 +121,5 @@ def resume_at(mapper: Mapper, source: Source, start: int) -> int:
     result = None if position < 0 else next(iter(source.frames(position, position + 1)))
     if result is None or result.stamp != last.stamp:
         raise UsageError(f"--resume: frame {last.index}, where the map ends, is not in {source.name}")
-    mapper.start_session(mapper.poses[-1], _SAME_FRAME)
+    mapper.start_session(mapper.poses[-1], _SAME_FRAME, len(mapper.keyframes) - 1)
     return position

@@ -16,10 +16,16 @@ import numpy as np
 import pytest
 
 from dpm2_core.cli import main
+from dpm2_core.config import dump_settings
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.estimates import Keyframe, Registration, State
 from dpm2_core.geometry import se3
+from dpm2_core.slam.build import make_map
+from dpm2_core.slam.mapping.parts import parts_of
+from dpm2_core.slam.session import open_session
 from dpm2_core.slam.store.check import check_map
+from dpm2_core.slam.store.map_data import load_map
+from dpm2_core.slam.store.map_store import MapStore
 from dpm2_ros.active_map import ActiveMap
 from dpm2_ros.settings import NodeConfig
 
@@ -291,6 +297,32 @@ def test_where_its_map_cannot_grow_a_robot_is_found_as_before(
     assert T_map_odom is not None
     np.testing.assert_allclose(T_map_odom, np.eye(4), atol=0.1)  # m: as exactly as it was found
     assert len(found.mapper.keyframes) == 5
+    found.close()
+    with MapStore.open(tmp_path / "drive.dpm2map") as store:
+        data = load_map(store)
+        assert parts_of(data).tolist() == [0] * 5  # exports left out what no edge tied
+        assert [(edge.from_node, edge.to_node) for edge in data.constraints][-1] == (2, 4)  # 10 is nearest to 12
+
+
+@pytest.mark.weights
+def test_a_drive_that_nothing_ties_to_the_map_is_no_place_in_it(tmp_path: Path) -> None:
+    """A robot was `tracking` there, wherever the frame of that drive happened to be in the map: 120 m off."""
+    made = ActiveMap(described(map_directory=str(tmp_path)), "", LOG)
+    made.add(keyframes(1)[0])
+    made.close()
+    path, settings = tmp_path / "drive.dpm2map", described().slam
+    with open_session(path, settings, dump_settings(described()), resume=True) as store:
+        mapper, _ = make_map(settings, store)
+        for n in (0, 5, 10, 15):
+            mapper.add(street(n))
+        mapper.finish()
+        assert mapper.placed.tolist() == [True] + [False] * 4
+    active = ActiveMap(described(map_file=str(path), localization_mode=True), "", LOG)
+    for n in (4, 5, 6):
+        active.add(street(n))
+    assert active.located is not None
+    assert active.located.state is State.RELOCALIZING
+    active.close()
 
 
 @pytest.mark.weights

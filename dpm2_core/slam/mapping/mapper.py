@@ -59,6 +59,15 @@ class _Robot:
     offset: int = 0
 
 
+@dataclass(frozen=True, eq=False)
+class _Start:
+    """Where a session in a loaded map begins: see `Mapper.start_session`."""
+
+    T_map_odom: Array
+    covariance: Array
+    node: int | None
+
+
 class Mapper:
     """Holds keyframes and pose graph of one robot or several; their odometry runs on untouched.
 
@@ -85,9 +94,7 @@ class Mapper:
         self._clouds = CloudStore()
         self._writer: MapWriter | None = None
         self._robots: dict[str, _Robot] = {}
-        self._known = {0}  # nodes whose pose in the map is known from the start
-        self._T_start: Array = np.eye(4)  # T_map_odom of the first robot of the session
-        self._tie: Array | None = None  # covariance of the session's first keyframe relative to the last of the map
+        self._start: _Start | None = None
         if store is not None:
             self._load(store)
         self.session_start = len(self.keyframes)
@@ -105,22 +112,25 @@ class Mapper:
     @property
     def T_map_odom(self) -> Array | None:
         """(4, 4) of the robot whose keyframe came last, which carries every correction; None before it is known."""
+        if not self.keyframes:
+            return np.eye(4)
         if len(self.keyframes) == self.session_start:
-            return self._T_start if self.session_start in self._known else None
+            start = self._start
+            return start.T_map_odom if start and (start.node is None or self._is_placed(start.node)) else None
         return self.T_map_odom_of(self.keyframes[-1].robot)
 
     def T_map_odom_of(self, robot: str) -> Array | None:
         """(4, 4) of a robot; None before it is known where in the map it is."""
         last = self._robots[robot].last if robot in self._robots else None
-        if last is None or self._graph.part(last) not in self._known_parts():
+        if last is None or not self._is_placed(last):
             return None
         return se3.orthonormalized(self._graph.pose(last) @ se3.inverse(self.keyframes[last].T_odom_kf))
 
     @property
     def placed(self) -> NDArray[np.bool_]:
         """(N,) of each keyframe, whether it is known where in the map it is: what nothing ties to it is not drawn."""
-        known = self._known_parts()
-        return np.array([self._graph.part(node) in known for node in range(len(self.keyframes))], np.bool_)
+        parts = np.array([self._graph.part(node) for node in range(len(self.keyframes))], np.intp)
+        return np.asarray(parts == parts[:1])
 
     @property
     def robots(self) -> list[str]:
@@ -156,16 +166,15 @@ class Mapper:
         """Where on Earth the map is, by the fixes of its keyframes; None while that is not known."""
         return self._graph.georeference
 
-    def start_session(self, T_map_odom: Array, covariance: Array | None = None) -> None:
-        """Before the first keyframe of a session in a loaded map: where its odometry begins.
+    def start_session(self, T_map_odom: Array, covariance: Array, node: int | None = None) -> None:
+        """Before the first keyframe of a session in a loaded map: where its odometry begins. Else only a loop tells.
 
         Args:
             T_map_odom: (4, 4).
-            covariance: (6, 6) of the first keyframe's pose relative to the last one of the map, which are then joined
-                by an edge; None: the new session is not tied to the map before a loop is found.
+            covariance: (6, 6) of the first keyframe's pose relative to that of `node`, to which an edge will tie it.
+            node: of the map, whose frame is the new session's first one; None: the nearest whose place is known.
         """
-        self._T_start, self._tie = T_map_odom, covariance
-        self._known.add(self.session_start)
+        self._start = _Start(T_map_odom, covariance, node)
 
     def described(self, keyframe: Keyframe) -> Keyframe:
         """The keyframe with descriptors, if loops are searched with them and its registration made none."""
@@ -204,7 +213,8 @@ class Mapper:
 
     def _lend(self, node: int, odometry: list[Edge], loops: list[Edge]) -> None:
         """Give up the cloud of a keyframe that came back to an older one for that one's."""
-        again = odometry if node == self.session_start else []  # the frame with which the session before ended
+        same = node == self.session_start and self._start is not None and self._start.node is not None
+        again = odometry if same else []  # the frame with which the session before ended
         loan = lender(node, [*again, *self._kept(loops)], self._clouds.loan, self._settings.redundancy)
         if loan is not None:
             self._clouds.borrow(node, loan)
@@ -244,8 +254,8 @@ class Mapper:
         """The pose graph as a g2o file."""
         self._graph.write_g2o(path)
 
-    def _known_parts(self) -> set[int]:
-        return {self._graph.part(node) for node in self._known if node < len(self.keyframes)}
+    def _is_placed(self, node: int) -> bool:
+        return self._graph.part(node) == self._graph.part(0)
 
     def _load(self, store: MapStore) -> None:
         data, channels = load_map(store), self._closer.channels
@@ -275,17 +285,28 @@ class Mapper:
             T_before_this = se3.inverse(before.T_odom_kf) @ keyframe.T_odom_kf
             covariance = result.covariance * np.clip(keyframe.id - before.id, 1, _MOST_MISSED)
             result = replace(result, T_target_source=T_before_this, covariance=covariance)
-        elif node == self.session_start and self._tie is not None:
-            last = node - 1
-            T_before_this = se3.inverse(self._graph.pose(last)) @ self._T_start @ keyframe.T_odom_kf
-            result = Registration(T_before_this, self._tie)
+        elif node == self.session_start and self._start is not None:
+            return [self._tie(node, self._start, self._start.T_map_odom @ keyframe.T_odom_kf)]
         else:
-            T_map_odom = self._T_start if node == self.session_start else np.eye(4)
-            self._graph.add_node(T_map_odom @ keyframe.T_odom_kf)
+            self._graph.add_node(keyframe.T_odom_kf)
             return []
         edge = Edge("odometry", last, node, result)
         self._graph.add_node(self._graph.pose(last) @ edge.T_from_to, edge)
         return [edge]
+
+    def _tie(self, node: int, start: _Start, T: Array) -> Edge:
+        """The first node of a session, at T (4, 4), and the edge that ties it to the map."""
+        other = self._nearest(T) if start.node is None else start.node
+        result = Registration(se3.inverse(self._graph.pose(other)) @ T, start.covariance)
+        edge = Edge("loop" if start.node is None else "odometry", other, node, result)
+        self._graph.add_node(T, edge if edge.kind == "odometry" else None)
+        return edge if edge.kind == "odometry" else self._tied(edge)
+
+    def _nearest(self, T_map_kf: Array) -> int:
+        """The node of a known place that is nearest."""
+        placed = np.flatnonzero(self.placed)
+        distance = np.linalg.norm(self.poses[placed, :3, 3] - T_map_kf[:3, 3], axis=1)
+        return int(placed[distance.argmin()])
 
     def _close_loops(self, due: bool) -> None:
         """Loops of the last keyframe: into the graph, unless they were rejected there or before.

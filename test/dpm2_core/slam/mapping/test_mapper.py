@@ -272,7 +272,7 @@ def test_another_drive_is_placed_where_one_says_where_it_begins(tmp_path: Path) 
         with MapStore.open(tmp_path / f"map {expected}") as store:
             mapper = make_mapper(SlamSettings.model_validate({"loops": {"enabled": False}}), store)
             if place is not None:
-                mapper.start_session(place)
+                mapper.start_session(place, 0.1**2 * np.eye(6))
             assert (mapper.T_map_odom is not None) == expected
             mapper.add(drifting(circle(1), np.zeros(6), np.zeros((0, 4), np.float32))[0])
             assert mapper.placed.tolist() == [True] * 60 + [expected]

@@ -163,7 +163,7 @@ def test_a_second_session_counts_on(tmp_path: Path) -> None:
             mapper = make(store)
             if mapper.keyframes:
                 T_map_odom = mapper.poses[-1] @ se3.inverse(drive[7].T_odom_kf)
-                mapper.start_session(T_map_odom, SIGMA)
+                mapper.start_session(T_map_odom, SIGMA, 7)
             for number, keyframe in enumerate(part):
                 edge = keyframe.edge if number else None
                 mapper.add(Keyframe(number, keyframe.stamp, keyframe.index, keyframe.T_odom_kf, keyframe.cloud, edge))
