@@ -128,6 +128,7 @@ def run_localized(drive: OfflineRun, out: Path, hint: Array | None, config: Conf
     write_json(out / LOCALIZATION, summary)
     remove_results(out, *MAPPING)
     until = summary["frames_until_found"]
-    found = "not found" if until is None else f"found after {until} frames"
+    why = f" ({summary['not_found']})" if summary["not_found"] else ""
+    found = f"not found{why}" if until is None else f"found after {until} frames"
     located = f"place known in {len(report.stamps)} of {summary['frames']} frames"
     return f"{name}: {found}, {located}; results in {out}", summary

@@ -9,10 +9,13 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from dpm2_core.config import dump_settings
+from dpm2_core.data.messages import returned
 from dpm2_core.data.source import Source
 from dpm2_core.errors import UsageError
+from dpm2_core.frame import Frame, Points
 from dpm2_core.network.pretrained import weights_id
 from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.mapping.tiles import TiledMap
@@ -23,6 +26,10 @@ from dpm2_core.slam.store.rows import Session
 
 MapMode = Literal["create", "resume", "extend", "localize"]
 """What to do with a map file: make it, go on with the drive that was cut off, add another drive, or only read it."""
+_COMPARED = 500  # points of a cloud
+_APART = (
+    0.75  # m, of three in four of them at most: another frame's are from 1.1 m on, its own at 0.01, or as de-skewed
+)
 _SAME_FRAME = np.diag([1e-4] * 3 + [1e-3] * 3) ** 2  # rad, m: the rounding of what is the same frame
 
 
@@ -106,7 +113,7 @@ def resume_at(mapper: Mapper, source: Source, start: int) -> int:
     """Position in the source of the map's last keyframe, from where the mapper goes on; `start` for an empty map.
 
     Raises:
-        UsageError: the frame of that keyframe is not in the source.
+        UsageError: the frame of that keyframe is not in the source, or is another one of the same stamp.
     """
     if not mapper.keyframes:
         return start
@@ -121,5 +128,16 @@ def resume_at(mapper: Mapper, source: Source, start: int) -> int:
     result = None if position < 0 else next(iter(source.frames(position, position + 1)))
     if result is None or result.stamp != last.stamp:
         raise UsageError(f"--resume: frame {last.index}, where the map ends, is not in {source.name}")
+    if not _shows(result, mapper.clouds[-1]):
+        raise UsageError(f"--resume: frame {last.index} of {source.name} is not the one with which the map ends")
     mapper.start_session(mapper.poses[-1], _SAME_FRAME, len(mapper.keyframes) - 1)
     return position
+
+
+def _shows(frame: Frame, cloud: Points) -> bool:
+    """Whether a keyframe's cloud (M, 4) is of that frame. Stamps alone say little: all synthetic drives begin at 0."""
+    points = frame.points[returned(frame.points)][:, :3]
+    if not len(points) or not len(cloud):
+        return True
+    apart, _ = cKDTree(points).query(cloud[:: -(-len(cloud) // _COMPARED), :3])
+    return bool(np.percentile(apart, 75) <= _APART)

@@ -199,6 +199,23 @@ def test_a_drive_with_missing_scans_goes_on(recording: Path, tmp_path: Path) -> 
         assert again.run().recorder.index[-1] == FRAMES - 2
 
 
+def test_another_drive_of_the_same_stamps_is_not_gone_on_with(recording: Path, tmp_path: Path) -> None:
+    """As all synthetic ones have them: it was tied to the end of the map, to the millimeter."""
+    path, other = tmp_path / "drive.dpm2map", tmp_path / "other"
+    with OfflineRun(recording, CONFIG, (0, 4), map_file=path) as begun:
+        begun.run()
+    first_scans(recording, FRAMES, other)
+    noise = np.random.default_rng(0)
+    for scan in other.rglob("velodyne/*.bin"):
+        scan.unlink()  # it may be a link
+        noise.uniform((-40, -40, -2, 0), (40, 40, 6, 1), (2000, 4)).astype("<f4").tofile(scan)
+    with (
+        pytest.raises(UsageError, match=r"--resume: frame \d+ of \w+ is not the one with which the map ends"),
+        OfflineRun(other, CONFIG, map_file=path, map_mode="resume") as again,
+    ):
+        again.run()
+
+
 def test_a_run_that_localizes_has_no_poses_of_its_own(recording: Path, tmp_path: Path) -> None:
     path = tmp_path / "drive.dpm2map"
     with OfflineRun(recording, Config(), (0, 8), map_file=path) as drive:
