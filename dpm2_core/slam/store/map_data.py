@@ -252,13 +252,21 @@ def map_cloud(clouds: CloudStore, poses: Array, voxel: float, nodes: Iterable[in
 
     `nodes`: those whose clouds are in it; None: all.
     """
-    cloud = NO_POINTS
     own = [node for node in (range(len(poses)) if nodes is None else nodes) if clouds.loan(node) is None]
-    for start in range(0, len(own), 50):  # in parts: memory is that of the map, not of all the clouds
-        part = own[start : start + 50]
-        cloud = np.concatenate([cloud, *(se3.transform(poses[node], clouds[node]) for node in part)])
-        cloud = cloud[voxel_first(cloud, voxel)]
-    return cloud
+    parts: list[tuple[int, Points]] = []  # in parts, since memory is to be that of the map, not of all the clouds
+    for start in range(0, len(own), 50):
+        joined = _thinned([se3.transform(poses[node], clouds[node]) for node in own[start : start + 50]], voxel)
+        size = 1
+        while parts and parts[-1][0] == size:  # equal ones, so that no point is thinned more than log2 of their number
+            joined, size = _thinned([parts.pop()[1], joined], voxel), 2 * size
+        parts.append((size, joined))
+    return _thinned([NO_POINTS, *(cloud for _, cloud in parts)], voxel)
+
+
+def _thinned(clouds: Sequence[Points], voxel: float) -> Points:
+    """One after the other, the first point in each voxel."""
+    cloud = np.concatenate(clouds)
+    return cloud[voxel_first(cloud, voxel)]
 
 
 def ways(data: MapData) -> dict[tuple[str, int], tuple[list[int], Array]]:

@@ -189,11 +189,10 @@ class MapStore:
         """`cloud`, `descriptors` or `thumbnail` of a node; None where it has none.
 
         Raises:
-            Dpm2Error: it cannot be read.
+            Dpm2Error: it cannot be read, or is damaged.
         """
-        with explained(self.path):
-            row = self._connection.execute(f"SELECT {what} FROM payloads WHERE node = ?", (node,)).fetchone()
-        return None if row is None else row[0]
+        at = schema.CONTENT["payloads"].index(what)
+        return next((row[at] for row in self.rows("payloads", where=f"node = {node:d}")), None)
 
     def cloud(self, node: int) -> bytes | None:
         """The packed cloud of a node."""

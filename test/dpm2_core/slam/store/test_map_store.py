@@ -406,6 +406,16 @@ def test_hostile_fixes_are_found_and_left_out(map_file: Path, tmp_path: Path, ta
     assert all(keyframe.fix is None for keyframe in data.keyframes)
 
 
+def test_damage_within_descriptors_is_found_when_they_are_read(map_file: Path) -> None:
+    """One bit, of which SQLite knows nothing: they were others then, and copies of the map were sound with them."""
+    with closing(sqlite3.connect(map_file)) as db, db:
+        node, packed = db.execute("SELECT node, descriptors FROM payloads WHERE descriptors NOT NULL").fetchone()
+        wrong = packed[:-40] + bytes([packed[-40] ^ 1]) + packed[-39:]
+        db.execute("UPDATE payloads SET descriptors = ? WHERE node = ?", (wrong, node))
+    with MapStore.open(map_file) as store, pytest.raises(Dpm2Error, match=f"payloads {node} is damaged; see dpm2 map"):
+        load_map(store)
+
+
 def test_what_is_no_map_is_rejected_in_one_line(tmp_path: Path, map_file: Path) -> None:
     text, other, later = tmp_path / "a.txt", tmp_path / "other.db", map_file
     text.write_text("no map at all, but long enough to look like something")
