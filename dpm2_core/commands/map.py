@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import typer
@@ -28,6 +28,9 @@ from dpm2_core.geometry import se3
 from dpm2_core.slam.mapping.tiles import write_tiles
 from dpm2_core.slam.store.map_data import MapData, load_map, map_cloud, save_as, trajectory, ways
 from dpm2_core.slam.store.map_store import MapStore
+
+if TYPE_CHECKING:
+    from dpm2_core.slam.settings import SlamSettings
 
 _OFF = 30.0  # m from where satellites have a map: receivers err by meters, and over its length so does a heading
 
@@ -93,10 +96,7 @@ def merge(
 ) -> None:
     """Join maps, by known transforms or by the places that they share."""
     from dpm2_core.network.pretrained import weights_id
-    from dpm2_core.slam.build import make_loops
-    from dpm2_core.slam.graph.pose_graph import PoseGraph
-    from dpm2_core.slam.mapping.merge import align as aligned
-    from dpm2_core.slam.mapping.merge import loops_by, merge_maps, off_by_satellites, optimized, tie_of
+    from dpm2_core.slam.mapping.merge import merge_maps, off_by_satellites, tie_of
     from dpm2_core.slam.settings import Config
 
     given = [parse_transform(text) for text in transform or ()]
@@ -112,19 +112,38 @@ def merge(
             described.add(weights_id(chosen.neural.weights))
         if len(described) > 1:
             raise UsageError(f"merge: descriptors of several weights: {', '.join(sorted(described))}")
-        first, *others = maps
-        for number, other in enumerate(others):
-            if align:
-                T, loops = aligned(first, other, loops_by(make_loops(chosen)))
-                first = optimized(merge_maps(first, other, T, loops), PoseGraph(chosen.pose_graph))
-                Console(stderr=True).print(f"{paths[number + 1]}: {len(loops)} loops to what came before")
-            else:
-                if (off := off_by_satellites(first, other, given[number])) > _OFF:
-                    doubt = f"{off:.0f} m from where the fixes of both maps have it: is its --transform right?"
-                    Console(stderr=True).print(f"{paths[number + 1]}: {doubt}", highlight=False, soft_wrap=True)
-                first = merge_maps(first, other, given[number], tie_of(first, other, given[number]))
+        named = list(zip(paths, maps, strict=True))
+        first = _joined_by_places(named, chosen) if align else maps[0]
+        for (path, other), T in zip(named[1:], given, strict=False):
+            if (off := off_by_satellites(first, other, T)) > _OFF:
+                doubt = f"{off:.0f} m from where the fixes of both maps have it: is its --transform right?"
+                Console(stderr=True).print(f"{path}: {doubt}", highlight=False, soft_wrap=True)
+            first = merge_maps(first, other, T, tie_of(first, other, T))
         save_as(first, out)
     Console(stderr=True).print(f"{out}: {len(first)} keyframes", highlight=False, soft_wrap=True)
+
+
+def _joined_by_places(maps: list[tuple[Path, MapData]], settings: SlamSettings) -> MapData:
+    """The first map with the others, in the order in which they share places with what is joined already.
+
+    Raises:
+        Dpm2Error: one shares none.
+    """
+    from dpm2_core.slam.build import make_loops
+    from dpm2_core.slam.graph.pose_graph import PoseGraph
+    from dpm2_core.slam.mapping.merge import align, loops_by, merge_maps, optimized
+
+    (_, first), *waiting = maps
+    while waiting:
+        tried = (align(first, other, loops_by(make_loops(settings))) for _, other in waiting)
+        number, found = next(((i, fit) for i, fit in enumerate(tried) if fit is not None), (0, None))
+        if found is None:
+            names = ", ".join(str(path) for path, _ in waiting)
+            raise Dpm2Error(f"{names}: nothing of the other maps was found there; --transform says where they are")
+        (path, other), (T, loops) = waiting.pop(number), found
+        first = optimized(merge_maps(first, other, T, loops), PoseGraph(settings.pose_graph))
+        Console(stderr=True).print(f"{path}: {len(loops)} loops to what came before", highlight=False, soft_wrap=True)
+    return first
 
 
 @app.command()

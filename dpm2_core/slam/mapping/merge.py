@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from dpm2_core.errors import Dpm2Error
 from dpm2_core.estimates import Edge, Registration
 from dpm2_core.frame import Array, Georeference, Points
 from dpm2_core.geometry import se3
@@ -75,15 +74,11 @@ def off_by_satellites(a: MapData, b: MapData, T_a_b: Array) -> float:
     return float(np.median(np.linalg.norm(away[:, :2, 3], axis=1)))
 
 
-def align(a: MapData, b: MapData, find_loops: FindLoops) -> tuple[Array, list[Edge]]:
-    """T_a_b (4, 4) by the loops between two maps, and these.
-
-    Raises:
-        Dpm2Error: none was found.
-    """
+def align(a: MapData, b: MapData, find_loops: FindLoops) -> tuple[Array, list[Edge]] | None:
+    """T_a_b (4, 4) by the loops between two maps, and these; None without any."""
     loops = find_loops(a, b)
     if not loops:
-        raise Dpm2Error("no place of one map was found in the other; give --transform if their frames are known")
+        return None
     guesses = [a.poses[e.from_node] @ e.T_from_to @ se3.inverse(b.poses[e.to_node]) for e in loops]
     # The one that the others are nearest to: a start for the optimization, which weighs them all.
     apart = [np.median([np.linalg.norm((T - other)[:3, 3]) for other in guesses]) for T in guesses]
