@@ -76,7 +76,7 @@ class FusedScanRegistration:
         points = None if self._always else self._geometric.located(scan, prediction)
         if points is not None:
             doubted = self._geometric.doubted(scan, prediction, points)
-            if _sure(doubted, prediction):
+            if _sure(doubted, prediction) and not prediction.strays(doubted):
                 return doubted
         # Not beside the doubt: with it, everything agrees with them.
         return self._geometric.doubted(scan, prediction, self._with_network(scan, prediction, points))
@@ -169,7 +169,7 @@ def _sure(points: Registration, prediction: Prediction) -> bool:
     Of a scan that has moved much finds nothing in a young map of few beams. Both the network and the likelihood of the
     points then prefer the place where the map was made, as what the beams meet looks the same from there.
     """
-    fits = prediction.confirmed(points) or prediction.expects(points.T_target_source)
+    fits = prediction.convinced(points) or prediction.expects(points.T_target_source)
     return points.ok and fits and points.worst_sigma <= _SURE_SIGMA
 
 

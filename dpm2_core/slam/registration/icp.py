@@ -215,7 +215,7 @@ class GeometricScanRegistration:
         found = [self._registration.register(scan.source, self._local_map, T, p.widen, p.information) for T in starts]
         if len(found) > 1:
             return self._registration.likeliest(scan.source, self._local_map, found)
-        if p.known and not p.confirmed(found[0]) and len(scan.source):
+        if p.known and len(scan.source) and (not p.convinced(found[0]) or p.strays(found[0])):
             return self._jolted(scan.source, p, found[0])
         return found[0]
 
@@ -227,7 +227,7 @@ class GeometricScanRegistration:
         T_steered = self._steered(source, prediction.starts[0], _JOLTS)
         if T_steered is prediction.starts[0]:
             return result
-        other = self._registration.register(source, self._local_map, T_steered, prediction.widen)
+        other = self._registration.register(source, self._local_map, T_steered, prediction.widen, prediction.information)
         return other if fits_better(other, result) else result
 
     def doubted(self, scan: Scan, prediction: Prediction, result: Registration) -> Registration:

@@ -94,12 +94,14 @@ class Prediction:
         """Whether a result of points fits well enough not to be doubted; see `convincing`."""
         return points.ok and points.confidence >= self.convincing
 
-    def confirmed(self, points: Registration) -> bool:
-        """Whether they are convincing where the motion leads, if it leads anywhere. Beside it, as after a jolt, nearly
-        all must fit, or they may be at the wrong walls: after a turn of 10 degrees from scan to scan 77 % of them did,
-        2.6 degrees off."""
-        led = not self.known or near(self.starts[0], points.T_target_source)
-        return self.convinced(points) and (led or points.confidence >= _NEARLY_ALL)
+    def strays(self, points: Registration) -> bool:
+        """Whether a result of points lies beside where the motion leads, and not nearly all of them fit.
+
+        After a jolt they may be at the wrong walls: after a turn of 10 degrees from scan to scan 77 % fitted, 2.6
+        degrees off.
+        """
+        beside = self.known and not near(self.starts[0], points.T_target_source)
+        return beside and points.confidence < _NEARLY_ALL
 
 
 class ScanRegistration(Protocol):
