@@ -109,6 +109,9 @@ class FusedScanRegistration:
             if not prediction.known and points.worst_sigma > _SURE_SIGMA and self._seen(scan):
                 return self._led(scan, neural)  # where points fit anywhere, they fit best where nothing has moved
             return _outvoting(points, neural, prediction)
+        if prediction.strays(points):  # the motion that held them has changed
+            led = self._geometric.located(scan, Prediction([neural.T_target_source], 1.0, _LED))
+            points = led if led.ok and agree(led, neural) else points
         if not self._always and _sure(points, prediction):
             return points  # all that they needed was the start
         return self._fused(scan, points, neural, prediction.information)
