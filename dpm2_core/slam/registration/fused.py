@@ -37,7 +37,8 @@ class FusedScanRegistration:
     If both agree (see `agree`), they are fused by their information: ICP dominates in structured scenes, the network
     along degenerate directions such as a tunnel. If they disagree, ICP starts from the network's pose as well, and the
     more likely of its results is kept, unless the points are just where the motion leads: among what repeats, such as
-    doors and parked cars, a place beside may fit better. Where little is known of the motion, it starts there at once:
+    doors and parked cars, a place beside may fit better. Points that have strayed from where the motion leads are
+    registered anew from a network's pose that they agree with. Where little is known of the motion, it starts there at once:
     a direction that seems open from afar may be closed at the right place. If ICP fails, it is tried again from the
     network's pose; if it fails there too, or converges elsewhere, the network's pose is returned, less sure than it
     claims. `reason` says which of the two disagreed, and why.
@@ -82,7 +83,7 @@ class FusedScanRegistration:
         return self._geometric.doubted(scan, prediction, self._with_network(scan, prediction, points))
 
     def _with_network(self, scan: Scan, prediction: Prediction, points: Registration | None) -> Registration:
-        """The network's pose, and that of the points, if they were registered."""
+        """What the network says as well, of points that were registered or, where it is always asked, are not yet."""
         neural = self._neural.register(scan, prediction) if len(self._neural) else None
         if neural is not None and neural.ok and not prediction.possible(neural.T_target_source):
             neural = replace(neural, ok=False, reason="found where no vehicle can have come")
@@ -95,6 +96,10 @@ class FusedScanRegistration:
             return points.because(f"neural: {neural.reason}")
         if not points.ok:
             return self._led(scan, neural)
+        return self._weighed(scan, prediction, points, neural)
+
+    def _weighed(self, scan: Scan, prediction: Prediction, points: Registration, neural: Registration) -> Registration:
+        """What of two results counts."""
         if prediction.expects(points.T_target_source) and not agree(points, neural, CHI2_95):
             return _outvoting(points, neural, prediction)
         agreed, starts = agree(points, neural), [points.T_target_source, neural.T_target_source]
