@@ -80,7 +80,7 @@ class GeometricRegistration:
     def __init__(self, settings: GeometricSettings) -> None:
         self._settings = settings
         self.min_points = settings.min_points
-        self.min_inliers, self.min_inliers_expected = settings.min_inliers, settings.min_inliers_expected
+        self.min_inliers_expected = settings.min_inliers_expected
 
     def register(
         self, source: Array, target: LocalMap, T_guess: Array, widen: float = 1.0, prior: Array | None = None
@@ -227,11 +227,8 @@ class GeometricScanRegistration:
         T_steered = self._steered(source, prediction.starts[0], _JOLTS)
         if T_steered is prediction.starts[0]:
             return result
-        other = self._registration.register(
-            source, self._local_map, T_steered, prediction.widen, prediction.information
-        )
-        fits = other.confidence >= self._registration.min_inliers  # fewer suffice only where the motion leads
-        return other if fits and fits_better(other, result) else result
+        other = self._registration.register(source, self._local_map, T_steered, prediction.widen)
+        return other if fits_better(other, result) else result
 
     def doubted(self, scan: Scan, prediction: Prediction, result: Registration) -> Registration:
         """A result whose covariance holds the way to a second pose, where many of the points move otherwise.
