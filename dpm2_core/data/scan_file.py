@@ -39,7 +39,7 @@ def read_scan(path: Path) -> tuple[Points, str | None]:
 def _are_none(points: Points) -> bool:
     """Whether most of (N, 4) are no places that a LiDAR measures, as integers of another layout read as floats."""
     with np.errstate(over="ignore", invalid="ignore"):
-        distance = np.abs(points[:, :3]).max(1, initial=0)
+        distance = np.abs(points[::16, :3]).max(1, initial=0)  # all of 120,000 would take 4 ms of each scan
     return len(points) > 0 and bool(np.mean((distance > 0) & ~((distance > 1e-3) & (distance < 1e5))) > 0.5)
 
 

@@ -27,9 +27,8 @@ from dpm2_core.slam.store.rows import Session
 MapMode = Literal["create", "resume", "extend", "localize"]
 """What to do with a map file: make it, go on with the drive that was cut off, add another drive, or only read it."""
 _COMPARED = 500  # points of a cloud
-_APART = (
-    0.75  # m, of three in four of them at most: another frame's are from 1.1 m on, its own at 0.01, or as de-skewed
-)
+_APART = 0.75
+"""m, of three in four of them: its own frame is at 0.01, or as far as it was de-skewed; another one from 1.1 on."""
 _SAME_FRAME = np.diag([1e-4] * 3 + [1e-3] * 3) ** 2  # rad, m: the rounding of what is the same frame
 
 

@@ -195,26 +195,26 @@ class Mapper:
         keyframe = self.described(keyframe if follows else replace(keyframe, edge=None))
         keyframe = replace(keyframe, id=keyframe.id + offset, cloud=NO_POINTS, thumbnail=None)
         packed = pack_cloud(cloud)
-        odometry = self._add_node(keyframe, robot.last if follows else None)
+        to_before = self._add_node(keyframe, robot.last if follows else None)
         self._clouds.append(packed)
         self.keyframes.append(keyframe)
         robot.last, robot.ids, robot.offset = node, keyframe.id + 1, offset
         before = len(self.loops)
         try:
             self._close_loops(keyframe.fix is not None and self._graph.add_fix(node, keyframe.fix))
-            self._lend(node, odometry, self.loops[before:])
+            self._lend(node, to_before, self.loops[before:])
             if not follows:  # from where it was before the way is not known: those clouds are no witnesses of this one
                 self._mark_moving(robot.window.finish(self.poses))
                 robot.window = MovingWindow(self._settings.moving)
             self._mark_moving(robot.window.add(node, cloud, self.poses))
         finally:
-            self._store(node, thumbnail, [*odometry, *self.loops[before:]])
+            self._store(node, thumbnail, [*to_before, *self.loops[before:]])
         return self.loops[before:]
 
-    def _lend(self, node: int, odometry: list[Edge], loops: list[Edge]) -> None:
+    def _lend(self, node: int, to_before: list[Edge], loops: list[Edge]) -> None:
         """Give up the cloud of a keyframe that came back to an older one for that one's."""
-        same = node == self.session_start and self._start is not None and self._start.node is not None
-        again = odometry if same else []  # the frame with which the session before ended
+        odometry = [edge for edge in to_before if edge.kind == "odometry"]
+        again = odometry if node == self.session_start else []  # the frame with which the session before ended
         loan = lender(node, [*again, *self._kept(loops)], self._clouds.loan, self._settings.redundancy)
         if loan is not None:
             self._clouds.borrow(node, loan)
@@ -298,9 +298,12 @@ class Mapper:
         """The first node of a session, at T (4, 4), and the edge that ties it to the map."""
         other = self._nearest(T) if start.node is None else start.node
         result = Registration(se3.inverse(self._graph.pose(other)) @ T, start.covariance)
-        edge = Edge("loop" if start.node is None else "odometry", other, node, result)
-        self._graph.add_node(T, edge if edge.kind == "odometry" else None)
-        return edge if edge.kind == "odometry" else self._tied(edge)
+        if start.node is None:
+            self._graph.add_node(T)
+            return self._tied(Edge("loop", other, node, result))
+        edge = Edge("odometry", other, node, result)
+        self._graph.add_node(T, edge)
+        return edge
 
     def _nearest(self, T_map_kf: Array) -> int:
         """The node of a known place that is nearest."""

@@ -102,9 +102,10 @@ class FusedScanRegistration:
         """What of two results counts."""
         if prediction.expects(points.T_target_source) and not agree(points, neural, CHI2_95):
             return _outvoting(points, neural, prediction)
-        agreed, starts = agree(points, neural), [points.T_target_source, neural.T_target_source]
+        agreed, together = agree(points, neural), near(points.T_target_source, neural.T_target_source)
         # What leaves a direction open at the wrong place, so that both agree, may close it at the right one.
-        if prediction.known and not (agreed and (points.worst_sigma <= _SURE_SIGMA or near(*starts))):
+        if prediction.known and not (agreed and (points.worst_sigma <= _SURE_SIGMA or together)):
+            starts = [points.T_target_source, neural.T_target_source]
             likelier = self._geometric.located(scan, replace(prediction, starts=starts))
             decides = not agreed or likelier.worst_sigma <= _SURE_SIGMA
             if likelier.ok and decides and agree(likelier, neural):
@@ -115,7 +116,7 @@ class FusedScanRegistration:
                 return self._led(scan, neural)  # where points fit anywhere, they fit best where nothing has moved
             return _outvoting(points, neural, prediction)
         if prediction.strays(points):  # the motion that held them has changed
-            led = self._geometric.located(scan, Prediction([neural.T_target_source], 1.0, _LED))
+            led = self._points_from(scan, neural)
             points = led if led.ok and agree(led, neural) else points
         if not self._always and _sure(points, prediction):
             return points  # all that they needed was the start
@@ -123,13 +124,16 @@ class FusedScanRegistration:
 
     def _led(self, scan: Scan, neural: Registration) -> Registration:
         """The points from the pose of the network, when the motion so far did not lead them to a result."""
-        points = self._geometric.located(scan, Prediction([neural.T_target_source], 1.0, _LED))
+        points = self._points_from(scan, neural)
         if not points.ok:
             covariance = neural.covariance + _UNCONFIRMED
             return replace(neural, covariance=covariance, reason=f"not refined: {points.reason}")
         if agree(points, neural):
             return self._fused(scan, points, neural, None)
         return _instead(neural, points)
+
+    def _points_from(self, scan: Scan, neural: Registration) -> Registration:
+        return self._geometric.located(scan, Prediction([neural.T_target_source], 1.0, _LED))
 
     def _fused(self, scan: Scan, points: Registration, neural: Registration, prior: Array | None) -> Registration:
         return _mean(points, neural, prior, self._seen(scan))

@@ -266,7 +266,7 @@ class GeometricScanRegistration:
         few = _few(source)
         places: list[Array] = []
         for i in np.argsort(-self._local_map.fit(few, poses), kind="stable"):
-            if all(_apart(poses[i], T) for T in places):
+            if not any(near(poses[i], T, _NEAR) for T in places):
                 places.append(poses[i])
             if len(places) == _PLACES:
                 break
@@ -274,14 +274,15 @@ class GeometricScanRegistration:
         found = [self._registration.register(part, self._local_map, T).T_target_source for T in places]
         fit = [self._registration.likelihood(part, self._local_map, T) for T in found]
         order = np.argsort(fit)[::-1]
-        rival = next((found[i] for i in order if _apart(found[i], found[order[0]])), None)
+        rival = next((found[i] for i in order if not near(found[i], found[order[0]], _NEAR)), None)
         result, likelihood = self._fitted(source, found[order[0]])
         if result.confidence < self._registration.min_inliers_expected:
             return replace(result, ok=False)
         if rival is not None:
             other, its_likelihood = self._fitted(source, rival)
             meters, _ = se3.magnitude(se3.inverse(result.T_target_source) @ other.T_target_source)
-            if its_likelihood > likelihood - DISTINCT and _apart(other.T_target_source, result.T_target_source):
+            one = near(other.T_target_source, result.T_target_source, _NEAR)
+            if its_likelihood > likelihood - DISTINCT and not one:
                 return replace(result, ok=False, reason=f"a place {meters:.1f} m away fits as well")
         return replace(result, ok=True, reason="")
 
@@ -325,8 +326,3 @@ def _with_spread(chosen: Registration, likely: Sequence[Registration]) -> Regist
     T = se3.inverse(chosen.T_target_source)
     way = max((se3.log(T @ other.T_target_source) for other in likely), key=lambda xi: float(np.linalg.norm(xi[3:])))
     return chosen.doubted(way)
-
-
-def _apart(T: Array, T_other: Array) -> bool:
-    meters, degrees = se3.magnitude(se3.inverse(T) @ T_other)
-    return meters > _NEAR[0] or degrees > _NEAR[1]

@@ -35,10 +35,11 @@ def agree(a: Registration, b: Registration, most: float = CHI2) -> bool:
     return bool(xi @ np.linalg.solve(a.of_scene + b.of_scene + MAP_NOISE, xi) <= most)
 
 
-def near(T_predicted: Array, T: Array) -> bool:
-    """Whether a pose (4, 4) is where one was predicted, as far as a vehicle's motion changes from scan to scan."""
-    meters, degrees = se3.magnitude(se3.inverse(T_predicted) @ T)
-    return meters <= _EXPECTED[0] and degrees <= _EXPECTED[1]
+def near(T: Array, T_other: Array, most: tuple[float, float] = _EXPECTED) -> bool:
+    """Whether two poses (4, 4) are at most so far apart, m and degrees: by default, as a vehicle's motion changes from
+    scan to scan."""
+    meters, degrees = se3.magnitude(se3.inverse(T) @ T_other)
+    return meters <= most[0] and degrees <= most[1]
 
 
 def fits_better(result: Registration, other: Registration) -> bool:
