@@ -9,6 +9,7 @@ number is unknown, the way along the open direction; it is the one at which the 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -24,10 +25,11 @@ from dpm2_core.geometry.contrast import local_contrast
 
 
 class VisualSettings(Settings):
-    """How far along, by the image."""
+    """How far along, by the image or by the intensities of the LiDAR."""
 
     enabled: bool = True
-    """Ask a camera where scans leave a direction open: the first one; a second one only where that has no image."""
+    """Ask a camera where scans leave a direction open: the first one; a second one only where that has no image. Where
+    none tells, ask the intensities of the LiDAR."""
     sigma: float = Field(0.08, gt=0)
     """Standard deviation of the position in its worst direction above which it counts as open, m."""
     reach: float = Field(20.0, gt=0)
@@ -99,7 +101,7 @@ class Reference:
 
 @dataclass(frozen=True)
 class Peak:
-    """A way along the open direction at which two images agree: m, its standard deviation, m, and the correlation."""
+    """A way along the open direction where two scans look alike: m, its standard deviation, m, and the correlation."""
 
     offset: float
     sigma: float
@@ -145,12 +147,21 @@ def along(
     found = _search(s, known, image, T_ref_target @ result.T_target_source, result.open_direction, reach)
     if isinstance(found, str):
         return result.because(found)
+    return moved_along(result, replace(found, sigma=float(np.hypot(found.sigma, image.sigma))), T_ref_target, "visual")
+
+
+def moved_along(result: Registration, found: Peak, T_ref_target: Array, method: str) -> Registration:
+    """A registration, moved along its open direction by what was found there, as far as that is surer.
+
+    Args:
+        T_ref_target: (4, 4) from the target to the scan by which it was found. method: what the result is of.
+    """
     b = np.concatenate([np.zeros(3), result.open_direction])
     prior = result.of_scene  # images say as little of calibration errors as points, and those grow with the new motion
-    gain = prior @ b / (b @ prior @ b + found.sigma**2 + image.sigma**2)
+    gain = prior @ b / (b @ prior @ b + found.sigma**2)
     T = se3.orthonormalized(result.T_target_source @ se3.exp(gain * found.offset))
     covariance = prior - np.outer(gain, b @ prior)
-    moved = replace(result, T_target_source=T, covariance=(covariance + covariance.T) / 2, method="visual")
+    moved = replace(result, T_target_source=T, covariance=(covariance + covariance.T) / 2, method=method)
     return with_calibration(moved, T_ref_target @ T)
 
 
@@ -184,7 +195,7 @@ def peaks(
     found = []
     for middle in offsets[candidates]:
         fine = _correlated(known, image, T_ref_lidar, axis, middle + around, 1)
-        found.append(_peak(middle + around, fine, len(known.points)))
+        found.append(peak(middle + around, fine, len(known.points) / _CORRELATED))
     return sorted(found, key=lambda peak: -peak.correlation)
 
 
@@ -249,8 +260,8 @@ def _correlations(
     return np.where(count >= _LEAST, (x * y).sum(1) / np.maximum(spread, 1e-6), 0.0)
 
 
-def _peak(offsets: Array, correlation: NDArray[np.float32], points: int) -> Peak:
-    """Maximum of a parabola through the top.
+def peak(offsets: NDArray[np.floating[Any]], correlation: NDArray[np.floating[Any]], independent: float) -> Peak:
+    """Maximum of a parabola through the top of the correlation (S,) at offsets (S,), m, of `independent` values.
 
     The information of a shift in y = x(shift) + noise is n (dx/dshift)^2 / var(noise); both follow from the correlation
     r and its second derivative: -n r'' r / (1 - r^2).
@@ -260,5 +271,5 @@ def _peak(offsets: Array, correlation: NDArray[np.float32], points: int) -> Peak
     step = offsets[1] - offsets[0]
     bend = max((2 * top - before - after) / step**2, 1e-3)
     offset = offsets[i] + float(np.clip((after - before) / (2 * bend * step), -step, step))
-    information = points / _CORRELATED * bend * max(top, 1e-6) / max(1 - top * top, 1e-3)
+    information = independent * bend * max(top, 1e-6) / max(1 - top * top, 1e-3)
     return Peak(offset, float(max(0.01, information**-0.5)), float(correlation.max()))

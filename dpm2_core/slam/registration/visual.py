@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The image where the geometry is silent, from scan to scan: see `texture`. In town no image is ever touched.
+"""Image or intensity where the geometry is silent, from scan to scan. In town neither is ever touched.
 
 Both images are of one camera. One is enough for one number, so that of two cameras the second is asked only where the
-earlier scan has no image of the first.
+earlier scan has no image of the first, and the intensities of the LiDAR itself where no image has told it.
 """
 
 from __future__ import annotations
@@ -12,10 +12,11 @@ from dataclasses import replace
 import numpy as np
 
 from dpm2_core.estimates import Registration
-from dpm2_core.frame import Array, Frame, Image
+from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.deskew import placed
 from dpm2_core.slam.preprocess import Scan
+from dpm2_core.slam.registration.intensity import IntensitySearch
 from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration
 from dpm2_core.slam.registration.texture import Reference, VisualSettings, along, reference, textured
 
@@ -25,13 +26,15 @@ _ANY_SPEED = 15.0  # m/s, standard deviation while it is not known
 
 
 class VisualScanRegistration:
-    """Any registration, and the image along the direction that it leaves open."""
+    """Any registration, and image or intensity along the direction that it leaves open."""
 
     def __init__(self, settings: VisualSettings, registration: ScanRegistration) -> None:
         self._settings = settings
         self._registration = registration
         self._last: tuple[Scan, Array] | None = None  # a scan with images and where it was taken
         self._reference: Reference | None = None  # made of it when first needed
+        self._intensity = IntensitySearch()
+        self._tied = False  # whether the last scan left no direction open
 
     uses_images = True
 
@@ -41,6 +44,7 @@ class VisualScanRegistration:
     def clear(self) -> None:
         self._registration.clear()
         self._last = self._reference = None
+        self._intensity.clear()
 
     def fresh(self) -> VisualScanRegistration:
         return VisualScanRegistration(self._settings, self._registration.fresh())
@@ -53,15 +57,16 @@ class VisualScanRegistration:
 
     def register(self, scan: Scan, prediction: Prediction) -> Registration:
         result = self._registration.register(scan, prediction)
-        if not result.ok or self._last is None or result.worst_sigma <= self._settings.sigma:
-            return result
-        earlier = self._last[0].images[0].camera.name
-        image = next((image for image in scan.images if image.camera.name == earlier), None)
-        return result if image is None else self._along(result, image, scan.twist, prediction.information)
+        for more in (self._by_image, self._by_intensity):
+            if result.ok and result.worst_sigma > self._settings.sigma:
+                result = more(scan, result, prediction.information)
+        self._tied = result.ok and result.worst_sigma <= self._settings.sigma
+        return result
 
     def update(self, scan: Scan, T_odom_lidar: Array) -> bool:
         if scan.images and self._wants(T_odom_lidar):
             self._last, self._reference = (scan, T_odom_lidar), None
+        self._intensity.update(scan.points, T_odom_lidar, self._tied)
         return self._registration.update(scan, T_odom_lidar)
 
     def _wants(self, T_odom_lidar: Array) -> bool:
@@ -69,25 +74,37 @@ class VisualScanRegistration:
             return True
         return bool(np.linalg.norm(self._last[1][:3, 3] - T_odom_lidar[:3, 3]) >= self._settings.baseline)
 
-    def _along(self, result: Registration, image: Image, twist: Array, information: Array | None) -> Registration:
+    def _by_image(self, scan: Scan, result: Registration, information: Array | None) -> Registration:
         """The result moved along its open direction to where the images agree; unchanged if they do not.
 
-        `twist` (6,) is the motion of the scan, by which the camera is elsewhere at an image that was taken later than
-        that of the earlier scan, relative to the scans.
+        The camera is elsewhere at an image that was taken later, relative to the scans, than that of the earlier scan.
         """
-        s = self._settings
-        reach, of_speed = s.reach, _ANY_SPEED
-        if information is not None:
-            b = np.concatenate([np.zeros(3), result.open_direction])
-            sigma = float(np.sqrt(b @ np.linalg.solve(information, b)))
-            reach, of_speed = min(reach, max(_LEAST_REACH, 4 * sigma)), sigma / _PERIOD
-        assert self._last is not None
-        scan, T_odom_ref = self._last
+        if self._last is None:
+            return result
+        s, (earlier, T_odom_ref) = self._settings, self._last
+        before = earlier.images[0]
+        image = next((image for image in scan.images if image.camera.name == before.camera.name), None)
+        if image is None:
+            return result
         if self._reference is None:
             axis = T_odom_ref[:3, :3].T @ result.T_target_source[:3, :3] @ result.open_direction
-            self._reference = reference(scan.points, textured(scan.images[0], s.width), s.points, axis)
+            self._reference = reference(earlier.points, textured(before, s.width), s.points, axis)
         # Only the difference: the twist itself follows from the images, so that moving the camera by its whole offset
         # feeds an error back, and it grows from half a period on. What is left is the offset times the change of speed.
-        late = image.time_offset - scan.images[0].time_offset
-        image_now = replace(textured(placed(image, late, twist), s.width), sigma=of_speed * abs(late))
+        late = image.time_offset - before.time_offset
+        reach, of_speed = self._reach(result, information)
+        image_now = replace(textured(placed(image, late, scan.twist), s.width), sigma=of_speed * abs(late))
         return along(s, result, self._reference, image_now, se3.inverse(T_odom_ref), reach)
+
+    def _by_intensity(self, scan: Scan, result: Registration, information: Array | None) -> Registration:
+        """As `_by_image`, by the intensities of the LiDAR."""
+        reach, _ = self._reach(result, information)
+        return self._intensity.along(result, scan.points, reach)
+
+    def _reach(self, result: Registration, information: Array | None) -> tuple[float, float]:
+        """How far to look along the open direction, m, and the standard deviation of the speed along it, m/s."""
+        if information is None:
+            return self._settings.reach, _ANY_SPEED
+        b = np.concatenate([np.zeros(3), result.open_direction])
+        sigma = float(np.sqrt(b @ np.linalg.solve(information, b)))
+        return min(self._settings.reach, max(_LEAST_REACH, 4 * sigma)), sigma / _PERIOD
