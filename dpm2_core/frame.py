@@ -186,6 +186,7 @@ class Frame:
         imu: samples since those of the frame before, up to the last point; None where there is no IMU.
         fix: the last one before the stamp that no frame before had; None where there is none.
         dropped: scans since the frame before that came, but were left out for want of time.
+        stepped: whether less time may have passed since the frame before than the stamps say: a clock was set.
     """
 
     stamp: int
@@ -198,6 +199,7 @@ class Frame:
     imu: Inertial | None = None
     fix: Fix | None = None
     dropped: int = 0
+    stepped: bool = False
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 4 or self.points.dtype != np.float32:

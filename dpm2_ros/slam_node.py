@@ -186,7 +186,7 @@ class SlamNode(ManagedNode):
         x, y, z = self._base.T_start_lidar[2, :3].tolist()
         self._frames.up = (x, y, z) if self._base.name else None  # what is up for the base is to be up in odom
         frame = self._frames.frame(bundle.stamp, bundle.cloud, self._index, bundle.beside)
-        tracked = self._tracked(replace(frame, dropped=bundle.dropped))
+        tracked = self._tracked(replace(frame, dropped=bundle.dropped, stepped=bundle.stepped))
         if tracked.imu and tracked.registration.method == "first":  # of the level; diagnostics may miss one cloud
             self.get_logger().warning(f"{self.calibration.imu_topic}: {tracked.imu}")
         self._index += 1

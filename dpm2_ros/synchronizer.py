@@ -50,6 +50,9 @@ class Bundle:
     cloud: Any
     arrival: float
     restarted: bool
+    """Whether time has gone back before it."""
+    stepped: bool = False
+    """Whether it has gone on by more than has passed."""
     beside: dict[str, tuple[int, Any]] = field(default_factory=dict)
     """Topic of each other sensor that has one to stamp (ns) and message."""
     dropped: int = 0
@@ -208,6 +211,7 @@ class Synchronizer:
         if bundle is None or self._newest is None:
             return
         bundle.restarted = true and bundle.stamp < self._newest
+        bundle.stepped = true and not bundle.restarted
         self.counts[
             StampCheck.RESTARTED if bundle.restarted else StampCheck.ACCEPTED if true else StampCheck.STRAY
         ] += 1
@@ -222,5 +226,6 @@ class Synchronizer:
         while len(self._queue) > self._room:
             oldest = self._queue.popleft()
             self._queue[0].restarted |= oldest.restarted  # not lost with the cloud that announced it
+            self._queue[0].stepped |= oldest.stepped
             self._queue[0].dropped += oldest.dropped + 1
             self.dropped += 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
@@ -80,18 +81,20 @@ class BagSource:
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
         """Frames start..stop-1 as recorded, also where their stamps repeat or go back; `notes` says so."""
-        before, count, known = None, 0, self._calibration
+        before, recorded_before, count, known = None, 0, 0, self._calibration
         found: Counter[str] = Counter()  # frames that have something of a topic
         self._imu.clear()
         self._gnss.clear()
         self._unsound.clear()
-        for index, (stamp, cloud, beside) in enumerate(islice(self._pairs(), stop)):
+        for index, (stamp, recorded, cloud, beside) in enumerate(islice(self._pairs(), stop)):
             if index < start:
                 continue
             if before is not None and stamp <= before:
                 self._note_once("time stamps do not increase", f"at frame {index}: {(stamp - before) * 1e-9:+.3f} s")
             frame = self._frames.frame(stamp, cloud, index, beside)
-            before, count = stamp, count + 1
+            if before is not None and (stamp - before) - (recorded - recorded_before) > JUMP:
+                frame = replace(frame, stepped=True)
+            before, recorded_before, count = stamp, recorded, count + 1
             found.update(image.camera.name for image in frame.images)
             found.update(beside.keys() & {known.second_topic})
             found[known.gnss_topic] += frame.fix is not None and stamp - frame.fix.stamp < JUMP
@@ -255,9 +258,9 @@ class BagSource:
         message = self._bag.first(topic) if wanted else None
         return None if message is None else checked_correction(float(message.data), f"{self.path}: {topic}")
 
-    def _pairs(self) -> Iterator[tuple[int, bytes, dict[str, tuple[int, bytes]]]]:
-        """(stamp, cloud, what goes with it: topic to stamp and message), serialized; the IMU's samples before it are in
-        the buffer then."""
+    def _pairs(self) -> Iterator[tuple[int, int, bytes, dict[str, tuple[int, bytes]]]]:
+        """(stamp, time of recording, cloud, what goes with it: topic to stamp and message), serialized; the IMU's
+        samples before it are in the buffer then."""
         known, offset = self._calibration, round(self._settings.image_time_offset * 1e9)
         others = dict.fromkeys((camera.topic for camera in known.cameras), offset)
         more = ((known.second_topic, 0), (self.imu_topic, -_SWEEP))
@@ -270,7 +273,7 @@ class BagSource:
             stamp = serialized_stamp(data, time)
             if topic == self.points_topic:
                 found = ((other, sensor.nearest(stamp)) for other, sensor in beside.items())
-                yield stamp, data, {other: message for other, message in found if message is not None}
+                yield stamp, time, data, {other: message for other, message in found if message is not None}
                 for sensor in beside.values():
                     sensor.forget(stamp)
             elif topic in (self.imu_topic, gnss):

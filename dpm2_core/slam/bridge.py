@@ -61,7 +61,9 @@ class Bridge:
     Attributes:
         registration: the map before the pause.
         twist: (6,) [rad/s, m/s] the motion there; None where it was not known.
-        tries: scans of the stretch that were registered to the map before.
+        agreed: whether most scans of the stretch agree on where it is, and only a motion would confirm it.
+        tries: scans that were registered to the map before, without those after which it had `agreed`: a robot that
+            has halted shows no motion.
         held: whether they were held back on their way: the pause may have been as short as a period.
     """
 
@@ -72,17 +74,18 @@ class Bridge:
         self.registration = registration
         self.twist = twist
         self._of_velocity = of_velocity
-        self.tries = 0
-        self.held = False
+        self.tries, self.agreed = 0, False
+        self.held = self._stepped = False
         self._T = T
         self._limits = limits
         self._ties: list[_Tie] = []
 
-    def begin(self, seconds: float, T_other: Array | None = None) -> Array:
+    def begin(self, seconds: float, T_other: Array | None = None, stepped: bool = False) -> Array:
         """A new stretch, so long after the last pose before the pause: where it begins (4, 4); there, if another
-        odometry knows the way."""
+        odometry knows the way. `stepped`: so long by a clock that was set meanwhile."""
         self._seconds = seconds
-        self.held = False
+        self._stepped |= stepped
+        self.held = self._stepped
         self._ties.clear()
         self._after: Array | None = None
         self._T_other = T_other
@@ -110,7 +113,7 @@ class Bridge:
             scan: its pose in the stretch is T_stretch (4, 4), its motion `twist` (6,), None where that is unknown, and
                 `own` is how it was registered there.
         """
-        self.tries += 1
+        self.tries, self.agreed = self.tries + 1, False
         if self._after is None and twist is not None:
             self._after = twist
             self._ties = [tie for tie in self._ties if not self._impossible(self._began(tie))]
@@ -125,7 +128,11 @@ class Bridge:
         if problem:
             return replace(result, ok=False, reason=problem), False
         self._ties.append(_Tie(result, T_stretch))
-        return result, self._together(fits)
+        agreeing = self._agreeing()
+        certain = bool(agreeing) and (fits or _apart(agreeing) >= _TIES)
+        if agreeing and not certain:
+            self.tries, self.agreed = self.tries - 1, True
+        return result, certain
 
     def _beginnings(self) -> Array:
         """Where the stretch may begin (P, 4, 4), the most likely first."""
@@ -196,8 +203,8 @@ class Bridge:
                 return f"after a pause: {came:.0f} m on, but it needs {least:.0f} m to stop and start again"
         return ""
 
-    def _together(self, fits: bool) -> bool:
-        """Whether most results move as the stretch does; at a halt that says little, unless the scan `fits`."""
+    def _agreeing(self) -> list[float]:
+        """How far from the last result those are that move as the stretch does, m; empty unless most do."""
         last = self._ties[-1]
         ways = [se3.inverse(tie.T_stretch) @ last.T_stretch for tie in self._ties]
         agreeing = [
@@ -205,9 +212,7 @@ class Bridge:
             for tie, way in zip(self._ties, ways, strict=True)
             if agree(replace(tie.before, T_target_source=tie.before.T_target_source @ way), last.before)
         ]
-        if len(agreeing) < _TIES or 2 * len(agreeing) <= len(self._ties):
-            return False
-        return fits or _apart(agreeing) >= _TIES
+        return agreeing if len(agreeing) >= _TIES and 2 * len(agreeing) > len(self._ties) else []
 
 
 def _apart(distances: Sequence[float]) -> int:

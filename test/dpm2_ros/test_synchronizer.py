@@ -317,6 +317,21 @@ def test_a_jump_ahead_that_lasts_loses_nothing() -> None:
     assert feed(make(camera=False), *stamps) == [(stamp, False) for stamp in stamps]
 
 
+def test_a_jump_ahead_is_told_from_a_pause() -> None:
+    """By what has passed meanwhile; also where the cloud that jumped had to be dropped."""
+    for arrival, stepped in ((0.1, True), (5.0, False)):
+        synchronizer = make(camera=False)
+        out = []
+        for stamp, now in ((10_000, 0.0), (15_000, arrival), (15_100, arrival + 0.1)):
+            synchronizer.add_cloud(stamp * MS, stamp, now)
+            out += drain(synchronizer, now)
+        assert [bundle.stepped for bundle in out] == [False, stepped, False]
+    synchronizer = make(camera=False, depth=2)
+    for stamp in (10_000, 15_000, 15_100, 15_200):
+        synchronizer.add_cloud(stamp * MS, stamp, now=0.0)
+    assert [(b.cloud, b.stepped) for b in drain(synchronizer, 0.0)] == [(15_100, True), (15_200, False)]
+
+
 def test_a_pause_of_the_sensor_is_no_jump() -> None:
     synchronizer = make(camera=False)
     synchronizer.add_cloud(10_000 * MS, "a", now=0.0)

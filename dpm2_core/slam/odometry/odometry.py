@@ -100,7 +100,7 @@ class Odometry:
         scan = self._registration.prepare(frame, twist)
         clock.append(perf_counter())
         pauses = self._pauses(frame, dt) and not self._registration.rejection(scan)
-        T_predicted = self._begin_stretch(dt) if pauses else motion.predicted(twist, dt)
+        T_predicted = self._begin_stretch(dt, frame.stepped) if pauses else motion.predicted(twist, dt)
         match, dt = self._register(frame, scan, T_predicted, dt)
         self._clock.correct(dt)
         if match.scan is not scan:  # the IMU was of no use: nor is it on the way to the stamp
@@ -189,8 +189,9 @@ class Odometry:
         known = len(self._registration) > 0 and frame.problem is None
         return known and self._motion.seconds + dt > self._clock.pause(least)
 
-    def _begin_stretch(self, dt: float) -> Array:
-        """After a pause: the scan begins a map of its own, at the predicted pose (4, 4), which it returns."""
+    def _begin_stretch(self, dt: float, stepped: bool) -> Array:
+        """After a pause: the scan begins a map of its own, at the predicted pose (4, 4), which it returns; `stepped` if
+        the pause may be of the clock alone."""
         motion = self._motion
         if self._bridge is None:
             limits = Limits(self._settings.steadiness, self._settings.degraded_sigma)
@@ -199,7 +200,7 @@ class Odometry:
         self._registration, self._first = self._registration.fresh(), None
         step = motion.step
         T_other = None if step is None else motion.T_registered @ step.T
-        motion.begin(self._bridge.begin(self._clock.now - self._left, T_other))
+        motion.begin(self._bridge.begin(self._clock.now - self._left, T_other, stepped))
         return motion.T
 
     def _cross(self, bridge: Bridge, scan: Scan, own: Registration) -> Registration:
@@ -218,7 +219,7 @@ class Odometry:
             self._bridge, self._failures, self._breaks = None, 0, self._breaks + 1
             self._broken = (self._clock.stamp or 0) - round(self._sweep.middle * 1e9)
             return replace(own, reason=f"broken by a pause: {result.reason}")
-        self._failures += 1
+        self._failures += not bridge.agreed
         T = result.T_target_source if result.ok else motion.T
         return replace(result, T_target_source=T, ok=False, reason=result.reason or "after a pause: not confirmed yet")
 

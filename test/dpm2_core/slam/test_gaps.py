@@ -85,6 +85,39 @@ def test_a_gap_at_a_halt_does_no_harm(world: World) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("step", [1.5, 4.0])
+def test_a_clock_that_is_set_is_no_way(world: World, step: float) -> None:
+    """Scans every 0.1 s whose stamps say that there was a pause: the vehicle was 14 to 40 m away, a break later."""
+    seconds = [0.1 * i for i in range(24)]
+    frames, poses = scanned(world, along(world), seconds)
+    late = [replace(frame, stamp=frame.stamp + round(step * 1e9)) for frame in frames[10:]]
+    tracked = run([*frames[:10], replace(late[0], stepped=True), *late[1:]])
+    assert off(tracked, poses).max() < 0.1
+    assert [t.state for t in tracked[-8:]] == [State.TRACKING] * 8
+    assert tracked[-1].breaks == 0
+
+
+@pytest.mark.slow
+def test_a_halt_after_a_gap_stays_where_it_is_until_it_moves_on(world: World) -> None:
+    """8 m/s, 2 s without a scan, a halt that its scans agree on without confirming it: no break, which moved it 7 m."""
+    halt = 1.4 + 1.0  # s along the drive: braked
+    at = [*(0.1 * i for i in range(15)), *[halt] * 16, *(halt + 0.1 * i for i in range(1, 13))]
+    scans, poses = scanned(world, along(world), at)
+    stamps = np.array(with_gap(15, 2.0, 28))
+    rng = np.random.default_rng(0)
+    frames = []
+    for scan, stamp in zip(scans, stamps, strict=True):
+        points = scan.points[rng.random(len(scan.points)) < 0.8]
+        points[:, :3] += rng.normal(0, 0.015, (len(points), 3))
+        frames.append(Frame(round(stamp * 1e9), points))
+    tracked = run(frames)
+    assert off(tracked, poses).max() < 0.1
+    assert State.LOST not in [t.state for t in tracked]
+    assert [t.state for t in tracked[-4:]] == [State.TRACKING] * 4
+    assert tracked[-1].breaks == 0
+
+
+@pytest.mark.slow
 def test_what_cannot_be_confirmed_is_lost_then_a_break_whose_uncertainty_covers_the_error(world: World) -> None:
     """Ten seconds: braked to a halt meanwhile, in a part of the street that is not in the map."""
 
