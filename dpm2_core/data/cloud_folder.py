@@ -32,13 +32,15 @@ _DATE = re.compile(r"(?:.*\D)?(\d{4})\D?([01]\d)\D?([0-3]\d)\D([0-2]\d)\D?([0-5]
 _EPOCHS = ((10**8, 10**11, 10**9), (10**11, 10**14, 10**6), (10**14, 10**17, 10**3), (10**17, 10**20, 1))
 """From, to, ns: a number in a name that is a time since 1970 after 1973."""
 
+_USUALLY = 3  # numbers whose steps are more than so many times the least are no count: milliseconds of a clock
+
 
 class CloudFolder:
     """Scans in the order of the numbers in their names. See `Source`; neither images nor ground truth.
 
     Fields are those of PointCloud2: intensity, and the time of each point, under their usual names. The stamp is the
     last number in the name where all of them are times since 1970 (s, ms, us or ns), or the last two, seconds and their
-    fraction, or a date and the time of day; else they are `input.period` apart.
+    fraction, or a date and the time of day; else they are `input.period` apart, more where numbers are missing.
 
     Raises:
         UsageError: no such file in the folder, or what reads PCD is not installed.
@@ -60,7 +62,10 @@ class CloudFolder:
             self.stamps = np.sort(np.array(times, np.int64))
         else:
             self._files = sorted(found, key=lambda file: (not _numbers(file), _numbers(file), file.name))
-            self.stamps = settings.steady_stamps(np.arange(len(found)), f"{folder}: the names are no times", self.notes)
+            numbers = _counts(self._files)
+            self.stamps = settings.steady_stamps(numbers, f"{folder}: the names are no times", self.notes)
+            if missing := int(numbers[-1]) + 1 - len(numbers):
+                self.notes.append(f"{folder}: {missing} numbers are missing among the names: taken to be scans as well")
         if any(file.suffix.lower() == ".pcd" for file in self._files):
             _pcd_type()  # now, rather than at the first scan
         self._frames = FrameBuilder(settings, Calibration(self.name), self.notes.append)
@@ -121,6 +126,18 @@ def _pcd_type() -> Any:
     with needs("datasets", "reading PCD"):
         from pypcd4 import PointCloud
     return PointCloud
+
+
+def _counts(files: list[Path]) -> NDArray[np.int64]:
+    """(N,) which scan of the drive each of the sorted files is, the first 0: by their last numbers if those count, some
+    of which may be missing; else one is right after the other."""
+    last = [numbers[-1] for file in files if (numbers := _numbers(file))]
+    whole = len(last) == len(files) > 1 and all(number == int(number) and number < 10**15 for number in last)
+    steps = np.diff(np.array([int(number) for number in last], np.int64)) if whole else np.zeros(1, np.int64)
+    usual = max(int(np.gcd.reduce(steps)), 1)
+    if steps.min() < 1 or np.median(steps) > _USUALLY * usual:
+        return np.arange(len(files))
+    return np.concatenate([[0], np.cumsum(steps // usual)])
 
 
 def _numbers(file: Path) -> list[Decimal]:
