@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 import signal
+import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from types import FrameType
 
 _Handler = Callable[[int, FrameType | None], None]
@@ -16,6 +17,9 @@ def terminate_as_interrupt() -> None:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
+_taken: list[int] = []  # Ctrl-C since each `interrupt_deferred` began that is under way, the innermost last
+
+
 @contextmanager
 def interrupt_deferred() -> Iterator[Callable[[], bool]]:
     """Inside, the first Ctrl-C raises nothing: the function that this yields returns True from then on.
@@ -23,21 +27,26 @@ def interrupt_deferred() -> Iterator[Callable[[], bool]]:
     KeyboardInterrupt at any other place would leave a frame half processed, and out of compiled code it comes as
     SystemError. The second Ctrl-C raises it, for work that hangs. A handler other than Python's own stays as it is,
     and so does that of a process that ignores Ctrl-C; outside of the main thread none is ever called.
-    With SIGTERM it is the same.
+    With SIGTERM it is the same. Within another one, each takes its own first Ctrl-C.
     """
-    requested = False
-
-    def note(number: int, frame: FrameType | None) -> None:
-        nonlocal requested
-        requested = True
-        _replace(note, signal.default_int_handler)
-
-    with suppress(ValueError):  # not the main thread
-        _replace(signal.default_int_handler, note)
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: False
+        return
+    level = len(_taken)
+    _taken.append(0)
+    _replace(signal.default_int_handler, _note)
     try:
-        yield lambda: requested
+        yield lambda: _taken[level] > 0
     finally:
-        _replace(note, signal.default_int_handler)
+        del _taken[level:]
+        if not _taken:
+            _replace(_note, signal.default_int_handler)
+
+
+def _note(number: int, frame: FrameType | None) -> None:
+    _taken[-1] += 1
+    if _taken[-1] > 1:
+        signal.default_int_handler(number, frame)
 
 
 def _replace(handler: _Handler, other: _Handler) -> None:

@@ -109,8 +109,8 @@ class OfflineRun:
         """
         result = Result(self.source, self._config, self.slam.mapper, self._truth, self._truth_name)
         began, problems = perf_counter(), list[str]()
-        try:
-            with interrupt_deferred() as interrupted:
+        with interrupt_deferred() as interrupted:
+            try:
                 for frame in prefetch(self.source.frames(self._start, self._stop)):
                     if frame.problem is None:
                         self._begun = None
@@ -123,10 +123,10 @@ class OfflineRun:
                     progress(step)
                     if interrupted():
                         raise KeyboardInterrupt
-        except KeyboardInterrupt:
-            result.interrupted = True
-        result.wall_s = perf_counter() - began
-        self.slam.finish()
+            except KeyboardInterrupt:
+                result.interrupted = True
+            result.wall_s = perf_counter() - began
+            self.slam.finish()
         if problems and len(problems) == len(result) and not result.interrupted:
             raise Dpm2Error(f"{self.source.name}: none of {len(result)} scans could be read; the first: {problems[0]}")
         return result

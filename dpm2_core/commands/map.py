@@ -26,7 +26,7 @@ from dpm2_core.files import write_json
 from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.mapping.tiles import write_tiles
-from dpm2_core.slam.store.map_data import MapData, load_map, map_cloud, save_as, trajectory, ways
+from dpm2_core.slam.store.map_data import MapData, check_new, load_map, map_cloud, save_as, trajectory, ways
 from dpm2_core.slam.store.map_store import MapStore
 
 if TYPE_CHECKING:
@@ -99,6 +99,7 @@ def merge(
     from dpm2_core.slam.mapping.merge import merge_maps, off_by_satellites, tie_of
     from dpm2_core.slam.settings import Config
 
+    check_new(out)
     given = [parse_transform(text) for text in transform or ()]
     if len(paths) < 2 or align == bool(given) or (given and len(given) != len(paths) - 1):
         raise UsageError("merge: want two or more maps, and either --align or a --transform for each but the first")
@@ -157,6 +158,7 @@ def prune(
     from dpm2_core.slam.mapping.prune import prune as pruned
     from dpm2_core.slam.mapping.prune import redundant_nodes
 
+    check_new(out)
     with MapStore.open(path) as store:
         data = load_map(store)
         less = pruned(data, redundant_nodes(data, distance, angle))
@@ -246,7 +248,9 @@ def _export_geojson(data: MapData, out: Path) -> None:
     from dpm2_core.slam.mapping.parts import placed_on_earth
 
     if data.georeference is None:
-        raise UsageError(f"{out}: the map has no georeference; see input.gnss_topic")
+        count = sum(keyframe.fix is not None for keyframe in data.keyframes)
+        why = f"{count} fixes do not tell it: the way is too short or too straight" if count else "see input.gnss_topic"
+        raise UsageError(f"{out}: the map has no georeference; {why}")
     placed, features = placed_on_earth(data), []
     for (robot, session), (_, poses) in ways(placed).items():
         way = poses[:, :3, 3]

@@ -13,6 +13,7 @@ import typer
 from dpm2_core.commands.options import JsonFile, show
 from dpm2_core.database import size_with_log
 from dpm2_core.frame import Array
+from dpm2_core.slam.mapping.parts import parts_of
 from dpm2_core.slam.mapping.restore import restore_solved
 from dpm2_core.slam.store.map_data import MapData, load_map, ways
 from dpm2_core.slam.store.map_store import MapStore
@@ -38,30 +39,34 @@ def info(path: MapFile, json_file: JsonFile = None) -> None:
         ("pruned", str(f["pruned"])),
         ("robots", ", ".join(robot or "(one)" for robot in f["robots"]) or "-"),
         ("length", f"{f['length_m']:.1f} m"),
-        ("extent", f"{extent} m, of the keyframes" if extent else "-"),
+        ("extent", f"{extent} m, of the keyframes that are tied to the first" if extent else "-"),
         ("loops", f"{f['loops_accepted']} accepted of {f['loops_tried']} tried"),
-        ("georeference", _georeference(f["georeference"])),
+        ("georeference", _georeference(f["georeference"], f["with_fix"])),
         ("size", f"{f['bytes'] / 1e6:.2f} MB, {f['bytes'] / max(f['keyframes'], 1) / 1e3:.1f} kB per keyframe"),
     )
     for row in rows:
         table.add_row(*row)
     for s in figures["sessions"]:
-        info = f"{s['keyframes']} keyframes, {s['started']}, dpm2 {s['program']}, weights {s['weights'] or 'none'}"
+        tied = f", {s['untied']} of them not tied to the first keyframe: elsewhere" if s["untied"] else ""
+        info = f"{s['keyframes']} keyframes{tied}, {s['started']}, dpm2 {s['program']}, weights {s['weights'] or 'none'}"
         table.add_row(f"session {s['session']}", info)
     show(table, figures, json_file)
 
 
 def _figures(path: Path, data: MapData, with_descriptors: int) -> dict[str, Any]:
     loops, drives = [edge for edge in data.edges if edge.kind == "loop"], ways(data)
+    parts = parts_of(data)
+    placed, session = parts == parts[:1], np.array(data.session, np.int64)
     return {
         "map": str(path),
         "keyframes": len(data),
         "own_clouds": sum(data.clouds.loan(node) is None for node in range(len(data))),
         "with_descriptors": with_descriptors,
+        "with_fix": sum(keyframe.fix is not None for keyframe in data.keyframes),
         "pruned": len(data.trail),
         "robots": sorted({robot for robot, _ in drives}),
         "length_m": _length(drives.values()),
-        "extent_m": np.ptp(data.poses[:, :3, 3], axis=0).tolist() if len(data) else [],
+        "extent_m": np.ptp(data.poses[placed, :3, 3], axis=0).tolist() if len(data) else [],
         "loops_accepted": sum(edge.ok for edge in loops),
         "loops_tried": len(loops),
         "georeference": _georeference_figures(data),
@@ -69,7 +74,8 @@ def _figures(path: Path, data: MapData, with_descriptors: int) -> dict[str, Any]
         "sessions": [
             {
                 "session": s.number,
-                "keyframes": data.session.count(s.number),
+                "keyframes": int((session == s.number).sum()),
+                "untied": int(((session == s.number) & ~placed).sum()),
                 "started": s.started,
                 "program": s.program,
                 "weights": s.weights,
@@ -101,9 +107,9 @@ def _georeference_figures(data: MapData) -> dict[str, Any] | None:
     }
 
 
-def _georeference(figures: dict[str, Any] | None) -> str:
+def _georeference(figures: dict[str, Any] | None, fixes: int) -> str:
     if figures is None:
-        return "-"
+        return f"- ({fixes} fixes do not tell it: the way is too short or too straight)" if fixes else "-"
     latitude, longitude, altitude = figures["origin"]
     heading = f"{figures['heading_deg']:.2f} deg from east to north"
     where = f"origin {latitude:.8f}, {longitude:.8f}, {altitude:.2f} m; map's x axis {heading}"

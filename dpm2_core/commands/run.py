@@ -21,6 +21,7 @@ from dpm2_core.evaluation.report import metrics_table
 from dpm2_core.evaluation.run_folder import TRAJECTORY
 from dpm2_core.evaluation.run_result import Result, save_config
 from dpm2_core.files import make_folder
+from dpm2_core.interrupt import interrupt_deferred
 from dpm2_core.pipeline import OfflineRun, Watch, open_recording
 from dpm2_core.slam.session import MapMode
 from dpm2_core.slam.settings import Config
@@ -101,7 +102,8 @@ def run(
             live = open_things.enter_context(LiveView(drive.source.name, view, record))
         if not (out / TRAJECTORY).exists():  # else it is beside the results of a run before until there are others
             save_config(chosen, out)  # now: whatever becomes of the run, it says how it was made
-        _report(_drive(drive, None if live is None else live.add), out, json_file)
+        with interrupt_deferred():  # after the drive, too: it would cost all that this gave
+            _report(_drive(drive, None if live is None else live.add), out, json_file)
 
 
 def _drive(drive: OfflineRun, watch: Watch | None) -> Result:

@@ -3,7 +3,11 @@
 
 from __future__ import annotations
 
+import os
+import socket
+import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +28,8 @@ _SCAN = 6000  # points of a scan that are shown; all of a keyframe are, in the m
 _COLORS = {State.TRACKING: (90, 200, 120), State.DEGRADED: (240, 180, 60), State.LOST: (230, 80, 70)}
 _ACCEPTED, _REJECTED, _WAY = (90, 160, 255), (230, 90, 80), (240, 210, 90)
 _WIDTH = 640  # pixels of an image that is shown, at most: to encode a larger one took longer than all the rest
+_PATIENCE = 10.0  # s, for a viewer to take what is left
+_PORT = 9876  # of a viewer that runs already, also on another machine: forwarded by ssh
 
 
 class LiveView:
@@ -46,6 +52,8 @@ class LiveView:
         layout = _layout(blueprint)
         sinks: list[Any] = []
         if viewer:
+            if not _shown():
+                raise Dpm2Error("--view: there is no display for rerun's viewer; --record FILE.rrd needs none")
             try:
                 self._stream.spawn(default_blueprint=layout)
             except Exception as error:
@@ -65,7 +73,8 @@ class LiveView:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._stream.flush()
+        with suppress(Exception):  # the viewer has been closed: what it has not shown is no loss
+            self._stream.flush(timeout_sec=_PATIENCE)
         self._stream.disconnect()
 
     def add(self, frame: Frame, result: SlamResult, mapper: Mapper) -> None:
@@ -130,6 +139,14 @@ class LiveView:
 
     def _pose(self, T: Array) -> rerun.Transform3D:
         return self._rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3])
+
+
+def _shown() -> bool:
+    """Whether a viewer can open, or one runs. Rerun starts a viewer without a display all the same, and waits for it."""
+    if not sys.platform.startswith("linux") or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY"))):
+        return True
+    with socket.socket() as found:
+        return found.connect_ex(("127.0.0.1", _PORT)) == 0
 
 
 def _layout(b: Any) -> Any:

@@ -16,7 +16,7 @@ def metrics_table(metrics: Metrics, title: str, frame: str) -> FigureTable:
     how_measured = ["how it is measured"]
     table = FigureTable(title, names=["figure"], figures=["value"], text=how_measured, caption=caption)
     t_err, r_err = metrics.t_err_percent, metrics.r_err_deg_per_100m
-    how = f"the path is shorter than {min(metrics.lengths_m):g} m; choose shorter --lengths"
+    how = f"the path is shorter than {min(metrics.lengths_m):g} m; `dpm2 eval --lengths` takes shorter ones"
     if t_err is not None and r_err is not None:
         lengths = ", ".join(f"{length:g}" for length in metrics.lengths_m)
         start = "each 10th frame" if metrics.lengths_m == OFFICIAL_LENGTHS else "each frame"

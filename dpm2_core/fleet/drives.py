@@ -59,7 +59,7 @@ def read_drives(given: Sequence[Path]) -> list[ManifestDrive]:
     twice = [name for name, count in Counter(drive.name for drive in named).items() if count > 1]
     if twice:
         paths = " and ".join(drive.path for drive in named if drive.name == twice[0])
-        raise UsageError(f"{paths}: both would be called {twice[0]}; a manifest can give them names")
+        raise UsageError(f"{paths}: both would be called {twice[0]}; a list (docs/fleet.md) can give them names")
     return named
 
 

@@ -30,6 +30,20 @@ def test_the_first_waits_and_the_second_raises() -> None:
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
+def test_within_another_one_each_takes_its_own() -> None:
+    """The one that ends the drive does not count for what is written then."""
+    with interrupt_deferred() as written:
+        with interrupt_deferred() as driven:
+            signal.raise_signal(signal.SIGINT)
+            assert driven()
+        assert not written()
+        signal.raise_signal(signal.SIGINT)
+        assert written()
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
 def test_sigterm_is_as_ctrl_c() -> None:
     before = signal.getsignal(signal.SIGTERM)
     try:

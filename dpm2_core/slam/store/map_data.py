@@ -182,18 +182,19 @@ def save_as(data: MapData, path: Path) -> None:
     Raises:
         UsageError: there is a file already. Dpm2Error: it could not be written.
     """
-    _check_new(path)
+    check_new(path)
     part = part_beside(path)
     try:
         with MapStore.create(part) as store:
             append_map(store, data)
-        _check_new(path)  # another program may have made one meanwhile
+        check_new(path)  # another program may have made one meanwhile
         move_map(part, path)
     finally:
         remove_map(part)
 
 
-def _check_new(path: Path) -> None:
+def check_new(path: Path) -> None:
+    """Raises UsageError if there is a file already."""
     if path.exists():
         raise UsageError(f"{path}: there is a file already")
 

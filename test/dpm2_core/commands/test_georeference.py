@@ -196,6 +196,23 @@ def test_only_fixes_that_are_in_the_graph_count_as_used(tmp_path: Path) -> None:
         assert json.loads((tmp_path / "info.json").read_text())["georeference"]["fixes_used"] == used
 
 
+def test_info_says_what_is_not_tied_and_measures_the_rest(tmp_path: Path) -> None:
+    """The two drives are far apart, in frames of their own."""
+    save_as(two_drives(), tmp_path / "map")
+    done = dpm2("map", "info", tmp_path / "map", "--json", tmp_path / "info.json")
+    assert "40 of them not tied to the first keyframe" in " ".join(done.stdout.split())
+    figures = json.loads((tmp_path / "info.json").read_text())
+    assert [session["untied"] for session in figures["sessions"]] == [0, 40]
+    np.testing.assert_allclose(figures["extent_m"], np.ptp(two_drives().poses[:40, :3, 3], axis=0))
+
+
+def test_fixes_that_do_not_tell_it_are_counted(tmp_path: Path) -> None:
+    data = replace(two_drives(), georeference=None)
+    save_as(data, tmp_path / "map")
+    assert "(80 fixes do not tell it" in " ".join(dpm2("map", "info", tmp_path / "map").stdout.split())
+    assert "80 fixes do not tell it" in dpm2("map", "export", tmp_path / "map", tmp_path / "a.geojson").stderr
+
+
 def test_a_map_without_one_says_so(map_file: Path, tmp_path: Path) -> None:
     done = dpm2("map", "export", map_file, tmp_path / "a.geojson")
     assert done.returncode == 2

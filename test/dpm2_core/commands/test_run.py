@@ -280,6 +280,22 @@ def test_interrupted_run_writes_what_there_is(sequence: Path, tmp_path: Path, an
     assert 1 <= len(read_trajectory(out / "trajectory_kitti.txt")) < 2000
 
 
+def test_an_interrupt_after_the_last_frame_costs_nothing(sequence: Path, tmp_path: Path) -> None:
+    """While the results are being written."""
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "dpm2_core.cli", "run", str(sequence), "--out", str(out), *QUICK]
+    listen = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, preexec_fn=listen)
+    assert process.stderr is not None
+    for line in process.stderr:
+        if f"{FRAMES}/{FRAMES}" in line:
+            break
+    process.send_signal(signal.SIGINT)
+    rest = process.communicate(timeout=60)[1]
+    assert process.returncode == 0, rest
+    assert {file.name for file in out.iterdir()} == RESULTS
+
+
 def _keyframes(path: Path) -> int:
     """In the map file so far."""
     try:

@@ -32,6 +32,18 @@ def recorded(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "run.rrd"
 
 
+def test_without_a_display_a_view_is_an_error_at_once(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rerun said nothing, and the run never ended."""
+    pytest.importorskip("rerun", reason="no rerun: pip install '.[view]'")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    done = dpm2("run", str(recording), "--out", str(tmp_path / "out"), "--view", "--frames", "0:3")
+    assert done.returncode == 1
+    assert "there is no display" in done.stderr
+
+
 @pytest.mark.slow
 def test_the_recording_has_the_pose_of_every_frame_the_map_and_the_figures(recorded: Path) -> None:
     names = entities(recorded)
