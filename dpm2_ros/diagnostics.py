@@ -9,7 +9,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
 from dpm2_ros.guard import GuardedNode, one_line
-from dpm2_ros.mapping import MapperThread
+from dpm2_ros.mapping import BEHIND, MapperThread
 from dpm2_ros.subscriptions import STEADY
 
 OK, WARN, ERROR, STALE = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR, DiagnosticStatus.STALE
@@ -46,6 +46,8 @@ def mapper_status(node: Node, mapper: MapperThread) -> DiagnosticStatus:
     accepted, tried = mapper.loops
     figures = {"keyframes": mapper.keyframes, "loops accepted": accepted, "loops tried": tried}
     problems = []
+    if mapper.waiting > BEHIND:
+        problems.append(f"{mapper.waiting} keyframes wait: the map, its loops and map -> odom are behind")
     if mapper.file_problem:
         problems.append(f"no map file, the map is only in memory: {mapper.file_problem}")
     if mapper.store_problem:

@@ -16,8 +16,8 @@ from dpm2_core.data.frames import FrameBuilder
 from dpm2_core.estimates import OdometryResult, State
 from dpm2_ros.diagnostics import ERROR, OK, STALE, WARN, DiagnosticsPublisher, mapper_status, message_status, status
 from dpm2_ros.guard import GuardedNode
-from dpm2_ros.keyframe_sender import BEHIND, KeyframeSender
-from dpm2_ros.mapping import MapperThread
+from dpm2_ros.keyframe_sender import KeyframeSender
+from dpm2_ros.mapping import BEHIND, MapperThread
 from dpm2_ros.other_odometry import OtherOdometry
 from dpm2_ros.state import SILENT
 from dpm2_ros.subscriptions import Inputs

@@ -34,9 +34,6 @@ from dpm2_ros.settings import RosSettings
 from dpm2_ros.subscriptions import STEADY
 from dpm2_ros.unsent import KeyframeFile, left_behind, path_of
 
-BEHIND = 10
-"""Keyframes that the mapper may lack before /diagnostics warns; a few are always on their way."""
-
 _MOST_ACKED = 1001  # numbers in an acknowledgment
 _TICK, _BURST = 0.25, 8  # s, and the keyframes that are sent again in one
 _FAREWELL = 4.0  # s; acknowledgments come twice a second, and those of one second are to agree

@@ -39,6 +39,10 @@ KEEP_ALL = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPol
 _GRID_PERIOD, _GRID_WORK = 0.5, 0.3  # s between two grids, and at most of work at one
 
 
+BEHIND = 10
+"""Keyframes that a map may lack before /diagnostics warns; a few are always on their way."""
+
+
 class MapperThread:
     """Works on the map so that a loop search or an optimization never delays the odometry.
 
@@ -200,6 +204,10 @@ class MapperThread:
         Raises:
             Dpm2Error: the map could not be written, or its file is incomplete.
         """
+        if self.waiting > BEHIND:
+            self._node.get_logger().warning(
+                f"{self.waiting} keyframes are still to be taken into the map: this takes a while"
+            )
         self._submit(self._active.finish)
         saved = self._thread.submit(self._active.save) if self._active.saves else None
         self._submit(self._active.close)

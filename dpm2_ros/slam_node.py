@@ -255,7 +255,7 @@ class SlamNode(ManagedNode):
                 self._line.submit(make).add_done_callback(self._report)
         tracked = replace(tracked, keyframe=None, state=self._slam.state(tracked.state))
         self._publish(tracked, BodyMotion.of_lidar(tracked).of_base(T_start_lidar))
-        self._state.send(tracked.state)
+        self._state.send(tracked)
         return tracked
 
     def _publish(self, tracked: OdometryResult, motion: BodyMotion) -> None:

@@ -9,12 +9,14 @@ import time
 from rclpy.node import Node
 from std_msgs.msg import String
 
-from dpm2_core.estimates import State
+from dpm2_core.estimates import OdometryResult, State
+from dpm2_ros.guard import one_line
 from dpm2_ros.subscriptions import LAST_ONE, STEADY
 
 SILENT = 2.0
 """Seconds without a message after which a sensor counts as silent, and without a pose the whole."""
 NO_POSE = "silent"
+_QUIET = 10.0  # s between two messages of the log
 
 
 class StatePublisher:
@@ -23,14 +25,21 @@ class StatePublisher:
     def __init__(self, node: Node) -> None:
         self._publisher = node.create_publisher(String, "dpm2/state", LAST_ONE)
         self._lock, self._said = threading.Lock(), ""
+        self._log, self._breaks = node.get_logger(), 0
         self._last: float | None = None  # when a pose was published
         self._say(str(State.INITIALIZING))
         node.create_timer(0.25, self._listen, clock=STEADY)
 
-    def send(self, state: State) -> None:
-        """That of a pose which is published now."""
+    def send(self, tracked: OdometryResult) -> None:
+        """That of a pose which is published now; what is lost with it is logged, too."""
         self._last = time.monotonic()
-        self._say(str(state))
+        reason = one_line(tracked.registration.reason)
+        if tracked.breaks > self._breaks:
+            self._log.warning(f"the odometry broke, how far it has come meanwhile is not known: {reason}")
+        elif tracked.state is State.LOST and self._said != str(State.LOST):
+            self._log.warning(f"lost: {reason}", throttle_duration_sec=_QUIET)
+        self._breaks = tracked.breaks
+        self._say(str(tracked.state))
 
     def _listen(self) -> None:
         if self._last is not None and time.monotonic() - self._last > SILENT:

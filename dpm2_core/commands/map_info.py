@@ -48,7 +48,9 @@ def info(path: MapFile, json_file: JsonFile = None) -> None:
         table.add_row(*row)
     for s in figures["sessions"]:
         tied = f", {s['untied']} of them not tied to the first keyframe: elsewhere" if s["untied"] else ""
-        info = f"{s['keyframes']} keyframes{tied}, {s['started']}, dpm2 {s['program']}, weights {s['weights'] or 'none'}"
+        info = (
+            f"{s['keyframes']} keyframes{tied}, {s['started']}, dpm2 {s['program']}, weights {s['weights'] or 'none'}"
+        )
         table.add_row(f"session {s['session']}", info)
     show(table, figures, json_file)
 

@@ -118,7 +118,10 @@ def test_numbers_that_are_missing_are_scans_that_are(
 ) -> None:
     """Without their time the odometry took a real drive of which 78 of 175 scans were kept for another one, 6 m off."""
     for n, number in enumerate(numbers):
-        write_ply(tmp_path / f"{'ab'[n % 2] * (len(set(numbers)) < len(numbers))}scan_{number}.ply", np.ones((5, 4), np.float32))
+        write_ply(
+            tmp_path / f"{'ab'[n % 2] * (len(set(numbers)) < len(numbers))}scan_{number}.ply",
+            np.ones((5, 4), np.float32),
+        )
     source = CloudFolder(tmp_path)
     assert source.stamps.tolist() == [scan * 10**8 for scan in scans]
     assert sum(f"{missing} numbers are missing" in note for note in source.notes) == (missing > 0)
