@@ -142,7 +142,7 @@ class LiveView:
 
 
 def _shown() -> bool:
-    """Whether a viewer can open, or one runs. Rerun starts a viewer without a display all the same, and waits for it."""
+    """Whether a viewer can open, or one runs: without a display rerun starts one all the same, and waits for ever."""
     if not sys.platform.startswith("linux") or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY"))):
         return True
     with socket.socket() as found:
