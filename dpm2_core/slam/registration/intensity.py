@@ -56,8 +56,9 @@ class IntensitySearch:
     """The way along an open direction, from the last scans to another one."""
 
     def __init__(self) -> None:
-        self._scans: deque[_Scan] = deque(maxlen=_SCANS)
+        self._scans: deque[_Placed] = deque(maxlen=_SCANS)
         self._missed = 0  # scans since the way was known
+        self._searched = _Scan(np.empty((0, 4), np.float32))  # the last one: it is often the next to be remembered
 
     def clear(self) -> None:
         self._scans.clear()
@@ -70,7 +71,8 @@ class IntensitySearch:
             way = np.linalg.norm(self._scans[-1].T_odom_lidar[:3, 3] - T_odom_lidar[:3, 3])
             if not tied or way < _SPACING:
                 return
-        self._scans.append(_Scan(points, T_odom_lidar, tied))
+        scan = self._searched if self._searched.points is points else _Scan(points)
+        self._scans.append(_Placed(scan, T_odom_lidar, tied))
 
     def along(self, result: Registration, points: Points, reach: float) -> Registration:
         """A registration of a scan (P, 4), moved along its open direction by `search`, or why it is not.
@@ -91,13 +93,13 @@ class IntensitySearch:
         """
         if len(self._scans) < _SCANS:
             return ""
-        cells = [scan.cells(axis) for scan in self._scans]
-        by_sensor = _unrolled(cells, axis)
-        tied = 1 + next((i for i, scan in enumerate(reversed(self._scans)) if not scan.tied), _SCANS - 1)
+        by_sensor = _unrolled([one.scan.cells(axis) for one in self._scans], axis)
+        tied = 1 + next((i for i, one in enumerate(reversed(self._scans)) if not one.tied), _SCANS - 1)
         T_lidar_odom = se3.inverse(T_odom_lidar)
-        known = zip(cells[-tied:], list(self._scans)[-tied:], strict=True)
-        before = _unrolled([one.moved(T_lidar_odom @ scan.T_odom_lidar) for one, scan in known], axis)
-        seen = _unrolled([_in_cells(points, axis)], axis)
+        known = list(self._scans)[-tied:]
+        before = _unrolled([one.scan.cells(axis).moved(T_lidar_odom @ one.T_odom_lidar) for one in known], axis)
+        self._searched = _Scan(points)
+        seen = _unrolled([self._searched.cells(axis)], axis)
         here = _Unrolled(seen.mean - by_sensor.mean, seen.count)
         clear = _CLEAR + (min(_ALONE * reach, _MOST_ALONE) if tied == 1 else 0)
         found = _best(_correlation(before.texture(), here.texture()), reach, clear)
@@ -110,17 +112,24 @@ class IntensitySearch:
 class _Scan:
     """A scan, of which what its intensities show is found when it is first asked for."""
 
-    def __init__(self, points: Points, T_odom_lidar: Array, tied: bool) -> None:
-        self._points = points
+    def __init__(self, points: Points) -> None:
+        self.points = points
         self._cells: _Cells | None = None
-        self.T_odom_lidar = T_odom_lidar
-        self.tied = tied
 
     def cells(self, axis: Array) -> _Cells:
         """Around an axis (3,) of the LiDAR frame, or one that was asked for before: they are fine, whatever it was."""
         if self._cells is None:
-            self._cells, self._points = _in_cells(self._points, axis), self._points[:0]
+            self._cells = _in_cells(self.points, axis)
         return self._cells
+
+
+@dataclass(frozen=True, eq=False)
+class _Placed:
+    """A scan and where it was taken (4, 4); `tied` if the way from the one before is known."""
+
+    scan: _Scan
+    T_odom_lidar: Array
+    tied: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +161,7 @@ class _Unrolled:
         return _Unrolled(np.clip(away / (spread + _LEAST_SPREAD), -_LIMIT, _LIMIT).astype(np.float32) * known, known)
 
 
-def contrast(points: Points) -> Float:
+def _contrast(points: Points) -> Float:
     """(P,) intensity of points (P, 4) relative to its neighbors in the beam, in standard deviations of these."""
     x, y, z, intensity = points.T
     ring = np.rint(np.arctan2(z, np.hypot(x, y)) / np.float32(_RING)).astype(np.int64)
@@ -170,12 +179,12 @@ def contrast(points: Points) -> Float:
 
 
 def _in_cells(points: Points, axis: Array) -> _Cells:
-    """The mean of what is in each cell around and along an axis (3,): half of the points of a dense scan, or fewer."""
+    """Points (P, 4), one for each cell around and along an axis (3,): the mean of those that are in it."""
     near = points[(points[:, :3] ** 2).sum(1) < (_COLUMNS * _CELL / 2) ** 2]
     cell, kept = _cell(near[:, :3], axis)
     count = np.bincount(cell, minlength=_ROWS * _COLUMNS)
     used = np.flatnonzero(count)
-    columns = [*near[kept, :3].T, contrast(near)[kept]]
+    columns = [*near[kept, :3].T, _contrast(near)[kept]]
     means = np.stack([np.bincount(cell, column)[used] / count[used] for column in columns], 1).astype(np.float32)
     return _Cells(means[:, :3], means[:, 3])
 
@@ -233,9 +242,9 @@ def _best(correlation: Array, reach: float, clear: float) -> Peak | str:
     others = np.abs(offset - offset[best]) > _APART
     random = 1.4826 * float(np.median(np.abs(correlation[others] - np.median(correlation[others]))))
     top, second = float(correlation[best]), float(np.max(correlation[others & within], initial=0.0))
-    if top <= clear * random:
+    around = slice(max(best - 1, 0), best + 2)
+    if top <= clear * random or top < correlation[around].max():  # the latter beside a place beyond reach
         return "intensity: no place stands out"
     if top - second < _DISTINCT * random:
         return "intensity: several places are alike"
-    around = slice(max(best - 1, 0), best + 2)
     return peak(offset[around] * _CELL, correlation[around], _OWN * random**-2)
