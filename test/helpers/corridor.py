@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -57,6 +58,15 @@ def seen(x: float, paint: Paint, camera: Camera, gain: float = 1.0, truck: bool 
     painted = with_truck(paint, x) if truck else paint
     gray = np.clip(gain * painted(hits(rays, x, truck)).reshape(u.shape), 0, 255).astype(np.uint8)
     return Image(np.repeat(gray[..., None], 3, 2), camera)
+
+
+def with_intensities(one: Frame, x: float, paint: Paint) -> Frame:
+    """The same scan from `x` m, whose points are as bright as the paint."""
+    there = one.points[:, :3].astype(np.float64)
+    there[:, 1:] = np.clip(there[:, 1:], [-HALF, -HEIGHT], [HALF, HEIGHT])  # the noise of the ranges
+    there[:, 0] += x
+    brightness = paint(there) / 255
+    return replace(one, points=np.c_[one.points[:, :3], brightness].astype(np.float32))
 
 
 def frame(x: float, paint: Paint, index: int = 0, gain: float = 1.0, truck: bool = False) -> Frame:

@@ -2,7 +2,7 @@
 """Image or intensity where the geometry is silent, from scan to scan. In town neither is ever touched.
 
 Both images are of one camera. One is enough for one number, so that of two cameras the second is asked only where the
-earlier scan has no image of the first, and the intensities of the LiDAR itself where no image has told it.
+earlier scan has no image of the first. Where the intensities of the LiDAR tell the way, the image is their check.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.geometry.deskew import placed
 from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.intensity import IntensitySearch
-from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration
+from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration, agree
 from dpm2_core.slam.registration.texture import Reference, VisualSettings, along, reference, textured
 
 _LEAST_REACH = 0.6  # m: however well the motion is known
@@ -57,9 +57,8 @@ class VisualScanRegistration:
 
     def register(self, scan: Scan, prediction: Prediction) -> Registration:
         result = self._registration.register(scan, prediction)
-        for more in (self._by_image, self._by_intensity):
-            if result.ok and result.worst_sigma > self._settings.sigma:
-                result = more(scan, result, prediction.information)
+        if result.ok and result.worst_sigma > self._settings.sigma:
+            result = self._told(scan, result, prediction.information)
         self._tied = result.ok and result.worst_sigma <= self._settings.sigma
         return result
 
@@ -73,6 +72,19 @@ class VisualScanRegistration:
         if self._last is None or self._reference is None:
             return True
         return bool(np.linalg.norm(self._last[1][:3, 3] - T_odom_lidar[:3, 3]) >= self._settings.baseline)
+
+    def _told(self, scan: Scan, result: Registration, information: Array | None) -> Registration:
+        """The result moved along its open direction by the intensities, which no calibration can lead astray, or else
+        by the image; as uncertain as these are apart where they exclude each other."""
+        by_image = self._by_image(scan, result, information)
+        seen = by_image.method == "visual"
+        by_intensity = self._by_intensity(scan, result if seen else by_image, information)
+        if by_intensity.method != "intensity":
+            return by_image if seen else by_intensity
+        if seen and not agree(by_intensity, by_image):
+            way = se3.log(se3.inverse(by_intensity.T_target_source) @ by_image.T_target_source)
+            return by_intensity.doubted(way).because(f"image and intensities {np.linalg.norm(way[3:]):.2f} m apart")
+        return by_intensity
 
     def _by_image(self, scan: Scan, result: Registration, information: Array | None) -> Registration:
         """The result moved along its open direction to where the images agree; unchanged if they do not.

@@ -21,7 +21,7 @@ from dpm2_core.slam.registration.protocol import Prediction
 from dpm2_core.slam.registration.texture import VisualSettings
 from dpm2_core.slam.settings import SlamSettings
 
-from ....helpers.corridor import CAMERA, T_LIDAR_CAM, Paint, frame, random_paint, seen, stripes
+from ....helpers.corridor import CAMERA, T_LIDAR_CAM, Paint, frame, random_paint, seen, stripes, with_intensities
 
 
 def registered(first: Frame, second: Frame, **visual: object) -> Registration:
@@ -110,6 +110,25 @@ def test_of_two_cameras_the_first_is_asked_and_the_second_where_it_has_no_image(
     by_none = registered(two[0], second[1])
     assert by_none.method == "geometric"
     assert "image" not in by_none.reason
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("focal", "apart"), [(1.0, False), (1.1, True)])
+def test_a_camera_whose_calibration_is_wrong_leads_nowhere_where_intensities_tell(focal: float, apart: bool) -> None:
+    """By the image alone 10 % of the focal length are 4 m of 39, `tracking`; intensities have no calibration."""
+    paint, states, reasons, ahead = random_paint(), [], [], []
+    camera = replace(CAMERA, K=CAMERA.K @ np.diag([focal, focal, 1.0]))
+    odometry = make_odometry(SlamSettings(registration="geometric"))
+    way = np.cumsum(np.interp(np.arange(60), [0, 20, 40], [0.6, 0.6, 0.9]))
+    for i, x in enumerate(way):
+        one = with_intensities(frame(x, paint, i), x, paint)
+        tracked = odometry.process(replace(one, images=(replace(one.images[0], camera=camera),)))
+        ahead.append(tracked.T_odom_lidar[0, 3] - x)
+        states.append(tracked.state)
+        reasons.append(tracked.registration.reason)
+    assert np.ptp(ahead[8:]) < 0.2  # two scans' worth of cells; the image's 4 m are 20 times that
+    assert any("image and intensities" in reason for reason in reasons[8:]) == apart
+    assert (State.DEGRADED in states[8:]) == apart
 
 
 def noisy(one: Frame) -> Frame:
