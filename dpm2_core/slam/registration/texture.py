@@ -28,8 +28,8 @@ class VisualSettings(Settings):
     """How far along, by the image or by the intensities of the LiDAR."""
 
     enabled: bool = True
-    """Where scans leave a direction open, ask the intensities of the LiDAR and a camera: the first one; a second one only
-    where that has no image."""
+    """Where scans leave a direction open, ask the intensities of the LiDAR and a camera: the first one; a second one
+    only where that has no image."""
     sigma: float = Field(0.08, gt=0)
     """Standard deviation of the position in its worst direction above which it counts as open, m."""
     reach: float = Field(20.0, gt=0)
