@@ -14,7 +14,7 @@ import typer
 from scipy.spatial.transform import Rotation
 
 from dpm2_core.commands.map_graph import optimize
-from dpm2_core.commands.map_info import MapFile, graph_of, info
+from dpm2_core.commands.map_info import MapFile, graph_of, info, too_few, with_fix
 from dpm2_core.commands.options import ConfigFile, Overrides
 from dpm2_core.config import load_settings
 from dpm2_core.console import Console
@@ -248,8 +248,7 @@ def _export_geojson(data: MapData, out: Path) -> None:
     from dpm2_core.slam.mapping.parts import placed_on_earth
 
     if data.georeference is None:
-        count = sum(keyframe.fix is not None for keyframe in data.keyframes)
-        why = f"{count} fixes do not tell it: the way is too short or too straight" if count else "see input.gnss_topic"
+        why = too_few(count) if (count := with_fix(data)) else "see input.gnss_topic"
         raise UsageError(f"{out}: the map has no georeference; {why}")
     placed, features = placed_on_earth(data), []
     for (robot, session), (_, poses) in ways(placed).items():

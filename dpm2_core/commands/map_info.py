@@ -64,7 +64,7 @@ def _figures(path: Path, data: MapData, with_descriptors: int) -> dict[str, Any]
         "keyframes": len(data),
         "own_clouds": sum(data.clouds.loan(node) is None for node in range(len(data))),
         "with_descriptors": with_descriptors,
-        "with_fix": sum(keyframe.fix is not None for keyframe in data.keyframes),
+        "with_fix": with_fix(data),
         "pruned": len(data.trail),
         "robots": sorted({robot for robot, _ in drives}),
         "length_m": _length(drives.values()),
@@ -109,9 +109,19 @@ def _georeference_figures(data: MapData) -> dict[str, Any] | None:
     }
 
 
+def with_fix(data: MapData) -> int:
+    """How many keyframes have a fix."""
+    return sum(keyframe.fix is not None for keyframe in data.keyframes)
+
+
+def too_few(fixes: int) -> str:
+    """Why a map with that many fixes has no georeference."""
+    return f"{fixes} fixes do not tell it: the way is too short or too straight"
+
+
 def _georeference(figures: dict[str, Any] | None, fixes: int) -> str:
     if figures is None:
-        return f"- ({fixes} fixes do not tell it: the way is too short or too straight)" if fixes else "-"
+        return f"- ({too_few(fixes)})" if fixes else "-"
     latitude, longitude, altitude = figures["origin"]
     heading = f"{figures['heading_deg']:.2f} deg from east to north"
     where = f"origin {latitude:.8f}, {longitude:.8f}, {altitude:.2f} m; map's x axis {heading}"

@@ -89,7 +89,7 @@ def run(
         wanted = chosen.slam.registration != "geometric" or chosen.slam.visual.enabled or chosen.slam.map.thumbnail > 0
         source = CorruptedSource(open_recording(src, chosen, wanted), corruption)
     if localise is not None:
-        with OfflineRun(source, chosen, span, map_file=localise, map_mode="localize") as drive:
+        with OfflineRun(source, chosen, span, map_file=localise, map_mode="localize") as drive, interrupt_deferred():
             found, figures = run_localized(drive, out, T_hint, chosen)
             show(found, figures, json_file)
         return

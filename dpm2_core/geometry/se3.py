@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
@@ -10,6 +12,8 @@ from scipy.spatial.transform import Rotation
 from dpm2_core.frame import is_rigid as is_rigid
 
 Array = NDArray[np.float64]
+
+_F = TypeVar("_F", bound=np.floating)
 
 
 def make(R: ArrayLike, t: ArrayLike) -> Array:
@@ -26,7 +30,7 @@ def inverse(T: Array) -> Array:
     return make(R_inv, -(R_inv @ T[..., :3, 3:])[..., 0])
 
 
-def transform(T: Array, points: NDArray[np.floating]) -> NDArray[np.floating]:
+def transform(T: Array, points: NDArray[_F]) -> NDArray[_F]:
     """T (4, 4) applied to the first three columns of (N, 3+) points; further columns and the dtype stay."""
     out = points.copy()
     out[:, :3] = points[:, :3] @ T[:3, :3].T.astype(points.dtype) + T[:3, 3].astype(points.dtype)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Intensity where the geometry is silent and no camera looks: how far along a tunnel or a highway.
+"""Intensity where the geometry is silent: how far along a tunnel or a highway, without a camera.
 
 As by an image (`texture`), one number is unknown, the way along the open direction. What a scan shows is laid out
 around that direction, as a tunnel that is cut open and unrolled. The way is the one at which the intensities of a scan
@@ -141,7 +141,7 @@ class _Cells:
 
     def moved(self, T: Array) -> _Cells:
         """By a transform (4, 4)."""
-        return _Cells(self.points @ T[:3, :3].T.astype(np.float32) + T[:3, 3].astype(np.float32), self.contrast)
+        return _Cells(se3.transform(T, self.points), self.contrast)
 
 
 @dataclass(frozen=True, eq=False)

@@ -126,7 +126,7 @@ def reference(points: Points, image: Texture, count: int, axis: Array) -> Refere
     Args:
         axis: (3,) in the LiDAR frame, the direction that is open; either sign.
     """
-    in_camera = _moved(image.T_cam_lidar, points[:, :3].astype(np.float64))
+    in_camera = se3.transform(image.T_cam_lidar, points[:, :3].astype(np.float64))
     kept = np.flatnonzero(image.project(in_camera)[1] & (in_camera[:, 2] > _NEAR) & (in_camera[:, 2] < _FAR))
     kept = kept[:: max(1, len(kept) // count)]
     step = image.T_cam_lidar[:3, :3] @ axis
@@ -196,7 +196,7 @@ def peaks(
     for middle in offsets[candidates]:
         fine = _correlated(known, image, T_ref_lidar, axis, middle + around, 1)
         found.append(peak(middle + around, fine, len(known.points) / _CORRELATED))
-    return sorted(found, key=lambda peak: -peak.correlation)
+    return sorted(found, key=lambda one: -one.correlation)
 
 
 def glance(known: Reference, image: Texture, T_ref_lidar: Array, axis: Array, reach: float) -> Peak:
@@ -212,7 +212,7 @@ def _correlated(
     known: Reference, image: Texture, T_ref_lidar: Array, axis: Array, offsets: Array, level: int
 ) -> NDArray[np.float32]:
     """Correlation (S,) of the texture with that of the image for the LiDAR at each of the offsets (S,), m."""
-    there = _moved(image.T_cam_lidar @ se3.inverse(T_ref_lidar), known.points.astype(np.float64))
+    there = se3.transform(image.T_cam_lidar @ se3.inverse(T_ref_lidar), known.points.astype(np.float64))
     step = image.T_cam_lidar[:3, :3] @ axis
     return _correlations(known.texture[level], *_changes(image, there, step, offsets, level))
 
@@ -242,10 +242,6 @@ def _maxima(correlation: NDArray[np.float32], least: float) -> NDArray[np.intp]:
     """Interior local maxima of the correlation above `least`."""
     inner = correlation[1:-1]
     return 1 + np.flatnonzero((inner >= correlation[:-2]) & (inner > correlation[2:]) & (inner > least))
-
-
-def _moved(T: Array, points: Array) -> Array:
-    return points @ T[:3, :3].T + T[:3, 3]
 
 
 def _correlations(

@@ -74,8 +74,8 @@ class VisualScanRegistration:
         return bool(np.linalg.norm(self._last[1][:3, 3] - T_odom_lidar[:3, 3]) >= self._settings.baseline)
 
     def _told(self, scan: Scan, result: Registration, information: Array | None) -> Registration:
-        """The result moved along its open direction by the intensities, which no calibration can lead astray, or else
-        by the image; as uncertain as these are apart where they exclude each other."""
+        """The result moved along its open direction by the intensities, which need no calibration, or else by the
+        image; as uncertain as these are apart where they exclude each other."""
         by_image = self._by_image(scan, result, information)
         seen = by_image.method == "visual"
         by_intensity = self._by_intensity(scan, result if seen else by_image, information)
