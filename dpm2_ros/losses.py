@@ -17,7 +17,8 @@ _OFF = 0.25
 class Losses:
     """Counts the gaps: of the publisher's own numbers, or, where the middleware has none, of the stamps' rhythm.
 
-    The numbers are exact, whatever the recording's pauses. Nothing is lost before the first message that arrives.
+    The numbers are exact, whatever the recording's pauses. Nothing is lost before the first message that arrives; of a
+    publisher that takes the place of another all that it has sent was to arrive.
 
     Attributes:
         count: messages lost so far.
@@ -39,15 +40,14 @@ class Losses:
         before, self._number = self._number, number
         lost = self._step(stamp)
         if number is not None:
-            lost = 0 if before is None else max(0, number - before - 1)  # another publisher begins at 1 again
+            lost = _between(before, number)
         self.count += lost
         return lost
 
     def skip(self, number: int | None) -> None:
         """A message with that number arrived, and is not used; so it is not lost."""
         if number is not None:
-            if self._number is not None:
-                self.count += max(0, number - self._number - 1)
+            self.count += _between(self._number, number)
             self._number = number
 
     def _step(self, stamp: int) -> int:
@@ -60,3 +60,10 @@ class Losses:
         self._steps.append(step)
         whole = round(periods)
         return whole - 1 if 1 < whole < _PAUSE and abs(periods - whole) <= _OFF else 0
+
+
+def _between(before: int | None, number: int) -> int:
+    """How many messages are missing between two; another publisher begins at 1 again."""
+    if before is None:
+        return 0
+    return number - 1 - (before if number > before else 0)

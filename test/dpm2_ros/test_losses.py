@@ -29,8 +29,14 @@ def test_numbers_are_exact_whatever_the_stamps_say(arrived: set[int], first: int
 
 
 def test_another_publisher_begins_anew() -> None:
+    """Of the first some had been sent before anybody listened; the second is heard from its first message on."""
     stamps = [n * PERIOD for n in range(6)]
     assert count(stamps, [7, 8, 10, 1, 2, 3]) == 1
+    assert count(stamps, [7, 8, 10, 4, 5, 6]) == 1 + 3
+    losses = Losses()
+    losses.add(0, 10)
+    losses.skip(3)
+    assert losses.count == 2
 
 
 def test_several_publishers_have_no_common_numbers() -> None:
