@@ -217,7 +217,7 @@ def _window(values: NDArray[np.floating[Any]]) -> Float:
 
 
 def _correlation(a: _Unrolled, b: _Unrolled) -> Array:
-    """Correlation (2 `_SEARCHED` + 1,) of a with b moved along by up to `_SEARCHED` cells, 0 where few are shared."""
+    """Correlation (2 `_SEARCHED` + 1,) of a with b moved along by up to `_SEARCHED` cells, NaN where few are shared."""
     n = scipy.fft.next_fast_len(_COLUMNS + _SEARCHED, real=True)
     (count_a, sum_a, squares_a), (count_b, sum_b, squares_b) = (
         [scipy.fft.rfft(x, n, axis=1) for x in (one.count, one.mean, one.mean**2)] for one in (a, b)
@@ -232,18 +232,23 @@ def _correlation(a: _Unrolled, b: _Unrolled) -> Array:
     mean_a, mean_b = summed(sum_a, count_b) / count, summed(count_a, sum_b) / count
     var_a, var_b = summed(squares_a, count_b) / count - mean_a**2, summed(count_a, squares_b) / count - mean_b**2
     covariance = summed(sum_a, sum_b) / count - mean_a * mean_b
-    return np.where(shared < _SHARED, 0, covariance / np.sqrt(np.maximum(var_a * var_b, 1e-6)))
+    return np.where(shared < _SHARED, np.nan, covariance / np.sqrt(np.maximum(var_a * var_b, 1e-6)))
 
 
 def _best(correlation: Array, reach: float, clear: float) -> Peak | str:
     offset = np.arange(-_SEARCHED, _SEARCHED + 1)
-    within = np.abs(offset) * _CELL <= reach
+    known = np.isfinite(correlation)
+    within = known & (np.abs(offset) * _CELL <= reach)
+    if known.sum() < _SEARCHED or not within.any():
+        return "intensity: too little is seen again"
     best = int(np.where(within, correlation, -1).argmax())
-    others = np.abs(offset - offset[best]) > _APART
+    others = known & (np.abs(offset - offset[best]) > _APART)
     random = 1.4826 * float(np.median(np.abs(correlation[others] - np.median(correlation[others]))))
     top, second = float(correlation[best]), float(np.max(correlation[others & within], initial=0.0))
     around = slice(max(best - 1, 0), best + 2)
-    if top <= clear * random or top < correlation[around].max():  # the latter beside a place beyond reach
+    if (
+        not random or top <= clear * random or not top >= correlation[around].max()
+    ):  # the latter beside a place beyond reach
         return "intensity: no place stands out"
     if top - second < _DISTINCT * random:
         return "intensity: several places are alike"

@@ -93,14 +93,31 @@ def test_what_moves_with_the_sensor_must_be_known_first() -> None:
 
 
 @pytest.mark.parametrize("intensity", [0.0, 1.0, 1e30])
-@pytest.mark.parametrize("every", [1, 2000, 10**6])
-def test_where_intensities_or_points_are_missing_nothing_is_told(intensity: float, every: int) -> None:
+@pytest.mark.parametrize(
+    ("every", "reason"),
+    [(1, "no place stands out"), (2000, "too little is seen again"), (10**6, "too little is seen again")],
+)
+def test_where_intensities_or_points_are_missing_nothing_is_told(intensity: float, every: int, reason: str) -> None:
     search = IntensitySearch()
     scan = Tunnel(0, 0.06).scan(100.0)[every - 1 :: every]
     scan[:, 3] = intensity
     for i in range(6):
         search.update(scan, _at(i))
-    assert search.search(scan, _at(6), _AHEAD, 6.0) == "intensity: no place stands out"
+    assert search.search(scan, _at(6), _AHEAD, 6.0) == f"intensity: {reason}"
+
+
+@pytest.mark.parametrize("half", [0.0, 0.5, 1.5])
+def test_a_scan_that_shows_a_short_stretch_tells_nothing(half: float) -> None:
+    """What correlates at random is not known then."""
+    search, tunnel = IntensitySearch(), Tunnel(0, 0.06)
+
+    def stretch(at: float) -> Points:
+        points = tunnel.scan(at)
+        return points[np.abs(points[:, 0]) <= half]
+
+    for i in range(5):
+        search.update(stretch(100 + 0.5 * i), _at(0.5 * i))
+    assert search.search(stretch(102.5), _at(2.5), _AHEAD, 6.0) == "intensity: too little is seen again"
 
 
 def _driven(tunnel: Tunnel, **settings: Any) -> tuple[list[State], Array]:
