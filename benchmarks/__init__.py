@@ -48,6 +48,7 @@ BENCHES: dict[str, Bench] = {
     "loop-cost": _bench("loop_cost:bench_loop_cost", "threads set"),
     "map": _bench("map:bench_map", "source set"),
     "memory": _bench("memory:bench_memory", "source threads set"),
+    "motion": _bench("motion:bench_motion", "threads set"),
     "neural": _bench("neural:bench_neural", "source kitti repetitions threads set weights unseen pairs only"),
     "paper": _bench("paper:bench_paper", "source kitti threads set weights only"),
     "pose-graph": _bench("pose_graph:bench_pose_graph", "kitti repetitions"),

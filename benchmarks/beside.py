@@ -17,7 +17,7 @@ from dpm2_core.evaluation.metrics import ape_rmse
 from dpm2_core.frame import Array, Frame, Guess
 from dpm2_core.sim.sensors import real_sensor
 from dpm2_core.sim.settings import PresetName
-from dpm2_core.sim.simulated_drive import TurningRobot, wheel_odometry
+from dpm2_core.sim.simulated_drive import Ride, TurningRobot, wheel_odometry
 from dpm2_core.sim.world import build_world
 from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.settings import SlamSettings
@@ -47,7 +47,7 @@ def bench_beside(options: Options) -> Report:
     settings, results = settings_of(options), dict[str, Any]()
     with Progress(transient=True) as progress:
         for name, (road, preset, seed, speed) in WORLDS.items():
-            robot = TurningRobot(build_world(road, preset, seed), FRAMES, speed, real_sensor(LIDAR))
+            robot = TurningRobot(build_world(road, preset, seed), FRAMES, Ride(speed), real_sensor(LIDAR))
             frames = list(progress.track(robot.frames(), total=FRAMES, description=name))
             results[name] = {way: _drive(_with(frames, robot.poses, wrong), robot.poses, settings)
                              for way, wrong in WAYS.items()}  # fmt: skip

@@ -18,7 +18,7 @@ from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
 from dpm2_core.sim.sensors import real_sensor
 from dpm2_core.sim.settings import ImuConfig, LidarConfig, PresetName
-from dpm2_core.sim.simulated_drive import TurningRobot
+from dpm2_core.sim.simulated_drive import Ride, TurningRobot
 from dpm2_core.sim.world import build_world
 from dpm2_core.slam.build import make_odometry
 from dpm2_core.slam.settings import SlamSettings
@@ -49,7 +49,7 @@ def bench_imu(options: Options) -> Report:
     with Progress(transient=True) as progress:
         for name, (preset, seed, speed, swings) in WORLDS.items():
             world = build_world("loop", preset, seed)
-            robot = TurningRobot(world, FRAMES, speed, real_sensor(LIDAR), imu, swings)
+            robot = TurningRobot(world, FRAMES, Ride(speed, swings), real_sensor(LIDAR), imu)
             frames = list(progress.track(robot.frames(), total=FRAMES, description=name))
             rates = _rates(robot.poses)
             results[name] = {

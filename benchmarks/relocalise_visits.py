@@ -40,7 +40,7 @@ def row_of(result: Registration, truth: Array, seconds: float) -> tuple[bool, fl
 
 def measured(frame: Frame, settings: SlamSettings) -> Points:
     """The points (N, 4) of a frame at rest, as the SLAM prepares them."""
-    return Preprocessor(settings.preprocess).measured(frame, np.zeros(6))
+    return Preprocessor(settings.preprocess).measured(frame, np.zeros(6))[0]
 
 
 def kept(points: Points, settings: SlamSettings) -> Points:

@@ -17,8 +17,9 @@ def bench(
     names: Annotated[
         list[str] | None,
         typer.Argument(
-            help="beside, covariance, diffslam, finetune, fleet, gaps, geometric (default), hard, imu, indoor, "
-            "loop-cost, map, memory, neural, paper, pose-graph, relocalise, roads, sensor, tilt, traffic, views."
+            help="beside, covariance, diffslam, finetune, fleet, gaps, geometric (default), hard, imu, "
+            "indoor, loop-cost, map, memory, motion, neural, paper, pose-graph, relocalise, roads, sensor, tilt, "
+            "traffic, views."
         ),
     ] = None,
     source: Annotated[

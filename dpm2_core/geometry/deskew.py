@@ -11,39 +11,35 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpm2_core.frame import Frame, Image
-from dpm2_core.geometry import se3
+from dpm2_core.geometry import curve, se3
 from dpm2_core.geometry.turning import turned
 
-_DESKEW_STEPS = 64  # poses along a sweep: at 1 rad/s and 0.1 s the remaining error is 1 mm at 1 m, 8 cm at 100 m
+Turn = Callable[[se3.Array], se3.Array | None]
 
 
 def deskew(
     points: NDArray[np.float32],
     time_offset: NDArray[np.float32],
-    twist: NDArray[np.float64],
-    turn: Callable[[se3.Array], se3.Array | None] | None = None,
+    motion: NDArray[np.float64],
+    turn: Turn | None = None,
 ) -> NDArray[np.float32]:
-    """(N, 4) points as if all had been taken at the stamp; `time_offset` (N,) s, `twist` (6,) [rad/s, m/s].
+    """(N, 4) points as if all had been taken at the stamp; `time_offset` (N,) s.
 
     Args:
+        motion: (6,) twist [rad/s, m/s] or (K, 6), see `curve.poses`, which leaves nothing to be measured.
         turn: gives, of times (M,) s, the rotations (M, 3, 3) from the axes then to those at the stamp, as they were
-            measured; where it gives None, and without it, the sensor turns as steadily as `twist` says.
+            measured; where it gives None, and without it, the sensor turns as `motion` says.
     """
-    if len(points) == 0:
-        return points
-    start, end = float(time_offset.min()), float(time_offset.max())
-    if end - start < 1e-6:
-        return points
-    step = np.rint((time_offset - start) * ((_DESKEW_STEPS - 1) / (end - start))).astype(np.int64)
-    times = np.linspace(start, end, _DESKEW_STEPS)
-    R = None if turn is None else turn(times)
-    T = (se3.exp(times[:, None] * twist) if R is None else _along(times, R, twist[3:])).astype(np.float32)
-    out = points.copy()
-    out[:, :3] = np.einsum("nij,nj->ni", T[step, :3, :3], points[:, :3]) + T[step, :3, 3]
-    return out
+    return curve.moved(points, time_offset, partial(way, motion=motion, turn=turn))
 
 
-def measured_turn(frame: Frame) -> Callable[[se3.Array], se3.Array | None] | None:
+def way(times: se3.Array, motion: NDArray[np.float64], turn: Turn | None) -> se3.Array:
+    """Poses (M, 4, 4) at increasing times (M,) s of a sensor that moves so, as `deskew` takes it."""
+    R = None if turn is None or motion.ndim == 2 else turn(times)
+    return curve.poses(times, motion) if R is None else _along(times, R, motion[3:])
+
+
+def measured_turn(frame: Frame) -> Turn | None:
     """How the LiDAR turned around the stamp, for `deskew`; None without an IMU."""
     imu = frame.imu
     return None if imu is None else partial(turned, (imu.stamps - frame.stamp) * 1e-9, imu.rates)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from dpm2_core.frame import Array, Frame
-from dpm2_core.geometry import se3
+from dpm2_core.geometry import curve, se3
 from dpm2_core.geometry.deskew import measured_turn
 
 _CENTERED = 0.1  # of a sweep: a stamp so near to its middle counts as the middle
@@ -44,17 +44,18 @@ class Sweep:
         """Whether another sweep, of `span` s, was only a part of one as this."""
         return self.span > _WHOLE * span
 
-    def to_stamp(self, frame: Frame, twist: Array | None) -> Array:
+    def to_stamp(self, frame: Frame, motion: Array | None) -> Array:
         """T_scan_lidar (4, 4): where the LiDAR was at the stamp, seen from where it was in the middle.
 
         Args:
-            frame: as `centered` gives it, with its IMU if that is of use. twist: (6,) [rad/s, m/s], None if not known.
+            frame: as `centered` gives it, with its IMU if that is of use. motion: (6,) twist [rad/s, m/s] or (K, 6) as
+                `curve.poses` takes it; None if not known.
         """
-        if not self.middle or twist is None:
+        if not self.middle or motion is None:
             return np.eye(4)
         turn = measured_turn(frame)
-        R = None if turn is None else turn(np.array([-self.middle]))
-        T = se3.exp(-self.middle * twist)
+        R = None if turn is None or motion.ndim == 2 else turn(np.array([-self.middle]))
+        T = curve.poses(-self.middle, motion)
         return T if R is None else se3.make(R[0], T[:3, 3])
 
     def covariance(self, change: Array) -> Array:

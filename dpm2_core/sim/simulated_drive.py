@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -69,12 +69,42 @@ class SimulatedDrive:
         return prefetch(map(self.frame, range(len(self))[start:stop]))
 
 
+@dataclass(frozen=True)
+class Ride:
+    """How a LiDAR is carried along a road.
+
+    Attributes:
+        speed: m/s, at most. turns: deg, to either side now and then; 0: not.
+        shakes: amplitudes (rad and m) and frequencies (Hz) of a sine about and along each axis, x to z.
+    """
+
+    speed: float
+    turns: float = 0.0
+    shakes: tuple[tuple[float, ...], tuple[float, ...]] = ((0.0,) * 6, (1.0,) * 6)
+
+    def shaken(self, times: Array) -> Array:
+        """(N, 4, 4) at times (N,), s, as seen from where it would be without shakes; they begin as it sets off."""
+        amplitudes, frequencies = (np.array(part) for part in self.shakes)
+        swing = amplitudes * np.sin(2 * np.pi * frequencies * times[:, None] + np.arange(6))
+        return se3.exp(_moving(times)[:, None] * swing)
+
+
+RIDES = {
+    "car": Ride(10.0),
+    "walking": Ride(1.4, shakes=((0.02, 0.035, 0.04, 0.01, 0.02, 0.025), (1.0, 2.0, 0.8, 2.0, 1.0, 2.0))),
+    "waved": Ride(1.4, shakes=((0.08, 0.08, 0.35, 0.03, 0.05, 0.05), (0.9, 1.1, 0.5, 2.0, 1.0, 1.5))),
+    "legged": Ride(1.0, shakes=((0.03, 0.02, 0.03, 0.006, 0.015, 0.012), (2.0, 4.0, 2.0, 4.0, 2.0, 4.0))),
+    "drone": Ride(5.0, shakes=((0.15, 0.15, 0.2, 0.3, 0.4, 0.2), (0.4, 0.35, 0.2, 0.3, 0.3, 0.25))),
+}
+"""On a car, carried by a walker, waved by hand, on four legs that trot, and below a drone."""
+
+
 class TurningRobot:
     """A `data.source.Source`: a robot that drives along a road and turns fast. Scans are as a driver delivers them,
     with the time of each point, from poses that change within a sweep; an IMU measures beside.
 
     Attributes:
-        T_world_lidar: (N, 4, 4) at the stamps, in the middle of the sweeps.
+        times, T_world_lidar: (N,) s and (N, 4, 4) at the stamps, in the middle of the sweeps.
     """
 
     T_cam_lidar = None
@@ -86,24 +116,21 @@ class TurningRobot:
         self,
         world: World,
         frames: int,
-        speed: float,
+        ride: Ride,
         lidar: LidarConfig,
         imu: ImuConfig | None = None,
-        swings: float = 0.0,
     ) -> None:
-        """Stands for 1 s, then drives at up to `speed` m/s, slower in curves: no turn is faster than 100 deg/s.
-
-        Args:
-            swings: deg, by which it also turns to either side now and then while it drives; 0: not.
-        """
+        """Stands for 1 s, then drives, slower in curves: but for its shakes no turn is faster than 100 deg/s."""
         self.name, self.notes, self._count = f"{world.preset} {world.seed}", list[str](), frames
         rng = np.random.default_rng([world.seed, _IMU_STREAM])
         end = frames * self.PERIOD + 1
-        self._world = replace(world, road=_robot_progress(world.road, end, speed, swings, rng))
+        self._world = replace(world, road=_robot_progress(world.road, end, ride, rng))
         self._lidar = Lidar(lidar)
         at = np.arange(0.0, end, _STEP)
-        self._T = np.stack([self._world.drive_pose(t, lidar.height, float(_moving(t))) for t in at])
-        self.T_world_lidar: Array = self.pose(self._time(np.arange(frames)))
+        level = np.stack([self._world.drive_pose(t, lidar.height, float(_moving(t))) for t in at])
+        self._T = level @ ride.shaken(at)
+        self.times: Array = 0.5 + np.arange(frames, dtype=np.float64) * self.PERIOD
+        self.T_world_lidar: Array = self.pose(self.times)
         self._imu = None if imu is None else Imu(imu, rng)
         if self._imu is not None:
             times = self._imu.times(0.1, end - 0.1)
@@ -126,7 +153,7 @@ class TurningRobot:
 
     def frame(self, i: int) -> Frame:
         """Frame i, the same whenever it is asked for; its samples are those since the sweep before."""
-        time, T, offsets = float(self._time(i)), self.T_world_lidar[i], self._lidar.beams.column_time.astype(float)
+        time, T, offsets = float(self.times[i]), self.T_world_lidar[i], self._lidar.beams.column_time.astype(float)
         turning = se3.inverse(T) @ self.pose(time + offsets)
         rng = np.random.default_rng([self._world.seed, _STREAM, i])
         scan = self._lidar.scan(self._world, T, time, rng, turning)
@@ -143,28 +170,25 @@ class TurningRobot:
         """Frames start..stop-1, simulated ahead in another thread."""
         return prefetch(map(self.frame, range(len(self))[start:stop]))
 
-    def _time(self, i: ArrayLike) -> Array:
-        return 0.5 + np.asarray(i) * self.PERIOD
-
 
 def _moving(time: ArrayLike) -> Array:
     """0 while it stands, 1 from when it has begun to drive, at times s."""
     return np.clip((np.asarray(time) - 1.5) / 1.0, 0, 1)
 
 
-def _robot_progress(road: Road, end: float, speed: float, swings: float, rng: np.random.Generator) -> Road:
+def _robot_progress(road: Road, end: float, ride: Ride, rng: np.random.Generator) -> Road:
     """The road with the progress and the heading of a robot that drives for `end` s."""
     times = np.arange(0.0, end + 1, _STEP)
     s, curvature = road.drive.s, np.abs(np.diff(road.drive.yaw) / np.diff(road.drive.s))
-    paces = np.minimum(speed, _FASTEST / np.maximum(curvature, 1e-3))
+    paces = np.minimum(ride.speed, _FASTEST / np.maximum(curvature, 1e-3))
     travelled = np.zeros(len(times))
     for k in range(1, len(times)):
         segment = int(np.searchsorted(s, travelled[k - 1] % road.drive.length, "right")) - 1
         pace = paces[min(segment, len(paces) - 1)]
         travelled[k] = travelled[k - 1] + _STEP * pace * float(_moving(times[k]))
     rate, k, side = np.zeros(len(times)), round(2.5 / _STEP), 1
-    while swings and k < len(times):
-        turn = np.radians(swings) * rng.uniform(0.5, 1)
+    while ride.turns and k < len(times):
+        turn = np.radians(ride.turns) * rng.uniform(0.5, 1)
         ramp, steady = round(_RAMP / _STEP), max(round((turn / _FASTEST - _RAMP) / _STEP), 1)
         shape = np.concatenate([np.linspace(0, 1, ramp), np.ones(steady), np.linspace(1, 0, ramp)]) * _FASTEST
         for sign in (side, -side):  # there and back

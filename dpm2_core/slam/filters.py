@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from dpm2_core.config import Settings
@@ -42,21 +43,21 @@ class FilterSettings(Settings):
     """movers: at most this fraction of a scan is left out, the most likely ones."""
 
 
-PointFilter = Callable[[Points], Points]
-"""Of the points (N, 4) float32 [x, y, z m, intensity 0..1] in the frame of the LiDAR, those that stay; may be none."""
+PointFilter = Callable[[Points], NDArray[np.bool_]]
+"""Which (N,) of the points (N, 4) float32 [x, y, z m, intensity 0..1] in the frame of the LiDAR stay; may be none."""
 
 
-def without_dynamic_objects(net: DynamicObjectNet, threshold: float, most: float, points: Points) -> Points:
+def without_dynamic_objects(net: DynamicObjectNet, threshold: float, most: float, points: Points) -> NDArray[np.bool_]:
     """Without what moves or could; see `network.perception.dynamic_objects`."""
     if not len(points):
-        return points
+        return np.zeros(0, bool)
     probability = net.probability(points)
     # A network that finds hardly anything else is wrong, or has nothing to go by: half a scan is still a scan.
     bound = max(threshold, float(np.quantile(probability, 1 - most)))
-    return points[probability <= bound]
+    return np.asarray(probability <= bound)
 
 
-def without_ground(net: GroundNet, points: Points) -> Points:
+def without_ground(net: GroundNet, points: Points) -> NDArray[np.bool_]:
     """Without the ground, and what lies off the grid of GndNet."""
     import torch
 
@@ -65,14 +66,14 @@ def without_ground(net: GroundNet, points: Points) -> Points:
     with torch.inference_mode():
         scan = torch.from_numpy(points)
         above = obstacle_weight(scan, net([scan])[0], net.settings) > 0.5
-    return points[above.numpy()]
+    return np.asarray(above.numpy())
 
 
-def without_traffic(net: Dslr, points: Points) -> Points:
+def without_traffic(net: Dslr, points: Points) -> NDArray[np.bool_]:
     """Without what stands in front of the scan as DSLR thinks that it would be without traffic."""
     import torch
 
-    return points[net.still(torch.from_numpy(points)).numpy()]
+    return np.asarray(net.still(torch.from_numpy(points)).numpy())
 
 
 def make_filter(settings: FilterSettings, threads: int) -> PointFilter | None:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numba import float32, float64, int64, types
@@ -35,7 +35,7 @@ class PreprocessSettings(Settings):
     source_voxel: float = 0.8
     """Spacing of the points that are registered, m; at least `map_voxel`."""
     deskew: bool = True
-    """Undo the motion during a sweep, at constant velocity, its rotation as an IMU measured it where there is one; only
+    """Undo the motion during a sweep, as its points or, where there is one, an IMU (the rotation) show it; only
     scans with a time per point can be."""
 
     @model_validator(mode="after")
@@ -55,6 +55,8 @@ class Scan:
         points: (P, 4) float32, all that were measured within range and that the filter, if any, left.
         cloud: (M, 4) float32, those for the local map. source: (N, 3) float64, those to register. Both are empty where
             the registration works on descriptors alone.
+        seen: (N, 3) float64, those to register as the LiDAR saw them, each when it was taken: times (N,), s from the
+            moment that the frame counts from. Both are empty where there is no motion to undo.
         description: neural descriptors, made when they are needed; None where the registration uses none.
         images: those that were taken with it, where the registration asks for them.
         twist: (6,) [rad/s, m/s] at which it was taken, as far as it was known, where the registration asks for images.
@@ -63,6 +65,8 @@ class Scan:
     points: Points
     cloud: Points = field(default_factory=lambda: np.zeros((0, 4), np.float32))
     source: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    seen: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    times: Array = field(default_factory=lambda: np.zeros(0))
     description: LazyDescriptors | None = None
     images: tuple[Image, ...] = ()
     twist: Array = field(default_factory=lambda: np.zeros(6))
@@ -80,8 +84,10 @@ class Preprocessor:
         self._settings = settings
         self._filter = point_filter
 
-    def measured(self, frame: Frame, twist: Array) -> Points:
-        """The valid points (P, 4); `twist` (6,) [rad/s, m/s] is the motion that deskewing undoes.
+    def measured(self, frame: Frame, motion: Array) -> tuple[Points, NDArray[np.int64]]:
+        """The valid points (P, 4), and which of the frame's they are (P,).
+
+        `motion`, (6,) twist [rad/s, m/s] or (K, 6), see `curve.poses`, is what deskewing undoes.
 
         NaN, inf and zero points are dropped, those out of range, what floats in the air where that is much, and what
         the filter leaves out.
@@ -92,15 +98,24 @@ class Preprocessor:
         if floating.any():
             points, used = points[~floating], used[~floating]
         if s.deskew and frame.time_offset is not None:
-            points = deskew(points, frame.time_offset[used], twist, measured_turn(frame))
-        return points if self._filter is None else self._filter(points)
+            points = deskew(points, frame.time_offset[used], motion, measured_turn(frame))
+        if self._filter is not None:
+            left = self._filter(points)
+            points, used = points[left], used[left]
+        return points, used
 
-    def prepare(self, frame: Frame, twist: Array) -> Scan:
+    def prepare(self, frame: Frame, motion: Array) -> Scan:
         """`measured`, downsampled for local map and registration."""
-        points = self.measured(frame, twist)
-        cloud = points[voxel_first(points, self._settings.map_voxel)]
-        source = cloud[voxel_first(cloud, self._settings.source_voxel), :3].astype(np.float64)
-        return Scan(points, cloud, source)
+        points, used = self.measured(frame, motion)
+        first = voxel_first(points, self._settings.map_voxel)
+        cloud = points[first]
+        few = voxel_first(cloud, self._settings.source_voxel)
+        scan = Scan(points, cloud, cloud[few, :3].astype(np.float64))
+        if frame.time_offset is None or not self._settings.deskew:
+            return scan
+        which = used[first[few]]
+        seen, times = (part[which].astype(np.float64) for part in (frame.points[:, :3], frame.time_offset))
+        return replace(scan, seen=seen, times=times)
 
 
 @compiled(types.Tuple((float32[:, ::1], int64[::1]))(READ_F4, float64, float64))

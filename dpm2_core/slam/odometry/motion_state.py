@@ -14,6 +14,7 @@ from dpm2_core.geometry.motion import OPEN, along_open, combined, covariance, pr
 from dpm2_core.slam.odometry.inertial import InertialMotion
 from dpm2_core.slam.odometry.other import OtherMotion, Step
 from dpm2_core.slam.odometry.settings import OdometrySettings
+from dpm2_core.slam.registration.swept import Beginning, Swept, begun_steadily
 
 _GYROSCOPE = np.radians(0.4)
 """Standard deviation of a measured turn beside the points, rad: where they know the heading they keep it. At 0.1 deg,
@@ -28,7 +29,9 @@ class MotionState:
     Attributes:
         settings: of what a vehicle can do.
         T, covariance: the last frame's pose (4, 4), registered or predicted, and its covariance (6, 6) [rad, m].
-        twist: (6,) [rad/s, m/s] between the last two registered frames; None until there are two.
+        twist: (6,) [rad/s, m/s] in the middle of the sweep of the last registered frame, or else from the one before to
+            it; None until there are two.
+        sweep: the motion during the sweep of the last registered frame, where its points have shown it.
         change: (6,) of the twist, from one registered frame to the next.
         of_velocity: covariance (3, 3) of the twist's velocity, m/s.
         T_registered, seconds: the last registered pose (4, 4), and the time from then to the last frame.
@@ -39,6 +42,7 @@ class MotionState:
         self.settings = settings
         self.T, self.covariance = np.eye(4), np.zeros((6, 6))
         self.twist: Array | None = None
+        self.sweep: Swept | None = None
         self.change = np.zeros(6)
         self.of_velocity = ANY_VELOCITY
         self.T_registered, self.seconds = np.eye(4), 0.0
@@ -48,12 +52,23 @@ class MotionState:
 
     def begin(self, T: Array) -> None:
         """A map begins at T (4, 4), to which no motion has led."""
-        self.T, self.twist, self.of_velocity = T, None, ANY_VELOCITY
+        self.T, self.twist, self.sweep, self.of_velocity = T, None, None, ANY_VELOCITY
 
     @property
     def known_twist(self) -> Array:
         """(6,); zeros while it is unknown."""
         return np.zeros(6) if self.twist is None else self.twist
+
+    @property
+    def ahead(self) -> Array:
+        """The twist (6,) that leads to the next frame; zeros while it is unknown. If the acceleration lasted, it would
+        change twice as much."""
+        return self.known_twist if self.sweep is None else self.known_twist + self.sweep.half / 2 * self.sweep.motion[1]
+
+    @property
+    def during(self) -> Array | None:
+        """The motion during the last sweep, (6,) or (K, 6), see `curve.poses`; None while it is unknown."""
+        return self.twist if self.sweep is None else self.sweep.motion
 
     @property
     def turn(self) -> Array | None:
@@ -91,6 +106,13 @@ class MotionState:
             covariance[:3, :3] += _GYROSCOPE**2 * np.eye(3)
         return np.linalg.inv(covariance).astype(np.float64)
 
+    def beginning(self, T: Array, seconds: float, half: float) -> Beginning:
+        """Of the sweep of a frame at T (4, 4), `seconds` after the last registered one; it began `half` s before."""
+        if self.sweep is not None:
+            return self.sweep.next(seconds, half, self.settings.steadiness)
+        twist = se3.log(se3.inverse(self.T_registered) @ T) / seconds
+        return begun_steadily(self.T_registered, twist, seconds, half, self.settings.steadiness)
+
     def unknown(self, dt: float) -> Array:
         """Covariance (6, 6) of a frame's pose, `dt` s after the one before, that is only predicted."""
         speed = float(np.linalg.norm(self.known_twist[3:]))
@@ -107,29 +129,33 @@ class MotionState:
             return replace(result, ok=False, reason=f"{degrees:.0f} deg from the prediction")
         return result
 
-    def advance(self, registration: Registration, dt: float, stamp: int | None, led: bool) -> None:
+    def advance(
+        self, registration: Registration, dt: float, stamp: int | None, led: bool, swept: Swept | None = None
+    ) -> None:
         """A frame was registered, `dt` s after the one before: go on from its pose, by the motion that led there.
 
         Args:
             registration: that of a map's first frame tells no motion. led: another odometry led to it.
+            swept: the motion during its sweep, where that is known.
         """
         seconds, moved = self.seconds + dt, registration.method != "first"
         if moved:
-            self._move(registration, seconds, led)
+            self._move(registration, seconds, led, swept)
         self.register(registration, stamp, moved)
+        self.sweep = swept
         self._open = self._open + seconds if registration.worst_sigma >= OPEN else 0.0
         if moved and self._open:
             # What the scene leaves open ends at 1 m; the motion does not, and each pose follows from the one before.
             self.covariance[3:, 3:] += along_open(registration.of_scene[3:, 3:], self.of_velocity) * self._open**2
 
-    def _move(self, registration: Registration, seconds: float, led: bool) -> None:
+    def _move(self, registration: Registration, seconds: float, led: bool, swept: Swept | None) -> None:
         """The motion from the last registered frame to one `seconds` later."""
         of_prediction = self.step.covariance if led and self.step is not None else self.of_prediction(seconds)
         of_motion = combined(registration.of_scene[3:, 3:], of_prediction[3:, 3:])
         self.of_velocity = of_motion / seconds**2
         # Not from the predicted pose of the frame before, of which an error would count as motion in one period.
         T_step = se3.inverse(self.T_registered) @ registration.T_target_source
-        twist = se3.log(T_step) / seconds
+        twist = se3.log(T_step) / seconds if swept is None else swept.motion[0]
         self.change = np.zeros(6) if self.twist is None else twist - self.twist
         self.twist = twist
         if self.other is not None:
@@ -140,7 +166,7 @@ class MotionState:
         T_before, self.T = self.T_registered, registration.T_target_source
         if self.inertial is not None and stamp is not None:
             self.inertial.registered(T_before, self.T, stamp, self.twist if moved else None)
-        self.T_registered, self.seconds = self.T, 0.0
+        self.T_registered, self.seconds, self.sweep = self.T, 0.0, None
         if self.other is not None:
             self.other.keep()
         self.covariance = registration.covariance.copy()
@@ -152,4 +178,4 @@ class MotionState:
         if (step := self.step) is not None:
             self.T, self.covariance = self.T_registered @ step.T, step.covariance
         elif self.twist is not None:
-            self.T = predicted(self.T_registered, self.turned(self.twist, self.seconds), self.seconds)
+            self.T = predicted(self.T_registered, self.turned(self.ahead, self.seconds), self.seconds)

@@ -30,7 +30,6 @@ from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration, f
 
 _ENCLOSED = "all that is seen is near: what encloses the LiDAR, as a lift does, may move along"
 _KNOWN = 0.5  # m and rad, standard deviation of the second pose, still skewed: where the points find it alone
-_BENT = 0.1  # m at half of the sweep and the usual range: by so much a wrong motion must bend a scan to count
 _BURST = 0.6  # of the usual period: while no motion is known, a frame that comes sooner was held back
 
 
@@ -50,6 +49,10 @@ class Odometry:
     def uses_images(self) -> bool:
         """Whether frames should come with their images."""
         return self._registration.uses_images
+
+    @property
+    def _matcher(self) -> ScanMatcher:
+        return ScanMatcher(self._settings, self._registration, self._motion, self._bridge)
 
     def request_keyframe(self) -> None:
         """Make a keyframe of the next registered scan, however short the way."""
@@ -105,7 +108,7 @@ class Odometry:
         self._clock.correct(dt)
         if match.scan is not scan:  # the IMU was of no use: nor is it on the way to the stamp
             frame = replace(frame, imu=None)
-        match = self._unbent(frame, match, twist, motion.seconds + dt)
+        match = self._unbent(frame, match, twist, dt)
         clock.append(perf_counter())
         scan, registration = match.scan, match.result
         enclosed = is_enclosed(scan.points)
@@ -124,7 +127,7 @@ class Odometry:
             T = registration.T_target_source
         if motion.inertial is not None:
             T = motion.inertial.T_level_odom @ T
-        T_scan_lidar = self._sweep.to_stamp(frame, motion.twist)
+        T_scan_lidar = self._sweep.to_stamp(frame, motion.during)
         T = T @ T_scan_lidar
         keyframe = self._keyframes.select(given, scan, T, registration, T_scan_lidar)
         clock.append(perf_counter())
@@ -148,7 +151,7 @@ class Odometry:
         """What an IMU and another odometry say of a frame, `seconds` after the last registered one: the frame with what
         is of use, and the twist (6,) that leads to it."""
         motion = self._motion
-        twist = motion.known_twist
+        twist = motion.ahead
         if frame.imu is not None and motion.inertial is None:
             motion.inertial = InertialMotion(not len(self._registration) and self._bridge is None)
         if motion.inertial is not None:
@@ -227,8 +230,7 @@ class Odometry:
         """A prepared frame, predicted at T_predicted (4, 4), in the map; and how long the period was, s: as stamped or,
         where that is in doubt, as the points say."""
         motion = self._motion
-        matcher = ScanMatcher(self._settings, self._registration, motion, self._bridge)
-        match = matcher.match(frame, scan, T_predicted, dt)
+        match = self._matcher.match(frame, scan, T_predicted, dt)
         usual = self._clock.usual or self._sweep.span
         burst = dt < _BURST * usual
         if burst and self._bridge is not None:
@@ -238,9 +240,9 @@ class Odometry:
         usual, result = usual or NOMINAL, match.result
         if DOUBTED[0] * usual <= dt <= DOUBTED[1] * usual or result.method == "none":
             return match, dt
-        T_usual = motion.predicted(motion.turned(motion.twist, motion.seconds + usual), usual)
+        T_usual = motion.predicted(motion.turned(motion.ahead, motion.seconds + usual), usual)
         if dt < usual or not Prediction([T_predicted]).convinced(result):
-            other = matcher.match(frame, scan, T_usual, usual)
+            other = self._matcher.match(frame, scan, T_usual, usual)
             if fits_better(other.result, result):
                 match, result = other, other.result
         if result.ok:
@@ -248,29 +250,14 @@ class Odometry:
             dt = period_by_motion(result.T_target_source, (dt, T_predicted), (usual, T_usual), steadiness)
         return match, dt
 
-    def _unbent(self, frame: Frame, match: Match, twist: Array, seconds: float) -> Match:
+    def _unbent(self, frame: Frame, match: Match, twist: Array, dt: float) -> Match:
         """Of a scan that was prepared by a motion (6,) other than the one found since, `seconds` after the last
         registered frame: prepared and registered anew; the first scan of a map with it."""
-        if self._first is None and match.result.ok and match.result.method != "first" and not match.led:
-            match = self._straightened(frame, match, twist, seconds)
+        if self._first is None:
+            match = self._matcher.straightened(frame, match, twist, dt, self._sweep.span / 2)
         if self._first is not None and match.result.ok:
-            match = self._begin_again(self._first, frame, match, seconds)
+            match = self._begin_again(self._first, frame, match, self._motion.seconds + dt)
         return match
-
-    def _straightened(self, frame: Frame, match: Match, twist: Array, seconds: float) -> Match:
-        """Anew, where the motion that was found is not that by which the scan was prepared, so that it was bent."""
-        motion = self._motion
-        if not self._sweep.span or motion.turn is not None:
-            return match
-        T = match.result.T_target_source
-        found = se3.log(se3.inverse(motion.T_registered) @ T) / seconds
-        change = np.linalg.norm((found - twist).reshape(2, 3), axis=1)
-        reach = float(np.median(np.linalg.norm(match.scan.points, axis=1)))
-        if self._sweep.span / 2 * (change[0] * reach + change[1]) < _BENT:
-            return match
-        again = self._registration.prepare(frame, found)
-        result = self._registration.register(again, Prediction([T], information=motion.information(seconds)))
-        return Match(again, result) if result.ok else match
 
     def _begin_again(self, first: Frame, frame: Frame, match: Match, seconds: float) -> Match:
         """The second scan has shown the velocity, `seconds` later: undo the motion in the first too; register anew."""
@@ -297,7 +284,7 @@ class Odometry:
             return
         if self._bridge is None:
             self._failures = 0
-        motion.advance(result, dt, self._clock.stamp, match.led)
+        motion.advance(result, dt, self._clock.stamp, match.led, match.swept)
         self._registration.update(match.scan, motion.T)
 
     def _state(self, registration: Registration, enclosed: bool) -> State:

@@ -3,13 +3,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from dpm2_core.estimates import Registration
 from dpm2_core.frame import Array, Frame
+from dpm2_core.geometry import curve, se3
+from dpm2_core.geometry.deskew import measured_turn, way
 from dpm2_core.geometry.motion import OPEN, predicted
 from dpm2_core.slam.bridge import Bridge
 from dpm2_core.slam.odometry.motion_state import MotionState
@@ -17,6 +21,9 @@ from dpm2_core.slam.odometry.settings import OdometrySettings
 from dpm2_core.slam.odometry.starts import starts_from_rest, turned_starts
 from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration, fits_better
+from dpm2_core.slam.registration.swept import JOINT, Swept
+
+_BENT = 0.02  # m at the ends of the sweep and the usual range: a scan that is bent by less is straight
 
 
 class Match(NamedTuple):
@@ -25,11 +32,13 @@ class Match(NamedTuple):
     Attributes:
         scan: for which the result holds: the given one, or one that was prepared anew.
         result: the registration. led: another odometry has led to it.
+        swept: the motion during the sweep, where the points have shown it.
     """
 
     scan: Scan
     result: Registration
     led: bool = False
+    swept: Swept | None = None
 
 
 @dataclass(frozen=True)
@@ -62,6 +71,28 @@ class ScanMatcher:
         if led is not None and own.result.worst_sigma >= OPEN:
             return Match(scan, led, led=True)
         return own
+
+    def straightened(self, frame: Frame, match: Match, twist: Array, dt: float, half: float) -> Match:
+        """A frame that was prepared by a twist (6,) and matched, with the motion that its points show during its sweep,
+        from `half` s before its middle on: anew, where that bends the scan otherwise. What did not fit may fit then."""
+        motion = self.motion
+        if not half or match.led or match.result.method in ("none", "first"):
+            return match
+        seconds, T_predicted = motion.seconds + dt, motion.predicted(twist, dt)
+        turn = measured_turn(frame)
+        beginning = motion.beginning(match.result.T_target_source, seconds, half)
+        if turn is not None and (measured := curve.fitted(turn, half)) is not None:
+            beginning = beginning.turning(measured)
+        swept = self.registration.swept(match.scan, match.result, beginning)
+        if swept is None:
+            return match
+        if _bent(match.scan, partial(way, motion=twist, turn=turn), swept) > _BENT:
+            scan = self.registration.prepare(frame, swept.motion)
+            information = np.linalg.inv(swept.covariance[:6, :6] + JOINT[:6, :6]).astype(np.float64)
+            result = self.registration.register(scan, Prediction([swept.T], information=information))
+            result = motion.gated(result, T_predicted, dt)
+            match = match._replace(scan=scan, result=result) if result.ok else match
+        return match._replace(swept=swept.placed(match.result)) if match.result.ok else match
 
     def _alone(self, frame: Frame, scan: Scan, T_predicted: Array, dt: float) -> Match:
         """By the motion so far, or from rest."""
@@ -118,3 +149,12 @@ class ScanMatcher:
             if prediction.convinced(result):
                 break
         return result
+
+
+def _bent(scan: Scan, prepared: Callable[[Array], Array], swept: Swept) -> float:
+    """How far the ends of a scan, m, that was prepared for poses at times are from where the motion of its sweep has
+    them."""
+    times = np.array([-swept.half, 0.0, swept.half])
+    off = se3.log(se3.inverse(prepared(times)) @ curve.poses(times, swept.motion))[[0, 2]]
+    reach = float(np.median(np.linalg.norm(scan.points[:, :3], axis=1)))
+    return float((np.linalg.norm(off.reshape(2, 2, 3), axis=2) @ [reach, 1.0]).max())

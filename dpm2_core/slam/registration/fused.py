@@ -17,6 +17,7 @@ from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.icp import GeometricScanRegistration
 from dpm2_core.slam.registration.neural import NeuralScanRegistration
 from dpm2_core.slam.registration.protocol import CHI2_95, MAP_NOISE, Prediction, agree, near
+from dpm2_core.slam.registration.swept import Beginning, Swept
 
 _LED = np.diag(np.repeat([np.radians(2), 0.5], 3) ** -2.0)
 """Information of a network pose with a standard deviation of 2 degrees and 0.5 m: enough to initialize ICP."""
@@ -64,8 +65,8 @@ class FusedScanRegistration:
     def fresh(self) -> FusedScanRegistration:
         return FusedScanRegistration(self._neural.fresh(), self._geometric.fresh(), self._always)
 
-    def prepare(self, frame: Frame, twist: Array) -> Scan:
-        scan = self._geometric.prepare(frame, twist)
+    def prepare(self, frame: Frame, motion: Array) -> Scan:
+        scan = self._geometric.prepare(frame, motion)
         images = frame.images if self.uses_images else ()
         description = LazyDescriptors(partial(self._neural.describe, scan.points, images))
         return replace(scan, description=description, images=images)
@@ -81,6 +82,9 @@ class FusedScanRegistration:
                 return doubted
         # Not beside the doubt: with it, everything agrees with them.
         return self._geometric.doubted(scan, prediction, self._with_network(scan, prediction, points))
+
+    def swept(self, scan: Scan, result: Registration, beginning: Beginning) -> Swept | None:
+        return self._geometric.swept(scan, result, beginning)
 
     def _with_network(self, scan: Scan, prediction: Prediction, points: Registration | None) -> Registration:
         """What the network says as well, of points that were registered or, where it is always asked, are not yet."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from pydantic import Field
@@ -22,6 +23,7 @@ from dpm2_core.slam.preprocess import Preprocessor, Scan
 from dpm2_core.slam.registration.local_map import LocalMap
 from dpm2_core.slam.registration.point_to_plane import linearize
 from dpm2_core.slam.registration.protocol import Prediction, fits_better, near
+from dpm2_core.slam.registration.swept import Beginning, Swept, register_sweep
 
 
 class GeometricSettings(Settings):
@@ -127,6 +129,15 @@ class GeometricRegistration:
         result = Registration(T, _covariance(H), ratio, rmse, "geometric", ok, reason)
         return with_calibration(result, target.from_nearest_scan(T))
 
+    def swept(self, scan: Scan, target: LocalMap, T: Array, beginning: Beginning) -> Swept | None:
+        """Pose and motion of the sweep of a scan, which was found at T (4, 4) as if it were rigid; None if its points
+        have no times."""
+        if not len(scan.times) or len(target) < self._settings.min_points:
+            return None
+        gate = 2 * self._settings.final_gate  # the ends of the sweep are farther off than its middle
+        matched = partial(self._matched, target=target, gate=gate)
+        return register_sweep(scan, lambda points, T: matched(points, T=T), T, beginning, CORRELATED)
+
     def likeliest(self, source: Array, target: LocalMap, found: Sequence[Registration]) -> Registration:
         """The best of several results, with the way to the farthest that is nearly as likely in its covariance."""
         fit = [self.likelihood(source, target, r.T_target_source) for r in found]
@@ -196,8 +207,8 @@ class GeometricScanRegistration:
     def fresh(self) -> GeometricScanRegistration:
         return GeometricScanRegistration(self._preprocessor, self._registration, self._local_map.fresh())
 
-    def prepare(self, frame: Frame, twist: Array) -> Scan:
-        return self._preprocessor.prepare(frame, twist)
+    def prepare(self, frame: Frame, motion: Array) -> Scan:
+        return self._preprocessor.prepare(frame, motion)
 
     def rejection(self, scan: Scan) -> str:
         least = self._registration.min_points
@@ -205,6 +216,9 @@ class GeometricScanRegistration:
 
     def register(self, scan: Scan, prediction: Prediction) -> Registration:
         return self.doubted(scan, prediction, self.located(scan, prediction))
+
+    def swept(self, scan: Scan, result: Registration, beginning: Beginning) -> Swept | None:
+        return self._registration.swept(scan, self._local_map, result.T_target_source, beginning)
 
     def located(self, scan: Scan, prediction: Prediction) -> Registration:
         """As `register`, whatever many of the points may do together."""

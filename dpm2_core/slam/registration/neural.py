@@ -21,6 +21,7 @@ from dpm2_core.slam.preprocess import Preprocessor, Scan
 from dpm2_core.slam.registration.descriptor_map import DescriptorMap
 from dpm2_core.slam.registration.protocol import Prediction, agree
 from dpm2_core.slam.registration.spacing import Spacing
+from dpm2_core.slam.registration.swept import Beginning, Swept
 
 if TYPE_CHECKING:  # torch takes seconds to import, and the geometric SLAM does without
     from dpm2_core.network.model import DeepPointMap2
@@ -79,8 +80,8 @@ class NeuralScanRegistration:
     def fresh(self) -> NeuralScanRegistration:
         return NeuralScanRegistration(self._settings, self._preprocessor, self._model)
 
-    def prepare(self, frame: Frame, twist: Array) -> Scan:
-        points = self._preprocessor.measured(frame, twist)
+    def prepare(self, frame: Frame, motion: Array) -> Scan:
+        points, _ = self._preprocessor.measured(frame, motion)
         images = frame.images if self.uses_images else ()
         return Scan(points, description=LazyDescriptors(partial(self.describe, points, images)), images=images)
 
@@ -117,6 +118,9 @@ class NeuralScanRegistration:
             if not agree(result, Registration(T_predicted, covariance, 0.0, np.inf, "predicted")):
                 return replace(result, ok=False, reason="contradicts the motion so far")
         return result
+
+    def swept(self, scan: Scan, result: Registration, beginning: Beginning) -> Swept | None:
+        return None
 
     def _registered(self, scan: Scan, T_near: Array, frames: int) -> Registration:
         """T_odom_lidar by the descriptors of the frames nearest to a pose (4, 4), merged."""

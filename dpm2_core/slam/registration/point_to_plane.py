@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The inner loops of the point-to-plane registration."""
+"""The inner loops of the point-to-plane registration, of a rigid scan and of a sweep in motion."""
 
 from __future__ import annotations
 
@@ -8,6 +8,10 @@ from numpy.typing import NDArray
 
 from dpm2_core.frame import Array
 from dpm2_core.geometry.compiled import compiled
+
+ORDER = 3
+"""Of the way during a sweep as a polynomial in time: a twist, its rate and the rate of that. Legs make 4 steps per
+second, in a sweep of 0.1 s nearly half of one: at order 2 such a robot's errors were 2 to 3 times as large."""
 
 
 @compiled("Tuple((f8[::1], f8[:, ::1], f8[::1]))(f8[:, ::1], i4[::1], f8[:, ::1], f8[:, ::1], f8[::1])")
@@ -70,3 +74,35 @@ def linearize(
         for column in range(row):
             H[column, row] = H[row, column]
     return H, gradient, fits, np.sqrt(total / fits) if fits else np.inf
+
+
+@compiled("Tuple((f8[:, :, ::1], f8[:, ::1]))(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[::1])")
+def moments(
+    source: Array, times: Array, R: Array, residual: Array, normals: Array, variances: Array
+) -> tuple[Array, Array]:
+    """As `linearize`, with the Hessian and the gradient weighed by powers of the times (N,) of the points.
+
+    Returns:
+        (2 ORDER + 1, 6, 6) Hessians, the k-th with each point times its time^k, and (ORDER + 1, 6) gradients.
+    """
+    H, gradient, J = np.zeros((2 * ORDER + 1, 6, 6)), np.zeros((ORDER + 1, 6)), np.empty(6)
+    for n in range(len(source)):
+        if np.isnan(residual[n]):
+            continue
+        for i in range(3):
+            J[3 + i] = normals[n, 0] * R[0, i] + normals[n, 1] * R[1, i] + normals[n, 2] * R[2, i]
+        J[0] = source[n, 1] * J[5] - source[n, 2] * J[4]
+        J[1] = source[n, 2] * J[3] - source[n, 0] * J[5]
+        J[2] = source[n, 0] * J[4] - source[n, 1] * J[3]
+        weight = 1 / (variances[n] + residual[n] * residual[n])
+        for k in range(2 * ORDER + 1):
+            for row in range(6):
+                if k <= ORDER:
+                    gradient[k, row] += J[row] * weight * residual[n]
+                for column in range(row + 1):
+                    H[k, row, column] += J[row] * weight * J[column]
+            weight *= times[n]
+    for row in range(6):
+        for column in range(row):
+            H[:, column, row] = H[:, row, column]
+    return H, gradient

@@ -13,6 +13,7 @@ from dpm2_core.estimates import Registration
 from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
 from dpm2_core.slam.preprocess import Scan
+from dpm2_core.slam.registration.swept import Beginning, Swept
 
 _EXPECTED = (0.3, 2.0)  # m and degrees from the prediction; hard braking makes 0.1 m in 0.1 s
 _EXACT = 0.1  # m
@@ -127,8 +128,9 @@ class ScanRegistration(Protocol):
         """Another one like it that remembers nothing yet."""
         ...
 
-    def prepare(self, frame: Frame, twist: Array) -> Scan:
-        """What it needs of a frame that was taken while moving at `twist` (6,) [rad/s, m/s]; never raises."""
+    def prepare(self, frame: Frame, motion: Array) -> Scan:
+        """What it needs of a frame that was taken while moving so: `motion` (6,) [rad/s, m/s] or (K, 6), as
+        `curve.poses` takes it; never raises."""
         ...
 
     def rejection(self, scan: Scan) -> str:
@@ -137,6 +139,10 @@ class ScanRegistration(Protocol):
 
     def register(self, scan: Scan, prediction: Prediction) -> Registration:
         """Find the pose of a scan; needs a map."""
+        ...
+
+    def swept(self, scan: Scan, result: Registration, beginning: Beginning) -> Swept | None:
+        """The motion during the sweep of a scan that was registered so; None: the scan does not show it."""
         ...
 
     def update(self, scan: Scan, T_odom_lidar: Array) -> bool:

@@ -18,6 +18,7 @@ from dpm2_core.geometry.deskew import placed
 from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.intensity import IntensitySearch
 from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration, agree
+from dpm2_core.slam.registration.swept import Beginning, Swept
 from dpm2_core.slam.registration.texture import Reference, VisualSettings, along, reference, textured
 
 _LEAST_REACH = 0.6  # m: however well the motion is known
@@ -49,8 +50,9 @@ class VisualScanRegistration:
     def fresh(self) -> VisualScanRegistration:
         return VisualScanRegistration(self._settings, self._registration.fresh())
 
-    def prepare(self, frame: Frame, twist: Array) -> Scan:
-        return replace(self._registration.prepare(frame, twist), images=frame.images, twist=twist)
+    def prepare(self, frame: Frame, motion: Array) -> Scan:
+        twist = np.atleast_2d(motion)[0]
+        return replace(self._registration.prepare(frame, motion), images=frame.images, twist=twist)
 
     def rejection(self, scan: Scan) -> str:
         return self._registration.rejection(scan)
@@ -61,6 +63,9 @@ class VisualScanRegistration:
             result = self._told(scan, result, prediction.information)
         self._tied = result.ok and result.worst_sigma <= self._settings.sigma
         return result
+
+    def swept(self, scan: Scan, result: Registration, beginning: Beginning) -> Swept | None:
+        return self._registration.swept(scan, result, beginning)
 
     def update(self, scan: Scan, T_odom_lidar: Array) -> bool:
         if scan.images and self._wants(T_odom_lidar):

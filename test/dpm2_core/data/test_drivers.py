@@ -90,7 +90,7 @@ def thickness(message: Any, settings: InputSettings | None = None) -> tuple[floa
     builder = FrameBuilder(settings or InputSettings(), Calibration("/points"), pytest.fail)
     frame = builder.frame(STAMP, message, 0)
     assert len(frame.points) == 2000
-    points = Preprocessor(PreprocessSettings()).measured(frame, TWIST)
+    points = Preprocessor(PreprocessSettings()).measured(frame, TWIST)[0]
     return float(np.abs(points[:, 0] - 20).max()), builder.time_problem
 
 

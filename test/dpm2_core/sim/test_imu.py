@@ -16,7 +16,7 @@ from dpm2_core.geometry.turning import turned
 from dpm2_core.sim.drive import simulate
 from dpm2_core.sim.imu import GRAVITY, Imu
 from dpm2_core.sim.settings import DriveConfig, ImuConfig, LidarConfig
-from dpm2_core.sim.simulated_drive import TurningRobot
+from dpm2_core.sim.simulated_drive import Ride, TurningRobot
 from dpm2_core.sim.world import World
 
 EXACT = ImuConfig(gyro_noise=0, gyro_bias=0, acceleration_noise=0, acceleration_bias=0, scale=0, misaligned=0)
@@ -39,7 +39,7 @@ def test_at_rest_it_shows_gravity_upwards_and_its_bias() -> None:
 
 
 def test_its_rates_lead_along_the_drive(city: World) -> None:
-    robot = TurningRobot(city, 30, 2.0, LIDAR, EXACT, swings=90.0)
+    robot = TurningRobot(city, 30, Ride(2.0, turns=90.0), LIDAR, EXACT)
     assert np.degrees(se3.angle(se3.inverse(robot.poses[:-1]) @ robot.poses[1:])).max() > 9  # deg in 0.1 s
     frames = list(robot.frames())
     for i, (last, frame) in enumerate(pairwise(frames), 1):
@@ -57,7 +57,7 @@ def test_its_rates_lead_along_the_drive(city: World) -> None:
 
 def test_each_point_has_its_own_moment(city: World) -> None:
     """Undone with the true poses, the scans of a swing lie on each other."""
-    robot = TurningRobot(city, 36, 2.0, LIDAR.model_copy(update={"noise": 0.0, "dropout": 0.0}), swings=90.0)
+    robot = TurningRobot(city, 36, Ride(2.0, turns=90.0), LIDAR.model_copy(update={"noise": 0.0, "dropout": 0.0}))
     frame = robot.frame(34)
     assert frame.time_offset is not None
     assert frame.imu is None

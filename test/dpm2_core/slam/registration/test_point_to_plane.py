@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from dpm2_core.geometry import se3
-from dpm2_core.slam.registration.point_to_plane import distances, linearize
+from dpm2_core.slam.registration.point_to_plane import ORDER, distances, linearize, moments
 
 N, M = 500, 200
 
@@ -53,3 +53,21 @@ def test_nothing_matched() -> None:
     assert not gradient.any()
     assert fits == 0
     assert rmse == np.inf
+
+
+def test_moments_are_normal_equations_weighed_by_powers_of_the_times() -> None:
+    rng = np.random.default_rng(2)
+    source, times, T = rng.normal(size=(N, 3)) * 20, rng.uniform(-0.05, 0.05, N), se3.exp(rng.normal(size=6))
+    normals = rng.normal(size=(N, 3))
+    residual, variances = rng.normal(size=N) * 0.2, rng.uniform(0.003, 0.05, N)
+    residual[::7] = np.nan
+    H, gradient = moments(source, times, np.ascontiguousarray(T[:3, :3]), residual, normals, variances)
+    used = ~np.isnan(residual)
+    n, r, t = normals[used] @ T[:3, :3], residual[used], times[used]
+    J = np.concatenate([np.cross(source[used], n), n], 1)
+    weight = 1 / (variances[used] + r * r)
+    assert (len(H), len(gradient)) == (2 * ORDER + 1, ORDER + 1)
+    for k in range(2 * ORDER + 1):  # sums in another order: rounding alone, of what shrinks by 0.05 with each power
+        np.testing.assert_allclose(H[k], J.T @ (J * (weight * t**k)[:, None]), rtol=1e-9, atol=1e-9 * 0.05**k)
+    for k in range(ORDER + 1):
+        np.testing.assert_allclose(gradient[k], J.T @ (weight * t**k * r), rtol=1e-9, atol=1e-9 * 0.05**k)

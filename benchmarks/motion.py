@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sweeps in motion: raw scans, with the time of each point, of LiDARs on a car, on foot, on legs and in the air.
+
+No IMU. The velocity changes within each sweep, which bends its scan; what is measured is the step from scan to scan.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from rich.console import Group
+from rich.progress import Progress
+
+from benchmarks.harness import Options, Report, settings_of
+from dpm2_core.experiments.peers import KissIcp
+from dpm2_core.extras import MissingPackageError
+from dpm2_core.frame import Array, Frame
+from dpm2_core.geometry import se3
+from dpm2_core.sim.sensors import real_sensor
+from dpm2_core.sim.settings import LidarConfig, PresetName
+from dpm2_core.sim.simulated_drive import RIDES, TurningRobot
+from dpm2_core.sim.world import build_world
+from dpm2_core.slam.build import make_odometry
+from dpm2_core.slam.settings import SlamSettings
+from dpm2_core.tables import FigureTable
+
+WORLDS: dict[str, tuple[PresetName, int, int, tuple[str, ...]]] = {
+    "suburb": ("suburb", 920, 32, tuple(RIDES)),
+    "building": ("indoor", 921, 16, ("walking", "waved", "legged")),
+}
+"""Kind of world, its seed, beams, and the rides through it."""
+FRAMES = 150
+OURS, BASELINE = ("dpm2", "dpm2 geometric"), "kiss-icp"
+_MOVING = 20  # frames, after which all that shakes does
+
+
+def bench_motion(options: Options) -> Report:
+    """Each ride once: the odometry alone with default settings, without the network, and KISS-ICP."""
+    results = dict[str, Any]()
+    settings = [settings_of(options), settings_of(options, "slam.registration=geometric")]
+    with Progress(transient=True) as progress:
+        for place, (preset, seed, beams, rides) in WORLDS.items():
+            world = build_world("loop", preset, seed)
+            for name in rides:
+                lidar = LidarConfig(beams=beams, columns=1024, height=1.4, car_body=False, min_range=0.4)
+                robot = TurningRobot(world, FRAMES, RIDES[name], real_sensor(lidar))
+                task = f"{place}, {name}"
+                frames = list(progress.track(robot.frames(), total=FRAMES, description=task))
+                results[task] = {way: _ours(frames, robot, s) for way, s in zip(OURS, settings, strict=True)}
+                if (kiss := _kiss(frames, robot, options.threads)) is not None:
+                    results[task][BASELINE] = kiss
+                progress.console.print(f"{task}: {results[task]}", soft_wrap=True)
+    return Report({"frames": FRAMES, "rides": results}, Group(_table(results)))
+
+
+def _ours(frames: Iterable[Frame], robot: TurningRobot, settings: SlamSettings) -> dict[str, Any]:
+    odometry, failed, poses = make_odometry(settings), 0, list[Array]()
+    for frame in frames:
+        tracked = odometry.process(frame)
+        poses.append(tracked.T_odom_lidar)
+        failed += not tracked.registration.ok
+    return {**_errors(np.array(poses), robot.poses), "failed_frames": failed}
+
+
+def _kiss(frames: Iterable[Frame], robot: TurningRobot, threads: int) -> dict[str, Any] | None:
+    """Compared with the truth in the middle and at the end of the sweeps: what fits better counts. None where it is not
+    installed."""
+    try:
+        peer = KissIcp(threads, deskew=True)
+    except MissingPackageError:
+        return None
+    for frame in frames:
+        peer.add(frame)
+    at_end = robot.pose(robot.times + robot.PERIOD / 2)
+    return min((_errors(peer.poses(), truth) for truth in (robot.poses, at_end)), key=lambda e: float(e["rpe_m"]))
+
+
+def _errors(poses: Array, truth: Array) -> dict[str, float]:
+    """Of the steps from scan to scan: root mean squares, and the largest."""
+    steps, true = (se3.inverse(T[:-1]) @ T[1:] for T in (poses, truth))
+    off = np.array([se3.magnitude(T) for T in (se3.inverse(true) @ steps)[_MOVING:]])
+    rms, worst = np.sqrt((off**2).mean(0)), off.max(0)
+    return {"rpe_m": rms[0], "rpe_deg": rms[1], "worst_m": worst[0], "worst_deg": worst[1]}
+
+
+def _table(rides: dict[str, Any]) -> FigureTable:
+    methods = [*OURS, *([BASELINE] if all(BASELINE in r for r in rides.values()) else [])]
+    figures = [f"{unit}, {name}" for unit in ("m", "deg") for name in methods]
+    table = FigureTable("from scan to scan, root mean square", names=["ride"], figures=figures)
+    for ride, r in rides.items():
+        table.add_row(ride, *(f"{r[name][key]:.3f}" for key in ("rpe_m", "rpe_deg") for name in methods))
+    return table

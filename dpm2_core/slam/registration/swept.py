@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A sweep in motion to a local map: its pose and, together with it, the motion that bent it.
+
+A rigid scan assumes one velocity during a sweep; who walks, hovers or drives over a bump changes it meanwhile. Here the
+way during the sweep is a polynomial of third degree in time that begins where, and as fast as, the sweep before ended.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from math import factorial
+
+import numpy as np
+
+from dpm2_core.estimates import Registration
+from dpm2_core.frame import Array
+from dpm2_core.geometry import curve, se3
+from dpm2_core.slam.preprocess import Scan
+from dpm2_core.slam.registration.point_to_plane import ORDER, moments
+
+_ITERATIONS = 12
+_CHI2 = 21.03
+"""95 % quantile of chi2 with 12 degrees of freedom. Of sweeps on foot, on legs and of cars the largest was 10; where a
+driver's times run backwards it is 30 on average."""
+_END = (3e-4, 3e-3)  # rad and m: a smaller change of the pose, and of the ends of the sweep, is none
+JOINT = np.diag(np.repeat([np.radians(0.05), 0.005, 0.1, 0.1], 3) ** 2)
+"""Covariance (12, 12) [rad, m, rad/s, m/s] of what is left between the end of a sweep and the beginning of the next."""
+
+_GYROSCOPE = 0.07
+"""Standard deviation of a measured rate of turn beside the points, rad/s, as that of a turn from scan to scan."""
+
+Matched = Callable[[Array, Array], tuple[Array, Array, Array]]
+"""Of points (N, 3) at a pose (4, 4): distances from the map's planes (N,), m, normals (N, 3), variances (N,), m2."""
+
+
+@dataclass(frozen=True, eq=False)
+class Beginning:
+    """What is known of a sweep before it is registered.
+
+    Attributes:
+        T: (4, 4) T_odom_lidar at its first point. twist: (6,) [rad/s, m/s] then. covariance: (12, 12) of both.
+        half: s from then to the middle of the sweep.
+        expected, deviation: (ORDER, 6) of the motion around its middle, beside that.
+    """
+
+    T: Array
+    twist: Array
+    covariance: Array
+    half: float
+    expected: Array
+    deviation: Array
+
+    def turning(self, measured: Array) -> Beginning:
+        """With the rotation during the sweep as an IMU has measured it, derivatives (ORDER, 3) of it."""
+        expected, deviation = self.expected.copy(), self.deviation.copy()
+        expected[:, :3] = measured
+        deviation[:, :3] = _GYROSCOPE / self.half ** np.arange(ORDER)[:, None]
+        return replace(self, expected=expected, deviation=deviation)
+
+
+@dataclass(frozen=True, eq=False)
+class Swept:
+    """A sweep that was registered.
+
+    Attributes:
+        T: (4, 4) T_odom_lidar in its middle. motion: (ORDER, 6) around then, see `curve.poses`.
+        covariance: (6 + 6 ORDER, 6 + 6 ORDER) of the pose, on its right, and of the motion.
+        half: s from its middle to its ends.
+    """
+
+    T: Array
+    motion: Array
+    covariance: Array
+    half: float
+
+    def placed(self, result: Registration) -> Swept:
+        """With the pose of a result, which may rest on more than the points: what differs was motion, too."""
+        T = result.T_target_source
+        off = se3.log(se3.inverse(self.T) @ T)
+        gain = np.linalg.solve(self.covariance[:6, :6] + result.of_scene, self.covariance[:6]).T
+        motion = self.motion + (gain @ off)[6:].reshape(ORDER, 6)
+        return replace(self, T=T, motion=motion, covariance=self.covariance - gain @ self.covariance[:6])
+
+    def next(self, seconds: float, half: float, steadiness: float) -> Beginning:
+        """Of a sweep whose middle is `seconds` later."""
+        pause = max(seconds - self.half - half, 0.0)
+        of_end = _at(self.half)
+        go_on = np.eye(12)
+        go_on[:6, 6:] = pause * np.eye(6)
+        change = go_on @ of_end
+        lost = np.repeat([steadiness * pause * pause / 2, steadiness * pause], 6) ** 2
+        twist = of_end[6:, 6:] @ self.motion.ravel()
+        T = self.T @ curve.poses(self.half, self.motion) @ se3.exp(pause * twist)
+        return Beginning(
+            T, twist, change @ self.covariance @ change.T + np.diag(lost) + JOINT, half, *_steady(half, steadiness)
+        )
+
+
+def begun_steadily(T_before: Array, twist: Array, seconds: float, half: float, steadiness: float) -> Beginning:
+    """Of a sweep whose middle is `seconds` after the pose T_before (4, 4), if nothing is known but the twist (6,) from
+    there to here."""
+    sigma = steadiness * seconds / 2
+    covariance = np.diag(np.repeat([sigma * half, sigma], 6) ** 2)
+    return Beginning(T_before @ se3.exp((seconds - half) * twist), twist, covariance, half, *_steady(half, steadiness))
+
+
+def register_sweep(scan: Scan, matched: Matched, T: Array, beginning: Beginning, shared: float) -> Swept | None:
+    """Pose and motion of a sweep, by least squares from a pose T (4, 4) and a steady motion on; None where they
+    contradict how it began: its times are wrong, or its points are at the wrong walls.
+
+    Args:
+        scan: timed from the middle of the sweep. matched: points to the map.
+        shared: so many points count as one, as those of a plane are not independent.
+    """
+    motion = np.concatenate([beginning.twist[None], np.zeros((ORDER - 1, 6))])
+    information = np.linalg.inv(beginning.covariance)
+    expected = np.concatenate([np.zeros(6), beginning.expected.ravel()])
+    alone = np.concatenate([np.zeros(6), beginning.deviation.ravel() ** -2])
+    start = _at(-beginning.half)
+    for _ in range(_ITERATIONS):
+        points = curve.moved(scan.seen, scan.times, partial(curve.poses, motion=motion))
+        H, gradient = _normal_equations(points, scan.times, T, matched(points, T), shared)
+        T_start = T @ curve.poses(-beginning.half, motion)
+        off = np.concatenate([se3.log(se3.inverse(beginning.T) @ T_start), _twist(start, motion) - beginning.twist])
+        H += start.T @ information @ start + np.diag(alone + 1e-9)
+        gradient += start.T @ information @ off + alone * (np.concatenate([np.zeros(6), motion.ravel()]) - expected)
+        step = np.linalg.solve(H, -gradient)
+        T, change = se3.orthonormalized(T @ se3.exp(step[:6])), step[6:].reshape(ORDER, 6)
+        motion = motion + change
+        moved = np.abs([step[:6], beginning.half * change[0]]).reshape(4, 3).max(1)
+        if max(moved[0], moved[2]) < _END[0] and max(moved[1], moved[3]) < _END[1]:
+            break
+    if off @ information @ off > _CHI2:
+        return None
+    return Swept(T, motion, np.asarray(np.linalg.inv(H), np.float64), beginning.half)
+
+
+def _normal_equations(
+    points: Array, times: Array, T: Array, matched: tuple[Array, Array, Array], shared: float
+) -> tuple[Array, Array]:
+    """Hessian (6 + 6 ORDER, 6 + 6 ORDER) and gradient of a step on the right of T and of a change of the motion."""
+    H, gradient = moments(points, times, np.ascontiguousarray(T[:3, :3]), *matched)
+    weight = [1 / factorial(k) for k in range(ORDER + 1)]
+    rows = [np.hstack([weight[i] * weight[j] * H[i + j] for j in range(ORDER + 1)]) for i in range(ORDER + 1)]
+    return np.vstack(rows) / shared, (np.array(weight)[:, None] * gradient).ravel() / shared
+
+
+def _steady(half: float, steadiness: float) -> tuple[Array, Array]:
+    """`expected` and `deviation` of a `Beginning`: an acceleration with that deviation (m/s2 and rad/s2), which may
+    become its opposite in half a sweep."""
+    deviation = [np.inf, *(steadiness * (2 / half) ** k for k in range(ORDER - 1))]
+    return np.zeros((ORDER, 6)), np.repeat(np.array(deviation)[:, None], 6, 1)
+
+
+def _at(time: float) -> Array:
+    """(12, 6 + 6 ORDER) how the pose and the twist at a time, s, change with the pose at 0 and the motion; to first
+    order in the way."""
+    of_pose = [time**k / factorial(k) for k in range(ORDER + 1)]
+    return np.concatenate([np.kron(of_pose, np.eye(6)), np.kron([0.0, *of_pose[:-1]], np.eye(6))])
+
+
+def _twist(at: Array, motion: Array) -> Array:
+    """(6,) at a time of which `at` is `_at`."""
+    return np.asarray(at[6:, 6:] @ motion.ravel())
