@@ -82,7 +82,7 @@ def _errors(poses: Array, truth: Array) -> dict[str, float]:
     steps, true = (se3.inverse(T[:-1]) @ T[1:] for T in (poses, truth))
     off = np.array([se3.magnitude(T) for T in (se3.inverse(true) @ steps)[_MOVING:]])
     rms, worst = np.sqrt((off**2).mean(0)), off.max(0)
-    return {"rpe_m": rms[0], "rpe_deg": rms[1], "worst_m": worst[0], "worst_deg": worst[1]}
+    return dict(zip(("rpe_m", "rpe_deg", "worst_m", "worst_deg"), [*rms.tolist(), *worst.tolist()], strict=True))
 
 
 def _table(rides: dict[str, Any]) -> FigureTable:

@@ -21,6 +21,7 @@ from dpm2_core.data.messages import scale_intensity
 from dpm2_core.data.scan_file import chosen, image_of, image_size, images_of, numbered_scans, read_scan
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.text import parse_row, read_lines, read_numbers
+from dpm2_core.data.time_order import out_of_order
 from dpm2_core.data.vertical_angle import HDL64_CORRECTION_DEG, checked_correction, correct_vertical_angle
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Camera, Fix, Frame, Inertial
@@ -130,7 +131,7 @@ class KittiSource:
             message = float(json.loads(note.read_text(encoding="utf-8"))["vertical_angle_correction_deg"])
         except FileNotFoundError:
             return HDL64_CORRECTION_DEG
-        except (OSError, ValueError, TypeError, KeyError) as error:
+        except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
             raise UsageError(f"{note}: no number vertical_angle_correction_deg ({error})") from None
         return checked_correction(message, str(note))
 
@@ -148,6 +149,13 @@ class KittiSource:
             step = float(np.median(np.diff(times[:, 0]))) if len(times) > 1 else self._settings.period
             self.notes.append(f"{path}: {len(times)} times for {n} scans; the rest continue every {step:.3f} s")
             seconds = np.where(known, seconds, seconds[last] + (self.numbers - self.numbers[last]) * step)
+        if (off := out_of_order(seconds)).any():
+            first = int(np.argmax(off))
+            self.notes.append(
+                f"{path}: {off.sum()} times are not between their neighbors and are taken to be, the first"
+                f" {seconds[first]:g} s of scan {self.numbers[first]}"
+            )
+            seconds[off] = np.interp(self.numbers[off], self.numbers[~off], seconds[~off])
         return np.round(seconds * 1e9).astype(np.int64)
 
     def _poses(self) -> Array | None:
@@ -169,6 +177,11 @@ class KittiSource:
         known = np.isfinite(rows).all(1)
         if not known.all():
             self.notes.append(f"{path}: {len(self) - known.sum()} of {len(self)} frames have no pose")
+        rigid = np.array([se3.is_rigid(se3.make(T[:, :3], T[:, 3]), ROUNDED) for T in rows.reshape(-1, 3, 4)], bool)
+        if (wrong := np.logical_and(known, ~rigid)).any():
+            first = self.numbers[int(np.argmax(wrong))]
+            self.notes.append(f"{path}: {wrong.sum()} poses are no rigid transforms and left out, that of scan {first}")
+            known = np.logical_and(known, rigid)
         T_world_cam = np.full((len(self), 4, 4), np.nan)
         # Rounded to 7 digits in the files, which a quaternion on the way through a bag would not keep.
         T_world_cam[known] = se3.from_rows(rows[known])

@@ -10,6 +10,8 @@ import numpy as np
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array
 
+_LARGEST = 9e9  # s, of a stamp in ns as an integer: the year 2255; no place or focal length is as large
+
 
 def read_numbers(path: Path, columns: int, skip: int = 0) -> Array:
     """(lines, columns) float64 of a text file below a header of `skip` lines; no rows if there is no such file.
@@ -36,11 +38,13 @@ def read_lines(path: Path) -> list[str]:
 
 
 def parse_row(text: str, count: int, where: str) -> Array:
-    """(count,) finite numbers of a line; the UsageError of any other line begins with `where`."""
+    """(count,) finite numbers of a line, none beyond 9e9; the UsageError of any other line begins with `where`."""
     try:
         row = np.array([float(word) for word in text.split()])
     except ValueError as error:
         raise UsageError(f"{where}: {error}") from None
     if len(row) != count or not np.isfinite(row).all():
         raise UsageError(f"{where}: {len(row)} numbers, want {count} finite ones")
+    if np.abs(row).max(initial=0) > _LARGEST:
+        raise UsageError(f"{where}: {np.abs(row).max():g} is no time, place or calibration")
     return row

@@ -271,6 +271,27 @@ def test_times_that_end_early_continue_at_their_pace(kitti_folder: MakeFolder) -
     assert "3 times for 5 scans" in source.notes[0]
 
 
+@pytest.mark.parametrize("wrong", [1.1, -0.9, 0.0, 1e6])
+def test_a_time_that_is_not_between_its_neighbors_is_taken_to_be(kitti_folder: MakeFolder, wrong: float) -> None:
+    """One of them moved a perfect drive by 2 to 18 m, over a break."""
+    folder = kitti_folder(numbers=range(30))
+    times = [0.1 * n + 5 for n in range(30)]
+    times[12] = wrong
+    (folder / "times.txt").write_text("".join(f"{t}\n" for t in times))
+    source = KittiSource(folder)
+    np.testing.assert_allclose(source.stamps * 1e-9, 0.1 * np.arange(30) + 5, atol=1e-9)
+    assert any("1 times are not between their neighbors" in note and "of scan 12" in note for note in source.notes)
+
+
+def test_poses_that_are_no_transforms_are_none(kitti_folder: MakeFolder) -> None:
+    folder = kitti_folder()
+    (folder / "poses.txt").write_text("".join(f"{1 + (n == 2)} 0 0 0 0 1 0 0 0 0 1 {n}\n" for n in range(5)))
+    source = KittiSource(folder, InputSettings(kitti_poses="semantic_kitti"))
+    assert source.poses is not None
+    np.testing.assert_array_equal(np.isnan(source.poses[:, 0, 0]), np.arange(5) == 2)
+    assert any("1 poses are no rigid transforms and left out, that of scan 2" in note for note in source.notes)
+
+
 @pytest.mark.parametrize("text", [None, ""])
 def test_without_times_frames_are_a_tenth_apart(kitti_folder: MakeFolder, text: str | None) -> None:
     folder = kitti_folder(numbers=[3, 4, 6])
@@ -287,6 +308,9 @@ def test_without_times_frames_are_a_tenth_apart(kitti_folder: MakeFolder, text: 
     [
         ("times.txt", "0\nten\n", r"times.txt:2: .*'ten'"),
         ("times.txt", "0\n\n1 2\n", r"times.txt:3: 2 numbers, want 1"),
+        ("times.txt", "0\n1e300\n", r"times.txt:2: 1e\+300 is no time"),
+        ("imu.txt", "0 0 0 0 0 0 1e300\n", r"imu.txt:1: 1e\+300 is no"),
+        ("gnss.txt", "1e20 49 8 100 1 1 1\n", r"gnss.txt:1: 1e\+20 is no time"),
         ("poses.txt", "1 0 0 0 0 1 0 0 0 0 1\n", r"poses.txt:1: 11 numbers, want 12"),
     ],
 )

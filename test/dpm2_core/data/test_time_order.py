@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Single times that are off are found, whatever they are; clocks that were set are left as they are."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dpm2_core.data.time_order import out_of_order
+
+TIMES = 0.1 * np.arange(40)
+
+
+@given(st.integers(1, 38), st.floats(0.15, 1e6), st.booleans())
+def test_one_that_is_off_by_more_than_a_period_is_found(which: int, off: float, before: bool) -> None:
+    times = TIMES.copy()
+    times[which] += -off if before else off
+    if not times[which - 1] < times[which] < times[which + 1]:
+        found = np.flatnonzero(out_of_order(times))
+        assert len(found) == 1
+        assert abs(found[0] - which) <= (off < 0.3)  # of two that have changed places either may be the wrong one
+
+
+@pytest.mark.parametrize("times", [TIMES, TIMES[:1], TIMES[:0], np.r_[TIMES, TIMES + 1.05], np.r_[TIMES, TIMES + 60]])
+def test_times_in_order_and_clocks_that_were_set_stay(times: np.ndarray) -> None:
+    assert not out_of_order(times).any()
+
+
+def test_at_most_three_in_a_row() -> None:
+    for count in (3, 4):
+        times = TIMES.copy()
+        times[10 : 10 + count] += 100
+        assert out_of_order(times).sum() == (count if count <= 3 else 0)
+
+
+def test_the_ends_have_one_neighbor() -> None:
+    """Nothing says what they are."""
+    for which in (0, -1):
+        times = TIMES.copy()
+        times[which] += 50 if which == 0 else -50
+        assert not out_of_order(times).any()
