@@ -143,6 +143,8 @@ def decode_camera(info: Any, T_lidar_cam: Array, name: str) -> Camera:
                            "supported: plumb_bob, rational_polynomial, equidistant")  # fmt: skip
     if not (K[0, 0] > 0 and K[1, 1] > 0 and np.isfinite(K).all()):
         raise MessageError(f"{name}: CameraInfo has no focal length (the camera is not calibrated)")
+    if (K[2] != (0, 0, 1)).any():
+        raise MessageError(f"{name}: the last row of CameraInfo's matrix is {K[2].tolist()}, not 0 0 1")
     possible = (0, _FISHEYE_COUNT) if info.distortion_model in _FISHEYE else DISTORTIONS
     if len(D) not in possible or not np.isfinite(D).all():
         raise MessageError(f"{name}: CameraInfo has {len(D)} distortion coefficients, or some that are not finite")

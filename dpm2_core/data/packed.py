@@ -156,7 +156,7 @@ class PackedDrive:
             self.offsets = np.load(folder / "offsets.npy", allow_pickle=False)
             self.has_images = (folder / "pixels.npy").exists()
             clouds, *views = [_mapped(folder, name).shape for name in ("clouds", *(_VIEWS if self.has_images else ()))]
-        except (EOFError, OSError, TypeError, ValueError) as error:
+        except (EOFError, MemoryError, OSError, RecursionError, TypeError, ValueError) as error:
             raise UsageError(f"{folder}: no packed drive: {error}") from None
         format = self.about.get("format") if isinstance(self.about, dict) else None
         if format != FORMAT:

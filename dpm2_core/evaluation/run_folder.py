@@ -163,7 +163,7 @@ def _json(path: Path) -> dict[str, Any]:
         return {}
     try:
         content = json.loads(path.read_text(encoding="utf-8"), parse_constant=_number)  # NaN is no JSON
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise UsageError(f"{path}: not JSON: {error}") from None
     if not isinstance(content, dict):
         raise UsageError(f"{path}: want a mapping")

@@ -52,12 +52,16 @@ def prepare(
     """Drives with their references, their last parts and the rehearsal, packed below `out`; what is there stays.
 
     Raises:
-        UsageError: the SLAM could hardly follow a drive, or one that is there was made by other settings.
+        UsageError: the SLAM could hardly follow a drive, or one that is there is another one or of other settings.
     """
-    asked = settings.model_dump(mode="json", include={"reference", "held_out", "input"})
+    common = settings.model_dump(mode="json", include={"reference", "held_out", "input"})
     slam = slam.model_copy(update={"registration": settings.reference})
-    for i, source in enumerate(sources):
-        name = f"{i:02d}_{source.name.replace('/', '_')}"
+    names = [f"{i:02d}_{source.name.replace('/', '_')}" for i, source in enumerate(sources)]
+    for kept in (out / DRIVES, out / HELD_OUT):
+        if left := sorted({path.name for path in kept.glob("*/")} - set(names)):
+            raise UsageError(f"{kept / left[0]}: of a drive that is not asked for; remove it, or choose another folder")
+    for name, source in zip(names, sources, strict=True):
+        asked = {**common, "scans": len(source)}
         if (out / DRIVES / name).exists():  # the last to be written
             check_same(out / DRIVES / name, asked)
             continue

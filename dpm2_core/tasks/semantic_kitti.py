@@ -13,9 +13,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import DTypeLike
+from numpy.typing import DTypeLike, NDArray
 
 from dpm2_core.errors import UsageError
+from dpm2_core.frame import Points
 from dpm2_core.tasks.scan import RequiredData, TaskScan
 
 _BYTES = {"velodyne": 16, "static": 16, "labels": 4}
@@ -63,15 +64,24 @@ class _KittiRun:
 
     def __getitem__(self, index: int) -> TaskScan:
         number = self.numbers[index]
-        points = self._values("velodyne", number, "<f4").reshape(-1, 4)
+        points, valid = self._points("velodyne", number)
         labels, static = None, None
         if self.labelled:
-            labels = torch.from_numpy((self._values("labels", number, "<u4") & 0xFFFF).astype(np.int64))
-            if len(labels) != len(points):
-                raise UsageError(f"{self._path('labels', number)}: {len(labels)} labels for {len(points)} points")
+            classes = (self._values("labels", number, "<u4") & 0xFFFF).astype(np.int64)
+            if len(classes) != len(valid):
+                raise UsageError(f"{self._path('labels', number)}: {len(classes)} labels for {len(valid)} points")
+            labels = torch.from_numpy(classes[valid])
         if self.paired:
-            static = torch.from_numpy(self._values("static", number, "<f4").reshape(-1, 4))
+            static = torch.from_numpy(self._points("static", number)[0])
         return TaskScan(torch.from_numpy(points), labels, static, self.name, number)
+
+    def _points(self, kind: str, number: int) -> tuple[Points, NDArray[np.bool_]]:
+        """(N, 4) with finite coordinates, 0 for an intensity that is not known, and which of the file's they are."""
+        points = self._values(kind, number, "<f4").reshape(-1, 4)
+        valid = np.isfinite(points[:, :3]).all(1)
+        if not valid.any():
+            raise UsageError(f"{self._path(kind, number)}: no valid points")
+        return np.nan_to_num(points[valid], nan=0, posinf=0, neginf=0), valid
 
     def check(self, number: int) -> None:
         """Raise UsageError unless the files of a scan are there and of the right length."""

@@ -545,6 +545,10 @@ def test_camera_with_distortion_keeps_it(model: str, count: int) -> None:
     [
         ({"d": [0.1] * 4, "distortion_model": "omni"}, "left: distortion model 'omni' is not supported"),
         ({"k": np.zeros(9), "p": np.zeros(12)}, "left: CameraInfo has no focal length"),
+        (
+            {"k": np.array([500.0, 0, 320, 0, 500, 240, 0, 0, 0]), "p": np.zeros(12)},
+            "left: the last row of CameraInfo's",
+        ),
         ({"width": 0}, "left: CameraInfo has no image size"),
     ],
 )

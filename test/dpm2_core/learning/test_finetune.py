@@ -152,6 +152,8 @@ def test_a_stopped_training_goes_on_to_the_same_weights(
     other = settings.model_copy(update={"held_out": 0.4})  # another part was held out, and it went on without a word
     with pytest.raises(UsageError, match=f"{data}.*: made with held_out {settings.held_out}, not 0.4; remove it"):
         prepare([open_source(recording)], other, network, SlamSettings(threads=1), data)
+    with pytest.raises(UsageError, match=r"00_\w+: of a drive that is not asked for; remove it"):
+        prepare([], settings, network, SlamSettings(threads=1), data)  # it was learned from, too
     whole = finetune(settings, tmp_path / "whole", data=data)
     finetune(settings, tmp_path / "parts", until=2, data=data)
     parts = finetune(settings, tmp_path / "parts", resume=True, data=data)

@@ -36,6 +36,26 @@ def test_a_scan_is_what_its_files_hold(write_drive: Callable[..., Path], tmp_pat
     assert np.array_equal(scan.static.numpy(), raw[:-100])
 
 
+def test_points_that_are_none_are_left_out_with_their_classes(write_drive: Callable[..., Path], tmp_path: Path) -> None:
+    """And an intensity that is not known is 0: GndNet learned nothing from such scans, or stopped in the middle."""
+    folder = write_drive(tmp_path / "00", range(2))
+    path = folder / "velodyne" / "000000.bin"
+    raw = np.fromfile(path, "<f4").reshape(-1, 4)
+    labels = np.fromfile(folder / "labels" / "000000.label", "<u4") & 0xFFFF
+    damaged = raw.copy()
+    damaged[3, 1], damaged[5, 3], damaged[7, 0] = np.nan, np.nan, np.inf
+    damaged.tofile(path)
+    scan = open_scans(folder, ("labels",))[0]
+    left = np.delete(raw, [3, 7], 0)
+    left[4, 3] = 0
+    np.testing.assert_array_equal(scan.points.numpy(), left)
+    assert scan.labels is not None
+    np.testing.assert_array_equal(scan.labels.numpy(), np.delete(labels, [3, 7]))
+    np.full((len(raw), 4), np.nan, "<f4").tofile(path)
+    with pytest.raises(UsageError, match=r"velodyne/000000.bin: no valid points"):
+        open_scans(folder, ("labels",))[0]
+
+
 def test_folders_of_every_depth_and_gaps(write_drive: Callable[..., Path], tmp_path: Path) -> None:
     """A sequence, a data set, a folder of data sets; a missing number ends a window's sequence."""
     one = write_drive(tmp_path / "a" / "sequences" / "00", [0, 1, 2, 5, 6])
