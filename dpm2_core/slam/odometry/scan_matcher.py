@@ -78,6 +78,8 @@ class ScanMatcher:
         motion = self.motion
         if not half or match.led or match.result.method in ("none", "first"):
             return match
+        if not match.result.ok and motion.twist is None:  # it may be anywhere
+            return match
         seconds, T_predicted = motion.seconds + dt, motion.predicted(twist, dt)
         turn = measured_turn(frame)
         beginning = motion.beginning(match.result.T_target_source, seconds, half)
