@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 from pydantic import Field
@@ -135,8 +134,7 @@ class GeometricRegistration:
         if not len(scan.times) or len(target) < self._settings.min_points:
             return None
         gate = 2 * self._settings.final_gate  # the ends of the sweep are farther off than its middle
-        matched = partial(self._matched, target=target, gate=gate)
-        return register_sweep(scan, lambda points, T: matched(points, T=T), T, beginning, CORRELATED)
+        return register_sweep(scan, lambda points, T: self._matched(points, target, T, gate), T, beginning, CORRELATED)
 
     def likeliest(self, source: Array, target: LocalMap, found: Sequence[Registration]) -> Registration:
         """The best of several results, with the way to the farthest that is nearly as likely in its covariance."""

@@ -35,6 +35,17 @@ def distances(
     return residual, normal, variance
 
 
+@compiled("void(f8[::1], f8[:, ::1], f8[::1], f8[::1])")
+def _slope(point: Array, R: Array, normal: Array, J: Array) -> None:
+    """Writes into J (6,) how the distance of a point (3,) along a normal (3,) changes with a step on the right of a
+    pose with the rotation R (3, 3)."""
+    for i in range(3):
+        J[3 + i] = normal[0] * R[0, i] + normal[1] * R[1, i] + normal[2] * R[2, i]
+    J[0] = point[1] * J[5] - point[2] * J[4]
+    J[1] = point[2] * J[3] - point[0] * J[5]
+    J[2] = point[0] * J[4] - point[1] * J[3]
+
+
 @compiled("Tuple((f8[:, ::1], f8[::1], i8, f8))(f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[::1])")
 def linearize(
     source: Array, R: Array, residual: Array, normals: Array, variances: Array
@@ -54,13 +65,7 @@ def linearize(
     for n in range(len(source)):
         if np.isnan(residual[n]):
             continue
-        a, b, c = normals[n, 0], normals[n, 1], normals[n, 2]
-        J[3] = a * R[0, 0] + b * R[1, 0] + c * R[2, 0]
-        J[4] = a * R[0, 1] + b * R[1, 1] + c * R[2, 1]
-        J[5] = a * R[0, 2] + b * R[1, 2] + c * R[2, 2]
-        J[0] = source[n, 1] * J[5] - source[n, 2] * J[4]
-        J[1] = source[n, 2] * J[3] - source[n, 0] * J[5]
-        J[2] = source[n, 0] * J[4] - source[n, 1] * J[3]
+        _slope(source[n], R, normals[n], J)
         squared = residual[n] * residual[n]
         weight = 1 / (variances[n] + squared)
         for row in range(6):
@@ -89,11 +94,7 @@ def moments(
     for n in range(len(source)):
         if np.isnan(residual[n]):
             continue
-        for i in range(3):
-            J[3 + i] = normals[n, 0] * R[0, i] + normals[n, 1] * R[1, i] + normals[n, 2] * R[2, i]
-        J[0] = source[n, 1] * J[5] - source[n, 2] * J[4]
-        J[1] = source[n, 2] * J[3] - source[n, 0] * J[5]
-        J[2] = source[n, 0] * J[4] - source[n, 1] * J[3]
+        _slope(source[n], R, normals[n], J)
         weight = 1 / (variances[n] + residual[n] * residual[n])
         for k in range(2 * ORDER + 1):
             for row in range(6):

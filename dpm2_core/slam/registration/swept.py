@@ -91,7 +91,7 @@ class Swept:
         go_on[:6, 6:] = pause * np.eye(6)
         change = go_on @ of_end
         lost = np.repeat([steadiness * pause * pause / 2, steadiness * pause], 6) ** 2
-        twist = of_end[6:, 6:] @ self.motion.ravel()
+        twist = _twist(of_end, self.motion)
         T = self.T @ curve.poses(self.half, self.motion) @ se3.exp(pause * twist)
         return Beginning(
             T, twist, change @ self.covariance @ change.T + np.diag(lost) + JOINT, half, *_steady(half, steadiness)
