@@ -24,6 +24,7 @@ from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration, f
 from dpm2_core.slam.registration.swept import JOINT, Swept
 
 _BENT = 0.02  # m at the ends of the sweep and the usual range: a scan that is bent by less is straight
+_BENT_ON_AVERAGE = 0.1  # m, the same, where only the way from scan to scan tells
 
 
 class Match(NamedTuple):
@@ -87,14 +88,26 @@ class ScanMatcher:
             beginning = beginning.turning(measured)
         swept = self.registration.swept(match.scan, match.result, beginning)
         if swept is None:
-            return match
-        if _bent(match.scan, partial(way, motion=twist, turn=turn), swept) > _BENT:
+            return match if turn is not None else self._steadied(frame, match, twist, seconds, half)
+        if _bent(match.scan, partial(way, motion=twist, turn=turn), swept.motion, half) > _BENT:
             scan = self.registration.prepare(frame, swept.motion)
             information = np.linalg.inv(swept.covariance[:6, :6] + JOINT[:6, :6]).astype(np.float64)
             result = self.registration.register(scan, Prediction([swept.T], information=information))
             result = motion.gated(result, T_predicted, dt)
             match = match._replace(scan=scan, result=result) if result.ok else match
         return match._replace(swept=swept.placed(match.result)) if match.result.ok else match
+
+    def _steadied(self, frame: Frame, match: Match, twist: Array, seconds: float, half: float) -> Match:
+        """As `straightened`, by the average motion of the `seconds` since the last scan, where the points of the sweep
+        do not show it."""
+        motion, T = self.motion, match.result.T_target_source
+        average = se3.log(se3.inverse(motion.T_registered) @ T) / seconds
+        prepared = partial(curve.poses, motion=twist)
+        if not match.result.ok or _bent(match.scan, prepared, average, half) < _BENT_ON_AVERAGE:
+            return match
+        scan = self.registration.prepare(frame, average)
+        result = self.registration.register(scan, Prediction([T], information=motion.information(seconds)))
+        return match._replace(scan=scan, result=result) if result.ok else match
 
     def _alone(self, frame: Frame, scan: Scan, T_predicted: Array, dt: float) -> Match:
         """By the motion so far, or from rest."""
@@ -153,10 +166,10 @@ class ScanMatcher:
         return result
 
 
-def _bent(scan: Scan, prepared: Callable[[Array], Array], swept: Swept) -> float:
-    """How far the ends of a scan, m, that was prepared for poses at times are from where the motion of its sweep has
-    them."""
-    times = np.array([-swept.half, 0.0, swept.half])
-    off = se3.log(se3.inverse(prepared(times)) @ curve.poses(times, swept.motion))[[0, 2]]
+def _bent(scan: Scan, prepared: Callable[[Array], Array], motion: Array, half: float) -> float:
+    """How far the ends of a scan, m, that was prepared for poses at times are from where a motion has them, (6,) or
+    (K, 6), `half` s from its middle."""
+    times = np.array([-half, 0.0, half])
+    off = se3.log(se3.inverse(prepared(times)) @ curve.poses(times, motion))[[0, 2]]
     reach = float(np.median(np.linalg.norm(scan.points[:, :3], axis=1)))
     return float((np.linalg.norm(off.reshape(2, 2, 3), axis=2) @ [reach, 1.0]).max())

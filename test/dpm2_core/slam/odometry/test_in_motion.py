@@ -29,10 +29,10 @@ def sweeps(name: str) -> tuple[TurningRobot, list[Frame]]:
     return robot, list(robot.frames())
 
 
-def steps(name: str, stamp_at: float = 0.0, backwards: bool = False) -> Array:
+def steps(name: str, stamp_at: float = 0.0, backwards: bool = False, registration: str = "geometric") -> Array:
     """(N, 2) m and degrees by which the steps from scan to scan are off, once it moves."""
     robot, frames = sweeps(name)
-    odometry, found = make_odometry(SlamSettings(registration="geometric")), []
+    odometry, found = make_odometry(SlamSettings.model_validate({"registration": registration})), []
     for frame in frames:
         assert frame.time_offset is not None
         given = replace(frame, time_offset=-frame.time_offset) if backwards else frame
@@ -57,3 +57,9 @@ def test_times_that_run_backwards_lose_nothing() -> None:
     off = steps("car", backwards=True)
     assert off[:, 0].max() < 0.15
     assert off[:, 1].max() < 0.5
+
+
+def test_descriptors_show_no_motion_within_a_sweep_but_that_since_the_last() -> None:
+    """By which their scans are prepared anew: by the one before alone the headings were off by 0.59 degrees."""
+    off = np.sqrt((steps("walking", registration="neural") ** 2).mean(0))
+    assert off[1] < 0.45
