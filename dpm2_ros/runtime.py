@@ -7,16 +7,17 @@ rclpy's own handlers give up at the second SIGINT, which `ros2 launch` sends, an
 from __future__ import annotations
 
 import faulthandler
+import math
 import os
 import re
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from queue import Empty, SimpleQueue
 from typing import Any
 
 from dpm2_core.errors import Dpm2Error, UsageError
@@ -26,6 +27,7 @@ from dpm2_ros.shared_memory import free_shared_memory
 _SWITCH = 5e-4
 """s until a thread must hand Python's lock on. The odometry asks for it tens of times per frame; with the usual 5 ms a
 network in the thread of the map keeps it waiting each time."""
+_SLICE = 0.05  # s after `Stop.set` within which who waits goes on
 _PROFILE, _NEW_NAME = "FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE"
 _NICER = 10  # steps of niceness: a tenth of the fraction of the odometry where both want a processor
 
@@ -33,12 +35,12 @@ _NICER = 10  # steps of niceness: a tenth of the fraction of the odometry where 
 class Stop:
     """As `threading.Event`, for signal handlers.
 
-    An event's `set` waits for ever in a handler that interrupts its `wait` or `set`.
+    An event's `set` waits for ever in a handler that interrupts its `wait` or `set`; and any lock, also that of a
+    queue, waits for its whole timeout when the signal comes right before it begins. Sleeping in slices has neither.
     """
 
     def __init__(self) -> None:
         self._is_set = False
-        self._wake = SimpleQueue[None]()  # its `put` may interrupt itself and `get`
 
     def is_set(self) -> bool:
         """Whether `set` was called."""
@@ -47,17 +49,16 @@ class Stop:
     def set(self) -> None:
         """From here on `is_set`, and no `wait` waits."""
         self._is_set = True
-        self._wake.put(None)
 
-    def wait(self, timeout: float | None = None) -> bool:
+    def wait(self, timeout: float = math.inf) -> bool:
         """Until `set`, or for `timeout` s.
 
         Returns:
             Whether it is set.
         """
-        if not self._is_set:
-            with suppress(Empty):
-                self._wake.put(self._wake.get(timeout=timeout))  # the next that waits
+        end = time.monotonic() + timeout
+        while not self._is_set and (left := end - time.monotonic()) > 0:
+            time.sleep(min(left, _SLICE))
         return self._is_set
 
 

@@ -120,7 +120,8 @@ for _ in range(2000):
 
 
 def test_a_signal_may_meet_each_moment_of_a_wait() -> None:
-    """With `threading.Event` one of some hundred did not come back: `bag_player` waits a hundred times per second."""
+    """With `threading.Event` one of some hundred did not come back, with `queue.SimpleQueue` one of some thousand:
+    `bag_player` waits a hundred times per second."""
     subprocess.run([sys.executable, "-c", STOPPED], check=True, timeout=120)
 
 
