@@ -44,12 +44,15 @@ def test_started_at_the_same_moment_nothing_is_lost(
     environment = ros_environment(harness.node.context.get_domain_id())
     node = start("slam_node", arguments, environment | imports, tmp_path / "node")
     processes.append(node)
-    for rate, name in (("1", "in time"), ("20", "too fast")):
+    # In time also on a busy machine, where 0.1 s may be too little for a cloud.
+    for rate, name in (("0.3", "in time"), ("20", "too fast")):
         processes.append(start("bag_player", [str(bag), "--wait", "90", "--rate", rate], environment, tmp_path / name))
         assert processes[-1].wait(180) == 0
         assert f"{drive.frames} of them clouds" in (tmp_path / name).read_text()
-        if rate == "1":
+        if name == "in time":
             ready, _, driving = (tmp_path / "node").read_text().partition("waiting for clouds")
+            gone = harness.status("slam_node: odometry", all_gone(drive.frames), since=0)
+            assert figures(gone)["processed"] == str(drive.frames)
     assert "import time:" in ready
     assert "import time:" not in driving
     # the last clouds are on their way through it
@@ -59,7 +62,7 @@ def test_started_at_the_same_moment_nothing_is_lost(
     assert account is not None
     parts = [int(number) for number in re.findall(r"\d+", account[3])]
     assert int(account[1]) == int(account[2]) + sum(parts) == 2 * drive.frames
-    assert drive.frames < int(account[2]) < 2 * drive.frames  # all of the first time
+    assert drive.frames < int(account[2]) < 2 * drive.frames
     assert "lost on the way" in account[3]
 
 
