@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
 from itertools import islice
@@ -24,6 +24,7 @@ from dpm2_core.data.livox import LIVOX
 from dpm2_core.data.messages import MessageError, serialized_stamp, stamp_ns
 from dpm2_core.data.pairing import JUMP, Beside, RawMessage, clouds_after_others
 from dpm2_core.data.settings import InputSettings
+from dpm2_core.data.time_order import in_order
 from dpm2_core.data.trajectory import interpolate
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.data.vertical_angle import checked_correction
@@ -119,9 +120,8 @@ class BagSource:
     @cached_property
     def stamps(self) -> Stamps:
         """(len,) ns: the header's stamp, or the time of recording where it is 0. Reads the clouds through once."""
-        return np.array(
-            [serialized_stamp(data, time) for _, time, data in self._bag.messages([self.points_topic])], np.int64
-        )
+        clouds = self._in_order(self._bag.messages([self.points_topic]))
+        return np.array([serialized_stamp(data, time) for _, time, data in clouds], np.int64)
 
     @cached_property
     def poses(self) -> Array | None:
@@ -267,7 +267,7 @@ class BagSource:
         others |= {topic: ahead for topic, ahead in more if topic}
         beside = {topic: Beside(self._settings.image_tolerance) for topic in others if topic != self.imu_topic}
         gnss = known.gnss_topic  # nobody waits for fixes: a late one has its place on the way, too
-        messages = self._bag.messages([self.points_topic, *others, *([gnss] if gnss else [])])
+        messages = self._in_order(self._bag.messages([self.points_topic, *others, *([gnss] if gnss else [])]))
         waiting: deque[tuple[int, RawMessage]] = deque()
         for topic, time, data in clouds_after_others(messages, [self.points_topic], others, waiting):
             stamp = serialized_stamp(data, time)
@@ -280,6 +280,14 @@ class BagSource:
                 self._add_sample(topic, stamp, data)
             else:
                 beside[topic].add(stamp + others[topic], data, [cloud for cloud, _ in waiting])
+
+    def _in_order(self, messages: Iterable[RawMessage]) -> Iterator[RawMessage]:
+        """With those stamps of clouds corrected that are not between their neighbors', which is noted."""
+        return in_order(messages, self.points_topic, self._corrected)
+
+    def _corrected(self, index: int, stamp: int) -> None:
+        what = f"{self.points_topic}: stamps that are not between their neighbors are taken to be"
+        self._note_once(what, f"the first at frame {index}: {stamp * 1e-9:.3f} s")
 
     def _add_sample(self, topic: str, stamp: int, data: bytes) -> None:
         buffer = self._imu if topic == self.imu_topic else self._gnss

@@ -64,8 +64,18 @@ def serialized_stamp(data: bytes, time: int) -> int:
     """Stamp in ns of a serialized message that begins with a header, without decoding the rest; `time` if it is 0."""
     if len(data) < 12:
         return time
-    sec, nanosec = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)  # after the 4 bytes that name the order
+    sec, nanosec = struct.unpack_from(_stamp_format(data), data, 4)
     return sec * 1_000_000_000 + nanosec or time
+
+
+def restamped(data: bytes, stamp: int) -> bytes:
+    """A serialized message that begins with a header, with another stamp, ns."""
+    return data[:4] + struct.pack(_stamp_format(data), *divmod(stamp, 1_000_000_000)) + data[12:]
+
+
+def _stamp_format(data: bytes) -> str:
+    """Of the stamp, which comes after the 4 bytes that name the byte order."""
+    return "<iI" if data[1] & 1 else ">iI"
 
 
 def cloud_view(msg: Any, names: Collection[str] | None = None) -> NDArray[np.void]:

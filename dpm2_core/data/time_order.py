@@ -4,14 +4,19 @@
 from __future__ import annotations
 
 from bisect import bisect_left
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dpm2_core.data.messages import restamped, serialized_stamp
+from dpm2_core.data.pairing import RawMessage
 from dpm2_core.frame import Array
 
 _FEW = 3  # in a row; more are a clock that was set
+_AROUND = 2 * _FEW + 1  # clouds on either side that show which of the stamps between them are off: more than may be
 
 
 def out_of_order(times: Array) -> NDArray[np.bool_]:
@@ -24,6 +29,60 @@ def out_of_order(times: Array) -> NDArray[np.bool_]:
     for before, after in pairwise(ends):
         off[before + 1 : after] = after - before <= _FEW + 1
     return off
+
+
+def in_order(messages: Iterable[RawMessage], topic: str, corrected: Callable[[int, int], None]) -> Iterator[RawMessage]:
+    """The messages of a recording, those clouds of a topic whose stamps are off with stamps between their neighbors'.
+
+    A stamp that is repeated stays: it may be the same cloud twice.
+
+    Args:
+        messages: in recorded order; up to seven clouds, and what came between them, are held back.
+        corrected: is told the number of each such cloud, and the stamp that it had, ns.
+    """
+    held, stamps, decided, number = deque[RawMessage](), deque[int](), 0, 0
+
+    def decide() -> Iterator[RawMessage]:
+        """All up to the first cloud that is held."""
+        nonlocal decided, number
+        while held[0][0] != topic:
+            yield held.popleft()
+        _, time, data = held.popleft()
+        stamp = _in_place(stamps, decided)
+        if stamp != stamps[decided]:
+            corrected(number, stamps[decided])
+            stamps[decided], data = stamp, restamped(data, stamp)
+        yield topic, time, data
+        decided, number = decided + 1, number + 1
+        if decided > _AROUND:
+            stamps.popleft()
+            decided -= 1
+
+    for message in messages:
+        if not held and message[0] != topic:
+            yield message
+            continue
+        held.append(message)
+        if message[0] == topic:
+            stamps.append(serialized_stamp(message[2], message[1]))
+            if len(stamps) - decided > _AROUND:
+                yield from decide()
+    while decided < len(stamps):
+        yield from decide()
+    yield from held
+
+
+def _in_place(stamps: Iterable[int], which: int) -> int:
+    """The stamp (ns) of one of some clouds in a row, put between its neighbors where it is off."""
+    near = np.array(list(stamps), np.int64)
+    steps, since = np.diff(near), near - near[0]
+    if (steps > 0).all() or not steps[max(which - 1, 0) : which + 1].all():
+        return int(near[which])
+    off = out_of_order(since)
+    if not off[which]:
+        return int(near[which])
+    in_order = np.flatnonzero(~off)
+    return int(near[0] + round(np.interp(which, in_order, since[in_order])))
 
 
 def _longest_increasing(times: Array) -> list[int]:

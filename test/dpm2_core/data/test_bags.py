@@ -421,6 +421,28 @@ def test_stamps_that_repeat_jump_back_or_stop_lose_no_frame(
     assert where in "".join(source.notes)
 
 
+@pytest.mark.parametrize("off", [-0.4, 0.4, 1, 60, -60])
+@pytest.mark.parametrize("count", [1, 3, 4])
+def test_stamps_that_are_off_are_put_between_their_neighbors(bags: Any, tmp_path: Path, off: float, count: int) -> None:
+    """Up to three in a row: more are a clock that was set. An image finds its cloud all the same."""
+    true = 10 + 0.1 * np.arange(20)
+    stamps = true + off * ((np.arange(20) >= 8) & (np.arange(20) < 8 + count))
+    messages: list[Message] = rig(bags)
+    for i, (now, stamp) in enumerate(zip(true, stamps, strict=True)):
+        messages += [(now, IMAGE, bags.image(now, i)), (now, POINTS, bags.cloud(stamp))]
+    source = BagSource(bags.write(tmp_path / "b", messages))
+    found = [frame.stamp * 1e-9 for frame in source.frames()]
+    assert found == pytest.approx(source.stamps * 1e-9)
+    corrected = [note for note in source.notes if "not between their neighbors" in note]
+    if count <= 3:
+        assert found == pytest.approx(true)
+        assert seen(source) == [*range(20)]
+        assert [f"frame 8: {stamps[8]:.3f} s" in note for note in corrected] == [True]
+    elif abs(off) > 0.4:
+        assert found == pytest.approx(stamps)
+        assert not corrected
+
+
 def test_a_looped_bag_keeps_its_images(bags: Any, tmp_path: Path) -> None:
     messages: list[Message] = rig(bags)
     for turn in range(2):

@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dpm2_core.data.time_order import out_of_order
+from dpm2_core.data.messages import restamped, serialized_stamp
+from dpm2_core.data.time_order import in_order, out_of_order
 
 TIMES = 0.1 * np.arange(40)
 
@@ -41,3 +44,32 @@ def test_the_ends_have_one_neighbor() -> None:
         times = TIMES.copy()
         times[which] += 50 if which == 0 else -50
         assert not out_of_order(times).any()
+
+
+@given(st.lists(st.tuples(st.sampled_from("ci"), st.integers(1, 10**18)), max_size=60))
+def test_whatever_the_stamps_each_message_comes_once_and_in_the_order_of_recording(sent: list[tuple[str, int]]) -> None:
+    messages = [
+        (topic, number, restamped(b"\0\1\0\0" + bytes(8) + number.to_bytes(4), stamp))
+        for number, (topic, stamp) in enumerate(sent)
+    ]
+    corrected = dict[int, int]()
+    out = list(in_order(messages, "c", corrected.__setitem__))
+    assert [(topic, number, data[12:]) for topic, number, data in out] == [
+        (topic, number, data[12:]) for topic, number, data in messages
+    ]
+    clouds = [(a[2], b[2]) for a, b in zip(messages, out, strict=True) if a[0] == "c"]
+    changed = {i: serialized_stamp(before, 0) for i, (before, after) in enumerate(clouds) if before != after}
+    assert changed == corrected
+    assert all(a[2] == b[2] for a, b in zip(messages, out, strict=True) if a[0] == "i")
+
+
+def test_no_more_than_seven_clouds_are_held_back() -> None:
+    taken = 0
+
+    def messages() -> Iterator[tuple[str, int, bytes]]:
+        nonlocal taken
+        for taken in range(1, 101):
+            yield "c", taken, restamped(b"\0\1\0\0" + bytes(8), taken * 10**8)
+
+    for given_out, _ in enumerate(in_order(messages(), "c", lambda *_: None)):
+        assert taken <= given_out + 8
