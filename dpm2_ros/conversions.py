@@ -23,7 +23,8 @@ from std_msgs.msg import Header
 from dpm2_core.estimates import Keyframe, OdometryResult
 from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
-from dpm2_core.slam.mapping.admission import MAX_ID, RejectedError
+from dpm2_core.slam.mapping.admission import RejectedError
+from dpm2_core.slam.store.rows import MAX_ID
 
 _KEYFRAME = re.compile(
     r"(?:(?P<robot>[\w/]{1,200})/)?kf_(?P<id>[0-9]{1,10})(?:\.(?P<session>[0-9a-f]{8}-?))?", re.ASCII

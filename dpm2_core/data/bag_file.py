@@ -32,6 +32,7 @@ from dpm2_core.database import check_plain
 from dpm2_core.errors import UsageError
 
 _MCAP_MAGIC = b"\x89MCAP0\r\n"
+_LATEST = 2**63 - 1  # ns; MCAP allows twice that
 
 
 @dataclass(eq=False)
@@ -61,9 +62,9 @@ class Bag:
             return
         count = 0
         try:
-            for message in self._read(requested):
+            for topic, time, data in self._read(requested):
                 count += 1
-                yield message
+                yield topic, min(time, _LATEST), data
         except Exception as error:  # a damaged chunk raises anything from ReaderError to struct.error
             self.notes.append(
                 f"{self.path}: damaged after {count} messages of {', '.join(requested)} ({_reason(error)})"

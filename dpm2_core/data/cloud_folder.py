@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+import os
 import re
+import struct
 from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
 from decimal import Decimal
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +25,8 @@ from dpm2_core.frame import Array, Frame
 
 SUFFIXES = (".pcd", ".ply")
 _LONGEST = 30_000_000_000  # ns from one scan to the next: beyond it numbers count something else, such as ms
-_PCD_HEADER = 65536  # bytes in which it ends
+_PCD_LINES = 10  # of a header: the package reads no more
+_PACKED = 100  # times longer than packed: LZF makes at most 264 bytes of 3
 _MOST_COLUMNS = 1000  # of a PCD file; a normal and its curvature are 4, a histogram of features is 308
 _PAIR = re.compile(r"(?:.*\D)?(\d{9,10})[_-](\d{1,9})")
 """Seconds since 1970 and their fraction, of 3, 6 or 9 digits; nanoseconds also without the zeros before them."""
@@ -67,7 +70,7 @@ class CloudFolder:
             if missing := int(numbers[-1]) + 1 - len(numbers):
                 self.notes.append(f"{folder}: {missing} numbers are missing among the names: taken to be scans as well")
         if any(file.suffix.lower() == ".pcd" for file in self._files):
-            _pcd_type()  # now, rather than at the first scan
+            _pcd_types()  # now, rather than at the first scan
         self._frames = FrameBuilder(settings, Calibration(self.name), self.notes.append)
 
     def __len__(self) -> int:
@@ -99,9 +102,10 @@ def _cloud(path: Path, stamp: int) -> Any:
 
 
 def _read_pcd(path: Path) -> Mapping[str, NDArray[Any]]:
-    PointCloud = _pcd_type()
+    MetaData, PointCloud = _pcd_types()
     try:
-        _check_columns(path)
+        with path.open("rb") as file:
+            _check_header(MetaData.parse_header(_pcd_header(file)), file)
         cloud = PointCloud.from_path(path)
         return {name: np.ascontiguousarray(cloud.pc_data[name]) for name in cloud.fields}
     except Exception as error:  # damaged headers and data raise anything from ValueError to lzf's own errors
@@ -109,23 +113,39 @@ def _read_pcd(path: Path) -> Mapping[str, NDArray[Any]]:
         raise UsageError(f"{path}: cannot be read as PCD: {reason}") from None
 
 
-def _check_columns(path: Path) -> None:
-    """Not thousands of columns: the package makes a name for each, which is gigabytes for a few digits in a header.
+def _pcd_types() -> tuple[Any, Any]:
+    with needs("datasets", "reading PCD"):
+        from pypcd4 import MetaData, PointCloud
+    return MetaData, PointCloud
+
+
+def _pcd_header(file: BinaryIO) -> list[str]:
+    """The lines that the package takes for the header; the data come next."""
+    lines = list[str]()
+    while len(lines) < _PCD_LINES and not (lines and lines[-1].startswith("DATA")) and (line := file.readline()):
+        if (text := line.decode().strip()) and not text.startswith("#"):
+            lines.append(text)
+    return lines
+
+
+def _check_header(header: Any, file: BinaryIO) -> None:
+    """Not thousands of columns: the package makes a name for each, which is gigabytes for a few digits in a header. Nor
+    other data than it announces: the package takes what there is, or makes room for what there is not.
+
+    Args:
+        file: where its data begin.
 
     Raises:
         ValueError: there are.
     """
-    with path.open("rb") as file:
-        header = file.read(_PCD_HEADER).partition(b"\nDATA")[0]
-    for line in header.splitlines():
-        if line.startswith(b"COUNT") and sum(map(int, line.split()[1:])) > _MOST_COLUMNS:
-            raise ValueError(f"more than {_MOST_COLUMNS} columns")
-
-
-def _pcd_type() -> Any:
-    with needs("datasets", "reading PCD"):
-        from pypcd4 import PointCloud
-    return PointCloud
+    if sum(header.count) > _MOST_COLUMNS:
+        raise ValueError(f"more than {_MOST_COLUMNS} columns")
+    want = header.points * int(np.dot(header.size, header.count))
+    rest = os.fstat(file.fileno()).st_size - file.tell()
+    packed = header.data.value == "binary_compressed" and want > 0
+    most = _PACKED * rest if packed else rest
+    if (header.data.value != "ascii" and want > most) or (packed and struct.unpack("<II", file.read(8))[1] != want):
+        raise ValueError(f"{header.points} points announced, in {rest} bytes")
 
 
 def _counts(files: list[Path]) -> NDArray[np.int64]:

@@ -27,6 +27,7 @@ from dpm2_core.slam.graph.graph_data import GraphData, components, integrate
 _VERTEX = {"VERTEX_SE2": 4, "VERTEX_SE3:QUAT": 8}  # numbers on a line
 _EDGE = {"EDGE_SE2": 11, "EDGE_SE3:QUAT": 30}
 _MOST_STARTS = 0.1  # of the nodes: in an order that breaks more often, neighbors are tied by chance, perhaps by a loop
+_FARTHEST = 1e9  # m: from there on float64 are tenths of micrometers off, and squares of what is much farther infinite
 _TANGENT = {True: np.array([3, 4, 2]), False: np.array([3, 4, 5, 0, 1, 2])}  # of the file's order, by planar
 
 
@@ -190,6 +191,8 @@ def _checked(path: Path, lines: _Lines) -> Array:
 
 def _poses(path: Path, lines: _Lines, values: Array, planar: bool) -> Array:
     """Leading numbers of (N, 3+) x y yaw or (N, 7+) x y z qx qy qz qw to (N, 4, 4)."""
+    if len(bad := np.flatnonzero(np.abs(values[:, : 2 if planar else 3]).max(1) > _FARTHEST)):
+        raise UsageError(f"{path}:{lines.at[bad[0]]}: farther than {_FARTHEST / 1000:.0f} km")
     if planar:
         R = Rotation.from_rotvec(values[:, 2:3] * [0, 0, 1]).as_matrix()
         return se3.make(R, np.column_stack([values[:, :2], np.zeros(len(values))]))

@@ -14,9 +14,8 @@ from dpm2_core.estimates import Keyframe
 from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.store.cloud_codec import MAX_POINTS
-from dpm2_core.slam.store.rows import FARTHEST
+from dpm2_core.slam.store.rows import FARTHEST, MAX_ID
 
-MAX_ID = 2**31 - 1
 MAX_DESCRIPTORS = 4096
 _REACH = 32_000.0  # m: as far as a packed cloud reaches
 _LARGEST_VARIANCE = 1e12  # m^2: of a pose that is not known at all

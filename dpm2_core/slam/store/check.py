@@ -320,9 +320,12 @@ class _Salvage:
 
     def _last(self, table: str, key: str) -> int:
         try:
-            last = int(self._sql.execute(f"SELECT coalesce(max({key}), -1) FROM {table}").fetchone()[0])
+            query = f"SELECT coalesce(max({key}), -1), coalesce(min({key}), 0) FROM {table}"
+            last, first = map(int, self._sql.execute(query).fetchone())
         except (sqlite3.DatabaseError, TypeError, ValueError):
             return min(self._end() * 10, self._most)  # of edges there are several a keyframe
+        if first < 0:
+            self._problem(f"{table}: rows before 0, from {first}")
         if last > self._most:
             self._problem(f"{table}: a row {last} in a file of at most {self._most}")
         return min(last, self._most)

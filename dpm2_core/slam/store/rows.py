@@ -24,6 +24,8 @@ from dpm2_core.slam.store.schema import row_crc
 NO_POINTS: Points = np.zeros((0, 4), np.float32)
 FARTHEST = 1e7
 """m from the origin: from there on float32 clouds are meters off. No pose of a map lies beyond."""
+MAX_ID = 2**31 - 1
+"""Of a keyframe, and of anything else that is counted: the next one still fits everywhere."""
 _LONGEST_NAME = 255
 _DESCRIPTORS = struct.Struct("<IIB")  # number, channels, the sum of what follows
 _AXES, _UP, _SCALE, _STEPS = 1, 2, 4, 8  # without steps, as in maps of version 3: features are float16
@@ -143,11 +145,12 @@ def keyframe_of(row: tuple[Any, ...]) -> tuple[int, Keyframe, int, Loan | None]:
         ValueError: a value that no keyframe has.
     """
     node, id, robot, session, stamp, frame, T, lender, T_lent = row
-    _check_types((node, id, session, stamp, frame), robot)
+    _check_types((stamp, frame), robot)
+    _check_counts(node, id, session)
     keyframe = Keyframe(id, stamp, frame, pose_of(T), NO_POINTS, None, robot)
     if lender is None:
         return node, keyframe, session, None
-    _check_types((lender,))
+    _check_counts(lender)
     return node, keyframe, session, Loan(lender, pose_of(T_lent))
 
 
@@ -200,7 +203,8 @@ def removed_of(row: tuple[Any, ...]) -> RemovedKeyframe:
         ValueError: a value that none has; the node may be any.
     """
     id, robot, session, stamp, node, T_node_kf = row
-    _check_types((id, session, stamp, node), robot)
+    _check_types((stamp, node), robot)
+    _check_counts(id, session)
     return RemovedKeyframe(id, robot, session, stamp, node, pose_of(T_node_kf))
 
 
@@ -249,7 +253,7 @@ def session_of(row: tuple[Any, ...]) -> Session:
         ValueError: a value that none has.
     """
     number, *texts = row
-    _check_types((number,))
+    _check_counts(number)
     if not all(isinstance(text, str) for text in texts):
         raise ValueError("a session that is not in words")
     return Session(number, *texts)
@@ -261,3 +265,10 @@ def _check_types(numbers: tuple[Any, ...], name: Any = "") -> None:
         raise ValueError("something else where a whole number belongs")
     if not isinstance(name, str) or len(name) > _LONGEST_NAME:
         raise ValueError(f"no name, or one of more than {_LONGEST_NAME} characters")
+
+
+def _check_counts(*numbers: Any) -> None:
+    """Raises ValueError unless they are whole numbers from 0 to `MAX_ID`."""
+    _check_types(numbers)
+    if not all(0 <= number <= MAX_ID for number in numbers):
+        raise ValueError(f"a number that is not from 0 to {MAX_ID}")

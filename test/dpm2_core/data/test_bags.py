@@ -58,6 +58,13 @@ def test_stamps_are_the_headers_else_those_of_recording(bags: Any, tmp_path: Pat
     assert [frame.stamp for frame in source.frames()] == source.stamps.tolist() == [4_900_000_000, 6_000_000_000]
 
 
+def test_times_of_recording_that_no_clock_shows(bags: Any, tmp_path: Path) -> None:
+    """MCAP has 64 bits for them, of which a stamp has 63."""
+    messages = [(5, POINTS, bags.cloud(4.9)), (1.2e10, POINTS, bags.cloud(0))]
+    source = BagSource(bags.write(tmp_path / "b", messages))
+    assert [frame.stamp for frame in source.frames()] == source.stamps.tolist() == [4_900_000_000, 2**63 - 1]
+
+
 def test_a_clock_that_was_set_is_told_from_a_pause_by_the_time_of_recording(bags: Any, tmp_path: Path) -> None:
     stamps, recorded = (1, 1.1, 4.1, 4.2, 8.2, 8.3), (1, 1.1, 1.2, 1.3, 5.3, 5.4)
     messages = [(at, POINTS, bags.cloud(stamp)) for at, stamp in zip(recorded, stamps, strict=True)]

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 import tracemalloc
 from pathlib import Path
 
@@ -139,10 +140,12 @@ def test_a_damaged_file_is_a_failed_frame(tmp_path: Path) -> None:
     assert "2.pcd: cannot be read as PCD" in (problems[2] or "")
 
 
-def test_a_header_of_millions_of_columns_is_refused_before_they_are_made(tmp_path: Path) -> None:
+@pytest.mark.parametrize("before", ["", " ", "# DATA\n#" + 70_000 * "a" + "\n"])
+def test_a_header_of_millions_of_columns_is_refused_before_they_are_made(tmp_path: Path, before: str) -> None:
     pytest.importorskip("pypcd4", reason="no pypcd4: pip install '.[datasets]'")
     header = (
-        "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 400000 1 1\nWIDTH 1\nHEIGHT 1\nPOINTS 1\nDATA ascii\n"
+        f"VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\n{before}COUNT 400000 1 1\n"
+        "WIDTH 1\nHEIGHT 1\nPOINTS 1\nDATA ascii\n"
     )
     (tmp_path / "0.pcd").write_text(header + "1 2 3\n")
     folder = CloudFolder(tmp_path)
@@ -153,4 +156,24 @@ def test_a_header_of_millions_of_columns_is_refused_before_they_are_made(tmp_pat
     finally:
         tracemalloc.stop()
     assert "0.pcd: cannot be read as PCD: more than 1000 columns" in (frame.problem or "")
+    assert most < 5e6
+
+
+@pytest.mark.parametrize("encoding", ["binary", "binary_compressed"])
+@pytest.mark.parametrize("points", [41, 10**9])
+def test_more_points_than_there_are_bytes_for_are_refused_before_there_is_room_for_them(
+    tmp_path: Path, encoding: str, points: int
+) -> None:
+    write_pcd(tmp_path / "0.pcd", encoding, 0.0)
+    header, data, rest = (tmp_path / "0.pcd").read_bytes().partition(f"DATA {encoding}\n".encode())
+    count = int(re.findall(rb"POINTS (\d+)", header)[0])
+    assert count != points
+    (tmp_path / "0.pcd").write_bytes(header.replace(b"POINTS %d" % count, b"POINTS %d" % points) + data + rest)
+    tracemalloc.start()
+    try:
+        (frame,) = CloudFolder(tmp_path).frames()
+        most = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert f"{points} points announced" in (frame.problem or "")
     assert most < 5e6

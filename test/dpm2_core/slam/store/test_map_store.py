@@ -406,6 +406,34 @@ def test_hostile_fixes_are_found_and_left_out(map_file: Path, tmp_path: Path, ta
     assert all(keyframe.fix is None for keyframe in data.keyframes)
 
 
+@pytest.mark.parametrize("column", ["id", "session", "lender"])
+@pytest.mark.parametrize("number", [2**63 - 1, 2**31, -1])
+def test_numbers_after_which_none_comes_are_found_and_left_out(map_file: Path, column: str, number: int) -> None:
+    """The next drive would count on from there."""
+    names = schema.CONTENT["keyframes"]
+    with closing(sqlite3.connect(map_file)) as db, db:
+        row = dict(
+            zip(names, db.execute(f"SELECT {', '.join(names)} FROM keyframes WHERE node = 3").fetchone(), strict=True)
+        )
+        row |= {"T_kf_lender": np.eye(4).tobytes()} | {column: number}
+        db.execute("DELETE FROM keyframes WHERE node = 3")
+        marks = ",".join("?" * (len(row) + 1))
+        db.execute(f"INSERT INTO keyframes VALUES ({marks})", (*row.values(), schema.row_crc(*row.values())))
+    with MapStore.open(map_file) as store, pytest.raises(Dpm2Error, match="see dpm2 map check"):
+        load_map(store)
+    assert any(
+        text.startswith(f"keyframe 3: a number that is not from 0 to {2**31 - 1}")
+        for text in check_map(map_file).problems
+    )
+
+
+def test_rows_before_the_first_are_found(map_file: Path) -> None:
+    with closing(sqlite3.connect(map_file)) as db, db:
+        (mask,) = (np.zeros(3, np.uint8).tobytes(),)
+        db.execute("INSERT INTO moving VALUES (?, ?, ?)", (-7, mask, schema.row_crc(-7, mask)))
+    assert check_map(map_file).problems == ["moving: rows before 0, from -7"]
+
+
 def test_damage_within_descriptors_is_found_when_they_are_read(map_file: Path) -> None:
     """One bit, of which SQLite knows nothing: they were others then, and copies of the map were sound with them."""
     with closing(sqlite3.connect(map_file)) as db, db:
