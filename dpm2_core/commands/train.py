@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -58,6 +58,7 @@ def pack(
 ) -> None:
     """A recorded drive with ground truth, or all of a data set, packed for training frame by frame."""
     from dpm2_core.data.open import sequences_below
+    from dpm2_core.learning.generate import check_same  # torch and embree are slow to import
 
     overrides = [*(settings or []), *(["images=false"] if no_image else [])]
     _check_packing(frames, preset, overrides)
@@ -71,12 +72,14 @@ def pack(
     left_out = []
     names = sequences_below(src)
     for name in names:
-        if not (out / name).exists():
-            try:
-                _pack_one(src, out / name, frames, preset, [*overrides, f"sequence={name}"])
-            except UsageError as error:  # of this drive; a full disk ends them all
-                typer.echo(f"{out / name}: left out: {printable(str(error))}", err=True)
-                left_out.append(name)
+        if (out / name).exists():
+            check_same(out / name, _packing(frames, preset, overrides))
+            continue
+        try:
+            _pack_one(src, out / name, frames, preset, [*overrides, f"sequence={name}"])
+        except UsageError as error:  # of this drive; a full disk ends them all
+            typer.echo(f"{out / name}: left out: {printable(str(error))}", err=True)
+            left_out.append(name)
     if left_out:
         raise Dpm2Error(f"{len(left_out)} of {len(names)} drives were left out: {', '.join(left_out)}")
 
@@ -89,6 +92,12 @@ def _check_packing(frames: str, preset: str, overrides: list[str]) -> None:
     load_settings(InputSettings, None, overrides)
     network_preset(preset)
     parse_range(frames)
+
+
+def _packing(frames: str, preset: str, overrides: list[str]) -> dict[str, Any]:
+    """What a packed drive is made by, beside its own frames."""
+    given = sorted(setting for setting in overrides if not setting.startswith("sequence="))
+    return {"frames": frames, "preset": preset, "input": given}
 
 
 def _pack_one(src: Path, out: Path, frames: str, preset: str, overrides: list[str]) -> None:
@@ -106,7 +115,8 @@ def _pack_one(src: Path, out: Path, frames: str, preset: str, overrides: list[st
     try:
         with progress_bar() as bar:
             task = bar.add_task(f"{source.name} -> {out}", total=len(chosen))
-            packed = write(source, out, network, chosen, lambda: bar.advance(task))
+            asked = _packing(frames, preset, overrides)
+            packed = write(source, out, network, chosen, lambda: bar.advance(task), asked)
     finally:
         for note in source.notes:  # such as an image that cannot be read
             typer.echo(note, err=True)
@@ -185,9 +195,11 @@ def _begin(
     out: Path, resume: bool, settings: ImageTrainingSettings | RegistrationTrainingSettings | OverlapTrainingSettings
 ) -> None:
     """Ready `out` for a training on packed drives, see `begin_or_resume`."""
-    from dpm2_core.data.packed import open_packed
+    from dpm2_core.data.packed import open_packed, packed_digest
     from dpm2_core.experiments.begun import begin_or_resume
 
-    frames = {folder: sum(map(len, open_packed(Path(folder)))) for folder in settings.data.packed}
+    drives = {folder: open_packed(Path(folder)) for folder in settings.data.packed}
+    frames = {folder: sum(map(len, found)) for folder, found in drives.items()}
+    content = {folder: packed_digest(found) for folder, found in drives.items()}
     read = [Path(settings.start)] if settings.start else []
-    begin_or_resume(out, resume, settings, read, {"frames": frames})
+    begin_or_resume(out, resume, settings, read, {"frames": frames, "content": content})

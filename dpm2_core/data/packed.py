@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import shutil
@@ -216,3 +217,11 @@ def open_packed(root: Path) -> list[PackedDrive]:
     if not found:
         raise UsageError(f"{root}: no packed drive below it; `dpm2 train pack` makes some")
     return found
+
+
+def packed_digest(drives: Iterable[PackedDrive]) -> str:
+    """What drives hold, in 16 characters: how many points each frame has, and where it is; no two drives share that."""
+    digest = hashlib.sha256()
+    for drive in drives:
+        digest.update(drive.offsets.tobytes() + drive.poses.tobytes())
+    return digest.hexdigest()[:16]

@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import math
 from contextlib import suppress
+from io import BytesIO
 from pathlib import Path
 from typing import IO, Any
 from zipfile import ZipFile
@@ -29,8 +30,10 @@ def save_checkpoint(path: Path, module: nn.Module, ema: nn.Module, optimiser: to
         "optimiser": optimiser.state_dict(),
         "step": step,
     }
+    whole = BytesIO()  # into a file that cannot grow, torch raises errors of its own
+    torch.save(state, whole)
     with atomic_write(path, "wb") as file:
-        torch.save(state, file)
+        file.write(whole.getbuffer())
 
 
 def load_checkpoint(path: Path, module: nn.Module, ema: nn.Module, optimiser: torch.optim.Optimizer) -> int:

@@ -52,7 +52,7 @@ class OptimizerSettings(Settings):
     """Largest norm of the gradient."""
     ema: float = Field(0.998, ge=0, lt=1)
     """Decay of the averaged weights, which are the ones that are kept."""
-    seed: int = 0
+    seed: int = Field(0, ge=0)
     """Of weights, data and everything random."""
     compile: bool = True
     """torch.compile: slower to start, about twice as fast."""

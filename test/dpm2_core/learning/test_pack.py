@@ -224,6 +224,13 @@ def test_all_drives_of_a_data_set_are_packed_and_a_second_run_makes_only_what_is
     assert CliRunner().invoke(app, arguments).exit_code == 0
     assert (out / "03" / "clouds.npy").stat().st_mtime_ns == kept
     assert len(PackedDrive(out / "05")) == 4
+    for other, name in (
+        (["--preset", "paper"], "preset small"),
+        (["--frames", "0:3"], "frames :"),
+        (["--no-image"], "input"),
+    ):
+        refused = CliRunner().invoke(app, [*arguments, *other])
+        assert f"03: made with {name}" in str(refused.exception)
     one_of_all = CliRunner().invoke(app, [*arguments, "--set", "sequence=03"])
     assert "packs every drive" in str(one_of_all.exception)
     nothing = CliRunner().invoke(app, ["train", "pack", str(tmp_path / "all" / "03"), str(tmp_path / "x"), "--all"])

@@ -5,16 +5,20 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import socket
 import subprocess
 import sys
 from itertools import repeat
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
+from typer.testing import CliRunner
 
+from dpm2_core.cli import app
 from dpm2_core.config import merged, settings_from
 from dpm2_core.data.packed import Sample, write_packed
 from dpm2_core.errors import Dpm2Error, UsageError
@@ -34,6 +38,7 @@ from dpm2_core.learning.trainer import OptimizerSettings, Trainer, learning_rate
 from dpm2_core.network.weights import network_settings, read_metadata
 
 from ...helpers import ranks
+from ...helpers.full_disk import largest_file
 from ...helpers.networks import tiny
 
 STILL = AugmentSettings(drop=0, occlusion=0, beams=0, jitter=0, tilt=0, shift=(0, 0, 0), image_drop=0)
@@ -215,6 +220,33 @@ def test_a_damaged_checkpoint_is_one_line_of_its_own(damage: str, tmp_path: Path
     want = said.get(damage, "damaged, or not a checkpoint; remove it to begin anew, without --resume")
     with pytest.raises(UsageError, match=f"^{path}: {want}$"):
         load_checkpoint(path, module, module, made)
+
+
+def test_a_full_disk_is_said_and_the_checkpoint_before_stays(tmp_path: Path) -> None:
+    path, module = tmp_path / "checkpoint.pt", torch.nn.Linear(32, 32)
+    made = make_optimizer(module, OptimizerSettings())
+    save_checkpoint(path, module, module, made, 7)
+    with largest_file(4000), pytest.raises(Dpm2Error, match=r"checkpoint\.pt: not written"):
+        save_checkpoint(path, module, module, made, 8)
+    assert load_checkpoint(path, module, module, made) == 7
+
+
+def test_drives_that_were_packed_anew_are_not_gone_on_with(
+    settings: RegistrationTrainingSettings, packed: Path, tmp_path: Path
+) -> None:
+    """As many frames may be others."""
+    drives = shutil.copytree(packed, tmp_path / "drives")
+    settings = settings.model_copy(
+        update={"data": settings.data.model_copy(update={"packed": {str(drives): 1.0}}), "validation": ""}
+    )
+    asked = tmp_path / "asked.yaml"
+    asked.write_text(json.dumps(settings.model_dump(mode="json")))
+    command = ["train", "phase1", "--config", str(asked), "--out", str(tmp_path / "out")]
+    assert CliRunner().invoke(app, command).exit_code == 0
+    poses = next(drives.rglob("poses.npy"))
+    np.save(poses, np.load(poses)[::-1])
+    refused = CliRunner().invoke(app, [*command, "--resume"])
+    assert f"began with content.{drives} " in str(refused.exception)
 
 
 @pytest.mark.slow
