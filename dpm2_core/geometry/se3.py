@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from math import atan2, sin, sqrt, tan
 from typing import TypeVar
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from dpm2_core.frame import is_rigid as is_rigid
+from dpm2_core.geometry.compiled import compiled
 
 Array = NDArray[np.float64]
 
@@ -45,40 +47,85 @@ def hat(w: ArrayLike) -> Array:
     return out - np.swapaxes(out, -1, -2)
 
 
-def _left_jacobian(w: Array) -> Array:
-    """V with translation = V @ rho, for (..., 3) rotation vectors; series below 1e-4 rad, where 1 - cos cancels."""
-    theta2 = (w * w).sum(-1)[..., None, None]
-    small = theta2 < 1e-8
-    safe = np.where(small, 1.0, theta2)
-    theta = np.sqrt(safe)
-    a = np.where(small, 0.5 - theta2 / 24, (1 - np.cos(theta)) / safe)
-    b = np.where(small, 1 / 6 - theta2 / 120, (theta - np.sin(theta)) / (safe * theta))
-    W = hat(w)
-    return np.eye(3) + a * W + b * (W @ W)
-
-
 def exp(xi: ArrayLike) -> Array:
     """(..., 6) tangent to (..., 4, 4)."""
-    xi = np.asarray(xi, np.float64)
-    w, rho = xi[..., :3], xi[..., 3:]
-    return make(rotation(w), (_left_jacobian(w) @ rho[..., None])[..., 0])
+    xi = np.ascontiguousarray(xi, np.float64)
+    T = np.empty((*xi.shape[:-1], 4, 4))
+    _exp(xi.reshape(-1, 6), T.reshape(-1, 4, 4))
+    return T
 
 
 def log(T: Array) -> Array:
     """(..., 4, 4) to (..., 6); inverse of `exp` for rotations below pi."""
-    w = rotation_vector(T[..., :3, :3])
-    rho = np.linalg.solve(_left_jacobian(w), T[..., :3, 3:])[..., 0]
-    return np.concatenate([w, rho], -1)
+    T = np.ascontiguousarray(T, np.float64)
+    xi = np.empty((*T.shape[:-2], 6))
+    _log(T.reshape(-1, 4, 4), xi.reshape(-1, 6))
+    return xi
 
 
 def rotation(w: Array) -> Array:
     """Rotation vectors (..., 3), rad, to (..., 3, 3)."""
-    return np.asarray(Rotation.from_rotvec(w.reshape(-1, 3)).as_matrix().reshape(*w.shape, 3))
+    return exp(np.concatenate([w, np.zeros_like(w)], -1))[..., :3, :3]
 
 
 def rotation_vector(R: Array) -> Array:
     """(..., 3, 3) to (..., 3), rad, up to pi."""
-    return np.asarray(Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec().reshape(*R.shape[:-1]))
+    return log(make(R, np.zeros(3)))[..., :3]
+
+
+@compiled("void(f8[:, ::1], f8[:, :, ::1])")
+def _exp(xi: Array, T: Array) -> None:
+    """`exp` of (N, 6), into (N, 4, 4): Rodrigues' formula, by half the angle, where 1 - cos does not cancel."""
+    for n in range(len(xi)):
+        x, y, z = xi[n, 0], xi[n, 1], xi[n, 2]
+        squared = x * x + y * y + z * z
+        angle = sqrt(squared)
+        if squared < 1e-8:  # where angle - sin cancels
+            first, second, third = 1 - squared / 6, 0.5 - squared / 24, 1 / 6 - squared / 120
+        else:
+            first, third = sin(angle) / angle, (angle - sin(angle)) / (squared * angle)
+            second = 2 * (sin(angle / 2) / angle) ** 2
+        # W is the matrix of the cross product with x, y, z; W W is w w^T - squared I.
+        W = ((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))
+        w, moved = (x, y, z), xi[n, 3:]
+        for a in range(3):
+            T[n, a, 3] = T[n, 3, a] = 0.0
+            for b in range(3):
+                same = 1.0 if a == b else 0.0
+                double = w[a] * w[b] - squared * same
+                T[n, a, b] = same + first * W[a][b] + second * double
+                T[n, a, 3] += (same + second * W[a][b] + third * double) * moved[b]
+        T[n, 3, 3] = 1.0
+
+
+@compiled("void(f8[:, :, ::1], f8[:, ::1])")
+def _log(T: Array, xi: Array) -> None:
+    """`log` of (N, 4, 4), into (N, 6): by the quaternion, whose largest part is found first (Shepperd 1978)."""
+    for n in range(len(T)):
+        R = T[n]
+        trace = R[0, 0] + R[1, 1] + R[2, 2]
+        a = 0 if R[0, 0] >= R[1, 1] and R[0, 0] >= R[2, 2] else (1 if R[1, 1] >= R[2, 2] else 2)
+        b, c = (a + 1) % 3, (a + 2) % 3
+        q = xi[n]  # the imaginary parts first
+        if trace > R[a, a]:
+            real = 1 + trace
+            q[0], q[1], q[2] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+        else:
+            real = R[c, b] - R[b, c]
+            q[a], q[b], q[c] = 1 + R[a, a] - R[b, b] - R[c, c], R[b, a] + R[a, b], R[c, a] + R[a, c]
+        length = sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2)
+        angle = 2 * atan2(length, abs(real))
+        scale = (angle / length if length > 0 else 0.0) * (-1.0 if real < 0 else 1.0)
+        x, y, z = q[0] * scale, q[1] * scale, q[2] * scale
+        squared = x * x + y * y + z * z
+        # Of the inverse of the matrix by which `_exp` moves: 1 - W / 2 + third W W.
+        third = 1 / 12 + squared / 720 if squared < 1e-4 else (1 - angle / 2 / tan(angle / 2)) / squared
+        u, v, w = T[n, 0, 3], T[n, 1, 3], T[n, 2, 3]
+        along = x * u + y * v + z * w
+        xi[n, 0], xi[n, 1], xi[n, 2] = x, y, z
+        xi[n, 3] = u - (y * w - z * v) / 2 + third * (x * along - squared * u)
+        xi[n, 4] = v - (z * u - x * w) / 2 + third * (y * along - squared * v)
+        xi[n, 5] = w - (x * v - y * u) / 2 + third * (z * along - squared * w)
 
 
 def adjoint(T: Array) -> Array:

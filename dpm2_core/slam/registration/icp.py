@@ -113,13 +113,14 @@ class GeometricRegistration:
                 return Registration.failed("geometric", f"{inliers} of {len(points)} points near the map", T_guess)
             pull = prior @ se3.log(se3.inverse(T_guess) @ T)
             step = np.linalg.solve(H + prior, -gradient - pull)
-            T = se3.orthonormalized(T @ se3.exp(step))
+            T = T @ se3.exp(step)
             gate = max(0.7 * gate, s.final_gate)
             radians, meters = _COARSE if coarse else _FINE
             if np.linalg.norm(step[:3]) < radians and np.linalg.norm(step[3:]) < meters:
                 if not coarse:
                     break
                 coarse, gate = False, s.final_gate
+        T = se3.orthonormalized(T)  # what rounding has added up to
         ratio = inliers / len(points)
         expected = predicted and target.is_young and near(T_guess, T)
         least = s.min_inliers_expected if expected else s.min_inliers

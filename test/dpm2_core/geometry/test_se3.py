@@ -6,9 +6,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import scipy.linalg
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from scipy.spatial.transform import Rotation
 
 from dpm2_core.geometry import se3
 
@@ -40,6 +41,23 @@ def test_exp_is_the_matrix_exponential(xi: np.ndarray) -> None:
 @given(tangents())
 def test_log_inverts_exp(xi: np.ndarray) -> None:
     np.testing.assert_allclose(se3.log(se3.exp(xi)), xi, atol=1e-9)
+
+
+@given(arrays(np.float64, 3, elements=st.floats(-1, 1)), st.floats(0, 1e-7), st.floats(-50, 50))
+def test_half_a_turn_is_no_special_case(axis: np.ndarray, less: float, t: float) -> None:
+    """Where the vector may be either of two, it leads to the same pose; 1e-6 m of 50 m: rounding of half turns."""
+    assume(np.linalg.norm(axis) > 1e-3)
+    T = se3.exp(np.r_[axis / np.linalg.norm(axis) * (np.pi - less), t, 1, -t])
+    xi = se3.log(T)
+    assert np.linalg.norm(xi[:3]) == pytest.approx(np.pi - less, abs=1e-7)
+    np.testing.assert_allclose(se3.exp(xi), T, atol=1e-6)
+
+
+@given(tangents())
+def test_rotations_are_those_of_scipy(xi: np.ndarray) -> None:
+    of_scipy = Rotation.from_rotvec(xi[:3])
+    np.testing.assert_allclose(se3.rotation(xi[:3]), of_scipy.as_matrix(), atol=1e-14)
+    np.testing.assert_allclose(se3.rotation_vector(of_scipy.as_matrix()), of_scipy.as_rotvec(), atol=1e-12)
 
 
 @given(tangents(), tangents())
