@@ -60,6 +60,10 @@ def stamp_ns(header: Any) -> int:
     return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
 
 
+LATEST = 2**31 * 1_000_000_000
+"""ns up to which a stamp can be: in 2038."""
+
+
 def serialized_stamp(data: bytes, time: int) -> int:
     """Stamp in ns of a serialized message that begins with a header, without decoding the rest; `time` if it is 0."""
     if len(data) < 12:

@@ -5,13 +5,13 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dpm2_core.data.messages import restamped, serialized_stamp
+from dpm2_core.data.messages import LATEST, restamped, serialized_stamp
 from dpm2_core.data.pairing import RawMessage
 from dpm2_core.frame import Array
 
@@ -72,17 +72,18 @@ def in_order(messages: Iterable[RawMessage], topic: str, corrected: Callable[[in
     yield from held
 
 
-def _in_place(stamps: Iterable[int], which: int) -> int:
+def _in_place(stamps: Sequence[int], which: int) -> int:
     """The stamp (ns) of one of some clouds in a row, put between its neighbors where it is off."""
-    near = np.array(list(stamps), np.int64)
-    steps, since = np.diff(near), near - near[0]
-    if (steps > 0).all() or not steps[max(which - 1, 0) : which + 1].all():
-        return int(near[which])
+    near = list(stamps)
+    increase = [before < after for before, after in pairwise(near)]
+    repeated = near[which] in near[max(which - 1, 0) : which] + near[which + 1 : which + 2]
+    if all(increase) or repeated:
+        return near[which]
+    since = np.array([stamp - near[0] for stamp in near], np.float64)  # whose differences may have more than 64 bits
     off = out_of_order(since)
-    if not off[which]:
-        return int(near[which])
-    in_order = np.flatnonzero(~off)
-    return int(near[0] + round(np.interp(which, in_order, since[in_order])))
+    known = np.flatnonzero(~off)
+    stamp = near[0] + round(np.interp(which, known, since[known]))
+    return stamp if off[which] and stamp < LATEST else near[which]
 
 
 def _longest_increasing(times: Array) -> list[int]:
