@@ -60,8 +60,8 @@ def stamp_ns(header: Any) -> int:
     return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
 
 
-LATEST = 2**31 * 1_000_000_000
-"""ns up to which a stamp can be: in 2038."""
+STAMP_END = 2**31 * 1_000_000_000
+"""ns before which the stamp of a header is: in 2038."""
 
 
 def serialized_stamp(data: bytes, time: int) -> int:

@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from dpm2_core.data.messages import LATEST, restamped, serialized_stamp
+from dpm2_core.data.messages import STAMP_END, restamped, serialized_stamp
 from dpm2_core.data.pairing import RawMessage
 from dpm2_core.frame import Array
 
@@ -83,7 +83,7 @@ def _in_place(stamps: Sequence[int], which: int) -> int:
     off = out_of_order(since)
     known = np.flatnonzero(~off)
     stamp = near[0] + round(np.interp(which, known, since[known]))
-    return stamp if off[which] and stamp < LATEST else near[which]
+    return stamp if off[which] and stamp < STAMP_END else near[which]
 
 
 def _longest_increasing(times: Array) -> list[int]:

@@ -139,7 +139,7 @@ def adjoint(T: Array) -> Array:
 
 def angle(T: Array) -> Array:
     """Rotation angle of (..., 4, 4), rad; exact near zero, where the trace formula is not."""
-    return np.linalg.norm(rotation_vector(T[..., :3, :3]), axis=-1)
+    return np.linalg.norm(log(T)[..., :3], axis=-1)
 
 
 def magnitude(T: Array) -> tuple[float, float]:

@@ -127,13 +127,14 @@ def register_sweep(scan: Scan, matched: Matched, T: Array, beginning: Beginning,
         H += start.T @ information @ start + np.diag(alone + 1e-9)
         gradient += start.T @ information @ off + alone * (np.concatenate([np.zeros(6), motion.ravel()]) - expected)
         step = np.linalg.solve(H, -gradient)
-        T, change = se3.orthonormalized(T @ se3.exp(step[:6])), step[6:].reshape(ORDER, 6)
+        T, change = T @ se3.exp(step[:6]), step[6:].reshape(ORDER, 6)
         motion = motion + change
         moved = np.abs([step[:6], beginning.half * change[0]]).reshape(4, 3).max(1)
         if max(moved[0], moved[2]) < _END[0] and max(moved[1], moved[3]) < _END[1]:
             break
     if off @ information @ off > _CHI2:
         return None
+    T = se3.orthonormalized(T)  # what rounding has added up to
     return Swept(T, motion, np.asarray(np.linalg.inv(H), np.float64), beginning.half)
 
 

@@ -14,6 +14,7 @@ from dpm2_core.data.cloud_folder import CloudFolder
 from dpm2_core.data.open import open_source
 from dpm2_core.data.ply import write_ply
 from dpm2_core.data.settings import InputSettings
+from dpm2_core.frame import Frame
 
 RAMP = np.linspace(0, 0.1, 40)
 POINTS = np.random.default_rng(0).uniform(-20, 20, (40, 3)).astype(np.float32)
@@ -140,6 +141,17 @@ def test_a_damaged_file_is_a_failed_frame(tmp_path: Path) -> None:
     assert "2.pcd: cannot be read as PCD" in (problems[2] or "")
 
 
+def only_frame(folder: Path) -> tuple[Frame, int]:
+    """The frame of a folder of one scan, and how many bytes it took at most to read it."""
+    source = CloudFolder(folder)
+    tracemalloc.start()
+    try:
+        (frame,) = source.frames()
+        return frame, tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
 @pytest.mark.parametrize("before", ["", " ", "# DATA\n#" + 70_000 * "a" + "\n"])
 def test_a_header_of_millions_of_columns_is_refused_before_they_are_made(tmp_path: Path, before: str) -> None:
     pytest.importorskip("pypcd4", reason="no pypcd4: pip install '.[datasets]'")
@@ -148,13 +160,7 @@ def test_a_header_of_millions_of_columns_is_refused_before_they_are_made(tmp_pat
         "WIDTH 1\nHEIGHT 1\nPOINTS 1\nDATA ascii\n"
     )
     (tmp_path / "0.pcd").write_text(header + "1 2 3\n")
-    folder = CloudFolder(tmp_path)
-    tracemalloc.start()
-    try:
-        (frame,) = folder.frames()
-        most = tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
+    frame, most = only_frame(tmp_path)
     assert "0.pcd: cannot be read as PCD: more than 1000 columns" in (frame.problem or "")
     assert most < 5e6
 
@@ -169,11 +175,6 @@ def test_more_points_than_there_are_bytes_for_are_refused_before_there_is_room_f
     count = int(re.findall(rb"POINTS (\d+)", header)[0])
     assert count != points
     (tmp_path / "0.pcd").write_bytes(header.replace(b"POINTS %d" % count, b"POINTS %d" % points) + data + rest)
-    tracemalloc.start()
-    try:
-        (frame,) = CloudFolder(tmp_path).frames()
-        most = tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
+    frame, most = only_frame(tmp_path)
     assert f"{points} points announced" in (frame.problem or "")
     assert most < 5e6
