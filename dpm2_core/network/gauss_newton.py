@@ -156,7 +156,10 @@ def solve_pose(
     information, gradient, step = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
     for _ in range(int(rounds)):
         _whiten(T, source, target, L, residual, jacobian)
-        information[:], gradient[:] = _DAMPING * np.eye(6), 0.0
+        for i in range(6):
+            for j in range(6):
+                information[i, j] = _DAMPING if i == j else 0.0
+            gradient[i] = 0.0
         for n in range(n_pairs):
             s = residual[n, 0] ** 2 + residual[n, 1] ** 2 + residual[n, 2] ** 2
             w = weight[n] * ((soft + 3) / (soft + s)) ** 2

@@ -26,12 +26,10 @@ def distances(
         i = index[q]
         if i < 0:
             continue
-        normal[q], variance[q] = normals[i], variances[i]
-        residual[q] = (
-            (queries[q, 0] - points[i, 0]) * normals[i, 0]
-            + (queries[q, 1] - points[i, 1]) * normals[i, 1]
-            + (queries[q, 2] - points[i, 2]) * normals[i, 2]
-        )
+        residual[q], variance[q] = 0.0, variances[i]
+        for a in range(3):
+            normal[q, a] = normals[i, a]
+            residual[q] += (queries[q, a] - points[i, a]) * normals[i, a]
     return residual, normal, variance
 
 
