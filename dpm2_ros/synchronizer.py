@@ -22,6 +22,9 @@ HOLD = 0.5
 """Longest wait (s) for the next stamp, which confirms a jump."""
 FEW = 2
 """Clouds that may wait at least where they come faster than they can be processed."""
+AHEAD = 3
+"""Periods of the LiDAR by which a stamp may exceed the last one and the time that has passed since; `JUMP` at most. If
+the stamp of one cloud is wrong by less than that, the next ones may have to catch up with it."""
 PATIENCE = 5
 """Clouds in a row that a sensor may miss before clouds no longer wait for it (until it delivers again)."""
 
@@ -109,6 +112,7 @@ class Synchronizer:
         self._moves = False  # whether a cloud has gone since the last was dropped: too slow, but not held up
         self._newest: int | None = None  # stamp of the last cloud accepted
         self._arrival = 0.0  # of that cloud
+        self._period = JUMP  # ns, from the last but one to that cloud
         self._jumped: Bundle | None = None
         self._left: tuple[float, float] = -float("inf"), 0.0  # stamp and arrival of the last cloud that went
 
@@ -135,7 +139,7 @@ class Synchronizer:
         """Take a cloud with its stamp (ns); `now` is when it arrived."""
         self.last_arrival = now
         if self._jumped is not None and self._newest is not None:
-            self._settle(abs(stamp - self._jumped.stamp) <= abs(stamp - self._newest))
+            self._settle(abs(stamp - self._jumped.stamp) < abs(stamp - self._newest))
         check = self._check(stamp, now)
         if check is StampCheck.JUMPED:
             self._jumped = Bundle(stamp, cloud, now, restarted=False)
@@ -199,11 +203,15 @@ class Synchronizer:
         if self._newest is None:
             return StampCheck.ACCEPTED
         step = stamp - self._newest
-        if step < -JUMP or step > JUMP + (now - self._arrival) * 1e9:
+        if step < -JUMP or self._ahead(stamp, now) > min(AHEAD * self._period, JUMP):
             return StampCheck.JUMPED
         if step > 0:
             return StampCheck.ACCEPTED
         return StampCheck.OUT_OF_ORDER if step else StampCheck.REPEATED
+
+    def _ahead(self, stamp: int, arrival: float) -> float:
+        """By how much more (ns) the stamps have gone on than time has passed since the last cloud."""
+        return stamp - self._newest - (arrival - self._arrival) * 1e9 if self._newest is not None else 0.0
 
     def _settle(self, true: bool) -> None:
         """Accept or reject the cloud whose stamp jumped."""
@@ -211,7 +219,7 @@ class Synchronizer:
         if bundle is None or self._newest is None:
             return
         bundle.restarted = true and bundle.stamp < self._newest
-        bundle.stepped = true and not bundle.restarted
+        bundle.stepped = true and self._ahead(bundle.stamp, bundle.arrival) > JUMP
         self.counts[
             StampCheck.RESTARTED if bundle.restarted else StampCheck.ACCEPTED if true else StampCheck.STRAY
         ] += 1
@@ -219,6 +227,8 @@ class Synchronizer:
             self._accept(bundle)
 
     def _accept(self, bundle: Bundle) -> None:
+        if self._newest is not None and bundle.stamp > self._newest:
+            self._period = bundle.stamp - self._newest
         self._newest, self._arrival = bundle.stamp, bundle.arrival
         self._queue.append(bundle)
         if len(self._queue) > self._room and self._moves:

@@ -290,7 +290,7 @@ def feed(synchronizer: Synchronizer, *stamps_ms: int, period: float = 0.1) -> li
     return [(bundle.cloud, bundle.restarted) for bundle in out]
 
 
-@pytest.mark.parametrize("stray", [10_000 + 86_400_000, 12_000, 0, 8_000])
+@pytest.mark.parametrize("stray", [10_000 + 86_400_000, 12_000, 10_900, 10_450, 0, 8_000])
 def test_one_stamp_far_off_costs_its_cloud_alone(stray: int) -> None:
     """Ahead or behind: what follows goes on from what was before, and nothing starts again."""
     synchronizer = make(camera=False)
@@ -330,6 +330,28 @@ def test_a_jump_ahead_is_told_from_a_pause() -> None:
     for stamp in (10_000, 15_000, 15_100, 15_200):
         synchronizer.add_cloud(stamp * MS, stamp, now=0.0)
     assert [(b.cloud, b.stepped) for b in drain(synchronizer, 0.0)] == [(15_100, True), (15_200, False)]
+
+
+@pytest.mark.parametrize("ahead", [11_000, 10_300, 10_150])
+def test_a_stamp_ahead_costs_no_more_than_what_its_cloud_overtakes(ahead: int) -> None:
+    """Less than three periods ahead nothing tells it from a pause: those until then are lost, all others go."""
+    synchronizer = make(camera=False)
+    true = range(10_000, 11_600, 100)
+    stamps = [ahead if stamp == 10_200 else stamp for stamp in true]
+    left = [stamp for stamp, _ in feed(synchronizer, *stamps)]
+    lost = set(true) - set(left)
+    assert lost <= {10_200, 10_300}
+    assert left == sorted(left)
+
+
+def test_a_burst_of_which_the_middle_was_lost_loses_nothing_more() -> None:
+    """A link that delivers late what it has kept: the clouds around the hole come at once, and no clock was set."""
+    stamps, out = [10_000, 10_100, 10_200, 10_900, 11_000, 11_100], []
+    synchronizer = make(camera=False, depth=8)
+    for stamp, now in zip(stamps, (0.0, 0.1, 1.2, 1.2, 1.2, 1.2), strict=True):
+        synchronizer.add_cloud(stamp * MS, stamp, now)
+        out += drain(synchronizer, now)
+    assert [(bundle.cloud, bundle.stepped) for bundle in out] == [(stamp, False) for stamp in stamps]
 
 
 def test_a_pause_of_the_sensor_is_no_jump() -> None:
