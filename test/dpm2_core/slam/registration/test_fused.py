@@ -117,6 +117,18 @@ def test_a_network_that_knows_less_moves_nothing(case: Case) -> None:
     np.testing.assert_allclose(result.T_target_source, alone.T_target_source, atol=1e-9)
 
 
+def test_a_network_that_claims_a_little_more_than_few_points_moves_nothing(suburb_drive: Drive) -> None:
+    """It claims 0.04 m, they 0.06: as at the walls of a building it is off by more than either."""
+    case, frame = Case(suburb_drive), suburb_drive[0][5]
+    case.scan = case.registration.prepare(replace(frame, points=frame.points[::100]), np.zeros(6))
+    result, error = case.register([0, 0, 0, 0.2, 0, 0])
+    assert (result.ok, result.method, result.reason) == (True, "refined", "")
+    alone, error_alone = case.register([0, 0, 0, 0, 0, 0], size=0)
+    assert alone.worst_sigma > 0.05
+    assert abs(error - error_alone) < 0.01
+    assert result.worst_sigma == pytest.approx(alone.worst_sigma, rel=0.05)
+
+
 @pytest.mark.parametrize("silent", [{"ok": False}, {"size": 0}])
 def test_points_alone_where_the_network_is_silent(case: Case, silent: dict[str, object]) -> None:
     result, error = case.register([0, 0, 0, 5, 0, 0], **silent)
