@@ -123,8 +123,13 @@ def _train(name: str, settings: TaskTraining, out: Path, resume: bool, sets: tup
     (src, sequences), val = sets
     scans = open_scans(src, kind.learns_from(settings), sequences)
     data = {"task": name, "SRC": str(src.resolve()), "sequences": list(sequences), "scans": len(scans)}
+    data["content"] = scans.digest()
     begin_or_resume(out, resume, settings, data=data)
-    measured = None if val is None else open_scans(val[0], kind.needs, val[1])
+    measured = None
+    if val is not None:
+        measured = open_scans(val[0], kind.needs, val[1])
+        if measured.digest() == data["content"]:
+            typer.echo(f"note: --val {val[0]} is what the task learns from", err=True)
     train_task(new_task(name, settings), scans, out, resume, measured)
     typer.echo(f"{out / WEIGHTS}: written", err=True)
 

@@ -41,7 +41,9 @@ def train(recording: Path, out: Path, *more: object) -> Done:
 def test_train_resume_and_measure(recording: Path, tmp_path: Path) -> None:
     """With the SLAM loss in the third epoch; a second training does not overwrite; figures, table and image."""
     out = tmp_path / "out"
-    assert train(recording, out, "--slam-weight", "0.5", "--slam-every", "3", "--val", recording).returncode == 0
+    first = train(recording, out, "--slam-weight", "0.5", "--slam-every", "3", "--val", recording)
+    assert first.returncode == 0
+    assert f"--val {recording} is what the task learns from" in first.stderr
     log = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
     assert [row["step"] for row in log if "slam_loss" in row] == [2]
     assert "miou" in log[-1]
@@ -63,6 +65,12 @@ def test_train_resume_and_measure(recording: Path, tmp_path: Path) -> None:
     assert {"mse", "miou", "precision", "recall"} <= printed.keys()
     assert image.stat().st_size > 1000
     assert "precision" in dpm2("eval-task", "gndnet", weights, recording).stdout
+
+    scan = recording / "sequences" / "00" / "velodyne" / "000000.bin"
+    scan.write_bytes(scan.read_bytes()[::-1])  # another drive of as many scans
+    replaced = train(recording, out, *same)
+    assert (replaced.returncode, replaced.stderr.count("\n")) == (2, 1)
+    assert "began with content " in replaced.stderr
 
 
 def test_errors_of_use(recording: Path, tmp_path: Path) -> None:
