@@ -35,14 +35,14 @@ _TOGETHER = 3.0  # m, least deviation of what it finds there by the images: most
 class FusedScanRegistration:
     """ICP and the network's registration, fused.
 
-    If both agree (see `agree`), they are fused by their information: ICP dominates in structured scenes, the network
-    along degenerate directions such as a tunnel. If they disagree, ICP starts from the network's pose as well, and the
-    more likely of its results is kept, unless the points are just where the motion leads: among what repeats, such as
-    doors and parked cars, a place beside may fit better. Points that have strayed from where the motion leads are
-    registered anew from a network's pose that they agree with. Where little is known of the motion, it starts there at
-    once: a direction that seems open from afar may be closed at the right place. If ICP fails, it is tried again from
-    the network's pose; if it fails there too, or converges elsewhere, the network's pose is returned, less sure than it
-    claims. `reason` says which of the two disagreed, and why.
+    If both agree (see `agree`), they are fused by their information (see `_mean`): nearly always that of the points. If
+    they disagree, ICP starts from the network's pose as well, and the more likely of its results is kept, unless the
+    points are just where the motion leads: among what repeats, such as doors and parked cars, a place beside may fit
+    better. Points that have strayed from where the motion leads are registered anew from a network's pose that they
+    agree with. Where little is known of the motion, it starts there at once: a direction that seems open from afar may
+    be closed at the right place. If ICP fails, it is tried again from the network's pose; if it fails there too, or
+    converges elsewhere, the network's pose is returned, less sure than it claims. `reason` says which of the two
+    disagreed, and why.
     """
 
     def __init__(
